@@ -1,0 +1,1 @@
+"""Scenarios, suites and training presets, as package data."""

@@ -1,0 +1,58 @@
+"""What drives: adaptive cruise control with a constant time headway (thesis 4.6.1)."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from tailgate.core import Array, Estimate, Finite, Mode, Model, NonNegative, Positive, param
+from tailgate.registry import register
+
+WIDEN_FACTOR = 1.5  # Mode.WIDEN: time headway times this
+BRAKE_ACCEL = -2.0  # Mode.BRAKE: at most this acceleration [m/s^2]
+STOP_ACCEL = -5.0  # Mode.STOP [m/s^2], the braking limit of the thesis's follower (section 3.5)
+
+
+@register("controller", "acc", reference="Dutta 2018, (4.13) and (4.14), corrected")
+@dataclass(frozen=True)
+class AdaptiveCruise:
+    """Constant-time-headway ACC on the estimated own state and the received state of the leader.
+
+        a_des = ((v_l - v_f) + gamma (x_l - x_f - d_r - h v_f)) / h
+
+    Erratum: (4.14) as printed has the sign wrong and omits d_r. With a set speed, the smaller of a_des and the same law
+    without the gap term, (v_set - v_f) / h, is taken (speed mode).
+    """
+
+    headway: Positive = param(3.0, "time headway h [s]")
+    standstill: NonNegative = param(5.0, "minimum stopping distance d_r [m]")
+    gamma: Positive = param(0.9, "gap gain [1/s]")
+    set_speed: Positive | None = param(29.95, "driver's set speed [m/s]; none: spacing mode only")
+    accel_min: Finite | None = param(-5.0, "lower limit of the command [m/s^2]; none: unlimited")
+    accel_max: Finite | None = param(2.0, "upper limit of the command [m/s^2]; none: unlimited")
+
+    def prepare(self, model: Model) -> Any:
+        return None
+
+    def start(self, plan: Any, batch: int) -> Any:
+        return None
+
+    def step(self, plan: Any, state: Any, estimate: Estimate, v2v: Array) -> tuple[Any, Array]:
+        """estimate.x (B, N, 3) = [x, v, a] and v2v (B, N, 2) = [x_l, v_l] to the command a_des (B, N, 1) [m/s^2]."""
+        x, v, mode = estimate.x[..., 0], estimate.x[..., 1], estimate.mode
+        headway = np.where(mode == Mode.WIDEN, WIDEN_FACTOR * self.headway, self.headway)
+        gap_error = v2v[..., 0] - x - self.standstill - headway * v
+        a = ((v2v[..., 1] - v) + self.gamma * gap_error) / headway
+        if self.set_speed is not None:
+            a = np.minimum(a, (self.set_speed - v) / headway)
+        a = np.where(mode == Mode.BRAKE, np.minimum(a, BRAKE_ACCEL), a)
+        a = np.where(mode == Mode.STOP, STOP_ACCEL, a)
+        if self.accel_min is not None:
+            a = np.maximum(a, self.accel_min)
+        if self.accel_max is not None:
+            a = np.minimum(a, self.accel_max)
+        return None, a[..., None]
+
+    def desired_gap(self, speed: Array) -> Array:
+        """d_r + h v [m] (4.13)."""
+        return np.asarray(self.standstill + self.headway * speed)

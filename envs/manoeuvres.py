@@ -1,0 +1,203 @@
+"""What the leader does: its acceleration [m/s^2] at each step."""
+
+import csv
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
+
+import numpy as np
+from pydantic import Field
+
+from tailgate import num
+from tailgate.core import Array, Finite, NonNegative, Positive, param
+from tailgate.draws import Draws
+from tailgate.errors import InputError
+from tailgate.registry import register
+
+Span = Annotated[tuple[NonNegative, NonNegative], Field(min_length=2, max_length=2)]
+
+
+def _within(span: tuple[float, float], u: Array) -> Array:
+    return np.asarray(span[0] + (span[1] - span[0]) * u)
+
+
+def _check_span(where: str, span: tuple[float, float]) -> None:
+    if span[0] > span[1]:
+        raise InputError(where, span, "two times [s], the smaller first")
+
+
+@register("manoeuvre", "constant", reference="Dutta 2018, (4.11), (4.12)")
+@dataclass(frozen=True)
+class Constant:
+    """A constant acceleration throughout."""
+
+    value: Finite = param(-0.108, "acceleration [m/s^2]")
+
+    def prepare(self, dt: float) -> Any:
+        return None
+
+    def start(self, plan: Any, draws: Draws) -> Any:
+        return None
+
+    def accel(self, plan: Any, state: Any, k: Array, speed: Array, draws: Draws) -> tuple[Any, Array]:
+        return None, np.full(len(k), self.value)
+
+
+class BrakingState(NamedTuple):
+    onset: Array  # (B,) [s]
+
+
+@register("manoeuvre", "braking")
+@dataclass(frozen=True)
+class Braking:
+    """Brakes at a random time until it stops."""
+
+    onset: Span = param((25.0, 35.0), "the onset is uniform on this span [s]")
+    decel: Positive = param(4.0, "deceleration [m/s^2]")
+
+    def __post_init__(self) -> None:
+        _check_span("manoeuvre braking.onset", self.onset)
+
+    def prepare(self, dt: float) -> float:
+        return dt
+
+    def start(self, plan: float, draws: Draws) -> BrakingState:
+        return BrakingState(_within(self.onset, draws.uniform()))
+
+    def accel(self, plan: float, state: BrakingState, k: Array, speed: Array, draws: Draws) -> tuple[Any, Array]:
+        return state, np.where(k * plan >= state.onset, np.maximum(-self.decel, -speed / plan), 0.0)
+
+
+class StopAndGoState(NamedTuple):
+    phase: Array  # (B,) 0 cruise, 1 brake, 2 dwell, 3 accelerate
+    clock: Array  # (B,) [s] left of a cruise or a dwell
+
+
+@register("manoeuvre", "stop_and_go")
+@dataclass(frozen=True)
+class StopAndGo:
+    """Cruises, brakes to a low speed, dwells there and speeds up again, with random times."""
+
+    cruise: Span = param((10.0, 30.0), "length of a cruise, uniform on this span [s]")
+    dwell: Span = param((3.0, 6.0), "length of a dwell at the low speed, uniform on this span [s]")
+    decel: Positive = param(3.0, "deceleration [m/s^2]")
+    accel_rate: Positive = param(1.5, "acceleration back to cruise [m/s^2]")
+    low_speed: NonNegative = param(0.0, "speed of the dwell [m/s]")
+    cruise_speed: Positive = param(29.05, "speed of the cruise [m/s]")
+
+    def __post_init__(self) -> None:
+        _check_span("manoeuvre stop_and_go.cruise", self.cruise)
+        _check_span("manoeuvre stop_and_go.dwell", self.dwell)
+        if self.low_speed >= self.cruise_speed:
+            raise InputError("manoeuvre stop_and_go.low_speed", self.low_speed, f"less than cruise_speed ({self.cruise_speed})")
+
+    def prepare(self, dt: float) -> float:
+        return dt
+
+    def start(self, plan: float, draws: Draws) -> StopAndGoState:
+        clock = _within(self.cruise, draws.uniform())
+        return StopAndGoState(np.zeros(len(clock), np.int8), clock)
+
+    def accel(self, plan: float, state: StopAndGoState, k: Array, speed: Array, draws: Draws) -> tuple[Any, Array]:
+        dt = plan
+        phase, clock = state.phase, state.clock - dt
+        done = np.where(
+            phase == 1, speed <= self.low_speed, np.where(phase == 3, speed >= self.cruise_speed, clock <= 0.0)
+        )
+        if done.any():
+            u = draws.uniform()
+            phase = np.where(done, (phase + 1) % 4, phase).astype(np.int8)
+            fresh = np.where(phase == 0, _within(self.cruise, u), _within(self.dwell, u))
+            clock = np.where(done, fresh, clock)
+        slow = np.maximum(-self.decel, (self.low_speed - speed) / dt)
+        fast = np.minimum(self.accel_rate, (self.cruise_speed - speed) / dt)
+        return StopAndGoState(phase, clock), np.where(phase == 1, slow, np.where(phase == 3, fast, 0.0))
+
+
+class OrnsteinUhlenbeckPlan(NamedTuple):
+    keep: float
+    kick: float
+
+
+class OrnsteinUhlenbeckState(NamedTuple):
+    accel: Array  # (B,)
+
+
+@register("manoeuvre", "ornstein_uhlenbeck", reference="Uhlenbeck and Ornstein 1930")
+@dataclass(frozen=True)
+class OrnsteinUhlenbeck:
+    """Random accelerations with a correlation time, drawn back to a mean speed."""
+
+    sd: NonNegative = param(0.8, "standard deviation of the random acceleration [m/s^2]")
+    correlation: Positive = param(3.0, "correlation time [s]")
+    mean_speed: Positive = param(25.0, "mean speed [m/s]")
+    pull: NonNegative = param(0.1, "return to the mean speed [1/s]")
+    limit: Positive = param(3.0, "largest |acceleration| [m/s^2]")
+
+    def prepare(self, dt: float) -> OrnsteinUhlenbeckPlan:
+        keep = float(num.exp(-dt / self.correlation))
+        return OrnsteinUhlenbeckPlan(keep, self.sd * math.sqrt(1.0 - keep * keep))
+
+    def start(self, plan: OrnsteinUhlenbeckPlan, draws: Draws) -> OrnsteinUhlenbeckState:
+        return OrnsteinUhlenbeckState(self.sd * draws.normal())
+
+    def accel(
+        self, plan: OrnsteinUhlenbeckPlan, state: OrnsteinUhlenbeckState, k: Array, speed: Array, draws: Draws
+    ) -> tuple[Any, Array]:
+        a = plan.keep * state.accel + plan.kick * draws.normal()
+        total = np.clip(a + self.pull * (self.mean_speed - speed), -self.limit, self.limit)
+        return OrnsteinUhlenbeckState(a), total
+
+
+class ProfilePlan(NamedTuple):
+    dt: float
+    speed: Array  # (K,) at k dt
+
+
+def read_profile(path: Path) -> tuple[Array, Array]:
+    """Times [s] and speeds [m/s] of a CSV file with the header `t,v`, validated."""
+    where = "manoeuvre profile.path"
+    try:
+        rows = list(csv.reader(path.read_text(encoding="utf-8-sig").splitlines()))
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(where, str(path), f"a readable CSV file ({error})") from None
+    if not rows or [c.strip() for c in rows[0]] != ["t", "v"]:
+        raise InputError(where, rows[0] if rows else "an empty file", "the header t,v (seconds, metres per second)")
+    times, speeds = [], []
+    for line, row in enumerate(rows[1:], start=2):
+        if not row:
+            continue
+        try:
+            t, v = (float(c) for c in row)
+        except ValueError:
+            raise InputError(f"{where}, line {line}", ",".join(row), "two numbers t,v") from None
+        if not (math.isfinite(t) and math.isfinite(v)) or v < 0:
+            raise InputError(f"{where}, line {line}", ",".join(row), "finite numbers, and a speed not below 0")
+        if times and t <= times[-1]:
+            raise InputError(f"{where}, line {line}", t, f"a time after {times[-1]}")
+        times.append(t)
+        speeds.append(v)
+    if len(times) < 2:
+        raise InputError(where, len(times), "at least two samples")
+    return np.array(times), np.array(speeds)
+
+
+@register("manoeuvre", "profile")
+@dataclass(frozen=True)
+class Profile:
+    """Follows the speeds of a CSV file (header t,v), linear between its samples and constant after the last."""
+
+    path: Path = param(Path("profile.csv"), "CSV file with times [s] and speeds [m/s]")
+
+    def prepare(self, dt: float) -> ProfilePlan:
+        times, speeds = read_profile(self.path)
+        steps = int(math.ceil((times[-1] - times[0]) / dt)) + 2
+        return ProfilePlan(dt, np.interp(times[0] + dt * np.arange(steps), times, speeds))
+
+    def start(self, plan: ProfilePlan, draws: Draws) -> Any:
+        return None
+
+    def accel(self, plan: ProfilePlan, state: Any, k: Array, speed: Array, draws: Draws) -> tuple[Any, Array]:
+        wanted = plan.speed[np.minimum(k + 1, len(plan.speed) - 1)]
+        return None, (wanted - speed) / plan.dt

@@ -1,0 +1,32 @@
+"""The oracle: told which measurements are attacked. An upper yardstick, shown and never ranked."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from tailgate.core import Array, Mode, Received
+from tailgate.errors import InputError
+from tailgate.registry import register
+
+from .compose import Composed, Detector, Filter, Mitigation, Score, Stateless
+from .kalman import KalmanFilter
+
+
+@dataclass(frozen=True)
+class RejectAttacked(Stateless):
+    """Accepts exactly the sensors that are not attacked."""
+
+    def step(self, plan: Any, state: Any, alarm: Array, received: Received) -> tuple[Any, Array, Array]:
+        if received.attacked is None:
+            raise InputError("oracle", None, "a loop that grants `truth`")
+        return None, received.valid & ~received.attacked, np.full_like(alarm, Mode.NORMAL, np.int8)
+
+
+@register("defence", "oracle", uses=("measurements", "truth"))
+@dataclass(frozen=True)
+class Oracle(Composed):
+    """Kalman filter that is told which measurements are attacked and ignores those."""
+
+    def parts(self) -> tuple[Filter, Detector, Mitigation]:
+        return KalmanFilter(), Score(), RejectAttacked()

@@ -1,0 +1,214 @@
+"""Compiled scalar kernels: elementary functions, the Philox generator, the policy network.
+
+Everything here is written with +, -, *, / and exact bit operations in a fixed order, so that a result does
+not depend on the batch size, on the machine's mathematical library, or on how the compiler vectorises a
+loop (no fast-math, no fused multiply-add). All kernels stand in one file because the on-disk cache of compiled
+code is invalidated by a change of the file that holds the kernel, and not of one that it calls.
+
+Sources: Salmon et al., *Parallel random numbers: as easy as 1, 2, 3*, SC11 (Philox4x32-10); Box and Muller 1958.
+"""
+
+import math
+
+import numba
+import numpy as np
+
+LN2_HI = 6.93147180369123816490e-01  # ln 2, its last bits zero: n * LN2_HI is exact for |n| < 2**20
+LN2_LO = 1.90821492927058770002e-10
+LOG2_E = 1.44269504088896338700e00
+TWO_PI = 6.283185307179586
+
+_jit = numba.njit(cache=True, fastmath=False, error_model="numpy")
+
+
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def _exp(x: float) -> float:
+    if x != x:
+        return x
+    if x > 709.7:
+        return math.inf
+    if x < -708.0:  # results below the normal range are flushed: no denormals on the scored path
+        return 0.0
+    n = math.floor(x * LOG2_E + 0.5)
+    r = (x - n * LN2_HI) - n * LN2_LO
+    p = 1.0 / 6227020800.0
+    p = p * r + 1.0 / 479001600.0
+    p = p * r + 1.0 / 39916800.0
+    p = p * r + 1.0 / 3628800.0
+    p = p * r + 1.0 / 362880.0
+    p = p * r + 1.0 / 40320.0
+    p = p * r + 1.0 / 5040.0
+    p = p * r + 1.0 / 720.0
+    p = p * r + 1.0 / 120.0
+    p = p * r + 1.0 / 24.0
+    p = p * r + 1.0 / 6.0
+    p = p * r + 0.5
+    p = p * r + 1.0
+    p = p * r + 1.0
+    return math.ldexp(p, int(n))
+
+
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def _log(x: float) -> float:
+    if not x > 0.0:
+        return -math.inf if x == 0.0 else math.nan
+    if x == math.inf:
+        return x
+    m, e = math.frexp(x)
+    if m < 0.7071067811865476:
+        m, e = 2.0 * m, e - 1
+    s = (m - 1.0) / (m + 1.0)
+    z = s * s
+    p = 1.0 / 23.0
+    p = p * z + 1.0 / 21.0
+    p = p * z + 1.0 / 19.0
+    p = p * z + 1.0 / 17.0
+    p = p * z + 1.0 / 15.0
+    p = p * z + 1.0 / 13.0
+    p = p * z + 1.0 / 11.0
+    p = p * z + 1.0 / 9.0
+    p = p * z + 1.0 / 7.0
+    p = p * z + 1.0 / 5.0
+    p = p * z + 1.0 / 3.0
+    p = p * z + 1.0
+    return e * LN2_HI + (2.0 * s * p + e * LN2_LO)
+
+
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def _sincos_turn(u: float) -> tuple[float, float]:
+    """Sine and cosine of 2 pi u, u in turns within [0, 1)."""
+    quarter = math.floor(4.0 * u + 0.5)
+    t = TWO_PI * (u - 0.25 * quarter)  # |t| <= pi/4
+    z = t * t
+    s = 1.0 / 355687428096000.0
+    s = s * z - 1.0 / 1307674368000.0
+    s = s * z + 1.0 / 6227020800.0
+    s = s * z - 1.0 / 39916800.0
+    s = s * z + 1.0 / 362880.0
+    s = s * z - 1.0 / 5040.0
+    s = s * z + 1.0 / 120.0
+    s = s * z - 1.0 / 6.0
+    s = (s * z + 1.0) * t
+    c = 1.0 / 20922789888000.0
+    c = c * z - 1.0 / 87178291200.0
+    c = c * z + 1.0 / 479001600.0
+    c = c * z - 1.0 / 3628800.0
+    c = c * z + 1.0 / 40320.0
+    c = c * z - 1.0 / 720.0
+    c = c * z + 1.0 / 24.0
+    c = c * z - 0.5
+    c = c * z + 1.0
+    q = int(quarter) & 3
+    if q == 0:
+        return s, c
+    if q == 1:
+        return c, -s
+    if q == 2:
+        return -s, -c
+    return -c, s
+
+
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def _tanh(x: float) -> float:
+    """Absolute error below 3e-16."""
+    if x > 20.0:
+        return 1.0
+    if x < -20.0:
+        return -1.0
+    return 1.0 - 2.0 / (_exp(2.0 * x) + 1.0)
+
+
+@numba.vectorize(["float64(float64)"], cache=True)
+def exp(x: float) -> float:
+    return _exp(x)
+
+
+@numba.vectorize(["float64(float64)"], cache=True)
+def log(x: float) -> float:
+    return _log(x)
+
+
+@numba.vectorize(["float64(float64)"], cache=True)
+def tanh(x: float) -> float:
+    return _tanh(x)
+
+
+@numba.njit(cache=True, inline="always")
+def _philox(c0, c1, c2, c3, k0, k1):  # type: ignore[no-untyped-def]
+    """Philox4x32-10. Counter and key words are uint64 holding 32 bits each."""
+    mask = np.uint64(0xFFFFFFFF)
+    shift = np.uint64(32)
+    for _ in range(10):
+        p0 = np.uint64(0xD2511F53) * c0
+        p1 = np.uint64(0xCD9E8D57) * c2
+        c0, c1, c2, c3 = (p1 >> shift) ^ c1 ^ k0, p1 & mask, (p0 >> shift) ^ c3 ^ k1, p0 & mask
+        k0 = (k0 + np.uint64(0x9E3779B9)) & mask
+        k1 = (k1 + np.uint64(0xBB67AE85)) & mask
+    return c0, c1, c2, c3
+
+
+@numba.njit(cache=True, inline="always")
+def _uniform_pair(key, episode, step, stream, block):  # type: ignore[no-untyped-def]
+    """Two uniforms in (0, 1), 52 bits each, never 0 nor 1."""
+    w0, w1, w2, w3 = _philox(
+        np.uint64(episode), np.uint64(block), np.uint64(step), np.uint64(stream),
+        np.uint64(key) & np.uint64(0xFFFFFFFF), np.uint64(key) >> np.uint64(32),
+    )  # fmt: skip
+    a = ((w0 << np.uint64(32)) | w1) >> np.uint64(12)
+    b = ((w2 << np.uint64(32)) | w3) >> np.uint64(12)
+    return (float(a) + 0.5) * 2.220446049250313e-16, (float(b) + 0.5) * 2.220446049250313e-16
+
+
+@_jit
+def philox_words(counter: np.ndarray, key: np.ndarray) -> np.ndarray:
+    """Raw Philox4x32-10 words for a (..., 4) counter and (..., 2) key of uint32, flattened to (M, 4)."""
+    out = np.empty((counter.shape[0], 4), np.uint32)
+    for i in range(counter.shape[0]):
+        w = _philox(
+            np.uint64(counter[i, 0]), np.uint64(counter[i, 1]), np.uint64(counter[i, 2]), np.uint64(counter[i, 3]),
+            np.uint64(key[i, 0]), np.uint64(key[i, 1]),
+        )  # fmt: skip
+        for j in range(4):
+            out[i, j] = np.uint32(w[j])
+    return out
+
+
+@_jit
+def fill_uniform(keys, episode, step, stream, out):  # type: ignore[no-untyped-def]
+    """Uniforms in (0, 1) into out (E, B); element e of a row is word e % 2 of block e // 2."""
+    for j in range((out.shape[0] + 1) // 2):
+        for b in range(out.shape[1]):
+            u0, u1 = _uniform_pair(keys[b], episode[b], step[b], stream, j)
+            out[2 * j, b] = u0
+            if 2 * j + 1 < out.shape[0]:
+                out[2 * j + 1, b] = u1
+
+
+@_jit
+def fill_normal(keys, episode, step, stream, out):  # type: ignore[no-untyped-def]
+    """Standard normals (Box-Muller) into out (E, B)."""
+    for j in range((out.shape[0] + 1) // 2):
+        for b in range(out.shape[1]):
+            u0, u1 = _uniform_pair(keys[b], episode[b], step[b], stream, j)
+            radius = math.sqrt(-2.0 * _log(u0))
+            s, c = _sincos_turn(u1)
+            out[2 * j, b] = radius * c
+            if 2 * j + 1 < out.shape[0]:
+                out[2 * j + 1, b] = radius * s
+
+
+@_jit
+def dense(x: np.ndarray, weight: np.ndarray, bias: np.ndarray, squash: bool) -> np.ndarray:
+    """One layer: x (B, i) float64, weight (i, o), bias (o,); sums run over i in ascending order."""
+    out = np.empty((x.shape[0], weight.shape[1]))
+    for b in range(x.shape[0]):
+        for o in range(weight.shape[1]):
+            out[b, o] = bias[o]
+        for i in range(weight.shape[0]):
+            v = x[b, i]
+            for o in range(weight.shape[1]):
+                out[b, o] += v * weight[i, o]
+        if squash:
+            for o in range(weight.shape[1]):
+                out[b, o] = _tanh(out[b, o])
+    return out

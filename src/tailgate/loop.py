@@ -1,0 +1,202 @@
+"""The loop: the arrows between the nouns, pure on its state.
+
+    each k:  plant -> sensors -> [seat: the attack's command] -> channel -> defence -> controller -> plant
+
+Time runs k = 1, 2, ..., horizon. At k = 0 the prior is the estimate and the controller drives the first step on it, so that every
+measured step is a predict and an update. `sense` and `advance` are the two halves of a step, with the attack's seat between them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from tailgate import num
+from tailgate.core import (
+    Array, Attack, Command, Controller, Defence, Estimate, Frame, Manoeuvre, Mode, Model, Plant, Received, Sensor, View, WhiteBox,
+)  # fmt: skip
+from tailgate.draws import Keys, Role
+from tailgate.threat import Brief, Channel, ChannelPlan, ChannelState, ThreatModel
+from tailgate.tree import duplicate, put_rows
+
+_START = np.uint32(0xFFFFFFFF)  # the step under which start() draws: no episode reaches it
+
+
+class LoopPlan(NamedTuple):
+    plant: Any
+    sensor: Any
+    controller: Any
+    manoeuvre: Any
+    defence: Any
+    channel: ChannelPlan
+
+
+class LoopState(NamedTuple):
+    """Every leaf has B first. `received` and `sent` are this step's, before the attack."""
+
+    keys: Keys
+    k: Array  # (B,) int64
+    plant: Any
+    manoeuvre: Any
+    controller: Any
+    defence: Any
+    channel: ChannelState
+    estimate: Estimate
+    known_u: Array  # (B, N, m)
+    sent: Array  # (B, N, q+p)
+    received: Received
+    ended: Array  # (B,) bool: collided
+
+
+@dataclass(frozen=True, eq=False)
+class Loop:
+    """A closed loop of one plant under one defence, for B independent episodes."""
+
+    plant: Plant
+    sensor: Sensor
+    controller: Controller
+    manoeuvre: Manoeuvre
+    threat: ThreatModel
+    horizon: int
+    defence: Defence
+    uses: tuple[str, ...] = ("measurements",)
+
+    @cached_property
+    def model(self) -> Model:
+        return self.plant.model(*self.sensor.matrices())
+
+    @cached_property
+    def brief(self) -> Brief:
+        return Brief(self.model, self.threat, self.horizon)
+
+    @cached_property
+    def plan(self) -> LoopPlan:
+        return LoopPlan(
+            self.plant.prepare(),
+            self.sensor.prepare(self.model),
+            self.controller.prepare(self.model),
+            self.manoeuvre.prepare(self.model.dt),
+            self.defence.prepare(self.model),
+            Channel().prepare(self.brief),
+        )
+
+    def start(self, keys: Keys) -> LoopState:
+        """States of B fresh episodes at k = 1, measured."""
+        plan, model = self.plan, self.model
+        batch = len(keys.key)
+        at_start = np.full(batch, _START)
+        plant = self.plant.start(plan.plant, keys.at(Role.PRIOR, at_start))
+        prior = self.plant.prior(plan.plant, batch)
+        manoeuvre = self.manoeuvre.start(plan.manoeuvre, keys.at(Role.MANOEUVRE, at_start))
+        shape = (batch, model.agents)
+        estimate = Estimate(
+            prior.mean, num.zeros(shape), num.zeros(shape, bool), num.full(shape, Mode.NORMAL, np.int8), num.full(shape, True, bool)
+        )
+        v2v = self.plant.v2v(plan.plant, plant)
+        expected = np.concatenate([num.matvec(model.C, prior.mean), v2v], axis=-1)
+        controller = self.controller.start(plan.controller, batch)
+        k = np.zeros(batch, np.int64)
+        controller, u, manoeuvre, plant = self._drive(keys, k, controller, manoeuvre, plant, estimate, v2v)
+        sent, received = self._measure(keys, k + 1, plant, estimate)
+        return LoopState(
+            keys, k + 1, plant, manoeuvre, controller, self.defence.start(plan.defence, prior),
+            Channel().start(plan.channel, num.batch_last(expected)), estimate, u, sent, received, np.zeros(batch, bool),
+        )  # fmt: skip
+
+    def restart(self, state: LoopState, mask: Array) -> LoopState:
+        """New episodes in the rows of `mask` (B,) bool, the next of their own counter; the other rows keep every bit."""
+        rows = np.flatnonzero(mask)
+        if not len(rows):
+            return state
+        keys = Keys(state.keys.key[rows], state.keys.episode[rows] + np.uint32(1))
+        return self.reseed(state, rows, keys)
+
+    def reseed(self, state: LoopState, rows: Array, keys: Keys) -> LoopState:
+        """New episodes in `rows` (R,) with the given keys of R rows."""
+        fresh = self.start(keys)
+        out: LoopState = put_rows(state, rows, fresh)
+        return out
+
+    def sense(self, state: LoopState) -> View:
+        """What the threat model lets the attacker see now."""
+        plan, channel = self.plan, state.channel
+        threat = self.threat
+        budget_left = Channel().budget_left(plan.channel, channel)
+        budget = np.full(len(state.k), np.inf if threat.budget is None else float(threat.budget))
+        view = View(
+            k=state.k,
+            progress=state.k / self.horizon,
+            scene=self.plant.scene(plan.plant, state.plant),
+            budget_left=budget_left,
+            budget=budget,
+            burst=channel.burst,
+            cooldown=channel.cooldown,
+            allowed=Channel().allowed(plan.channel, channel, state.k),
+            last=channel.last,
+        )
+        if threat.knowledge in ("grey", "white"):
+            view = view._replace(control=state.known_u)
+        if threat.knowledge == "white":
+            box = WhiteBox(self.defence, plan.defence, duplicate(state.defence), state.known_u)
+            view = view._replace(defence=box, estimate=state.estimate, truth=self.plant.truth(plan.plant, state.plant))
+        if threat.sees_measurement or threat.knowledge == "white":
+            view = view._replace(received=state.received)
+        return view
+
+    def advance(self, state: LoopState, command: Command) -> tuple[LoopState, Frame]:
+        """The rest of the step: channel, defence, controller, plant, and the next measurement."""
+        plan = self.plan
+        channel, received, wires, charged, refused = Channel().apply(
+            plan.channel, state.channel, state.sent, state.received, command, state.k
+        )
+        heard = received._replace(
+            v2v=received.v2v if "v2v" in self.uses else None,
+            attacked=received.attacked if "truth" in self.uses else None,
+        )
+        defence, estimate = self.defence.step(
+            plan.defence, state.defence, heard, state.known_u, state.keys.at(Role.DEFENCE, state.k)
+        )
+        truth = self.plant.truth(plan.plant, state.plant)
+        assert received.v2v is not None
+        controller, u, manoeuvre, plant = self._drive(
+            state.keys, state.k, state.controller, state.manoeuvre, state.plant, estimate, received.v2v
+        )
+        scene = self.plant.scene(plan.plant, plant)
+        collided = (scene.gap <= 0.0).any(axis=1)
+        rear_collided = (scene.rear_gap <= 0.0).any(axis=1)
+        frame = Frame(
+            state.k, truth, state.sent, wires, channel.last, refused, estimate, u, scene, collided, rear_collided
+        )
+        sent, fresh = self._measure(state.keys, state.k + 1, plant, estimate)
+        ended = state.ended | collided | rear_collided
+        state = LoopState(
+            state.keys, state.k + 1, plant, manoeuvre, controller, defence, channel, estimate, u, sent, fresh, ended
+        )
+        return state, frame
+
+    def step(self, state: LoopState, attack: Attack, plan: Any, memory: Any) -> tuple[LoopState, Any, Frame]:
+        """sense, decide, advance. `plan` and `memory` are the attack's plan and state."""
+        memory, command = attack.decide(plan, memory, self.sense(state), state.keys.at(Role.ATTACK, state.k))
+        state, frame = self.advance(state, command)
+        return state, memory, frame
+
+    def _measure(self, keys: Keys, k: Array, plant: Any, estimate: Estimate) -> tuple[Array, Received]:
+        truth = self.plant.truth(self.plan.plant, plant)
+        received = self.sensor.measure(self.plan.sensor, truth, estimate.probe, keys.at(Role.SENSOR, k))
+        columns = [received.y[..., i] for i in range(received.y.shape[-1])]
+        v2v = self.plant.v2v(self.plan.plant, plant)
+        return num.stack(columns + [v2v[..., i] for i in range(v2v.shape[-1])]), received
+
+    def _drive(
+        self, keys: Keys, k: Array, controller: Any, manoeuvre: Any, plant: Any, estimate: Estimate, v2v: Array
+    ) -> tuple[Any, Array, Any, Any]:
+        plan = self.plan
+        controller, u = self.controller.step(plan.controller, controller, estimate, v2v)
+        manoeuvre, exo = self.manoeuvre.accel(
+            plan.manoeuvre, manoeuvre, k, self.plant.lead_speed_of(plant), keys.at(Role.MANOEUVRE, k)
+        )
+        plant = self.plant.step(plan.plant, plant, u, exo, keys.at(Role.PROCESS, k))
+        return controller, u, manoeuvre, plant

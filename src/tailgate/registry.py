@@ -1,0 +1,187 @@
+"""Names to components. A component is a frozen dataclass; its fields are its parameters.
+
+Built-in ones register where they are defined; others come from the entry-point groups `tailgate.estimators` and `tailgate.agents`,
+from `module:Class` on the command line, or as objects in Python. A configuration file names registered components only.
+"""
+
+import importlib
+import inspect
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.metadata import entry_points
+from typing import Any, Literal, TypeVar
+
+from tailgate.errors import InputError, unknown
+from tailgate.schema import as_data, build, fields_of, scalar
+
+Family = Literal["defence", "attack", "plant", "sensor", "controller", "manoeuvre"]
+USES = ("measurements", "odometry", "probe", "v2v", "redundant", "leader_input", "truth")
+_MODULES = {
+    "defence": "tailgate.estimators",
+    "attack": "tailgate.agents",
+    "plant": "tailgate.envs",
+    "sensor": "tailgate.envs",
+    "controller": "tailgate.envs",
+    "manoeuvre": "tailgate.envs",
+}
+_GROUPS = {"defence": "tailgate.estimators", "attack": "tailgate.agents"}
+_entries: dict[str, dict[str, "Entry"]] = {family: {} for family in _MODULES}
+_plugins_loaded: set[str] = set()
+T = TypeVar("T", bound=type)
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A registered component: what a card shows of it."""
+
+    family: Family
+    name: str
+    cls: type
+    version: int = 1
+    reference: str = ""
+    uses: tuple[str, ...] = ("measurements",)
+    knowledge: str = "black"
+    optimal: bool = False
+    sentinel: str = ""
+
+    @property
+    def summary(self) -> str:
+        return (inspect.getdoc(self.cls) or "").split("\n\n")[0].replace("\n", " ")
+
+    def card(self) -> dict[str, Any]:
+        """JSON data: name, version, reference, uses and every parameter with its default and sentence."""
+        params = {
+            name: {"default": as_data(f.default), "doc": f.metadata.get("doc", "")} for name, f in fields_of(self.cls).items()
+        }
+        out: dict[str, Any] = {"name": self.name, "version": self.version, "summary": self.summary, "reference": self.reference}
+        if self.family == "defence":
+            out |= {"uses": list(self.uses), "sentinel": self.sentinel}
+        if self.family == "attack":
+            out |= {"knowledge": self.knowledge, "optimal": self.optimal}
+        return out | {"parameters": params}
+
+
+def register(family: Family, name: str, **card: Any) -> Callable[[T], T]:
+    """Class decorator. Reusing a name is an error."""
+
+    def add(cls: T) -> T:
+        put(Entry(family, name, cls, **card))
+        return cls
+
+    return add
+
+
+def put(entry: Entry) -> None:
+    for use in entry.uses:
+        if use not in USES:
+            raise unknown(f"{entry.name}.uses", use, USES)
+    held = _entries[entry.family].get(entry.name)
+    if held is not None and held.cls is not entry.cls:
+        raise InputError(f"{entry.family} name", entry.name, "a name that is not taken")
+    _entries[entry.family][entry.name] = entry
+
+
+def _load(family: Family) -> dict[str, Entry]:
+    importlib.import_module(_MODULES[family])
+    group = _GROUPS.get(family)
+    if group and group not in _plugins_loaded:
+        _plugins_loaded.add(group)
+        for point in entry_points(group=group):
+            put(entry_of(family, point.name, point.load()))
+    return _entries[family]
+
+
+def entry_of(family: Family, name: str, cls: type) -> Entry:
+    """An entry for somebody else's class, which may carry `uses`, `reference` and `version` as class attributes."""
+    uses = tuple(getattr(cls, "uses", ("measurements",)))
+    return Entry(
+        family, name, cls, version=int(getattr(cls, "version", 1)), reference=str(getattr(cls, "reference", "")), uses=uses,
+        knowledge=str(getattr(cls, "knowledge", "black")),
+    )  # fmt: skip
+
+
+def entries(family: Family) -> dict[str, Entry]:
+    """Every registered component of a family by name, plug-ins included."""
+    return dict(sorted(_load(family).items()))
+
+
+def find(family: Family, name: str) -> Entry:
+    known = _load(family)
+    if name not in known:
+        raise unknown(family, name, known)
+    return known[name]
+
+
+def make(family: Family, name: str, **params: Any) -> Any:
+    """A component by name, its parameters validated."""
+    if not isinstance(name, str):
+        raise InputError(f"{family}.name", name, "the name of a registered component")
+    entry = find(family, name)
+    return build(entry.cls, params, f"{family} {name}")
+
+
+def make_from(family: Family, data: Any, where: str) -> Any:
+    """A component from configuration data: a name, or a mapping with `name` and parameters."""
+    if isinstance(data, str):
+        data = {"name": data}
+    if not isinstance(data, dict) or "name" not in data:
+        raise InputError(where, data, "a name, or a mapping with a name and parameters")
+    return make(family, **data)
+
+
+@dataclass(frozen=True)
+class Spec:
+    """A component as a user names it: text that a row can record and another process can rebuild.
+
+    `name`, `name:key=value,key=value`, `module:Class`, `module:Class:key=value`, or (attacks) the JSON file of an exported policy.
+    """
+
+    family: Family
+    text: str
+
+    def _parts(self) -> tuple[str, dict[str, Any]]:
+        head, params = self.text, {}
+        before, sep, tail = self.text.rpartition(":")
+        if sep and "=" in tail:
+            head = before
+            for item in _split(tail):
+                key, eq, value = item.partition("=")
+                if not eq:
+                    raise InputError(self.family, self.text, "name:key=value,key=value")
+                params[key.strip()] = scalar(value)
+        return head, params
+
+    @property
+    def entry(self) -> Entry:
+        head, _ = self._parts()
+        if self.family == "attack" and head.endswith(".json"):
+            return find("attack", "policy")
+        if ":" not in head:
+            return find(self.family, head)
+        module, _, name = head.partition(":")
+        try:
+            cls = getattr(importlib.import_module(module), name)
+        except ImportError as error:
+            raise InputError(self.family, self.text, f"an importable module ({error})") from None
+        except AttributeError:
+            raise InputError(self.family, self.text, f"a class that module {module} defines") from None
+        if not isinstance(cls, type):
+            raise InputError(self.family, self.text, "a class")
+        return entry_of(self.family, head, cls)
+
+    def make(self) -> Any:
+        head, params = self._parts()
+        if self.family == "attack" and head.endswith(".json"):
+            params = {"path": head, **params}
+        return build(self.entry.cls, params, f"{self.family} {head}")
+
+
+def _split(text: str) -> list[str]:
+    """Split at commas outside of brackets."""
+    out, depth, start = [], 0, 0
+    for i, ch in enumerate(text):
+        depth += (ch in "[(") - (ch in "])")
+        if ch == "," and depth == 0:
+            out.append(text[start:i])
+            start = i + 1
+    return [*out, text[start:]]

@@ -1,0 +1,118 @@
+"""Scenarios and suites: versioned YAML files, frozen once published."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+from tailgate.core import Defence, PositiveCount, param
+from tailgate.errors import InputError, unknown
+from tailgate.loop import Loop
+from tailgate.registry import make_from
+from tailgate.schema import build, canonical, fields_of, read_yaml
+from tailgate.threat import Brief, ThreatModel
+
+_COMPONENTS = ("plant", "sensor", "controller", "manoeuvre")
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """plant + sensor + controller + manoeuvre + horizon + threat model."""
+
+    name: str
+    plant: Any
+    sensor: Any
+    controller: Any
+    manoeuvre: Any
+    horizon: PositiveCount
+    threat_model: ThreatModel
+    about: str = ""
+
+    def loop(self, defence: Defence, uses: tuple[str, ...] = ("measurements",)) -> Loop:
+        loop = Loop(
+            self.plant, self.sensor, self.controller, self.manoeuvre, self.threat_model, self.horizon, defence, uses
+        )
+        _ = loop.brief.granted  # refuses unknown targets here, not in the first step
+        return loop
+
+    def brief(self) -> Brief:
+        model = self.plant.model(*self.sensor.matrices())
+        return Brief(model, self.threat_model, self.horizon)
+
+    def with_threat(self, **changes: Any) -> Scenario:
+        """The same scenario under a changed threat model."""
+        data = dataclasses.asdict(self.threat_model) | changes
+        return dataclasses.replace(self, threat_model=build(ThreatModel, data, "threat_model"))
+
+    @property
+    def config_hash(self) -> str:
+        return hashlib.blake2b(canonical(self).encode(), digest_size=8).hexdigest()
+
+
+@dataclass(frozen=True)
+class Suite:
+    """A named, versioned set of scenarios, doses, defences, attacks and seeds."""
+
+    name: str = param("", "name of the suite")
+    about: str = param("", "one sentence")
+    scenarios: tuple[str, ...] = param((), "scenario names")
+    doses: tuple[int | None, ...] = param((None,), "attack budgets [steps]; none: the scenario's own")
+    defences: tuple[str, ...] = param((), "defences, as on the command line")
+    attacks: tuple[str, ...] = param((), "attacks, as on the command line")
+    seeds: PositiveCount = param(100, "episodes per cell")
+    knowledge: str | None = param(None, "knowledge that every attacker is granted; none: the least that each needs")
+
+
+def _builtin(folder: str) -> dict[str, Path]:
+    root = Path(str(files("tailgate.configs").joinpath(folder)))
+    return {path.stem: path for path in sorted(root.glob("*.yaml"))}
+
+
+def config_path(folder: str, name: str, where: str) -> Path:
+    """A YAML file by its built-in name or its path."""
+    if name.endswith((".yaml", ".yml")):
+        return Path(name)
+    known = _builtin(folder)
+    if name not in known:
+        raise unknown(where, name, known)
+    return known[name]
+
+
+def list_scenarios() -> list[str]:
+    return list(_builtin("scenarios"))
+
+
+def list_suites() -> list[str]:
+    return list(_builtin("suites"))
+
+
+def load_scenario(name: str) -> Scenario:
+    """A scenario by name, or from a YAML file."""
+    path = config_path("scenarios", name, "scenario")
+    data = read_yaml(path, "scenario")
+    where = f"scenario {path.stem}"
+    for key in data:
+        if key not in fields_of(Scenario):
+            raise unknown(f"{where}: unknown field", key, fields_of(Scenario))
+    for key in (*_COMPONENTS, "horizon"):
+        if key not in data:
+            raise InputError(f"{where}.{key}", None, "a value; the field is required")
+    manoeuvre = data["manoeuvre"]
+    if isinstance(manoeuvre, dict) and isinstance(manoeuvre.get("path"), str):  # relative to the file that names it
+        data["manoeuvre"] = manoeuvre | {"path": path.parent / manoeuvre["path"]}
+    parts = {key: make_from(key, data[key], f"{where}.{key}") for key in _COMPONENTS}  # type: ignore[arg-type]
+    threat = data.get("threat_model", {})
+    if not isinstance(threat, dict):
+        raise InputError(f"{where}.threat_model", threat, "a mapping of fields")
+    rest = {"name": data.get("name", path.stem), "horizon": data["horizon"], "about": data.get("about", "")}
+    return build(Scenario, parts | rest | {"threat_model": build(ThreatModel, threat, f"{where}.threat_model")}, where)
+
+
+def load_suite(name: str) -> Suite:
+    """A suite by name, or from a YAML file."""
+    path = config_path("suites", name, "suite")
+    return build(Suite, {"name": path.stem} | read_yaml(path, "suite"), f"suite {path.stem}")

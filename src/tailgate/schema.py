@@ -1,0 +1,122 @@
+"""From data to validated parameters: one typed schema (the dataclasses) is the single truth for defaults."""
+
+import dataclasses
+import hashlib
+import json
+import types
+from functools import cache
+from pathlib import Path
+from typing import Any, TypeVar
+
+import yaml
+from pydantic import ConfigDict, TypeAdapter, ValidationError
+from pydantic.errors import PydanticSchemaGenerationError, PydanticUserError
+
+from tailgate.errors import InputError, unknown
+
+T = TypeVar("T")
+
+
+def fields_of(cls: type) -> dict[str, Any]:
+    """Name -> dataclasses.Field of the parameters that a user may set."""
+    if not dataclasses.is_dataclass(cls):
+        return {}
+    return {f.name: f for f in dataclasses.fields(cls) if f.init}
+
+
+@cache
+def _adapter(cls: type) -> TypeAdapter[Any]:
+    try:
+        return TypeAdapter(cls, config=ConfigDict(extra="forbid"))
+    except PydanticUserError:  # the class carries its own configuration
+        return TypeAdapter(cls)
+
+
+def build(cls: type[T], data: dict[str, Any], where: str) -> T:
+    """An instance of dataclass `cls` from `data`; raises InputError that names `where`.field, value and expectation."""
+    known = fields_of(cls)
+    for key in data:
+        if key not in known:
+            raise unknown(f"{where}: unknown field", key, known)
+    if not known:
+        return cls()
+    try:
+        adapter = _adapter(cls)
+    except PydanticSchemaGenerationError:  # a plug-in with fields that are not data: its own constructor decides
+        return cls(**data)
+    try:
+        return adapter.validate_python(data)  # type: ignore[no-any-return]
+    except ValidationError as error:
+        first = error.errors()[0]
+        if isinstance(inner := first.get("ctx", {}).get("error"), InputError):
+            raise inner from None
+        path = ".".join(str(part) for part in first["loc"]) or cls.__name__
+        message = first["msg"][0].lower() + first["msg"][1:]
+        raise InputError(f"{where}.{path}", first["input"], message) from None
+
+
+def as_data(value: Any) -> Any:
+    """Parameters as plain JSON data, every default written out."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {f.name: as_data(getattr(value, f.name)) for f in dataclasses.fields(value) if f.init}
+    if isinstance(value, dict):
+        return {str(k): as_data(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [as_data(v) for v in value]
+    if isinstance(value, (types.NoneType, bool, int, float, str)):
+        return value
+    if isinstance(value, Path):  # what the file says counts, not where it lies
+        return f"{value.name}#{hashlib.sha256(value.read_bytes()).hexdigest()[:16]}" if value.is_file() else value.name
+    return repr(value)
+
+
+def canonical(value: Any) -> str:
+    """JSON text that is the same for the same parameters: what hashes are taken of."""
+    return json.dumps(as_data(value), sort_keys=True, separators=(",", ":"))
+
+
+def read_yaml(path: Path, where: str) -> dict[str, Any]:
+    """A mapping from a YAML file, read safely."""
+    try:
+        data = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(where, str(path), f"a readable YAML file ({error.strerror})") from None
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise InputError(where, str(path), f"valid YAML ({' '.join(str(error).split())})") from None
+    if not isinstance(data, dict):
+        raise InputError(where, str(path), "a YAML mapping of fields")
+    return data
+
+
+def scalar(text: str) -> Any:
+    """A command-line value, read as YAML reads a scalar or a flow list ('3', 'true', '[1, 2]', 'none')."""
+    if text.lower() in ("none", "null"):
+        return None
+    try:
+        value = yaml.safe_load(text)
+    except yaml.YAMLError:
+        return text
+    if isinstance(value, str):
+        try:
+            return float(value)  # YAML 1.1 takes 1e5 for text
+        except ValueError:
+            return value
+    return value
+
+
+def override(data: dict[str, Any], assignments: list[str]) -> dict[str, Any]:
+    """`data` with dotted `key=value` assignments put in."""
+    out: dict[str, Any] = json.loads(json.dumps(data))
+    for text in assignments:
+        key, sep, value = text.partition("=")
+        if not sep or not key:
+            raise InputError("override", text, "key=value, for example steps=100000")
+        node = out
+        *parents, leaf = key.split(".")
+        for name in parents:
+            child = node.setdefault(name, {})
+            if not isinstance(child, dict):
+                raise InputError(f"override {key}", value, f"a field below a mapping; {name} is {child!r}")
+            node = child
+        node[leaf] = scalar(value)
+    return out

@@ -1,0 +1,117 @@
+"""A trace: what happened in B episodes, step by step, and its fingerprints."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from tailgate.core import Array, Attack, Frame
+from tailgate.draws import Keys, Role
+from tailgate.loop import Loop, LoopState
+
+_DECISIONS = ("kind", "target", "alarm", "mode", "refused", "collided", "rear_collided")
+
+
+def _signals(frame: Frame) -> dict[str, Array]:
+    scene, command, estimate = frame.scene, frame.command, frame.estimate
+    return {
+        "gap": scene.gap, "speed": scene.speed, "accel": scene.accel, "lead_speed": scene.lead_speed, "rear_gap": scene.rear_gap,
+        "rear_speed": scene.rear_speed, "position": scene.position,
+        "truth": frame.truth, "estimate": estimate.x, "score": estimate.score, "clean": frame.clean, "wires": frame.wires,
+        "control": frame.control, "value": command.value,
+        "kind": command.kind, "target": command.target, "alarm": estimate.alarm, "mode": estimate.mode, "refused": frame.refused,
+        "collided": frame.collided, "rear_collided": frame.rear_collided,
+    }  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Trace:
+    """B episodes. `signals` are (K, B, ...); row b is valid for its first length[b] steps (it ends with a collision).
+
+    truth, estimate, wires and commands belong to step k; the road (gap, speed, ...) to k + 1, after the step. `first` holds the road
+    before the first step.
+    """
+
+    dt: float
+    horizon: int
+    length: Array  # (B,)
+    signals: dict[str, Array]
+    first: dict[str, Array]
+    desired_gap: Callable[[Array], Array]
+
+    def __getattr__(self, name: str) -> Array:
+        try:
+            return self.__dict__["signals"][name]  # type: ignore[no-any-return]
+        except KeyError:
+            raise AttributeError(name) from None
+
+    @property
+    def batch(self) -> int:
+        return len(self.length)
+
+    @property
+    def live(self) -> Array:
+        """(K, B) bool: the steps that belong to the episode."""
+        return np.arange(len(self.kind))[:, None] < self.length
+
+    def _hash(self, row: int, names: list[str]) -> str:
+        digest = hashlib.blake2b(digest_size=16)
+        n = int(self.length[row])
+        digest.update(f"{n}/{self.horizon}/{self.dt!r}".encode())
+        for name in names:
+            column = np.ascontiguousarray(self.signals[name][:n, row])
+            digest.update(f"{name}:{column.dtype.str}:{column.shape}".encode())
+            digest.update(column.tobytes())
+        return digest.hexdigest()
+
+    def trace_hash(self, row: int) -> str:
+        """Of every signal of one episode, to the last bit."""
+        return self._hash(row, sorted(self.signals))
+
+    def decision_hash(self, row: int) -> str:
+        """Of commands, alarms, modes and collisions: the same on every engine and platform."""
+        return self._hash(row, sorted(_DECISIONS))
+
+
+class Recorder:
+    """Collects frames into a Trace."""
+
+    def __init__(self, loop: Loop, state: LoopState) -> None:
+        self.loop = loop
+        self.first = loop.plant.scene(loop.plan.plant, state.plant)._asdict()
+        self.signals: dict[str, Array] = {}
+        self.length = np.zeros(len(state.k), np.int64)
+        self.steps = 0
+
+    def add(self, frame: Frame, live: Array) -> None:
+        """`live` (B,): the episodes that this step belongs to."""
+        for name, value in _signals(frame).items():
+            if name not in self.signals:
+                self.signals[name] = np.zeros((self.loop.horizon, *value.shape), value.dtype)
+            self.signals[name][self.steps] = value
+        self.length += live
+        self.steps += 1
+
+    def trace(self) -> Trace:
+        signals = {name: value[: self.steps] for name, value in self.signals.items()}
+        loop = self.loop
+        return Trace(loop.model.dt, loop.horizon, self.length, signals, self.first, loop.controller.desired_gap)
+
+
+def rollout(loop: Loop, attack: Attack, keys: Keys, *, terminate: bool = True) -> Trace:
+    """Play one episode per key. With `terminate` an episode ends at its first collision, else it runs to the horizon."""
+    state = loop.start(keys)
+    plan = attack.prepare(loop.brief)
+    memory: Any = attack.start(plan, len(keys.key), keys.at(Role.ATTACK, np.zeros(len(keys.key), np.int64)))
+    recorder = Recorder(loop, state)
+    for _ in range(loop.horizon):
+        live = ~state.ended if terminate else np.ones(len(state.k), bool)
+        if not live.any():
+            break
+        state, memory, frame = loop.step(state, attack, plan, memory)
+        recorder.add(frame, live)
+    return recorder.trace()

@@ -1,0 +1,48 @@
+"""Walks over states: nested NamedTuples whose leaves are arrays with B first, or None."""
+
+import copy
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from tailgate.core import Array
+
+
+def map_leaves(function: Callable[..., Any], tree: Any, *others: Any) -> Any:
+    """The tree with `function` applied to its leaves, several trees of one shape side by side."""
+    if tree is None:
+        return None
+    if isinstance(tree, tuple):
+        parts = [map_leaves(function, *branches) for branches in zip(tree, *others, strict=True)]
+        return type(tree)(*parts) if hasattr(tree, "_fields") else tuple(parts)
+    return function(tree, *others)
+
+
+def put_rows(tree: Any, rows: Array, fresh: Any) -> Any:
+    """A copy of the tree with `rows` (R,) replaced by the leaves of `fresh`, which have R rows."""
+
+    def put(leaf: Array, new: Array) -> Array:
+        out = leaf.copy(order="K")
+        out[rows] = new
+        return out
+
+    return map_leaves(put, tree, fresh)
+
+
+def duplicate(tree: Any) -> Any:
+    """A copy that shares nothing, objects inside of arrays included."""
+    return map_leaves(lambda leaf: copy.deepcopy(leaf) if leaf.dtype == object else leaf.copy(order="K"), tree)
+
+
+def leaves(tree: Any, prefix: str = "") -> dict[str, np.ndarray]:
+    """Every leaf by its dotted name."""
+    if tree is None:
+        return {}
+    if isinstance(tree, tuple):
+        names = getattr(tree, "_fields", range(len(tree)))
+        out: dict[str, np.ndarray] = {}
+        for name, branch in zip(names, tree, strict=True):
+            out |= leaves(branch, f"{prefix}{name}.")
+        return out
+    return {prefix[:-1]: tree}
