@@ -1,0 +1,59 @@
+"""Tailgate: defences for adaptive cruise control, scored against an adversary that learns when to attack.
+
+    import gymnasium
+    env = gymnasium.make("tailgate:tailgate/CarFollowing-v0", defence="chi2_kf")
+"""
+
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any
+
+try:
+    __version__ = version("tailgate")
+except PackageNotFoundError:  # a source tree that was never installed
+    __version__ = "0+unknown"
+
+from tailgate.errors import InputError
+from tailgate.registry import entries, make
+
+__all__ = ["InputError", "evaluate", "list_attacks", "list_defences", "make_attack", "make_defence", "per_episode"]
+
+
+def make_defence(name: str, **params: Any) -> Any:
+    """A registered defence by name; raises InputError for an unknown name or field."""
+    return make("defence", name, **params)
+
+
+def make_attack(name: str, **params: Any) -> Any:
+    """A registered attack by name; raises InputError for an unknown name or field."""
+    return make("attack", name, **params)
+
+
+def list_defences() -> list[str]:
+    """Names of every defence, plug-ins included."""
+    return list(entries("defence"))
+
+
+def list_attacks() -> list[str]:
+    """Names of every attack, plug-ins included."""
+    return list(entries("attack"))
+
+
+def __getattr__(name: str) -> Any:
+    if name == "per_episode":
+        from tailgate.estimators import per_episode
+
+        return per_episode
+    if name == "evaluate":
+        from tailgate.evaluate import evaluate
+
+        return evaluate
+    raise AttributeError(f"module 'tailgate' has no attribute {name!r}")
+
+
+def _register() -> None:
+    from tailgate.envs.faces import register_all
+
+    register_all()
+
+
+_register()

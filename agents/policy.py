@@ -1,0 +1,225 @@
+"""A learned policy as an attack: safetensors + JSON, played without torch, Stable-Baselines3 or pickle.
+
+The network is a tanh perceptron in float64 with a fixed order of summation, so that a trace does not depend on the batch.
+The JSON file names the tensor file, its SHA-256, the action and observation codecs, and how the policy was made.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from safetensors import SafetensorError
+from safetensors.numpy import load as load_tensors
+from safetensors.numpy import save as save_tensors
+
+from tailgate import num
+from tailgate.core import Array, Command, View, param
+from tailgate.draws import Draws, Keys, Role
+from tailgate.errors import InputError
+from tailgate.files import write_atomic
+from tailgate.registry import register
+from tailgate.schema import as_data, build
+from tailgate.threat import Brief
+
+from .codec import ActionCodec, ActionSpec, ObservationCodec
+
+FORMAT = "tailgate-policy-1"
+
+
+@dataclass(frozen=True)
+class Header:
+    """The JSON file of a policy."""
+
+    format: Literal["tailgate-policy-1"]
+    tensors: str
+    sha256: str
+    layers: int
+    action: ActionSpec
+    observation: tuple[str, ...]
+    knowledge: Literal["black", "grey", "white"]
+    sees_measurement: bool = False
+    training: dict[str, Any] = dataclasses.field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class Network:
+    """weights[l] (i, o) and biases[l] (o,), tanh between layers; log_std (values,) for continuous actions."""
+
+    weights: tuple[Array, ...]
+    biases: tuple[Array, ...]
+    log_std: Array | None = None
+
+    def __call__(self, observation: Array) -> Array:
+        """(B, d) float32 to (B, o): logits, or the mean of a continuous action."""
+        x = observation.astype(np.float64)
+        for i, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
+            x = num.dense(x, weight, bias, squash=i + 1 < len(self.weights))
+        return x
+
+
+def choose(network: Network, codec: ActionCodec, observation: Array, draws: Draws | None, forced: Array | None = None) -> Array:
+    """Actions (B,) or (B, size): the likeliest, or drawn when `draws` is given.
+
+    `forced` (B,) bool sets when to attack and leaves the policy to choose what (yoked schedules).
+    """
+    out = network(observation)
+    if codec.discrete:
+        if draws is not None:
+            out = out - num.log(-num.log(np.ascontiguousarray(draws.uniform((out.shape[1],)))))
+        if forced is not None:
+            return np.where(forced, 1 + np.argmax(out[:, 1:], axis=1), 0)
+        return np.argmax(out, axis=1)
+    if draws is not None and network.log_std is not None:
+        out = out + num.exp(network.log_std) * draws.normal((out.shape[1],))
+    if forced is not None:
+        out = np.concatenate([np.where(forced, 1.0, -1.0)[:, None], out[:, 1:]], axis=1)
+    return np.clip(out, -1.0, 1.0)
+
+
+def save_policy(path: Path, network: Network, header: dict[str, Any]) -> Path:
+    """Write PATH.safetensors and PATH.json; `header` holds action, observation, knowledge, sees_measurement and training."""
+    tensors: dict[str, Array] = {}
+    for i, (weight, bias) in enumerate(zip(network.weights, network.biases, strict=True)):
+        tensors |= {f"layer{i}.weight": np.ascontiguousarray(weight), f"layer{i}.bias": np.ascontiguousarray(bias)}
+    if network.log_std is not None:
+        tensors["log_std"] = np.ascontiguousarray(network.log_std)
+    blob = save_tensors(tensors)
+    file = path.with_suffix(".safetensors")
+    data = {"format": FORMAT, "tensors": file.name, "sha256": hashlib.sha256(blob).hexdigest(), "layers": len(network.weights)}
+    write_atomic(file, blob)
+    write_atomic(path.with_suffix(".json"), json.dumps(data | as_data(header), indent=1).encode() + b"\n")
+    return path.with_suffix(".json")
+
+
+def load_policy(path: Path) -> tuple[Header, Network]:
+    """Read a policy; raises InputError when a file is missing, damaged, or does not fit its header."""
+    where = f"policy {path.name}"
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError("policy", str(path), f"a readable file ({error.strerror})") from None
+    except (ValueError, UnicodeDecodeError) as error:
+        raise InputError(where, str(path), f"valid JSON ({error})") from None
+    if not isinstance(data, dict) or data.get("format") != FORMAT:
+        raise InputError(where, data.get("format") if isinstance(data, dict) else type(data).__name__, f"a JSON object of format {FORMAT!r}")
+    header = build(Header, data, where)
+    if Path(header.tensors).name != header.tensors:
+        raise InputError(f"{where}.tensors", header.tensors, "the name of a file beside the JSON file")
+    try:
+        blob = path.with_name(header.tensors).read_bytes()
+    except OSError as error:
+        raise InputError(f"{where}.tensors", header.tensors, f"a readable file ({error.strerror})") from None
+    if hashlib.sha256(blob).hexdigest() != header.sha256:
+        raise InputError(f"{where}.sha256", header.sha256, f"the digest of {header.tensors}: the file is damaged or another one")
+    try:
+        tensors = load_tensors(blob)
+    except SafetensorError as error:
+        raise InputError(f"{where}.tensors", header.tensors, f"a safetensors file ({error})") from None
+    weights, biases, width = [], [], len(header.observation)
+    for i in range(header.layers):
+        weight, bias = tensors.get(f"layer{i}.weight"), tensors.get(f"layer{i}.bias")
+        fits = weight is not None and bias is not None and weight.ndim == 2 and weight.shape[0] == width and bias.shape == weight.shape[1:]
+        if not fits or not (np.isfinite(weight).all() and np.isfinite(bias).all()):
+            shown = None if weight is None else weight.shape
+            raise InputError(f"{where}: layer{i}", shown, f"finite weights ({width}, outputs) and as many biases")
+        weights.append(np.ascontiguousarray(weight, np.float64))
+        biases.append(np.ascontiguousarray(bias, np.float64))
+        width = weight.shape[1]
+    log_std = tensors.get("log_std")
+    return header, Network(tuple(weights), tuple(biases), None if log_std is None else log_std.astype(np.float64))
+
+
+class PolicyPlan(NamedTuple):
+    network: Network
+    action: ActionCodec
+    observation: ObservationCodec
+
+
+@register("attack", "policy")
+@dataclass(frozen=True)
+class PolicyAttack:
+    """A learned policy from a JSON + safetensors file."""
+
+    path: Path = param(Path("policy.json"), "the JSON file of an exported policy")
+    stochastic: bool = param(False, "draw actions from the policy instead of taking the likeliest")
+
+    @cached_property
+    def _loaded(self) -> tuple[Header, Network]:
+        return load_policy(self.path)
+
+    @property
+    def knowledge(self) -> str:
+        """What the policy was trained to see."""
+        return self._loaded[0].knowledge
+
+    @property
+    def sees_measurement(self) -> bool:
+        return self._loaded[0].sees_measurement
+
+    def prepare(self, brief: Brief) -> PolicyPlan:
+        header, network = self._loaded
+        action, observation = ActionCodec(header.action, brief), ObservationCodec(brief)
+        if observation.names != header.observation:
+            missing = sorted(set(header.observation) ^ set(observation.names))
+            raise InputError(f"policy {self.path.name}", f"observation {', '.join(missing)}", "the observation of this scenario and threat model")
+        if network.weights[-1].shape[1] != action.size:
+            raise InputError(f"policy {self.path.name}", f"{network.weights[-1].shape[1]} actions", f"{action.size} actions under this threat model")
+        return PolicyPlan(network, action, observation)
+
+    def start(self, plan: PolicyPlan, batch: int, draws: Draws) -> Any:
+        return None
+
+    def decide(self, plan: PolicyPlan, state: Any, view: View, draws: Draws, forced: Array | None = None) -> tuple[Any, Command]:
+        observation = plan.observation.observe(view)
+        chance = policy_draws(draws) if self.stochastic else None
+        return None, plan.action.decode(choose(plan.network, plan.action, observation, chance, forced), view)
+
+
+def policy_draws(draws: Draws) -> Draws:
+    """The POLICY stream that belongs to the ATTACK stream given to `decide`."""
+    return draws._replace(stream=int(Role.POLICY))
+
+
+class YokedState(NamedTuple):
+    row: Array  # (B,) index into the schedule
+
+
+@dataclass(frozen=True, eq=False)
+class Yoked:
+    """The policy with somebody else's timing: on and off as `schedule` (K, B) bool says, values chosen in its own state."""
+
+    policy: PolicyAttack
+    schedule: Array
+
+    def prepare(self, brief: Brief) -> PolicyPlan:
+        return self.policy.prepare(brief)
+
+    def start(self, plan: PolicyPlan, batch: int, draws: Draws) -> YokedState:
+        if batch != self.schedule.shape[1]:
+            raise InputError("schedule", self.schedule.shape, f"(steps, {batch})")
+        return YokedState(np.arange(batch))
+
+    def decide(self, plan: PolicyPlan, state: YokedState, view: View, draws: Draws) -> tuple[YokedState, Command]:
+        _, command = self.policy.decide(plan, None, view, draws, forced=self.schedule[view.k - 1, state.row])
+        return state, command
+
+
+def timing_advantage(loop: Any, policy: PolicyAttack, keys: Keys) -> tuple[Array, Array]:
+    """(own, yoked) crashes (B,) of a policy: yoked plays the on and off runs of the next episode of the same policy.
+
+    The schedules are recorded with termination off, as an episode that ended early would else have a short one.
+    """
+    from tailgate.metrics import crashed
+    from tailgate.trace import rollout
+
+    own = crashed(rollout(loop, policy, keys))
+    schedule = rollout(loop, policy, keys, terminate=False).kind != 0
+    yoked = crashed(rollout(loop, Yoked(policy, np.roll(schedule, 1, axis=1)), keys))
+    return own, yoked

@@ -1,0 +1,301 @@
+"""The Gymnasium faces: the loop with the attack's seat left open.
+
+The core is a vector environment without autoreset; NEXT_STEP and SAME_STEP are thin faces over it, and the single environment is
+a batch of one. reset(seed=s): row i equals gymnasium.make(...).reset(seed=s + i); each further episode of a row adds 1 to its
+episode counter.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from typing import Any, ClassVar
+
+import gymnasium
+import numpy as np
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
+
+from tailgate import draws
+from tailgate.agents.codec import LIMIT, ActionCodec, ActionSpec, ObservationCodec, Reward, action_space
+from tailgate.core import Array, Command, Frame, View
+from tailgate.errors import InputError, unknown
+from tailgate.loop import Loop, LoopState
+from tailgate.registry import Spec
+from tailgate.scenario import load_scenario
+from tailgate.schema import as_data, build, canonical, fields_of
+from tailgate.threat import ThreatModel
+
+_AUTORESET = {"next_step": AutoresetMode.NEXT_STEP, "same_step": AutoresetMode.SAME_STEP, "disabled": AutoresetMode.DISABLED}
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Seat:
+    """Everything that an adversary environment is, apart from its episodes: loop, codecs and reward, from checked arguments."""
+
+    loop: Loop
+    action: ActionCodec
+    observation: ObservationCodec
+    reward: Reward
+    config: dict[str, Any]
+
+    @classmethod
+    def make(
+        cls,
+        scenario: str = "stop-and-go-v0",
+        defence: Any = "chi2_kf",
+        threat: dict[str, Any] | None = None,
+        **options: Any,
+    ) -> Seat:
+        """scenario: name or YAML file. defence: name (`chi2_kf:eta=15`) or object. threat: changes of the scenario's threat model.
+
+        options: the fields of ActionSpec and Reward, and `knowledge`.
+        """
+        threat = dict(threat or {})
+        if not isinstance(scenario, str):
+            raise InputError("scenario", scenario, "the name of a scenario, or of a YAML file")
+        if "knowledge" in options:
+            threat["knowledge"] = options.pop("knowledge")
+        known = fields_of(ActionSpec) | fields_of(Reward)
+        for key in options:
+            if key not in known:
+                raise unknown("environment argument", key, [*known, "scenario", "defence", "threat", "knowledge"])
+        for key in threat:
+            if key not in fields_of(ThreatModel):
+                raise unknown("threat: unknown field", key, fields_of(ThreatModel))
+        action = build(ActionSpec, {k: v for k, v in options.items() if k in fields_of(ActionSpec)}, "action")
+        reward = build(Reward, {k: v for k, v in options.items() if k in fields_of(Reward)}, "reward")
+        place = load_scenario(scenario).with_threat(**threat)
+        if isinstance(defence, str):
+            spec = Spec("defence", defence)
+            built, uses, named = spec.make(), spec.entry.uses, {"spec": defence, "parameters": as_data(spec.make())}
+        else:
+            if not all(hasattr(defence, name) for name in ("prepare", "start", "step")):
+                raise InputError("defence", defence, "a registered name, or an object with prepare, start and step")
+            built, uses = defence, tuple(getattr(defence, "uses", ("measurements",)))
+            named = {"spec": type(defence).__name__, "parameters": as_data(defence)}
+        loop = place.loop(built, uses)
+        config = {"scenario": as_data(place), "defence": named, "action": as_data(action), "reward": as_data(reward)}
+        return cls(loop, ActionCodec(action, loop.brief), ObservationCodec(loop.brief), reward, config)
+
+    def card(self) -> dict[str, Any]:
+        """What papers and rows cite: the whole configuration, and its hash."""
+        from tailgate import __version__
+
+        digest = hashlib.blake2b(canonical(self.config).encode(), digest_size=8).hexdigest()
+        features, actions = list(self.observation.names), [name for name, *_ in self.action.modes] if self.action.discrete else None
+        card = self.config | {"observation": features, "actions": actions, "version": __version__, "hash": digest}
+        return json.loads(json.dumps(card))  # type: ignore[no-any-return]
+
+
+class AdversaryVectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
+    """B adversary environments stepped as one batch; see `Seat.make` for the arguments."""
+
+    metadata: dict[str, Any] = {  # noqa: RUF012 - Gymnasium's own annotation
+        "render_modes": ["rgb_array"], "render_fps": 10, "autoreset_mode": AutoresetMode.NEXT_STEP,
+    }  # fmt: skip
+    purpose: ClassVar[str] = "train"
+
+    def __init__(self, num_envs: int = 1, *, render_mode: str | None = None, autoreset: str = "next_step", **arguments: Any) -> None:
+        if not isinstance(num_envs, int) or num_envs < 1:
+            raise InputError("num_envs", num_envs, "a whole number not below 1")
+        if autoreset not in _AUTORESET:
+            raise unknown("autoreset", autoreset, _AUTORESET)
+        if render_mode not in (None, "rgb_array"):
+            raise InputError("render_mode", render_mode, "None or 'rgb_array'")
+        self.seat = Seat.make(**arguments)
+        self.num_envs = num_envs
+        self.render_mode = render_mode
+        self.autoreset = _AUTORESET[autoreset]
+        self.metadata = self.metadata | {"autoreset_mode": self.autoreset, "render_fps": round(1.0 / self.seat.loop.model.dt)}
+        features = len(self.seat.observation.names)
+        self.single_observation_space = gymnasium.spaces.Box(-LIMIT, LIMIT, (features,), np.float32)
+        self.single_action_space = action_space(self.seat.action)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self.state: LoopState | None = None
+        self._done = np.zeros(num_envs, bool)
+        self._potential = np.zeros(num_envs)
+        self.frame: Frame | None = None  # the last step, for rendering and curious readers
+
+    def card(self) -> dict[str, Any]:
+        """JSON data that names this environment completely, with a hash."""
+        return self.seat.card()
+
+    # -- episodes
+
+    def reset(self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None) -> tuple[Array, dict[str, Any]]:
+        """seed s or one per row. options["reset_mask"] (B,) bool restarts those rows only."""
+        mask = None if options is None else options.get("reset_mask")
+        if isinstance(seed, (list, tuple, np.ndarray)):
+            if len(seed) != self.num_envs:
+                raise InputError("seed", seed, f"one seed per row ({self.num_envs})")
+            seeds = [None if s is None else int(s) for s in seed]
+            super().reset(seed=next((s for s in seeds if s is not None), None))
+        else:
+            super().reset(seed=seed)
+            seeds = [None] * self.num_envs if seed is None else [int(seed) + i for i in range(self.num_envs)]
+        if mask is None:
+            rows = np.ones(self.num_envs, bool)
+        else:
+            rows = np.asarray(mask)
+            if rows.dtype != bool or rows.shape != (self.num_envs,) or not rows.any():
+                raise InputError("options.reset_mask", mask, f"a bool array of shape ({self.num_envs},) with at least one True")
+        if self.state is None:
+            fresh = [int(self.np_random.integers(2**31)) if s is None else s for s in seeds]
+            self.state = self.seat.loop.start(draws.keys(self.purpose, fresh))
+        else:
+            again = rows & np.array([s is None for s in seeds])
+            self.state = self.seat.loop.restart(self.state, again)
+            named = np.flatnonzero(rows & ~again)
+            if len(named):
+                keys = draws.keys(self.purpose, [seeds[i] for i in named])  # type: ignore[misc]
+                self.state = self.seat.loop.reseed(self.state, named, keys)
+        self._done = self._done & ~rows
+        self.frame = None
+        view = self.seat.loop.sense(self.state)
+        self._potential = np.where(rows, self.seat.reward.potential(view.scene.gap), self._potential)
+        quiet = np.zeros(self.num_envs, bool)
+        return self.seat.observation.observe(view), self._info(view, quiet, quiet, quiet)
+
+    def step(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
+        """actions (B,) for discrete spaces, (B, size) for Box -> the Gymnasium five."""
+        if self.state is None:
+            raise InputError("step", "no episode", "reset() first")
+        actions = self._checked(actions)
+        view = self.seat.loop.sense(self.state)
+        return self.apply(self.seat.action.decode(actions, view))
+
+    def apply(self, command: Command) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
+        """Step with a command itself."""
+        assert self.state is not None
+        loop, seat = self.seat.loop, self.seat
+        over, resets = self._done, self.autoreset == AutoresetMode.NEXT_STEP
+        if over.any() and self.autoreset == AutoresetMode.DISABLED:
+            raise InputError("step", np.flatnonzero(over).tolist(), "rows that are over to be reset with options['reset_mask'] first")
+        self.state, frame = loop.advance(self.state, command)
+        self.frame = frame
+        crashed = frame.collided | frame.rear_collided
+        error = frame.truth[..., 0] - frame.estimate.x[..., 0]  # positive: the car believes that it is further back
+        potential = seat.reward.potential(frame.scene.gap, error)
+        reward = seat.reward(
+            loop.model.dt, np.abs(error), frame.estimate.alarm, crashed, frame.refused, self._potential, potential
+        )
+        self._potential = potential
+        terminated, truncated = crashed, ~crashed & (self.state.k > loop.horizon)
+        illegal = frame.refused
+        if resets and over.any():  # these rows were over: this step is their reset
+            self._restart(over)
+            reward, illegal = np.where(over, 0.0, reward), illegal & ~over
+            terminated, truncated = terminated & ~over, truncated & ~over
+        collided, rear = frame.collided & terminated, frame.rear_collided & terminated
+        self._done = terminated | truncated
+        view = loop.sense(self.state)
+        observation = seat.observation.observe(view)
+        info = self._info(view, illegal, collided, rear)
+        if self.autoreset == AutoresetMode.SAME_STEP and self._done.any():
+            done, final = self._done, observation
+            self._restart(done)
+            view = loop.sense(self.state)
+            observation = seat.observation.observe(view)
+            final_info = info
+            info = self._info(view, illegal, collided, rear)
+            info |= {"final_obs": final, "_final_obs": done.copy(), "final_info": final_info, "_final_info": done.copy()}
+            self._done = np.zeros_like(done)
+        return observation, reward, terminated, truncated, info
+
+    def action_masks(self) -> Array:
+        """(B, actions) bool: what the channel would accept now. Discrete action spaces only."""
+        if self.state is None or not self.seat.action.discrete:
+            raise InputError("action_masks", self.seat.action.spec.action, "a running episode with a discrete action space")
+        return self.seat.action.mask(self.seat.loop.sense(self.state))
+
+    def render(self) -> tuple[Array, ...] | None:  # type: ignore[override]
+        """One (H, W, 3) uint8 picture per row: road, true and believed gap, attack, alarm."""
+        if self.render_mode is None or self.state is None:
+            return None
+        from .render import draw
+
+        return tuple(draw(self.seat.loop, self.state, self.frame, row) for row in range(self.num_envs))
+
+    # -- inside
+
+    def _restart(self, rows: Array) -> None:
+        assert self.state is not None
+        loop = self.seat.loop
+        self.state = loop.restart(self.state, rows)
+        fresh = self.seat.reward.potential(loop.plant.scene(loop.plan.plant, self.state.plant).gap)
+        self._potential = np.where(rows, fresh, self._potential)
+
+    def _checked(self, actions: Array) -> Array:
+        actions = np.asarray(actions)
+        shape = self.action_space.shape
+        if actions.shape != shape:
+            raise InputError("actions", f"shape {actions.shape}", f"shape {shape}")
+        if self.seat.action.discrete:
+            if actions.dtype.kind not in "iu" or ((actions < 0) | (actions >= self.seat.action.size)).any():
+                raise InputError("actions", actions.tolist(), f"whole numbers from 0 to {self.seat.action.size - 1}")
+        elif not np.isfinite(actions).all():
+            raise InputError("actions", actions.tolist(), "finite numbers in [-1, 1]")
+        return actions
+
+    def _info(self, view: View, illegal: Array, collided: Array, rear: Array) -> dict[str, Any]:
+        info: dict[str, Any] = {
+            "illegal": illegal.copy(), "collided": collided.copy(), "rear_collided": rear.copy(), "allowed": view.allowed.copy(),
+            "gap": np.min(view.scene.gap, axis=1), "step": view.k.copy(),
+        }  # fmt: skip
+        if self.seat.action.discrete:
+            info["action_mask"] = self.seat.action.mask(view)
+        everyone = np.ones(self.num_envs, bool)
+        return info | {f"_{key}": everyone for key in info}
+
+
+class AdversaryEnv(gymnasium.Env[Array, Any]):
+    """One adversary environment; see `Seat.make` for the arguments."""
+
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012 - Gymnasium's own annotation
+
+    def __init__(self, *, render_mode: str | None = None, **arguments: Any) -> None:
+        self.batch = AdversaryVectorEnv(1, render_mode=render_mode, autoreset="disabled", **arguments)
+        self.render_mode = render_mode
+        self.metadata = self.metadata | {"render_fps": self.batch.metadata["render_fps"]}
+        self.observation_space = self.batch.single_observation_space
+        self.action_space = self.batch.single_action_space
+
+    def card(self) -> dict[str, Any]:
+        """JSON data that names this environment completely, with a hash."""
+        return self.batch.card()
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Array, dict[str, Any]]:
+        super().reset(seed=seed)
+        if self.batch.state is None and seed is None:
+            seed = int(self.np_random.integers(2**31))
+        observation, info = self.batch.reset(seed=seed)
+        return observation[0], self._row(info)
+
+    def step(self, action: Any) -> tuple[Array, float, bool, bool, dict[str, Any]]:
+        observation, reward, terminated, truncated, info = self.batch.step(np.asarray(action)[None])
+        return observation[0], float(reward[0]), bool(terminated[0]), bool(truncated[0]), self._row(info)
+
+    def action_masks(self) -> Array:
+        """(actions,) bool: what the channel would accept now. Discrete action spaces only."""
+        return np.asarray(self.batch.action_masks()[0])
+
+    def render(self) -> Any:
+        frames = self.batch.render()
+        return None if frames is None else frames[0]
+
+    @staticmethod
+    def _row(info: dict[str, Any]) -> dict[str, Any]:
+        return {k: v[0].copy() if v[0].ndim else v[0].item() for k, v in info.items() if not k.startswith("_")}
+
+
+def register_all() -> None:
+    """Make the ids known to Gymnasium. Called on import of tailgate."""
+    gymnasium.register(
+        id="tailgate/CarFollowing-v0",
+        entry_point="tailgate.envs.faces:AdversaryEnv",
+        vector_entry_point="tailgate.envs.faces:AdversaryVectorEnv",
+        order_enforce=True,
+    )

@@ -1,0 +1,318 @@
+"""Evaluation: cells (scenario x dose x defence x attack) to rows, one per episode.
+
+A row names everything that is needed to play it again. Finished cells are kept beside the output until all are done, so that an
+interrupted run resumes, and a component that crashes costs its own rows only.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import multiprocessing
+import shutil
+import sys
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import tailgate
+from tailgate import draws
+from tailgate.core import Array, Estimate, Model, Prior, Received
+from tailgate.errors import InputError
+from tailgate.files import write_atomic, writable_directory
+from tailgate.metrics import METRICS, measure
+from tailgate.registry import Entry, Spec, entry_of
+from tailgate.scenario import Scenario, Suite, load_scenario, load_suite
+from tailgate.schema import as_data, canonical
+from tailgate.trace import rollout
+
+ENGINE = "plain"
+KEYS = ("suite", "scenario", "dose", "knowledge", "defence", "attack")
+
+
+@dataclass(frozen=True)
+class Cell:
+    """Episodes that share everything but their seed."""
+
+    suite: str
+    scenario: str
+    dose: int | None
+    defence: str
+    attack: str
+    seeds: int
+    purpose: str = "report"
+    first_seed: int = 0
+    batch: int = 256
+    threat: dict[str, Any] = field(default_factory=dict)
+
+    def place(self, attack: Any, knowledge: str) -> Scenario:
+        """The scenario under the dose and the knowledge that the attack needs."""
+        changes: dict[str, Any] = dict(self.threat)
+        if self.dose is not None:
+            changes["budget"] = self.dose
+        changes.setdefault("knowledge", getattr(attack, "knowledge", knowledge))
+        if getattr(attack, "sees_measurement", False):
+            changes["sees_measurement"] = True
+        return load_scenario(self.scenario).with_threat(**changes)
+
+
+@dataclass(frozen=True, eq=False)
+class Checked:
+    """A defence whose outputs are checked for type, shape and finiteness at every step."""
+
+    inner: Any
+
+    def prepare(self, model: Model) -> Any:
+        return model, self.inner.prepare(model)
+
+    def start(self, plan: Any, prior: Prior) -> Any:
+        return self.inner.start(plan[1], prior)
+
+    def step(self, plan: Any, state: Any, received: Received, known_u: Array, random: draws.Draws) -> tuple[Any, Estimate]:
+        model, inner = plan
+        state, estimate = self.inner.step(inner, state, received, known_u, random)
+        shape = received.y.shape[:2]
+        wanted = {
+            "x": ((*shape, model.states), "f"), "score": (shape, "f"), "alarm": (shape, "b"), "mode": (shape, "iu"), "probe": (shape, "b"),
+        }  # fmt: skip
+        for name, (size, kinds) in wanted.items():
+            value = getattr(estimate, name, None)
+            if not isinstance(value, np.ndarray) or value.shape != size or value.dtype.kind not in kinds:
+                got = f"{value.dtype} {value.shape}" if isinstance(value, np.ndarray) else type(value).__name__
+                raise InputError(f"defence output {name}", got, f"an array of shape {size}, kind {kinds!r}")
+            if kinds == "f" and not np.isfinite(value).all():
+                raise InputError(f"defence output {name}", "NaN or infinity", "finite numbers")
+        return state, estimate
+
+    def look(self, plan: Any, *arguments: Any) -> Any:
+        return self.inner.look(plan[1], *arguments)
+
+
+def _component(family: Any, value: Any) -> tuple[Any, Any, str]:
+    """(object, entry, text) of a spec text or an object."""
+    if isinstance(value, str):
+        spec = Spec(family, value)
+        return spec.make(), spec.entry, value
+    cls = type(value)
+    return value, entry_of(family, cls.__name__, cls), f"{cls.__name__}({canonical(value)})"
+
+
+def run_cell(cell: Cell, defence: Any = None, attack: Any = None) -> list[dict[str, Any]]:
+    """The rows of a cell. `defence` and `attack` stand in for the cell's texts when they are objects."""
+    guard, guard_entry, _ = _component("defence", cell.defence if defence is None else defence)
+    rival, rival_entry, _ = _component("attack", cell.attack if attack is None else attack)
+    place = cell.place(rival, rival_entry.knowledge)
+    head = _head(cell, place, guard_entry, rival_entry)
+    seeds = list(_seeds(cell))
+    rows: list[dict[str, Any]] = []
+    for start in range(0, cell.seeds, cell.batch):
+        chunk = seeds[start : start + cell.batch]
+        try:
+            loop = place.loop(Checked(guard), guard_entry.uses)
+            trace = rollout(loop, rival, draws.keys(cell.purpose, chunk))
+            values = measure(trace)
+        except Exception as error:  # whatever a component raises costs its own rows, and only them
+            rows += _failed(head, chunk, f"{type(error).__name__}: {error}")
+            continue
+        for i, seed in enumerate(chunk):
+            numbers = {name: None if np.isnan(v[i]) else float(v[i]) for name, v in values.items()}
+            hashes = {"trace_hash": trace.trace_hash(i), "decision_hash": trace.decision_hash(i)}
+            rows.append(head | {"seed": seed, "status": "ok", "reason": "", **numbers, **hashes})
+    return rows
+
+
+def _seeds(cell: Cell) -> range:
+    return range(cell.first_seed, cell.first_seed + cell.seeds)
+
+
+def _head(cell: Cell, place: Scenario, guard: Entry, rival: Entry) -> dict[str, Any]:
+    threat = place.threat_model
+    return {
+        "suite": cell.suite, "scenario": place.name, "threat_model": as_data(threat), "dose": threat.budget,
+        "knowledge": threat.knowledge, "defence": cell.defence, "uses": list(guard.uses), "attack": cell.attack,
+        "learned": rival.name == "policy", "optimal": rival.optimal, "purpose": cell.purpose, "batch": cell.batch,
+        "engine": ENGINE, "versions": {"defence": guard.version, "attack": rival.version},
+        "config_hash": place.config_hash, "version": tailgate.__version__, "cell": cell_id(cell),
+    }  # fmt: skip
+
+
+def _failed(head: dict[str, Any], seeds: Iterable[int], reason: str) -> list[dict[str, Any]]:
+    empty = dict.fromkeys(METRICS) | {"trace_hash": None, "decision_hash": None}
+    text = " ".join(reason.split())[:500]
+    return [head | {"seed": seed, "status": "error", "reason": text, **empty} for seed in seeds]
+
+
+def failed_rows(cell: Cell, reason: str) -> list[dict[str, Any]]:
+    """The rows of a cell that could not be played."""
+    rival, entry = Spec("attack", cell.attack).make(), Spec("attack", cell.attack).entry
+    head = _head(cell, cell.place(rival, entry.knowledge), Spec("defence", cell.defence).entry, entry)
+    return _failed(head, _seeds(cell), reason)
+
+
+def cell_id(cell: Cell) -> str:
+    """Of everything that decides a cell's rows: a finished cell with this id is not played again."""
+    data = dataclasses.asdict(cell)
+    if cell.attack.endswith(".json"):
+        data["policy"] = hashlib.sha256(Path(cell.attack).read_bytes()).hexdigest() if Path(cell.attack).is_file() else ""
+    data["scenario"] = load_scenario(cell.scenario).config_hash
+    return hashlib.blake2b(f"{tailgate.__version__}/{canonical(data)}".encode(), digest_size=12).hexdigest()
+
+
+def cells_of(suite: Suite, *, batch: int = 256, purpose: str = "report", threat: dict[str, Any] | None = None) -> list[Cell]:
+    """Every cell of a suite, in its order. Raises InputError for anything that does not exist."""
+    changes = dict(threat or {}) | ({} if suite.knowledge is None else {"knowledge": suite.knowledge})
+    out = [
+        Cell(suite.name, scenario, dose, defence, attack, suite.seeds, purpose, 0, batch, changes)
+        for scenario in suite.scenarios for dose in suite.doses for defence in suite.defences for attack in suite.attacks
+    ]  # fmt: skip
+    for name in suite.defences:
+        Spec("defence", name).make()
+    for cell in out:
+        spec = Spec("attack", cell.attack)
+        rival = spec.make()
+        rival.prepare(cell.place(rival, spec.entry.knowledge).brief())
+    return out
+
+
+def read_rows(path: Path) -> list[dict[str, Any]]:
+    """Rows of a JSON Lines file; raises InputError that names the line."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError("rows", str(path), f"a readable JSON Lines file ({error})") from None
+    rows = []
+    for number, line in enumerate(text.splitlines(), start=1):
+        try:
+            row = json.loads(line)
+        except ValueError:
+            raise InputError(f"rows {path.name}, line {number}", line[:60], "a JSON object") from None
+        if not isinstance(row, dict) or not all(key in row for key in (*KEYS, "seed", "status")):
+            raise InputError(f"rows {path.name}, line {number}", line[:60], f"a row with {', '.join(KEYS)}, seed and status")
+        rows.append(row)
+    return rows
+
+
+def _encode(rows: Sequence[dict[str, Any]]) -> bytes:
+    return "".join(json.dumps(row, allow_nan=False) + "\n" for row in rows).encode()
+
+
+def run(
+    cells: Sequence[Cell], out: Path | None = None, workers: int = 1, progress: Callable[[int, int], None] | None = None
+) -> list[dict[str, Any]]:
+    """Rows of all cells in their order. With `out`, cells that an earlier run finished are taken from it."""
+    if workers < 1:
+        raise InputError("workers", workers, "a whole number not below 1")
+    ids = [cell_id(cell) for cell in cells]
+    done: dict[str, list[dict[str, Any]]] = {}
+    parts = None
+    if out is not None:
+        parts = writable_directory(out.with_name(out.name + ".parts"))
+        known = read_rows(out) if out.is_file() else []
+        for part in sorted(parts.glob("*.jsonl")):
+            known += read_rows(part)
+        for row in known:
+            done.setdefault(str(row.get("cell")), []).append(row)
+        done = {i: done[i][: cell.seeds] for i, cell in zip(ids, cells, strict=True) if len(done.get(i, [])) >= cell.seeds}
+    missing = [(i, cell) for i, cell in zip(ids, cells, strict=True) if i not in done]
+    for i, rows in _play([cell for _, cell in missing], workers):
+        done[ids[cells.index(missing[i][1])]] = rows
+        if parts is not None:
+            write_atomic(parts / f"{missing[i][0]}.jsonl", _encode(rows))
+        if progress is not None:
+            progress(len(done), len(cells))
+    rows = [row for i in ids for row in done[i]]
+    if out is not None and parts is not None:
+        write_atomic(out, _encode(rows))
+        shutil.rmtree(parts)
+    return rows
+
+
+def _play(cells: Sequence[Cell], workers: int) -> Iterator[tuple[int, list[dict[str, Any]]]]:
+    if workers == 1 or len(cells) < 2:
+        for i, cell in enumerate(cells):
+            yield i, run_cell(cell)
+        return
+    lost = []
+    with _pool(workers) as pool:
+        waiting = {pool.submit(run_cell, cell): i for i, cell in enumerate(cells)}
+        for future in as_completed(waiting):
+            try:
+                yield waiting[future], future.result()
+            except BrokenProcessPool:  # one cell killed its process, and the pool with it: which one shows below
+                lost.append(waiting[future])
+    for i in sorted(lost):
+        with _pool(1) as pool:
+            try:
+                rows = pool.submit(run_cell, cells[i]).result()
+            except BrokenProcessPool:
+                rows = failed_rows(cells[i], "the process that played this cell died")
+        yield i, rows
+
+
+def _pool(workers: int) -> ProcessPoolExecutor:
+    context = multiprocessing.get_context("spawn")  # a fork after compiled parallel code can hang
+    return ProcessPoolExecutor(workers, mp_context=context, initializer=_same_path, initargs=(list(sys.path),))
+
+
+def _same_path(path: list[str]) -> None:
+    sys.path[:] = path  # a submission's module is found where the parent found it
+
+
+def evaluate(
+    suite: str | Suite | None = None,
+    *,
+    defences: Sequence[Any] | None = None,
+    attacks: Sequence[Any] | None = None,
+    scenarios: Sequence[str] | None = None,
+    doses: Sequence[int | None] | None = None,
+    seeds: int | None = None,
+    purpose: str = "report",
+    batch: int = 256,
+    workers: int = 1,
+    out: Path | str | None = None,
+    threat: dict[str, Any] | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> list[dict[str, Any]]:
+    """Rows of a suite, or of any part of it that is given here; defences and attacks by name or as objects.
+
+    `threat` changes the scenarios' threat models. Raises InputError before anything is played.
+    """
+    base = load_suite(suite) if isinstance(suite, str) else suite if suite is not None else Suite(name="custom")
+    guards = list(base.defences if defences is None else defences)
+    rivals = list(base.attacks if attacks is None else attacks)
+    if batch < 1:
+        raise InputError("batch", batch, "a whole number not below 1")
+    if seeds is not None and seeds < 1:
+        raise InputError("seeds", seeds, "a whole number not below 1")
+    named = dataclasses.replace(
+        base,
+        scenarios=tuple(base.scenarios if scenarios is None else scenarios),
+        doses=tuple(base.doses if doses is None else doses),
+        defences=tuple(g for g in guards if isinstance(g, str)),
+        attacks=tuple(r for r in rivals if isinstance(r, str)),
+        seeds=base.seeds if seeds is None else seeds,
+    )
+    for name, value in (("scenarios", named.scenarios), ("defences", guards), ("attacks", rivals)):
+        if not value:
+            raise InputError(name, list(value), "at least one")
+    for dose in named.doses:
+        if dose is not None and (not isinstance(dose, int) or dose < 0):
+            raise InputError("dose", dose, "a whole number of attack steps, not below 0")
+    cells = cells_of(named, batch=batch, purpose=purpose, threat=threat)
+    rows = run(cells, Path(out) if out is not None else None, workers, progress) if cells else []
+    for guard in guards:
+        for rival in rivals:
+            if isinstance(guard, str) and isinstance(rival, str):
+                continue
+            texts = _component("defence", guard)[2], _component("attack", rival)[2]
+            for scenario in named.scenarios:
+                for dose in named.doses:
+                    cell = Cell(named.name, scenario, dose, *texts, named.seeds, purpose, 0, batch, dict(threat or {}))
+                    rows += run_cell(cell, guard, rival)
+    return rows
