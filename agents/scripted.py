@@ -8,7 +8,7 @@ import numpy as np
 from tailgate import num
 from tailgate.core import Array, Command, Finite, Kind, NonNegative, PositiveCount, Probability, View, no_command, param
 from tailgate.draws import Draws
-from tailgate.errors import InputError, unknown
+from tailgate.errors import InputError, NotApplicable, unknown
 from tailgate.registry import register
 from tailgate.threat import Brief
 
@@ -216,7 +216,7 @@ class Stealth(Script):
             raise InputError("threat_model.knowledge", plan.brief.threat.knowledge, "white, which attack stealth needs")
         box = view.defence
         if not hasattr(box.defence, "look"):
-            raise InputError("attack stealth", type(box.defence).__name__, "a defence that shows its innovation (look)")
+            raise NotApplicable("attack stealth", type(box.defence).__name__, "a defence that shows its innovation (look)")
         look = box.defence.look(box.plan, box.state, view.received, box.known_u)
         gate = self.gate if self.gate is not None else look.gate if look.gate is not None else 20.0
         r, S = look.innovation

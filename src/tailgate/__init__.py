@@ -44,7 +44,7 @@ def __getattr__(name: str) -> Any:
 
         return per_episode
     if name == "evaluate":
-        from tailgate.evaluate import evaluate
+        from tailgate.evaluation import evaluate
 
         return evaluate
     raise AttributeError(f"module 'tailgate' has no attribute {name!r}")

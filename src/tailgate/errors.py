@@ -17,6 +17,10 @@ class InputError(ValueError):
         return type(self), (self.field, self.value, self.expected)
 
 
+class NotApplicable(InputError):
+    """A pairing of components that has no meaning: its rows are skipped, with the reason."""
+
+
 def unknown(field: str, name: object, known: Iterable[str]) -> InputError:
     """An InputError for a name that does not exist: lists what does, the nearest first."""
     names = sorted(known)

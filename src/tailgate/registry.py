@@ -4,11 +4,13 @@ Built-in ones register where they are defined; others come from the entry-point 
 from `module:Class` on the command line, or as objects in Python. A configuration file names registered components only.
 """
 
+import hashlib
 import importlib
 import inspect
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.metadata import entry_points
+from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 from tailgate.errors import InputError, unknown
@@ -168,6 +170,18 @@ class Spec:
         if not isinstance(cls, type):
             raise InputError(self.family, self.text, "a class")
         return entry_of(self.family, head, cls)
+
+    @property
+    def digest(self) -> str:
+        """Of the file that somebody else's component comes from; empty for registered ones, which carry a version."""
+        head, _ = self._parts()
+        if head.endswith(".json"):
+            path = Path(head)
+        elif ":" in head:
+            path = Path(inspect.getfile(self.entry.cls))
+        else:
+            return ""
+        return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ""
 
     def make(self) -> Any:
         head, params = self._parts()

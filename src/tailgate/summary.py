@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from tailgate.evaluate import KEYS
+from tailgate.evaluation import KEYS
 from tailgate.stats import proportion
 
 
@@ -15,7 +15,7 @@ def summarise(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """One entry per (suite, scenario, dose, knowledge, defence, attack), in order of appearance.
 
     crash: share of episodes with a collision in front or behind, with a 95 % Clopper-Pearson interval; the other columns are medians
-    with quartiles. Rows with an error are counted in `failed` and left out of the figures.
+    with quartiles. Rows with an error are counted in `failed`; those and skipped pairings are left out of the figures.
     """
     groups: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
     for row in rows:
@@ -25,7 +25,7 @@ def summarise(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
         good = [row for row in members if row["status"] == "ok"]
         entry: dict[str, Any] = dict(zip(KEYS, key, strict=True))
         entry |= {
-            "n": len(good), "failed": len(members) - len(good), "learned": bool(members[0].get("learned")),
+            "n": len(good), "failed": sum(r["status"] == "error" for r in members), "learned": bool(members[0].get("learned")),
             "optimal": bool(members[0].get("optimal")), "reason": next((r["reason"] for r in members if r["status"] != "ok"), ""),
         }  # fmt: skip
         if good:

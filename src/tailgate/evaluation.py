@@ -24,7 +24,7 @@ import numpy as np
 import tailgate
 from tailgate import draws
 from tailgate.core import Array, Estimate, Model, Prior, Received
-from tailgate.errors import InputError
+from tailgate.errors import InputError, NotApplicable
 from tailgate.files import write_atomic, writable_directory
 from tailgate.metrics import METRICS, measure
 from tailgate.registry import Entry, Spec, entry_of
@@ -90,8 +90,10 @@ class Checked:
                 raise InputError(f"defence output {name}", "NaN or infinity", "finite numbers")
         return state, estimate
 
-    def look(self, plan: Any, *arguments: Any) -> Any:
-        return self.inner.look(plan[1], *arguments)
+    def __getattr__(self, name: str) -> Any:
+        if name == "look" and hasattr(self.__dict__["inner"], "look"):  # only where the defence has one
+            return lambda plan, *arguments: self.inner.look(plan[1], *arguments)
+        raise AttributeError(name)
 
 
 def _component(family: Any, value: Any) -> tuple[Any, Any, str]:
@@ -117,6 +119,9 @@ def run_cell(cell: Cell, defence: Any = None, attack: Any = None) -> list[dict[s
             loop = place.loop(Checked(guard), guard_entry.uses)
             trace = rollout(loop, rival, draws.keys(cell.purpose, chunk))
             values = measure(trace)
+        except NotApplicable as error:
+            rows += _failed(head, chunk, str(error), "skipped")
+            continue
         except Exception as error:  # whatever a component raises costs its own rows, and only them
             rows += _failed(head, chunk, f"{type(error).__name__}: {error}")
             continue
@@ -142,10 +147,10 @@ def _head(cell: Cell, place: Scenario, guard: Entry, rival: Entry) -> dict[str, 
     }  # fmt: skip
 
 
-def _failed(head: dict[str, Any], seeds: Iterable[int], reason: str) -> list[dict[str, Any]]:
+def _failed(head: dict[str, Any], seeds: Iterable[int], reason: str, status: str = "error") -> list[dict[str, Any]]:
     empty = dict.fromkeys(METRICS) | {"trace_hash": None, "decision_hash": None}
     text = " ".join(reason.split())[:500]
-    return [head | {"seed": seed, "status": "error", "reason": text, **empty} for seed in seeds]
+    return [head | {"seed": seed, "status": status, "reason": text, **empty} for seed in seeds]
 
 
 def failed_rows(cell: Cell, reason: str) -> list[dict[str, Any]]:
@@ -158,8 +163,7 @@ def failed_rows(cell: Cell, reason: str) -> list[dict[str, Any]]:
 def cell_id(cell: Cell) -> str:
     """Of everything that decides a cell's rows: a finished cell with this id is not played again."""
     data = dataclasses.asdict(cell)
-    if cell.attack.endswith(".json"):
-        data["policy"] = hashlib.sha256(Path(cell.attack).read_bytes()).hexdigest() if Path(cell.attack).is_file() else ""
+    data["sources"] = [Spec("defence", cell.defence).digest, Spec("attack", cell.attack).digest]
     data["scenario"] = load_scenario(cell.scenario).config_hash
     return hashlib.blake2b(f"{tailgate.__version__}/{canonical(data)}".encode(), digest_size=12).hexdigest()
 
@@ -205,7 +209,7 @@ def _encode(rows: Sequence[dict[str, Any]]) -> bytes:
 def run(
     cells: Sequence[Cell], out: Path | None = None, workers: int = 1, progress: Callable[[int, int], None] | None = None
 ) -> list[dict[str, Any]]:
-    """Rows of all cells in their order. With `out`, cells that an earlier run finished are taken from it."""
+    """Rows of all cells in their order. With `out`, cells that an interrupted run finished are not played again."""
     if workers < 1:
         raise InputError("workers", workers, "a whole number not below 1")
     ids = [cell_id(cell) for cell in cells]
@@ -213,12 +217,10 @@ def run(
     parts = None
     if out is not None:
         parts = writable_directory(out.with_name(out.name + ".parts"))
-        known = read_rows(out) if out.is_file() else []
-        for part in sorted(parts.glob("*.jsonl")):
-            known += read_rows(part)
-        for row in known:
-            done.setdefault(str(row.get("cell")), []).append(row)
-        done = {i: done[i][: cell.seeds] for i, cell in zip(ids, cells, strict=True) if len(done.get(i, [])) >= cell.seeds}
+        for i in ids:
+            part = parts / f"{i}.jsonl"
+            if part.is_file() and all(row["status"] != "error" for row in (rows := read_rows(part))):
+                done[i] = rows
     missing = [(i, cell) for i, cell in zip(ids, cells, strict=True) if i not in done]
     for i, rows in _play([cell for _, cell in missing], workers):
         done[ids[cells.index(missing[i][1])]] = rows
