@@ -219,8 +219,9 @@ def run(
         parts = writable_directory(out.with_name(out.name + ".parts"))
         for i in ids:
             part = parts / f"{i}.jsonl"
-            if part.is_file() and all(row["status"] != "error" for row in (rows := read_rows(part))):
-                done[i] = rows
+            kept = read_rows(part) if part.is_file() else []
+            if kept and all(row["status"] != "error" for row in kept):
+                done[i] = kept
     missing = [(i, cell) for i, cell in zip(ids, cells, strict=True) if i not in done]
     for i, rows in _play([cell for _, cell in missing], workers):
         done[ids[cells.index(missing[i][1])]] = rows
