@@ -2,10 +2,33 @@
 
 from .policy import PolicyAttack, Yoked, load_policy, save_policy
 from .scripted import (
-    Dropout, Hold, Inject, InjectBernoulli, InjectGaussian, InjectRamp, Jam, NoAttack, Script, Stealth, ThesisTimes,
+    Dropout,
+    Hold,
+    Inject,
+    InjectBernoulli,
+    InjectGaussian,
+    InjectRamp,
+    Jam,
+    NoAttack,
+    Script,
+    Stealth,
+    ThesisTimes,
 )  # fmt: skip
 
 __all__ = [
-    "Dropout", "Hold", "Inject", "InjectBernoulli", "InjectGaussian", "InjectRamp", "Jam", "NoAttack", "Script", "Stealth",
-    "PolicyAttack", "ThesisTimes", "Yoked", "load_policy", "save_policy",
+    "Dropout",
+    "Hold",
+    "Inject",
+    "InjectBernoulli",
+    "InjectGaussian",
+    "InjectRamp",
+    "Jam",
+    "NoAttack",
+    "PolicyAttack",
+    "Script",
+    "Stealth",
+    "ThesisTimes",
+    "Yoked",
+    "load_policy",
+    "save_policy",
 ]  # fmt: skip

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from tailgate.errors import InputError
 from tailgate.threat import Brief, KindName
 
 LIMIT = 10.0  # observations are clipped to +-LIMIT
-ActionName = Literal["timing", "mode", "continuous", "increment"]
+ActionName = Literal["timing", "mode", "ramp", "continuous", "increment"]
 
 
 @dataclass(frozen=True)
@@ -24,15 +24,26 @@ class ActionSpec:
     """Which decisions the learner takes.
 
     timing: {none, attack}, the attack is `kind` with `value`. mode: {none, then one per granted kind, +value and -value for fdi}.
+    ramp: as mode, but fdi has three: raise, keep or lower the value injected last by `rate`, from +-`value` at the start of a burst.
     continuous: [trigger, value per wire] in [-1, 1], attack when trigger > 0, values in units of the bound. increment: the same, but
-    each value is the change since the last injected one, in units of `rate`.
+    each value is the change since the value injected last, in units of `rate`.
     """
 
-    action: ActionName = param("mode", "timing, mode, continuous or increment")
+    action: ActionName = param("mode", "timing, mode, ramp, continuous or increment")
     kind: KindName = param("fdi", "timing: what an attack is")
-    value: Finite = param(-4.0, "timing and mode: bias of fdi, jammer's value of dos_jam [unit of the wire]")
-    rate: Positive = param(0.5, "increment: largest change per step [unit of the wire]")
-    per_sensor: bool = param(False, "mode: also one mode per single wire")
+    value: Finite = param(-4.0, "timing, mode, ramp: bias of fdi, jammer's value of dos_jam [unit of the wire]")
+    rate: Positive = param(0.5, "ramp, increment: (largest) change per step [unit of the wire]")
+    per_sensor: bool = param(False, "mode, ramp: also one mode per single wire")
+
+
+class Mode(NamedTuple):
+    """One discrete action: its name, kind, target (q+p,) bool, value, and direction of a ramp."""
+
+    name: str
+    kind: Kind
+    target: Array
+    value: float
+    sign: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,10 +55,11 @@ class ActionCodec:
 
     def __post_init__(self) -> None:
         threat, value = self.brief.threat, self.spec.value
-        used = [self.spec.kind] if self.spec.action == "timing" else ["fdi"] if self.spec.action != "mode" else list(threat.kinds)
+        used = [self.spec.kind] if self.spec.action == "timing" else list(threat.kinds) if self.discrete else ["fdi"]
         for name in used:
             if name not in threat.kinds:
-                raise InputError("action", f"{self.spec.action} with {name}", f"a kind that the threat model grants: {', '.join(threat.kinds)}")
+                granted = ", ".join(threat.kinds)
+                raise InputError("action", f"{self.spec.action} with {name}", f"a kind that the threat model grants: {granted}")
         if self.discrete and "fdi" in used and abs(value) > threat.fdi_bound:
             raise InputError("value", value, f"at most the threat model's fdi_bound ({threat.fdi_bound}) in size")
         if self.discrete and "dos_jam" in used and not threat.jam_range[0] <= value <= threat.jam_range[1]:
@@ -57,7 +69,7 @@ class ActionCodec:
 
     @property
     def discrete(self) -> bool:
-        return self.spec.action in ("timing", "mode")
+        return self.spec.action in ("timing", "mode", "ramp")
 
     @cached_property
     def wires(self) -> Array:
@@ -65,22 +77,22 @@ class ActionCodec:
         return np.flatnonzero(self.brief.granted)
 
     @cached_property
-    def modes(self) -> list[tuple[str, Kind, Array, float]]:
-        """Discrete meanings: name, kind, target (q+p,) and value, in the order of the action's number."""
+    def modes(self) -> list[Mode]:
+        """Discrete meanings, in the order of the action's number."""
         granted, value = self.brief.granted, self.spec.value
-        none = ("none", Kind.NONE, np.zeros_like(granted), 0.0)
         groups = [("", granted)]
         if self.spec.per_sensor and len(self.wires) > 1:
             groups += [(":" + self.brief.model.wires[w], np.arange(len(granted)) == w) for w in self.wires]
         kinds: tuple[KindName, ...] = (self.spec.kind,) if self.spec.action == "timing" else self.brief.threat.kinds
-        out = [none]
+        out = [Mode("none", Kind.NONE, np.zeros_like(granted), 0.0)]
         for suffix, target in groups:
             for name in kinds:
                 kind = Kind[name.upper()]
-                if kind == Kind.FDI and self.spec.action == "mode":
-                    out += [(f"fdi+{suffix}", kind, target, abs(value)), (f"fdi-{suffix}", kind, target, -abs(value))]
+                if kind == Kind.FDI and self.spec.action != "timing":
+                    signs = {"+": 1, "-": -1} if self.spec.action == "mode" else {"+": 1, "=": 0, "-": -1}
+                    out += [Mode(f"fdi{tag}{suffix}", kind, target, sign * abs(value), sign) for tag, sign in signs.items()]
                 else:
-                    out.append((name + suffix, kind, target, value if kind in (Kind.FDI, Kind.DOS_JAM) else 0.0))
+                    out.append(Mode(name + suffix, kind, target, value if kind in (Kind.FDI, Kind.DOS_JAM) else 0.0))
         return out
 
     @property
@@ -93,9 +105,14 @@ class ActionCodec:
         brief = self.brief
         if self.discrete:
             index = np.asarray(action).reshape(-1)
-            kinds = np.array([kind for _, kind, _, _ in self.modes], np.int8)[index]
-            target = np.array([target for _, _, target, _ in self.modes])[index][:, None, :]
-            value = np.array([value for _, _, _, value in self.modes])[index][:, None, None]
+            kinds = np.array([mode.kind for mode in self.modes], np.int8)[index]
+            target = np.array([mode.target for mode in self.modes])[index][:, None, :]
+            value = np.array([mode.value for mode in self.modes])[index][:, None, None]
+            if self.spec.action == "ramp":
+                bound, sign = brief.threat.fdi_bound, np.array([mode.sign for mode in self.modes])[index][:, None, None]
+                grown = np.clip(view.last.value + self.spec.rate * sign, -bound, bound)
+                ramping = ((view.last.kind == Kind.FDI) & (kinds == Kind.FDI))[:, None, None]
+                value = np.where(ramping, grown, value)
             return brief.command(index != 0, kinds, target, value)
         action = np.clip(np.asarray(action, np.float64), -1.0, 1.0)
         values = action[:, 1:].reshape(len(action), brief.model.agents, len(self.wires))

@@ -58,7 +58,7 @@ class Network:
 
     def __call__(self, observation: Array) -> Array:
         """(B, d) float32 to (B, o): logits, or the mean of a continuous action."""
-        x = observation.astype(np.float64)
+        x: Array = np.asarray(observation, np.float64)
         for i, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
             x = num.dense(x, weight, bias, squash=i + 1 < len(self.weights))
         return x
@@ -108,7 +108,8 @@ def load_policy(path: Path) -> tuple[Header, Network]:
     except (ValueError, UnicodeDecodeError) as error:
         raise InputError(where, str(path), f"valid JSON ({error})") from None
     if not isinstance(data, dict) or data.get("format") != FORMAT:
-        raise InputError(where, data.get("format") if isinstance(data, dict) else type(data).__name__, f"a JSON object of format {FORMAT!r}")
+        shown = data.get("format") if isinstance(data, dict) else type(data).__name__
+        raise InputError(where, shown, f"a JSON object of format {FORMAT!r}")
     header = build(Header, data, where)
     if Path(header.tensors).name != header.tensors:
         raise InputError(f"{where}.tensors", header.tensors, "the name of a file beside the JSON file")
@@ -125,8 +126,10 @@ def load_policy(path: Path) -> tuple[Header, Network]:
     weights, biases, width = [], [], len(header.observation)
     for i in range(header.layers):
         weight, bias = tensors.get(f"layer{i}.weight"), tensors.get(f"layer{i}.bias")
-        fits = weight is not None and bias is not None and weight.ndim == 2 and weight.shape[0] == width and bias.shape == weight.shape[1:]
-        if not fits or not (np.isfinite(weight).all() and np.isfinite(bias).all()):
+        if (
+            weight is None or bias is None or weight.ndim != 2 or weight.shape[0] != width or bias.shape != weight.shape[1:]
+            or not (np.isfinite(weight).all() and np.isfinite(bias).all())
+        ):  # fmt: skip
             shown = None if weight is None else weight.shape
             raise InputError(f"{where}: layer{i}", shown, f"finite weights ({width}, outputs) and as many biases")
         weights.append(np.ascontiguousarray(weight, np.float64))
@@ -167,10 +170,11 @@ class PolicyAttack:
         header, network = self._loaded
         action, observation = ActionCodec(header.action, brief), ObservationCodec(brief)
         if observation.names != header.observation:
-            missing = sorted(set(header.observation) ^ set(observation.names))
-            raise InputError(f"policy {self.path.name}", f"observation {', '.join(missing)}", "the observation of this scenario and threat model")
-        if network.weights[-1].shape[1] != action.size:
-            raise InputError(f"policy {self.path.name}", f"{network.weights[-1].shape[1]} actions", f"{action.size} actions under this threat model")
+            differing = ", ".join(sorted(set(header.observation) ^ set(observation.names)))
+            raise InputError(f"policy {self.path.name}", f"observation {differing}", "the observation of this scenario and threat model")
+        outputs = network.weights[-1].shape[1]
+        if outputs != action.size:
+            raise InputError(f"policy {self.path.name}", f"{outputs} actions", f"{action.size} actions under this threat model")
         return PolicyPlan(network, action, observation)
 
     def start(self, plan: PolicyPlan, batch: int, draws: Draws) -> Any:

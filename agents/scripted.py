@@ -35,7 +35,7 @@ class ScriptPlan(NamedTuple):
 
 class ScriptState(NamedTuple):
     opened: Array  # (B,) bool: the window has opened
-    count: Array  # (B,) int64: steps since it opened
+    elapsed: Array  # (B,) int64: steps since it opened
 
 
 @dataclass(frozen=True)
@@ -68,10 +68,10 @@ class Script:
         elif self.trigger == "near":
             ready &= (view.scene.gap < self.threshold).any(axis=1)
         opened = state.opened | ready
-        on = opened if self.length is None else opened & (state.count < self.length)
+        on = opened if self.length is None else opened & (state.elapsed < self.length)
         on = on & view.allowed  # a script that knows its budget does not ask for more
-        command = self.command(plan, on, state.count, view, draws)
-        return ScriptState(opened, state.count + opened), command
+        command = self.command(plan, on, state.elapsed, view, draws)
+        return ScriptState(opened, state.elapsed + opened), command
 
     def command(self, plan: ScriptPlan, on: Array, count: Array, view: View, draws: Draws) -> Command:
         """What is sent in the rows `on` (B,), `count` (B,) steps after the window opened."""
@@ -160,13 +160,13 @@ class InjectBernoulli(Script):
 class InjectRamp(Script):
     """False data injection: a bias that grows at a constant rate up to a limit, slow enough to pass a gate."""
 
-    targets: tuple[str, ...] = param(("position",), "wires to attack")
+    base: Finite = param(0.0, "bias before the first growth [unit of the wire]")
     rate: Finite = param(-0.3, "growth a step [unit of the wire]")
     limit: NonNegative = param(50.0, "largest |bias|; the threat model's bound holds as well [unit of the wire]")
 
     def command(self, plan: ScriptPlan, on: Array, count: Array, view: View, draws: Draws) -> Command:
         limit = min(self.limit, plan.brief.threat.fdi_bound)
-        value = np.clip(self.rate * (count + 1), -limit, limit)
+        value = np.clip(self.base + self.rate * (count + 1), -limit, limit)
         return plan.brief.command(on, Kind.FDI, plan.target, value[:, None, None])
 
 

@@ -84,7 +84,7 @@ class Seat:
         from tailgate import __version__
 
         digest = hashlib.blake2b(canonical(self.config).encode(), digest_size=8).hexdigest()
-        features, actions = list(self.observation.names), [name for name, *_ in self.action.modes] if self.action.discrete else None
+        features, actions = list(self.observation.names), [mode.name for mode in self.action.modes] if self.action.discrete else None
         card = self.config | {"observation": features, "actions": actions, "version": __version__, "hash": digest}
         return json.loads(json.dumps(card))  # type: ignore[no-any-return]
 
@@ -150,7 +150,7 @@ class AdversaryVectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
             self.state = self.seat.loop.restart(self.state, again)
             named = np.flatnonzero(rows & ~again)
             if len(named):
-                keys = draws.keys(self.purpose, [seeds[i] for i in named])  # type: ignore[misc]
+                keys = draws.keys(self.purpose, [s for s in (seeds[i] for i in named) if s is not None])
                 self.state = self.seat.loop.reseed(self.state, named, keys)
         self._done = self._done & ~rows
         self.frame = None
@@ -211,7 +211,7 @@ class AdversaryVectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
             raise InputError("action_masks", self.seat.action.spec.action, "a running episode with a discrete action space")
         return self.seat.action.mask(self.seat.loop.sense(self.state))
 
-    def render(self) -> tuple[Array, ...] | None:  # type: ignore[override]
+    def render(self) -> tuple[Array, ...] | None:
         """One (H, W, 3) uint8 picture per row: road, true and believed gap, attack, alarm."""
         if self.render_mode is None or self.state is None:
             return None

@@ -164,7 +164,8 @@ def read_profile(path: Path) -> tuple[Array, Array]:
         raise InputError(where, str(path), f"a readable CSV file ({error})") from None
     if not rows or [c.strip() for c in rows[0]] != ["t", "v"]:
         raise InputError(where, rows[0] if rows else "an empty file", "the header t,v (seconds, metres per second)")
-    times, speeds = [], []
+    times: list[float] = []
+    speeds: list[float] = []
     for line, row in enumerate(rows[1:], start=2):
         if not row:
             continue
@@ -192,7 +193,7 @@ class Profile:
 
     def prepare(self, dt: float) -> ProfilePlan:
         times, speeds = read_profile(self.path)
-        steps = int(math.ceil((times[-1] - times[0]) / dt)) + 2
+        steps = math.ceil((times[-1] - times[0]) / dt) + 2
         return ProfilePlan(dt, np.interp(times[0] + dt * np.arange(steps), times, speeds))
 
     def start(self, plan: ProfilePlan, draws: Draws) -> Any:

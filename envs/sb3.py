@@ -28,7 +28,7 @@ class BatchVecEnv(VecEnv):
         self._returns, self._lengths = np.zeros(num_envs), np.zeros(num_envs, np.int64)
         self._no_infos: list[dict[str, Any]] = [{} for _ in range(num_envs)]
 
-    def reset(self) -> Array:  # type: ignore[override]
+    def reset(self) -> Array:
         if self._seeds[0] is not None:
             seed: int | None = self._seeds[0]
         else:

@@ -25,7 +25,7 @@ import tailgate
 from tailgate import draws
 from tailgate.core import Array, Estimate, Model, Prior, Received
 from tailgate.errors import InputError, NotApplicable
-from tailgate.files import write_atomic, writable_directory
+from tailgate.files import writable_directory, write_atomic
 from tailgate.metrics import METRICS, measure
 from tailgate.registry import Entry, Spec, entry_of
 from tailgate.scenario import Scenario, Suite, load_scenario, load_suite
@@ -223,10 +223,10 @@ def run(
             if kept and all(row["status"] != "error" for row in kept):
                 done[i] = kept
     missing = [(i, cell) for i, cell in zip(ids, cells, strict=True) if i not in done]
-    for i, rows in _play([cell for _, cell in missing], workers):
-        done[ids[cells.index(missing[i][1])]] = rows
+    for position, rows in _play([cell for _, cell in missing], workers):
+        done[missing[position][0]] = rows
         if parts is not None:
-            write_atomic(parts / f"{missing[i][0]}.jsonl", _encode(rows))
+            write_atomic(parts / f"{missing[position][0]}.jsonl", _encode(rows))
         if progress is not None:
             progress(len(done), len(cells))
     rows = [row for i in ids for row in done[i]]

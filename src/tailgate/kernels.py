@@ -134,7 +134,7 @@ def tanh(x: float) -> float:
 
 
 @numba.njit(cache=True, inline="always")
-def _philox(c0, c1, c2, c3, k0, k1):  # type: ignore[no-untyped-def]
+def _philox(c0, c1, c2, c3, k0, k1):
     """Philox4x32-10. Counter and key words are uint64 holding 32 bits each."""
     mask = np.uint64(0xFFFFFFFF)
     shift = np.uint64(32)
@@ -148,7 +148,7 @@ def _philox(c0, c1, c2, c3, k0, k1):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, inline="always")
-def _uniform_pair(key, episode, step, stream, block):  # type: ignore[no-untyped-def]
+def _uniform_pair(key, episode, step, stream, block):
     """Two uniforms in (0, 1), 52 bits each, never 0 nor 1."""
     w0, w1, w2, w3 = _philox(
         np.uint64(episode), np.uint64(block), np.uint64(step), np.uint64(stream),
@@ -174,7 +174,7 @@ def philox_words(counter: np.ndarray, key: np.ndarray) -> np.ndarray:
 
 
 @_jit
-def fill_uniform(keys, episode, step, stream, out):  # type: ignore[no-untyped-def]
+def fill_uniform(keys, episode, step, stream, out):
     """Uniforms in (0, 1) into out (E, B); element e of a row is word e % 2 of block e // 2."""
     for j in range((out.shape[0] + 1) // 2):
         for b in range(out.shape[1]):
@@ -185,7 +185,7 @@ def fill_uniform(keys, episode, step, stream, out):  # type: ignore[no-untyped-d
 
 
 @_jit
-def fill_normal(keys, episode, step, stream, out):  # type: ignore[no-untyped-def]
+def fill_normal(keys, episode, step, stream, out):
     """Standard normals (Box-Muller) into out (E, B)."""
     for j in range((out.shape[0] + 1) // 2):
         for b in range(out.shape[1]):

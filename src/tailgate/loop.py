@@ -16,7 +16,21 @@ import numpy as np
 
 from tailgate import num
 from tailgate.core import (
-    Array, Attack, Command, Controller, Defence, Estimate, Frame, Manoeuvre, Mode, Model, Plant, Received, Sensor, View, WhiteBox,
+    Array,
+    Attack,
+    Command,
+    Controller,
+    Defence,
+    Estimate,
+    Frame,
+    Manoeuvre,
+    Mode,
+    Model,
+    Plant,
+    Received,
+    Sensor,
+    View,
+    WhiteBox,
 )  # fmt: skip
 from tailgate.draws import Keys, Role
 from tailgate.threat import Brief, Channel, ChannelPlan, ChannelState, ThreatModel
@@ -149,7 +163,7 @@ class Loop:
     def advance(self, state: LoopState, command: Command) -> tuple[LoopState, Frame]:
         """The rest of the step: channel, defence, controller, plant, and the next measurement."""
         plan = self.plan
-        channel, received, wires, charged, refused = Channel().apply(
+        channel, received, wires, refused = Channel().apply(
             plan.channel, state.channel, state.sent, state.received, command, state.k
         )
         heard = received._replace(
@@ -165,8 +179,8 @@ class Loop:
             state.keys, state.k, state.controller, state.manoeuvre, state.plant, estimate, received.v2v
         )
         scene = self.plant.scene(plan.plant, plant)
-        collided = (scene.gap <= 0.0).any(axis=1)
-        rear_collided = (scene.rear_gap <= 0.0).any(axis=1)
+        collided = np.any(scene.gap <= 0.0, axis=1)
+        rear_collided = np.any(scene.rear_gap <= 0.0, axis=1)
         frame = Frame(
             state.k, truth, state.sent, wires, channel.last, refused, estimate, u, scene, collided, rear_collided
         )

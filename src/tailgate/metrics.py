@@ -70,13 +70,13 @@ def _first_step(event: Array) -> Array:
 @metric("0/1")
 def collided(trace: Trace) -> Array:
     """The car hit the one ahead."""
-    return (trace.collided & trace.live).any(axis=0).astype(float)
+    return np.asarray((trace.collided & trace.live).any(axis=0), np.float64)
 
 
 @metric("0/1")
 def rear_collided(trace: Trace) -> Array:
     """The car behind hit the car."""
-    return (trace.rear_collided & trace.live).any(axis=0).astype(float)
+    return np.asarray((trace.rear_collided & trace.live).any(axis=0), np.float64)
 
 
 @metric("0/1")
@@ -159,7 +159,7 @@ def alarm_onsets(trace: Trace) -> Array:
     """Times that the alarm went on."""
     alarm = _alarm(trace)
     before = np.concatenate([np.zeros_like(alarm[:1]), alarm[:-1]])
-    return np.count_nonzero(alarm & ~before, axis=0).astype(float)
+    return np.asarray(np.count_nonzero(alarm & ~before, axis=0), np.float64)
 
 
 @metric("share")
@@ -211,13 +211,13 @@ def string_gain(trace: Trace) -> Array:
 @metric("steps")
 def attack_steps(trace: Trace) -> Array:
     """Steps in which an attack took effect."""
-    return np.count_nonzero(_attacked(trace), axis=0).astype(float)
+    return np.asarray(np.count_nonzero(_attacked(trace), axis=0), np.float64)
 
 
 @metric("steps")
 def refused_commands(trace: Trace) -> Array:
     """Commands that the channel refused."""
-    return np.count_nonzero(trace.refused & trace.live, axis=0).astype(float)
+    return np.asarray(np.count_nonzero(trace.refused & trace.live, axis=0), np.float64)
 
 
 def measure(trace: Trace) -> dict[str, Array]:

@@ -153,6 +153,11 @@ class Spec:
                 params[key.strip()] = scalar(value)
         return head, params
 
+    def refuse_imports(self, where: str) -> None:
+        """Raise InputError when this names a class to import: configuration files never run code."""
+        if ":" in self._parts()[0]:
+            raise InputError(f"{where}: {self.family}", self.text, "a registered name; code is named on the command line only")
+
     @property
     def entry(self) -> Entry:
         head, _ = self._parts()

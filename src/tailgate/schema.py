@@ -25,7 +25,7 @@ def fields_of(cls: type) -> dict[str, Any]:
 
 
 @cache
-def _adapter(cls: type) -> TypeAdapter[Any]:
+def _adapter(cls: Any) -> TypeAdapter[Any]:
     try:
         return TypeAdapter(cls, config=ConfigDict(extra="forbid"))
     except PydanticUserError:  # the class carries its own configuration
@@ -41,7 +41,7 @@ def build(cls: type[T], data: dict[str, Any], where: str) -> T:
     if not known:
         return cls()
     try:
-        adapter = _adapter(cls)
+        adapter = _adapter(cls)  # type: ignore[arg-type]
     except PydanticSchemaGenerationError:  # a plug-in with fields that are not data: its own constructor decides
         return cls(**data)
     try:

@@ -8,7 +8,6 @@ from typing import Annotated, Literal, NamedTuple
 import numpy as np
 from pydantic import Field
 
-from tailgate import num
 from tailgate.core import Array, Command, Count, Kind, Model, Positive, PositiveCount, Received, no_command, param
 from tailgate.errors import InputError, unknown
 
@@ -121,8 +120,8 @@ class Channel:
 
     def apply(
         self, plan: ChannelPlan, state: ChannelState, sent: Array, received: Received, command: Command, k: Array
-    ) -> tuple[ChannelState, Received, Array, Array, Array]:
-        """-> state, received, wires (B, N, q+p) as they arrived, charged (B,) bool, refused (B,) bool.
+    ) -> tuple[ChannelState, Received, Array, Array]:
+        """-> state, received, wires (B, N, q+p) as they arrived, refused (B,) bool.
 
         `sent` (B, N, q+p) holds the sensor readings and the V2V message before the attack.
         """
@@ -167,4 +166,4 @@ class Channel:
         state = ChannelState(
             state.used + charged, np.where(charged, state.burst + 1, 0), cooldown, held, fresh, last
         )
-        return state, out, wires, charged, refused
+        return state, out, wires, refused

@@ -46,3 +46,16 @@ def leaves(tree: Any, prefix: str = "") -> dict[str, np.ndarray]:
             out |= leaves(branch, f"{prefix}{name}.")
         return out
     return {prefix[:-1]: tree}
+
+
+def with_leaves(tree: Any, values: dict[str, np.ndarray], prefix: str = "") -> Any:
+    """The tree with its leaves replaced by name, as `leaves` names them; their memory layout is kept."""
+    if tree is None:
+        return None
+    if isinstance(tree, tuple):
+        names = getattr(tree, "_fields", range(len(tree)))
+        parts = [with_leaves(branch, values, f"{prefix}{name}.") for name, branch in zip(names, tree, strict=True)]
+        return type(tree)(*parts) if hasattr(tree, "_fields") else tuple(parts)
+    out = tree.copy(order="K")
+    out[...] = values[prefix[:-1]]
+    return out

@@ -1,0 +1,1 @@
+"""The static leaderboard: rows in, one HTML page out."""

@@ -1,0 +1,313 @@
+"""Builds the leaderboard: one self-contained HTML page, and the aggregated figures beside it as JSON."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import math
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment, StrictUndefined
+from markupsafe import Markup
+
+from tailgate.errors import InputError
+from tailgate.files import writable_directory, write_atomic
+from tailgate.metrics import METRICS
+from tailgate.registry import Entry, entries
+from tailgate.summary import summarise
+
+Data = dict[str, Any]
+TITLE = "Tailgate leaderboard"
+COLUMNS = (  # of the table of every cell, after the crash share: key of the summary, heading
+    ("min_gap", "Smallest gap [m]"), ("max_error", "Largest error [m]"), ("alarm_onsets", "Alarm onsets"),
+    ("attack_steps", "Attack steps"),
+)  # fmt: skip
+STYLES = 8  # line styles of the learning curve
+
+
+@dataclass(frozen=True)
+class Name:
+    """A component's text from a row, as people read it. `base` is the name that a card may exist for."""
+
+    label: str
+    params: tuple[str, ...] = ()
+    base: str = ""
+    policy: bool = False
+
+    @property
+    def full(self) -> str:
+        return " ".join((self.label, *self.params))
+
+
+def names_of(texts: Iterable[str]) -> dict[str, Name]:
+    """Text to name. Policies go by as many folders of their path as tell them apart: one where that is enough."""
+    split = {text: _split(text) for text in texts}
+    paths = {text: tuple(p for p in re.split(r"[\\/]", head.removesuffix(".json")) if p) for text, (head, _) in split.items()}
+    out = {}
+    for text, (head, params) in split.items():
+        if head.endswith(".json"):
+            rivals = {paths[t] for t, (h, _) in split.items() if h.endswith(".json")} - {paths[text]}
+            depth = 2
+            while depth < len(paths[text]) and any(p[-depth:] == paths[text][-depth:] for p in rivals):
+                depth += 1
+            out[text] = Name("/".join(paths[text][-depth:]), params, "policy", True)
+        elif found := re.fullmatch(r"(\w+)\((\{.*\})\)", head, re.DOTALL):  # an object that was evaluated from Python
+            out[text] = Name(found[1], tuple(found[2].strip("{}").replace('"', "").split(",")) if found[2] != "{}" else ())
+        else:
+            out[text] = Name(head, params, head)
+    return out
+
+
+def _split(text: str) -> tuple[str, tuple[str, ...]]:
+    """Head and parameters. The text is never resolved: a page must not import what a row names."""
+    head, sep, tail = text.rpartition(":")
+    if not sep or "=" not in tail or text.endswith(")"):
+        return text, ()
+    params = tuple(re.split(r",\s*(?=\w+=)", tail))
+    path = next((p for p in params if head == "policy" and p.startswith("path=")), None)
+    return (head, params) if path is None else (path.removeprefix("path="), tuple(p for p in params if p != path))
+
+
+def percent(value: float) -> str:
+    """Whole percents, but never 0 % or 100 % for a share that is not."""
+    if value < 0:
+        return f"\N{MINUS SIGN}{percent(-value)}"
+    if value in (0, 1) or 0.005 <= value < 0.995:
+        return f"{100 * value:.0f}%"
+    if value < 0.0005 or value > 0.9995:
+        return "<0.1%" if value < 0.5 else ">99.9%"
+    return f"{100 * value:.1f}%"
+
+
+def shade(value: float) -> str:
+    """Class of the colour scale: s0 for none at all, then one per ten percent."""
+    return f"s{math.ceil(min(max(value, 0.0), 1.0) * 10 - 1e-9)}"
+
+
+def steps(value: float) -> str:
+    """A number of environment steps, short."""
+    for size, unit in ((1_000_000, "M"), (1_000, "k")):
+        if value >= size:
+            return f"{value / size:.3g}{unit}"
+    return f"{value:.0f}"
+
+
+def unranked(name: Name, uses: Iterable[str], card: Entry | None) -> str:
+    """Why a defence takes no rank; empty where it takes one."""
+    if name.base == "none":
+        return "baseline: no defence"
+    if "truth" in uses:
+        return "reference: is told what is attacked"
+    if card is not None and card.sentinel:
+        return f"sentinel: shows what a crash share alone misses ({card.sentinel})"
+    return ""
+
+
+@dataclass(frozen=True)
+class _Words:
+    """What the page knows of components: the names in the rows, and the cards of registered ones."""
+
+    defence: dict[str, Name]
+    attack: dict[str, Name]
+    defences: dict[str, Entry]
+    attacks: dict[str, Entry]
+
+
+def _cell(entry: Data, words: _Words) -> Data:
+    attack = words.attack[entry["attack"]]
+    out = entry | {"defence": words.defence[entry["defence"]], "attack": attack, "learned": entry["learned"] or attack.policy}
+    crash, failed, reason = entry["crash"], entry["failed"], entry["reason"]
+    if crash is None:
+        what = "not played" if not reason and not failed else "failed" if failed else "skipped"
+        why = ": ".join(filter(None, (what, reason)))
+        return out | {"text": "n/a", "shade": "na", "label": why, "why": why, "lost": what != "skipped"}
+    why = f"{failed} more failed: {reason}" if failed else ""
+    low, high = percent(crash["low"]), percent(crash["high"])
+    label = f"95% interval {low} to {high}, {entry['n']} episodes"
+    out |= {"low": low, "high": high, "text": percent(crash["value"]), "shade": shade(crash["value"]), "why": why, "lost": failed > 0}
+    return out | {"label": "; ".join(filter(None, (label, why)))}
+
+
+def _line(text: str, cells: list[Data], uses: set[str], words: _Words) -> Data:
+    """A defence's row of the heat map. Its worst case is over attacks that do not know the best answer beforehand."""
+    name = words.defence[text]
+    against = [c for c in cells if not c["optimal"]]
+    known = [c for c in against if c["crash"]]
+    lost = sum(c["lost"] for c in against)
+    why = unranked(name, uses, words.defences.get(name.base))
+    if not why and lost:  # else a defence would gain by failing where it is weak
+        why = f"incomplete: {lost} {'attack' if lost == 1 else 'attacks'} without full figures"
+    if not why and not known:
+        why = "no figures"
+    shares = [c["crash"]["value"] for c in known]
+    worst = max(known, key=lambda c: c["crash"]["value"], default=None)
+    order = (bool(why), max(shares, default=2.0), sum(shares) / max(len(shares), 1))
+    return {"name": name, "cells": cells, "why": why, "worst": worst, "known": len(known), "of": len(against), "order": order}
+
+
+def _section(key: tuple[Any, ...], group: Sequence[Data], rows: Sequence[Data], words: _Words) -> Data:
+    """One suite, scenario and dose: a row per defence; a column per attack, twice where its knowledge differs."""
+    kept = {(e["defence"], e["attack"], e["knowledge"]): e for e in group}
+    columns = list(dict.fromkeys((e["attack"], e["knowledge"]) for e in group))
+    marks = {c: {k: any(e[k] for e in group if e["attack"] == c[0]) for k in ("learned", "optimal")} for c in columns}
+    lines = []
+    for text in dict.fromkeys(e["defence"] for e in group):
+        cells = []
+        for column in columns:
+            missing = {"defence": text, "attack": column[0], "knowledge": column[1], "n": 0, "failed": 0, "reason": "", "crash": None}
+            cells.append(_cell(kept.get((text, *column), missing | marks[column]), words))
+        uses = {use for row in rows if row["defence"] == text for use in row.get("uses", ())}
+        lines.append(_line(text, cells, uses, words))
+    lines.sort(key=lambda line: line["order"])
+    ranked = [line for line in lines if not line["why"]]
+    for line in ranked:  # equal worst cases share a rank
+        line["rank"] = 1 + sum(other["order"][1] < line["order"][1] for other in ranked)
+    heads = []
+    for column in columns:
+        name = words.attack[column[0]]
+        card = words.attacks.get(name.base)
+        learned = marks[column]["learned"] or name.policy
+        about = card.summary if card else ""
+        heads.append({"name": name, "knowledge": column[1], "about": about, **marks[column], "learned": learned})
+    bodies = [("", ranked), ("Unranked, for comparison", [line for line in lines if line["why"]])]
+    return {
+        "suite": key[0], "scenario": key[1], "dose": key[2], "heads": heads, "lines": lines,
+        "bodies": [(title, body) for title, body in bodies if body],
+        "n": spans(e["n"] for e in group if e["n"]), "hashes": _distinct(rows, "config_hash"),
+    }  # fmt: skip
+
+
+def _cards(words: _Words, family: str) -> list[Data]:
+    """One card per component in the rows, with the variants that were played."""
+    used, known = (words.defence, words.defences) if family == "defence" else (words.attack, words.attacks)
+    out: dict[str, Data] = {}
+    for name in used.values():
+        entry = known.get(name.base)
+        card = out.setdefault(name.base or name.label, {"title": name.base or name.label, "card": entry and entry.card(), "played": []})
+        if name.policy or name.params:
+            card["played"].append(name.full if name.policy else ", ".join(name.params))
+    return list(out.values())
+
+
+def _distinct(rows: Sequence[Data], key: str) -> list[str]:
+    return sorted({str(row[key]) for row in rows if row.get(key) not in (None, "")})
+
+
+def spans(numbers: Iterable[int]) -> str:
+    """Whole numbers as ranges: 0-49, 100."""
+    out: list[list[int]] = []
+    for number in sorted(set(numbers)):
+        if out and number == out[-1][1] + 1:
+            out[-1][1] = number
+        else:
+            out.append([number, number])
+    return ", ".join(str(a) if a == b else f"{a}\N{EN DASH}{b}" for a, b in out)
+
+
+def _numbers(where: str, item: Any, keys: Sequence[str]) -> list[float]:
+    if not isinstance(item, Mapping):
+        raise InputError(where, item, f"a mapping with {', '.join(keys)}")
+    out = []
+    for key in keys:
+        value = item.get(key)
+        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+            raise InputError(f"{where}.{key}", value, "a finite number")
+        out.append(float(value))
+    return out
+
+
+def _headline(data: Data | None) -> Data | None:
+    """Dots and intervals as places on an axis in percent; the axis has a negative half where a value needs it."""
+    if data is None:
+        return None
+    points = []
+    for i, item in enumerate(data.get("items", [])):
+        value, low, high = _numbers(f"headline.items[{i}]", item, ("value", "low", "high"))
+        if not -1 <= low <= value <= high <= 1:
+            raise InputError(f"headline.items[{i}]", (low, value, high), "low <= value <= high within -1 to 1")
+        points.append((str(item.get("label", "")), str(item.get("note", "")), value, low, high))
+    start = -1.0 if any(low < 0 for *_, low, _ in points) else 0.0
+
+    def at(x: float) -> float:
+        return round(100 * (x - start) / (1 - start), 2)
+
+    items = [
+        {"label": label, "note": note, "x": at(v), "low": at(a), "high": at(b), "value": percent(v), "span": f"{percent(a)} to {percent(b)}"}
+        for label, note, v, a, b in points
+    ]
+    ticks = [{"x": at(t), "text": percent(t)} for t in (start, (start + 1) / 2, 1.0)]
+    return {"text": str(data.get("text", "")), "items": items, "ticks": ticks, "zero": at(0.0)}
+
+
+def _curve(data: Sequence[Data] | None) -> Data | None:
+    """One polyline per seed on a 1000 x 1000 field, and its figures in words."""
+    runs: dict[int, list[tuple[float, float]]] = {}
+    for i, point in enumerate(data or ()):
+        seed, at, crash = _numbers(f"curve[{i}]", point, ("seed", "steps", "crash"))
+        if at < 0 or not 0 <= crash <= 1:
+            raise InputError(f"curve[{i}]", (at, crash), "steps not below 0, and a share of crashed episodes")
+        runs.setdefault(int(seed), []).append((at, crash))
+    if not runs:
+        return None
+    end = max(x for run in runs.values() for x, _ in run) or 1.0
+    lines = []
+    for i, (seed, run) in enumerate(sorted(runs.items())):
+        run.sort()
+        lines.append({
+            "seed": seed, "style": i % STYLES, "first": percent(run[0][1]), "last": percent(run[-1][1]),
+            "peak": percent(max(y for _, y in run)), "steps": steps(run[-1][0]),
+            "points": " ".join(f"{1000 * x / end:.1f},{1000 - 1000 * y:.1f}" for x, y in run),
+        })  # fmt: skip
+    return {"lines": lines, "ticks": [{"x": 25 * i, "text": steps(end * i / 4)} for i in range(5)]}
+
+
+def _asset(name: str) -> str:
+    return files("tailgate.leaderboard").joinpath(name).read_text(encoding="utf-8")
+
+
+def _inline(name: str) -> Data:
+    """A style sheet or script as it stands in the page, and its hash: the page's policy lets nothing else run."""
+    text = _asset(name)
+    return {"text": Markup(text), "hash": base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}
+
+
+def build(
+    rows: Sequence[Data], out: Path, *, title: str | None = None, curve: list[Data] | None = None, headline: Data | None = None
+) -> Path:
+    """Writes out/index.html and out/summary.json from evaluation rows, and returns the path of the page.
+
+    curve: {steps, seed, crash} of a training run; headline: {text, items: [{label, value, low, high, note}]}, shares as fractions.
+    Raises InputError for no rows, and for a curve or headline that cannot be drawn.
+    """
+    if not rows:
+        raise InputError("rows", list(rows), "at least one row of an evaluation")
+    cells = summarise(rows)
+    words = _Words(
+        names_of(c["defence"] for c in cells), names_of(c["attack"] for c in cells), entries("defence"), entries("attack")
+    )
+    groups: dict[tuple[Any, ...], tuple[list[Data], list[Data]]] = {}
+    for i, kind in enumerate((cells, rows)):
+        for item in kind:
+            groups.setdefault((item["suite"], item["scenario"], item["dose"]), ([], []))[i].append(item)
+    facts = {
+        "rows": len(rows), "played": sum(row["status"] == "ok" for row in rows), "seeds": spans(row["seed"] for row in rows),
+        "purposes": _distinct(rows, "purpose"), "versions": _distinct(rows, "version"), "engines": _distinct(rows, "engine"),
+    }  # fmt: skip
+    heading = title or TITLE
+    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    page = environment.from_string(_asset("page.html")).render(
+        title=heading, css=_inline("page.css"), js=_inline("page.js"), columns=[(key, text, METRICS[key].__doc__ or "") for key, text in COLUMNS], facts=facts, headline=_headline(headline),
+        curve=_curve(curve), sections=[_section(key, *group, words) for key, group in groups.items()],
+        families=[("Defences", _cards(words, "defence")), ("Attacks", _cards(words, "attack"))],
+    )  # fmt: skip
+    figures = {"title": heading, **facts, "cells": cells, "curve": curve, "headline": headline}
+    folder = writable_directory(Path(out))
+    write_atomic(folder / "summary.json", (json.dumps(figures, indent=1, allow_nan=False) + "\n").encode())
+    write_atomic(folder / "index.html", page.encode("utf-8", "replace"))  # a lone surrogate in a row must not stop the page
+    return folder / "index.html"

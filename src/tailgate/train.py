@@ -1,0 +1,257 @@
+"""Training: from a configuration to a policy, a comparison on fresh seeds, and a page."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import time
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tailgate import draws
+from tailgate.core import Array, Count, Positive, PositiveCount, param
+from tailgate.errors import InputError
+from tailgate.evaluation import Cell, cells_of, run
+from tailgate.files import writable_directory, write_atomic
+from tailgate.registry import Spec
+from tailgate.scenario import Suite, config_path, load_scenario
+from tailgate.schema import as_data, build, canonical, override, read_yaml
+from tailgate.stats import Interval, paired_difference, proportion
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """What `train.py` reads. Learner settings stand below `ppo`, the environment's below `environment`."""
+
+    name: str = param("quickstart", "name of the run; its files go to out/name")
+    out: str = param("runs", "directory of the runs")
+    scenario: str = param("gusty-stop-and-go-v0", "scenario, by name or YAML file")
+    defence: str = param("chi2_kf", "registered defence to attack")
+    threat: dict[str, Any] = field(default_factory=dict, metadata={"doc": "changes of the scenario's threat model"})
+    environment: dict[str, Any] = field(default_factory=dict, metadata={"doc": "action and reward settings of the environment"})
+    ppo: dict[str, Any] = field(default_factory=dict, metadata={"doc": "hyper-parameters of PPO"})
+    gamma: Positive = param(0.995, "discount, of the learner and of the shaping [-]")
+    steps: PositiveCount = param(3_000_000, "environment steps per training seed")
+    first_seed: Count = param(0, "first training seed")
+    seeds: PositiveCount = param(1, "training seeds, one policy each")
+    checkpoint_every: PositiveCount = param(500_000, "environment steps between checkpoints")
+    tensorboard: bool = param(True, "write TensorBoard event files")
+    episodes: PositiveCount = param(400, "fresh episodes per attack in the final comparison")
+    rivals: tuple[str, ...] = param((), "scripted attacks of equal knowledge and dose to compare with")
+    ceilings: tuple[str, ...] = param(("stealth:trigger=near,threshold=40",), "white-box attacks, shown as yardsticks")
+    others: tuple[str, ...] = param(("none", "kf", "oracle"), "further defences that the attacks are played on")
+
+    @property
+    def directory(self) -> Path:
+        return Path(self.out) / self.name
+
+
+def load_config(source: str | None, overrides: list[str]) -> TrainConfig:
+    """A preset by name or YAML file (default: quickstart) with `key=value` overrides."""
+    name = source or "quickstart"
+    path = config_path(".", name, "config")
+    data = override(read_yaml(path, "config"), overrides)
+    for key in ("threat", "environment", "ppo"):
+        if not isinstance(data.get(key, {}), dict):
+            raise InputError(f"config.{key}", data[key], "a mapping of fields")
+    config = build(TrainConfig, data, "config")
+    for spec in [Spec("defence", config.defence), *(Spec("defence", name) for name in config.others)]:
+        spec.refuse_imports("config")
+    for spec in (Spec("attack", name) for name in (*config.rivals, *config.ceilings)):
+        spec.refuse_imports("config")
+    return config
+
+
+def environment_of(config: TrainConfig) -> dict[str, Any]:
+    """Arguments of the adversary environment."""
+    return {"scenario": config.scenario, "defence": config.defence, "threat": dict(config.threat), **config.environment}
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """How one trained policy did on the report seeds, episode by episode (0 or 1 each)."""
+
+    seed: int
+    policy: Path
+    learned: Array
+    yoked: Array
+
+
+def train(config: TrainConfig, progress: Callable[[int, Any], None], resume: bool = False) -> list[Path]:
+    """Train one policy per seed; returns their JSON files. `progress(seed, Progress)` is called after each rollout."""
+    from tailgate.agents.ppo import Learner, PPOConfig
+
+    ppo = build(PPOConfig, dict(config.ppo), "config.ppo")
+    directory = writable_directory(config.directory)
+    snapshot = json.dumps(as_data(config), indent=1).encode() + b"\n"
+    held = directory / "config.json"
+    if resume and held.is_file():
+        before = {k: v for k, v in json.loads(held.read_text()).items() if k != "steps"}
+        now = {k: v for k, v in as_data(config).items() if k != "steps"}
+        if before != now:
+            changed = ", ".join(k for k in now if before.get(k) != now[k])
+            raise InputError("resume", changed, f"the configuration in {held}, apart from steps")
+    write_atomic(held, snapshot)
+    policies = []
+    for seed in range(config.first_seed, config.first_seed + config.seeds):
+        board = directory / "tensorboard" if config.tensorboard else None
+        learner = Learner(seed, config.gamma, ppo, environment_of(config), board)
+        checkpoint = directory / f"checkpoint-{seed}.safetensors"
+        if resume and checkpoint.exists():
+            learner.load(checkpoint)
+        started = time.perf_counter()
+        learner.learn(config.steps, partial(progress, seed), checkpoint, config.checkpoint_every)
+        facts = {
+            "learner": "ppo", "seed": seed, "steps": learner.model.num_timesteps, "config": as_data(config), "ppo": as_data(ppo),
+            "environment": learner.env.batch.card()["hash"], "curve": learner.curve,
+        }  # fmt: skip
+        policies.append(learner.export(directory / f"policy-{seed}", facts))
+        curve = {"curve": learner.curve, "seconds": time.perf_counter() - started}
+        write_atomic(directory / f"curve-{seed}.json", json.dumps(curve).encode() + b"\n")
+        learner.env.close()
+    return policies
+
+
+def _crashes(rows: list[dict[str, Any]]) -> Array:
+    bad = next((row for row in rows if row["status"] != "ok"), None)
+    if bad is not None:
+        raise InputError(f"attack {bad['attack']}", bad["status"], f"an attack that plays here ({bad['reason']})")
+    return np.array([row["crashed"] for row in rows], np.float64)
+
+
+def compare(config: TrainConfig, policies: list[Path], progress: Callable[[int, int], None] | None = None) -> dict[str, Any]:
+    """Play the policies and the scripted rivals on fresh report seeds; writes rows.jsonl and report.json; returns the report.
+
+    The best rival is chosen on select seeds and reported on report seeds, so that the choice does not favour it.
+    """
+    from tailgate.agents.policy import PolicyAttack, timing_advantage
+    threat = dict(config.threat)
+    names = [str(p) for p in policies]
+    guard = config.defence
+    choice = Suite(config.name, "", (config.scenario,), (None,), (guard,), config.rivals, min(config.episodes, 200))
+    selection = run(cells_of(choice, purpose="select", threat=threat)) if config.rivals else []
+    best = max(config.rivals, key=lambda a: _crashes([r for r in selection if r["attack"] == a]).mean(), default=None)
+
+    attacks = ("none", *config.rivals, *config.ceilings, *names)
+    suite = Suite(config.name, "", (config.scenario,), (None,), (guard, *config.others), attacks, config.episodes)
+    cells: list[Cell] = cells_of(suite, threat=threat)
+    rows = run(cells, config.directory / "rows.jsonl", progress=progress)
+
+    def crashes(attack: str) -> Array:
+        return _crashes([r for r in rows if r["attack"] == attack and r["defence"] == guard])
+
+    built, uses = Spec("defence", guard).make(), Spec("defence", guard).entry.uses
+    keys = draws.keys("report", range(config.episodes))
+    verdicts = []
+    for path, seed in zip(policies, range(config.first_seed, config.first_seed + config.seeds), strict=True):
+        policy = PolicyAttack(path)
+        place = load_scenario(config.scenario).with_threat(**threat, knowledge=policy.knowledge)
+        own, yoked = timing_advantage(place.loop(built, uses), policy, keys)
+        verdicts.append(Verdict(seed, path, own, yoked))
+    return _report(config, verdicts, crashes, best)
+
+
+def _report(config: TrainConfig, verdicts: list[Verdict], crashes: Callable[[str], Array], best: str | None) -> dict[str, Any]:
+    learned = np.array([v.learned for v in verdicts])
+    yoked = np.array([v.yoked for v in verdicts])
+    none = np.broadcast_to(crashes("none"), learned.shape)
+
+    def share(x: Array) -> Interval:
+        return proportion(int(x.sum()), x.size)
+
+    items = [("no attack", share(crashes("none")), "")]
+    if best is not None:
+        items.append((best, share(crashes(best)), "best scripted attack of equal knowledge and dose, chosen on other seeds"))
+    items += [(f"learned, seed {v.seed}", share(v.learned), "") for v in verdicts]
+    items += [(f"learned, seed {v.seed}, yoked", share(v.yoked), "its own values at another episode's times") for v in verdicts]
+    items += [(name, share(crashes(name)), "white box: a yardstick, not a rival") for name in config.ceilings]
+    versus = {"no attack": paired_difference(learned, none), "own yoked schedule": paired_difference(learned, yoked)}
+    if best is not None:
+        versus["best scripted attack"] = paired_difference(learned, np.broadcast_to(crashes(best), learned.shape))
+    report = {
+        "name": config.name, "scenario": config.scenario, "defence": config.defence, "episodes": config.episodes, "steps": config.steps,
+        "threat": as_data(load_scenario(config.scenario).with_threat(**config.threat).threat_model),
+        "config": json.loads(canonical(config)), "policies": [str(v.policy) for v in verdicts], "best_scripted": best,
+        "crash": [{"label": label, **interval._asdict(), "note": note} for label, interval, note in items],
+        "advantage": {name: interval._asdict() for name, interval in versus.items()},
+    }  # fmt: skip
+    write_atomic(config.directory / "report.json", json.dumps(report, indent=1, allow_nan=False).encode() + b"\n")
+    return report
+
+
+def headline(report: dict[str, Any]) -> dict[str, Any]:
+    """The report as the page shows it at its top."""
+    gains = "; ".join(
+        f"{100 * g['value']:+.0f} points over {name} [{100 * g['low']:+.0f}, {100 * g['high']:+.0f}]"
+        for name, g in report["advantage"].items()
+    )
+    text = (
+        f"An adversary was trained for {report['steps']:,} steps against {report['defence']} on {report['scenario']}. "
+        f"Share of {report['episodes']} fresh episodes that end in a collision: {gains} (95 % paired bootstrap)."
+    )
+    return {"text": text, "items": report["crash"]}
+
+
+def make_page(config: TrainConfig, report: dict[str, Any]) -> Path:
+    """The page of a finished run."""
+    from tailgate.evaluation import read_rows
+    from tailgate.leaderboard.build import build as build_page
+
+    curve = [
+        point for seed in range(config.first_seed, config.first_seed + config.seeds)
+        for point in json.loads((config.directory / f"curve-{seed}.json").read_text())["curve"]
+    ]  # fmt: skip
+    rows = read_rows(config.directory / "rows.jsonl")
+    title = f"{config.name}: {config.defence} under attack"
+    return build_page(rows, config.directory / "page", title=title, curve=curve, headline=headline(report))
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Entry point of train.py."""
+    import sys
+
+    from tailgate.cli import main as command
+
+    return command(["train", *(sys.argv[1:] if arguments is None else arguments)])
+
+
+def tracked(config: TrainConfig, console: Any) -> AbstractContextManager[Callable[[int, Any], None]]:
+    """A progress bar over all training seeds, with the curve's latest figures."""
+    from contextlib import contextmanager
+
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+    @contextmanager
+    def bar() -> Any:
+        columns = (
+            TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[figures]}"), TimeElapsedColumn(), TimeRemainingColumn(),
+        )  # fmt: skip
+        with Progress(*columns, console=console) as shown:
+            tasks: dict[int, Any] = {}
+
+            def update(seed: int, progress: Any) -> None:
+                if seed not in tasks:
+                    tasks[seed] = shown.add_task(f"training, seed {seed}", total=config.steps, figures="")
+                figures = f"{progress.steps / 1e6:5.2f} M steps"
+                if progress.crash is not None:
+                    figures += f", collisions {100 * progress.crash:4.1f} %, return {progress.reward:+.2f}"
+                    shown.update(tasks[seed], figures=figures)
+                shown.update(tasks[seed], completed=progress.steps)
+
+            yield update
+
+    return bar()
+
+
+def parameters() -> list[dict[str, Any]]:
+    """Every field of the configuration with default and sentence, for --help."""
+    return [
+        {"name": f.name, "default": as_data(f.default if f.default is not dataclasses.MISSING else {}), "doc": f.metadata.get("doc", "")}
+        for f in dataclasses.fields(TrainConfig)
+    ]

@@ -1,0 +1,88 @@
+"""Shared builders: short scenarios, rollouts, linear models, and equality to the last bit."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import tailgate
+from tailgate.core import Model
+from tailgate.draws import keys
+from tailgate.registry import entries
+from tailgate.scenario import load_scenario
+from tailgate.trace import rollout
+from tailgate.tree import leaves
+
+
+def _same_bits(a, b):
+    a, b = np.ascontiguousarray(a), np.ascontiguousarray(b)
+    return a.shape == b.shape and a.dtype == b.dtype and a.tobytes() == b.tobytes()
+
+
+@pytest.fixture(scope="session")
+def same_bits():
+    """Two arrays agree in shape, type and every bit."""
+    return _same_bits
+
+
+@pytest.fixture(scope="session")
+def same_tree():
+    """Names of the leaves of two states that differ by a bit; `rows` picks rows of the first."""
+
+    def differing(a, b, rows=slice(None)):
+        one, two = leaves(a), leaves(b)
+        assert one.keys() == two.keys()
+        return [name for name in one if not _same_bits(one[name][rows], two[name])]
+
+    return differing
+
+
+@pytest.fixture(scope="session")
+def short():
+    """A published scenario cut to a short horizon, with an early onset and any other change of its threat model."""
+
+    def make(name="stop-and-go-v0", horizon=60, **threat):
+        place = load_scenario(name)
+        place = dataclasses.replace(place, horizon=min(horizon, place.horizon))
+        return place.with_threat(**({"onset": 10, "end": None} | threat))
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def loop_of():
+    """The loop of a scenario under a defence: a name, or an object."""
+
+    def make(place, defence):
+        if not isinstance(defence, str):
+            return place.loop(defence)
+        return place.loop(tailgate.make_defence(defence), entries("defence")[defence].uses)
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def play(loop_of):
+    """The trace of a scenario under a defence and an attack, each a name or an object; grants what a named attack needs."""
+
+    def run(place, defence, attack, seeds, **options):
+        if isinstance(attack, str):
+            if entries("attack")[attack].knowledge == "white":
+                place = place.with_threat(knowledge="white")
+            attack = tailgate.make_attack(attack)
+        return rollout(loop_of(place, defence), attack, keys("train", list(seeds)), **options)
+
+    return run
+
+
+@pytest.fixture(scope="session")
+def linear_model():
+    """A one-agent Model from its matrices."""
+
+    def make(A, C, Q, R, B=None, dt=1.0):
+        A, C, Q, R = (np.atleast_2d(np.asarray(m, float)) for m in (A, C, Q, R))
+        n, q = len(A), len(C)
+        B = np.zeros((n, 1)) if B is None else np.asarray(B, float)
+        return Model(A, B, np.zeros(n), C[None], Q, R[None], np.eye(1, dtype=bool), dt, tuple(f"y{i}" for i in range(q)))
+
+    return make
