@@ -11,7 +11,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from tailgate import num
-from tailgate.core import Array, Command, Finite, Kind, NonNegative, Positive, View, param
+from tailgate.core import Array, Command, Finite, Kind, NonNegative, Positive, PositiveCount, View, param
 from tailgate.errors import InputError
 from tailgate.threat import Brief, KindName
 
@@ -34,6 +34,7 @@ class ActionSpec:
     value: Finite = param(-4.0, "timing, mode, ramp: bias of fdi, jammer's value of dos_jam [unit of the wire]")
     rate: Positive = param(0.5, "ramp, increment: (largest) change per step [unit of the wire]")
     per_sensor: bool = param(False, "mode, ramp: also one mode per single wire")
+    interval: PositiveCount = param(1, "steps for which a decision holds: one step of the environment")
 
 
 class Mode(NamedTuple):
@@ -189,19 +190,21 @@ class ObservationCodec:
         return out
 
 
-RewardName = Literal["collision", "error", "stealth"]
+RewardName = Literal["collision", "min_gap", "error", "stealth"]
+NEAR = 20.0  # min_gap: a smaller gap than this counts [m]
 
 
 @dataclass(frozen=True)
 class Reward:
     """Reward presets. Scores never use them: they use raw outcomes.
 
-    collision: 1 at a collision in front or behind. error: |position error| / 10 m, capped at 1, per second. stealth: error, less one
+    collision: 1 at a collision in front or behind. min_gap: the same, and the metres by which the smallest gap of the episode falls
+    below 20 m, over 20 m: a burst at the right moment earns something long before it makes a collision. error: |position error| / 10 m, capped at 1, per second. stealth: error, less one
     per second of alarm. The shaping terms are potential-based (Ng, Harada, Russell 1999): they leave the best policy unchanged
     when `gamma` is the learner's, and may use the truth, which the policy itself does not see.
     """
 
-    reward: RewardName = param("collision", "collision, error or stealth")
+    reward: RewardName = param("min_gap", "collision, min_gap, error or stealth")
     gap_shaping: NonNegative = param(0.5, "weight of the closeness of the car ahead as a potential [-]")
     error_shaping: NonNegative = param(1.0, "weight of the believed extra gap, per 10 m and capped at 20 m, as a potential [-]")
     gamma: Positive = param(0.995, "discount in the potential's difference [-]")
@@ -213,16 +216,28 @@ class Reward:
         fooled = np.max(np.clip(belief, 0.0, 20.0) / 10.0 + np.zeros_like(gap), axis=1)
         return np.asarray(self.gap_shaping * near + self.error_shaping * fooled)
 
-    def __call__(self, dt: float, error: Array, alarm: Array, crashed: Array, refused: Array, before: Array, after: Array) -> Array:
-        """(B,) reward of a step from |error| (B, N) [m], alarm (B, N), and potentials before and after it (B,)."""
+    def least(self, gap: Array, before: Array | float = NEAR) -> Array:
+        """(B,) smallest gap so far, within [0, NEAR], from a gap (B, N) and the smallest one before [m]."""
+        return np.asarray(np.minimum(np.clip(np.min(gap, axis=1), 0.0, NEAR), before))
+
+    def __call__(
+        self, dt: float, error: Array, alarm: Array, crashed: Array, refused: Array, fall: Array
+    ) -> Array:
+        """(B,) reward of one step of the loop: |error| (B, N) [m], alarm (B, N), fall (B,) of the smallest gap [m]."""
         out = -self.illegal_penalty * refused.astype(np.float64)
-        if self.reward == "collision":
+        if self.reward in ("collision", "min_gap"):
             out = out + crashed
+            if self.reward == "min_gap":
+                out = out + fall / NEAR
         else:
             out = out + dt * np.minimum(np.max(error, axis=1) / 10.0, 1.0)
             if self.reward == "stealth":
                 out = out - dt * alarm.any(axis=1)
-        return np.asarray(out + self.gamma * np.where(crashed, 0.0, after) - before)
+        return np.asarray(out)
+
+    def shaped(self, raw: Array, before: Array, after: Array, terminated: Array) -> Array:
+        """(B,) reward of a decision from its raw reward and the potentials (B,) before and after it."""
+        return np.asarray(raw + self.gamma * np.where(terminated, 0.0, after) - before)
 
 
 def action_space(codec: ActionCodec) -> Any:

@@ -64,22 +64,17 @@ class Network:
         return x
 
 
-def choose(network: Network, codec: ActionCodec, observation: Array, draws: Draws | None, forced: Array | None = None) -> Array:
-    """Actions (B,) or (B, size): the likeliest, or drawn when `draws` is given.
-
-    `forced` (B,) bool sets when to attack and leaves the policy to choose what (yoked schedules).
-    """
+def choose(network: Network, codec: ActionCodec, observation: Array, draws: Draws | None = None, always: bool = False) -> Array:
+    """Actions (B,) or (B, size): the likeliest, or drawn when `draws` is given. With `always`, the best one that attacks."""
     out = network(observation)
     if codec.discrete:
         if draws is not None:
             out = out - num.log(-num.log(np.ascontiguousarray(draws.uniform((out.shape[1],)))))
-        if forced is not None:
-            return np.where(forced, 1 + np.argmax(out[:, 1:], axis=1), 0)
-        return np.argmax(out, axis=1)
+        return np.asarray(1 + np.argmax(out[:, 1:], axis=1) if always else np.argmax(out, axis=1))
     if draws is not None and network.log_std is not None:
         out = out + num.exp(network.log_std) * draws.normal((out.shape[1],))
-    if forced is not None:
-        out = np.concatenate([np.where(forced, 1.0, -1.0)[:, None], out[:, 1:]], axis=1)
+    if always:
+        out = np.concatenate([np.ones((len(out), 1)), out[:, 1:]], axis=1)
     return np.clip(out, -1.0, 1.0)
 
 
@@ -139,6 +134,10 @@ def load_policy(path: Path) -> tuple[Header, Network]:
     return header, Network(tuple(weights), tuple(biases), None if log_std is None else log_std.astype(np.float64))
 
 
+class PolicyState(NamedTuple):
+    action: Array  # (B,) or (B, size): the decision that holds
+
+
 class PolicyPlan(NamedTuple):
     network: Network
     action: ActionCodec
@@ -177,13 +176,21 @@ class PolicyAttack:
             raise InputError(f"policy {self.path.name}", f"{outputs} actions", f"{action.size} actions under this threat model")
         return PolicyPlan(network, action, observation)
 
-    def start(self, plan: PolicyPlan, batch: int, draws: Draws) -> Any:
-        return None
+    def start(self, plan: PolicyPlan, batch: int, draws: Draws) -> PolicyState:
+        return PolicyState(np.zeros(batch, np.int64) if plan.action.discrete else np.zeros((batch, plan.action.size)))
 
-    def decide(self, plan: PolicyPlan, state: Any, view: View, draws: Draws, forced: Array | None = None) -> tuple[Any, Command]:
-        observation = plan.observation.observe(view)
+    def decide(self, plan: PolicyPlan, state: PolicyState, view: View, draws: Draws) -> tuple[PolicyState, Command]:
+        state = self.consider(plan, state, view, draws)
+        return state, plan.action.decode(state.action, view)
+
+    def consider(self, plan: PolicyPlan, state: PolicyState, view: View, draws: Draws, always: bool = False) -> PolicyState:
+        """A new decision in the rows where one is due; the others hold theirs."""
+        due = (view.k - 1) % plan.action.spec.interval == 0
+        if not due.any():
+            return state
         chance = policy_draws(draws) if self.stochastic else None
-        return None, plan.action.decode(choose(plan.network, plan.action, observation, chance, forced), view)
+        fresh = choose(plan.network, plan.action, plan.observation.observe(view), chance, always)
+        return PolicyState(np.where(due if fresh.ndim == 1 else due[:, None], fresh, state.action))
 
 
 def policy_draws(draws: Draws) -> Draws:
@@ -193,6 +200,7 @@ def policy_draws(draws: Draws) -> Draws:
 
 class YokedState(NamedTuple):
     row: Array  # (B,) index into the schedule
+    policy: PolicyState
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,11 +216,15 @@ class Yoked:
     def start(self, plan: PolicyPlan, batch: int, draws: Draws) -> YokedState:
         if batch != self.schedule.shape[1]:
             raise InputError("schedule", self.schedule.shape, f"(steps, {batch})")
-        return YokedState(np.arange(batch))
+        return YokedState(np.arange(batch), self.policy.start(plan, batch, draws))
 
     def decide(self, plan: PolicyPlan, state: YokedState, view: View, draws: Draws) -> tuple[YokedState, Command]:
-        _, command = self.policy.decide(plan, None, view, draws, forced=self.schedule[view.k - 1, state.row])
-        return state, command
+        held = self.policy.consider(plan, state.policy, view, draws, always=True)
+        on = self.schedule[view.k - 1, state.row]
+        command = plan.action.decode(held.action, view)
+        keep = on[:, None, None]
+        quiet = Command(np.where(on, command.kind, 0).astype(np.int8), command.target & keep, np.where(keep, command.value, 0.0))
+        return YokedState(state.row, held), quiet
 
 
 def timing_advantage(loop: Any, policy: PolicyAttack, keys: Keys) -> tuple[Array, Array]:

@@ -131,7 +131,7 @@ class Learner:
         arrays: dict[str, Any] = {f"loop.{k}": v for k, v in leaves(batch.state).items()}
         _, words, position, _, _ = np.random.get_state()  # noqa: NPY002 - Stable-Baselines3 shuffles with it
         arrays |= {
-            "env.potential": batch._potential, "env.returns": self.env._returns, "env.lengths": self.env._lengths,
+            "env.potential": batch._potential, "env.least": batch._least, "env.returns": self.env._returns, "env.lengths": self.env._lengths,
             "last_obs": model._last_obs, "last_starts": model._last_episode_starts, "numpy": words,
         }  # fmt: skip
         for name, array in arrays.items():
@@ -175,6 +175,7 @@ class Learner:
 
             batch.state = with_leaves(batch.state, {k: restored(f"loop.{k}", v) for k, v in leaves(batch.state).items()})
             batch._potential = restored("env.potential", batch._potential).copy()
+            batch._least = restored("env.least", batch._least).copy()
             self.env._returns[:] = tensors["env.returns"].numpy()
             self.env._lengths[:] = tensors["env.lengths"].numpy()
             model._last_obs = tensors["last_obs"].numpy().copy()

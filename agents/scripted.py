@@ -204,7 +204,8 @@ class ThesisTimes:
 class Stealth(Script):
     """White box: each step moves the estimate as far along one state as the gate lets through, and never alarms.
 
-    With e the direction, the innovation is driven to r = s sqrt(g) S K' e / sqrt(e' K S K' e), just inside the gate g.
+    With e the direction and every sensor granted, the innovation is driven to r = s sqrt(g) S K' e / sqrt(e' K S K' e), just inside the
+    gate g; with fewer wires, to the farthest point that those reach.
     """
 
     state_index: Literal[0, 1, 2] = param(0, "which state to push: 0 position, 1 velocity, 2 acceleration")
@@ -220,11 +221,23 @@ class Stealth(Script):
         look = box.defence.look(box.plan, box.state, view.received, box.known_u)
         gate = self.gate if self.gate is not None else look.gate if look.gate is not None else 20.0
         r, S = look.innovation
-        row = look.gain[..., self.state_index, :]  # K' e (B, N, q)
-        push = num.matvec(S, row)
-        wanted = self.sign * np.sqrt((1.0 - 1e-9) * gate / num.dot(row, push))[..., None] * push
-        sensors = r.shape[-1]
+        touched = np.flatnonzero(plan.target[: r.shape[-1]])
+        row = look.gain[..., self.state_index, :][..., touched]  # K' e on the wires that are attacked
+        W = num.inverse(S)
+        part = num.inverse(W[..., touched[:, None], touched])
+        pull = num.matvec(W, r)[..., touched]
+        # (r + a)' W (r + a) over the attacked wires is least at -centre, and there leaves `spent` of the gate
+        centre = num.matvec(part, pull)
+        spent = num.dot(r, num.matvec(W, r)) - num.dot(pull, centre)
+        room = (1.0 - 1e-9) * gate - spent
+        push = num.matvec(part, row)
+        reach = np.sqrt(np.maximum(room, 0.0) / num.dot(row, push))
+        wanted = self.sign * reach[..., None] * push - centre
+        # on the line from no injection to the wanted one the score stays convex: shrinking to the bound stays inside
+        largest = np.max(np.abs(wanted), axis=-1)
+        wanted = wanted * np.minimum(1.0, plan.brief.threat.fdi_bound / np.maximum(largest, 1e-300))[..., None]
         value = num.zeros((len(view.k), plan.brief.model.agents, len(plan.target)))
-        bound = plan.brief.threat.fdi_bound
-        value[..., :sensors] = np.clip(wanted - r, -bound, bound)
+        value[..., touched] = wanted
+        inside = num.quadratic(r + value[..., : r.shape[-1]], W) <= gate
+        on = on & inside.all(axis=1)  # out of reach in this step, whatever is injected: keep still
         return plan.brief.command(on, Kind.FDI, plan.target, value)

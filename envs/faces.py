@@ -19,7 +19,7 @@ from gymnasium.vector.utils import batch_space
 
 from tailgate import draws
 from tailgate.agents.codec import LIMIT, ActionCodec, ActionSpec, ObservationCodec, Reward, action_space
-from tailgate.core import Array, Command, Frame, View
+from tailgate.core import Array, Frame, View
 from tailgate.errors import InputError, unknown
 from tailgate.loop import Loop, LoopState
 from tailgate.registry import Spec
@@ -116,7 +116,7 @@ class AdversaryVectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.state: LoopState | None = None
         self._done = np.zeros(num_envs, bool)
-        self._potential = np.zeros(num_envs)
+        self._potential, self._least = np.zeros(num_envs), np.zeros(num_envs)  # of the reward
         self.frame: Frame | None = None  # the last step, for rendering and curious readers
 
     def card(self) -> dict[str, Any]:
@@ -155,7 +155,7 @@ class AdversaryVectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
         self._done = self._done & ~rows
         self.frame = None
         view = self.seat.loop.sense(self.state)
-        self._potential = np.where(rows, self.seat.reward.potential(view.scene.gap), self._potential)
+        self._begin(rows)
         quiet = np.zeros(self.num_envs, bool)
         return self.seat.observation.observe(view), self._info(view, quiet, quiet, quiet)
 
@@ -164,32 +164,30 @@ class AdversaryVectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
         if self.state is None:
             raise InputError("step", "no episode", "reset() first")
         actions = self._checked(actions)
-        view = self.seat.loop.sense(self.state)
-        return self.apply(self.seat.action.decode(actions, view))
-
-    def apply(self, command: Command) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
-        """Step with a command itself."""
-        assert self.state is not None
-        loop, seat = self.seat.loop, self.seat
         over, resets = self._done, self.autoreset == AutoresetMode.NEXT_STEP
         if over.any() and self.autoreset == AutoresetMode.DISABLED:
             raise InputError("step", np.flatnonzero(over).tolist(), "rows that are over to be reset with options['reset_mask'] first")
-        self.state, frame = loop.advance(self.state, command)
-        self.frame = frame
-        crashed = frame.collided | frame.rear_collided
-        error = frame.truth[..., 0] - frame.estimate.x[..., 0]  # positive: the car believes that it is further back
-        potential = seat.reward.potential(frame.scene.gap, error)
-        reward = seat.reward(
-            loop.model.dt, np.abs(error), frame.estimate.alarm, crashed, frame.refused, self._potential, potential
-        )
+        loop, seat = self.seat.loop, self.seat
+        raw, potential = np.zeros(self.num_envs), self._potential
+        collided, rear, illegal = (np.zeros(self.num_envs, bool) for _ in range(3))
+        for _ in range(seat.action.spec.interval):
+            live = ~over & ~self.state.ended & (self.state.k <= loop.horizon)
+            self.state, frame = loop.advance(self.state, seat.action.decode(actions, loop.sense(self.state)))
+            self.frame = frame
+            crashed = frame.collided | frame.rear_collided
+            error = frame.truth[..., 0] - frame.estimate.x[..., 0]  # positive: the car believes that it is further back
+            least = seat.reward.least(frame.scene.gap, self._least)
+            gained = seat.reward(loop.model.dt, np.abs(error), frame.estimate.alarm, crashed, frame.refused, self._least - least)
+            raw += np.where(live, gained, 0.0)
+            potential = np.where(live, seat.reward.potential(frame.scene.gap, error), potential)
+            self._least = least
+            collided, rear, illegal = collided | (frame.collided & live), rear | (frame.rear_collided & live), illegal | (frame.refused & live)
+        terminated = self.state.ended & ~over
+        truncated = ~terminated & ~over & (self.state.k > loop.horizon)
+        reward = np.where(over, 0.0, seat.reward.shaped(raw, self._potential, potential, terminated))
         self._potential = potential
-        terminated, truncated = crashed, ~crashed & (self.state.k > loop.horizon)
-        illegal = frame.refused
         if resets and over.any():  # these rows were over: this step is their reset
             self._restart(over)
-            reward, illegal = np.where(over, 0.0, reward), illegal & ~over
-            terminated, truncated = terminated & ~over, truncated & ~over
-        collided, rear = frame.collided & terminated, frame.rear_collided & terminated
         self._done = terminated | truncated
         view = loop.sense(self.state)
         observation = seat.observation.observe(view)
@@ -223,10 +221,15 @@ class AdversaryVectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
 
     def _restart(self, rows: Array) -> None:
         assert self.state is not None
-        loop = self.seat.loop
-        self.state = loop.restart(self.state, rows)
-        fresh = self.seat.reward.potential(loop.plant.scene(loop.plan.plant, self.state.plant).gap)
-        self._potential = np.where(rows, fresh, self._potential)
+        self.state = self.seat.loop.restart(self.state, rows)
+        self._begin(rows)
+
+    def _begin(self, rows: Array) -> None:
+        assert self.state is not None
+        loop, reward = self.seat.loop, self.seat.reward
+        gap = loop.plant.scene(loop.plan.plant, self.state.plant).gap
+        self._potential = np.where(rows, reward.potential(gap), self._potential)
+        self._least = np.where(rows, reward.least(gap), self._least)
 
     def _checked(self, actions: Array) -> Array:
         actions = np.asarray(actions)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
-from typing import NamedTuple
 
 import numpy as np
 
@@ -20,24 +19,21 @@ except ImportError as error:
 from tailgate.core import Array, Frame, Kind, Mode
 from tailgate.loop import Loop, LoopState
 
-Points = list[tuple[float, float]]
-
 HEIGHT, WIDTH = 320, 960  # multiples of 16, which video encoders ask for
 ZOOM = 2  # drawn larger and shrunk: Pillow's lines are not smooth
 AGENT = 0  # whom the picture follows
 
 # Columns [px]. The ego's nose stays in place; there is twice as much room ahead as behind, as ACC keeps twice a human's headway.
-MARGIN, CAR, NOSE = 12.0, 84.0, 404.0
-AHEAD, BEHIND = WIDTH - MARGIN - CAR - NOSE, NOSE - 2 * CAR - MARGIN  # room for the two gaps
+MARGIN, CAR, NOSE, TAIL = 12.0, 84.0, 404.0, 320.0
+AHEAD, BEHIND = WIDTH - MARGIN - CAR - NOSE, TAIL - CAR - MARGIN  # room for the two gaps
 SPANS = (15.0, 30.0, 60.0, 120.0, 240.0, 480.0)  # metres in AHEAD: few and fixed, so that the scale does not jitter
 FAR = 1e6  # beyond any picture; keeps wild beliefs drawable
-LANE_DASH = AHEAD / 12
+LANE = AHEAD / 6  # a dash of the lane and its space; also the ruler
 BADGE, BUDGET, LAMP, LAMP_TEXT = (150.0, 610.0), 628.0, 780.0, 806.0
 # Rows [px] from the top: header, dimension line and wheels of the true strip, then those of the believed strip
 HEADER, TRUE_LINE, WHEELS, STRIP, BELIEVED_LINE, GHOST_WHEELS = 54.0, 100.0, 144.0, 200.0, 250.0, 294.0
 ROAD, CAR_HEIGHT, WHEEL, LAMP_SIZE = 14.0, 34.0, 7.5, 15.0
-FIRST, SECOND = 25.0, 43.0  # lines of the header
-TINY, SMALL, NORMAL, LARGE = 9, 13, 16, 20  # letters
+FIRST, SECOND, TINY, SMALL, NORMAL, LARGE = 25.0, 43.0, 9, 13, 16, 20  # lines of the header; letters
 
 # Okabe and Ito's colours and darker shades of them, which colour-blind readers can tell apart
 INK, GREY, PALE, WHITE, GLASS = "#1a1a1a", "#5f5f5f", "#ececec", "#ffffff", "#dcebf5"
@@ -48,6 +44,7 @@ ATTACK, WARNING = "#b34700", "#f0e442"
 BODY = ((0.0, 0.18), (0.0, 0.6), (0.12, 0.64), (0.26, 1.0), (0.62, 1.0), (0.78, 0.62), (0.97, 0.54), (1.0, 0.18))
 WINDOW = ((0.2, 0.66), (0.3, 0.92), (0.59, 0.92), (0.7, 0.66))
 AXLES = (0.22, 0.78)
+UNITS = {"position": " m", "velocity": " m/s"}
 
 COMMANDS = {
     Kind.NONE: ("NO ATTACK", "every wire arrives as it was sent"),
@@ -57,6 +54,7 @@ COMMANDS = {
     Kind.DROPOUT: ("ATTACK: dropout", "nothing arrives from "),
     Kind.FDI: ("ATTACK: false data (FDI)", "adds "),
 }
+_metres = "{:,.1f} m".format
 
 
 @lru_cache
@@ -77,7 +75,7 @@ class _Canvas:
     def disc(self, x: float, y: float, radius: float, fill: str, edge: str) -> None:
         self.pen.circle((x * ZOOM, y * ZOOM), radius * ZOOM, fill, edge, 2 * ZOOM)
 
-    def shape(self, points: Points, fill: str, edge: str | None = None) -> None:
+    def shape(self, points: list[tuple[float, float]], fill: str, edge: str | None = None) -> None:
         self.pen.polygon([(x * ZOOM, y * ZOOM) for x, y in points], fill, edge, ZOOM)
 
     def line(self, x0: float, y0: float, x1: float, y1: float, ink: str, width: int = 2, dash: float = 0.0) -> None:
@@ -89,16 +87,16 @@ class _Canvas:
 
     def text(
         self, x: float, y: float, words: str, ink: str = INK, size: int = NORMAL, anchor: str = "ls", bold: bool = False,
-        room: tuple[float, float] = (-FAR, FAR), halo: str | None = None,
+        room: tuple[float, float] = (-FAR, FAR), ground: str | None = None,
     ) -> None:  # fmt: skip
-        """Letters, shrunk to `room` (left, right) px and moved into it. halo: the ground's colour, where lines pass beneath."""
+        """Letters, shrunk to `room` (left, right) px and moved into it. ground: its colour, where lines pass beneath."""
         while size > TINY and _font(size).getbbox(words)[2] > (room[1] - room[0]) * ZOOM:
             size -= 1
         length = _font(size).getbbox(words)[2] / ZOOM
         x = max(room[0], min(x - {"l": 0.0, "m": 0.5, "r": 1.0}[anchor[0]] * length, room[1] - length))
         at, anchor = (x * ZOOM, y * ZOOM), "l" + anchor[1]
-        if halo:
-            self.pen.text(at, words, halo, _font(size), anchor, stroke_width=3 * ZOOM)
+        if ground:
+            self.box(x - 3, y - size, x + length + 3, y + size / 4, ground)
         self.pen.text(at, words, ink, _font(size), anchor, stroke_width=ZOOM / 4 if bold else 0)  # the font has one weight
 
     def head(self, x: float, y: float, way: float, ink: str, size: float = 7.0) -> None:
@@ -139,33 +137,11 @@ class _Canvas:
         self.text(left + MARGIN, HEADER + 41, words, size=LARGE, bold=True)
 
 
-class _Road(NamedTuple):
-    """One row's road, and the gap that its car believes in."""
-
-    gap: float
-    believed: float
-    rear_gap: float
-    speed: float
-    lead_speed: float
-    rear_speed: float
-    position: float
-    ended: bool
-
-    @property
-    def scale(self) -> float:
-        """Pixels a metre: the least span that holds the leader, or the next one if that shows the car behind."""
-        first = next((i for i, span in enumerate(SPANS) if self.gap <= span), len(SPANS) - 1)
-        scales = [AHEAD / span for span in SPANS[first : first + 2]]
-        return next((scale for scale in scales if self.rear_gap * scale <= BEHIND), scales[0])
-
-
-def _metres(value: float) -> str:
-    return f"{value:.1f} m" if abs(value) < 1e5 else f"{value:.1e} m"
-
-
-def _wire(name: str, value: float | None) -> str:
-    unit = " m" if "position" in name else " m/s" if "velocity" in name else ""
-    return name.replace("_", " ") + ("" if value is None else f" {value:+.4g}{unit}")
+def _scale(gap: float, rear_gap: float) -> float:
+    """Pixels a metre: the least span that holds the leader, or the next one if that shows the car behind."""
+    first = next((i for i, span in enumerate(SPANS) if gap <= span), len(SPANS) - 1)
+    scales = [AHEAD / span for span in SPANS[first : first + 2]]
+    return next((scale for scale in scales if rear_gap * scale <= BEHIND), scales[0])
 
 
 def _header(canvas: _Canvas, loop: Loop, state: LoopState, row: int, refused: bool) -> None:
@@ -173,20 +149,19 @@ def _header(canvas: _Canvas, loop: Loop, state: LoopState, row: int, refused: bo
     canvas.box(0, 0, WIDTH, HEADER, PALE)
     canvas.text(MARGIN, FIRST, f"t = {steps * dt:.{1 if dt >= 0.1 else 2}f} s", size=LARGE, bold=True)
     canvas.text(MARGIN, SECOND, f"step {steps} of {loop.horizon}", GREY, SMALL)
-
-    kind = Kind(int(last.kind[row]))
-    (title, does), on, valued = COMMANDS[kind], kind != Kind.NONE, kind in (Kind.DOS_JAM, Kind.FDI)
-    hit = np.flatnonzero(last.target[row, AGENT])
-    does += ", ".join(_wire(loop.model.wires[i], float(last.value[row, AGENT, i]) if valued else None) for i in hit)
+    kind, wires = Kind(int(last.kind[row])), []
+    title, does = COMMANDS[kind]
+    for i in np.flatnonzero(last.target[row, AGENT]):
+        name, unit = loop.model.wires[i].replace("_", " "), UNITS.get(loop.model.wires[i].split("_")[-1], "")
+        wires.append(name + (f" {last.value[row, AGENT, i]:+.4g}{unit}" if kind in (Kind.DOS_JAM, Kind.FDI) else ""))
+    on, does = kind != Kind.NONE, does + ", ".join(wires)
     canvas.box(BADGE[0], 5, BADGE[1], HEADER - 5, ATTACK if on else WHITE, INK if on else GREY, 2 if on else 1)
     room, ink = (BADGE[0] + MARGIN, BADGE[1] - MARGIN), WHITE if on else GREY
     canvas.text(room[0], FIRST, title + ("  (a command was refused)" if refused else ""), ink, bold=on)
     canvas.text(room[0], SECOND, does, ink, SMALL, room=room)
-
     if loop.threat.budget is not None:
         canvas.text(BUDGET, FIRST, f"{loop.threat.budget - int(state.channel.used[row])} of {loop.threat.budget}", bold=True)
         canvas.text(BUDGET, SECOND, "attack steps left", GREY, SMALL)
-
     alarm, mode = bool(state.estimate.alarm[row, AGENT]), Mode(int(state.estimate.mode[row, AGENT]))
     ink = INK if alarm else GREY
     if alarm:
@@ -209,73 +184,66 @@ def _car(canvas: _Canvas, nose: float, colour: str, name: str, speed: float, roo
     canvas.text(middle, WHEELS + 45, f"{speed:.1f} m/s", colour, SMALL, "ms", True, room=room)
 
 
-def _truth(canvas: _Canvas, road: _Road) -> None:
-    scale, tail = road.scale, NOSE - CAR
-    leader, rear = NOSE + road.gap * scale, tail - road.rear_gap * scale
+def _truth(canvas: _Canvas, road: dict[str, float], scale: float, ended: bool) -> None:
+    leader, rear = NOSE + road["gap"] * scale, TAIL - road["rear_gap"] * scale
     canvas.text(MARGIN, HEADER + 17, "THE ROAD AS IT IS", GREY, SMALL)
     canvas.box(0, WHEELS, WIDTH, WHEELS + ROAD, LEADER)
-    period = 2 * LANE_DASH
-    for x in np.arange(-(road.position * scale) % period - period, WIDTH, period):  # marks stand on the road: the car passes them
-        canvas.box(x, WHEELS + ROAD / 2 - 1, x + LANE_DASH, WHEELS + ROAD / 2 + 1, WHITE)
-    if math.isfinite(road.rear_gap):
-        _car(canvas, rear, HUMAN, "human driver", road.rear_speed, (MARGIN, tail - 4))
-    _car(canvas, leader + CAR, LEADER, "leader", road.lead_speed, (NOSE + 2, WIDTH - MARGIN))
-    _car(canvas, NOSE, EGO, "ego (ACC)", road.speed, (tail, NOSE))
-    edge = tail + CAR / 4  # keeps the texts apart where both gaps are small
-    if road.rear_gap <= 0.0:
-        canvas.crash(tail, tail - 2 * CAR, "REAR COLLISION")
-    elif math.isfinite(road.rear_gap):
-        middle = canvas.gap(tail, rear, TRUE_LINE, HUMAN)
-        canvas.text(middle, TRUE_LINE - 9, f"gap behind {_metres(road.rear_gap)}", HUMAN, SMALL, "ms", room=(MARGIN, edge))
-    if road.gap <= 0.0 or (road.ended and road.rear_gap > 0.0):
+    for x in np.arange(-(road["position"] * scale) % LANE - LANE, WIDTH, LANE):  # the dashes stand on the road: the car passes them
+        canvas.box(x, WHEELS + ROAD / 2 - 1, x + LANE / 2, WHEELS + ROAD / 2 + 1, WHITE)
+    if math.isfinite(road["rear_gap"]):
+        _car(canvas, rear, HUMAN, "human driver", road["rear_speed"], (MARGIN, TAIL - 4))
+    _car(canvas, leader + CAR, LEADER, "leader", road["lead_speed"], (NOSE + 2, WIDTH - MARGIN))
+    _car(canvas, NOSE, EGO, "ego (ACC)", road["speed"], (TAIL, NOSE))
+    edge = TAIL + CAR / 4  # keeps the texts apart where both gaps are small
+    if road["rear_gap"] <= 0.0:
+        canvas.crash(TAIL, TAIL - 2 * CAR, "REAR COLLISION")
+    elif math.isfinite(road["rear_gap"]):
+        middle = canvas.gap(TAIL, rear, TRUE_LINE, HUMAN)
+        canvas.text(middle, TRUE_LINE - 9, "gap behind " + _metres(road["rear_gap"]), HUMAN, SMALL, "ms", room=(MARGIN, edge))
+    if road["gap"] <= 0.0 or (ended and road["rear_gap"] > 0.0):
         canvas.crash(NOSE, NOSE - CAR / 4, "COLLISION")
     else:
-        middle, words = canvas.gap(NOSE, leader, TRUE_LINE, INK), f"true gap {_metres(road.gap)}"
+        middle, words = canvas.gap(NOSE, leader, TRUE_LINE, INK), "true gap " + _metres(road["gap"])
         canvas.text(middle, TRUE_LINE - 9, words, INK, LARGE, "ms", True, room=(edge + MARGIN, WIDTH - MARGIN))
 
 
-def _belief(canvas: _Canvas, road: _Road) -> None:
-    leader, off = NOSE + road.gap * road.scale, road.gap - road.believed
-    ghost = max(-FAR, min(NOSE + off * road.scale, FAR))
+def _belief(canvas: _Canvas, gap: float, believed: float, scale: float) -> None:
+    leader, off = NOSE + gap * scale, gap - believed
+    ghost = max(-FAR, min(NOSE + off * scale, FAR))
     canvas.box(0, STRIP, WIDTH, HEIGHT, BELIEF_PALE)
     canvas.line(0, STRIP, WIDTH, STRIP, BELIEF, 1)
     canvas.line(0, GHOST_WHEELS, WIDTH, GHOST_WHEELS, BELIEF, 1, dash=3.0)
     canvas.line(leader, TRUE_LINE, leader, GHOST_WHEELS, LEADER, 1, dash=3.0)  # the same bumper in both strips
     canvas.text(MARGIN, STRIP + 17, "WHERE THE EGO BELIEVES IT IS", BELIEF, SMALL)
-    middle, words = canvas.gap(ghost, leader, BELIEVED_LINE, BELIEF, dash=5.0), f"believed gap {_metres(road.believed)}"
+    middle, words = canvas.gap(ghost, leader, BELIEVED_LINE, BELIEF, dash=5.0), f"believed gap {_metres(believed)}"
     canvas.text(middle, BELIEVED_LINE - 11, words, BELIEF, LARGE, "ms", True, (MARGIN, WIDTH - MARGIN), BELIEF_PALE)
     if ghost > 0.0 and ghost - CAR < WIDTH:
         canvas.car(ghost, GHOST_WHEELS, BELIEF, ghost=True)
     else:
-        way, y = math.copysign(1.0, ghost), GHOST_WHEELS - CAR_HEIGHT / 2
-        x = WIDTH - MARGIN if way > 0 else MARGIN
+        way, x, y = 1 if ghost > 0.0 else -1, WIDTH - MARGIN if ghost > 0.0 else MARGIN, GHOST_WHEELS - CAR_HEIGHT / 2
         canvas.head(x, y, way, BELIEF, 20.0)
         words = f"out of view: {_metres(abs(off))} {'ahead of' if way > 0 else 'behind'} where it really is"
-        canvas.text(x - way * 26, y + 5, words, BELIEF, anchor="rs" if way > 0 else "ls", halo=BELIEF_PALE)
-    canvas.gap(MARGIN, MARGIN + AHEAD / 6, HEIGHT - 10, GREY)
-    canvas.text(MARGIN + AHEAD / 6 + 8, HEIGHT - 5, f"{AHEAD / 6 / road.scale:g} m", GREY, SMALL)
+        canvas.text(x - way * 26, y + 5, words, BELIEF, anchor="rs" if way > 0 else "ls", ground=BELIEF_PALE)
+    canvas.gap(MARGIN, MARGIN + LANE, HEIGHT - 10, GREY)
+    canvas.text(MARGIN + LANE + 8, HEIGHT - 5, f"{LANE / scale:g} m", GREY, SMALL)
 
 
 def draw(loop: Loop, state: LoopState, frame: Frame | None, row: int) -> Array:
     """(H, W, 3) uint8: row `row` after `frame`. frame is None right after a reset, be it of other rows."""
-    at, scene, horizon = (row, AGENT), loop.plant.scene(loop.plan.plant, state.plant), loop.horizon
-    # The belief that the controller acted on is one step older than the scene, and so is the leader's position that goes with it.
-    leader = float(scene.position[at] + scene.gap[at] - scene.lead_speed[at] * loop.model.dt)
-    refused, past = False, ""
+    at, model = (row, AGENT), loop.model
+    road = {name: float(leaf[at]) for name, leaf in loop.plant.scene(loop.plan.plant, state.plant)._asdict().items()}
+    # The belief that the controller acted on is one step older than the road, and so is the leader's position that goes with it.
+    leader, refused, past = road["position"] + road["gap"] - road["lead_speed"] * model.dt, False, ""
     if frame is not None and frame.k[row] + 1 == state.k[row]:
         refused = bool(frame.refused[row])
-        if "leader_position" in loop.model.v2v:  # as the controller heard it
-            leader = float(frame.wires[at][loop.model.wires.index("leader_position")])
-    elif frame is not None and frame.k[row] <= horizon and frame.collided[row] | frame.rear_collided[row]:
+        if "leader_position" in model.v2v:  # as the controller heard it
+            leader = float(frame.wires[at][model.wires.index("leader_position")])
+    elif frame is not None and frame.k[row] <= loop.horizon and frame.collided[row] | frame.rear_collided[row]:
         past = "COLLISION" if frame.collided[row] else "REAR COLLISION"  # of the episode that an autoreset has just replaced
-    road = _Road(
-        float(scene.gap[at]), leader - float(state.estimate.x[at][0]), float(scene.rear_gap[at]), float(scene.speed[at]),
-        float(scene.lead_speed[at]), float(scene.rear_speed[at]), float(scene.position[at]), bool(state.ended[row]),
-    )  # fmt: skip
-    canvas = _Canvas()
+    canvas, scale = _Canvas(), _scale(road["gap"], road["rear_gap"])
     _header(canvas, loop, state, row, refused)
-    _belief(canvas, road)
-    _truth(canvas, road)
+    _belief(canvas, road["gap"], leader - float(state.estimate.x[at][0]), scale)
+    _truth(canvas, road, scale, bool(state.ended[row]))
     if past:
         canvas.text(WIDTH - MARGIN, HEADER + 17, f"new episode; the last one ended in a {past}", INK, SMALL, "rs", True)
     return np.array(canvas.image.reduce(ZOOM), np.uint8)

@@ -35,6 +35,16 @@ class KalmanState(NamedTuple):
     P: Array
 
 
+def alone(S: Array, keep: Array) -> Array:
+    """S with the covariances of the sensors that `keep` (B, N, q) leaves out set to zero: those that stay see their own marginal."""
+    if keep.all():
+        return S
+    out = S * (keep[..., :, None] & keep[..., None, :])
+    for i in range(S.shape[-1]):
+        out[..., i, i] = S[..., i, i]
+    return out
+
+
 @dataclass(frozen=True)
 class KalmanFilter:
     """The textbook filter, time-varying gain."""
@@ -53,7 +63,7 @@ class KalmanFilter:
     def innovation(self, plan: KalmanPlan, state: KalmanState, received: Received) -> Innovation:
         r = np.where(received.valid, received.y - num.matvec(plan.C, state.x), 0.0)
         cross = num.matmul(plan.C, state.P)
-        return Innovation(r, num.matmul(plan.C, num.transpose(cross)) + plan.R)
+        return Innovation(r, alone(num.matmul(plan.C, num.transpose(cross)) + plan.R, received.valid))
 
     def gain(self, plan: KalmanPlan, state: KalmanState, innovation: Innovation) -> Array:
         cross = num.transpose(num.matmul(plan.C, state.P))  # P- C'
@@ -65,9 +75,7 @@ class KalmanFilter:
         if not accept.all():  # multiplying by one would change no bit of the other rows
             keep = accept.astype(np.float64)
             cross = cross * keep[..., None]
-            S = S * (keep[..., :, None] * keep[..., None, :])
-            for i in range(S.shape[-1]):
-                S[..., i, i] += 1.0 - keep[..., i]
+            S = alone(S, accept)
             r = r * keep
         K = num.transpose(num.matmul(num.inverse(S), cross))
         x = state.x + num.matvec(K, r)

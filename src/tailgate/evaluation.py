@@ -27,13 +27,13 @@ from tailgate.core import Array, Estimate, Model, Prior, Received
 from tailgate.errors import InputError, NotApplicable
 from tailgate.files import writable_directory, write_atomic
 from tailgate.metrics import METRICS, measure
-from tailgate.registry import Entry, Spec, entry_of
+from tailgate.registry import Entry, Spec, entry_for
 from tailgate.scenario import Scenario, Suite, load_scenario, load_suite
 from tailgate.schema import as_data, canonical
 from tailgate.trace import rollout
 
 ENGINE = "plain"
-KEYS = ("suite", "scenario", "dose", "knowledge", "defence", "attack")
+KEYS = ("suite", "scenario", "dose", "knowledge", "defence", "attack", "purpose", "config_hash")
 
 
 @dataclass(frozen=True)
@@ -101,8 +101,8 @@ def _component(family: Any, value: Any) -> tuple[Any, Any, str]:
     if isinstance(value, str):
         spec = Spec(family, value)
         return spec.make(), spec.entry, value
-    cls = type(value)
-    return value, entry_of(family, cls.__name__, cls), f"{cls.__name__}({canonical(value)})"
+    entry = entry_for(family, type(value))
+    return value, entry, f"{entry.name}:{canonical(value)}"
 
 
 def run_cell(cell: Cell, defence: Any = None, attack: Any = None) -> list[dict[str, Any]]:
@@ -198,6 +198,8 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
             raise InputError(f"rows {path.name}, line {number}", line[:60], "a JSON object") from None
         if not isinstance(row, dict) or not all(key in row for key in (*KEYS, "seed", "status")):
             raise InputError(f"rows {path.name}, line {number}", line[:60], f"a row with {', '.join(KEYS)}, seed and status")
+        if row["status"] == "ok" and not all(name in row for name in METRICS):
+            raise InputError(f"rows {path.name}, line {number}", line[:60], "every metric in a row that is ok")
         rows.append(row)
     return rows
 

@@ -23,14 +23,9 @@ _jit = numba.njit(cache=True, fastmath=False, error_model="numpy")
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
 def _exp(x: float) -> float:
-    if x != x:
-        return x
-    if x > 709.7:
-        return math.inf
-    if x < -708.0:  # results below the normal range are flushed: no denormals on the scored path
-        return 0.0
-    n = math.floor(x * LOG2_E + 0.5)
-    r = (x - n * LN2_HI) - n * LN2_LO
+    y = min(max(x, -708.0), 709.7) if x == x else 0.0  # what is computed raises no flag, whatever x is
+    n = math.floor(y * LOG2_E + 0.5)
+    r = (y - n * LN2_HI) - n * LN2_LO
     p = 1.0 / 6227020800.0
     p = p * r + 1.0 / 479001600.0
     p = p * r + 1.0 / 39916800.0
@@ -45,7 +40,12 @@ def _exp(x: float) -> float:
     p = p * r + 0.5
     p = p * r + 1.0
     p = p * r + 1.0
-    return math.ldexp(p, int(n))
+    p = p * np.int64((np.int64(n) + 1022) << 52).view(np.float64) * 2.0  # 2**n in two exact steps: n may be 1024
+    if x != x:
+        return x
+    if x > 709.7:
+        return math.inf
+    return p if x >= -708.0 else 0.0  # below the normal range: flushed, no denormals on the scored path
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
@@ -54,7 +54,12 @@ def _log(x: float) -> float:
         return -math.inf if x == 0.0 else math.nan
     if x == math.inf:
         return x
-    m, e = math.frexp(x)
+    e = np.int64(0)
+    if x < 2.2250738585072014e-308:  # denormal: scale it up first
+        x, e = x * 18014398509481984.0, np.int64(-54)
+    bits = np.float64(x).view(np.int64)
+    e += ((bits >> 52) & 0x7FF) - 1022
+    m = np.int64((bits & 0x000FFFFFFFFFFFFF) | 0x3FE0000000000000).view(np.float64)  # in [1/2, 1)
     if m < 0.7071067811865476:
         m, e = 2.0 * m, e - 1
     s = (m - 1.0) / (m + 1.0)

@@ -77,6 +77,7 @@ class Loop:
     horizon: int
     defence: Defence
     uses: tuple[str, ...] = ("measurements",)
+    ends_on_collision: bool = True
 
     @cached_property
     def model(self) -> Model:
@@ -185,7 +186,7 @@ class Loop:
             state.k, truth, state.sent, wires, channel.last, refused, estimate, u, scene, collided, rear_collided
         )
         sent, fresh = self._measure(state.keys, state.k + 1, plant, estimate)
-        ended = state.ended | collided | rear_collided
+        ended = state.ended | ((collided | rear_collided) & self.ends_on_collision)
         state = LoopState(
             state.keys, state.k + 1, plant, manoeuvre, controller, defence, channel, estimate, u, sent, fresh, ended
         )

@@ -45,8 +45,19 @@ def stack(columns: Sequence[Array]) -> Array:
     return np.moveaxis(np.stack([np.moveaxis(c, 0, -1) for c in columns], axis=-2), -1, 0)
 
 
+def _constant(x: Array) -> Array | None:
+    """x without its agent axis when it is one matrix for the whole batch."""
+    return x if x.ndim == 2 else x[0] if x.ndim == 3 and x.shape[0] == 1 else None
+
+
 def matmul(x: Array, y: Array) -> Array:
     """(..., i, k) times (..., k, j), summed over k in ascending order."""
+    fixed = _constant(x)
+    if fixed is not None and y.ndim > 3:
+        out = zeros((*y.shape[:-2], fixed.shape[0], y.shape[-1]))
+        for i, k in zip(*np.nonzero(fixed), strict=True):  # row by row: structural zeros cost nothing
+            out[..., i, :] += fixed[i, k] * y[..., k, :]
+        return out
     batch = np.broadcast_shapes(x.shape[:-2], y.shape[:-2])
     out = zeros((*batch, x.shape[-2], y.shape[-1])) if batch else np.zeros((x.shape[-2], y.shape[-1]))
     np.multiply(x[..., :, 0, None], y[..., 0, None, :], out=out)
@@ -57,6 +68,12 @@ def matmul(x: Array, y: Array) -> Array:
 
 def matvec(x: Array, v: Array) -> Array:
     """(..., i, k) times (..., k), summed over k in ascending order."""
+    fixed = _constant(x)
+    if fixed is not None and v.ndim > 2:
+        out = zeros((*v.shape[:-1], fixed.shape[0]))
+        for i, k in zip(*np.nonzero(fixed), strict=True):
+            out[..., i] += fixed[i, k] * v[..., k]
+        return out
     batch = np.broadcast_shapes(x.shape[:-2], v.shape[:-1])
     out = zeros((*batch, x.shape[-2])) if batch else np.zeros(x.shape[-2])
     np.multiply(x[..., :, 0], v[..., 0, None], out=out)

@@ -102,6 +102,14 @@ def entry_of(family: Family, name: str, cls: type) -> Entry:
     )  # fmt: skip
 
 
+def entry_for(family: Family, cls: type) -> Entry:
+    """The entry under which a class is registered, or one made of its attributes."""
+    for entry in _load(family).values():
+        if entry.cls is cls:
+            return entry
+    return entry_of(family, cls.__name__, cls)
+
+
 def entries(family: Family) -> dict[str, Entry]:
     """Every registered component of a family by name, plug-ins included."""
     return dict(sorted(_load(family).items()))

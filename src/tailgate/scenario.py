@@ -30,12 +30,14 @@ class Scenario:
     manoeuvre: Any
     horizon: PositiveCount
     threat_model: ThreatModel
+    ends_on_collision: bool = True
     about: str = ""
 
     def loop(self, defence: Defence, uses: tuple[str, ...] = ("measurements",)) -> Loop:
         loop = Loop(
-            self.plant, self.sensor, self.controller, self.manoeuvre, self.threat_model, self.horizon, defence, uses
-        )
+            self.plant, self.sensor, self.controller, self.manoeuvre, self.threat_model, self.horizon, defence, uses,
+            self.ends_on_collision,
+        )  # fmt: skip
         _ = loop.brief.granted  # refuses unknown targets here, not in the first step
         return loop
 
@@ -108,7 +110,7 @@ def load_scenario(name: str) -> Scenario:
     threat = data.get("threat_model", {})
     if not isinstance(threat, dict):
         raise InputError(f"{where}.threat_model", threat, "a mapping of fields")
-    rest = {"name": data.get("name", path.stem), "horizon": data["horizon"], "about": data.get("about", "")}
+    rest = {key: data[key] for key in ("horizon", "ends_on_collision", "about") if key in data} | {"name": data.get("name", path.stem)}
     return build(Scenario, parts | rest | {"threat_model": build(ThreatModel, threat, f"{where}.threat_model")}, where)
 
 

@@ -12,16 +12,17 @@ from tailgate.stats import proportion
 
 
 def summarise(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """One entry per (suite, scenario, dose, knowledge, defence, attack), in order of appearance.
+    """One entry per cell (the columns of evaluation.KEYS), in order of appearance; a seed counts once, its last row.
 
     crash: share of episodes with a collision in front or behind, with a 95 % Clopper-Pearson interval; the other columns are medians
     with quartiles. Rows with an error are counted in `failed`; those and skipped pairings are left out of the figures.
     """
-    groups: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
+    groups: dict[tuple[Any, ...], dict[int, dict[str, Any]]] = {}
     for row in rows:
-        groups.setdefault(tuple(row[key] for key in KEYS), []).append(row)
+        groups.setdefault(tuple(row[key] for key in KEYS), {})[row["seed"]] = row
     out = []
-    for key, members in groups.items():
+    for key, by_seed in groups.items():
+        members = list(by_seed.values())
         good = [row for row in members if row["status"] == "ok"]
         entry: dict[str, Any] = dict(zip(KEYS, key, strict=True))
         entry |= {

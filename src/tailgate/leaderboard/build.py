@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from jinja2 import Environment, StrictUndefined
-from markupsafe import Markup
+from markupsafe import Markup, escape
 
 from tailgate.errors import InputError
 from tailgate.files import writable_directory, write_atomic
@@ -25,7 +25,7 @@ from tailgate.summary import summarise
 Data = dict[str, Any]
 TITLE = "Tailgate leaderboard"
 COLUMNS = (  # of the table of every cell, after the crash share: key of the summary, heading
-    ("min_gap", "Smallest gap [m]"), ("max_error", "Largest error [m]"), ("alarm_onsets", "Alarm onsets"),
+    ("min_gap", "Min. gap [m]"), ("max_error", "Max. error [m]"), ("alarm_onsets", "Alarm onsets"),
     ("attack_steps", "Attack steps"),
 )  # fmt: skip
 STYLES = 8  # line styles of the learning curve
@@ -94,8 +94,20 @@ def steps(value: float) -> str:
     """A number of environment steps, short."""
     for size, unit in ((1_000_000, "M"), (1_000, "k")):
         if value >= size:
-            return f"{value / size:.3g}{unit}"
+            return f"{value / size:.4g}{unit}"
     return f"{value:.0f}"
+
+
+def ticks(end: float) -> list[Data]:
+    """Round places on an axis from 0 to end, at most six."""
+    unit = 10.0 ** math.floor(math.log10(end))
+    size = next(unit * m for m in (0.2, 0.5, 1, 2) if end <= 5 * unit * m)
+    return [{"x": round(100 * i * size / end, 2), "text": steps(i * size)} for i in range(math.floor(end / size + 1e-9) + 1)]
+
+
+def breakable(text: str) -> Markup:
+    """Escaped, with places where a narrow column may break it."""
+    return Markup(re.sub(r"([=_/:])", r"\1<wbr>", str(escape(text))))
 
 
 def unranked(name: Name, uses: Iterable[str], card: Entry | None) -> str:
@@ -105,7 +117,7 @@ def unranked(name: Name, uses: Iterable[str], card: Entry | None) -> str:
     if "truth" in uses:
         return "reference: is told what is attacked"
     if card is not None and card.sentinel:
-        return f"sentinel: shows what a crash share alone misses ({card.sentinel})"
+        return f"sentinel: useless by design ({card.sentinel})"
     return ""
 
 
@@ -130,7 +142,8 @@ def _cell(entry: Data, words: _Words) -> Data:
     why = f"{failed} more failed: {reason}" if failed else ""
     low, high = percent(crash["low"]), percent(crash["high"])
     label = f"95% interval {low} to {high}, {entry['n']} episodes"
-    out |= {"low": low, "high": high, "text": percent(crash["value"]), "shade": shade(crash["value"]), "why": why, "lost": failed > 0}
+    out |= {"low": low, "high": high, "text": percent(crash["value"]), "shade": shade(crash["value"])}
+    out |= {"why": why, "lost": failed > 0}
     return out | {"label": "; ".join(filter(None, (label, why)))}
 
 
@@ -160,8 +173,9 @@ def _section(key: tuple[Any, ...], group: Sequence[Data], rows: Sequence[Data], 
     for text in dict.fromkeys(e["defence"] for e in group):
         cells = []
         for column in columns:
-            missing = {"defence": text, "attack": column[0], "knowledge": column[1], "n": 0, "failed": 0, "reason": "", "crash": None}
-            cells.append(_cell(kept.get((text, *column), missing | marks[column]), words))
+            place = {"defence": text, "attack": column[0], "knowledge": column[1]}
+            missing = place | {"n": 0, "failed": 0, "reason": "", "crash": None} | marks[column]
+            cells.append(_cell(kept.get((text, *column), missing), words))
         uses = {use for row in rows if row["defence"] == text for use in row.get("uses", ())}
         lines.append(_line(text, cells, uses, words))
     lines.sort(key=lambda line: line["order"])
@@ -188,8 +202,8 @@ def _cards(words: _Words, family: str) -> list[Data]:
     used, known = (words.defence, words.defences) if family == "defence" else (words.attack, words.attacks)
     out: dict[str, Data] = {}
     for name in used.values():
-        entry = known.get(name.base)
-        card = out.setdefault(name.base or name.label, {"title": name.base or name.label, "card": entry and entry.card(), "played": []})
+        title, entry = name.base or name.label, known.get(name.base)
+        card = out.setdefault(title, {"title": title, "card": {"sentinel": ""} | entry.card() if entry else None, "played": []})
         if name.policy or name.params:
             card["played"].append(name.full if name.policy else ", ".join(name.params))
     return list(out.values())
@@ -238,9 +252,12 @@ def _headline(data: Data | None) -> Data | None:
         return round(100 * (x - start) / (1 - start), 2)
 
     items = [
-        {"label": label, "note": note, "x": at(v), "low": at(a), "high": at(b), "value": percent(v), "span": f"{percent(a)} to {percent(b)}"}
+        {
+            "label": label, "note": note, "x": at(v), "low": at(a), "high": at(b),
+            "value": percent(v), "span": f"{percent(a)} to {percent(b)}",
+        }
         for label, note, v, a, b in points
-    ]
+    ]  # fmt: skip
     ticks = [{"x": at(t), "text": percent(t)} for t in (start, (start + 1) / 2, 1.0)]
     return {"text": str(data.get("text", "")), "items": items, "ticks": ticks, "zero": at(0.0)}
 
@@ -264,7 +281,7 @@ def _curve(data: Sequence[Data] | None) -> Data | None:
             "peak": percent(max(y for _, y in run)), "steps": steps(run[-1][0]),
             "points": " ".join(f"{1000 * x / end:.1f},{1000 - 1000 * y:.1f}" for x, y in run),
         })  # fmt: skip
-    return {"lines": lines, "ticks": [{"x": 25 * i, "text": steps(end * i / 4)} for i in range(5)]}
+    return {"lines": lines, "ticks": ticks(end)}
 
 
 def _asset(name: str) -> str:
@@ -282,15 +299,13 @@ def build(
 ) -> Path:
     """Writes out/index.html and out/summary.json from evaluation rows, and returns the path of the page.
 
-    curve: {steps, seed, crash} of a training run; headline: {text, items: [{label, value, low, high, note}]}, shares as fractions.
+    curve: [{steps, seed, crash}] of a training run; headline: {text, items: [{label, value, low, high, note}]}; shares are 0 to 1.
     Raises InputError for no rows, and for a curve or headline that cannot be drawn.
     """
     if not rows:
         raise InputError("rows", list(rows), "at least one row of an evaluation")
     cells = summarise(rows)
-    words = _Words(
-        names_of(c["defence"] for c in cells), names_of(c["attack"] for c in cells), entries("defence"), entries("attack")
-    )
+    words = _Words(names_of(c["defence"] for c in cells), names_of(c["attack"] for c in cells), entries("defence"), entries("attack"))
     groups: dict[tuple[Any, ...], tuple[list[Data], list[Data]]] = {}
     for i, kind in enumerate((cells, rows)):
         for item in kind:
@@ -301,8 +316,10 @@ def build(
     }  # fmt: skip
     heading = title or TITLE
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    environment.filters["breakable"] = breakable
+    columns = [(key, text, METRICS[key].__doc__ or "") for key, text in COLUMNS]
     page = environment.from_string(_asset("page.html")).render(
-        title=heading, css=_inline("page.css"), js=_inline("page.js"), columns=[(key, text, METRICS[key].__doc__ or "") for key, text in COLUMNS], facts=facts, headline=_headline(headline),
+        title=heading, css=_inline("page.css"), js=_inline("page.js"), columns=columns, facts=facts, headline=_headline(headline),
         curve=_curve(curve), sections=[_section(key, *group, words) for key, group in groups.items()],
         families=[("Defences", _cards(words, "defence")), ("Attacks", _cards(words, "attack"))],
     )  # fmt: skip

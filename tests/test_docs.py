@@ -1,0 +1,62 @@
+"""The documentation's examples run as they stand."""
+
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+
+
+def _blocks(name: str, language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", (ROOT / name).read_text(encoding="utf-8"), flags=re.S)
+
+
+@pytest.fixture
+def package(tmp_path: Path) -> Path:
+    (tmp_path / "mydefence.py").write_text(_blocks("docs/new-defence.md", "python")[0], encoding="utf-8")
+    return tmp_path
+
+
+def test_the_new_defence_has_at_most_30_lines_of_code() -> None:
+    code = [line for line in _blocks("docs/new-defence.md", "python")[0].splitlines() if line.strip()]
+    assert 10 < len(code) <= 30
+
+
+def test_the_new_defence_is_evaluated_from_the_command_line(package: Path) -> None:
+    """Found in the working directory, played in two spawned processes, and on the page."""
+    command = [sys.executable, "-m", "tailgate.cli", "evaluate", "--suite", "quick-v0", "--scenario", "gusty-stop-and-go-v0"]
+    command += ["--defence", "mydefence:Saturated:gain=0.1", "--attack", "none", "--attack", "fdi:trigger=near,threshold=30,value=-4"]
+    done = subprocess.run(
+        [*command, "--seeds", "20", "--workers", "2", "--out", "rows.jsonl", "--json"], cwd=package, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    table = json.loads(done.stdout)
+    assert [entry["n"] for entry in table] == [20, 20]
+    assert table[0]["crash"]["value"] == 0.0
+    rows = [json.loads(line) for line in (package / "rows.jsonl").read_text().splitlines()]
+    assert {row["status"] for row in rows} == {"ok"}
+    build = [sys.executable, "-m", "tailgate.cli", "leaderboard", "build", "--rows", "rows.jsonl", "--out", "page"]
+    assert subprocess.run(build, cwd=package, capture_output=True, text=True, check=False).returncode == 0
+    assert "mydefence:Saturated" in (package / "page" / "index.html").read_text(encoding="utf-8")
+
+
+def test_the_new_defence_plays_as_an_object(package: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(package)
+    scope: dict[str, object] = {}
+    exec(_blocks("docs/new-defence.md", "python")[1], scope)
+    env = scope["env"]
+    env.reset(seed=0)  # type: ignore[attr-defined]
+    assert env.step(0)[4]["gap"] > 50.0  # type: ignore[attr-defined]
+    sys.modules.pop("mydefence", None)
+
+
+@pytest.mark.parametrize("name", ["README.md", "docs/new-defence.md", "CONTRIBUTING.md"])
+def test_links_to_files_exist(name: str) -> None:
+    text = (ROOT / name).read_text(encoding="utf-8")
+    for target in re.findall(r"\]\(([^)#]+?)(?:#[^)]*)?\)", text):
+        if "://" not in target:
+            assert ((ROOT / name).parent / target).exists(), f"{name}: {target}"

@@ -1,0 +1,304 @@
+"""The Gymnasium faces: both checkers without a warning, batch equal to single, autoreset, masks, cards and errors."""
+
+import json
+import subprocess
+import sys
+import warnings
+from typing import get_args
+
+import gymnasium
+import numpy as np
+import pytest
+import yaml
+from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode
+
+import tailgate
+from tailgate.agents.codec import ActionName, ActionSpec, Reward, RewardName
+from tailgate.core import Kind
+from tailgate.envs.faces import AdversaryEnv, AdversaryVectorEnv
+from tailgate.errors import InputError
+from tailgate.schema import fields_of
+
+ID = "tailgate/CarFollowing-v0"
+ACTIONS = get_args(ActionName)
+
+
+@pytest.fixture(scope="module")
+def brief_scenario(tmp_path_factory):
+    """A scenario of 40 steps, short enough for many episodes."""
+    data = {
+        "plant": {"name": "car_following", "gap": 20.0}, "sensor": "odometry", "controller": "acc", "horizon": 40,
+        "manoeuvre": {"name": "braking", "onset": [0.0, 1.0]},
+        "threat_model": {"kinds": ["dos_jam", "dos_hold", "dropout", "fdi"], "onset": 3},
+    }  # fmt: skip
+    path = tmp_path_factory.mktemp("scenario") / "tiny.yaml"
+    path.write_text(yaml.safe_dump(data))
+    return str(path)
+
+
+@pytest.fixture
+def strict(monkeypatch):
+    """Every warning is an error, Gymnasium's own too."""
+
+    def shout(message, *arguments, **_):
+        raise AssertionError(f"gymnasium warns: {message % arguments if arguments else message}")
+
+    monkeypatch.setattr(gymnasium.logger, "warn", shout)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        yield
+
+
+@pytest.mark.parametrize("knowledge", ["black", "grey", "white"])
+@pytest.mark.parametrize("action", ACTIONS)
+def test_both_checkers_pass_without_a_warning(action, knowledge, strict, brief_scenario):
+    """gymnasium's and Stable-Baselines3's check_env, for every action, knowledge and reward."""
+    sb3 = pytest.importorskip("stable_baselines3.common.env_checker")
+    for reward in get_args(RewardName):
+        arguments = dict(scenario=brief_scenario, action=action, knowledge=knowledge, reward=reward)
+        check_env(gymnasium.make(ID, **arguments).unwrapped, skip_render_check=True)
+        sb3.check_env(gymnasium.make(ID, **arguments), warn=True)
+
+
+def test_the_checker_passes_with_its_render_check(strict):
+    """The default environment, every declared render mode included."""
+    pytest.importorskip("PIL")
+    check_env(gymnasium.make(ID).unwrapped)
+
+
+def test_the_id_works_in_a_fresh_interpreter():
+    """Gymnasium alone imports the module that the id names."""
+    code = (
+        "import gymnasium; e = gymnasium.make('tailgate:tailgate/CarFollowing-v0'); o, i = e.reset(seed=1);"
+        "print(e.step(e.action_space.sample())[0].shape == e.observation_space.shape)"
+    )
+    done = subprocess.run([sys.executable, "-W", "error", "-c", code], capture_output=True, text=True, timeout=120)
+    assert done.stdout == "True\n", done.stderr
+
+
+def test_a_batch_of_4096_steps():
+    """make_vec is native: shapes, types and spaces of 4096 rows."""
+    vec = gymnasium.make_vec(ID, num_envs=4096)
+    assert isinstance(vec.unwrapped, AdversaryVectorEnv)
+    observation, _ = vec.reset(seed=0)
+    for _ in range(5):
+        assert vec.observation_space.contains(observation) and len(np.unique(observation, axis=0)) == 4096
+        observation, reward, terminated, truncated, info = vec.step(vec.action_space.sample())
+    assert reward.shape == terminated.shape == truncated.shape == info["illegal"].shape == (4096,)
+    assert reward.dtype == np.float64 and terminated.dtype == truncated.dtype == bool
+
+
+def _actions(vec, steps, seed=0):
+    vec.action_space.seed(seed)
+    return [vec.action_space.sample() for _ in range(steps)]
+
+
+@pytest.mark.parametrize("interval", [1, 3])
+@pytest.mark.parametrize("action", ACTIONS)
+def test_row_i_is_the_single_environment_of_seed_s_plus_i(action, interval, brief_scenario, same_bits):
+    """Two whole episodes: observation, reward, flags and info of every row, bit for bit; autoreset adds 1 to the episode."""
+    arguments = dict(scenario=brief_scenario, action=action, value=-8.0, knowledge="white", reward="stealth", interval=interval)
+    vec = gymnasium.make_vec(ID, num_envs=4, **arguments)
+    start, _ = vec.reset(seed=70)
+    steps = [(a, *vec.step(a)) for a in _actions(vec, 81)]
+    for i in range(4):
+        env = gymnasium.make(ID, **arguments)
+        first, _ = env.reset(seed=70 + i)
+        assert same_bits(first, start[i])
+        over, episodes = False, 1
+        for action_, observation, reward, terminated, truncated, info in steps:
+            if over:
+                alone = (*env.reset(), 0.0, False, False)
+                alone = (alone[0], *alone[2:], alone[1])
+                episodes += 1
+            else:
+                alone = env.step(action_[i])
+            assert same_bits(alone[0], observation[i])
+            assert alone[1:4] == (reward[i], terminated[i], truncated[i])
+            for key, value in alone[4].items():
+                assert np.array_equal(value, info[key][i]), key
+            over = alone[2] or alone[3]
+        assert episodes >= 2
+        assert vec.unwrapped.state.keys.episode[i] == episodes - 1 == env.unwrapped.batch.state.keys.episode[0]
+
+
+def test_next_step_same_step_and_disabled_are_one_core(brief_scenario, same_bits):
+    """NEXT_STEP spends a step on the reset, SAME_STEP reports the last observation as final_obs, DISABLED waits for a mask."""
+    modes = ("next_step", "same_step", "disabled")
+    faces = {mode: AdversaryVectorEnv(6, autoreset=mode, scenario=brief_scenario, value=-20.0) for mode in modes}
+    assert [face.metadata["autoreset_mode"] for face in faces.values()] == [
+        AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP, AutoresetMode.DISABLED,
+    ]  # fmt: skip
+    for face in faces.values():
+        face.reset(seed=3)
+    rng = np.random.default_rng(0)
+    ended = 0
+    for _ in range(120):
+        actions = rng.integers(0, faces["disabled"].seat.action.size, 6)
+        plain = faces["disabled"].step(actions)
+        same = faces["same_step"].step(actions)
+        following = faces["next_step"].step(actions)
+        done = plain[2] | plain[3]
+        for other in (same, following):
+            assert all(np.array_equal(plain[j], other[j]) for j in (1, 2, 3))
+        assert same_bits(plain[0], following[0]) and same_bits(plain[0][~done], same[0][~done])
+        if not done.any():
+            assert "final_obs" not in same[4]
+            continue
+        ended += int(done.sum())
+        assert same_bits(same[4]["final_obs"], plain[0]) and np.array_equal(same[4]["_final_obs"], done)
+        assert np.array_equal(same[4]["final_info"]["collided"], plain[4]["collided"])
+        with pytest.raises(InputError, match=r"step: got \[.*reset_mask"):
+            faces["disabled"].step(actions)
+        fresh, _ = faces["disabled"].reset(options={"reset_mask": done})
+        assert same_bits(fresh, same[0])
+        faces["next_step"].reset(options={"reset_mask": done})
+    assert ended > 12 and len({tuple(f.state.keys.episode) for f in faces.values()}) == 1
+
+
+def test_next_step_ignores_the_action_of_a_resetting_row(brief_scenario):
+    """The step after an end: reward 0, no flag, no illegal command, the first observation of the next episode."""
+    vec = AdversaryVectorEnv(3, scenario=brief_scenario, threat={"end": 3}, illegal_penalty=1.0)
+    vec.reset(seed=0)
+    for _ in range(200):
+        out = vec.step(np.ones(3, np.int64))
+        if (done := out[2] | out[3]).any():
+            break
+    assert vec.state.keys.episode.max() == 0
+    after = vec.step(np.ones(3, np.int64))
+    assert not after[1][done].any() and not (after[2] | after[3])[done].any() and not after[4]["illegal"][done].any()
+    assert (after[4]["step"][done] == 1).all() and (vec.state.keys.episode == done).all()
+
+
+@pytest.mark.parametrize("mask", [[True], np.zeros(3, bool), np.ones(3), np.ones((3, 1), bool), "all"])
+def test_a_bad_reset_mask_is_refused(mask, brief_scenario):
+    """reset_mask is a bool array (B,) with at least one True."""
+    vec = AdversaryVectorEnv(3, autoreset="disabled", scenario=brief_scenario)
+    vec.reset(seed=0)
+    with pytest.raises(InputError, match=r"options\.reset_mask.*shape \(3,\)"):
+        vec.reset(options={"reset_mask": mask})
+
+
+def test_a_reset_with_seeds_by_row(brief_scenario, same_bits):
+    """A list of seeds: rows with one restart under it, rows without go on to their next episode."""
+    vec = AdversaryVectorEnv(3, scenario=brief_scenario)
+    vec.reset(seed=0)
+    observation, _ = vec.reset(seed=[9, None, 5])
+    single = AdversaryEnv(scenario=brief_scenario)
+    assert same_bits(observation[0], single.reset(seed=9)[0]) and same_bits(observation[2], single.reset(seed=5)[0])
+    single.reset(seed=1)
+    assert same_bits(observation[1], single.reset()[0])
+    with pytest.raises(InputError, match=r"seed.*one seed per row \(3\)"):
+        vec.reset(seed=[1, 2])
+
+
+@pytest.mark.parametrize("action", ["timing", "mode", "ramp"])
+def test_masks_are_what_the_channel_accepts(action, brief_scenario):
+    """An action is illegal exactly where its mask was False, under a budget, a duration, a cooldown and an end."""
+    threat = {"budget": 9, "duration": 3, "cooldown": 2, "end": 35, "fdi_bound": 10.0}
+    vec = AdversaryVectorEnv(16, scenario=brief_scenario, action=action, threat=threat, per_sensor=action != "timing")
+    _, info = vec.reset(seed=0)
+    rng, seen = np.random.default_rng(1), {True: 0, False: 0}
+    for _ in range(90):
+        mask = vec.action_masks()
+        assert np.array_equal(mask, info["action_mask"]) and mask[:, 0].all()
+        actions = rng.integers(0, mask.shape[1], 16)
+        over = vec._done.copy()
+        *_, info = vec.step(actions)
+        legal = mask[np.arange(16), actions]
+        assert np.array_equal(info["illegal"][~over], ~legal[~over])
+        took = vec.frame.command.kind != Kind.NONE
+        assert np.array_equal(took[~over], (legal & (actions != 0))[~over])
+        for ok in (True, False):
+            seen[ok] += int((legal[~over] == ok).sum())
+    assert min(seen.values()) > 100
+
+
+def test_the_spec_survives_a_round_trip(brief_scenario, same_bits):
+    """gymnasium.make(env.spec) is the same environment: same card, same episode."""
+    env = gymnasium.make(ID, scenario=brief_scenario, defence="chi2_kf:eta=9", action="timing", knowledge="grey", threat={"budget": 5})
+    again = gymnasium.make(gymnasium.envs.registration.EnvSpec.from_json(env.spec.to_json()))
+    assert env.unwrapped.card() == again.unwrapped.card() == gymnasium.make(env.spec).unwrapped.card()
+    assert same_bits(env.reset(seed=4)[0], again.reset(seed=4)[0])
+    assert all(same_bits(env.step(k % 2)[0], again.step(k % 2)[0]) for k in range(20))
+
+
+CHANGES = [
+    {"scenario": "braking-v0"}, {"defence": "kf"}, {"defence": "chi2_kf:eta=19"}, {"knowledge": "grey"}, {"threat": {"budget": 5}},
+    {"threat": {"sees_measurement": True}}, {"action": "timing"}, {"kind": "dropout"}, {"value": -3.0}, {"rate": 0.4},
+    {"per_sensor": True}, {"interval": 2}, {"reward": "error"}, {"gap_shaping": 0.1}, {"error_shaping": 0.1}, {"gamma": 0.9},
+    {"illegal_penalty": 0.2},
+]  # fmt: skip
+
+
+def test_the_card_names_everything():
+    """JSON, stable, and another hash for every changed argument; nothing that moves between processes."""
+    card = AdversaryEnv().card()
+    assert json.loads(json.dumps(card)) == card == AdversaryVectorEnv(7, autoreset="same_step").card()
+    hashes = [AdversaryEnv(**change).card()["hash"] for change in CHANGES]
+    assert len({card["hash"], *hashes}) == len(CHANGES) + 1
+    named = {key for change in CHANGES for key in change}
+    assert named == {"scenario", "defence", "threat", "knowledge", *fields_of(ActionSpec), *fields_of(Reward)}
+    assert AdversaryEnv(defence=tailgate.make_defence("chi2_kf")).card()["defence"]["parameters"] == card["defence"]["parameters"]
+
+
+def test_the_card_of_an_adapted_filter_is_the_same_in_every_process():
+    """No memory address of a user's object gets into the card."""
+    text = json.dumps(AdversaryEnv(defence=tailgate.per_episode(_OneEpisode)).card())
+    text += json.dumps(AdversaryEnv(defence=tailgate.per_episode(lambda: _OneEpisode())).card())
+    assert "0x" not in text
+
+
+class _OneEpisode:
+    def reset(self, model, prior):
+        self.x = prior.mean
+
+    def step(self, y, valid, u):
+        return self.x, 0.0
+
+
+BAD = [
+    ({"defense": "kf"}, ["defense", "did you mean 'defence'", "reward"]),
+    ({"defence": "chi2_kff"}, ["defence", "'chi2_kff'", "did you mean 'chi2_kf'"]),
+    ({"defence": "chi2_kf:eta=-1"}, ["chi2_kf.eta", "-1", "greater than 0"]), ({"defence": 3}, ["defence", "3", "prepare, start and step"]),
+    ({"scenario": "stop-and-go"}, ["scenario", "'stop-and-go'", "stop-and-go-v0"]), ({"scenario": 3}, ["scenario", "3", "name"]),
+    ({"knowledge": "blue"}, ["threat_model.knowledge", "'blue'", "'black'"]), ({"reward": "fame"}, ["reward", "'fame'", "'stealth'"]),
+    ({"threat": {"budget": -1}}, ["threat_model.budget", "-1", "than or equal to 0"]), ({"action": "x"}, ["action", "'x'", "'mode'"]),
+    ({"threat": {"bugdet": 1}}, ["threat", "'bugdet'", "did you mean 'budget'"]), ({"value": 1e3}, ["value", "1000.0", "fdi_bound (50.0)"]),
+    ({"value": float("nan")}, ["value", "nan", "finite"]), ({"render_mode": "human"}, ["render_mode", "'human'", "rgb_array"]),
+    ({"threat": {"kinds": ["fdi"]}, "action": "timing", "kind": "dropout"}, ["action", "dropout", "fdi"]),
+    ({"threat": {"targets": ["speed"]}}, ["targets", "'speed'", "velocity"]), ({"gamma": 0}, ["gamma", "0", "greater than 0"]),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("arguments, words", BAD)
+def test_bad_arguments_name_field_value_and_expectation(arguments, words):
+    """InputError with the field, what was given and what was expected, from both faces."""
+    for make in (AdversaryEnv, lambda **a: AdversaryVectorEnv(2, **a)):
+        with pytest.raises(InputError) as caught:
+            make(**arguments)
+        text = str(caught.value)
+        assert all(word in text for word in words) and "expected" in text and "\n" not in text
+
+
+def test_bad_calls_are_refused(brief_scenario):
+    """A step before the reset, wrong shapes, numbers out of range, NaN."""
+    env, box = AdversaryEnv(scenario=brief_scenario), AdversaryEnv(scenario=brief_scenario, action="continuous")
+    for early in (lambda: env.step(0), lambda: env.action_masks()):
+        with pytest.raises(InputError):
+            early()
+    env.reset(seed=0)
+    box.reset(seed=0)
+    size = env.action_space.n
+    for bad, words in ((size, f"0 to {size - 1}"), (-1, "whole"), (0.5, "whole"), ([0], "shape"), (np.nan, "whole")):
+        with pytest.raises(InputError, match=f"actions.*{words}"):
+            env.step(bad)
+    for bad, words in ((np.full(3, np.nan), "finite"), (np.full(3, np.inf), "finite"), (np.zeros(2), "shape"), (0.0, "shape")):
+        with pytest.raises(InputError, match=f"actions.*{words}"):
+            box.step(bad)
+    with pytest.raises(InputError, match=r"action_masks.*discrete"):
+        box.action_masks()
+    for arguments in ({"num_envs": 0}, {"num_envs": 1.5}, {"autoreset": "now"}):
+        with pytest.raises(InputError, match=next(iter(arguments))):
+            AdversaryVectorEnv(**({"num_envs": 1} | arguments))

@@ -1,0 +1,250 @@
+"""Kalman filtering and the chi-square gate: equality with filterpy, known steady states, and what the theorems bound."""
+
+import math
+
+import numpy as np
+import pytest
+from filterpy.kalman import KalmanFilter as Reference
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import stats
+
+import tailgate
+from tailgate.core import Innovation, Prior, Received
+from tailgate.draws import Role, keys
+from tailgate.estimators import AcceptAll, ChiSquare, GatedKalman, Kalman, KalmanFilter, compose
+from tailgate.estimators.kalman import KalmanState
+from tailgate.scenario import load_scenario
+
+RNG = np.random.default_rng(11)
+NO_DRAWS = keys("train", [0]).at(Role.DEFENCE, np.zeros(1))
+
+
+class FilterpyFilter:
+    """filterpy's filter as an object of one episode; sensors that were not received are left out."""
+
+    def reset(self, model, prior):
+        self.C, self.R = model.C[0], model.R[0]
+        self.f = Reference(dim_x=model.states, dim_z=len(self.C), dim_u=model.inputs)
+        self.f.F, self.f.B, self.f.Q = model.A, model.B, model.Q
+        self.f.x, self.f.P = prior.mean.copy(), prior.cov.copy()
+
+    def step(self, y, valid, u):
+        self.f.predict(u=u)
+        if valid.any():
+            self.f.update(y[valid], R=self.R[np.ix_(valid, valid)], H=self.C[valid])
+        return self.f.x.copy(), 0.0
+
+
+def _received(y, valid=None):
+    y = np.asarray(y, float)
+    return Received(y, np.ones(y.shape, bool) if valid is None else valid, np.zeros(y.shape[:2]))
+
+
+def _odometry():
+    return load_scenario("stop-and-go-v0").brief().model
+
+
+def _prior(model, batch, spread=1.0):
+    n = model.states
+    return Prior(np.zeros((batch, 1, n)), np.broadcast_to(spread * np.eye(n), (batch, 1, n, n)).copy())
+
+
+def test_kf_equals_filterpy_over_300_steps():
+    """Estimate and covariance within 1e-10, with a known input and sensors that drop out."""
+    model = _odometry()
+    y, u = np.cumsum(RNG.normal(size=(300, 4, 1, 2)), axis=0), RNG.normal(size=(300, 4, 1, 1))
+    valid = RNG.uniform(size=(300, 4, 1, 2)) > 0.2
+    prior = _prior(model, 4, 2.0)
+    defence = Kalman()
+    plan = defence.prepare(model)
+    state = defence.start(plan, prior)
+    references = [FilterpyFilter() for _ in range(4)]
+    for b, reference in enumerate(references):
+        reference.reset(model, Prior(prior.mean[b, 0], prior.cov[b, 0]))
+    for k in range(300):
+        state, estimate = defence.step(plan, state, _received(y[k], valid[k]), u[k], NO_DRAWS)
+        for b, reference in enumerate(references):
+            x, _ = reference.step(y[k, b, 0], valid[k, b, 0], u[k, b, 0])
+            np.testing.assert_allclose(estimate.x[b, 0], x, atol=1e-10)
+            np.testing.assert_allclose(state.filter.P[b, 0], reference.f.P, atol=1e-10)
+
+
+def test_filterpy_plays_through_the_adapter(short, play):
+    """per_episode(filterpy) drives the same closed loop as `kf`, row by row, under a dropout of one sensor."""
+    attack = tailgate.make_attack("dropout", targets=("velocity",), length=20)
+    place = short(horizon=120)
+    ours = play(place, "kf", attack, range(3), terminate=False)
+    theirs = play(place, tailgate.per_episode(FilterpyFilter), attack, range(3), terminate=False)
+    np.testing.assert_allclose(theirs.estimate, ours.estimate, atol=1e-9)
+    np.testing.assert_allclose(theirs.gap, ours.gap, atol=1e-9)
+    alone = play(place, tailgate.per_episode(FilterpyFilter), attack, [2], terminate=False)
+    assert alone.trace_hash(0) == theirs.trace_hash(2)
+
+
+def test_scalar_steady_state_is_the_golden_ratio(linear_model):
+    """A = C = Q = R = 1: prediction variance 1.618..., gain 0.618..."""
+    model = linear_model(1.0, 1.0, 1.0, 1.0)
+    filter_ = KalmanFilter()
+    plan = filter_.prepare(model)
+    state = filter_.start(plan, _prior(model, 2, 5.0))
+    for _ in range(60):
+        state = filter_.predict(plan, state, np.zeros((2, 1, 1)))
+        innovation = filter_.innovation(plan, state, _received(np.zeros((2, 1, 1))))
+        predicted, gain = state.P, filter_.gain(plan, state, innovation)
+        state = filter_.update(plan, state, innovation, np.ones((2, 1, 1), bool))
+    golden = (1 + math.sqrt(5)) / 2
+    np.testing.assert_allclose(predicted, golden, rtol=1e-12)
+    np.testing.assert_allclose(gain, golden - 1, rtol=1e-12)
+
+
+@pytest.mark.parametrize("attack", ["none", "fdi", "dos_jam", "dropout", "dos_hold"])
+def test_a_gate_at_infinity_is_the_kalman_filter(attack, short, play):
+    """chi2_kf with eta = 1e12 equals kf to the last bit of the trace."""
+    kf = play(short(), "kf", attack, range(8))
+    gated = play(short(), GatedKalman(eta=1e12), attack, range(8))
+    assert [kf.trace_hash(i) for i in range(8)] == [gated.trace_hash(i) for i in range(8)]
+
+
+def test_a_gated_step_is_open_loop():
+    """Above eta: alarm, x = x- and P = P-; below: the Kalman update; row by row."""
+    model, defence = _odometry(), GatedKalman(eta=9.0)
+    plan = defence.prepare(model)
+    state = defence.start(plan, _prior(model, 3))
+    u = RNG.normal(size=(3, 1, 1))
+    predicted = plan.filter.predict(plan.filter_plan, state.filter, u)
+    y = predicted.x[..., :2] + np.array([[[1e3, 0.0]], [[0.5, 0.5]], [[0.0, -1e3]]])
+    after, estimate = defence.step(plan, state, _received(y), u, NO_DRAWS)
+    np.testing.assert_array_equal(estimate.alarm[:, 0], [True, False, True])
+    for b in (0, 2):
+        np.testing.assert_array_equal(estimate.x[b], predicted.x[b])
+        np.testing.assert_allclose(after.filter.P[b], predicted.P[b], rtol=1e-14)
+    _, kf = Kalman().step(Kalman().prepare(model), Kalman().start(Kalman().prepare(model), _prior(model, 3)), _received(y), u, NO_DRAWS)
+    np.testing.assert_array_equal(estimate.x[1], kf.x[1])
+    assert abs(estimate.x[1, 0, 0] - predicted.x[1, 0, 0]) > 0.1
+
+
+def test_false_alarm_rate_with_two_sensors_is_exp_of_minus_half_eta():
+    """On a matched linear simulation the innovations are white and chi-square: alarms are Binomial(n, exp(-eta/2))."""
+    eta, batch, steps = 4.0, 2000, 30
+    model = _odometry()
+    defence = compose(KalmanFilter(), ChiSquare(eta), AcceptAll())
+    plan = defence.prepare(model)
+    prior = _prior(model, batch)
+    state, x = defence.start(plan, prior), RNG.normal(size=(batch, 3))
+    alarms, scores = 0, []
+    for _ in range(steps):
+        u = RNG.normal(size=(batch, 1, 1))
+        x = x @ model.A.T + u[:, 0] @ model.B.T + RNG.normal(size=(batch, 3)) * np.sqrt(np.diag(model.Q))
+        y = x @ model.C[0].T + RNG.normal(size=(batch, 2)) * np.sqrt(np.diag(model.R[0]))
+        state, estimate = defence.step(plan, state, _received(y[:, None]), u, NO_DRAWS)
+        alarms += int(estimate.alarm.sum())
+        scores.append(estimate.score.ravel())
+    rate, n = math.exp(-eta / 2), batch * steps
+    assert abs(alarms - n * rate) < 5 * math.sqrt(n * rate * (1 - rate))
+    assert stats.kstest(np.concatenate(scores), stats.chi2(2).cdf).pvalue > 1e-4
+
+
+_VALUES = st.floats(-1.0, 1.0)
+
+
+@given(st.lists(_VALUES, min_size=9, max_size=9), st.lists(_VALUES, min_size=2, max_size=2), st.floats(0.5, 40.0))
+def test_one_accepted_sample_moves_the_estimate_by_at_most_the_bound(root, direction, eta):
+    """|x - x-| <= sqrt(eta lambda_max(P- - P+)) for every innovation within the gate."""
+    model, filter_ = _odometry(), KalmanFilter()
+    plan = filter_.prepare(model)
+    P = np.array(root).reshape(3, 3)
+    state = KalmanState(np.zeros((1, 1, 3)), (P @ P.T + 0.01 * np.eye(3))[None, None])
+    S = filter_.innovation(plan, state, _received(np.zeros((1, 1, 2)))).S[0, 0]
+    r = np.linalg.cholesky(S) @ np.array(direction)
+    r *= math.sqrt(eta / max(r @ np.linalg.solve(S, r), eta))
+    after = filter_.update(plan, state, Innovation(r[None, None], S[None, None]), np.ones((1, 1, 2), bool))
+    bound = math.sqrt(eta * np.linalg.eigvalsh(state.P[0, 0] - after.P[0, 0])[-1])
+    assert np.linalg.norm(after.x) <= bound * (1 + 1e-9)
+
+
+def test_the_jump_bound_is_tight():
+    """Some innovation on the gate reaches it: along e, r = sqrt(eta) S K' e / sqrt(e' K S K' e)."""
+    model, filter_, eta = _odometry(), KalmanFilter(), 20.0
+    plan = filter_.prepare(model)
+    state = filter_.predict(plan, filter_.start(plan, _prior(model, 1)), np.zeros((1, 1, 1)))
+    innovation = filter_.innovation(plan, state, _received(np.zeros((1, 1, 2))))
+    K, S = filter_.gain(plan, state, innovation)[0, 0], innovation.S[0, 0]
+    after = filter_.update(plan, state, innovation, np.ones((1, 1, 2), bool))
+    gap, vectors = np.linalg.eigh(state.P[0, 0] - after.P[0, 0])
+    np.testing.assert_allclose(K @ S @ K.T, state.P[0, 0] - after.P[0, 0], atol=1e-12)
+    e = vectors[:, -1]
+    r = math.sqrt(eta) * S @ K.T @ e / math.sqrt(e @ K @ S @ K.T @ e)
+    moved = filter_.update(plan, state, Innovation(r[None, None], S[None, None]), np.ones((1, 1, 2), bool)).x
+    assert r @ np.linalg.solve(S, r) == pytest.approx(eta, rel=1e-12)
+    assert np.linalg.norm(moved) == pytest.approx(math.sqrt(eta * gap[-1]), rel=1e-9)
+
+
+@pytest.mark.parametrize("eta", [4.0, 20.0])
+def test_stealth_reaches_the_gate_and_never_alarms(eta, short, play):
+    """Every attacked step scores within 1e-6 of the gate from below, and pushes the car's belief backwards."""
+    trace = play(short(horizon=90, fdi_bound=1e4), GatedKalman(eta=eta), "stealth", range(16), terminate=False)
+    on = trace.kind != 0
+    assert on[9:].all() and not on[:9].any()
+    score = trace.score[9:, :, 0]
+    assert np.max(np.abs(score - eta)) < 1e-6 and score.max() < eta
+    assert not trace.alarm[9:].any()
+    assert (trace.estimate[-1, :, 0, 0] - trace.truth[-1, :, 0, 0]).max() < -5.0
+
+
+def test_stealth_that_meets_the_injection_bound_never_alarms(short, play):
+    """When the threat model's bound is reached, the attack goes no further than it can keep hidden."""
+    trace = play(short(horizon=90, fdi_bound=10.0), "chi2_kf", "stealth", range(16), terminate=False)
+    assert 9.0 < np.max(np.abs(trace.value)) <= 10.0
+    assert (trace.kind != 0)[9:].mean() > 0.9 and not trace.alarm[9:].any()
+
+
+def test_stealth_on_one_granted_wire_never_alarms(short, play):
+    """An attacker who may touch the position alone still stays under the gate."""
+    trace = play(short(horizon=90, fdi_bound=1e4, targets=("position",)), "chi2_kf", "stealth", range(16), terminate=False)
+    assert (trace.kind != 0)[9:].mean() > 0.9 and not trace.target[..., 1].any()
+    assert not trace.alarm[9:].any()
+    assert (trace.estimate[-1, :, 0, 0] - trace.truth[-1, :, 0, 0]).max() < -1.0
+
+
+@pytest.mark.parametrize("sensor", [0, 1])
+def test_partial_acceptance_is_a_filter_with_that_sensor_alone(sensor, linear_model):
+    """Accepting one of two correlated sensors equals the model that has only that one."""
+    full = _odometry()
+    R = np.array([[1.0, 0.6], [0.6, 2.0]])
+    both = linear_model(full.A, full.C[0], full.Q, R)
+    one = linear_model(full.A, full.C[0][[sensor]], full.Q, R[sensor, sensor])
+    P = RNG.normal(size=(5, 1, 3, 3))
+    state = KalmanState(RNG.normal(size=(5, 1, 3)), P @ np.swapaxes(P, -1, -2))
+    y, accept = RNG.normal(size=(5, 1, 2)), np.broadcast_to(np.arange(2) == sensor, (5, 1, 2))
+    after = []
+    for model, reading, use in ((both, y, accept), (one, y[..., [sensor]], np.ones((5, 1, 1), bool))):
+        filter_ = KalmanFilter()
+        plan = filter_.prepare(model)
+        after.append(filter_.update(plan, state, filter_.innovation(plan, state, _received(reading)), use))
+    np.testing.assert_allclose(after[0].x, after[1].x, atol=1e-12)
+    np.testing.assert_allclose(after[0].P, after[1].P, atol=1e-12)
+
+
+def test_dropout_equals_rejection(same_bits):
+    """Nothing received (even NaN on the wire) leaves the state of a rejected measurement, bit for bit, and no alarm."""
+    model, defence = _odometry(), GatedKalman(eta=9.0)
+    plan = defence.prepare(model)
+    state, u = defence.start(plan, _prior(model, 2)), RNG.normal(size=(2, 1, 1))
+    lost, quiet = defence.step(plan, state, _received(np.full((2, 1, 2), np.nan), np.zeros((2, 1, 2), bool)), u, NO_DRAWS)
+    rejected, loud = defence.step(plan, state, _received(np.full((2, 1, 2), 1e4)), u, NO_DRAWS)
+    assert loud.alarm.all() and not quiet.alarm.any()
+    assert same_bits(lost.filter.x, rejected.filter.x) and same_bits(lost.filter.P, rejected.filter.P)
+
+
+@pytest.mark.parametrize("lost", [0, 1])
+def test_the_gate_judges_what_was_received(lost):
+    """With one sensor dropped out, the score is r^2 / S of the other alone: chi-square with one degree of freedom."""
+    model, defence = _odometry(), GatedKalman()
+    plan = defence.prepare(model)
+    P = np.array([[4.0, 1.5, 0.2], [1.5, 1.0, 0.3], [0.2, 0.3, 0.5]])
+    state = defence.start(plan, Prior(np.zeros((1, 1, 3)), P[None, None]))
+    valid = (np.arange(2) != lost)[None, None]
+    _, estimate = defence.step(plan, state, _received([[[2.0, 2.0]]], valid), np.zeros((1, 1, 1)), NO_DRAWS)
+    S = model.C[0] @ (model.A @ P @ model.A.T + model.Q) @ model.C[0].T + model.R[0]
+    assert estimate.score[0, 0] == pytest.approx(4.0 / S[1 - lost, 1 - lost], rel=1e-12)

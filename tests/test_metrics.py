@@ -1,0 +1,144 @@
+"""Metrics: known answers on hand-made traces, undefined where they have no meaning, the same bits in every batch."""
+
+import math
+
+import numpy as np
+import pytest
+
+import tailgate
+from tailgate.metrics import METRICS, UNITS, measure, metric
+from tailgate.trace import Trace
+
+DT = 0.5
+
+
+def trace(steps=4, length=None, first=None, **signals):
+    """A trace of one episode; each signal is a list over steps (or a constant)."""
+    zeros = dict(gap=50.0, speed=10.0, accel=0.0, lead_speed=10.0, rear_gap=20.0, rear_speed=10.0, position=0.0)
+    flags = dict(kind=0, alarm=False, refused=False, collided=False, rear_collided=False)
+    assert set(signals) <= {*zeros, *flags, "error", "speed_error"}
+    column = {name: np.broadcast_to(np.asarray(signals.get(name, value)), steps).copy() for name, value in (zeros | flags).items()}
+    out = {name: column[name].astype(float)[:, None, None] for name in zeros}
+    out |= {name: column[name][:, None] for name in ("kind", "refused", "collided", "rear_collided")}
+    out["alarm"] = column["alarm"][:, None, None]
+    out["truth"] = np.full((steps, 1, 1, 3), 7.0)
+    out["estimate"] = out["truth"].copy()
+    for i, name in enumerate(("error", "speed_error")):
+        out["estimate"][:, 0, 0, i] += np.broadcast_to(signals.get(name, 0.0), steps)
+    begin = {name: np.array([[(first or {}).get(name, value)]], float) for name, value in zeros.items()}
+    return Trace(DT, steps, np.array([steps if length is None else length]), out, begin, lambda v: 5.0 + 3.0 * v)
+
+
+def value(name, *arguments, **signals):
+    got = measure(trace(*arguments, **signals))[name]
+    assert got.shape == (1,) and got.dtype == np.float64
+    return got[0]
+
+
+CASES = {
+    "collided": [
+        ({"collided": [0, 0, 0, 1]}, 1.0), ({}, 0.0), ({"collided": [0, 0, 0, 1], "length": 3}, 0.0), ({"rear_collided": 1}, 0.0),
+    ],
+    "rear_collided": [({"rear_collided": [0, 0, 0, 1]}, 1.0), ({"collided": 1}, 0.0)],
+    "crashed": [({"rear_collided": [0, 0, 0, 1]}, 1.0), ({"collided": [0, 0, 0, 1]}, 1.0), ({}, 0.0)],
+    "min_gap": [({"gap": [9, 4, 6, 1]}, 1.0), ({"gap": [9, 4, 6, 1], "length": 3}, 4.0), ({"first": {"gap": 2.5}}, 2.5)],
+    "impact_speed": [
+        ({"collided": [0, 0, 0, 1], "speed": [10, 9, 8, 7], "lead_speed": 2.0}, 5.0), ({}, None), ({"rear_collided": 1}, None),
+    ],
+    "min_ttc": [
+        ({"speed": [10, 12, 14, 11], "gap": [9, 6, 6, 6]}, 1.5), ({}, 100.0), ({"speed": 10.01}, 100.0), ({"speed": 12, "gap": -1}, 0.0),
+    ],
+    "rmse_position": [({"error": [3, 4, 3, -4]}, math.sqrt(12.5)), ({"error": [3, -3, 90, 90], "length": 2}, 3.0)],
+    "rmse_velocity": [({"speed_error": [1, 1, 1, 5]}, math.sqrt(7.0))],
+    "max_error": [({"error": [3, -4, 2, 0]}, 4.0), ({"error": [3, -4, 9, 0], "length": 2}, 4.0)],
+    "recovery_time": [
+        ({"kind": [0, 5, 0, 0], "gap": [35, 80, 38, 36.9]}, 1.0), ({"kind": [0, 5, 0, 0], "gap": [35, 35, 33, 37]}, 0.5),
+        ({"kind": [0, 5, 0, 0]}, None), ({"gap": 35}, None), ({"kind": [0, 0, 0, 5], "gap": 35}, None),
+        ({"kind": [0, 5, 0, 0], "gap": [35, 80, 80, 35], "length": 3}, None),
+    ],
+    "detection_delay": [
+        ({"kind": [0, 5, 0, 5], "alarm": [1, 0, 0, 1]}, 2.0), ({"kind": [0, 5, 0, 0], "alarm": [0, 1, 1, 0]}, 0.0),
+        ({"kind": [0, 5, 5, 5]}, None), ({"alarm": 1}, None), ({"kind": [0, 5, 5, 5], "alarm": [1, 0, 0, 0]}, None),
+        ({"kind": [0, 5, 5, 5], "alarm": [0, 0, 0, 1], "length": 3}, None),
+    ],
+    "missed_deadline": [
+        ({"kind": [0, 5, 0, 0], "alarm": [0, 0, 1, 0]}, 0.0), ({"kind": [0, 5, 0, 0]}, 1.0), ({}, None), ({"alarm": 1}, None),
+        ({"steps": 14, "kind": [5] + 13 * [0], "alarm": 10 * [0] + [1, 0, 0, 0]}, 0.0),
+        ({"steps": 14, "kind": [5] + 13 * [0], "alarm": 11 * [0] + [1, 0, 0]}, 1.0),
+    ],
+    "alarm_onsets": [({"alarm": [1, 0, 1, 1]}, 2.0), ({"alarm": 1}, 1.0), ({}, 0.0), ({"alarm": [1, 0, 1, 1], "length": 2}, 1.0)],
+    "alarm_rate": [({"alarm": [1, 0, 1, 1]}, 0.75), ({"alarm": [1, 0, 1, 1], "length": 2}, 0.5)],
+    "time_gap_inflation": [({"gap": 38.5}, 0.1), ({"gap": [35, 70, 35, 0], "length": 2}, 0.5), ({"gap": [35, 0, 35, 70]}, 0.0)],
+    "distance_travelled": [
+        ({"position": [2, 4, 7, 9], "first": {"position": 1.0}}, 8.0), ({"position": [2, 4, 7, 9], "length": 2}, 4.0),
+    ],
+    "max_decel": [({"accel": [-3, 2, -1, 0]}, 3.0), ({"accel": 2.0}, 0.0), ({"accel": [-3, 2, -9, 0], "length": 2}, 3.0)],
+    "rms_jerk": [({"accel": [1, 1, 0, 0], "first": {"accel": 0.0}}, math.sqrt(2.0)), ({"accel": 2.0, "first": {"accel": 2.0}}, 0.0)],
+    "string_gain": [
+        ({"speed": [10, 7, 10, 11], "lead_speed": [10, 8, 10, 10]}, 1.5), ({"speed": [10, 7, 10, 11]}, None),
+        ({"speed": [10, 7, 1, 11], "lead_speed": [10, 6, 10, 10], "length": 2}, 0.75),
+    ],
+    "attack_steps": [({"kind": [1, 0, 5, 2]}, 3.0), ({"kind": [1, 0, 5, 2], "length": 2}, 1.0), ({}, 0.0)],
+    "refused_commands": [({"refused": [1, 0, 1, 1]}, 3.0), ({"refused": [1, 0, 1, 1], "length": 3}, 2.0)],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name, case", [(name, case) for name, cases in CASES.items() for case in cases])
+def test_known_answers(name, case):
+    """A hand-made episode gives the number worked out by hand; None where the metric is undefined."""
+    signals, want = case
+    got = value(name, **signals)
+    assert math.isnan(got) if want is None else got == pytest.approx(want, rel=1e-12, abs=1e-12)
+
+
+@pytest.mark.parametrize("name, case", [(name, case) for name, cases in CASES.items() for case in cases])
+def test_what_follows_the_end_of_an_episode_does_not_count(name, case, same_bits):
+    """A companion that lives longer pads the episode with steps that are not its own: no metric moves by a bit."""
+    alone = trace(**case[0])
+    padded = {}
+    for key, signal in alone.signals.items():
+        rest = np.full((3, *signal.shape[1:]), 1, signal.dtype) if signal.dtype != float else np.full((3, *signal.shape[1:]), -1e9)
+        padded[key] = np.concatenate([signal, rest])
+    longer = Trace(DT, alone.horizon + 3, alone.length, padded, alone.first, alone.desired_gap)
+    assert same_bits(measure(longer)[name], measure(alone)[name])
+
+
+def test_every_metric_has_a_known_answer_and_a_unit():
+    """No metric without a case above, a unit and a sentence."""
+    assert set(METRICS) == set(CASES) == set(UNITS)
+    assert all(METRICS[name].__doc__ and UNITS[name] for name in METRICS)
+
+
+@pytest.mark.parametrize("attack", ["fdi_ramp", "dos_jam"])
+def test_a_row_has_the_same_bits_whatever_its_companions(attack, short, play, same_bits):
+    """Metrics of a seed alone, among 7 in another order, and among 64: equal bit for bit, undefined ones too."""
+    place = short(horizon=150)
+    everyone = play(place, "kf", attack, range(64))
+    whole = measure(everyone)
+    assert len(set(everyone.length)) > 1  # some companions outlive others
+    for seeds in ([11], [63, 2, 40, 11, 5, 900, 901], list(range(30, 60))):
+        part = measure(play(place, "kf", attack, seeds))
+        for name, column in part.items():
+            for i, seed in enumerate(seeds):
+                if seed < 64:
+                    assert same_bits(column[i], whole[name][seed]), (name, seed)
+
+
+def test_a_registered_metric_is_a_column_and_never_nan_or_infinite():
+    """A new metric appears in the rows of an evaluation; NaN and infinities become null."""
+    kept = list(METRICS)
+    try:
+
+        @metric("1")
+        def odd(trace):
+            """1 for even rows, NaN and infinity else."""
+            return np.where(np.arange(trace.batch) % 2 == 0, 1.0, np.where(np.arange(trace.batch) % 4 == 1, np.nan, np.inf))
+
+        rows = tailgate.evaluate(scenarios=["thesis-ch4-v0"], defences=["kf"], attacks=["none"], seeds=4)
+    finally:
+        METRICS.pop("odd", None)
+        UNITS.pop("odd", None)
+    assert [row["odd"] for row in rows] == [1.0, None, 1.0, None]
+    for row in rows:
+        assert row["status"] == "ok" and row["detection_delay"] is None and row["alarm_rate"] == 0.0
+        assert all(row[name] is None or math.isfinite(row[name]) for name in kept)

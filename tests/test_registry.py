@@ -1,0 +1,249 @@
+"""Names to components: specs as text, nearest names, plug-ins, and data that is the same for the same parameters."""
+
+import dataclasses
+import json
+import pickle
+import sys
+import textwrap
+from dataclasses import dataclass
+from importlib.metadata import EntryPoint
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import tailgate
+from tailgate import registry
+from tailgate.core import Positive, param
+from tailgate.errors import InputError, NotApplicable, unknown
+from tailgate.estimators import GatedKalman, Kalman
+from tailgate.registry import Entry, Spec, entries, find, make_from, put, register
+from tailgate.schema import as_data, build, canonical, override, read_yaml, scalar
+
+PLUGIN = """
+    from dataclasses import dataclass
+    from tailgate.estimators import Kalman
+
+    NUMBER = 3
+
+    @dataclass(frozen=True)
+    class Mine(Kalman):
+        '''A plug-in.'''
+        uses = ("measurements", "v2v")
+        version = 4
+        reference = "nobody"
+        gain: float = 2.0
+        names: tuple[str, ...] = ()
+"""
+
+
+@pytest.fixture
+def plugin(tmp_path, monkeypatch):
+    """A module of somebody else on the path."""
+    (tmp_path / "their_defence.py").write_text(textwrap.dedent(PLUGIN))
+    monkeypatch.syspath_prepend(str(tmp_path))
+    yield "their_defence"
+    sys.modules.pop("their_defence", None)
+
+
+@pytest.fixture
+def shelf(monkeypatch):
+    """A registry that forgets what a test put in."""
+    monkeypatch.setattr(registry, "_entries", {family: dict(known) for family, known in registry._entries.items()})
+    monkeypatch.setattr(registry, "_plugins_loaded", set())
+    return registry
+
+
+SPECS = [
+    ("defence", "kf", Kalman()), ("defence", "chi2_kf", GatedKalman(20.0)), ("defence", "chi2_kf:eta=7", GatedKalman(7.0)),
+    ("defence", "chi2_kf:eta=1e12", GatedKalman(1e12)), ("defence", "chi2_kf: eta = 7.5", GatedKalman(7.5)),
+    ("defence", "tailgate.estimators:GatedKalman", GatedKalman(20.0)), ("defence", "tailgate.estimators:GatedKalman:eta=3", GatedKalman(3.0)),
+    ("attack", "fdi:value=-4,length=10", tailgate.make_attack("fdi", value=-4.0, length=10)),
+    ("attack", "fdi:targets=[position,velocity],value=2", tailgate.make_attack("fdi", targets=("position", "velocity"), value=2.0)),
+    ("attack", "fdi:targets=[velocity]", tailgate.make_attack("fdi", targets=("velocity",))),
+    ("attack", "dos_hold:fresh=true,length=none", tailgate.make_attack("dos_hold", fresh=True)),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("family, text, want", SPECS)
+def test_specs(family, text, want):
+    """Text gives the component with these parameters, equal to the one made in Python."""
+    made = Spec(family, text).make()
+    assert type(made) is type(want) and made == want and canonical(made) == canonical(want)
+
+
+def test_somebody_elses_class(plugin):
+    """module:Class, with parameters; uses, version and reference come from the class; its file's digest is known."""
+    made = Spec("defence", f"{plugin}:Mine:gain=3,names=[a,b]").make()
+    assert (made.gain, made.names) == (3.0, ("a", "b"))
+    entry = Spec("defence", f"{plugin}:Mine").entry
+    assert (entry.name, entry.uses, entry.version, entry.reference) == (f"{plugin}:Mine", ("measurements", "v2v"), 4, "nobody")
+    assert len(Spec("defence", f"{plugin}:Mine").digest) == 64 and Spec("defence", "kf").digest == ""
+
+
+BAD = [
+    ("defence", "chi2_fk", r"defence: got 'chi2_fk'; expected one of .*kf.*did you mean 'chi2_kf'"),
+    ("attack", "fdi_rampp", r"attack.*did you mean 'fdi_ramp'"), ("defence", "", r"defence: got ''; expected one of"),
+    ("defence", "chi2_kf:etta=3", r"chi2_kf: unknown field: got 'etta'.*did you mean 'eta'"),
+    ("defence", "chi2_kf:eta=big", r"chi2_kf\.eta: got 'big'; expected"), ("defence", "chi2_kf:eta=-1", r"chi2_kf\.eta: got -1"),
+    ("defence", "chi2_kf:eta=nan", r"chi2_kf\.eta: got nan"), ("defence", "chi2_kf:eta=3,4", r"name:key=value,key=value"),
+    ("defence", "no_such_module:Thing", r"importable module"), ("defence", "tailgate.estimators:Nothing", r"a class that module"),
+    ("defence", "their_defence:NUMBER", r"expected a class"), ("defence", "their_defence:Mine:gain=x", r"gain: got 'x'"),
+    ("defence", ":Mine", r"defence: got ':Mine'"), ("defence", ".estimators:Kalman", r"defence: got '\.estimators:Kalman'"),
+    ("attack", "nowhere.json:speed=1", r"unknown field: got 'speed'"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("family, text, message", BAD)
+def test_bad_specs(family, text, message, plugin):
+    """One line with the field, the value and what was expected, the nearest name included."""
+    with pytest.raises(InputError, match=message) as caught:
+        Spec(family, text).make()
+    assert "\n" not in str(caught.value)
+
+
+def test_configuration_files_name_registered_components_only(plugin):
+    """A class to import is refused where a file names it; a mapping needs a name."""
+    with pytest.raises(InputError, match="command line only"):
+        Spec("defence", f"{plugin}:Mine").refuse_imports("suite x")
+    Spec("defence", "chi2_kf:eta=3").refuse_imports("suite x")
+    with pytest.raises(InputError, match="defence"):
+        make_from("defence", f"{plugin}:Mine", "suite x")
+    with pytest.raises(InputError, match="a name, or a mapping"):
+        make_from("defence", {"eta": 3}, "suite x")
+    assert make_from("defence", {"name": "chi2_kf", "eta": 3}, "suite x") == GatedKalman(3.0)
+
+
+def test_reusing_a_name_is_an_error(shelf):
+    """Another class under a name that is taken is refused; the same class again is not."""
+
+    @dataclass(frozen=True)
+    class Other(Kalman):
+        """Another."""
+
+    with pytest.raises(InputError, match=r"defence name: got 'kf'; expected a name that is not taken"):
+        register("defence", "kf")(Other)
+    assert find("defence", "kf").cls is Kalman
+    put(find("defence", "kf"))
+    assert register("defence", "kf_of_somebody")(Other) is Other and "kf_of_somebody" in tailgate.list_defences()
+    with pytest.raises(InputError, match=r"uses.*'sonar'"):
+        put(Entry("defence", "x", Other, uses=("sonar",)))
+
+
+def _points(monkeypatch, group, **named):
+    asked = []
+
+    def entry_points(group=None):
+        asked.append(group)
+        return [EntryPoint(name, value, group) for name, value in named.items()] if group == target else []
+
+    target = group
+    monkeypatch.setattr(registry, "entry_points", entry_points)
+    return asked
+
+
+def test_plug_ins_by_entry_point(shelf, plugin, monkeypatch):
+    """Entry points of the group are loaded once, listed and made like built-in ones."""
+    asked = _points(monkeypatch, "tailgate.estimators", mine=f"{plugin}:Mine")
+    assert "mine" in tailgate.list_defences() and tailgate.make_defence("mine", gain=5).gain == 5.0
+    assert find("defence", "mine").card()["uses"] == ["measurements", "v2v"] and find("defence", "mine").version == 4
+    assert Spec("defence", "mine:gain=6").make().gain == 6.0 and "mine" not in tailgate.list_attacks()
+    assert asked == ["tailgate.estimators", "tailgate.agents"]
+    with pytest.raises(InputError, match="did you mean 'mine'"):
+        tailgate.make_defence("minee")
+
+
+def test_a_plug_in_cannot_take_a_built_in_name(shelf, plugin, monkeypatch):
+    """The clash is reported whenever the family is asked for, and the built-in one stays."""
+    _points(monkeypatch, "tailgate.estimators", kf=f"{plugin}:Mine")
+    for _ in range(2):
+        with pytest.raises(InputError, match="'kf'.*not taken"):
+            tailgate.list_defences()
+    assert registry._entries["defence"]["kf"].cls is Kalman
+
+
+def test_cards_are_json():
+    """Every entry's card is JSON with its parameters' defaults and sentences."""
+    for family in ("defence", "attack", "plant", "sensor", "controller", "manoeuvre"):
+        for name, entry in entries(family).items():
+            card = entry.card()
+            assert json.loads(json.dumps(card)) == card and card["name"] == name and card["summary"]
+            assert all(p["doc"] for p in card["parameters"].values())
+    assert find("defence", "chi2_kf").card()["parameters"]["eta"]["default"] == 20.0
+
+
+@dataclass(frozen=True)
+class Sample:
+    """Parameters of every type."""
+
+    b: Positive = param(1.0, "a number [-]")
+    a: tuple[int, ...] = param((1, 2), "a list")
+    c: dict[str, float] = dataclasses.field(default_factory=lambda: {"y": 1.0, "x": 2.0})
+    path: Path | None = param(None, "a file")
+
+
+def test_canonical_text_is_stable(tmp_path):
+    """Sorted keys, every default written out, files by their content and not by their place."""
+    assert canonical(Sample()) == '{"a":[1,2],"b":1.0,"c":{"x":2.0,"y":1.0},"path":null}'
+    assert canonical(Sample(c={"x": 2.0, "y": 1.0})) == canonical(Sample()) != canonical(Sample(b=2.0))
+    for folder in ("one", "two"):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "f.csv").write_text("t,v\n")
+    one, two = (canonical(Sample(path=tmp_path / folder / "f.csv")) for folder in ("one", "two"))
+    assert one == two and str(tmp_path) not in one
+    (tmp_path / "two" / "f.csv").write_text("t,v\n0,1\n")
+    assert canonical(Sample(path=tmp_path / "two" / "f.csv")) != one
+    assert as_data(GatedKalman(3.0)) == {"eta": 3.0}
+
+
+def test_built_values_have_the_declared_types():
+    """An int for a float, a list for a tuple: the same canonical text as in Python; unknown and bad fields are named."""
+    assert canonical(build(Sample, {"b": 3, "a": [4]}, "sample")) == canonical(Sample(b=3.0, a=(4,)))
+    for data, message in (({"bb": 1}, r"sample: unknown field: got 'bb'.*did you mean"), ({"b": 0}, r"sample\.b: got 0"), ({"a": 3}, r"sample\.a")):
+        with pytest.raises(InputError, match=message):
+            build(Sample, data, "sample")
+
+
+@given(st.one_of(st.integers(-(10**9), 10**9), st.floats(allow_nan=False, allow_infinity=False), st.booleans()))
+def test_scalars_survive_their_text(value):
+    """A number written on the command line is read back."""
+    assert scalar(repr(value)) == value and scalar(json.dumps(value)) == value
+
+
+@pytest.mark.parametrize(
+    "text, value", [("none", None), ("null", None), ("1e5", 1e5), ("[1, 2]", [1, 2]), ("[a,b]", ["a", "b"]), ("word", "word"), ("", None)]
+)
+def test_scalar_forms(text, value):
+    """YAML scalars and flow lists, 1e5 as a number."""
+    assert scalar(text) == value
+
+
+def test_overrides():
+    """Dotted assignments change nested fields of a copy; anything else is refused."""
+    data = {"a": {"b": 1}, "c": 2}
+    assert override(data, ["a.b=5", "d.e=[1]", "c=x=y"]) == {"a": {"b": 5}, "c": "x=y", "d": {"e": [1]}}
+    assert data == {"a": {"b": 1}, "c": 2}
+    for bad in ("c", "=3", "c.d=1"):
+        with pytest.raises(InputError, match="override"):
+            override(data, [bad])
+
+
+@pytest.mark.parametrize("text, message", [("a: [", "valid YAML"), ("- 1", "mapping"), ("a: !!python/object/apply:os.getcwd []", "valid YAML")])
+def test_yaml_is_read_safely(text, message, tmp_path):
+    """Broken YAML, a list and a tag that would run code are input errors; so is a missing file."""
+    (tmp_path / "x.yaml").write_text(text)
+    with pytest.raises(InputError, match=message):
+        read_yaml(tmp_path / "x.yaml", "suite")
+    with pytest.raises(InputError, match=r"suite: got .*missing\.yaml.*readable"):
+        read_yaml(tmp_path / "missing.yaml", "suite")
+
+
+@pytest.mark.parametrize("cls", [InputError, NotApplicable])
+def test_errors_cross_process_borders(cls):
+    """An error keeps its type, field, value and expectation through pickle; long values are cut; one line always."""
+    error = pickle.loads(pickle.dumps(cls("field", 3, "four")))
+    assert type(error) is cls and (error.field, error.value, error.expected) == ("field", 3, "four")
+    assert str(error) == "field: got 3; expected four" and isinstance(error, ValueError)
+    assert len(str(InputError("f", "x" * 1000, "y"))) < 150
+    assert str(unknown("f", "ab", [])).endswith("nothing: none is registered")

@@ -1,0 +1,239 @@
+"""What the built-in attacks send and when, and what a learner is paid for."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+import tailgate
+from tailgate.agents import scripted
+from tailgate.core import Kind
+from tailgate.envs.faces import AdversaryVectorEnv
+from tailgate.errors import InputError, NotApplicable
+from tailgate.scenario import load_scenario
+from tailgate.trace import rollout
+
+K = 60
+
+
+@pytest.fixture(scope="module")
+def sends(short, play):
+    """The trace of a script against the Kalman filter, without an end at collisions; `seeds` rows."""
+
+    def run(name, seeds=4, threat=None, scenario="stop-and-go-v0", horizon=K, **params):
+        place = short(scenario, horizon=horizon, **({"onset": 1} | (threat or {})))
+        return play(place, "kf", tailgate.make_attack(name, **params), range(seeds), terminate=False)
+
+    return run
+
+
+def steps(trace, row=0):
+    """Steps (from 1) in which an attack took effect."""
+    return (np.flatnonzero(trace.kind[:, row]) + 1).tolist()
+
+
+def test_none_sends_nothing(sends):
+    """No command, none refused, every wire as sent."""
+    trace = sends("none")
+    assert not trace.kind.any() and not trace.refused.any()
+    np.testing.assert_array_equal(trace.wires, trace.clean)
+
+
+def test_a_window_of_time(sends):
+    """A script opens at start_step, or at the onset if that is later, and lasts `length` steps."""
+    assert steps(sends("fdi", start_step=20, length=5)) == [20, 21, 22, 23, 24]
+    assert steps(sends("fdi", start_step=20, length=5, threat={"onset": 30})) == [30, 31, 32, 33, 34]
+    assert steps(sends("fdi", start_step=50)) == list(range(50, K + 1))
+
+
+def test_a_script_never_asks_in_vain(sends):
+    """Budget, duration, cooldown and end silence a script: nothing is refused."""
+    trace = sends("fdi", threat={"budget": 9, "duration": 4, "cooldown": 2, "end": 40})
+    assert not trace.refused.any() and len(steps(trace)) == 9
+    trace = sends("fdi", start_step=30, threat={"end": 40})
+    assert not trace.refused.any() and steps(trace) == list(range(30, 41))
+
+
+@pytest.mark.parametrize("trigger, threshold", [("near", 60.0), ("closing", 1.0)])
+def test_a_window_of_the_road(trigger, threshold, sends):
+    """near: opens when the gap passes the threshold; closing: when the closing speed does; then stays open."""
+    trace = sends("dropout", trigger=trigger, threshold=threshold, length=30, scenario="braking-v0", horizon=400)
+    for row in range(4):
+        gap = np.concatenate([[np.nan], trace.gap[:-1, row, 0]])  # the road before the step
+        closing = np.concatenate([[np.nan], (trace.speed - trace.lead_speed)[:-1, row, 0]])
+        hit = gap < threshold if trigger == "near" else closing > threshold
+        first = int(np.argmax(hit)) + 1
+        assert hit.any() and first > 1
+        assert steps(trace, row) == list(range(first, first + 30))
+
+
+def test_constant_bias(sends):
+    """fdi adds its value to every granted wire, or to those it names."""
+    trace = sends("fdi", value=-7.0)
+    np.testing.assert_allclose(trace.wires[..., :2] - trace.clean[..., :2], -7.0, atol=1e-11)
+    trace = sends("fdi", value=3.0, targets=("velocity",))
+    np.testing.assert_array_equal(trace.wires[..., 0], trace.clean[..., 0])
+    np.testing.assert_allclose((trace.wires - trace.clean)[..., 1], 3.0, atol=1e-11)
+
+
+def test_ramp(sends):
+    """fdi_ramp adds rate, 2 rate, ... from the opening of its window, up to its limit and the threat model's bound."""
+    grown = -0.5 * np.arange(1, K + 1)
+    trace = sends("fdi_ramp", rate=-0.5, limit=8.0, targets=("position",))
+    np.testing.assert_array_equal(trace.value[:, 0, 0, 0], np.maximum(grown, -8.0))
+    trace = sends("fdi_ramp", rate=-0.5, threat={"fdi_bound": 6.0}, targets=("position",))
+    np.testing.assert_array_equal(trace.value[:, 0, 0, 0], np.maximum(grown, -6.0))
+    assert not trace.refused.any()
+
+
+def test_gaussian_injection(sends):
+    """fdi_gaussian has its mean and deviation, independent between wires, and never exceeds the bound."""
+    trace = sends("fdi_gaussian", seeds=200, mean=1.0, sd=3.0)
+    value = trace.value[..., 0, :2].reshape(-1, 2)
+    n = len(value)
+    assert np.max(np.abs(value.mean(axis=0) - 1.0)) < 5 * 3.0 / math.sqrt(n)
+    assert np.max(np.abs(value.std(axis=0) / 3.0 - 1)) < 5 / math.sqrt(2 * n)
+    assert abs(np.corrcoef(value.T)[0, 1]) < 5 / math.sqrt(n)
+    tight = sends("fdi_gaussian", sd=30.0, threat={"fdi_bound": 5.0})
+    assert np.max(np.abs(tight.value)) == 5.0 and not tight.refused.any()
+
+
+def test_bernoulli_injection(sends):
+    """fdi_bernoulli hits each wire by itself with its probability, always by the same value."""
+    trace = sends("fdi_bernoulli", seeds=200, probability=0.3, value=-2.0)
+    hit = trace.target[..., 0, :2].reshape(-1, 2)
+    n, share = len(hit), hit.mean(axis=0)
+    assert np.max(np.abs(share - 0.3)) < 5 * math.sqrt(0.21 / n)
+    assert abs((hit[:, 0] & hit[:, 1]).mean() - 0.09) < 5 * math.sqrt(0.0819 / n)
+    assert set(np.unique(trace.value)) == {-2.0, 0.0}
+
+
+def test_jammer(sends):
+    """dos_jam leaves uniform values of its range on every granted wire."""
+    trace = sends("dos_jam", seeds=200, low=-10.0, high=30.0)
+    heard = trace.wires[..., 0, :2].ravel()
+    n = heard.size
+    assert heard.min() >= -10.0 and heard.max() <= 30.0
+    assert abs(heard.mean() - 10.0) < 5 * 40 / math.sqrt(12 * n)
+    assert abs(heard.var() / (1600 / 12) - 1) < 5 * math.sqrt(0.8 / n)
+
+
+def test_hold(sends):
+    """dos_hold repeats the sample before its first step throughout; the drop-out lets the receiver know."""
+    trace = sends("dos_hold", start_step=20)
+    np.testing.assert_array_equal(trace.wires[19:, :, 0, :2], np.broadcast_to(trace.clean[18, :, 0, :2], (K - 19, 4, 2)))
+    fresh = sends("dos_hold", start_step=20, fresh=True, threat={"duration": 5})
+    assert set(np.unique(fresh.kind)) == {Kind.NONE, Kind.DOS_HOLD_FRESH}
+    second = next(k for k in steps(fresh) if k > 25)
+    np.testing.assert_array_equal(fresh.wires[second - 1, :, 0, :2], fresh.clean[second - 2, :, 0, :2])
+
+
+@pytest.mark.parametrize("kind, times", [("fdi", scripted.THESIS_FDI_STEPS), ("dos", scripted.THESIS_DOS_STEPS)])
+def test_thesis_times(kind, times, short, play):
+    """The attack steps of figures 4.5 and 4.6, on the case study they belong to."""
+    place = load_scenario("thesis-ch4-v0")
+    trace = play(place, "kf", tailgate.make_attack("thesis_times", kind=kind), range(50), terminate=False)
+    assert steps(trace) == list(times) and not trace.refused.any()
+    value = trace.value[np.array(times) - 1][..., :2]
+    low, high = (0.0, 77.0) if kind == "fdi" else (-108.0, 108.0)
+    assert low <= value.min() < low + 3 and high - 3 < value.max() <= high
+
+
+def test_stealth_needs_a_white_box(short, play):
+    """Without the knowledge it says so; against a defence without an innovation the pairing has no meaning."""
+    with pytest.raises(InputError, match=r"threat_model\.knowledge: got 'black'; expected white"):
+        play(short(), "kf", tailgate.make_attack("stealth"), [0])
+    with pytest.raises(NotApplicable, match="look"):
+        play(short(), "none", "stealth", [0])
+
+
+@pytest.mark.parametrize("state, sign", [(0, -1), (0, 1), (1, 1), (2, -1)])
+def test_stealth_pushes_the_state_it_names(state, sign, short, play):
+    """Each direction is pushed in its sense, without an alarm."""
+    place = short(horizon=40, fdi_bound=1e4, knowledge="white")
+    trace = play(place, "chi2_kf", tailgate.make_attack("stealth", state_index=state, sign=sign), range(8), terminate=False)
+    error = (trace.estimate - trace.truth)[-1, :, 0, state] * sign
+    assert error.min() > 0.1 and not trace.alarm[9:].any()
+
+
+@pytest.mark.parametrize("bad", [{"targets": ("speed",)}, {"targets": ("position", "sonar")}])
+def test_unknown_targets_are_refused(bad, short):
+    """A script names wires that exist."""
+    with pytest.raises(InputError, match=r"attack targets.*position, velocity"):
+        tailgate.make_attack("fdi", **bad).prepare(short().brief())
+
+
+def test_an_inverted_jammer_is_refused():
+    """low above high is an input error that names the field."""
+    with pytest.raises(InputError, match=r"dos_jam\.low: got 2\.0; expected at most high \(1\.0\)"):
+        tailgate.make_attack("dos_jam", low=2.0, high=1.0)
+
+
+def _episode(interval=1, **options):
+    """Two environments with the same episodes, with shaping and without it: first themselves, then a pair of outputs per step."""
+    envs = []
+    for extra in ({}, {"gap_shaping": 0.0, "error_shaping": 0.0}):
+        options |= {"scenario": "gusty-stop-and-go-v0", "value": -20.0, "interval": interval}
+        env = AdversaryVectorEnv(8, autoreset="disabled", **options, **extra)
+        env.seat = dataclasses.replace(env.seat, loop=dataclasses.replace(env.seat.loop, horizon=240))
+        env.reset(seed=0)
+        envs.append(env)
+    yield envs, None
+    rng = np.random.default_rng(0)
+    while True:
+        actions = rng.integers(0, envs[0].seat.action.size, 8)
+        pair = [env.step(actions) for env in envs]
+        yield envs, pair
+        if (pair[0][2] | pair[0][3]).any():
+            return
+
+
+@pytest.mark.parametrize("interval", [1, 5])
+@pytest.mark.parametrize("reward", ["collision", "min_gap", "error", "stealth"])
+def test_shaping_telescopes(reward, interval):
+    """The discounted sum of what shaping adds is gamma^T Phi(end) - Phi(start), Phi(end) = 0 at a collision: no policy gains."""
+    total, discount = np.zeros(8), 1.0
+    episode = _episode(reward=reward, gamma=0.97, interval=interval)
+    (shaped, _), _ = next(episode)
+    start = shaped._potential.copy()
+    assert start.min() > 0.05
+    for _, (one, two) in episode:
+        total += discount * (one[1] - two[1])
+        discount *= 0.97
+        terminated = one[2]
+    end = np.where(terminated, 0.0, shaped._potential)
+    np.testing.assert_allclose(total, discount * end - start, atol=1e-12)
+
+
+@pytest.mark.parametrize("interval", [1, 5])
+def test_raw_rewards(interval):
+    """collision pays 1 at a crash; min_gap also the fall of the smallest gap below 20 m, over 20 m; error and stealth per second."""
+    paid = {name: np.zeros(8) for name in ("collision", "min_gap", "error", "stealth")}
+    for name in paid:
+        least, alarms, crashed = np.full(8, 20.0), np.zeros(8), np.zeros(8, bool)
+        episode = _episode(reward=name, interval=interval)
+        (_, bare), _ = next(episode)
+        for _, (_, two) in episode:
+            paid[name] += two[1]
+            crashed |= two[2]
+            least = np.minimum(least, bare.frame.scene.gap[:, 0])
+            alarms += 0.1 * bare.frame.estimate.alarm[:, 0]
+        if name == "collision":
+            np.testing.assert_array_equal(paid[name], crashed.astype(float))
+        if name == "min_gap" and interval == 1:
+            np.testing.assert_allclose(paid[name], crashed + 1.0 - np.maximum(least, 0.0) / 20.0, atol=1e-12)
+    assert (paid["error"] > 0).all()
+    if interval == 1:
+        np.testing.assert_allclose(paid["error"] - paid["stealth"], alarms, atol=1e-9)
+
+
+def test_rollout_stops_when_all_have_crashed(short, loop_of):
+    """With termination the trace ends with the last collision; without, at the horizon."""
+    attack = tailgate.make_attack("fdi", value=-50.0)
+    loop = loop_of(short("braking-v0", horizon=600), "none")
+    held = tailgate.draws.keys("train", range(4))
+    ended, full = rollout(loop, attack, held), rollout(loop, attack, held, terminate=False)
+    assert len(ended.kind) == ended.length.max() < 600 == len(full.kind)
+    last = ended.length - 1
+    assert (ended.collided | ended.rear_collided)[last, range(4)].all()
