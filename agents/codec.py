@@ -199,9 +199,9 @@ class Reward:
     """Reward presets. Scores never use them: they use raw outcomes.
 
     collision: 1 at a collision in front or behind. min_gap: the same, and the metres by which the smallest gap of the episode falls
-    below 20 m, over 20 m: a burst at the right moment earns something long before it makes a collision. error: |position error| / 10 m, capped at 1, per second. stealth: error, less one
-    per second of alarm. The shaping terms are potential-based (Ng, Harada, Russell 1999): they leave the best policy unchanged
-    when `gamma` is the learner's, and may use the truth, which the policy itself does not see.
+    below 20 m, over 20 m: a burst at the right moment earns something long before it makes a collision. error: |position error| / 10 m,
+    capped at 1, per second. stealth: error, less one per second of alarm. The shaping terms are potential-based (Ng, Harada, Russell
+    1999): they leave the best policy unchanged when `gamma` is the learner's, and may use the truth, which the policy does not see.
     """
 
     reward: RewardName = param("min_gap", "collision, min_gap, error or stealth")
@@ -220,9 +220,7 @@ class Reward:
         """(B,) smallest gap so far, within [0, NEAR], from a gap (B, N) and the smallest one before [m]."""
         return np.asarray(np.minimum(np.clip(np.min(gap, axis=1), 0.0, NEAR), before))
 
-    def __call__(
-        self, dt: float, error: Array, alarm: Array, crashed: Array, refused: Array, fall: Array
-    ) -> Array:
+    def __call__(self, dt: float, error: Array, alarm: Array, crashed: Array, refused: Array, fall: Array) -> Array:
         """(B,) reward of one step of the loop: |error| (B, N) [m], alarm (B, N), fall (B,) of the smallest gap [m]."""
         out = -self.illegal_penalty * refused.astype(np.float64)
         if self.reward in ("collision", "min_gap"):

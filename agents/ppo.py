@@ -50,6 +50,12 @@ class PPOConfig:
     hidden: tuple[PositiveCount, ...] = param((64, 64), "widths of the hidden layers")
     rest: Probability = param(0.1, "initial probability of attacking in a step: a policy that spends its budget at once learns no timing")
 
+    def check(self) -> None:
+        """Raise InputError when the fields do not fit each other."""
+        samples = self.envs * self.rollout
+        if samples % self.batch_size:
+            raise InputError("ppo.batch_size", self.batch_size, f"a divisor of envs x rollout ({samples})")
+
 
 @dataclass(frozen=True)
 class Progress:
@@ -65,9 +71,7 @@ class Learner:
 
     def __init__(self, seed: int, gamma: float, config: PPOConfig, environment: dict[str, Any], tensorboard: Path | None = None) -> None:
         torch.set_num_threads(1)  # more threads gain nothing on networks of this size
-        samples = config.envs * config.rollout
-        if samples % config.batch_size:
-            raise InputError("ppo.batch_size", config.batch_size, f"a divisor of envs x rollout ({samples})")
+        config.check()
         self.seed, self.config = seed, config
         # rows of different training seeds never share an episode
         self.env = BatchVecEnv(config.envs, seed=seed * 1_000_000, gamma=gamma, **environment)
@@ -131,8 +135,8 @@ class Learner:
         arrays: dict[str, Any] = {f"loop.{k}": v for k, v in leaves(batch.state).items()}
         _, words, position, _, _ = np.random.get_state()  # noqa: NPY002 - Stable-Baselines3 shuffles with it
         arrays |= {
-            "env.potential": batch._potential, "env.least": batch._least, "env.returns": self.env._returns, "env.lengths": self.env._lengths,
-            "last_obs": model._last_obs, "last_starts": model._last_episode_starts, "numpy": words,
+            "env.potential": batch._potential, "env.least": batch._least,
+            "env.returns": self.env._returns, "env.lengths": self.env._lengths, "last_obs": model._last_obs, "last_starts": model._last_episode_starts, "numpy": words,
         }  # fmt: skip
         for name, array in arrays.items():
             whole = np.array(array, order="C")  # torch has no unsigned integers of 32 and 64 bits: keep their bits

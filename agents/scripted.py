@@ -202,7 +202,7 @@ class ThesisTimes:
 @register("attack", "stealth", knowledge="white", reference="Dutta 2018, Theorem 4.5.3")
 @dataclass(frozen=True)
 class Stealth(Script):
-    """White box: each step moves the estimate as far along one state as the gate lets through, and never alarms.
+    """White box: each step moves the estimate as far along one state as the gate lets through; no attacked step alarms.
 
     With e the direction and every sensor granted, the innovation is driven to r = s sqrt(g) S K' e / sqrt(e' K S K' e), just inside the
     gate g; with fewer wires, to the farthest point that those reach.

@@ -97,7 +97,7 @@ def measure(repeats: int) -> dict[str, float]:
         f"loop with attack, chi2_kf, {EPISODES} episodes": plain_loop("chi2_kf", EPISODES, 50),
         f"loop with attack, kf, {EPISODES} episodes": plain_loop("kf", EPISODES, 50),
         f"loop with attack, none, {EPISODES} episodes": plain_loop("none", EPISODES, 50),
-        f"loop with attack, chi2_kf, 256 episodes": plain_loop("chi2_kf", 256, 200),
+        "loop with attack, chi2_kf, 256 episodes": plain_loop("chi2_kf", 256, 200),
         f"make_vec, chi2_kf, {EPISODES} environments": vector_env(EPISODES, 50),
         "make, chi2_kf": single_env(300),
     }  # fmt: skip

@@ -181,7 +181,8 @@ class AdversaryVectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
             raw += np.where(live, gained, 0.0)
             potential = np.where(live, seat.reward.potential(frame.scene.gap, error), potential)
             self._least = least
-            collided, rear, illegal = collided | (frame.collided & live), rear | (frame.rear_collided & live), illegal | (frame.refused & live)
+            collided, rear = collided | (frame.collided & live), rear | (frame.rear_collided & live)
+            illegal = illegal | (frame.refused & live)
         terminated = self.state.ended & ~over
         truncated = ~terminated & ~over & (self.state.k > loop.horizon)
         reward = np.where(over, 0.0, seat.reward.shaped(raw, self._potential, potential, terminated))

@@ -98,6 +98,7 @@ for update in range(1, max(1, args.steps // (args.envs * args.rollout)) + 1):
     if ended:
         steps = update * args.envs * args.rollout
         rate = steps / (time.perf_counter() - started)
-        print(f"{steps / 1e6:6.2f} M steps  {rate / 1e3:5.0f} k steps/s  collisions in {100 * crashed / ended:5.1f} % of {ended} episodes", flush=True)
+        share = f"collisions in {100 * crashed / ended:5.1f} % of {ended} episodes"
+        print(f"{steps / 1e6:6.2f} M steps  {rate / 1e3:5.0f} k steps/s  {share}", flush=True)
         ended = crashed = 0
 envs.close()

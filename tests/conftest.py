@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from hypothesis import settings
 
 import tailgate
 from tailgate.core import Model
@@ -12,6 +13,9 @@ from tailgate.registry import entries
 from tailgate.scenario import load_scenario
 from tailgate.trace import rollout
 from tailgate.tree import leaves
+
+settings.register_profile("steady", deadline=None, derandomize=True)  # machines differ in speed, and a suite shall repeat
+settings.load_profile("steady")
 
 
 def _same_bits(a, b):

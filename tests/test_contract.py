@@ -1,5 +1,6 @@
 """One contract over the registry: whatever is registered, plug-ins included, obeys the same laws."""
 
+import contextlib
 import dataclasses
 
 import numpy as np
@@ -225,6 +226,43 @@ def test_a_defence_gets_only_what_its_card_declares(defence, short):
 
     rollout(short().loop(Spy(), uses), tailgate.make_attack("fdi"), keys("train", [0]))
     assert all((r.v2v is not None) == ("v2v" in uses) and (r.attacked is not None) == ("truth" in uses) for r in seen)
+
+
+def _scribble(tree):
+    """Write into every array that can be written; read-only ones are as good as untouched."""
+    for leaf in leaves(tree).values():
+        with contextlib.suppress(ValueError):
+            leaf[...] = ~leaf if leaf.dtype == bool else 1
+
+
+@pytest.mark.parametrize("knowledge", ["black", "grey", "white"])
+def test_an_attack_cannot_write_through_its_view(knowledge, short, loop_of):
+    """The channel is the only way: an attack that scribbles over all that it is shown changes nothing of the episode."""
+    loop = loop_of(short(knowledge=knowledge, sees_measurement=True), "chi2_kf")
+
+    class Vandal(type(tailgate.make_attack("none"))):
+        def decide(self, plan, state, view, draws):
+            _scribble(view._replace(defence=None))
+            return super().decide(plan, state, view, draws)
+
+    plain, vandal = (rollout(loop, a, keys("train", range(3)), terminate=False) for a in (tailgate.make_attack("none"), Vandal()))
+    assert [plain.trace_hash(i) for i in range(3)] == [vandal.trace_hash(i) for i in range(3)]
+
+
+def test_a_defence_cannot_write_into_the_record(short):
+    """A defence that scribbles over what it received, after use, changes neither the record nor what the controller hears."""
+
+    class Vandal(type(tailgate.make_defence("kf"))):
+        def step(self, plan, state, received, known_u, draws):
+            out = super().step(plan, state, received, known_u.copy(), draws)
+            _scribble((received, known_u))
+            return out
+
+    plain, vandal = (
+        rollout(short().loop(d, ("measurements", "v2v")), tailgate.make_attack("fdi"), keys("train", range(3)), terminate=False)
+        for d in (tailgate.make_defence("kf"), Vandal())
+    )
+    assert [plain.trace_hash(i) for i in range(3)] == [vandal.trace_hash(i) for i in range(3)]
 
 
 @pytest.mark.parametrize("family, name", [(f, n) for f in FAMILIES for n in entries(f)])

@@ -127,13 +127,10 @@ def test_next_step_same_step_and_disabled_are_one_core(brief_scenario, same_bits
     """NEXT_STEP spends a step on the reset, SAME_STEP reports the last observation as final_obs, DISABLED waits for a mask."""
     modes = ("next_step", "same_step", "disabled")
     faces = {mode: AdversaryVectorEnv(6, autoreset=mode, scenario=brief_scenario, value=-20.0) for mode in modes}
-    assert [face.metadata["autoreset_mode"] for face in faces.values()] == [
-        AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP, AutoresetMode.DISABLED,
-    ]  # fmt: skip
-    for face in faces.values():
+    for mode, face in faces.items():
+        assert face.metadata["autoreset_mode"] == AutoresetMode[mode.upper()]
         face.reset(seed=3)
-    rng = np.random.default_rng(0)
-    ended = 0
+    rng, ended = np.random.default_rng(0), 0
     for _ in range(120):
         actions = rng.integers(0, faces["disabled"].seat.action.size, 6)
         plain = faces["disabled"].step(actions)
@@ -210,8 +207,7 @@ def test_masks_are_what_the_channel_accepts(action, brief_scenario):
         assert np.array_equal(info["illegal"][~over], ~legal[~over])
         took = vec.frame.command.kind != Kind.NONE
         assert np.array_equal(took[~over], (legal & (actions != 0))[~over])
-        for ok in (True, False):
-            seen[ok] += int((legal[~over] == ok).sum())
+        seen = {ok: n + int((legal[~over] == ok).sum()) for ok, n in seen.items()}
     assert min(seen.values()) > 100
 
 
@@ -285,11 +281,10 @@ def test_bad_arguments_name_field_value_and_expectation(arguments, words):
 def test_bad_calls_are_refused(brief_scenario):
     """A step before the reset, wrong shapes, numbers out of range, NaN."""
     env, box = AdversaryEnv(scenario=brief_scenario), AdversaryEnv(scenario=brief_scenario, action="continuous")
-    for early in (lambda: env.step(0), lambda: env.action_masks()):
+    for early in (lambda: env.step(0), env.action_masks):
         with pytest.raises(InputError):
             early()
-    env.reset(seed=0)
-    box.reset(seed=0)
+    _ = env.reset(seed=0), box.reset(seed=0)
     size = env.action_space.n
     for bad, words in ((size, f"0 to {size - 1}"), (-1, "whole"), (0.5, "whole"), ([0], "shape"), (np.nan, "whole")):
         with pytest.raises(InputError, match=f"actions.*{words}"):

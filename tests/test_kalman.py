@@ -192,18 +192,21 @@ def test_stealth_reaches_the_gate_and_never_alarms(eta, short, play):
     assert (trace.estimate[-1, :, 0, 0] - trace.truth[-1, :, 0, 0]).max() < -5.0
 
 
-def test_stealth_that_meets_the_injection_bound_never_alarms(short, play):
-    """When the threat model's bound is reached, the attack goes no further than it can keep hidden."""
+def test_stealth_that_meets_the_injection_bound_keeps_still_rather_than_alarm(short, play):
+    """No attacked step alarms, also where the threat model's bound no longer hides what was injected before."""
     trace = play(short(horizon=90, fdi_bound=10.0), "chi2_kf", "stealth", range(16), terminate=False)
     assert 9.0 < np.max(np.abs(trace.value)) <= 10.0
-    assert (trace.kind != 0)[9:].mean() > 0.9 and not trace.alarm[9:].any()
+    assert (trace.kind != 0)[9:20].all() and not trace.alarm[trace.kind != 0].any()
 
 
-def test_stealth_on_one_granted_wire_never_alarms(short, play):
-    """An attacker who may touch the position alone still stays under the gate."""
-    trace = play(short(horizon=90, fdi_bound=1e4, targets=("position",)), "chi2_kf", "stealth", range(16), terminate=False)
-    assert (trace.kind != 0)[9:].mean() > 0.9 and not trace.target[..., 1].any()
-    assert not trace.alarm[9:].any()
+@pytest.mark.parametrize("wire", [0, 1])
+def test_stealth_on_one_granted_wire(wire, short, play):
+    """With one wire alone: no attacked step alarms, each reaches the gate, and the belief is pushed backwards."""
+    place = short(horizon=90, fdi_bound=1e4, targets=(("position", "velocity")[wire],))
+    trace = play(place, "chi2_kf", "stealth", range(16), terminate=False)
+    on = trace.kind != 0
+    assert on[9:15].all() and not trace.target[..., 1 - wire].any()
+    assert not trace.alarm[on].any() and np.max(np.abs(trace.score[on] - 20.0)) < 1e-6
     assert (trace.estimate[-1, :, 0, 0] - trace.truth[-1, :, 0, 0]).max() < -1.0
 
 

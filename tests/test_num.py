@@ -63,6 +63,17 @@ def test_sine_and_cosine_of_turns():
     assert [kernels._sincos_turn(v) for v in (0.0, 0.25, 0.5, 0.75)] == [(0.0, 1.0), (1.0, 0.0), (0.0, -1.0), (-1.0, 0.0)]
 
 
+@pytest.mark.parametrize("size", [1, 9])
+def test_no_floating_point_flags(size):
+    """exp and tanh of anything and log of any positive number raise no warning, also in vectorised loops."""
+    with np.errstate(all="raise"):
+        for x in (0.0, 1.0, -1.0, 700.0, 1e5, -1e5, np.inf, -np.inf):
+            num.exp(np.full(size, x))
+            num.tanh(np.full(size, x))
+        for x in (5e-324, 1e-310, 1.0, 1e300, 1.7976931348623157e308, np.inf):
+            num.log(np.full(size, x))
+
+
 @given(st.floats(allow_nan=True, allow_infinity=True))
 def test_compiled_functions_equal_their_python_source(x):
     """Compilation changes no bit of exp, log and tanh."""

@@ -58,7 +58,8 @@ def shelf(monkeypatch):
 SPECS = [
     ("defence", "kf", Kalman()), ("defence", "chi2_kf", GatedKalman(20.0)), ("defence", "chi2_kf:eta=7", GatedKalman(7.0)),
     ("defence", "chi2_kf:eta=1e12", GatedKalman(1e12)), ("defence", "chi2_kf: eta = 7.5", GatedKalman(7.5)),
-    ("defence", "tailgate.estimators:GatedKalman", GatedKalman(20.0)), ("defence", "tailgate.estimators:GatedKalman:eta=3", GatedKalman(3.0)),
+    ("defence", "tailgate.estimators:GatedKalman", GatedKalman(20.0)),
+    ("defence", "tailgate.estimators:GatedKalman:eta=3", GatedKalman(3.0)),
     ("attack", "fdi:value=-4,length=10", tailgate.make_attack("fdi", value=-4.0, length=10)),
     ("attack", "fdi:targets=[position,velocity],value=2", tailgate.make_attack("fdi", targets=("position", "velocity"), value=2.0)),
     ("attack", "fdi:targets=[velocity]", tailgate.make_attack("fdi", targets=("velocity",))),
@@ -158,7 +159,7 @@ def test_a_plug_in_cannot_take_a_built_in_name(shelf, plugin, monkeypatch):
     """The clash is reported whenever the family is asked for, and the built-in one stays."""
     _points(monkeypatch, "tailgate.estimators", kf=f"{plugin}:Mine")
     for _ in range(2):
-        with pytest.raises(InputError, match="'kf'.*not taken"):
+        with pytest.raises(InputError, match=r"'kf'.*not taken"):
             tailgate.list_defences()
     assert registry._entries["defence"]["kf"].cls is Kalman
 
@@ -200,7 +201,8 @@ def test_canonical_text_is_stable(tmp_path):
 def test_built_values_have_the_declared_types():
     """An int for a float, a list for a tuple: the same canonical text as in Python; unknown and bad fields are named."""
     assert canonical(build(Sample, {"b": 3, "a": [4]}, "sample")) == canonical(Sample(b=3.0, a=(4,)))
-    for data, message in (({"bb": 1}, r"sample: unknown field: got 'bb'.*did you mean"), ({"b": 0}, r"sample\.b: got 0"), ({"a": 3}, r"sample\.a")):
+    bad = {"bb": r"sample: unknown field: got 'bb'", "b": r"sample\.b: got 0", "a": r"sample\.a: got 0", "c": r"sample\.c: got 0"}
+    for data, message in (({name: 0}, message) for name, message in bad.items()):
         with pytest.raises(InputError, match=message):
             build(Sample, data, "sample")
 
@@ -229,7 +231,10 @@ def test_overrides():
             override(data, [bad])
 
 
-@pytest.mark.parametrize("text, message", [("a: [", "valid YAML"), ("- 1", "mapping"), ("a: !!python/object/apply:os.getcwd []", "valid YAML")])
+UNSAFE = "a: !!python/object/apply:os.getcwd []"
+
+
+@pytest.mark.parametrize("text, message", [("a: [", "valid YAML"), ("- 1", "mapping"), (UNSAFE, "valid YAML")])
 def test_yaml_is_read_safely(text, message, tmp_path):
     """Broken YAML, a list and a tag that would run code are input errors; so is a missing file."""
     (tmp_path / "x.yaml").write_text(text)

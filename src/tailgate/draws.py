@@ -6,6 +6,7 @@ parties have unrelated keys: what a defence or an attack holds tells nothing of 
 """
 
 import hashlib
+import math
 from collections.abc import Sequence
 from enum import IntEnum
 from typing import Any, NamedTuple
@@ -72,7 +73,7 @@ class Draws(NamedTuple):
     stream: int
 
     def _fill(self, fill: Any, shape: tuple[int, ...], tag: int) -> Array:
-        size = int(np.prod(shape, dtype=np.int64))
+        size = math.prod(shape)
         out = np.empty((size, len(self.key)))
         fill(np.ascontiguousarray(self.key), self.episode, self.step, self.stream << 16 | tag, out)
         return np.moveaxis(out.reshape(*shape, len(self.key)), -1, 0)

@@ -8,7 +8,7 @@ class InputError(ValueError):
     """Bad input: names the field, the value and what was expected, in one line."""
 
     def __init__(self, field: str, value: object, expected: str) -> None:
-        shown = repr(value)
+        shown = " ".join(repr(value).split())
         shown = shown if len(shown) <= 120 else shown[:117] + "..."
         super().__init__(f"{field}: got {shown}; expected {expected}")
         self.field, self.value, self.expected = field, value, expected

@@ -27,7 +27,7 @@ from tailgate.core import Array, Estimate, Model, Prior, Received
 from tailgate.errors import InputError, NotApplicable
 from tailgate.files import writable_directory, write_atomic
 from tailgate.metrics import METRICS, measure
-from tailgate.registry import Entry, Spec, entry_for
+from tailgate.registry import Entry, Spec, entry_for, text_of
 from tailgate.scenario import Scenario, Suite, load_scenario, load_suite
 from tailgate.schema import as_data, canonical
 from tailgate.trace import rollout
@@ -102,7 +102,7 @@ def _component(family: Any, value: Any) -> tuple[Any, Any, str]:
         spec = Spec(family, value)
         return spec.make(), spec.entry, value
     entry = entry_for(family, type(value))
-    return value, entry, f"{entry.name}:{canonical(value)}"
+    return value, entry, text_of(entry, value)
 
 
 def run_cell(cell: Cell, defence: Any = None, attack: Any = None) -> list[dict[str, Any]]:
@@ -110,7 +110,7 @@ def run_cell(cell: Cell, defence: Any = None, attack: Any = None) -> list[dict[s
     guard, guard_entry, _ = _component("defence", cell.defence if defence is None else defence)
     rival, rival_entry, _ = _component("attack", cell.attack if attack is None else attack)
     place = cell.place(rival, rival_entry.knowledge)
-    head = _head(cell, place, guard_entry, rival_entry)
+    head = _head(cell, place, guard_entry, rival_entry, cell_id(cell) if defence is None and attack is None else "")
     seeds = list(_seeds(cell))
     rows: list[dict[str, Any]] = []
     for start in range(0, cell.seeds, cell.batch):
@@ -136,14 +136,14 @@ def _seeds(cell: Cell) -> range:
     return range(cell.first_seed, cell.first_seed + cell.seeds)
 
 
-def _head(cell: Cell, place: Scenario, guard: Entry, rival: Entry) -> dict[str, Any]:
+def _head(cell: Cell, place: Scenario, guard: Entry, rival: Entry, identity: str) -> dict[str, Any]:
     threat = place.threat_model
     return {
         "suite": cell.suite, "scenario": place.name, "threat_model": as_data(threat), "dose": threat.budget,
         "knowledge": threat.knowledge, "defence": cell.defence, "uses": list(guard.uses), "attack": cell.attack,
         "learned": rival.name == "policy", "optimal": rival.optimal, "purpose": cell.purpose, "batch": cell.batch,
         "engine": ENGINE, "versions": {"defence": guard.version, "attack": rival.version},
-        "config_hash": place.config_hash, "version": tailgate.__version__, "cell": cell_id(cell),
+        "config_hash": place.config_hash, "version": tailgate.__version__, "cell": identity,
     }  # fmt: skip
 
 
@@ -156,7 +156,7 @@ def _failed(head: dict[str, Any], seeds: Iterable[int], reason: str, status: str
 def failed_rows(cell: Cell, reason: str) -> list[dict[str, Any]]:
     """The rows of a cell that could not be played."""
     rival, entry = Spec("attack", cell.attack).make(), Spec("attack", cell.attack).entry
-    head = _head(cell, cell.place(rival, entry.knowledge), Spec("defence", cell.defence).entry, entry)
+    head = _head(cell, cell.place(rival, entry.knowledge), Spec("defence", cell.defence).entry, entry, cell_id(cell))
     return _failed(head, _seeds(cell), reason)
 
 
@@ -170,17 +170,18 @@ def cell_id(cell: Cell) -> str:
 
 def cells_of(suite: Suite, *, batch: int = 256, purpose: str = "report", threat: dict[str, Any] | None = None) -> list[Cell]:
     """Every cell of a suite, in its order. Raises InputError for anything that does not exist."""
+    if purpose not in draws.PURPOSES:
+        raise InputError("purpose", purpose, f"one of {', '.join(draws.PURPOSES)}")
     changes = dict(threat or {}) | ({} if suite.knowledge is None else {"knowledge": suite.knowledge})
     out = [
         Cell(suite.name, scenario, dose, defence, attack, suite.seeds, purpose, 0, batch, changes)
         for scenario in suite.scenarios for dose in suite.doses for defence in suite.defences for attack in suite.attacks
     ]  # fmt: skip
-    for name in suite.defences:
-        Spec("defence", name).make()
     for cell in out:
-        spec = Spec("attack", cell.attack)
+        spec, guard = Spec("attack", cell.attack), Spec("defence", cell.defence)
         rival = spec.make()
-        rival.prepare(cell.place(rival, spec.entry.knowledge).brief())
+        place = cell.place(rival, spec.entry.knowledge)
+        rival.prepare(place.loop(guard.make(), guard.entry.uses).brief)
     return out
 
 

@@ -23,7 +23,8 @@ _jit = numba.njit(cache=True, fastmath=False, error_model="numpy")
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
 def _exp(x: float) -> float:
-    y = min(max(x, -708.0), 709.7) if x == x else 0.0  # what is computed raises no flag, whatever x is
+    z = x if x == x else 0.0
+    y = min(max(z, -708.0), 709.7)  # what is computed raises no flag, whatever x is
     n = math.floor(y * LOG2_E + 0.5)
     r = (y - n * LN2_HI) - n * LN2_LO
     p = 1.0 / 6227020800.0
@@ -43,9 +44,9 @@ def _exp(x: float) -> float:
     p = p * np.int64((np.int64(n) + 1022) << 52).view(np.float64) * 2.0  # 2**n in two exact steps: n may be 1024
     if x != x:
         return x
-    if x > 709.7:
+    if z > 709.7:
         return math.inf
-    return p if x >= -708.0 else 0.0  # below the normal range: flushed, no denormals on the scored path
+    return p if z >= -708.0 else 0.0  # below the normal range: flushed, no denormals on the scored path
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
@@ -54,9 +55,9 @@ def _log(x: float) -> float:
         return -math.inf if x == 0.0 else math.nan
     if x == math.inf:
         return x
-    e = np.int64(0)
-    if x < 2.2250738585072014e-308:  # denormal: scale it up first
-        x, e = x * 18014398509481984.0, np.int64(-54)
+    small = x < 2.2250738585072014e-308  # denormal: scale it up first
+    e = np.int64(-54) if small else np.int64(0)
+    x = x * (18014398509481984.0 if small else 1.0)
     bits = np.float64(x).view(np.int64)
     e += ((bits >> 52) & 0x7FF) - 1022
     m = np.int64((bits & 0x000FFFFFFFFFFFFF) | 0x3FE0000000000000).view(np.float64)  # in [1/2, 1)
@@ -115,7 +116,7 @@ def _sincos_turn(u: float) -> tuple[float, float]:
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
 def _tanh(x: float) -> float:
-    """Absolute error below 3e-16."""
+    """Absolute error below 4e-16."""
     if x > 20.0:
         return 1.0
     if x < -20.0:

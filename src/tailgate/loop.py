@@ -34,7 +34,7 @@ from tailgate.core import (
 )  # fmt: skip
 from tailgate.draws import Keys, Role
 from tailgate.threat import Brief, Channel, ChannelPlan, ChannelState, ThreatModel
-from tailgate.tree import duplicate, put_rows
+from tailgate.tree import duplicate, frozen, put_rows
 
 _START = np.uint32(0xFFFFFFFF)  # the step under which start() draws: no episode reaches it
 
@@ -155,11 +155,12 @@ class Loop:
         if threat.knowledge in ("grey", "white"):
             view = view._replace(control=state.known_u)
         if threat.knowledge == "white":
-            box = WhiteBox(self.defence, plan.defence, duplicate(state.defence), state.known_u)
+            box = WhiteBox(self.defence, plan.defence, duplicate(state.defence), frozen(state.known_u))
             view = view._replace(defence=box, estimate=state.estimate, truth=self.plant.truth(plan.plant, state.plant))
         if threat.sees_measurement or threat.knowledge == "white":
             view = view._replace(received=state.received)
-        return view
+        shown: View = frozen(view._replace(defence=None))  # an attack looks; the channel alone acts
+        return shown._replace(defence=view.defence)
 
     def advance(self, state: LoopState, command: Command) -> tuple[LoopState, Frame]:
         """The rest of the step: channel, defence, controller, plant, and the next measurement."""
@@ -172,7 +173,7 @@ class Loop:
             attacked=received.attacked if "truth" in self.uses else None,
         )
         defence, estimate = self.defence.step(
-            plan.defence, state.defence, heard, state.known_u, state.keys.at(Role.DEFENCE, state.k)
+            plan.defence, state.defence, frozen(heard), frozen(state.known_u), state.keys.at(Role.DEFENCE, state.k)
         )
         truth = self.plant.truth(plan.plant, state.plant)
         assert received.v2v is not None

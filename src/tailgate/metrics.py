@@ -185,7 +185,7 @@ def distance_travelled(trace: Trace) -> Array:
 @metric("m/s^2")
 def max_decel(trace: Trace) -> Array:
     """Hardest braking of the car."""
-    return np.asarray(np.max(np.where(trace.live, -_front(trace, "accel"), 0.0), axis=0))
+    return np.asarray(np.max(np.where(trace.live, np.maximum(-_front(trace, "accel"), 0.0), 0.0), axis=0))
 
 
 @metric("m/s^3")

@@ -7,6 +7,7 @@ from `module:Class` on the command line, or as objects in Python. A configuratio
 import hashlib
 import importlib
 import inspect
+import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.metadata import entry_points
@@ -87,9 +88,9 @@ def _load(family: Family) -> dict[str, Entry]:
     importlib.import_module(_MODULES[family])
     group = _GROUPS.get(family)
     if group and group not in _plugins_loaded:
-        _plugins_loaded.add(group)
         for point in entry_points(group=group):
             put(entry_of(family, point.name, point.load()))
+        _plugins_loaded.add(group)  # only now: a plug-in that fails shall fail again, not vanish
     return _entries[family]
 
 
@@ -108,6 +109,15 @@ def entry_for(family: Family, cls: type) -> Entry:
         if entry.cls is cls:
             return entry
     return entry_of(family, cls.__name__, cls)
+
+
+def text_of(entry: Entry, value: Any) -> str:
+    """The text that names this object on a command line, as far as one can."""
+    cls = type(value)
+    name = entry.name if _entries[entry.family].get(entry.name) is entry else f"{cls.__module__}:{cls.__qualname__}"
+    params = as_data(value)
+    shown = ",".join(f"{key}={json.dumps(params[key])}" for key in params) if isinstance(params, dict) else ""
+    return f"{name}:{shown}" if shown else name
 
 
 def entries(family: Family) -> dict[str, Entry]:
@@ -176,7 +186,7 @@ class Spec:
         module, _, name = head.partition(":")
         try:
             cls = getattr(importlib.import_module(module), name)
-        except ImportError as error:
+        except (ImportError, ValueError, TypeError) as error:  # also an empty or relative module name
             raise InputError(self.family, self.text, f"an importable module ({error})") from None
         except AttributeError:
             raise InputError(self.family, self.text, f"a class that module {module} defines") from None

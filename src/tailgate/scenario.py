@@ -38,12 +38,12 @@ class Scenario:
             self.plant, self.sensor, self.controller, self.manoeuvre, self.threat_model, self.horizon, defence, uses,
             self.ends_on_collision,
         )  # fmt: skip
-        _ = loop.brief.granted  # refuses unknown targets here, not in the first step
+        _ = loop.plan  # refuses what does not fit (unknown targets, a damaged profile) here, not in the first step
         return loop
 
     def brief(self) -> Brief:
-        model = self.plant.model(*self.sensor.matrices())
-        return Brief(model, self.threat_model, self.horizon)
+        """What an attacker knows before the episode."""
+        return Brief(self.plant.model(*self.sensor.matrices()), self.threat_model, self.horizon)
 
     def with_threat(self, **changes: Any) -> Scenario:
         """The same scenario under a changed threat model."""

@@ -67,7 +67,8 @@ def as_data(value: Any) -> Any:
         return value
     if isinstance(value, Path):  # what the file says counts, not where it lies
         return f"{value.name}#{hashlib.sha256(value.read_bytes()).hexdigest()[:16]}" if value.is_file() else value.name
-    return repr(value)
+    named = value if callable(value) and hasattr(value, "__qualname__") else type(value)  # a repr may hold an address
+    return f"{named.__module__}.{named.__qualname__}"
 
 
 def canonical(value: Any) -> str:

@@ -158,9 +158,10 @@ class Channel:
             attacked=hit[..., :q],
         )
         ended = (state.burst > 0) & ~charged
-        cooldown = np.where(ended, threat.cooldown, np.maximum(state.cooldown - 1, 0))
+        # the step that ends a burst is itself the first of the pause
+        cooldown = np.where(ended, max(threat.cooldown - 1, 0), np.maximum(state.cooldown - 1, 0))
         last = Command(
-            np.where(charged, kind, 0).astype(np.int8), hit, np.where(hit, command.value, 0.0)
+            np.where(charged, kind, 0).astype(np.int8), hit, np.where(hit & (jam | fdi), command.value, 0.0)
         )
         fresh = np.where(hit, state.fresh, sent)
         state = ChannelState(

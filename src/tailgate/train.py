@@ -17,7 +17,7 @@ import numpy as np
 from tailgate import draws
 from tailgate.core import Array, Count, Positive, PositiveCount, param
 from tailgate.errors import InputError
-from tailgate.evaluation import Cell, cells_of, run
+from tailgate.evaluation import cells_of, run
 from tailgate.files import writable_directory, write_atomic
 from tailgate.registry import Spec
 from tailgate.scenario import Suite, config_path, load_scenario
@@ -73,6 +73,19 @@ def environment_of(config: TrainConfig) -> dict[str, Any]:
     return {"scenario": config.scenario, "defence": config.defence, "threat": dict(config.threat), **config.environment}
 
 
+def _check(config: TrainConfig) -> None:
+    """Everything that a run will need, tried before anything is written: a typing error shall not cost an hour."""
+    from tailgate.envs.faces import Seat
+
+    Seat.make(**environment_of(config))
+    cells_of(_suite(config, (*config.rivals, *config.ceilings)), threat=config.threat)
+
+
+def _suite(config: TrainConfig, attacks: tuple[str, ...]) -> Suite:
+    """The final comparison, with these attacks."""
+    return Suite(config.name, "", (config.scenario,), (None,), (config.defence, *config.others), attacks, config.episodes)
+
+
 @dataclass(frozen=True)
 class Verdict:
     """How one trained policy did on the report seeds, episode by episode (0 or 1 each)."""
@@ -88,6 +101,8 @@ def train(config: TrainConfig, progress: Callable[[int, Any], None], resume: boo
     from tailgate.agents.ppo import Learner, PPOConfig
 
     ppo = build(PPOConfig, dict(config.ppo), "config.ppo")
+    ppo.check()
+    _check(config)
     directory = writable_directory(config.directory)
     snapshot = json.dumps(as_data(config), indent=1).encode() + b"\n"
     held = directory / "config.json"
@@ -139,9 +154,7 @@ def compare(config: TrainConfig, policies: list[Path], progress: Callable[[int, 
     best = max(config.rivals, key=lambda a: _crashes([r for r in selection if r["attack"] == a]).mean(), default=None)
 
     attacks = ("none", *config.rivals, *config.ceilings, *names)
-    suite = Suite(config.name, "", (config.scenario,), (None,), (guard, *config.others), attacks, config.episodes)
-    cells: list[Cell] = cells_of(suite, threat=threat)
-    rows = run(cells, config.directory / "rows.jsonl", progress=progress)
+    rows = run(cells_of(_suite(config, attacks), threat=threat), config.directory / "rows.jsonl", progress=progress)
 
     def crashes(attack: str) -> Array:
         return _crashes([r for r in rows if r["attack"] == attack and r["defence"] == guard])

@@ -30,6 +30,17 @@ def put_rows(tree: Any, rows: Array, fresh: Any) -> Any:
     return map_leaves(put, tree, fresh)
 
 
+def frozen(tree: Any) -> Any:
+    """The tree with read-only views of its leaves: what others are shown of a state."""
+
+    def lock(leaf: Array) -> Array:
+        out = leaf.view()
+        out.flags.writeable = False
+        return out
+
+    return map_leaves(lock, tree)
+
+
 def duplicate(tree: Any) -> Any:
     """A copy that shares nothing, objects inside of arrays included."""
     return map_leaves(lambda leaf: copy.deepcopy(leaf) if leaf.dtype == object else leaf.copy(order="K"), tree)

@@ -1,0 +1,94 @@
+"""The house: every package is listed, every file has its size, the scored path keeps to its arithmetic."""
+
+import ast
+import re
+import tomllib
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+CONFIG = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+FOLDERS = CONFIG["tool"]["setuptools"]["package-dir"]
+SOURCES = sorted({p.resolve() for folder in FOLDERS.values() for p in (ROOT / folder).glob("*.py")})
+
+# What a trace is made of. Their results must not depend on the batch, so no BLAS, no einsum, no sums by shape, no library transcendentals.
+SCORED = [
+    *(ROOT / "envs").glob("*.py"), *(ROOT / "estimators").glob("*.py"), *(ROOT / "agents").glob("*.py"),
+    *(ROOT / "src/tailgate" / f"{n}.py" for n in ("loop", "threat", "trace", "metrics", "draws", "num", "tree")),
+]  # fmt: skip
+UNSCORED = {"render.py", "sb3.py", "ppo.py"}
+FORBIDDEN = {
+    "einsum", "dot", "matmul", "inner", "tensordot", "vdot", "sum", "mean", "std", "var", "prod", "nansum", "nanmean", "exp", "log", "log1p", "expm1",
+    "sin", "cos", "tan", "tanh", "arctan2", "power", "float_power", "exp2", "log2", "log10", "hypot", "cbrt", "linalg", "random",
+}  # fmt: skip
+
+
+def test_every_folder_with_code_is_a_listed_package() -> None:
+    listed = {(ROOT / folder).resolve() for folder in FOLDERS.values()}
+    top = [ROOT / name for name in ("envs", "estimators", "agents", "configs")]
+    found = {p.parent.resolve() for base in (*top, ROOT / "src") for p in base.rglob("__init__.py")}
+    assert found == listed
+    assert set(FOLDERS) == set(CONFIG["tool"]["setuptools"]["packages"])
+
+
+def test_package_data_covers_every_data_file() -> None:
+    patterns = CONFIG["tool"]["setuptools"]["package-data"]
+    for name, folder in FOLDERS.items():
+        matched = {p for pattern in patterns.get(name, []) for p in (ROOT / folder).glob(pattern)}
+        children = {(ROOT / other).resolve() for other in FOLDERS.values()} - {(ROOT / folder).resolve()}
+        data = {
+            p for p in (ROOT / folder).rglob("*")
+            if p.is_file() and p.suffix != ".py" and "__pycache__" not in p.parts and not children & set(p.resolve().parents) - set((ROOT / folder).resolve().parents)
+        }  # fmt: skip
+        assert data == matched, name
+
+
+def test_no_module_shadows_a_well_known_name() -> None:
+    names = {p.name for folder in ("envs", "estimators", "agents", "configs") for p in (ROOT / folder).glob("*.py")}
+    assert not names & {"types.py", "gym.py", "typing.py", "random.py", "copy.py", "io.py"}
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda p: str(p.relative_to(ROOT)))
+def test_no_file_grows_past_400_lines(path: Path) -> None:
+    assert len(path.read_text(encoding="utf-8").splitlines()) <= 400
+
+
+def _called(tree: ast.AST) -> set[tuple[int, str]]:
+    out = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id in ("np", "numpy") and node.attr in FORBIDDEN:
+            out.add((node.lineno, f"np.{node.attr}"))
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr in ("sum", "mean", "std", "var", "prod", "dot"):
+            owner = node.func.value
+            if not (isinstance(owner, ast.Name) and owner.id in ("num", "math")):
+                out.add((node.lineno, f".{node.func.attr}()"))
+        if isinstance(node, ast.BinOp) and isinstance(node.op, ast.MatMult):
+            out.add((node.lineno, "@"))
+    return out
+
+
+@pytest.mark.parametrize("path", [p for p in SCORED if p.name not in UNSCORED], ids=lambda p: str(p.relative_to(ROOT)))
+def test_the_scored_path_keeps_to_elementwise_arithmetic(path: Path) -> None:
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    assert not _called(tree)
+
+
+def test_the_lint_sees_what_it_forbids() -> None:
+    source = "import numpy as np\na = b @ c\nd = np.einsum('ij,j', b, c)\ne = b.sum(axis=0)\nf = np.exp(b)\ng = num.dot(b, c)\n"
+    assert {line for line, _ in _called(ast.parse(source))} == {2, 3, 4, 5}
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda p: str(p.relative_to(ROOT)))
+def test_nothing_made_by_others_can_execute(path: Path) -> None:
+    text = path.read_text(encoding="utf-8")
+    assert not re.search(r"import (cloud)?pickle|pickle\.\w|\byaml\.(unsafe_)?load\(|(?<![\w.])(eval|exec)\(|torch\.load\(|np\.load\(|allow_pickle", text)
+
+
+def test_constraints_pin_every_requirement_and_name_no_index() -> None:
+    text = (ROOT / "constraints.txt").read_text(encoding="utf-8")
+    pinned = {line.split("==")[0].lower().replace("_", "-") for line in text.splitlines() if line}
+    assert all(re.fullmatch(r"[A-Za-z0-9._-]+==[A-Za-z0-9.+!]+", line) for line in text.splitlines() if line)
+    wanted = CONFIG["project"]["dependencies"] + [r for group in CONFIG["project"]["optional-dependencies"].values() for r in group]
+    names = {re.split(r"[\[><=~! ]", requirement)[0].lower().replace("_", "-") for requirement in wanted} - {"tailgate"}
+    assert names <= pinned

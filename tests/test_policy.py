@@ -1,0 +1,162 @@
+"""Learned policies: files, playing as an attack, yoked schedules."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tailgate import draws
+from tailgate.agents.codec import ActionCodec, ActionSpec, ObservationCodec
+from tailgate.agents.policy import Network, PolicyAttack, Yoked, choose, load_policy, save_policy, timing_advantage
+from tailgate.envs.faces import AdversaryVectorEnv
+from tailgate.errors import InputError
+from tailgate.metrics import crashed
+from tailgate.registry import Spec
+from tailgate.scenario import Scenario, load_scenario
+from tailgate.trace import Recorder, rollout
+
+THREAT = {"budget": 20, "kinds": ["dos_jam", "fdi"], "fdi_bound": 5.0}
+SEEDS = list(range(12))
+
+
+def _place(knowledge: str) -> Scenario:
+    return load_scenario("gusty-stop-and-go-v0").with_threat(**THREAT, knowledge=knowledge)
+
+
+def _policy(path: Path, action: dict[str, Any], knowledge: str = "black", seed: int = 0) -> Path:
+    """A random network that attacks now and then."""
+    brief = _place(knowledge).brief()
+    spec = ActionSpec(**action)
+    codec, names = ActionCodec(spec, brief), ObservationCodec(brief).names
+    rng = np.random.default_rng(seed)
+    weights = (rng.normal(size=(len(names), 16)), rng.normal(size=(16, codec.size)))
+    network = Network(weights, (rng.normal(size=16), rng.normal(size=codec.size)), None if codec.discrete else np.full(codec.size, -1.0))
+    header = {"action": spec, "observation": names, "knowledge": knowledge, "sees_measurement": False, "training": {}}
+    return save_policy(path / "policy", network, header)
+
+
+@pytest.mark.parametrize("interval", [1, 5])
+@pytest.mark.parametrize("knowledge", ["black", "white"])
+@pytest.mark.parametrize("action", ["timing", "mode", "ramp", "continuous", "increment"])
+def test_stepping_the_environment_and_playing_as_an_attack_give_one_trace(tmp_path: Path, action: str, knowledge: str, interval: int) -> None:
+    spec = {"action": action, "interval": interval, "rate": 0.5}
+    path = _policy(tmp_path, spec, knowledge)
+    _, network = load_policy(path)
+    env = AdversaryVectorEnv(
+        len(SEEDS), scenario="gusty-stop-and-go-v0", threat=THREAT, knowledge=knowledge, autoreset="disabled", **spec
+    )
+    loop = env.seat.loop
+    played = rollout(loop, PolicyAttack(path), draws.keys("train", SEEDS))
+
+    observation, _ = env.reset(seed=SEEDS[0])
+    assert env.state is not None
+    recorder = Recorder(loop, env.state)
+    advance = loop.advance
+
+    def recorded(state: Any, command: Any) -> Any:  # every step inside of a decision, as the environment makes them
+        live = ~state.ended & (state.k <= loop.horizon)
+        state, frame = advance(state, command)
+        if live.any() and recorder.steps < loop.horizon:
+            recorder.add(frame, live)
+        return state, frame
+
+    object.__setattr__(loop, "advance", recorded)
+    for _ in range(-(-loop.horizon // interval)):
+        observation, *_ = env.step(choose(network, env.seat.action, observation))
+        env._done[:] = False  # play on: the recorder knows which rows are over
+    stepped = recorder.trace()
+    assert (played.kind != 0).any()
+    assert [stepped.trace_hash(i) for i in range(len(SEEDS))] == [played.trace_hash(i) for i in range(len(SEEDS))]
+
+
+@pytest.mark.parametrize("action", ["mode", "increment"])
+def test_a_stochastic_policy_repeats_whatever_the_batch(tmp_path: Path, action: str) -> None:
+    path = _policy(tmp_path, {"action": action})
+    loop = _place("black").loop(Spec("defence", "kf").make())
+    together = rollout(loop, PolicyAttack(path, stochastic=True), draws.keys("report", SEEDS))
+    alone = [rollout(loop, PolicyAttack(path, stochastic=True), draws.keys("report", [s])).trace_hash(0) for s in SEEDS[:4]]
+    assert [together.trace_hash(i) for i in range(4)] == alone
+    calm = rollout(loop, PolicyAttack(path), draws.keys("report", SEEDS))
+    assert together.trace_hash(0) != calm.trace_hash(0)
+
+
+def test_what_is_saved_is_what_is_loaded(tmp_path: Path) -> None:
+    path = _policy(tmp_path, {"action": "increment", "rate": 0.7, "interval": 3})
+    header, network = load_policy(path)
+    assert header.action == ActionSpec(action="increment", rate=0.7, interval=3)
+    rng = np.random.default_rng(0)
+    assert np.array_equal(network.weights[0], rng.normal(size=network.weights[0].shape))
+    assert network.log_std is not None and (network.log_std == -1.0).all()
+
+
+def test_a_yoked_policy_attacks_exactly_when_its_schedule_says(tmp_path: Path) -> None:
+    path = _policy(tmp_path, {"action": "mode", "interval": 2})
+    loop = _place("black").loop(Spec("defence", "kf").make())
+    schedule = np.zeros((loop.horizon, len(SEEDS)), bool)
+    for row in range(len(SEEDS)):
+        schedule[100 + 10 * row : 105 + 10 * row, row] = True
+    trace = rollout(loop, Yoked(PolicyAttack(path), schedule), draws.keys("report", SEEDS), terminate=False)
+    assert np.array_equal(trace.kind != 0, schedule)
+
+
+def test_a_policy_without_timing_has_no_timing_advantage(tmp_path: Path) -> None:
+    """A policy that attacks at the same steps in every episode is its own yoked twin."""
+    brief = _place("black").brief()
+    names = ObservationCodec(brief).names
+    weight = np.zeros((len(names), 4))
+    weight[names.index("progress"), 3] = 100.0  # fdi-: whenever anything is left of the budget
+    header = {"action": ActionSpec(action="mode"), "observation": names, "knowledge": "black", "sees_measurement": False, "training": {}}
+    path = save_policy(tmp_path / "policy", Network((weight,), (np.zeros(4),)), header)
+    loop = _place("black").loop(Spec("defence", "chi2_kf").make())
+    keys = draws.keys("report", range(40))
+    own, yoked = timing_advantage(loop, PolicyAttack(path), keys)
+    assert np.array_equal(own, yoked)
+    assert np.array_equal(own, crashed(rollout(loop, PolicyAttack(path), keys)))
+
+
+def _damage(path: Path, how: str) -> None:
+    data = json.loads(path.read_text())
+    tensors = path.with_suffix(".safetensors")
+    match how:
+        case "not json":
+            path.write_text("{")
+        case "other format":
+            path.write_text(json.dumps(data | {"format": "something"}))
+        case "unknown field":
+            path.write_text(json.dumps(data | {"speed": 3}))
+        case "no tensors":
+            tensors.unlink()
+        case "flipped bit":
+            blob = bytearray(tensors.read_bytes())
+            blob[-3] ^= 1
+            tensors.write_bytes(bytes(blob))
+        case "truncated":
+            tensors.write_bytes(tensors.read_bytes()[:100])
+        case "path outside":
+            path.write_text(json.dumps(data | {"tensors": "../policy.safetensors"}))
+        case "too many layers":
+            path.write_text(json.dumps(data | {"layers": 3}))
+        case "unknown action":
+            path.write_text(json.dumps(data | {"action": data["action"] | {"action": "fly"}}))
+
+
+@pytest.mark.parametrize(
+    ("how", "field"),
+    [
+        ("not json", "JSON"), ("other format", "format"), ("unknown field", "speed"), ("no tensors", "tensors"), ("flipped bit", "sha256"),
+        ("truncated", "sha256"), ("path outside", "tensors"), ("too many layers", "layer2"), ("unknown action", "action"),
+    ],
+)  # fmt: skip
+def test_a_damaged_policy_is_refused_with_one_clear_error(tmp_path: Path, how: str, field: str) -> None:
+    path = _policy(tmp_path, {"action": "mode"})
+    _damage(path, how)
+    with pytest.raises(InputError, match=field):
+        Spec("attack", str(path)).make().prepare(_place("black").brief())
+
+
+def test_a_policy_of_another_observation_is_refused(tmp_path: Path) -> None:
+    path = _policy(tmp_path, {"action": "mode"}, "white")
+    with pytest.raises(InputError, match="error0"):
+        PolicyAttack(path).prepare(_place("black").brief())

@@ -1,0 +1,154 @@
+"""Training: exact resume, clear errors, and the whole run end to end on a small budget."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tailgate import train
+from tailgate.agents.ppo import Learner, PPOConfig
+from tailgate.errors import InputError
+from tailgate.tree import leaves
+
+ENVIRONMENT: dict[str, Any] = {
+    "scenario": "gusty-stop-and-go-v0", "defence": "kf", "threat": {"kinds": ["dos_jam", "fdi"], "budget": 30}, "interval": 5,
+}  # fmt: skip
+SMALL = PPOConfig(envs=16, rollout=40, batch_size=160, epochs=2, hidden=(16,))
+UPDATE = SMALL.envs * SMALL.rollout
+
+
+def _learner(seed: int = 3, **changes: Any) -> Learner:
+    return Learner(seed, 0.99, SMALL, ENVIRONMENT | changes)
+
+
+@pytest.mark.parametrize("action", ["mode", "increment"])
+def test_a_resumed_run_gives_the_policy_of_an_uninterrupted_one(tmp_path: Path, action: str) -> None:
+    """To the last bit, episodes in flight included: the interruption falls in the middle of them."""
+    straight = _learner(action=action)
+    straight.learn(7 * UPDATE, lambda progress: None)
+    first = _learner(action=action)
+    first.learn(4 * UPDATE, lambda progress: None, tmp_path / "c.safetensors")
+    second = _learner(action=action)
+    np.random.rand(5)  # noqa: NPY002 - a restarted process has another global state
+    second.load(tmp_path / "c.safetensors")
+    second.learn(7 * UPDATE, lambda progress: None)
+    assert second.model.num_timesteps == 7 * UPDATE
+    for name, value in straight.model.policy.state_dict().items():
+        assert np.array_equal(value.numpy(), second.model.policy.state_dict()[name].numpy()), name
+    assert straight.env.batch.state is not None and second.env.batch.state is not None
+    for name, leaf in leaves(straight.env.batch.state).items():
+        assert np.array_equal(leaf, leaves(second.env.batch.state)[name]), name
+    assert straight.curve == second.curve
+    a, b = straight.export(tmp_path / "a", {}), second.export(tmp_path / "b", {})
+    assert a.with_suffix(".safetensors").read_bytes() == b.with_suffix(".safetensors").read_bytes()
+
+
+def test_two_runs_of_one_seed_are_equal_and_of_two_seeds_are_not() -> None:
+    weights = []
+    for seed in (3, 3, 4):
+        run = _learner(seed)
+        run.learn(2 * UPDATE, lambda progress: None)
+        weights.append(run.model.policy.action_net.weight.detach().numpy().copy())
+    first, second, third = weights
+    assert np.array_equal(first, second) and not np.array_equal(first, third)
+
+
+def test_a_checkpoint_is_written_on_the_way(tmp_path: Path) -> None:
+    learner, path = _learner(), tmp_path / "c.safetensors"
+    seen: list[bool] = []
+    learner.learn(4 * UPDATE, lambda progress: seen.append(path.exists()), path, every=2 * UPDATE)
+    assert seen == [False, False, True, True]  # after two updates, when the third rollout starts
+
+
+@pytest.mark.parametrize("damage", ["empty", "cut", "foreign", "other seed", "other environment"])
+def test_a_checkpoint_that_does_not_fit_is_refused(tmp_path: Path, damage: str) -> None:
+    path = tmp_path / "c.safetensors"
+    learner = _learner()
+    learner.learn(UPDATE, lambda progress: None, path)
+    blob = path.read_bytes()
+    other = learner
+    if damage == "empty":
+        path.write_bytes(b"")
+    elif damage == "cut":
+        path.write_bytes(blob[: len(blob) // 2])
+    elif damage == "foreign":
+        path.write_bytes(learner.export(tmp_path / "p", {}).with_suffix(".safetensors").read_bytes())
+    elif damage == "other seed":
+        other = _learner(4)
+    else:
+        other = _learner(value=-3.0)
+    with pytest.raises(InputError, match="checkpoint"):
+        other.load(path)
+
+
+def test_the_learner_rests_first() -> None:
+    """The first policy attacks in about a tenth of its steps, so that some of its budget is left when it matters."""
+    for action in ("mode", "increment"):
+        learner = _learner(action=action)
+        learner.env.reset()
+        observation = np.zeros((4000, learner.env.observation_space.shape[0]), np.float32)
+        actions, _ = learner.model.predict(observation)
+        share = np.mean(actions != 0) if action == "mode" else np.mean(actions[:, 0] > 0)
+        assert share == pytest.approx(0.1, abs=0.03)
+
+
+def _command(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, "-m", "tailgate.cli", "train", *arguments], cwd=cwd, capture_output=True, text=True, check=False)
+
+
+SMALL_RUN = (
+    "steps=1280", "ppo={envs: 16, rollout: 40, batch_size: 160, epochs: 1}", "episodes=12", "rivals=['fdi:trigger=near,threshold=30']", "others=[kf]",
+    "tensorboard=false",
+)  # fmt: skip
+
+
+def test_the_command_trains_compares_and_writes_a_page(tmp_path: Path) -> None:
+    done = _command(*SMALL_RUN, "--json", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    report = json.loads(done.stdout)
+    assert set(report["advantage"]) == {"no attack", "own yoked schedule", "best scripted attack"}
+    assert report["crash"][0]["label"] == "no attack"
+    run = tmp_path / "runs" / "quickstart"
+    rows = [json.loads(line) for line in (run / "rows.jsonl").read_text().splitlines()]
+    played = {(row["defence"], row["attack"]) for row in rows}
+    assert ("chi2_kf", str(Path("runs/quickstart/policy-0.json"))) in played and ("kf", "none") in played
+    page = (run / "page" / "index.html").read_text(encoding="utf-8")
+    assert "quickstart" in page and "learned" in page
+    again = _command(*SMALL_RUN, "steps=1920", "--resume", cwd=tmp_path)
+    assert again.returncode == 0, again.stderr
+    assert json.loads((run / "policy-0.json").read_text())["training"]["steps"] == 1920
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["stepz=10"], ["stepz", "steps"]), (["steps=-1"], ["steps", "-1"]), (["defence=kff"], ["kff", "'kf'"]), (["ppo.epoch=1"], ["epoch", "epochs"]),
+        (["defence=os:system"], ["os:system", "registered"]), (["threat.budget=-3"], ["budget", "-3"]), (["environment.action=fly"], ["action", "fly"]),
+        (["ppo.batch_size=7"], ["batch_size", "7"]), (["--config", "nosuch"], ["nosuch", "quickstart"]), (["--config", "bad.yaml"], ["bad.yaml", "YAML"]),
+        (["out=file/below"], ["file", "writable"]), (["steps"], ["steps", "key=value"]), (["scenario=nan.yaml"], ["nan", "line 3"]),
+    ],
+)  # fmt: skip
+def test_bad_input_is_one_clear_error_and_leaves_nothing(tmp_path: Path, arguments: list[str], words: list[str]) -> None:
+    (tmp_path / "bad.yaml").write_text("a: [1\n")
+    (tmp_path / "file").write_text("")
+    (tmp_path / "nan.csv").write_text("t,v\n0,20\n1,nan\n")
+    (tmp_path / "nan.yaml").write_text(
+        "plant: car_following\nsensor: odometry\ncontroller: acc\nmanoeuvre: {name: profile, path: nan.csv}\nhorizon: 10\n"
+    )
+    before = sorted(p.name for p in tmp_path.rglob("*"))
+    done = _command(*SMALL_RUN, *arguments, cwd=tmp_path)
+    assert done.returncode == 2, done.stderr
+    error = [line for line in done.stderr.splitlines() if line.startswith("tailgate: error: ")]
+    assert len(error) == 1 and "Traceback" not in done.stderr
+    assert all(word in error[0] for word in words) and "expected" in error[0]
+    assert sorted(p.name for p in tmp_path.rglob("*")) == before
+
+
+def test_a_configuration_is_one_schema() -> None:
+    config = train.load_config(None, ["threat.budget=5", "ppo.epochs=3", "rivals=[none]"])
+    assert config.threat["budget"] == 5 and config.ppo["epochs"] == 3 and config.rivals == ("none",)
+    assert train.load_config("quickstart", []).steps == train.load_config(None, []).steps
