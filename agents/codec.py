@@ -11,7 +11,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from tailgate import num
-from tailgate.core import Array, Command, Finite, Kind, NonNegative, Positive, PositiveCount, View, param
+from tailgate.core import Array, Command, Finite, Frame, Kind, NonNegative, Positive, PositiveCount, View, param
 from tailgate.errors import InputError
 from tailgate.threat import Brief, KindName
 
@@ -209,6 +209,7 @@ class Reward:
     error_shaping: NonNegative = param(1.0, "weight of the believed extra gap, per 10 m and capped at 20 m, as a potential [-]")
     gamma: Positive = param(0.995, "discount in the potential's difference [-]")
     illegal_penalty: NonNegative = param(0.0, "cost of a refused command [-]")
+    attack_cost: NonNegative = param(0.0, "cost of a step under attack: what makes waiting for the right moment pay [-]")
 
     def potential(self, gap: Array, belief: Array | float = 0.0) -> Array:
         """(B,) potential of a gap (B, N) [m] and of what the car believes it has on top of it (B, N) [m]."""
@@ -220,17 +221,19 @@ class Reward:
         """(B,) smallest gap so far, within [0, NEAR], from a gap (B, N) and the smallest one before [m]."""
         return np.asarray(np.minimum(np.clip(np.min(gap, axis=1), 0.0, NEAR), before))
 
-    def __call__(self, dt: float, error: Array, alarm: Array, crashed: Array, refused: Array, fall: Array) -> Array:
-        """(B,) reward of one step of the loop: |error| (B, N) [m], alarm (B, N), fall (B,) of the smallest gap [m]."""
-        out = -self.illegal_penalty * refused.astype(np.float64)
+    def __call__(self, dt: float, frame: Frame, fall: Array) -> Array:
+        """(B,) reward of one step of the loop; fall (B,) of the smallest gap [m]."""
+        crashed = frame.collided | frame.rear_collided
+        out = -self.illegal_penalty * frame.refused - self.attack_cost * (frame.command.kind != Kind.NONE)
         if self.reward in ("collision", "min_gap"):
             out = out + crashed
             if self.reward == "min_gap":
                 out = out + fall / NEAR
         else:
+            error = np.abs(frame.estimate.x[..., 0] - frame.truth[..., 0])
             out = out + dt * np.minimum(np.max(error, axis=1) / 10.0, 1.0)
             if self.reward == "stealth":
-                out = out - dt * alarm.any(axis=1)
+                out = out - dt * frame.estimate.alarm.any(axis=1)
         return np.asarray(out)
 
     def shaped(self, raw: Array, before: Array, after: Array, terminated: Array) -> Array:

@@ -135,8 +135,8 @@ class Learner:
         arrays: dict[str, Any] = {f"loop.{k}": v for k, v in leaves(batch.state).items()}
         _, words, position, _, _ = np.random.get_state()  # noqa: NPY002 - Stable-Baselines3 shuffles with it
         arrays |= {
-            "env.potential": batch._potential, "env.least": batch._least,
-            "env.returns": self.env._returns, "env.lengths": self.env._lengths, "last_obs": model._last_obs, "last_starts": model._last_episode_starts, "numpy": words,
+            "env.potential": batch._potential, "env.least": batch._least, "env.returns": self.env._returns,
+            "env.lengths": self.env._lengths, "last_obs": model._last_obs, "last_starts": model._last_episode_starts, "numpy": words,
         }  # fmt: skip
         for name, array in arrays.items():
             whole = np.array(array, order="C")  # torch has no unsigned integers of 32 and 64 bits: keep their bits

@@ -174,10 +174,9 @@ class AdversaryVectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
             live = ~over & ~self.state.ended & (self.state.k <= loop.horizon)
             self.state, frame = loop.advance(self.state, seat.action.decode(actions, loop.sense(self.state)))
             self.frame = frame
-            crashed = frame.collided | frame.rear_collided
             error = frame.truth[..., 0] - frame.estimate.x[..., 0]  # positive: the car believes that it is further back
             least = seat.reward.least(frame.scene.gap, self._least)
-            gained = seat.reward(loop.model.dt, np.abs(error), frame.estimate.alarm, crashed, frame.refused, self._least - least)
+            gained = seat.reward(loop.model.dt, frame, self._least - least)
             raw += np.where(live, gained, 0.0)
             potential = np.where(live, seat.reward.potential(frame.scene.gap, error), potential)
             self._least = least

@@ -103,7 +103,7 @@ def _print_report(report: dict[str, Any]) -> None:
         table.add_column(heading, overflow="fold")
     for row in report["crash"]:
         table.add_row(row["label"], f"{100 * row['value']:.1f} %", f"{100 * row['low']:.1f} to {100 * row['high']:.1f} %", row["note"])
-    console = Console()
+    console = _console()
     console.print(table)
     for name, gain in report["advantage"].items():
         low, high = 100 * gain["low"], 100 * gain["high"]
@@ -166,7 +166,7 @@ def _evaluate(options: argparse.Namespace) -> int:
 
 
 def _print_summary(table: list[dict[str, Any]]) -> None:
-    console = Console()
+    console = _console()
     for place in dict.fromkeys((e["scenario"], e["dose"]) for e in table):
         scenario, dose = place
         shown = Table(title=f"{scenario}, budget {'unlimited' if dose is None else f'{dose} steps'}")
@@ -233,7 +233,7 @@ def _list(options: argparse.Namespace) -> int:
     if options.json:
         print(json.dumps(chosen, indent=1))
         return 0
-    console = Console()
+    console = _console()
     for title, group in chosen.items():
         table = Table("name", "what it is", "parameters (default)", title=title)
         for card in group:
@@ -241,6 +241,11 @@ def _list(options: argparse.Namespace) -> int:
             table.add_row(card["name"], card["summary"], fields)
         console.print(table)
     return 0
+
+
+def _console() -> Console:
+    """Standard output: as wide as the terminal, and wide enough for whole cells where there is none."""
+    return Console(width=None if sys.stdout.isatty() else 160)
 
 
 def _bar(console: Console, label: str) -> Any:

@@ -1,0 +1,82 @@
+"""The command line: exit codes, one clear error, tables and JSON."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tailgate import cli
+
+
+def _run(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, "-m", "tailgate.cli", *arguments], cwd=cwd, capture_output=True, text=True, check=False)
+
+
+def test_list_shows_every_component_with_its_parameters(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["list", "--json"]) == 0
+    cards = json.loads(capsys.readouterr().out)
+    chi2 = next(card for card in cards["defences"] if card["name"] == "chi2_kf")
+    assert chi2["parameters"]["eta"]["default"] == 20.0 and "[-]" in chi2["parameters"]["eta"]["doc"]
+    assert chi2["summary"] and chi2["reference"] and chi2["uses"] == ["measurements"]
+    assert {card["name"] for card in cards["attacks"]} >= {"none", "dos_jam", "fdi", "stealth", "thesis_times", "policy"}
+    assert all(card["summary"] for group in cards.values() for card in group)
+    assert cli.main(["list", "defences"]) == 0
+    table = capsys.readouterr().out
+    assert "chi2_kf" in table and "stealth" not in table
+
+
+def test_evaluate_prints_a_table_or_json_and_writes_rows(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    part = ["evaluate", "--scenario", "gusty-stop-and-go-v0", "--defence", "kf", "--attack", "none", "--seeds", "4"]
+    assert cli.main([*part, "--out", "rows.jsonl", "--json"]) == 0
+    (entry,) = json.loads(capsys.readouterr().out)
+    assert entry["n"] == 4 and entry["crash"]["value"] == 0.0 and entry["crash"]["high"] == pytest.approx(0.6024, abs=1e-4)
+    assert len((tmp_path / "rows.jsonl").read_text().splitlines()) == 4
+    assert cli.main(part) == 0
+    assert "0.0 to 60.2 %" in capsys.readouterr().out
+    assert cli.main([*part, "--dose", "none", "--threat", "fdi_bound=2", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)[0]["dose"] is None
+    assert cli.main(["leaderboard", "build", "--rows", "rows.jsonl", "--out", "page"]) == 0
+    assert (tmp_path / "page" / "index.html").is_file()
+
+
+def test_a_failing_component_is_exit_code_1_and_its_rows_say_why(tmp_path: Path) -> None:
+    (tmp_path / "bad.py").write_text("class Bad:\n    def prepare(self, model):\n        raise RuntimeError('no')\n    start = step = None\n")
+    done = _run("evaluate", "--scenario", "gusty-stop-and-go-v0", "--defence", "kf", "--defence", "bad:Bad", "--attack", "none",
+                "--seeds", "2", "--out", "rows.jsonl", cwd=tmp_path)  # fmt: skip
+    assert done.returncode in (1, 2), done.stderr
+    assert "no" in (done.stdout + done.stderr)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["evaluate", "--defence", "kff"], ["defence", "kff", "kf"]), (["evaluate", "--suite", "quik-v0"], ["quik-v0", "quick-v0"]),
+        (["evaluate", "--seeds", "0"], ["seeds", "0"]), (["evaluate", "--dose", "-4"], ["dose", "-4"]), (["evaluate", "--dose", "x"], ["dose", "x"]),
+        (["evaluate", "--threat", "budget"], ["--threat", "budget", "key=value"]), (["evaluate", "--attack", "missing.json"], ["missing.json"]),
+        (["evaluate", "--out", "file/rows.jsonl"], ["out", "file", "writable"]), (["evaluate", "--suite", "bad.yaml"], ["suite bad", "seedz", "seeds"]),
+        (["leaderboard", "build", "--rows", "none.jsonl", "--out", "page"], ["rows", "none.jsonl"]),
+        (["leaderboard", "build", "--rows", "bad.jsonl", "--out", "page"], ["bad.jsonl", "line 1"]),
+        (["leaderboard", "build", "--rows", "file", "--out", "page"], ["rows"]),
+        (["train", "--config", "missing"], ["config", "missing", "quickstart"]),
+    ],
+)  # fmt: skip
+def test_bad_input_is_exit_code_2_and_one_line(tmp_path: Path, arguments: list[str], words: list[str]) -> None:
+    (tmp_path / "file").write_text("")
+    (tmp_path / "bad.jsonl").write_text("{]\n")
+    (tmp_path / "bad.yaml").write_text("scenarios: [braking-v0]\nseedz: 3\n")
+    before = sorted(p.name for p in tmp_path.rglob("*"))
+    done = _run(*arguments, cwd=tmp_path)
+    assert done.returncode == 2, done.stderr
+    error = [line for line in done.stderr.splitlines() if line.startswith("tailgate: error: ")]
+    assert len(error) == 1 and "Traceback" not in done.stderr
+    assert all(word in error[0] for word in words) and "expected" in error[0]
+    assert sorted(p.name for p in tmp_path.rglob("*")) == before
+
+
+def test_an_unknown_command_explains_itself(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        cli.main(["fly"])
+    assert stop.value.code == 2 and "evaluate" in capsys.readouterr().err
