@@ -17,6 +17,7 @@ from rich.table import Table
 
 import tailgate
 from tailgate.errors import InputError
+from tailgate.progress import progress
 from tailgate.schema import scalar
 
 EXIT_INPUT = 2
@@ -83,10 +84,13 @@ def _train(options: argparse.Namespace) -> int:
     config = train.load_config(options.config, overrides)
     console = Console(stderr=True)
     console.print(f"[bold]{config.name}[/]: training against [bold]{config.defence}[/] on {config.scenario}, files in {config.directory}")
-    with train.tracked(config, console) as update:
-        policies = train.train(config, update, resume=options.resume)
-    with _bar(console, "comparing on fresh seeds") as progress:
-        report = train.compare(config, policies, progress)
+    with progress(console) as update:
+
+        def trained(seed: int, now: Any) -> None:
+            update(f"training, seed {seed}", now.steps, config.steps, train.figures(now))
+
+        policies = train.train(config, trained, resume=options.resume)
+        report = train.compare(config, policies, lambda done, total: update("comparing on fresh seeds", done, total, _cells(done, total)))
     page = train.make_page(config, report)
     if options.json:
         print(json.dumps(report | {"page": str(page)}, indent=1))
@@ -148,11 +152,11 @@ def _evaluate(options: argparse.Namespace) -> int:
             raise InputError("--threat", text, "key=value, for example fdi_bound=10")
         threat[key] = scalar(value)
     doses = None if options.dose is None else [scalar(d) for d in options.dose]
-    with _bar(Console(stderr=True), "playing") as progress:
+    with progress(Console(stderr=True)) as update:
         rows = evaluate(
             options.suite, defences=options.defence, attacks=options.attack, scenarios=options.scenario, doses=doses,
             seeds=options.seeds, purpose=options.purpose, batch=options.batch, workers=options.workers,
-            out=options.out, threat=threat, progress=progress,
+            out=options.out, threat=threat, progress=lambda done, total: update("playing", done, total, _cells(done, total)),
         )  # fmt: skip
     table = summarise(rows)
     if options.json:
@@ -243,25 +247,13 @@ def _list(options: argparse.Namespace) -> int:
     return 0
 
 
+def _cells(done: int, total: int) -> str:
+    return f"{done} of {total} cells"
+
+
 def _console() -> Console:
     """Standard output: as wide as the terminal, and wide enough for whole cells where there is none."""
     return Console(width=None if sys.stdout.isatty() else 160)
-
-
-def _bar(console: Console, label: str) -> Any:
-    """A context whose value is called with (done, total)."""
-    from contextlib import contextmanager
-
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-
-    @contextmanager
-    def bar() -> Any:
-        columns = (TextColumn(label), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
-        with Progress(*columns, console=console) as shown:
-            task = shown.add_task(label, total=None)
-            yield lambda done, total: shown.update(task, completed=done, total=total)
-
-    return bar()
 
 
 if __name__ == "__main__":

@@ -6,7 +6,6 @@ import dataclasses
 import json
 import time
 from collections.abc import Callable
-from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -234,32 +233,12 @@ def main(arguments: list[str] | None = None) -> int:
     return command(["train", *(sys.argv[1:] if arguments is None else arguments)])
 
 
-def tracked(config: TrainConfig, console: Any) -> AbstractContextManager[Callable[[int, Any], None]]:
-    """A progress bar over all training seeds, with the curve's latest figures."""
-    from contextlib import contextmanager
-
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-
-    @contextmanager
-    def bar() -> Any:
-        columns = (
-            TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[figures]}"), TimeElapsedColumn(), TimeRemainingColumn(),
-        )  # fmt: skip
-        with Progress(*columns, console=console) as shown:
-            tasks: dict[int, Any] = {}
-
-            def update(seed: int, progress: Any) -> None:
-                if seed not in tasks:
-                    tasks[seed] = shown.add_task(f"training, seed {seed}", total=config.steps, figures="")
-                figures = f"{progress.steps / 1e6:5.2f} M steps"
-                if progress.crash is not None:
-                    figures += f", collisions {100 * progress.crash:4.1f} %, return {progress.reward:+.2f}"
-                    shown.update(tasks[seed], figures=figures)
-                shown.update(tasks[seed], completed=progress.steps)
-
-            yield update
-
-    return bar()
+def figures(progress: Any) -> str:
+    """The curve's latest figures, as a progress bar shows them."""
+    text = f"{progress.steps / 1e6:5.2f} M decisions"
+    if progress.crash is not None:
+        text += f", collisions {100 * progress.crash:4.1f} %, return {progress.reward:+.2f}"
+    return text
 
 
 def parameters() -> list[dict[str, Any]]:

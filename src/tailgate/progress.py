@@ -1,0 +1,37 @@
+"""Progress of long work on standard error: a bar on a terminal, a line per tenth elsewhere."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+Update = Callable[[str, int, int, str], None]  # label, done, total, figures
+
+
+@contextmanager
+def progress(console: Console) -> Iterator[Update]:
+    """Yields update(label, done, total, figures); each label is a bar of its own."""
+    if not console.is_terminal:
+        shown: dict[str, int] = {}
+
+        def line(label: str, done: int, total: int, figures: str = "") -> None:
+            tenth = 10 * done // max(total, 1)
+            if tenth > shown.get(label, 0):
+                shown[label] = tenth
+                console.print(f"{label}: {10 * tenth} % {figures}".rstrip(), highlight=False)
+
+        yield line
+        return
+    columns = (
+        TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[figures]}"), TimeElapsedColumn(), TimeRemainingColumn(),
+    )  # fmt: skip
+    with Progress(*columns, console=console) as bars:
+        tasks: dict[str, object] = {}
+
+        def bar(label: str, done: int, total: int, figures: str = "") -> None:
+            if label not in tasks:
+                tasks[label] = bars.add_task(label, total=total, figures="")
+            bars.update(tasks[label], completed=done, total=total, figures=figures)  # type: ignore[arg-type]
+
+        yield bar
