@@ -215,6 +215,10 @@ class _Reporter(BaseCallback):
 
     def _on_rollout_end(self) -> None:
         crash = reward = None
+        seat = self.learner.env.batch.seat
+        whole = -(-seat.loop.horizon // seat.action.spec.interval) * self.learner.config.envs
+        if self.num_timesteps < whole:  # until the first horizon only collisions have ended
+            self.ended = []
         if self.ended:
             crash, reward = (float(np.mean(column)) for column in zip(*self.ended, strict=True))
             self.learner.curve.append({"steps": self.num_timesteps, "seed": self.learner.seed, "crash": crash, "reward": reward})

@@ -24,6 +24,9 @@ from tailgate.schema import as_data, build, canonical, override, read_yaml
 from tailgate.stats import Interval, paired_difference, proportion
 
 
+BATCH = 512  # episodes side by side in the comparison
+
+
 @dataclass(frozen=True)
 class TrainConfig:
     """What `train.py` reads. Learner settings stand below `ppo`, the environment's below `environment`."""
@@ -42,6 +45,7 @@ class TrainConfig:
     checkpoint_every: PositiveCount = param(500_000, "environment steps between checkpoints")
     tensorboard: bool = param(True, "write TensorBoard event files")
     episodes: PositiveCount = param(400, "fresh episodes per attack in the final comparison")
+    workers: PositiveCount = param(2, "processes of the final comparison; change no result")
     rivals: tuple[str, ...] = param((), "scripted attacks of equal knowledge and dose to compare with")
     ceilings: tuple[str, ...] = param(("stealth:trigger=near,threshold=40",), "white-box attacks, shown as yardsticks")
     others: tuple[str, ...] = param(("none", "kf", "oracle"), "further defences that the attacks are played on")
@@ -149,11 +153,12 @@ def compare(config: TrainConfig, policies: list[Path], progress: Callable[[int, 
     names = [str(p) for p in policies]
     guard = config.defence
     choice = Suite(config.name, "", (config.scenario,), (None,), (guard,), config.rivals, min(config.episodes, 200))
-    selection = run(cells_of(choice, purpose="select", threat=threat)) if config.rivals else []
+    selection = run(cells_of(choice, batch=BATCH, purpose="select", threat=threat), workers=config.workers) if config.rivals else []
     best = max(config.rivals, key=lambda a: _crashes([r for r in selection if r["attack"] == a]).mean(), default=None)
 
     attacks = ("none", *config.rivals, *config.ceilings, *names)
-    rows = run(cells_of(_suite(config, attacks), threat=threat), config.directory / "rows.jsonl", progress=progress)
+    cells = cells_of(_suite(config, attacks), batch=BATCH, threat=threat)
+    rows = run(cells, config.directory / "rows.jsonl", config.workers, progress)
 
     def crashes(attack: str) -> Array:
         return _crashes([r for r in rows if r["attack"] == attack and r["defence"] == guard])
