@@ -23,7 +23,6 @@ from tailgate.scenario import Suite, config_path, load_scenario
 from tailgate.schema import as_data, build, canonical, override, read_yaml
 from tailgate.stats import Interval, paired_difference, proportion
 
-
 BATCH = 512  # episodes side by side in the comparison
 
 
