@@ -7,6 +7,7 @@ random generators. An interrupted run that resumes gives the policy of an uninte
 from __future__ import annotations
 
 import json
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -62,7 +63,7 @@ class Progress:
     """What a training run reports after each rollout."""
 
     steps: int
-    crash: float | None  # share of the episodes that ended since the last report
+    crash: float | None  # share of collisions in the latest episodes
     reward: float | None
 
 
@@ -83,6 +84,8 @@ class Learner:
             tensorboard_log=str(tensorboard) if tensorboard else None,
         )  # fmt: skip
         self.curve: list[dict[str, Any]] = []
+        # rows start together and end together: a window of two batches of episodes is steady, one rollout's are not
+        self.ended: deque[tuple[bool, float]] = deque(maxlen=2 * config.envs)
         self._rest_first(config.rest)
 
     def _rest_first(self, probability: float) -> None:
@@ -97,7 +100,7 @@ class Learner:
                 bias[0] = float(norm.ppf(p) * np.exp(-0.5))
 
     def learn(self, steps: int, report: Callable[[Progress], None], checkpoint: Path | None = None, every: int = 1_000_000) -> None:
-        """Train until `steps` environment steps in total; calls `report` after each rollout."""
+        """Train until `steps` decisions in total; calls `report` after each rollout."""
         remaining = steps - self.model.num_timesteps
         if remaining <= 0:
             return
@@ -144,7 +147,7 @@ class Learner:
         tensors["torch"] = torch.get_rng_state()
         facts = {
             "format": FORMAT, "seed": self.seed, "steps": model.num_timesteps, "updates": model._n_updates, "card": batch.card()["hash"],
-            "numpy_position": int(position), "curve": self.curve,
+            "numpy_position": int(position), "curve": self.curve, "ended": list(self.ended),
         }  # fmt: skip
         write_atomic(path, save_tensors(tensors, {"facts": json.dumps(facts)}))
 
@@ -189,6 +192,7 @@ class Learner:
             torch.set_rng_state(tensors["torch"])
             model.num_timesteps, model._n_updates = facts["steps"], facts["updates"]
             self.curve = facts["curve"]
+            self.ended.extend((bool(crashed), float(reward)) for crashed, reward in facts["ended"])
         except (KeyError, ValueError, RuntimeError, TypeError) as error:
             raise InputError("checkpoint", str(path), f"a checkpoint that fits this configuration ({error})") from None
 
@@ -200,12 +204,11 @@ class _Reporter(BaseCallback):
         super().__init__()
         self.learner, self.report, self.checkpoint, self.every = learner, report, checkpoint, every
         self.saved = learner.model.num_timesteps
-        self.ended: list[tuple[bool, float]] = []
 
     def _on_step(self) -> bool:
         for info in self.locals["infos"]:
             if info:
-                self.ended.append((info["crashed"], info["episode"]["r"]))
+                self.learner.ended.append((info["crashed"], info["episode"]["r"]))
         return True
 
     def _on_rollout_start(self) -> None:  # the update of the last rollout is done
@@ -217,11 +220,8 @@ class _Reporter(BaseCallback):
         crash = reward = None
         seat = self.learner.env.batch.seat
         whole = -(-seat.loop.horizon // seat.action.spec.interval) * self.learner.config.envs
-        if self.num_timesteps < whole:  # until the first horizon only collisions have ended
-            self.ended = []
-        if self.ended:
-            crash, reward = (float(np.mean(column)) for column in zip(*self.ended, strict=True))
+        if self.learner.ended and self.num_timesteps > whole:  # until the first horizon only collisions have ended
+            crash, reward = (float(np.mean(column)) for column in zip(*self.learner.ended, strict=True))
             self.learner.curve.append({"steps": self.num_timesteps, "seed": self.learner.seed, "crash": crash, "reward": reward})
             self.logger.record("attack/crash_rate", crash)
-            self.ended = []
         self.report(Progress(self.num_timesteps, crash, reward))

@@ -38,10 +38,10 @@ class TrainConfig:
     environment: dict[str, Any] = field(default_factory=dict, metadata={"doc": "action and reward settings of the environment"})
     ppo: dict[str, Any] = field(default_factory=dict, metadata={"doc": "hyper-parameters of PPO"})
     gamma: Positive = param(0.995, "discount, of the learner and of the shaping [-]")
-    steps: PositiveCount = param(3_000_000, "environment steps per training seed")
+    steps: PositiveCount = param(3_000_000, "decisions per training seed, over all environments")
     first_seed: Count = param(0, "first training seed")
     seeds: PositiveCount = param(1, "training seeds, one policy each")
-    checkpoint_every: PositiveCount = param(500_000, "environment steps between checkpoints")
+    checkpoint_every: PositiveCount = param(500_000, "decisions between checkpoints")
     tensorboard: bool = param(True, "write TensorBoard event files")
     episodes: PositiveCount = param(400, "fresh episodes per attack in the final comparison")
     workers: PositiveCount = param(2, "processes of the final comparison; change no result")
@@ -201,14 +201,18 @@ def _report(config: TrainConfig, verdicts: list[Verdict], crashes: Callable[[str
     return report
 
 
+def _points(share: float) -> str:
+    return f"{round(100 * share) + 0:+d}"
+
+
 def headline(report: dict[str, Any]) -> dict[str, Any]:
     """The report as the page shows it at its top."""
     gains = "; ".join(
-        f"{100 * g['value']:+.0f} points over {name} [{100 * g['low']:+.0f}, {100 * g['high']:+.0f}]"
+        f"{_points(g['value'])} points over {name} [{_points(g['low'])}, {_points(g['high'])}]"
         for name, g in report["advantage"].items()
     )
     text = (
-        f"An adversary was trained for {report['steps']:,} steps against {report['defence']} on {report['scenario']}. "
+        f"An adversary was trained for {report['steps']:,} decisions against {report['defence']} on {report['scenario']}. "
         f"Share of {report['episodes']} fresh episodes that end in a collision: {gains} (95 % paired bootstrap)."
     )
     return {"text": text, "items": report["crash"]}

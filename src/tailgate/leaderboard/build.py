@@ -91,7 +91,7 @@ def shade(value: float) -> str:
 
 
 def steps(value: float) -> str:
-    """A number of environment steps, short."""
+    """A number of decisions, short."""
     for size, unit in ((1_000_000, "M"), (1_000, "k")):
         if value >= size:
             return f"{value / size:.4g}{unit}"
