@@ -6,6 +6,7 @@ random generators. An interrupted run that resumes gives the policy of an uninte
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections import deque
 from collections.abc import Callable
@@ -29,11 +30,13 @@ from tailgate.core import NonNegative, Positive, PositiveCount, Probability, par
 from tailgate.envs.sb3 import BatchVecEnv
 from tailgate.errors import InputError
 from tailgate.files import write_atomic
+from tailgate.schema import canonical
 from tailgate.tree import leaves, with_leaves
 
 from .policy import Network, save_policy
 
 FORMAT = "tailgate-ppo-checkpoint-1"
+SEED_STRIDE = 1_000_000  # between the rows of two training seeds
 
 
 @dataclass(frozen=True)
@@ -54,8 +57,10 @@ class PPOConfig:
     def check(self) -> None:
         """Raise InputError when the fields do not fit each other."""
         samples = self.envs * self.rollout
-        if samples % self.batch_size:
-            raise InputError("ppo.batch_size", self.batch_size, f"a divisor of envs x rollout ({samples})")
+        if self.batch_size < 2 or samples % self.batch_size:
+            raise InputError("ppo.batch_size", self.batch_size, f"a divisor of envs x rollout ({samples}), and at least 2")
+        if self.envs > SEED_STRIDE:
+            raise InputError("ppo.envs", self.envs, f"at most {SEED_STRIDE}")
 
 
 @dataclass(frozen=True)
@@ -74,8 +79,8 @@ class Learner:
         torch.set_num_threads(1)  # more threads gain nothing on networks of this size
         config.check()
         self.seed, self.config = seed, config
-        # rows of different training seeds never share an episode
-        self.env = BatchVecEnv(config.envs, seed=seed * 1_000_000, gamma=gamma, **environment)
+        self.identity = hashlib.blake2b(canonical([config, gamma]).encode(), digest_size=8).hexdigest()
+        self.env = BatchVecEnv(config.envs, gamma=gamma, **environment)
         extra = {} if self.env.batch.seat.action.discrete else {"log_std_init": -0.5}
         self.model = PPO(
             "MlpPolicy", self.env, learning_rate=config.learning_rate, n_steps=config.rollout, batch_size=config.batch_size,
@@ -83,6 +88,7 @@ class Learner:
             policy_kwargs={"net_arch": list(config.hidden), **extra}, seed=seed, device="cpu",
             tensorboard_log=str(tensorboard) if tensorboard else None,
         )  # fmt: skip
+        self.env.seed(seed * SEED_STRIDE)  # Stable-Baselines3 has seeded the rows with seed, seed + 1, ...: training seeds would share them
         self.curve: list[dict[str, Any]] = []
         # rows start together and end together: a window of two batches of episodes is steady, one rollout's are not
         self.ended: deque[tuple[bool, float]] = deque(maxlen=2 * config.envs)
@@ -146,8 +152,8 @@ class Learner:
             tensors[name] = torch.from_numpy(whole.view(np.uint8) if whole.dtype.kind == "u" and whole.ndim else whole)
         tensors["torch"] = torch.get_rng_state()
         facts = {
-            "format": FORMAT, "seed": self.seed, "steps": model.num_timesteps, "updates": model._n_updates, "card": batch.card()["hash"],
-            "numpy_position": int(position), "curve": self.curve, "ended": list(self.ended),
+            "format": FORMAT, "seed": self.seed, "card": batch.card()["hash"], "learner": self.identity, "steps": model.num_timesteps,
+            "updates": model._n_updates, "numpy_position": int(position), "curve": self.curve, "ended": list(self.ended),
         }  # fmt: skip
         write_atomic(path, save_tensors(tensors, {"facts": json.dumps(facts)}))
 
@@ -161,9 +167,10 @@ class Learner:
         except (OSError, SafetensorError, ValueError, KeyError, TypeError) as error:
             raise InputError("checkpoint", str(path), f"a checkpoint of this program ({type(error).__name__})") from None
         batch, model = self.env.batch, self.model
-        if facts.get("format") != FORMAT or facts.get("seed") != self.seed or facts.get("card") != batch.card()["hash"]:
-            expected = f"seed {self.seed}, environment {batch.card()['hash']}"
-            raise InputError("checkpoint", f"{path}: seed {facts.get('seed')}, environment {facts.get('card')}", expected)
+        wanted = {"format": FORMAT, "seed": self.seed, "card": batch.card()["hash"], "learner": self.identity}
+        held = {key: facts.get(key) for key in wanted}
+        if held != wanted:
+            raise InputError("checkpoint", f"{path}: {held}", f"one of this run: {wanted}")
         try:
             self.env.reset()
             assert batch.state is not None

@@ -170,6 +170,19 @@ class InjectRamp(Script):
         return plan.brief.command(on, Kind.FDI, plan.target, value[:, None, None])
 
 
+@register("attack", "fdi_then_jam")
+@dataclass(frozen=True)
+class InjectThenJam(Script):
+    """A constant bias first, then jamming: what the gate has let in is kept in, as it now shuts out the honest samples."""
+
+    value: Finite = param(-3.0, "bias, and the jammer's value [unit of the wire]")
+    inject: PositiveCount = param(15, "steps of the bias before the jamming")
+
+    def command(self, plan: ScriptPlan, on: Array, count: Array, view: View, draws: Draws) -> Command:
+        kind = np.where(count < self.inject, Kind.FDI, Kind.DOS_JAM)
+        return plan.brief.command(on, kind, plan.target, self.value)
+
+
 # Attack steps of the thesis's figures 4.5 and 4.6.
 THESIS_FDI_STEPS = (5, 11, 23, 24, 25, 44, 50, 51, 52, 118, 119, 120, 146)
 THESIS_DOS_STEPS = (10, 28, 29, 30, 55, 56, 57, 97, 98, 99, 100, 123, 124, 148)

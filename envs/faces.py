@@ -52,6 +52,8 @@ class Seat:
 
         options: the fields of ActionSpec and Reward, and `knowledge`.
         """
+        if threat is not None and not isinstance(threat, dict):
+            raise InputError("threat", threat, "a mapping of changes of the threat model")
         threat = dict(threat or {})
         if not isinstance(scenario, str):
             raise InputError("scenario", scenario, "the name of a scenario, or of a YAML file")
@@ -98,8 +100,9 @@ class AdversaryVectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
     purpose: ClassVar[str] = "train"
 
     def __init__(self, num_envs: int = 1, *, render_mode: str | None = None, autoreset: str = "next_step", **arguments: Any) -> None:
-        if not isinstance(num_envs, int) or num_envs < 1:
+        if not isinstance(num_envs, (int, np.integer)) or num_envs < 1:
             raise InputError("num_envs", num_envs, "a whole number not below 1")
+        num_envs = int(num_envs)
         if autoreset not in _AUTORESET:
             raise unknown("autoreset", autoreset, _AUTORESET)
         if render_mode not in (None, "rgb_array"):
@@ -260,6 +263,8 @@ class AdversaryEnv(gymnasium.Env[Array, Any]):
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012 - Gymnasium's own annotation
 
     def __init__(self, *, render_mode: str | None = None, **arguments: Any) -> None:
+        if "autoreset" in arguments:
+            raise InputError("autoreset", arguments["autoreset"], "a vector environment (make_vec); a single one is reset by its user")
         self.batch = AdversaryVectorEnv(1, render_mode=render_mode, autoreset="disabled", **arguments)
         self.render_mode = render_mode
         self.metadata = self.metadata | {"render_fps": self.batch.metadata["render_fps"]}

@@ -191,6 +191,11 @@ class Profile:
 
     path: Path = param(Path("profile.csv"), "CSV file with times [s] and speeds [m/s]")
 
+    @property
+    def initial_speed(self) -> float:
+        """First speed of the file [m/s], which the plant's leader has to start with."""
+        return float(read_profile(self.path)[1][0])
+
     def prepare(self, dt: float) -> ProfilePlan:
         times, speeds = read_profile(self.path)
         steps = math.ceil((times[-1] - times[0]) / dt) + 2

@@ -20,20 +20,15 @@ from .faces import AdversaryVectorEnv
 class BatchVecEnv(VecEnv):
     """One batch as a VecEnv: same-step autoreset, infos filled at episode ends only (with `episode`, as Monitor writes it)."""
 
-    def __init__(self, num_envs: int, seed: int | None = None, **arguments: Any) -> None:
+    def __init__(self, num_envs: int, **arguments: Any) -> None:
         self.batch = AdversaryVectorEnv(num_envs, autoreset="same_step", **arguments)
         super().__init__(num_envs, self.batch.single_observation_space, self.batch.single_action_space)
-        self._first_seed = seed
         self._actions: Array = np.zeros(0)
         self._returns, self._lengths = np.zeros(num_envs), np.zeros(num_envs, np.int64)
         self._no_infos: list[dict[str, Any]] = [{} for _ in range(num_envs)]
 
     def reset(self) -> Array:
-        if self._seeds[0] is not None:
-            seed: int | None = self._seeds[0]
-        else:
-            seed, self._first_seed = self._first_seed, None
-        observation, _ = self.batch.reset(seed=seed)
+        observation, _ = self.batch.reset(seed=self._seeds[0])  # row i: this seed + i, as `seed` sets them
         self._reset_seeds()
         self._returns[:], self._lengths[:] = 0.0, 0
         return observation

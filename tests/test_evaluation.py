@@ -11,10 +11,12 @@ import pytest
 
 import tailgate
 from tailgate import evaluation
+from tailgate import rows as rows_module
 from tailgate.errors import InputError
 from tailgate.estimators import Kalman, Oracle
-from tailgate.evaluation import Cell, cells_of, read_rows, run, run_cell
+from tailgate.evaluation import Cell, cells_of, run, run_cell
 from tailgate.metrics import METRICS
+from tailgate.rows import read_rows
 from tailgate.scenario import Suite
 from tailgate.summary import summarise
 
@@ -36,7 +38,7 @@ def test_rows_do_not_depend_on_the_batch_or_the_workers(tmp_path: Path) -> None:
 
 def test_a_row_has_every_column_and_no_nan() -> None:
     (row,) = run_cell(Cell("s", "braking-v0", None, "kf", "none", 1))
-    for name in (*evaluation.KEYS, "seed", "batch", "engine", "status", "reason", "trace_hash", "decision_hash", "version", "threat_model", *METRICS):
+    for name in (*rows_module.KEYS, "seed", "batch", "engine", "status", "reason", "trace_hash", "decision_hash", "version", "threat_model", *METRICS):
         assert name in row, name
     assert row["impact_speed"] is None and row["detection_delay"] is None  # undefined without a collision, without an attack
     json.dumps(row, allow_nan=False)

@@ -205,8 +205,8 @@ def _leaderboard_parser(commands: Any) -> None:
 
 
 def _build(options: argparse.Namespace) -> int:
-    from tailgate.evaluation import read_rows
     from tailgate.leaderboard.build import build
+    from tailgate.rows import read_rows
 
     rows = [row for name in options.rows for row in read_rows(Path(name))]
     print(build(rows, Path(options.out), title=options.title))

@@ -79,6 +79,12 @@ class Model:
     sensors: tuple[str, ...]
     v2v: tuple[str, ...] = ()
 
+    def __post_init__(self) -> None:
+        for name in ("A", "B", "c", "C", "Q", "R", "graph"):  # public, and nobody's to change: own copies, read-only
+            own = np.array(getattr(self, name))
+            own.flags.writeable = False
+            object.__setattr__(self, name, own)
+
     @property
     def agents(self) -> int:
         return int(self.C.shape[0])

@@ -6,11 +6,10 @@ interrupted run resumes, and a component that crashes costs its own rows only.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import hashlib
-import json
 import multiprocessing
-import shutil
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -23,17 +22,16 @@ import numpy as np
 
 import tailgate
 from tailgate import draws
-from tailgate.core import Array, Estimate, Model, Prior, Received
 from tailgate.errors import InputError, NotApplicable
 from tailgate.files import writable_directory, write_atomic
 from tailgate.metrics import METRICS, measure
 from tailgate.registry import Entry, Spec, entry_for, text_of
+from tailgate.rows import encode, read_rows
 from tailgate.scenario import Scenario, Suite, load_scenario, load_suite
 from tailgate.schema import as_data, canonical
 from tailgate.trace import rollout
 
 ENGINE = "plain"
-KEYS = ("suite", "scenario", "dose", "knowledge", "defence", "attack", "purpose", "config_hash")
 
 
 @dataclass(frozen=True)
@@ -62,40 +60,6 @@ class Cell:
         return load_scenario(self.scenario).with_threat(**changes)
 
 
-@dataclass(frozen=True, eq=False)
-class Checked:
-    """A defence whose outputs are checked for type, shape and finiteness at every step."""
-
-    inner: Any
-
-    def prepare(self, model: Model) -> Any:
-        return model, self.inner.prepare(model)
-
-    def start(self, plan: Any, prior: Prior) -> Any:
-        return self.inner.start(plan[1], prior)
-
-    def step(self, plan: Any, state: Any, received: Received, known_u: Array, random: draws.Draws) -> tuple[Any, Estimate]:
-        model, inner = plan
-        state, estimate = self.inner.step(inner, state, received, known_u, random)
-        shape = received.y.shape[:2]
-        wanted = {
-            "x": ((*shape, model.states), "f"), "score": (shape, "f"), "alarm": (shape, "b"), "mode": (shape, "iu"), "probe": (shape, "b"),
-        }  # fmt: skip
-        for name, (size, kinds) in wanted.items():
-            value = getattr(estimate, name, None)
-            if not isinstance(value, np.ndarray) or value.shape != size or value.dtype.kind not in kinds:
-                got = f"{value.dtype} {value.shape}" if isinstance(value, np.ndarray) else type(value).__name__
-                raise InputError(f"defence output {name}", got, f"an array of shape {size}, kind {kinds!r}")
-            if kinds == "f" and not np.isfinite(value).all():
-                raise InputError(f"defence output {name}", "NaN or infinity", "finite numbers")
-        return state, estimate
-
-    def __getattr__(self, name: str) -> Any:
-        if name == "look" and hasattr(self.__dict__["inner"], "look"):  # only where the defence has one
-            return lambda plan, *arguments: self.inner.look(plan[1], *arguments)
-        raise AttributeError(name)
-
-
 def _component(family: Any, value: Any) -> tuple[Any, Any, str]:
     """(object, entry, text) of a spec text or an object."""
     if isinstance(value, str):
@@ -116,7 +80,7 @@ def run_cell(cell: Cell, defence: Any = None, attack: Any = None) -> list[dict[s
     for start in range(0, cell.seeds, cell.batch):
         chunk = seeds[start : start + cell.batch]
         try:
-            loop = place.loop(Checked(guard), guard_entry.uses)
+            loop = place.loop(guard, guard_entry.uses)
             trace = rollout(loop, rival, draws.keys(cell.purpose, chunk))
             values = measure(trace)
         except NotApplicable as error:
@@ -143,8 +107,14 @@ def _head(cell: Cell, place: Scenario, guard: Entry, rival: Entry, identity: str
         "knowledge": threat.knowledge, "defence": cell.defence, "uses": list(guard.uses), "attack": cell.attack,
         "learned": rival.name == "policy", "optimal": rival.optimal, "purpose": cell.purpose, "batch": cell.batch,
         "engine": ENGINE, "versions": {"defence": guard.version, "attack": rival.version},
+        "defence_digest": _digest("defence", cell.defence, identity), "attack_digest": _digest("attack", cell.attack, identity),
         "config_hash": place.config_hash, "version": tailgate.__version__, "cell": identity,
     }  # fmt: skip
+
+
+def _digest(family: Any, text: str, identity: str) -> str:
+    """Of the file of a component that is not built in; objects have none."""
+    return Spec(family, text).digest if identity else ""
 
 
 def _failed(head: dict[str, Any], seeds: Iterable[int], reason: str, status: str = "error") -> list[dict[str, Any]]:
@@ -179,34 +149,15 @@ def cells_of(suite: Suite, *, batch: int = 256, purpose: str = "report", threat:
     ]  # fmt: skip
     for cell in out:
         spec, guard = Spec("attack", cell.attack), Spec("defence", cell.defence)
-        rival = spec.make()
+        rival, defence = spec.make(), guard.make()
         place = cell.place(rival, spec.entry.knowledge)
-        rival.prepare(place.loop(guard.make(), guard.entry.uses).brief)
-    return out
-
-
-def read_rows(path: Path) -> list[dict[str, Any]]:
-    """Rows of a JSON Lines file; raises InputError that names the line."""
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError("rows", str(path), f"a readable JSON Lines file ({error})") from None
-    rows = []
-    for number, line in enumerate(text.splitlines(), start=1):
         try:
-            row = json.loads(line)
-        except ValueError:
-            raise InputError(f"rows {path.name}, line {number}", line[:60], "a JSON object") from None
-        if not isinstance(row, dict) or not all(key in row for key in (*KEYS, "seed", "status")):
-            raise InputError(f"rows {path.name}, line {number}", line[:60], f"a row with {', '.join(KEYS)}, seed and status")
-        if row["status"] == "ok" and not all(name in row for name in METRICS):
-            raise InputError(f"rows {path.name}, line {number}", line[:60], "every metric in a row that is ok")
-        rows.append(row)
-    return rows
-
-
-def _encode(rows: Sequence[dict[str, Any]]) -> bytes:
-    return "".join(json.dumps(row, allow_nan=False) + "\n" for row in rows).encode()
+            rival.prepare(place.loop(defence, guard.entry.uses).brief)
+        except InputError:
+            raise
+        except Exception:  # a component that breaks costs its own rows: run_cell will say why
+            continue
+    return out
 
 
 def run(
@@ -219,7 +170,9 @@ def run(
     done: dict[str, list[dict[str, Any]]] = {}
     parts = None
     if out is not None:
-        parts = writable_directory(out.with_name(out.name + ".parts"))
+        if out.is_dir():
+            raise InputError("out", str(out), "a file, not a directory")
+        parts = writable_directory(out.with_name(f".{out.name}.parts"))
         for i in ids:
             part = parts / f"{i}.jsonl"
             kept = read_rows(part) if part.is_file() else []
@@ -229,18 +182,22 @@ def run(
     for position, rows in _play([cell for _, cell in missing], workers):
         done[missing[position][0]] = rows
         if parts is not None:
-            write_atomic(parts / f"{missing[position][0]}.jsonl", _encode(rows))
+            write_atomic(parts / f"{missing[position][0]}.jsonl", encode(rows))
         if progress is not None:
             progress(len(done), len(cells))
     rows = [row for i in ids for row in done[i]]
     if out is not None and parts is not None:
-        write_atomic(out, _encode(rows))
-        shutil.rmtree(parts)
+        write_atomic(out, encode(rows))
+        for i in ids:
+            (parts / f"{i}.jsonl").unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # something else lies there: not ours to remove
+            parts.rmdir()
     return rows
 
 
 def _play(cells: Sequence[Cell], workers: int) -> Iterator[tuple[int, list[dict[str, Any]]]]:
-    if workers == 1 or len(cells) < 2:
+    foreign = any(Spec("defence", cell.defence).imports or Spec("attack", cell.attack).imports for cell in cells)
+    if not foreign and (workers == 1 or len(cells) < 2):
         for i, cell in enumerate(cells):
             yield i, run_cell(cell)
         return
@@ -321,4 +278,6 @@ def evaluate(
                 for dose in named.doses:
                     cell = Cell(named.name, scenario, dose, *texts, named.seeds, purpose, 0, batch, dict(threat or {}))
                     rows += run_cell(cell, guard, rival)
+    if out is not None and len(rows) > sum(cell.seeds for cell in cells):
+        write_atomic(Path(out), encode(rows))  # with the rows of objects
     return rows

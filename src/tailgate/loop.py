@@ -33,10 +33,26 @@ from tailgate.core import (
     WhiteBox,
 )  # fmt: skip
 from tailgate.draws import Keys, Role
+from tailgate.errors import InputError
 from tailgate.threat import Brief, Channel, ChannelPlan, ChannelState, ThreatModel
 from tailgate.tree import duplicate, frozen, put_rows
 
 _START = np.uint32(0xFFFFFFFF)  # the step under which start() draws: no episode reaches it
+
+
+def check_estimate(estimate: Estimate, model: Model, batch: int) -> None:
+    """Raise InputError when a defence's output has not the type, shape or finiteness that the loop needs."""
+    shape = (batch, model.agents)
+    wanted = {
+        "x": ((*shape, model.states), "f"), "score": (shape, "f"), "alarm": (shape, "b"), "mode": (shape, "iu"), "probe": (shape, "b"),
+    }  # fmt: skip
+    for name, (size, kinds) in wanted.items():
+        value = getattr(estimate, name, None)
+        if not isinstance(value, np.ndarray) or value.shape != size or value.dtype.kind not in kinds:
+            got = f"{value.dtype} {value.shape}" if isinstance(value, np.ndarray) else type(value).__name__
+            raise InputError(f"defence output {name}", got, f"an array of shape {size}, kind {kinds!r}")
+        if kinds == "f" and not np.isfinite(value).all():
+            raise InputError(f"defence output {name}", "NaN or infinity", "finite numbers")
 
 
 class LoopPlan(NamedTuple):
@@ -175,6 +191,7 @@ class Loop:
         defence, estimate = self.defence.step(
             plan.defence, state.defence, frozen(heard), frozen(state.known_u), state.keys.at(Role.DEFENCE, state.k)
         )
+        check_estimate(estimate, self.model, len(state.k))
         truth = self.plant.truth(plan.plant, state.plant)
         assert received.v2v is not None
         controller, u, manoeuvre, plant = self._drive(

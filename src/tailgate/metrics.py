@@ -93,10 +93,11 @@ def min_gap(trace: Trace) -> Array:
 
 @metric("m/s")
 def impact_speed(trace: Trace) -> Array:
-    """Closing speed at a collision with the car ahead."""
-    hit = trace.collided & trace.live
+    """Closing speed at the first collision with the car ahead, at least 0."""
+    first = _first_step(trace.collided & trace.live)
     closing = _front(trace, "speed") - _front(trace, "lead_speed")
-    return np.where(hit.any(axis=0), _total(np.where(hit, closing, 0.0)), np.nan)
+    at = closing[np.where(np.isnan(first), 0, first).astype(np.int64), np.arange(trace.batch)]
+    return np.where(np.isnan(first), np.nan, np.maximum(at, 0.0))
 
 
 @metric("s")
@@ -129,13 +130,14 @@ def max_error(trace: Trace) -> Array:
 
 @metric("s")
 def recovery_time(trace: Trace) -> Array:
-    """From the last attack step until the gap error is within 2 m for the first time; null if never, or no attack."""
+    """From the last attack step until the gap error stays within 2 m; null without an attack, after a collision, or if it never does."""
     attacked = _attacked(trace)
     steps = np.arange(len(attacked))[:, None]
     last = np.max(np.where(attacked, steps, -1), axis=0)
     error = np.abs(_front(trace, "gap") - trace.desired_gap(_front(trace, "speed")))
-    calm = (error <= RECOVERY_TOLERANCE) & trace.live & (steps > last)
-    return np.where(last >= 0, (_first_step(calm) - last) * trace.dt, np.nan)
+    restless = np.max(np.where((error > RECOVERY_TOLERANCE) & trace.live, steps, -1), axis=0)
+    recovered = (last >= 0) & (restless < trace.length - 1) & (crashed(trace) == 0.0)
+    return np.where(recovered, np.maximum(restless - last, 0) * trace.dt, np.nan)
 
 
 @metric("steps")
@@ -197,15 +199,10 @@ def rms_jerk(trace: Trace) -> Array:
 
 @metric("ratio")
 def string_gain(trace: Trace) -> Array:
-    """Largest speed deviation of the car over that of the car ahead; null where the car ahead keeps its speed."""
-    live = trace.live
-
-    def swing(name: str) -> Array:
-        deviation = np.abs(_front(trace, name) - trace.first[name][None, :, 0])
-        return np.asarray(np.max(np.where(live, deviation, 0.0), axis=0))
-
-    lead = swing("lead_speed")
-    return np.asarray(swing("speed") / np.where(lead > 0.1, lead, np.nan))
+    """Root mean square acceleration of the car over that of the car ahead; null where the car ahead keeps its speed."""
+    speed = np.concatenate([trace.first["lead_speed"][None, :, 0], _front(trace, "lead_speed")])
+    lead = _rms((speed[1:] - speed[:-1]) / trace.dt, trace.live)
+    return np.asarray(_rms(_front(trace, "accel"), trace.live) / np.where(lead > 0.01, lead, np.nan))
 
 
 @metric("steps")

@@ -8,6 +8,7 @@ import hashlib
 import importlib
 import inspect
 import json
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.metadata import entry_points
@@ -89,7 +90,12 @@ def _load(family: Family) -> dict[str, Entry]:
     group = _GROUPS.get(family)
     if group and group not in _plugins_loaded:
         for point in entry_points(group=group):
-            put(entry_of(family, point.name, point.load()))
+            try:
+                cls = point.load()
+            except Exception as error:  # somebody's broken package shall not stop those who do not use it
+                warnings.warn(f"plug-in {point.name!r} of {group} cannot be loaded: {error}", stacklevel=2)
+                continue
+            put(entry_of(family, point.name, cls))
         _plugins_loaded.add(group)  # only now: a plug-in that fails shall fail again, not vanish
     return _entries[family]
 
@@ -116,8 +122,10 @@ def text_of(entry: Entry, value: Any) -> str:
     cls = type(value)
     name = entry.name if _entries[entry.family].get(entry.name) is entry else f"{cls.__module__}:{cls.__qualname__}"
     params = as_data(value)
-    shown = ",".join(f"{key}={json.dumps(params[key])}" for key in params) if isinstance(params, dict) else ""
-    return f"{name}:{shown}" if shown else name
+    if not isinstance(params, dict):
+        return name
+    shown = [f"{key}={json.dumps(held)}" for key, held in params.items() if key != "class"]
+    return f"{name}:{','.join(shown)}" if shown else name
 
 
 def entries(family: Family) -> dict[str, Entry]:
@@ -173,7 +181,7 @@ class Spec:
 
     def refuse_imports(self, where: str) -> None:
         """Raise InputError when this names a class to import: configuration files never run code."""
-        if ":" in self._parts()[0]:
+        if self.imports:
             raise InputError(f"{where}: {self.family}", self.text, "a registered name; code is named on the command line only")
 
     @property
@@ -195,6 +203,11 @@ class Spec:
         return entry_of(self.family, head, cls)
 
     @property
+    def imports(self) -> bool:
+        """Whether this names a class to import."""
+        return ":" in self._parts()[0]
+
+    @property
     def digest(self) -> str:
         """Of the file that somebody else's component comes from; empty for registered ones, which carry a version."""
         head, _ = self._parts()
@@ -210,7 +223,11 @@ class Spec:
         head, params = self._parts()
         if self.family == "attack" and head.endswith(".json"):
             params = {"path": head, **params}
-        return build(self.entry.cls, params, f"{self.family} {head}")
+        made: Any = build(self.entry.cls, params, f"{self.family} {head}")
+        steps = {"defence": ("prepare", "start", "step"), "attack": ("prepare", "start", "decide")}.get(self.family, ())
+        if not all(callable(getattr(made, name, None)) for name in steps):
+            raise InputError(self.family, self.text, f"a class with {', '.join(steps)}")
+        return made
 
 
 def _split(text: str) -> list[str]:

@@ -12,7 +12,7 @@ from typing import Any
 from tailgate.core import Defence, PositiveCount, param
 from tailgate.errors import InputError, unknown
 from tailgate.loop import Loop
-from tailgate.registry import make_from
+from tailgate.registry import Spec, make_from
 from tailgate.schema import build, canonical, fields_of, read_yaml
 from tailgate.threat import Brief, ThreatModel
 
@@ -38,6 +38,9 @@ class Scenario:
             self.plant, self.sensor, self.controller, self.manoeuvre, self.threat_model, self.horizon, defence, uses,
             self.ends_on_collision,
         )  # fmt: skip
+        begins, drives = getattr(self.manoeuvre, "initial_speed", None), getattr(self.plant, "lead_speed", None)
+        if begins is not None and drives is not None and abs(begins - drives) > 0.5:
+            raise InputError(f"scenario {self.name}: plant.lead_speed", drives, f"the manoeuvre's first speed ({begins} m/s)")
         _ = loop.plan  # refuses what does not fit (unknown targets, a damaged profile) here, not in the first step
         return loop
 
@@ -117,4 +120,9 @@ def load_scenario(name: str) -> Scenario:
 def load_suite(name: str) -> Suite:
     """A suite by name, or from a YAML file."""
     path = config_path("suites", name, "suite")
-    return build(Suite, {"name": path.stem} | read_yaml(path, "suite"), f"suite {path.stem}")
+    suite = build(Suite, {"name": path.stem} | read_yaml(path, "suite"), f"suite {path.stem}")
+    for text in suite.defences:
+        Spec("defence", text).refuse_imports(f"suite {path.stem}")
+    for text in suite.attacks:
+        Spec("attack", text).refuse_imports(f"suite {path.stem}")
+    return suite

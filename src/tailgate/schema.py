@@ -56,9 +56,11 @@ def build(cls: type[T], data: dict[str, Any], where: str) -> T:
 
 
 def as_data(value: Any) -> Any:
-    """Parameters as plain JSON data, every default written out."""
+    """Parameters as plain JSON data: the class, and every default written out."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {f.name: as_data(getattr(value, f.name)) for f in dataclasses.fields(value) if f.init}
+        kind = type(value)
+        fields = {f.name: as_data(getattr(value, f.name)) for f in dataclasses.fields(value) if f.init}
+        return {"class": f"{kind.__module__}.{kind.__qualname__}", **fields}
     if isinstance(value, dict):
         return {str(k): as_data(v) for k, v in value.items()}
     if isinstance(value, (list, tuple)):

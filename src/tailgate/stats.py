@@ -25,19 +25,20 @@ def proportion(successes: int, n: int, level: float = 0.95) -> Interval:
     return Interval(successes / n, float(ci.low), float(ci.high))
 
 
-def paired_difference(a: Array, b: Array, level: float = 0.95, resamples: int = 10_000, seed: int = 0) -> Interval:
-    """Mean of a - b with a percentile bootstrap interval.
+def paired_difference(a: Array, b: Array, level: float = 0.95, resamples: int = 4000, seed: int = 0) -> Interval:
+    """Mean of a - b on the same episodes, with an interval.
 
-    a and b are (episodes,), or (training seeds, episodes) on the same episodes: then training seeds are resampled first and
-    episodes within (hierarchical bootstrap). A seed gives the same interval twice.
+    a and b are (episodes,), or (training seeds, episodes). The part of the episodes comes from a bootstrap over them (a seed gives
+    the same interval twice); that of the training seeds from Student's t over their means, as a bootstrap of three or five runs is too
+    narrow. Both are added in squares. With one training seed the interval speaks of that policy alone.
     """
     delta = np.atleast_2d(np.asarray(a, np.float64) - np.asarray(b, np.float64))
     runs, episodes = delta.shape
+    value, of_episode = float(delta.mean()), delta.mean(axis=0)
     rng = np.random.default_rng(seed)
-    means = np.empty(resamples)
-    for i in range(resamples):
-        chosen = rng.integers(runs, size=runs)
-        columns = rng.integers(episodes, size=episodes)
-        means[i] = delta[np.ix_(chosen, columns)].mean()
+    means = np.array([of_episode[rng.integers(episodes, size=episodes)].mean() for _ in range(resamples)])
     low, high = np.quantile(means, [(1 - level) / 2, (1 + level) / 2])
-    return Interval(float(delta.mean()), float(low), float(high))
+    spread = 0.0
+    if runs > 1:
+        spread = float(stats.t.ppf((1 + level) / 2, runs - 1) * delta.mean(axis=1).std(ddof=1) / np.sqrt(runs))
+    return Interval(value, value - float(np.hypot(value - low, spread)), value + float(np.hypot(high - value, spread)))

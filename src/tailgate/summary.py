@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from tailgate.evaluation import KEYS
+from tailgate.rows import KEYS
 from tailgate.stats import proportion
 
 
 def summarise(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """One entry per cell (the columns of evaluation.KEYS), in order of appearance; a seed counts once, its last row.
+    """One entry per cell (the columns of rows.KEYS), in order of appearance; a seed counts once, its last row.
 
     crash: share of episodes with a collision in front or behind, with a 95 % Clopper-Pearson interval; the other columns are medians
     with quartiles. Rows with an error are counted in `failed`; those and skipped pairings are left out of the figures.

@@ -9,21 +9,25 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import Field
 
 from tailgate import draws
-from tailgate.core import Array, Count, Positive, PositiveCount, param
-from tailgate.errors import InputError
+from tailgate.agents.codec import ActionSpec, Reward
+from tailgate.core import Array, Count, PositiveCount, param
+from tailgate.errors import InputError, unknown
 from tailgate.evaluation import cells_of, run
 from tailgate.files import writable_directory, write_atomic
 from tailgate.registry import Spec
 from tailgate.scenario import Suite, config_path, load_scenario
-from tailgate.schema import as_data, build, canonical, override, read_yaml
+from tailgate.schema import as_data, build, canonical, fields_of, override, read_yaml
 from tailgate.stats import Interval, paired_difference, proportion
 
 BATCH = 512  # episodes side by side in the comparison
+SELECT_EPISODES = 1024  # that the best rival is chosen on: fewer would choose by chance
+Discount = Annotated[float, Field(gt=0, le=1)]
 
 
 @dataclass(frozen=True)
@@ -37,7 +41,7 @@ class TrainConfig:
     threat: dict[str, Any] = field(default_factory=dict, metadata={"doc": "changes of the scenario's threat model"})
     environment: dict[str, Any] = field(default_factory=dict, metadata={"doc": "action and reward settings of the environment"})
     ppo: dict[str, Any] = field(default_factory=dict, metadata={"doc": "hyper-parameters of PPO"})
-    gamma: Positive = param(0.995, "discount, of the learner and of the shaping [-]")
+    gamma: Discount = param(0.995, "discount, of the learner and of the shaping [-]")
     steps: PositiveCount = param(3_000_000, "decisions per training seed, over all environments")
     first_seed: Count = param(0, "first training seed")
     seeds: PositiveCount = param(1, "training seeds, one policy each")
@@ -46,7 +50,7 @@ class TrainConfig:
     episodes: PositiveCount = param(400, "fresh episodes per attack in the final comparison")
     workers: PositiveCount = param(2, "processes of the final comparison; change no result")
     rivals: tuple[str, ...] = param((), "scripted attacks of equal knowledge and dose to compare with")
-    ceilings: tuple[str, ...] = param(("stealth:trigger=near,threshold=40",), "white-box attacks, shown as yardsticks")
+    white_box: tuple[str, ...] = param(("stealth:trigger=near,threshold=40",), "attacks that know more, shown beside the others")
     others: tuple[str, ...] = param(("none", "kf", "oracle"), "further defences that the attacks are played on")
 
     @property
@@ -65,13 +69,17 @@ def load_config(source: str | None, overrides: list[str]) -> TrainConfig:
     config = build(TrainConfig, data, "config")
     for spec in [Spec("defence", config.defence), *(Spec("defence", name) for name in config.others)]:
         spec.refuse_imports("config")
-    for spec in (Spec("attack", name) for name in (*config.rivals, *config.ceilings)):
+    for spec in (Spec("attack", name) for name in (*config.rivals, *config.white_box)):
         spec.refuse_imports("config")
     return config
 
 
 def environment_of(config: TrainConfig) -> dict[str, Any]:
     """Arguments of the adversary environment."""
+    known = (fields_of(ActionSpec) | fields_of(Reward)).keys() - {"gamma"}
+    for key in config.environment:
+        if key not in known:  # the scenario, the defence, the threat model and gamma have a field of their own
+            raise unknown("config.environment: unknown field", key, known)
     return {"scenario": config.scenario, "defence": config.defence, "threat": dict(config.threat), **config.environment}
 
 
@@ -80,7 +88,7 @@ def _check(config: TrainConfig) -> None:
     from tailgate.envs.faces import Seat
 
     Seat.make(**environment_of(config))
-    cells_of(_suite(config, (*config.rivals, *config.ceilings)), threat=config.threat)
+    cells_of(_suite(config, (*config.rivals, *config.white_box)), threat=config.threat)
 
 
 def _suite(config: TrainConfig, attacks: tuple[str, ...]) -> Suite:
@@ -109,11 +117,11 @@ def train(config: TrainConfig, progress: Callable[[int, Any], None], resume: boo
     snapshot = json.dumps(as_data(config), indent=1).encode() + b"\n"
     held = directory / "config.json"
     if resume and held.is_file():
-        before = {k: v for k, v in json.loads(held.read_text()).items() if k != "steps"}
-        now = {k: v for k, v in as_data(config).items() if k != "steps"}
-        if before != now:
-            changed = ", ".join(k for k in now if before.get(k) != now[k])
-            raise InputError("resume", changed, f"the configuration in {held}, apart from steps")
+        _same_run(held, config)
+    elif not resume:
+        for pattern in ("checkpoint-*", "policy-*", "curve-*.json", "report.json", "rows.jsonl"):  # of an earlier run of this name
+            for old in directory.glob(pattern):
+                old.unlink()
     write_atomic(held, snapshot)
     policies = []
     for seed in range(config.first_seed, config.first_seed + config.seeds):
@@ -135,6 +143,18 @@ def train(config: TrainConfig, progress: Callable[[int, Any], None], resume: boo
     return policies
 
 
+def _same_run(held: Path, config: TrainConfig) -> None:
+    """Raise InputError when a run would be resumed with another configuration; only the number of steps may change."""
+    now = as_data(config)
+    try:
+        before = json.loads(held.read_text(encoding="utf-8"))
+        changed = [key for key in now if key != "steps" and before.get(key) != now[key]]
+    except (OSError, ValueError, AttributeError) as error:
+        raise InputError("resume", str(held), f"the configuration of the run ({error})") from None
+    if changed:
+        raise InputError("resume", ", ".join(changed), f"the configuration in {held}, apart from steps")
+
+
 def _crashes(rows: list[dict[str, Any]]) -> Array:
     bad = next((row for row in rows if row["status"] != "ok"), None)
     if bad is not None:
@@ -145,17 +165,18 @@ def _crashes(rows: list[dict[str, Any]]) -> Array:
 def compare(config: TrainConfig, policies: list[Path], progress: Callable[[int, int], None] | None = None) -> dict[str, Any]:
     """Play the policies and the scripted rivals on fresh report seeds; writes rows.jsonl and report.json; returns the report.
 
-    The best rival is chosen on select seeds and reported on report seeds, so that the choice does not favour it.
+    The best rival is chosen on select seeds and reported on report seeds, so that the choice does not favour it; every rival is
+    reported as well.
     """
     from tailgate.agents.policy import PolicyAttack, timing_advantage
     threat = dict(config.threat)
     names = [str(p) for p in policies]
     guard = config.defence
-    choice = Suite(config.name, "", (config.scenario,), (None,), (guard,), config.rivals, min(config.episodes, 200))
+    choice = Suite(config.name, "", (config.scenario,), (None,), (guard,), config.rivals, SELECT_EPISODES)
     selection = run(cells_of(choice, batch=BATCH, purpose="select", threat=threat), workers=config.workers) if config.rivals else []
     best = max(config.rivals, key=lambda a: _crashes([r for r in selection if r["attack"] == a]).mean(), default=None)
 
-    attacks = ("none", *config.rivals, *config.ceilings, *names)
+    attacks = ("none", *config.rivals, *config.white_box, *names)
     cells = cells_of(_suite(config, attacks), batch=BATCH, threat=threat)
     rows = run(cells, config.directory / "rows.jsonl", config.workers, progress)
 
@@ -167,7 +188,7 @@ def compare(config: TrainConfig, policies: list[Path], progress: Callable[[int, 
     verdicts = []
     for path, seed in zip(policies, range(config.first_seed, config.first_seed + config.seeds), strict=True):
         policy = PolicyAttack(path)
-        place = load_scenario(config.scenario).with_threat(**threat, knowledge=policy.knowledge)
+        place = load_scenario(config.scenario).with_threat(**(threat | {"knowledge": policy.knowledge}))
         own, yoked = timing_advantage(place.loop(built, uses), policy, keys)
         verdicts.append(Verdict(seed, path, own, yoked))
     return _report(config, verdicts, crashes, best)
@@ -186,16 +207,21 @@ def _report(config: TrainConfig, verdicts: list[Verdict], crashes: Callable[[str
         items.append((best, share(crashes(best)), "best scripted attack of equal knowledge and dose, chosen on other seeds"))
     items += [(f"learned, seed {v.seed}", share(v.learned), "") for v in verdicts]
     items += [(f"learned, seed {v.seed}, yoked", share(v.yoked), "its own values at another episode's times") for v in verdicts]
-    items += [(name, share(crashes(name)), "white box: a yardstick, not a rival") for name in config.ceilings]
+    items += [(name, share(crashes(name)), "white box, and no step of it alarms: knows more, dares less") for name in config.white_box]
+
+    def over(attack: str) -> Interval:
+        return paired_difference(learned, np.broadcast_to(crashes(attack), learned.shape))
+
     versus = {"no attack": paired_difference(learned, none), "own yoked schedule": paired_difference(learned, yoked)}
     if best is not None:
-        versus["best scripted attack"] = paired_difference(learned, np.broadcast_to(crashes(best), learned.shape))
+        versus["best scripted attack"] = over(best)
     report = {
         "name": config.name, "scenario": config.scenario, "defence": config.defence, "episodes": config.episodes, "steps": config.steps,
         "threat": as_data(load_scenario(config.scenario).with_threat(**config.threat).threat_model),
         "config": json.loads(canonical(config)), "policies": [str(v.policy) for v in verdicts], "best_scripted": best,
         "crash": [{"label": label, **interval._asdict(), "note": note} for label, interval, note in items],
         "advantage": {name: interval._asdict() for name, interval in versus.items()},
+        "rivals": {name: {"crash": share(crashes(name))._asdict(), "advantage": over(name)._asdict()} for name in config.rivals},
     }  # fmt: skip
     write_atomic(config.directory / "report.json", json.dumps(report, indent=1, allow_nan=False).encode() + b"\n")
     return report
@@ -211,17 +237,19 @@ def headline(report: dict[str, Any]) -> dict[str, Any]:
         f"{_points(g['value'])} points over {name} [{_points(g['low'])}, {_points(g['high'])}]"
         for name, g in report["advantage"].items()
     )
+    runs = len(report["policies"])
+    speaks = "of this one policy: other training seeds differ" if runs == 1 else f"over {runs} training seeds"
     text = (
         f"An adversary was trained for {report['steps']:,} decisions against {report['defence']} on {report['scenario']}. "
-        f"Share of {report['episodes']} fresh episodes that end in a collision: {gains} (95 % paired bootstrap)."
+        f"Share of {report['episodes']} fresh episodes that end in a collision: {gains} (paired, 95 %; {speaks})."
     )
     return {"text": text, "items": report["crash"]}
 
 
 def make_page(config: TrainConfig, report: dict[str, Any]) -> Path:
     """The page of a finished run."""
-    from tailgate.evaluation import read_rows
     from tailgate.leaderboard.build import build as build_page
+    from tailgate.rows import read_rows
 
     curve = [
         point for seed in range(config.first_seed, config.first_seed + config.seeds)

@@ -1,0 +1,57 @@
+"""Rows: one JSON object per episode and line, with everything that is needed to play it again."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import ConfigDict, Field, ValidationError, create_model
+
+from tailgate.errors import InputError
+from tailgate.metrics import METRICS
+
+# What tells one cell from another: rows that differ in one of these are never summed up together.
+KEYS = (
+    "suite", "scenario", "dose", "knowledge", "defence", "attack", "purpose", "config_hash", "version", "defence_digest", "attack_digest",
+)  # fmt: skip
+
+_Text = Annotated[str, Field(strict=True)]
+_Number = Annotated[float, Field(strict=True, allow_inf_nan=False)] | None
+_FIELDS: dict[str, Any] = {
+    **{key: (_Text, ...) for key in KEYS}, **{name: (_Number, ...) for name in METRICS},
+    "dose": (Annotated[int, Field(strict=True)] | None, ...), "seed": (Annotated[int, Field(strict=True)], ...),
+    "status": (Literal["ok", "error", "skipped"], ...), "reason": (_Text, ""), "uses": (list[_Text], ...),
+    "learned": (bool, ...), "optimal": (bool, ...),
+}  # fmt: skip
+_Row = create_model("Row", __config__=ConfigDict(extra="allow"), **_FIELDS)
+
+
+def read_rows(path: Path) -> list[dict[str, Any]]:
+    """Rows of a JSON Lines file, checked; raises InputError that names the line."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError("rows", str(path), f"a readable JSON Lines file ({error})") from None
+    rows = []
+    for number, line in enumerate(text.splitlines(), start=1):
+        where = f"rows {path.name}, line {number}"
+        try:
+            row = json.loads(line)
+        except ValueError:
+            raise InputError(where, line[:60], "a JSON object") from None
+        try:
+            _Row.model_validate(row)
+        except ValidationError as error:
+            first = error.errors()[0]
+            field = ".".join(str(part) for part in first["loc"])
+            shown = first["input"] if isinstance(row, dict) and field in row else None
+            raise InputError(f"{where}: {field}", shown, first["msg"]) from None
+        if row["status"] == "ok" and row["crashed"] not in (0.0, 1.0):
+            raise InputError(f"{where}: crashed", row["crashed"], "0 or 1")
+        rows.append(row)
+    return rows
+
+
+def encode(rows: Sequence[dict[str, Any]]) -> bytes:
+    """Rows as JSON Lines; NaN and infinity are refused."""
+    return "".join(json.dumps(row, allow_nan=False) + "\n" for row in rows).encode()
