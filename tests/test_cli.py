@@ -43,11 +43,15 @@ def test_evaluate_prints_a_table_or_json_and_writes_rows(tmp_path: Path, capsys:
 
 
 def test_a_failing_component_is_exit_code_1_and_its_rows_say_why(tmp_path: Path) -> None:
-    (tmp_path / "bad.py").write_text("class Bad:\n    def prepare(self, model):\n        raise RuntimeError('no')\n    start = step = None\n")
+    (tmp_path / "bad.py").write_text(
+        "class Bad:\n    def prepare(self, model):\n        raise RuntimeError('out of order')\n    def start(self): ...\n    def step(self): ...\n"
+    )
     done = _run("evaluate", "--scenario", "gusty-stop-and-go-v0", "--defence", "kf", "--defence", "bad:Bad", "--attack", "none",
                 "--seeds", "2", "--out", "rows.jsonl", cwd=tmp_path)  # fmt: skip
-    assert done.returncode in (1, 2), done.stderr
-    assert "no" in (done.stdout + done.stderr)
+    assert done.returncode == 1, done.stderr
+    rows = [json.loads(line) for line in (tmp_path / "rows.jsonl").read_text().splitlines()]
+    assert [row["status"] for row in rows] == ["ok", "ok", "error", "error"] and "out of order" in rows[-1]["reason"]
+    assert "2 of 4 rows failed" in done.stderr
 
 
 @pytest.mark.parametrize(

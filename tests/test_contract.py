@@ -1,7 +1,6 @@
 """One contract over the registry: whatever is registered, plug-ins included, obeys the same laws."""
 
 import contextlib
-import dataclasses
 
 import numpy as np
 import pytest
@@ -10,7 +9,6 @@ import tailgate
 from tailgate.core import Command, Kind, Mode
 from tailgate.draws import Draws, Keys, Role, keys
 from tailgate.errors import InputError, NotApplicable
-from tailgate.evaluation import Checked
 from tailgate.registry import entries, make
 from tailgate.scenario import list_scenarios, list_suites, load_scenario, load_suite
 from tailgate.schema import fields_of
@@ -72,7 +70,6 @@ def test_outputs_are_finite_and_of_the_right_shape(defence, attack, short, play,
     """Under every kind of attack, with the widest jammer, a defence returns finite arrays of the declared shapes and types."""
     place = short(jam_range=(-1e6, 1e6))
     loop = loop_of(place, defence)
-    loop = dataclasses.replace(loop, defence=Checked(loop.defence))
     options = {"low": -1e6, "high": 1e6} if attack == "dos_jam" else {}
     trace = rollout(loop, tailgate.make_attack(attack, **options), keys("train", range(9)), terminate=False)
     assert trace.estimate.shape == (60, 9, 1, 3) and trace.score.shape == trace.alarm.shape == trace.mode.shape == (60, 9, 1)

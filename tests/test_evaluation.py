@@ -161,5 +161,48 @@ def test_damaged_rows_are_refused_with_their_line(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="line 2"):
         read_rows(path)
     path.write_text(json.dumps({k: v for k, v in rows[0].items() if k != "crashed"}))
-    with pytest.raises(InputError, match=r"line 1.*every metric"):
+    with pytest.raises(InputError, match=r"line 1: crashed"):
         read_rows(path)
+
+
+def test_a_suite_file_never_imports_code(tmp_path: Path) -> None:
+    (tmp_path / "s.yaml").write_text("scenarios: [braking-v0]\ndefences: ['os:system']\nattacks: [none]\n")
+    with pytest.raises(InputError, match="os:system"):
+        tailgate.evaluate(str(tmp_path / "s.yaml"))
+
+
+def test_rows_of_objects_are_written_too(tmp_path: Path) -> None:
+    out = tmp_path / "rows.jsonl"
+    rows = tailgate.evaluate(scenarios=["gusty-stop-and-go-v0"], defences=["kf", Oracle()], attacks=["none"], seeds=2, out=out)
+    assert len(rows) == 4 and read_rows(out) == rows
+
+
+def test_an_output_directory_is_refused_and_strangers_files_are_kept(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="out"):
+        run(cells_of(SUITE), tmp_path)
+    parts = tmp_path / ".rows.jsonl.parts"
+    parts.mkdir()
+    (parts / "mine.txt").write_text("keep")
+    run(cells_of(SUITE)[:1], tmp_path / "rows.jsonl")
+    assert (parts / "mine.txt").read_text() == "keep"
+
+
+@pytest.mark.parametrize(
+    ("field", "value"), [("min_gap", float("nan")), ("min_gap", "x"), ("seed", [1]), ("scenario", {}), ("uses", 5), ("crashed", 0.5), ("dose", "abc")]
+)
+def test_a_row_with_a_wrong_value_is_refused_with_its_line(tmp_path: Path, field: str, value: Any) -> None:
+    (row,) = run_cell(Cell("s", "gusty-stop-and-go-v0", None, "kf", "none", 1))
+    (tmp_path / "rows.jsonl").write_text(json.dumps(row | {field: value}))
+    with pytest.raises(InputError, match=f"line 1: {field}"):
+        read_rows(tmp_path / "rows.jsonl")
+
+
+def test_different_defences_never_share_an_identity() -> None:
+    """Two compositions without parameters differ in their parts, and so do their rows and cards."""
+    from tailgate.envs.faces import AdversaryEnv
+    from tailgate.estimators import AcceptAll, ChiSquare, GateOut, KalmanFilter, Score, compose
+
+    plain, gated = compose(KalmanFilter(), Score(), AcceptAll()), compose(KalmanFilter(), ChiSquare(), GateOut())
+    rows = tailgate.evaluate(scenarios=["gusty-stop-and-go-v0"], defences=[plain, gated], attacks=["none"], seeds=2)
+    assert len(summarise(rows)) == 2
+    assert AdversaryEnv(defence=plain).card()["hash"] != AdversaryEnv(defence=gated).card()["hash"]

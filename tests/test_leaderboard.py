@@ -23,7 +23,7 @@ def cell(defence, attack, crashes, *, n=20, failed=0, skipped="", knowledge="bla
     head = {
         "suite": "tiny-v0", "scenario": "stop-and-go-v0", "dose": 12, "knowledge": knowledge, "defence": defence, "attack": attack,
         "learned": attack.endswith(".json"), "optimal": optimal, "uses": ["measurements", *uses], "purpose": "report", "version": "0.1.0",
-        "engine": "plain", "config_hash": "abc123",
+        "engine": "plain", "config_hash": "abc123", "defence_digest": "", "attack_digest": "",
     } | more  # fmt: skip
     empty = dict.fromkeys(METRICS)
     rows = []

@@ -44,6 +44,7 @@ CASES = {
     "min_gap": [({"gap": [9, 4, 6, 1]}, 1.0), ({"gap": [9, 4, 6, 1], "length": 3}, 4.0), ({"first": {"gap": 2.5}}, 2.5)],
     "impact_speed": [
         ({"collided": [0, 0, 0, 1], "speed": [10, 9, 8, 7], "lead_speed": 2.0}, 5.0), ({}, None), ({"rear_collided": 1}, None),
+        ({"collided": [0, 1, 1, 1], "speed": [10, 9, 8, 7], "lead_speed": 2.0}, 7.0), ({"collided": 1, "speed": 1.0}, 0.0),
     ],
     "min_ttc": [
         ({"speed": [10, 12, 14, 11], "gap": [9, 6, 6, 6]}, 1.5), ({}, 100.0), ({"speed": 10.01}, 100.0), ({"speed": 12, "gap": -1}, 0.0),
@@ -55,6 +56,7 @@ CASES = {
         ({"kind": [0, 5, 0, 0], "gap": [35, 80, 38, 36.9]}, 1.0), ({"kind": [0, 5, 0, 0], "gap": [35, 35, 33, 37]}, 0.5),
         ({"kind": [0, 5, 0, 0]}, None), ({"gap": 35}, None), ({"kind": [0, 0, 0, 5], "gap": 35}, None),
         ({"kind": [0, 5, 0, 0], "gap": [35, 80, 80, 35], "length": 3}, None),
+        ({"kind": [5, 0, 0, 0], "gap": [35, 35, 80, 35]}, 1.5), ({"kind": [5, 0, 0, 0], "gap": 35, "collided": [0, 0, 0, 1]}, None),
     ],
     "detection_delay": [
         ({"kind": [0, 5, 0, 5], "alarm": [1, 0, 0, 1]}, 2.0), ({"kind": [0, 5, 0, 0], "alarm": [0, 1, 1, 0]}, 0.0),
@@ -75,8 +77,8 @@ CASES = {
     "max_decel": [({"accel": [-3, 2, -1, 0]}, 3.0), ({"accel": 2.0}, 0.0), ({"accel": [-3, 2, -9, 0], "length": 2}, 3.0)],
     "rms_jerk": [({"accel": [1, 1, 0, 0], "first": {"accel": 0.0}}, math.sqrt(2.0)), ({"accel": 2.0, "first": {"accel": 2.0}}, 0.0)],
     "string_gain": [
-        ({"speed": [10, 7, 10, 11], "lead_speed": [10, 8, 10, 10]}, 1.5), ({"speed": [10, 7, 10, 11]}, None),
-        ({"speed": [10, 7, 1, 11], "lead_speed": [10, 6, 10, 10], "length": 2}, 0.75),
+        ({"lead_speed": [11, 12, 13, 14], "accel": 1.0}, 0.5), ({"lead_speed": [11, 12, 13, 14], "accel": [2, -2, 9, 9], "length": 2}, 1.0),
+        ({"accel": 3.0}, None), ({"lead_speed": [9, 8, 7, 6], "accel": [0, 0, 0, 4]}, 1.0),
     ],
     "attack_steps": [({"kind": [1, 0, 5, 2]}, 3.0), ({"kind": [1, 0, 5, 2], "length": 2}, 1.0), ({}, 0.0)],
     "refused_commands": [({"refused": [1, 0, 1, 1]}, 3.0), ({"refused": [1, 0, 1, 1], "length": 3}, 2.0)],

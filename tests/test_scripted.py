@@ -237,3 +237,11 @@ def test_rollout_stops_when_all_have_crashed(short, loop_of):
     assert len(ended.kind) == ended.length.max() < 600 == len(full.kind)
     last = ended.length - 1
     assert (ended.collided | ended.rear_collided)[last, range(4)].all()
+
+
+def test_nobody_can_rewrite_the_model(short):
+    """The public model is handed to attacks and defences: its arrays are copies, and read-only."""
+    loop = short().loop(tailgate.make_defence("kf"))
+    for name in ("A", "B", "c", "C", "Q", "R", "graph"):
+        with pytest.raises(ValueError, match="read-only"):
+            getattr(loop.brief.model, name)[...] = 0

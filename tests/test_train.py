@@ -130,6 +130,8 @@ def test_the_command_trains_compares_and_writes_a_page(tmp_path: Path) -> None:
         (["defence=os:system"], ["os:system", "registered"]), (["threat.budget=-3"], ["budget", "-3"]), (["environment.action=fly"], ["action", "fly"]),
         (["ppo.batch_size=7"], ["batch_size", "7"]), (["--config", "nosuch"], ["nosuch", "quickstart"]), (["--config", "bad.yaml"], ["bad.yaml", "YAML"]),
         (["out=file/below"], ["file", "writable"]), (["steps"], ["steps", "key=value"]), (["scenario=nan.yaml"], ["nan", "line 3"]),
+        (["environment.defence=os:system"], ["defence", "environment"]), (["environment.gamma=0.5"], ["gamma"]), (["gamma=1.5"], ["gamma", "1.5"]),
+        (["threat.knowledge=gray"], ["knowledge", "gray"]), (["ppo.batch_size=1"], ["batch_size", "1"]),
     ],
 )  # fmt: skip
 def test_bad_input_is_one_clear_error_and_leaves_nothing(tmp_path: Path, arguments: list[str], words: list[str]) -> None:
@@ -152,3 +154,32 @@ def test_a_configuration_is_one_schema() -> None:
     config = train.load_config(None, ["threat.budget=5", "ppo.epochs=3", "rivals=[none]"])
     assert config.threat["budget"] == 5 and config.ppo["epochs"] == 3 and config.rivals == ("none",)
     assert train.load_config("quickstart", []).steps == train.load_config(None, []).steps
+
+
+def test_training_seeds_share_no_environment() -> None:
+    """Stable-Baselines3 numbers the rows of seed s from s on: two training seeds must not meet there."""
+    keys = []
+    for seed in (0, 1):
+        learner = _learner(seed)
+        learner.learn(UPDATE, lambda progress: None)
+        assert learner.env.batch.state is not None
+        keys.append({int(k) for k in learner.env.batch.state.keys.key[:, 0]})
+    assert not keys[0] & keys[1]
+
+
+def test_a_fresh_start_forgets_the_run_before_and_resume_wants_the_same_learner(tmp_path: Path) -> None:
+    """A policy of one configuration must not end up beside the JSON of another."""
+    learner = _learner()
+    learner.learn(UPDATE, lambda progress: None, tmp_path / "c.safetensors")
+    other = Learner(3, 0.9, SMALL, ENVIRONMENT)
+    with pytest.raises(InputError, match="checkpoint"):
+        other.load(tmp_path / "c.safetensors")
+    run = tmp_path / "runs" / "quickstart"
+    run.mkdir(parents=True)
+    (run / "checkpoint-0.safetensors").write_bytes(b"of an older run")
+    (run / "policy-7.json").write_text("{}")
+    done = _command(*SMALL_RUN, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert not (run / "policy-7.json").exists()
+    (run / "config.json").write_text("{")
+    assert "resume" in _command(*SMALL_RUN, "--resume", cwd=tmp_path).stderr

@@ -136,8 +136,9 @@ def recovery_time(trace: Trace) -> Array:
     last = np.max(np.where(attacked, steps, -1), axis=0)
     error = np.abs(_front(trace, "gap") - trace.desired_gap(_front(trace, "speed")))
     restless = np.max(np.where((error > RECOVERY_TOLERANCE) & trace.live, steps, -1), axis=0)
-    recovered = (last >= 0) & (restless < trace.length - 1) & (crashed(trace) == 0.0)
-    return np.where(recovered, np.maximum(restless - last, 0) * trace.dt, np.nan)
+    calm_from = np.maximum(restless, last) + 1
+    recovered = (last >= 0) & (calm_from < trace.length) & (crashed(trace) == 0.0)
+    return np.where(recovered, (calm_from - last) * trace.dt, np.nan)
 
 
 @metric("steps")
