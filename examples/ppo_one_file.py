@@ -1,6 +1,6 @@
 """Proximal policy optimisation in one file, read top to bottom, on the native vector environment.
 
-    python examples/ppo_one_file.py --steps 1000000
+    python examples/ppo_one_file.py
 
 Nothing but gymnasium, numpy and torch. The environment resets a row in the step in which its episode ends (same_step), and gives the
 last observation of the old episode as info["final_obs"]: what a time limit cuts off is bootstrapped from it.
@@ -15,13 +15,13 @@ import torch
 from torch import nn
 
 parser = argparse.ArgumentParser(description="PPO against a gated Kalman filter")
-parser.add_argument("--steps", type=int, default=3_000_000, help="environment steps")
+parser.add_argument("--steps", type=int, default=600_000, help="decisions, over all environments")
 parser.add_argument("--envs", type=int, default=512, help="environments in the batch")
-parser.add_argument("--rollout", type=int, default=64, help="steps per environment and update")
+parser.add_argument("--rollout", type=int, default=60, help="steps per environment and update")
 parser.add_argument("--epochs", type=int, default=6, help="passes over a rollout")
-parser.add_argument("--minibatch", type=int, default=4096, help="samples per gradient step")
-parser.add_argument("--lr", type=float, default=1e-3, help="learning rate")
-parser.add_argument("--gamma", type=float, default=0.995, help="discount")
+parser.add_argument("--minibatch", type=int, default=3072, help="samples per gradient step")
+parser.add_argument("--lr", type=float, default=2e-3, help="learning rate")
+parser.add_argument("--gamma", type=float, default=0.99, help="discount")
 parser.add_argument("--lam", type=float, default=0.95, help="GAE lambda")
 parser.add_argument("--clip", type=float, default=0.2, help="clip range")
 parser.add_argument("--seed", type=int, default=0, help="seed")
@@ -31,7 +31,8 @@ torch.set_num_threads(1)
 torch.manual_seed(args.seed)
 envs = gymnasium.make_vec(
     "tailgate:tailgate/CarFollowing-v0", num_envs=args.envs, autoreset="same_step", scenario="gusty-stop-and-go-v0", defence="chi2_kf",
-    action="mode", value=-3.0, gamma=args.gamma, threat={"kinds": ["dos_jam", "fdi"], "fdi_bound": 3.0, "budget": 20},
+    action="mode", value=-3.0, interval=10, gamma=args.gamma, gap_shaping=0.0, error_shaping=0.0,
+    threat={"kinds": ["dos_jam", "fdi"], "fdi_bound": 3.0, "budget": 20},
 )  # fmt: skip
 features, actions = envs.single_observation_space.shape[0], int(envs.single_action_space.n)
 
@@ -46,7 +47,7 @@ def network(outputs: int, last_gain: float) -> nn.Sequential:
 
 actor, critic = network(actions, 0.01), network(1, 1.0)
 with torch.no_grad():
-    actor[-1].bias[0] = np.log((actions - 1) * 9.0)  # begin with resting in nine steps of ten: a spent budget teaches nothing
+    actor[-1].bias[0] = np.log((actions - 1) * 19.0)  # begin with resting in 19 decisions of 20: a spent budget teaches nothing
 optimiser = torch.optim.Adam([*actor.parameters(), *critic.parameters()], lr=args.lr, eps=1e-5)
 
 shape = (args.rollout, args.envs)

@@ -60,3 +60,15 @@ def test_links_to_files_exist(name: str) -> None:
     for target in re.findall(r"\]\(([^)#]+?)(?:#[^)]*)?\)", text):
         if "://" not in target:
             assert ((ROOT / name).parent / target).exists(), f"{name}: {target}"
+
+
+def test_the_scenario_of_the_documentation_plays(tmp_path: Path) -> None:
+    from tailgate import draws, make_attack, make_defence
+    from tailgate.scenario import load_scenario
+    from tailgate.trace import rollout
+
+    (tmp_path / "mine.yaml").write_text(_blocks("docs/scenarios.md", "yaml")[0], encoding="utf-8")
+    (tmp_path / "leader.csv").write_text(_blocks("docs/scenarios.md", "csv")[0], encoding="utf-8")
+    loop = load_scenario(str(tmp_path / "mine.yaml")).loop(make_defence("kf"))
+    trace = rollout(loop, make_attack("none"), draws.keys("tune", range(3)))
+    assert trace.lead_speed[149 - 2, 0, 0] == pytest.approx(5.0, abs=0.35) and not trace.collided.any()
