@@ -93,7 +93,7 @@ def _check(config: TrainConfig) -> None:
 
 def _suite(config: TrainConfig, attacks: tuple[str, ...]) -> Suite:
     """The final comparison, with these attacks."""
-    return Suite(config.name, "", (config.scenario,), (None,), (config.defence, *config.others), attacks, config.episodes)
+    return Suite(config.name, "", (config.scenario,), (None,), tuple(dict.fromkeys((config.defence, *config.others))), attacks, config.episodes)
 
 
 @dataclass(frozen=True)
@@ -176,7 +176,7 @@ def compare(config: TrainConfig, policies: list[Path], progress: Callable[[int, 
     selection = run(cells_of(choice, batch=BATCH, purpose="select", threat=threat), workers=config.workers) if config.rivals else []
     best = max(config.rivals, key=lambda a: _crashes([r for r in selection if r["attack"] == a]).mean(), default=None)
 
-    attacks = ("none", *config.rivals, *config.white_box, *names)
+    attacks = tuple(dict.fromkeys(("none", *config.rivals, *config.white_box, *names)))  # each once
     cells = cells_of(_suite(config, attacks), batch=BATCH, threat=threat)
     rows = run(cells, config.directory / "rows.jsonl", config.workers, progress)
 
