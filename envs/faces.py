@@ -252,7 +252,7 @@ class AdversaryVectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
             "gap": np.min(view.scene.gap, axis=1), "step": view.k.copy(),
         }  # fmt: skip
         if self.seat.action.discrete:
-            info["action_mask"] = self.seat.action.mask(view)
+            info["action_mask"] = self.seat.action.mask(view).astype(np.int8)  # as Space.sample(mask) wants it
         everyone = np.ones(self.num_envs, bool)
         return info | {f"_{key}": everyone for key in info}
 

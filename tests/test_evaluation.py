@@ -206,3 +206,14 @@ def test_different_defences_never_share_an_identity() -> None:
     rows = tailgate.evaluate(scenarios=["gusty-stop-and-go-v0"], defences=[plain, gated], attacks=["none"], seeds=2)
     assert len(summarise(rows)) == 2
     assert AdversaryEnv(defence=plain).card()["hash"] != AdversaryEnv(defence=gated).card()["hash"]
+
+
+def test_a_mode_that_does_not_exist_is_refused() -> None:
+    @dataclass(frozen=True)
+    class Ninth(Kalman):
+        def step(self, plan: Any, state: Any, received: Any, known_u: Any, draws: Any) -> Any:
+            state, estimate = super().step(plan, state, received, known_u, draws)
+            return state, estimate._replace(mode=np.full_like(estimate.mode, 9))
+
+    rows = tailgate.evaluate(scenarios=["gusty-stop-and-go-v0"], defences=[Ninth()], attacks=["none"], seeds=1)
+    assert "mode" in rows[0]["reason"] and "NORMAL" in rows[0]["reason"]

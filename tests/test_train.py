@@ -130,7 +130,7 @@ def test_the_command_trains_compares_and_writes_a_page(tmp_path: Path) -> None:
         (["defence=os:system"], ["os:system", "registered"]), (["threat.budget=-3"], ["budget", "-3"]), (["environment.action=fly"], ["action", "fly"]),
         (["ppo.batch_size=7"], ["batch_size", "7"]), (["--config", "nosuch"], ["nosuch", "quickstart"]), (["--config", "bad.yaml"], ["bad.yaml", "YAML"]),
         (["out=file/below"], ["file", "writable"]), (["steps"], ["steps", "key=value"]), (["scenario=nan.yaml"], ["nan", "line 3"]),
-        (["environment.defence=os:system"], ["defence", "environment"]), (["environment.gamma=0.5"], ["gamma"]), (["gamma=1.5"], ["gamma", "1.5"]),
+        (["environment.defence=os:system"], ["defence", "environment"]), (["environment.gamma=0.5"], ["gamma"]), (["gamma=1.5"], ["gamma", "1.5"]), (["name=../up"], ["name", "../up"]),
         (["threat.knowledge=gray"], ["knowledge", "gray"]), (["ppo.batch_size=1"], ["batch_size", "1"]),
     ],
 )  # fmt: skip
@@ -181,5 +181,6 @@ def test_a_fresh_start_forgets_the_run_before_and_resume_wants_the_same_learner(
     done = _command(*SMALL_RUN, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert not (run / "policy-7.json").exists()
+    assert (run.with_name("quickstart.1") / "policy-7.json").read_text() == "{}"  # set aside, not lost
     (run / "config.json").write_text("{")
     assert "resume" in _command(*SMALL_RUN, "--resume", cwd=tmp_path).stderr

@@ -204,11 +204,17 @@ def _play(cells: Sequence[Cell], workers: int) -> Iterator[tuple[int, list[dict[
     lost = []
     with _pool(workers) as pool:
         waiting = {pool.submit(run_cell, cell): i for i, cell in enumerate(cells)}
-        for future in as_completed(waiting):
-            try:
-                yield waiting[future], future.result()
-            except BrokenProcessPool:  # one cell killed its process, and the pool with it: which one shows below
-                lost.append(waiting[future])
+        try:
+            for future in as_completed(waiting):
+                try:
+                    yield waiting[future], future.result()
+                except BrokenProcessPool:  # one cell killed its process, and the pool with it: which one shows below
+                    lost.append(waiting[future])
+        except BaseException:  # an interrupt shall not wait for what is still to play
+            pool.shutdown(wait=False, cancel_futures=True)
+            for process in list((pool._processes or {}).values()):
+                process.terminate()
+            raise
     for i in sorted(lost):
         with _pool(1) as pool:
             try:

@@ -53,6 +53,9 @@ def check_estimate(estimate: Estimate, model: Model, batch: int) -> None:
             raise InputError(f"defence output {name}", got, f"an array of shape {size}, kind {kinds!r}")
         if kinds == "f" and not np.isfinite(value).all():
             raise InputError(f"defence output {name}", "NaN or infinity", "finite numbers")
+    if ((estimate.mode < 0) | (estimate.mode >= len(Mode))).any():
+        known = ", ".join(f"{m.value} ({m.name})" for m in Mode)
+        raise InputError("defence output mode", np.unique(estimate.mode).tolist(), f"one of {known}")
 
 
 class LoopPlan(NamedTuple):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
 import time
 from collections.abc import Callable
@@ -67,6 +68,8 @@ def load_config(source: str | None, overrides: list[str]) -> TrainConfig:
         if not isinstance(data.get(key, {}), dict):
             raise InputError(f"config.{key}", data[key], "a mapping of fields")
     config = build(TrainConfig, data, "config")
+    if Path(config.name).name != config.name:
+        raise InputError("config.name", config.name, "the name of a directory, without a separator")
     for spec in [Spec("defence", config.defence), *(Spec("defence", name) for name in config.others)]:
         spec.refuse_imports("config")
     for spec in (Spec("attack", name) for name in (*config.rivals, *config.white_box)):
@@ -93,7 +96,8 @@ def _check(config: TrainConfig) -> None:
 
 def _suite(config: TrainConfig, attacks: tuple[str, ...]) -> Suite:
     """The final comparison, with these attacks."""
-    return Suite(config.name, "", (config.scenario,), (None,), tuple(dict.fromkeys((config.defence, *config.others))), attacks, config.episodes)
+    defences = tuple(dict.fromkeys((config.defence, *config.others)))  # each once
+    return Suite(config.name, "", (config.scenario,), (None,), defences, attacks, config.episodes)
 
 
 @dataclass(frozen=True)
@@ -113,15 +117,13 @@ def train(config: TrainConfig, progress: Callable[[int, Any], None], resume: boo
     ppo = build(PPOConfig, dict(config.ppo), "config.ppo")
     ppo.check()
     _check(config)
+    if not resume and config.directory.is_dir() and any(config.directory.iterdir()):
+        _set_aside(config.directory)
     directory = writable_directory(config.directory)
     snapshot = json.dumps(as_data(config), indent=1).encode() + b"\n"
     held = directory / "config.json"
     if resume and held.is_file():
         _same_run(held, config)
-    elif not resume:
-        for pattern in ("checkpoint-*", "policy-*", "curve-*.json", "report.json", "rows.jsonl"):  # of an earlier run of this name
-            for old in directory.glob(pattern):
-                old.unlink()
     write_atomic(held, snapshot)
     policies = []
     for seed in range(config.first_seed, config.first_seed + config.seeds):
@@ -141,6 +143,15 @@ def train(config: TrainConfig, progress: Callable[[int, Any], None], resume: boo
         write_atomic(directory / f"curve-{seed}.json", json.dumps(curve).encode() + b"\n")
         learner.env.close()
     return policies
+
+
+def _set_aside(directory: Path) -> None:
+    """Rename an earlier run of this name to name.1, name.2, ...: nothing is lost, and nothing of it is mistaken for the new one."""
+    number = next(n for n in itertools.count(1) if not directory.with_name(f"{directory.name}.{n}").exists())
+    try:
+        directory.rename(directory.with_name(f"{directory.name}.{number}"))
+    except OSError as error:
+        raise InputError("out", str(directory), f"a writable directory ({error.strerror})") from None
 
 
 def _same_run(held: Path, config: TrainConfig) -> None:

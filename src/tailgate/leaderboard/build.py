@@ -138,7 +138,7 @@ def _cell(entry: Data, words: _Words) -> Data:
     if crash is None:
         what = "not played" if not reason and not failed else "failed" if failed else "skipped"
         why = ": ".join(filter(None, (what, reason)))
-        return out | {"text": "n/a", "shade": "na", "label": why, "why": why, "lost": what != "skipped"}
+        return out | {"text": "n/a", "shade": "na", "label": why, "why": why, "lost": True}
     why = f"{failed} more failed: {reason}" if failed else ""
     low, high = percent(crash["low"]), percent(crash["high"])
     label = f"95% interval {low} to {high}, {entry['n']} episodes"
@@ -154,7 +154,7 @@ def _line(text: str, cells: list[Data], uses: set[str], words: _Words) -> Data:
     known = [c for c in against if c["crash"]]
     lost = sum(c["lost"] for c in against)
     why = unranked(name, uses, words.defences.get(name.base))
-    if not why and lost:  # else a defence would gain by failing where it is weak
+    if not why and lost:  # else a defence would gain by failing, or by not being attackable, where it is weak
         why = f"incomplete: {lost} {'attack' if lost == 1 else 'attacks'} without full figures"
     if not why and not known:
         why = "no figures"
