@@ -15,9 +15,6 @@ class Interval(NamedTuple):
     low: float
     high: float
 
-    def __str__(self) -> str:
-        return f"{self.value:.3f} [{self.low:.3f}, {self.high:.3f}]"
-
 
 def proportion(successes: int, n: int, level: float = 0.95) -> Interval:
     """Share of successes with the exact (Clopper-Pearson) interval."""
