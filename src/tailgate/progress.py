@@ -1,5 +1,6 @@
 """Progress of long work on standard error: a bar on a terminal, a line per tenth elsewhere."""
 
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
@@ -10,23 +11,23 @@ Update = Callable[[str, int, int, str], None]  # label, done, total, figures
 
 
 @contextmanager
-def progress(console: Console) -> Iterator[Update]:
+def progress(shown_on: Console) -> Iterator[Update]:
     """Yields update(label, done, total, figures); each label is a bar of its own."""
-    if not console.is_terminal:
+    if not shown_on.is_terminal:
         shown: dict[str, int] = {}
 
         def line(label: str, done: int, total: int, figures: str = "") -> None:
             tenth = 10 * done // max(total, 1)
             if tenth > shown.get(label, 0):
                 shown[label] = tenth
-                console.print(f"{label}: {10 * tenth} % {figures}".rstrip(), highlight=False)
+                shown_on.print(f"{label}: {10 * tenth} % {figures}".rstrip(), highlight=False)
 
         yield line
         return
     columns = (
         TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[figures]}"), TimeElapsedColumn(), TimeRemainingColumn(),
     )  # fmt: skip
-    with Progress(*columns, console=console) as bars:
+    with Progress(*columns, console=shown_on) as bars:
         tasks: dict[str, object] = {}
 
         def bar(label: str, done: int, total: int, figures: str = "") -> None:
@@ -35,3 +36,13 @@ def progress(console: Console) -> Iterator[Update]:
             bars.update(tasks[label], completed=done, total=total, figures=figures)  # type: ignore[arg-type]
 
         yield bar
+
+
+def cells(done: int, total: int) -> str:
+    """How far an evaluation is, beside its bar."""
+    return f"{done} of {total} cells"
+
+
+def console() -> Console:
+    """Standard output: as wide as the terminal, and wide enough for whole cells where there is none."""
+    return Console(width=None if sys.stdout.isatty() else 160)

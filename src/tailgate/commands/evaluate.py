@@ -1,0 +1,88 @@
+"""tailgate evaluate: defences against attacks, one row per episode."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from tailgate.errors import InputError
+from tailgate.progress import cells, console, progress
+from tailgate.schema import scalar
+
+
+def add(commands: Any) -> None:
+    command = commands.add_parser(
+        "evaluate", help="play defences against attacks and write one row per episode",
+        description="Play a suite, or the part of it that the options name. NAME: a registered component, NAME:key=value,key=value, "
+        "module:Class, or (attacks) the JSON file of an exported policy.",
+    )  # fmt: skip
+    command.add_argument("--suite", default="quick-v0", metavar="NAME", help="suite by name or YAML file (default: quick-v0)")
+    command.add_argument("--defence", action="append", metavar="NAME", help="a defence instead of the suite's (repeatable)")
+    command.add_argument("--attack", action="append", metavar="NAME", help="an attack instead of the suite's (repeatable)")
+    command.add_argument("--scenario", action="append", metavar="NAME", help="a scenario instead of the suite's (repeatable)")
+    command.add_argument("--dose", action="append", metavar="STEPS", help="attack budget instead of the suite's, or none (repeatable)")
+    command.add_argument("--threat", action="append", metavar="key=value", default=[], help="change the threat model (repeatable)")
+    command.add_argument("--seeds", type=int, metavar="N", help="episodes per cell instead of the suite's")
+    command.add_argument("--purpose", default="report", help="which seeds: train, tune, calibrate, select or report (default)")
+    command.add_argument("--batch", type=int, default=256, metavar="N", help="episodes side by side (default 256); changes no result")
+    command.add_argument("--workers", type=int, default=1, metavar="N", help="processes (default 1); changes no result")
+    command.add_argument("--engine", default="local", choices=["local"], help="where workers run")
+    command.add_argument("--out", metavar="FILE", help="write the rows to this JSON Lines file; an interrupted run resumes")
+    command.add_argument("--json", action="store_true", help="print the table as JSON")
+    command.set_defaults(run=_evaluate)
+
+
+def _evaluate(options: argparse.Namespace) -> int:
+    from tailgate.evaluation import evaluate
+    from tailgate.summary import summarise
+
+    sys.path.insert(0, "")  # module:Class is looked for in the working directory, as `python -m` does
+    threat = {}
+    for text in options.threat:
+        key, sep, value = text.partition("=")
+        if not sep:
+            raise InputError("--threat", text, "key=value, for example fdi_bound=10")
+        threat[key] = scalar(value)
+    doses = None if options.dose is None else [scalar(d) for d in options.dose]
+    with progress(Console(stderr=True)) as update:
+        rows = evaluate(
+            options.suite, defences=options.defence, attacks=options.attack, scenarios=options.scenario, doses=doses,
+            seeds=options.seeds, purpose=options.purpose, batch=options.batch, workers=options.workers,
+            out=options.out, threat=threat, progress=lambda done, total: update("playing", done, total, cells(done, total)),
+        )  # fmt: skip
+    table = summarise(rows)
+    if options.json:
+        print(json.dumps(table, indent=1, allow_nan=False))
+    else:
+        _print_summary(table)
+    failed = sum(entry["failed"] for entry in table)
+    if failed:
+        print(f"tailgate: {failed} of {len(rows)} rows failed; their reasons are in the rows", file=sys.stderr)
+    return 1 if failed else 0
+
+
+def _print_summary(table: list[dict[str, Any]]) -> None:
+    out = console()
+    for place in dict.fromkeys((e["scenario"], e["dose"]) for e in table):
+        scenario, dose = place
+        shown = Table(title=f"{scenario}, budget {'unlimited' if dose is None else f'{dose} steps'}")
+        measures = ("n", "collisions", "95 % interval", "min gap [m]", "max error [m]", "alarm onsets")
+        for heading in ("defence", "attack", "knowledge", *measures):
+            shown.add_column(heading, overflow="fold")
+        for entry in table:
+            if (entry["scenario"], entry["dose"]) != place:
+                continue
+            head = [entry["defence"], entry["attack"], entry["knowledge"], str(entry["n"])]
+            crash = entry["crash"]
+            if crash is None:
+                shown.add_row(*head, "-", entry["reason"])
+                continue
+            figures = [f"{100 * crash['value']:.1f} %", f"{100 * crash['low']:.1f} to {100 * crash['high']:.1f} %"]
+            figures += [f"{entry[k]['median']:.2f}" if entry[k] else "-" for k in ("min_gap", "max_error", "alarm_onsets")]
+            shown.add_row(*head, *figures)
+        out.print(shown)

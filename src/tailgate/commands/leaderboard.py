@@ -1,0 +1,26 @@
+"""tailgate leaderboard: the static page."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+
+def add(commands: Any) -> None:
+    command = commands.add_parser("leaderboard", help="build the static page from rows")
+    actions = command.add_subparsers(required=True, metavar="ACTION")
+    build = actions.add_parser("build", help="one self-contained HTML page from rows files")
+    build.add_argument("--rows", nargs="+", required=True, metavar="FILE", help="JSON Lines files of `tailgate evaluate`")
+    build.add_argument("--out", required=True, metavar="DIR", help="directory of the page")
+    build.add_argument("--title", help="title of the page")
+    build.set_defaults(run=_build)
+
+
+def _build(options: argparse.Namespace) -> int:
+    from tailgate.leaderboard.build import build
+    from tailgate.rows import read_rows
+
+    rows = [row for name in options.rows for row in read_rows(Path(name))]
+    print(build(rows, Path(options.out), title=options.title))
+    return 0

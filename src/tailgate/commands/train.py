@@ -1,0 +1,68 @@
+"""tailgate train: an adversary from a preset."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from tailgate.progress import cells, console, progress
+
+
+def add(commands: Any) -> None:
+    from tailgate.train import parameters
+
+    fields = "\n".join(f"  {p['name']:<18} {p['doc']} (default: {json.dumps(p['default'])})" for p in parameters())
+    command = commands.add_parser(
+        "train", help="train an adversary, compare it with scripted attacks on fresh seeds, write a page",
+        description="Train an adversary. Without --config, the preset `quickstart`.",
+        epilog=f"keys (dotted below environment, threat and ppo, for example ppo.epochs=4):\n{fields}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )  # fmt: skip
+    command.add_argument("--config", metavar="FILE", help="preset by name, or YAML file")
+    command.add_argument("--seed", type=int, help="first training seed (the same as first_seed=N)")
+    command.add_argument("--resume", action="store_true", help="continue from the run's checkpoints")
+    command.add_argument("--json", action="store_true", help="print the report as JSON")
+    command.add_argument("overrides", nargs="*", metavar="key=value", help="change a field of the configuration")
+    command.set_defaults(run=_train)
+
+
+def _train(options: argparse.Namespace) -> int:
+    from tailgate import train
+
+    overrides = list(options.overrides) + ([f"first_seed={options.seed}"] if options.seed is not None else [])
+    config = train.load_config(options.config, overrides)
+    errors = Console(stderr=True)
+    errors.print(f"[bold]{config.name}[/]: training against [bold]{config.defence}[/] on {config.scenario}, files in {config.directory}")
+    with progress(errors) as update:
+
+        def trained(seed: int, now: Any) -> None:
+            update(f"training, seed {seed}", now.steps, config.steps, train.figures(now))
+
+        policies = train.train(config, trained, resume=options.resume)
+        report = train.compare(config, policies, lambda done, total: update("comparing on fresh seeds", done, total, cells(done, total)))
+    page = train.make_page(config, report)
+    if options.json:
+        print(json.dumps(report | {"page": str(page)}, indent=1))
+    else:
+        _print_report(report)
+    errors.print(f"policy: {', '.join(str(p) for p in policies)}\npage:   {page}")
+    return 0
+
+
+def _print_report(report: dict[str, Any]) -> None:
+    threat = report["threat"]
+    table = Table(title=f"{report['episodes']} fresh episodes, {report['defence']}, {report['scenario']}, budget {threat['budget']} steps")
+    for heading in ("attack", "collisions", "95 % interval", "note"):
+        table.add_column(heading, overflow="fold")
+    for row in report["crash"]:
+        table.add_row(row["label"], f"{100 * row['value']:.1f} %", f"{100 * row['low']:.1f} to {100 * row['high']:.1f} %", row["note"])
+    out = console()
+    out.print(table)
+    for name, gain in report["advantage"].items():
+        low, high = 100 * gain["low"], 100 * gain["high"]
+        verdict = "wins" if low > 0 else "loses" if high < 0 else "undecided"
+        out.print(f"learned against {name}: {100 * gain['value']:+.1f} points, 95 % interval {low:+.1f} to {high:+.1f} ({verdict})")
