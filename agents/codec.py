@@ -32,18 +32,19 @@ class ActionSpec:
     action: ActionName = param("mode", "timing, mode, ramp, continuous or increment")
     kind: KindName = param("fdi", "timing: what an attack is")
     value: Finite = param(-4.0, "timing, mode, ramp: bias of fdi, jammer's value of dos_jam [unit of the wire]")
+    steps: PositiveCount = param(10, "age of a delay, window of a replay [steps]")
     rate: Positive = param(0.5, "ramp, increment: (largest) change per step [unit of the wire]")
     per_sensor: bool = param(False, "mode, ramp: also one mode per single wire")
     interval: PositiveCount = param(1, "steps for which a decision holds: one step of the environment")
 
 
 class Mode(NamedTuple):
-    """One discrete action: its name, kind, target (q+p,) bool, value, and direction of a ramp."""
+    """One discrete action: its name, kind, target (w,) bool, value (w,), and direction of a ramp."""
 
     name: str
     kind: Kind
     target: Array
-    value: float
+    value: Array
     sign: int = 0
 
 
@@ -65,6 +66,8 @@ class ActionCodec:
             raise InputError("value", value, f"at most the threat model's fdi_bound ({threat.fdi_bound}) in size")
         if self.discrete and "dos_jam" in used and not threat.jam_range[0] <= value <= threat.jam_range[1]:
             raise InputError("value", value, f"within the threat model's jam_range {threat.jam_range}")
+        if self.discrete and {"delay", "replay"} & set(used) and self.spec.steps > threat.memory:
+            raise InputError("steps", self.spec.steps, f"at most the threat model's memory ({threat.memory})")
         if not self.brief.granted.any():
             raise InputError("threat_model.targets", threat.targets, "at least one wire")
 
@@ -85,15 +88,21 @@ class ActionCodec:
         if self.spec.per_sensor and len(self.wires) > 1:
             groups += [(":" + self.brief.model.wires[w], np.arange(len(granted)) == w) for w in self.wires]
         kinds: tuple[KindName, ...] = (self.spec.kind,) if self.spec.action == "timing" else self.brief.threat.kinds
-        out = [Mode("none", Kind.NONE, np.zeros_like(granted), 0.0)]
+        bounds, nothing = self.brief.bounds, np.zeros(len(granted))
+        out = [Mode("none", Kind.NONE, np.zeros_like(granted), nothing)]
         for suffix, target in groups:
             for name in kinds:
                 kind = Kind[name.upper()]
                 if kind == Kind.FDI and self.spec.action != "timing":
                     signs = {"+": 1, "-": -1} if self.spec.action == "mode" else {"+": 1, "=": 0, "-": -1}
-                    out += [Mode(f"fdi{tag}{suffix}", kind, target, sign * abs(value), sign) for tag, sign in signs.items()]
+                    out += [Mode(f"fdi{t}{suffix}", kind, target, sign * np.minimum(abs(value), bounds), sign) for t, sign in signs.items()]
+                elif kind in (Kind.FDI, Kind.DOS_JAM):  # what is too much for an actuator is cut
+                    cut = np.clip(value, -bounds, bounds)
+                    sent = cut if kind == Kind.FDI else np.where(self.brief.is_actuator, cut, value)
+                    out.append(Mode(name + suffix, kind, target, sent))
                 else:
-                    out.append(Mode(name + suffix, kind, target, value if kind in (Kind.FDI, Kind.DOS_JAM) else 0.0))
+                    old = kind in (Kind.DELAY, Kind.REPLAY)
+                    out.append(Mode(name + suffix, kind, target, nothing + self.spec.steps * old))
         return out
 
     @property
@@ -108,16 +117,16 @@ class ActionCodec:
             index = np.asarray(action).reshape(-1)
             kinds = np.array([mode.kind for mode in self.modes], np.int8)[index]
             target = np.array([mode.target for mode in self.modes])[index][:, None, :]
-            value = np.array([mode.value for mode in self.modes])[index][:, None, None]
+            value = np.array([mode.value for mode in self.modes])[index][:, None, :]
             if self.spec.action == "ramp":
-                bound, sign = brief.threat.fdi_bound, np.array([mode.sign for mode in self.modes])[index][:, None, None]
+                bound, sign = brief.bounds, np.array([mode.sign for mode in self.modes])[index][:, None, None]
                 grown = np.clip(view.last.value + self.spec.rate * sign, -bound, bound)
                 ramping = ((view.last.kind == Kind.FDI) & (kinds == Kind.FDI))[:, None, None]
                 value = np.where(ramping, grown, value)
             return brief.command(index != 0, kinds, target, value)
         action = np.clip(np.asarray(action, np.float64), -1.0, 1.0)
         values = action[:, 1:].reshape(len(action), brief.model.agents, len(self.wires))
-        bound = brief.threat.fdi_bound
+        bound = brief.bounds[self.wires]
         wide = num.zeros((len(action), brief.model.agents, len(brief.granted)))
         if self.spec.action == "increment":
             wide[..., self.wires] = np.clip(view.last.value[..., self.wires] + self.spec.rate * values, -bound, bound)
@@ -169,7 +178,7 @@ class ObservationCodec:
             gap, speed, lead = scene.gap[:, i], scene.speed[:, i], scene.lead_speed[:, i]
             columns += [gap / 50.0, speed / 15.0, lead / 15.0, (speed - lead) / 5.0, scene.accel[:, i] / 3.0]
             columns += [scene.rear_gap[:, i] / 50.0, (scene.rear_speed[:, i] - speed) / 5.0]
-            columns += [last.value[:, i, w] / min(threat.fdi_bound, 10.0) for w in np.flatnonzero(brief.granted)]
+            columns += [last.value[:, i, w] / min(brief.bounds[w], 10.0) for w in np.flatnonzero(brief.granted)]
             if threat.knowledge != "black":
                 assert view.control is not None
                 columns += [view.control[:, i, j] / 3.0 for j in range(brief.model.inputs)]

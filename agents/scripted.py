@@ -30,7 +30,7 @@ class NoAttack:
 
 class ScriptPlan(NamedTuple):
     brief: Brief
-    target: Array  # (q+p,) bool
+    target: Array  # (w,) bool
 
 
 class ScriptState(NamedTuple):

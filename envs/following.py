@@ -94,7 +94,7 @@ class CarFollowing:
         plan = self.prepare()
         return Model(
             A=plan.A, B=plan.B, c=np.zeros(3), C=C, Q=np.diag(self.process_var), R=R, graph=np.eye(1, dtype=bool), dt=self.dt,
-            sensors=sensors, v2v=("leader_position", "leader_velocity"),
+            sensors=sensors, v2v=("leader_position", "leader_velocity"), actuators=("acceleration",),
         )  # fmt: skip
 
     def prior(self, plan: FollowingPlan, batch: int) -> Prior:

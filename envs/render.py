@@ -44,7 +44,7 @@ ATTACK, WARNING = "#b34700", "#f0e442"
 BODY = ((0.0, 0.18), (0.0, 0.6), (0.12, 0.64), (0.26, 1.0), (0.62, 1.0), (0.78, 0.62), (0.97, 0.54), (1.0, 0.18))
 WINDOW = ((0.2, 0.66), (0.3, 0.92), (0.59, 0.92), (0.7, 0.66))
 AXLES = (0.22, 0.78)
-UNITS = {"position": " m", "velocity": " m/s"}
+UNITS = {"position": " m", "velocity": " m/s", "acceleration": " m/s\N{SUPERSCRIPT TWO}"}
 
 COMMANDS = {
     Kind.NONE: ("NO ATTACK", "every wire arrives as it was sent"),
@@ -53,6 +53,8 @@ COMMANDS = {
     Kind.DOS_HOLD_FRESH: ("ATTACK: DoS hold (fresh)", "stuck at the last reading before this burst: "),
     Kind.DROPOUT: ("ATTACK: dropout", "nothing arrives from "),
     Kind.FDI: ("ATTACK: false data (FDI)", "adds "),
+    Kind.DELAY: ("ATTACK: delay", "old readings, by steps: "),
+    Kind.REPLAY: ("ATTACK: replay", "plays the last readings again, window in steps: "),
 }
 _metres = "{:,.1f} m".format
 
@@ -153,7 +155,9 @@ def _header(canvas: _Canvas, loop: Loop, state: LoopState, row: int, refused: bo
     title, does = COMMANDS[kind]
     for i in np.flatnonzero(last.target[row, AGENT]):
         name, unit = loop.model.wires[i].replace("_", " "), UNITS.get(loop.model.wires[i].split("_")[-1], "")
-        wires.append(name + (f" {last.value[row, AGENT, i]:+.4g}{unit}" if kind in (Kind.DOS_JAM, Kind.FDI) else ""))
+        value = last.value[row, AGENT, i]
+        signed = f" {value:+.4g}{unit}"
+        wires.append(name + {Kind.DOS_JAM: signed, Kind.FDI: signed, Kind.DELAY: f" {value:g}", Kind.REPLAY: f" {value:g}"}.get(kind, ""))
     on, does = kind != Kind.NONE, does + ", ".join(wires)
     canvas.box(BADGE[0], 5, BADGE[1], HEADER - 5, ATTACK if on else WHITE, INK if on else GREY, 2 if on else 1)
     room, ink = (BADGE[0] + MARGIN, BADGE[1] - MARGIN), WHITE if on else GREY

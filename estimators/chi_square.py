@@ -6,25 +6,30 @@ Erratum: the thesis's g uses P^-1 in one place; S^-1 is meant. Per step and with
 """
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 from tailgate import num
-from tailgate.core import Array, Innovation, Positive, param
+from tailgate.core import Innovation, Positive, param
 from tailgate.registry import register
 
-from .compose import Composed, Detector, Filter, GateOut, Mitigation, Stateless
+from .compose import Composed, Detector, Filter, GateOut, Mitigation, Stateless, Verdict, blame_all
 from .kalman import KalmanFilter
 
 
+@register("detector", "chi2", reference="Dutta 2018, section 4.2")
 @dataclass(frozen=True)
 class ChiSquare(Stateless):
     """Alarms when the normalised innovation squared exceeds eta."""
 
+    threshold_field: ClassVar[str] = "eta"
     eta: Positive = param(20.0, "threshold on r' S^-1 r [-]")
 
-    def step(self, plan: Any, state: Any, innovation: Innovation) -> tuple[Any, Array, Array]:
+    def step(self, plan: Any, state: Any, innovation: Innovation) -> tuple[Any, Verdict]:
         score = num.quadratic(innovation.r, num.inverse(innovation.S))
-        return None, score, score > self.eta
+        return None, blame_all(score, score > self.eta, innovation)
+
+    def gate(self, plan: Any, state: Any) -> float:
+        return self.eta
 
 
 @register("defence", "chi2_kf", reference="Dutta 2018, Algorithm 3 and section 4.5")
@@ -32,6 +37,7 @@ class ChiSquare(Stateless):
 class GatedKalman(Composed):
     """Kalman filter that ignores a measurement whose normalised innovation squared exceeds eta."""
 
+    threshold_field: ClassVar[str] = "eta"
     eta: Positive = param(20.0, "gate on r' S^-1 r [-]")
 
     def parts(self) -> tuple[Filter, Detector, Mitigation]:

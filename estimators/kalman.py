@@ -26,6 +26,7 @@ class KalmanPlan(NamedTuple):
     C: Array  # (N, q, n)
     Q: Array
     R: Array  # (N, q, q)
+    broad: Array  # (n,) variances of a filter that has forgotten
 
 
 class KalmanState(NamedTuple):
@@ -45,12 +46,25 @@ def alone(S: Array, keep: Array) -> Array:
     return out
 
 
+def broad(model: Model) -> Array:
+    """(n,) variances so large that the next measurement decides: a million times those after 100 steps of the filter."""
+    P = np.array(model.Q)
+    for _ in range(100):
+        C, R = model.C[0], model.R[0]
+        S = num.matmul(num.matmul(C, P), num.transpose(C)) + R
+        K = num.matmul(num.matmul(P, num.transpose(C)), num.inverse(S))
+        P = P - num.matmul(num.matmul(K, C), P)
+        P = num.matmul(num.matmul(model.A, P), num.transpose(model.A)) + model.Q
+    return np.asarray(1e6 * np.maximum(P.diagonal(), 1e-12))
+
+
+@register("filter", "kf", reference="R. E. Kalman, A New Approach to Linear Filtering and Prediction Problems, 1960")
 @dataclass(frozen=True)
 class KalmanFilter:
     """The textbook filter, time-varying gain."""
 
     def prepare(self, model: Model) -> KalmanPlan:
-        return KalmanPlan(model.A, model.B, model.c, model.C, model.Q, model.R)
+        return KalmanPlan(model.A, model.B, model.c, model.C, model.Q, model.R, broad(model))
 
     def start(self, plan: KalmanPlan, prior: Prior) -> KalmanState:
         return KalmanState(prior.mean, prior.cov)
@@ -81,6 +95,9 @@ class KalmanFilter:
         x = state.x + num.matvec(K, r)
         P = state.P - num.matmul(K, cross)
         return KalmanState(x, 0.5 * (P + num.transpose(P)))
+
+    def forget(self, plan: KalmanPlan, state: KalmanState, where: Array) -> KalmanState:
+        return KalmanState(state.x, np.where(where[..., None, None], np.diag(plan.broad), state.P))
 
     def estimate(self, state: KalmanState) -> Array:
         return state.x

@@ -5,11 +5,11 @@ from typing import Any
 
 import numpy as np
 
-from tailgate.core import Array, Mode, Received
+from tailgate.core import Mode, Received
 from tailgate.errors import InputError
 from tailgate.registry import register
 
-from .compose import Composed, Detector, Filter, Mitigation, Score, Stateless
+from .compose import Composed, Decision, Detector, Filter, Mitigation, Score, Stateless, Verdict
 from .kalman import KalmanFilter
 
 
@@ -17,10 +17,10 @@ from .kalman import KalmanFilter
 class RejectAttacked(Stateless):
     """Accepts exactly the sensors that are not attacked."""
 
-    def step(self, plan: Any, state: Any, alarm: Array, received: Received) -> tuple[Any, Array, Array]:
+    def step(self, plan: Any, state: Any, verdict: Verdict, received: Received) -> tuple[Any, Decision]:
         if received.attacked is None:
             raise InputError("oracle", None, "a loop that grants `truth`")
-        return None, received.valid & ~received.attacked, np.full_like(alarm, Mode.NORMAL, np.int8)
+        return None, Decision(received.valid & ~received.attacked, np.full_like(verdict.alarm, Mode.NORMAL, np.int8))
 
 
 @register("defence", "oracle", uses=("measurements", "truth"))

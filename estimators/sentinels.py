@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 
 from tailgate import num
-from tailgate.core import Array, Innovation, Mode, Received
+from tailgate.core import Innovation, Mode, Received
 from tailgate.registry import register
 
-from .compose import AcceptAll, Composed, Detector, Filter, Mitigation, Score, Stateless
+from .compose import AcceptAll, Composed, Decision, Detector, Filter, Mitigation, Score, Stateless, Verdict, blame_all
 from .kalman import KalmanFilter
 
 
@@ -17,9 +17,12 @@ from .kalman import KalmanFilter
 class AlwaysAlarm(Stateless):
     """Alarms at every step."""
 
-    def step(self, plan: Any, state: Any, innovation: Innovation) -> tuple[Any, Array, Array]:
+    def step(self, plan: Any, state: Any, innovation: Innovation) -> tuple[Any, Verdict]:
         score = np.ones(innovation.r.shape[:2])
-        return None, score, np.ones_like(score, bool)
+        return None, blame_all(score, np.ones_like(score, bool), innovation)
+
+    def gate(self, plan: Any, state: Any) -> None:
+        return None
 
 
 @dataclass(frozen=True)
@@ -28,8 +31,8 @@ class AlwaysMode(Stateless):
 
     mode: Mode
 
-    def step(self, plan: Any, state: Any, alarm: Array, received: Received) -> tuple[Any, Array, Array]:
-        return None, received.valid, num.full(alarm.shape, self.mode, np.int8)
+    def step(self, plan: Any, state: Any, verdict: Verdict, received: Received) -> tuple[Any, Decision]:
+        return None, Decision(received.valid, num.full(verdict.alarm.shape, self.mode, np.int8))
 
 
 @register("defence", "always_alarm", sentinel="false alarms")

@@ -10,15 +10,16 @@ from tailgate.errors import InputError
 from tailgate.scenario import load_scenario
 from tailgate.threat import Brief, Channel, ThreatModel
 
-ALL = ("dos_jam", "dos_hold", "dos_hold_fresh", "dropout", "fdi")
-P, V, LP, LV = range(4)  # wires: position, velocity, leader's position and velocity
+ALL = ("dos_jam", "dos_hold", "dos_hold_fresh", "dropout", "fdi", "delay", "replay")
+P, V, LP, LV, ACC = range(5)  # wires: position, velocity, leader's position and velocity, the acceleration command
+OLD = (Kind.DELAY, Kind.REPLAY)
 MODEL = load_scenario("stop-and-go-v0").brief().model
-EXPECTED = np.array([-1.0, -2.0, -3.0, -4.0])
+EXPECTED = np.array([-1.0, -2.0, -3.0, -4.0, -5.0])
 
 
 def sent(k):
     """What is sent at step k: every number tells its step and wire."""
-    return 100.0 * k + np.arange(4)
+    return 100.0 * k + np.arange(5)
 
 
 class Wire:
@@ -26,22 +27,23 @@ class Wire:
 
     def __init__(self, **threat):
         self.plan = Channel().prepare(Brief(MODEL, ThreatModel(**({"kinds": ALL} | threat)), 1000))
-        self.state = Channel().start(self.plan, EXPECTED[None, None].copy())
+        self.state = Channel().start(self.plan, EXPECTED[None, None, :4].copy(), EXPECTED[None, None, 4:].copy())
         self.k = 0
 
     def step(self, kind=Kind.NONE, targets=(), value=0.0):
         """-> wires, valid, charged, refused."""
         self.k += 1
-        target = np.isin(np.arange(4), targets)[None, None]
-        command = Command(np.array([kind], np.int8), target, np.broadcast_to(np.asarray(value, float), (1, 1, 4)).copy())
-        y = sent(self.k)[None, None]
+        target = np.isin(np.arange(5), targets)[None, None]
+        command = Command(np.array([kind], np.int8), target, np.broadcast_to(np.asarray(value, float), (1, 1, 5)).copy())
+        y, u = sent(self.k)[None, None, :4], sent(self.k)[None, None, 4:]
         received = Received(y[..., :2].copy(), np.ones((1, 1, 2), bool), np.zeros((1, 1)))
         used = self.state.used
         self.state, out, wires, refused = Channel().apply(self.plan, self.state, y.copy(), received, command, np.array([self.k]))
         charged = self.state.used - used == 1
         np.testing.assert_array_equal(np.concatenate([out.y, out.v2v], axis=-1), wires)
         np.testing.assert_array_equal(out.attacked[0, 0], (target & charged)[0, 0, :2])
-        return wires[0, 0], out.valid[0, 0], bool(charged[0]), bool(refused[0])
+        self.state, applied = Channel().actuate(self.plan, self.state, u.copy())
+        return np.concatenate([wires[0, 0], applied[0, 0]]), out.valid[0, 0], bool(charged[0]), bool(refused[0])
 
     def idle(self, steps):
         for _ in range(steps):
@@ -70,26 +72,26 @@ def assert_accepted(wire, *command, **options):
 def test_kind_not_granted(kind):
     """A kind outside of the threat model is refused."""
     others = tuple(name for name in ALL if name != kind.name.lower())
-    assert_refused(Wire(kinds=others).idle(2), kind, [P])
-    assert_accepted(Wire().idle(2), kind, [P])
+    assert_refused(Wire(kinds=others).idle(2), kind, [P], 1.0)
+    assert_accepted(Wire().idle(2), kind, [P], 1.0)
 
 
 @pytest.mark.parametrize("kind", [k for k in Kind if k != Kind.NONE])
-@pytest.mark.parametrize("targets", [[LP], [LV], [P, LP], [P, V, LP, LV]])
+@pytest.mark.parametrize("targets", [[LP], [LV], [P, LP], [ACC], [P, ACC], [P, V, LP, LV, ACC]])
 def test_wire_not_granted(kind, targets):
     """One wire too many refuses the whole command; without `targets` no V2V field is granted."""
-    assert_refused(Wire(), kind, targets)
-    assert_refused(Wire(targets=("leader_velocity",)), kind, [P])
-    assert_accepted(Wire(targets=("leader_velocity", "leader_position", "position", "velocity")), kind, targets)
+    assert_refused(Wire(), kind, targets, 1.0)
+    assert_refused(Wire(targets=("leader_velocity",)), kind, [P], 1.0)
+    assert_accepted(Wire(targets=("leader_velocity", "leader_position", "position", "velocity", "acceleration")), kind, targets, 1.0)
 
 
 @pytest.mark.parametrize("value", [5.000001, -5.000001, np.inf, -np.inf, np.nan])
 def test_injected_value_over_the_bound(value):
     """|value| over fdi_bound on any targeted wire, or NaN, is refused; on other wires it does not matter."""
     assert_refused(Wire(fdi_bound=5.0), Kind.FDI, [P], value)
-    assert_refused(Wire(fdi_bound=5.0), Kind.FDI, [P, V], [1.0, value, 0.0, 0.0])
-    wires = assert_accepted(Wire(fdi_bound=5.0), Kind.FDI, [P], [5.0, value, value, 0.0])
-    np.testing.assert_array_equal(wires - sent(1), [5.0, 0.0, 0.0, 0.0])
+    assert_refused(Wire(fdi_bound=5.0), Kind.FDI, [P, V], [1.0, value, 0.0, 0.0, 0.0])
+    wires = assert_accepted(Wire(fdi_bound=5.0), Kind.FDI, [P], [5.0, value, value, 0.0, 0.0])
+    np.testing.assert_array_equal(wires - sent(1), [5.0, 0.0, 0.0, 0.0, 0.0])
 
 
 @pytest.mark.parametrize("value", [-1.0001, 2.0001, np.inf, np.nan])
@@ -109,7 +111,7 @@ def test_a_value_that_is_not_used_never_enters_the_record(kind):
     assert np.isfinite(wire.state.last.value).all()
 
 
-@pytest.mark.parametrize("number", [-128, -1, 6, 99, 127])
+@pytest.mark.parametrize("number", [-128, -1, 8, 99, 127])
 def test_unknown_kind_number(number):
     """A number that is no kind is refused."""
     assert_refused(Wire(), number, [P], 1.0)
@@ -170,17 +172,17 @@ def test_onset_and_end():
 def test_end_is_never_after_the_horizon():
     """Without an end the last step is the horizon."""
     plan = Channel().prepare(Brief(MODEL, ThreatModel(kinds=ALL), 30))
-    state = Channel().start(plan, np.zeros((2, 1, 4)))
+    state = Channel().start(plan, np.zeros((2, 1, 4)), np.zeros((2, 1, 1)))
     np.testing.assert_array_equal(Channel().allowed(plan, state, np.array([30, 31])), [True, False])
 
 
-@pytest.mark.parametrize("targets", [[P], [V], [P, V], [V, LV], [P, V, LP, LV]])
+@pytest.mark.parametrize("targets", [[P], [V], [P, V], [V, LV], [ACC], [P, V, LP, LV, ACC]])
 def test_every_kind_does_what_it_says_on_its_targets_only(targets):
     """Jam replaces, hold repeats, dropout keeps the last value and says so, injection adds; other wires keep every bit."""
-    value, on = np.array([7.0, 8.0, 9.0, 10.0]), np.isin(np.arange(4), targets)
+    value, on = np.array([7.0, 8.0, 9.0, 10.0, 11.0]), np.isin(np.arange(5), targets)
     effects = {Kind.DOS_JAM: value, Kind.DOS_HOLD: sent(2), Kind.DOS_HOLD_FRESH: sent(2), Kind.DROPOUT: sent(2), Kind.FDI: sent(3) + value}
     for kind, effect in effects.items():
-        wire = Wire(targets=MODEL.wires).idle(2)
+        wire = Wire(targets=MODEL.wires, actuator_bound=20.0).idle(2)
         wires, valid, charged, _ = wire.step(kind, targets, value)
         assert charged
         np.testing.assert_array_equal(wires, np.where(on, effect, sent(3)))
@@ -216,8 +218,43 @@ def test_injected_and_refused_samples_are_not_good_samples_or_attacks():
     assert wire.step(Kind.DOS_HOLD, [P])[0][P] == sent(3)[P]
 
 
-VALUES = st.sampled_from([0.0, 3.0, -5.0, 5.0, 5.1, -200.0, np.nan, np.inf])
-COMMANDS = st.lists(st.tuples(st.integers(-1, 6), st.sets(st.integers(0, 3)), VALUES), min_size=5, max_size=25)
+def test_delay_reads_what_was_sent_some_steps_ago():
+    """Age 3 at step k reads step k - 3, attacked steps included; before the first sample, what the prior expects."""
+    wire = Wire(targets=MODEL.wires, memory=5)
+    assert wire.step(Kind.DELAY, [P, ACC], 3)[0][P] == EXPECTED[P]
+    wire.idle(5)
+    for k in (7, 8, 9, 10, 11, 12, 13):
+        np.testing.assert_array_equal(wire.step(Kind.DELAY, [P, ACC], 3)[0], np.where([1, 0, 0, 0, 1], sent(k - 3), sent(k)))
+    arrived = wire.step(Kind.DELAY, [P, V, LV], [5, 1, 9, 2, 9])[0]
+    np.testing.assert_array_equal(arrived, [sent(9)[P], sent(13)[V], sent(14)[LP], sent(12)[LV], sent(14)[ACC]])
+
+
+def test_replay_plays_the_last_window_again_and_again():
+    """A window of 3 before step 7 is 4, 5, 6, 4, 5, 6, ...; the tape stands still meanwhile, and a new replay plays what came after."""
+    wire = Wire(targets=MODEL.wires, memory=4).idle(6)
+    assert [wire.step(Kind.REPLAY, [V, ACC], 3)[0][V] for _ in range(7)] == [sent(k)[V] for k in (4, 5, 6, 4, 5, 6, 4)]
+    wire.idle(1)  # step 14
+    assert [wire.step(Kind.REPLAY, [ACC], 2)[0][ACC] for _ in range(3)] == [sent(k)[ACC] for k in (6, 14, 6)]
+
+
+@pytest.mark.parametrize("kind", OLD)
+@pytest.mark.parametrize("value", [0, -1, 5, 1.5, np.nan, np.inf])
+def test_an_age_is_a_whole_number_within_the_memory(kind, value):
+    """Steps from 1 to memory."""
+    assert_refused(Wire(memory=4).idle(6), kind, [P], value)
+    assert assert_accepted(Wire(memory=4).idle(6), kind, [P], 4)[P] == sent(3)[P]
+
+
+@pytest.mark.parametrize("kind", [Kind.FDI, Kind.DOS_JAM])
+def test_an_actuator_has_its_own_bound(kind):
+    """actuator_bound limits what is added to, or jammed onto, the acceleration command; fdi_bound and jam_range do not."""
+    wide = {"targets": ("acceleration",), "fdi_bound": 100.0, "jam_range": (-100.0, 100.0), "actuator_bound": 1.5}
+    assert_refused(Wire(**wide), kind, [ACC], -1.6)
+    assert assert_accepted(Wire(**wide), kind, [ACC], -1.5)[ACC] == (sent(1)[ACC] if kind == Kind.FDI else 0.0) - 1.5
+
+
+VALUES = st.sampled_from([0.0, 1.0, 3.0, -5.0, 5.0, 5.1, -200.0, np.nan, np.inf])
+COMMANDS = st.lists(st.tuples(st.integers(-1, 8), st.sets(st.integers(0, 4)), VALUES), min_size=5, max_size=25)
 
 
 @settings(max_examples=150, deadline=None)

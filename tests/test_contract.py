@@ -18,7 +18,7 @@ from tailgate.tree import leaves
 DEFENCES = tailgate.list_defences()
 ATTACKS = [name for name in tailgate.list_attacks() if name != "policy"]  # a policy needs a file
 SCENARIOS = list_scenarios()
-FAMILIES = ("defence", "attack", "plant", "sensor", "controller", "manoeuvre")
+FAMILIES = ("defence", "filter", "detector", "mitigation", "attack", "plant", "sensor", "controller", "manoeuvre")
 ORDER = [5, 63, 0, 1017, 17, 9, 31]  # other companions in another order
 
 
@@ -88,7 +88,7 @@ def test_commands_are_well_formed(attack, short, loop_of):
     for _ in range(12):
         memory, command = rival.decide(plan, memory, loop.sense(state), state.keys.at(Role.ATTACK, state.k))
         assert isinstance(command, Command) and command.kind.shape == (5,) and command.kind.dtype == np.int8
-        assert command.target.shape == command.value.shape == (5, 1, 4) and command.target.dtype == bool
+        assert command.target.shape == command.value.shape == (5, 1, 5) and command.target.dtype == bool
         assert np.isin(command.kind, list(Kind)).all() and np.isfinite(command.value).all()
         assert all(len(leaf) == 5 for leaf in leaves(memory).values())
         state, _ = loop.advance(state, command)

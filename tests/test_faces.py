@@ -225,7 +225,7 @@ CHANGES = [
     {"threat": {"sees_measurement": True}}, {"action": "timing"}, {"kind": "dropout"}, {"value": -3.0}, {"rate": 0.4},
     {"per_sensor": True}, {"interval": 2}, {"reward": "error"}, {"gap_shaping": 0.1}, {"error_shaping": 0.1}, {"gamma": 0.9},
     {"illegal_penalty": 0.2},
-    {"attack_cost": 0.1},
+    {"attack_cost": 0.1}, {"steps": 7},
 ]  # fmt: skip
 
 

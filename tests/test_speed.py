@@ -15,7 +15,7 @@ def _rate(episodes: int, steps: int) -> float:
     """Steps per second of the plain loop with chi2_kf, the best of three."""
     loop = load_scenario("stop-and-go-v0").loop(Spec("defence", "chi2_kf").make())
     state = loop.start(draws.keys("tune", range(episodes)))
-    command = loop.brief.command(np.zeros(episodes, bool), Kind.NONE, np.zeros(4, bool), 0.0)
+    command = loop.brief.command(np.zeros(episodes, bool), Kind.NONE, np.zeros(5, bool), 0.0)
     rates = []
     for _ in range(3):
         current = state

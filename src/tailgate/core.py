@@ -1,4 +1,4 @@
-"""The nouns. Axes: B episodes, N agents, feature last; n states, m inputs, q sensors per agent, p V2V fields.
+"""The nouns. Axes: B episodes, N agents, feature last; n states, m inputs, q sensors per agent, p V2V fields, w = q + p + m wires.
 
 Three things are never mixed:
 
@@ -49,6 +49,8 @@ class Kind(IntEnum):
     DOS_HOLD_FRESH = 3  # the receiver reads the last good sample before this burst
     DROPOUT = 4  # nothing is received, and the receiver knows it
     FDI = 5  # value is added (4.4)
+    DELAY = 6  # the receiver reads what was sent `value` steps ago
+    REPLAY = 7  # the receiver reads the last `value` samples before this replay, over and over
 
 
 class Mode(IntEnum):
@@ -65,7 +67,7 @@ class Model:
     """What is publicly known of the plant: x+ = A x + B u + c + w, y_i = C_i x + v_i.
 
     A (n, n), B (n, m), c (n,), C (N, q, n), Q = cov w (n, n), R = cov v (N, q, q); graph (N, N) bool, [i, j] when i hears j;
-    dt [s]; `sensors` names the q rows of C, `v2v` the p fields of the message that a controller hears.
+    dt [s]; `sensors` names the q rows of C, `v2v` the p fields of the message that a controller hears, `actuators` the m inputs.
     """
 
     A: Array
@@ -78,6 +80,7 @@ class Model:
     dt: float
     sensors: tuple[str, ...]
     v2v: tuple[str, ...] = ()
+    actuators: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         for name in ("A", "B", "c", "C", "Q", "R", "graph"):  # public, and nobody's to change: own copies, read-only
@@ -99,8 +102,8 @@ class Model:
 
     @property
     def wires(self) -> tuple[str, ...]:
-        """Everything that an attacker may touch: the sensors, then the V2V fields."""
-        return self.sensors + self.v2v
+        """Everything that an attacker may touch: the sensors, then the V2V fields, then the actuators."""
+        return self.sensors + self.v2v + self.actuators
 
 
 class Prior(NamedTuple):
@@ -137,7 +140,7 @@ class Received(NamedTuple):
 
 
 class Command(NamedTuple):
-    """One attack command per episode: kind (B,) int8, target (B, N, q+p) bool, value (B, N, q+p)."""
+    """One attack command per episode: kind (B,) int8, target (B, N, w) bool, value (B, N, w)."""
 
     kind: Array
     target: Array
@@ -203,7 +206,8 @@ class Frame(NamedTuple):
     command: Command  # what took effect
     refused: Array  # (B,) bool
     estimate: Estimate
-    control: Array  # (B, N, m)
+    control: Array  # (B, N, m) what the controller commanded
+    applied: Array  # (B, N, m) what the actuators got
     scene: Scene
     collided: Array  # (B,) bool
     rear_collided: Array  # (B,) bool

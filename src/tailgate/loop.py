@@ -1,6 +1,6 @@
 """The loop: the arrows between the nouns, pure on its state.
 
-    each k:  plant -> sensors -> [seat: the attack's command] -> channel -> defence -> controller -> plant
+    each k:  plant -> sensors -> [seat: the attack's command] -> channel -> defence -> controller -> channel -> plant
 
 Time runs k = 1, 2, ..., horizon. At k = 0 the prior is the estimate and the controller drives the first step on it, so that every
 measured step is a predict and an update. `sense` and `advance` are the two halves of a step, with the attack's seat between them.
@@ -133,11 +133,12 @@ class Loop:
         expected = np.concatenate([num.matvec(model.C, prior.mean), v2v], axis=-1)
         controller = self.controller.start(plan.controller, batch)
         k = np.zeros(batch, np.int64)
-        controller, u, manoeuvre, plant = self._drive(keys, k, controller, manoeuvre, plant, estimate, v2v)
+        controller, u = self.controller.step(plan.controller, controller, estimate, v2v)
+        manoeuvre, plant = self._move(keys, k, manoeuvre, plant, u)
         sent, received = self._measure(keys, k + 1, plant, estimate)
         return LoopState(
             keys, k + 1, plant, manoeuvre, controller, self.defence.start(plan.defence, prior),
-            Channel().start(plan.channel, num.batch_last(expected)), estimate, u, sent, received, np.zeros(batch, bool),
+            Channel().start(plan.channel, expected, u), estimate, u, sent, received, np.zeros(batch, bool),
         )  # fmt: skip
 
     def restart(self, state: LoopState, mask: Array) -> LoopState:
@@ -184,7 +185,7 @@ class Loop:
     def advance(self, state: LoopState, command: Command) -> tuple[LoopState, Frame]:
         """The rest of the step: channel, defence, controller, plant, and the next measurement."""
         plan = self.plan
-        channel, received, wires, refused = Channel().apply(
+        channel, received, arrived, refused = Channel().apply(
             plan.channel, state.channel, state.sent, state.received, command, state.k
         )
         heard = received._replace(
@@ -197,14 +198,14 @@ class Loop:
         check_estimate(estimate, self.model, len(state.k))
         truth = self.plant.truth(plan.plant, state.plant)
         assert received.v2v is not None
-        controller, u, manoeuvre, plant = self._drive(
-            state.keys, state.k, state.controller, state.manoeuvre, state.plant, estimate, received.v2v
-        )
+        controller, u = self.controller.step(plan.controller, state.controller, estimate, received.v2v)
+        channel, applied = Channel().actuate(plan.channel, channel, u)
+        manoeuvre, plant = self._move(state.keys, state.k, state.manoeuvre, state.plant, applied)
         scene = self.plant.scene(plan.plant, plant)
         collided = np.any(scene.gap <= 0.0, axis=1)
         rear_collided = np.any(scene.rear_gap <= 0.0, axis=1)
         frame = Frame(
-            state.k, truth, state.sent, wires, channel.last, refused, estimate, u, scene, collided, rear_collided
+            state.k, truth, state.sent, arrived, channel.last, refused, estimate, u, applied, scene, collided, rear_collided
         )
         sent, fresh = self._measure(state.keys, state.k + 1, plant, estimate)
         ended = state.ended | ((collided | rear_collided) & self.ends_on_collision)
@@ -226,13 +227,9 @@ class Loop:
         v2v = self.plant.v2v(self.plan.plant, plant)
         return num.stack(columns + [v2v[..., i] for i in range(v2v.shape[-1])]), received
 
-    def _drive(
-        self, keys: Keys, k: Array, controller: Any, manoeuvre: Any, plant: Any, estimate: Estimate, v2v: Array
-    ) -> tuple[Any, Array, Any, Any]:
+    def _move(self, keys: Keys, k: Array, manoeuvre: Any, plant: Any, u: Array) -> tuple[Any, Any]:
         plan = self.plan
-        controller, u = self.controller.step(plan.controller, controller, estimate, v2v)
         manoeuvre, exo = self.manoeuvre.accel(
             plan.manoeuvre, manoeuvre, k, self.plant.lead_speed_of(plant), keys.at(Role.MANOEUVRE, k)
         )
-        plant = self.plant.step(plan.plant, plant, u, exo, keys.at(Role.PROCESS, k))
-        return controller, u, manoeuvre, plant
+        return manoeuvre, self.plant.step(plan.plant, plant, u, exo, keys.at(Role.PROCESS, k))

@@ -18,10 +18,13 @@ from typing import Any, Literal, TypeVar
 from tailgate.errors import InputError, unknown
 from tailgate.schema import as_data, build, fields_of, scalar
 
-Family = Literal["defence", "attack", "plant", "sensor", "controller", "manoeuvre"]
+Family = Literal["defence", "filter", "detector", "mitigation", "attack", "plant", "sensor", "controller", "manoeuvre"]
 USES = ("measurements", "odometry", "probe", "v2v", "redundant", "leader_input", "truth")
 _MODULES = {
     "defence": "tailgate.estimators",
+    "filter": "tailgate.estimators",
+    "detector": "tailgate.estimators",
+    "mitigation": "tailgate.estimators",
     "attack": "tailgate.agents",
     "plant": "tailgate.envs",
     "sensor": "tailgate.envs",
@@ -29,6 +32,7 @@ _MODULES = {
     "manoeuvre": "tailgate.envs",
 }
 _GROUPS = {"defence": "tailgate.estimators", "attack": "tailgate.agents"}
+_FILES = {".json": "policy", ".yaml": "program", ".yml": "program"}  # attacks that are files
 _entries: dict[str, dict[str, "Entry"]] = {family: {} for family in _MODULES}
 _plugins_loaded: set[str] = set()
 T = TypeVar("T", bound=type)
@@ -161,14 +165,16 @@ def make_from(family: Family, data: Any, where: str) -> Any:
 class Spec:
     """A component as a user names it: text that a row can record and another process can rebuild.
 
-    `name`, `name:key=value,key=value`, `module:Class`, `module:Class:key=value`, or (attacks) the JSON file of an exported policy.
+    `name`, `name:key=value,key=value`, `module:Class`, `module:Class:key=value`, or (attacks) the JSON file of an exported policy or the
+    YAML file of a program. `part.key=value` is a parameter of the part that another parameter names.
     """
 
     family: Family
     text: str
 
     def _parts(self) -> tuple[str, dict[str, Any]]:
-        head, params = self.text, {}
+        head = self.text
+        params: dict[str, Any] = {}
         before, sep, tail = self.text.rpartition(":")
         if sep and "=" in tail:
             head = before
@@ -176,7 +182,7 @@ class Spec:
                 key, eq, value = item.partition("=")
                 if not eq:
                     raise InputError(self.family, self.text, "name:key=value,key=value")
-                params[key.strip()] = scalar(value)
+                _put(params, key.strip(), scalar(value))
         return head, params
 
     def refuse_imports(self, where: str) -> None:
@@ -187,8 +193,8 @@ class Spec:
     @property
     def entry(self) -> Entry:
         head, _ = self._parts()
-        if self.family == "attack" and head.endswith(".json"):
-            return find("attack", "policy")
+        if self.family == "attack" and (kind := _FILES.get(Path(head).suffix)):
+            return find("attack", kind)
         if ":" not in head:
             return find(self.family, head)
         module, _, name = head.partition(":")
@@ -211,7 +217,7 @@ class Spec:
     def digest(self) -> str:
         """Of the file that somebody else's component comes from; empty for registered ones, which carry a version."""
         head, _ = self._parts()
-        if head.endswith(".json"):
+        if self.family == "attack" and Path(head).suffix in _FILES:
             path = Path(head)
         elif ":" in head:
             path = Path(inspect.getfile(self.entry.cls))
@@ -221,13 +227,23 @@ class Spec:
 
     def make(self) -> Any:
         head, params = self._parts()
-        if self.family == "attack" and head.endswith(".json"):
+        if self.family == "attack" and Path(head).suffix in _FILES:
             params = {"path": head, **params}
         made: Any = build(self.entry.cls, params, f"{self.family} {head}")
         steps = {"defence": ("prepare", "start", "step"), "attack": ("prepare", "start", "decide")}.get(self.family, ())
         if not all(callable(getattr(made, name, None)) for name in steps):
             raise InputError(self.family, self.text, f"a class with {', '.join(steps)}")
         return made
+
+
+def _put(params: dict[str, Any], key: str, value: Any) -> None:
+    """params[key] = value; `part.key` goes into the mapping of the part, whose name may stand there already."""
+    part, dot, inner = key.partition(".")
+    held = params.get(part)
+    if not dot:
+        params[part] = held | {"name": value} if isinstance(held, dict) else value
+    else:
+        params[part] = {**(held if isinstance(held, dict) else {"name": held} if held is not None else {}), inner: value}
 
 
 def _split(text: str) -> list[str]:

@@ -8,10 +8,11 @@ from typing import Annotated, Literal, NamedTuple
 import numpy as np
 from pydantic import Field
 
+from tailgate import num
 from tailgate.core import Array, Command, Count, Kind, Model, Positive, PositiveCount, Received, no_command, param
 from tailgate.errors import InputError, unknown
 
-KindName = Literal["dos_jam", "dos_hold", "dos_hold_fresh", "dropout", "fdi"]
+KindName = Literal["dos_jam", "dos_hold", "dos_hold_fresh", "dropout", "fdi", "delay", "replay"]
 Pair = Annotated[tuple[float, float], Field(min_length=2, max_length=2)]
 
 
@@ -20,9 +21,11 @@ class ThreatModel:
     """What an attacker may do and see. A command outside of it has no effect and is counted as refused."""
 
     kinds: tuple[KindName, ...] = param(("dos_hold", "fdi"), "attack kinds that are granted")
-    targets: tuple[str, ...] = param((), "wires that may be attacked; empty: every sensor, no V2V field")
-    fdi_bound: Positive = param(50.0, "largest |value| that false data injection may add [unit of the wire]")
+    targets: tuple[str, ...] = param((), "wires that may be attacked; empty: every sensor, no V2V field and no actuator")
+    fdi_bound: Positive = param(50.0, "largest |value| that false data injection may add to a sensor or V2V field [unit of the wire]")
+    actuator_bound: Positive = param(2.0, "largest |value| that may be added to, or jammed onto, an actuator [m/s^2]")
     jam_range: Pair = param((-108.0, 108.0), "values that a jammer may leave at the receiver [unit of the wire]")
+    memory: PositiveCount = param(50, "longest delay, and longest window that is replayed [steps]")
     budget: Count | None = param(None, "attack steps in an episode (the dose); none: unlimited")
     duration: PositiveCount | None = param(None, "longest burst [steps]; none: unlimited")
     cooldown: Count = param(0, "steps between two bursts")
@@ -49,7 +52,7 @@ class Brief:
 
     @property
     def granted(self) -> Array:
-        """(q+p,) bool: the wires that may be attacked."""
+        """(w,) bool: the wires that may be attacked."""
         wires = self.model.wires
         for name in self.threat.targets:
             if name not in wires:
@@ -57,8 +60,19 @@ class Brief:
         names = self.threat.targets or self.model.sensors
         return np.array([w in names for w in wires])
 
+    @property
+    def is_actuator(self) -> Array:
+        """(w,) bool: the wires that lead to actuators."""
+        model = self.model
+        return np.arange(len(model.wires)) >= len(model.sensors) + len(model.v2v)
+
+    @property
+    def bounds(self) -> Array:
+        """(w,) largest |value| that false data injection may add to each wire [unit of the wire]."""
+        return np.where(self.is_actuator, self.threat.actuator_bound, self.threat.fdi_bound)
+
     def command(self, on: Array, kind: Array | Kind, target: Array, value: Array | float) -> Command:
-        """A command where `on` (B,) holds, else none. target and value broadcast to (B, N, q+p)."""
+        """A command where `on` (B,) holds, else none. target and value broadcast to (B, N, w)."""
         out = no_command(len(on), self.model.agents, len(self.model.wires))
         out.kind[...] = np.where(on, kind, 0)
         out.target[...] = on[:, None, None] & target
@@ -68,10 +82,22 @@ class Brief:
 
 class ChannelPlan(NamedTuple):
     threat: ThreatModel
-    granted: Array  # (q+p,) bool
+    granted: Array  # (w,) bool
     kinds: Array  # (kinds,) bool
+    bounds: Array  # (w,) of false data injection
+    low: Array  # (w,) of jamming
+    high: Array  # (w,)
     last_step: int
     sensors: int
+    recorded: int  # samples kept for delay and replay; 0 where neither is granted
+
+
+class Memory(NamedTuple):
+    """What the channel keeps of some wires: held, fresh (B, N, .) and history (B, N, ., recorded), a ring."""
+
+    held: Array  # last good sample before the first attack
+    fresh: Array  # last good sample of each wire
+    history: Array  # what was sent in the last steps
 
 
 class ChannelState(NamedTuple):
@@ -80,29 +106,45 @@ class ChannelState(NamedTuple):
     used: Array  # (B,) attack steps charged
     burst: Array  # (B,) length of the running burst
     cooldown: Array  # (B,) steps before the next burst
-    held: Array  # (B, N, q+p) last good sample before the first attack
-    fresh: Array  # (B, N, q+p) last good sample of each wire
+    played: Array  # (B,) steps that the running replay has lasted
+    taped: Array  # (B,) samples in the recording; it stands still while it is replayed
+    links: Memory  # of sensors and V2V fields
+    drives: Memory  # of actuators
     last: Command
 
 
 class Channel:
-    """Applies commands to the wires and enforces the threat model, for scripts and learned policies alike."""
+    """Applies commands to the wires and enforces the threat model, for scripts and learned policies alike.
+
+    A step has two halves: `apply` decides on the command and changes what is measured and heard, `actuate` then changes what the
+    controller commands.
+    """
 
     def prepare(self, brief: Brief) -> ChannelPlan:
+        threat = brief.threat
         kinds = np.zeros(len(Kind), bool)
-        for name in brief.threat.kinds:
+        for name in threat.kinds:
             kinds[Kind[name.upper()]] = True
-        last = brief.horizon if brief.threat.end is None else min(brief.threat.end, brief.horizon)
-        return ChannelPlan(brief.threat, brief.granted, kinds, last, len(brief.model.sensors))
+        last = brief.horizon if threat.end is None else min(threat.end, brief.horizon)
+        low, high = (
+            np.where(brief.is_actuator, sign * threat.actuator_bound, end) for sign, end in zip((-1.0, 1.0), threat.jam_range, strict=True)
+        )
+        recorded = threat.memory if kinds[Kind.DELAY] or kinds[Kind.REPLAY] else 0
+        return ChannelPlan(threat, brief.granted, kinds, brief.bounds, low, high, last, len(brief.model.sensors), recorded)
 
-    def start(self, plan: ChannelPlan, expected: Array) -> ChannelState:
-        """expected (B, N, q+p): what the wires would read at the prior, held if an attack comes first."""
-        batch, agents, wires = expected.shape
+    def start(self, plan: ChannelPlan, expected: Array, u: Array) -> ChannelState:
+        """expected (B, N, q+p) at the prior and the first input u (B, N, m): what is held if an attack comes first."""
+        batch, agents, links = expected.shape
         count = np.zeros(batch, np.int64)
         return ChannelState(
-            count, count.copy(), count.copy(), expected.copy(order="K"), expected.copy(order="K"),
-            no_command(batch, agents, wires),
+            count, count.copy(), count.copy(), count.copy(), count.copy(), self._memory(plan, expected), self._memory(plan, u),
+            no_command(batch, agents, links + u.shape[-1]),
         )  # fmt: skip
+
+    def _memory(self, plan: ChannelPlan, expected: Array) -> Memory:
+        history = num.zeros((*expected.shape, plan.recorded))
+        history[...] = expected[..., None]
+        return Memory(num.batch_last(expected), num.batch_last(expected), history)
 
     def budget_left(self, plan: ChannelPlan, state: ChannelState) -> Array:
         if plan.threat.budget is None:
@@ -121,50 +163,86 @@ class Channel:
     def apply(
         self, plan: ChannelPlan, state: ChannelState, sent: Array, received: Received, command: Command, k: Array
     ) -> tuple[ChannelState, Received, Array, Array]:
-        """-> state, received, wires (B, N, q+p) as they arrived, refused (B,) bool.
+        """-> state, received, links (B, N, q+p) as they arrived, refused (B,) bool.
 
         `sent` (B, N, q+p) holds the sensor readings and the V2V message before the attack.
         """
         threat, kind = plan.threat, command.kind
         wanted = (kind != Kind.NONE) & command.target.any(axis=(1, 2))
-        low, high = threat.jam_range
-        jam = (kind == Kind.DOS_JAM)[:, None, None]
-        fdi = (kind == Kind.FDI)[:, None, None]
-        with np.errstate(invalid="ignore"):
-            value_ok = np.where(jam, (command.value >= low) & (command.value <= high), True)
-            value_ok &= np.where(fdi, np.abs(command.value) <= threat.fdi_bound, True)
-        known = (kind >= 0) & (kind < len(plan.kinds))
-        legal = known & plan.kinds[np.where(known, kind, 0)]
-        legal &= ~(command.target & ~(plan.granted & value_ok)).any(axis=(1, 2))
+        legal = self._legal(plan, command)
         charged = wanted & legal & self.allowed(plan, state, k)
         refused = ((kind != Kind.NONE) | command.target.any(axis=(1, 2))) & ~charged
 
         hit = command.target & charged[:, None, None]
+        kind = np.where(charged, kind, 0).astype(np.int8)
+        valued = ~np.isin(kind, (Kind.NONE, Kind.DOS_HOLD, Kind.DOS_HOLD_FRESH, Kind.DROPOUT))[:, None, None]
+        last = Command(kind, hit, np.where(hit & valued, command.value, 0.0))
         first = charged & (state.used == 0)
-        held = np.where(first[:, None, None], state.fresh, state.held)
-        kind3 = kind[:, None, None]
-        wires = np.where(hit & jam, command.value, sent)
-        wires = np.where(hit & fdi, sent + command.value, wires)
-        wires = np.where(hit & (kind3 == Kind.DOS_HOLD), held, wires)
-        wires = np.where(hit & (kind3 == Kind.DOS_HOLD_FRESH), state.fresh, wires)
-        lost = hit & (kind3 == Kind.DROPOUT)
-        wires = np.where(lost, state.fresh, wires)  # a receiver that hears nothing keeps its last value
-
-        q = plan.sensors
-        out = received._replace(
-            y=wires[..., :q],
-            valid=received.valid & ~lost[..., :q],
-            v2v=wires[..., q:],
-            attacked=hit[..., :q],
-        )
         ended = (state.burst > 0) & ~charged
         # the step that ends a burst is itself the first of the pause
         cooldown = np.where(ended, max(threat.cooldown - 1, 0), np.maximum(state.cooldown - 1, 0))
-        last = Command(
-            np.where(charged, kind, 0).astype(np.int8), hit, np.where(hit & (jam | fdi), command.value, 0.0)
+        state = state._replace(
+            used=state.used + charged, burst=np.where(charged, state.burst + 1, 0), cooldown=cooldown, last=last,
+            links=_hold(state.links, first), drives=_hold(state.drives, first),
+        )  # fmt: skip
+        links = self._arrive(plan, state, state.links, sent, slice(0, sent.shape[-1]))
+        lost = hit & (kind == Kind.DROPOUT)[:, None, None]
+        q = plan.sensors
+        out = received._replace(
+            y=links[..., :q], valid=received.valid & ~lost[..., :q], v2v=links[..., q:], attacked=hit[..., :q]
         )
-        fresh = np.where(hit, state.fresh, sent)
-        state = ChannelState(
-            state.used + charged, np.where(charged, state.burst + 1, 0), cooldown, held, fresh, last
-        )
-        return state, out, wires, refused
+        return state._replace(links=self._keep(plan, state, state.links, sent, hit[..., : sent.shape[-1]])), out, links, refused
+
+    def actuate(self, plan: ChannelPlan, state: ChannelState, u: Array) -> tuple[ChannelState, Array]:
+        """-> state, u (B, N, m) as the actuators get it."""
+        wires = slice(plan.granted.size - u.shape[-1], None)
+        applied, drives = u, state.drives
+        if plan.granted[wires].any():
+            applied = self._arrive(plan, state, state.drives, u, wires)
+            drives = self._keep(plan, state, state.drives, u, state.last.target[..., wires])
+        playing = state.last.kind == Kind.REPLAY
+        played = np.where(playing, state.played + 1, 0)
+        return state._replace(drives=drives, played=played, taped=state.taped + ~playing), applied
+
+    def _legal(self, plan: ChannelPlan, command: Command) -> Array:
+        """(B,) bool: kind, targets and values are granted."""
+        kind, value = command.kind, command.value
+        known = (kind >= 0) & (kind < len(plan.kinds))
+        legal = known & plan.kinds[np.where(known, kind, 0)]
+        kind3 = kind[:, None, None]
+        with np.errstate(invalid="ignore"):
+            ok = np.where(kind3 == Kind.DOS_JAM, (value >= plan.low) & (value <= plan.high), True)
+            ok &= np.where(kind3 == Kind.FDI, np.abs(value) <= plan.bounds, True)
+            old = (kind3 == Kind.DELAY) | (kind3 == Kind.REPLAY)
+            ok &= np.where(old, (value >= 1) & (value <= plan.threat.memory) & (value == np.floor(value)), True)
+        return np.asarray(legal & ~(command.target & ~(plan.granted & ok)).any(axis=(1, 2)))
+
+    def _arrive(self, plan: ChannelPlan, state: ChannelState, memory: Memory, sent: Array, wires: slice) -> Array:
+        """What arrives of `sent` (B, N, .), the part `wires` of all wires, under the command in force."""
+        command = state.last
+        hit, value, kind = command.target[..., wires], command.value[..., wires], command.kind[:, None, None]
+        out = np.where(hit & (kind == Kind.DOS_JAM), value, sent)
+        out = np.where(hit & (kind == Kind.FDI), sent + value, out)
+        out = np.where(hit & (kind == Kind.DOS_HOLD), memory.held, out)
+        # a receiver that hears nothing keeps its last value
+        out = np.where(hit & ((kind == Kind.DOS_HOLD_FRESH) | (kind == Kind.DROPOUT)), memory.fresh, out)
+        if plan.recorded and (old := hit & ((kind == Kind.DELAY) | (kind == Kind.REPLAY))).any():
+            span = np.where(old, value, 1.0).astype(np.int64)
+            turn = np.where(kind == Kind.REPLAY, state.played[:, None, None] % span, 0)
+            slot = (state.taped[:, None, None] - span + turn) % plan.recorded
+            out = np.where(old, np.take_along_axis(memory.history, slot[..., None], axis=-1)[..., 0], out)
+        return out
+
+    def _keep(self, plan: ChannelPlan, state: ChannelState, memory: Memory, sent: Array, hit: Array) -> Memory:
+        """The memory after this step's `sent` (B, N, .), of which `hit` was attacked."""
+        history = memory.history
+        if plan.recorded:
+            rows = np.flatnonzero(state.last.kind != Kind.REPLAY)
+            history = history.copy(order="K")
+            history[rows, :, :, state.taped[rows] % plan.recorded] = sent[rows]
+        return Memory(memory.held, np.where(hit, memory.fresh, sent), history)
+
+
+def _hold(memory: Memory, first: Array) -> Memory:
+    """The memory with its held sample taken where `first` (B,) attack begins."""
+    return memory._replace(held=np.where(first[:, None, None], memory.fresh, memory.held))

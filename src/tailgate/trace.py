@@ -22,7 +22,7 @@ def _signals(frame: Frame) -> dict[str, Array]:
         "gap": scene.gap, "speed": scene.speed, "accel": scene.accel, "lead_speed": scene.lead_speed, "rear_gap": scene.rear_gap,
         "rear_speed": scene.rear_speed, "position": scene.position,
         "truth": frame.truth, "estimate": estimate.x, "score": estimate.score, "clean": frame.clean, "wires": frame.wires,
-        "control": frame.control, "value": command.value,
+        "control": frame.control, "applied": frame.applied, "value": command.value,
         "kind": command.kind, "target": command.target, "alarm": estimate.alarm, "mode": estimate.mode, "refused": frame.refused,
         "collided": frame.collided, "rear_collided": frame.rear_collided,
     }  # fmt: skip
