@@ -2,7 +2,11 @@
 
 from .controllers import AdaptiveCruise
 from .following import CarFollowing
+from .literal import CarFollowingLiteral, RelativeDistance
 from .manoeuvres import Braking, Constant, OrnsteinUhlenbeck, Profile, StopAndGo
 from .sensors import Odometry
 
-__all__ = ["AdaptiveCruise", "Braking", "CarFollowing", "Constant", "Odometry", "OrnsteinUhlenbeck", "Profile", "StopAndGo"]
+__all__ = [
+    "AdaptiveCruise", "Braking", "CarFollowing", "CarFollowingLiteral", "Constant", "Odometry", "OrnsteinUhlenbeck", "Profile",
+    "RelativeDistance", "StopAndGo",
+]  # fmt: skip

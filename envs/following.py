@@ -114,17 +114,8 @@ class CarFollowing:
     def step(self, plan: FollowingPlan, state: FollowingState, u: Array, exo: Array, draws: Draws) -> FollowingState:
         dt, half = self.dt, 0.5 * self.dt
         noise = plan.noise_sd[:, None] * np.moveaxis(draws.normal((3,)), 0, -1)  # (3, B)
-        x, v, a = state.ego[:, 0, 0], state.ego[:, 0, 1], state.ego[:, 0, 2]
-        drive = u[:, 0, 0]
-        A, B = plan.A, plan.B
-        x_next = x + A[0, 1] * v + A[0, 2] * a + B[0, 0] * drive + noise[0]
-        v_next = v + A[1, 2] * a + B[1, 0] * drive + noise[1]
-        a_next = A[2, 2] * a + B[2, 0] * drive + noise[2]
-        halted = v_next <= 0.0  # a car that stands neither rolls back nor decelerates
-        v_next = np.maximum(v_next, 0.0)
-        a_next = np.where(halted, np.maximum(a_next, 0.0), a_next)
-        x_next = np.where(halted, np.maximum(x_next, x), x_next)
-
+        x, v = state.ego[:, 0, 0], state.ego[:, 0, 1]
+        ego = self.move(plan, state.ego, u, noise)
         lead_v = np.maximum(0.0, state.lead_v + exo * dt)
         lead_x = state.lead_x + half * (state.lead_v + lead_v)
         rear_x, rear_v, intent, slot = state.rear_x, state.rear_v, state.rear_intent, state.rear_slot
@@ -140,8 +131,20 @@ class CarFollowing:
                 made = decided
             rear_v = np.maximum(0.0, rear_v + made * dt)
             rear_x = rear_x + half * (state.rear_v + rear_v)
-        ego = num.stack([x_next[:, None], v_next[:, None], a_next[:, None]])
         return FollowingState(lead_x, lead_v, ego, rear_x, rear_v, intent, slot)
+
+    def move(self, plan: FollowingPlan, ego: Array, u: Array, noise: Array) -> Array:
+        """The follower (B, 1, 3) one step later, under u (B, 1, 1) [m/s^2] and noise (3, B)."""
+        x, v, a = ego[:, 0, 0], ego[:, 0, 1], ego[:, 0, 2]
+        drive, A, B = u[:, 0, 0], plan.A, plan.B
+        x_next = x + A[0, 1] * v + A[0, 2] * a + B[0, 0] * drive + noise[0]
+        v_next = v + A[1, 2] * a + B[1, 0] * drive + noise[1]
+        a_next = A[2, 2] * a + B[2, 0] * drive + noise[2]
+        halted = v_next <= 0.0  # a car that stands neither rolls back nor decelerates
+        v_next = np.maximum(v_next, 0.0)
+        a_next = np.where(halted, np.maximum(a_next, 0.0), a_next)
+        x_next = np.where(halted, np.maximum(x_next, x), x_next)
+        return num.stack([x_next[:, None], v_next[:, None], a_next[:, None]])
 
     def truth(self, plan: FollowingPlan, state: FollowingState) -> Array:
         return state.ego

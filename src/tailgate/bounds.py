@@ -1,0 +1,99 @@
+"""What a chi-square gate bounds, and what it does not (thesis, Theorems 4.5.1-4.5.3 and Lemma 4.5.4, restated).
+
+With gate g = r' S^-1 r <= eta and update x = x- + K r, for one agent: P- (n, n), S (q, q), K (n, q). These are formulas for a reader and
+for tests, not part of the scored path.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import solve_discrete_are
+
+from tailgate.core import Array, Model
+
+
+class Steady(NamedTuple):
+    """The Kalman filter at rest: predicted and updated covariance (n, n), innovation covariance (q, q), gain (n, q)."""
+
+    before: Array
+    after: Array
+    S: Array
+    K: Array
+
+
+def steady_state(model: Model, agent: int = 0) -> Steady:
+    """The steady-state filter of one agent on its own sensors. Raises LinAlgError where none exists."""
+    C, R = model.C[agent], model.R[agent]
+    return updated(solve_discrete_are(model.A.T, C.T, model.Q, R), C, R)
+
+
+def updated(before: Array, C: Array, R: Array) -> Steady:
+    """One measurement update of the covariance P- (n, n)."""
+    S = C @ before @ C.T + R
+    K = np.linalg.solve(S, C @ before).T
+    after = before - K @ S @ K.T
+    return Steady(before, 0.5 * (after + after.T), S, K)
+
+
+def accepted_jump(before: Array, after: Array, eta: float) -> float:
+    """c = sqrt(eta lambda_max(P- - P+)): the farthest that one accepted sample moves the estimate. Tight.
+
+    K S K' = P- - P+, so this is Theorem 4.5.3's constant. It bounds the jump of one step and not the error, and it grows while the gate
+    is shut, as P- does.
+    """
+    return float(np.sqrt(eta * np.linalg.eigvalsh(before - after)[-1]))
+
+
+def innovation_norms(S: Array, eta: float) -> tuple[float, float]:
+    """(c1, c2) of Lemma 4.5.4: |r| > c1 always alarms, |r| <= c2 never does. Both tight.
+
+    Erratum: the thesis takes the eigenvalues of P and leaves eta out of c2; r has the covariance S.
+    """
+    values = np.linalg.eigvalsh(S)
+    return float(np.sqrt(eta * values[-1])), float(np.sqrt(eta * values[0]))
+
+
+def stealth_bound(A: Array, filters: list[Steady], eta: float, direction: Array) -> float:
+    """sqrt(eta) sum_j || S^(1/2) K' (A')^j e ||: how far N unnoticed samples move the estimate along e (n,). Tight.
+
+    A is the filter's predictor, as the known input cancels; `filters` holds S and K of each of the N steps in their order. What the attacker
+    injects is counted as innovation: x_k = A x_k-1 + K_k r_k with every r_k inside of its gate.
+    """
+    total, reach = 0.0, np.asarray(direction, np.float64)
+    for step in reversed(filters):
+        total += np.sqrt(max(reach @ step.K @ step.S @ step.K.T @ reach, 0.0))
+        reach = A.T @ reach
+    return float(np.sqrt(eta) * total)
+
+
+def stealth_innovations(A: Array, filters: list[Steady], eta: float, direction: Array) -> Array:
+    """(N, q) the innovations that reach `stealth_bound`: r_k along S K' (A')^j e, on the gate."""
+    out, reach = [], np.asarray(direction, np.float64)
+    for step in reversed(filters):
+        push = step.S @ step.K.T @ reach
+        length = np.sqrt(reach @ step.K @ push)
+        out.append(np.sqrt(eta) * push / length if length > 0.0 else 0.0 * push)
+        reach = A.T @ reach
+    return np.array(out[::-1])
+
+
+def lock_out(steady: Steady, Q: Array, steps: int, index: int = 0) -> float:
+    """About how many honest samples a gate rejects after `steps` stealth steps along state `index`, while that is positive.
+
+    (n^2 (P- - P+)_pp - S_pp) / Q_pp: the displacement n c against a gate that opens by Q_pp a step. Sensor `index` reads state `index`.
+    """
+    gained = (steady.before - steady.after)[index, index]
+    return float((steps * steps * gained - steady.S[index, index]) / Q[index, index])
+
+
+def reopening(steady: Steady, Q: Array, bias: float, eta: float, index: int = 0) -> float:
+    """About how many samples with a lasting bias on the sensor of a random-walk state a gate rejects before it opens again.
+
+    The gate opens when eta S_pp has grown to bias^2: alarms stop, and the error becomes the bias.
+    """
+    return float((bias * bias / eta - steady.S[index, index]) / Q[index, index])
+
+
+def false_alarm_rate(eta: float) -> float:
+    """Per step and with two sensors: Pr(chi2_2 > eta) = exp(-eta / 2)."""
+    return float(np.exp(-0.5 * eta))

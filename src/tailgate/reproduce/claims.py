@@ -1,0 +1,85 @@
+"""A claim of the thesis beside what is measured."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+
+from tailgate.core import Array
+
+Holds = Literal["yes", "partly", "no"]
+
+
+@dataclass(frozen=True)
+class Claim:
+    """One claim. `thesis` and `measured` are JSON data: a number, a text, or figures by name; `why` says what the verdict rests on."""
+
+    id: str
+    claim: str
+    thesis: Any
+    measured: Any
+    holds: Holds
+    why: str = ""
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of text cells."""
+
+    title: str
+    columns: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A picture (PNG) with what it shows; `name` becomes its file's."""
+
+    name: str
+    caption: str
+    png: bytes
+
+
+@dataclass
+class Report:
+    """Everything that one chapter's reproduction found, in the order in which it is read."""
+
+    chapter: str
+    title: str
+    settings: dict[str, Any]
+    claims: list[Claim] = field(default_factory=list)
+    tables: list[Table] = field(default_factory=list)
+    figures: list[Figure] = field(default_factory=list)
+
+    def add(self, part: Report) -> None:
+        self.claims += part.claims
+        self.tables += part.tables
+        self.figures += part.figures
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Median, quartiles and central 95 % of a figure over seeds."""
+
+    median: float
+    q25: float
+    q75: float
+    low: float
+    high: float
+
+    @classmethod
+    def of(cls, values: Array) -> Spread:
+        q = np.quantile(np.asarray(values, np.float64), [0.5, 0.25, 0.75, 0.025, 0.975])
+        return cls(*(float(v) for v in q))
+
+    def __str__(self) -> str:
+        return f"{self.median:.2f} [{self.q25:.2f}, {self.q75:.2f}]"
+
+    def covers(self, value: float) -> bool:
+        """Whether a single run with this figure is among the central 95 %."""
+        return self.low <= value <= self.high
+
+    def data(self) -> dict[str, float]:
+        return {"median": round(self.median, 6), "q25": round(self.q25, 6), "q75": round(self.q75, 6)}
