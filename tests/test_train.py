@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -118,9 +119,31 @@ def test_the_command_trains_compares_and_writes_a_page(tmp_path: Path) -> None:
     assert ("chi2_kf", str(Path("runs/quickstart/policy-0.json"))) in played and ("kf", "none") in played
     page = (run / "page" / "index.html").read_text(encoding="utf-8")
     assert "quickstart" in page and "learned" in page
-    again = _command(*SMALL_RUN, "steps=1920", "--resume", cwd=tmp_path)
+    again = _command("steps=1920", "--resume", cwd=tmp_path)  # the rest of the configuration is the run's own
     assert again.returncode == 0, again.stderr
     assert json.loads((run / "policy-0.json").read_text())["training"]["steps"] == 1920
+
+
+def test_a_run_that_was_killed_and_resumed_gives_the_policy_of_an_uninterrupted_one(tmp_path: Path) -> None:
+    """SIGKILL in the middle of a rollout, at no moment that the program chose."""
+    long_run = [*SMALL_RUN, "steps=12800", "checkpoint_every=640"]
+    for name in ("straight", "killed"):
+        (tmp_path / name).mkdir()
+    assert _command(*long_run, cwd=tmp_path / "straight").returncode == 0
+    command = [sys.executable, "-m", "tailgate.cli", "train", *long_run]
+    process = subprocess.Popen(command, cwd=tmp_path / "killed", stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    run = tmp_path / "killed" / "runs" / "quickstart"
+    while not (run / "checkpoint-0.safetensors").exists():
+        assert process.poll() is None
+        time.sleep(0.02)
+    time.sleep(0.15)
+    process.kill()
+    process.wait()
+    assert not (run / "policy-0.json").exists()
+    done = _command("--resume", cwd=tmp_path / "killed")
+    assert done.returncode == 0, done.stderr
+    one, two = ((tmp_path / name / "runs" / "quickstart" / "policy-0.safetensors").read_bytes() for name in ("straight", "killed"))
+    assert one == two
 
 
 @pytest.mark.parametrize(

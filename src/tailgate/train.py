@@ -59,11 +59,25 @@ class TrainConfig:
         return Path(self.out) / self.name
 
 
-def load_config(source: str | None, overrides: list[str]) -> TrainConfig:
-    """A preset by name or YAML file (default: quickstart) with `key=value` overrides."""
-    name = source or "quickstart"
-    path = config_path(".", name, "config")
-    data = override(read_yaml(path, "config"), overrides)
+def load_config(source: str | None, overrides: list[str], resume: bool = False) -> TrainConfig:
+    """A preset by name or YAML file (default: quickstart) with `key=value` overrides.
+
+    With `resume` the configuration that the run of this name was started with takes the preset's place.
+    """
+    path = config_path(".", source or "quickstart", "config")
+    config = _checked(override(read_yaml(path, "config"), overrides))
+    held = config.directory / "config.json"
+    if not resume or not held.is_file():
+        return config
+    try:
+        started = json.loads(held.read_text(encoding="utf-8"))
+        del started["class"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError("resume", str(held), f"the configuration of the run ({error})") from None
+    return _checked(override(started, overrides))
+
+
+def _checked(data: dict[str, Any]) -> TrainConfig:
     for key in ("threat", "environment", "ppo"):
         if not isinstance(data.get(key, {}), dict):
             raise InputError(f"config.{key}", data[key], "a mapping of fields")

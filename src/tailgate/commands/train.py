@@ -24,7 +24,7 @@ def add(commands: Any) -> None:
     )  # fmt: skip
     command.add_argument("--config", metavar="FILE", help="preset by name, or YAML file")
     command.add_argument("--seed", type=int, help="first training seed (the same as first_seed=N)")
-    command.add_argument("--resume", action="store_true", help="continue from the run's checkpoints")
+    command.add_argument("--resume", action="store_true", help="continue from the run's checkpoints, with the configuration that it was started with")
     command.add_argument("--json", action="store_true", help="print the report as JSON")
     command.add_argument("overrides", nargs="*", metavar="key=value", help="change a field of the configuration")
     command.set_defaults(run=_train)
@@ -34,7 +34,7 @@ def _train(options: argparse.Namespace) -> int:
     from tailgate import train
 
     overrides = list(options.overrides) + ([f"first_seed={options.seed}"] if options.seed is not None else [])
-    config = train.load_config(options.config, overrides)
+    config = train.load_config(options.config, overrides, options.resume)
     errors = Console(stderr=True)
     errors.print(f"[bold]{config.name}[/]: training against [bold]{config.defence}[/] on {config.scenario}, files in {config.directory}")
     with progress(errors) as update:
