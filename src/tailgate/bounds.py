@@ -56,8 +56,8 @@ def innovation_norms(S: Array, eta: float) -> tuple[float, float]:
 def stealth_bound(A: Array, filters: list[Steady], eta: float, direction: Array) -> float:
     """sqrt(eta) sum_j || S^(1/2) K' (A')^j e ||: how far N unnoticed samples move the estimate along e (n,). Tight.
 
-    A is the filter's predictor, as the known input cancels; `filters` holds S and K of each of the N steps in their order. What the attacker
-    injects is counted as innovation: x_k = A x_k-1 + K_k r_k with every r_k inside of its gate.
+    A is the filter's predictor, as the known input cancels; `filters` holds S and K of each of the N steps in their order. What is
+    injected is counted as innovation: x_k = A x_k-1 + K_k r_k with every r_k inside of its gate.
     """
     total, reach = 0.0, np.asarray(direction, np.float64)
     for step in reversed(filters):

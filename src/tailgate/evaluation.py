@@ -103,7 +103,8 @@ def _seeds(cell: Cell) -> range:
 def _head(cell: Cell, place: Scenario, guard: Entry, rival: Entry, identity: str) -> dict[str, Any]:
     threat = place.threat_model
     return {
-        "suite": cell.suite, "scenario": place.name, "threat_model": as_data(threat), "dose": threat.budget,
+        "suite": cell.suite, "scenario": place.name, "scenario_file": cell.scenario if cell.scenario.endswith((".yaml", ".yml")) else "",
+        "threat_model": as_data(threat), "dose": threat.budget,
         "knowledge": threat.knowledge, "defence": cell.defence, "uses": list(guard.uses), "attack": cell.attack,
         "learned": rival.name == "policy", "optimal": rival.optimal, "purpose": cell.purpose, "batch": cell.batch,
         "engine": ENGINE, "versions": {"defence": guard.version, "attack": rival.version},
@@ -142,7 +143,7 @@ def cells_of(suite: Suite, *, batch: int = 256, purpose: str = "report", threat:
     """Every cell of a suite, in its order. Raises InputError for anything that does not exist."""
     if purpose not in draws.PURPOSES:
         raise InputError("purpose", purpose, f"one of {', '.join(draws.PURPOSES)}")
-    changes = dict(threat or {}) | ({} if suite.knowledge is None else {"knowledge": suite.knowledge})
+    changes = suite.threat | dict(threat or {}) | ({} if suite.knowledge is None else {"knowledge": suite.knowledge})
     out = [
         Cell(suite.name, scenario, dose, defence, attack, suite.seeds, purpose, 0, batch, changes)
         for scenario in suite.scenarios for dose in suite.doses for defence in suite.defences for attack in suite.attacks
@@ -282,7 +283,7 @@ def evaluate(
             texts = _component("defence", guard)[2], _component("attack", rival)[2]
             for scenario in named.scenarios:
                 for dose in named.doses:
-                    cell = Cell(named.name, scenario, dose, *texts, named.seeds, purpose, 0, batch, dict(threat or {}))
+                    cell = Cell(named.name, scenario, dose, *texts, named.seeds, purpose, 0, batch, named.threat | dict(threat or {}))
                     rows += run_cell(cell, guard, rival)
     if out is not None and len(rows) > sum(cell.seeds for cell in cells):
         write_atomic(Path(out), encode(rows))  # with the rows of objects

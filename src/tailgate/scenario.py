@@ -69,6 +69,7 @@ class Suite:
     defences: tuple[str, ...] = param((), "defences, as on the command line")
     attacks: tuple[str, ...] = param((), "attacks, as on the command line")
     seeds: PositiveCount = param(100, "episodes per cell")
+    threat: dict[str, Any] = dataclasses.field(default_factory=dict, metadata={"doc": "changes of every scenario's threat model"})
     knowledge: str | None = param(None, "knowledge that every attacker is granted; none: the least that each needs")
 
 
@@ -121,6 +122,9 @@ def load_suite(name: str) -> Suite:
     """A suite by name, or from a YAML file."""
     path = config_path("suites", name, "suite")
     suite = build(Suite, {"name": path.stem} | read_yaml(path, "suite"), f"suite {path.stem}")
+    for key in suite.threat:
+        if key not in fields_of(ThreatModel):
+            raise unknown(f"suite {path.stem}: threat: unknown field", key, fields_of(ThreatModel))
     for text in suite.defences:
         Spec("defence", text).refuse_imports(f"suite {path.stem}")
     for text in suite.attacks:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from pathlib import Path
 from typing import Any
 
 from rich.console import Console
@@ -33,6 +34,7 @@ def add(commands: Any) -> None:
     command.add_argument("--workers", type=int, default=1, metavar="N", help="processes (default 1); changes no result")
     command.add_argument("--engine", default="local", choices=["local"], help="where workers run")
     command.add_argument("--out", metavar="FILE", help="write the rows to this JSON Lines file; an interrupted run resumes")
+    command.add_argument("--plot", metavar="DIR", help="draw defences x attacks: error, smallest gap, collisions (needs tailgate[viz])")
     command.add_argument("--json", action="store_true", help="print the table as JSON")
     command.set_defaults(run=_evaluate)
 
@@ -60,6 +62,11 @@ def _evaluate(options: argparse.Namespace) -> int:
         print(json.dumps(table, indent=1, allow_nan=False))
     else:
         _print_summary(table)
+    if options.plot:
+        from tailgate.plots import write_overview
+
+        for path in write_overview(table, Path(options.plot)):
+            print(f"picture: {path}", file=sys.stderr)
     failed = sum(entry["failed"] for entry in table)
     if failed:
         print(f"tailgate: {failed} of {len(rows)} rows failed; their reasons are in the rows", file=sys.stderr)

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import io
-from typing import Any
-
 import numpy as np
+
+from tailgate.plots import canvas, png
 
 from .ch4_cases import CASES, FILTERS, READINGS, Runs
 from .ch4_theory import ETAS, Curves, Times
@@ -16,22 +15,6 @@ STYLES = {  # told apart without colour as well
     "kf": {"color": "#0072B2", "linestyle": "--"}, "ours": {"color": "#D55E00", "linestyle": "-"},
     "rkf": {"color": "#009E73", "linestyle": "-."}, "rkf_bad": {"color": "#7F7F7F", "linestyle": ":"},
 }  # fmt: skip
-
-
-def canvas(width: float, height: float, rows: int, columns: int) -> tuple[Any, Any]:
-    """A matplotlib figure and its axes, without the global state of pyplot."""
-    try:
-        from matplotlib.figure import Figure as Canvas
-    except ImportError as error:
-        raise ImportError("figures need matplotlib: pip install 'tailgate[viz]'") from error
-    figure = Canvas(figsize=(width, height), layout="constrained")
-    return figure, figure.subplots(rows, columns, squeeze=False)
-
-
-def png(figure: Any) -> bytes:
-    out = io.BytesIO()
-    figure.savefig(out, format="png", dpi=110, metadata={"Software": None})
-    return out.getvalue()
 
 
 def all_figures(runs: Runs, curves: Curves, times: Times, row: int = 0) -> list[Figure]:
