@@ -1,35 +1,50 @@
 """Attacks: scripted ones, learned policies, and the learners."""
 
+from .model_based import Covert, Stealth, ZeroDynamics
 from .policy import PolicyAttack, Yoked, load_policy, save_policy
+from .program import Program
 from .scripted import (
+    Delay,
     Dropout,
     Hold,
     Inject,
+    InjectActuator,
     InjectBernoulli,
     InjectGaussian,
     InjectRamp,
+    InjectSparse,
     InjectThenJam,
+    InjectUniform,
     Jam,
     NoAttack,
+    Replay,
     Script,
-    Stealth,
     ThesisTimes,
 )  # fmt: skip
 
 __all__ = [
+    "Covert",
+    "Delay",
     "Dropout",
     "Hold",
     "Inject",
+    "InjectActuator",
     "InjectBernoulli",
     "InjectGaussian",
-    "InjectRamp", "InjectThenJam",
+    "InjectRamp",
+    "InjectSparse",
+    "InjectThenJam",
+    "InjectUniform",
     "Jam",
     "NoAttack",
     "PolicyAttack",
+    "Program",
+    "Replay",
     "Script",
     "Stealth",
     "ThesisTimes",
     "Yoked",
+    "ZeroDynamics",
     "load_policy",
     "save_policy",
 ]  # fmt: skip

@@ -1,16 +1,22 @@
 """Scripted attacks: what to inject is fixed, when is a window that opens at a step or on a condition of the road."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from tailgate import num
 from tailgate.core import Array, Command, Finite, Kind, NonNegative, PositiveCount, Probability, View, no_command, param
 from tailgate.draws import Draws
 from tailgate.errors import InputError, NotApplicable, unknown
 from tailgate.registry import register
 from tailgate.threat import Brief
+
+from .triggers import Closing, Fast, LeaderBraking, Near, Slow, Timing, Trigger, TriggerState, idle
+from .values import LAWS, TAGS, Constant, Gaussian, Law, Ramp, Uniform, check_wires, fit, law_of
+
+_CONDITIONS = {"closing": Closing, "near": Near, "speed": Fast, "slow": Slow, "leader_braking": LeaderBraking}
 
 
 @register("attack", "none")
@@ -31,11 +37,28 @@ class NoAttack:
 class ScriptPlan(NamedTuple):
     brief: Brief
     target: Array  # (w,) bool
+    extra: Any = None  # what a script computes before the episode
 
 
-class ScriptState(NamedTuple):
-    opened: Array  # (B,) bool: the window has opened
-    elapsed: Array  # (B,) int64: steps since it opened
+def chosen(brief: Brief, names: tuple[str, ...], default: Array) -> Array:
+    """(w,) bool: the wires that `names` lists, or `default` where it lists none."""
+    wires = brief.model.wires
+    for name in names:
+        if name not in wires:
+            raise unknown("attack targets", name, wires)
+    return np.array([w in names for w in wires]) if names else default
+
+
+def require(brief: Brief, attack: str, kinds: Iterable[str] = (), target: Array | None = None) -> None:
+    """Raise NotApplicable unless the threat model grants every one of `kinds` and the wires of `target` (w,)."""
+    threat = brief.threat
+    for kind in kinds:
+        if kind not in threat.kinds:
+            raise NotApplicable(f"{attack}: threat_model.kinds", list(threat.kinds), f"a threat model that grants {kind}")
+    missing = [name for name, m in zip(brief.model.wires, [] if target is None else target & ~brief.granted, strict=False) if m]
+    if missing:
+        granted = [name for name, g in zip(brief.model.wires, brief.granted, strict=True) if g]
+        raise NotApplicable(f"{attack}: threat_model.targets", granted, f"a threat model that grants {', '.join(missing)}")
 
 
 @dataclass(frozen=True)
@@ -45,37 +68,50 @@ class Script:
     targets: tuple[str, ...] = param((), "wires to attack; empty: all that are granted")
     start_step: PositiveCount = param(1, "first step of the window")
     length: PositiveCount | None = param(None, "steps in the window; none: to the end")
-    trigger: Literal["time", "closing", "near"] = param(
-        "time", "time: open at start; closing: when the speed difference, near: when the gap passes the threshold"
+    trigger: Literal["time", "closing", "near", "speed", "slow", "leader_braking"] = param(
+        "time",
+        "time: open at start; closing: when the speed difference, near: when the gap passes the threshold; speed, slow: when the own speed "
+        "is above or below it; leader_braking: when the leader's deceleration is above it",
     )
-    threshold: NonNegative = param(3.0, "closing speed above [m/s], or gap below [m], which the trigger waits for")
+    threshold: NonNegative = param(3.0, "what the trigger waits for: a speed [m/s], a gap [m] or a deceleration [m/s^2]")
+
+    @cached_property
+    def when(self) -> Trigger:
+        """The trigger that the fields describe."""
+        if self.trigger == "time":
+            return Trigger(start=self.start_step, window=self.length)
+        return _CONDITIONS[self.trigger](start=self.start_step, window=self.length, threshold=self.threshold)
 
     def prepare(self, brief: Brief) -> ScriptPlan:
-        wires = brief.model.wires
-        for name in self.targets:
-            if name not in wires:
-                raise unknown("attack targets", name, wires)
-        target = np.array([w in self.targets for w in wires]) if self.targets else brief.granted
-        return ScriptPlan(brief, target)
+        return ScriptPlan(brief, chosen(brief, self.targets, brief.granted))
 
-    def start(self, plan: ScriptPlan, batch: int, draws: Draws) -> ScriptState:
-        return ScriptState(np.zeros(batch, bool), np.zeros(batch, np.int64))
+    def start(self, plan: ScriptPlan, batch: int, draws: Draws) -> TriggerState:
+        return idle(batch, plan.brief.model.agents)
 
-    def decide(self, plan: ScriptPlan, state: ScriptState, view: View, draws: Draws) -> tuple[Any, Command]:
-        ready = (view.k >= self.start_step) & (view.k >= plan.brief.threat.onset)
-        if self.trigger == "closing":
-            ready &= (view.scene.speed - view.scene.lead_speed > self.threshold).any(axis=1)
-        elif self.trigger == "near":
-            ready &= (view.scene.gap < self.threshold).any(axis=1)
-        opened = state.opened | ready
-        on = opened if self.length is None else opened & (state.elapsed < self.length)
+    def decide(self, plan: ScriptPlan, state: TriggerState, view: View, draws: Draws) -> tuple[TriggerState, Command]:
+        timing = Timing(plan.brief.threat.onset, plan.brief.model.dt)
+        after, on, count = self.when.step(timing, state, view, draws)
         on = on & view.allowed  # a script that knows its budget does not ask for more
-        command = self.command(plan, on, state.elapsed, view, draws)
-        return ScriptState(opened, state.elapsed + opened), command
+        return after, self.command(plan, on, count, view, draws)
 
     def command(self, plan: ScriptPlan, on: Array, count: Array, view: View, draws: Draws) -> Command:
         """What is sent in the rows `on` (B,), `count` (B,) steps after the window opened."""
         raise TypeError(f"{type(self).__name__} must define command()")
+
+
+def inject(plan: ScriptPlan, on: Array, law: Law, count: Array, draws: Draws, tag: int = 0, hit: Array | None = None) -> Command:
+    """False data injection of a law's values, cut at the bounds; with `hit` (B, N, w), on these of the targets only."""
+    brief = plan.brief
+    value = fit(brief, Kind.FDI, law.sample(brief, count, draws, tag))
+    if hit is None:
+        return brief.command(on, Kind.FDI, plan.target, value)
+    target = plan.target & hit
+    return brief.command(on & target.any(axis=(1, 2)), Kind.FDI, target, value)
+
+
+def wires_hit(plan: ScriptPlan, probability: float | Array, draws: Draws) -> Array:
+    """(B, N, w) bool: each wire by itself with its probability."""
+    return np.asarray(draws.uniform((plan.brief.model.agents, len(plan.target))) < probability)
 
 
 @register("attack", "dos_jam", reference="Dutta 2018, (4.3)")
@@ -91,8 +127,7 @@ class Jam(Script):
             raise InputError("attack dos_jam.low", self.low, f"at most high ({self.high})")
 
     def command(self, plan: ScriptPlan, on: Array, count: Array, view: View, draws: Draws) -> Command:
-        shape = (plan.brief.model.agents, len(plan.target))
-        return plan.brief.command(on, Kind.DOS_JAM, plan.target, self.low + (self.high - self.low) * draws.uniform(shape))
+        return plan.brief.command(on, Kind.DOS_JAM, plan.target, Uniform(self.low, self.high).sample(plan.brief, count, draws))
 
 
 @register("attack", "dos_hold", reference="Dutta 2018, (6.18)")
@@ -112,8 +147,11 @@ class Hold(Script):
 class Dropout(Script):
     """Denial of service: nothing is received, and the receiver knows it."""
 
+    probability: Probability = param(1.0, "probability of a loss per step and wire [-]")
+
     def command(self, plan: ScriptPlan, on: Array, count: Array, view: View, draws: Draws) -> Command:
-        return plan.brief.command(on, Kind.DROPOUT, plan.target, 0.0)
+        target = plan.target & wires_hit(plan, self.probability, draws)
+        return plan.brief.command(on & target.any(axis=(1, 2)), Kind.DROPOUT, target, 0.0)
 
 
 @register("attack", "fdi", reference="Dutta 2018, (4.4)")
@@ -136,9 +174,7 @@ class InjectGaussian(Script):
     sd: NonNegative = param(10.0, "standard deviation [unit of the wire]")
 
     def command(self, plan: ScriptPlan, on: Array, count: Array, view: View, draws: Draws) -> Command:
-        bound = plan.brief.threat.fdi_bound
-        value = self.mean + self.sd * draws.normal((plan.brief.model.agents, len(plan.target)))
-        return plan.brief.command(on, Kind.FDI, plan.target, np.clip(value, -bound, bound))
+        return inject(plan, on, Gaussian(self.mean, self.sd), count, draws)
 
 
 @register("attack", "fdi_bernoulli", reference="Dutta 2018, section 6.3: each sensor with its own Bernoulli variable")
@@ -150,8 +186,7 @@ class InjectBernoulli(Script):
     value: Finite = param(-20.0, "bias [unit of the wire]")
 
     def command(self, plan: ScriptPlan, on: Array, count: Array, view: View, draws: Draws) -> Command:
-        hit = draws.uniform((plan.brief.model.agents, len(plan.target))) < self.probability
-        target = plan.target & hit
+        target = plan.target & wires_hit(plan, self.probability, draws)
         return plan.brief.command(on & target.any(axis=(1, 2)), Kind.FDI, target, self.value)
 
 
@@ -165,9 +200,7 @@ class InjectRamp(Script):
     limit: NonNegative = param(50.0, "largest |bias|; the threat model's bound holds as well [unit of the wire]")
 
     def command(self, plan: ScriptPlan, on: Array, count: Array, view: View, draws: Draws) -> Command:
-        limit = min(self.limit, plan.brief.threat.fdi_bound)
-        value = np.clip(self.base + self.rate * (count + 1), -limit, limit)
-        return plan.brief.command(on, Kind.FDI, plan.target, value[:, None, None])
+        return inject(plan, on, Ramp(self.base, self.rate, self.limit), count, draws)
 
 
 @register("attack", "fdi_then_jam")
@@ -181,6 +214,118 @@ class InjectThenJam(Script):
     def command(self, plan: ScriptPlan, on: Array, count: Array, view: View, draws: Draws) -> Command:
         kind = np.where(count < self.inject, Kind.FDI, Kind.DOS_JAM)
         return plan.brief.command(on, kind, plan.target, self.value)
+
+
+@register("attack", "fdi_uniform", reference="Dutta 2018, figure 4.5")
+@dataclass(frozen=True)
+class InjectUniform(Script):
+    """False data injection: uniform random values, cut at the bound of the threat model."""
+
+    low: Finite = param(-10.0, "smallest value [unit of the wire]")
+    high: Finite = param(10.0, "largest value [unit of the wire]")
+
+    def __post_init__(self) -> None:
+        if self.low > self.high:
+            raise InputError("attack fdi_uniform.low", self.low, f"at most high ({self.high})")
+
+    def prepare(self, brief: Brief) -> ScriptPlan:
+        require(brief, "attack fdi_uniform", kinds=["fdi"])
+        return super().prepare(brief)
+
+    def command(self, plan: ScriptPlan, on: Array, count: Array, view: View, draws: Draws) -> Command:
+        return inject(plan, on, Uniform(self.low, self.high), count, draws)
+
+
+@register("attack", "fdi_sparse", reference="Dutta 2018, section 4.7: y' = y + Gamma_k y_af, Gamma_k diagonal of Bernoulli variables")
+@dataclass(frozen=True)
+class InjectSparse(Script):
+    """Sparse false data injection: each sensor is hit at each step with a probability of its own, by values of a law.
+
+    `start_step` is the thesis's k_f, the step from which the probabilities hold.
+    """
+
+    probability: Probability | tuple[Probability, ...] = param(
+        0.2, "probability of a hit per step: one number, or one for each of `targets` in their order [-]"
+    )
+    value: Any = param(-4.0, f"law of the values: a number, or one of {', '.join(LAWS)}; value.mean=... and so on set its parameters")
+
+    def __post_init__(self) -> None:
+        _ = self.law  # a wrong law shall fail here
+
+    @cached_property
+    def law(self) -> Law:
+        return law_of(self.value, "attack fdi_sparse.value")
+
+    def prepare(self, brief: Brief) -> ScriptPlan:
+        plan = super().prepare(brief)
+        require(brief, "attack fdi_sparse", ["fdi"], plan.target)
+        check_wires(self.law, plan.target, brief, "attack fdi_sparse.value")
+        names = self.targets or tuple(name for name, hit in zip(brief.model.wires, plan.target, strict=True) if hit)
+        chances = (self.probability,) * len(names) if isinstance(self.probability, (int, float)) else self.probability
+        if len(chances) != len(names):
+            raise InputError("attack fdi_sparse.probability", self.probability, f"one number, or one for each of {', '.join(names)}")
+        held = dict(zip(names, chances, strict=True))
+        return plan._replace(extra=np.array([held.get(name, 0.0) for name in brief.model.wires]))
+
+    def command(self, plan: ScriptPlan, on: Array, count: Array, view: View, draws: Draws) -> Command:
+        return inject(plan, on, self.law, count, draws, TAGS, wires_hit(plan, plan.extra, draws))
+
+
+@register("attack", "actuator_fdi")
+@dataclass(frozen=True)
+class InjectActuator(Script):
+    """False data injection into the command on its way to the actuator: a constant bias, of which the defence is not told."""
+
+    value: Finite = param(1.0, "bias, cut at actuator_bound [unit of the actuator]")
+
+    def prepare(self, brief: Brief) -> ScriptPlan:
+        default = brief.is_actuator & brief.granted if (brief.is_actuator & brief.granted).any() else brief.is_actuator
+        target = chosen(brief, self.targets, default)
+        for name, other in zip(brief.model.wires, target & ~brief.is_actuator, strict=True):
+            if other:
+                raise InputError("attack actuator_fdi.targets", name, f"actuators ({', '.join(brief.model.actuators)})")
+        require(brief, "attack actuator_fdi", ["fdi"], target)
+        return ScriptPlan(brief, target)
+
+    def command(self, plan: ScriptPlan, on: Array, count: Array, view: View, draws: Draws) -> Command:
+        return inject(plan, on, Constant(self.value), count, draws)
+
+
+@register("attack", "delay")
+@dataclass(frozen=True)
+class Delay(Script):
+    """The receiver reads what was sent some steps ago."""
+
+    age: PositiveCount = param(5, "age of what is read [steps]")
+
+    def prepare(self, brief: Brief) -> ScriptPlan:
+        return _old(super().prepare(brief), "delay", "age", self.age)
+
+    def command(self, plan: ScriptPlan, on: Array, count: Array, view: View, draws: Draws) -> Command:
+        return plan.brief.command(on, Kind.DELAY, plan.target, float(self.age))
+
+
+@register("attack", "replay", reference="Y. Mo and B. Sinopoli, Secure Control against Replay Attacks, 2009; Dutta 2018, section 4.7")
+@dataclass(frozen=True)
+class Replay(Script):
+    """The receiver reads the samples before the attack over and over again."""
+
+    window: PositiveCount = param(20, "length of the recording that is repeated [steps]")
+
+    def prepare(self, brief: Brief) -> ScriptPlan:
+        return _old(super().prepare(brief), "replay", "window", self.window)
+
+    def command(self, plan: ScriptPlan, on: Array, count: Array, view: View, draws: Draws) -> Command:
+        return plan.brief.command(on, Kind.REPLAY, plan.target, float(self.window))
+
+
+def _old(plan: ScriptPlan, kind: str, field: str, steps: int) -> ScriptPlan:
+    """The plan of an attack with old samples, where the threat model grants them."""
+    require(plan.brief, f"attack {kind}", [kind], plan.target)
+    memory = plan.brief.threat.memory
+    if steps > memory:
+        raise NotApplicable(f"attack {kind}.{field}", steps, f"at most threat_model.memory ({memory} steps)")
+    return plan
 
 
 # Attack steps of the thesis's figures 4.5 and 4.6.
@@ -210,47 +355,3 @@ class ThesisTimes:
             return None, plan.brief.command(on, Kind.FDI, plan.target, self.fdi_max * u)
         on = np.isin(view.k, THESIS_DOS_STEPS)
         return None, plan.brief.command(on, Kind.DOS_JAM, plan.target, self.dos_max * (2.0 * u - 1.0))
-
-
-@register("attack", "stealth", knowledge="white", reference="Dutta 2018, Theorem 4.5.3")
-@dataclass(frozen=True)
-class Stealth(Script):
-    """White box: each step moves the estimate as far along one state as the gate lets through; no attacked step alarms.
-
-    With e the direction and every sensor granted, the innovation is driven to r = s sqrt(g) S K' e / sqrt(e' K S K' e), just inside the
-    gate g; with fewer wires, to the farthest point that those reach.
-    """
-
-    state_index: Literal[0, 1, 2] = param(0, "which state to push: 0 position, 1 velocity, 2 acceleration")
-    sign: Literal[-1, 1] = param(-1, "-1 makes the car believe that it is further back")
-    gate: NonNegative | None = param(None, "gate to stay under; none: the defence's own, or 20 where it has none [-]")
-
-    def command(self, plan: ScriptPlan, on: Array, count: Array, view: View, draws: Draws) -> Command:
-        if view.defence is None or view.received is None:
-            raise InputError("threat_model.knowledge", plan.brief.threat.knowledge, "white, which attack stealth needs")
-        box = view.defence
-        if not hasattr(box.defence, "look"):
-            raise NotApplicable("attack stealth", type(box.defence).__name__, "a defence that shows its innovation (look)")
-        look = box.defence.look(box.plan, box.state, view.received, box.known_u)
-        gate = self.gate if self.gate is not None else look.gate if look.gate is not None else 20.0
-        r, S = look.innovation
-        touched = np.flatnonzero(plan.target[: r.shape[-1]])
-        row = look.gain[..., self.state_index, :][..., touched]  # K' e on the wires that are attacked
-        W = num.inverse(S)
-        part = num.inverse(W[..., touched[:, None], touched])
-        pull = num.matvec(W, r)[..., touched]
-        # (r + a)' W (r + a) over the attacked wires is least at -centre, and there leaves `spent` of the gate
-        centre = num.matvec(part, pull)
-        spent = num.dot(r, num.matvec(W, r)) - num.dot(pull, centre)
-        room = (1.0 - 1e-9) * gate - spent
-        push = num.matvec(part, row)
-        reach = np.sqrt(np.maximum(room, 0.0) / num.dot(row, push))
-        wanted = self.sign * reach[..., None] * push - centre
-        # on the line from no injection to the wanted one the score stays convex: shrinking to the bound stays inside
-        largest = np.max(np.abs(wanted), axis=-1)
-        wanted = wanted * np.minimum(1.0, plan.brief.threat.fdi_bound / np.maximum(largest, 1e-300))[..., None]
-        value = num.zeros((len(view.k), plan.brief.model.agents, len(plan.target)))
-        value[..., touched] = wanted
-        inside = num.quadratic(r + value[..., : r.shape[-1]], W) <= gate
-        on = on & inside.all(axis=1)  # out of reach in this step, whatever is injected: keep still
-        return plan.brief.command(on, Kind.FDI, plan.target, value)

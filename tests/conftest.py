@@ -1,6 +1,8 @@
 """Shared builders: short scenarios, rollouts, linear models, and equality to the last bit."""
 
 import dataclasses
+from itertools import combinations
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -9,8 +11,10 @@ from hypothesis import settings
 import tailgate
 from tailgate.core import Model
 from tailgate.draws import keys
+from tailgate.errors import NotApplicable
 from tailgate.registry import entries
 from tailgate.scenario import load_scenario
+from tailgate.threat import KindName
 from tailgate.trace import rollout
 from tailgate.tree import leaves
 
@@ -66,14 +70,35 @@ def loop_of():
 
 
 @pytest.fixture(scope="session")
-def play(loop_of):
+def granting():
+    """The scenario with what a named attack needs: knowledge, kinds and, where `targets` is left open, wires."""
+
+    def widen(place, attack):
+        if entries("attack")[attack].knowledge == "white":
+            place = place.with_threat(knowledge="white")
+        model, every = place.brief().model, get_args(KindName)
+        wider = [{}, {"kinds": every}]
+        if not place.threat_model.targets:
+            some = [names for n in range(len(model.sensors), 0, -1) for names in combinations(model.sensors, n)]
+            wider += [{"kinds": every, "targets": (*names, *model.actuators)} for names in some]
+        for changes in wider:
+            try:
+                tailgate.make_attack(attack).prepare(place.with_threat(**changes).brief())
+            except NotApplicable:
+                continue
+            return place.with_threat(**changes)
+        return place
+
+    return widen
+
+
+@pytest.fixture(scope="session")
+def play(loop_of, granting):
     """The trace of a scenario under a defence and an attack, each a name or an object; grants what a named attack needs."""
 
     def run(place, defence, attack, seeds, **options):
         if isinstance(attack, str):
-            if entries("attack")[attack].knowledge == "white":
-                place = place.with_threat(knowledge="white")
-            attack = tailgate.make_attack(attack)
+            place, attack = granting(place, attack), tailgate.make_attack(attack)
         return rollout(loop_of(place, defence), attack, keys("train", list(seeds)), **options)
 
     return run

@@ -78,10 +78,9 @@ def test_outputs_are_finite_and_of_the_right_shape(defence, attack, short, play,
 
 
 @pytest.mark.parametrize("attack", ATTACKS)
-def test_commands_are_well_formed(attack, short, loop_of):
+def test_commands_are_well_formed(attack, short, loop_of, granting):
     """A command has the declared shapes and types, and the attack's memory has B first in every leaf."""
-    place = short(onset=2)
-    place = place.with_threat(knowledge="white") if entries("attack")[attack].knowledge == "white" else place
+    place = granting(short(onset=2), attack)
     loop, rival = loop_of(place, "chi2_kf"), tailgate.make_attack(attack)
     state, plan = loop.start(keys("train", range(5))), rival.prepare(loop.brief)
     memory = rival.start(plan, 5, state.keys.at(Role.ATTACK, np.zeros(5, np.int64)))

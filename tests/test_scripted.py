@@ -5,10 +5,13 @@ import math
 
 import numpy as np
 import pytest
+from scipy import stats
 
 import tailgate
 from tailgate.agents import scripted
+from tailgate.agents.values import Gamma
 from tailgate.core import Kind
+from tailgate.draws import Role, keys
 from tailgate.envs.faces import AdversaryVectorEnv
 from tailgate.errors import InputError, NotApplicable
 from tailgate.scenario import load_scenario
@@ -127,6 +130,147 @@ def test_hold(sends):
     assert set(np.unique(fresh.kind)) == {Kind.NONE, Kind.DOS_HOLD_FRESH}
     second = next(k for k in steps(fresh) if k > 25)
     np.testing.assert_array_equal(fresh.wires[second - 1, :, 0, :2], fresh.clean[second - 2, :, 0, :2])
+
+
+def test_dropout_with_a_probability(sends):
+    """Each wire loses each sample by itself; with probability 1 every one."""
+    trace = sends("dropout", seeds=200, probability=0.3)
+    lost = trace.target[..., 0, :2].reshape(-1, 2)
+    assert np.max(np.abs(lost.mean(axis=0) - 0.3)) < 5 * math.sqrt(0.21 / len(lost))
+    assert abs((lost[:, 0] & lost[:, 1]).mean() - 0.09) < 5 * math.sqrt(0.0819 / len(lost))
+    assert sends("dropout").target[..., :2].all() and not trace.refused.any()
+
+
+def test_uniform_injection(sends):
+    """fdi_uniform is uniform on its range and is cut at the bound."""
+    trace = sends("fdi_uniform", seeds=100, low=-6.0, high=2.0)
+    assert stats.kstest(trace.value[..., 0, :2].ravel(), stats.uniform(-6.0, 8.0).cdf).pvalue > 1e-3
+    tight = sends("fdi_uniform", low=-6.0, high=2.0, threat={"fdi_bound": 5.0})
+    assert tight.value.min() == -5.0 and not tight.refused.any()
+
+
+@pytest.mark.parametrize("shape", [0.5, 1.0, 2.0, 3.5])
+def test_gamma_magnitudes(shape, short):
+    """The law is the gamma distribution, with one sign or both; other wires and steps are independent."""
+    brief = short().brief()
+    draws = keys("train", range(1500)).at(Role.ATTACK, np.full(1500, 3))
+    values = Gamma(shape=shape, scale=2.0, sign=-1).sample(brief, np.zeros(1500), draws)
+    assert values.shape == (1500, 1, 5)
+    assert stats.kstest(-values.ravel(), stats.gamma(shape, scale=2.0).cdf).pvalue > 1e-3
+    assert abs(np.corrcoef(values[:, 0, 0], values[:, 0, 1])[0, 1]) < 5 / math.sqrt(1500)
+    both = Gamma(shape=shape, scale=2.0, sign=0).sample(brief, np.zeros(1500), draws)
+    np.testing.assert_array_equal(np.abs(both), -values)
+    assert abs((both > 0).mean() - 0.5) < 5 * 0.5 / math.sqrt(both.size)
+    assert abs(np.corrcoef((both > 0).ravel(), np.abs(both).ravel())[0, 1]) < 5 / math.sqrt(both.size)
+
+
+def test_sparse_injection(sends):
+    """Thesis 4.7: from k_f on, each sensor is hit by itself with its own probability; the values do not depend on the hits."""
+    trace = sends("fdi_sparse", seeds=200, probability=[0.1, 0.6], targets=["velocity", "position"], start_step=11, value={"name": "gaussian", "mean": 3.0, "sd": 1.0})
+    assert not trace.kind[:10].any() and not trace.refused.any()
+    hit = trace.target[10:, :, 0, :2].reshape(-1, 2)
+    assert np.max(np.abs(hit.mean(axis=0) - [0.6, 0.1])) < 5 * math.sqrt(0.24 / len(hit))
+    assert abs((hit[:, 0] & hit[:, 1]).mean() - 0.06) < 5 * math.sqrt(0.06 / len(hit))
+    values = trace.value[10:, :, 0, :2].reshape(-1, 2)[hit]
+    assert abs(values.mean() - 3.0) < 5 / math.sqrt(values.size) and abs(values.std() - 1.0) < 5 / math.sqrt(2 * values.size)
+    assert stats.kstest(values, stats.norm(3.0, 1.0).cdf).pvalue > 1e-3
+
+
+def test_sparse_injection_as_text(sends):
+    """The law and its parameters, per sensor too, can be written as a command line writes them."""
+    spec = tailgate.registry.Spec("attack", "fdi_sparse:probability=1,value=gamma,value.shape=1.5,value.sign=1")
+    assert spec.make().law == Gamma(shape=1.5, sign=1)
+    per = sends("fdi_sparse", probability=1.0, value={"position": 2.0, "velocity": {"name": "ramp", "rate": 0.5}})
+    np.testing.assert_array_equal(per.value[:, 0, 0, 0], 2.0)
+    np.testing.assert_array_equal(per.value[:, 0, 0, 1], 0.5 * np.arange(1, K + 1))
+
+
+@pytest.mark.parametrize(
+    "params, message",
+    [
+        ({"value": "gamm"}, r"fdi_sparse\.value\.name: got 'gamm'.*did you mean 'gamma'"), ({"value": {"name": "gamma", "shape": 0.3}}, r"value\.shape"),
+        ({"probability": [0.1, 0.2, 0.3]}, r"probability: got .*expected one number, or one for each of position, velocity"),
+        ({"probability": 1.2}, "probability"), ({"value": {"position": 1.0}}, "'velocity' has none"),
+    ],
+)  # fmt: skip
+def test_wrong_sparse_injections_are_refused(params, message, short):
+    """A wrong law, or more probabilities than targets, is an input error."""
+    with pytest.raises(InputError, match=message):
+        tailgate.make_attack("fdi_sparse", **params).prepare(short().brief())
+
+
+OLD = {"kinds": ("fdi", "delay", "replay")}
+
+
+def test_delay(sends):
+    """The receiver reads what was sent `age` steps ago, on its targets."""
+    trace = sends("delay", age=7, start_step=20, targets=["position"], threat=OLD)
+    np.testing.assert_array_equal(trace.wires[19:, :, 0, 0], trace.clean[12:-7, :, 0, 0])
+    np.testing.assert_array_equal(trace.wires[..., 1], trace.clean[..., 1])
+
+
+def test_replay(sends):
+    """The receiver reads the `window` samples before the attack, over and over."""
+    trace = sends("replay", window=8, start_step=20, length=20, threat=OLD)
+    recorded = trace.clean[11:19, :, 0, :2]
+    np.testing.assert_array_equal(trace.wires[19:39, :, 0, :2], np.concatenate([recorded, recorded, recorded[:4]]))
+    np.testing.assert_array_equal(trace.wires[39:], trace.clean[39:])
+
+
+def test_a_replayed_speed_passes_the_gate_in_a_steady_cruise_and_a_replayed_position_does_not(short, play):
+    """Thesis 4.7: a replay without a change of level escapes the chi-square detector."""
+    place = dataclasses.replace(short("stop-and-go-v0", horizon=300, onset=1, **OLD), manoeuvre=tailgate.registry.make("manoeuvre", "constant", value=0.0))
+    rate = {}
+    for name in ("velocity", "position"):
+        trace = play(place, "chi2_kf", tailgate.make_attack("replay", start_step=200, targets=(name,)), range(40), terminate=False)
+        rate[name] = trace.alarm[trace.kind != 0].mean()
+    assert rate["velocity"] < 0.005 and rate["position"] > 0.99
+
+
+def test_actuator_injection(sends):
+    """The actuator gets the command and the bias, cut at its bound; sensors and the defence's knowledge stay as they are."""
+    grant = {"targets": ("position", "acceleration"), "actuator_bound": 1.5}
+    for value, arrives in ((-1.0, -1.0), (9.0, 1.5)):
+        trace = sends("actuator_fdi", value=value, start_step=10, threat=grant)
+        np.testing.assert_allclose((trace.applied - trace.control)[9:], arrives, atol=1e-12)
+        np.testing.assert_array_equal(trace.applied[:9], trace.control[:9])
+        np.testing.assert_array_equal(trace.wires, trace.clean)
+        assert not trace.refused.any()
+
+
+@pytest.mark.parametrize(
+    "name, params, message",
+    [
+        ("delay", {}, "grants delay"), ("replay", {}, "grants replay"), ("delay", {"age": 51, "threat": OLD}, "at most threat_model.memory"),
+        ("replay", {"targets": ["leader_velocity"], "threat": OLD}, "grants leader_velocity"), ("actuator_fdi", {}, "grants acceleration"),
+        ("fdi_uniform", {"threat": {"kinds": ("dropout",)}}, "grants fdi"), ("fdi_sparse", {"threat": {"kinds": ("dropout",)}}, "grants fdi"),
+    ],
+)  # fmt: skip
+def test_what_is_not_granted_is_not_applicable(name, params, message, sends):
+    """Attacks that need more than the threat model grants say what, before the first step."""
+    with pytest.raises(NotApplicable, match=message):
+        sends(name, **params)
+
+
+def test_actuator_injection_has_no_other_targets(short):
+    """A sensor as its target is an input error that lists the actuators."""
+    with pytest.raises(InputError, match=r"actuator_fdi\.targets: got 'position'; expected actuators \(acceleration\)"):
+        tailgate.make_attack("actuator_fdi", targets=("position",)).prepare(short().brief())
+
+
+@pytest.mark.parametrize("name, targets", [("delay", ()), ("replay", ()), ("actuator_fdi", ("acceleration",)), ("fdi_sparse", ()), ("fdi_uniform", ())])
+def test_rows_do_not_depend_on_their_batch(name, targets, short, loop_of):
+    """With what they need granted: alone, among 3 or among 16; budget and cooldown hold; before the onset nothing differs."""
+    loop = loop_of(short(targets=targets, onset=25, budget=15, duration=4, cooldown=2, **OLD), "chi2_kf")
+    attack = tailgate.make_attack(name)
+    whole = rollout(loop, attack, keys("train", range(16)), terminate=False)
+    for seeds in ([7], [9, 0, 15]):
+        some = rollout(loop, attack, keys("train", seeds), terminate=False)
+        assert [some.trace_hash(i) for i in range(len(seeds))] == [whole.trace_hash(s) for s in seeds]
+    clean = rollout(loop, tailgate.make_attack("none"), keys("train", range(16)), terminate=False)
+    for signal in clean.signals:
+        np.testing.assert_array_equal(whole.signals[signal][:24], clean.signals[signal][:24], err_msg=signal)
+    assert ((whole.kind != 0).sum(axis=0) <= 15).all() and not whole.refused.any() and not np.array_equal(whole.estimate, clean.estimate)
 
 
 @pytest.mark.parametrize("kind, times", [("fdi", scripted.THESIS_FDI_STEPS), ("dos", scripted.THESIS_DOS_STEPS)])

@@ -154,6 +154,8 @@ def cells_of(suite: Suite, *, batch: int = 256, purpose: str = "report", threat:
         place = cell.place(rival, spec.entry.knowledge)
         try:
             rival.prepare(place.loop(defence, guard.entry.uses).brief)
+        except NotApplicable:  # its rows will be skipped, with the reason
+            continue
         except InputError:
             raise
         except Exception:  # a component that breaks costs its own rows: run_cell will say why

@@ -216,11 +216,13 @@ class Spec:
     @property
     def digest(self) -> str:
         """Of the file that somebody else's component comes from; empty for registered ones, which carry a version."""
-        head, _ = self._parts()
+        head, params = self._parts()
         if self.family == "attack" and Path(head).suffix in _FILES:
             path = Path(head)
         elif ":" in head:
             path = Path(inspect.getfile(self.entry.cls))
+        elif self.family == "attack" and Path(str(params.get("path"))).suffix in _FILES:
+            path = Path(params["path"])
         else:
             return ""
         return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ""

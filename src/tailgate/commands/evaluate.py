@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from tailgate.errors import InputError
@@ -20,7 +21,7 @@ def add(commands: Any) -> None:
     command = commands.add_parser(
         "evaluate", help="play defences against attacks and write one row per episode",
         description="Play a suite, or the part of it that the options name. NAME: a registered component, NAME:key=value,key=value, "
-        "module:Class, or (attacks) the JSON file of an exported policy.",
+        "module:Class, or (attacks) the JSON file of an exported policy or the YAML file of a program.",
     )  # fmt: skip
     command.add_argument("--suite", default="quick-v0", metavar="NAME", help="suite by name or YAML file (default: quick-v0)")
     command.add_argument("--defence", action="append", metavar="NAME", help="a defence instead of the suite's (repeatable)")
@@ -84,10 +85,10 @@ def _print_summary(table: list[dict[str, Any]]) -> None:
         for entry in table:
             if (entry["scenario"], entry["dose"]) != place:
                 continue
-            head = [entry["defence"], entry["attack"], entry["knowledge"], str(entry["n"])]
+            head = [escape(entry["defence"]), escape(entry["attack"]), entry["knowledge"], str(entry["n"])]
             crash = entry["crash"]
             if crash is None:
-                shown.add_row(*head, "-", entry["reason"])
+                shown.add_row(*head, "-", escape(entry["reason"]))
                 continue
             figures = [f"{100 * crash['value']:.1f} %", f"{100 * crash['low']:.1f} to {100 * crash['high']:.1f} %"]
             figures += [f"{entry[k]['median']:.2f}" if entry[k] else "-" for k in ("min_gap", "max_error", "alarm_onsets")]

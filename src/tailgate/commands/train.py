@@ -7,6 +7,7 @@ import json
 from typing import Any
 
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from tailgate.progress import cells, console, progress
@@ -24,7 +25,7 @@ def add(commands: Any) -> None:
     )  # fmt: skip
     command.add_argument("--config", metavar="FILE", help="preset by name, or YAML file")
     command.add_argument("--seed", type=int, help="first training seed (the same as first_seed=N)")
-    command.add_argument("--resume", action="store_true", help="continue from the run's checkpoints, with the configuration that it was started with")
+    command.add_argument("--resume", action="store_true", help="continue from the run's checkpoints, with the run's own configuration")
     command.add_argument("--json", action="store_true", help="print the report as JSON")
     command.add_argument("overrides", nargs="*", metavar="key=value", help="change a field of the configuration")
     command.set_defaults(run=_train)
@@ -59,7 +60,8 @@ def _print_report(report: dict[str, Any]) -> None:
     for heading in ("attack", "collisions", "95 % interval", "note"):
         table.add_column(heading, overflow="fold")
     for row in report["crash"]:
-        table.add_row(row["label"], f"{100 * row['value']:.1f} %", f"{100 * row['low']:.1f} to {100 * row['high']:.1f} %", row["note"])
+        interval = f"{100 * row['low']:.1f} to {100 * row['high']:.1f} %"
+        table.add_row(escape(row["label"]), f"{100 * row['value']:.1f} %", interval, row["note"])
     out = console()
     out.print(table)
     for name, gain in report["advantage"].items():

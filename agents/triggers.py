@@ -1,0 +1,274 @@
+"""When an attack is on: triggers, the same for scripts and for programs.
+
+A trigger is armed at the start of an episode, or in a program when the phase before has ended. From then on it fires or does not, step by
+step. One that latches opens at its first firing and stays open, another is on only while it fires; both close `window` steps after the
+first firing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any, NamedTuple
+
+import numpy as np
+from pydantic import Field
+
+from tailgate.core import Array, Count, NonNegative, Positive, PositiveCount, Probability, View, param
+from tailgate.draws import Draws
+from tailgate.errors import InputError, unknown
+from tailgate.schema import build
+from tailgate.threat import Brief
+
+TAG = 0x4000  # of the draws of triggers; what is injected draws below it
+
+Interval = Annotated[tuple[PositiveCount, PositiveCount], Field(min_length=2, max_length=2)]
+Share = Annotated[float, Field(gt=0, lt=1)]
+
+
+class Timing(NamedTuple):
+    """What a trigger is told of an episode: the first step that is granted, and the length of a step [s]."""
+
+    onset: int
+    dt: float
+
+
+class TriggerState(NamedTuple):
+    """The memory of any trigger; every leaf has B first."""
+
+    armed: Array  # (B,) int64: steps since the trigger was armed
+    opened: Array  # (B,) bool: it has fired
+    elapsed: Array  # (B,) int64: steps since it first fired
+    burst: Array  # (B,) int8: 1 in a random burst, 0 between two, -1 before the first draw
+    lead_speed: Array  # (B, N) the leader's speed at the last look; -inf before the first
+
+
+def idle(batch: int, agents: int) -> TriggerState:
+    """The memory of triggers that have just been armed."""
+    count = np.zeros(batch, np.int64)
+    return TriggerState(count, np.zeros(batch, bool), count.copy(), np.full(batch, -1, np.int8), np.full((batch, agents), -np.inf))
+
+
+def rearm(state: TriggerState, where: Array) -> TriggerState:
+    """The memory in which the triggers of the rows `where` (B,) have just been armed; what was seen of the road is kept."""
+    fresh = idle(*state.lead_speed.shape)
+    armed, opened, elapsed, burst = (np.where(where, new, old) for new, old in zip(fresh[:4], state[:4], strict=True))
+    return TriggerState(armed, opened, elapsed, burst, state.lead_speed)
+
+
+@dataclass(frozen=True)
+class Trigger:
+    """On from a step on."""
+
+    start: PositiveCount = param(1, "first step of the episode at which it may fire")
+    after: Count = param(0, "steps that it waits after it was armed")
+    window: PositiveCount | None = param(None, "steps from the first firing to its end; none: no end")
+
+    @property
+    def latches(self) -> bool:
+        """Whether it stays open after its first firing."""
+        return False
+
+    @property
+    def ends(self) -> bool:
+        """Whether it ends by itself."""
+        return self.window is not None
+
+    def prepare(self, brief: Brief) -> Timing:
+        return Timing(brief.threat.onset, brief.model.dt)
+
+    def step(self, timing: Timing, state: TriggerState, view: View, draws: Draws) -> tuple[TriggerState, Array, Array]:
+        """-> state, on (B,) bool, count (B,): steps since the first firing."""
+        ready = (view.k >= self.start) & (view.k >= timing.onset) & (state.armed >= self.after)
+        burst, hit = self.fires(timing, state, view, ready, draws)
+        fired = ready & hit
+        opened = state.opened | fired
+        on = opened if self.latches else fired
+        if self.window is not None:
+            on = on & (state.elapsed < self.window)
+        after = TriggerState(state.armed + 1, opened, state.elapsed + opened, burst, np.array(view.scene.lead_speed))
+        return after, on, state.elapsed
+
+    def fires(self, timing: Timing, state: TriggerState, view: View, ready: Array, draws: Draws) -> tuple[Array, Array]:
+        """-> the burst state after this step, and whether it fires (B,) bool, in the rows that are `ready`."""
+        return state.burst, ready
+
+    def over(self, state: TriggerState, k: Array) -> Array:
+        """(B,) bool: after step k (B,), the last one played, it will not be on again."""
+        never = np.zeros(len(k), bool)
+        return never if self.window is None else never | (state.opened & (state.elapsed >= self.window))
+
+
+@dataclass(frozen=True)
+class Steps(Trigger):
+    """On at the listed steps."""
+
+    at: Annotated[tuple[PositiveCount | Interval, ...], Field(min_length=1)] = param(
+        (1,), "steps of the episode, each a number, or a pair [first, last]"
+    )
+
+    def __post_init__(self) -> None:
+        for item in self.at:
+            if not isinstance(item, int) and item[0] > item[1]:
+                raise InputError("at", item, "a pair [first, last], first <= last")
+
+    @property
+    def steps(self) -> list[int]:
+        """The steps, one by one."""
+        pairs = [(item, item) if isinstance(item, int) else item for item in self.at]
+        return sorted({k for first, last in pairs for k in range(first, last + 1)})
+
+    @property
+    def ends(self) -> bool:
+        return True
+
+    def fires(self, timing: Timing, state: TriggerState, view: View, ready: Array, draws: Draws) -> tuple[Array, Array]:
+        return state.burst, np.asarray(np.isin(view.k, self.steps))
+
+    def over(self, state: TriggerState, k: Array) -> Array:
+        return super().over(state, k) | (k >= self.steps[-1])
+
+
+@dataclass(frozen=True)
+class Chance(Trigger):
+    """Fires at each step with a probability, independently."""
+
+    probability: Probability = param(0.1, "probability of firing per step [-]")
+    latch: bool = param(False, "stay open after the first firing: a random onset")
+
+    @property
+    def latches(self) -> bool:
+        return self.latch
+
+    def fires(self, timing: Timing, state: TriggerState, view: View, ready: Array, draws: Draws) -> tuple[Array, Array]:
+        return state.burst, np.asarray(draws.uniform(tag=TAG) < self.probability)
+
+
+@dataclass(frozen=True)
+class Bursts(Trigger):
+    """Random bursts of a two-state Markov chain (Gilbert 1960) with a wanted mean length and a wanted frequency or share of time.
+
+    With steps of dt, a burst of mean D [s] is left with probability dt / D a step; the pause between two, of mean 1 / f - D for f bursts
+    a second, or D (1 - s) / s for a share s, is left with dt over that mean. The first step is drawn from the chain's stationary law, so
+    that frequency and share hold on average from the beginning.
+    """
+
+    duration: Positive = param(0.5, "mean length of a burst [s]")
+    frequency: Positive | None = param(None, "mean number of bursts a second [1/s]; none: `share` decides")
+    share: Share | None = param(None, "mean share of the time that lies in bursts [-]; none: `frequency` decides")
+
+    def __post_init__(self) -> None:
+        if (self.frequency is None) == (self.share is None):
+            raise InputError("frequency", self.frequency, "a frequency or a share, and not both")
+        if self.frequency is not None and self.frequency * self.duration >= 1.0:
+            raise InputError("frequency", self.frequency, f"less than 1 / duration ({1.0 / self.duration:g} 1/s)")
+
+    def chain(self, dt: float) -> tuple[float, float, float]:
+        """-> probabilities per step of entering and of leaving a burst, and the share of time in bursts."""
+        share = self.frequency * self.duration if self.frequency is not None else self.share or 0.0
+        pause = self.duration * (1.0 - share) / share
+        for name, mean in (("duration", self.duration), ("frequency" if self.share is None else "share", pause)):
+            if mean < dt * (1.0 - 1e-9):
+                raise InputError(f"trigger bursts.{name}", getattr(self, name), f"bursts and pauses that last a step ({dt:g} s) on average")
+        return min(dt / pause, 1.0), min(dt / self.duration, 1.0), share
+
+    def prepare(self, brief: Brief) -> Timing:
+        self.chain(brief.model.dt)  # what cannot be met shall fail here
+        return super().prepare(brief)
+
+    def fires(self, timing: Timing, state: TriggerState, view: View, ready: Array, draws: Draws) -> tuple[Array, Array]:
+        enter, leave, share = self.chain(timing.dt)
+        u = draws.uniform(tag=TAG)
+        inside = np.where(state.burst < 0, u < share, np.where(state.burst == 0, u < enter, u >= leave))
+        return np.where(ready, inside, state.burst).astype(np.int8), inside
+
+
+@dataclass(frozen=True)
+class Condition(Trigger):
+    """Base of the triggers that watch the road; one vehicle that meets the condition is enough."""
+
+    latch: bool = param(True, "stay open after the first firing; false: on only while the condition holds")
+
+    @property
+    def latches(self) -> bool:
+        return self.latch
+
+    def fires(self, timing: Timing, state: TriggerState, view: View, ready: Array, draws: Draws) -> tuple[Array, Array]:
+        return state.burst, np.asarray(self.holds(timing, state, view).any(axis=1))
+
+    def holds(self, timing: Timing, state: TriggerState, view: View) -> Array:
+        """(B, N) bool."""
+        raise TypeError(f"{type(self).__name__} must define holds()")
+
+
+@dataclass(frozen=True)
+class Near(Condition):
+    """Fires when the gap is small."""
+
+    threshold: NonNegative = param(40.0, "gap below [m]")
+
+    def holds(self, timing: Timing, state: TriggerState, view: View) -> Array:
+        return np.asarray(view.scene.gap < self.threshold)
+
+
+@dataclass(frozen=True)
+class Closing(Condition):
+    """Fires when the follower is faster than the leader."""
+
+    threshold: NonNegative = param(3.0, "closing speed above [m/s]")
+
+    def holds(self, timing: Timing, state: TriggerState, view: View) -> Array:
+        return np.asarray(view.scene.speed - view.scene.lead_speed > self.threshold)
+
+
+@dataclass(frozen=True)
+class Fast(Condition):
+    """Fires when the follower drives fast."""
+
+    threshold: NonNegative = param(25.0, "speed above [m/s]")
+
+    def holds(self, timing: Timing, state: TriggerState, view: View) -> Array:
+        return np.asarray(view.scene.speed > self.threshold)
+
+
+@dataclass(frozen=True)
+class Slow(Condition):
+    """Fires when the follower drives slowly."""
+
+    threshold: NonNegative = param(5.0, "speed below [m/s]")
+
+    def holds(self, timing: Timing, state: TriggerState, view: View) -> Array:
+        return np.asarray(view.scene.speed < self.threshold)
+
+
+@dataclass(frozen=True)
+class LeaderBraking(Condition):
+    """Fires when the leader has braked hard since the last step, as its speed then and now tells."""
+
+    threshold: NonNegative = param(2.0, "deceleration of the leader above [m/s^2]")
+
+    def holds(self, timing: Timing, state: TriggerState, view: View) -> Array:
+        return np.asarray((state.lead_speed - view.scene.lead_speed) / timing.dt > self.threshold)
+
+
+TRIGGERS: dict[str, type[Trigger]] = {
+    "time": Trigger, "steps": Steps, "chance": Chance, "bursts": Bursts, "near": Near, "closing": Closing, "speed": Fast, "slow": Slow,
+    "leader_braking": LeaderBraking,
+}  # fmt: skip
+
+
+def part(known: Mapping[str, type[Any]], data: Any, where: str) -> Any:
+    """One of the `known` classes from data: a name, or a mapping with `name` and parameters; InputErrors name `where` and the field."""
+    if isinstance(data, str):
+        data = {"name": data}
+    if not isinstance(data, dict) or "name" not in data:
+        raise InputError(where, data, f"a name, or a mapping with a name ({', '.join(known)}) and parameters")
+    if not isinstance(data["name"], str) or data["name"] not in known:
+        raise unknown(f"{where}.name", data["name"], known)
+    params = {str(key): value for key, value in data.items() if key != "name"}
+    try:
+        return build(known[data["name"]], params, where)
+    except InputError as error:
+        if error.field.startswith(where):
+            raise
+        raise InputError(f"{where}.{error.field}", error.value, error.expected) from None
