@@ -106,7 +106,8 @@ class AdversaryVectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
         if autoreset not in _AUTORESET:
             raise unknown("autoreset", autoreset, _AUTORESET)
         if render_mode not in (None, "rgb_array"):
-            raise InputError("render_mode", render_mode, "None or 'rgb_array'")
+            why = "; a window shows one episode: gymnasium.make(..., render_mode='human')" if render_mode == "human" else ""
+            raise InputError("render_mode", render_mode, f"None or 'rgb_array'{why}")
         self.seat = Seat.make(**arguments)
         self.num_envs = num_envs
         self.render_mode = render_mode
@@ -260,14 +261,19 @@ class AdversaryVectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
 class AdversaryEnv(gymnasium.Env[Array, Any]):
     """One adversary environment; see `Seat.make` for the arguments."""
 
-    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012 - Gymnasium's own annotation
+    metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array"], "render_fps": 10}  # noqa: RUF012 - Gymnasium's own annotation
 
     def __init__(self, *, render_mode: str | None = None, **arguments: Any) -> None:
         if "autoreset" in arguments:
             raise InputError("autoreset", arguments["autoreset"], "a vector environment (make_vec); a single one is reset by its user")
-        self.batch = AdversaryVectorEnv(1, render_mode=render_mode, autoreset="disabled", **arguments)
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise InputError("render_mode", render_mode, "None, 'rgb_array' or 'human'")
+        drawn = None if render_mode is None else "rgb_array"
+        self.batch = AdversaryVectorEnv(1, render_mode=drawn, autoreset="disabled", **arguments)
         self.render_mode = render_mode
         self.metadata = self.metadata | {"render_fps": self.batch.metadata["render_fps"]}
+        self._window: Any = None
+        self._shown: LoopState | None = None  # in the window
         self.observation_space = self.batch.single_observation_space
         self.action_space = self.batch.single_action_space
 
@@ -280,10 +286,14 @@ class AdversaryEnv(gymnasium.Env[Array, Any]):
         if self.batch.state is None and seed is None:
             seed = int(self.np_random.integers(2**31))
         observation, info = self.batch.reset(seed=seed)
+        if self.render_mode == "human":
+            self.render()
         return observation[0], self._row(info)
 
     def step(self, action: Any) -> tuple[Array, float, bool, bool, dict[str, Any]]:
         observation, reward, terminated, truncated, info = self.batch.step(np.asarray(action)[None])
+        if self.render_mode == "human":
+            self.render()
         return observation[0], float(reward[0]), bool(terminated[0]), bool(truncated[0]), self._row(info)
 
     def action_masks(self) -> Array:
@@ -291,8 +301,28 @@ class AdversaryEnv(gymnasium.Env[Array, Any]):
         return np.asarray(self.batch.action_masks()[0])
 
     def render(self) -> Any:
-        frames = self.batch.render()
-        return None if frames is None else frames[0]
+        """The picture (H, W, 3) uint8; in human mode None: reset() and step() show it in a window by themselves."""
+        if self.render_mode != "human":
+            frames = self.batch.render()
+            return None if frames is None else frames[0]
+        if self.batch.state is None or self.batch.state is self._shown:
+            return None
+        if self._window is None:
+            from .render import Window
+
+            self._window = Window(self.metadata["render_fps"])
+        if not self._window.dismissed:
+            frames = self.batch.render()
+            assert frames is not None
+            self._window.show(frames[0])
+        self._shown = self.batch.state
+        return None
+
+    def close(self) -> None:
+        if self._window is not None:
+            self._window.close()
+            self._window = self._shown = None
+        super().close()
 
     @staticmethod
     def _row(info: dict[str, Any]) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""One picture of one episode for render_mode "rgb_array" (extra: viz).
+"""One picture of one episode for render_mode "rgb_array", and the window that shows it for "human" (extra: viz).
 
 The upper strip is the road as it is, the lower one the same stretch as the car believes it to be. Gaps between bumpers are to scale,
 cars are not. Nothing is told by colour alone, and the same state always gives the same picture.
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 
@@ -17,6 +18,7 @@ except ImportError as error:
     raise ImportError("Pillow is missing, which draws the pictures: pip install 'tailgate[viz]'") from error
 
 from tailgate.core import Array, Frame, Kind, Mode
+from tailgate.errors import InputError
 from tailgate.loop import Loop, LoopState
 
 HEIGHT, WIDTH = 320, 960  # multiples of 16, which video encoders ask for
@@ -251,3 +253,49 @@ def draw(loop: Loop, state: LoopState, frame: Frame | None, row: int) -> Array:
     if past:
         canvas.text(WIDTH - MARGIN, HEADER + 17, f"new episode; the last one ended in a {past}", INK, SMALL, "rs", True)
     return np.array(canvas.image.reduce(ZOOM), np.uint8)
+
+
+class Window:
+    """A window on the screen, opened by its first picture. One that its reader has closed stays closed."""
+
+    def __init__(self, fps: int) -> None:
+        self.fps = fps
+        self.open = False
+        self.dismissed = False  # by its reader
+        self._pygame: Any = None
+        self._clock: Any = None
+
+    def show(self, picture: Array) -> None:
+        """Show a picture (H, W, 3) uint8, no sooner than the frame rate allows. Raises InputError where there is no screen."""
+        if self.dismissed:
+            return
+        if not self.open or self._pygame.display.get_surface() is None:  # also where another environment has closed the one display
+            self._start()
+        pygame = self._pygame
+        if any(event.type in (pygame.QUIT, pygame.WINDOWCLOSE) for event in pygame.event.get()):
+            self.dismissed = True
+            self.close()
+            return
+        screen = pygame.display.get_surface()
+        screen.blit(pygame.image.frombuffer(np.ascontiguousarray(picture), (WIDTH, HEIGHT), "RGB"), (0, 0))
+        pygame.display.flip()
+        self._clock.tick(self.fps)
+
+    def close(self) -> None:
+        """Close the window, if it is open."""
+        if self.open:
+            self.open = False
+            self._pygame.display.quit()
+
+    def _start(self) -> None:
+        try:
+            import pygame
+        except ImportError as error:
+            raise ImportError("pygame is missing, which opens the window: pip install 'tailgate[viz]'") from error
+        try:
+            pygame.display.init()
+            pygame.display.set_mode((WIDTH, HEIGHT))
+        except pygame.error as error:
+            raise InputError("render_mode", "human", f"a screen for the window ({error}); 'rgb_array' needs none") from None
+        pygame.display.set_caption("Tailgate: car following")
+        self._pygame, self._clock, self.open = pygame, pygame.time.Clock(), True

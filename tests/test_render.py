@@ -14,7 +14,8 @@ from gymnasium.utils.env_checker import check_env
 
 from tailgate.core import Kind, Mode
 from tailgate.envs import render
-from tailgate.envs.faces import AdversaryVectorEnv
+from tailgate.envs.faces import AdversaryEnv, AdversaryVectorEnv
+from tailgate.errors import InputError
 from tailgate.tree import duplicate
 
 BADGE = np.s_[: int(render.HEADER), int(render.BADGE[0]) : int(render.BADGE[1])]
@@ -241,7 +242,9 @@ def test_every_row_has_its_own_picture(made):
         assert all((one != other).any() for other in pictures[:row])
 
 
-def test_gymnasium_accepts_it():
+def test_gymnasium_accepts_it(monkeypatch):
+    pytest.importorskip("pygame")
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         env = gymnasium.make("tailgate:tailgate/CarFollowing-v0", render_mode="rgb_array")
@@ -250,3 +253,143 @@ def test_gymnasium_accepts_it():
         env.step(env.action_space.sample())
         assert env.render().shape == (render.HEIGHT, render.WIDTH, 3)
         env.close()
+
+
+# -- the window
+
+
+@pytest.fixture
+def screen(monkeypatch):
+    """pygame on a screen that is not there."""
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    pygame = pytest.importorskip("pygame")
+    yield pygame
+    pygame.display.quit()
+
+
+@pytest.fixture
+def watched(screen):
+    """A single environment in human mode, without its waiting."""
+
+    def make(**arguments):
+        env = gymnasium.make("tailgate:tailgate/CarFollowing-v0", render_mode="human", **(ROLLS | arguments))
+        env.unwrapped.metadata["render_fps"] = 10_000
+        return env
+
+    return make
+
+
+def shown(pygame):
+    return np.moveaxis(pygame.surfarray.array3d(pygame.display.get_surface()), 0, 1)
+
+
+def test_the_window_shows_the_picture_of_each_step_by_itself(watched, screen):
+    """No window before the first frame; reset() and step() show what rgb_array returns; render() returns None; close() closes."""
+    env, twin = watched(), AdversaryEnv(render_mode="rgb_array", **ROLLS)
+    assert env.render_mode == "human" and not screen.display.get_init()
+    env.reset(seed=5), twin.reset(seed=5)
+    assert (shown(screen) == twin.render()).all()
+    for action in (0, 1, 1):
+        env.step(action), twin.step(action)
+        assert (shown(screen) == twin.render()).all()
+        assert env.render() is None
+    env.close()
+    assert not screen.display.get_init()
+    env.close()
+    env.reset(seed=6)  # opens anew
+    assert screen.display.get_init()
+    env.close()
+
+
+def test_human_mode_changes_no_bit_of_an_episode(watched):
+    """Observations and rewards with and without a window are the same."""
+    env, twin = watched(), AdversaryEnv(**ROLLS)
+    assert (env.reset(seed=5)[0] == twin.reset(seed=5)[0]).all()
+    for action in (0, 1, 1, 0):
+        one, other = env.step(action), twin.step(action)
+        assert (one[0] == other[0]).all() and one[1:4] == other[1:4]
+    env.close()
+
+
+def test_a_frame_is_shown_once_and_at_the_frame_rate(watched, screen, monkeypatch):
+    """render() after step() shows nothing anew, and each frame waits for the rate."""
+    env, calls = watched(), []
+    monkeypatch.setattr(render.Window, "show", lambda self, picture: calls.append(self.fps))
+    env.reset(seed=1)
+    env.step(0)
+    env.render()
+    assert calls == [10_000, 10_000]
+    env.close()
+    window = render.Window(20)
+    monkeypatch.undo()
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    blank = np.zeros((render.HEIGHT, render.WIDTH, 3), np.uint8)
+    window.show(blank)
+    start = screen.time.get_ticks()
+    for _ in range(4):
+        window.show(blank)
+    assert screen.time.get_ticks() - start >= 150  # four frames of 50 ms, the first of them begun before
+    window.close()
+
+
+@pytest.mark.parametrize("event", ["QUIT", "WINDOWCLOSE"])
+def test_a_window_that_its_reader_closes_stays_closed(watched, screen, event):
+    """The episode goes on without it, and later frames open no other."""
+    env = watched()
+    env.reset(seed=5)
+    screen.event.post(screen.event.Event(getattr(screen, event)))
+    env.step(0)
+    assert not screen.display.get_init()
+    _, _, terminated, truncated, _ = env.step(0)
+    assert not terminated and not truncated and not screen.display.get_init()
+    env.reset()
+    assert not screen.display.get_init()
+    env.close()
+
+
+def test_two_environments_share_the_one_display(watched, screen):
+    """Closing one does not break the other."""
+    one, other = watched(), watched()
+    one.reset(seed=1), other.reset(seed=2)
+    one.close()
+    other.step(0)
+    assert screen.display.get_init()
+    other.close()
+
+
+def test_without_pygame_the_extra_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pygame", None)
+    env = AdversaryEnv(render_mode="human", **ROLLS)
+    with pytest.raises(ImportError, match=r"pip install 'tailgate\[viz\]'"):
+        env.reset(seed=0)
+
+
+def test_without_a_screen_the_error_says_so(screen, monkeypatch):
+    monkeypatch.setenv("SDL_VIDEODRIVER", "no_such_driver")
+    screen.display.quit()
+    env = AdversaryEnv(render_mode="human", **ROLLS)
+    with pytest.raises(InputError, match=r"render_mode.*human.*screen.*rgb_array"):
+        env.reset(seed=0)
+    env.close()
+
+
+def test_a_vector_environment_has_no_window():
+    for make in (lambda **a: AdversaryVectorEnv(2, **a), lambda **a: gymnasium.make_vec("tailgate:tailgate/CarFollowing-v0", num_envs=2, **a)):
+        with pytest.raises(InputError, match=r"render_mode.*'human'.*rgb_array.*one episode: gymnasium\.make"):
+            make(render_mode="human")
+
+
+# -- Gymnasium's own recording
+
+
+def test_gymnasium_records_a_video(tmp_path):
+    """RecordVideo writes a file with something in it."""
+    pytest.importorskip("moviepy")
+    env = gymnasium.make("tailgate:tailgate/CarFollowing-v0", render_mode="rgb_array", **ROLLS)
+    env = gymnasium.wrappers.RecordVideo(env, str(tmp_path / "films"), video_length=6)
+    env.reset(seed=0)
+    for _ in range(8):
+        env.step(env.action_space.sample())
+    env.close()
+    (film,) = tmp_path.glob("films/*.mp4")
+    assert film.stat().st_size > 2000

@@ -14,7 +14,7 @@ import tailgate
 from tailgate.errors import InputError
 
 EXIT_INPUT = 2
-COMMANDS = ("train", "evaluate", "leaderboard", "list")
+COMMANDS = ("train", "evaluate", "calibrate", "leaderboard", "replay", "reproduce", "list")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -20,7 +20,7 @@ _Number = Annotated[float, Field(strict=True, allow_inf_nan=False)] | None
 _FIELDS: dict[str, Any] = {
     **{key: (_Text, ...) for key in KEYS}, **{name: (_Number, ...) for name in METRICS},
     "dose": (Annotated[int, Field(strict=True)] | None, ...), "seed": (Annotated[int, Field(strict=True)], ...),
-    "status": (Literal["ok", "error", "skipped"], ...), "reason": (_Text, ""), "uses": (list[_Text], ...),
+    "status": (Literal["ok", "error", "skipped"], ...), "reason": (_Text, ""), "scenario_file": (_Text, ""), "uses": (list[_Text], ...),
     "learned": (bool, ...), "optimal": (bool, ...),
 }  # fmt: skip
 _Row = create_model("Row", __config__=ConfigDict(extra="allow"), **_FIELDS)

@@ -1,0 +1,284 @@
+"""An episode played again from its row: which row, what may be played, and whether it is the same trace.
+
+Rows may come from strangers. What a row names is read (a scenario, a policy), never run: a row whose component is code to import is
+played only when the user names that component as well.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+import tailgate
+from tailgate import draws
+from tailgate.core import Array, Attack, Frame
+from tailgate.draws import Keys, Role
+from tailgate.errors import InputError
+from tailgate.evaluation import ENGINE
+from tailgate.loop import Loop, LoopState
+from tailgate.metrics import measure
+from tailgate.registry import Spec
+from tailgate.scenario import Scenario, list_scenarios, load_scenario
+from tailgate.schema import build
+from tailgate.threat import ThreatModel
+from tailgate.trace import Recorder, Trace
+from tailgate.tree import duplicate
+
+AGENT = 0  # whom a replay follows
+YAML = (".yaml", ".yml")
+
+Row = dict[str, Any]
+Verdict = Literal["same", "decisions", "different", "unknown"]
+
+
+@dataclass(frozen=True)
+class Filter:
+    """Which rows a user means; None: any. What is named here is also what the user allows to be imported."""
+
+    line: int | None = None
+    scenario: str | None = None
+    defence: str | None = None
+    attack: str | None = None
+    dose: int | Literal["none"] | None = None
+    seed: int | None = None
+
+    def fits(self, row: Row) -> bool:
+        return (
+            self._scenario_fits(row) and self.defence in (None, row["defence"]) and self._attack_fits(row)
+            and (self.dose is None or row["dose"] == (None if self.dose == "none" else self.dose)) and self.seed in (None, row["seed"])
+        )  # fmt: skip
+
+    def _scenario_fits(self, row: Row) -> bool:
+        if self.scenario in (None, row["scenario"], row.get("scenario_file")):
+            return True
+        return str(self.scenario).endswith(YAML) and _name_of(str(self.scenario)) == row["scenario"]
+
+    def _attack_fits(self, row: Row) -> bool:
+        """The same text; or a file with the same content and the same parameters, wherever it lies now."""
+        if self.attack in (None, row["attack"]):
+            return True
+        (head, params), (held, own) = _split(str(self.attack)), _split(row["attack"])
+        is_file = Path(head).suffix == Path(held).suffix and Path(head).is_file() and params == own
+        return is_file and bool(row["attack_digest"]) and _digest_of(str(self.attack)) == row["attack_digest"]
+
+    def __str__(self) -> str:
+        named = {name: value for name, value in dataclasses.asdict(self).items() if value is not None}
+        return ", ".join(f"{name} {value}" for name, value in named.items()) or "any"
+
+
+@cache
+def _name_of(scenario: str) -> str:
+    return load_scenario(scenario).name
+
+
+@cache
+def _digest_of(attack: str) -> str:
+    return Spec("attack", attack).digest
+
+
+def _split(text: str) -> tuple[str, str]:
+    """Head and parameters of a component's text."""
+    head, sep, tail = text.rpartition(":")
+    return (head, tail) if sep and "=" in tail else (text, "")
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """A row, its line in the file (from 1), how many rows matched, and why it is this one."""
+
+    row: Row
+    line: int
+    matched: int
+    why: str
+
+
+def choose(rows: Sequence[Row], wanted: Filter) -> Chosen:
+    """The row to play: the line that is wanted, or of those that match the worst outcome, a crash first, then the smallest gap."""
+    if not rows:
+        raise InputError("rows", "an empty file", "at least one row")
+    if wanted.line is not None:
+        if not 1 <= wanted.line <= len(rows):
+            raise InputError("--line", wanted.line, f"a line from 1 to {len(rows)}")
+        row = rows[wanted.line - 1]
+        if not wanted.fits(row):
+            shown = f"{row['scenario']}, {row['defence']}, {row['attack']}, dose {row['dose']}, seed {row['seed']}"
+            raise InputError(f"line {wanted.line}", shown, f"a row that matches the filters ({wanted})")
+        return Chosen(row, wanted.line, 1, "the line that was asked for")
+    matching = [(i, row) for i, row in enumerate(rows, start=1) if wanted.fits(row)]
+    if not matching:
+        keys = ("scenario", "defence", "attack", "dose")
+        there = "; ".join(f"{key}: {', '.join(_some({str(row[key]) for row in rows}))}" for key in keys)
+        raise InputError("rows", str(wanted), f"filters that a row matches ({there})")
+    played = [(i, row) for i, row in matching if row["status"] == "ok"]
+    if not played:
+        line, row = matching[0]
+        raise InputError(f"line {line}", f"{row['status']}: {row['reason']}", "a row that was played; no row that matches was")
+
+    def outcome(item: tuple[int, Row]) -> tuple[float, float]:
+        gap = item[1]["min_gap"]
+        return -item[1]["crashed"], np.inf if gap is None else gap
+
+    line, row = min(played, key=outcome)
+    return Chosen(row, line, len(matching), "the only one" if len(matching) == 1 else "the worst outcome")
+
+
+def _some(names: set[str], most: int = 8) -> list[str]:
+    shown = sorted(names)
+    return shown if len(shown) <= most else [*shown[:most], f"and {len(shown) - most} more"]
+
+
+@dataclass(frozen=True)
+class Check:
+    """Something that the row records and what it is here."""
+
+    name: str
+    row: str
+    here: str
+
+    @property
+    def same(self) -> bool:
+        return self.row == self.here
+
+
+@dataclass(frozen=True, eq=False)
+class Replay:
+    """An episode that was played again. `gate` (K,) is the defence's own gate at each step, NaN where it has none."""
+
+    row: Row
+    place: Scenario
+    loop: Loop
+    attack: Any
+    trace: Trace
+    gate: Array
+    metrics: dict[str, float | None]
+    checks: tuple[Check, ...]
+
+    @property
+    def verdict(self) -> Verdict:
+        """Whether this is the episode of the row: to the last bit, in its decisions only, not at all; or the row records no hash."""
+        by_name = {check.name: check for check in self.checks}
+        trace, decisions = by_name["trace_hash"], by_name["decision_hash"]
+        if trace.same:
+            return "same"
+        if not trace.row and not decisions.row:
+            return "unknown"
+        return "decisions" if decisions.same else "different"
+
+    @property
+    def differences(self) -> list[Check]:
+        """What is not as the row says, the hashes of the trace apart; also figures that came out otherwise."""
+        figures = [Check(name, _figure(self.row[name]), _figure(value)) for name, value in self.metrics.items()]
+        return [check for check in (*self.checks[2:], *figures) if not check.same]
+
+    @property
+    def keys(self) -> Keys:
+        return draws.keys(self.row["purpose"], [self.row["seed"]])
+
+
+def _figure(value: float | None) -> str:
+    return "none" if value is None else repr(float(value))
+
+
+def play(row: Row, allowed: Filter | None = None) -> Replay:
+    """Play a row's episode. `allowed`: the components and the scenario file that the user named.
+
+    Raises InputError for a row that was not played, that names code which the user did not, or whose files are not here.
+    """
+    allowed = allowed or Filter()
+    if row["status"] != "ok":
+        raise InputError("row", f"{row['status']}: {row['reason']}", "a row that was played (status ok)")
+    if not allowed.fits(row):
+        raise InputError("row", f"{row['scenario']}, {row['defence']}, {row['attack']}", f"a row that matches {allowed}")
+    guard, rival = _component("defence", row, allowed.defence), _component("attack", row, allowed.attack)
+    place = _place(row, allowed.scenario)
+    loop, attack = place.loop(guard.make(), guard.entry.uses), rival.make()
+    states = episode(loop, attack, draws.keys(row["purpose"], [row["seed"]]))
+    start, _ = next(states)
+    recorder, gate = Recorder(loop, start), [_gate(loop, start)]
+    for state, frame in states:
+        assert frame is not None
+        recorder.add(frame, np.ones(1, bool))
+        gate.append(_gate(loop, state))
+    trace = recorder.trace()
+    metrics = {name: None if np.isnan(value[0]) else float(value[0]) for name, value in measure(trace).items()}
+    versions = {"defence": guard.entry.version, "attack": rival.entry.version}
+    here = {
+        "trace_hash": trace.trace_hash(0), "decision_hash": trace.decision_hash(0), "version": tailgate.__version__,
+        "config_hash": place.config_hash, "engine": ENGINE, "versions": ", ".join(f"{k} {v}" for k, v in versions.items()),
+        "defence_digest": guard.digest, "attack_digest": rival.digest,
+    }  # fmt: skip
+    held = {**row, "versions": ", ".join(f"{k} {v}" for k, v in _mapping(row.get("versions")).items())}
+    checks = tuple(Check(name, str(held.get(name) or ""), value) for name, value in here.items())
+    return Replay(row, place, loop, attack, trace, np.array(gate[: len(trace.kind)]), metrics, checks)
+
+
+def episode(loop: Loop, attack: Attack, keys: Keys) -> Iterator[tuple[LoopState, Frame | None]]:
+    """The states of one episode: the start, then each step with its frame, until it ends."""
+    state = loop.start(keys)
+    plan = attack.prepare(loop.brief)
+    memory: Any = attack.start(plan, 1, keys.at(Role.ATTACK, np.zeros(1, np.int64)))
+    yield state, None
+    for _ in range(loop.horizon):
+        if state.ended.all():
+            return
+        state, memory, frame = loop.step(state, attack, plan, memory)
+        yield state, frame
+
+
+def threshold(defence: Any) -> tuple[str, float] | None:
+    """Name and value of the parameter at which the defence, or its detector, alarms; None where none is declared."""
+    parts = defence.parts() if callable(getattr(defence, "parts", None)) else ()
+    for part in (defence, *parts):
+        name = getattr(part, "threshold_field", None)
+        value = getattr(part, name, None) if isinstance(name, str) else None
+        if isinstance(name, str) and isinstance(value, int | float):
+            return name, float(value)
+    return None
+
+
+def _gate(loop: Loop, state: LoopState) -> float:
+    if not hasattr(loop.defence, "look"):
+        return np.nan
+    look = loop.defence.look(loop.plan.defence, duplicate(state.defence), state.received, state.known_u)
+    return np.nan if look.gate is None else float(np.broadcast_to(look.gate, (1, loop.model.agents))[0, AGENT])
+
+
+def _mapping(value: Any) -> dict[str, Any]:
+    return value if isinstance(value, dict) else {}
+
+
+def _component(family: Literal["defence", "attack"], row: Row, named: str | None) -> Spec:
+    """The component that the row names, or the one that the user named for it (`Filter.fits` has seen that they agree)."""
+    held = Spec(family, row[family])
+    if named is None and held.imports:
+        raise InputError(
+            f"the row's {family}", row[family],
+            f"a registered name: a row must not import code. If you trust this class, name it yourself: --{family} '{row[family]}'",
+        )  # fmt: skip
+    spec = held if named is None else Spec(family, named)
+    head, _ = _split(spec.text)
+    if family == "attack" and Path(head).suffix in (".json", *YAML) and not spec.imports and not Path(head).is_file():
+        raise InputError("the row's attack", spec.text, "a file that is here; say where the same file lies now: --attack FILE")
+    return spec
+
+
+def _place(row: Row, named: str | None) -> Scenario:
+    """The row's scenario under the row's threat model."""
+    source = row.get("scenario_file") or row["scenario"]
+    if named is not None and named.endswith(YAML):
+        source = named
+    elif source == row["scenario"] and not source.endswith(YAML) and source not in list_scenarios():
+        raise InputError("the row's scenario", source, "a built-in one, or its file: --scenario FILE.yaml")
+    elif source.endswith(YAML) and not Path(source).is_file():
+        raise InputError("the row's scenario", source, "a file that is here; say where the same file lies now: --scenario FILE.yaml")
+    threat = row.get("threat_model")
+    if not isinstance(threat, dict):
+        raise InputError("the row's threat_model", threat, "a mapping of fields")
+    fields = {key: value for key, value in threat.items() if key != "class"}
+    return dataclasses.replace(load_scenario(source), threat_model=build(ThreatModel, fields, "the row's threat_model"))

@@ -1,0 +1,107 @@
+"""A film of a replay: the pictures of `tailgate.envs.render`, step by step (extra: viz)."""
+
+from __future__ import annotations
+
+import math
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import suppress
+from importlib.util import find_spec
+from io import BytesIO
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+from tailgate.core import Array
+from tailgate.errors import InputError
+from tailgate.files import writable_directory, write_atomic
+
+from .replay import AGENT, Replay, episode
+
+FORMATS = {".gif": "GIF", ".webp": "WEBP", ".mp4": "MP4"}
+FASTEST = 20  # frames a second
+MOST = 600  # frames of an animated picture, which is put together in memory
+SHORTEST = 10.0  # [s]: an episode that lasts less is slowed down
+HOLD = 2.0  # [s] that the last frame stays
+
+
+def check_format(path: Path) -> None:
+    """Raise InputError for a name whose ending is no format, ImportError for an encoder that is missing."""
+    if path.suffix.lower() not in FORMATS:
+        raise InputError("--video", str(path), f"a file that ends in {', '.join(FORMATS)}")
+    if FORMATS[path.suffix.lower()] == "MP4" and find_spec("imageio_ffmpeg") is None:
+        raise ImportError("imageio-ffmpeg is missing, which writes MP4: pip install 'tailgate[video]' (.gif and .webp do without)")
+    from tailgate.envs import render  # noqa: F401 - names the extra where Pillow is missing
+
+
+def pace(dt: float, length: int, most: float = math.inf) -> tuple[int, float]:
+    """(steps from frame to frame, frames a second): real time, but every step of an episode that would last less than ten seconds."""
+    stride = 1 if length * dt < SHORTEST else max(1, round(1.0 / (dt * FASTEST)), math.ceil(length / most))
+    return stride, min(1.0 / (dt * stride), float(FASTEST))
+
+
+def frames(replay: Replay, stride: int) -> Iterator[Array]:
+    """(H, W, 3) uint8 pictures of the start, every `stride`-th step, and the last one."""
+    from tailgate.envs.render import draw
+
+    last = int(replay.trace.length[0])
+    for step, (state, frame) in enumerate(episode(replay.loop, replay.attack, replay.keys)):
+        if step % stride == 0 or step == last:
+            yield draw(replay.loop, state, frame, AGENT)
+
+
+def write_video(replay: Replay, path: Path) -> str:
+    """Writes the film in the format that the file's ending names, and returns a sentence about it."""
+    check_format(path)
+    dt, length = replay.trace.dt, int(replay.trace.length[0])
+    kind = FORMATS[path.suffix.lower()]
+    stride, rate = pace(dt, length, math.inf if kind == "MP4" else MOST)
+    pictures = frames(replay, stride)
+    count = len(range(0, length, stride)) + 1
+    if kind == "MP4":
+        _write_mp4(pictures, path, rate)
+    else:
+        _write_animation(pictures, path, kind, rate, count)
+    speed = rate * stride * dt
+    return f"{path} ({count} frames, {rate:g} a second{'' if abs(speed - 1.0) < 0.01 else f', at {speed:.2g} times the real speed'})"
+
+
+def _write_animation(pictures: Iterator[Array], path: Path, kind: str, rate: float, count: int) -> None:
+    from PIL import Image
+
+    def reduced(picture: Array) -> Any:  # 256 colours of its own are plenty for drawings, and take a third of the memory
+        return Image.fromarray(picture).quantize(256, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
+
+    pause = round(1000.0 / rate)
+    durations = [pause] * (count - 1) + [round(1000.0 * HOLD)]
+    options: dict[str, Any] = {"lossless": True, "method": 0, "quality": 40} if kind == "WEBP" else {"optimize": False}
+    out = BytesIO()
+    first = reduced(next(pictures))
+    first.save(out, kind, save_all=True, append_images=[reduced(picture) for picture in pictures], duration=durations, loop=0, **options)
+    write_atomic(path, out.getvalue(), "video")
+
+
+def _write_mp4(pictures: Iterator[Array], path: Path, rate: float) -> None:
+    import imageio_ffmpeg
+
+    first = next(pictures)
+    writable_directory(path.parent, "video")
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}.", suffix=".mp4")
+    os.close(handle)
+    try:
+        size = (first.shape[1], first.shape[0])
+        encoder = imageio_ffmpeg.write_frames(name, size, fps=rate, codec="libx264", quality=7, ffmpeg_log_level="error")
+        encoder.send(None)
+        picture = first
+        for picture in chain([first], pictures):
+            encoder.send(picture.tobytes())
+        for _ in range(round(HOLD * rate)):
+            encoder.send(picture.tobytes())
+        encoder.close()
+        os.chmod(name, 0o644)
+        os.replace(name, path)
+    except BaseException:
+        with suppress(OSError):
+            os.unlink(name)
+        raise
