@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import re
+import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -65,8 +66,8 @@ def value(entry: dict[str, Any], key: str) -> float:
 def matrices(table: Table, title: str) -> bytes:
     """Defences x attacks, one above the other: position error, smallest gap, collisions."""
     defences, attacks = (list(dict.fromkeys(e[key] for e in table)) for key in ("defence", "attack"))
-    longest = max(len(name) for name in attacks)
-    size = 3.0 + 0.5 * len(attacks), 0.8 + 3 * (0.5 + 0.27 * len(defences)) + 0.075 * longest
+    labels = [textwrap.fill(name.replace(",", ", "), 26) for name in attacks]
+    size = 3.0 + 0.52 * len(attacks), 2.6 + 3 * (0.5 + 0.27 * len(defences))
     figure, axes = canvas(*size, 3, 1, sharex=True)
     for ax, (key, words, colours) in zip(axes[:, 0], PANELS, strict=True):
         grid = np.full((len(defences), len(attacks)), np.nan)
@@ -81,7 +82,7 @@ def matrices(table: Table, title: str) -> bytes:
                 dark = sum(image.cmap(image.norm(shade[i, j]))[:3]) < 1.5
                 ax.text(j, i, _short(number), ha="center", va="center", fontsize=7, color="white" if dark else "black")
         ax.set_title(words, fontsize=10)
-        ax.set_xticks(range(len(attacks)), attacks, rotation=90, fontsize=7)
+        ax.set_xticks(range(len(attacks)), labels, rotation=90, fontsize=7)
         ax.set_yticks(range(len(defences)), defences, fontsize=8)
     figure.suptitle(title)
     return png(figure)
@@ -103,7 +104,11 @@ def scatter(table: Table) -> bytes:
         ax.scatter(x[~hit], y[~hit], facecolors="none", edgecolors=style["color"], marker=style["marker"], s=30, label=name)
         ax.scatter(x[hit], y[hit], **style)
     ax.axhline(0.0, color="black", linewidth=0.8)
-    ax.set(xscale="log", xlabel="position RMSE [m], median", ylabel="smallest gap [m], median")
+    ax.set_yscale("symlog", linthresh=10.0)
+    ticks = [-10, -5, 0, 5, 10, 20, 50, 100]
+    ax.set_yticks(ticks, [str(tick) for tick in ticks])
+    ax.set_ylim(min(-2.0, 1.2 * min(value(e, "min_gap") for e in table)), 120.0)
+    ax.set(xscale="log", xlabel="position RMSE [m], median", ylabel="smallest gap [m], median (above 10 m: logarithmic)")
     ax.set_title(f"What the error hides: rank correlation {_rank_correlation(table):+.2f}; filled: most episodes collide", fontsize=10)
     ax.grid(alpha=0.3, which="both")
     figure.legend(loc="outside right upper", fontsize=8, title="defence")

@@ -55,13 +55,16 @@ def _eta(curves: Curves) -> Figure:
         for case, (words, style, marker) in lines.items():
             ax.plot(ETAS, curve[case], linestyle=style, marker=marker, markersize=4, label=words)
         ax.set(xscale="log", yscale="log", xlabel="threshold eta", ylabel="position RMSE [m], median", title=name)
+        ax.yaxis.set_major_formatter("{x:g}")
+        ax.yaxis.set_minor_formatter("{x:g}")
+        ax.tick_params(which="minor", labelsize=7)
         ax.grid(alpha=0.3, which="both")
         ax.legend(fontsize=8)
     last = axes[0, -1]
     for (name, curve), style in zip(curves.items(), ("-", "--"), strict=False):
         last.plot(ETAS, curve["bound"], linestyle=style, label=f"bound c, {name} [m]")
     rates = next(iter(curves.values()))["alarms"]
-    last.plot(ETAS, [max(r, 1e-6) for r in rates], linestyle=":", marker="o", markersize=4, label="false alarms a step [-]")
+    last.plot(ETAS, [r or np.nan for r in rates], linestyle=":", marker="o", markersize=4, label="false alarms a step [-]")
     last.set(xscale="log", yscale="log", xlabel="threshold eta", title="largest jump, and false alarms")
     last.grid(alpha=0.3, which="both")
     last.legend(fontsize=8)
