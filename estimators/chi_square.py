@@ -3,6 +3,8 @@
     g = r' S^-1 r;     g > eta: x = x-, P = P-  (open loop);     else the Kalman update
 
 Erratum: the thesis's g uses P^-1 in one place; S^-1 is meant. Per step and with two sensors, the false-alarm rate is exp(-eta/2).
+
+A shut gate widens with P, and so re-opens in time. With the steady gain it does not.
 """
 
 from dataclasses import dataclass
@@ -13,7 +15,7 @@ from tailgate.core import Innovation, Positive, param
 from tailgate.registry import register
 
 from .compose import Composed, Detector, Filter, GateOut, Mitigation, Stateless, Verdict, blame_all
-from .kalman import KalmanFilter
+from .kalman import GAIN, Gain, KalmanFilter
 
 
 @register("detector", "chi2", reference="Dutta 2018, section 4.2")
@@ -39,6 +41,7 @@ class GatedKalman(Composed):
 
     threshold_field: ClassVar[str] = "eta"
     eta: Positive = param(20.0, "gate on r' S^-1 r [-]")
+    gain: Gain = param("varying", GAIN)
 
     def parts(self) -> tuple[Filter, Detector, Mitigation]:
-        return KalmanFilter(), ChiSquare(self.eta), GateOut()
+        return KalmanFilter(self.gain == "steady"), ChiSquare(self.eta), GateOut()

@@ -6,14 +6,16 @@ A method that does not split this way implements `tailgate.core.Defence` itself.
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Literal, NamedTuple, Protocol
 
 import numpy as np
 
 from tailgate import num
-from tailgate.core import Array, Estimate, Innovation, Mode, Model, Prior, Received, param
+from tailgate.core import Array, Count, Estimate, Innovation, Mode, Model, NonNegative, Prior, Received, param
 from tailgate.draws import Draws
+from tailgate.errors import NotApplicable
 from tailgate.registry import make_from, register
 from tailgate.schema import fields_of
 
@@ -74,7 +76,10 @@ class Detector(Protocol):
     def step(self, plan: Any, state: Any, innovation: Innovation) -> tuple[Any, Verdict]: ...
 
     def gate(self, plan: Any, state: Any) -> Array | float | None:
-        """The largest r' S^-1 r (B, N) that raises no alarm in the next step; None where there is no such number."""
+        """The largest r' S^-1 r (B, N) that raises no alarm in the next step; None where there is no such number.
+
+        Negative in the rows where the memory alone raises an alarm, whatever is received.
+        """
 
 
 class Mitigation(Protocol):
@@ -116,6 +121,15 @@ class Composed:
     def parts(self) -> tuple[Filter, Detector, Mitigation]:
         """The filter, detector and mitigation, made from this defence's parameters."""
         raise TypeError(f"{type(self).__name__} must define parts()")
+
+    def with_threshold(self, value: float) -> Composed:
+        """This defence with its alarm threshold, or its detector's, at `value`. Raises NotApplicable where neither has one."""
+        own = getattr(self, "threshold_field", None)
+        if own is not None:
+            changed: Composed = dataclasses.replace(self, **{own: value})  # type: ignore[type-var]
+            return changed
+        f, d, m = self.parts()
+        return compose(f, dataclasses.replace(d, **{threshold_field(d): value}), m)  # type: ignore[type-var]
 
     def prepare(self, model: Model) -> ComposedPlan:
         f, d, m = self.parts()
@@ -183,6 +197,11 @@ class NamedParts(Composed):
     def __post_init__(self) -> None:
         self.parts()  # a wrong name shall fail here
 
+    def with_threshold(self, value: float) -> NamedParts:
+        name = threshold_field(self.parts()[1])
+        held = self.detector if isinstance(self.detector, dict) else {"name": self.detector}
+        return dataclasses.replace(self, detector=held | {name: value})
+
     def parts(self) -> tuple[Filter, Detector, Mitigation]:
         return self._part("filter"), self._part("detector"), self._part("mitigation")
 
@@ -204,6 +223,14 @@ class Stateless:
         return None
 
 
+def threshold_field(detector: Any) -> str:
+    """The name of a detector's threshold. Raises NotApplicable where it has none."""
+    name = getattr(detector, "threshold_field", None)
+    if name is None:
+        raise NotApplicable("threshold", type(detector).__name__, "a detector that alarms at a threshold")
+    return str(name)
+
+
 def blame_all(score: Array, alarm: Array, innovation: Innovation) -> Verdict:
     """The verdict of a detector that cannot tell the sensors apart."""
     return Verdict(score, alarm, np.broadcast_to(alarm[..., None], innovation.r.shape))
@@ -222,19 +249,83 @@ class Score(Stateless):
         return None
 
 
+ModeName = Literal["normal", "widen", "brake", "stop"]
+
+
+class ReactionPlan(NamedTuple):
+    agents: int
+    sensors: int
+    linger: int  # steps that a mode outlasts its alarm
+
+
+class ReactionState(NamedTuple):
+    left: Array | None  # (B, N) int64: steps that the mode still lasts; none where no mode is ever asked for
+    readings: Any  # what the subclass keeps to choose the readings
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reaction:
+    """Base of mitigations: a subclass's `choose` says which readings to use; the mode asked of the controller is the same for all."""
+
+    mode: ModeName = param("normal", "what is asked of the controller while alarmed: normal, widen, brake or stop")
+    linger: NonNegative = param(2.0, "time that the mode outlasts the last alarm [s]")
+
+    def prepare(self, model: Model) -> ReactionPlan:
+        return ReactionPlan(model.agents, len(model.sensors), round(self.linger / model.dt))
+
+    def start(self, plan: ReactionPlan, batch: int) -> ReactionState:
+        left = None if self.mode == "normal" else num.zeros((batch, plan.agents), np.int64)
+        return ReactionState(left, self.begin(plan, batch))
+
+    def begin(self, plan: ReactionPlan, batch: int) -> Any:
+        """What `choose` keeps, every leaf with B first; None where it keeps nothing."""
+        return None
+
+    def choose(self, plan: ReactionPlan, state: Any, verdict: Verdict, received: Received) -> tuple[Any, Decision]:
+        """The readings to use."""
+        raise TypeError(f"{type(self).__name__} must define choose()")
+
+    def step(self, plan: ReactionPlan, state: ReactionState, verdict: Verdict, received: Received) -> tuple[ReactionState, Decision]:
+        readings, decision = self.choose(plan, state.readings, verdict, received)
+        if state.left is None:
+            return ReactionState(None, readings), decision
+        left = np.where(verdict.alarm, plan.linger + 1, np.maximum(state.left - 1, 0))
+        mode = np.where(left > 0, Mode[self.mode.upper()], Mode.NORMAL).astype(np.int8)
+        return ReactionState(left, readings), decision._replace(mode=mode)
+
+
+def quiet(verdict: Verdict) -> Array:
+    """Mode.NORMAL for everybody."""
+    return np.full_like(verdict.alarm, Mode.NORMAL, np.int8)
+
+
 @register("mitigation", "accept_all")
 @dataclass(frozen=True)
-class AcceptAll(Stateless):
+class AcceptAll(Reaction):
     """Uses whatever was received."""
 
-    def step(self, plan: Any, state: Any, verdict: Verdict, received: Received) -> tuple[Any, Decision]:
-        return None, Decision(received.valid, np.full_like(verdict.alarm, Mode.NORMAL, np.int8))
+    def choose(self, plan: ReactionPlan, state: Any, verdict: Verdict, received: Received) -> tuple[Any, Decision]:
+        return None, Decision(received.valid, quiet(verdict))
 
 
 @register("mitigation", "gate_out", reference="Dutta 2018, Algorithm 3")
 @dataclass(frozen=True)
-class GateOut(Stateless):
+class GateOut(Reaction):
     """Ignores the suspected sensors: without any, the filter predicts open loop."""
 
-    def step(self, plan: Any, state: Any, verdict: Verdict, received: Received) -> tuple[Any, Decision]:
-        return None, Decision(received.valid & ~verdict.suspect, np.full_like(verdict.alarm, Mode.NORMAL, np.int8))
+    latch: Count = param(0, "steps that the gate stays shut after the last suspicion")
+
+    def begin(self, plan: ReactionPlan, batch: int) -> Array | None:
+        """(B, N, q) int64: steps that the gate of each sensor stays shut."""
+        return num.zeros((batch, plan.agents, plan.sensors), np.int64) if self.latch else None
+
+    def shut(self, state: Array | None, verdict: Verdict) -> tuple[Array | None, Array]:
+        """The next state, and (B, N, q) bool: the sensors whose readings are not to be used."""
+        if state is None:
+            return None, verdict.suspect
+        state = np.where(verdict.suspect, self.latch + 1, np.maximum(state - 1, 0))
+        return state, state > 0
+
+    def choose(self, plan: ReactionPlan, state: Any, verdict: Verdict, received: Received) -> tuple[Any, Decision]:
+        state, shut = self.shut(state, verdict)
+        return state, Decision(received.valid & ~shut, quiet(verdict))

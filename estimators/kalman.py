@@ -5,18 +5,25 @@
     x = x- + K r                P = P- - K S K'                                                        (4.7)
 
 A sensor that is not accepted has its row of C, and its covariances in S, set to zero: no sensor at all gives x = x-, P = P-.
+
+The steady filter holds P- at the solution of P- = A (P- - K S K') A' + Q. Its gain is constant for each set of sensors: where some are
+left out, the others correct with the gain that they have alone at the same P-. What it misses does not widen its S.
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
 from tailgate import num
-from tailgate.core import Array, Innovation, Model, Prior, Received
+from tailgate.core import Array, Innovation, Model, Prior, Received, param
+from tailgate.errors import InputError
 from tailgate.registry import register
 
 from .compose import AcceptAll, Composed, Detector, Filter, Mitigation, Score
+
+Gain = Literal["varying", "steady"]
+GAIN = "varying: the gain follows the covariance; steady: both are held where they settle when nothing is missed"
 
 
 class KalmanPlan(NamedTuple):
@@ -27,13 +34,14 @@ class KalmanPlan(NamedTuple):
     Q: Array
     R: Array  # (N, q, q)
     broad: Array  # (n,) variances of a filter that has forgotten
+    held: Array | None = None  # (N, n, n) P- of the steady filter
 
 
 class KalmanState(NamedTuple):
-    """x (B, N, n) and P (B, N, n, n); predicted or updated."""
+    """x (B, N, n) and P (B, N, n, n), predicted or updated. P is None in a steady filter: its plan holds it."""
 
     x: Array
-    P: Array
+    P: Array | None
 
 
 def alone(S: Array, keep: Array) -> Array:
@@ -58,33 +66,92 @@ def broad(model: Model) -> Array:
     return np.asarray(1e6 * np.maximum(P.diagonal(), 1e-12))
 
 
-@register("filter", "kf", reference="R. E. Kalman, A New Approach to Linear Filtering and Prediction Problems, 1960")
-@dataclass(frozen=True)
-class KalmanFilter:
-    """The textbook filter, time-varying gain."""
+def _solve(M: Array, Y: Array) -> Array:
+    """M^-1 Y for one (n, n) and one (n, k), by elimination with row pivots in fixed order."""
+    M, Y = np.array(M), np.array(Y)
+    for p in range(len(M)):
+        best = p + int(np.argmax(np.abs(M[p:, p])))
+        M[[p, best]], Y[[p, best]] = M[[best, p]], Y[[best, p]]
+        for i in range(len(M)):
+            if i != p:
+                factor = M[i, p] / M[p, p]
+                M[i] -= factor * M[p]
+                Y[i] -= factor * Y[p]
+    return np.asarray(Y / M.diagonal()[:, None])
+
+
+def _riccati(A: Array, C: Array, Q: Array, R: Array) -> Array | None:
+    """P- (n, n) of one agent by structured doubling (Anderson 1978): round j gives what 2^j steps of the filter give."""
+    F, H, eye = np.array(A.T), np.array(Q), np.eye(len(A))
+    G = num.matmul(num.matmul(C.T, num.inverse(R)), C)
+    with np.errstate(all="ignore"):  # without a limit it overflows
+        for _ in range(64):
+            W = _solve(eye + num.matmul(G, H), eye)
+            FW = num.matmul(F, W)
+            grown = num.matmul(num.matmul(num.matmul(F.T, H), W), F)
+            G = G + num.matmul(num.matmul(FW, G), F.T)
+            H = H + 0.5 * (grown + grown.T)
+            F = num.matmul(FW, F)  # the closed loop to the power 2^j
+            scale = np.sqrt(H.diagonal()[:, None] * H.diagonal())
+            if (np.abs(grown) <= 1e-15 * scale).all() and (np.abs(F) <= 1e-8).all():
+                return _settle(A, C, Q, R, H)
+    return None
+
+
+def _settle(A: Array, C: Array, Q: Array, R: Array, P: Array) -> Array:
+    """P- (n, n) after 64 more steps of the filter in Joseph's form, which wash out the rounding of the doubling."""
+    for _ in range(64):
+        S = num.matmul(num.matmul(C, P), C.T) + R
+        K = num.matmul(num.matmul(P, C.T), num.inverse(S))
+        left = np.eye(len(A)) - num.matmul(K, C)
+        P = num.matmul(num.matmul(left, P), left.T) + num.matmul(num.matmul(K, R), K.T)
+        P = num.matmul(num.matmul(A, P), A.T) + Q
+        P = 0.5 * (P + P.T)
+    return P
+
+
+def steady_state(model: Model) -> Array:
+    """P- (N, n, n) at which the predicted covariances settle. Raises InputError where they do not."""
+    out = []
+    for i in range(model.agents):
+        P = _riccati(model.A, model.C[i], model.Q, model.R[i])
+        if P is None:
+            wanted = "(A, C) detectable and process noise on every mode that does not die out, so that the filter has a steady state"
+            raise InputError("model", f"agent {i}", wanted)
+        out.append(P)
+    return np.stack(out)
+
+
+class LinearFilter:
+    """The recursion. A subclass says in `steady` whether P- is held."""
+
+    steady: bool
 
     def prepare(self, model: Model) -> KalmanPlan:
-        return KalmanPlan(model.A, model.B, model.c, model.C, model.Q, model.R, broad(model))
+        held = steady_state(model) if self.steady else None
+        return KalmanPlan(model.A, model.B, model.c, model.C, model.Q, model.R, broad(model), held)
 
     def start(self, plan: KalmanPlan, prior: Prior) -> KalmanState:
-        return KalmanState(prior.mean, prior.cov)
+        return KalmanState(prior.mean, prior.cov if plan.held is None else None)
 
     def predict(self, plan: KalmanPlan, state: KalmanState, known_u: Array) -> KalmanState:
         x = num.matvec(plan.A, state.x) + num.matvec(plan.B, known_u) + plan.c
+        if state.P is None:
+            return KalmanState(x, None)
         half = num.matmul(plan.A, state.P)
         return KalmanState(x, num.matmul(plan.A, num.transpose(half)) + plan.Q)
 
     def innovation(self, plan: KalmanPlan, state: KalmanState, received: Received) -> Innovation:
         r = np.where(received.valid, received.y - num.matvec(plan.C, state.x), 0.0)
-        cross = num.matmul(plan.C, state.P)
-        return Innovation(r, alone(num.matmul(plan.C, num.transpose(cross)) + plan.R, received.valid))
+        S = num.matmul(plan.C, num.transpose(self._cross(plan, state))) + plan.R
+        return Innovation(r, alone(np.broadcast_to(S, (*r.shape, r.shape[-1])), received.valid))
 
     def gain(self, plan: KalmanPlan, state: KalmanState, innovation: Innovation) -> Array:
-        cross = num.transpose(num.matmul(plan.C, state.P))  # P- C'
+        cross = num.transpose(self._cross(plan, state))  # P- C'
         return num.matmul(cross, num.inverse(innovation.S))
 
     def update(self, plan: KalmanPlan, state: KalmanState, innovation: Innovation, accept: Array) -> KalmanState:
-        cross = num.matmul(plan.C, state.P)  # C P-
+        cross = self._cross(plan, state)
         S, r = innovation.S, innovation.r
         if not accept.all():  # multiplying by one would change no bit of the other rows
             keep = accept.astype(np.float64)
@@ -93,14 +160,34 @@ class KalmanFilter:
             r = r * keep
         K = num.transpose(num.matmul(num.inverse(S), cross))
         x = state.x + num.matvec(K, r)
+        if state.P is None or plan.held is not None:
+            return KalmanState(x, None)
         P = state.P - num.matmul(K, cross)
         return KalmanState(x, 0.5 * (P + num.transpose(P)))
 
     def forget(self, plan: KalmanPlan, state: KalmanState, where: Array) -> KalmanState:
-        return KalmanState(state.x, np.where(where[..., None, None], np.diag(plan.broad), state.P))
+        """A steady filter forgets for this one step."""
+        return KalmanState(state.x, np.where(where[..., None, None], np.diag(plan.broad), self._predicted(plan, state)))
 
     def estimate(self, state: KalmanState) -> Array:
         return state.x
+
+    def _predicted(self, plan: KalmanPlan, state: KalmanState) -> Array:
+        P = plan.held if state.P is None else state.P
+        assert P is not None
+        return P
+
+    def _cross(self, plan: KalmanPlan, state: KalmanState) -> Array:
+        """C P- (B, N, q, n), or (N, q, n) where it is the same for all."""
+        return num.matmul(plan.C, self._predicted(plan, state))
+
+
+@register("filter", "kf", reference="R. E. Kalman, A New Approach to Linear Filtering and Prediction Problems, 1960")
+@dataclass(frozen=True)
+class KalmanFilter(LinearFilter):
+    """The textbook filter, with a time-varying gain or in steady state."""
+
+    steady: bool = param(False, "hold gain and covariance where they settle when nothing is missed")
 
 
 @register("defence", "kf", reference="R. E. Kalman, A New Approach to Linear Filtering and Prediction Problems, 1960")
@@ -108,5 +195,7 @@ class KalmanFilter:
 class Kalman(Composed):
     """Kalman filter that believes every measurement."""
 
+    gain: Gain = param("varying", GAIN)
+
     def parts(self) -> tuple[Filter, Detector, Mitigation]:
-        return KalmanFilter(), Score(), AcceptAll()
+        return KalmanFilter(self.gain == "steady"), Score(), AcceptAll()

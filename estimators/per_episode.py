@@ -1,8 +1,10 @@
 """Adapter for filters that are one object per episode (filterpy, Stone Soup): plays them at their own speed."""
 
+import copy
+import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -15,46 +17,117 @@ class EpisodeFilter(Protocol):
     """What `per_episode` adapts."""
 
     def reset(self, model: Model, prior: Prior) -> None:
-        """A new episode: prior.mean (n,), prior.cov (n, n)."""
+        """A new episode of one agent: model.C (1, q, n), prior.mean (n,), prior.cov (n, n)."""
 
     def step(self, y: Array, valid: Array, u: Array) -> tuple[Array, float]:
         """Readings y (q,), valid (q,) bool, known input u (m,) since the last step -> estimate x (n,), score."""
 
 
+@runtime_checkable
+class Recalling(EpisodeFilter, Protocol):
+    """A filter that can say what it remembers: one object then plays every episode, and a state is plain numbers.
+
+    Any other is copied whole in every step, so that states stay independent of each other.
+    """
+
+    def memory(self) -> tuple[Array, ...]:
+        """Everything that a step changes and needs, as float arrays of fixed shapes."""
+
+    def recall(self, memory: tuple[Array, ...]) -> None:
+        """Go on from a memory; the arrays are the filter's own."""
+
+
+class EpisodePlan(NamedTuple):
+    models: tuple[Model, ...]  # of each agent alone
+    players: tuple[Recalling, ...]  # one for each agent; empty where every episode has its own
+
+
 class EpisodeState(NamedTuple):
-    filters: Array  # (B, N) of objects
+    """Either is empty."""
+
+    filters: Array | None  # (B, N) of objects
+    memory: tuple[Array, ...]  # (B, N, ...) each
+
+
+class EpisodeByEpisode:
+    """A defence that plays one episode and agent after the other. A subclass makes the filter."""
+
+    def make(self) -> EpisodeFilter:
+        """A filter, before its first reset."""
+        raise TypeError(f"{type(self).__name__} must define make()")
+
+    def prepare(self, model: Model) -> EpisodePlan:
+        models = tuple(
+            dataclasses.replace(model, C=model.C[i : i + 1], R=model.R[i : i + 1], graph=np.eye(1, dtype=bool)) for i in range(model.agents)
+        )
+        made = [self.make() for _ in models]
+        return EpisodePlan(models, tuple(player for player in made if isinstance(player, Recalling)))
+
+    def start(self, plan: EpisodePlan, prior: Prior) -> EpisodeState:
+        batch, agents, _ = prior.mean.shape
+        filters, memory = np.empty((batch, agents), object), _Memory(batch, agents)
+        for b, i in np.ndindex(batch, agents):
+            played = plan.players[i] if plan.players else self.make()
+            played.reset(plan.models[i], Prior(_own(prior.mean[b, i]), _own(prior.cov[b, i])))
+            filters[b, i] = played
+            if isinstance(played, Recalling):
+                memory.put(b, i, played.memory())
+        return EpisodeState(None if plan.players else filters, memory.arrays)
+
+    def step(
+        self, plan: EpisodePlan, state: EpisodeState, received: Received, known_u: Array, draws: Draws
+    ) -> tuple[EpisodeState, Estimate]:
+        batch, agents = received.y.shape[:2]
+        x, score = num.zeros((batch, agents, plan.models[0].states)), np.zeros((batch, agents))
+        filters, memory = np.empty((batch, agents), object), _Memory(batch, agents)
+        for b, i in np.ndindex(batch, agents):
+            if state.filters is None:
+                played: Any = plan.players[i]
+                played.recall(tuple(_own(array[b, i]) for array in state.memory))
+            else:
+                played = copy.deepcopy(state.filters[b, i], _shared(plan.models[i]))
+            filters[b, i] = played
+            x[b, i], score[b, i] = played.step(_own(received.y[b, i]), _own(received.valid[b, i]), _own(known_u[b, i]))
+            if state.filters is None:
+                memory.put(b, i, played.memory())
+        quiet = np.zeros_like(score, bool)
+        state = EpisodeState(None if state.filters is None else filters, memory.arrays)
+        return state, Estimate(x, score, quiet, num.full(score.shape, Mode.NORMAL, np.int8), ~quiet)
+
+
+class _Memory:
+    """Collects the memories of B episodes and N agents."""
+
+    def __init__(self, batch: int, agents: int) -> None:
+        self.shape = (batch, agents)
+        self.arrays: tuple[Array, ...] = ()
+
+    def put(self, b: int, i: int, memory: tuple[Array, ...]) -> None:
+        if not self.arrays:
+            self.arrays = tuple(num.zeros((*self.shape, *part.shape)) for part in memory)
+        for array, part in zip(self.arrays, memory, strict=True):
+            array[b, i] = part
+
+
+def _own(x: Array) -> Array:
+    """A copy in one layout whatever the batch: a library may add up in the order of the memory."""
+    return np.array(x, order="C")
+
+
+def _shared(model: Model) -> dict[int, Any]:
+    """What copies of a filter have in common: the model, and its read-only matrices."""
+    parts = (model, model.A, model.B, model.c, model.C, model.Q, model.R)
+    return {id(part): part for part in parts}
 
 
 @dataclass(frozen=True)
-class PerEpisode:
+class PerEpisode(EpisodeByEpisode):
     """A defence that keeps one object of `factory` for every episode and agent."""
 
     factory: Callable[[], EpisodeFilter]
 
-    def prepare(self, model: Model) -> Model:
-        return model
-
-    def start(self, plan: Model, prior: Prior) -> EpisodeState:
-        batch, agents, _ = prior.mean.shape
-        filters = np.empty((batch, agents), object)
-        for b in range(batch):
-            for i in range(agents):
-                filters[b, i] = self.factory()
-                filters[b, i].reset(plan, Prior(prior.mean[b, i].copy(), prior.cov[b, i].copy()))
-        return EpisodeState(filters)
-
-    def step(
-        self, plan: Model, state: EpisodeState, received: Received, known_u: Array, draws: Draws
-    ) -> tuple[EpisodeState, Estimate]:
-        batch, agents = state.filters.shape
-        x, score = num.zeros((batch, agents, plan.states)), np.zeros((batch, agents))
-        for b in range(batch):
-            for i in range(agents):
-                x[b, i], score[b, i] = state.filters[b, i].step(
-                    received.y[b, i].copy(), received.valid[b, i].copy(), known_u[b, i].copy()
-                )
-        quiet = np.zeros_like(score, bool)
-        return state, Estimate(x, score, quiet, num.full(score.shape, Mode.NORMAL, np.int8), ~quiet)
+    def make(self) -> EpisodeFilter:
+        return self.factory()
 
 
 def per_episode(factory: Callable[[], EpisodeFilter]) -> PerEpisode:

@@ -54,7 +54,7 @@ def test_the_new_defence_plays_as_an_object(package: Path, monkeypatch: pytest.M
     sys.modules.pop("mydefence", None)
 
 
-@pytest.mark.parametrize("name", ["README.md", "docs/new-defence.md", "CONTRIBUTING.md"])
+@pytest.mark.parametrize("name", ["README.md", "CONTRIBUTING.md", *(f"docs/{name.name}" for name in sorted((ROOT / "docs").glob("*.md")))])
 def test_links_to_files_exist(name: str) -> None:
     text = (ROOT / name).read_text(encoding="utf-8")
     for target in re.findall(r"\]\(([^)#]+?)(?:#[^)]*)?\)", text):

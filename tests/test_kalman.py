@@ -8,13 +8,16 @@ from filterpy.kalman import KalmanFilter as Reference
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
+from scipy.linalg import solve_discrete_are
 
 import tailgate
-from tailgate.core import Innovation, Prior, Received
+from tailgate.core import Innovation, Model, Prior, Received
 from tailgate.draws import Role, keys
+from tailgate.errors import InputError
 from tailgate.estimators import AcceptAll, ChiSquare, GatedKalman, Kalman, KalmanFilter, compose
-from tailgate.estimators.kalman import KalmanState
-from tailgate.scenario import load_scenario
+from tailgate.estimators.kalman import KalmanState, steady_state
+from tailgate.registry import Spec
+from tailgate.scenario import list_scenarios, load_scenario
 
 RNG = np.random.default_rng(11)
 NO_DRAWS = keys("train", [0]).at(Role.DEFENCE, np.zeros(1))
@@ -251,3 +254,126 @@ def test_the_gate_judges_what_was_received(lost):
     _, estimate = defence.step(plan, state, _received([[[2.0, 2.0]]], valid), np.zeros((1, 1, 1)), NO_DRAWS)
     S = model.C[0] @ (model.A @ P @ model.A.T + model.Q) @ model.C[0].T + model.R[0]
     assert estimate.score[0, 0] == pytest.approx(4.0 / S[1 - lost, 1 - lost], rel=1e-12)
+
+
+@pytest.mark.parametrize("name", list_scenarios())
+def test_the_steady_state_of_every_scenario_solves_the_riccati_equation(name):
+    """P- agrees with scipy's to 1e-11, and one step of the filter gives it back to 1e-14."""
+    model = load_scenario(name).brief().model
+    A, C, Q, R = model.A, model.C[0], model.Q, model.R[0]
+    P = steady_state(model)[0]
+    np.testing.assert_allclose(P, solve_discrete_are(A.T, C.T, Q, R), rtol=1e-11)
+    K = P @ C.T @ np.linalg.inv(C @ P @ C.T + R)
+    np.testing.assert_allclose(A @ (P - K @ C @ P) @ A.T + Q, P, rtol=1e-13)
+
+
+def test_the_steady_state_of_random_models():
+    """P- agrees with scipy's for stable, marginal and unstable plants, each agent with its own sensors."""
+    rng = np.random.default_rng(4)
+    for _ in range(15):
+        n, q = rng.integers(1, 7), rng.integers(1, 4)
+        A = rng.normal(size=(n, n))
+        A *= rng.choice([0.5, 1.0, 1.3]) / np.max(np.abs(np.linalg.eigvals(A)))
+        C, root, noise = rng.normal(size=(2, q, n)), rng.normal(size=(n, n + 1)), rng.normal(size=(2, q, q + 1))
+        Q, R = root @ root.T * 10.0 ** rng.integers(-3, 3), noise @ np.swapaxes(noise, 1, 2) + 0.1 * np.eye(q)
+        model = Model(A, np.zeros((n, 1)), np.zeros(n), C, Q, R, np.eye(2, dtype=bool), 1.0, tuple(f"y{i}" for i in range(q)))
+        for i, P in enumerate(steady_state(model)):
+            want = solve_discrete_are(A.T, C[i].T, Q, R[i])
+            np.testing.assert_allclose(P, want, atol=1e-8 * np.max(np.abs(want)))
+
+
+@pytest.mark.parametrize(
+    "A, C, Q",
+    [
+        ([[1.0, 0.1], [0.0, 1.0]], [[0.0, 1.0]], np.eye(2)),  # nobody sees the position
+        ([[1.2]], [[0.0]], 1.0),
+        ([[1.0]], [[1.0]], 0.0),  # the gain dies out, and never settles
+    ],
+)
+def test_no_steady_state_is_one_clear_error(A, C, Q, linear_model):
+    """A pair that is not detectable, or a lasting mode without noise, is an InputError that says so."""
+    model = linear_model(A, C, Q, 1.0)
+    for prepare in (KalmanFilter(steady=True).prepare, Kalman(gain="steady").prepare, tailgate.make_defence("rkf").prepare):
+        with pytest.raises(InputError, match="detectable"):
+            prepare(model)
+    KalmanFilter().prepare(model)
+
+
+def test_a_stable_mode_that_nobody_sees_has_a_steady_state(linear_model):
+    """Detectable is enough: 1 / (1 - 0.9^2), unseen."""
+    assert steady_state(linear_model(0.9, 0.0, 1.0, 1.0))[0, 0, 0] == pytest.approx(1.0 / 0.19, rel=1e-12)
+
+
+def test_the_time_varying_filter_settles_at_the_steady_one():
+    """From its golden-ratio gain on, the steady filter's estimates are the varying one's: 1.618 and 0.618 for A = C = Q = R = 1."""
+    model = load_scenario("thesis-ch4-v0").brief().model
+    held, varying = KalmanFilter(steady=True), KalmanFilter()
+    plan, other = held.prepare(model), varying.prepare(model)
+    one, two = held.start(plan, _prior(model, 2)), varying.start(other, _prior(model, 2))
+    for _ in range(1500):
+        y, u = _received(RNG.normal(size=(2, 1, 2))), RNG.normal(size=(2, 1, 1))
+        one, two = held.predict(plan, one, u), varying.predict(other, two, u)
+        ours, theirs = held.innovation(plan, one, y), varying.innovation(other, two, y)
+        gains = held.gain(plan, one, ours), varying.gain(other, two, theirs)
+        settled = two.P
+        one, two = (f.update(p, s, i, y.valid) for f, p, s, i in ((held, plan, one, ours), (varying, other, two, theirs)))
+    np.testing.assert_allclose(plan.held[0], settled[0, 0], rtol=1e-9)
+    np.testing.assert_allclose(ours.S, theirs.S, rtol=1e-9)
+    np.testing.assert_allclose(gains[0], gains[1], rtol=1e-9)
+    np.testing.assert_allclose(one.x, two.x, atol=1e-8)
+    assert gains[0][0, 0, 0, 0] == pytest.approx(0.618, abs=2e-3) and plan.held[0, 0, 0] == pytest.approx(1.618, abs=5e-3)
+
+
+def test_the_golden_ratio_is_the_steady_state_of_the_scalar_case(linear_model):
+    """A = C = Q = R = 1: P- = (1 + sqrt 5) / 2 and K = P- - 1, to the last digit but one."""
+    P = steady_state(linear_model(1.0, 1.0, 1.0, 1.0))[0, 0, 0]
+    np.testing.assert_allclose([P, P / (P + 1.0)], [(math.sqrt(5) + 1) / 2, (math.sqrt(5) - 1) / 2], rtol=4e-16)
+
+
+@pytest.mark.parametrize("sensor", [0, 1])
+def test_a_steady_filter_without_one_sensor_uses_the_other_alone_at_the_same_covariance(sensor):
+    """x = x- + P- C_j' r_j / S_jj, whether the other is missing or not accepted; S does not widen."""
+    model, filter_ = _odometry(), KalmanFilter(steady=True)
+    plan = filter_.prepare(model)
+    belief = filter_.predict(plan, filter_.start(plan, _prior(model, 1)), np.zeros((1, 1, 1)))
+    r, only = np.array([[[1.5, -2.0]]]), (np.arange(2) == sensor)[None, None]
+    P, C = plan.held[0], model.C[0][sensor]
+    want = P @ C * r[0, 0, sensor] / (C @ P @ C + model.R[0, sensor, sensor])
+    y = belief.x[..., :2] + r
+    for valid, accept in ((only, only), (np.ones_like(only), only)):
+        innovation = filter_.innovation(plan, belief, _received(np.where(valid, y, np.nan), valid))
+        after = filter_.update(plan, belief, innovation, accept)
+        np.testing.assert_allclose(after.x[0, 0] - belief.x[0, 0], want, rtol=1e-12)
+        assert after.P is None
+
+
+def test_a_shut_gate_widens_only_with_a_varying_gain(short, play):
+    """Under a lasting jump the score of the open-loop filter falls as S grows; with the steady gain it does not."""
+    attack = tailgate.make_attack("fdi", targets=("position",), value=40.0)
+    place = short("gusty-stop-and-go-v0", horizon=400)
+    late = [play(place, GatedKalman(gain=gain), attack, range(6), terminate=False).score[350:].mean() for gain in ("varying", "steady")]
+    assert late[0] < 20.0 < 1000.0 < late[1]
+
+
+def test_a_steady_filter_may_forget_for_one_step(short, play):
+    """Re-acquiring ends the lock-out with a steady gain too, and its rows do not depend on their batch."""
+    attack = tailgate.make_attack("fdi", value=40.0, length=30)
+    defences = [Spec("defence", f"composed:filter=kf,filter.steady=true,mitigation={m}").make() for m in ("reacquire", "gate_out")]
+    place = short("gusty-stop-and-go-v0", horizon=90)
+    traces = [play(place, d, attack, range(9), terminate=False) for d in defences]
+    error = [np.abs(t.estimate - t.truth)[-1, :, 0, 0] for t in traces]
+    assert np.median(error[0]) < 3.0 and np.isfinite(error[0]).all()
+    assert not np.array_equal(traces[0].estimate, traces[1].estimate)
+    alone = play(place, defences[0], attack, [5], terminate=False)
+    assert alone.trace_hash(0) == traces[0].trace_hash(5)
+
+
+@pytest.mark.parametrize("defence", [Kalman(gain="steady"), GatedKalman(gain="steady")])
+def test_rows_of_a_steady_filter_do_not_depend_on_their_batch(defence, short, play):
+    """trace_hash is the same alone and among 16, where some rows lose a sensor and others do not."""
+    place = short(jam_range=(-1e3, 1e3))
+    for attack in ("dropout", "fdi_bernoulli"):
+        rival = tailgate.make_attack(attack, trigger="closing", threshold=1.0, targets=("velocity",))
+        whole = play(place, defence, rival, range(16))
+        for seed in (0, 7, 15):
+            assert play(place, defence, rival, [seed]).trace_hash(0) == whole.trace_hash(seed)

@@ -61,7 +61,7 @@ def stealth_bound(A: Array, filters: list[Steady], eta: float, direction: Array)
     """
     total, reach = 0.0, np.asarray(direction, np.float64)
     for step in reversed(filters):
-        total += np.sqrt(max(reach @ step.K @ step.S @ step.K.T @ reach, 0.0))
+        total += float(np.sqrt(max(float(reach @ step.K @ step.S @ step.K.T @ reach), 0.0)))
         reach = A.T @ reach
     return float(np.sqrt(eta) * total)
 

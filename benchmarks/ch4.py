@@ -1,0 +1,93 @@
+"""The record of thesis chapter 4: its reproduction, and every defence against every attack on minutes of driving.
+
+    python benchmarks/ch4.py [--seeds 100] [--out results/ch4-v0]
+"""
+
+import argparse
+import json
+import platform
+import time
+from pathlib import Path
+
+from rich.console import Console
+
+import tailgate
+from tailgate.evaluation import evaluate
+from tailgate.files import write_atomic
+from tailgate.plots import write_overview
+from tailgate.progress import cells, progress
+from tailgate.reproduce import reproduce, write
+from tailgate.scenario import load_suite
+from tailgate.summary import summarise
+
+SUITES = ("ch4-long-v0", "ch4-actuator-v0")
+FILTERPY = ("filterpy_kf", "filterpy_ekf", "filterpy_ukf", "filterpy_hinfinity", "filterpy_imm")
+FILTERPY_SEEDS = 8  # one object per episode: slow
+
+
+def markdown(table, places):
+    """Per scenario a matrix: share of collisions, and below it the median of the smallest gap and of the position error."""
+    lines = []
+    for scenario, dose in places:
+        here = [e for e in table if (e["scenario"], e["dose"]) == (scenario, dose)]
+        attacks = list(dict.fromkeys(e["attack"] for e in here))
+        lines += ["", f"## {scenario}, budget {dose} steps", ""]
+        lines += ["In each cell: collisions; smallest gap (median) / position RMSE (median).", ""]
+        lines += ["| defence | " + " | ".join(f"`{name}`" for name in attacks) + " |", "|---" * (len(attacks) + 1) + "|"]
+        for name in dict.fromkeys(e["defence"] for e in here):
+            row = {e["attack"]: e for e in here if e["defence"] == name}
+            lines.append(f"| `{name}` | " + " | ".join(cell(row[attack]) for attack in attacks) + " |")
+    return lines
+
+
+def cell(entry):
+    if entry["crash"] is None:
+        return "not applicable"
+    return f"**{100 * entry['crash']['value']:.0f} %**; {entry['min_gap']['median']:.1f} m / {entry['rmse_position']['median']:.2g} m"
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--seeds", type=int, default=100)
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--out", default="results/ch4-v0")
+    options = parser.parse_args()
+    out, errors = Path(options.out), Console(stderr=True)
+    begun = time.perf_counter()
+    page = write(reproduce("ch4", 200, lambda text: errors.print(text, highlight=False)), out)
+    page.unlink()  # the pictures and the text are beside it
+    seconds = {"reproduce": time.perf_counter() - begun}
+    table = []
+    for name in SUITES:
+        begun = time.perf_counter()
+        with progress(errors) as update:
+            rows = evaluate(
+                name, seeds=options.seeds, workers=options.workers,
+                progress=lambda done, total, name=name, update=update: update(name, done, total, cells(done, total)),
+            )  # fmt: skip
+        table += summarise(rows)
+        seconds[name] = time.perf_counter() - begun
+    begun, suite = time.perf_counter(), load_suite(SUITES[0])
+    with progress(errors) as update:
+        rows = evaluate(
+            suite, defences=FILTERPY, scenarios=["stop-and-go-v0"], seeds=FILTERPY_SEEDS, workers=options.workers,
+            progress=lambda done, total: update("filterpy", done, total, cells(done, total)),
+        )  # fmt: skip
+    slow = summarise(rows)
+    seconds["filterpy"] = time.perf_counter() - begun
+    places = list(dict.fromkeys((e["scenario"], e["dose"]) for e in table))
+    text = [
+        "# Chapter 4 on minutes of driving", "",
+        f"`python benchmarks/ch4.py`: suites {' and '.join(SUITES)}, {options.seeds} report seeds a cell; Tailgate {tailgate.__version__}, "
+        f"Python {platform.python_version()}, {options.workers} workers; seconds: "
+        + ", ".join(f"{key} {value:.0f}" for key, value in seconds.items()) + ".", "",
+        "![position error against smallest gap](rmse-against-gap.png)", "",
+        *(f"![{scenario}]({path.name})" for (scenario, _), path in zip(places, write_overview(table, out), strict=False)),
+        *markdown(table, places), "", f"# filterpy's filters, {FILTERPY_SEEDS} seeds a cell", *markdown(slow, [("stop-and-go-v0", 50)]),
+    ]  # fmt: skip
+    write_atomic(out / "long.md", ("\n".join(text) + "\n").encode())
+    write_atomic(out / "long.json", json.dumps(table + slow, allow_nan=False).encode() + b"\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,183 @@
+"""Calibration: the onsets are those of the metric, the thresholds hold on fresh runs, and the defaults are the recorded ones."""
+
+import dataclasses
+import json
+import math
+import shlex
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy import stats
+
+import tailgate
+from tailgate import cli
+from tailgate.calibrate import MIXTURE, Bench, Count, Crossings, calibrate, count_onsets
+from tailgate.draws import keys
+from tailgate.errors import InputError, NotApplicable
+from tailgate.estimators import Cusum, GateOut, KalmanFilter, Mewma, WindowedChiSquare, compose
+from tailgate.metrics import METRICS
+from tailgate.scenario import config_path
+from tailgate.trace import rollout
+
+RECORDS = json.loads((Path(__file__).parents[1] / "benchmarks/results/calibration.json").read_text(encoding="utf-8"))
+ENTRIES = [entry | {"command": record["command"]} for record in RECORDS for entry in record["results"]]
+STEPS = 120  # of the episodes here: short ones side by side are quicker than long ones
+
+
+@pytest.fixture(scope="module")
+def roads(tmp_path_factory):
+    """Two scenarios of 12 s episodes, as files."""
+    out = []
+    for name in ("stop-and-go-v0", "ornstein-uhlenbeck-v0"):
+        text = config_path("scenarios", name, "scenario").read_text(encoding="utf-8")
+        out.append(tmp_path_factory.mktemp("roads") / f"brief-{name}.yaml")
+        out[-1].write_text(text.replace("horizon: 600", f"horizon: {STEPS}"), encoding="utf-8")
+    return tuple(str(path) for path in out)
+
+
+@pytest.mark.parametrize("keep", [10**6, 300])
+def test_crossings_count_climbs_over_a_level(keep):
+    """The level for n climbs is passed n times, and no higher one is: counted step by step on random scores."""
+    score = np.random.default_rng(2).exponential(size=(200, 40)).cumsum(axis=0) % 7.0
+    before = np.concatenate([np.full((1, 40), -np.inf), score[:-1]])
+    crossings = Crossings(keep)
+    for part in (slice(0, 15), slice(15, 40)):
+        climbed = score[:, part] > before[:, part]
+        crossings.add(before[:, part][climbed], score[:, part][climbed])
+
+    def climbs(level):
+        return np.count_nonzero((before <= level) & (score > level))
+
+    for wanted in (1, 7, 100):
+        level = crossings.level(wanted)
+        assert climbs(level) >= wanted and all(climbs(higher) < wanted for higher in np.linspace(level + 1e-3, 7.0, 200))
+    assert crossings.level(10**6) is None
+
+
+def test_onsets_are_those_of_the_metric(short):
+    """Counted while the loop runs, they equal `alarm_onsets` of the traces, also of episodes that end early."""
+    place = short("thesis-ch4-v0", horizon=150)
+    place = dataclasses.replace(place, ends_on_collision=True)
+    loop = place.loop(tailgate.make_defence("chi2_kf", eta=4.0))
+    held = keys("calibrate", range(40))
+    onsets, steps = count_onsets(loop, held)
+    trace = rollout(loop, tailgate.make_attack("none"), held)
+    np.testing.assert_array_equal(onsets, METRICS["alarm_onsets"](trace))
+    assert steps == trace.length.sum() < 40 * 150 and onsets.min() < onsets.max()
+
+
+def test_the_interval_is_exact_poisson():
+    """Its ends are the means under which the count is a 2.5 % event; clusters widen it; no onset has no upper end."""
+    low, high = Count(12, 36_000.0, 1, 1.0).interval()
+    assert stats.poisson.cdf(12, 10.0 / low) == pytest.approx(0.025, rel=1e-9)
+    assert stats.poisson.sf(11, 10.0 / high) == pytest.approx(0.025, rel=1e-9)
+    wide = Count(12, 36_000.0, 1, 3.0).interval()
+    assert wide[0] < low and wide[1] > high and Count(12, 36_000.0, 1, 0.5).interval() == (low, high)
+    assert Count(0, 3600.0, 1, 1.0).hours is None and Count(0, 3600.0, 1, 1.0).interval() == (pytest.approx(1 / 3.6889, rel=1e-4), None)
+
+
+@pytest.mark.parametrize("defence", ["chi2_kf", "windowed_chi2_kf", "cusum_kf", "mewma_kf"])
+def test_a_calibrated_threshold_holds_on_fresh_runs(defence, roads):
+    """For 0.1 h: the mean time between onsets is within 20 % on fresh seeds; for chi2 the threshold is that of theory."""
+    done = calibrate(defence, 0.1, scenarios=roads[:1], onsets=200, check=True)
+    assert done.settled and abs(done.measured.hours / 0.1 - 1) < 0.03
+    assert abs(done.fresh.hours / 0.1 - 1) < 0.2
+    assert done.fresh.onsets > 160 and done.measured.steps == done.fresh.steps == 200 * 3600
+    if defence == "chi2_kf":  # exp(-eta / 2) a step
+        assert done.threshold == pytest.approx(2.0 * math.log(3600.0), abs=0.5)
+
+
+def test_a_long_mean_time_is_found_on_fewer_alarms(roads):
+    """Where a run would take too many steps it is cut, and the interval says what that leaves; with too few alarms it is refused."""
+    done = calibrate("composed:detector=chi2,mitigation=accept_all", 0.2, scenarios=roads[:1], onsets=400, most_steps=180_000)
+    assert done.field == "detector.eta" and done.measured.steps == 180_000 and 24 <= done.measured.onsets <= 26
+    low, high = done.measured.interval()
+    assert low < 0.14 and high > 0.29 and done.threshold == pytest.approx(2.0 * math.log(7200.0), abs=1.2)
+    with pytest.raises(InputError, match=r"hours: got 0\.3; expected at most 0\.25 with 180000 steps"):
+        calibrate("chi2_kf", 0.3, scenarios=roads[:1], onsets=400, most_steps=180_000)
+
+
+def test_results_do_not_depend_on_the_batch_and_seeds_are_not_shared(roads):
+    """The same record for batches of 5 and 64, and it is JSON; no two scenarios play the same noise."""
+    one, two = (calibrate("chi2_kf", 0.01, scenarios=roads, onsets=4, batch=batch).as_data() for batch in (5, 64))
+    assert one == two and json.loads(json.dumps(one)) == one
+    assert list(one["seeds"].values()) == [[0, 5], [6, 11]] and one["measured"]["steps"] == 12 * STEPS
+
+
+@pytest.mark.parametrize("entry", ENTRIES, ids=lambda e: f"{e['defence']}, {e['wanted_hours']:g} h")
+def test_the_record_holds_on_fresh_runs(entry):
+    """Each recorded threshold was within 20 % on fresh seeds of the declared mixture, or as near as the number of its alarms tells."""
+    measured, fresh, wanted = entry["measured"], entry["fresh"], entry["wanted_hours"]
+    assert list(entry["seeds"]) == list(MIXTURE) and (measured["purpose"], fresh["purpose"]) == ("calibrate", "report")
+    assert abs(measured["hours"] / wanted - 1) < 0.03
+    if wanted <= 1.0:
+        assert abs(fresh["hours"] / wanted - 1) < 0.2 and fresh["onsets"] > 300
+    else:  # both counts are uncertain: 2.6 deviations of the logarithm of their ratio, 1 % by chance
+        assert abs(math.log(fresh["hours"] / wanted)) < 2.6 * math.sqrt(1 / measured["onsets"] + 1 / fresh["onsets"]) < 0.8
+    assert entry["settled"] and f"--defence {entry['defence']} " in entry["command"] and "--check" in entry["command"]
+
+
+DEFAULTS = {entry["defence"]: entry["threshold"] for entry in ENTRIES if entry["wanted_hours"] == 1.0}
+DETECTORS = [(WindowedChiSquare(), "windowed_chi2_kf"), (Cusum(), "cusum_kf"), (Mewma(), "mewma_kf")]
+
+
+def test_defaults_are_the_recorded_thresholds():
+    """Named defences and their detectors alarm once in an hour by default; chi2_kf keeps the thesis's gate."""
+    named = ["windowed_chi2_kf", "cusum_kf", "mewma_kf", "reacquire_kf", "cusum_reacquire_kf", "widen_kf", "brake_kf"]
+    for name in named:
+        made = tailgate.make_defence(name)
+        assert getattr(made, made.threshold_field) == DEFAULTS[name], name
+    for detector, name in DETECTORS:
+        assert detector.threshold == DEFAULTS[name], name
+    assert tailgate.make_defence("chi2_kf").eta == 20.0 and DEFAULTS["chi2_kf"] == pytest.approx(2 * math.log(36_000.0), abs=0.5)
+
+
+BAD = [
+    ({"hours": 0.0}, "hours"), ({"hours": -1.0}, "hours"), ({"hours": math.nan}, "hours"), ({"hours": math.inf}, "hours"),
+    ({"hours": 1e-6}, "score does not climb that often"), ({"onsets": 0}, "onsets"), ({"most_steps": 0}, "steps"), ({"batch": 0}, "batch"),
+    ({"scenarios": ("stop-and-go",)}, "stop-and-go-v0"), ({"scenarios": ()}, "at least one"),
+    ({"scenarios": ("braking-v0", "braking-v0")}, "each scenario once"),
+    ({"defence": "cusum_fk"}, "cusum_kf"), ({"defence": "cusum_kf:threshold=0"}, "greater than 0"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("changes, expected", BAD)
+def test_bad_input(changes, expected, roads):
+    """One InputError that names the field, before anything long is played."""
+    arguments = {"defence": "chi2_kf", "hours": 0.01, "scenarios": roads, "onsets": 5} | changes
+    with pytest.raises(InputError, match=expected):
+        calibrate(arguments.pop("defence"), arguments.pop("hours"), **arguments)
+
+
+@pytest.mark.parametrize("defence", ["none", "kf", "oracle", "always_alarm", "composed:detector=score"])
+def test_a_defence_without_a_threshold(defence, roads):
+    """NotApplicable, with the reason."""
+    with pytest.raises(NotApplicable, match=r"defence: got .*alarms at a threshold"):
+        Bench.of(defence, roads, 64, None)
+
+
+def test_objects_have_thresholds_too(roads):
+    """A defence made in Python, and one by name, are set at a threshold and say what the parameter is called."""
+    for defence, field in ((compose(KalmanFilter(), Mewma(weight=0.5), GateOut()), "detector.threshold"), ("cusum_kf:drift=2", "threshold")):
+        bench = Bench.of(defence, roads, 64, None)
+        assert bench.field == field and bench.at(7.0).parts()[1].threshold == 7.0 and bench.text
+
+
+def test_the_command(roads, capsys):
+    """JSON with the command that makes it again, a table for people, progress beside them; bad input is exit code 2."""
+    part = ["calibrate", "--defence", "chi2_kf", "--hours", "0.01", "--scenario", roads[0], "--onsets", "20"]
+    assert cli.main([*part, "--check", "--json"]) == 0
+    out, err = capsys.readouterr()
+    record = json.loads(out)
+    (result,) = record["results"]
+    assert shlex.split(record["command"]) == [
+        "tailgate", "calibrate", "--defence", "chi2_kf", "--scenario", roads[0], "--hours", "0.01", "--onsets", "20", "--steps", "20000000",
+        "--check", "--json",
+    ]  # fmt: skip
+    assert result["field"] == "eta" and result["fresh"]["purpose"] == "report" and list(result["seeds"].values()) == [[0, 59]]
+    assert "closed loop, run 1" in err
+    assert cli.main(part) == 0
+    assert f"{result['threshold']:g}" in capsys.readouterr().out
+    assert cli.main(["calibrate", "--defence", "kf", "--hours", "1"]) == cli.EXIT_INPUT
+    assert "threshold" in capsys.readouterr().err
