@@ -167,11 +167,11 @@ class Channel:
 
         `sent` (B, N, q+p) holds the sensor readings and the V2V message before the attack.
         """
-        threat, kind = plan.threat, command.kind
-        wanted = (kind != Kind.NONE) & command.target.any(axis=(1, 2))
-        legal = self._legal(plan, command)
-        charged = wanted & legal & self.allowed(plan, state, k)
-        refused = ((kind != Kind.NONE) | command.target.any(axis=(1, 2))) & ~charged
+        threat, kind, aimed = plan.threat, command.kind, command.target.any(axis=(1, 2))
+        charged = (kind != Kind.NONE) & aimed
+        if charged.any():
+            charged = charged & self._legal(plan, command) & self.allowed(plan, state, k)
+        refused = ((kind != Kind.NONE) | aimed) & ~charged
 
         hit = command.target & charged[:, None, None]
         kind = np.where(charged, kind, 0).astype(np.int8)
@@ -183,8 +183,9 @@ class Channel:
         cooldown = np.where(ended, max(threat.cooldown - 1, 0), np.maximum(state.cooldown - 1, 0))
         state = state._replace(
             used=state.used + charged, burst=np.where(charged, state.burst + 1, 0), cooldown=cooldown, last=last,
-            links=_hold(state.links, first), drives=_hold(state.drives, first),
         )  # fmt: skip
+        if first.any():
+            state = state._replace(links=_hold(state.links, first), drives=_hold(state.drives, first))
         links = self._arrive(plan, state, state.links, sent, slice(0, sent.shape[-1]))
         lost = hit & (kind == Kind.DROPOUT)[:, None, None]
         q = plan.sensors
@@ -219,19 +220,28 @@ class Channel:
 
     def _arrive(self, plan: ChannelPlan, state: ChannelState, memory: Memory, sent: Array, wires: slice) -> Array:
         """What arrives of `sent` (B, N, .), the part `wires` of all wires, under the command in force."""
-        command = state.last
-        hit, value, kind = command.target[..., wires], command.value[..., wires], command.kind[:, None, None]
-        out = np.where(hit & (kind == Kind.DOS_JAM), value, sent)
-        out = np.where(hit & (kind == Kind.FDI), sent + value, out)
-        out = np.where(hit & (kind == Kind.DOS_HOLD), memory.held, out)
-        # a receiver that hears nothing keeps its last value
-        out = np.where(hit & ((kind == Kind.DOS_HOLD_FRESH) | (kind == Kind.DROPOUT)), memory.fresh, out)
-        if plan.recorded and (old := hit & ((kind == Kind.DELAY) | (kind == Kind.REPLAY))).any():
-            span = np.where(old, value, 1.0).astype(np.int64)
-            turn = np.where(kind == Kind.REPLAY, state.played[:, None, None] % span, 0)
-            slot = (state.taped[:, None, None] - span + turn) % plan.recorded
-            out = np.where(old, np.take_along_axis(memory.history, slot[..., None], axis=-1)[..., 0], out)
+        command, out = state.last, sent
+        target, value = command.target[..., wires], command.value[..., wires]
+        for kind in sorted(set(command.kind[target.any(axis=(1, 2))].tolist())):
+            hit = target & (command.kind == kind)[:, None, None]
+            if kind == Kind.DOS_JAM:
+                changed = value
+            elif kind == Kind.FDI:
+                changed = sent + value
+            elif kind == Kind.DOS_HOLD:
+                changed = memory.held
+            elif kind in (Kind.DELAY, Kind.REPLAY):
+                changed = self._taped(plan, state, memory, np.where(hit, value, 1.0).astype(np.int64), kind)
+            else:  # a receiver that hears nothing keeps its last value, as one that holds it does
+                changed = memory.fresh
+            out = np.where(hit, changed, out)
         return out
+
+    def _taped(self, plan: ChannelPlan, state: ChannelState, memory: Memory, span: Array, kind: int) -> Array:
+        """The sample of `span` (B, N, .) steps ago, or the one that a replayed window of that length has come to."""
+        turn = state.played[:, None, None] % span if kind == Kind.REPLAY else 0
+        slot = (state.taped[:, None, None] - span + turn) % plan.recorded
+        return np.asarray(np.take_along_axis(memory.history, slot[..., None], axis=-1)[..., 0])
 
     def _keep(self, plan: ChannelPlan, state: ChannelState, memory: Memory, sent: Array, hit: Array) -> Memory:
         """The memory after this step's `sent` (B, N, .), of which `hit` was attacked."""
@@ -240,7 +250,7 @@ class Channel:
             rows = np.flatnonzero(state.last.kind != Kind.REPLAY)
             history = history.copy(order="K")
             history[rows, :, :, state.taped[rows] % plan.recorded] = sent[rows]
-        return Memory(memory.held, np.where(hit, memory.fresh, sent), history)
+        return Memory(memory.held, np.where(hit, memory.fresh, sent) if hit.any() else sent, history)
 
 
 def _hold(memory: Memory, first: Array) -> Memory:
