@@ -127,7 +127,8 @@ class Jam(Script):
             raise InputError("attack dos_jam.low", self.low, f"at most high ({self.high})")
 
     def command(self, plan: ScriptPlan, on: Array, count: Array, view: View, draws: Draws) -> Command:
-        return plan.brief.command(on, Kind.DOS_JAM, plan.target, Uniform(self.low, self.high).sample(plan.brief, count, draws))
+        value = fit(plan.brief, Kind.DOS_JAM, Uniform(self.low, self.high).sample(plan.brief, count, draws))
+        return plan.brief.command(on, Kind.DOS_JAM, plan.target, value)
 
 
 @register("attack", "dos_hold", reference="Dutta 2018, (6.18)")
@@ -157,12 +158,12 @@ class Dropout(Script):
 @register("attack", "fdi", reference="Dutta 2018, (4.4)")
 @dataclass(frozen=True)
 class Inject(Script):
-    """False data injection: a constant bias."""
+    """False data injection: a constant bias, cut at the bound of the threat model."""
 
     value: Finite = param(-20.0, "bias [unit of the wire]")
 
     def command(self, plan: ScriptPlan, on: Array, count: Array, view: View, draws: Draws) -> Command:
-        return plan.brief.command(on, Kind.FDI, plan.target, self.value)
+        return inject(plan, on, Constant(self.value), count, draws)
 
 
 @register("attack", "fdi_gaussian", reference="Dutta 2018, (6.17)")
@@ -186,8 +187,7 @@ class InjectBernoulli(Script):
     value: Finite = param(-20.0, "bias [unit of the wire]")
 
     def command(self, plan: ScriptPlan, on: Array, count: Array, view: View, draws: Draws) -> Command:
-        target = plan.target & wires_hit(plan, self.probability, draws)
-        return plan.brief.command(on & target.any(axis=(1, 2)), Kind.FDI, target, self.value)
+        return inject(plan, on, Constant(self.value), count, draws, hit=wires_hit(plan, self.probability, draws))
 
 
 @register("attack", "fdi_ramp")
@@ -212,8 +212,10 @@ class InjectThenJam(Script):
     inject: PositiveCount = param(15, "steps of the bias before the jamming")
 
     def command(self, plan: ScriptPlan, on: Array, count: Array, view: View, draws: Draws) -> Command:
-        kind = np.where(count < self.inject, Kind.FDI, Kind.DOS_JAM)
-        return plan.brief.command(on, kind, plan.target, self.value)
+        biased = count < self.inject
+        value = Constant(self.value).sample(plan.brief, count, draws)
+        value = np.where(biased[:, None, None], fit(plan.brief, Kind.FDI, value), fit(plan.brief, Kind.DOS_JAM, value))
+        return plan.brief.command(on, np.where(biased, Kind.FDI, Kind.DOS_JAM), plan.target, value)
 
 
 @register("attack", "fdi_uniform", reference="Dutta 2018, figure 4.5")
@@ -349,9 +351,9 @@ class ThesisTimes:
         return None
 
     def decide(self, plan: ScriptPlan, state: Any, view: View, draws: Draws) -> tuple[Any, Command]:
-        u = draws.uniform((plan.brief.model.agents, len(plan.target)))
+        u, brief = draws.uniform((plan.brief.model.agents, len(plan.target))), plan.brief
         if self.kind == "fdi":
-            on = np.isin(view.k, THESIS_FDI_STEPS)
-            return None, plan.brief.command(on, Kind.FDI, plan.target, self.fdi_max * u)
-        on = np.isin(view.k, THESIS_DOS_STEPS)
-        return None, plan.brief.command(on, Kind.DOS_JAM, plan.target, self.dos_max * (2.0 * u - 1.0))
+            on, value = np.isin(view.k, THESIS_FDI_STEPS) & view.allowed, fit(brief, Kind.FDI, self.fdi_max * u)
+            return None, brief.command(on, Kind.FDI, plan.target, value)
+        on, value = np.isin(view.k, THESIS_DOS_STEPS) & view.allowed, fit(brief, Kind.DOS_JAM, self.dos_max * (2.0 * u - 1.0))
+        return None, brief.command(on, Kind.DOS_JAM, plan.target, value)

@@ -99,6 +99,8 @@ def _pivot(r: Array, S: Array, W: Array, half: Array) -> Array:
         change = wrong & ((patience >= 0)[:, None] | last)
         signs = np.where(change, np.where(signs == 0.0, np.sign(g), 0.0), signs)
         left, r, W, half, size, signs, fewest, patience = (x[go] for x in (left, r, W, half, size, signs, fewest, patience))
+    else:
+        raise ArithmeticError(f"rkf: {len(left)} problems of {q} sensors are not solved after {ROUNDS} rounds of pivoting")
     return out
 
 
@@ -162,7 +164,7 @@ class Penalty:
 class Solved(Penalty):
     """The price, and who solves."""
 
-    solver: Literal["exact", "cvxpy"] = param("exact", "exact: closed form or coordinate descent; cvxpy: an interior-point solver, slow")
+    solver: Literal["exact", "cvxpy"] = param("exact", "exact: closed form or block pivoting; cvxpy: an interior-point solver, slow")
 
     def __post_init__(self) -> None:
         if self.solver == "cvxpy":

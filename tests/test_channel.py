@@ -230,11 +230,20 @@ def test_delay_reads_what_was_sent_some_steps_ago():
 
 
 def test_replay_plays_the_last_window_again_and_again():
-    """A window of 3 before step 7 is 4, 5, 6, 4, 5, 6, ...; the tape stands still meanwhile, and a new replay plays what came after."""
+    """A window of 3 before step 7 is 4, 5, 6, 4, 5, 6, ...; the recorder runs on, and the next replay plays what was sent meanwhile."""
     wire = Wire(targets=MODEL.wires, memory=4).idle(6)
     assert [wire.step(Kind.REPLAY, [V, ACC], 3)[0][V] for _ in range(7)] == [sent(k)[V] for k in (4, 5, 6, 4, 5, 6, 4)]
     wire.idle(1)  # step 14
-    assert [wire.step(Kind.REPLAY, [ACC], 2)[0][ACC] for _ in range(3)] == [sent(k)[ACC] for k in (6, 14, 6)]
+    assert [wire.step(Kind.REPLAY, [ACC], 2)[0][ACC] for _ in range(3)] == [sent(k)[ACC] for k in (13, 14, 13)]
+
+
+def test_a_delay_after_a_replay_is_as_old_as_it_says():
+    """Also on wires that were not replayed, and however long the replay was."""
+    wire = Wire(targets=MODEL.wires, memory=5).idle(8)
+    for _ in range(12):
+        wire.step(Kind.REPLAY, [P], 2)  # to step 20
+    np.testing.assert_array_equal(wire.step(Kind.DELAY, [P, V, ACC], 5)[0], np.where([1, 1, 0, 0, 1], sent(16), sent(21)))
+    assert wire.step(Kind.REPLAY, [P], 3)[0][P] == sent(19)[P]
 
 
 @pytest.mark.parametrize("kind", OLD)

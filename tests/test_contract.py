@@ -224,6 +224,38 @@ def test_a_defence_gets_only_what_its_card_declares(defence, short):
     assert all((r.v2v is not None) == ("v2v" in uses) and (r.attacked is not None) == ("truth" in uses) for r in seen)
 
 
+@pytest.mark.parametrize("defence", DEFENCES)
+def test_a_white_box_cannot_write_into_the_defence(defence, short, loop_of):
+    """Whatever of plan and state can be written is a copy: an episode with a vandal equals the plain one."""
+    loop = loop_of(short(knowledge="white", horizon=40), defence)
+
+    def spoil(thing, seen):
+        if id(thing) in seen:
+            return
+        seen.add(id(thing))
+        if isinstance(thing, np.ndarray) and thing.dtype != object:
+            with contextlib.suppress(ValueError):
+                thing[...] = 1
+        elif isinstance(thing, np.ndarray):
+            spoil(thing.ravel().tolist(), seen)
+        elif isinstance(thing, (tuple, list)):
+            for part in thing:
+                spoil(part, seen)
+        elif isinstance(thing, dict):
+            spoil(list(thing.values()), seen)
+        elif hasattr(thing, "__dict__"):
+            spoil(vars(thing), seen)
+
+    class Vandal(type(tailgate.make_attack("none"))):
+        def decide(self, plan, state, view, draws):
+            spoil([view.defence.plan, view.defence.state], set())
+            return super().decide(plan, state, view, draws)
+
+    held = keys("train", range(3))
+    plain, spoiled = (rollout(loop, a, held) for a in (tailgate.make_attack("none"), Vandal()))
+    assert [plain.trace_hash(i) for i in range(3)] == [spoiled.trace_hash(i) for i in range(3)]
+
+
 def _scribble(tree):
     """Write into every array that can be written; read-only ones are as good as untouched."""
     for leaf in leaves(tree).values():

@@ -252,3 +252,10 @@ def test_errors_cross_process_borders(cls):
     assert str(error) == "field: got 3; expected four" and isinstance(error, ValueError)
     assert len(str(InputError("f", "x" * 1000, "y"))) < 150
     assert str(unknown("f", "ab", [])).endswith("nothing: none is registered")
+
+
+@pytest.mark.parametrize("text", ["chi2_kf:eta", "chi2_kf:eta 3", "chi2_kf:"])
+def test_a_parameter_without_a_value_is_no_module(text):
+    """The name is registered, so what follows it should have been key=value."""
+    with pytest.raises(InputError, match="chi2_kf:key=value"):
+        Spec("defence", text).make()

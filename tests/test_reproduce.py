@@ -6,11 +6,12 @@ import json
 import numpy as np
 import pytest
 
+import tailgate
 from tailgate import cli
 from tailgate.errors import InputError
 from tailgate.reproduce import Claim, Report, reproduce, write
 from tailgate.reproduce.ch4_cases import READINGS
-from tailgate.reproduce.claims import Spread, Table
+from tailgate.reproduce.claims import Spread, Table, verdict
 from tailgate.reproduce.run import flat, markdown
 
 FIELDS = {"id", "claim", "thesis", "measured", "holds", "why"}
@@ -50,7 +51,7 @@ def test_chapter_4(chapter_4):
     assert claims["4.5.2-resilience"]["holds"] == "no" and claims["4.5.2-resilience"]["measured"]["alarms"] == 0
     assert claims["4.3-stealth"]["holds"] == "no" and claims["4.6.2-collision"]["holds"] == "partly"  # better than the KF, not than the robust one
     assert claims["4.5-lasting-bias"]["holds"] == "no"
-    assert max(claims["4.5.1-complexity"]["measured"]["exponent from 16 to 64"].values()) < 3.6
+    assert claims["4.5.1-complexity"]["measured"]["exponent from 16 to 64"].keys() == {"n (q = 2)", "q (n = 2)", "n = q"}
 
     names = {"figure-4-4", "figure-4-5", "figure-4-6", "figure-eta", "figure-cost"}
     assert {p.stem for p in out.glob("*.png")} == names and all((out / f"{n}.png").read_bytes()[:4] == b"\x89PNG" for n in names)
@@ -103,6 +104,31 @@ def test_a_report_is_written_safely_and_reads_the_same_everywhere(tmp_path):
     assert "<script>alert" not in page and "&lt;script&gt;" in page and "does not hold" in page
     assert "1|2".replace("|", "\\|") in markdown(report) and "1 [0.5, 2]" in markdown(report)
     assert flat({"a": {"b": 0.12345}}) == "a (b: 0.123)" and flat([1.0, "x"]) == "1, x"
+
+
+@pytest.mark.parametrize(("yes", "no", "word"), [(True, False, "yes"), (False, True, "no"), (False, False, "partly"), (True, True, "yes")])
+def test_a_verdict_has_three_values(yes, no, word):
+    """yes, no, or partly where neither is met."""
+    assert verdict(yes, no) == word
+
+
+def test_verdicts_follow_what_is_measured(monkeypatch):
+    """On a plant, attack or gate for which a claim is true, the same code says so; on another that it is false."""
+    from tailgate.estimators import GatedKalman
+    from tailgate.reproduce import ch4_safety, ch4_theory
+
+    calm = ch4_theory.case_study()
+    rng = np.random.default_rng(0)
+    shrinking = dataclasses.replace(calm, A=0.5 * np.eye(3))  # whatever is injected is forgotten: the error is bounded
+    assert [c.holds for c in ch4_theory._theorem_3(calm, rng, 50)] == ["partly", "no"]
+    assert ch4_theory._theorem_3(shrinking, rng, 50)[1].holds == "yes"
+    monkeypatch.setattr(ch4_theory, "GatedKalman", lambda eta: GatedKalman(eta=0.01))  # a gate that alarms at almost everything
+    assert ch4_theory._theorem_1(calm, rng, 20).holds == "no"
+    monkeypatch.undo()
+    honest = tailgate.make_attack("none")
+    monkeypatch.setattr(ch4_safety.tailgate, "make_attack", lambda name, **_: honest)
+    assert ch4_safety._stealth(4).holds == "yes"
+    assert ch4_safety._ramps(4).holds == "no"  # nothing is heard of an attack that does nothing
 
 
 def test_spread_is_median_quartiles_and_the_central_95_percent():

@@ -180,7 +180,7 @@ class View(NamedTuple):
     cooldown: Array  # (B,) steps before the next burst may start
     allowed: Array  # (B,) bool: a legal command would be accepted now
     last: Command  # the last command that took effect
-    control: Array | None = None  # (B, N, m) grey: the input now applied
+    control: Array | None = None  # (B, N, m) grey: the input last commanded
     received: Received | None = None  # the defence's measurement, before this step's attack
     defence: WhiteBox | None = None  # white: the defence object, its plan and its state
     estimate: Estimate | None = None  # white
@@ -225,7 +225,7 @@ class Defence(Protocol):
     def step(
         self, plan: Any, state: Any, received: Received, known_u: Array, draws: Draws
     ) -> tuple[Any, Estimate]:
-        """One step: known_u (B, N, m) is the input applied since the last step (zero where an agent does not know it)."""
+        """One step: known_u (B, N, m) is the input commanded since the last step (zero where an agent does not know it)."""
 
 
 class Attack(Protocol):

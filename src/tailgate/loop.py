@@ -8,6 +8,7 @@ measured step is a predict and an update. `sense` and `advance` are the two halv
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -35,7 +36,7 @@ from tailgate.core import (
 from tailgate.draws import Keys, Role
 from tailgate.errors import InputError
 from tailgate.threat import Brief, Channel, ChannelPlan, ChannelState, ThreatModel
-from tailgate.tree import duplicate, frozen, put_rows
+from tailgate.tree import duplicate, frozen, lock, put_rows
 
 _START = np.uint32(0xFFFFFFFF)  # the step under which start() draws: no episode reaches it
 
@@ -117,6 +118,11 @@ class Loop:
             Channel().prepare(self.brief),
         )
 
+    @cached_property
+    def _shown(self) -> Any:
+        """The defence's plan as a white-box attacker holds it: a copy, so that nothing it writes reaches the defence."""
+        return lock(copy.deepcopy(self.plan.defence))
+
     def start(self, keys: Keys) -> LoopState:
         """States of B fresh episodes at k = 1, measured."""
         plan, model = self.plan, self.model
@@ -175,7 +181,7 @@ class Loop:
         if threat.knowledge in ("grey", "white"):
             view = view._replace(control=state.known_u)
         if threat.knowledge == "white":
-            box = WhiteBox(self.defence, plan.defence, duplicate(state.defence), frozen(state.known_u))
+            box = WhiteBox(self.defence, self._shown, duplicate(state.defence), frozen(state.known_u))
             view = view._replace(defence=box, estimate=state.estimate, truth=self.plant.truth(plan.plant, state.plant))
         if threat.sees_measurement or threat.knowledge == "white":
             view = view._replace(received=state.received)

@@ -198,6 +198,8 @@ class Spec:
         if ":" not in head:
             return find(self.family, head)
         module, _, name = head.partition(":")
+        if module in _load(self.family):
+            raise InputError(self.family, self.text, f"{module}:key=value,key=value")
         try:
             cls = getattr(importlib.import_module(module), name)
         except (ImportError, ValueError, TypeError) as error:  # also an empty or relative module name

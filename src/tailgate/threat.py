@@ -13,6 +13,7 @@ from tailgate.core import Array, Command, Count, Kind, Model, Positive, Positive
 from tailgate.errors import InputError, unknown
 
 KindName = Literal["dos_jam", "dos_hold", "dos_hold_fresh", "dropout", "fdi", "delay", "replay"]
+Span = Annotated[int, Field(ge=1, le=10_000)]
 Pair = Annotated[tuple[float, float], Field(min_length=2, max_length=2)]
 
 
@@ -23,9 +24,9 @@ class ThreatModel:
     kinds: tuple[KindName, ...] = param(("dos_hold", "fdi"), "attack kinds that are granted")
     targets: tuple[str, ...] = param((), "wires that may be attacked; empty: every sensor, no V2V field and no actuator")
     fdi_bound: Positive = param(50.0, "largest |value| that false data injection may add to a sensor or V2V field [unit of the wire]")
-    actuator_bound: Positive = param(2.0, "largest |value| that may be added to, or jammed onto, an actuator [m/s^2]")
+    actuator_bound: Positive = param(2.0, "largest |value| that may be added to, or jammed onto, an actuator, its limits aside [m/s^2]")
     jam_range: Pair = param((-108.0, 108.0), "values that a jammer may leave at the receiver [unit of the wire]")
-    memory: PositiveCount = param(50, "longest delay, and longest window that is replayed [steps]")
+    memory: Span = param(50, "longest delay, and longest window that is replayed, at most 10 000 [steps]")
     budget: Count | None = param(None, "attack steps in an episode (the dose); none: unlimited")
     duration: PositiveCount | None = param(None, "longest burst [steps]; none: unlimited")
     cooldown: Count = param(0, "steps between two bursts")
@@ -93,11 +94,12 @@ class ChannelPlan(NamedTuple):
 
 
 class Memory(NamedTuple):
-    """What the channel keeps of some wires: held, fresh (B, N, .) and history (B, N, ., recorded), a ring."""
+    """What the channel keeps of some wires: held, fresh (B, N, .); history, tape (B, N, ., recorded), two rings."""
 
     held: Array  # last good sample before the first attack
     fresh: Array  # last good sample of each wire
     history: Array  # what was sent in the last steps
+    tape: Array  # the history as it was when the running replay began
 
 
 class ChannelState(NamedTuple):
@@ -107,7 +109,8 @@ class ChannelState(NamedTuple):
     burst: Array  # (B,) length of the running burst
     cooldown: Array  # (B,) steps before the next burst
     played: Array  # (B,) steps that the running replay has lasted
-    taped: Array  # (B,) samples in the recording; it stands still while it is replayed
+    taped: Array  # (B,) samples recorded so far
+    anchor: Array  # (B,) samples recorded before the running replay began
     links: Memory  # of sensors and V2V fields
     drives: Memory  # of actuators
     last: Command
@@ -137,14 +140,14 @@ class Channel:
         batch, agents, links = expected.shape
         count = np.zeros(batch, np.int64)
         return ChannelState(
-            count, count.copy(), count.copy(), count.copy(), count.copy(), self._memory(plan, expected), self._memory(plan, u),
-            no_command(batch, agents, links + u.shape[-1]),
+            count, count.copy(), count.copy(), count.copy(), count.copy(), count.copy(),
+            self._memory(plan, expected), self._memory(plan, u), no_command(batch, agents, links + u.shape[-1]),
         )  # fmt: skip
 
     def _memory(self, plan: ChannelPlan, expected: Array) -> Memory:
         history = num.zeros((*expected.shape, plan.recorded))
         history[...] = expected[..., None]
-        return Memory(num.batch_last(expected), num.batch_last(expected), history)
+        return Memory(num.batch_last(expected), num.batch_last(expected), history, history.copy(order="K"))
 
     def budget_left(self, plan: ChannelPlan, state: ChannelState) -> Array:
         if plan.threat.budget is None:
@@ -186,6 +189,11 @@ class Channel:
         )  # fmt: skip
         if first.any():
             state = state._replace(links=_hold(state.links, first), drives=_hold(state.drives, first))
+        begins = np.flatnonzero((kind == Kind.REPLAY) & (state.played == 0))
+        if len(begins):
+            anchor = state.anchor.copy()
+            anchor[begins] = state.taped[begins]
+            state = state._replace(anchor=anchor, links=_copy_tape(state.links, begins), drives=_copy_tape(state.drives, begins))
         links = self._arrive(plan, state, state.links, sent, slice(0, sent.shape[-1]))
         lost = hit & (kind == Kind.DROPOUT)[:, None, None]
         q = plan.sensors
@@ -201,9 +209,8 @@ class Channel:
         if plan.granted[wires].any():
             applied = self._arrive(plan, state, state.drives, u, wires)
             drives = self._keep(plan, state, state.drives, u, state.last.target[..., wires])
-        playing = state.last.kind == Kind.REPLAY
-        played = np.where(playing, state.played + 1, 0)
-        return state._replace(drives=drives, played=played, taped=state.taped + ~playing), applied
+        played = np.where(state.last.kind == Kind.REPLAY, state.played + 1, 0)
+        return state._replace(drives=drives, played=played, taped=state.taped + 1), applied
 
     def _legal(self, plan: ChannelPlan, command: Command) -> Array:
         """(B,) bool: kind, targets and values are granted."""
@@ -239,20 +246,29 @@ class Channel:
 
     def _taped(self, plan: ChannelPlan, state: ChannelState, memory: Memory, span: Array, kind: int) -> Array:
         """The sample of `span` (B, N, .) steps ago, or the one that a replayed window of that length has come to."""
-        turn = state.played[:, None, None] % span if kind == Kind.REPLAY else 0
-        slot = (state.taped[:, None, None] - span + turn) % plan.recorded
-        return np.asarray(np.take_along_axis(memory.history, slot[..., None], axis=-1)[..., 0])
+        if kind == Kind.REPLAY:
+            ring, last = memory.tape, state.anchor[:, None, None] + state.played[:, None, None] % span
+        else:
+            ring, last = memory.history, state.taped[:, None, None]
+        return np.asarray(np.take_along_axis(ring, ((last - span) % plan.recorded)[..., None], axis=-1)[..., 0])
 
     def _keep(self, plan: ChannelPlan, state: ChannelState, memory: Memory, sent: Array, hit: Array) -> Memory:
         """The memory after this step's `sent` (B, N, .), of which `hit` was attacked."""
         history = memory.history
         if plan.recorded:
-            rows = np.flatnonzero(state.last.kind != Kind.REPLAY)
+            rows = np.arange(len(sent))
             history = history.copy(order="K")
-            history[rows, :, :, state.taped[rows] % plan.recorded] = sent[rows]
-        return Memory(memory.held, np.where(hit, memory.fresh, sent) if hit.any() else sent, history)
+            history[rows, :, :, state.taped % plan.recorded] = sent
+        return memory._replace(fresh=np.where(hit, memory.fresh, sent) if hit.any() else sent, history=history)
 
 
 def _hold(memory: Memory, first: Array) -> Memory:
     """The memory with its held sample taken where `first` (B,) attack begins."""
     return memory._replace(held=np.where(first[:, None, None], memory.fresh, memory.held))
+
+
+def _copy_tape(memory: Memory, rows: Array) -> Memory:
+    """The memory with the recording of `rows` (R,) copied for a replay: the recorder itself runs on."""
+    tape = memory.tape.copy(order="K")
+    tape[rows] = memory.history[rows]
+    return memory._replace(tape=tape)

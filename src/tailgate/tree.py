@@ -70,3 +70,15 @@ def with_leaves(tree: Any, values: dict[str, np.ndarray], prefix: str = "") -> A
     out = tree.copy(order="K")
     out[...] = values[prefix[:-1]]
     return out
+
+
+def lock(plan: Any) -> Any:
+    """The plan with every array in it made read-only, in place: constants are shared by all episodes, and by whoever looks."""
+    if isinstance(plan, np.ndarray):
+        plan.flags.writeable = False
+    elif isinstance(plan, (tuple, list)):
+        for part in plan:
+            lock(part)
+    elif isinstance(plan, dict):
+        lock(list(plan.values()))
+    return plan

@@ -211,9 +211,11 @@ def play(row: Row, allowed: Filter | None = None) -> Replay:
     here = {
         "trace_hash": trace.trace_hash(0), "decision_hash": trace.decision_hash(0), "version": tailgate.__version__,
         "config_hash": place.config_hash, "engine": ENGINE, "versions": ", ".join(f"{k} {v}" for k, v in versions.items()),
-        "defence_digest": guard.digest, "attack_digest": rival.digest,
+        "defence_digest": guard.digest, "attack_digest": rival.digest, "dose": _text(place.threat_model.budget),
+        "knowledge": place.threat_model.knowledge, "uses": ", ".join(guard.entry.uses),
     }  # fmt: skip
     held = {**row, "versions": ", ".join(f"{k} {v}" for k, v in _mapping(row.get("versions")).items())}
+    held |= {"dose": _text(row["dose"]), "uses": ", ".join(map(str, row["uses"]))}
     checks = tuple(Check(name, str(held.get(name) or ""), value) for name, value in here.items())
     return Replay(row, place, loop, attack, trace, np.array(gate[: len(trace.kind)]), metrics, checks)
 
@@ -247,6 +249,10 @@ def _gate(loop: Loop, state: LoopState) -> float:
         return np.nan
     look = loop.defence.look(loop.plan.defence, duplicate(state.defence), state.received, state.known_u)
     return np.nan if look.gate is None else float(np.broadcast_to(look.gate, (1, loop.model.agents))[0, AGENT])
+
+
+def _text(dose: int | None) -> str:
+    return "unlimited" if dose is None else str(dose)
 
 
 def _mapping(value: Any) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from tailgate.registry import Spec
 from tailgate.scenario import load_scenario
 from tailgate.trace import Trace, rollout
 
-from .claims import Claim, Holds, Report, Spread, Table
+from .claims import Claim, Holds, Report, Spread, Table, verdict
 
 Tick = Callable[[str], None]
 CASES = {"clean": "attack-free", "fdi": "false data injection", "dos": "denial of service"}
@@ -32,7 +32,7 @@ THESIS = {
 }  # fmt: skip
 QUANTITIES = (("rmse_position", "position", "m"), ("rmse_velocity", "velocity", "m/s"))
 STANDSTILL = 5.0  # d_r [m]: what the thesis takes for a safe error
-LAMBDAS = np.geomspace(0.5, 32.0, 7)  # in units of 1/sd
+LAMBDAS = np.geomspace(0.5, 8.0, 9)  # in units of 1/sd
 TUNING = ("fdi_bernoulli:probability=0.09,value=40", "fdi_gaussian:start_step=60,length=14,sd=40")  # not the reported attacks
 
 
@@ -158,7 +158,7 @@ def _figure_claim(runs: Runs, case: str, name: str, quantity: str, label: str, u
     holds: Holds = "yes" if any(t.startswith("printed") for t in inside) else "partly" if inside else "no"
     why = {
         "yes": "the printed run is among the central 95 % of ours",
-        "partly": f"only by the reading {'; '.join(inside)}: the noise that the thesis prints cannot give it",
+        "partly": f"only by {'; '.join(inside)}: noise that was fitted to these figures, as the printed one cannot give them",
         "no": "no reading has the printed run among its central 95 %",
     }[holds]
     text = f"{CASES[case].capitalize()}: the error of the {label} is {value} {unit} with {FILTERS[name].split(',')[0]}"
@@ -236,9 +236,9 @@ def _prompt(runs: Runs) -> Claim:
         for case in ("fdi", "dos"):
             trace = runs[r.name, case, "ours"].trace
             shares[f"{r.name}: {CASES[case]}"] = float(trace.alarm[:, :, 0][trace.kind != 0].mean())
-    ok = min(shares.values()) > 0.9
     return Claim(
-        "4.6.2-prompt", "The chi-square detector promptly detects the attacks", "promptly", shares, "yes" if ok else "partly",
+        "4.6.2-prompt", "The chi-square detector promptly detects the attacks", "promptly", shares,
+        verdict(min(shares.values()) > 0.9, max(shares.values()) < 0.5),
         "share of attacked steps that alarm; the misses are values drawn near zero, and biases that the gate let in before",
     )  # fmt: skip
 
@@ -251,10 +251,10 @@ def _other_steps(runs: Runs) -> Claim:
             quiet = ~attacked
             ours, best = (np.sqrt(np.mean(runs[r.name, c, n].error[quiet] ** 2)) for c, n in ((case, "ours"), ("clean", "kf")))
             ratio[f"{r.name}: {CASES[case]}"] = float(ours / best)
-    ok = max(ratio.values()) < 1.05
     return Claim(
         "4.6.2-other-steps", "At the steps without an attack it performs as well as the optimal Kalman filter", "as well", ratio,
-        "yes" if ok else "partly", "its error there over that of a Kalman filter that was never attacked; as well means within 5 %",
+        verdict(max(ratio.values()) < 1.05, min(ratio.values()) > 1.05),
+        "its error there over that of a Kalman filter that was never attacked; as well means within 5 %",
     )  # fmt: skip
 
 

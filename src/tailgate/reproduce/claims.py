@@ -24,6 +24,11 @@ class Claim:
     why: str = ""
 
 
+def verdict(yes: bool, no: bool) -> Holds:
+    """yes or no where one of them is met, else partly."""
+    return "yes" if yes else "no" if no else "partly"
+
+
 @dataclass(frozen=True)
 class Table:
     """A table of text cells."""

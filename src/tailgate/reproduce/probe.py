@@ -11,7 +11,7 @@ from tailgate.core import Array, Model, Prior, Received
 from tailgate.draws import Role, keys
 from tailgate.estimators import Composed
 
-_DRAWS = keys("report", [0]).at(Role.DEFENCE, np.zeros(1, np.int64))  # a composed filter draws nothing
+DRAWS = keys("report", [0]).at(Role.DEFENCE, np.zeros(1, np.int64))  # a composed filter draws nothing
 
 
 class Fed(NamedTuple):
@@ -51,7 +51,7 @@ def feed(
         if innovations is not None:
             y = y + num.matvec(model.C, plan.filter.predict(plan.filter_plan, state.filter, u).x)
         received = Received(y, np.ones((batch, 1, q), bool), np.zeros((batch, 1)))
-        state, estimate = defence.step(plan, state, received, u, _DRAWS)
+        state, estimate = defence.step(plan, state, received, u, DRAWS)
         xs[k], covs[k] = state.filter.x[:, 0], state.filter.P[:, 0]
         alarms[k], scores[k] = estimate.alarm[:, 0], estimate.score[:, 0]
     return Fed(xs, covs, alarms, scores)
