@@ -22,6 +22,7 @@ from tailgate.summary import summarise
 
 SUITES = ("ch4-long-v0", "ch4-actuator-v0")
 FILTERPY = ("filterpy_kf", "filterpy_ekf", "filterpy_ukf", "filterpy_hinfinity", "filterpy_imm")
+FIELDS = ("suite", "scenario", "dose", "defence", "attack", "knowledge", "n", "crash", "min_gap", "rmse_position", "max_error", "alarm_onsets")
 FILTERPY_SEEDS = 8  # one object per episode: slow
 
 
@@ -86,7 +87,8 @@ def main():
         *markdown(table, places), "", f"# filterpy's filters, {FILTERPY_SEEDS} seeds a cell", *markdown(slow, [("stop-and-go-v0", 50)]),
     ]  # fmt: skip
     write_atomic(out / "long.md", ("\n".join(text) + "\n").encode())
-    write_atomic(out / "long.json", json.dumps(table + slow, allow_nan=False).encode() + b"\n")
+    kept = [{key: entry[key] for key in FIELDS if key in entry} for entry in table + slow]
+    write_atomic(out / "long.json", ("[\n" + ",\n".join(json.dumps(entry, allow_nan=False) for entry in kept) + "\n]\n").encode())
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ from .monitored import (
     WindowedKalman,
 )
 from .oracle import Oracle
-from .per_episode import PerEpisode, per_episode
+from .per_episode import EpisodeByEpisode, PerEpisode, per_episode
 from .raw import Raw
 from .robust import Outlier, RobustKalman, RobustKalmanFilter
 from .sentinels import AlarmSentinel, BrakeSentinel, StandStillSentinel
@@ -25,8 +25,8 @@ from .sparse import SparseChiSquare, SparseGatedKalman
 
 __all__ = [
     "AcceptAll", "AlarmSentinel", "Brake", "BrakeSentinel", "BrakingKalman", "ChiSquare", "Composed", "Cusum", "CusumKalman",
-    "CusumReacquiringKalman", "Decision", "FilterpyExtended", "FilterpyHInfinity", "FilterpyInteracting", "FilterpyKalman",
-    "FilterpyUnscented", "GateOut", "GatedKalman", "Hold", "InteractingModels", "Kalman", "KalmanFilter", "Latch", "Mewma",
+    "CusumReacquiringKalman", "Decision", "EpisodeByEpisode", "FilterpyExtended", "FilterpyHInfinity", "FilterpyInteracting",
+    "FilterpyKalman", "FilterpyUnscented", "GateOut", "GatedKalman", "Hold", "InteractingModels", "Kalman", "KalmanFilter", "Latch", "Mewma",
     "MewmaKalman", "NamedParts", "Oracle", "Outlier", "PerEpisode", "Raw", "Reacquire", "ReacquiringKalman", "RobustKalman",
     "RobustKalmanFilter", "Score", "SparseChiSquare", "SparseGatedKalman", "StandStillSentinel", "Stateless", "Verdict", "Widen",
     "WideningKalman", "WindowedChiSquare", "WindowedKalman", "blame_all", "compose", "per_episode",

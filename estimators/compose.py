@@ -16,8 +16,8 @@ from tailgate import num
 from tailgate.core import Array, Count, Estimate, Innovation, Mode, Model, NonNegative, Prior, Received, param
 from tailgate.draws import Draws
 from tailgate.errors import NotApplicable
-from tailgate.registry import make_from, register
-from tailgate.schema import fields_of
+from tailgate.registry import imported, make_from, register
+from tailgate.schema import build, fields_of
 
 
 class Verdict(NamedTuple):
@@ -209,6 +209,10 @@ class NamedParts(Composed):
         data = getattr(self, family)
         if isinstance(data, dict):  # a mapping without a name changes the default part
             data = {"name": fields_of(type(self))[family].default, **data}
+        name = data.get("name") if isinstance(data, dict) else data
+        if isinstance(name, str) and ":" in name:  # Spec.imports tells those who read files and rows that it is one
+            params = {key: value for key, value in data.items() if key != "name"} if isinstance(data, dict) else {}
+            return build(imported(family, name).cls, params, f"defence composed.{family}")
         return make_from(family, data, f"defence composed.{family}")
 
 

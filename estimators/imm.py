@@ -13,7 +13,7 @@ The score is the log odds of "some sensor noise is inflated" against the nominal
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, ClassVar, NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -74,6 +74,7 @@ class Modes:
 class InteractingModels(Modes):
     """Interacting multiple model filter: Kalman filters that trust the sensors more or less, weighed by how well each predicts."""
 
+    threshold_field: ClassVar[str] = "threshold"
     threshold: Finite = param(0.0, "alarm above these log odds of an inflated noise; 0: probability 1/2 [-]")
 
     def with_threshold(self, value: float) -> "InteractingModels":

@@ -44,7 +44,7 @@ def test_evaluate_prints_a_table_or_json_and_writes_rows(tmp_path: Path, capsys:
 
 def test_a_failing_component_is_exit_code_1_and_its_rows_say_why(tmp_path: Path) -> None:
     (tmp_path / "bad.py").write_text(
-        "class Bad:\n    def prepare(self, model):\n        raise RuntimeError('out of order')\n    def start(self): ...\n    def step(self): ...\n"
+        "class Bad:\n    def prepare(self, model):\n        raise RuntimeError('out of order')\n    def start(self): ...\n    def step(self, plan, state, received, known_u, draws): ...\n"
     )
     done = _run("evaluate", "--scenario", "gusty-stop-and-go-v0", "--defence", "kf", "--defence", "bad:Bad", "--attack", "none",
                 "--seeds", "2", "--out", "rows.jsonl", cwd=tmp_path)  # fmt: skip
@@ -84,3 +84,22 @@ def test_an_unknown_command_explains_itself(capsys: pytest.CaptureFixture[str]) 
     with pytest.raises(SystemExit) as stop:
         cli.main(["fly"])
     assert stop.value.code == 2 and "evaluate" in capsys.readouterr().err
+
+
+def test_a_file_of_other_rows_is_kept(tmp_path: Path) -> None:
+    """The same command replaces its own rows; another one sets them aside and says where."""
+    run = ["evaluate", "--scenario", "thesis-ch4-v0", "--dose", "none", "--attack", "none", "--seeds", "2", "--out", "rows.jsonl"]
+    for defence, kept in (("kf", 0), ("kf", 0), ("chi2_kf", 1), ("kf", 2)):
+        done = _run(*run, "--defence", defence, cwd=tmp_path)
+        assert done.returncode == 0, done.stderr
+        assert len(list(tmp_path.glob("rows.jsonl.*"))) == kept
+    assert "rows.jsonl.2" in done.stderr and '"kf"' in (tmp_path / "rows.jsonl.1").read_text()
+
+
+def test_a_detector_is_no_defence(tmp_path: Path) -> None:
+    """Named as a defence, it is refused with the way to use it; an attack that is granted nothing is marked in the table."""
+    run = ["evaluate", "--scenario", "thesis-ch4-v0", "--dose", "none", "--attack", "dos_jam", "--seeds", "2", "--threat", "kinds=[fdi]"]
+    done = _run(*run, "--defence", "tailgate.estimators:Cusum", cwd=tmp_path)
+    assert done.returncode == 2 and "composed:detector=module:Class" in done.stderr
+    done = _run(*run, "--defence", "kf", cwd=tmp_path)
+    assert done.returncode == 0 and "not granted" in " ".join(done.stdout.split())

@@ -72,3 +72,26 @@ def test_the_scenario_of_the_documentation_plays(tmp_path: Path) -> None:
     loop = load_scenario(str(tmp_path / "mine.yaml")).loop(make_defence("kf"))
     trace = rollout(loop, make_attack("none"), draws.keys("tune", range(3)))
     assert trace.lead_speed[149 - 2, 0, 0] == pytest.approx(5.0, abs=0.35) and not trace.collided.any()
+
+
+def _evaluated(folder: Path, *arguments: str) -> list[dict[str, object]]:
+    command = [sys.executable, "-m", "tailgate.cli", "evaluate", "--scenario", "thesis-ch4-v0", "--dose", "none", "--seeds", "4", "--json"]
+    done = subprocess.run([*command, *arguments], cwd=folder, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return list(json.loads(done.stdout))
+
+
+def test_the_detector_of_the_documentation_plays(tmp_path: Path) -> None:
+    """As a part named on the command line, attacked through its own gate as well."""
+    (tmp_path / "mydetector.py").write_text(_blocks("docs/detectors.md", "python")[0], encoding="utf-8")
+    guard = "composed:detector=mydetector:Leaky,detector.threshold=40"
+    quiet, stealth = _evaluated(tmp_path, "--defence", guard, "--attack", "none", "--attack", "stealth")
+    assert quiet["n"] == stealth["n"] == 4
+    assert stealth["alarm_onsets"]["median"] == 0.0 and stealth["max_error"]["median"] > 20.0  # type: ignore[index]
+
+
+def test_the_adapted_filter_of_the_documentation_plays(tmp_path: Path) -> None:
+    """filterpy's fading-memory filter, named as module:Class with its parameter."""
+    (tmp_path / "myfilter.py").write_text(_blocks("docs/new-defence.md", "python")[2], encoding="utf-8")
+    (entry,) = _evaluated(tmp_path, "--defence", "myfilter:Fading:alpha=1.05", "--attack", "none")
+    assert entry["n"] == 4 and 0.3 < entry["rmse_position"]["median"] < 1.5  # type: ignore[index]

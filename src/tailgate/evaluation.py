@@ -23,7 +23,7 @@ import numpy as np
 import tailgate
 from tailgate import draws
 from tailgate.errors import InputError, NotApplicable
-from tailgate.files import writable_directory, write_atomic
+from tailgate.files import set_aside, writable_directory, write_atomic
 from tailgate.metrics import METRICS, measure
 from tailgate.registry import Entry, Spec, entry_for, text_of
 from tailgate.rows import encode, read_rows
@@ -190,12 +190,25 @@ def run(
             progress(len(done), len(cells))
     rows = [row for i in ids for row in done[i]]
     if out is not None and parts is not None:
+        _keep_others(out, set(ids))
         write_atomic(out, encode(rows))
         for i in ids:
             (parts / f"{i}.jsonl").unlink(missing_ok=True)
         with contextlib.suppress(OSError):  # something else lies there: not ours to remove
             parts.rmdir()
     return rows
+
+
+def _keep_others(out: Path, ids: set[str]) -> None:
+    """Set a file aside that holds anything but rows of these cells: it is somebody's result."""
+    if not out.is_file():
+        return
+    try:
+        held = {row.get("cell") for row in read_rows(out)}
+    except InputError:
+        held = {None}
+    if not held <= ids:
+        set_aside(out)
 
 
 def _play(cells: Sequence[Cell], workers: int) -> Iterator[tuple[int, list[dict[str, Any]]]]:

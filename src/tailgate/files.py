@@ -1,6 +1,7 @@
 """Writing so that nothing is ever half written."""
 
 import contextlib
+import itertools
 import os
 import tempfile
 from pathlib import Path
@@ -35,3 +36,12 @@ def writable_directory(path: Path, field: str = "out") -> Path:
     except OSError as error:
         raise InputError(field, str(path), f"a writable directory ({error.strerror})") from None
     return path
+
+
+def set_aside(path: Path, field: str = "out") -> Path:
+    """Rename a file or directory to name.1, name.2, ...: nothing is lost. Returns the new path."""
+    number = next(n for n in itertools.count(1) if not path.with_name(f"{path.name}.{n}").exists())
+    try:
+        return path.rename(path.with_name(f"{path.name}.{number}"))
+    except OSError as error:
+        raise InputError(field, str(path), f"a writable path ({error.strerror})") from None

@@ -67,7 +67,8 @@ def matrices(table: Table, title: str) -> bytes:
     """Defences x attacks, one above the other: position error, smallest gap, collisions."""
     defences, attacks = (list(dict.fromkeys(e[key] for e in table)) for key in ("defence", "attack"))
     labels = [textwrap.fill(name.replace(",", ", "), 26) for name in attacks]
-    size = 3.0 + 0.52 * len(attacks), 2.6 + 3 * (0.5 + 0.27 * len(defences))
+    width = max(4.5, 0.52 * len(attacks)) + 0.075 * max(len(name) for name in defences)
+    size = width, 2.6 + 3 * (0.5 + 0.27 * len(defences))
     figure, axes = canvas(*size, 3, 1, sharex=True)
     for ax, (key, words, colours) in zip(axes[:, 0], PANELS, strict=True):
         grid = np.full((len(defences), len(attacks)), np.nan)
@@ -94,7 +95,7 @@ def _short(number: float) -> str:
 
 def scatter(table: Table) -> bytes:
     """Position error against smallest gap, one mark a cell: filled where episodes collide."""
-    figure, axes = canvas(9.0, 5.6)
+    figure, axes = canvas(10.0, 5.8)
     ax, defences = axes[0, 0], list(dict.fromkeys(e["defence"] for e in table))
     for i, name in enumerate(defences):
         cells = [e for e in table if e["defence"] == name]
@@ -109,9 +110,9 @@ def scatter(table: Table) -> bytes:
     ax.set_yticks(ticks, [str(tick) for tick in ticks])
     ax.set_ylim(min(-2.0, 1.2 * min(value(e, "min_gap") for e in table)), 120.0)
     ax.set(xscale="log", xlabel="position RMSE [m], median", ylabel="smallest gap [m], median (above 10 m: logarithmic)")
-    ax.set_title(f"What the error hides: rank correlation {_rank_correlation(table):+.2f}; filled: most episodes collide", fontsize=10)
+    ax.set_title(f"What the error hides: rank correlation {_rank_correlation(table):+.2f}\nfilled: most episodes collide", fontsize=10)
     ax.grid(alpha=0.3, which="both")
-    figure.legend(loc="outside right upper", fontsize=8, title="defence")
+    figure.legend(loc="outside lower center", fontsize=8, ncols=3)
     return png(figure)
 
 

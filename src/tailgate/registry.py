@@ -8,6 +8,7 @@ import hashlib
 import importlib
 import inspect
 import json
+import re
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -33,6 +34,7 @@ _MODULES = {
 }
 _GROUPS = {"defence": "tailgate.estimators", "attack": "tailgate.agents"}
 _FILES = {".json": "policy", ".yaml": "program", ".yml": "program"}  # attacks that are files
+PARTS: tuple[Family, ...] = ("filter", "detector", "mitigation")  # of the defence `composed`
 _entries: dict[str, dict[str, "Entry"]] = {family: {} for family in _MODULES}
 _plugins_loaded: set[str] = set()
 T = TypeVar("T", bound=type)
@@ -173,17 +175,23 @@ class Spec:
     text: str
 
     def _parts(self) -> tuple[str, dict[str, Any]]:
-        head = self.text
+        head, tail = split_text(self.text)
         params: dict[str, Any] = {}
-        before, sep, tail = self.text.rpartition(":")
-        if sep and "=" in tail:
-            head = before
-            for item in _split(tail):
-                key, eq, value = item.partition("=")
-                if not eq:
-                    raise InputError(self.family, self.text, "name:key=value,key=value")
-                _put(params, key.strip(), scalar(value))
+        for item in _split(tail) if tail else ():
+            key, eq, value = item.partition("=")
+            if not eq:
+                raise InputError(self.family, self.text, "name:key=value,key=value")
+            _put(params, key.strip(), scalar(value))
         return head, params
+
+    def _imported(self) -> list[tuple[Family, str]]:
+        """Family and module:Class of everything that this text imports."""
+        head, params = self._parts()
+        named: list[tuple[Family, Any]] = [(self.family, head)]
+        for part in PARTS:
+            held = params.get(part)
+            named.append((part, held.get("name") if isinstance(held, dict) else held))
+        return [(family, name) for family, name in named if isinstance(name, str) and ":" in name]
 
     def refuse_imports(self, where: str) -> None:
         """Raise InputError when this names a class to import: configuration files never run code."""
@@ -197,37 +205,22 @@ class Spec:
             return find("attack", kind)
         if ":" not in head:
             return find(self.family, head)
-        module, _, name = head.partition(":")
-        if module in _load(self.family):
-            raise InputError(self.family, self.text, f"{module}:key=value,key=value")
-        try:
-            cls = getattr(importlib.import_module(module), name)
-        except (ImportError, ValueError, TypeError) as error:  # also an empty or relative module name
-            raise InputError(self.family, self.text, f"an importable module ({error})") from None
-        except AttributeError:
-            raise InputError(self.family, self.text, f"a class that module {module} defines") from None
-        if not isinstance(cls, type):
-            raise InputError(self.family, self.text, "a class")
-        return entry_of(self.family, head, cls)
+        return imported(self.family, head)
 
     @property
     def imports(self) -> bool:
         """Whether this names a class to import."""
-        return ":" in self._parts()[0]
+        return bool(self._imported())
 
     @property
     def digest(self) -> str:
-        """Of the file that somebody else's component comes from; empty for registered ones, which carry a version."""
+        """Of the files that somebody else's components come from; empty for registered ones, which carry a version."""
         head, params = self._parts()
-        if self.family == "attack" and Path(head).suffix in _FILES:
-            path = Path(head)
-        elif ":" in head:
-            path = Path(inspect.getfile(self.entry.cls))
-        elif self.family == "attack" and Path(str(params.get("path"))).suffix in _FILES:
-            path = Path(params["path"])
-        else:
-            return ""
-        return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ""
+        paths = [Path(inspect.getfile(imported(family, name).cls)) for family, name in self._imported()]
+        if self.family == "attack":
+            paths = [Path(str(text)) for text in (head, params.get("path")) if Path(str(text)).suffix in _FILES] or paths
+        blobs = [path.read_bytes() for path in paths if path.is_file()]
+        return hashlib.sha256(b"".join(blobs)).hexdigest() if blobs else ""
 
     def make(self) -> Any:
         head, params = self._parts()
@@ -237,7 +230,40 @@ class Spec:
         steps = {"defence": ("prepare", "start", "step"), "attack": ("prepare", "start", "decide")}.get(self.family, ())
         if not all(callable(getattr(made, name, None)) for name in steps):
             raise InputError(self.family, self.text, f"a class with {', '.join(steps)}")
+        if self.family == "defence" and _takes(made.step) < 5:
+            raise InputError(
+                self.family, self.text, "a class whose step takes plan, state, received, known_u and draws; a filter, detector or "
+                "mitigation is a part: composed:detector=module:Class"
+            )  # fmt: skip
         return made
+
+
+def imported(family: Family, text: str) -> Entry:
+    """The entry of a class that the user names as module:Class."""
+    module, _, name = text.partition(":")
+    if module in _load(family):
+        raise InputError(family, text, f"{module}:key=value,key=value")
+    try:
+        cls = getattr(importlib.import_module(module), name)
+    except (ImportError, ValueError, TypeError) as error:  # also an empty or relative module name
+        raise InputError(family, text, f"an importable module ({error})") from None
+    except AttributeError:
+        raise InputError(family, text, f"a class that module {module} defines") from None
+    if not isinstance(cls, type):
+        raise InputError(family, text, "a class")
+    return entry_of(family, text, cls)
+
+
+def split_text(text: str) -> tuple[str, str]:
+    """Head and parameters of a component's text: `name` and `key=value,...`, or the text and nothing."""
+    found = re.fullmatch(r"(.*?):(\s*[A-Za-z_][\w.]*\s*=.*)", text, re.DOTALL)
+    return (found[1], found[2]) if found else (text, "")
+
+
+def _takes(function: Callable[..., Any]) -> float:
+    """How many arguments a method takes at most."""
+    kinds = [p.kind for p in inspect.signature(function).parameters.values()]
+    return float("inf") if inspect.Parameter.VAR_POSITIONAL in kinds else len(kinds)
 
 
 def _put(params: dict[str, Any], key: str, value: Any) -> None:

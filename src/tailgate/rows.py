@@ -32,13 +32,14 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise InputError("rows", str(path), f"a readable JSON Lines file ({error})") from None
-    rows = []
-    for number, line in enumerate(text.splitlines(), start=1):
+    rows, lines = [], text.splitlines()
+    for number, line in enumerate(lines, start=1):
         where = f"rows {path.name}, line {number}"
         try:
             row = json.loads(line)
         except ValueError:
-            raise InputError(where, line[:60], "a JSON object") from None
+            cut = "; the file was cut here: run the same command again" if number == len(lines) and not text.endswith("\n") else ""
+            raise InputError(where, line[:60], f"a JSON object{cut}") from None
         try:
             _Row.model_validate(row)
         except ValidationError as error:

@@ -51,7 +51,7 @@ def build(cls: type[T], data: dict[str, Any], where: str) -> T:
         if isinstance(inner := first.get("ctx", {}).get("error"), InputError):
             raise inner from None
         path = ".".join(str(part) for part in first["loc"]) or cls.__name__
-        message = first["msg"][0].lower() + first["msg"][1:]
+        message = (first["msg"][0].lower() + first["msg"][1:]).removeprefix("input should be ")
         raise InputError(f"{where}.{path}", first["input"], message) from None
 
 

@@ -29,6 +29,8 @@ def summarise(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
             "n": len(good), "failed": sum(r["status"] == "error" for r in members), "learned": bool(members[0].get("learned")),
             "optimal": bool(members[0].get("optimal")), "reason": next((r["reason"] for r in members if r["status"] != "ok"), ""),
         }  # fmt: skip
+        # an attack that the threat model grants nothing of is harmless for that reason alone
+        entry["refused_all"] = bool(good) and all(r["attack_steps"] == 0 and r["refused_commands"] for r in good)
         if good:
             share = proportion(sum(bool(r["crashed"]) for r in good), len(good))
             entry["crash"] = {"value": share.value, "low": share.low, "high": share.high}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import json
 import time
 from collections.abc import Callable
@@ -20,7 +19,7 @@ from tailgate.agents.codec import ActionSpec, Reward
 from tailgate.core import Array, Count, PositiveCount, param
 from tailgate.errors import InputError, unknown
 from tailgate.evaluation import cells_of, run
-from tailgate.files import writable_directory, write_atomic
+from tailgate.files import set_aside, writable_directory, write_atomic
 from tailgate.registry import Spec
 from tailgate.scenario import Suite, config_path, load_scenario
 from tailgate.schema import as_data, build, canonical, fields_of, override, read_yaml
@@ -67,8 +66,11 @@ def load_config(source: str | None, overrides: list[str], resume: bool = False) 
     path = config_path(".", source or "quickstart", "config")
     config = _checked(override(read_yaml(path, "config"), overrides))
     held = config.directory / "config.json"
-    if not resume or not held.is_file():
+    if not resume:
         return config
+    if not config.directory.is_dir():
+        known = sorted(p.parent.name for p in Path(config.out).glob("*/config.json"))
+        raise InputError("resume", config.name, f"the name of a run in {config.out}: {', '.join(known) or 'there is none'}")
     try:
         started = json.loads(held.read_text(encoding="utf-8"))
         del started["class"]
@@ -132,7 +134,7 @@ def train(config: TrainConfig, progress: Callable[[int, Any], None], resume: boo
     ppo.check()
     _check(config)
     if not resume and config.directory.is_dir() and any(config.directory.iterdir()):
-        _set_aside(config.directory)
+        set_aside(config.directory)
     directory = writable_directory(config.directory)
     snapshot = json.dumps(as_data(config), indent=1).encode() + b"\n"
     held = directory / "config.json"
@@ -157,15 +159,6 @@ def train(config: TrainConfig, progress: Callable[[int, Any], None], resume: boo
         write_atomic(directory / f"curve-{seed}.json", json.dumps(curve).encode() + b"\n")
         learner.env.close()
     return policies
-
-
-def _set_aside(directory: Path) -> None:
-    """Rename an earlier run of this name to name.1, name.2, ...: nothing is lost, and nothing of it is mistaken for the new one."""
-    number = next(n for n in itertools.count(1) if not directory.with_name(f"{directory.name}.{n}").exists())
-    try:
-        directory.rename(directory.with_name(f"{directory.name}.{number}"))
-    except OSError as error:
-        raise InputError("out", str(directory), f"a writable directory ({error.strerror})") from None
 
 
 def _same_run(held: Path, config: TrainConfig) -> None:

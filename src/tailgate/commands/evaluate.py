@@ -34,7 +34,7 @@ def add(commands: Any) -> None:
     command.add_argument("--batch", type=int, default=256, metavar="N", help="episodes side by side (default 256); changes no result")
     command.add_argument("--workers", type=int, default=1, metavar="N", help="processes (default 1); changes no result")
     command.add_argument("--engine", default="local", choices=["local"], help="where workers run")
-    command.add_argument("--out", metavar="FILE", help="write the rows to this JSON Lines file; an interrupted run resumes")
+    command.add_argument("--out", metavar="FILE", help="write rows here (JSON Lines); an interrupted run resumes, other rows are set aside")
     command.add_argument("--plot", metavar="DIR", help="draw defences x attacks: error, smallest gap, collisions (needs tailgate[viz])")
     command.add_argument("--json", action="store_true", help="print the table as JSON")
     command.set_defaults(run=_evaluate)
@@ -52,12 +52,15 @@ def _evaluate(options: argparse.Namespace) -> int:
             raise InputError("--threat", text, "key=value, for example fdi_bound=10")
         threat[key] = scalar(value)
     doses = None if options.dose is None else [scalar(d) for d in options.dose]
+    before = _kept(options.out)
     with progress(Console(stderr=True)) as update:
         rows = evaluate(
             options.suite, defences=options.defence, attacks=options.attack, scenarios=options.scenario, doses=doses,
             seeds=options.seeds, purpose=options.purpose, batch=options.batch, workers=options.workers,
             out=options.out, threat=threat, progress=lambda done, total: update("playing", done, total, cells(done, total)),
         )  # fmt: skip
+    for earlier in sorted(_kept(options.out) - before):
+        print(f"tailgate: {options.out} held other rows; they are in {earlier}", file=sys.stderr)
     table = summarise(rows)
     if options.json:
         print(json.dumps(table, indent=1, allow_nan=False))
@@ -72,6 +75,11 @@ def _evaluate(options: argparse.Namespace) -> int:
     if failed:
         print(f"tailgate: {failed} of {len(rows)} rows failed; their reasons are in the rows", file=sys.stderr)
     return 1 if failed else 0
+
+
+def _kept(out: str | None) -> set[str]:
+    """Files that were set aside for this one."""
+    return {str(path) for path in Path(out).parent.glob(f"{Path(out).name}.[0-9]*")} if out else set()
 
 
 def _print_summary(table: list[dict[str, Any]]) -> None:
@@ -90,6 +98,8 @@ def _print_summary(table: list[dict[str, Any]]) -> None:
             if crash is None:
                 shown.add_row(*head, "-", escape(entry["reason"]))
                 continue
+            if entry["refused_all"]:
+                head[1] += " (refused: not granted)"
             figures = [f"{100 * crash['value']:.1f} %", f"{100 * crash['low']:.1f} to {100 * crash['high']:.1f} %"]
             figures += [f"{entry[k]['median']:.2f}" if entry[k] else "-" for k in ("min_gap", "max_error", "alarm_onsets")]
             shown.add_row(*head, *figures)

@@ -12,8 +12,9 @@ from tailgate.progress import console
 
 
 def add(commands: Any) -> None:
-    command = commands.add_parser("list", help="what there is: defences, attacks, scenarios, suites")
-    command.add_argument("what", nargs="?", choices=["defences", "attacks", "scenarios", "suites"], help="only these")
+    command = commands.add_parser("list", help="what there is: defences and their parts, attacks, scenarios, suites")
+    groups = ["defences", "filters", "detectors", "mitigations", "attacks", "scenarios", "suites"]
+    command.add_argument("what", nargs="?", choices=groups, help="only these")
     command.add_argument("--json", action="store_true", help="print cards with every parameter as JSON")
     command.set_defaults(run=_list)
 
@@ -24,6 +25,9 @@ def _list(options: argparse.Namespace) -> int:
 
     cards: dict[str, list[dict[str, Any]]] = {
         "defences": [entry.card() for entry in entries("defence").values()],
+        "filters": [entry.card() for entry in entries("filter").values()],
+        "detectors": [entry.card() for entry in entries("detector").values()],
+        "mitigations": [entry.card() for entry in entries("mitigation").values()],
         "attacks": [entry.card() for entry in entries("attack").values()],
         "scenarios": [{"name": name, "summary": load_scenario(name).about} for name in list_scenarios()],
         "suites": [{"name": name, "summary": load_suite(name).about} for name in list_suites()],

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from tailgate.progress import console
@@ -40,7 +41,8 @@ def _reproduce(options: argparse.Namespace) -> int:
         for heading in ("claim", "thesis", "measured", "holds", "why"):
             table.add_column(heading, overflow="fold")
         for claim in report.claims:
-            table.add_row(claim.claim, flat(claim.thesis), flat(claim.measured), claim.holds, claim.why, end_section=True)
+            head = f"{escape(claim.claim)}\n[dim]{escape(claim.id)}[/]"
+            table.add_row(head, flat(claim.thesis), escape(flat(claim.measured)), claim.holds, claim.why, end_section=True)
         out = console()
         out.print(table)
         out.print(summary(report), highlight=False)

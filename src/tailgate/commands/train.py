@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
+import sys
+from collections.abc import Iterator
 from typing import Any
 
 from rich.console import Console
@@ -25,7 +28,7 @@ def add(commands: Any) -> None:
     )  # fmt: skip
     command.add_argument("--config", metavar="FILE", help="preset by name, or YAML file")
     command.add_argument("--seed", type=int, help="first training seed (the same as first_seed=N)")
-    command.add_argument("--resume", action="store_true", help="continue from the run's checkpoints, with the run's own configuration")
+    command.add_argument("--resume", action="store_true", help="continue, with the run's own configuration; steps may change")
     command.add_argument("--json", action="store_true", help="print the report as JSON")
     command.add_argument("overrides", nargs="*", metavar="key=value", help="change a field of the configuration")
     command.set_defaults(run=_train)
@@ -38,7 +41,7 @@ def _train(options: argparse.Namespace) -> int:
     config = train.load_config(options.config, overrides, options.resume)
     errors = Console(stderr=True)
     errors.print(f"[bold]{config.name}[/]: training against [bold]{config.defence}[/] on {config.scenario}, files in {config.directory}")
-    with progress(errors) as update:
+    with _resumable(config.name), progress(errors) as update:
 
         def trained(seed: int, now: Any) -> None:
             update(f"training, seed {seed}", now.steps, config.steps, train.figures(now))
@@ -52,6 +55,16 @@ def _train(options: argparse.Namespace) -> int:
         _print_report(report)
     errors.print(f"policy: {', '.join(str(p) for p in policies)}\npage:   {page}")
     return 0
+
+
+@contextlib.contextmanager
+def _resumable(name: str) -> Iterator[None]:
+    """Says how to go on after an interrupt."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        print(f"tailgate: go on with: tailgate train --resume name={name}", file=sys.stderr)
+        raise
 
 
 def _print_report(report: dict[str, Any]) -> None:

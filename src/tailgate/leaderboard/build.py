@@ -19,7 +19,7 @@ from markupsafe import Markup, escape
 from tailgate.errors import InputError
 from tailgate.files import writable_directory, write_atomic
 from tailgate.metrics import METRICS
-from tailgate.registry import Entry, entries
+from tailgate.registry import Entry, entries, split_text
 from tailgate.summary import summarise
 
 Data = dict[str, Any]
@@ -66,8 +66,8 @@ def names_of(texts: Iterable[str]) -> dict[str, Name]:
 
 def _split(text: str) -> tuple[str, tuple[str, ...]]:
     """Head and parameters. The text is never resolved: a page must not import what a row names."""
-    head, sep, tail = text.rpartition(":")
-    if not sep or "=" not in tail or text.endswith(")"):
+    head, tail = split_text(text)
+    if not tail or text.endswith(")"):
         return text, ()
     params = tuple(re.split(r",\s*(?=\w+=)", tail))
     path = next((p for p in params if head == "policy" and p.startswith("path=")), None)

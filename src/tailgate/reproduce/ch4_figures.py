@@ -7,7 +7,7 @@ import numpy as np
 from tailgate.plots import canvas, png
 
 from .ch4_cases import CASES, FILTERS, READINGS, Runs
-from .ch4_theory import ETAS, Curves, Times
+from .ch4_theory import ETAS, SIZES, Curves, Times
 from .claims import Figure
 
 NUMBERS = {"clean": "4.4", "fdi": "4.5", "dos": "4.6"}
@@ -80,7 +80,10 @@ def _cost(times: Times) -> Figure:
     last = max(times["n = q"])
     ax.plot([last / 4, last], [1e6 * times["n = q"][last] / 64, 1e6 * times["n = q"][last]], color="grey", linewidth=1, label="slope 3")
     ax.set(xscale="log", yscale="log", xlabel="size", ylabel="time of a step of one episode [us]", title="Algorithm 3: cost of a step")
+    ax.xaxis.set_major_formatter("{x:g}")
+    ax.xaxis.set_minor_formatter("")
+    ax.set_xticks(list(SIZES))
     ax.grid(alpha=0.3, which="both")
     ax.legend(fontsize=8)
-    caption = "Time of a step against the number of states n and of sensors q; the claim is at most slope 3."
+    caption = "Time of a step against the number of states n and of sensors q; the claim is at most slope 3. Wall-clock: other load shows."
     return Figure("figure-cost", caption, png(figure))
