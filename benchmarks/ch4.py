@@ -22,7 +22,9 @@ from tailgate.summary import summarise
 
 SUITES = ("ch4-long-v0", "ch4-actuator-v0")
 FILTERPY = ("filterpy_kf", "filterpy_ekf", "filterpy_ukf", "filterpy_hinfinity", "filterpy_imm")
-FIELDS = ("suite", "scenario", "dose", "defence", "attack", "knowledge", "n", "crash", "min_gap", "rmse_position", "max_error", "alarm_onsets")
+FIELDS = (
+    "suite", "scenario", "dose", "defence", "attack", "knowledge", "n", "crash", "min_gap", "rmse_position", "max_error", "alarm_onsets",
+)  # fmt: skip
 FILTERPY_SEEDS = 8  # one object per episode: slow
 
 

@@ -26,8 +26,8 @@ from .sparse import SparseChiSquare, SparseGatedKalman
 __all__ = [
     "AcceptAll", "AlarmSentinel", "Brake", "BrakeSentinel", "BrakingKalman", "ChiSquare", "Composed", "Cusum", "CusumKalman",
     "CusumReacquiringKalman", "Decision", "EpisodeByEpisode", "FilterpyExtended", "FilterpyHInfinity", "FilterpyInteracting",
-    "FilterpyKalman", "FilterpyUnscented", "GateOut", "GatedKalman", "Hold", "InteractingModels", "Kalman", "KalmanFilter", "Latch", "Mewma",
-    "MewmaKalman", "NamedParts", "Oracle", "Outlier", "PerEpisode", "Raw", "Reacquire", "ReacquiringKalman", "RobustKalman",
-    "RobustKalmanFilter", "Score", "SparseChiSquare", "SparseGatedKalman", "StandStillSentinel", "Stateless", "Verdict", "Widen",
-    "WideningKalman", "WindowedChiSquare", "WindowedKalman", "blame_all", "compose", "per_episode",
+    "FilterpyKalman", "FilterpyUnscented", "GateOut", "GatedKalman", "Hold", "InteractingModels", "Kalman", "KalmanFilter",
+    "Latch", "Mewma", "MewmaKalman", "NamedParts", "Oracle", "Outlier", "PerEpisode", "Raw", "Reacquire", "ReacquiringKalman",
+    "RobustKalman", "RobustKalmanFilter", "Score", "SparseChiSquare", "SparseGatedKalman", "StandStillSentinel", "Stateless",
+    "Verdict", "Widen", "WideningKalman", "WindowedChiSquare", "WindowedKalman", "blame_all", "compose", "per_episode",
 ]  # fmt: skip
