@@ -1,6 +1,8 @@
 """Shared builders: short scenarios, rollouts, linear models, and equality to the last bit."""
 
 import dataclasses
+import os
+import shutil
 from itertools import combinations
 from typing import get_args
 
@@ -115,3 +117,34 @@ def linear_model():
         return Model(A, B, np.zeros(n), C[None], Q, R[None], np.eye(1, dtype=bool), dt, tuple(f"y{i}" for i in range(q)))
 
     return make
+
+
+def _missing(what):
+    if os.environ.get("TAILGATE_REQUIRE_BROWSER") == "1":
+        pytest.fail(f"TAILGATE_REQUIRE_BROWSER=1, but there is no {what}")
+    pytest.skip(f"no {what}: the page is not tried in a browser")
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory):
+    """A headless Chromium; without one its tests are skipped, or fail where TAILGATE_REQUIRE_BROWSER is 1."""
+    try:
+        from selenium import webdriver
+        from selenium.webdriver.chrome.service import Service
+    except ImportError:
+        _missing("selenium")
+    chromium = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    driver = shutil.which("chromedriver")
+    if chromium is None or driver is None:
+        _missing("Chromium with chromedriver")
+    options = webdriver.ChromeOptions()
+    options.binary_location = chromium
+    for flag in (
+        "headless", "no-sandbox", "disable-gpu", "disable-quic", "no-first-run", "disable-background-networking",
+        "disable-component-update", "disable-sync", f"user-data-dir={tmp_path_factory.mktemp('profile')}",
+    ):  # fmt: skip
+        options.add_argument(f"--{flag}")
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
+    window = webdriver.Chrome(options=options, service=Service(executable_path=driver))
+    yield window
+    window.quit()

@@ -1,9 +1,7 @@
 """The leaderboard page: what it says, that nothing in the rows becomes markup, and how it behaves in a browser."""
 
 import json
-import os
 import re
-import shutil
 from html.parser import HTMLParser
 from importlib.resources import files
 
@@ -244,36 +242,6 @@ def test_text_stands_out_on_every_shade_and_shades_are_in_order(mode):
     for line in (f"c{i}" for i in range(8)):
         dark, light = sorted((luminance(colours["page"]), luminance(colours[line])))
         assert (light + 0.05) / (dark + 0.05) >= 3, line
-
-
-def missing(what):
-    if os.environ.get("TAILGATE_REQUIRE_BROWSER") == "1":
-        pytest.fail(f"TAILGATE_REQUIRE_BROWSER=1, but there is no {what}")
-    pytest.skip(f"no {what}: the page is not tried in a browser")
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory):
-    try:
-        from selenium import webdriver
-        from selenium.webdriver.chrome.service import Service
-    except ImportError:
-        missing("selenium")
-    chromium = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-    driver = shutil.which("chromedriver")
-    if chromium is None or driver is None:
-        missing("Chromium with chromedriver")
-    options = webdriver.ChromeOptions()
-    options.binary_location = chromium
-    for flag in (
-        "headless", "no-sandbox", "disable-gpu", "disable-quic", "no-first-run", "disable-background-networking",
-        "disable-component-update", "disable-sync", f"user-data-dir={tmp_path_factory.mktemp('profile')}",
-    ):  # fmt: skip
-        options.add_argument(f"--{flag}")
-    options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
-    window = webdriver.Chrome(options=options, service=Service(executable_path=driver))
-    yield window
-    window.quit()
 
 
 @pytest.fixture

@@ -1,8 +1,6 @@
 """The page of a replay in a browser: quiet, moved by slider, keys and pointer, nothing cut, nothing told by colour alone."""
 
 import json
-import os
-import shutil
 
 import pytest
 import yaml
@@ -21,36 +19,6 @@ SCENARIO = {
         "targets": ["position", "velocity", "leader_position", "acceleration"],
     },
 }  # fmt: skip
-
-
-def missing(what):
-    if os.environ.get("TAILGATE_REQUIRE_BROWSER") == "1":
-        pytest.fail(f"TAILGATE_REQUIRE_BROWSER=1, but there is no {what}")
-    pytest.skip(f"no {what}: the page is not tried in a browser")
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory):
-    try:
-        from selenium import webdriver
-        from selenium.webdriver.chrome.service import Service
-    except ImportError:
-        missing("selenium")
-    chromium = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-    driver = shutil.which("chromedriver")
-    if chromium is None or driver is None:
-        missing("Chromium with chromedriver")
-    options = webdriver.ChromeOptions()
-    options.binary_location = chromium
-    for flag in (
-        "headless", "no-sandbox", "disable-gpu", "disable-quic", "no-first-run", "disable-background-networking",
-        "disable-component-update", "disable-sync", f"user-data-dir={tmp_path_factory.mktemp('profile')}",
-    ):  # fmt: skip
-        options.add_argument(f"--{flag}")
-    options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
-    window = webdriver.Chrome(options=options, service=Service(executable_path=driver))
-    yield window
-    window.quit()
 
 
 @pytest.fixture(scope="module")
