@@ -150,8 +150,8 @@ class InteractingAdapter(KalmanAdapter):
 
     def reset(self, model: Model, prior: Prior) -> None:
         self.model, count = model, len(self.modes.factors)
-        self.library = import_module("filterpy.kalman")
-        self.bank = [self.library.KalmanFilter(model.states, len(model.sensors), model.inputs + 1) for _ in self.modes.factors]
+        library = import_module("filterpy.kalman")
+        self.bank = [library.KalmanFilter(model.states, len(model.sensors), model.inputs + 1) for _ in self.modes.factors]
         for f in self.bank:
             f.F, f.B, f.Q = model.A, np.column_stack([model.B, model.c]), model.Q
         self.recall((np.stack([prior.mean] * count), np.stack([prior.cov] * count), self.modes.share()))
@@ -163,7 +163,7 @@ class InteractingAdapter(KalmanAdapter):
         x, P, mu = memory
         for f, mean, cov in zip(self.bank, x, P, strict=True):
             f.x, f.P = mean, cov
-        self.filter = self.library.IMMEstimator(self.bank, mu, self.modes.moves())
+        self.filter = import_module("filterpy.kalman").IMMEstimator(self.bank, mu, self.modes.moves())
 
     def step(self, y: Array, valid: Array, u: Array) -> tuple[Array, float]:
         _, score = super().step(y, valid, u)
