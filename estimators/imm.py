@@ -10,7 +10,6 @@ Model j takes the noise of every sensor for factor_j R. With mode probabilities 
 The score is the log odds of "some sensor noise is inflated" against the nominal model; an alarm at 0 is one at probability 1/2.
 """
 
-import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, NamedTuple
@@ -76,10 +75,6 @@ class InteractingModels(Modes):
 
     threshold_field: ClassVar[str] = "threshold"
     threshold: Finite = param(0.0, "alarm above these log odds of an inflated noise; 0: probability 1/2 [-]")
-
-    def with_threshold(self, value: float) -> "InteractingModels":
-        """This defence with its alarm threshold at `value`."""
-        return dataclasses.replace(self, threshold=value)
 
     def prepare(self, model: Model) -> ImmPlan:
         nominal = KalmanFilter().prepare(model)

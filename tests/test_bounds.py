@@ -80,8 +80,7 @@ def test_the_jump_grows_while_the_gate_is_shut(model):
 @pytest.mark.parametrize("steps", [1, 5, 40])
 def test_the_stealth_bound_is_reached_and_not_passed(model, steps, index):
     """N unnoticed steps along one state reach sqrt(eta) sum ||S^1/2 K' A'^j e|| to 1e-6; random and greedy ones stay below."""
-    if index >= model.states:
-        index = model.states - 1
+    index = min(index, model.states - 1)
     rest = bounds.steady_state(model)
     e = np.eye(model.states)[index]
     reach = bounds.stealth_bound(model.A, [rest] * steps, ETA, e)

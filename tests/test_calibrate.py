@@ -18,6 +18,7 @@ from tailgate.errors import InputError, NotApplicable
 from tailgate.estimators import Cusum, GateOut, KalmanFilter, Mewma, WindowedChiSquare, compose
 from tailgate.metrics import METRICS
 from tailgate.scenario import config_path
+from tailgate.schema import fields_of
 from tailgate.trace import rollout
 
 RECORDS = json.loads((Path(__file__).parents[1] / "benchmarks/results/calibration.json").read_text(encoding="utf-8"))
@@ -181,3 +182,16 @@ def test_the_command(roads, capsys):
     assert f"{result['threshold']:g}" in capsys.readouterr().out
     assert cli.main(["calibrate", "--defence", "kf", "--hours", "1"]) == cli.EXIT_INPUT
     assert "threshold" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", tailgate.list_defences())
+def test_every_defence_has_a_threshold_or_says_that_it_has_none(name):
+    """What is set is what is named: the defence at a threshold carries it in the field that the table prints, or it does not apply."""
+    bench = Bench(tailgate.make_defence(name), (), name, (), 1, lambda *_: None)
+    try:
+        turned = bench.at(12.5)
+    except NotApplicable as error:
+        assert "threshold" in str(error)
+        return
+    holder = turned if bench.field in fields_of(type(turned)) else turned.parts()[1]
+    assert getattr(holder, bench.field.rpartition(".")[2]) == 12.5

@@ -1,5 +1,6 @@
 """The interacting multiple model filter: equality with filterpy's, its limits, and its odds."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -94,7 +95,7 @@ def test_the_score_is_the_log_odds_and_alarms_above_one_half():
     np.testing.assert_allclose(estimate.score, odds, atol=1e-6)
     np.testing.assert_array_equal(estimate.alarm, state.mu[..., 0] < 0.5)
     assert 0.1 < estimate.alarm.mean() < 0.9
-    strict = defence.with_threshold(3.0)
+    strict = dataclasses.replace(defence, threshold=3.0)
     _, later = strict.step(plan, strict.start(plan, prior), _received(y), np.zeros((400, 1, 1)), NO_DRAWS)
     np.testing.assert_array_equal(later.alarm, estimate.score > 3.0)
 
