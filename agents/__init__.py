@@ -1,5 +1,7 @@
 """Attacks: scripted ones, learned policies, and the learners."""
 
+from .burst_loss import BurstLoss
+from .ghost import GhostState
 from .model_based import Covert, Stealth, ZeroDynamics
 from .policy import PolicyAttack, Yoked, load_policy, save_policy
 from .program import Program
@@ -23,9 +25,11 @@ from .scripted import (
 )  # fmt: skip
 
 __all__ = [
+    "BurstLoss",
     "Covert",
     "Delay",
     "Dropout",
+    "GhostState",
     "Hold",
     "Inject",
     "InjectActuator",

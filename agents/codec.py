@@ -1,6 +1,4 @@
-"""From a view to an observation vector, and from an action to a command: pure, and used by the environments and by
-trained policies that play as attacks alike.
-"""
+"""From an action to a command: pure, and used by the environments and by trained policies that play as attacks alike."""
 
 from __future__ import annotations
 
@@ -11,11 +9,10 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from tailgate import num
-from tailgate.core import Array, Command, Finite, Frame, Kind, NonNegative, Positive, PositiveCount, View, param
+from tailgate.core import Array, Command, Finite, Kind, Positive, PositiveCount, View, param
 from tailgate.errors import InputError
 from tailgate.threat import Brief, KindName
 
-LIMIT = 10.0  # observations are clipped to +-LIMIT
 ActionName = Literal["timing", "mode", "ramp", "continuous", "increment"]
 
 
@@ -35,11 +32,12 @@ class ActionSpec:
     steps: PositiveCount = param(10, "age of a delay, window of a replay [steps]")
     rate: Positive = param(0.5, "ramp, increment: (largest) change per step [unit of the wire]")
     per_sensor: bool = param(False, "mode, ramp: also one mode per single wire")
+    per_agent: bool = param(False, "mode, ramp: also one mode per single agent")
     interval: PositiveCount = param(1, "steps for which a decision holds: one step of the environment")
 
 
 class Mode(NamedTuple):
-    """One discrete action: its name, kind, target (w,) bool, value (w,), and direction of a ramp."""
+    """One discrete action: its name, kind, target (N, w) bool, value (w,), and direction of a ramp."""
 
     name: str
     kind: Kind
@@ -77,18 +75,28 @@ class ActionCodec:
 
     @cached_property
     def wires(self) -> Array:
-        """(w,) indices of the granted wires."""
-        return np.flatnonzero(self.brief.granted)
+        """Indices of the wires that are granted at any agent."""
+        return np.flatnonzero(self.brief.granted.any(axis=0))
+
+    @cached_property
+    def victims(self) -> Array:
+        """Indices of the agents with a granted wire."""
+        return np.flatnonzero(self.brief.granted.any(axis=1))
 
     @cached_property
     def modes(self) -> list[Mode]:
         """Discrete meanings, in the order of the action's number."""
         granted, value = self.brief.granted, self.spec.value
         groups = [("", granted)]
-        if self.spec.per_sensor and len(self.wires) > 1:
-            groups += [(":" + self.brief.model.wires[w], np.arange(len(granted)) == w) for w in self.wires]
+        named = [(":" + self.brief.model.wires[w], np.arange(granted.shape[1]) == w) for w in self.wires] if self.spec.per_sensor else []
+        agents = [(f"[{i}]", (np.arange(granted.shape[0]) == i)[:, None]) for i in self.victims] if self.spec.per_agent else []
+        if len(named) > 1:
+            groups += [(name, granted & mask) for name, mask in named]
+        if len(agents) > 1:
+            groups += [(tag, granted & mask) for tag, mask in agents]
+            groups += [(name + tag, granted & mask & here) for tag, here in agents for name, mask in named if len(named) > 1]
         kinds: tuple[KindName, ...] = (self.spec.kind,) if self.spec.action == "timing" else self.brief.threat.kinds
-        bounds, nothing = self.brief.bounds, np.zeros(len(granted))
+        bounds, nothing = self.brief.bounds, np.zeros(granted.shape[1])
         out = [Mode("none", Kind.NONE, np.zeros_like(granted), nothing)]
         for suffix, target in groups:
             for name in kinds:
@@ -108,7 +116,7 @@ class ActionCodec:
     @property
     def size(self) -> int:
         """Number of discrete actions, or length of the continuous vector."""
-        return len(self.modes) if self.discrete else 1 + self.brief.model.agents * len(self.wires)
+        return len(self.modes) if self.discrete else 1 + len(self.victims) * len(self.wires)
 
     def decode(self, action: Array, view: View) -> Command:
         """Discrete (B,) int or continuous (B, size) in [-1, 1] to a command."""
@@ -116,7 +124,7 @@ class ActionCodec:
         if self.discrete:
             index = np.asarray(action).reshape(-1)
             kinds = np.array([mode.kind for mode in self.modes], np.int8)[index]
-            target = np.array([mode.target for mode in self.modes])[index][:, None, :]
+            target = np.array([mode.target for mode in self.modes])[index]
             value = np.array([mode.value for mode in self.modes])[index][:, None, :]
             if self.spec.action == "ramp":
                 bound, sign = brief.bounds, np.array([mode.sign for mode in self.modes])[index][:, None, None]
@@ -125,13 +133,13 @@ class ActionCodec:
                 value = np.where(ramping, grown, value)
             return brief.command(index != 0, kinds, target, value)
         action = np.clip(np.asarray(action, np.float64), -1.0, 1.0)
-        values = action[:, 1:].reshape(len(action), brief.model.agents, len(self.wires))
-        bound = brief.bounds[self.wires]
-        wide = num.zeros((len(action), brief.model.agents, len(brief.granted)))
+        values = action[:, 1:].reshape(len(action), len(self.victims), len(self.wires))
+        bound, held = brief.bounds[self.wires], (slice(None), self.victims[:, None], self.wires)
+        wide = num.zeros((len(action), *brief.granted.shape))
         if self.spec.action == "increment":
-            wide[..., self.wires] = np.clip(view.last.value[..., self.wires] + self.spec.rate * values, -bound, bound)
+            wide[held] = np.clip(view.last.value[held] + self.spec.rate * values, -bound, bound)
         else:
-            wide[..., self.wires] = bound * values
+            wide[held] = bound * values
         return brief.command(action[:, 0] > 0.0, Kind.FDI, brief.granted, wide)
 
     def mask(self, view: View) -> Array:
@@ -139,115 +147,6 @@ class ActionCodec:
         out = np.repeat(np.asarray(view.allowed)[:, None], self.size, axis=1)
         out[:, 0] = True
         return out
-
-
-@dataclass(frozen=True, eq=False)
-class ObservationCodec:
-    """What the learner sees, scaled to about one and clipped."""
-
-    brief: Brief
-
-    @cached_property
-    def names(self) -> tuple[str, ...]:
-        model, threat = self.brief.model, self.brief.threat
-        out = ["progress", "allowed", "budget_left", "burst", "cooldown"]
-        for i in range(model.agents):
-            tag = "" if model.agents == 1 else f"[{i}]"
-            out += [name + tag for name in ("gap", "speed", "lead_speed", "closing", "accel", "rear_gap", "rear_closing")]
-            out += [f"last_{model.wires[w]}{tag}" for w in np.flatnonzero(self.brief.granted)]
-            if threat.knowledge != "black":
-                out += [f"control{j}{tag}" for j in range(model.inputs)]
-            if threat.knowledge == "white":
-                out += [f"error{j}{tag}" for j in range(model.states)] + ["score" + tag, "alarm" + tag]
-            if threat.sees_measurement or threat.knowledge == "white":
-                out += [f"noise_{name}{tag}" for name in self._seen]
-        return (*out, "attacking")
-
-    @cached_property
-    def _seen(self) -> tuple[str, ...]:
-        return tuple(name for name in self.brief.model.sensors if name in ("position", "velocity"))
-
-    def observe(self, view: View) -> Array:
-        """(B, d) float32, d = len(names)."""
-        brief, threat = self.brief, self.brief.threat
-        scene, last = view.scene, view.last
-        bounded = np.isfinite(view.budget)
-        left = np.where(bounded, view.budget_left / np.where(bounded & (view.budget > 0), view.budget, 1.0), 1.0)
-        columns: list[Array] = [view.progress, view.allowed, left, view.burst / 50.0, view.cooldown / 50.0]
-        for i in range(brief.model.agents):
-            gap, speed, lead = scene.gap[:, i], scene.speed[:, i], scene.lead_speed[:, i]
-            columns += [gap / 50.0, speed / 15.0, lead / 15.0, (speed - lead) / 5.0, scene.accel[:, i] / 3.0]
-            columns += [scene.rear_gap[:, i] / 50.0, (scene.rear_speed[:, i] - speed) / 5.0]
-            columns += [last.value[:, i, w] / min(brief.bounds[w], 10.0) for w in np.flatnonzero(brief.granted)]
-            if threat.knowledge != "black":
-                assert view.control is not None
-                columns += [view.control[:, i, j] / 3.0 for j in range(brief.model.inputs)]
-            if threat.knowledge == "white":
-                assert view.estimate is not None and view.truth is not None
-                error = view.estimate.x - view.truth
-                columns += [error[:, i, j] / 5.0 for j in range(brief.model.states)]
-                columns += [view.estimate.score[:, i] / 20.0, view.estimate.alarm[:, i]]
-            if threat.sees_measurement or threat.knowledge == "white":
-                assert view.received is not None
-                for name in self._seen:
-                    sent = view.received.y[:, i, brief.model.sensors.index(name)]
-                    columns.append(sent - (scene.position if name == "position" else scene.speed)[:, i])
-        columns.append(last.kind != Kind.NONE)
-        out = np.empty((len(view.k), len(columns)), np.float32)
-        for j, column in enumerate(columns):
-            out[:, j] = np.clip(column, -LIMIT, LIMIT)
-        return out
-
-
-RewardName = Literal["collision", "min_gap", "error", "stealth"]
-NEAR = 20.0  # min_gap: a smaller gap than this counts [m]
-
-
-@dataclass(frozen=True)
-class Reward:
-    """Reward presets. Scores never use them: they use raw outcomes.
-
-    collision: 1 at a collision in front or behind. min_gap: the same, and the metres by which the smallest gap of the episode falls
-    below 20 m, over 20 m: a burst at the right moment earns something long before it makes a collision. error: |position error| / 10 m,
-    capped at 1, per second. stealth: error, less one per second of alarm. The shaping terms are potential-based (Ng, Harada, Russell
-    1999): they leave the best policy unchanged when `gamma` is the learner's, and may use the truth, which the policy does not see.
-    """
-
-    reward: RewardName = param("min_gap", "collision, min_gap, error or stealth")
-    gap_shaping: NonNegative = param(0.5, "weight of the closeness of the car ahead as a potential [-]")
-    error_shaping: NonNegative = param(1.0, "weight of the believed extra gap, per 10 m and capped at 20 m, as a potential [-]")
-    gamma: Positive = param(0.995, "discount in the potential's difference [-]")
-    illegal_penalty: NonNegative = param(0.0, "cost of a refused command [-]")
-    attack_cost: NonNegative = param(0.0, "cost of a step under attack: what makes waiting for the right moment pay [-]")
-
-    def potential(self, gap: Array, belief: Array | float = 0.0) -> Array:
-        """(B,) potential of a gap (B, N) [m] and of what the car believes it has on top of it (B, N) [m]."""
-        near = 1.0 - np.clip(np.min(gap, axis=1), 0.0, 100.0) / 100.0
-        fooled = np.max(np.clip(belief, 0.0, 20.0) / 10.0 + np.zeros_like(gap), axis=1)
-        return np.asarray(self.gap_shaping * near + self.error_shaping * fooled)
-
-    def least(self, gap: Array, before: Array | float = NEAR) -> Array:
-        """(B,) smallest gap so far, within [0, NEAR], from a gap (B, N) and the smallest one before [m]."""
-        return np.asarray(np.minimum(np.clip(np.min(gap, axis=1), 0.0, NEAR), before))
-
-    def __call__(self, dt: float, frame: Frame, fall: Array) -> Array:
-        """(B,) reward of one step of the loop; fall (B,) of the smallest gap [m]."""
-        crashed = frame.collided | frame.rear_collided
-        out = -self.illegal_penalty * frame.refused - self.attack_cost * (frame.command.kind != Kind.NONE)
-        if self.reward in ("collision", "min_gap"):
-            out = out + crashed
-            if self.reward == "min_gap":
-                out = out + fall / NEAR
-        else:
-            error = np.abs(frame.estimate.x[..., 0] - frame.truth[..., 0])
-            out = out + dt * np.minimum(np.max(error, axis=1) / 10.0, 1.0)
-            if self.reward == "stealth":
-                out = out - dt * frame.estimate.alarm.any(axis=1)
-        return np.asarray(out)
-
-    def shaped(self, raw: Array, before: Array, after: Array, terminated: Array) -> Array:
-        """(B,) reward of a decision from its raw reward and the potentials (B,) before and after it."""
-        return np.asarray(raw + self.gamma * np.where(terminated, 0.0, after) - before)
 
 
 def action_space(codec: ActionCodec) -> Any:

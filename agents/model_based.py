@@ -10,7 +10,7 @@ import numpy as np
 from scipy import linalg
 
 from tailgate import num
-from tailgate.core import Array, Command, Count, Finite, Kind, NonNegative, Positive, View, param
+from tailgate.core import Array, Command, Count, Finite, Kind, Model, NonNegative, Positive, View, param
 from tailgate.draws import Draws
 from tailgate.errors import InputError, NotApplicable
 from tailgate.registry import register
@@ -46,6 +46,13 @@ def consistent(brief: Brief, inputs: Array, actuators: Array, lied: Array, steps
     return out
 
 
+def _driver(brief: Brief, where: str) -> None:
+    """Raise NotApplicable unless what an agent commands is the model's input, and there is one agent."""
+    model = brief.model
+    if model.agents != 1 or model.inputs != len(model.actuators):
+        raise NotApplicable(f"{where}: model", f"{model.agents} agents, of which each knows the closed loop", "one agent and its own input")
+
+
 def _share_of_bounds(brief: Brief, value: Array) -> float:
     """The largest |value| (..., w) in units of its wire's bound."""
     return float(np.max(np.abs(value) / brief.bounds))
@@ -74,7 +81,8 @@ class Covert(Script):
     def prepare(self, brief: Brief) -> ScriptPlan:
         model, where = brief.model, "attack covert"
         sensors = np.arange(len(model.wires)) < len(model.sensors)
-        target = chosen(brief, self.targets, sensors | brief.is_actuator & brief.granted)
+        _driver(brief, where)
+        target = chosen(brief, self.targets, sensors | brief.is_actuator & brief.granted)[0]
         if not target[sensors].all() or not (target & brief.is_actuator).any() or (target & ~sensors & ~brief.is_actuator).any():
             wanted = f"a threat model and targets with every sensor ({', '.join(model.sensors)}) and an actuator"
             raise NotApplicable(f"{where}: targets", [n for n, m in zip(model.wires, target, strict=True) if m], wanted)
@@ -90,7 +98,7 @@ class Covert(Script):
         value = consistent(brief, inputs, actuators, target, brief.horizon + 1)
         share = _share_of_bounds(brief, value)
         scale = 1.0 if share <= 1.0 else (1.0 - 1e-12) / share
-        return ScriptPlan(brief, target, Schedule(scale * value, scale))
+        return ScriptPlan(brief, target[None], Schedule(scale * value, scale))
 
     def _cheapest(self, brief: Brief, actuators: Array, goal: Array) -> Array:
         """(T, actuators) inputs of least energy from rest to `goal`: a = W' (W W')^-1 goal, with W = [.., A B, B]."""
@@ -169,7 +177,8 @@ class ZeroDynamics(Script):
     def prepare(self, brief: Brief) -> ScriptPlan:
         model, where = brief.model, "attack zero_dynamics"
         sensors = np.arange(len(model.wires)) < len(model.sensors)
-        target = chosen(brief, self.targets, brief.granted & (sensors | brief.is_actuator))
+        _driver(brief, where)
+        target = chosen(brief, self.targets, brief.granted & (sensors | brief.is_actuator))[0]
         actuators = np.flatnonzero(target[brief.is_actuator])
         if not len(actuators):
             raise NotApplicable(f"{where}: threat_model.targets", list(brief.threat.targets), "a threat model that grants an actuator")
@@ -196,7 +205,7 @@ class ZeroDynamics(Script):
         last = within.index(False) if False in within else len(within)
         if last < 2:
             raise NotApplicable(f"{where}.first", self.first, "a first input far below the bounds of the threat model")
-        return ScriptPlan(brief, target, Schedule(value[:last], 1.0))
+        return ScriptPlan(brief, target[None], Schedule(value[:last], 1.0))
 
     def command(self, plan: ScriptPlan, on: Array, count: Array, view: View, draws: Draws) -> Command:
         schedule: Schedule = plan.extra
@@ -206,14 +215,15 @@ class ZeroDynamics(Script):
 @register("attack", "stealth", knowledge="white", reference="Dutta 2018, Theorem 4.5.3")
 @dataclass(frozen=True)
 class Stealth(Script):
-    """White box: each step moves the estimate as far along one state as the gate lets through; no attacked step alarms.
+    """White box: each step moves the estimate as far along one state as the gate lets through; no attacked agent alarms in that step.
 
     With e the direction and every sensor granted, the innovation is driven to r = s sqrt(g) S K' e / sqrt(e' K S K' e), just inside the
-    gate g; with fewer wires, to the farthest point that those reach.
+    gate g; with fewer wires, to the farthest point that those reach. Among several agents each is pushed to its own gate; those that fuse
+    its belief afterwards may alarm.
     """
 
-    state_index: Literal[0, 1, 2] = param(0, "which state to push: 0 position, 1 velocity, 2 acceleration")
-    sign: Literal[-1, 1] = param(-1, "-1 makes the car believe that it is further back")
+    state_index: Count = param(0, "which state to push: 0 position, 1 velocity, 2 acceleration; among several cars 0 the gap, 1 the speed")
+    sign: Literal[-1, 1] = param(-1, "-1 makes the car believe that it is further back, or has a larger gap")
     gate: NonNegative | None = param(None, "gate to stay under; none: the defence's own, or 20 where it has none [-]")
 
     def command(self, plan: ScriptPlan, on: Array, count: Array, view: View, draws: Draws) -> Command:
@@ -225,8 +235,9 @@ class Stealth(Script):
         look = box.defence.look(box.plan, box.state, view.received, box.known_u)
         gate = self.gate if self.gate is not None else look.gate if look.gate is not None else 20.0
         r, S = look.innovation
-        touched = np.flatnonzero(plan.target[: r.shape[-1]])
-        row = look.gain[..., self.state_index, :][..., touched]  # K' e on the wires that are attacked
+        aimed = plan.target[:, : r.shape[-1]]
+        touched = np.flatnonzero(aimed.any(axis=0))
+        row = self._gain(plan.brief, look.gain)[..., touched]  # K' e on the wires that are attacked
         W = num.inverse(S)
         part = num.inverse(W[..., touched[:, None], touched])
         pull = num.matvec(W, r)[..., touched]
@@ -235,13 +246,44 @@ class Stealth(Script):
         spent = num.dot(r, num.matvec(W, r)) - num.dot(pull, centre)
         room = (1.0 - 1e-9) * gate - spent
         push = num.matvec(part, row)
-        reach = np.sqrt(np.maximum(room, 0.0) / num.dot(row, push))
+        strength = num.dot(row, push)
+        reach = np.sqrt(np.maximum(room, 0.0) / np.where(strength > 0.0, strength, np.inf))
         wanted = self.sign * reach[..., None] * push - centre
         # on the line from no injection to the wanted one the score stays convex: shrinking to the bound stays inside
         largest = np.max(np.abs(wanted), axis=-1)
         wanted = wanted * np.minimum(1.0, plan.brief.threat.fdi_bound / np.maximum(largest, 1e-300))[..., None]
-        value = num.zeros((len(view.k), plan.brief.model.agents, len(plan.target)))
-        value[..., touched] = wanted
+        value = num.zeros((len(view.k), *plan.target.shape))
+        value[..., touched] = np.where(aimed[:, touched], wanted, 0.0)
         inside = num.quadratic(r + value[..., : r.shape[-1]], W) <= gate
-        on = on & inside.all(axis=1)  # out of reach in this step, whatever is injected: keep still
-        return plan.brief.command(on, Kind.FDI, plan.target, value)
+        target = plan.target & inside[..., None]  # out of reach in this step, whatever is injected: keep still
+        return plan.brief.command(on & target.any(axis=(1, 2)), Kind.FDI, target, value)
+
+    def prepare(self, brief: Brief) -> ScriptPlan:
+        plan, model, where = super().prepare(brief), brief.model, "attack stealth"
+        if self.state_index >= (2 if model.agents > 1 and model.followers.any() else model.states):
+            raise NotApplicable(f"{where}.state_index", self.state_index, "a state of the model; among several cars 0 or 1")
+        sensors = plan.target[:, : len(model.sensors)]
+        if not sensors.any():
+            raise NotApplicable(f"{where}: targets", list(self.targets), "a sensor")
+        if (sensors.any(axis=1, keepdims=True) & (sensors != sensors.any(axis=0))).any():
+            raise NotApplicable(f"{where}: targets", sensors.tolist(), "the same sensors of every attacked agent")
+        rows = self._rows(model)
+        if rows is not None and not (rows != 0.0)[sensors.any(axis=1)].any():
+            raise NotApplicable(f"{where}: agents", list(self.agents or brief.threat.agents), "an agent that follows another")
+        return plan
+
+    def _rows(self, model: Model) -> Array | None:
+        """(N, n) what is pushed of each car, where several drive behind each other; else state `state_index` itself."""
+        if model.agents == 1 or not model.followers.any():
+            return None
+        return model.speed if self.state_index else model.gap
+
+    def _gain(self, brief: Brief, gain: Array) -> Array:
+        """(B, N, q): how much the state that is pushed moves with each sensor, from the gain (B, N, n, q)."""
+        rows = self._rows(brief.model)
+        if rows is None:
+            return gain[..., self.state_index, :]
+        out = num.zeros((*gain.shape[:2], gain.shape[-1]))
+        for i, j in zip(*np.nonzero(rows), strict=True):
+            out[:, i] += (1.0 if self.state_index else -1.0) * rows[i, j] * gain[:, i, j]
+        return out

@@ -20,7 +20,7 @@ from safetensors.numpy import load as load_tensors
 from safetensors.numpy import save as save_tensors
 
 from tailgate import num
-from tailgate.core import Array, Command, View, param
+from tailgate.core import Array, Command, PositiveCount, View, param
 from tailgate.draws import Draws, Keys, Role
 from tailgate.errors import InputError
 from tailgate.files import write_atomic
@@ -28,9 +28,11 @@ from tailgate.registry import register
 from tailgate.schema import as_data, build
 from tailgate.threat import Brief
 
-from .codec import ActionCodec, ActionSpec, ObservationCodec
+from .codec import ActionCodec, ActionSpec
+from .observation import ObservationCodec
 
 FORMAT = "tailgate-policy-1"
+SOME = 8  # names in an error, at most
 
 
 @dataclass(frozen=True)
@@ -45,6 +47,7 @@ class Header:
     observation: tuple[str, ...]
     knowledge: Literal["black", "grey", "white"]
     sees_measurement: bool = False
+    agents: PositiveCount | None = None  # of the system that it was trained on; files from before there were several have none
     training: dict[str, Any] = dataclasses.field(default_factory=dict)
 
 
@@ -79,7 +82,7 @@ def choose(network: Network, codec: ActionCodec, observation: Array, draws: Draw
 
 
 def save_policy(path: Path, network: Network, header: dict[str, Any]) -> Path:
-    """Write PATH.safetensors and PATH.json; `header` holds action, observation, knowledge, sees_measurement and training."""
+    """Write PATH.safetensors and PATH.json; `header` holds the other fields of `Header`: action, observation, knowledge and so on."""
     tensors: dict[str, Array] = {}
     for i, (weight, bias) in enumerate(zip(network.weights, network.biases, strict=True)):
         tensors |= {f"layer{i}.weight": np.ascontiguousarray(weight), f"layer{i}.bias": np.ascontiguousarray(bias)}
@@ -167,10 +170,15 @@ class PolicyAttack:
 
     def prepare(self, brief: Brief) -> PolicyPlan:
         header, network = self._loaded
+        agents = brief.model.agents
+        if (1 if header.agents is None else header.agents) != agents:
+            made = f"a policy for {_count(header.agents or 1)}"
+            raise InputError(f"policy {self.path.name}", made, f"one for this scenario's {_count(agents)}")
         action, observation = ActionCodec(header.action, brief), ObservationCodec(brief)
         if observation.names != header.observation:
-            differing = ", ".join(sorted(set(header.observation) ^ set(observation.names)))
-            raise InputError(f"policy {self.path.name}", f"observation {differing}", "the observation of this scenario and threat model")
+            differing = sorted(set(header.observation) ^ set(observation.names)) or ["in another order"]
+            shown = ", ".join(differing[:SOME]) + (f" and {len(differing) - SOME} more" if len(differing) > SOME else "")
+            raise InputError(f"policy {self.path.name}", f"observation {shown}", "the observation of this scenario and threat model")
         outputs = network.weights[-1].shape[1]
         if outputs != action.size:
             raise InputError(f"policy {self.path.name}", f"{outputs} actions", f"{action.size} actions under this threat model")
@@ -191,6 +199,10 @@ class PolicyAttack:
         chance = policy_draws(draws) if self.stochastic else None
         fresh = choose(plan.network, plan.action, plan.observation.observe(view), chance, always)
         return PolicyState(np.where(due if fresh.ndim == 1 else due[:, None], fresh, state.action))
+
+
+def _count(agents: int) -> str:
+    return f"{agents} agent{'' if agents == 1 else 's'}"
 
 
 def policy_draws(draws: Draws) -> Draws:
@@ -227,15 +239,16 @@ class Yoked:
         return YokedState(state.row, held), quiet
 
 
-def timing_advantage(loop: Any, policy: PolicyAttack, keys: Keys) -> tuple[Array, Array]:
-    """(own, yoked) crashes (B,) of a policy: yoked plays the on and off runs of the next episode of the same policy.
+def timing_advantage(loop: Any, policy: PolicyAttack, keys: Keys, outcome: str = "crashed") -> tuple[Array, Array]:
+    """(own, yoked) outcomes (B,) of a policy, a metric: yoked plays the on and off runs of the next episode of the same policy.
 
     The schedules are recorded with termination off, as an episode that ended early would else have a short one.
     """
-    from tailgate.metrics import crashed
+    from tailgate.metrics import METRICS
     from tailgate.trace import rollout
 
-    own = crashed(rollout(loop, policy, keys))
+    count = METRICS[outcome]
+    own = count(rollout(loop, policy, keys))
     schedule = rollout(loop, policy, keys, terminate=False).kind != 0
-    yoked = crashed(rollout(loop, Yoked(policy, np.roll(schedule, 1, axis=1)), keys))
+    yoked = count(rollout(loop, Yoked(policy, np.roll(schedule, 1, axis=1)), keys))
     return own, yoked

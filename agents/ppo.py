@@ -68,7 +68,7 @@ class Progress:
     """What a training run reports after each rollout."""
 
     steps: int
-    crash: float | None  # share of collisions in the latest episodes
+    crash: float | None  # share of collisions in the latest episodes; none also where there is no road
     reward: float | None
 
 
@@ -128,7 +128,7 @@ class Learner:
         threat = seat.loop.threat
         header = {
             "action": seat.action.spec, "observation": seat.observation.names, "knowledge": threat.knowledge,
-            "sees_measurement": threat.sees_measurement, "training": training,
+            "sees_measurement": threat.sees_measurement, "agents": seat.loop.model.agents, "training": training,
         }  # fmt: skip
         return save_policy(path, Network(weights, biases, log_std), header)
 
@@ -229,6 +229,8 @@ class _Reporter(BaseCallback):
         whole = -(-seat.loop.horizon // seat.action.spec.interval) * self.learner.config.envs
         if self.learner.ended and self.num_timesteps > whole:  # until the first horizon only collisions have ended
             crash, reward = (float(np.mean(column)) for column in zip(*self.learner.ended, strict=True))
+            crash = crash if seat.loop.model.followers.any() else None
             self.learner.curve.append({"steps": self.num_timesteps, "seed": self.learner.seed, "crash": crash, "reward": reward})
-            self.logger.record("attack/crash_rate", crash)
+            if crash is not None:
+                self.logger.record("attack/crash_rate", crash)
         self.report(Progress(self.num_timesteps, crash, reward))

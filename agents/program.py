@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -9,9 +10,9 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from tailgate.core import Array, Command, Kind, PositiveCount, Probability, View, no_command, param
+from tailgate.core import Array, Command, Count, Kind, PositiveCount, Probability, View, no_command, param
 from tailgate.draws import Draws
-from tailgate.errors import InputError, unknown
+from tailgate.errors import InputError, NotApplicable, unknown
 from tailgate.registry import register
 from tailgate.scenario import config_path
 from tailgate.schema import build, read_yaml
@@ -32,6 +33,7 @@ class Phase:
 
     kind: KindName = param("fdi", "what is done; the threat model has to grant it")
     targets: tuple[str, ...] = param((), "wires to attack; empty: those that `value` names, or all that are granted")
+    agents: tuple[Count, ...] = param((), "agents to attack, by number from 0; empty: all that are granted")
     value: Any = param(None, "law of the values, for the kinds that have one: of one wire or of each")
     trigger: Any = param("time", "when it is on: a trigger's name, or a mapping with name and parameters")
     probability: Probability | dict[str, Probability] = param(
@@ -80,7 +82,7 @@ def _phase(data: Any, where: str) -> Phase:
         raise InputError(f"{where}.value", phase.value, f"no value: kind {phase.kind} has none")
     law = None if phase.value is None else law_of(phase.value, f"{where}.value")
     trigger = part(TRIGGERS, phase.trigger, f"{where}.trigger")
-    return Phase(phase.kind, phase.targets, law, trigger, phase.probability, phase.length, phase.duration)
+    return dataclasses.replace(phase, value=law, trigger=trigger)
 
 
 class Ready(NamedTuple):
@@ -90,7 +92,7 @@ class Ready(NamedTuple):
     trigger: Trigger
     timing: Timing
     kind: Kind
-    target: Array  # (w,) bool
+    target: Array  # (N, w) bool
     probability: Array  # (w,)
 
 
@@ -146,7 +148,7 @@ class Program:
             if not here.any():
                 continue
             now, on, count = ready.trigger.step(ready.timing, state.trigger, view, draws)
-            hit = draws.uniform((brief.model.agents, len(ready.target)), HIT) < ready.probability
+            hit = draws.uniform(ready.target.shape, HIT) < ready.probability
             target = ready.target & hit
             on = on & here & view.allowed & target.any(axis=(1, 2))
             law = ready.phase.value
@@ -181,10 +183,7 @@ def _ready(phase: Phase, brief: Brief, where: str) -> Ready:
     law: Law | None = phase.value
     names = phase.targets or (law.wires if isinstance(law, PerWire) else ())
     wires = brief.model.wires
-    for name in names:
-        if name not in wires:
-            raise unknown(f"{where}.targets", name, wires)
-    target = chosen(brief, names, brief.granted)
+    target = chosen(brief, names, brief.granted, phase.agents, f"{where}.")
     if law is not None:
         check_wires(law, target, brief, f"{where}.value")
     chance = phase.probability
@@ -198,6 +197,6 @@ def _ready(phase: Phase, brief: Brief, where: str) -> Ready:
     require(brief, where, [phase.kind], target)
     try:
         timing = phase.trigger.prepare(brief)
-    except InputError as error:
-        raise InputError(f"{where}: {error.field}", error.value, error.expected) from None
+    except InputError as error:  # the file is sound, but not for steps of this length
+        raise NotApplicable(f"{where}: {error.field}", error.value, error.expected) from None
     return Ready(phase, phase.trigger, timing, Kind[phase.kind.upper()], target, chances)

@@ -7,15 +7,16 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from tailgate.core import Array, Command, Finite, Kind, NonNegative, PositiveCount, Probability, View, no_command, param
+from tailgate.core import Array, Command, Count, Finite, Kind, NonNegative, PositiveCount, Probability, View, no_command, param
 from tailgate.draws import Draws
 from tailgate.errors import InputError, NotApplicable, unknown
 from tailgate.registry import register
 from tailgate.threat import Brief
 
-from .triggers import Closing, Fast, LeaderBraking, Near, Slow, Timing, Trigger, TriggerState, idle
+from .triggers import TAG, Closing, Fast, LeaderBraking, Near, Slow, Timing, Trigger, TriggerState, idle
 from .values import LAWS, TAGS, Constant, Gaussian, Law, Ramp, Uniform, check_wires, fit, law_of
 
+CHANCE = TAG - 1  # tag of the draws of `chance`
 _CONDITIONS = {"closing": Closing, "near": Near, "speed": Fast, "slow": Slow, "leader_braking": LeaderBraking}
 
 
@@ -36,17 +37,26 @@ class NoAttack:
 
 class ScriptPlan(NamedTuple):
     brief: Brief
-    target: Array  # (w,) bool
+    target: Array  # (N, w) bool
     extra: Any = None  # what a script computes before the episode
 
 
-def chosen(brief: Brief, names: tuple[str, ...], default: Array) -> Array:
-    """(w,) bool: the wires that `names` lists, or `default` where it lists none."""
-    wires = brief.model.wires
+def chosen(brief: Brief, names: tuple[str, ...], default: Array, agents: tuple[int, ...] = (), where: str = "attack ") -> Array:
+    """(N, w) bool: the wires that `names` lists, or else `default` (w,) or (N, w), of `agents`, or else of all that are granted.
+
+    Raises InputError for a wire that the model has not, NotApplicable for an agent; `where` is what the fields' names begin with.
+    """
+    model = brief.model
     for name in names:
-        if name not in wires:
-            raise unknown("attack targets", name, wires)
-    return np.array([w in names for w in wires]) if names else default
+        if name not in model.wires:
+            raise unknown(f"{where}targets", name, model.wires)
+    for i in agents:
+        if i >= model.agents:
+            raise NotApplicable(f"{where}agents", i, f"an agent's number, from 0 to {model.agents - 1}")
+    some = np.asarray(np.isin(np.arange(model.agents), agents) if agents else np.any(brief.granted, axis=1))
+    if agents and default.ndim == 2:  # of agents that are named, also where it is not granted: the channel refuses, and `require` says so
+        default = np.any(default, axis=0)
+    return np.asarray(some[:, None] & (np.array([w in names for w in model.wires]) if names else default))
 
 
 def require(brief: Brief, attack: str, kinds: Iterable[str] = (), target: Array | None = None) -> None:
@@ -55,10 +65,13 @@ def require(brief: Brief, attack: str, kinds: Iterable[str] = (), target: Array 
     for kind in kinds:
         if kind not in threat.kinds:
             raise NotApplicable(f"{attack}: threat_model.kinds", list(threat.kinds), f"a threat model that grants {kind}")
-    missing = [name for name, m in zip(brief.model.wires, [] if target is None else target & ~brief.granted, strict=False) if m]
-    if missing:
-        granted = [name for name, g in zip(brief.model.wires, brief.granted, strict=True) if g]
-        raise NotApplicable(f"{attack}: threat_model.targets", granted, f"a threat model that grants {', '.join(missing)}")
+    beyond = np.zeros_like(brief.granted) if target is None else target & ~brief.granted
+    if beyond.any():
+        missing = [name for name, m in zip(brief.model.wires, np.any(beyond, axis=0).tolist(), strict=True) if m]
+        granted = [name for name, g in zip(brief.model.wires, np.any(brief.granted, axis=0).tolist(), strict=True) if g]
+        strangers = np.flatnonzero(beyond.any(axis=1) & ~brief.granted.any(axis=1)).tolist()
+        whose = f" of agents {', '.join(map(str, strangers))}" if strangers else ""
+        raise NotApplicable(f"{attack}: threat_model.targets", granted, f"a threat model that grants {', '.join(missing)}{whose}")
 
 
 @dataclass(frozen=True)
@@ -66,6 +79,8 @@ class Script:
     """When: a window that opens at step `start`, or at the first later step at which a condition of the road holds."""
 
     targets: tuple[str, ...] = param((), "wires to attack; empty: all that are granted")
+    agents: tuple[Count, ...] = param((), "agents to attack, by number from 0; empty: all that are granted")
+    chance: Probability = param(1.0, "probability of an attack per step and agent, while the window is open [-]")
     start_step: PositiveCount = param(1, "first step of the window")
     length: PositiveCount | None = param(None, "steps in the window; none: to the end")
     trigger: Literal["time", "closing", "near", "speed", "slow", "leader_braking"] = param(
@@ -83,7 +98,7 @@ class Script:
         return _CONDITIONS[self.trigger](start=self.start_step, window=self.length, threshold=self.threshold)
 
     def prepare(self, brief: Brief) -> ScriptPlan:
-        return ScriptPlan(brief, chosen(brief, self.targets, brief.granted))
+        return ScriptPlan(brief, chosen(brief, self.targets, brief.granted, self.agents))
 
     def start(self, plan: ScriptPlan, batch: int, draws: Draws) -> TriggerState:
         return idle(batch, plan.brief.model.agents)
@@ -92,7 +107,12 @@ class Script:
         timing = Timing(plan.brief.threat.onset, plan.brief.model.dt)
         after, on, count = self.when.step(timing, state, view, draws)
         on = on & view.allowed  # a script that knows its budget does not ask for more
-        return after, self.command(plan, on, count, view, draws)
+        command = self.command(plan, on, count, view, draws)
+        if self.chance < 1.0:
+            hit = command.target & (draws.uniform((plan.brief.model.agents,), CHANCE) < self.chance)[..., None]
+            kind = np.where(hit.any(axis=(1, 2)), command.kind, 0).astype(np.int8)
+            command = Command(kind, hit, np.where(hit, command.value, 0.0))
+        return after, command
 
     def command(self, plan: ScriptPlan, on: Array, count: Array, view: View, draws: Draws) -> Command:
         """What is sent in the rows `on` (B,), `count` (B,) steps after the window opened."""
@@ -111,7 +131,7 @@ def inject(plan: ScriptPlan, on: Array, law: Law, count: Array, draws: Draws, ta
 
 def wires_hit(plan: ScriptPlan, probability: float | Array, draws: Draws) -> Array:
     """(B, N, w) bool: each wire by itself with its probability."""
-    return np.asarray(draws.uniform((plan.brief.model.agents, len(plan.target))) < probability)
+    return np.asarray(draws.uniform(plan.target.shape) < probability)
 
 
 @register("attack", "dos_jam", reference="Dutta 2018, (4.3)")
@@ -262,7 +282,8 @@ class InjectSparse(Script):
         plan = super().prepare(brief)
         require(brief, "attack fdi_sparse", ["fdi"], plan.target)
         check_wires(self.law, plan.target, brief, "attack fdi_sparse.value")
-        names = self.targets or tuple(name for name, hit in zip(brief.model.wires, plan.target, strict=True) if hit)
+        aimed = np.any(plan.target, axis=0).tolist()
+        names = self.targets or tuple(name for name, hit in zip(brief.model.wires, aimed, strict=True) if hit)
         chances = (self.probability,) * len(names) if isinstance(self.probability, (int, float)) else self.probability
         if len(chances) != len(names):
             raise InputError("attack fdi_sparse.probability", self.probability, f"one number, or one for each of {', '.join(names)}")
@@ -281,9 +302,11 @@ class InjectActuator(Script):
     value: Finite = param(1.0, "bias, cut at actuator_bound [unit of the actuator]")
 
     def prepare(self, brief: Brief) -> ScriptPlan:
+        if not brief.model.actuators:
+            raise NotApplicable("attack actuator_fdi", "no actuator", "a plant whose agents command actuators")
         default = brief.is_actuator & brief.granted if (brief.is_actuator & brief.granted).any() else brief.is_actuator
-        target = chosen(brief, self.targets, default)
-        for name, other in zip(brief.model.wires, target & ~brief.is_actuator, strict=True):
+        target = chosen(brief, self.targets, default, self.agents)
+        for name, other in zip(brief.model.wires, np.any(target & ~brief.is_actuator, axis=0).tolist(), strict=True):
             if other:
                 raise InputError("attack actuator_fdi.targets", name, f"actuators ({', '.join(brief.model.actuators)})")
         require(brief, "attack actuator_fdi", ["fdi"], target)
@@ -351,7 +374,7 @@ class ThesisTimes:
         return None
 
     def decide(self, plan: ScriptPlan, state: Any, view: View, draws: Draws) -> tuple[Any, Command]:
-        u, brief = draws.uniform((plan.brief.model.agents, len(plan.target))), plan.brief
+        u, brief = draws.uniform(plan.target.shape), plan.brief
         if self.kind == "fdi":
             on, value = np.isin(view.k, THESIS_FDI_STEPS) & view.allowed, fit(brief, Kind.FDI, self.fdi_max * u)
             return None, brief.command(on, Kind.FDI, plan.target, value)

@@ -142,14 +142,14 @@ def law_of(data: Any, where: str) -> Law:
 
 
 def check_wires(law: Law, target: Array, brief: Brief, where: str) -> None:
-    """Raise InputError where a law per wire names a wire that does not exist, or leaves out one of `target` (w,)."""
+    """Raise InputError where a law per wire names a wire that does not exist, or leaves out one of `target` (N, w)."""
     if not isinstance(law, PerWire):
         return
     wires = brief.model.wires
     for name in law.wires:
         if name not in wires:
             raise unknown(where, name, wires)
-    for name, hit in zip(wires, target, strict=True):
+    for name, hit in zip(wires, np.any(target, axis=0).tolist(), strict=True):
         if hit and name not in law.wires:
             raise InputError(where, sorted(law.wires), f"a law for every target; {name!r} has none")
 

@@ -53,6 +53,9 @@ class AdaptiveCruise:
             a = np.minimum(a, self.accel_max)
         return None, a[..., None]
 
+    def held(self, plan: Any, state: Any, batch: int) -> Array:
+        return np.zeros((batch, 1, 0))
+
     def desired_gap(self, speed: Array) -> Array:
         """d_r + h v [m] (4.13)."""
         return np.asarray(self.standstill + self.headway * speed)

@@ -1,4 +1,4 @@
-"""The Gymnasium faces: the loop with the attack's seat left open.
+"""The Gymnasium faces: the loop with the attack's seat left open, under one id for each kind of system.
 
 The core is a vector environment without autoreset; NEXT_STEP and SAME_STEP are thin faces over it, and the single environment is
 a batch of one. reset(seed=s): row i equals gymnasium.make(...).reset(seed=s + i); each further episode of a row adds 1 to its
@@ -18,7 +18,9 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from tailgate import draws
-from tailgate.agents.codec import LIMIT, ActionCodec, ActionSpec, ObservationCodec, Reward, action_space
+from tailgate.agents.codec import ActionCodec, ActionSpec, action_space
+from tailgate.agents.observation import LIMIT, ObservationCodec
+from tailgate.agents.reward import Reward
 from tailgate.core import Array, Frame, View
 from tailgate.errors import InputError, unknown
 from tailgate.loop import Loop, LoopState
@@ -27,6 +29,12 @@ from tailgate.scenario import load_scenario
 from tailgate.schema import as_data, build, canonical, fields_of
 from tailgate.threat import ThreatModel
 
+CAR_FOLLOWING = "tailgate/CarFollowing-v0"
+FACES: dict[str, dict[str, Any]] = {  # what each id is where nothing else is said: the one place of these defaults
+    CAR_FOLLOWING: {"scenario": "stop-and-go-v0", "defence": "chi2_kf"},
+    "tailgate/Platoon-v0": {"scenario": "platoon-braking-v0", "defence": "lasso_dkf"},
+    "tailgate/SensorNetwork-v0": {"scenario": "thesis-ch5-v0", "defence": "norm_resilient", "reward": "error"},
+}
 _AUTORESET = {"next_step": AutoresetMode.NEXT_STEP, "same_step": AutoresetMode.SAME_STEP, "disabled": AutoresetMode.DISABLED}
 
 
@@ -41,17 +49,13 @@ class Seat:
     config: dict[str, Any]
 
     @classmethod
-    def make(
-        cls,
-        scenario: str = "stop-and-go-v0",
-        defence: Any = "chi2_kf",
-        threat: dict[str, Any] | None = None,
-        **options: Any,
-    ) -> Seat:
+    def make(cls, scenario: Any = None, defence: Any = None, threat: dict[str, Any] | None = None, **options: Any) -> Seat:
         """scenario: name or YAML file. defence: name (`chi2_kf:eta=15`) or object. threat: changes of the scenario's threat model.
 
-        options: the fields of ActionSpec and Reward, and `knowledge`.
+        options: the fields of ActionSpec and Reward, and `knowledge`. Scenario and defence are those of car following where they are None.
         """
+        scenario = FACES[CAR_FOLLOWING]["scenario"] if scenario is None else scenario
+        defence = FACES[CAR_FOLLOWING]["defence"] if defence is None else defence
         if threat is not None and not isinstance(threat, dict):
             raise InputError("threat", threat, "a mapping of changes of the threat model")
         threat = dict(threat or {})
@@ -78,6 +82,7 @@ class Seat:
             built, uses = defence, tuple(getattr(defence, "uses", ("measurements",)))
             named = {"spec": type(defence).__name__, "parameters": as_data(defence)}
         loop = place.loop(built, uses)
+        reward.check(loop.model)
         config = {"scenario": as_data(place), "defence": named, "action": as_data(action), "reward": as_data(reward)}
         return cls(loop, ActionCodec(action, loop.brief), ObservationCodec(loop.brief), reward, config)
 
@@ -121,7 +126,12 @@ class AdversaryVectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
         self.state: LoopState | None = None
         self._done = np.zeros(num_envs, bool)
         self._potential, self._least = np.zeros(num_envs), np.zeros(num_envs)  # of the reward
+        self._error = np.zeros(num_envs)  # the largest of an agent, where there is no road
         self.frame: Frame | None = None  # the last step, for rendering and curious readers
+
+    @property
+    def _road(self) -> bool:
+        return bool(self.seat.loop.model.followers.any())
 
     def card(self) -> dict[str, Any]:
         """JSON data that names this environment completely, with a hash."""
@@ -178,12 +188,14 @@ class AdversaryVectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
             live = ~over & ~self.state.ended & (self.state.k <= loop.horizon)
             self.state, frame = loop.advance(self.state, seat.action.decode(actions, loop.sense(self.state)))
             self.frame = frame
-            error = frame.truth[..., 0] - frame.estimate.x[..., 0]  # positive: the car believes that it is further back
+            error = loop.model.gap_error(frame.estimate.x, frame.truth)
             least = seat.reward.least(frame.scene.gap, self._least)
-            gained = seat.reward(loop.model.dt, frame, self._least - least)
+            gained = seat.reward(loop.model, frame, self._least - least)
             raw += np.where(live, gained, 0.0)
             potential = np.where(live, seat.reward.potential(frame.scene.gap, error), potential)
             self._least = least
+            if not self._road:
+                self._error = np.where(live, np.max(loop.model.error(frame.estimate.x, frame.truth), axis=1), self._error)
             collided, rear = collided | (frame.collided & live), rear | (frame.rear_collided & live)
             illegal = illegal | (frame.refused & live)
         terminated = self.state.ended & ~over
@@ -214,7 +226,7 @@ class AdversaryVectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
         return self.seat.action.mask(self.seat.loop.sense(self.state))
 
     def render(self) -> tuple[Array, ...] | None:
-        """One (H, W, 3) uint8 picture per row: road, true and believed gap, attack, alarm."""
+        """One (H, W, 3) uint8 picture per row: the road or the graph, what is believed, attack, alarm."""
         if self.render_mode is None or self.state is None:
             return None
         from .render import draw
@@ -234,6 +246,7 @@ class AdversaryVectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
         gap = loop.plant.scene(loop.plan.plant, self.state.plant).gap
         self._potential = np.where(rows, reward.potential(gap), self._potential)
         self._least = np.where(rows, reward.least(gap), self._least)
+        self._error = np.where(rows, 0.0, self._error)
 
     def _checked(self, actions: Array) -> Array:
         actions = np.asarray(actions)
@@ -250,8 +263,9 @@ class AdversaryVectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
     def _info(self, view: View, illegal: Array, collided: Array, rear: Array) -> dict[str, Any]:
         info: dict[str, Any] = {
             "illegal": illegal.copy(), "collided": collided.copy(), "rear_collided": rear.copy(), "allowed": view.allowed.copy(),
-            "gap": np.min(view.scene.gap, axis=1), "step": view.k.copy(),
+            "step": view.k.copy(),
         }  # fmt: skip
+        info |= {"gap": np.min(view.scene.gap, axis=1)} if self._road else {"error": self._error.copy()}
         if self.seat.action.discrete:
             info["action_mask"] = self.seat.action.mask(view).astype(np.int8)  # as Space.sample(mask) wants it
         everyone = np.ones(self.num_envs, bool)
@@ -331,9 +345,11 @@ class AdversaryEnv(gymnasium.Env[Array, Any]):
 
 def register_all() -> None:
     """Make the ids known to Gymnasium. Called on import of tailgate."""
-    gymnasium.register(
-        id="tailgate/CarFollowing-v0",
-        entry_point="tailgate.envs.faces:AdversaryEnv",
-        vector_entry_point="tailgate.envs.faces:AdversaryVectorEnv",
-        order_enforce=True,
-    )
+    for name, defaults in FACES.items():
+        gymnasium.register(
+            id=name,
+            entry_point="tailgate.envs.faces:AdversaryEnv",
+            vector_entry_point="tailgate.envs.faces:AdversaryVectorEnv",
+            order_enforce=True,
+            kwargs=dict(defaults),
+        )

@@ -1,16 +1,10 @@
 """Car following: a leader, a follower with adaptive cruise control, and a human-like driver behind (thesis 4.6).
 
-The follower's actuator is a first-order lag,
+The follower's actuator is a first-order lag, tau a' + a = a_des (4.15), discretised exactly (vehicle.py):
 
-    tau a' + a = a_des                                                                              (4.15)
+    X+ = A X + B a_des + w,     w ~ N(0, Q)
 
-discretised exactly (zero-order hold) with E = exp(-dt/tau) and s1 = tau (1 - E):
-
-    x+ = x + v dt + tau (dt - s1) a + (dt^2/2 - tau (dt - s1)) a_des
-    v+ = v + s1 a + (dt - s1) a_des
-    a+ = E a + (1 - E) a_des
-
-plus process noise w ~ N(0, Q). State [x_f m, v_f m/s, a_f m/s^2], readings y = [x_f, v_f] + noise. Errata: the thesis's A_a, A_d switch on
+State [x_f m, v_f m/s, a_f m/s^2], readings y = [x_f, v_f] + noise. Errata: the thesis's A_a, A_d switch on
 the sign of the acceleration, and A_a is unstable; (4.14) has its sign wrong and omits d_r (see controllers.py).
 """
 
@@ -21,9 +15,11 @@ import numpy as np
 from pydantic import Field
 
 from tailgate import num
-from tailgate.core import Array, Finite, Model, NonNegative, Positive, Prior, Scene, param
+from tailgate.core import Array, Controller, Finite, Model, NonNegative, Positive, Prior, Scene, Sensor, param
 from tailgate.draws import Draws
 from tailgate.registry import register
+
+from .vehicle import drive, lag
 
 Triple = Annotated[tuple[NonNegative, NonNegative, NonNegative], Field(min_length=3, max_length=3)]
 
@@ -82,28 +78,35 @@ class CarFollowing:
     rear: bool = param(True, "a human-like driver follows behind")
     rear_reaction: NonNegative = param(1.0, "reaction time of the driver behind [s]")
 
-    def prepare(self) -> FollowingPlan:
-        dt, tau = self.dt, self.tau
-        E = float(num.exp(-dt / tau))
-        s1 = tau * (1.0 - E)
-        A = np.array([[1.0, dt, tau * (dt - s1)], [0.0, 1.0, s1], [0.0, 0.0, E]])
-        B = np.array([[dt * dt / 2.0 - tau * (dt - s1)], [dt - s1], [1.0 - E]])
-        return FollowingPlan(A, B, np.sqrt(np.array(self.process_var)), round(self.rear_reaction / dt) if self.rear else 0)
+    @property
+    def size(self) -> tuple[int, int]:
+        return 1, 3
 
-    def model(self, sensors: tuple[str, ...], C: Array, R: Array) -> Model:
-        plan = self.prepare()
+    def dynamics(self) -> tuple[Array, Array]:
+        """A (3, 3) and B (3, 1)."""
+        return lag(self.dt, self.tau)
+
+    def prepare(self, model: Model) -> FollowingPlan:
+        reaction = round(self.rear_reaction / self.dt) if self.rear else 0
+        return FollowingPlan(model.A, model.B, np.sqrt(np.array(self.process_var)), reaction)
+
+    def model(self, sensor: Sensor, controller: Controller) -> Model:
+        (A, B), (sensors, C, R) = self.dynamics(), sensor.matrices(self)
         return Model(
-            A=plan.A, B=plan.B, c=np.zeros(3), C=C, Q=np.diag(self.process_var), R=R, graph=np.eye(1, dtype=bool), dt=self.dt,
+            A=A, B=B, c=np.zeros(3), C=C, Q=np.diag(self.process_var), R=R, graph=np.eye(1, dtype=bool), dt=self.dt,
             sensors=sensors, v2v=("leader_position", "leader_velocity"), actuators=("acceleration",),
+            gap=np.array([[-1.0, 0.0, 0.0]]), speed=np.array([[0.0, 1.0, 0.0]]),
         )  # fmt: skip
 
-    def prior(self, plan: FollowingPlan, batch: int) -> Prior:
-        mean = num.full((batch, 1, 3), np.array([self.position, self.speed, self.accel]))
-        return Prior(mean, num.full((batch, 1, 3, 3), np.diag(self.prior_var)))
+    def prior(self, plan: FollowingPlan, state: FollowingState, held: Array, draws: Draws) -> Prior:
+        return Prior(self._mean(len(state.lead_x)), num.full((len(state.lead_x), 1, 3, 3), np.diag(self.prior_var)))
+
+    def _mean(self, batch: int) -> Array:
+        return num.full((batch, 1, 3), np.array([self.position, self.speed, self.accel]))
 
     def start(self, plan: FollowingPlan, draws: Draws) -> FollowingState:
         batch = len(draws.key)
-        ego = self.prior(plan, batch).mean + np.array(self.initial_sd) * draws.normal((1, 3))
+        ego = self._mean(batch) + np.array(self.initial_sd) * draws.normal((1, 3))
         rear_gap = IDM_GAP + IDM_HEADWAY * self.speed
         lead_x = np.full(batch, self.position + self.gap)
         return FollowingState(
@@ -135,18 +138,13 @@ class CarFollowing:
 
     def move(self, plan: FollowingPlan, ego: Array, u: Array, noise: Array) -> Array:
         """The follower (B, 1, 3) one step later, under u (B, 1, 1) [m/s^2] and noise (3, B)."""
-        x, v, a = ego[:, 0, 0], ego[:, 0, 1], ego[:, 0, 2]
-        drive, A, B = u[:, 0, 0], plan.A, plan.B
-        x_next = x + A[0, 1] * v + A[0, 2] * a + B[0, 0] * drive + noise[0]
-        v_next = v + A[1, 2] * a + B[1, 0] * drive + noise[1]
-        a_next = A[2, 2] * a + B[2, 0] * drive + noise[2]
-        halted = v_next <= 0.0  # a car that stands neither rolls back nor decelerates
-        v_next = np.maximum(v_next, 0.0)
-        a_next = np.where(halted, np.maximum(a_next, 0.0), a_next)
-        x_next = np.where(halted, np.maximum(x_next, x), x_next)
-        return num.stack([x_next[:, None], v_next[:, None], a_next[:, None]])
+        x, v, a = drive(plan.A, plan.B, ego[:, 0, 0], ego[:, 0, 1], ego[:, 0, 2], u[:, 0, 0], noise)
+        return num.stack([x[:, None], v[:, None], a[:, None]])
 
-    def truth(self, plan: FollowingPlan, state: FollowingState) -> Array:
+    def known(self, plan: FollowingPlan, u: Array, exo: Array) -> Array:
+        return u
+
+    def truth(self, plan: FollowingPlan, state: FollowingState, held: Array) -> Array:
         return state.ego
 
     def lead_speed_of(self, state: FollowingState) -> Array:

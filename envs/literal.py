@@ -30,12 +30,12 @@ class CarFollowingLiteral(CarFollowing):
     headway: Positive = param(3.0, "time headway h [s]")
     gamma: Positive = param(0.9, "gap gain [1/s]")
 
-    def prepare(self) -> FollowingPlan:
+    def dynamics(self) -> tuple[Array, Array]:
         dt, tau, h = self.dt, self.tau, self.headway
         k = (1.0 + 1.0 / h) / tau
         A = np.array([[1.0, dt, 0.0], [0.0, 1.0, dt], [0.0, -dt * k * self.gamma, 1.0 - dt * k]])
         B = dt * np.array([[(1.0 + 1.0 / h) / (tau * tau * h) - self.gamma / (tau * h)], [-1.0 / (tau * h)], [0.0]])
-        return super().prepare()._replace(A=A, B=B)
+        return A, B
 
     def move(self, plan: FollowingPlan, ego: Array, u: Array, noise: Array) -> Array:
         """The follower (B, 1, 3) one step later, under u (B, 1, 1) [m] and noise (3, B)."""
@@ -62,6 +62,9 @@ class RelativeDistance:
     def step(self, plan: Any, state: Any, estimate: Estimate, v2v: Array) -> tuple[Any, Array]:
         """estimate.x (B, N, 3) and v2v (B, N, 2) = [x_l, v_l] to u (B, N, 1) [m]."""
         return None, (v2v[..., 0] - estimate.x[..., 0])[..., None]
+
+    def held(self, plan: Any, state: Any, batch: int) -> Array:
+        return np.zeros((batch, 1, 0))
 
     def desired_gap(self, speed: Array) -> Array:
         """d_r + h v [m] (4.13)."""

@@ -44,6 +44,62 @@ class Constant:
         return None, np.full(len(k), self.value)
 
 
+@register("manoeuvre", "pulse", reference="Dutta 2018, section 6.6")
+@dataclass(frozen=True)
+class Pulse:
+    """A constant acceleration for some time, none before and after."""
+
+    value: Finite = param(0.3, "acceleration [m/s^2]")
+    begin: NonNegative = param(18.0, "time at which it begins [s]")
+    end: NonNegative = param(30.0, "time at which it ends [s]")
+
+    def __post_init__(self) -> None:
+        _check_span("manoeuvre pulse.begin, end", (self.begin, self.end))
+
+    def prepare(self, dt: float) -> float:
+        return dt
+
+    def start(self, plan: float, draws: Draws) -> Any:
+        return None
+
+    def accel(self, plan: float, state: Any, k: Array, speed: Array, draws: Draws) -> tuple[Any, Array]:
+        t = k * plan
+        return None, np.where((t >= self.begin) & (t < self.end), self.value, 0.0)
+
+
+class SinePlan(NamedTuple):
+    cos: float  # of the angle of one step
+    sin: float
+
+
+class SineState(NamedTuple):
+    cos: Array  # (B,) of the angle so far
+    sin: Array
+
+
+@register("manoeuvre", "sine")
+@dataclass(frozen=True)
+class Sine:
+    """Accelerates and slows down as a cosine of time, so that the mean speed stays: for frequency responses."""
+
+    amplitude: NonNegative = param(0.5, "largest acceleration [m/s^2]")
+    frequency: Positive = param(0.05, "frequency [Hz]")
+
+    def prepare(self, dt: float) -> SinePlan:
+        angle = 2.0 * math.pi * self.frequency * dt
+        turn = num.expm(np.array([[0.0, -angle], [angle, 0.0]]))
+        return SinePlan(float(turn[0, 0]), float(turn[1, 0]))
+
+    def start(self, plan: SinePlan, draws: Draws) -> SineState:
+        batch = len(draws.key)
+        return SineState(np.ones(batch), np.zeros(batch))
+
+    def accel(self, plan: SinePlan, state: SineState, k: Array, speed: Array, draws: Draws) -> tuple[SineState, Array]:
+        """The angle is turned from step to step: no library's cosine, whose last bits may depend on the batch."""
+        after = SineState(plan.cos * state.cos - plan.sin * state.sin, plan.sin * state.cos + plan.cos * state.sin)
+        return after, self.amplitude * state.cos
+
+
 class BrakingState(NamedTuple):
     onset: Array  # (B,) [s]
 

@@ -13,15 +13,21 @@ except ImportError as error:
     raise ImportError("Stable-Baselines3 is missing: pip install 'tailgate[train]'") from error
 
 from tailgate.core import Array
+from tailgate.errors import unknown
 
-from .faces import AdversaryVectorEnv
+from .faces import CAR_FOLLOWING, FACES, AdversaryVectorEnv
 
 
 class BatchVecEnv(VecEnv):
-    """One batch as a VecEnv: same-step autoreset, infos filled at episode ends only (with `episode`, as Monitor writes it)."""
+    """One batch as a VecEnv: same-step autoreset, infos filled at episode ends only (with `episode`, as Monitor writes it).
 
-    def __init__(self, num_envs: int, **arguments: Any) -> None:
-        self.batch = AdversaryVectorEnv(num_envs, autoreset="same_step", **arguments)
+    id: whose defaults hold for what `arguments` leaves open.
+    """
+
+    def __init__(self, num_envs: int, id: str = CAR_FOLLOWING, **arguments: Any) -> None:
+        if id not in FACES:
+            raise unknown("id", id, FACES)
+        self.batch = AdversaryVectorEnv(num_envs, autoreset="same_step", **(FACES[id] | arguments))
         super().__init__(num_envs, self.batch.single_observation_space, self.batch.single_action_space)
         self._actions: Array = np.zeros(0)
         self._returns, self._lengths = np.zeros(num_envs), np.zeros(num_envs, np.int64)

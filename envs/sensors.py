@@ -7,8 +7,9 @@ import numpy as np
 from pydantic import Field
 
 from tailgate import num
-from tailgate.core import Array, Model, NonNegative, Received, param
+from tailgate.core import Array, Model, NonNegative, Received, Sized, param
 from tailgate.draws import Draws
+from tailgate.errors import InputError
 from tailgate.registry import register
 
 Pair = Annotated[tuple[NonNegative, NonNegative], Field(min_length=2, max_length=2)]
@@ -26,7 +27,9 @@ class Odometry:
 
     noise_var: Pair = param((1.0, 1.0), "noise variance of position and velocity [m^2, (m/s)^2]")
 
-    def matrices(self) -> tuple[tuple[str, ...], Array, Array]:
+    def matrices(self, plant: Sized) -> tuple[tuple[str, ...], Array, Array]:
+        if plant.size != (1, 3):
+            raise InputError("sensor odometry", type(plant).__name__, "a car-following plant: one follower, [x, v, a]")
         C = np.array([[[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]])
         return ("position", "velocity"), C, np.diag(self.noise_var)[None]
 

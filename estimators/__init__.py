@@ -1,11 +1,17 @@
 """Defences: one method per file, its reference in the docstring."""
 
+from .centralised import CentralisedKalman, CentralisedLasso
 from .chi_square import ChiSquare, GatedKalman
 from .compose import AcceptAll, Composed, Decision, GateOut, NamedParts, Score, Stateless, Verdict, blame_all, compose
+from .consensus import ConsensusFilter, ConsensusKalman
+from .control_defences import AccFallback, InputClip, SlidingMode
 from .detectors import Cusum, Mewma, WindowedChiSquare
+from .disagreement import DisagreeingDistributedKalman, DisagreementFilter
+from .distributed import DistributedFilter, DistributedKalman, DistributedKalmanFilter, GatedDistributedKalman, TailChiSquare
 from .filterpy_filters import FilterpyExtended, FilterpyHInfinity, FilterpyInteracting, FilterpyKalman, FilterpyUnscented
 from .imm import InteractingModels
 from .kalman import Kalman, KalmanFilter
+from .lasso import LassoFilter, LassoKalman
 from .mitigations import Brake, Hold, Latch, Reacquire, Widen
 from .monitored import (
     BrakingKalman,
@@ -16,18 +22,26 @@ from .monitored import (
     WideningKalman,
     WindowedKalman,
 )
-from .oracle import Oracle
+from .norm_resilient import NormResilient, NormResilientFilter
+from .oracle import DistributedOracle, Oracle
 from .per_episode import EpisodeByEpisode, PerEpisode, per_episode
 from .raw import Raw
 from .robust import Outlier, RobustKalman, RobustKalmanFilter
+from .saturated import SaturatedDistributedKalman, SaturatedFilter
 from .sentinels import AlarmSentinel, BrakeSentinel, StandStillSentinel
 from .sparse import SparseChiSquare, SparseGatedKalman
+from .trimmed import TrimmedConsensus, TrimmedFilter
+from .trust import TrustFilter, TrustingDistributedKalman
 
 __all__ = [
-    "AcceptAll", "AlarmSentinel", "Brake", "BrakeSentinel", "BrakingKalman", "ChiSquare", "Composed", "Cusum", "CusumKalman",
-    "CusumReacquiringKalman", "Decision", "EpisodeByEpisode", "FilterpyExtended", "FilterpyHInfinity", "FilterpyInteracting",
-    "FilterpyKalman", "FilterpyUnscented", "GateOut", "GatedKalman", "Hold", "InteractingModels", "Kalman", "KalmanFilter",
-    "Latch", "Mewma", "MewmaKalman", "NamedParts", "Oracle", "Outlier", "PerEpisode", "Raw", "Reacquire", "ReacquiringKalman",
-    "RobustKalman", "RobustKalmanFilter", "Score", "SparseChiSquare", "SparseGatedKalman", "StandStillSentinel", "Stateless",
+    "AccFallback", "AcceptAll", "AlarmSentinel", "Brake", "BrakeSentinel", "BrakingKalman", "CentralisedKalman", "CentralisedLasso",
+    "ChiSquare", "Composed", "ConsensusFilter", "ConsensusKalman", "Cusum", "CusumKalman", "CusumReacquiringKalman", "Decision",
+    "DisagreeingDistributedKalman", "DisagreementFilter", "DistributedFilter", "DistributedKalman", "DistributedKalmanFilter",
+    "DistributedOracle", "EpisodeByEpisode", "FilterpyExtended", "FilterpyHInfinity", "FilterpyInteracting", "FilterpyKalman",
+    "FilterpyUnscented", "GateOut", "GatedDistributedKalman", "GatedKalman", "Hold", "InputClip", "InteractingModels", "Kalman",
+    "KalmanFilter", "LassoFilter", "LassoKalman", "Latch", "Mewma", "MewmaKalman", "NamedParts", "NormResilient", "NormResilientFilter",
+    "Oracle", "Outlier", "PerEpisode", "Raw", "Reacquire", "ReacquiringKalman", "RobustKalman", "RobustKalmanFilter",
+    "SaturatedDistributedKalman", "SaturatedFilter", "Score", "SlidingMode", "SparseChiSquare", "SparseGatedKalman",
+    "StandStillSentinel", "Stateless", "TailChiSquare", "TrimmedConsensus", "TrimmedFilter", "TrustFilter", "TrustingDistributedKalman",
     "Verdict", "Widen", "WideningKalman", "WindowedChiSquare", "WindowedKalman", "blame_all", "compose", "per_episode",
 ]  # fmt: skip

@@ -32,13 +32,15 @@ class Decision(NamedTuple):
     """What a mitigation makes of it.
 
     accept (B, N, q) bool: the readings to use; mode (B, N) int8 for the controller; instead (B, N, q): readings to use in place of
-    those received; forget (B, N) bool: where the filter shall first forget how sure it was.
+    those received; forget (B, N) bool: where the filter shall first forget how sure it was; limits (B, N, m, 2): the least and the
+    largest command that the controller may give.
     """
 
     accept: Array
     mode: Array
     instead: Array | None = None
     forget: Array | None = None
+    limits: Array | None = None
 
 
 class Filter(Protocol):
@@ -158,7 +160,7 @@ class Composed:
             innovation = plan.filter.innovation(plan.filter_plan, belief, used)
         belief = plan.filter.update(plan.filter_plan, belief, innovation, decision.accept)
         estimate = Estimate(
-            plan.filter.estimate(belief), verdict.score, verdict.alarm, decision.mode, np.ones_like(verdict.alarm)
+            plan.filter.estimate(belief), verdict.score, verdict.alarm, decision.mode, np.ones_like(verdict.alarm), decision.limits
         )
         return ComposedState(belief, detector, mitigation), estimate
 
@@ -253,7 +255,7 @@ class Score(Stateless):
         return None
 
 
-ModeName = Literal["normal", "widen", "brake", "stop"]
+ModeName = Literal["normal", "widen", "brake", "stop", "acc"]
 
 
 class ReactionPlan(NamedTuple):
@@ -271,7 +273,7 @@ class ReactionState(NamedTuple):
 class Reaction:
     """Base of mitigations: a subclass's `choose` says which readings to use; the mode asked of the controller is the same for all."""
 
-    mode: ModeName = param("normal", "what is asked of the controller while alarmed: normal, widen, brake or stop")
+    mode: ModeName = param("normal", "what is asked of the controller while alarmed: normal, widen, brake, stop or acc")
     linger: NonNegative = param(2.0, "time that the mode outlasts the last alarm [s]")
 
     def prepare(self, model: Model) -> ReactionPlan:

@@ -11,13 +11,14 @@ left out, the others correct with the gain that they have alone at the same P-. 
 """
 
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 from tailgate import num
 from tailgate.core import Array, Innovation, Model, Prior, Received, param
-from tailgate.errors import InputError
+from tailgate.errors import NotApplicable
+from tailgate.reach import blind
 from tailgate.registry import register
 
 from .compose import AcceptAll, Composed, Detector, Filter, Mitigation, Score
@@ -66,35 +67,23 @@ def broad(model: Model) -> Array:
     return np.asarray(1e6 * np.maximum(P.diagonal(), 1e-12))
 
 
-def _solve(M: Array, Y: Array) -> Array:
-    """M^-1 Y for one (n, n) and one (n, k), by elimination with row pivots in fixed order."""
-    M, Y = np.array(M), np.array(Y)
-    for p in range(len(M)):
-        best = p + int(np.argmax(np.abs(M[p:, p])))
-        M[[p, best]], Y[[p, best]] = M[[best, p]], Y[[best, p]]
-        for i in range(len(M)):
-            if i != p:
-                factor = M[i, p] / M[p, p]
-                M[i] -= factor * M[p]
-                Y[i] -= factor * Y[p]
-    return np.asarray(Y / M.diagonal()[:, None])
+def riccati(A: Array, G: Array, Q: Array) -> Array | None:
+    """The predicted covariance P = A (P^-1 + G)^-1 A' + Q (n, n) of one agent, G being the information C' R^-1 C; None where it grows.
 
-
-def _riccati(A: Array, C: Array, Q: Array, R: Array) -> Array | None:
-    """P- (n, n) of one agent by structured doubling (Anderson 1978): round j gives what 2^j steps of the filter give."""
+    By structured doubling (Anderson 1978): round j gives what 2^j steps of the filter give.
+    """
     F, H, eye = np.array(A.T), np.array(Q), np.eye(len(A))
-    G = num.matmul(num.matmul(C.T, num.inverse(R)), C)
     with np.errstate(all="ignore"):  # without a limit it overflows
         for _ in range(64):
-            W = _solve(eye + num.matmul(G, H), eye)
-            FW = num.matmul(F, W)
-            grown = num.matmul(num.matmul(num.matmul(F.T, H), W), F)
-            G = G + num.matmul(num.matmul(FW, G), F.T)
+            W = num.solve(eye + num.product(G, H), eye)
+            FW = num.product(F, W)
+            grown = num.product(num.product(num.product(F.T, H), W), F)
+            G = G + num.product(num.product(FW, G), F.T)
             H = H + 0.5 * (grown + grown.T)
-            F = num.matmul(FW, F)  # the closed loop to the power 2^j
+            F = num.product(FW, F)  # the closed loop to the power 2^j
             scale = np.sqrt(H.diagonal()[:, None] * H.diagonal())
             if (np.abs(grown) <= 1e-15 * scale).all() and (np.abs(F) <= 1e-8).all():
-                return _settle(A, C, Q, R, H)
+                return H
     return None
 
 
@@ -111,46 +100,51 @@ def _settle(A: Array, C: Array, Q: Array, R: Array, P: Array) -> Array:
 
 
 def steady_state(model: Model) -> Array:
-    """P- (N, n, n) at which the predicted covariances settle. Raises InputError where they do not."""
+    """P- (N, n, n) at which the predicted covariances settle. Raises NotApplicable, naming the agents, where they do not."""
+    lost = blind(model, np.eye(model.agents, dtype=bool))  # the doubling may take a mode that nobody sees for one that settles
     out = []
-    for i in range(model.agents):
-        P = _riccati(model.A, model.C[i], model.Q, model.R[i])
+    for i in range(0 if lost else model.agents):
+        C = model.C[i]
+        P = riccati(model.A, num.matmul(num.matmul(C.T, num.inverse(model.R[i])), C), model.Q)
         if P is None:
-            wanted = "(A, C) detectable and process noise on every mode that does not die out, so that the filter has a steady state"
-            raise InputError("model", f"agent {i}", wanted)
-        out.append(P)
+            lost.append(i)
+        else:
+            out.append(_settle(model.A, C, model.Q, model.R[i], P))
+    if lost:
+        wanted = "(A, C) detectable and process noise on every mode that does not die out, so that the filter has a steady state"
+        raise NotApplicable("model", f"agents {', '.join(map(str, lost))} on their own sensors", wanted)
     return np.stack(out)
 
 
 class LinearFilter:
-    """The recursion. A subclass says in `steady` whether P- is held."""
+    """The recursion, on a KalmanPlan or what has its fields. A subclass says in `steady` whether P- is held."""
 
     steady: bool
 
-    def prepare(self, model: Model) -> KalmanPlan:
+    def prepare(self, model: Model) -> Any:
         held = steady_state(model) if self.steady else None
         return KalmanPlan(model.A, model.B, model.c, model.C, model.Q, model.R, broad(model), held)
 
-    def start(self, plan: KalmanPlan, prior: Prior) -> KalmanState:
+    def start(self, plan: Any, prior: Prior) -> KalmanState:
         return KalmanState(prior.mean, prior.cov if plan.held is None else None)
 
-    def predict(self, plan: KalmanPlan, state: KalmanState, known_u: Array) -> KalmanState:
+    def predict(self, plan: Any, state: KalmanState, known_u: Array) -> KalmanState:
         x = num.matvec(plan.A, state.x) + num.matvec(plan.B, known_u) + plan.c
         if state.P is None:
             return KalmanState(x, None)
         half = num.matmul(plan.A, state.P)
         return KalmanState(x, num.matmul(plan.A, num.transpose(half)) + plan.Q)
 
-    def innovation(self, plan: KalmanPlan, state: KalmanState, received: Received) -> Innovation:
+    def innovation(self, plan: Any, state: KalmanState, received: Received) -> Innovation:
         r = np.where(received.valid, received.y - num.matvec(plan.C, state.x), 0.0)
         S = num.matmul(plan.C, num.transpose(self._cross(plan, state))) + plan.R
         return Innovation(r, alone(np.broadcast_to(S, (*r.shape, r.shape[-1])), received.valid))
 
-    def gain(self, plan: KalmanPlan, state: KalmanState, innovation: Innovation) -> Array:
+    def gain(self, plan: Any, state: KalmanState, innovation: Innovation) -> Array:
         cross = num.transpose(self._cross(plan, state))  # P- C'
         return num.matmul(cross, num.inverse(innovation.S))
 
-    def update(self, plan: KalmanPlan, state: KalmanState, innovation: Innovation, accept: Array) -> KalmanState:
+    def update(self, plan: Any, state: KalmanState, innovation: Innovation, accept: Array) -> KalmanState:
         cross = self._cross(plan, state)
         S, r = innovation.S, innovation.r
         if not accept.all():  # multiplying by one would change no bit of the other rows
@@ -165,19 +159,19 @@ class LinearFilter:
         P = state.P - num.matmul(K, cross)
         return KalmanState(x, 0.5 * (P + num.transpose(P)))
 
-    def forget(self, plan: KalmanPlan, state: KalmanState, where: Array) -> KalmanState:
+    def forget(self, plan: Any, state: KalmanState, where: Array) -> KalmanState:
         """A steady filter forgets for this one step."""
         return KalmanState(state.x, np.where(where[..., None, None], np.diag(plan.broad), self._predicted(plan, state)))
 
     def estimate(self, state: KalmanState) -> Array:
         return state.x
 
-    def _predicted(self, plan: KalmanPlan, state: KalmanState) -> Array:
+    def _predicted(self, plan: Any, state: KalmanState) -> Array:
         P = plan.held if state.P is None else state.P
         assert P is not None
         return P
 
-    def _cross(self, plan: KalmanPlan, state: KalmanState) -> Array:
+    def _cross(self, plan: Any, state: KalmanState) -> Array:
         """C P- (B, N, q, n), or (N, q, n) where it is the same for all."""
         return num.matmul(plan.C, self._predicted(plan, state))
 

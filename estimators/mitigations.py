@@ -85,7 +85,7 @@ class Reacquire(GateOut):
 class Widen(GateOut):
     """Ignores the suspected sensors, and asks for a longer time headway while alarmed and for some time after."""
 
-    mode: ModeName = param("widen", "what is asked of the controller while alarmed: normal, widen, brake or stop")
+    mode: ModeName = param("widen", "what is asked of the controller while alarmed: normal, widen, brake, stop or acc")
 
 
 @register("mitigation", "brake")
@@ -93,4 +93,4 @@ class Widen(GateOut):
 class Brake(GateOut):
     """Ignores the suspected sensors, and asks for gentle braking while alarmed and for some time after."""
 
-    mode: ModeName = param("brake", "what is asked of the controller while alarmed: normal, widen, brake or stop")
+    mode: ModeName = param("brake", "what is asked of the controller while alarmed: normal, widen, brake, stop or acc")

@@ -5,12 +5,13 @@ from typing import Any
 
 import numpy as np
 
-from tailgate.core import Mode, Received
+from tailgate.core import Mode, Received, param
 from tailgate.errors import InputError
 from tailgate.registry import register
 
 from .compose import Composed, Decision, Detector, Filter, Mitigation, Score, Stateless, Verdict
-from .kalman import KalmanFilter
+from .distributed import DistributedKalmanFilter
+from .kalman import GAIN, Gain, KalmanFilter
 
 
 @dataclass(frozen=True)
@@ -30,3 +31,14 @@ class Oracle(Composed):
 
     def parts(self) -> tuple[Filter, Detector, Mitigation]:
         return KalmanFilter(), Score(), RejectAttacked()
+
+
+@register("defence", "dkf_oracle", uses=("measurements", "truth"), reference="Dutta 2018, (6.19)-(6.25)")
+@dataclass(frozen=True)
+class DistributedOracle(Composed):
+    """Distributed Kalman filter in which every agent is told which of its readings are attacked and ignores those."""
+
+    gain: Gain = param("varying", GAIN)
+
+    def parts(self) -> tuple[Filter, Detector, Mitigation]:
+        return DistributedKalmanFilter(self.gain == "steady"), Score(), RejectAttacked()

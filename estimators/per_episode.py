@@ -57,8 +57,11 @@ class EpisodeByEpisode:
         raise TypeError(f"{type(self).__name__} must define make()")
 
     def prepare(self, model: Model) -> EpisodePlan:
+        assert model.gap is not None and model.speed is not None
+        rows = [slice(i, i + 1) for i in range(model.agents)]
         models = tuple(
-            dataclasses.replace(model, C=model.C[i : i + 1], R=model.R[i : i + 1], graph=np.eye(1, dtype=bool)) for i in range(model.agents)
+            dataclasses.replace(model, C=model.C[i], R=model.R[i], graph=np.eye(1, dtype=bool), gap=model.gap[i], speed=model.speed[i])
+            for i in rows
         )
         made = [self.make() for _ in models]
         return EpisodePlan(models, tuple(player for player in made if isinstance(player, Recalling)))

@@ -8,39 +8,62 @@ import numpy as np
 from tailgate import num
 from tailgate.core import Array, Estimate, Mode, Model, Prior, Received
 from tailgate.draws import Draws
-from tailgate.errors import InputError
+from tailgate.errors import NotApplicable
 from tailgate.registry import register
 
 
-class RawPlan(NamedTuple):
-    wiring: Array  # (q,) the state that each sensor reads
+class Reading(NamedTuple):
+    """Who learns which state from whose sensor: four indices of the same length, no state of an agent twice."""
+
+    agent: Array
+    state: Array
+    teller: Array
+    sensor: Array
 
 
 class RawState(NamedTuple):
     x: Array  # (B, N, n) the last values
 
 
+def readings(model: Model) -> tuple[Reading, ...]:
+    """What each agent reads and hears, in rounds: where two sensors tell the same, the later round counts, the own sensors last.
+
+    Raises NotApplicable where a sensor does not read one state directly.
+    """
+    if not (np.isin(model.C, (0.0, 1.0)).all() and (np.count_nonzero(model.C, axis=2) == 1).all()):
+        raise NotApplicable("defence none", "this sensor matrix", "sensors that each read one state directly")
+    state = np.argmax(model.C, axis=2)
+    rounds: list[list[tuple[int, int, int, int]]] = []
+    for i in range(model.agents):
+        told: dict[int, int] = {}  # how often each state was told
+        tellers = [j for j in np.flatnonzero(model.graph[i]).tolist() if j != i]
+        for j in (*tellers, i):
+            for s, column in enumerate(state[j].tolist()):
+                turn = told[column] = told.get(column, -1) + 1
+                if turn == len(rounds):
+                    rounds.append([])
+                rounds[turn].append((i, column, j, s))
+    return tuple(Reading(*np.array(each).T) for each in rounds)
+
+
 @register("defence", "none")
 @dataclass(frozen=True)
 class Raw:
-    """Believes the sensors: each measured state is its reading, a state that no sensor reads keeps its prior."""
+    """Believes the sensors, its own and those that it hears of: what they read is the state; one that nobody reads keeps its prior."""
 
-    def prepare(self, model: Model) -> RawPlan:
-        C = model.C[0]
-        one_each = np.isin(C, (0.0, 1.0)).all() and (np.count_nonzero(C, axis=1) == 1).all()
-        if not (one_each and (model.C == C).all()):
-            raise InputError("defence none", "this sensor matrix", "sensors that each read one state directly")
-        return RawPlan(np.argmax(C, axis=1))
+    def prepare(self, model: Model) -> tuple[Reading, ...]:
+        return readings(model)
 
-    def start(self, plan: RawPlan, prior: Prior) -> RawState:
+    def start(self, plan: tuple[Reading, ...], prior: Prior) -> RawState:
         return RawState(prior.mean)
 
     def step(
-        self, plan: RawPlan, state: RawState, received: Received, known_u: Array, draws: Draws
+        self, plan: tuple[Reading, ...], state: RawState, received: Received, known_u: Array, draws: Draws
     ) -> tuple[RawState, Estimate]:
         x = state.x.copy(order="K")
-        for sensor, column in enumerate(plan.wiring):
-            x[..., column] = np.where(received.valid[..., sensor], received.y[..., sensor], x[..., column])
+        for agent, column, teller, sensor in plan:
+            there = received.valid[:, teller, sensor]
+            x[:, agent, column] = np.where(there, received.y[:, teller, sensor], x[:, agent, column])
         score = np.zeros(x.shape[:2])
         quiet = np.zeros(x.shape[:2], bool)
         return RawState(x), Estimate(x, score, quiet, num.full(score.shape, Mode.NORMAL, np.int8), ~quiet)

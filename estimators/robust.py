@@ -18,7 +18,7 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from tailgate import num
+from tailgate import kernels, num
 from tailgate.core import Array, Innovation, Model, Positive, param
 from tailgate.registry import register
 
@@ -39,9 +39,12 @@ def believed(r: Array, S: Array, lam: Array) -> Array:
     rows = np.nonzero((2.0 * np.abs(num.matvec(W, r)) > lam).any(axis=-1))
     if not len(rows[0]):
         return r
-    solve = {1: _single, 2: _pair}.get(r.shape[-1], _pivot)
-    y = r.copy(order="K")
-    y[rows] = solve(r[rows], S[rows], W[rows], 0.5 * lam[rows])
+    y, half = r.copy(order="K"), 0.5 * lam
+    if r.shape[-1] > 2:
+        y[rows] = _pivot(r, S, W, half, rows)
+    else:
+        solve = _single if r.shape[-1] == 1 else _pair
+        y[rows] = solve(r[rows], S[rows], W[rows], half[rows])
     return y
 
 
@@ -69,60 +72,34 @@ def _pair(r: Array, S: Array, W: Array, half: Array) -> Array:
     return y
 
 
-def _pivot(r: Array, S: Array, W: Array, half: Array) -> Array:
+def _pivot(r: Array, S: Array, W: Array, half: Array, rows: tuple[Array, ...]) -> Array:
     """Any number of sensors: block principal pivoting (Judice and Pires 1992), which ends in a finite number of rounds.
 
     A round solves for the outliers of presumed signs, and changes the presumptions that its solution contradicts: all of them while they
     grow fewer, else the last one alone. (Coordinate descent is simpler, and takes thousands of sweeps where sensors are correlated.)
     """
-    q = r.shape[-1]
-    out, left = r.copy(), np.arange(len(r))
-    signs, fewest, patience = np.zeros_like(r), np.full(len(r), q + 1), np.full(len(r), PATIENCE)
-    size = S.diagonal(axis1=-2, axis2=-1)
-    for _ in range(ROUNDS):
-        y = _with_outliers(r, signs, W, half)
-        g = num.matvec(W, y)
-        largest = np.max(np.abs(W * y[:, None, :]), axis=-1)
-        wrong = np.where(
-            signs == 0.0,
-            np.abs(g) > half + (TOLERANCE * half + ROUNDING * largest),
-            signs * (r - y) < -(TOLERANCE * half * size + ROUNDING * (np.abs(r) + np.abs(y))),
-        )
-        out[left] = y
-        count = np.count_nonzero(wrong, axis=-1)
-        go = count > 0
-        if not go.any():
-            break
-        patience = np.where(count < fewest, PATIENCE, patience - 1)
-        fewest = np.minimum(count, fewest)
-        last = np.arange(q) == (q - 1 - np.argmax(wrong[:, ::-1], axis=-1))[:, None]
-        change = wrong & ((patience >= 0)[:, None] | last)
-        signs = np.where(change, np.where(signs == 0.0, np.sign(g), 0.0), signs)
-        left, r, W, half, size, signs, fewest, patience = (x[go] for x in (left, r, W, half, size, signs, fewest, patience))
-    else:
-        raise ArithmeticError(f"rkf: {len(left)} problems of {q} sensors are not solved after {ROUNDS} rounds of pivoting")
-    return out
-
-
-def _with_outliers(r: Array, signs: Array, W: Array, half: Array) -> Array:
-    """The solution if exactly the sensors with a sign that is not 0 have outliers."""
-    free = signs != 0.0
-    inverse, y = num.inverse(alone(W, free)), np.where(free, 0.0, r)
-    for _ in range(2):  # the second time mends the rounding of the first
-        y = y + np.where(free, num.matvec(inverse, np.where(free, signs * half - num.matvec(W, y), 0.0)), 0.0)
+    r, half = np.ascontiguousarray(r[rows]), np.ascontiguousarray(half[rows])
+    size = np.ascontiguousarray(S.diagonal(axis1=-2, axis2=-1)[rows])
+    shared = W.ndim == 4 and W.strides[0] == 0  # the same for the whole batch
+    blocks, which = (W[0], rows[1]) if shared else (W[rows], np.arange(len(r)))
+    y = np.empty_like(r)
+    left = kernels.pivot_each(r, np.ascontiguousarray(blocks), which, half, size, TOLERANCE, ROUNDING, PATIENCE, ROUNDS, y)
+    if left:
+        raise ArithmeticError(f"believed: {left} problems of {r.shape[1]} sensors are not solved after {ROUNDS} rounds of pivoting")
     return y
 
 
 @cache
 def _problem(q: int) -> tuple[Any, dict[str, Any], Any]:
     """The cvxpy problem of q sensors, its parameters and its variable. W = F'F, d = F r."""
-    cp = _cvxpy()
+    cp = load_cvxpy()
     z, known = cp.Variable(q), {"F": cp.Parameter((q, q)), "d": cp.Parameter(q), "lam": cp.Parameter(q, nonneg=True)}
     price = cp.sum_squares(known["d"] - cp.matmul(known["F"], z)) + cp.norm1(cp.multiply(known["lam"], z))
     return cp.Problem(cp.Minimize(price)), known, z
 
 
-def _cvxpy() -> Any:
+def load_cvxpy() -> Any:
+    """The package cvxpy. Raises ImportError with the command that installs it."""
     try:
         return import_module("cvxpy")
     except ImportError as error:
@@ -168,7 +145,7 @@ class Solved(Penalty):
 
     def __post_init__(self) -> None:
         if self.solver == "cvxpy":
-            _cvxpy()  # missing: say so here, not in the first step
+            load_cvxpy()  # missing: say so here, not in the first step
 
 
 @register("filter", "rkf", reference="Mattingley and Boyd, Real-time convex optimization in signal processing, 2010; Dutta 2018, [29]")

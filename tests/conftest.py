@@ -81,7 +81,8 @@ def granting():
         model, every = place.brief().model, get_args(KindName)
         wider = [{}, {"kinds": every}]
         if not place.threat_model.targets:
-            some = [names for n in range(len(model.sensors), 0, -1) for names in combinations(model.sensors, n)]
+            fewest = 0 if model.agents == 1 else len(model.sensors) - 1  # a network may have too many for every choice
+            some = [names for n in range(len(model.sensors), fewest, -1) for names in combinations(model.sensors, n)]
             wider += [{"kinds": every, "targets": (*names, *model.actuators)} for names in some]
         for changes in wider:
             try:

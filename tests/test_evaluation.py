@@ -1,5 +1,6 @@
 """Rows: the same whatever the batch, the workers and interruptions; a failure costs its own rows."""
 
+import dataclasses
 import json
 import sys
 from dataclasses import dataclass
@@ -10,15 +11,19 @@ import numpy as np
 import pytest
 
 import tailgate
-from tailgate import evaluation
+from tailgate import draws, evaluation, trace
 from tailgate import rows as rows_module
+from tailgate.core import no_command
+from tailgate.envs import SensorNetwork
 from tailgate.errors import InputError
 from tailgate.estimators import Kalman, Oracle
 from tailgate.evaluation import Cell, cells_of, run, run_cell
 from tailgate.metrics import METRICS
+from tailgate.reach import blind
 from tailgate.rows import read_rows
-from tailgate.scenario import Suite
+from tailgate.scenario import Scenario, Suite, load_scenario
 from tailgate.summary import summarise
+from tailgate.trace import Trace, episodes_at_once, rollout
 
 SUITE = Suite("small", "", ("gusty-stop-and-go-v0",), (12,), ("kf", "chi2_kf"), ("none", "fdi:trigger=near,threshold=30,value=-4"), 9)
 
@@ -217,3 +222,120 @@ def test_a_mode_that_does_not_exist_is_refused() -> None:
 
     rows = tailgate.evaluate(scenarios=["gusty-stop-and-go-v0"], defences=[Ninth()], attacks=["none"], seeds=1)
     assert "mode" in rows[0]["reason"] and "NORMAL" in rows[0]["reason"]
+
+
+PLATOON = Cell("s", "platoon-braking-v0", None, "none", "fdi:start_step=200,value=60,chance=0.5", 7)
+
+
+def test_a_cell_plays_no_more_at_once_than_memory_holds(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The batch is cut where a trace would need more than trace.MEMORY; the rows do not change, nor do those of a cell that fails."""
+    sizes: list[int] = []
+
+    def counted(loop: Any, attack: Any, keys: Any, **options: Any) -> Trace:
+        sizes.append(len(keys.key))
+        return rollout(loop, attack, keys, **options)
+
+    monkeypatch.setattr(evaluation, "rollout", counted)
+    whole, broken = run_cell(PLATOON), run_cell(PLATOON, defence=Faulty(how="nan"))
+    loop = load_scenario("platoon-braking-v0").loop(Kalman())
+    used = sum(held.nbytes for held in _recorded(loop).values())
+    assert 0.98 < used / (1e9 / episodes_at_once(loop.model, loop.horizon, 10**9)) < 1.02
+    monkeypatch.setattr(trace, "MEMORY", 3.5 * used)
+    assert _results(run_cell(PLATOON)) == _results(whole) and {row["status"] for row in whole} == {"ok"}
+    assert _results(run_cell(PLATOON, defence=Faulty(how="nan"))) == _results(broken) and {row["status"] for row in broken} == {"error"}
+    monkeypatch.setattr(trace, "MEMORY", 1.0)
+    assert episodes_at_once(loop.model, loop.horizon, 256) == 1
+    assert sizes == [7, 7, 3, 3, 1, 3, 3, 1]
+
+
+def _recorded(loop: Any) -> dict[str, Any]:
+    """What a recorder holds of one episode."""
+    state = loop.start(draws.keys("train", [0]))
+    recorder = trace.Recorder(loop, state)
+    _, frame = loop.advance(state, no_command(1, loop.model.agents, len(loop.model.wires)))
+    recorder.add(frame, np.ones(1, bool))
+    return recorder.signals
+
+
+class OwnTruth(SensorNetwork):
+    """A network whose agents' truths are copies."""
+
+    def truth(self, plan: Any, state: Any, held: Any) -> Any:
+        return np.array(super().truth(plan, state, held))
+
+
+def test_a_truth_that_agents_share_is_stored_once() -> None:
+    """One copy in memory, as many as there are agents to a reader, and the fingerprints of a truth that is stored in full."""
+    place = dataclasses.replace(load_scenario("network-weak-v0"), horizon=15)
+    plant = OwnTruth(**{field.name: getattr(place.plant, field.name) for field in dataclasses.fields(place.plant)})
+    shared, own = (
+        rollout(dataclasses.replace(place, plant=p).loop(tailgate.make_defence("dkf")), tailgate.make_attack("none"), draws.keys("train", range(3)))
+        for p in (place.plant, plant)
+    )
+    assert shared.truth.shape == own.truth.shape == (15, 3, 10, 10)
+    assert shared.truth.strides[2] == 0 and own.truth.strides[2] != 0
+    assert [shared.trace_hash(i) for i in range(3)] == [own.trace_hash(i) for i in range(3)]
+
+
+def test_every_scenario_of_many_agents_is_checked_once_per_defence(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Attacks and doses do not prepare the same filter again before anything is played: that of a long platoon takes minutes."""
+    made: list[str] = []
+    real = Scenario.loop
+
+    def counted(self: Scenario, *arguments: Any) -> Any:
+        made.append(self.name)
+        return real(self, *arguments)
+
+    monkeypatch.setattr(Scenario, "loop", counted)
+    suite = Suite("s", "", ("network-weak-v0", "thesis-ch6-v0"), (1, 2, None), ("dkf", "none"), ("none", "fdi", "stealth", "covert"), 2)
+    assert len(cells_of(suite)) == 48
+    assert sorted(made) == ["network-weak-v0"] * 2 + ["thesis-ch6-v0"] * 2
+
+
+def test_agents_and_wires_are_checked_before_anything_is_played() -> None:
+    """Also where the defence has no meaning: the attack and the threat model are looked at by themselves."""
+    for change, words in (({"threat": {"agents": [10]}}, "agents: got 10"), ({"attacks": ["fdi:targets=[distance]"]}, "got 'distance'")):
+        arguments: dict[str, Any] = {"scenarios": ["network-weak-v0"], "defences": ["none"], "attacks": ["none"], "seeds": 1}
+        with pytest.raises(InputError, match=words):
+            tailgate.evaluate(**(arguments | change))
+
+
+def test_a_network_has_rows_without_a_road(tmp_path: Path) -> None:
+    """They are read again, say how large the error was, and have null for what needs a road; a summary has both."""
+    out = tmp_path / "rows.jsonl"
+    rows = tailgate.evaluate(scenarios=["network-weak-v0"], defences=["dkf", "none"], attacks=["fdi:value=20"], seeds=2, out=out)
+    assert read_rows(out) == rows and [row["status"] for row in rows] == ["ok", "ok", "skipped", "skipped"]
+    assert rows[0]["min_gap"] is None and rows[0]["max_error"] > 5.0 and rows[0]["crashed"] == 0.0
+    good, bad = summarise(rows)
+    assert good["min_gap"] is None and good["max_error"]["median"] > 5.0 and bad["crash"] is None and "directly" in bad["reason"]
+
+
+SCENARIOS = (Path(__file__).parents[1] / "docs/scenarios.md").read_text(encoding="utf-8")
+
+
+def test_the_network_of_the_documentation_plays(tmp_path: Path) -> None:
+    """As it stands; and nobody in it knows the state alone."""
+    (tmp_path / "mine.yaml").write_text(SCENARIOS.split("```yaml\n")[2].split("```")[0], encoding="utf-8")
+    rows = tailgate.evaluate(scenarios=[str(tmp_path / "mine.yaml")], defences=["dkf"], attacks=["fdi"], seeds=2)
+    assert {row["status"] for row in rows} == {"ok"} and rows[0]["attack_steps"] == 180.0
+    model = load_scenario(str(tmp_path / "mine.yaml")).brief().model
+    assert blind(model, np.eye(5, dtype=bool)) == [0, 1, 2, 3, 4]
+
+
+@pytest.mark.parametrize(
+    ("scenario", "plant", "threat", "defence", "attack"),
+    [
+        ("network-weak-v0", {"agents": 5, "states": 6, "graph": "path", "directed": True}, {}, "dkf", "none"), ("thesis-ch5-v0", {"agents": 7}, {}, "dkf", "none"),
+        ("network-weak-v0", {"agents": 3, "edges": ((0, 3),)}, {}, "dkf", "none"), ("platoon-braking-v0", {}, {"agents": (5,)}, "dkf", "none"),
+        ("platoon-braking-v0", {}, {}, "rkf", "none"), ("network-noisy-v0", {}, {}, "none", "none"), ("platoon-braking-v0", {}, {}, "dkf", "covert"),
+        ("network-noisy-v0", {}, {}, "dkf", "program"),
+    ],
+)  # fmt: skip
+def test_the_error_texts_of_the_documentation_are_those_that_come(scenario: str, plant: Any, threat: Any, defence: str, attack: str) -> None:
+    place = load_scenario(scenario).with_threat(**threat)
+    place = dataclasses.replace(place, plant=dataclasses.replace(place.plant, **plant))
+    if "directed" in plant:
+        place = dataclasses.replace(place, sensor=dataclasses.replace(place.sensor, modes_seen=1))
+    with pytest.raises(InputError) as caught:
+        tailgate.make_attack(attack).prepare(place.loop(tailgate.make_defence(defence)).brief)
+    assert f"\n{caught.value}\n" in SCENARIOS

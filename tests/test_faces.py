@@ -1,9 +1,11 @@
 """The Gymnasium faces: both checkers without a warning, batch equal to single, autoreset, masks, cards and errors."""
 
 import json
+import re
 import subprocess
 import sys
 import warnings
+from pathlib import Path
 from typing import get_args
 
 import gymnasium
@@ -14,27 +16,52 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
 import tailgate
-from tailgate.agents.codec import ActionName, ActionSpec, Reward, RewardName
+from tailgate.agents.codec import ActionName, ActionSpec
+from tailgate.agents.reward import Reward, RewardName
 from tailgate.core import Kind
-from tailgate.envs.faces import AdversaryEnv, AdversaryVectorEnv
+from tailgate.envs.faces import FACES, AdversaryEnv, AdversaryVectorEnv
 from tailgate.errors import InputError
 from tailgate.schema import fields_of
 
 ID = "tailgate/CarFollowing-v0"
+ROOT = Path(__file__).parents[1]
+PLATOON, NETWORK = "tailgate/Platoon-v0", "tailgate/SensorNetwork-v0"
 ACTIONS = get_args(ActionName)
+KINDS = ["dos_jam", "dos_hold", "dropout", "fdi"]
+TINY = {  # scenarios of 40 steps, short enough for many episodes
+    ID: {
+        "plant": {"name": "car_following", "gap": 20.0}, "sensor": "odometry", "controller": "acc", "horizon": 40,
+        "manoeuvre": {"name": "braking", "onset": [0.0, 1.0]}, "threat_model": {"kinds": KINDS, "onset": 3},
+    },
+    PLATOON: {
+        "plant": {"name": "platoon", "followers": 2, "gap": 14.0}, "sensor": "platoon_sensors", "controller": "cacc", "horizon": 40,
+        "manoeuvre": {"name": "braking", "onset": [0.0, 1.0]},
+        "threat_model": {"kinds": KINDS, "targets": ["distance", "velocity"], "agents": [1, 2], "onset": 3},
+    },
+    NETWORK: {
+        "plant": {"name": "sensor_network", "agents": 4, "states": 3, "graph": "ring"}, "sensor": {"name": "linear_sensors", "sensors": 2},
+        "controller": "none", "manoeuvre": {"name": "constant", "value": 0.0}, "horizon": 40,
+        "threat_model": {"kinds": KINDS, "agents": [0, 2], "onset": 3},
+    },
+}  # fmt: skip
 
 
 @pytest.fixture(scope="module")
-def brief_scenario(tmp_path_factory):
-    """A scenario of 40 steps, short enough for many episodes."""
-    data = {
-        "plant": {"name": "car_following", "gap": 20.0}, "sensor": "odometry", "controller": "acc", "horizon": 40,
-        "manoeuvre": {"name": "braking", "onset": [0.0, 1.0]},
-        "threat_model": {"kinds": ["dos_jam", "dos_hold", "dropout", "fdi"], "onset": 3},
-    }  # fmt: skip
-    path = tmp_path_factory.mktemp("scenario") / "tiny.yaml"
-    path.write_text(yaml.safe_dump(data))
-    return str(path)
+def tiny(tmp_path_factory):
+    """Arguments of each id with its scenario of 40 steps."""
+    folder = tmp_path_factory.mktemp("scenario")
+    out = {}
+    for name, data in TINY.items():
+        path = folder / f"{name.split('/')[1]}.yaml"
+        path.write_text(yaml.safe_dump(data))
+        out[name] = {"scenario": str(path)}
+    return out
+
+
+@pytest.fixture(scope="module")
+def brief_scenario(tiny):
+    """A car-following scenario of 40 steps."""
+    return tiny[ID]["scenario"]
 
 
 @pytest.fixture
@@ -61,22 +88,65 @@ def test_both_checkers_pass_without_a_warning(action, knowledge, strict, brief_s
         sb3.check_env(gymnasium.make(ID, **arguments), warn=True)
 
 
-def test_the_checker_passes_with_its_render_check(strict, monkeypatch):
-    """The default environment, every declared render mode included."""
+@pytest.mark.parametrize("knowledge, sees", [("black", True), ("white", False)])
+@pytest.mark.parametrize("action", ACTIONS)
+@pytest.mark.parametrize("name", [PLATOON, NETWORK])
+def test_both_checkers_pass_on_every_system(name, action, knowledge, sees, strict, tiny):
+    """Platoon and network: modes of single agents and wires, vectors, intervals, every reward that can be earned there."""
+    sb3 = pytest.importorskip("stable_baselines3.common.env_checker")
+    for reward in get_args(RewardName):
+        if name == NETWORK and reward in ("min_gap", "collision"):
+            continue
+        arguments = tiny[name] | dict(action=action, knowledge=knowledge, reward=reward, threat={"sees_measurement": sees}, interval=3, per_agent=True)
+        check_env(gymnasium.make(name, **arguments).unwrapped, skip_render_check=True)
+        sb3.check_env(gymnasium.make(name, **arguments), warn=True)
+
+
+@pytest.mark.parametrize("name", FACES)
+def test_the_checker_passes_with_its_render_check(name, strict, monkeypatch):
+    """Each id as it comes, every declared render mode included."""
     pytest.importorskip("PIL")
     pytest.importorskip("pygame")
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
-    check_env(gymnasium.make(ID).unwrapped)
+    check_env(gymnasium.make(name).unwrapped)
 
 
-def test_the_id_works_in_a_fresh_interpreter():
+@pytest.mark.parametrize("name", FACES)
+def test_the_id_works_in_a_fresh_interpreter(name):
     """Gymnasium alone imports the module that the id names."""
     code = (
-        "import gymnasium; e = gymnasium.make('tailgate:tailgate/CarFollowing-v0'); o, i = e.reset(seed=1);"
+        f"import gymnasium; e = gymnasium.make('tailgate:{name}'); o, i = e.reset(seed=1);"
         "print(e.step(e.action_space.sample())[0].shape == e.observation_space.shape)"
     )
     done = subprocess.run([sys.executable, "-W", "error", "-c", code], capture_output=True, text=True, timeout=120)
     assert done.stdout == "True\n", done.stderr
+
+
+def test_the_defaults_of_an_id_hold_everywhere(tiny):
+    """make, make_vec and the VecEnv of one id are the same environment; what is said wins over the default."""
+    sb3 = pytest.importorskip("tailgate.envs.sb3")
+    for name, defaults in FACES.items():
+        cards = [gymnasium.make(name).unwrapped.card(), gymnasium.make_vec(name, num_envs=2).unwrapped.card(), sb3.BatchVecEnv(2, name).batch.card()]
+        assert cards[0] == cards[1] == cards[2]
+        assert cards[0]["scenario"]["name"] == defaults["scenario"] and cards[0]["defence"]["spec"] == defaults["defence"]
+        other = gymnasium.make(name, reward="stealth", **tiny[name]).unwrapped.card()
+        assert other["reward"]["reward"] == "stealth" and other["scenario"]["horizon"] == 40
+    assert AdversaryEnv().card() == gymnasium.make(ID).unwrapped.card()
+    with pytest.raises(InputError, match=r"id.*'tailgate/Plato'.*tailgate/Platoon-v0"):
+        sb3.BatchVecEnv(2, "tailgate/Plato")
+
+
+def test_info_is_finite_and_has_what_the_system_has(tiny):
+    """On a road the smallest gap; without one the largest error of an agent, 0 at the start of an episode."""
+    for name in FACES:
+        vec = gymnasium.make_vec(name, num_envs=3, **tiny[name])
+        _, info = vec.reset(seed=2)
+        assert ("gap" in info) == (name != NETWORK) and ("error" in info) == (name == NETWORK)
+        for _ in range(90):
+            assert all(np.isfinite(value).all() for value in info.values())
+            if name == NETWORK:
+                assert ((info["error"] == 0.0) == (info["step"] == 1)).all()
+            *_, info = vec.step(vec.action_space.sample())
 
 
 def test_a_batch_of_4096_steps():
@@ -96,16 +166,18 @@ def _actions(vec, steps, seed=0):
     return [vec.action_space.sample() for _ in range(steps)]
 
 
-@pytest.mark.parametrize("interval", [1, 3])
-@pytest.mark.parametrize("action", ACTIONS)
-def test_row_i_is_the_single_environment_of_seed_s_plus_i(action, interval, brief_scenario, same_bits):
+SEEDED = [*((ID, action, interval) for action in ACTIONS for interval in (1, 3)), (PLATOON, "mode", 1), (PLATOON, "increment", 3), (NETWORK, "ramp", 3), (NETWORK, "continuous", 1)]
+
+
+@pytest.mark.parametrize("name, action, interval", SEEDED)
+def test_row_i_is_the_single_environment_of_seed_s_plus_i(name, action, interval, tiny, same_bits):
     """Two whole episodes: observation, reward, flags and info of every row, bit for bit; autoreset adds 1 to the episode."""
-    arguments = dict(scenario=brief_scenario, action=action, value=-8.0, knowledge="white", reward="stealth", interval=interval)
-    vec = gymnasium.make_vec(ID, num_envs=4, **arguments)
+    arguments = tiny[name] | dict(action=action, value=-8.0, knowledge="white", reward="stealth", interval=interval)
+    vec = gymnasium.make_vec(name, num_envs=4, **arguments)
     start, _ = vec.reset(seed=70)
     steps = [(a, *vec.step(a)) for a in _actions(vec, 81)]
     for i in range(4):
-        env = gymnasium.make(ID, **arguments)
+        env = gymnasium.make(name, **arguments)
         first, _ = env.reset(seed=70 + i)
         assert same_bits(first, start[i])
         over, episodes = False, 1
@@ -125,10 +197,11 @@ def test_row_i_is_the_single_environment_of_seed_s_plus_i(action, interval, brie
         assert vec.unwrapped.state.keys.episode[i] == episodes - 1 == env.unwrapped.batch.state.keys.episode[0]
 
 
-def test_next_step_same_step_and_disabled_are_one_core(brief_scenario, same_bits):
+@pytest.mark.parametrize("name", FACES)
+def test_next_step_same_step_and_disabled_are_one_core(name, tiny, same_bits):
     """NEXT_STEP spends a step on the reset, SAME_STEP reports the last observation as final_obs, DISABLED waits for a mask."""
     modes = ("next_step", "same_step", "disabled")
-    faces = {mode: AdversaryVectorEnv(6, autoreset=mode, scenario=brief_scenario, value=-20.0) for mode in modes}
+    faces = {mode: AdversaryVectorEnv(6, autoreset=mode, **(FACES[name] | tiny[name]), value=-20.0) for mode in modes}
     for mode, face in faces.items():
         assert face.metadata["autoreset_mode"] == AutoresetMode[mode.upper()]
         face.reset(seed=3)
@@ -153,7 +226,7 @@ def test_next_step_same_step_and_disabled_are_one_core(brief_scenario, same_bits
         fresh, _ = faces["disabled"].reset(options={"reset_mask": done})
         assert same_bits(fresh, same[0])
         faces["next_step"].reset(options={"reset_mask": done})
-    assert ended > 12 and len({tuple(f.state.keys.episode) for f in faces.values()}) == 1
+    assert ended >= 12 and len({tuple(f.state.keys.episode) for f in faces.values()}) == 1
 
 
 def test_next_step_ignores_the_action_of_a_resetting_row(brief_scenario):
@@ -225,7 +298,7 @@ def test_the_spec_survives_a_round_trip(brief_scenario, same_bits):
 CHANGES = [
     {"scenario": "braking-v0"}, {"defence": "kf"}, {"defence": "chi2_kf:eta=19"}, {"knowledge": "grey"}, {"threat": {"budget": 5}},
     {"threat": {"sees_measurement": True}}, {"action": "timing"}, {"kind": "dropout"}, {"value": -3.0}, {"rate": 0.4},
-    {"per_sensor": True}, {"interval": 2}, {"reward": "error"}, {"gap_shaping": 0.1}, {"error_shaping": 0.1}, {"gamma": 0.9},
+    {"per_sensor": True}, {"per_agent": True}, {"error_scale": 5.0}, {"interval": 2}, {"reward": "error"}, {"gap_shaping": 0.1}, {"error_shaping": 0.1}, {"gamma": 0.9},
     {"illegal_penalty": 0.2},
     {"attack_cost": 0.1}, {"steps": 7},
 ]  # fmt: skip
@@ -267,6 +340,7 @@ BAD = [
     ({"threat": {"bugdet": 1}}, ["threat", "'bugdet'", "did you mean 'budget'"]), ({"value": 1e3}, ["value", "1000.0", "fdi_bound (50.0)"]),
     ({"value": float("nan")}, ["value", "nan", "finite"]), ({"render_mode": "ansi"}, ["render_mode", "'ansi'", "rgb_array"]),
     ({"threat": {"kinds": ["fdi"]}, "action": "timing", "kind": "dropout"}, ["action", "dropout", "fdi"]),
+    ({"threat": {"agents": [1]}}, ["agents", "1", "0 to 0"]), ({"scenario": "thesis-ch5-v0", "defence": "dkf"}, ["reward", "'min_gap'", "error or stealth"]),
     ({"threat": {"targets": ["speed"]}}, ["targets", "'speed'", "velocity"]), ({"gamma": 0}, ["gamma", "0", "greater than 0"]),
 ]  # fmt: skip
 
@@ -300,3 +374,19 @@ def test_bad_calls_are_refused(brief_scenario):
     for arguments in ({"num_envs": 0}, {"num_envs": 1.5}, {"autoreset": "now"}):
         with pytest.raises(InputError, match=next(iter(arguments))):
             AdversaryVectorEnv(**({"num_envs": 1} | arguments))
+
+
+def test_the_documentation_runs_as_written(tmp_path):
+    """Every Python example of the page, the one for Stable-Baselines3 with fewer decisions; its names of ids and fields exist."""
+    pytest.importorskip("stable_baselines3")
+    text = (ROOT / "docs/environment.md").read_text(encoding="utf-8")
+    blocks = re.findall(r"```python\n(.*?)```", text, flags=re.S)
+    assert len(blocks) == 2 and "learn(150_000)" in blocks[1]
+    code = "\n".join(blocks).replace("learn(150_000)", "learn(7_000)")
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert set(re.findall(r"tailgate/\w+-v0", text)) == set(FACES)
+    named = {name for cell in re.findall(r"^\| (`[^|]*) \|", text, flags=re.M) for name in re.findall(r"`(\w+)`", cell)}
+    assert set(fields_of(ActionSpec)) | set(fields_of(Reward)) <= named
+    for name, defaults in FACES.items():
+        assert f"| `{name}` |" in text and f"| `{defaults['scenario']}` | `{defaults['defence']}` |" in text

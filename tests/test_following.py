@@ -25,6 +25,11 @@ LONG += [(n, "chi2_kf") for n in list_scenarios() if load_scenario(n).horizon > 
 QUIET = {"process_var": (0.0, 0.0, 0.0), "rear": False}
 
 
+def prepared(plant):
+    """The plan of a plant."""
+    return plant.prepare(plant.model(Odometry(), AdaptiveCruise()))
+
+
 def _draws(role, step, batch=1):
     return keys("train", range(batch)).at(role, np.full(batch, step))
 
@@ -44,7 +49,7 @@ def _run(loop, attack=None, seeds=(0,)):
 @pytest.mark.parametrize("dt, tau", [(0.1, 1.008), (0.01, 1.008), (1.0, 0.3), (0.05, 5.0)])
 def test_the_plant_is_the_zero_order_hold_of_its_continuous_model(dt, tau):
     """A and B equal scipy's discretisation of x' = v, v' = a, tau a' = u - a."""
-    plan = CarFollowing(dt=dt, tau=tau).prepare()
+    plan = prepared(CarFollowing(dt=dt, tau=tau))
     A = np.array([[0, 1, 0], [0, 0, 1], [0, 0, -1 / tau]])
     B = np.array([[0], [0], [1 / tau]])
     want = cont2discrete((A, B, np.eye(3), np.zeros((3, 1))), dt, "zoh")
@@ -55,7 +60,7 @@ def test_the_plant_is_the_zero_order_hold_of_its_continuous_model(dt, tau):
 def test_the_state_follows_the_public_model():
     """One step of a moving car is A x + B u."""
     plant = CarFollowing(**QUIET)
-    plan = plant.prepare()
+    plan = prepared(plant)
     state = plant.start(plan, _draws(Role.PRIOR, 0))
     after = plant.step(plan, state, np.array([[[-1.7]]]), np.array([0.3]), _draws(Role.PROCESS, 1))
     np.testing.assert_allclose(after.ego[0, 0], plan.A @ state.ego[0, 0] + plan.B[:, 0] * -1.7, rtol=1e-15)
@@ -66,7 +71,7 @@ def test_process_noise_has_the_stated_variance():
     """Noise of x, v and a over 20000 rows, within five standard errors."""
     var, n = (0.04, 0.09, 0.25), 20_000
     plant = CarFollowing(process_var=var, rear=False)
-    plan = plant.prepare()
+    plan = prepared(plant)
     state = plant.start(plan, _draws(Role.PRIOR, 0, n))
     noisy = plant.step(plan, state, np.zeros((n, 1, 1)), np.zeros(n), _draws(Role.PROCESS, 1, n)).ego[:, 0]
     residual = noisy - state.ego[0, 0] @ plan.A.T
@@ -109,7 +114,7 @@ def test_the_set_speed_limits():
 def test_a_stopped_car_does_not_roll_back():
     """Under full braking: speed never below zero, position never falls, and the car stands still."""
     plant = CarFollowing(rear=False, process_var=(0.0, 0.0, 0.0), speed=3.0)
-    plan = plant.prepare()
+    plan = prepared(plant)
     state = plant.start(plan, _draws(Role.PRIOR, 0))
     xs, vs = [state.ego[0, 0, 0]], []
     for k in range(100):
@@ -138,7 +143,7 @@ def test_nobody_collides_without_an_attack(name, defence):
 def test_the_driver_behind_reacts_after_its_reaction_time():
     """Intelligent Driver Model with a delay: nothing for 1 s, then the acceleration decided 1 s before."""
     plant = CarFollowing(process_var=(0.0, 0.0, 0.0))
-    plan = plant.prepare()
+    plan = prepared(plant)
     state, decided = plant.start(plan, _draws(Role.PRIOR, 0)), []
     speeds = [state.rear_v[0]]
     for k in range(30):

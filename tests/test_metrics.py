@@ -1,15 +1,18 @@
 """Metrics: known answers on hand-made traces, undefined where they have no meaning, the same bits in every batch."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import tailgate
 from tailgate.metrics import METRICS, UNITS, measure, metric
+from tailgate.scenario import load_scenario
 from tailgate.trace import Trace
 
 DT = 0.5
+MODEL = replace(load_scenario("stop-and-go-v0").brief().model, dt=DT)
 
 
 def trace(steps=4, length=None, first=None, **signals):
@@ -26,7 +29,7 @@ def trace(steps=4, length=None, first=None, **signals):
     for i, name in enumerate(("error", "speed_error")):
         out["estimate"][:, 0, 0, i] += np.broadcast_to(signals.get(name, 0.0), steps)
     begin = {name: np.array([[(first or {}).get(name, value)]], float) for name, value in zeros.items()}
-    return Trace(DT, steps, np.array([steps if length is None else length]), out, begin, lambda v: 5.0 + 3.0 * v)
+    return Trace(MODEL, steps, np.array([steps if length is None else length]), out, begin, lambda v: 5.0 + 3.0 * v)
 
 
 def value(name, *arguments, **signals):
@@ -101,7 +104,7 @@ def test_what_follows_the_end_of_an_episode_does_not_count(name, case, same_bits
     for key, signal in alone.signals.items():
         rest = np.full((3, *signal.shape[1:]), 1, signal.dtype) if signal.dtype != float else np.full((3, *signal.shape[1:]), -1e9)
         padded[key] = np.concatenate([signal, rest])
-    longer = Trace(DT, alone.horizon + 3, alone.length, padded, alone.first, alone.desired_gap)
+    longer = Trace(MODEL, alone.horizon + 3, alone.length, padded, alone.first, alone.desired_gap)
     assert same_bits(measure(longer)[name], measure(alone)[name])
 
 
@@ -144,3 +147,49 @@ def test_a_registered_metric_is_a_column_and_never_nan_or_infinite():
     for row in rows:
         assert row["status"] == "ok" and row["detection_delay"] is None and row["alarm_rate"] == 0.0
         assert all(row[name] is None or math.isfinite(row[name]) for name in kept)
+
+
+STRING = replace(load_scenario("platoon-braking-v0").brief().model, dt=DT)
+
+
+def string(steps=4, **signals):
+    """A trace of the leader 0 and four followers in one episode; each signal is (steps, 5), (5,) or a number."""
+    road = dict(gap=[np.inf, 50, 50, 50, 50], speed=10.0, accel=0.0, lead_speed=10.0, rear_gap=np.inf, rear_speed=0.0, position=0.0)
+    column = {name: np.broadcast_to(np.asarray(signals.get(name, value), float), (steps, 5))[:, None] for name, value in road.items()}
+    out = {name: value.copy() for name, value in column.items()}
+    out["alarm"] = np.broadcast_to(np.asarray(signals.get("alarm", False), bool), (steps, 5))[:, None].copy()
+    flags = ("kind", "refused", "collided", "rear_collided")
+    out |= {name: np.broadcast_to(signals.get(name, 0), steps)[:, None].copy() for name in flags}
+    truth = np.full((steps, 1, 5, 19), 7.0)
+    estimate, error = truth.copy(), np.broadcast_to(np.asarray(signals.get("error", 0.0), float), (steps, 5))
+    for i in range(1, 5):
+        estimate[:, 0, i, 3 + 4 * (i - 1)] += error[:, i]  # its own gap: what it believes of the others' does not count
+        estimate[:, 0, i, 3 + 4 * (i % 4)] += 99.0
+    out["truth"], out["estimate"] = truth, estimate
+    first = {name: np.broadcast_to(np.asarray(value, float), (1, 5)).copy() for name, value in road.items()}
+    return Trace(STRING, steps, np.array([steps]), out, first, lambda v: 5.0 + 3.0 * v)
+
+
+A, B = [0, 0, 0, 1, 0], [0, 0, 1, 0, 0]  # an alarm of car 3, of car 2
+
+
+@pytest.mark.parametrize(
+    "name, signals, want",
+    [
+        ("min_gap", {"gap": [np.inf, 9, 4, 6, 8]}, 4.0), ("min_gap", {}, 50.0), ("collided", {"collided": [0, 0, 1, 0]}, 1.0),
+        ("impact_speed", {"collided": 1, "gap": [np.inf, 9, -0.1, -0.2, 9], "speed": [10, 11, 12, 15, 16], "lead_speed": 10.0}, 5.0),
+        ("min_ttc", {"gap": [np.inf, 9, 4, 6, 8], "speed": [10, 10, 11, 12, 10]}, 3.0), ("min_ttc", {"speed": [50, 10, 10, 10, 10]}, 100.0),
+        ("rmse_position", {"error": [0, 3, 0, 4, 0]}, 2.5), ("max_error", {"error": [0, 3, 0, -4, 0]}, 4.0),
+        ("max_decel", {"accel": [-9, -1, -3, 0, 2]}, 3.0), ("distance_travelled", {"position": [90, 80, 60, 70, 75]}, 60.0),
+        ("time_gap_inflation", {"gap": [np.inf, 35, 35, 35, 70]}, 0.25), ("rms_jerk", {"accel": [[7, 0, 0, 0, 0]] * 2 + [[9, 0, 0, 0, 2]] * 2}, 1.0),
+        ("string_gain", {"lead_speed": np.array([[11], [12], [13], [14]]) * np.ones(5), "accel": [0, 9, 9, 9, 1]}, 0.5),
+        ("recovery_time", {"kind": [5, 0, 0, 0], "gap": [[np.inf, 35, 35, 35, 35], [np.inf, 35, 80, 35, 35]] + [[np.inf, 35, 35, 35, 35]] * 2}, 1.0),
+        ("recovery_time", {"kind": [5, 0, 0, 0], "gap": [np.inf, 35, 35, 80, 35]}, None),
+        ("alarm_onsets", {"alarm": [A, B, [0] * 5, A]}, 2.0), ("alarm_rate", {"alarm": [A, B, [0] * 5, A]}, 0.75),
+        ("detection_delay", {"kind": [0, 5, 5, 5], "alarm": [A, [0] * 5, B, A]}, 1.0), ("rear_collided", {}, 0.0),
+    ],
+)  # fmt: skip
+def test_known_answers_of_a_string(name, signals, want):
+    """Over all cars that follow another: the leader's own driving, and what a car believes of others, do not count; any alarm does."""
+    got = measure(string(**signals))[name][0]
+    assert math.isnan(got) if want is None else got == pytest.approx(want, rel=1e-12, abs=1e-12)

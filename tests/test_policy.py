@@ -1,5 +1,6 @@
 """Learned policies: files, playing as an attack, yoked schedules."""
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -8,11 +9,13 @@ import numpy as np
 import pytest
 
 from tailgate import draws
-from tailgate.agents.codec import ActionCodec, ActionSpec, ObservationCodec
+from tailgate.agents.codec import ActionCodec, ActionSpec
+from tailgate.agents.observation import ObservationCodec
 from tailgate.agents.policy import Network, PolicyAttack, Yoked, choose, load_policy, save_policy, timing_advantage
 from tailgate.envs.faces import AdversaryVectorEnv
+from tailgate.envs.network import SensorNetwork
 from tailgate.errors import InputError
-from tailgate.metrics import crashed
+from tailgate.metrics import METRICS, crashed
 from tailgate.registry import Spec
 from tailgate.scenario import Scenario, load_scenario
 from tailgate.trace import Recorder, rollout
@@ -21,19 +24,28 @@ THREAT = {"budget": 20, "kinds": ["dos_jam", "fdi"], "fdi_bound": 5.0}
 SEEDS = list(range(12))
 
 
-def _place(knowledge: str) -> Scenario:
-    return load_scenario("gusty-stop-and-go-v0").with_threat(**THREAT, knowledge=knowledge)
+MANY: dict[str, dict[str, Any]] = {  # several agents: the scenario, and the environment's other arguments
+    "platoon-braking-v0": {"defence": "lasso_dkf", "threat": {"budget": 60, "targets": ["distance"], "agents": [1, 3]}},
+    "thesis-ch5-v0": {"defence": "norm_resilient", "threat": {"budget": 20}, "reward": "error"},
+}
 
 
-def _policy(path: Path, action: dict[str, Any], knowledge: str = "black", seed: int = 0) -> Path:
+def _place(knowledge: str, scenario: str = "gusty-stop-and-go-v0") -> Scenario:
+    threat: dict[str, Any] = MANY[scenario]["threat"] if scenario in MANY else THREAT
+    return load_scenario(scenario).with_threat(**threat, knowledge=knowledge)
+
+
+def _policy(path: Path, action: dict[str, Any], knowledge: str = "black", seed: int = 0, scenario: str = "gusty-stop-and-go-v0") -> Path:
     """A random network that attacks now and then."""
-    brief = _place(knowledge).brief()
+    brief = _place(knowledge, scenario).brief()
     spec = ActionSpec(**action)
     codec, names = ActionCodec(spec, brief), ObservationCodec(brief).names
     rng = np.random.default_rng(seed)
     weights = (rng.normal(size=(len(names), 16)), rng.normal(size=(16, codec.size)))
     network = Network(weights, (rng.normal(size=16), rng.normal(size=codec.size)), None if codec.discrete else np.full(codec.size, -1.0))
-    header = {"action": spec, "observation": names, "knowledge": knowledge, "sees_measurement": False, "training": {}}
+    header = {
+        "action": spec, "observation": names, "knowledge": knowledge, "sees_measurement": False, "agents": brief.model.agents, "training": {},
+    }  # fmt: skip
     return save_policy(path / "policy", network, header)
 
 
@@ -41,13 +53,21 @@ def _policy(path: Path, action: dict[str, Any], knowledge: str = "black", seed: 
 @pytest.mark.parametrize("knowledge", ["black", "white"])
 @pytest.mark.parametrize("action", ["timing", "mode", "ramp", "continuous", "increment"])
 def test_stepping_the_environment_and_playing_as_an_attack_give_one_trace(tmp_path: Path, action: str, knowledge: str, interval: int) -> None:
-    spec = {"action": action, "interval": interval, "rate": 0.5}
-    path = _policy(tmp_path, spec, knowledge)
+    _same_trace(tmp_path, {"action": action, "interval": interval, "rate": 0.5}, knowledge, "gusty-stop-and-go-v0", {"threat": THREAT})
+
+
+@pytest.mark.parametrize("scenario", MANY)
+@pytest.mark.parametrize(("action", "knowledge"), [({"action": "mode", "per_agent": True}, "black"), ({"action": "increment"}, "white")])
+def test_a_policy_of_many_agents_plays_as_it_was_trained(tmp_path: Path, scenario: str, action: dict[str, Any], knowledge: str) -> None:
+    _same_trace(tmp_path, action | {"interval": 3}, knowledge, scenario, MANY[scenario])
+
+
+def _same_trace(tmp_path: Path, spec: dict[str, Any], knowledge: str, scenario: str, arguments: dict[str, Any]) -> None:
+    """The environment stepped with a policy's choices, and the policy played as an attack: bit for bit."""
+    path = _policy(tmp_path, spec, knowledge, scenario=scenario)
     _, network = load_policy(path)
-    env = AdversaryVectorEnv(
-        len(SEEDS), scenario="gusty-stop-and-go-v0", threat=THREAT, knowledge=knowledge, autoreset="disabled", **spec
-    )
-    loop = env.seat.loop
+    env = AdversaryVectorEnv(len(SEEDS), scenario=scenario, knowledge=knowledge, autoreset="disabled", **arguments, **spec)
+    loop, interval = env.seat.loop, spec["interval"]
     played = rollout(loop, PolicyAttack(path), draws.keys("train", SEEDS))
 
     observation, _ = env.reset(seed=SEEDS[0])
@@ -154,6 +174,40 @@ def test_a_damaged_policy_is_refused_with_one_clear_error(tmp_path: Path, how: s
     _damage(path, how)
     with pytest.raises(InputError, match=field):
         Spec("attack", str(path)).make().prepare(_place("black").brief())
+
+
+@pytest.mark.parametrize("other", ["platoon-20-v0", "thesis-ch5-v0", "gusty-stop-and-go-v0"])
+def test_a_policy_of_another_size_is_refused(tmp_path: Path, other: str) -> None:
+    """In one short line that says how many agents it was made for; also where the observations would agree."""
+    path = _policy(tmp_path, {"action": "mode"}, scenario="platoon-braking-v0")
+    agents = load_scenario(other).brief().model.agents
+    with pytest.raises(InputError, match=rf"a policy for 5 agents.*this scenario's {agents} agents?") as caught:
+        PolicyAttack(path).prepare(load_scenario(other).brief())
+    assert len(str(caught.value)) < 200
+    network = _policy(tmp_path, {"action": "mode"}, scenario="thesis-ch5-v0")
+    plant = SensorNetwork(agents=12, graph="ring")
+    place = dataclasses.replace(load_scenario("thesis-ch5-v0"), plant=plant).with_threat(budget=20)
+    assert ObservationCodec(place.brief()).names == load_policy(network)[0].observation
+    with pytest.raises(InputError, match=r"10 agents.*12 agents"):
+        PolicyAttack(network).prepare(place.brief())
+
+
+def test_an_error_names_some_of_many_observations(tmp_path: Path) -> None:
+    path = _policy(tmp_path, {"action": "mode"}, scenario="thesis-ch5-v0")
+    other = load_scenario("thesis-ch5-v0").with_threat(knowledge="white", agents=(3,))
+    with pytest.raises(InputError, match=r"and \d+ more") as caught:
+        PolicyAttack(path).prepare(other.brief())
+    assert len(str(caught.value)) < 300
+
+
+def test_a_timing_advantage_counts_any_metric(tmp_path: Path) -> None:
+    """The outcome is a metric's; where nothing collides it is an error."""
+    path = _policy(tmp_path, {"action": "mode"}, scenario="thesis-ch5-v0")
+    spec = Spec("defence", "norm_resilient")
+    loop, keys = _place("black", "thesis-ch5-v0").loop(spec.make(), spec.entry.uses), draws.keys("report", range(6))
+    own, yoked = timing_advantage(loop, PolicyAttack(path), keys, "rmse_position")
+    assert np.array_equal(own, METRICS["rmse_position"](rollout(loop, PolicyAttack(path), keys)))
+    assert (yoked > 0.0).all() and not timing_advantage(loop, PolicyAttack(path), keys)[0].any()
 
 
 def test_a_policy_of_another_observation_is_refused(tmp_path: Path) -> None:

@@ -189,10 +189,9 @@ def test_mistakes_are_input_errors(text, message, write):
     ("phases: [{kind: fdi, value: {position: 1}, targets: [position, velocity]}]", r"phase 1\.value: got \['position'\]; expected .*'velocity' has none"),
     ("phases: [{kind: fdi, value: {position: 1, sonar: 2}, targets: [position]}]", r"phase 1\.value: got 'sonar'"),
     ("phases: [{kind: dropout, probability: {sonar: 0.5}}]", r"phase 1\.probability: got 'sonar'"),
-    ("phases: [{kind: dropout, trigger: {name: bursts, duration: 0.01, share: 0.5}}]", r"phase 1: trigger bursts\.duration: got 0\.01"),
 ])  # fmt: skip
 def test_what_does_not_fit_the_scenario_is_an_input_error(text, message, write, short):
-    """Wires that do not exist and bursts shorter than a step are named when the scenario is known."""
+    """Wires that do not exist are named when the scenario is known."""
     with pytest.raises(InputError, match=message) as caught:
         write(text).prepare(short().brief())
     assert not isinstance(caught.value, NotApplicable)
@@ -200,10 +199,11 @@ def test_what_does_not_fit_the_scenario_is_an_input_error(text, message, write, 
 
 @pytest.mark.parametrize("text, message", [
     ("phases: [{kind: dropout, length: 3}, {kind: replay, value: 4}]", r"phase 2: threat_model\.kinds.*grants replay"),
+    ("phases: [{kind: dropout, trigger: {name: bursts, duration: 0.01, share: 0.5}}]", r"phase 1: trigger bursts\.duration: got 0\.01"),
     ("phases: [{kind: fdi, value: 1, targets: [position, acceleration]}]", r"phase 1: threat_model\.targets: got \['position', 'velocity'\].*acceleration"),
 ])  # fmt: skip
 def test_what_is_not_granted_is_not_applicable(text, message, write, short):
-    """A program that needs more than the threat model grants has its rows skipped, with the reason."""
+    """What a program needs beyond the threat model, or bursts that are shorter than a step: its rows are skipped, with the reason."""
     with pytest.raises(NotApplicable, match=message):
         write(text).prepare(short().brief())
 

@@ -13,16 +13,18 @@ pytest.importorskip("PIL")
 from gymnasium.utils.env_checker import check_env
 
 from tailgate.core import Kind, Mode
-from tailgate.envs import render
+from tailgate.envs import render, render_canvas, render_following
 from tailgate.envs.faces import AdversaryEnv, AdversaryVectorEnv
 from tailgate.errors import InputError
 from tailgate.tree import duplicate
 
-BADGE = np.s_[: int(render.HEADER), int(render.BADGE[0]) : int(render.BADGE[1])]
-BUDGET = np.s_[: int(render.HEADER), int(render.BUDGET) : int(render.LAMP - 2 * render.LAMP_SIZE)]
-LAMP = np.s_[: int(render.HEADER), int(render.LAMP - 2 * render.LAMP_SIZE) :]
-ROAD = np.s_[int(render.HEADER) : int(render.STRIP)]
-BELIEF = np.s_[int(render.STRIP) + 2 :]
+HEADER = int(render_canvas.HEADER)
+LEFT_OF_LAMP = int(render_canvas.LAMP - 2 * render_canvas.LAMP_SIZE)
+BADGE = np.s_[:HEADER, int(render_canvas.BADGE[0]) : int(render_canvas.BADGE[1])]
+BUDGET = np.s_[:HEADER, int(render_canvas.BUDGET) : LEFT_OF_LAMP]
+LAMP = np.s_[:HEADER, LEFT_OF_LAMP:]
+ROAD = np.s_[HEADER : int(render_following.STRIP)]
+BELIEF = np.s_[int(render_following.STRIP) + 2 :]
 REGIONS = {"badge": BADGE, "budget": BUDGET, "lamp": LAMP, "road": ROAD, "belief": BELIEF}
 ROLLS = {"scenario": "stop-and-go-v0", "defence": "kf"}
 CRASHES = {"value": -30.0, "threat": {"onset": 1}} | ROLLS  # an unguarded filter: 30 m of false data end in a collision
@@ -92,7 +94,7 @@ def test_drawing_leaves_the_state_alone(made, same_tree):
 
 def test_without_pillow_the_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "PIL", None)
-    spec = importlib.util.spec_from_file_location("without_pillow", render.__file__)
+    spec = importlib.util.spec_from_file_location("without_pillow", render_canvas.__file__)
     with pytest.raises(ImportError, match=r"pip install 'tailgate\[viz\]'"):
         spec.loader.exec_module(importlib.util.module_from_spec(spec))
 
@@ -148,19 +150,20 @@ def test_budget_is_shown_only_where_there_is_one(made):
 @pytest.mark.parametrize("rear_gap", [0.01, 3.0, 42.0, 900.0])
 def test_cars_stay_in_the_picture_or_are_said_to_be_out_of_it(made, monkeypatch, gap, rear_gap):
     env, words, noses = made(), [], []
-    text, car = render._Canvas.text, render._Canvas.car
-    monkeypatch.setattr(render._Canvas, "text", lambda self, x, y, said, *a, **k: (words.append(said), text(self, x, y, said, *a, **k))[1])
-    monkeypatch.setattr(render._Canvas, "car", lambda self, nose, *a, **k: (noses.append(nose), car(self, nose, *a, **k))[1])
+    canvas = render_canvas.Canvas
+    text, car = canvas.text, canvas.car
+    monkeypatch.setattr(canvas, "text", lambda self, x, y, said, *a, **k: (words.append(said), text(self, x, y, said, *a, **k))[1])
+    monkeypatch.setattr(canvas, "car", lambda self, nose, *a, **k: (noses.append(nose), car(self, nose, *a, **k))[1])
     picture(env, with_gaps(env.state, gap, rear_gap))
     out = sum(said in ("leader (out of view)", "human driver (out of view)") for said in words)
     real = [nose for nose in noses[-(3 - out) :]]  # the ghost is drawn before them
-    assert all(render.CAR <= nose <= render.WIDTH for nose in real) and len(real) + out == 3
-    assert ("leader (out of view)" in words) == (gap > render.SPANS[-1])
+    assert all(render_canvas.CAR <= nose <= render.WIDTH for nose in real) and len(real) + out == 3
+    assert ("leader (out of view)" in words) == (gap > render_following.SPANS[-1])
 
 
 def test_scale_comes_from_a_fixed_set():
-    scales = {render._scale(gap, rear) for gap in np.linspace(-2.0, 2000.0, 400) for rear in (0.0, 10.0, 50.0, 1000.0, np.inf)}
-    assert scales == {render.AHEAD / span for span in render.SPANS}
+    scales = {render_following._scale(gap, rear) for gap in np.linspace(-2.0, 2000.0, 400) for rear in (0.0, 10.0, 50.0, 1000.0, np.inf)}
+    assert scales == {render_following.AHEAD / span for span in render_following.SPANS}
 
 
 def test_no_driver_behind(made):
@@ -170,8 +173,8 @@ def test_no_driver_behind(made):
 
 def _signs(monkeypatch):
     said = []
-    crash = render._Canvas.crash
-    monkeypatch.setattr(render._Canvas, "crash", lambda self, x, left, words: (said.append(words), crash(self, x, left, words))[1])
+    sign = render_canvas.Canvas.sign
+    monkeypatch.setattr(render_canvas.Canvas, "sign", lambda self, left, top, words: (said.append(words), sign(self, left, top, words))[1])
     return said
 
 

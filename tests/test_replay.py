@@ -16,7 +16,8 @@ from tailgate import cli
 from tailgate.core import Kind
 from tailgate.errors import InputError
 from tailgate.evaluation import Cell, evaluate, run_cell
-from tailgate.replay.page import context_of, embedded, episode_of, render, write_page
+from tailgate.replay.episode import episode_of
+from tailgate.replay.page import context_of, embedded, render, write_page
 from tailgate.replay.replay import Filter, choose, play
 from tailgate.rows import encode, read_rows
 
@@ -193,9 +194,10 @@ def test_the_data_of_the_page_are_those_of_the_trace(pick):
     assert data["left"][0] == 30 and data["left"][-1] == 30 - sum(wire["hit"])
     np.testing.assert_allclose(data["road"]["gap"][1:], trace.gap[:, 0, 0], rtol=1e-5)
     assert data["road"]["gap"][0] == pytest.approx(trace.first["gap"][0, 0], rel=1e-5)
-    np.testing.assert_allclose(data["error"]["position"], (trace.estimate - trace.truth)[:, 0, 0, 0], rtol=1e-5)
+    errors = {one["name"]: one["values"] for one in data["errors"]}
+    np.testing.assert_allclose(errors["position"], (trace.estimate - trace.truth)[:, 0, 0, 0], rtol=1e-5)
     gap_at_k = (trace.first["position"] + trace.first["gap"])[0, 0] - trace.truth[0, 0, 0, 0]
-    assert data["believed"]["gap"][0] == pytest.approx(gap_at_k - data["error"]["position"][0], rel=1e-4)
+    assert data["believed"]["gap"][0] == pytest.approx(gap_at_k - errors["position"][0], rel=1e-4)
     json.dumps(data, allow_nan=False)
 
 

@@ -78,10 +78,10 @@ def test_the_readings_differ_as_they_say():
 
 def test_the_literal_plant_switches_on_the_sign_of_the_acceleration():
     """a+ = a + dt (-k gamma v +- k a): plus while it accelerates."""
-    from tailgate.envs import CarFollowingLiteral
+    from tailgate.envs import CarFollowingLiteral, Odometry, RelativeDistance
 
     plant = CarFollowingLiteral(dt=0.01)
-    plan, k = plant.prepare(), (1 + 1 / 3) / 1.008
+    plan, k = plant.prepare(plant.model(Odometry(), RelativeDistance())), (1 + 1 / 3) / 1.008
     ego = np.array([[[0.0, 20.0, 0.5]], [[0.0, 20.0, -0.5]]])
     after = plant.move(plan, ego, np.array([[[10.0]], [[10.0]]]), np.zeros((3, 2)))
     np.testing.assert_allclose(after[:, 0, 2], [0.5 + 0.01 * (-k * 18 + k * 0.5), -0.5 + 0.01 * (-k * 18 + k * 0.5)])

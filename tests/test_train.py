@@ -13,6 +13,7 @@ import pytest
 from tailgate import train
 from tailgate.agents.ppo import Learner, PPOConfig
 from tailgate.errors import InputError
+from tailgate.schema import build
 from tailgate.tree import leaves
 
 ENVIRONMENT: dict[str, Any] = {
@@ -112,7 +113,7 @@ def test_the_command_trains_compares_and_writes_a_page(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     report = json.loads(done.stdout)
     assert set(report["advantage"]) == {"no attack", "own yoked schedule", "best scripted attack"}
-    assert report["crash"][0]["label"] == "no attack"
+    assert report["attacks"][0]["label"] == "no attack"
     run = tmp_path / "runs" / "quickstart"
     rows = [json.loads(line) for line in (run / "rows.jsonl").read_text().splitlines()]
     played = {(row["defence"], row["attack"]) for row in rows}
@@ -122,6 +123,51 @@ def test_the_command_trains_compares_and_writes_a_page(tmp_path: Path) -> None:
     again = _command("steps=1920", "--resume", cwd=tmp_path)  # the rest of the configuration is the run's own
     assert again.returncode == 0, again.stderr
     assert json.loads((run / "policy-0.json").read_text())["training"]["steps"] == 1920
+
+
+PRESETS = sorted(path.stem for path in (Path(__file__).parents[1] / "configs").glob("*.yaml"))
+SYSTEMS = {"platoon": "crashed", "network": "rmse_position"}
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_every_preset_can_be_played(name: str) -> None:
+    """Scenario, defences, rivals, environment and learner of each fit together."""
+    config = train.load_config(name, [])
+    train._check(config)
+    build(PPOConfig, dict(config.ppo), "ppo").check()
+    assert config.name == name and config.rivals
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_the_command_trains_on_every_system(tmp_path: Path, name: str) -> None:
+    """Policy, comparison by the system's own outcome, yoked twin and page; the policy plays in an evaluation of its scenario."""
+    config = train.load_config(name, [])
+    small = ["steps=560", "ppo.envs=16", "ppo.rollout=35", "ppo.batch_size=140", "ppo.epochs=1", "episodes=6", f"rivals=['{config.rivals[0]}']", "others=[]"]
+    done = _command("--config", name, *small, "tensorboard=false", "workers=1", "--json", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    report = json.loads(done.stdout)
+    assert report["outcome"] == SYSTEMS[name] and report["attacks"][0]["label"] == "no attack"
+    assert {"learned, seed 0", "learned, seed 0, yoked"} <= {item["label"] for item in report["attacks"]}
+    assert all(item["low"] <= item["value"] <= item["high"] for item in report["attacks"])
+    run = tmp_path / "runs" / name
+    rows = [json.loads(line) for line in (run / "rows.jsonl").read_text().splitlines()]
+    learned = [row[report["outcome"]] for row in rows if row["learned"]]
+    assert len(learned) == 6 and np.mean(learned) == pytest.approx(report["attacks"][2]["value"])
+    page = (run / "page" / "index.html").read_text(encoding="utf-8")
+    assert "learned" in page and (name != "network" or "Mean rmse_position of 6 fresh episodes" in page)
+    points = json.loads((run / "curve-0.json").read_text())["curve"]
+    assert all((point["crash"] is None) == (name == "network") for point in points)
+
+
+def test_an_outcome_is_a_metric_that_every_episode_has(tmp_path: Path) -> None:
+    """A wrong name lists the metrics; one that is undefined somewhere is refused when it is met."""
+    with pytest.raises(InputError, match=r"config\.outcome.*'gap'.*min_gap"):
+        train.load_config(None, ["outcome=gap"])
+    assert train.outcome_of(train.load_config("network", [])) == "rmse_position"
+    assert train.outcome_of(train.load_config("platoon", ["outcome=max_error"])) == "max_error"
+    row = {"status": "ok", "attack": "fdi", "recovery_time": None}
+    with pytest.raises(InputError, match="recovery_time"):
+        train._outcomes([row], "recovery_time")
 
 
 def test_a_run_that_was_killed_and_resumed_gives_the_policy_of_an_uninterrupted_one(tmp_path: Path) -> None:

@@ -3,6 +3,9 @@
 Alarms feed back into the filter (a gate) and into the detector (a reset), so the loop itself is played. One run without alarms gives the
 first guess: how often its score climbs over each level. A few closed-loop runs on the same random numbers then correct it, by secants on
 the logarithm of the mean time, which is close to linear in the threshold. `docs/detectors.md` tells more.
+
+Several agents raise one alarm: that of the group, on as long as any of them alarms. Its mean time is in hours of the system, not of agents;
+N agents that alarm independently have N times as long each. A step of a network without a step of its own counts as `dt`, 1 s.
 """
 
 from __future__ import annotations
@@ -17,11 +20,12 @@ import numpy as np
 from scipy import stats
 
 from tailgate import draws
-from tailgate.core import Array, Estimate, no_command
+from tailgate.core import Array, Estimate, Model, no_command
 from tailgate.errors import InputError, NotApplicable
 from tailgate.loop import Loop
 from tailgate.registry import Spec, entry_for, text_of
 from tailgate.scenario import Scenario, load_scenario
+from tailgate.trace import MEMORY
 
 MIXTURE = ("braking-v0", "stop-and-go-v0", "ornstein-uhlenbeck-v0")  # equal shares of the running time
 SILENT = 1e12  # a threshold that nothing reaches
@@ -116,6 +120,11 @@ class Crossings:
         return float(0.5 * (ends[i] + ends[i + 1]) if i + 1 < len(ends) else ends[i])
 
 
+def most_at_once(model: Model, most: int) -> int:
+    """How many episodes, at most `most`, have room in memory side by side: a filter works on some ten covariances of each agent."""
+    return int(max(1, min(most, MEMORY // (80 * model.agents * model.states * model.states))))
+
+
 def play_clean(loop: Loop, keys: draws.Keys) -> Iterator[tuple[Estimate, Array]]:
     """(estimate, live (B,)) of each step without an attack; an episode ends with a collision."""
     state = loop.start(keys)
@@ -195,15 +204,15 @@ class Bench:
     def run(self, threshold: float, hours: float, purpose: str, label: str, crossings: Crossings | None = None) -> Count:
         """Clean runs of `hours` in all; `crossings` collects how the score climbs."""
         guard = self.at(threshold)
-        chunks = [
-            (place, seeds[first : first + self.batch])
-            for place, seeds in zip(self.places, self.seeds(hours), strict=True) for first in range(0, len(seeds), self.batch)
-        ]  # fmt: skip
+        loops = {place.name: place.loop(guard, self.uses) for place in self.places}
+        chunks = []
+        for place, seeds in zip(self.places, self.seeds(hours), strict=True):
+            size = most_at_once(loops[place.name].model, self.batch)
+            chunks += [(place, seeds[first : first + size]) for first in range(0, len(seeds), size)]
         counts: list[Array] = []
         steps = dict.fromkeys((place.name for place in self.places), 0)
         for done, (place, seeds) in enumerate(chunks, start=1):
-            loop = place.loop(guard, self.uses)
-            onsets, played = count_onsets(loop, draws.keys(purpose, seeds), crossings)
+            onsets, played = count_onsets(loops[place.name], draws.keys(purpose, seeds), crossings)
             counts.append(onsets)
             steps[place.name] += played
             self.progress(label, done, len(chunks), f"threshold {threshold:.{DIGITS}g}" if threshold < SILENT else "no alarms")
@@ -214,7 +223,7 @@ class Bench:
 
 
 def count_onsets(loop: Loop, keys: draws.Keys, crossings: Crossings | None = None) -> tuple[Array, int]:
-    """(B,) alarm onsets of clean episodes, as the metric of that name counts them, and the steps played."""
+    """(B,) alarm onsets of clean episodes, as the metric of that name counts them, and the steps played. Of several agents any alarms."""
     batch, steps = len(keys.key), 0
     alarmed, onsets, last = np.zeros(batch, bool), np.zeros(batch, np.int64), np.full(batch, -np.inf)
     low: list[Array] = []

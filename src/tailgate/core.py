@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from tailgate.draws import Draws
+from tailgate.errors import InputError
 
 if TYPE_CHECKING:
     from tailgate.threat import Brief
@@ -60,14 +61,17 @@ class Mode(IntEnum):
     WIDEN = 1  # a longer time headway
     BRAKE = 2  # slow down gently
     STOP = 3  # brake as hard as the vehicle can
+    ACC = 4  # use no message of other vehicles: cooperative cruise control falls back to the own sensors
 
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """What is publicly known of the plant: x+ = A x + B u + c + w, y_i = C_i x + v_i.
+    """What is publicly known of the plant: x+ = A x + B u + c + w, y_i = C_i x + v_i, x being one state for all agents.
 
     A (n, n), B (n, m), c (n,), C (N, q, n), Q = cov w (n, n), R = cov v (N, q, q); graph (N, N) bool, [i, j] when i hears j;
-    dt [s]; `sensors` names the q rows of C, `v2v` the p fields of the message that a controller hears, `actuators` the m inputs.
+    dt [s]; `sensors` names the q rows of C, `v2v` the fields of the message that a controller hears, `actuators` what an agent commands.
+    Row i of `gap` and `speed` (N, n) says how agent i's gap to the vehicle ahead and its own speed depend on x; a row of zeros, the
+    default, is an agent without a road.
     """
 
     A: Array
@@ -81,12 +85,17 @@ class Model:
     sensors: tuple[str, ...]
     v2v: tuple[str, ...] = ()
     actuators: tuple[str, ...] = ()
+    gap: Array | None = None
+    speed: Array | None = None
 
     def __post_init__(self) -> None:
-        for name in ("A", "B", "c", "C", "Q", "R", "graph"):  # public, and nobody's to change: own copies, read-only
-            own = np.array(getattr(self, name))
+        for name in ("A", "B", "c", "C", "Q", "R", "graph", "gap", "speed"):  # public, and nobody's to change: own copies, read-only
+            held = getattr(self, name)
+            own = np.zeros((self.agents, self.states)) if held is None else np.array(held)
             own.flags.writeable = False
             object.__setattr__(self, name, own)
+        if len(set(self.wires)) < len(self.wires):  # a threat model grants wires by name
+            raise InputError("model: sensors, v2v, actuators", list(self.wires), "names of which no two are equal")
 
     @property
     def agents(self) -> int:
@@ -105,6 +114,39 @@ class Model:
         """Everything that an attacker may touch: the sensors, then the V2V fields, then the actuators."""
         return self.sensors + self.v2v + self.actuators
 
+    @property
+    def followers(self) -> Array:
+        """(N,) bool: the agents that drive behind another vehicle."""
+        assert self.gap is not None
+        return np.asarray((self.gap != 0.0).any(axis=1))
+
+    def gap_error(self, x: Array, truth: Array) -> Array:
+        """(..., N) [m] by how much each agent overestimates its gap, from (..., N, n); 0 without a road."""
+        return _rows(self.gap, x, truth)
+
+    def speed_error(self, x: Array, truth: Array) -> Array:
+        """(..., N) [m/s] by how much each agent overestimates its speed, from (..., N, n); 0 without a road."""
+        return _rows(self.speed, x, truth)
+
+    def error(self, x: Array, truth: Array) -> Array:
+        """(..., N) size of an estimate's error: of the gap [m] where some agent follows another, else the 2-norm of the whole state's."""
+        if self.followers.any():
+            return np.abs(self.gap_error(x, truth))
+        total = np.zeros(x.shape[:-1])
+        for j in range(x.shape[-1]):  # state by state: of many agents the whole difference is large
+            off = x[..., j] - truth[..., j]
+            total += off * off
+        return np.sqrt(total)
+
+
+def _rows(rows: Array | None, x: Array, truth: Array) -> Array:
+    """(..., N): row i of `rows` (N, n) times the error x - truth (..., N, n) of agent i, in fixed order."""
+    assert rows is not None
+    out = np.zeros(x.shape[:-1])
+    for i, j in zip(*np.nonzero(rows), strict=True):
+        out[..., i] += rows[i, j] * (x[..., i, j] - truth[..., i, j])
+    return out
+
 
 class Prior(NamedTuple):
     """What the defence is told before the first measurement: mean (B, N, n) and cov (B, N, n, n)."""
@@ -116,11 +158,11 @@ class Prior(NamedTuple):
 class Scene(NamedTuple):
     """The road as anyone beside it sees it, each (B, N). Gap [m] to the car ahead, bumper to bumper; speeds [m/s]."""
 
-    gap: Array
+    gap: Array  # inf where nobody drives ahead
     speed: Array
     accel: Array
-    lead_speed: Array
-    rear_gap: Array  # to the car behind; inf where nobody drives behind
+    lead_speed: Array  # of the car ahead; the own speed where there is none
+    rear_gap: Array  # to a car behind that is not an agent; inf where there is none
     rear_speed: Array
     position: Array
 
@@ -151,7 +193,8 @@ class Estimate(NamedTuple):
     """All that the loop takes from a defence.
 
     x (B, N, n), score (B, N) (higher is more suspect), alarm (B, N) bool, mode (B, N) int8 of `Mode`, probe (B, N) bool:
-    False mutes the defence's own sensor in the next step.
+    False mutes the defence's own sensor in the next step. limits (B, N, m, 2), optional: the least and the largest command that the
+    defence lets the controller give; infinite where it does not care.
     """
 
     x: Array
@@ -159,6 +202,7 @@ class Estimate(NamedTuple):
     alarm: Array
     mode: Array
     probe: Array
+    limits: Array | None = None
 
 
 class Innovation(NamedTuple):
@@ -225,7 +269,7 @@ class Defence(Protocol):
     def step(
         self, plan: Any, state: Any, received: Received, known_u: Array, draws: Draws
     ) -> tuple[Any, Estimate]:
-        """One step: known_u (B, N, m) is the input commanded since the last step (zero where an agent does not know it)."""
+        """One step: known_u (B, N, m) is the model's input since the last step (zero where an agent does not know it)."""
 
 
 class Attack(Protocol):
@@ -238,22 +282,35 @@ class Attack(Protocol):
     def decide(self, plan: Any, state: Any, view: View, draws: Draws) -> tuple[Any, Command]: ...
 
 
-class Plant(Protocol):
+class Sized(Protocol):
+    """What a sensor is told of its plant; one that needs more looks for a plant that it knows."""
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """How many agents and how many states of the model there are."""
+
+
+class Plant(Sized, Protocol):
     """What moves. `truth`, `scene`, `v2v` and `lead_speed_of` read the state that start and step return."""
 
-    def prepare(self) -> Any: ...
+    def prepare(self, model: Model) -> Any: ...
 
-    def model(self, sensors: tuple[str, ...], C: Array, R: Array) -> Model:
-        """The public model, completed with what the sensor says of itself."""
-
-    def prior(self, plan: Any, batch: int) -> Prior: ...
+    def model(self, sensor: Sensor, controller: Controller) -> Model:
+        """The public model. Where agents do not know each other's commands, it is a model of the closed loop."""
 
     def start(self, plan: Any, draws: Draws) -> Any: ...
 
-    def step(self, plan: Any, state: Any, u: Array, exo: Array, draws: Draws) -> Any:
-        """u (B, N, m) inputs, exo (B,) the manoeuvre's acceleration of the leader [m/s^2]."""
+    def prior(self, plan: Any, state: Any, held: Array, draws: Draws) -> Prior:
+        """What the defence is told of a state that `start` made; `draws` are those of `start`, whose tags below 16 are taken."""
 
-    def truth(self, plan: Any, state: Any) -> Array: ...
+    def step(self, plan: Any, state: Any, u: Array, exo: Array, draws: Draws) -> Any:
+        """u (B, N, m) commands, exo (B,) the manoeuvre's acceleration of the leader [m/s^2]."""
+
+    def known(self, plan: Any, u: Array, exo: Array) -> Array:
+        """(B, N, model inputs): what each agent knows of the model's input in a step with these commands."""
+
+    def truth(self, plan: Any, state: Any, held: Array) -> Array:
+        """(B, N, n) the model's state; `held` (B, N, .) is the part of it that the controllers keep."""
 
     def scene(self, plan: Any, state: Any) -> Scene: ...
 
@@ -266,8 +323,8 @@ class Plant(Protocol):
 class Sensor(Protocol):
     """What measures: truth (B, N, n) to readings; probe (B, N) False where the defence muted its own transmitter."""
 
-    def matrices(self) -> tuple[tuple[str, ...], Array, Array]:
-        """Names of the q readings, C (N, q, n) and R (N, q, q)."""
+    def matrices(self, plant: Sized) -> tuple[tuple[str, ...], Array, Array]:
+        """Names of the q readings, C (N, q, n) and R (N, q, q). Raises InputError for a plant that it does not fit."""
 
     def prepare(self, model: Model) -> Any: ...
 
@@ -282,6 +339,9 @@ class Controller(Protocol):
     def start(self, plan: Any, batch: int) -> Any: ...
 
     def step(self, plan: Any, state: Any, estimate: Estimate, v2v: Array) -> tuple[Any, Array]: ...
+
+    def held(self, plan: Any, state: Any, batch: int) -> Array:
+        """(B, N, .) the part of the model's state that the controllers keep; empty (B, N, 0) for most."""
 
     def desired_gap(self, speed: Array) -> Array:
         """The gap [m] that it steers for at a speed [m/s], elementwise."""

@@ -85,3 +85,9 @@ class Draws(NamedTuple):
     def uniform(self, shape: tuple[int, ...] = (), tag: int = 0) -> Array:
         """Uniforms on (0, 1), ends excluded, (B, *shape)."""
         return self._fill(kernels.fill_uniform, shape, tag)
+
+
+def constants(name: str, seed: int) -> Draws:
+    """Draws for the random constants of a component, such as the matrices of a random system: one row, the same for every episode."""
+    digest = hashlib.blake2b(f"constants/{name}/{int(seed)}".encode(), digest_size=8).digest()
+    return Draws(np.array([int.from_bytes(digest, "little")], np.uint64), np.zeros(1, np.uint32), np.zeros(1, np.uint32), 0)

@@ -22,6 +22,7 @@ import numpy as np
 
 import tailgate
 from tailgate import draws
+from tailgate.core import Model
 from tailgate.errors import InputError, NotApplicable
 from tailgate.files import set_aside, writable_directory, write_atomic
 from tailgate.metrics import METRICS, measure
@@ -29,7 +30,8 @@ from tailgate.registry import Entry, Spec, entry_for, text_of
 from tailgate.rows import encode, read_rows
 from tailgate.scenario import Scenario, Suite, load_scenario, load_suite
 from tailgate.schema import as_data, canonical
-from tailgate.trace import rollout
+from tailgate.threat import Brief
+from tailgate.trace import episodes_at_once, rollout
 
 ENGINE = "plain"
 
@@ -75,25 +77,32 @@ def run_cell(cell: Cell, defence: Any = None, attack: Any = None) -> list[dict[s
     rival, rival_entry, _ = _component("attack", cell.attack if attack is None else attack)
     place = cell.place(rival, rival_entry.knowledge)
     head = _head(cell, place, guard_entry, rival_entry, cell_id(cell) if defence is None and attack is None else "")
-    seeds = list(_seeds(cell))
     rows: list[dict[str, Any]] = []
-    for start in range(0, cell.seeds, cell.batch):
-        chunk = seeds[start : start + cell.batch]
+    try:
+        loop = place.loop(guard, guard_entry.uses)
+        size = episodes_at_once(loop.model, loop.horizon, cell.batch)
+    except Exception as error:
+        return _failed(head, _seeds(cell), *_why(error))
+    for start in range(0, cell.seeds, size):
+        chunk = _seeds(cell)[start : start + size]
         try:
-            loop = place.loop(guard, guard_entry.uses)
             trace = rollout(loop, rival, draws.keys(cell.purpose, chunk))
             values = measure(trace)
-        except NotApplicable as error:
-            rows += _failed(head, chunk, str(error), "skipped")
-            continue
         except Exception as error:  # whatever a component raises costs its own rows, and only them
-            rows += _failed(head, chunk, f"{type(error).__name__}: {error}")
+            rows += _failed(head, chunk, *_why(error))
             continue
         for i, seed in enumerate(chunk):
             numbers = {name: None if np.isnan(v[i]) else float(v[i]) for name, v in values.items()}
             hashes = {"trace_hash": trace.trace_hash(i), "decision_hash": trace.decision_hash(i)}
             rows.append(head | {"seed": seed, "status": "ok", "reason": "", **numbers, **hashes})
     return rows
+
+
+def _why(error: Exception) -> tuple[str, str]:
+    """Reason and status of the rows that an error costs."""
+    if isinstance(error, NotApplicable):
+        return str(error), "skipped"
+    return f"{type(error).__name__}: {error}", "error"
 
 
 def _seeds(cell: Cell) -> range:
@@ -139,6 +148,19 @@ def cell_id(cell: Cell) -> str:
     return hashlib.blake2b(f"{tailgate.__version__}/{canonical(data)}".encode(), digest_size=12).hexdigest()
 
 
+@contextlib.contextmanager
+def _sparing() -> Iterator[None]:
+    """Lets bad input through, and nothing else: a pairing without meaning, or a component that breaks, costs its own rows."""
+    try:
+        yield
+    except NotApplicable:
+        return
+    except InputError:
+        raise
+    except Exception:
+        return
+
+
 def cells_of(suite: Suite, *, batch: int = 256, purpose: str = "report", threat: dict[str, Any] | None = None) -> list[Cell]:
     """Every cell of a suite, in its order. Raises InputError for anything that does not exist."""
     if purpose not in draws.PURPOSES:
@@ -148,18 +170,22 @@ def cells_of(suite: Suite, *, batch: int = 256, purpose: str = "report", threat:
         Cell(suite.name, scenario, dose, defence, attack, suite.seeds, purpose, 0, batch, changes)
         for scenario in suite.scenarios for dose in suite.doses for defence in suite.defences for attack in suite.attacks
     ]  # fmt: skip
+    models: dict[str, Model] = {}
+    fitted: set[tuple[str, str]] = set()
     for cell in out:
         spec, guard = Spec("attack", cell.attack), Spec("defence", cell.defence)
         rival, defence = spec.make(), guard.make()
         place = cell.place(rival, spec.entry.knowledge)
-        try:
-            rival.prepare(place.loop(defence, guard.entry.uses).brief)
-        except NotApplicable:  # its rows will be skipped, with the reason
-            continue
-        except InputError:
-            raise
-        except Exception:  # a component that breaks costs its own rows: run_cell will say why
-            continue
+        if (cell.scenario, cell.defence) not in fitted:  # once: the filter of a large network takes its time
+            fitted.add((cell.scenario, cell.defence))
+            with _sparing():
+                place.loop(defence, guard.entry.uses)
+        if cell.scenario not in models:
+            models[cell.scenario] = place.brief().model
+        brief = Brief(models[cell.scenario], place.threat_model, place.horizon)
+        _ = brief.granted  # names wires and agents that exist
+        with _sparing():
+            rival.prepare(brief)
     return out
 
 

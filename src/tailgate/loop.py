@@ -54,6 +54,10 @@ def check_estimate(estimate: Estimate, model: Model, batch: int) -> None:
             raise InputError(f"defence output {name}", got, f"an array of shape {size}, kind {kinds!r}")
         if kinds == "f" and not np.isfinite(value).all():
             raise InputError(f"defence output {name}", "NaN or infinity", "finite numbers")
+    if estimate.limits is not None:
+        size = (*shape, len(model.actuators), 2)
+        if estimate.limits.shape != size or not (estimate.limits[..., 0] <= estimate.limits[..., 1]).all():
+            raise InputError("defence output limits", estimate.limits.shape, f"an array of shape {size}, the lower limits first")
     if ((estimate.mode < 0) | (estimate.mode >= len(Mode))).any():
         known = ", ".join(f"{m.value} ({m.name})" for m in Mode)
         raise InputError("defence output mode", np.unique(estimate.mode).tolist(), f"one of {known}")
@@ -79,7 +83,8 @@ class LoopState(NamedTuple):
     defence: Any
     channel: ChannelState
     estimate: Estimate
-    known_u: Array  # (B, N, m)
+    control: Array  # (B, N, m) what was commanded last
+    known_u: Array  # (B, N, model inputs)
     sent: Array  # (B, N, q+p)
     received: Received
     ended: Array  # (B,) bool: collided
@@ -101,7 +106,7 @@ class Loop:
 
     @cached_property
     def model(self) -> Model:
-        return self.plant.model(*self.sensor.matrices())
+        return self.plant.model(self.sensor, self.controller)
 
     @cached_property
     def brief(self) -> Brief:
@@ -110,7 +115,7 @@ class Loop:
     @cached_property
     def plan(self) -> LoopPlan:
         return LoopPlan(
-            self.plant.prepare(),
+            self.plant.prepare(self.model),
             self.sensor.prepare(self.model),
             self.controller.prepare(self.model),
             self.manoeuvre.prepare(self.model.dt),
@@ -129,7 +134,9 @@ class Loop:
         batch = len(keys.key)
         at_start = np.full(batch, _START)
         plant = self.plant.start(plan.plant, keys.at(Role.PRIOR, at_start))
-        prior = self.plant.prior(plan.plant, batch)
+        controller = self.controller.start(plan.controller, batch)
+        held = self.controller.held(plan.controller, controller, batch)
+        prior = self.plant.prior(plan.plant, plant, held, keys.at(Role.PRIOR, at_start))
         manoeuvre = self.manoeuvre.start(plan.manoeuvre, keys.at(Role.MANOEUVRE, at_start))
         shape = (batch, model.agents)
         estimate = Estimate(
@@ -137,14 +144,13 @@ class Loop:
         )
         v2v = self.plant.v2v(plan.plant, plant)
         expected = np.concatenate([num.matvec(model.C, prior.mean), v2v], axis=-1)
-        controller = self.controller.start(plan.controller, batch)
         k = np.zeros(batch, np.int64)
         controller, u = self.controller.step(plan.controller, controller, estimate, v2v)
-        manoeuvre, plant = self._move(keys, k, manoeuvre, plant, u)
-        sent, received = self._measure(keys, k + 1, plant, estimate)
+        manoeuvre, plant, known = self._move(keys, k, manoeuvre, plant, u)
+        sent, received = self._measure(keys, k + 1, plant, controller, estimate)
         return LoopState(
             keys, k + 1, plant, manoeuvre, controller, self.defence.start(plan.defence, prior),
-            Channel().start(plan.channel, expected, u), estimate, u, sent, received, np.zeros(batch, bool),
+            Channel().start(plan.channel, expected, u), estimate, u, known, sent, received, np.zeros(batch, bool),
         )  # fmt: skip
 
     def restart(self, state: LoopState, mask: Array) -> LoopState:
@@ -179,10 +185,10 @@ class Loop:
             last=channel.last,
         )
         if threat.knowledge in ("grey", "white"):
-            view = view._replace(control=state.known_u)
+            view = view._replace(control=state.control)
         if threat.knowledge == "white":
             box = WhiteBox(self.defence, self._shown, duplicate(state.defence), frozen(state.known_u))
-            view = view._replace(defence=box, estimate=state.estimate, truth=self.plant.truth(plan.plant, state.plant))
+            view = view._replace(defence=box, estimate=state.estimate, truth=self._truth(state.plant, state.controller))
         if threat.sees_measurement or threat.knowledge == "white":
             view = view._replace(received=state.received)
         shown: View = frozen(view._replace(defence=None))  # an attack looks; the channel alone acts
@@ -202,21 +208,24 @@ class Loop:
             plan.defence, state.defence, frozen(heard), frozen(state.known_u), state.keys.at(Role.DEFENCE, state.k)
         )
         check_estimate(estimate, self.model, len(state.k))
-        truth = self.plant.truth(plan.plant, state.plant)
+        truth = self._truth(state.plant, state.controller)
         assert received.v2v is not None
         controller, u = self.controller.step(plan.controller, state.controller, estimate, received.v2v)
+        if estimate.limits is not None:
+            u = np.clip(u, estimate.limits[..., 0], estimate.limits[..., 1])
+            estimate = estimate._replace(limits=None)
         channel, applied = Channel().actuate(plan.channel, channel, u)
-        manoeuvre, plant = self._move(state.keys, state.k, state.manoeuvre, state.plant, applied)
+        manoeuvre, plant, known = self._move(state.keys, state.k, state.manoeuvre, state.plant, applied, u)
         scene = self.plant.scene(plan.plant, plant)
         collided = np.any(scene.gap <= 0.0, axis=1)
         rear_collided = np.any(scene.rear_gap <= 0.0, axis=1)
         frame = Frame(
             state.k, truth, state.sent, arrived, channel.last, refused, estimate, u, applied, scene, collided, rear_collided
         )
-        sent, fresh = self._measure(state.keys, state.k + 1, plant, estimate)
+        sent, fresh = self._measure(state.keys, state.k + 1, plant, controller, estimate)
         ended = state.ended | ((collided | rear_collided) & self.ends_on_collision)
         state = LoopState(
-            state.keys, state.k + 1, plant, manoeuvre, controller, defence, channel, estimate, u, sent, fresh, ended
+            state.keys, state.k + 1, plant, manoeuvre, controller, defence, channel, estimate, u, known, sent, fresh, ended
         )
         return state, frame
 
@@ -226,16 +235,22 @@ class Loop:
         state, frame = self.advance(state, command)
         return state, memory, frame
 
-    def _measure(self, keys: Keys, k: Array, plant: Any, estimate: Estimate) -> tuple[Array, Received]:
-        truth = self.plant.truth(self.plan.plant, plant)
+    def _truth(self, plant: Any, controller: Any) -> Array:
+        held = self.controller.held(self.plan.controller, controller, len(self.plant.lead_speed_of(plant)))
+        return self.plant.truth(self.plan.plant, plant, held)
+
+    def _measure(self, keys: Keys, k: Array, plant: Any, controller: Any, estimate: Estimate) -> tuple[Array, Received]:
+        truth = self._truth(plant, controller)
         received = self.sensor.measure(self.plan.sensor, truth, estimate.probe, keys.at(Role.SENSOR, k))
         columns = [received.y[..., i] for i in range(received.y.shape[-1])]
         v2v = self.plant.v2v(self.plan.plant, plant)
         return num.stack(columns + [v2v[..., i] for i in range(v2v.shape[-1])]), received
 
-    def _move(self, keys: Keys, k: Array, manoeuvre: Any, plant: Any, u: Array) -> tuple[Any, Any]:
+    def _move(self, keys: Keys, k: Array, manoeuvre: Any, plant: Any, applied: Array, u: Array | None = None) -> tuple[Any, Any, Array]:
+        """-> manoeuvre, plant, and what is known of the input; u is what was commanded, where that is not what is applied."""
         plan = self.plan
         manoeuvre, exo = self.manoeuvre.accel(
             plan.manoeuvre, manoeuvre, k, self.plant.lead_speed_of(plant), keys.at(Role.MANOEUVRE, k)
         )
-        return manoeuvre, self.plant.step(plan.plant, plant, u, exo, keys.at(Role.PROCESS, k))
+        known = self.plant.known(plan.plant, applied if u is None else u, exo)
+        return manoeuvre, self.plant.step(plan.plant, plant, applied, exo, keys.at(Role.PROCESS, k)), known

@@ -1,4 +1,8 @@
-"""Metrics: functions Trace -> (B,) floats, NaN where undefined (null in a row). Names are the columns."""
+"""Metrics: functions Trace -> (B,) floats, NaN where undefined (null in a row). Names are the columns.
+
+Among several agents a metric of the road is over those that follow another vehicle, in the way that its sentence says; without any it is
+undefined. An estimate's error is that of the gap, or of the whole state's norm where there is no road (`Model.error`).
+"""
 
 from collections.abc import Callable
 
@@ -41,13 +45,26 @@ def _rms(x: Array, where: Array) -> Array:
     return np.asarray(np.sqrt(_mean(x * x, where)))
 
 
-def _front(trace: Trace, name: str) -> Array:
-    """(K, B) of a road signal: the first agent's (car following has one)."""
-    return np.asarray(trace.signals[name][:, :, 0])
+def _pooled(x: Array, where: Array) -> Array:
+    """Mean over steps and agents of x (K, B, N), in their order."""
+    if not x.shape[2]:
+        return np.full(x.shape[1], np.nan)
+    return _mean(np.concatenate(np.moveaxis(x, 2, 0)), np.concatenate([where] * x.shape[2]))
+
+
+def _road(trace: Trace, name: str) -> Array:
+    """(K, B, followers) of a road signal."""
+    return np.asarray(trace.signals[name][:, :, trace.model.followers])
+
+
+def _before(trace: Trace, name: str) -> Array:
+    """(B, followers) of a road signal before the first step."""
+    return np.asarray(trace.first[name][:, trace.model.followers])
 
 
 def _least(x: Array, where: Array) -> Array:
-    return np.asarray(np.min(np.where(where, x, np.inf), axis=0))
+    """(B,) smallest of x (K, B, N)."""
+    return np.asarray(np.min(np.where(where[:, :, None], x, np.inf), axis=(0, 2), initial=np.inf))
 
 
 def _finite(x: Array) -> Array:
@@ -69,13 +86,13 @@ def _first_step(event: Array) -> Array:
 
 @metric("0/1")
 def collided(trace: Trace) -> Array:
-    """The car hit the one ahead."""
+    """A car hit the one ahead."""
     return np.asarray((trace.collided & trace.live).any(axis=0), np.float64)
 
 
 @metric("0/1")
 def rear_collided(trace: Trace) -> Array:
-    """The car behind hit the car."""
+    """A car behind, no agent, hit the car."""
     return np.asarray((trace.rear_collided & trace.live).any(axis=0), np.float64)
 
 
@@ -87,57 +104,63 @@ def crashed(trace: Trace) -> Array:
 
 @metric("m")
 def min_gap(trace: Trace) -> Array:
-    """Smallest gap to the car ahead."""
-    return np.minimum(_least(_front(trace, "gap"), trace.live), trace.first["gap"][:, 0])
+    """Smallest gap of any car to the one ahead."""
+    return np.asarray(np.minimum(_least(_road(trace, "gap"), trace.live), np.min(_before(trace, "gap"), axis=1, initial=np.inf)))
 
 
 @metric("m/s")
 def impact_speed(trace: Trace) -> Array:
-    """Closing speed at the first collision with the car ahead, at least 0."""
+    """Closing speed at the first collision with the car ahead, where the gap is smallest, at least 0."""
     first = _first_step(trace.collided & trace.live)
-    closing = _front(trace, "speed") - _front(trace, "lead_speed")
-    at = closing[np.where(np.isnan(first), 0, first).astype(np.int64), np.arange(trace.batch)]
-    return np.where(np.isnan(first), np.nan, np.maximum(at, 0.0))
+    if not trace.model.followers.any():
+        return np.full(trace.batch, np.nan)
+    at = np.where(np.isnan(first), 0, first).astype(np.int64), np.arange(trace.batch)
+    who = np.argmin(_road(trace, "gap")[at], axis=1)[:, None]
+    closing = np.take_along_axis((_road(trace, "speed") - _road(trace, "lead_speed"))[at], who, axis=1)[:, 0]
+    return np.where(np.isnan(first), np.nan, np.maximum(closing, 0.0))
 
 
 @metric("s")
 def min_ttc(trace: Trace) -> Array:
-    """Smallest time to collision, capped at 100 s."""
-    closing = _front(trace, "speed") - _front(trace, "lead_speed")
-    gap = np.maximum(_front(trace, "gap"), 0.0)
+    """Smallest time to collision of any car, capped at 100 s."""
+    closing = _road(trace, "speed") - _road(trace, "lead_speed")
+    gap = np.maximum(_road(trace, "gap"), 0.0)
     ttc = np.where(closing > 0.0, gap / np.where(closing > 0.0, closing, 1.0), TTC_CAP)
-    return np.minimum(_least(ttc, trace.live), TTC_CAP)
+    return np.where(trace.model.followers.any(), np.minimum(_least(ttc, trace.live), TTC_CAP), np.nan)
 
 
 @metric("m")
 def rmse_position(trace: Trace) -> Array:
-    """Root mean square error of the estimated position."""
-    return _rms(trace.estimate[:, :, 0, 0] - trace.truth[:, :, 0, 0], trace.live)
+    """Root mean square error of the estimated position, or gap; without a road of the norm of the state's error."""
+    error, road = trace.model.error(trace.estimate, trace.truth), trace.model.followers
+    error = error[:, :, road] if road.any() else error
+    return np.asarray(np.sqrt(_pooled(error * error, trace.live)))
 
 
 @metric("m/s")
 def rmse_velocity(trace: Trace) -> Array:
     """Root mean square error of the estimated velocity."""
-    return _rms(trace.estimate[:, :, 0, 1] - trace.truth[:, :, 0, 1], trace.live)
+    error = trace.model.speed_error(trace.estimate, trace.truth)[:, :, trace.model.followers]
+    return np.asarray(np.sqrt(_pooled(error * error, trace.live)))
 
 
 @metric("m")
 def max_error(trace: Trace) -> Array:
-    """Largest error of the estimated position."""
-    error = np.abs(trace.estimate[:, :, 0, 0] - trace.truth[:, :, 0, 0])
-    return np.asarray(np.max(np.where(trace.live, error, 0.0), axis=0))
+    """Largest error of an estimated position, or gap; without a road of the norm of the state's error."""
+    error = trace.model.error(trace.estimate, trace.truth)
+    return np.asarray(np.max(np.where(trace.live[:, :, None], error, 0.0), axis=(0, 2)))
 
 
 @metric("s")
 def recovery_time(trace: Trace) -> Array:
-    """From the last attack step until the gap error stays within 2 m; null without an attack, after a collision, or if it never does."""
+    """From the last attack step until all gap errors stay within 2 m; null without an attack, after a collision, or if it never does."""
     attacked = _attacked(trace)
     steps = np.arange(len(attacked))[:, None]
     last = np.max(np.where(attacked, steps, -1), axis=0)
-    error = np.abs(_front(trace, "gap") - trace.desired_gap(_front(trace, "speed")))
-    restless = np.max(np.where((error > RECOVERY_TOLERANCE) & trace.live, steps, -1), axis=0)
+    error = np.abs(_road(trace, "gap") - trace.desired_gap(_road(trace, "speed")))
+    restless = np.max(np.where((error > RECOVERY_TOLERANCE).any(axis=2) & trace.live, steps, -1), axis=0)
     calm_from = np.maximum(restless, last) + 1
-    recovered = (last >= 0) & (calm_from < trace.length) & (crashed(trace) == 0.0)
+    recovered = (last >= 0) & (calm_from < trace.length) & (crashed(trace) == 0.0) & trace.model.followers.any()
     return np.where(recovered, (calm_from - last) * trace.dt, np.nan)
 
 
@@ -174,36 +197,41 @@ def alarm_rate(trace: Trace) -> Array:
 @metric("ratio")
 def time_gap_inflation(trace: Trace) -> Array:
     """Mean gap over the desired gap at the same speed, less one."""
-    desired = trace.desired_gap(_front(trace, "speed"))
-    return _mean(_front(trace, "gap") / np.maximum(desired, 1e-3) - 1.0, trace.live)
+    desired = trace.desired_gap(_road(trace, "speed"))
+    return _pooled(_road(trace, "gap") / np.maximum(desired, 1e-3) - 1.0, trace.live)
 
 
 @metric("m")
 def distance_travelled(trace: Trace) -> Array:
-    """Distance from the start to the end of the episode."""
+    """Distance from the start to the end of the episode, of the car that comes least far."""
     last = np.maximum(trace.length - 1, 0)
-    return np.asarray(_front(trace, "position")[last, np.arange(trace.batch)] - trace.first["position"][:, 0])
+    moved = _road(trace, "position")[last, np.arange(trace.batch)] - _before(trace, "position")
+    return _finite(np.min(moved, axis=1, initial=np.inf))
 
 
 @metric("m/s^2")
 def max_decel(trace: Trace) -> Array:
-    """Hardest braking of the car."""
-    return np.asarray(np.max(np.where(trace.live, np.maximum(-_front(trace, "accel"), 0.0), 0.0), axis=0))
+    """Hardest braking of any car that follows another."""
+    hardest = np.max(np.where(trace.live[:, :, None], -_road(trace, "accel"), 0.0), axis=(0, 2), initial=0.0)
+    return np.where(trace.model.followers.any(), hardest, np.nan)
 
 
 @metric("m/s^3")
 def rms_jerk(trace: Trace) -> Array:
     """Root mean square of the rate of change of the acceleration."""
-    accel = np.concatenate([trace.first["accel"][None, :, 0], _front(trace, "accel")])
-    return _rms((accel[1:] - accel[:-1]) / trace.dt, trace.live)
+    accel = np.concatenate([_before(trace, "accel")[None], _road(trace, "accel")])
+    jerk = (accel[1:] - accel[:-1]) / trace.dt
+    return np.asarray(np.sqrt(_pooled(jerk * jerk, trace.live)))
 
 
 @metric("ratio")
 def string_gain(trace: Trace) -> Array:
-    """Root mean square acceleration of the car over that of the car ahead; null where the car ahead keeps its speed."""
-    speed = np.concatenate([trace.first["lead_speed"][None, :, 0], _front(trace, "lead_speed")])
+    """Root mean square acceleration of the last car over that of the car ahead of the first; null where that keeps its speed."""
+    if not trace.model.followers.any():
+        return np.full(trace.batch, np.nan)
+    speed = np.concatenate([_before(trace, "lead_speed")[None], _road(trace, "lead_speed")])[:, :, 0]
     lead = _rms((speed[1:] - speed[:-1]) / trace.dt, trace.live)
-    return np.asarray(_rms(_front(trace, "accel"), trace.live) / np.where(lead > 0.01, lead, np.nan))
+    return np.asarray(_rms(_road(trace, "accel")[:, :, -1], trace.live) / np.where(lead > 0.01, lead, np.nan))
 
 
 @metric("steps")

@@ -8,6 +8,7 @@ Arrays are (B, N, ...) by index and keep B contiguous in memory (`batch_last`): 
 runs along the batch.
 """
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -113,19 +114,89 @@ def inverse(s: Array) -> Array:
         out[..., 1, 1] = a * scale
         out[..., 0, 1] = out[..., 1, 0] = -b * scale
         return out
-    left = s.copy(order="K")
-    right = np.empty_like(s)
-    right[...] = np.eye(q)
-    for p in range(q):
-        scale = 1.0 / left[..., p, p, None]
-        left[..., p, :] *= scale
-        right[..., p, :] *= scale
-        for i in range(q):
-            if i != p:
-                factor = left[..., i, p, None].copy()
-                left[..., i, :] -= factor * left[..., p, :]
-                right[..., i, :] -= factor * right[..., p, :]
-    return right
+    if s.ndim > 2 and len(s) > 1 and s.strides[0] == 0:  # the same for the whole batch
+        return np.broadcast_to(inverse(s[:1]), s.shape)
+    flat = np.array(s, np.float64, order="C").reshape(-1, q, q)
+    flat_out = np.empty_like(flat)
+    kernels.invert_each(flat, flat_out)
+    full_out = flat_out.reshape(s.shape)
+    return batch_last(full_out) if s.ndim > 2 else full_out
+
+
+def apply(matrices: Array, x: Array) -> Array:
+    """Each agent's own matrix, `transposed` (N, k, i), times its vector in x (B, N, k): (B, N, i), summed over k in ascending order."""
+    flat = np.ascontiguousarray(np.moveaxis(x, 0, -1))
+    out = np.empty((flat.shape[0], matrices.shape[2], flat.shape[2]))
+    kernels.apply_each(matrices, flat, out)
+    return np.moveaxis(out, -1, 0)
+
+
+def transposed(matrices: Array) -> Array:
+    """(N, i, k) as `apply` wants it: (N, k, i), contiguous."""
+    return np.ascontiguousarray(np.swapaxes(matrices, 1, 2), np.float64)
+
+
+def product(x: Array, y: Array) -> Array:
+    """One (i, k) times one (k, j) of any size, compiled; summed over k in ascending order."""
+    return np.asarray(kernels.product(np.ascontiguousarray(x, np.float64), np.ascontiguousarray(y, np.float64)))
+
+
+def solve(m: Array, y: Array) -> Array:
+    """M^-1 Y for one (n, n) and one (n, k), by elimination with row pivots in fixed order."""
+    return np.asarray(kernels.solve(np.array(m, np.float64, order="C"), np.array(y, np.float64, order="C")))
+
+
+def orthogonal(x: Array, y: Array) -> tuple[Array, Array]:
+    """V'X, whose rows are orthogonal, and V'Y for X (M, q, n) and Y (M, q, p): each row of V'X to its own relative accuracy.
+
+    Jacobi's rotations in fixed order; V is orthogonal. The squared lengths of the rows are the eigenvalues of X X', in no order.
+    """
+    n = x.shape[-1]
+    both = np.ascontiguousarray(np.concatenate([x, y], axis=-1), np.float64)
+    kernels.turn_rows(both, n)
+    return both[..., :n], both[..., n:]
+
+
+def root(s: Array) -> tuple[Array, Array]:
+    """D^1/2 V' and D^-1/2 V' for symmetric positive definite V D V' (M, q, q): Y with Y'Y = S, and with Y'Y = S^-1."""
+    rows, turn = orthogonal(s, np.broadcast_to(np.eye(s.shape[-1]), s.shape))
+    half = np.sqrt(dot(rows, turn))[..., None]  # V'S = D V'
+    return turn * half, turn / half
+
+
+def in_ball(w: Array, c: Array) -> Array:
+    """u_k = w_k / (c_k + mu) with the least mu >= 0 at which |u| <= 1, for w (B, P, q) and c (P, q) >= 0: (B, P, q). 0/0 counts as 0."""
+    flat = np.ascontiguousarray(np.moveaxis(w, 0, -1))
+    out = np.empty_like(flat)
+    kernels.ball_each(flat, np.ascontiguousarray(c), out)
+    return np.moveaxis(out, -1, 0)
+
+
+def expm(m: Array) -> Array:
+    """The exponential of one square matrix: Taylor's series of M / 2^s, squared s times."""
+    size = float(np.max(np.abs(m)) * len(m))
+    halvings = max(0, math.frexp(size)[1] + 4) if size > 0.0 else 0
+    small, term = np.array(m) / 2.0**halvings, np.eye(len(m))
+    out = np.eye(len(m))
+    for k in range(1, 19):
+        term = product(term, small) / k
+        out = out + term
+    for _ in range(halvings):
+        out = product(out, out)
+    return out
+
+
+def spectral_radius(m: Array) -> float:
+    """The largest |eigenvalue| of one square matrix, as the limit of |M^(2^k)|^(1 / 2^k)."""
+    power, size = np.array(m, np.float64), 0.0
+    for k in range(60):
+        scale = float(np.max(np.abs(power)))
+        if scale == 0.0:
+            return 0.0
+        size += float(log(scale)) / 2.0**k
+        power = power / scale
+        power = product(power, power)
+    return float(exp(size))
 
 
 def dense(x: Array, weight: Array, bias: Array, squash: bool) -> Array:

@@ -20,6 +20,10 @@ PANELS = (  # key, title, colours; each darkens from harmless to harmful
     ("min_gap", "smallest gap [m], median", "Oranges_r"),
     ("crash", "episodes with a collision [%]", "Reds"),
 )
+NO_ROAD = (  # of systems that nothing drives in
+    ("rmse_position", "RMS of the state's error (2-norm), median", "Blues"),
+    ("max_error", "largest error of an agent's state (2-norm), median", "Purples"),
+)
 MARKERS = "osD^v<>PX*phd"
 
 
@@ -41,7 +45,7 @@ def png(figure: Any) -> bytes:
 
 
 def write_overview(table: Table, directory: Path) -> list[Path]:
-    """One picture of matrices per scenario and dose, and one scatter over all; returns their paths."""
+    """One picture of matrices per scenario and dose, and one scatter over all that have a road; returns their paths."""
     writable_directory(directory, "plot")
     good = [entry for entry in table if entry["crash"] is not None]
     out = []
@@ -50,9 +54,10 @@ def write_overview(table: Table, directory: Path) -> list[Path]:
         name = re.sub(r"[^\w.-]+", "-", f"{scenario}-{'unlimited' if dose is None else dose}.png")
         out.append(directory / name)
         write_atomic(out[-1], matrices(here, f"{scenario}, budget {'unlimited' if dose is None else f'{dose} steps'}"))
-    if good:
+    road = [entry for entry in good if entry["min_gap"]]
+    if road:
         out.append(directory / "rmse-against-gap.png")
-        write_atomic(out[-1], scatter(good))
+        write_atomic(out[-1], scatter(road))
     return out
 
 
@@ -64,17 +69,18 @@ def value(entry: dict[str, Any], key: str) -> float:
 
 
 def matrices(table: Table, title: str) -> bytes:
-    """Defences x attacks, one above the other: position error, smallest gap, collisions."""
+    """Defences x attacks, one above the other: position error, smallest gap, collisions; without a road the state's error alone."""
+    panels = PANELS if any(entry["min_gap"] for entry in table) else NO_ROAD
     defences, attacks = (list(dict.fromkeys(e[key] for e in table)) for key in ("defence", "attack"))
     labels = [textwrap.fill(name.replace(",", ", "), 26) for name in attacks]
     width = max(4.5, 0.52 * len(attacks)) + 0.075 * max(len(name) for name in defences)
-    size = width, 2.6 + 3 * (0.5 + 0.27 * len(defences))
-    figure, axes = canvas(*size, 3, 1, sharex=True)
-    for ax, (key, words, colours) in zip(axes[:, 0], PANELS, strict=True):
+    size = width, 2.6 + len(panels) * (0.5 + 0.27 * len(defences))
+    figure, axes = canvas(*size, len(panels), 1, sharex=True)
+    for ax, (key, words, colours) in zip(axes[:, 0], panels, strict=True):
         grid = np.full((len(defences), len(attacks)), np.nan)
         for entry in table:
             grid[defences.index(entry["defence"]), attacks.index(entry["attack"])] = value(entry, key)
-        shade = np.log10(np.maximum(grid, 1e-2)) if key == "rmse_position" else grid
+        shade = np.log10(np.maximum(grid, 1e-2)) if key in ("rmse_position", "max_error") else grid
         shade = np.clip(shade, 0.0, 20.0) if key == "min_gap" else shade
         low, high = {"crash": (0.0, 100.0), "min_gap": (0.0, 20.0)}.get(key, (np.nanmin(shade), np.nanmax(shade) + 1e-9))
         image = ax.imshow(shade, cmap=colours, aspect="auto", vmin=low, vmax=high)

@@ -46,7 +46,7 @@ class Scenario:
 
     def brief(self) -> Brief:
         """What an attacker knows before the episode."""
-        return Brief(self.plant.model(*self.sensor.matrices()), self.threat_model, self.horizon)
+        return Brief(self.plant.model(self.sensor, self.controller), self.threat_model, self.horizon)
 
     def with_threat(self, **changes: Any) -> Scenario:
         """The same scenario under a changed threat model."""

@@ -23,6 +23,7 @@ class ThreatModel:
 
     kinds: tuple[KindName, ...] = param(("dos_hold", "fdi"), "attack kinds that are granted")
     targets: tuple[str, ...] = param((), "wires that may be attacked; empty: every sensor, no V2V field and no actuator")
+    agents: tuple[Count, ...] = param((), "agents that may be attacked, by number from 0; empty: all")
     fdi_bound: Positive = param(50.0, "largest |value| that false data injection may add to a sensor or V2V field [unit of the wire]")
     actuator_bound: Positive = param(2.0, "largest |value| that may be added to, or jammed onto, an actuator, its limits aside [m/s^2]")
     jam_range: Pair = param((-108.0, 108.0), "values that a jammer may leave at the receiver [unit of the wire]")
@@ -53,13 +54,16 @@ class Brief:
 
     @property
     def granted(self) -> Array:
-        """(w,) bool: the wires that may be attacked."""
-        wires = self.model.wires
+        """(N, w) bool: the wires that may be attacked, of each agent."""
+        wires, agents = self.model.wires, self.model.agents
         for name in self.threat.targets:
             if name not in wires:
                 raise unknown("threat_model.targets", name, wires)
-        names = self.threat.targets or self.model.sensors
-        return np.array([w in names for w in wires])
+        for i in self.threat.agents:
+            if i >= agents:
+                raise InputError("threat_model.agents", i, f"an agent's number, from 0 to {agents - 1}")
+        names, some = self.threat.targets or self.model.sensors, self.threat.agents or range(agents)
+        return np.asarray(np.isin(np.arange(agents), list(some))[:, None] & np.array([w in names for w in wires]))
 
     @property
     def is_actuator(self) -> Array:
@@ -83,7 +87,7 @@ class Brief:
 
 class ChannelPlan(NamedTuple):
     threat: ThreatModel
-    granted: Array  # (w,) bool
+    granted: Array  # (N, w) bool
     kinds: Array  # (kinds,) bool
     bounds: Array  # (w,) of false data injection
     low: Array  # (w,) of jamming
@@ -204,9 +208,9 @@ class Channel:
 
     def actuate(self, plan: ChannelPlan, state: ChannelState, u: Array) -> tuple[ChannelState, Array]:
         """-> state, u (B, N, m) as the actuators get it."""
-        wires = slice(plan.granted.size - u.shape[-1], None)
+        wires = slice(plan.granted.shape[1] - u.shape[-1], None)
         applied, drives = u, state.drives
-        if plan.granted[wires].any():
+        if plan.granted[:, wires].any():
             applied = self._arrive(plan, state, state.drives, u, wires)
             drives = self._keep(plan, state, state.drives, u, state.last.target[..., wires])
         played = np.where(state.last.kind == Kind.REPLAY, state.played + 1, 0)

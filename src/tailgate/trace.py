@@ -9,10 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from tailgate.core import Array, Attack, Frame
+from tailgate.core import Array, Attack, Frame, Model
 from tailgate.draws import Keys, Role
 from tailgate.loop import Loop, LoopState
 
+MEMORY = 1e9  # [bytes] that a trace may take: who plays many episodes plays so many at a time
 _DECISIONS = ("kind", "target", "alarm", "mode", "refused", "collided", "rear_collided")
 
 
@@ -36,12 +37,16 @@ class Trace:
     before the first step.
     """
 
-    dt: float
+    model: Model
     horizon: int
     length: Array  # (B,)
     signals: dict[str, Array]
     first: dict[str, Array]
     desired_gap: Callable[[Array], Array]
+
+    @property
+    def dt(self) -> float:
+        return self.model.dt
 
     def __getattr__(self, name: str) -> Array:
         try:
@@ -77,8 +82,15 @@ class Trace:
         return self._hash(row, sorted(_DECISIONS))
 
 
+def episodes_at_once(model: Model, horizon: int, most: int) -> int:
+    """How many episodes, at most `most`, can be recorded side by side in MEMORY; at least one. A row does not depend on it."""
+    agents, wires = model.agents, len(model.wires)
+    step = 8 * (agents * (model.states + 3 * wires + 8) + model.states) + agents * (wires + 2)  # bytes of a frame's signals
+    return int(max(1, min(most, MEMORY // (step * horizon))))
+
+
 class Recorder:
-    """Collects frames into a Trace."""
+    """Collects frames into a Trace. A truth that all agents share is stored once."""
 
     def __init__(self, loop: Loop, state: LoopState) -> None:
         self.loop = loop
@@ -90,16 +102,22 @@ class Recorder:
     def add(self, frame: Frame, live: Array) -> None:
         """`live` (B,): the episodes that this step belongs to."""
         for name, value in _signals(frame).items():
-            if name not in self.signals:
-                self.signals[name] = np.zeros((self.loop.horizon, *value.shape), value.dtype)
-            self.signals[name][self.steps] = value
+            held = self.signals.get(name)
+            if name == "truth" and value.strides[1] == 0 and (held is None or held.shape[2] == 1):
+                value = value[:, :1]
+            if held is None:
+                held = self.signals[name] = np.zeros((self.loop.horizon, *value.shape), value.dtype)
+            elif held.shape[1:] != value.shape:  # shared until now
+                held = self.signals[name] = np.repeat(held, value.shape[1], axis=2)
+            held[self.steps] = value
         self.length += live
         self.steps += 1
 
     def trace(self) -> Trace:
-        signals = {name: value[: self.steps] for name, value in self.signals.items()}
-        loop = self.loop
-        return Trace(loop.model.dt, loop.horizon, self.length, signals, self.first, loop.controller.desired_gap)
+        signals, loop = {name: value[: self.steps] for name, value in self.signals.items()}, self.loop
+        if signals and signals["truth"].shape != signals["estimate"].shape:
+            signals["truth"] = np.broadcast_to(signals["truth"], signals["estimate"].shape)
+        return Trace(loop.model, loop.horizon, self.length, signals, self.first, loop.controller.desired_gap)
 
 
 def rollout(loop: Loop, attack: Attack, keys: Keys, *, terminate: bool = True) -> Trace:

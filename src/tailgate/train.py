@@ -15,17 +15,20 @@ import numpy as np
 from pydantic import Field
 
 from tailgate import draws
-from tailgate.agents.codec import ActionSpec, Reward
+from tailgate.agents.codec import ActionSpec
+from tailgate.agents.reward import Reward
 from tailgate.core import Array, Count, PositiveCount, param
 from tailgate.errors import InputError, unknown
 from tailgate.evaluation import cells_of, run
 from tailgate.files import set_aside, writable_directory, write_atomic
+from tailgate.metrics import METRICS, UNITS
 from tailgate.registry import Spec
 from tailgate.scenario import Suite, config_path, load_scenario
 from tailgate.schema import as_data, build, canonical, fields_of, override, read_yaml
 from tailgate.stats import Interval, paired_difference, proportion
 
 BATCH = 512  # episodes side by side in the comparison
+SHARE = "0/1"  # unit of a metric that is yes or no
 SELECT_EPISODES = 1024  # that the best rival is chosen on: fewer would choose by chance
 Discount = Annotated[float, Field(gt=0, le=1)]
 
@@ -47,6 +50,7 @@ class TrainConfig:
     seeds: PositiveCount = param(1, "training seeds, one policy each")
     checkpoint_every: PositiveCount = param(500_000, "decisions between checkpoints")
     tensorboard: bool = param(True, "write TensorBoard event files")
+    outcome: str | None = param(None, "metric that is compared, the larger the worse; none: crashed, or rmse_position without a road")
     episodes: PositiveCount = param(400, "fresh episodes per attack in the final comparison")
     workers: PositiveCount = param(2, "processes of the final comparison; change no result")
     rivals: tuple[str, ...] = param((), "scripted attacks of equal knowledge and dose to compare with")
@@ -86,6 +90,8 @@ def _checked(data: dict[str, Any]) -> TrainConfig:
     config = build(TrainConfig, data, "config")
     if Path(config.name).name != config.name:
         raise InputError("config.name", config.name, "the name of a directory, without a separator")
+    if config.outcome is not None and config.outcome not in METRICS:
+        raise unknown("config.outcome", config.outcome, METRICS)
     for spec in [Spec("defence", config.defence), *(Spec("defence", name) for name in config.others)]:
         spec.refuse_imports("config")
     for spec in (Spec("attack", name) for name in (*config.rivals, *config.white_box)):
@@ -100,6 +106,13 @@ def environment_of(config: TrainConfig) -> dict[str, Any]:
         if key not in known:  # the scenario, the defence, the threat model and gamma have a field of their own
             raise unknown("config.environment: unknown field", key, known)
     return {"scenario": config.scenario, "defence": config.defence, "threat": dict(config.threat), **config.environment}
+
+
+def outcome_of(config: TrainConfig) -> str:
+    """The metric that the comparison counts."""
+    if config.outcome is not None:
+        return config.outcome
+    return "crashed" if load_scenario(config.scenario).brief().model.followers.any() else "rmse_position"
 
 
 def _check(config: TrainConfig) -> None:
@@ -118,7 +131,7 @@ def _suite(config: TrainConfig, attacks: tuple[str, ...]) -> Suite:
 
 @dataclass(frozen=True)
 class Verdict:
-    """How one trained policy did on the report seeds, episode by episode (0 or 1 each)."""
+    """How one trained policy did on the report seeds: the outcome of each episode."""
 
     seed: int
     policy: Path
@@ -173,11 +186,13 @@ def _same_run(held: Path, config: TrainConfig) -> None:
         raise InputError("resume", ", ".join(changed), f"the configuration in {held}, apart from steps")
 
 
-def _crashes(rows: list[dict[str, Any]]) -> Array:
+def _outcomes(rows: list[dict[str, Any]], outcome: str) -> Array:
     bad = next((row for row in rows if row["status"] != "ok"), None)
     if bad is not None:
         raise InputError(f"attack {bad['attack']}", bad["status"], f"an attack that plays here ({bad['reason']})")
-    return np.array([row["crashed"] for row in rows], np.float64)
+    if any(row[outcome] is None for row in rows):
+        raise InputError("config.outcome", outcome, "a metric that every episode has")
+    return np.array([row[outcome] for row in rows], np.float64)
 
 
 def compare(config: TrainConfig, policies: list[Path], progress: Callable[[int, int], None] | None = None) -> dict[str, Any]:
@@ -188,18 +203,20 @@ def compare(config: TrainConfig, policies: list[Path], progress: Callable[[int, 
     """
     from tailgate.agents.policy import PolicyAttack, timing_advantage
     threat = dict(config.threat)
-    names = [str(p) for p in policies]
+    names, outcome = [str(p) for p in policies], outcome_of(config)
     guard = config.defence
-    choice = Suite(config.name, "", (config.scenario,), (None,), (guard,), config.rivals, SELECT_EPISODES)
-    selection = run(cells_of(choice, batch=BATCH, purpose="select", threat=threat), workers=config.workers) if config.rivals else []
-    best = max(config.rivals, key=lambda a: _crashes([r for r in selection if r["attack"] == a]).mean(), default=None)
+    best = next(iter(config.rivals), None)
+    if len(config.rivals) > 1:
+        choice = Suite(config.name, "", (config.scenario,), (None,), (guard,), config.rivals, SELECT_EPISODES)
+        selection = run(cells_of(choice, batch=BATCH, purpose="select", threat=threat), workers=config.workers)
+        best = max(config.rivals, key=lambda a: _outcomes([r for r in selection if r["attack"] == a], outcome).mean())
 
     attacks = tuple(dict.fromkeys(("none", *config.rivals, *config.white_box, *names)))  # each once
     cells = cells_of(_suite(config, attacks), batch=BATCH, threat=threat)
     rows = run(cells, config.directory / "rows.jsonl", config.workers, progress)
 
-    def crashes(attack: str) -> Array:
-        return _crashes([r for r in rows if r["attack"] == attack and r["defence"] == guard])
+    def outcomes(attack: str) -> Array:
+        return _outcomes([r for r in rows if r["attack"] == attack and r["defence"] == guard], outcome)
 
     built, uses = Spec("defence", guard).make(), Spec("defence", guard).entry.uses
     keys = draws.keys("report", range(config.episodes))
@@ -207,61 +224,72 @@ def compare(config: TrainConfig, policies: list[Path], progress: Callable[[int, 
     for path, seed in zip(policies, range(config.first_seed, config.first_seed + config.seeds), strict=True):
         policy = PolicyAttack(path)
         place = load_scenario(config.scenario).with_threat(**(threat | {"knowledge": policy.knowledge}))
-        own, yoked = timing_advantage(place.loop(built, uses), policy, keys)
+        own, yoked = timing_advantage(place.loop(built, uses), policy, keys, outcome)
         verdicts.append(Verdict(seed, path, own, yoked))
-    return _report(config, verdicts, crashes, best)
+    return _report(config, verdicts, outcomes, best, outcome)
 
 
-def _report(config: TrainConfig, verdicts: list[Verdict], crashes: Callable[[str], Array], best: str | None) -> dict[str, Any]:
+def _report(
+    config: TrainConfig, verdicts: list[Verdict], outcomes: Callable[[str], Array], best: str | None, outcome: str
+) -> dict[str, Any]:
     learned = np.array([v.learned for v in verdicts])
     yoked = np.array([v.yoked for v in verdicts])
-    none = np.broadcast_to(crashes("none"), learned.shape)
+    none = np.broadcast_to(outcomes("none"), learned.shape)
 
-    def share(x: Array) -> Interval:
-        return proportion(int(x.sum()), x.size)
+    def mean(x: Array) -> Interval:
+        """Of the outcomes (episodes,): of 0 and 1 the exact interval, of others the bootstrap's."""
+        return proportion(int(x.sum()), x.size) if UNITS[outcome] == SHARE else paired_difference(x, np.zeros_like(x))
 
-    items = [("no attack", share(crashes("none")), "")]
+    items = [("no attack", mean(outcomes("none")), "")]
     if best is not None:
-        items.append((best, share(crashes(best)), "best scripted attack of equal knowledge and dose, chosen on other seeds"))
-    items += [(f"learned, seed {v.seed}", share(v.learned), "") for v in verdicts]
-    items += [(f"learned, seed {v.seed}, yoked", share(v.yoked), "its own values at another episode's times") for v in verdicts]
-    items += [(name, share(crashes(name)), "white box, and no step of it alarms: knows more, dares less") for name in config.white_box]
+        items.append((best, mean(outcomes(best)), "best scripted attack of equal knowledge and dose, chosen on other seeds"))
+    items += [(f"learned, seed {v.seed}", mean(v.learned), "") for v in verdicts]
+    items += [(f"learned, seed {v.seed}, yoked", mean(v.yoked), "its own values at another episode's times") for v in verdicts]
+    items += [(name, mean(outcomes(name)), "white box, and no step of it alarms: knows more, dares less") for name in config.white_box]
 
     def over(attack: str) -> Interval:
-        return paired_difference(learned, np.broadcast_to(crashes(attack), learned.shape))
+        return paired_difference(learned, np.broadcast_to(outcomes(attack), learned.shape))
 
     versus = {"no attack": paired_difference(learned, none), "own yoked schedule": paired_difference(learned, yoked)}
     if best is not None:
         versus["best scripted attack"] = over(best)
     report = {
         "name": config.name, "scenario": config.scenario, "defence": config.defence, "episodes": config.episodes, "steps": config.steps,
+        "outcome": outcome, "unit": UNITS[outcome],
         "threat": as_data(load_scenario(config.scenario).with_threat(**config.threat).threat_model),
         "config": json.loads(canonical(config)), "policies": [str(v.policy) for v in verdicts], "best_scripted": best,
-        "crash": [{"label": label, **interval._asdict(), "note": note} for label, interval, note in items],
+        "attacks": [{"label": label, **interval._asdict(), "note": note} for label, interval, note in items],
         "advantage": {name: interval._asdict() for name, interval in versus.items()},
-        "rivals": {name: {"crash": share(crashes(name))._asdict(), "advantage": over(name)._asdict()} for name in config.rivals},
+        "rivals": {name: {"outcome": mean(outcomes(name))._asdict(), "advantage": over(name)._asdict()} for name in config.rivals},
     }  # fmt: skip
     write_atomic(config.directory / "report.json", json.dumps(report, indent=1, allow_nan=False).encode() + b"\n")
     return report
 
 
-def _points(share: float) -> str:
-    return f"{round(100 * share) + 0:+d}"
+def shown(report: dict[str, Any], value: float, sign: str = "") -> str:
+    """An outcome, or with sign "+" a difference of two, as people read it."""
+    if report["unit"] != SHARE:
+        return f"{value:{sign}.3g}"
+    return f"{round(100 * value) + 0:+d}" if sign else f"{100 * value:.1f} %"
 
 
 def headline(report: dict[str, Any]) -> dict[str, Any]:
     """The report as the page shows it at its top."""
+    share = report["unit"] == SHARE
+    points = " points" if share else ""
     gains = "; ".join(
-        f"{_points(g['value'])} points over {name} [{_points(g['low'])}, {_points(g['high'])}]"
+        f"{shown(report, g['value'], '+')}{points} over {name} [{shown(report, g['low'], '+')}, {shown(report, g['high'], '+')}]"
         for name, g in report["advantage"].items()
     )
+    what = "Share of" if share else f"Mean {report['outcome']} of"
+    which = {"crashed": " that end in a collision"}.get(report["outcome"], f" with {report['outcome']}" if share else "")
     runs = len(report["policies"])
     speaks = "of this one policy: other training seeds differ" if runs == 1 else f"over {runs} training seeds"
     text = (
         f"An adversary was trained for {report['steps']:,} decisions against {report['defence']} on {report['scenario']}. "
-        f"Share of {report['episodes']} fresh episodes that end in a collision: {gains} (paired, 95 %; {speaks})."
+        f"{what} {report['episodes']} fresh episodes{which}: {gains} (paired, 95 %; {speaks})."
     )
-    return {"text": text, "items": report["crash"]}
+    return {"text": text, "items": report["attacks"] if share else []}
 
 
 def make_page(config: TrainConfig, report: dict[str, Any]) -> Path:
@@ -275,7 +303,8 @@ def make_page(config: TrainConfig, report: dict[str, Any]) -> Path:
     ]  # fmt: skip
     rows = read_rows(config.directory / "rows.jsonl")
     title = f"{config.name}: {config.defence} under attack"
-    return build_page(rows, config.directory / "page", title=title, curve=curve, headline=headline(report))
+    drawn = curve if all(point["crash"] is not None for point in curve) else None
+    return build_page(rows, config.directory / "page", title=title, curve=drawn, headline=headline(report))
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -291,8 +320,8 @@ def figures(progress: Any) -> str:
     """The curve's latest figures, as a progress bar shows them."""
     text = f"{progress.steps / 1e6:5.2f} M decisions"
     if progress.crash is not None:
-        text += f", collisions {100 * progress.crash:4.1f} %, return {progress.reward:+.2f}"
-    return text
+        text += f", collisions {100 * progress.crash:4.1f} %"
+    return text if progress.reward is None else f"{text}, return {progress.reward:+.2f}"
 
 
 def parameters() -> list[dict[str, Any]]:

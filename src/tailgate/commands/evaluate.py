@@ -86,13 +86,14 @@ def _print_summary(table: list[dict[str, Any]]) -> None:
     out = console()
     for place in dict.fromkeys((e["scenario"], e["dose"]) for e in table):
         scenario, dose = place
+        here = [entry for entry in table if (entry["scenario"], entry["dose"]) == place]
+        road = any(entry["crash"] and entry["min_gap"] for entry in here)  # else nothing drives, and an error has no unit
         shown = Table(title=f"{scenario}, budget {'unlimited' if dose is None else f'{dose} steps'}")
-        measures = ("n", "collisions", "95 % interval", "min gap [m]", "max error [m]", "alarm onsets")
+        errors = ("min gap [m]", "max error [m]") if road else ("RMS error", "max error")
+        measures = ("n", *(("collisions", "95 % interval") if road else ()), *errors, "alarm onsets")
         for heading in ("defence", "attack", "knowledge", *measures):
             shown.add_column(heading, overflow="fold")
-        for entry in table:
-            if (entry["scenario"], entry["dose"]) != place:
-                continue
+        for entry in here:
             head = [escape(entry["defence"]), escape(entry["attack"]), entry["knowledge"], str(entry["n"])]
             crash = entry["crash"]
             if crash is None:
@@ -100,7 +101,8 @@ def _print_summary(table: list[dict[str, Any]]) -> None:
                 continue
             if entry["refused_all"]:
                 head[1] += " (refused: not granted)"
-            figures = [f"{100 * crash['value']:.1f} %", f"{100 * crash['low']:.1f} to {100 * crash['high']:.1f} %"]
-            figures += [f"{entry[k]['median']:.2f}" if entry[k] else "-" for k in ("min_gap", "max_error", "alarm_onsets")]
+            figures = [f"{100 * crash['value']:.1f} %", f"{100 * crash['low']:.1f} to {100 * crash['high']:.1f} %"] if road else []
+            keys = ("min_gap" if road else "rmse_position", "max_error", "alarm_onsets")
+            figures += [f"{entry[k]['median']:.2f}" if entry[k] else "-" for k in keys]
             shown.add_row(*head, *figures)
         out.print(shown)

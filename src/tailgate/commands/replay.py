@@ -16,7 +16,7 @@ def add(commands: Any) -> None:
     command = commands.add_parser(
         "replay", help="play one episode again from its row and write a page of it",
         description="Play one episode again from its row, check its hash, and write one HTML page. Of the rows that the options leave, the "
-        "one with the worst outcome is played: a crash first, then the smallest gap.",
+        "one with the worst outcome is played: a crash first, then the smallest gap, then the largest error.",
     )  # fmt: skip
     command.add_argument("rows", metavar="ROWS.jsonl", help="rows of `tailgate evaluate` or `train`")
     which = command.add_mutually_exclusive_group()
@@ -27,6 +27,7 @@ def add(commands: Any) -> None:
     command.add_argument("--scenario", metavar="NAME", help="rows of this scenario; also where its YAML file lies now")
     command.add_argument("--dose", metavar="STEPS", help="rows with this attack budget, or none")
     command.add_argument("--seed", type=int, metavar="N", help="rows with this seed")
+    command.add_argument("--agent", type=int, metavar="N", help="the car or agent to look at first (default: the one attacked most)")
     command.add_argument("--out", required=True, metavar="PATH", help="the page: a file that ends in .html, or a directory")
     command.add_argument("--video", metavar="FILE", help="also a film: .gif, .webp or .mp4")
     command.add_argument("--json", action="store_true", help="print what was played and checked as JSON")
@@ -58,7 +59,7 @@ def _replay(options: argparse.Namespace) -> int:
     source = Path(options.rows)
     chosen = choose(read_rows(source), wanted)
     replay = play(chosen.row, wanted)
-    page = write_page(replay, Path(options.out), f"line {chosen.line} of {source.name}")
+    page = write_page(replay, Path(options.out), f"line {chosen.line} of {source.name}", options.agent)
     film = write_video(replay, video) if video is not None else None
     row = chosen.row
     report = {

@@ -68,16 +68,21 @@ def _resumable(name: str) -> Iterator[None]:
 
 
 def _print_report(report: dict[str, Any]) -> None:
+    from tailgate.train import SHARE, shown
+
     threat = report["threat"]
-    table = Table(title=f"{report['episodes']} fresh episodes, {report['defence']}, {report['scenario']}, budget {threat['budget']} steps")
-    for heading in ("attack", "collisions", "95 % interval", "note"):
+    budget = "unlimited budget" if threat["budget"] is None else f"budget {threat['budget']} steps"
+    table = Table(title=f"{report['episodes']} fresh episodes, {report['defence']}, {report['scenario']}, {budget}")
+    what = {"crashed": "collisions"}.get(report["outcome"], f"mean {report['outcome']}")
+    for heading in ("attack", what, "95 % interval", "note"):
         table.add_column(heading, overflow="fold")
-    for row in report["crash"]:
-        interval = f"{100 * row['low']:.1f} to {100 * row['high']:.1f} %"
-        table.add_row(escape(row["label"]), f"{100 * row['value']:.1f} %", interval, row["note"])
+    for row in report["attacks"]:
+        value, low, high = (shown(report, row[key]) for key in ("value", "low", "high"))
+        table.add_row(escape(row["label"]), value, f"{low} to {high}", row["note"])
     out = console()
     out.print(table)
     for name, gain in report["advantage"].items():
-        low, high = 100 * gain["low"], 100 * gain["high"]
-        verdict = "wins" if low > 0 else "loses" if high < 0 else "undecided"
-        out.print(f"learned against {name}: {100 * gain['value']:+.1f} points, 95 % interval {low:+.1f} to {high:+.1f} ({verdict})")
+        verdict = "wins" if gain["low"] > 0 else "loses" if gain["high"] < 0 else "undecided"
+        scale, points = (100.0, " points") if report["unit"] == SHARE else (1.0, "")
+        value, low, high = (f"{scale * gain[key]:+.{1 if points else 3}f}" for key in ("value", "low", "high"))
+        out.print(f"learned against {name}: {value}{points}, 95 % interval {low} to {high} ({verdict})")

@@ -6,11 +6,24 @@
   const slider = at("slider"), canvas = at("road"), playButton = at("play"), speedMenu = at("speed");
   let now = -1, playing = false, last = 0, carry = 0;
 
-  const plots = buildPlots(at("plots"), episode, (s) => {
+  const seek = (s) => {
     halt();
     show(s);
-  });
-  const { digits, attacked, alarms, short } = plots;
+  };
+  // one agent: all plots. Many: those of all, and those of the one that is looked at
+  const many = Boolean(episode.agents), drawScene = episode.graph ? drawGraph : many ? drawString : drawRoad;
+  const together = many ? buildPlots(at("together"), episode, seek, "all") : null;
+  let agent = many ? episode.agent : 0, plots = null;
+  const choose = (number) => {
+    if (plots) plots.stop();
+    agent = number;
+    at("plots").replaceChildren();
+    plots = buildPlots(at("plots"), many ? { ...episode, ...episode.agents[agent], number: agent } : episode, seek, many ? "one" : "");
+    if (now >= 0) plots.show(now);
+    drawScene(canvas, episode, Math.max(now, 0), agent);
+  };
+  choose(agent);
+  const { digits, attacked, alarms, short } = together || plots;
 
   const words = (s) => {
     // the command that took effect in step s
@@ -18,15 +31,24 @@
     if (!kind) return ["No attack", s ? "every wire arrives as it was sent" : "before the first step"];
     const { name, does, valued, unit } = episode.kinds[kind];
     const hit = episode.wires.filter((wire) => wire.hit[s - 1]);
-    const list = hit.map((wire) => (valued ? `${wire.name} ${kind === 5 && wire.value[s - 1] > 0 ? "+" : ""}${short(wire.value[s - 1])} ${unit || wire.unit}` : wire.name));
+    const list = hit.map((wire) => (valued && wire.value ? `${wire.name} ${kind === 5 && wire.value[s - 1] > 0 ? "+" : ""}${short(wire.value[s - 1])} ${unit || wire.unit}` : wire.name));
     return [`ATTACK: ${name}`, `${list.join(", ")} (${does})`];
+  };
+
+  // the smallest gap at a step, or the largest error where there is no road
+  const worst = (s) => {
+    if (episode.graph) return s ? Math.max(...episode.graph.error.map((values) => values[s - 1])) : 0;
+    return episode.string ? Math.min(...episode.string.gap.map((values) => values[s]).filter((gap) => gap !== null)) : episode.road.gap[s];
   };
 
   const show = (s) => {
     s = Math.max(0, Math.min(s, length));
     if (s === now) return;
     now = s;
-    const [title, does] = words(s), refused = s > 0 && episode.refused[s - 1], alarm = s > 0 && Boolean(episode.alarm[s - 1]), mode = s ? episode.mode[s - 1] : 0;
+    const [title, does] = words(s), refused = s > 0 && episode.refused[s - 1], alarm = s > 0 && Boolean(episode.alarm[s - 1]);
+    const own = many ? episode.agents[agent] : episode, mode = s ? own.mode[s - 1] : 0;
+    const who = many && alarm ? episode.alarms[s - 1].flatMap((on, i) => (on ? [i] : [])) : [], whose = many ? ` of ${episode.noun} ${agent}` : "";
+    const list = who.length > 6 ? `${who.length} ${episode.noun}s` : who.length ? `${episode.noun}${who.length > 1 ? "s" : ""} ${who.join(", ")}` : "";
     at("time").textContent = `t = ${(s * dt).toFixed(digits)} s`;
     at("when").textContent = `${(s * dt).toFixed(digits)} s`;
     at("step").textContent = `step ${s} of ${episode.horizon}`;
@@ -36,12 +58,13 @@
     if (episode.left) at("budget").querySelector("b").textContent = `${episode.left[s]} of ${episode.budget}`;
     at("alarm").classList.toggle("on", alarm);
     at("alarm").querySelector("b").textContent = alarm ? "ALARM" : "no alarm";
-    at("alarm").querySelector(".words span").textContent = mode ? `mode: ${episode.modes[mode]}` : "";
+    at("alarm").querySelector(".words span").textContent = [list, mode ? `mode${whose}: ${episode.modes[mode]}` : ""].filter(Boolean).join("; ");
     slider.value = s;
-    const gap = short(episode.road.gap[s]);
-    slider.setAttribute("aria-valuetext", `${(s * dt).toFixed(digits)} seconds, gap ${gap} metres, ${title}, ${alarm ? "alarm" : "no alarm"}`);
-    drawRoad(canvas, episode, s);
+    const least = worst(s), shown = episode.graph ? `largest error ${s ? short(least) : "unknown"}` : `${many ? "smallest gap" : "gap"} ${short(least)} metres`;
+    slider.setAttribute("aria-valuetext", `${(s * dt).toFixed(digits)} seconds, ${shown}, ${title}, ${alarm ? "alarm" : "no alarm"}`);
+    drawScene(canvas, episode, s, agent);
     plots.show(s);
+    if (together) together.show(s);
   };
 
   const halt = () => {
@@ -99,8 +122,9 @@
   const places = [["Start", 0]];
   if (attacked.length) places.push(["First attack", attacked[0][0]], ["Last attack step", attacked[attacked.length - 1][1]]);
   if (alarms.length) places.push(["First alarm", alarms[0][0]]);
-  const nearest = episode.road.gap.indexOf(Math.min(...episode.road.gap.filter((gap) => gap !== null)));
-  places.push(["Smallest gap", nearest]);
+  const course = [...Array(length + 1).keys()].map((s) => [worst(s), s]).filter(([value]) => value !== null);
+  const way = episode.graph ? -1 : 1, [, extreme] = course.reduce((best, one) => (way * one[0] < way * best[0] ? one : best));
+  places.push([episode.graph ? "Largest error" : "Smallest gap", extreme]);
   if (episode.hit !== null) places.push(["Collision", episode.hit]);
   if (episode.rear_hit !== null) places.push(["Rear collision", episode.rear_hit]);
   if (length !== episode.hit && length !== episode.rear_hit) places.push(["End", length]);
@@ -123,6 +147,11 @@
       marks.append(bar);
     }
   }
-  new ResizeObserver(() => drawRoad(canvas, episode, now)).observe(canvas);
+  if (many) {
+    const menu = at("agent");
+    for (const number of Object.keys(episode.agents)) menu.add(new Option(`${episode.noun} ${number}`, number, false, Number(number) === agent));
+    menu.addEventListener("change", () => choose(Number(menu.value)));
+  }
+  new ResizeObserver(() => drawScene(canvas, episode, now, agent)).observe(canvas);
   show(0);
 })();

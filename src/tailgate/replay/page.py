@@ -7,7 +7,6 @@ import dataclasses
 import hashlib
 import inspect
 import json
-import math
 import re
 from collections.abc import Callable
 from importlib.resources import files
@@ -18,26 +17,13 @@ import numpy as np
 from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 
-from tailgate.core import Array, Kind, Mode
 from tailgate.files import writable_directory, write_atomic
 from tailgate.leaderboard.build import names_of
 from tailgate.metrics import METRICS, UNITS
 
-from .replay import AGENT, Replay, threshold
+from .episode import Data, episode_of, first_step, noun
+from .replay import Replay
 
-Data = dict[str, Any]
-DIGITS = 6  # of a curve; decisions are exact
-WIRE_UNITS = {"position": "m", "velocity": "m/s", "acceleration": "m/s\N{SUPERSCRIPT TWO}"}
-KINDS = {  # what a reader sees of a kind: short name, name, what it does to the wire
-    Kind.DOS_JAM: ("JAM", "DoS jam", "the receiver reads the jammer's value"),
-    Kind.DOS_HOLD: ("HOLD", "DoS hold", "the receiver is stuck at the last reading before the first attack"),
-    Kind.DOS_HOLD_FRESH: ("HOLD*", "DoS hold (fresh)", "the receiver is stuck at the last reading before this burst"),
-    Kind.DROPOUT: ("DROP", "dropout", "nothing arrives, and the receiver knows it"),
-    Kind.FDI: ("FDI", "false data injection", "the value is added"),
-    Kind.DELAY: ("DELAY", "delay", "the receiver reads what was sent so many steps ago"),
-    Kind.REPLAY: ("REPLAY", "replay", "the receiver reads the last so many samples over and over"),
-}
-VALUED = {Kind.DOS_JAM: "", Kind.FDI: "", Kind.DELAY: "steps", Kind.REPLAY: "steps"}  # unit; empty: that of the wire
 VERDICTS = {
     "same": ("good", "The same trace, bit for bit", "every signal of every step has the hash that the row records"),
     "decisions": ("warn", "The same decisions, not the same bits", "commands, alarms, modes and collisions agree, other signals differ"),
@@ -48,83 +34,21 @@ NO_ENTRY = "not recorded"
 LABELS = {"version": "version of Tailgate", "config_hash": "configuration (config_hash)", "versions": "versions of the components"}
 
 
-def _curve(values: Array) -> list[float | None]:
-    """Numbers for drawing: some digits, null where not finite."""
-    return [float(f"{v:.{DIGITS}g}") if math.isfinite(v) else None for v in values.tolist()]
-
-
-def _road(replay: Replay, name: str) -> Array:
-    """(K + 1,): before the first step, then after each."""
-    trace = replay.trace
-    return np.concatenate([trace.first[name][:, AGENT], trace.signals[name][:, 0, AGENT]])
-
-
-def _believed_gap(replay: Replay) -> Array:
-    """(K,) the leader's position as the controller heard it, less the estimated own one."""
-    trace, model = replay.trace, replay.loop.model
-    if "leader_position" in model.v2v:
-        leader = trace.wires[:, 0, AGENT, model.wires.index("leader_position")]
-    else:
-        leader = (_road(replay, "position") + _road(replay, "gap"))[:-1]
-    return np.asarray(leader - trace.estimate[:, 0, AGENT, 0])
-
-
-def _wires(replay: Replay) -> list[Data]:
-    """The wires that were ever attacked, each with the kinds that hit it."""
-    trace, out = replay.trace, []
-    for i, name in enumerate(replay.loop.model.wires):
-        hit = trace.target[:, 0, AGENT, i] & (trace.kind[:, 0] != Kind.NONE)
-        if hit.any():
-            kinds = sorted(set(trace.kind[hit, 0].tolist()))
-            out.append({
-                "name": name.replace("_", " "), "unit": WIRE_UNITS.get(name.split("_")[-1], ""), "kinds": kinds,
-                "hit": hit.astype(int).tolist(), "value": [float(v) for v in trace.value[:, 0, AGENT, i]],
-            })  # fmt: skip
-    return out
-
-
-def episode_of(replay: Replay) -> Data:
-    """Everything that the page draws, as JSON data.
-
-    Road signals have K + 1 entries, the first before the first step; all others K, entry s - 1 for step s.
-    """
-    trace, threat = replay.trace, replay.loop.threat
-    commanded, applied = trace.control[:, 0, AGENT, 0], trace.applied[:, 0, AGENT, 0]
-    kind, rear = trace.kind[:, 0], _road(replay, "rear_gap")
-    used = np.concatenate([[0], np.cumsum(kind != Kind.NONE)])
-    limit, score, alarm = threshold(replay.loop.defence), trace.score[:, 0, AGENT], trace.alarm[:, 0, AGENT]
-    return {
-        "dt": trace.dt, "horizon": trace.horizon, "length": int(trace.length[0]),
-        "road": {name: _curve(_road(replay, name)) for name in ("gap", "speed", "lead_speed", "position")},
-        "rear": {name: _curve(_road(replay, name)) for name in ("rear_gap", "rear_speed")} if np.isfinite(rear).all() else None,
-        "desired": _curve(np.asarray(trace.desired_gap(_road(replay, "speed")))),
-        "believed": {"gap": _curve(_believed_gap(replay)), "speed": _curve(trace.estimate[:, 0, AGENT, 1])},
-        "error": {
-            name: _curve(trace.estimate[:, 0, AGENT, i] - trace.truth[:, 0, AGENT, i]) for i, name in enumerate(("position", "velocity"))
-        },
-        "score": _curve(score), "alarm": alarm.astype(int).tolist(), "mode": trace.mode[:, 0, AGENT].tolist(),
-        "modes": [mode.name for mode in Mode],
-        "threshold": None if limit is None else {"name": limit[0], "value": limit[1], "rules": bool(((score > limit[1]) == alarm).all())},
-        "gate": _curve(replay.gate) if limit is None and np.isfinite(replay.gate).any() else None,
-        "control": _curve(commanded), "applied": None if (commanded == applied).all() else _curve(applied),
-        "kind": kind.tolist(), "wires": _wires(replay), "refused": trace.refused[:, 0].astype(int).tolist(),
-        "kinds": {int(k): {"code": code, "name": name, "does": does, "valued": k in VALUED, "unit": VALUED.get(k, "")}
-                  for k, (code, name, does) in KINDS.items()},
-        "left": None if threat.budget is None else (threat.budget - used).tolist(), "budget": threat.budget,
-        "hit": _first(trace.collided[:, 0]), "rear_hit": _first(trace.rear_collided[:, 0]),
-    }  # fmt: skip
-
-
-def _first(event: Array) -> int | None:
-    """The first step (from 1) in which something happened."""
-    return int(np.argmax(event)) + 1 if event.any() else None
-
-
 def outcome(replay: Replay) -> str:
     """How the episode went, in a sentence."""
-    trace, metrics = replay.trace, replay.metrics
-    hits = [(trace.collided, "the car hit the one ahead"), (trace.rear_collided, "the car behind hit the car")]
-    words = [f"{what} at t = {step * trace.dt:.4g} s (step {step})" for signal, what in hits if (step := _first(signal[:, 0])) is not None]
+    trace, metrics, model = replay.trace, replay.metrics, replay.loop.model
+    if not model.followers.any():
+        size = model.error(trace.estimate[:, 0], trace.truth[:, 0])
+        last, agent = divmod(int(np.argmax(size)), model.agents)
+        when = f"at t = {(last + 1) * trace.dt:.4g} s (step {last + 1})"
+        return f"The largest error of an estimate was {size.max():.4g}, of agent {agent} {when}"
+    ahead, behind = "the car hit the one ahead", "the car behind hit the car"
+    if model.agents > 1 and (step := first_step(trace.collided[:, 0])) is not None:
+        car = int(np.argmin(trace.gap[step - 1, 0]))
+        ahead = f"car {car} hit {'the leader' if car == 1 else f'car {car - 1}'}"
+    hits = [(trace.collided, ahead), (trace.rear_collided, behind)]
+    found = [(what, at) for signal, what in hits if (at := first_step(signal[:, 0])) is not None]
+    words = [f"{what} at t = {at * trace.dt:.4g} s (step {at})" for what, at in found]
     if metrics["collided"] and metrics["impact_speed"] is not None:
         words[0] += f", closing at {metrics['impact_speed']:.3g} m/s"
     if words:
@@ -172,11 +96,20 @@ def _file_name(path: str) -> str:
     return re.split(r"[\\/]", path)[-1]
 
 
+PICTURES = {  # what the canvas shows
+    "road": "The road as it is, and where the car believes that it is",
+    "string": "The road as it is, and where each car believes that it is",
+    "graph": "The graph of the agents, shaded by their errors",
+}  # fmt: skip
+
+
 def context_of(replay: Replay, source: str) -> Data:
     """What the template shows in words and tables. `source` says where the row comes from."""
+    model = replay.loop.model
+    picture = "graph" if not model.followers.any() else "string" if model.agents > 1 else "road"
     row, place = replay.row, replay.place
     tone, title, why = VERDICTS[replay.verdict]
-    crash = bool(replay.metrics["crashed"])
+    tone_of = "plain" if picture == "graph" else "bad" if replay.metrics["crashed"] else "good"
     metrics = [
         (name.replace("_", " "), _measured(value), UNITS[name], " ".join((METRICS[name].__doc__ or "").split()),
          _measured(row[name]) if row[name] != value else "")
@@ -184,9 +117,9 @@ def context_of(replay: Replay, source: str) -> Data:
     ]  # fmt: skip
     cards = [_card(part, getattr(place, part)) for part in ("plant", "sensor", "controller", "manoeuvre")]
     return {
-        "source": source,
+        "source": source, "picture": PICTURES[picture], "many": model.agents > 1, "noun": noun(replay),
         "defence": _named(row["defence"]), "attack": _named(row["attack"]), "seed": row["seed"], "purpose": row["purpose"],
-        "check": {"tone": tone, "title": title, "why": why}, "crash": crash, "outcome": outcome(replay), "metrics": metrics,
+        "check": {"tone": tone, "title": title, "why": why}, "tone": tone_of, "outcome": outcome(replay), "metrics": metrics,
         "differences": [(LABELS.get(c.name, c.name.replace("_", " ")), c.row or NO_ENTRY, c.here or "none") for c in replay.differences],
         "hashes": [(c.name, c.row or NO_ENTRY, c.here, c.same) for c in replay.checks[:2]],
         "identity": _identity(replay),
@@ -220,16 +153,16 @@ def embedded(data: Any) -> Markup:
     return Markup(text)
 
 
-def render(replay: Replay, source: str = "") -> str:
-    """The page as text."""
+def render(replay: Replay, source: str = "", agent: int | None = None) -> str:
+    """The page as text. agent: the one to look at first, of many."""
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    css, js = _inline(_asset("page.css")), _inline(_asset("road.js", "plots.js", "page.js"))
-    data = embedded(episode_of(replay))
+    css, js = _inline(_asset("page.css")), _inline(_asset("pen.js", "road.js", "string.js", "graph.js", "plots.js", "page.js"))
+    data = embedded(episode_of(replay, agent))
     return environment.from_string(_asset("page.html")).render(css=css, js=js, data=data, **context_of(replay, source))
 
 
-def write_page(replay: Replay, out: Path, source: str = "") -> Path:
+def write_page(replay: Replay, out: Path, source: str = "", agent: int | None = None) -> Path:
     """Writes the page to `out` (a file that ends in .html, or a directory for index.html) and returns its path."""
     path = out if out.suffix.lower() in (".html", ".htm") else writable_directory(out) / "index.html"
-    write_atomic(path, render(replay, source).encode("utf-8", "replace"))  # a lone surrogate in a row must not stop the page
+    write_atomic(path, render(replay, source, agent).encode("utf-8", "replace"))  # a lone surrogate in a row must not stop the page
     return path

@@ -28,7 +28,7 @@ const buildPlots = (() => {
     return node;
   };
   const minus = (words) => String(words).replace(/-/g, "−");
-  const short = (x) => (x === null || x === undefined ? "–" : minus(Math.abs(x) >= 1e5 || (x && Math.abs(x) < 1e-3) ? x.toExponential(1) : +x.toPrecision(4)));
+  const short = (x) => (x === null || x === undefined ? "–" : minus(Math.abs(x) >= 1e5 || (x && Math.abs(x) < 1e-3) ? String(Number(x.toPrecision(2)).toExponential()).replace("e+", "e") : +x.toPrecision(4)));
   const fixed = (x, digits) => (x === null || x === undefined ? "–" : Math.abs(x) >= 1e5 ? short(x) : minus(x.toFixed(x && digits && Math.abs(x) < 0.95 ? 2 : digits)));
 
   const niceStep = (span, most) => {
@@ -72,13 +72,17 @@ const buildPlots = (() => {
     return holder;
   };
 
-  return (box, episode, seek) => {
-    const { dt, length, road, believed, error, wires, kinds } = episode;
+  // inks and dashes of the curves of many agents
+  const INKS = [TRUTH, EGO, DESIRED, BELIEF, "#8a5a00", LEADER], DASHES = ["none", "7 4", "2 3", "10 3 2 3"];
+
+  // of one agent alone everything; of many the plots of all (part "all") or those of one of them (part "one")
+  return (box, episode, seek, part = "") => {
+    const { dt, length, road, believed, errors, wires, kinds } = episode;
     const end = Math.max(length, 1) * dt, digits = dt >= 0.1 ? 1 : dt >= 0.01 ? 2 : 3;
     const attacked = runsOf(length, (s) => episode.kind[s - 1] !== 0);
     const alarms = runsOf(length, (s) => episode.alarm[s - 1]);
     const hits = [episode.hit, episode.rear_hit].filter((step) => step !== null), panels = [];
-    box.append(patterns());
+    if (!document.getElementById("attacked")) document.body.append(patterns());
 
     // a panel: heading, keys with values, picture; `draw(svg, frame)` fills the picture at the present width
     const panel = (title, unit, height, draw, name) => {
@@ -170,7 +174,7 @@ const buildPlots = (() => {
         let ticks = niceTicks(low, high, (options.height || HEIGHT) > 100 ? 5 : 3);
         if (options.log) {
           const decades = niceTicks(Math.ceil(bottom), top, 5).filter(Number.isInteger);
-          ticks = decades.map((e) => 10 ** e);
+          ticks = decades.length > 1 ? decades.map((e) => 10 ** e) : niceTicks(10 ** bottom, 10 ** top, 4).filter((v) => v > 0);
         }
         for (const tick of ticks) {
           make("line", { class: tick === 0 ? "zero" : "grid", x1: frame.left, x2: frame.right, y1: y(tick), y2: y(tick) }, self.svg);
@@ -183,7 +187,7 @@ const buildPlots = (() => {
         if (options.over) options.over(self, frame, y);
         finish(self, frame);
       }, name);
-      for (const curve of curves) key(one, curve, curve.level ? null : (s) => fixed(curve.values[s - curve.offset], curve.digits ?? 1));
+      for (const curve of curves) key(one, curve, curve.level ? null : (s) => (curve.short ? short(curve.values[s - curve.offset]) : fixed(curve.values[s - curve.offset], curve.digits ?? 1)));
       for (const curve of off) {
         const [a, b] = extent([curve.values]);
         note(one, `${curve.name} leaves the plot: ${short(a)} to ${short(b)} ${unit}`);
@@ -191,78 +195,101 @@ const buildPlots = (() => {
       return one;
     };
 
-    chart("gap", "Gap to the car ahead", "m", [
+    const collisions = (self, frame) => hits.forEach((step) => {
+      const at = frame.x(step * dt), before = at - frame.left > 100, words = step === episode.hit ? "collision" : "rear collision";
+      make("text", { class: "mark", x: at + (before ? -5 : 5), y: TOP + 10, "text-anchor": before ? "end" : "start" }, self.svg, words);
+    });
+    if (part === "all") {
+      const many = (lists, offset, digits) => Object.entries(lists).map(([i, values], place) => ({
+        name: `${episode.noun} ${i}`, values, offset, digits, ink: INKS[place % INKS.length], dash: DASHES[Math.floor(place / INKS.length) % DASHES.length], thick: 1.8,
+      }));
+      if (episode.string) {
+        const followers = Object.fromEntries(Object.keys(episode.sizes).filter((i) => episode.agents[i].road).map((i) => [i, episode.string.gap[i]]));
+        chart("gaps", "Gap of each car to the one ahead", "m", many(followers, 0, 1), { include: [0], least: 5, height: 190, over: collisions });
+        const sizes = Object.fromEntries(Object.entries(episode.sizes).filter(([i]) => i in followers));
+        chart("sizes", "Size of the error of each car's believed gap", "m", many(sizes, 1, 2), { include: [0], least: 1, height: 150 });
+      } else {
+        const found = Object.values(episode.sizes).flat().filter((v) => v > 0), top = Math.max(...found, 1e-9);
+        const bottom = 10 ** Math.floor(Math.log10(Math.max(Math.min(...found, top), 1e-6 * top)));
+        const lines = many(episode.sizes, 1, 3).map((one) => ({ ...one, short: true }));
+        const one = chart("sizes", "Error of each agent's estimate, 2-norm, logarithmic", "-", lines, { log: true, floor: bottom, height: 220 });
+        if (Math.min(...Object.values(episode.sizes).flat()) < bottom) note(one, `below ${short(bottom)}: drawn at the lower edge`);
+      }
+    }
+    if (part !== "all" && road) chart("gap", "Gap to the car ahead", "m", [
       { name: "true", values: road.gap, offset: 0, ink: TRUTH, thick: 2.5 },
       { name: "believed", values: believed.gap, offset: 1, ink: BELIEF, dash: "6 4", wild: true },
       { name: "desired at the true speed", values: episode.desired, offset: 0, ink: DESIRED, dash: "2 3" },
     ], {
       include: [0], least: 5, height: 190,
-      over: (self, frame) => hits.forEach((step) => {
-        const at = frame.x(step * dt), before = at - frame.left > 100, words = step === episode.hit ? "collision" : "rear collision";
-        make("text", { class: "mark", x: at + (before ? -5 : 5), y: TOP + 10, "text-anchor": before ? "end" : "start" }, self.svg, words);
-      }),
+      over: collisions,
     });
-    chart("speed", "Speed", "m/s", [
-      { name: "ego", values: road.speed, offset: 0, ink: EGO, thick: 2.5, digits: 2 },
-      { name: "leader", values: road.lead_speed, offset: 0, ink: LEADER, dash: "10 3 2 3", digits: 2 },
+    if (part !== "all" && road) chart("speed", "Speed", "m/s", [
+      { name: part ? `car ${episode.number}` : "ego", values: road.speed, offset: 0, ink: EGO, thick: 2.5, digits: 2 },
+      { name: part ? "car ahead" : "leader", values: road.lead_speed, offset: 0, ink: LEADER, dash: "10 3 2 3", digits: 2 },
       { name: "believed own", values: believed.speed, offset: 1, ink: BELIEF, dash: "6 4", wild: true, digits: 2 },
     ], { include: [0], least: 2 });
-    chart("position", "Estimation error of the position", "m", [
-      { name: "estimate less truth", values: error.position, offset: 1, ink: BELIEF, digits: 2 },
-    ], { include: [0], least: 1, height: 130 });
-    chart("velocity", "Estimation error of the velocity", "m/s", [
-      { name: "estimate less truth", values: error.velocity, offset: 1, ink: BELIEF, digits: 2 },
-    ], { include: [0], least: 0.5, height: 130 });
+    if (part !== "all") for (const { name, title, unit, least, values } of errors) {
+      chart(name, title, unit, [{ name: "estimate less truth", values, offset: 1, ink: BELIEF, digits: 2 }], { include: [0], least, height: 130 });
+    }
 
     // score, threshold or gate, alarm
-    const limit = episode.threshold, modes = runsOf(length, (s) => episode.mode[s - 1] !== 0);
-    const scores = [{ name: "score", values: episode.score, offset: 1, ink: TRUTH, thick: 1.5, digits: 2 }];
-    const bar = limit ? Array(length).fill(limit.value) : null;
-    if (bar) scores.push({ name: `threshold ${limit.name} = ${short(limit.value)}`, values: bar, offset: 1, ink: ATTACK, dash: "7 4", level: true });
-    if (episode.gate) scores.push({ name: "gate", values: episode.gate, offset: 1, ink: ATTACK, dash: "7 4", digits: 2 });
-    const positive = episode.score.filter((v) => v > 0).sort((a, b) => a - b), middle = positive[Math.floor(positive.length / 2)] || 1;
-    const [least, most] = extent([episode.score]);
-    const log = least >= 0 && most > 30 * Math.max(middle, limit ? limit.value / 10 : 0);
-    const floor = 10 ** Math.floor(Math.log10(middle) - 1.5);
-    const score = chart("score", log ? "Score of the defence, logarithmic" : "Score of the defence", "-", scores, {
-      include: [0], least: 1e-3, log, floor, height: 170,
-      over: (self, frame) => {
-        for (const [a, b] of alarms) {
-          const from = frame.x(Math.max(0, (a - 0.5) * dt)), to = frame.x(Math.min(end, (b + 0.5) * dt));
-          make("rect", { x: from, y: TOP - 8, width: Math.max(1.5, to - from), height: 8, fill: TRUTH, class: "alarm" }, self.svg);
-        }
-      },
-    });
-    const count = episode.alarm.reduce((a, b) => a + b, 0);
-    if (count) {
-      const sign = html("li", score.keys), swatch = make("svg", { "aria-hidden": "true" }, sign);
-      make("rect", { x: 4, y: 2, width: 20, height: 8, fill: TRUTH }, swatch);
-      html("span", sign, `alarm, at the upper edge: ${count} ${count === 1 ? "step" : "steps"}, ${alarms.length} ${alarms.length === 1 ? "onset" : "onsets"}`);
-    } else note(score, "no alarm in this episode");
-    if (log) note(score, `below ${short(floor)}: drawn at the lower edge`);
-    if (limit && !limit.rules) note(score, "this defence's alarm does not follow from the threshold alone");
-    if (!limit && !episode.gate) note(score, "no threshold declared");
+    const modes = part === "all" ? [] : runsOf(length, (s) => episode.mode[s - 1] !== 0);
+    if (part !== "all") drawScore();
+    function drawScore() {
+      const limit = episode.threshold;
+      const scores = [{ name: "score", values: episode.score, offset: 1, ink: TRUTH, thick: 1.5, digits: 2 }];
+      const bar = limit ? Array(length).fill(limit.value) : null;
+      if (bar) scores.push({ name: `threshold ${limit.name} = ${short(limit.value)}`, values: bar, offset: 1, ink: ATTACK, dash: "7 4", level: true });
+      if (episode.gate) scores.push({ name: "gate", values: episode.gate, offset: 1, ink: ATTACK, dash: "7 4", digits: 2 });
+      const positive = episode.score.filter((v) => v > 0).sort((a, b) => a - b), middle = positive[Math.floor(positive.length / 2)] || 1;
+      const [least, most] = extent([episode.score]);
+      const log = least >= 0 && most > 30 * Math.max(middle, limit ? limit.value / 10 : 0);
+      const floor = 10 ** Math.floor(Math.log10(middle) - 1.5);
+      const score = chart("score", log ? "Score of the defence, logarithmic" : "Score of the defence", "-", scores, {
+        include: [0], least: 1e-3, log, floor, height: 170,
+        over: (self, frame) => {
+          for (const [a, b] of alarms) {
+            const from = frame.x(Math.max(0, (a - 0.5) * dt)), to = frame.x(Math.min(end, (b + 0.5) * dt));
+            make("rect", { x: from, y: TOP - 8, width: Math.max(1.5, to - from), height: 8, fill: TRUTH, class: "alarm" }, self.svg);
+          }
+        },
+      });
+      const count = episode.alarm.reduce((a, b) => a + b, 0);
+      if (count) {
+        const sign = html("li", score.keys), swatch = make("svg", { "aria-hidden": "true" }, sign);
+        make("rect", { x: 4, y: 2, width: 20, height: 8, fill: TRUTH }, swatch);
+        html("span", sign, `alarm, at the upper edge: ${count} ${count === 1 ? "step" : "steps"}, ${alarms.length} ${alarms.length === 1 ? "onset" : "onsets"}`);
+      } else note(score, "no alarm in this episode");
+      if (log) note(score, `below ${short(floor)}: drawn at the lower edge`);
+      if (limit && !limit.rules) note(score, "this defence's alarm does not follow from the threshold alone");
+      if (!limit && !episode.gate) note(score, "no threshold declared");
+    }
 
-    const commands = [{ name: "commanded", values: episode.control, offset: 1, ink: TRUTH, digits: 2 }];
-    if (episode.applied) commands.push({ name: "applied (attacked)", values: episode.applied, offset: 1, ink: ATTACK, dash: "6 4", digits: 2 });
-    const control = chart("control", "Commanded acceleration", "m/s²", commands, { include: [0], least: 1, height: 130 });
-    if (!episode.applied) note(control, "applied as commanded throughout");
+    if (episode.control && part !== "all") {
+      const commands = [{ name: "commanded", values: episode.control, offset: 1, ink: TRUTH, digits: 2 }];
+      if (episode.applied) commands.push({ name: "applied (attacked)", values: episode.applied, offset: 1, ink: ATTACK, dash: "6 4", digits: 2 });
+      const control = chart("control", "Commanded acceleration", "m/s²", commands, { include: [0], least: 1, height: 130 });
+      if (!episode.applied) note(control, "applied as commanded throughout");
+    }
 
     // lanes of decisions: a lane for each wire and kind, for refused commands, for modes other than the normal one
     const lanes = [];
     for (const wire of wires) for (const kind of wire.kinds) {
       const { valued, unit } = kinds[kind], on = (s) => wire.hit[s - 1] && episode.kind[s - 1] === kind;
-      const values = wire.value.map((v, i) => (on(i + 1) ? v : null)), [low, high] = extent([values]), of = unit || wire.unit;
-      const size = !valued ? "" : low === high ? `, ${short(low)} ${of}` : `, ${short(low)} to ${short(high)} ${of}`;
-      lanes.push({ name: `${wire.name}: ${kinds[kind].code}${size}`, runs: runsOf(length, on), fill: `url(#kind-${kind})`, ink: LOOKS[kind][0], values: valued ? values : null, low, high });
+      const values = wire.value ? wire.value.map((v, i) => (on(i + 1) ? v : null)) : [], [low, high] = extent([values]), of = unit || wire.unit;
+      const size = !valued || !wire.value ? "" : low === high ? `, ${short(low)} ${of}` : `, ${short(low)} to ${short(high)} ${of}`;
+      lanes.push({ name: `${wire.name}: ${kinds[kind].code}${size}`, runs: runsOf(length, on), fill: `url(#kind-${kind})`, ink: LOOKS[kind][0], values: valued && wire.value ? values : null, low, high });
     }
     const refused = runsOf(length, (s) => episode.refused[s - 1]);
     if (refused.length) lanes.push({ name: `refused commands: ${episode.refused.reduce((a, b) => a + b, 0)}`, runs: refused, fill: TRUTH, ink: TRUTH });
-    const attack = panel("Attack", "", TOP + BOTTOM + Math.max(1, lanes.length) * LANE_STEP, (self, width) => drawLanes(self, width, lanes, "No attack took effect in this episode."), "attack");
-    for (const kind of [...new Set(wires.flatMap((w) => w.kinds))].sort()) {
-      const item = html("li", attack.keys), sample = make("svg", { "aria-hidden": "true" }, item);
-      make("rect", { width: 28, height: 12, fill: `url(#kind-${kind})`, stroke: LOOKS[kind][0] }, sample);
-      html("span", item, `${kinds[kind].code}: ${kinds[kind].name}, ${kinds[kind].does}`);
+    if (part !== "one") {
+      const attack = panel("Attack", "", TOP + BOTTOM + Math.max(1, lanes.length) * LANE_STEP, (self, width) => drawLanes(self, width, lanes, "No attack took effect in this episode."), "attack");
+      for (const kind of [...new Set(wires.flatMap((w) => w.kinds))].sort()) {
+        const item = html("li", attack.keys), sample = make("svg", { "aria-hidden": "true" }, item);
+        make("rect", { width: 28, height: 12, fill: `url(#kind-${kind})`, stroke: LOOKS[kind][0] }, sample);
+        html("span", item, `${kinds[kind].code}: ${kinds[kind].name}, ${kinds[kind].does}`);
+      }
     }
     if (modes.length) {
       const shown = [...new Set(episode.mode)].filter((m) => m).sort();
@@ -298,7 +325,7 @@ const buildPlots = (() => {
       });
       finish(self, frame);
     }
-    if (episode.left) {
+    if (episode.left && part !== "one") {
       const left = [episode.budget, ...episode.left.slice(1)];
       chart("budget", "Attack steps left", "steps", [{ name: `of ${episode.budget}`, values: left, offset: 0, ink: ATTACK, digits: 0 }], { include: [0], least: 1, height: SLIM + 20 });
     }
@@ -332,10 +359,12 @@ const buildPlots = (() => {
         if (event.buttons & 1) move(event);
       });
     }
-    new ResizeObserver(fit).observe(box);
+    const observer = new ResizeObserver(fit);
+    observer.observe(box);
     fit();
     return {
       digits, attacked, alarms, short,
+      stop: () => observer.disconnect(),
       show: (s) => {
         now = s;
         for (const one of panels) {

@@ -30,7 +30,6 @@ from tailgate.threat import ThreatModel
 from tailgate.trace import Recorder, Trace
 from tailgate.tree import duplicate
 
-AGENT = 0  # whom a replay follows
 YAML = (".yaml", ".yml")
 
 Row = dict[str, Any]
@@ -99,7 +98,7 @@ class Chosen:
 
 
 def choose(rows: Sequence[Row], wanted: Filter) -> Chosen:
-    """The row to play: the line that is wanted, or of those that match the worst outcome, a crash first, then the smallest gap."""
+    """The row to play: the line that is wanted, or of those that match the worst outcome: a crash, the smallest gap, the largest error."""
     if not rows:
         raise InputError("rows", "an empty file", "at least one row")
     if wanted.line is not None:
@@ -120,9 +119,9 @@ def choose(rows: Sequence[Row], wanted: Filter) -> Chosen:
         line, row = matching[0]
         raise InputError(f"line {line}", f"{row['status']}: {row['reason']}", "a row that was played; no row that matches was")
 
-    def outcome(item: tuple[int, Row]) -> tuple[float, float]:
+    def outcome(item: tuple[int, Row]) -> tuple[float, float, float]:
         gap = item[1]["min_gap"]
-        return -item[1]["crashed"], np.inf if gap is None else gap
+        return -item[1]["crashed"], np.inf if gap is None else gap, -(item[1]["max_error"] or 0.0)
 
     line, row = min(played, key=outcome)
     return Chosen(row, line, len(matching), "the only one" if len(matching) == 1 else "the worst outcome")
@@ -148,7 +147,7 @@ class Check:
 
 @dataclass(frozen=True, eq=False)
 class Replay:
-    """An episode that was played again. `gate` (K,) is the defence's own gate at each step, NaN where it has none."""
+    """An episode that was played again. `gate` (K, N) is the defence's own gate at each step, NaN where it has none."""
 
     row: Row
     place: Scenario
@@ -244,11 +243,13 @@ def threshold(defence: Any) -> tuple[str, float] | None:
     return None
 
 
-def _gate(loop: Loop, state: LoopState) -> float:
+def _gate(loop: Loop, state: LoopState) -> Array:
+    """(N,) the gate of each agent; NaN where there is none."""
+    nobody = np.full(loop.model.agents, np.nan)
     if not hasattr(loop.defence, "look"):
-        return np.nan
+        return nobody
     look = loop.defence.look(loop.plan.defence, duplicate(state.defence), state.received, state.known_u)
-    return np.nan if look.gate is None else float(np.broadcast_to(look.gate, (1, loop.model.agents))[0, AGENT])
+    return nobody if look.gate is None else np.broadcast_to(look.gate, (1, loop.model.agents))[0]
 
 
 def _text(dose: int | None) -> str:

@@ -17,7 +17,7 @@ from tailgate.core import Array
 from tailgate.errors import InputError
 from tailgate.files import writable_directory, write_atomic
 
-from .replay import AGENT, Replay, episode
+from .replay import Replay, episode
 
 FORMATS = {".gif": "GIF", ".webp": "WEBP", ".mp4": "MP4"}
 FASTEST = 20  # frames a second
@@ -48,7 +48,7 @@ def frames(replay: Replay, stride: int) -> Iterator[Array]:
     last = int(replay.trace.length[0])
     for step, (state, frame) in enumerate(episode(replay.loop, replay.attack, replay.keys)):
         if step % stride == 0 or step == last:
-            yield draw(replay.loop, state, frame, AGENT)
+            yield draw(replay.loop, state, frame, 0)
 
 
 def write_video(replay: Replay, path: Path) -> str:

@@ -1,0 +1,221 @@
+"""From a view to an observation vector: pure, and used by the environments and by trained policies that play as attacks alike."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+
+from tailgate import num
+from tailgate.core import Array, Kind, View
+from tailgate.threat import Brief
+
+LIMIT = 10.0  # observations are clipped to +-LIMIT
+SHOWN = 24  # agents with components of their own in an observation, at most
+T = TypeVar("T")
+
+
+class Sight(NamedTuple):
+    """A view, and what is computed of it once for all agents, each (B, N); None where it is not granted."""
+
+    view: View
+    gap_error: Array | None = None
+    speed_error: Array | None = None
+    error: Array | None = None  # the state's, 2-norm
+    noise: Array | None = None  # the readings', 2-norm
+    reading: Array | None = None
+
+
+Column = tuple[str, Callable[[Sight], Array]]  # a component of the observation: its name, and its values (B,)
+
+
+@dataclass(frozen=True, eq=False)
+class ObservationCodec:
+    """What the learner sees, scaled to about one and clipped.
+
+    A road shows gaps, speeds and accelerations of the cars; without one there is nothing to see from outside. Of many agents the SHOWN
+    that are nearest to the attacked ones have components of their own, tagged with their number; all count in the smallest gap.
+    """
+
+    brief: Brief
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(name for name, _ in self.columns)
+
+    @cached_property
+    def alone(self) -> bool:
+        """One car that follows another: the layout of the published policies."""
+        return self.brief.model.agents == 1 and bool(self.brief.model.followers[0])
+
+    @cached_property
+    def victims(self) -> list[int]:
+        return [int(i) for i in np.flatnonzero(self.brief.granted.any(axis=1))]
+
+    @cached_property
+    def shown(self) -> list[int]:
+        """The agents with components of their own: all, or of many those with the fewest hops to an attacked one."""
+        model = self.brief.model
+        near, hops = set(self.victims), dict.fromkeys(self.victims, 0)
+        linked = model.graph | model.graph.T
+        while near:
+            near = {int(j) for i in near for j in np.flatnonzero(linked[i])} - hops.keys()
+            hops |= dict.fromkeys(near, 1 + max(hops.values(), default=0))
+        order = sorted(range(model.agents), key=lambda i: (hops.get(i, model.agents), i))
+        return sorted(order[:SHOWN])
+
+    @cached_property
+    def spread(self) -> float:
+        """How far the state goes in a step that nobody can foresee, as the defence is told: the scale of a state's error."""
+        return math.sqrt(sum(self.brief.model.Q.diagonal().tolist()))
+
+    @cached_property
+    def columns(self) -> tuple[Column, ...]:
+        """Every component in its order."""
+        out: list[Column] = [
+            ("progress", lambda s: s.view.progress), ("allowed", lambda s: s.view.allowed), ("budget_left", _left),
+            ("burst", lambda s: s.view.burst / 50.0), ("cooldown", lambda s: s.view.cooldown / 50.0),
+        ]  # fmt: skip
+        for i in self.shown:
+            tag = "" if self.brief.model.agents == 1 else f"[{i}]"
+            parts = self._road(i) + self._commands(i) + self._errors(i) + self._noise(i)
+            out += [(name + tag, column) for name, column in parts]
+        if len(self.shown) < self.brief.model.agents:
+            out += self._all()
+        out.append(("attacking", lambda s: s.view.last.kind != Kind.NONE))
+        return tuple(out)
+
+    def _road(self, i: int) -> list[Column]:
+        """What anyone beside the road sees of car i."""
+        model = self.brief.model
+        speed: list[Column] = [("speed", lambda s: s.view.scene.speed[:, i] / 15.0)]
+        accel: list[Column] = [("accel", lambda s: s.view.scene.accel[:, i] / 3.0)]
+        if not model.followers[i]:
+            return speed + accel if model.speed is not None and model.speed[i].any() else []
+        gap: list[Column] = [("gap", lambda s: s.view.scene.gap[:, i] / 50.0)]
+        closing: list[Column] = [("closing", lambda s: (s.view.scene.speed[:, i] - s.view.scene.lead_speed[:, i]) / 5.0)]
+        if not self.alone:  # the car ahead and the one behind have components of their own
+            return gap + speed + closing + accel
+        lead: list[Column] = [("lead_speed", lambda s: s.view.scene.lead_speed[:, i] / 15.0)]
+        rear: list[Column] = [
+            ("rear_gap", lambda s: s.view.scene.rear_gap[:, i] / 50.0),
+            ("rear_closing", lambda s: (s.view.scene.rear_speed[:, i] - s.view.scene.speed[:, i]) / 5.0),
+        ]
+        return gap + speed + lead + closing + accel + rear
+
+    def _commands(self, i: int) -> list[Column]:
+        """What the attacker did last to agent i, and (grey) what was commanded."""
+        model, bounds = self.brief.model, self.brief.bounds
+        scale = np.minimum(bounds, 10.0) if model.followers.any() else bounds
+        out: list[Column] = [
+            (f"last_{model.wires[w]}", _last(i, w, float(scale[w]))) for w in np.flatnonzero(self.brief.granted[i]).tolist()
+        ]  # fmt: skip
+        if len(self.victims) > 1 and i in self.victims:
+            out.append(("attacked", lambda s: np.any(s.view.last.target[:, i], axis=1)))
+        if self.brief.threat.knowledge != "black" and (model.followers[i] or not model.followers.any()):
+            out += [(f"control{j}", _control(i, j)) for j in range(len(model.actuators))]
+        return out
+
+    def _errors(self, i: int) -> list[Column]:
+        """White: how wrong agent i is, and what its defence says."""
+        model = self.brief.model
+        if self.brief.threat.knowledge != "white":
+            return []
+        if self.alone:
+            out: list[Column] = [(f"error{j}", _state_error(i, j)) for j in range(model.states)]
+        elif model.followers.any():
+            out = [("gap_error", lambda s: _given(s.gap_error)[:, i] / 5.0)] if model.followers[i] else []
+            out.append(("speed_error", lambda s: _given(s.speed_error)[:, i] / 5.0))
+        else:
+            out = [("error", lambda s: num.log(1.0 + _given(s.error)[:, i] / self.spread))]
+        score: Column = ("score", lambda s: _given(s.view.estimate).score[:, i] / 20.0)
+        return [*out, score, ("alarm", lambda s: _given(s.view.estimate).alarm[:, i])]
+
+    def _noise(self, i: int) -> list[Column]:
+        """Where the measurement is granted: by how much agent i's readings of gap and speed are off; without a road sizes only."""
+        model, threat = self.brief.model, self.brief.threat
+        if not (threat.sees_measurement or threat.knowledge == "white"):
+            return []
+        if not model.followers.any():
+            known = threat.knowledge == "white"
+            off: Column = ("noise", lambda s: _given(s.noise)[:, i] / math.sqrt(sum(model.R[i].diagonal().tolist())))
+            return [off] if known else [("reading", lambda s: num.log(1.0 + _given(s.reading)[:, i] / self.spread))]
+        sd = [1.0 if self.alone else math.sqrt(model.R[i, j, j]) for j in range(len(model.sensors))]
+        read = {j: truth for j in range(len(model.sensors)) if (truth := self._read(i, j))}
+        return [(f"noise_{model.sensors[j]}", _off(i, j, truth, sd[j])) for j, truth in read.items()]
+
+    def _read(self, i: int, j: int) -> str:
+        """The part of the scene that sensor j of agent i reads: gap, speed or position; empty where it is none of them."""
+        model = self.brief.model
+        assert model.gap is not None and model.speed is not None
+        rows = {"gap": model.gap[i], "position": -model.gap[i], "speed": model.speed[i]}
+        return next((name for name, row in rows.items() if row.any() and np.array_equal(row, model.C[i, j])), "")
+
+    def _all(self) -> list[Column]:
+        """Of all agents together, where not every one is shown."""
+        road, white = bool(self.brief.model.followers.any()), self.brief.threat.knowledge == "white"
+        out: list[Column] = [("least_gap", lambda s: np.min(s.view.scene.gap, axis=1) / 50.0)] if road else []
+        if white and road:
+            out.append(("largest_error", lambda s: np.max(np.abs(_given(s.gap_error)), axis=1) / 5.0))
+        elif white:
+            out.append(("largest_error", lambda s: num.log(1.0 + np.max(_given(s.error), axis=1) / self.spread)))
+        return out
+
+    def observe(self, view: View) -> Array:
+        """(B, d) float32, d = len(names)."""
+        sight = self._sight(view)
+        out = np.empty((len(view.k), len(self.columns)), np.float32)
+        for j, (_, column) in enumerate(self.columns):
+            out[:, j] = np.clip(column(sight), -LIMIT, LIMIT)
+        return out
+
+    def _sight(self, view: View) -> Sight:
+        model, threat = self.brief.model, self.brief.threat
+        sight, road, white = Sight(view), bool(model.followers.any()), threat.knowledge == "white"
+        if self.alone:
+            return sight
+        if white:
+            x, truth = _given(view.estimate).x, _given(view.truth)
+            if road:
+                sight = sight._replace(gap_error=model.gap_error(x, truth), speed_error=model.speed_error(x, truth))
+            else:
+                off = _given(view.received).y - num.apply(num.transposed(model.C), truth)
+                sight = sight._replace(error=model.error(x, truth), noise=np.sqrt(num.dot(off, off)))
+        elif threat.sees_measurement and not road:
+            y = _given(view.received).y
+            sight = sight._replace(reading=np.sqrt(num.dot(y, y)))
+        return sight
+
+
+def _given(value: T | None) -> T:
+    """What the threat model grants."""
+    assert value is not None
+    return value
+
+
+def _left(sight: Sight) -> Array:
+    """Share of the budget that is left; 1 where it is unlimited."""
+    view = sight.view
+    bounded = np.isfinite(view.budget)
+    return np.where(bounded, view.budget_left / np.where(bounded & (view.budget > 0), view.budget, 1.0), 1.0)
+
+
+def _last(i: int, w: int, scale: float) -> Callable[[Sight], Array]:
+    return lambda s: s.view.last.value[:, i, w] / scale
+
+
+def _control(i: int, j: int) -> Callable[[Sight], Array]:
+    return lambda s: _given(s.view.control)[:, i, j] / 3.0
+
+
+def _state_error(i: int, j: int) -> Callable[[Sight], Array]:
+    return lambda s: (_given(s.view.estimate).x[:, i, j] - _given(s.view.truth)[:, i, j]) / 5.0
+
+
+def _off(i: int, j: int, truth: str, sd: float) -> Callable[[Sight], Array]:
+    """By how much sensor j of agent i is off the part `truth` of the scene, in standard deviations."""
+    return lambda s: (_given(s.view.received).y[:, i, j] - getattr(s.view.scene, truth)[:, i]) / sd

@@ -1,0 +1,68 @@
+"""What the learner is paid for. Scores never use it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from tailgate.core import Array, Frame, Kind, Model, NonNegative, Positive, param
+from tailgate.errors import InputError
+
+RewardName = Literal["collision", "min_gap", "error", "stealth"]
+NEAR = 20.0  # min_gap: a smaller gap than this counts [m]
+
+
+@dataclass(frozen=True)
+class Reward:
+    """Reward presets. Scores never use them: they use raw outcomes.
+
+    collision: 1 at a collision in front or behind. min_gap: the same, and the metres by which the smallest gap of the episode falls
+    below 20 m, over 20 m: a burst at the right moment earns something long before it makes a collision. error: the largest error of an
+    agent (`Model.error`) over `error_scale`, capped at 1, per second. stealth: error, less one per second of alarm. The shaping terms are
+    potential-based (Ng, Harada, Russell 1999): they leave the best policy unchanged when `gamma` is the learner's, and may use the truth,
+    which the policy does not see. Without a road nothing collides, and the potentials are 0.
+    """
+
+    reward: RewardName = param("min_gap", "collision, min_gap, error or stealth")
+    error_scale: Positive = param(10.0, "error, stealth: the error that earns 1 per second: of the gap [m], or of the state [its unit]")
+    gap_shaping: NonNegative = param(0.5, "weight of the closeness of the car ahead as a potential [-]")
+    error_shaping: NonNegative = param(1.0, "weight of the believed extra gap, per 10 m and capped at 20 m, as a potential [-]")
+    gamma: Positive = param(0.995, "discount in the potential's difference [-]")
+    illegal_penalty: NonNegative = param(0.0, "cost of a refused command [-]")
+    attack_cost: NonNegative = param(0.0, "cost of a step under attack: what makes waiting for the right moment pay [-]")
+
+    def potential(self, gap: Array, belief: Array | float = 0.0) -> Array:
+        """(B,) potential of a gap (B, N) [m], infinite where nobody is ahead, and of what a car believes it has on top of it (B, N) [m]."""
+        near = 1.0 - np.clip(np.min(gap, axis=1), 0.0, 100.0) / 100.0
+        fooled = np.max(np.clip(belief, 0.0, 20.0) / 10.0 + np.zeros_like(gap), axis=1)
+        return np.asarray(self.gap_shaping * near + self.error_shaping * fooled)
+
+    def least(self, gap: Array, before: Array | float = NEAR) -> Array:
+        """(B,) smallest gap so far, within [0, NEAR], from a gap (B, N) and the smallest one before [m]."""
+        return np.asarray(np.minimum(np.clip(np.min(gap, axis=1), 0.0, NEAR), before))
+
+    def check(self, model: Model) -> None:
+        """Raise InputError for a reward that nothing can earn under this model."""
+        if self.reward in ("collision", "min_gap") and not model.followers.any():
+            raise InputError("reward", self.reward, "error or stealth: nobody drives in this scenario, so nobody collides")
+
+    def __call__(self, model: Model, frame: Frame, fall: Array) -> Array:
+        """(B,) reward of one step of the loop; fall (B,) of the smallest gap [m]."""
+        crashed = frame.collided | frame.rear_collided
+        out = -self.illegal_penalty * frame.refused - self.attack_cost * (frame.command.kind != Kind.NONE)
+        if self.reward in ("collision", "min_gap"):
+            out = out + crashed
+            if self.reward == "min_gap":
+                out = out + fall / NEAR
+        else:
+            error = model.error(frame.estimate.x, frame.truth)
+            out = out + model.dt * np.minimum(np.max(error, axis=1) / self.error_scale, 1.0)
+            if self.reward == "stealth":
+                out = out - model.dt * frame.estimate.alarm.any(axis=1)
+        return np.asarray(out)
+
+    def shaped(self, raw: Array, before: Array, after: Array, terminated: Array) -> Array:
+        """(B,) reward of a decision from its raw reward and the potentials (B,) before and after it."""
+        return np.asarray(raw + self.gamma * np.where(terminated, 0.0, after) - before)

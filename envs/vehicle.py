@@ -1,0 +1,35 @@
+"""The vehicle that every plant drives: a first-order lag between command and acceleration, and a standstill from which nothing rolls back.
+
+    x' = v          v' = a          tau a' + a = u                                                     (4.15), (6.4)
+
+discretised exactly (zero-order hold of u) with E = exp(-dt/tau) and s1 = tau (1 - E):
+
+    x+ = x + v dt + tau (dt - s1) a + (dt^2/2 - tau (dt - s1)) u
+    v+ = v + s1 a + (dt - s1) u
+    a+ = E a + (1 - E) u
+"""
+
+import numpy as np
+
+from tailgate import num
+from tailgate.core import Array
+
+
+def lag(dt: float, tau: float) -> tuple[Array, Array]:
+    """A (3, 3) and B (3, 1) of one vehicle's [x m, v m/s, a m/s^2] for a step dt [s] and a lag tau [s]."""
+    E = float(num.exp(-dt / tau))
+    s1 = tau * (1.0 - E)
+    A = np.array([[1.0, dt, tau * (dt - s1)], [0.0, 1.0, s1], [0.0, 0.0, E]])
+    return A, np.array([[dt * dt / 2.0 - tau * (dt - s1)], [dt - s1], [1.0 - E]])
+
+
+def drive(A: Array, B: Array, x: Array, v: Array, a: Array, u: Array, noise: Array) -> tuple[Array, Array, Array]:
+    """x, v, a one step later, under u [m/s^2] and noise (3, ...), elementwise."""
+    x_next = x + A[0, 1] * v + A[0, 2] * a + B[0, 0] * u + noise[0]
+    v_next = v + A[1, 2] * a + B[1, 0] * u + noise[1]
+    a_next = A[2, 2] * a + B[2, 0] * u + noise[2]
+    halted = v_next <= 0.0  # a car that stands neither rolls back nor decelerates
+    v_next = np.maximum(v_next, 0.0)
+    a_next = np.where(halted, np.maximum(a_next, 0.0), a_next)
+    x_next = np.where(halted, np.maximum(x_next, x), x_next)
+    return x_next, v_next, a_next

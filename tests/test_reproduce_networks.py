@@ -1,0 +1,150 @@
+"""Chapters 5 and 6: the measured figures of the design on seeds of their own, and the reports."""
+
+import json
+
+import numpy as np
+import pytest
+from scipy import stats
+
+import tailgate
+from tailgate import cli, draws
+from tailgate.metrics import measure
+from tailgate.reproduce import ch5_cases, ch5_theory, ch6_cases, ch6_loop, reproduce, write
+from tailgate.scenario import load_scenario
+from tailgate.trace import rollout
+
+LEVEL = 0.999
+
+
+def seeds_of(name, count):
+    """Seeds that follow from a test's name."""
+    first = int.from_bytes(name.encode()[:64], "little") % 1_000_000_007
+    return list(range(first, first + count))
+
+
+def median_interval(values):
+    """A 99.9 % interval of the median, from the order statistics."""
+    values, n = np.sort(values), len(values)
+    low = int(stats.binom.ppf((1.0 - LEVEL) / 2.0, n, 0.5))
+    return values[max(low - 1, 0)], values[min(n - low, n - 1)]
+
+
+def holds(values, figure, digits):
+    """Whether the design's figure, as it is rounded, is within the interval of the median."""
+    low, high = median_interval(values)
+    half = 0.5 * 10.0**-digits
+    return low - half <= figure <= high + half
+
+
+@pytest.fixture(scope="module")
+def systems():
+    """Errors of both estimators on 40 fresh systems."""
+    seeds = seeds_of("test_chapter_5", 40)
+    attack = ch5_cases.random_attack(ch5_cases.COMPROMISED)
+    out = {
+        name: np.concatenate([ch5_cases.errors(ch5_cases.fresh(s), ch5_cases.defence(name), attack, [s]) for s in seeds], axis=1)
+        for name in ch5_cases.GUARDS
+    }
+    return out | {"size": np.concatenate([ch5_cases.sizes(ch5_cases.fresh(s), s) for s in seeds], axis=1)}
+
+
+def test_chapter_5_worst_errors(systems):
+    """The design has 2.3 with resilience (thesis below 3) and about 1450 without (thesis about 1400)."""
+    assert holds(ch5_cases.worst(systems["norm"]), 2.3, 1)
+    assert holds(ch5_cases.worst(systems["dkf"]), 1450.0, -1)
+    assert not holds(ch5_cases.worst(systems["norm"]), 3.0, 1)  # the test can fail
+
+
+def test_chapter_5_clean_convergence(systems):
+    """The design has convergence to 1 % in about 7 steps (thesis about 10)."""
+    low, high = median_interval(ch5_cases.steps_to(systems["norm"], systems["size"]))
+    assert low >= 5 and high <= 9
+
+
+@pytest.mark.parametrize(
+    ("case", "guard", "figure", "digits"), [("dos", "lasso", 0.72, 2), ("dos", "dkf", 9.9, 1), ("fdi", "lasso", 0.56, 2), ("fdi", "dkf", 4.8, 1)]
+)
+def test_chapter_6_own_distance(case, guard, figure, digits):
+    """Largest own-distance error after 20 s: the design's four figures."""
+    _, attack, options = ch6_cases.CASES[case]
+    seeds = seeds_of(f"test_chapter_6_{case}_{guard}", 300)
+    loop = load_scenario(ch6_cases.SCENARIO).loop(ch6_cases.defence(guard))
+    trace = rollout(loop, tailgate.make_attack(attack, **options), draws.keys("report", seeds), terminate=False)
+    worst = ch6_cases.Played(trace).worst
+    assert holds(worst, figure, digits) and not holds(worst, 1.5 * figure, digits)
+
+
+def test_chapter_6_clean():
+    """Attack-free the own-distance error is below 0.01 m at 10 s."""
+    loop = load_scenario(ch6_cases.SCENARIO).loop(ch6_cases.defence("lasso"))
+    trace = rollout(loop, tailgate.make_attack("none"), draws.keys("report", seeds_of("test_chapter_6_clean", 300)), terminate=False)
+    assert np.quantile(ch6_cases.Played(trace).own[9].max(axis=1), 0.975) < 0.01
+
+
+@pytest.mark.parametrize("guard", list(ch6_loop.GUARDS))
+@pytest.mark.parametrize("label", list(ch6_loop.SPEC))
+def test_chapter_6_collisions(label, guard):
+    """Runs without a collision in closed loop: the design's counts of 300, by Fisher's exact test at 0.1 %."""
+    n, of = 60, 300
+    design = dict(zip(ch6_loop.GUARDS, ch6_loop.SPEC[label], strict=True))[guard]
+    name, options = ch6_loop.GUARDS[guard]
+    loop = load_scenario(ch6_loop.SCENARIO).loop(tailgate.make_defence(name, **options))
+    attack, arguments = ch6_loop.ATTACKS[label]
+    seeds = seeds_of(f"test_chapter_6_{label}_{guard}", n)
+    safe = int((measure(rollout(loop, tailgate.make_attack(attack, **arguments), draws.keys("report", seeds)))["collided"] == 0.0).sum())
+    assert stats.fisher_exact([[safe, n - safe], [design, of - design]]).pvalue > 1.0 - LEVEL
+
+
+def test_the_fixed_point_is_one():
+    """One more step of (5.5) changes the covariances by less than 1e-12 of their size, on a fresh system and on the platoon."""
+    from tailgate.estimators.distributed import fixed_point
+
+    for model in (ch5_cases.fresh(9).brief().model, load_scenario(ch6_cases.SCENARIO).brief().model):
+        assert ch5_theory.residual(model, fixed_point(model).P) < 1e-12
+        assert ch5_theory.residual(model, 1.001 * fixed_point(model).P) > 1e-5  # the measure can fail
+
+
+@pytest.mark.parametrize("kind", ["norm", "lasso"])
+def test_the_scalar_counter_example(kind):
+    """An initial error of lam / c converges, one of 1.999 lam / c does not."""
+    assert ch5_theory.scalar_convergence(1.0, kind) and not ch5_theory.scalar_convergence(1.999, kind)
+
+
+@pytest.mark.parametrize(("chapter", "claims", "figures"), [("ch5", 10, 4), ("ch6", 18, 5)])
+def test_a_report(chapter, claims, figures, tmp_path):
+    """Ten seeds give every claim with a verdict and a reason, tables and figures."""
+    report = reproduce(chapter, seeds=10)
+    page = write(report, tmp_path)
+    data = json.loads((tmp_path / "report.json").read_text())
+    assert len(report.claims) >= claims and len({c.id for c in report.claims}) == len(report.claims)
+    assert all(c.holds in ("yes", "partly", "no") and c.why for c in report.claims)
+    assert len(data["claims"]) == len(report.claims) and len(report.figures) == figures
+    assert all(len(row) == len(t.columns) for t in report.tables for row in t.rows)
+    assert all((tmp_path / f"{f.name}.png").read_bytes() == f.png and len(f.png) > 5000 for f in report.figures)
+    text = page.read_text()
+    assert all(c.id in text for c in report.claims) and "nan" not in (tmp_path / "report.json").read_text().lower()
+
+
+def test_unknown_chapter_names_those_that_exist(capsys):
+    """The error lists every chapter."""
+    assert cli.main(["reproduce", "ch9"]) == 2
+    error = capsys.readouterr().err
+    assert all(name in error for name in ("ch4", "ch5", "ch6"))
+
+
+def test_verdicts_go_both_ways():
+    """The claims on several runs are judged by what is measured: figures of either sign change the verdict."""
+    far, near = ch5_theory.SUDDEN, "random, 700 randn"
+    base = {(label, words): 1.0 for label in ch5_theory.CASES for words in ch5_theory.RIVALS}
+    kinds = lambda found: [claim.holds for claim in ch5_theory._others(found)]  # noqa: E731
+    better = base | {(label, "gate"): 2.0 for label in ch5_theory.CASES}
+    worse = base | {(label, "gate"): 0.5 for label in ch5_theory.CASES} | {(far, "resilient (5.8)"): 9.0}
+    assert kinds(better) == ["yes", "yes"] and kinds(worse) == ["no", "no"]
+    assert kinds(better | {(near, "gate"): 0.5}) == ["yes", "partly"]
+    few = {(label, guard): 100 for label in ch6_loop.ATTACKS for guard in ch6_loop.GUARDS}
+    none = dict.fromkeys(few, 0)
+    for judge in (ch6_loop._every_step, ch6_loop._collision):
+        assert judge(none, 100).holds == "no"
+    assert ch6_loop._every_step(few, 100).holds == "yes" and ch6_loop._zero_mean(few, 100).holds == "no" and ch6_loop._zero_mean(none, 100).holds == "yes"
+    safe = few | {(label, "DKF"): 0 for label in ch6_loop.ATTACKS}
+    assert ch6_loop._collision(safe, 100).holds == "yes"
