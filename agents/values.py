@@ -164,4 +164,6 @@ def fit(brief: Brief, kind: Kind, value: Array) -> Array:
         return np.clip(value, np.where(brief.is_actuator, -strongest, low), np.where(brief.is_actuator, strongest, high))
     if kind in (Kind.DELAY, Kind.REPLAY):
         return np.clip(np.floor(value + 0.5), 1.0, float(threat.memory))
+    if kind in (Kind.NOISE_JAM, Kind.ECHO_DELAY):
+        return np.clip(value, 1e-12, threat.jam_power if kind == Kind.NOISE_JAM else threat.delay_bound)
     return np.zeros_like(value)

@@ -4,16 +4,20 @@ from .cacc import FeedForward
 from .consensus_cacc import Consensus
 from .controllers import AdaptiveCruise
 from .following import CarFollowing
+from .idm import IntelligentDriver
 from .linear_platoon import LinearPlatoon
 from .literal import CarFollowingLiteral, RelativeDistance
-from .manoeuvres import Braking, Constant, OrnsteinUhlenbeck, Profile, Pulse, Sine, StopAndGo
+from .manoeuvres import Braking, Constant, OrnsteinUhlenbeck, Profile, Pulse, Sine, StopAndGo, Switched
 from .network import LinearSensors, NoControl, SensorNetwork
 from .platoon import Platoon, PlatoonSensors
 from .ploeg import Ploeg
+from .radar import FmcwRadar
+from .radar_car import RadarCruise
+from .radar_following import RadarFollowing
 from .sensors import Odometry
 
 __all__ = [
-    "AdaptiveCruise", "Braking", "CarFollowing", "CarFollowingLiteral", "Consensus", "Constant", "FeedForward", "LinearPlatoon",
-    "LinearSensors", "NoControl", "Odometry", "OrnsteinUhlenbeck", "Platoon", "PlatoonSensors", "Ploeg", "Profile", "Pulse",
-    "RelativeDistance", "SensorNetwork", "Sine", "StopAndGo",
+    "AdaptiveCruise", "Braking", "CarFollowing", "CarFollowingLiteral", "Consensus", "Constant", "FeedForward", "FmcwRadar",
+    "IntelligentDriver", "LinearPlatoon", "LinearSensors", "NoControl", "Odometry", "OrnsteinUhlenbeck", "Platoon", "PlatoonSensors",
+    "Ploeg", "Profile", "Pulse", "RadarCruise", "RadarFollowing", "RelativeDistance", "SensorNetwork", "Sine", "StopAndGo", "Switched",
 ]  # fmt: skip

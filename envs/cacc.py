@@ -20,7 +20,7 @@ from tailgate.core import Array, Estimate, Finite, Mode, Model, NonNegative, Pos
 from tailgate.errors import InputError
 from tailgate.registry import register
 
-from .controllers import BRAKE_ACCEL, STOP_ACCEL, WIDEN_FACTOR
+from .controllers import WIDEN_FACTOR, limited, obeyed
 
 V2V = ("predecessor_acceleration", "leader_acceleration", "predecessor_command")
 PER_CAR = 4  # states of a follower
@@ -109,7 +109,7 @@ class Law:
         """(B, N, 1) f of each car."""
         return state.f[..., None]
 
-    def step(self, plan: LawPlan, state: LawState, estimate: Estimate, v2v: Array) -> tuple[LawState, Array]:
+    def step(self, plan: LawPlan, state: LawState, estimate: Estimate, v2v: Array, odometry: Array) -> tuple[LawState, Array]:
         """estimate.x (B, N, n), row i being what car i believes, and v2v (B, N, 3) to the commands u (B, N, 1) [m/s^2]."""
         mode = estimate.mode
         u, f = self._act(plan.normal, estimate.x, state.f, v2v)
@@ -117,12 +117,7 @@ class Law:
             if (mode == other).any():
                 v, g = self._act(tuned, estimate.x, state.f, v2v)
                 u, f = np.where(mode == other, v, u), np.where(mode == other, g, f)
-        u = np.where(mode == Mode.BRAKE, np.minimum(u, BRAKE_ACCEL), u)
-        u = np.where(mode == Mode.STOP, STOP_ACCEL, u)
-        if self.accel_min is not None:
-            u = np.maximum(u, self.accel_min)
-        if self.accel_max is not None:
-            u = np.minimum(u, self.accel_max)
+        u = limited(obeyed(u, mode), self.accel_min, self.accel_max)
         u[:, 0] = 0.0  # the manoeuvre drives the leader
         return LawState(f), u[..., None]
 

@@ -13,6 +13,23 @@ BRAKE_ACCEL = -2.0  # Mode.BRAKE: at most this acceleration [m/s^2]
 STOP_ACCEL = -5.0  # Mode.STOP [m/s^2], the braking limit of the thesis's follower (section 3.5)
 
 
+def widened(headway: float, mode: Array) -> Array:
+    """The time headway [s] under a mode that the defence asks for."""
+    return np.where(mode == Mode.WIDEN, WIDEN_FACTOR * headway, headway)
+
+
+def obeyed(a: Array, mode: Array) -> Array:
+    """The command [m/s^2] under a mode that the defence asks for."""
+    a = np.where(mode == Mode.BRAKE, np.minimum(a, BRAKE_ACCEL), a)
+    return np.where(mode == Mode.STOP, STOP_ACCEL, a)
+
+
+def limited(a: Array, low: float | None, high: float | None) -> Array:
+    """The command within its limits; none: unlimited."""
+    a = a if low is None else np.maximum(a, low)
+    return a if high is None else np.minimum(a, high)
+
+
 @register("controller", "acc", reference="Dutta 2018, (4.13) and (4.14), corrected")
 @dataclass(frozen=True)
 class AdaptiveCruise:
@@ -37,21 +54,15 @@ class AdaptiveCruise:
     def start(self, plan: Any, batch: int) -> Any:
         return None
 
-    def step(self, plan: Any, state: Any, estimate: Estimate, v2v: Array) -> tuple[Any, Array]:
+    def step(self, plan: Any, state: Any, estimate: Estimate, v2v: Array, odometry: Array) -> tuple[Any, Array]:
         """estimate.x (B, N, 3) = [x, v, a] and v2v (B, N, 2) = [x_l, v_l] to the command a_des (B, N, 1) [m/s^2]."""
         x, v, mode = estimate.x[..., 0], estimate.x[..., 1], estimate.mode
-        headway = np.where(mode == Mode.WIDEN, WIDEN_FACTOR * self.headway, self.headway)
+        headway = widened(self.headway, mode)
         gap_error = v2v[..., 0] - x - self.standstill - headway * v
         a = ((v2v[..., 1] - v) + self.gamma * gap_error) / headway
         if self.set_speed is not None:
             a = np.minimum(a, (self.set_speed - v) / headway)
-        a = np.where(mode == Mode.BRAKE, np.minimum(a, BRAKE_ACCEL), a)
-        a = np.where(mode == Mode.STOP, STOP_ACCEL, a)
-        if self.accel_min is not None:
-            a = np.maximum(a, self.accel_min)
-        if self.accel_max is not None:
-            a = np.minimum(a, self.accel_max)
-        return None, a[..., None]
+        return None, limited(obeyed(a, mode), self.accel_min, self.accel_max)[..., None]
 
     def held(self, plan: Any, state: Any, batch: int) -> Array:
         return np.zeros((batch, 1, 0))

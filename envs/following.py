@@ -9,7 +9,7 @@ the sign of the acceleration, and A_a is unstable; (4.14) has its sign wrong and
 """
 
 from dataclasses import dataclass
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -19,33 +19,16 @@ from tailgate.core import Array, Controller, Finite, Model, NonNegative, Positiv
 from tailgate.draws import Draws
 from tailgate.registry import register
 
+from .idm import Behind, BehindState
 from .vehicle import drive, lag
 
 Triple = Annotated[tuple[NonNegative, NonNegative, NonNegative], Field(min_length=3, max_length=3)]
-
-# The Intelligent Driver Model (Treiber, Hennecke, Helbing 2000) of the human behind, with a reaction time.
-IDM_SPEED = 33.3  # desired speed [m/s]
-IDM_HEADWAY = 1.5  # desired time headway [s]
-IDM_GAP = 2.0  # gap at standstill [m]
-IDM_ACCEL = 1.4  # largest acceleration [m/s^2]
-IDM_DECEL = 2.0  # comfortable deceleration [m/s^2]
-IDM_BRAKE = 8.0  # physical limit [m/s^2]
-
-
-def idm_accel(gap: Array, speed: Array, lead_speed: Array) -> Array:
-    """IDM acceleration [m/s^2] for gap [m] and speeds [m/s], elementwise."""
-    closing = speed * (speed - lead_speed) / (2.0 * np.sqrt(IDM_ACCEL * IDM_DECEL))
-    wanted = IDM_GAP + np.maximum(0.0, speed * IDM_HEADWAY + closing)
-    free = (speed / IDM_SPEED) * (speed / IDM_SPEED)
-    near = wanted / np.maximum(gap, 0.1)
-    return np.asarray(np.clip(IDM_ACCEL * (1.0 - free * free - near * near), -IDM_BRAKE, IDM_ACCEL))
-
 
 class FollowingPlan(NamedTuple):
     A: Array
     B: Array
     noise_sd: Array  # (3,)
-    reaction: int  # steps
+    behind: Behind | None
 
 
 class FollowingState(NamedTuple):
@@ -54,10 +37,7 @@ class FollowingState(NamedTuple):
     lead_x: Array  # (B,)
     lead_v: Array  # (B,)
     ego: Array  # (B, 1, 3)
-    rear_x: Array  # (B,)
-    rear_v: Array  # (B,)
-    rear_intent: Array  # (B, reaction): accelerations that the driver behind has decided and not yet made
-    rear_slot: Array  # (B,) where the next one goes
+    behind: BehindState | None
 
 
 @register("plant", "car_following", reference="Dutta 2018, section 4.6; equation (4.15)")
@@ -87,8 +67,8 @@ class CarFollowing:
         return lag(self.dt, self.tau)
 
     def prepare(self, model: Model) -> FollowingPlan:
-        reaction = round(self.rear_reaction / self.dt) if self.rear else 0
-        return FollowingPlan(model.A, model.B, np.sqrt(np.array(self.process_var)), reaction)
+        behind = Behind(self.dt, round(self.rear_reaction / self.dt)) if self.rear else None
+        return FollowingPlan(model.A, model.B, np.sqrt(np.array(self.process_var)), behind)
 
     def model(self, sensor: Sensor, controller: Controller) -> Model:
         (A, B), (sensors, C, R) = self.dynamics(), sensor.matrices(self)
@@ -107,12 +87,8 @@ class CarFollowing:
     def start(self, plan: FollowingPlan, draws: Draws) -> FollowingState:
         batch = len(draws.key)
         ego = self._mean(batch) + np.array(self.initial_sd) * draws.normal((1, 3))
-        rear_gap = IDM_GAP + IDM_HEADWAY * self.speed
-        lead_x = np.full(batch, self.position + self.gap)
-        return FollowingState(
-            lead_x, np.full(batch, self.lead_speed), ego, ego[:, 0, 0] - rear_gap, np.full(batch, self.speed),
-            num.zeros((batch, plan.reaction)), np.zeros(batch, np.int64),
-        )  # fmt: skip
+        behind = plan.behind.start(ego[:, 0, 0], self.speed) if plan.behind else None
+        return FollowingState(np.full(batch, self.position + self.gap), np.full(batch, self.lead_speed), ego, behind)
 
     def step(self, plan: FollowingPlan, state: FollowingState, u: Array, exo: Array, draws: Draws) -> FollowingState:
         dt, half = self.dt, 0.5 * self.dt
@@ -121,39 +97,31 @@ class CarFollowing:
         ego = self.move(plan, state.ego, u, noise)
         lead_v = np.maximum(0.0, state.lead_v + exo * dt)
         lead_x = state.lead_x + half * (state.lead_v + lead_v)
-        rear_x, rear_v, intent, slot = state.rear_x, state.rear_v, state.rear_intent, state.rear_slot
-        if self.rear:
-            decided = idm_accel(x - rear_x, rear_v, v)
-            if plan.reaction:
-                rows = np.arange(len(slot))
-                made = intent[rows, slot]
-                intent = intent.copy(order="K")
-                intent[rows, slot] = decided
-                slot = (slot + 1) % plan.reaction
-            else:
-                made = decided
-            rear_v = np.maximum(0.0, rear_v + made * dt)
-            rear_x = rear_x + half * (state.rear_v + rear_v)
-        return FollowingState(lead_x, lead_v, ego, rear_x, rear_v, intent, slot)
+        behind = plan.behind.step(state.behind, x, v) if plan.behind and state.behind else None
+        return FollowingState(lead_x, lead_v, ego, behind)
 
     def move(self, plan: FollowingPlan, ego: Array, u: Array, noise: Array) -> Array:
         """The follower (B, 1, 3) one step later, under u (B, 1, 1) [m/s^2] and noise (3, B)."""
         x, v, a = drive(plan.A, plan.B, ego[:, 0, 0], ego[:, 0, 1], ego[:, 0, 2], u[:, 0, 0], noise)
         return num.stack([x[:, None], v[:, None], a[:, None]])
 
-    def known(self, plan: FollowingPlan, u: Array, exo: Array) -> Array:
+    def known(self, plan: FollowingPlan, u: Array, exo: Array, state: Any) -> Array:
         return u
 
     def truth(self, plan: FollowingPlan, state: FollowingState, held: Array) -> Array:
         return state.ego
+
+    def odometry(self, plan: FollowingPlan, state: FollowingState) -> Array:
+        return np.zeros((len(state.lead_x), 1, 0))
 
     def lead_speed_of(self, state: FollowingState) -> Array:
         return state.lead_v
 
     def scene(self, plan: FollowingPlan, state: FollowingState) -> Scene:
         x, v, a = state.ego[..., 0], state.ego[..., 1], state.ego[..., 2]
-        behind = (x - state.rear_x[:, None]) if self.rear else np.full_like(x, np.inf)
-        return Scene(state.lead_x[:, None] - x, v, a, state.lead_v[:, None], behind, state.rear_v[:, None], x)
+        rear = state.behind
+        rear_gap, rear_v = (np.full_like(x, np.inf), v) if rear is None else (x - rear.x[:, None], rear.v[:, None])
+        return Scene(state.lead_x[:, None] - x, v, a, state.lead_v[:, None], rear_gap, rear_v, x)
 
     def v2v(self, plan: FollowingPlan, state: FollowingState) -> Array:
         return num.stack([state.lead_x[:, None], state.lead_v[:, None]])

@@ -59,7 +59,7 @@ class RelativeDistance:
     def start(self, plan: Any, batch: int) -> Any:
         return None
 
-    def step(self, plan: Any, state: Any, estimate: Estimate, v2v: Array) -> tuple[Any, Array]:
+    def step(self, plan: Any, state: Any, estimate: Estimate, v2v: Array, odometry: Array) -> tuple[Any, Array]:
         """estimate.x (B, N, 3) and v2v (B, N, 2) = [x_l, v_l] to u (B, N, 1) [m]."""
         return None, (v2v[..., 0] - estimate.x[..., 0])[..., None]
 

@@ -67,6 +67,25 @@ class Pulse:
         return None, np.where((t >= self.begin) & (t < self.end), self.value, 0.0)
 
 
+@register("manoeuvre", "switched", reference="Dutta 2018, section 3.5.2, scenario (ii)")
+@dataclass(frozen=True)
+class Switched:
+    """One constant acceleration, and from some time on another."""
+
+    value: Finite = param(-0.1082, "acceleration at first [m/s^2]")
+    then: Finite = param(0.012, "acceleration afterwards [m/s^2]")
+    at: NonNegative = param(100.0, "time of the switch, which the thesis does not give [s]")
+
+    def prepare(self, dt: float) -> float:
+        return dt
+
+    def start(self, plan: float, draws: Draws) -> Any:
+        return None
+
+    def accel(self, plan: float, state: Any, k: Array, speed: Array, draws: Draws) -> tuple[Any, Array]:
+        return None, np.where(k * plan < self.at, self.value, self.then)
+
+
 class SinePlan(NamedTuple):
     cos: float  # of the angle of one step
     sin: float

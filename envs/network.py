@@ -167,11 +167,14 @@ class SensorNetwork:
         x = num.apply(plan.A, state.x[:, None])[:, 0]
         return NetworkState(x + plan.noise_sd * draws.normal((self.states,)) if plan.noise_sd else x)
 
-    def known(self, plan: NetworkPlan, u: Array, exo: Array) -> Array:
+    def known(self, plan: NetworkPlan, u: Array, exo: Array, state: Any) -> Array:
         return u
 
     def truth(self, plan: NetworkPlan, state: NetworkState, held: Array) -> Array:
         return np.broadcast_to(state.x[:, None], (len(state.x), self.agents, self.states))
+
+    def odometry(self, plan: NetworkPlan, state: NetworkState) -> Array:
+        return np.zeros((len(state.x), self.agents, 0))
 
     def lead_speed_of(self, state: NetworkState) -> Array:
         return np.zeros(len(state.x))
@@ -254,7 +257,7 @@ class NoControl:
     def start(self, plan: int, batch: int) -> Any:
         return None
 
-    def step(self, plan: int, state: Any, estimate: Estimate, v2v: Array) -> tuple[Any, Array]:
+    def step(self, plan: int, state: Any, estimate: Estimate, v2v: Array, odometry: Array) -> tuple[Any, Array]:
         return None, np.zeros((len(v2v), plan, 0))
 
     def held(self, plan: int, state: Any, batch: int) -> Array:

@@ -144,12 +144,15 @@ class String:
         mean = truth + self.initial_sd * draws.normal(truth.shape[1:], 16)
         return Prior(mean, np.broadcast_to(self.prior_var * np.eye(shape[-1]), shape))
 
-    def known(self, plan: Any, u: Array, exo: Array) -> Array:
+    def known(self, plan: Any, u: Array, exo: Array, state: Any) -> Array:
         """The leader knows its command; the others where the scenario says so."""
         out = num.zeros(u.shape)
         out[:, :, 0] = exo[:, None] if self.leader_input_known else 0.0
         out[:, 0, 0] = exo
         return out
+
+    def odometry(self, plan: Any, state: Any) -> Array:
+        return np.zeros((len(state[0]), self.size[0], 0))
 
 
 class PlatoonPlan(NamedTuple):

@@ -21,6 +21,12 @@ class Reading(NamedTuple):
     sensor: Array
 
 
+class RawPlan(NamedTuple):
+    rounds: tuple[Reading, ...]
+    inputs: Array  # (n, m) B in the rows of the states that the known input alone decides, else 0
+    by_input: Array  # (n,) bool: these states
+
+
 class RawState(NamedTuple):
     x: Array  # (B, N, n) the last values
 
@@ -49,19 +55,25 @@ def readings(model: Model) -> tuple[Reading, ...]:
 @register("defence", "none")
 @dataclass(frozen=True)
 class Raw:
-    """Believes the sensors, its own and those that it hears of: what they read is the state; one that nobody reads keeps its prior."""
+    """Believes the sensors, its own and those that it hears of: what they read is the state; one that nobody reads keeps its prior.
 
-    def prepare(self, model: Model) -> tuple[Reading, ...]:
-        return readings(model)
+    A state that the known input alone decides, such as a speed by odometry, follows that input.
+    """
 
-    def start(self, plan: tuple[Reading, ...], prior: Prior) -> RawState:
+    def prepare(self, model: Model) -> RawPlan:
+        by_input = np.asarray(~model.A.any(axis=1) & model.B.any(axis=1))
+        return RawPlan(readings(model), model.B * by_input[:, None], by_input)
+
+    def start(self, plan: RawPlan, prior: Prior) -> RawState:
         return RawState(prior.mean)
 
     def step(
-        self, plan: tuple[Reading, ...], state: RawState, received: Received, known_u: Array, draws: Draws
+        self, plan: RawPlan, state: RawState, received: Received, known_u: Array, draws: Draws
     ) -> tuple[RawState, Estimate]:
         x = state.x.copy(order="K")
-        for agent, column, teller, sensor in plan:
+        if plan.by_input.any():
+            x = np.where(plan.by_input, num.matvec(plan.inputs, known_u), x)
+        for agent, column, teller, sensor in plan.rounds:
             there = received.valid[:, teller, sensor]
             x[:, agent, column] = np.where(there, received.y[:, teller, sensor], x[:, agent, column])
         score = np.zeros(x.shape[:2])

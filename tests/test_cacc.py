@@ -38,7 +38,7 @@ def act(law, plan, X, f, v2v=None, mode=Mode.NORMAL):
     quiet = np.zeros((1, cars), bool)
     estimate = Estimate(X[None], np.zeros((1, cars)), quiet, np.full((1, cars), mode, np.int8), ~quiet)
     state = law.start(plan, 1)._replace(f=np.array(f, float)[None])
-    state, u = law.step(plan, state, estimate, np.zeros((1, cars, 3)) if v2v is None else v2v[None])
+    state, u = law.step(plan, state, estimate, np.zeros((1, cars, 3)) if v2v is None else v2v[None], np.zeros((1, cars, 0)))
     return u[0, :, 0], state.f[0]
 
 
@@ -169,7 +169,7 @@ def test_modes_of_one_car_leave_the_others():
     commands = []
     for modes in ([0, 0, 0, 0, 0], [0, 0, Mode.ACC, Mode.WIDEN, 0]):
         estimate = Estimate(X[None], np.zeros((1, 5)), quiet, np.array([modes], np.int8), ~quiet)
-        commands.append(law.step(plan, law.start(plan, 1)._replace(f=f[None]), estimate, np.ones((1, 5, 3)))[1][0, :, 0])
+        commands.append(law.step(plan, law.start(plan, 1)._replace(f=f[None]), estimate, np.ones((1, 5, 3)), np.zeros((1, 5, 0)))[1][0, :, 0])
     np.testing.assert_array_equal(commands[0][[0, 1, 4]], commands[1][[0, 1, 4]])
     assert (commands[0][[2, 3]] != commands[1][[2, 3]]).all()
 

@@ -13,6 +13,8 @@ from tailgate.threat import Brief, Channel, ThreatModel
 ALL = ("dos_jam", "dos_hold", "dos_hold_fresh", "dropout", "fdi", "delay", "replay")
 P, V, LP, LV, ACC = range(5)  # wires: position, velocity, leader's position and velocity, the acceleration command
 OLD = (Kind.DELAY, Kind.REPLAY)
+AIRED = (Kind.NOISE_JAM, Kind.ECHO_DELAY)  # a sensor that listens to its echo: tests/test_air.py
+WIRED = [kind for kind in Kind if kind != Kind.NONE and kind not in AIRED]
 MODEL = load_scenario("stop-and-go-v0").brief().model
 EXPECTED = np.array([-1.0, -2.0, -3.0, -4.0, -5.0])
 
@@ -68,7 +70,7 @@ def assert_accepted(wire, *command, **options):
     return wires
 
 
-@pytest.mark.parametrize("kind", [k for k in Kind if k != Kind.NONE])
+@pytest.mark.parametrize("kind", WIRED)
 def test_kind_not_granted(kind):
     """A kind outside of the threat model is refused."""
     others = tuple(name for name in ALL if name != kind.name.lower())
@@ -76,13 +78,19 @@ def test_kind_not_granted(kind):
     assert_accepted(Wire().idle(2), kind, [P], 1.0)
 
 
-@pytest.mark.parametrize("kind", [k for k in Kind if k != Kind.NONE])
+@pytest.mark.parametrize("kind", WIRED)
 @pytest.mark.parametrize("targets", [[LP], [LV], [P, LP], [ACC], [P, ACC], [P, V, LP, LV, ACC]])
 def test_wire_not_granted(kind, targets):
     """One wire too many refuses the whole command; without `targets` no V2V field is granted."""
     assert_refused(Wire(), kind, targets, 1.0)
     assert_refused(Wire(targets=("leader_velocity",)), kind, [P], 1.0)
     assert_accepted(Wire(targets=("leader_velocity", "leader_position", "position", "velocity", "acceleration")), kind, targets, 1.0)
+
+
+@pytest.mark.parametrize("kind", AIRED)
+def test_sensors_that_receive_nothing_over_the_air(kind):
+    """Granted or not, there is nothing that noise or a late echo could reach."""
+    assert_refused(Wire(kinds=(*ALL, "noise_jam", "echo_delay")), kind, [P], 0.05)
 
 
 @pytest.mark.parametrize("value", [5.000001, -5.000001, np.inf, -np.inf, np.nan])

@@ -11,7 +11,7 @@ import tailgate
 from tailgate.agents import Inject
 from tailgate.draws import Role, keys
 from tailgate.envs import AdaptiveCruise, Braking, CarFollowing, Constant, Odometry, OrnsteinUhlenbeck, Profile, StopAndGo
-from tailgate.envs.following import idm_accel
+from tailgate.envs.idm import idm_accel
 from tailgate.errors import InputError
 from tailgate.estimators import Raw
 from tailgate.loop import Loop
@@ -145,13 +145,13 @@ def test_the_driver_behind_reacts_after_its_reaction_time():
     plant = CarFollowing(process_var=(0.0, 0.0, 0.0))
     plan = prepared(plant)
     state, decided = plant.start(plan, _draws(Role.PRIOR, 0)), []
-    speeds = [state.rear_v[0]]
+    speeds = [state.behind.v[0]]
     for k in range(30):
-        decided.append(idm_accel(state.ego[0, 0, 0] - state.rear_x, state.rear_v, state.ego[:, 0, 1])[0])
+        decided.append(idm_accel(state.ego[0, 0, 0] - state.behind.x, state.behind.v, state.ego[:, 0, 1])[0])
         state = plant.step(plan, state, np.full((1, 1, 1), -2.0), np.zeros(1), _draws(Role.PROCESS, k))
-        speeds.append(state.rear_v[0])
+        speeds.append(state.behind.v[0])
     made = np.diff(speeds) / 0.1
-    assert plan.reaction == 10 and not made[:10].any()
+    assert plan.behind.reaction == 10 and not made[:10].any()
     np.testing.assert_allclose(made[10:], decided[:20], atol=1e-12)
 
 

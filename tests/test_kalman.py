@@ -262,9 +262,9 @@ def test_the_steady_state_of_every_scenario_solves_the_riccati_equation(name):
     model = load_scenario(name).brief().model
     A, C, Q, R = model.A, model.C[0], model.Q, model.R[0]
     P = steady_state(model)[0]
-    np.testing.assert_allclose(P, solve_discrete_are(A.T, C.T, Q, R), rtol=1e-11)
+    np.testing.assert_allclose(P, solve_discrete_are(A.T, C.T, Q, R), rtol=1e-11, atol=1e-16)
     K = P @ C.T @ np.linalg.inv(C @ P @ C.T + R)
-    np.testing.assert_allclose(A @ (P - K @ C @ P) @ A.T + Q, P, rtol=1e-13)
+    np.testing.assert_allclose(A @ (P - K @ C @ P) @ A.T + Q, P, rtol=1e-13, atol=1e-18)
 
 
 def test_the_steady_state_of_random_models():

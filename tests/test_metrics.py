@@ -19,11 +19,12 @@ def trace(steps=4, length=None, first=None, **signals):
     """A trace of one episode; each signal is a list over steps (or a constant)."""
     zeros = dict(gap=50.0, speed=10.0, accel=0.0, lead_speed=10.0, rear_gap=20.0, rear_speed=10.0, position=0.0)
     flags = dict(kind=0, alarm=False, refused=False, collided=False, rear_collided=False)
-    assert set(signals) <= {*zeros, *flags, "error", "speed_error"}
+    assert set(signals) <= {*zeros, *flags, "error", "speed_error", "probe"}
     column = {name: np.broadcast_to(np.asarray(signals.get(name, value)), steps).copy() for name, value in (zeros | flags).items()}
     out = {name: column[name].astype(float)[:, None, None] for name in zeros}
     out |= {name: column[name][:, None] for name in ("kind", "refused", "collided", "rear_collided")}
     out["alarm"] = column["alarm"][:, None, None]
+    out["probe"] = np.broadcast_to(np.asarray(signals.get("probe", True)), steps).astype(bool).copy()[:, None, None]
     out["truth"] = np.full((steps, 1, 1, 3), 7.0)
     out["estimate"] = out["truth"].copy()
     for i, name in enumerate(("error", "speed_error")):
@@ -42,6 +43,7 @@ CASES = {
     "collided": [
         ({"collided": [0, 0, 0, 1]}, 1.0), ({}, 0.0), ({"collided": [0, 0, 0, 1], "length": 3}, 0.0), ({"rear_collided": 1}, 0.0),
     ],
+    "muted_steps": [({}, 0.0), ({"probe": [1, 0, 0, 1]}, 2.0), ({"probe": [1, 0, 0, 0], "length": 2}, 1.0)],
     "rear_collided": [({"rear_collided": [0, 0, 0, 1]}, 1.0), ({"collided": 1}, 0.0)],
     "crashed": [({"rear_collided": [0, 0, 0, 1]}, 1.0), ({"collided": [0, 0, 0, 1]}, 1.0), ({}, 0.0)],
     "min_gap": [({"gap": [9, 4, 6, 1]}, 1.0), ({"gap": [9, 4, 6, 1], "length": 3}, 4.0), ({"first": {"gap": 2.5}}, 2.5)],
@@ -157,7 +159,8 @@ def string(steps=4, **signals):
     road = dict(gap=[np.inf, 50, 50, 50, 50], speed=10.0, accel=0.0, lead_speed=10.0, rear_gap=np.inf, rear_speed=0.0, position=0.0)
     column = {name: np.broadcast_to(np.asarray(signals.get(name, value), float), (steps, 5))[:, None] for name, value in road.items()}
     out = {name: value.copy() for name, value in column.items()}
-    out["alarm"] = np.broadcast_to(np.asarray(signals.get("alarm", False), bool), (steps, 5))[:, None].copy()
+    for name, value in (("alarm", False), ("probe", True)):
+        out[name] = np.broadcast_to(np.asarray(signals.get(name, value), bool), (steps, 5))[:, None].copy()
     flags = ("kind", "refused", "collided", "rear_collided")
     out |= {name: np.broadcast_to(signals.get(name, 0), steps)[:, None].copy() for name in flags}
     truth = np.full((steps, 1, 5, 19), 7.0)

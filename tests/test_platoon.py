@@ -204,7 +204,7 @@ def test_the_prior_is_the_truth_with_its_own_error_for_each_car():
 def test_who_knows_the_leaders_command(told):
     """The leader always, its followers where the scenario says so."""
     plant = Platoon(leader_input_known=told)
-    known = plant.known(None, np.ones((2, 5, 1)), np.array([-4.0, 1.0]))
+    known = plant.known(None, np.ones((2, 5, 1)), np.array([-4.0, 1.0]), None)
     assert known.shape == (2, 5, 1)
     np.testing.assert_array_equal(known[:, 0, 0], [-4.0, 1.0])
     np.testing.assert_array_equal(known[:, 1:, 0], np.outer([-4.0, 1.0], np.full(4, float(told))))

@@ -71,7 +71,7 @@ def with_gaps(state, gap=None, rear_gap=None):
     if gap is not None:
         plant = plant._replace(lead_x=x + gap)
     if rear_gap is not None:
-        plant = plant._replace(rear_x=x - rear_gap)
+        plant = plant._replace(behind=plant.behind._replace(x=x - rear_gap))
     return state._replace(plant=plant)
 
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,6 +52,11 @@ class Kind(IntEnum):
     FDI = 5  # value is added (4.4)
     DELAY = 6  # the receiver reads what was sent `value` steps ago
     REPLAY = 7  # the receiver reads the last `value` samples before this replay, over and over
+    NOISE_JAM = 8  # over the air: noise of `value` watts reaches the receiver
+    ECHO_DELAY = 9  # over the air: the receiver's own signal comes back `value` metres too late
+
+
+RADIATED = (Kind.DOS_JAM, Kind.NOISE_JAM, Kind.ECHO_DELAY)  # kinds that a receiver which falls silent still hears
 
 
 class Mode(IntEnum):
@@ -71,7 +76,8 @@ class Model:
     A (n, n), B (n, m), c (n,), C (N, q, n), Q = cov w (n, n), R = cov v (N, q, q); graph (N, N) bool, [i, j] when i hears j;
     dt [s]; `sensors` names the q rows of C, `v2v` the fields of the message that a controller hears, `actuators` what an agent commands.
     Row i of `gap` and `speed` (N, n) says how agent i's gap to the vehicle ahead and its own speed depend on x; a row of zeros, the
-    default, is an agent without a road.
+    default, is an agent without a road. `air` says that the sensors listen to their own echo, so that noise_jam and echo_delay reach them
+    and a challenge is possible.
     """
 
     A: Array
@@ -87,6 +93,7 @@ class Model:
     actuators: tuple[str, ...] = ()
     gap: Array | None = None
     speed: Array | None = None
+    air: bool = False
 
     def __post_init__(self) -> None:
         for name in ("A", "B", "c", "C", "Q", "R", "graph", "gap", "speed"):  # public, and nobody's to change: own copies, read-only
@@ -175,10 +182,18 @@ class Received(NamedTuple):
 
     y: Array  # (B, N, q) sensor readings
     valid: Array  # (B, N, q) bool, False where nothing arrived
-    energy: Array  # (B, N) energy heard while the own probe was muted
+    energy: Array  # (B, N) mean power heard, over that of the receiver's noise; 0 of sensors that do not listen to an echo
     v2v: Array | None = None  # (B, N, p) the message of the car ahead
-    odometry: Array | None = None  # (B, N, .) trusted own odometry
+    odometry: Array | None = None  # (B, N, 2) trusted own odometry: position [m] and speed [m/s]
     attacked: Array | None = None  # (B, N, q) bool, the truth about the attack: the oracle's
+
+
+class Air(NamedTuple):
+    """What an attacker radiates at each receiver in one step."""
+
+    power: Array  # (B, N) noise [W]; 0 for none
+    delay: Array  # (B, N) by how much an answered echo is too late, as range [m]; 0 where none is answered
+    reaction: float  # time until the attacker hears that a probe is muted, and falls silent [s]; inf when it never does
 
 
 class Command(NamedTuple):
@@ -253,6 +268,7 @@ class Frame(NamedTuple):
     control: Array  # (B, N, m) what the controller commanded
     applied: Array  # (B, N, m) what the actuators got
     scene: Scene
+    received: Received  # after the attack
     collided: Array  # (B,) bool
     rear_collided: Array  # (B,) bool
 
@@ -306,8 +322,8 @@ class Plant(Sized, Protocol):
     def step(self, plan: Any, state: Any, u: Array, exo: Array, draws: Draws) -> Any:
         """u (B, N, m) commands, exo (B,) the manoeuvre's acceleration of the leader [m/s^2]."""
 
-    def known(self, plan: Any, u: Array, exo: Array) -> Array:
-        """(B, N, model inputs): what each agent knows of the model's input in a step with these commands."""
+    def known(self, plan: Any, u: Array, exo: Array, state: Any) -> Array:
+        """(B, N, model inputs): what each agent knows of the model's input in the step with these commands that led to `state`."""
 
     def truth(self, plan: Any, state: Any, held: Array) -> Array:
         """(B, N, n) the model's state; `held` (B, N, .) is the part of it that the controllers keep."""
@@ -315,6 +331,9 @@ class Plant(Sized, Protocol):
     def scene(self, plan: Any, state: Any) -> Scene: ...
 
     def v2v(self, plan: Any, state: Any) -> Array: ...
+
+    def odometry(self, plan: Any, state: Any) -> Array:
+        """(B, N, 2) position [m] and speed [m/s] as each agent measures them itself, trusted; (B, N, 0) where it has no such thing."""
 
     def lead_speed_of(self, state: Any) -> Array:
         """(B,) speed of the vehicle that the manoeuvre drives [m/s]."""
@@ -331,6 +350,14 @@ class Sensor(Protocol):
     def measure(self, plan: Any, truth: Array, probe: Array, draws: Draws) -> Received: ...
 
 
+@runtime_checkable
+class Receiver(Sensor, Protocol):
+    """A sensor that listens to the echo of its own probe, so that an attacker can reach it over the air."""
+
+    def disturbed(self, plan: Any, truth: Array, probe: Array, draws: Draws, air: Air) -> Received:
+        """What `measure` gives under `air`, by the same draws: where nothing is radiated the two agree to the last bit."""
+
+
 class Controller(Protocol):
     """What drives, on the defence's estimate."""
 
@@ -338,7 +365,8 @@ class Controller(Protocol):
 
     def start(self, plan: Any, batch: int) -> Any: ...
 
-    def step(self, plan: Any, state: Any, estimate: Estimate, v2v: Array) -> tuple[Any, Array]: ...
+    def step(self, plan: Any, state: Any, estimate: Estimate, v2v: Array, odometry: Array) -> tuple[Any, Array]:
+        """estimate, messages v2v (B, N, p) as received, and trusted odometry (B, N, 2 or 0) to the commands (B, N, m)."""
 
     def held(self, plan: Any, state: Any, batch: int) -> Array:
         """(B, N, .) the part of the model's state that the controllers keep; empty (B, N, 0) for most."""

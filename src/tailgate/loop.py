@@ -9,6 +9,7 @@ measured step is a predict and an update. `sense` and `advance` are the two halv
 from __future__ import annotations
 
 import copy
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -17,6 +18,7 @@ import numpy as np
 
 from tailgate import num
 from tailgate.core import (
+    Air,
     Array,
     Attack,
     Command,
@@ -29,6 +31,7 @@ from tailgate.core import (
     Model,
     Plant,
     Received,
+    Receiver,
     Sensor,
     View,
     WhiteBox,
@@ -145,7 +148,8 @@ class Loop:
         v2v = self.plant.v2v(plan.plant, plant)
         expected = np.concatenate([num.matvec(model.C, prior.mean), v2v], axis=-1)
         k = np.zeros(batch, np.int64)
-        controller, u = self.controller.step(plan.controller, controller, estimate, v2v)
+        odometry = self.plant.odometry(plan.plant, plant)
+        controller, u = self.controller.step(plan.controller, controller, estimate, v2v, odometry)
         manoeuvre, plant, known = self._move(keys, k, manoeuvre, plant, u)
         sent, received = self._measure(keys, k + 1, plant, controller, estimate)
         return LoopState(
@@ -197,20 +201,21 @@ class Loop:
     def advance(self, state: LoopState, command: Command) -> tuple[LoopState, Frame]:
         """The rest of the step: channel, defence, controller, plant, and the next measurement."""
         plan = self.plan
+        truth, odometry = self._truth(state.plant, state.controller), self.plant.odometry(plan.plant, state.plant)
         channel, received, arrived, refused = Channel().apply(
-            plan.channel, state.channel, state.sent, state.received, command, state.k
+            plan.channel, state.channel, state.sent, state.received, command, state.k, self._again(state, truth)
         )
         heard = received._replace(
             v2v=received.v2v if "v2v" in self.uses else None,
+            odometry=odometry if "odometry" in self.uses else None,
             attacked=received.attacked if "truth" in self.uses else None,
         )
         defence, estimate = self.defence.step(
             plan.defence, state.defence, frozen(heard), frozen(state.known_u), state.keys.at(Role.DEFENCE, state.k)
         )
         check_estimate(estimate, self.model, len(state.k))
-        truth = self._truth(state.plant, state.controller)
         assert received.v2v is not None
-        controller, u = self.controller.step(plan.controller, state.controller, estimate, received.v2v)
+        controller, u = self.controller.step(plan.controller, state.controller, estimate, received.v2v, odometry)
         if estimate.limits is not None:
             u = np.clip(u, estimate.limits[..., 0], estimate.limits[..., 1])
             estimate = estimate._replace(limits=None)
@@ -220,7 +225,8 @@ class Loop:
         collided = np.any(scene.gap <= 0.0, axis=1)
         rear_collided = np.any(scene.rear_gap <= 0.0, axis=1)
         frame = Frame(
-            state.k, truth, state.sent, arrived, channel.last, refused, estimate, u, applied, scene, collided, rear_collided
+            state.k, truth, state.sent, arrived, channel.last, refused, estimate, u, applied, scene, received, collided,
+            rear_collided,
         )
         sent, fresh = self._measure(state.keys, state.k + 1, plant, controller, estimate)
         ended = state.ended | ((collided | rear_collided) & self.ends_on_collision)
@@ -239,6 +245,13 @@ class Loop:
         held = self.controller.held(self.plan.controller, controller, len(self.plant.lead_speed_of(plant)))
         return self.plant.truth(self.plan.plant, plant, held)
 
+    def _again(self, state: LoopState, truth: Array) -> Callable[[Air], Received] | None:
+        """This step's measurement under what is radiated; None of sensors that receive nothing over the air."""
+        if not isinstance(self.sensor, Receiver):
+            return None
+        sensor, draws = self.sensor, state.keys.at(Role.SENSOR, state.k)
+        return lambda air: sensor.disturbed(self.plan.sensor, truth, state.estimate.probe, draws, air)
+
     def _measure(self, keys: Keys, k: Array, plant: Any, controller: Any, estimate: Estimate) -> tuple[Array, Received]:
         truth = self._truth(plant, controller)
         received = self.sensor.measure(self.plan.sensor, truth, estimate.probe, keys.at(Role.SENSOR, k))
@@ -252,5 +265,5 @@ class Loop:
         manoeuvre, exo = self.manoeuvre.accel(
             plan.manoeuvre, manoeuvre, k, self.plant.lead_speed_of(plant), keys.at(Role.MANOEUVRE, k)
         )
-        known = self.plant.known(plan.plant, applied if u is None else u, exo)
-        return manoeuvre, self.plant.step(plan.plant, plant, applied, exo, keys.at(Role.PROCESS, k)), known
+        plant = self.plant.step(plan.plant, plant, applied, exo, keys.at(Role.PROCESS, k))
+        return manoeuvre, plant, self.plant.known(plan.plant, applied if u is None else u, exo, plant)

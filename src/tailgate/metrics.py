@@ -235,6 +235,13 @@ def string_gain(trace: Trace) -> Array:
 
 
 @metric("steps")
+def muted_steps(trace: Trace) -> Array:
+    """Steps in which a defence muted its own probe to listen for an attacker: measurements that it gave up."""
+    muted = ~trace.probe.all(axis=2) & trace.live
+    return np.asarray(np.count_nonzero(muted, axis=0), np.float64)
+
+
+@metric("steps")
 def attack_steps(trace: Trace) -> Array:
     """Steps in which an attack took effect."""
     return np.asarray(np.count_nonzero(_attacked(trace), axis=0), np.float64)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, Literal, NamedTuple
 
@@ -9,11 +10,26 @@ import numpy as np
 from pydantic import Field
 
 from tailgate import num
-from tailgate.core import Array, Command, Count, Kind, Model, Positive, PositiveCount, Received, no_command, param
+from tailgate.core import (
+    RADIATED,
+    Air,
+    Array,
+    Command,
+    Count,
+    Kind,
+    Model,
+    NonNegative,
+    Positive,
+    PositiveCount,
+    Received,
+    no_command,
+    param,
+)  # fmt: skip
 from tailgate.errors import InputError, unknown
 
-KindName = Literal["dos_jam", "dos_hold", "dos_hold_fresh", "dropout", "fdi", "delay", "replay"]
+KindName = Literal["dos_jam", "dos_hold", "dos_hold_fresh", "dropout", "fdi", "delay", "replay", "noise_jam", "echo_delay"]
 Span = Annotated[int, Field(ge=1, le=10_000)]
+_AIRED = (Kind.NOISE_JAM, Kind.ECHO_DELAY)  # they change what the sensor measures, and not what it sends
 Pair = Annotated[tuple[float, float], Field(min_length=2, max_length=2)]
 
 
@@ -27,6 +43,9 @@ class ThreatModel:
     fdi_bound: Positive = param(50.0, "largest |value| that false data injection may add to a sensor or V2V field [unit of the wire]")
     actuator_bound: Positive = param(2.0, "largest |value| that may be added to, or jammed onto, an actuator, its limits aside [m/s^2]")
     jam_range: Pair = param((-108.0, 108.0), "values that a jammer may leave at the receiver [unit of the wire]")
+    jam_power: Positive = param(0.1, "largest power of a jammer's noise, and that with which dos_jam is radiated [W]")
+    delay_bound: Positive = param(20.0, "largest extra range of an echo that is answered too late [m]")
+    reaction: NonNegative | None = param(None, "time until a radiating attacker notices a challenge and falls silent [s]; none: never")
     memory: Span = param(50, "longest delay, and longest window that is replayed, at most 10 000 [steps]")
     budget: Count | None = param(None, "attack steps in an episode (the dose); none: unlimited")
     duration: PositiveCount | None = param(None, "longest burst [steps]; none: unlimited")
@@ -94,6 +113,7 @@ class ChannelPlan(NamedTuple):
     high: Array  # (w,)
     last_step: int
     sensors: int
+    air: bool
     recorded: int  # samples kept for delay and replay; 0 where neither is granted
 
 
@@ -137,7 +157,7 @@ class Channel:
             np.where(brief.is_actuator, sign * threat.actuator_bound, end) for sign, end in zip((-1.0, 1.0), threat.jam_range, strict=True)
         )
         recorded = threat.memory if kinds[Kind.DELAY] or kinds[Kind.REPLAY] else 0
-        return ChannelPlan(threat, brief.granted, kinds, brief.bounds, low, high, last, len(brief.model.sensors), recorded)
+        return ChannelPlan(threat, brief.granted, kinds, brief.bounds, low, high, last, len(brief.model.sensors), brief.model.air, recorded)
 
     def start(self, plan: ChannelPlan, expected: Array, u: Array) -> ChannelState:
         """expected (B, N, q+p) at the prior and the first input u (B, N, m): what is held if an attack comes first."""
@@ -168,11 +188,12 @@ class Channel:
         return np.asarray(ok)
 
     def apply(
-        self, plan: ChannelPlan, state: ChannelState, sent: Array, received: Received, command: Command, k: Array
-    ) -> tuple[ChannelState, Received, Array, Array]:
+        self, plan: ChannelPlan, state: ChannelState, sent: Array, received: Received, command: Command, k: Array,
+        again: Callable[[Air], Received] | None = None,
+    ) -> tuple[ChannelState, Received, Array, Array]:  # fmt: skip
         """-> state, received, links (B, N, q+p) as they arrived, refused (B,) bool.
 
-        `sent` (B, N, q+p) holds the sensor readings and the V2V message before the attack.
+        `sent` (B, N, q+p) holds the sensor readings and the V2V message before the attack; `again` measures under what is radiated.
         """
         threat, kind, aimed = plan.threat, command.kind, command.target.any(axis=(1, 2))
         charged = (kind != Kind.NONE) & aimed
@@ -182,8 +203,14 @@ class Channel:
 
         hit = command.target & charged[:, None, None]
         kind = np.where(charged, kind, 0).astype(np.int8)
+        q, value = plan.sensors, command.value
+        aired = np.isin(kind, _AIRED)
+        if aired.any():  # who reaches a receiver over the air reaches all that it reads
+            strength = np.max(np.where(hit, value, 0.0), axis=2, keepdims=True)
+            whole = aired[:, None, None] & hit.any(axis=2, keepdims=True) & (np.arange(hit.shape[2]) < q)
+            hit, value = hit | whole, np.where(whole, strength, value)
         valued = ~np.isin(kind, (Kind.NONE, Kind.DOS_HOLD, Kind.DOS_HOLD_FRESH, Kind.DROPOUT))[:, None, None]
-        last = Command(kind, hit, np.where(hit & valued, command.value, 0.0))
+        last = Command(kind, hit, np.where(hit & valued, value, 0.0))
         first = charged & (state.used == 0)
         ended = (state.burst > 0) & ~charged
         # the step that ends a burst is itself the first of the pause
@@ -198,9 +225,12 @@ class Channel:
             anchor = state.anchor.copy()
             anchor[begins] = state.taped[begins]
             state = state._replace(anchor=anchor, links=_copy_tape(state.links, begins), drives=_copy_tape(state.drives, begins))
-        links = self._arrive(plan, state, state.links, sent, slice(0, sent.shape[-1]))
+        heard = sent
+        if again is not None and np.isin(kind, RADIATED).any():
+            received = again(self._radiated(plan, last))
+            heard = num.stack([received.y[..., i] for i in range(q)] + [sent[..., i] for i in range(q, sent.shape[-1])])
+        links = self._arrive(plan, state, state.links, heard, slice(0, sent.shape[-1]))
         lost = hit & (kind == Kind.DROPOUT)[:, None, None]
-        q = plan.sensors
         out = received._replace(
             y=links[..., :q], valid=received.valid & ~lost[..., :q], v2v=links[..., q:], attacked=hit[..., :q]
         )
@@ -225,15 +255,27 @@ class Channel:
         with np.errstate(invalid="ignore"):
             ok = np.where(kind3 == Kind.DOS_JAM, (value >= plan.low) & (value <= plan.high), True)
             ok &= np.where(kind3 == Kind.FDI, np.abs(value) <= plan.bounds, True)
+            for aired, most in zip(_AIRED, (plan.threat.jam_power, plan.threat.delay_bound), strict=True):
+                sensor = np.arange(value.shape[2]) < plan.sensors
+                ok &= np.where(kind3 == aired, plan.air & sensor & (value > 0.0) & (value <= most), True)
             old = (kind3 == Kind.DELAY) | (kind3 == Kind.REPLAY)
             ok &= np.where(old, (value >= 1) & (value <= plan.threat.memory) & (value == np.floor(value)), True)
         return np.asarray(legal & ~(command.target & ~(plan.granted & ok)).any(axis=(1, 2)))
+
+    def _radiated(self, plan: ChannelPlan, command: Command) -> Air:
+        """What a command in force radiates at each receiver."""
+        hit = command.target[..., : plan.sensors].any(axis=2)
+        strength = np.max(command.value[..., : plan.sensors], axis=2)
+        kind = command.kind[:, None]
+        power = np.where(kind == Kind.NOISE_JAM, strength, np.where(kind == Kind.DOS_JAM, plan.threat.jam_power, 0.0))
+        reaction = np.inf if plan.threat.reaction is None else plan.threat.reaction
+        return Air(np.where(hit, power, 0.0), np.where(hit & (kind == Kind.ECHO_DELAY), strength, 0.0), reaction)
 
     def _arrive(self, plan: ChannelPlan, state: ChannelState, memory: Memory, sent: Array, wires: slice) -> Array:
         """What arrives of `sent` (B, N, .), the part `wires` of all wires, under the command in force."""
         command, out = state.last, sent
         target, value = command.target[..., wires], command.value[..., wires]
-        for kind in sorted(set(command.kind[target.any(axis=(1, 2))].tolist())):
+        for kind in sorted(set(command.kind[target.any(axis=(1, 2))].tolist()) - set(_AIRED)):
             hit = target & (command.kind == kind)[:, None, None]
             if kind == Kind.DOS_JAM:
                 changed = value

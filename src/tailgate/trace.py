@@ -23,6 +23,7 @@ def _signals(frame: Frame) -> dict[str, Array]:
         "gap": scene.gap, "speed": scene.speed, "accel": scene.accel, "lead_speed": scene.lead_speed, "rear_gap": scene.rear_gap,
         "rear_speed": scene.rear_speed, "position": scene.position,
         "truth": frame.truth, "estimate": estimate.x, "score": estimate.score, "clean": frame.clean, "wires": frame.wires,
+        "valid": frame.received.valid, "energy": frame.received.energy, "probe": estimate.probe,
         "control": frame.control, "applied": frame.applied, "value": command.value,
         "kind": command.kind, "target": command.target, "alarm": estimate.alarm, "mode": estimate.mode, "refused": frame.refused,
         "collided": frame.collided, "rear_collided": frame.rear_collided,
@@ -33,8 +34,8 @@ def _signals(frame: Frame) -> dict[str, Array]:
 class Trace:
     """B episodes. `signals` are (K, B, ...); row b is valid for its first length[b] steps (it ends with a collision).
 
-    truth, estimate, wires and commands belong to step k; the road (gap, speed, ...) to k + 1, after the step. `first` holds the road
-    before the first step.
+    truth, estimate, wires, commands and what was received belong to step k, `probe` to the measurement at k + 1; the road (gap, speed,
+    ...) to k + 1, after the step. `first` holds the road before the first step.
     """
 
     model: Model
@@ -85,7 +86,7 @@ class Trace:
 def episodes_at_once(model: Model, horizon: int, most: int) -> int:
     """How many episodes, at most `most`, can be recorded side by side in MEMORY; at least one. A row does not depend on it."""
     agents, wires = model.agents, len(model.wires)
-    step = 8 * (agents * (model.states + 3 * wires + 8) + model.states) + agents * (wires + 2)  # bytes of a frame's signals
+    step = 8 * (agents * (model.states + 3 * wires + 9) + model.states) + agents * (2 * wires + 3)  # bytes of a frame's signals
     return int(max(1, min(most, MEMORY // (step * horizon))))
 
 

@@ -1,0 +1,69 @@
+"""What a car with a radar estimates, and the controllers that drive it."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from tailgate.core import Array, Estimate, Finite, Model, NonNegative, Positive, param
+from tailgate.errors import InputError
+from tailgate.registry import register
+
+from .controllers import limited, obeyed, widened
+
+GAP, RELATIVE_SPEED, LEAD_ACCEL, OWN_SPEED = range(4)
+STATES = 4
+
+
+def check_radar_car(model: Model, where: str) -> None:
+    """Raise InputError where the state is not [gap, relative speed, leader's acceleration, own speed]."""
+    if model.agents != 1 or model.states != STATES or model.gap is None or not np.array_equal(model.gap, np.eye(STATES)[[GAP]]):
+        raise InputError(where, f"{model.agents} agents, {model.states} states", "the plant radar_following")
+
+
+@register("controller", "acc_radar", reference="Dutta 2018, (3.12), (3.13), (3.16), corrected")
+@dataclass(frozen=True)
+class RadarCruise:
+    """Adaptive cruise control with a speed and a spacing mode, on a radar's estimates and the trusted own speed.
+
+        d_des = d0 + tau_h v_F                                                                                    (3.12)
+        v_des = v_F/KL + TL/(tau_h KL) (dv + g (d - d_des))        spacing mode                                   (3.13)
+        v_des = v_set when d > d0 + tau_h v_set                    speed mode;   v_des <= v_set in both
+        a_des = clip((v_des - v_F)/T, a_min, a_max)                                                               (3.16)
+
+    Erratum: the "1/k" of (3.13) is a constant gain g [1/s], not the time index.
+    """
+
+    headway: Positive = param(3.0, "time headway tau_h [s]")
+    standstill: NonNegative = param(5.0, "minimum stopping distance d0 [m]")
+    g: Positive = param(0.9, "gap gain [1/s]")
+    tau: Positive = param(1.008, "time constant TL [s]")
+    gain: Positive = param(1.0, "gain KL [-]")
+    sample: Positive = param(1.0, "time T in which the desired speed is to be reached [s]")
+    set_speed: Positive = param(29.95168, "driver's set speed v_set [m/s]; 67 mph")
+    accel_min: Finite = param(-5.0, "lower limit of the command [m/s^2]")
+    accel_max: Finite = param(2.0, "upper limit of the command [m/s^2]")
+
+    def prepare(self, model: Model) -> Any:
+        check_radar_car(model, "controller acc_radar")
+
+    def start(self, plan: Any, batch: int) -> Any:
+        return None
+
+    def step(self, plan: Any, state: Any, estimate: Estimate, v2v: Array, odometry: Array) -> tuple[Any, Array]:
+        """estimate.x (B, N, 4) = [d, dv, ...] and odometry (B, N, 2) = [x_F, v_F] to the command a_des (B, N, 1) [m/s^2]."""
+        d, dv, v = estimate.x[..., GAP], estimate.x[..., RELATIVE_SPEED], odometry[..., 1]
+        headway = widened(self.headway, estimate.mode)
+        off = d - (self.standstill + headway * v)
+        spacing = v / self.gain + self.tau / (headway * self.gain) * (dv + self.g * off)
+        free = d > self.standstill + headway * self.set_speed
+        wanted = np.where(free, self.set_speed, np.minimum(spacing, self.set_speed))
+        a = (wanted - v) / self.sample
+        return None, limited(obeyed(a, estimate.mode), self.accel_min, self.accel_max)[..., None]
+
+    def held(self, plan: Any, state: Any, batch: int) -> Array:
+        return np.zeros((batch, 1, 0))
+
+    def desired_gap(self, speed: Array) -> Array:
+        """d0 + tau_h v [m] (3.12)."""
+        return np.asarray(self.standstill + self.headway * speed)
