@@ -1,7 +1,7 @@
 """The FMCW radar as a sensor: what it reads of the car ahead, and what a jammer and a late echo make of it."""
 
 from dataclasses import dataclass
-from typing import Annotated, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -12,24 +12,44 @@ from tailgate.draws import Draws
 from tailgate.errors import InputError
 from tailgate.registry import register
 
+from . import fmcw_signal
+from .fmcw import Link, challenge_samples, heard_energy, outlier_probability, tone_sd
 from .radar_car import STATES
 
 Span = Annotated[tuple[Positive, Positive], Field(min_length=2, max_length=2)]
+NEAREST = 0.1  # closer than this [m] the radar equation means nothing: powers are those at this distance
+_UNIFORM, _SAMPLES = 1, 2  # tags of the draws
 
 
 class RadarSensorPlan(NamedTuple):
     C: Array  # (2, n)
-    sd: Array  # (2,)
+    sd: Array  # (2,) of the target's extent
+    echo: float  # the echo's power over the receiver's noise, from 1 m
+    jam: float  # a jammer's power in the IF samples over the receiver's noise, per W and from 1 m
+    challenge: int  # samples of a challenge
 
 
 @register("sensor", "fmcw_radar", reference="Dutta 2018, section 3.3.1; (3.5)-(3.11)")
 @dataclass(frozen=True)
-class FmcwRadar:
-    """A 77 GHz long-range radar: distance and relative speed of the car ahead."""
+class FmcwRadar(Link):
+    """A 77 GHz long-range radar: distance and relative speed of the car ahead, by two beats (3.5)-(3.8).
+
+    An answered echo masks the true one at the true one's power, and is late by the attacker's delay. A muted receiver hears what is
+    radiated for min(reaction, window)/window of the challenge.
+    """
 
     range_sd: Positive = param(0.25, "standard deviation of the distance, from the target's extent [m]")
-    speed_sd: Positive = param(0.1, "standard deviation of the relative speed [m/s]")
-    reach: Span = param((2.0, 200.0), "least and largest distance that it measures [m]")
+    speed_sd: Positive = param(0.1, "standard deviation of the relative speed, from the target's extent [m/s]")
+    reach: Span = param((2.0, 200.0), "least and largest distance that it reports [m]")
+    window: Positive = param(0.1, "duration of a challenge, in which the energy heard is measured [s]")
+    path: Literal["closed_form", "signal"] = param(
+        "closed_form", "closed_form: beats with the errors of root-MUSIC drawn; signal: IF samples simulated and root-MUSIC run on them"
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.reach[0] >= self.reach[1]:
+            raise InputError("fmcw_radar.reach", self.reach, "two distances, the least first")
 
     def matrices(self, plant: Sized) -> tuple[tuple[str, ...], Array, Array]:
         if plant.size != (1, STATES):
@@ -38,17 +58,48 @@ class FmcwRadar:
         return ("distance", "relative_speed"), C, np.diag([self.range_sd**2, self.speed_sd**2])[None]
 
     def prepare(self, model: Model) -> RadarSensorPlan:
-        return RadarSensorPlan(model.C[0], np.array([self.range_sd, self.speed_sd]))
+        noise = self.noise_power
+        echo, jam = float(self.echo_power(1.0)) / noise, self.passed * float(self.jam_power(1.0, 1.0)) / noise
+        sd = np.array([self.range_sd, self.speed_sd])
+        return RadarSensorPlan(model.C[0], sd, echo, jam, challenge_samples(self.window, self.bandwidth))
 
     def measure(self, plan: RadarSensorPlan, truth: Array, probe: Array, draws: Draws) -> Received:
         quiet = num.zeros(probe.shape)
         return self.disturbed(plan, truth, probe, draws, Air(quiet, quiet, np.inf))
 
     def disturbed(self, plan: RadarSensorPlan, truth: Array, probe: Array, draws: Draws, air: Air) -> Received:
-        y = num.matvec(plan.C, truth) + plan.sd * draws.normal((1, 2))
-        y[..., 0] += air.delay
-        seen = probe & (y[..., 0] >= self.reach[0]) & (y[..., 0] <= self.reach[1])
+        z = draws.normal((1, 7))
+        true = num.matvec(plan.C, truth)
+        near = np.maximum(true[..., 0], NEAREST)
+        square = near * near
+        jam, tone = plan.jam * air.power / square, plan.echo / (square * square)
+        target = true + plan.sd * z[..., :2]
+        d, dv = target[..., 0], target[..., 1]
+        up, down = self.beats(d + air.delay, dv)
+        seen = probe & self.within_band(up, down)  # else the IF filter leaves nothing of the echo
+        if self.path == "signal":
+            noise = draws.normal((1, 2, self.samples, 2), tag=_SAMPLES)
+            y = num.stack(fmcw_signal.read(self, d, dv, air.delay, tone, 1.0 + jam, noise))
+        else:
+            x = self.samples * tone / (1.0 + jam)
+            y = num.stack(self.range_speed(*self._estimated(up, down, x, z[..., 2:4], draws.uniform((1, 4), tag=_UNIFORM))))
         valid = num.full(y.shape, True, bool)
-        valid &= seen[..., None]
-        energy = np.where(air.power > 0.0, 1e3, 0.0) + np.where(air.delay > 0.0, 1e3, 0.0) + np.where(probe, 1e3, 0.0)
-        return Received(np.where(valid, y, 0.0), valid, energy + 1.0)
+        valid &= (seen & (y[..., 0] >= self.reach[0]) & (y[..., 0] <= self.reach[1]))[..., None]
+        return Received(np.where(valid, y, 0.0), valid, self._energy(plan, probe, jam, tone, air, z[..., 4:7]))
+
+    def _estimated(self, up: Array, down: Array, x: Array, z: Array, u: Array) -> tuple[Array, Array]:
+        """Beats [Hz] as root-MUSIC estimates them at the SNR x after integration, from normals z (B, N, 2) and uniforms u (B, N, 4)."""
+        sd, lost = tone_sd(self, x), outlier_probability(x)
+        up = np.where(u[..., 0] < lost, self.lowest + self.bandwidth * u[..., 1], up + sd * z[..., 0])
+        down = np.where(u[..., 2] < lost, self.lowest + self.bandwidth * u[..., 3], down + sd * z[..., 1])
+        return up, down
+
+    def _energy(self, plan: RadarSensorPlan, probe: Array, jam: Array, tone: Array, air: Air, z: Array) -> Array:
+        """(B, N) mean power over the receiver's noise in a window of the length of a challenge."""
+        attacked = (air.power > 0.0) | (air.delay > 0.0)
+        part = min(air.reaction, self.window) / self.window * plan.challenge  # samples, not always a whole number
+        whole = max(1.0, float(np.ceil(part)))
+        cut = ~probe & attacked
+        heard, scale = np.where(cut, whole, float(plan.challenge)), np.where(cut, part / whole, 1.0)
+        tone = np.where(probe | (air.delay > 0.0), tone, 0.0)
+        return heard_energy(plan.challenge, heard, jam * scale, tone * scale, z)

@@ -227,7 +227,9 @@ class Channel:
             state = state._replace(anchor=anchor, links=_copy_tape(state.links, begins), drives=_copy_tape(state.drives, begins))
         heard = sent
         if again is not None and np.isin(kind, RADIATED).any():
-            received = again(self._radiated(plan, last))
+            under, left = again(self._radiated(plan, last)), (kind == Kind.DOS_JAM)[:, None, None]
+            valid = np.where(left, received.valid, under.valid)  # what the jammer leaves is read wherever anything would be
+            received = under._replace(y=np.where(left, received.y, under.y), valid=valid)
             heard = num.stack([received.y[..., i] for i in range(q)] + [sent[..., i] for i in range(q, sent.shape[-1])])
         links = self._arrive(plan, state, state.links, heard, slice(0, sent.shape[-1]))
         lost = hit & (kind == Kind.DROPOUT)[:, None, None]

@@ -1,0 +1,207 @@
+"""Closed forms of the FMCW radar: beats, link budget, jammer, estimation error, and the energy detector of a silent receiver.
+
+    f_R = 2 d Bs/(c Ts)     f_D = 2 dv/lam     fb+ = f_R + f_D     fb- = f_R - f_D                                      [Hz] (3.5), (3.6)
+    d = c Ts (fb+ + fb-)/(4 Bs)                dv = lam (fb+ - fb-)/4              dv = v_leader - v_follower                (3.7), (3.8)
+    Pr = Pt G^2 lam^2 s/((4 pi)^3 d^4 L)       PJ,rx = PJ GJ lam^2 G B/((4 pi)^2 d^2 BJ LJ)                             [W]  (3.9), (3.10)
+    Pr/PJ,rx = Pt G s BJ LJ/(4 pi PJ GJ d^2 B L)                                                                            (3.11)
+
+Erratum: with dv positive when the gap opens, the printed signs of (3.5), (3.6) and (3.8) give the closing speed; those above agree with a
+simulated chirp (fmcw_signal.py).
+
+A ratio (3.11) below 1 does not by itself deny service. The jammer must also beat the IF filter, which passes B_if/B of a noise that fills
+the swept band (`in_band`), and the integration of the M samples of a sweep. What decides is the SNR after both,
+
+    x = M Pr/(k T0 F B_if + in_band PJ,rx)
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+from pydantic import Field
+from scipy import stats
+
+from tailgate import num
+from tailgate.core import Array, Finite, Positive, param
+from tailgate.errors import InputError
+
+LIGHT = 299_792_458.0  # speed of light c [m/s]
+KT0 = 1.380649e-23 * 290.0  # thermal noise density at the reference temperature of a noise figure [W/Hz]
+_LN10 = 2.302585092994046
+
+Share = Annotated[float, Field(gt=0, le=1)]
+
+
+def from_db(value: float) -> float:
+    """10^(value/10)."""
+    return float(num.exp(value * (_LN10 / 10.0)))
+
+
+def to_db(ratio: Array | float) -> Array:
+    """10 log10(ratio)."""
+    return np.asarray(num.log(np.asarray(ratio, np.float64)) * (10.0 / _LN10))
+
+
+@dataclass(frozen=True)
+class Link:
+    """A triangular FMCW radar, its target, and a jammer that the target carries (self-screening)."""
+
+    wavelength: Positive = param(3.89e-3, "wavelength lam of the 77 GHz carrier [m]")
+    sweep: Positive = param(150e6, "swept bandwidth Bs of one sweep [Hz]")
+    sweep_time: Positive = param(2e-3, "duration Ts of one sweep, up or down [s]")
+    power: Positive = param(10e-3, "transmitted power Pt [W]")
+    gain_db: Finite = param(28.0, "gain G of the antenna [dBi]")
+    loss_db: Finite = param(0.10, "losses L of the radar [dB]")
+    cross_section: Positive = param(10.0, "radar cross-section s of the car ahead, which does not fluctuate [m^2]")
+    bandwidth: Positive = param(256e3, "IF bandwidth B_if, which is the rate of the complex samples [Hz]")
+    noise_figure_db: Finite = param(12.0, "noise figure F of the receiver [dB]")
+    operating_band: Positive = param(150e6, "operating bandwidth B of the radar, as a jammer sees it [Hz]")
+    jam_gain_db: Finite = param(10.0, "gain GJ of the jammer's antenna [dBi]")
+    jam_band: Positive = param(155e6, "bandwidth BJ of the jammer [Hz]")
+    jam_loss_db: Finite = param(0.10, "losses LJ of the jammer [dB]")
+    in_band: Share | None = param(
+        None, "share of the jammer's received power that the IF filter passes; none: B_if/B, of noise over all B; 1: it follows the chirp"
+    )
+
+    def __post_init__(self) -> None:
+        if self.samples < 64:
+            raise InputError("fmcw_radar.bandwidth", self.bandwidth, f"at least 64 samples a sweep, {64.0 / self.sweep_time:g} Hz")
+
+    @property
+    def slope(self) -> float:
+        """Chirp rate Bs/Ts [Hz/s]."""
+        return self.sweep / self.sweep_time
+
+    @property
+    def hz_per_metre(self) -> float:
+        return 2.0 * self.slope / LIGHT
+
+    @property
+    def hz_per_speed(self) -> float:
+        """Of either beat, per m/s of relative speed [Hz/(m/s)]."""
+        return 2.0 / self.wavelength
+
+    @property
+    def samples(self) -> int:
+        """Complex IF samples M of one sweep."""
+        return round(self.bandwidth * self.sweep_time)
+
+    @property
+    def lowest(self) -> float:
+        """Least beat that the receiver's band holds [Hz]; the band reaches from here over B_if, for beats are mostly positive."""
+        return -0.25 * self.bandwidth
+
+    @property
+    def noise_power(self) -> float:
+        """Of the receiver, k T0 F B_if [W]."""
+        return KT0 * from_db(self.noise_figure_db) * self.bandwidth
+
+    @property
+    def passed(self) -> float:
+        """Share of the received jammer's power that reaches the IF samples."""
+        return min(1.0, self.bandwidth / self.operating_band) if self.in_band is None else self.in_band
+
+    def beats(self, d: Array, dv: Array) -> tuple[Array, Array]:
+        """fb+ and fb- [Hz] of a target at d [m] with relative speed dv [m/s]: (3.5), (3.6)."""
+        by_range, by_speed = self.hz_per_metre * d, self.hz_per_speed * dv
+        return by_range + by_speed, by_range - by_speed
+
+    def range_speed(self, up: Array, down: Array) -> tuple[Array, Array]:
+        """d [m] and dv [m/s] of the beats fb+ and fb- [Hz]: (3.7), (3.8)."""
+        return 0.5 * (up + down) / self.hz_per_metre, 0.5 * (up - down) / self.hz_per_speed
+
+    def within_band(self, up: Array, down: Array) -> Array:
+        """bool: the IF filter passes both beats [Hz]."""
+        high = self.lowest + self.bandwidth
+        return np.asarray((np.minimum(up, down) >= self.lowest) & (np.maximum(up, down) < high))
+
+    def echo_power(self, d: Array | float) -> Array:
+        """Pr [W] of the echo from d [m]: (3.9)."""
+        gain, four_pi = from_db(self.gain_db), 4.0 * math.pi
+        at_1m = self.power * gain * gain * self.wavelength * self.wavelength * self.cross_section
+        at_1m /= four_pi * four_pi * four_pi * from_db(self.loss_db)
+        square = np.square(d)
+        return np.asarray(at_1m / (square * square))
+
+    def jam_power(self, d: Array | float, radiated: Array | float) -> Array:
+        """PJ,rx [W] in the operating band B, of a jammer at d [m] that radiates PJ [W]: (3.10). `passed` of it reaches the IF samples."""
+        four_pi = 4.0 * math.pi
+        at_1m = from_db(self.jam_gain_db) * self.wavelength * self.wavelength * from_db(self.gain_db) * self.operating_band
+        at_1m /= four_pi * four_pi * self.jam_band * from_db(self.jam_loss_db)
+        return np.asarray(at_1m * radiated / np.square(d))
+
+    def burn_through(self, radiated: float) -> float:
+        """Distance d_burn [m] at which echo and jammer, of PJ [W], are received equally strong: (3.11) = 1."""
+        square = self.power * from_db(self.gain_db) * self.cross_section * self.jam_band * from_db(self.jam_loss_db)
+        square /= 4.0 * math.pi * radiated * from_db(self.jam_gain_db) * self.operating_band * from_db(self.loss_db)
+        return math.sqrt(square)
+
+    def snr(self, d: Array | float, radiated: Array | float = 0.0) -> Array:
+        """Echo over all noise in one IF sample, of a target at d [m] whose jammer radiates PJ [W]."""
+        return np.asarray(self.echo_power(d) / (self.noise_power + self.passed * self.jam_power(d, radiated)))
+
+
+# Root-MUSIC's error against the SNR x after integration, fitted to the signal path at 512 samples a sweep by benchmarks/radar_path.py.
+_EFFICIENCY = (1.42, 21.6, 222.0)  # variance over the Cramer-Rao bound: e0 (1 + e1/x + e2/x^2)
+_OUTLIER = (3.96, 1.08, 0.207)  # odds of an outlier: exp(o0 - o1 ln x - o2 x)
+_CELL = 4.0  # an outlier misses by more than _CELL/M cycles per sample, the resolution of a window of M/4 samples
+
+
+def tone_sd(link: Link, x: Array) -> Array:
+    """Standard deviation [Hz] of a beat that is no outlier, at the SNR x after integration.
+
+    Root-MUSIC's variance as a multiple of the Cramer-Rao bound of one tone in M samples, 6 B_if^2/((2 pi)^2 x (M^2 - 1)) (Rife and
+    Boorstyn 1974).
+    """
+    inverse, cell = 1.0 / x, _CELL / link.samples
+    bound = 6.0 / (4.0 * math.pi * math.pi * (link.samples * link.samples - 1)) * inverse
+    e0, e1, e2 = _EFFICIENCY
+    variance = bound * e0 * (1.0 + inverse * (e1 + inverse * e2))
+    return np.asarray(link.bandwidth * np.sqrt(np.minimum(variance, cell * cell / 3.0)))
+
+
+def outlier_probability(x: Array) -> Array:
+    """Probability that the largest root is the noise's, at the SNR x after integration: the beat is then uniform over the band."""
+    o0, o1, o2 = _OUTLIER
+    return np.asarray(1.0 / (1.0 + num.exp(np.minimum(o1 * num.log(x) + o2 * x - o0, 700.0))))
+
+
+def challenge_samples(window: float, bandwidth: float) -> int:
+    """Complex IF samples N_c that a challenge of `window` [s] yields."""
+    return max(1, round(window * bandwidth))
+
+
+def false_alarm_threshold(p_fa: float, samples: int) -> float:
+    """Mean power E over the receiver's noise that noise alone exceeds with probability p_fa: 2 N_c E is chi-square with 2 N_c degrees."""
+    return float(stats.chi2.isf(p_fa, 2 * samples) / (2 * samples))
+
+
+def miss_probability(threshold: float, samples: int, jam: float = 0.0, tone: float = 0.0) -> float:
+    """Probability that the energy of a challenge stays at or below the threshold, under noise of power `jam` and an answer of power `tone`.
+
+    Both are over the receiver's noise, and last for the whole challenge: 2 N_c E/(1 + jam) is chi-square with 2 N_c degrees of freedom and
+    noncentrality 2 N_c tone/(1 + jam). For an answer that stops after a share r of it, tone = r times its power is exact.
+    """
+    scale = 2.0 * samples / (1.0 + jam)
+    if tone == 0.0:
+        return float(stats.chi2.cdf(scale * threshold, 2 * samples))
+    return float(stats.ncx2.cdf(scale * threshold, 2 * samples, scale * tone))
+
+
+def heard_energy(samples: int, heard: Array, jam: Array, tone: Array, z: Array) -> Array:
+    """Mean power E (B, N) over the receiver's noise, of N_c complex samples of which `heard` (B, N), at least 1, carry what is radiated.
+
+    jam and tone (B, N): powers over the noise in those samples. z (B, N, 3): standard normals. The tone adds to that part of the noise that
+    is in phase with it, one normal; the other 2 N_c - 1 are two gamma variables by Wilson and Hilferty's cube (1931).
+    """
+    noise, rest = 1.0 + jam, samples - heard
+    in_phase = np.sqrt(0.5) * z[..., 0] + np.sqrt(heard * tone / noise)
+    loud = noise * (_gamma(heard - 0.5, z[..., 1]) + in_phase * in_phase)
+    quiet = np.where(rest > 0.0, _gamma(np.maximum(rest, 1.0), z[..., 2]), 0.0)
+    return np.asarray((loud + quiet) / samples)
+
+
+def _gamma(shape: Array, z: Array) -> Array:
+    root = np.maximum(1.0 - 1.0 / (9.0 * shape) + z / (3.0 * np.sqrt(shape)), 0.0)
+    return np.asarray(shape * (root * root * root))
