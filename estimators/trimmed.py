@@ -128,11 +128,16 @@ def clusters(A: Array) -> list[tuple[complex, int]]:
 def split(A: Array) -> tuple[list[Block], Block]:
     """The lasting modes of A, and one block of all that dies out.
 
-    Only the rounded eigenvalues come from LAPACK; from them on the arithmetic is in fixed order.
+    Only the rounded eigenvalues come from LAPACK; from them on the arithmetic is in fixed order. Raises NotApplicable for a chain of states
+    that is too long for it.
     """
     found = clusters(A)
     dual = [_eigenspace(A.T, value, size) for value, size in found]
     V = [_eigenspace(A, value, size) for value, size in found]
+    for (value, size), basis in zip(found, V, strict=True):
+        if not basis.any(axis=0).all():
+            wanted = "modes whose generalised eigenvectors rounding lets apart"
+            raise NotApplicable("defence trimmed_consensus", f"a chain of {size} states at the eigenvalue {value:g}", wanted)
     V.append(_complement(np.concatenate([*dual, np.zeros((len(A), 0))], axis=1)))
     W, first, out = num.solve(np.concatenate(V, axis=1), np.eye(len(A))), 0, []
     for value, basis in zip((*(value for value, _ in found), 0j), V, strict=True):

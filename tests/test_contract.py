@@ -89,7 +89,7 @@ def test_commands_are_well_formed(attack, short, loop_of, granting):
     """A command has the declared shapes and types, and the attack's memory has B first in every leaf."""
     place = granting(short(onset=2), attack)
     loop, rival = loop_of(place, "chi2_kf"), tailgate.make_attack(attack)
-    state, plan = loop.start(keys("train", range(5))), rival.prepare(loop.brief)
+    state, plan = loop.start(keys("train", range(5))), _play(rival.prepare, loop.brief)
     memory = rival.start(plan, 5, state.keys.at(Role.ATTACK, np.zeros(5, np.int64)))
     for _ in range(12):
         memory, command = rival.decide(plan, memory, loop.sense(state), state.keys.at(Role.ATTACK, state.k))
