@@ -27,12 +27,14 @@ from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
 
 from tailgate.core import NonNegative, Positive, PositiveCount, Probability, param
+from tailgate.envs.faces import Seat
 from tailgate.envs.sb3 import BatchVecEnv
 from tailgate.errors import InputError
 from tailgate.files import write_atomic
 from tailgate.schema import canonical
 from tailgate.tree import leaves, with_leaves
 
+from .learning import Progress, header_of
 from .policy import Network, save_policy
 
 FORMAT = "tailgate-ppo-checkpoint-1"
@@ -40,7 +42,7 @@ SEED_STRIDE = 1_000_000  # between the rows of two training seeds
 
 
 @dataclass(frozen=True)
-class PPOConfig:
+class Config:
     """Hyper-parameters, tuned on training seeds of the quickstart scenario."""
 
     envs: PositiveCount = param(512, "environments in the batch")
@@ -63,19 +65,10 @@ class PPOConfig:
             raise InputError("ppo.envs", self.envs, f"at most {SEED_STRIDE}")
 
 
-@dataclass(frozen=True)
-class Progress:
-    """What a training run reports after each rollout."""
-
-    steps: int
-    crash: float | None  # share of collisions in the latest episodes; none also where there is no road
-    reward: float | None
-
-
 class Learner:
     """One training run of one seed."""
 
-    def __init__(self, seed: int, gamma: float, config: PPOConfig, environment: dict[str, Any], tensorboard: Path | None = None) -> None:
+    def __init__(self, seed: int, gamma: float, config: Config, environment: dict[str, Any], tensorboard: Path | None = None) -> None:
         torch.set_num_threads(1)  # more threads gain nothing on networks of this size
         config.check()
         self.seed, self.config = seed, config
@@ -105,6 +98,15 @@ class Learner:
 
                 bias[0] = float(norm.ppf(p) * np.exp(-0.5))
 
+    @property
+    def seat(self) -> Seat:
+        return self.env.batch.seat
+
+    @property
+    def steps(self) -> int:
+        """Decisions taken so far."""
+        return int(self.model.num_timesteps)
+
     def learn(self, steps: int, report: Callable[[Progress], None], checkpoint: Path | None = None, every: int = 1_000_000) -> None:
         """Train until `steps` decisions in total; calls `report` after each rollout."""
         remaining = steps - self.model.num_timesteps
@@ -120,17 +122,16 @@ class Learner:
     def export(self, path: Path, training: dict[str, Any]) -> Path:
         """Write the policy as safetensors + JSON."""
         policy: Any = self.model.policy
-        seat = self.env.batch.seat
+        seat = self.seat
         layers = [m for m in policy.mlp_extractor.policy_net if isinstance(m, torch.nn.Linear)] + [policy.action_net]
         weights = tuple(layer.weight.detach().numpy().T.astype(np.float64) for layer in layers)
         biases = tuple(layer.bias.detach().numpy().astype(np.float64) for layer in layers)
         log_std = None if seat.action.discrete else policy.log_std.detach().numpy().astype(np.float64)
-        threat = seat.loop.threat
-        header = {
-            "action": seat.action.spec, "observation": seat.observation.names, "knowledge": threat.knowledge,
-            "sees_measurement": threat.sees_measurement, "agents": seat.loop.model.agents, "training": training,
-        }  # fmt: skip
-        return save_policy(path, Network(weights, biases, log_std), header)
+        return save_policy(path, Network(weights, biases, log_std), header_of(seat, training))
+
+    def close(self) -> None:
+        """Close the environments."""
+        self.env.close()
 
     # -- checkpoints
 

@@ -121,7 +121,7 @@ def test_the_attack_free_end_of_scenario_i():
     trace = runs(seeds=1, **QUIET)
     assert trace.gap[-1, 0, 0] == pytest.approx(5.0, abs=0.05) and not trace.collided.any()
     lead = trace.lead_speed[:, 0, 0]  # entry i belongs to the time i + 2
-    assert lead[266] > 0.0 and lead[267] == 0.0 and 29.0576 / 0.1082 == pytest.approx(268.55, abs=0.01)
+    assert lead[266] > 0.0 and lead[267] == 0.0 and pytest.approx(268.55, abs=0.01) == 29.0576 / 0.1082
 
 
 def test_a_late_echo_shifts_the_gap_by_itself():

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from tailgate import train
-from tailgate.agents.ppo import Learner, PPOConfig
+from tailgate.agents.ppo import Config, Learner
 from tailgate.errors import InputError
 from tailgate.schema import build
 from tailgate.tree import leaves
@@ -19,7 +19,7 @@ from tailgate.tree import leaves
 ENVIRONMENT: dict[str, Any] = {
     "scenario": "gusty-stop-and-go-v0", "defence": "kf", "threat": {"kinds": ["dos_jam", "fdi"], "budget": 30}, "interval": 5,
 }  # fmt: skip
-SMALL = PPOConfig(envs=16, rollout=40, batch_size=160, epochs=2, hidden=(16,))
+SMALL = Config(envs=16, rollout=40, batch_size=160, epochs=2, hidden=(16,))
 UPDATE = SMALL.envs * SMALL.rollout
 
 
@@ -134,7 +134,7 @@ def test_every_preset_can_be_played(name: str) -> None:
     """Scenario, defences, rivals, environment and learner of each fit together."""
     config = train.load_config(name, [])
     train._check(config)
-    build(PPOConfig, dict(config.ppo), "ppo").check()
+    build(Config, dict(config.ppo), "ppo").check()
     assert config.name == name and config.rivals
 
 

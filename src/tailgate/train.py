@@ -16,6 +16,7 @@ from pydantic import Field
 
 from tailgate import draws
 from tailgate.agents.codec import ActionSpec
+from tailgate.agents.learning import LEARNERS, Learner, learner_of
 from tailgate.agents.reward import Reward
 from tailgate.core import Array, Count, PositiveCount, param
 from tailgate.errors import InputError, unknown
@@ -35,7 +36,7 @@ Discount = Annotated[float, Field(gt=0, le=1)]
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """What `train.py` reads. Learner settings stand below `ppo`, the environment's below `environment`."""
+    """What `train.py` reads. A learner's settings stand below its name, the environment's below `environment`."""
 
     name: str = param("quickstart", "name of the run; its files go to out/name")
     out: str = param("runs", "directory of the runs")
@@ -43,7 +44,9 @@ class TrainConfig:
     defence: str = param("chi2_kf", "registered defence to attack")
     threat: dict[str, Any] = field(default_factory=dict, metadata={"doc": "changes of the scenario's threat model"})
     environment: dict[str, Any] = field(default_factory=dict, metadata={"doc": "action and reward settings of the environment"})
+    learner: str = param("ppo", f"who learns: {'; '.join(f'{name}, {what}' for name, what in LEARNERS.items())}")
     ppo: dict[str, Any] = field(default_factory=dict, metadata={"doc": "hyper-parameters of PPO"})
+    cem: dict[str, Any] = field(default_factory=dict, metadata={"doc": "hyper-parameters of the cross-entropy method"})
     gamma: Discount = param(0.995, "discount, of the learner and of the shaping [-]")
     steps: PositiveCount = param(3_000_000, "decisions per training seed, over all environments")
     first_seed: Count = param(0, "first training seed")
@@ -84,7 +87,7 @@ def load_config(source: str | None, overrides: list[str], resume: bool = False) 
 
 
 def _checked(data: dict[str, Any]) -> TrainConfig:
-    for key in ("threat", "environment", "ppo"):
+    for key in ("threat", "environment", *LEARNERS):
         if not isinstance(data.get(key, {}), dict):
             raise InputError(f"config.{key}", data[key], "a mapping of fields")
     config = build(TrainConfig, data, "config")
@@ -141,10 +144,9 @@ class Verdict:
 
 def train(config: TrainConfig, progress: Callable[[int, Any], None], resume: bool = False) -> list[Path]:
     """Train one policy per seed; returns their JSON files. `progress(seed, Progress)` is called after each rollout."""
-    from tailgate.agents.ppo import Learner, PPOConfig
-
-    ppo = build(PPOConfig, dict(config.ppo), "config.ppo")
-    ppo.check()
+    module = learner_of(config.learner)
+    settings = build(module.Config, dict(getattr(config, config.learner)), f"config.{config.learner}")
+    settings.check()
     _check(config)
     if not resume and config.directory.is_dir() and any(config.directory.iterdir()):
         set_aside(config.directory)
@@ -157,20 +159,20 @@ def train(config: TrainConfig, progress: Callable[[int, Any], None], resume: boo
     policies = []
     for seed in range(config.first_seed, config.first_seed + config.seeds):
         board = directory / "tensorboard" if config.tensorboard else None
-        learner = Learner(seed, config.gamma, ppo, environment_of(config), board)
+        learner: Learner = module.Learner(seed, config.gamma, settings, environment_of(config), board)
         checkpoint = directory / f"checkpoint-{seed}.safetensors"
         if resume and checkpoint.exists():
             learner.load(checkpoint)
         started = time.perf_counter()
         learner.learn(config.steps, partial(progress, seed), checkpoint, config.checkpoint_every)
         facts = {
-            "learner": "ppo", "seed": seed, "steps": learner.model.num_timesteps, "config": as_data(config), "ppo": as_data(ppo),
-            "environment": learner.env.batch.card()["hash"], "curve": learner.curve,
+            "learner": config.learner, "seed": seed, "steps": learner.steps, "config": as_data(config), config.learner: as_data(settings),
+            "environment": learner.seat.card()["hash"], "curve": learner.curve,
         }  # fmt: skip
         policies.append(learner.export(directory / f"policy-{seed}", facts))
         curve = {"curve": learner.curve, "seconds": time.perf_counter() - started}
         write_atomic(directory / f"curve-{seed}.json", json.dumps(curve).encode() + b"\n")
-        learner.env.close()
+        learner.close()
     return policies
 
 

@@ -23,7 +23,7 @@ def add(commands: Any) -> None:
     command = commands.add_parser(
         "train", help="train an adversary, compare it with scripted attacks on fresh seeds, write a page",
         description="Train an adversary. Without --config, the preset `quickstart`.",
-        epilog=f"keys (dotted below environment, threat and ppo, for example ppo.epochs=4):\n{fields}",
+        epilog=f"keys (dotted below environment, threat and the learners, for example ppo.epochs=4):\n{fields}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )  # fmt: skip
     command.add_argument("--config", metavar="FILE", help="preset by name, or YAML file")

@@ -1,0 +1,209 @@
+"""The cross-entropy method (Rubinstein 1999) on the weights of a small policy: no gradient, no torch.
+
+A generation draws `population` weight vectors from a normal distribution with a diagonal covariance, plays each of them on the same
+`episodes` fresh episodes, and moves the distribution to the best of them:
+
+    mean+ = mean + a (mean of the elite - mean)        sd+^2 = variance of the elite + extra^2
+
+where `extra` falls to 0 over the first generations (Szita and Lorincz 2006), so that the search does not narrow too early. Member 0 is the
+mean itself. All members of a generation meet the same episodes: what differs is the policy.
+
+Random numbers are a function of (seed, generation), so that a resumed run gives the policy of an uninterrupted one.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
+
+import numpy as np
+from pydantic import Field
+from safetensors import SafetensorError
+from safetensors.numpy import load as load_tensors
+from safetensors.numpy import save as save_tensors
+
+from tailgate import draws
+from tailgate.core import Array, NonNegative, Positive, PositiveCount, Probability, param
+from tailgate.envs.faces import Seat
+from tailgate.errors import InputError
+from tailgate.files import write_atomic
+from tailgate.schema import canonical
+
+from .learning import Progress, header_of
+from .policy import Network, save_policy
+
+FORMAT = "tailgate-cem-checkpoint-1"
+SEED_STRIDE = 1_000_000  # between the episodes of two training seeds
+Share = Annotated[float, Field(gt=0, le=1)]
+
+
+@dataclass(frozen=True)
+class Config:
+    """Hyper-parameters of the cross-entropy method, tuned on training seeds of the quickstart scenario."""
+
+    population: PositiveCount = param(128, "policies in a generation")
+    episodes: PositiveCount = param(24, "episodes that each policy of a generation plays, the same for all")
+    elite: Share = param(0.125, "share of a generation that the next one is made of [-]")
+    step: Share = param(0.7, "how far the mean moves to that of the elite [-]")
+    sd: Positive = param(1.0, "standard deviation of the first generation's weights [-]")
+    extra: NonNegative = param(0.1, "extra standard deviation of the first generations [-]")
+    extra_until: PositiveCount = param(200, "generations until the extra has fallen to 0")
+    hidden: tuple[PositiveCount, ...] = param((16,), "widths of the hidden layers")
+    rest: Probability = param(0.5, "bias of the first mean towards rest: the probability of it that a softmax would give")
+
+    @property
+    def elites(self) -> int:
+        return max(2, round(self.elite * self.population))
+
+    def check(self) -> None:
+        """Raise InputError when the fields do not fit each other."""
+        if self.elites > self.population:
+            raise InputError("cem.population", self.population, "at least 2 policies")
+
+
+class Shape(NamedTuple):
+    """Where each layer's weights and biases stand in a weight vector."""
+
+    sizes: tuple[tuple[int, int], ...]
+
+    @property
+    def length(self) -> int:
+        return sum((i + 1) * o for i, o in self.sizes)
+
+    def layers(self, theta: Array) -> list[tuple[Array, Array]]:
+        """(..., length) to weights (..., i, o) and biases (..., o)."""
+        out, at = [], 0
+        for i, o in self.sizes:
+            weight = theta[..., at : at + i * o].reshape(*theta.shape[:-1], i, o)
+            out.append((weight, theta[..., at + i * o : at + (i + 1) * o]))
+            at += (i + 1) * o
+        return out
+
+
+class Learner:
+    """One training run of one seed."""
+
+    def __init__(self, seed: int, gamma: float, config: Config, environment: dict[str, Any], tensorboard: Path | None = None) -> None:
+        self.seed, self.config = seed, config
+        self.seat = Seat.make(gamma=gamma, **environment)
+        self.identity = hashlib.blake2b(canonical([config, gamma]).encode(), digest_size=8).hexdigest()
+        sizes = (len(self.seat.observation.names), *config.hidden, self.seat.action.size)
+        self.shape = Shape(tuple(itertools.pairwise(sizes)))
+        self.mean, self.sd = np.zeros(self.shape.length), np.full(self.shape.length, config.sd)
+        self.mean[-sizes[-1]] = _rest(config.rest, sizes[-1], self.seat.action.discrete)
+        self.generation, self.steps = 0, 0
+        self.curve: list[dict[str, Any]] = []
+
+    def learn(self, steps: int, report: Callable[[Progress], None], checkpoint: Path | None = None, every: int = 1_000_000) -> None:
+        """Train until `steps` decisions in total; calls `report` after each generation."""
+        saved = self.steps
+        while self.steps < steps:
+            report(self._generation())
+            if checkpoint is not None and (self.steps - saved >= every or self.steps >= steps):
+                saved = self.steps
+                self.save(checkpoint)
+
+    def export(self, path: Path, training: dict[str, Any]) -> Path:
+        """Write the policy of the mean as safetensors + JSON."""
+        weights, biases = zip(*self.shape.layers(self.mean), strict=True)
+        return save_policy(path, Network(weights, biases), header_of(self.seat, training))
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+    # -- one generation
+
+    def _generation(self) -> Progress:
+        config = self.config
+        rng = np.random.default_rng([self.seed, self.generation])
+        theta = self.mean + self.sd * rng.standard_normal((config.population, self.shape.length))
+        theta[0] = self.mean
+        reward, crashed = self._play(theta)
+        order = np.argsort(-reward, kind="stable")[: config.elites]
+        elite = theta[order]
+        left = max(0.0, 1.0 - (self.generation + 1) / config.extra_until)
+        self.mean = self.mean + config.step * (elite.mean(axis=0) - self.mean)
+        self.sd = np.sqrt(elite.var(axis=0) + (left * config.extra) ** 2)
+        self.generation += 1
+        road = bool(self.seat.loop.model.followers.any())
+        crash = float(crashed[0]) if road else None
+        self.curve.append({"steps": self.steps, "seed": self.seed, "crash": crash, "reward": float(reward[0])})
+        return Progress(self.steps, crash, float(reward[0]))
+
+    def _play(self, theta: Array) -> tuple[Array, Array]:
+        """Mean reward of an episode and share of collisions, (P,) each, of the weight vectors (P, length) on the generation's episodes."""
+        seat, members, episodes = self.seat, len(theta), self.config.episodes
+        loop, interval = seat.loop, seat.action.spec.interval
+        first = self.seed * SEED_STRIDE + self.generation * episodes
+        state = loop.start(draws.keys("train", list(range(first, first + episodes)) * members))
+        gap = loop.plant.scene(loop.plan.plant, state.plant).gap
+        least, potential = seat.reward.least(gap), seat.reward.potential(gap)
+        total, crashed = np.zeros(members * episodes), np.zeros(members * episodes, bool)
+        weight = np.ones(members * episodes)
+        layers = self.shape.layers(theta)
+        for begin in range(0, loop.horizon, interval):
+            over = state.ended.copy()
+            if over.all():
+                break
+            self.steps += int(np.count_nonzero(~over))
+            action = self._act(layers, seat.observation.observe(loop.sense(state)).reshape(members, episodes, -1))
+            raw, before = np.zeros(len(total)), potential
+            for _ in range(min(interval, loop.horizon - begin)):
+                live = ~state.ended
+                state, frame = loop.advance(state, seat.action.decode(action, loop.sense(state)))
+                error = loop.model.gap_error(frame.estimate.x, frame.truth)
+                now = seat.reward.least(frame.scene.gap, least)
+                raw += np.where(live, seat.reward(loop.model, frame, least - now), 0.0)
+                potential = np.where(live, seat.reward.potential(frame.scene.gap, error), potential)
+                least = now
+                crashed |= live & (frame.collided | frame.rear_collided)
+            total += np.where(over, 0.0, weight * seat.reward.shaped(raw, before, potential, state.ended))
+            weight = weight * seat.reward.gamma
+        return total.reshape(members, episodes).mean(axis=1), crashed.reshape(members, episodes).mean(axis=1)
+
+    def _act(self, layers: list[tuple[Array, Array]], observation: Array) -> Array:
+        """Actions of all rows, members first, from observations (P, E, d)."""
+        x = np.asarray(observation, np.float64)
+        for i, (weight, bias) in enumerate(layers):
+            x = np.matmul(x, weight) + bias[:, None]
+            x = np.tanh(x) if i + 1 < len(layers) else x
+        x = x.reshape(-1, x.shape[-1])
+        return np.argmax(x, axis=1) if self.seat.action.discrete else np.clip(x, -1.0, 1.0)
+
+    # -- checkpoints
+
+    def save(self, path: Path) -> None:
+        """Write a checkpoint."""
+        facts = {
+            "format": FORMAT, "seed": self.seed, "card": self.seat.card()["hash"], "learner": self.identity, "steps": self.steps,
+            "generation": self.generation, "curve": self.curve,
+        }  # fmt: skip
+        write_atomic(path, save_tensors({"mean": self.mean, "sd": self.sd}, {"facts": json.dumps(facts)}))
+
+    def load(self, path: Path) -> None:
+        """Continue from a checkpoint; raises InputError when it is damaged or of another run."""
+        try:
+            blob = path.read_bytes()
+            tensors = load_tensors(blob)
+            length = int.from_bytes(blob[:8], "little")
+            facts = json.loads(json.loads(blob[8 : 8 + length])["__metadata__"]["facts"])
+            wanted = {"format": FORMAT, "seed": self.seed, "card": self.seat.card()["hash"], "learner": self.identity}
+            held = {key: facts.get(key) for key in wanted}
+            mean, sd = (tensors[name].reshape(self.mean.shape) for name in ("mean", "sd"))
+            steps, generation, curve = int(facts["steps"]), int(facts["generation"]), list(facts["curve"])
+        except (OSError, SafetensorError, ValueError, KeyError, TypeError, AttributeError) as error:
+            raise InputError("checkpoint", str(path), f"a checkpoint of this program ({type(error).__name__})") from None
+        if held != wanted:
+            raise InputError("checkpoint", f"{path}: {held}", f"one of this run: {wanted}")
+        self.mean, self.sd, self.steps, self.generation, self.curve = mean, sd, steps, generation, curve
+
+
+def _rest(probability: float, actions: int, discrete: bool) -> float:
+    """Bias of the output that rests: of a discrete action's first, or of a continuous one's trigger."""
+    p = min(max(probability, 1e-6), 1.0 - 1e-6)
+    return float(np.log((actions - 1) * p / (1.0 - p))) if discrete else -p

@@ -1,0 +1,68 @@
+"""What every learner has in common: its configuration's name, what it reports, and how its policy is written."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+from tailgate.errors import unknown
+
+if TYPE_CHECKING:
+    from tailgate.envs.faces import Seat
+
+LEARNERS = {"ppo": "PPO of Stable-Baselines3", "cem": "the cross-entropy method"}
+
+
+@dataclass(frozen=True)
+class Progress:
+    """What a training run reports after each round."""
+
+    steps: int
+    crash: float | None  # share of collisions in the latest episodes; none also where there is no road
+    reward: float | None
+
+
+class Config(Protocol):
+    """Hyper-parameters of a learner: a frozen dataclass of `param` fields."""
+
+    def check(self) -> None:
+        """Raise InputError when the fields do not fit each other."""
+
+
+class Learner(Protocol):
+    """One training run of one seed. Resumed from a checkpoint it gives the policy of an uninterrupted one."""
+
+    seat: Seat
+    steps: int  # decisions taken so far
+    curve: list[dict[str, Any]]
+
+    def learn(self, steps: int, report: Callable[[Progress], None], checkpoint: Path | None = None, every: int = 1_000_000) -> None:
+        """Train until `steps` decisions in total, with a checkpoint every `every` of them and one at the end."""
+
+    def load(self, path: Path) -> None:
+        """Continue from a checkpoint. Raises InputError when it is damaged or of another run."""
+
+    def export(self, path: Path, training: dict[str, Any]) -> Path:
+        """Write the policy as safetensors + JSON; `training` says how it was made."""
+
+    def close(self) -> None:
+        """Free what it holds."""
+
+
+def learner_of(name: str) -> Any:
+    """The module of a learner, with its classes `Config` and `Learner`. Raises InputError for one that does not exist."""
+    if name not in LEARNERS:
+        raise unknown("learner", name, LEARNERS)
+    return import_module(f"tailgate.agents.{name}")
+
+
+def header_of(seat: Seat, training: dict[str, Any]) -> dict[str, Any]:
+    """The JSON of a policy that was trained in this seat, apart from its tensors."""
+    threat = seat.loop.threat
+    return {
+        "action": seat.action.spec, "observation": seat.observation.names, "knowledge": threat.knowledge,
+        "sees_measurement": threat.sees_measurement, "agents": seat.loop.model.agents, "training": training,
+    }  # fmt: skip

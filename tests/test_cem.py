@@ -1,0 +1,116 @@
+"""The cross-entropy method: it learns, it resumes to the bit, and what it exports plays as it did in training."""
+
+import json
+
+import numpy as np
+import pytest
+
+from tailgate import draws
+from tailgate.agents.cem import Config, Learner, Shape
+from tailgate.agents.policy import PolicyAttack
+from tailgate.errors import InputError
+from tailgate.metrics import measure
+from tailgate.trace import rollout
+
+ROAD = {
+    "scenario": "gusty-stop-and-go-v0", "defence": "kf", "threat": {"kinds": ["fdi"], "budget": 30, "fdi_bound": 6.0}, "value": -6.0, "interval": 30,
+    "reward": "min_gap", "gap_shaping": 0.0, "error_shaping": 0.0,
+}
+SMALL = Config(population=8, episodes=4, hidden=(4,))
+ROUND = 8 * 4 * 20  # decisions of a generation without a collision
+
+
+def run(steps, seed=0, config=SMALL, environment=ROAD, **options):
+    learner = Learner(seed, 0.99, config, environment)
+    learner.learn(steps, lambda progress: None, **options)
+    return learner
+
+
+def test_a_weight_vector_is_its_layers():
+    """The parts of a vector are disjoint and cover it, one vector or many."""
+    shape = Shape(((3, 2), (2, 5)))
+    assert shape.length == 3 * 2 + 2 + 2 * 5 + 5
+    theta = np.arange(4 * shape.length, dtype=float).reshape(4, -1)
+    many, one = shape.layers(theta), shape.layers(theta[2])
+    for (weight, bias), (w, b), (i, o) in zip(many, one, shape.sizes, strict=True):
+        assert weight.shape == (4, i, o) and bias.shape == (4, o)
+        np.testing.assert_array_equal(weight[2], w)
+        np.testing.assert_array_equal(bias[2], b)
+    assert sorted(np.concatenate([part.ravel() for layer in one for part in layer])) == sorted(theta[2])
+
+
+def test_it_learns():
+    """In ten generations the mean's reward on fresh seeds doubles that of rest, and beats the first generation's by far."""
+    config = Config(population=24, episodes=12, hidden=(8,), extra_until=8)
+    learner = Learner(0, 0.99, config, ROAD)
+    first, _ = learner._play(learner.mean[None])
+    learner.generation = 0
+    learner.learn(10 * 24 * 12 * 20, lambda progress: None)
+    before, after = first[0], np.mean([entry["reward"] for entry in learner.curve[-3:]])
+    assert after > before + 0.3
+    assert [entry["steps"] for entry in learner.curve] == sorted({entry["steps"] for entry in learner.curve})
+
+
+def test_the_elite_is_the_best():
+    """One generation by hand: the mean moves to the mean of the members with the largest reward, member 0 being the mean."""
+    learner = Learner(3, 0.99, SMALL, ROAD)
+    mean, sd = learner.mean.copy(), learner.sd.copy()
+    theta = mean + sd * np.random.default_rng([3, 0]).standard_normal((8, len(mean)))
+    theta[0] = mean
+    twin = Learner(3, 0.99, SMALL, ROAD)
+    reward, _ = twin._play(theta)
+    elite = theta[np.argsort(-reward, kind="stable")[:2]]
+    learner.learn(1, lambda progress: None)
+    np.testing.assert_allclose(learner.mean, mean + 0.7 * (elite.mean(axis=0) - mean))
+    np.testing.assert_allclose(learner.sd, np.sqrt(elite.var(axis=0) + (0.1 * 199 / 200) ** 2))
+    assert learner.steps == twin.steps and learner.generation == 1
+
+
+@pytest.mark.parametrize("environment", [ROAD, ROAD | {"action": "continuous"}], ids=["discrete", "continuous"])
+def test_what_is_exported_plays_as_in_training(environment, tmp_path):
+    """The mean's reward and collisions in training are those of the exported policy on the same episodes."""
+    learner = run(3 * ROUND, environment=environment)
+    first = learner.seed * 1_000_000 + learner.generation * SMALL.episodes
+    reward, crashed = learner._play(learner.mean[None])
+    attack = PolicyAttack(learner.export(tmp_path / "policy", {"learner": "cem"}))
+    trace = rollout(learner.seat.loop, attack, draws.keys("train", range(first, first + SMALL.episodes)))
+    assert measure(trace)["crashed"].mean() == crashed[0]
+    fell = 20.0 - np.minimum(measure(trace)["min_gap"], 20.0).clip(0.0)
+    assert reward[0] <= np.mean(fell / 20.0) + crashed[0] + 1e-9  # undiscounted, of which the discounted is no more
+    assert json.loads((tmp_path / "policy.json").read_text())["training"]["learner"] == "cem"
+
+
+def test_two_runs_of_a_seed_and_a_resumed_one_agree(tmp_path):
+    """Same seed, same policy file; interrupted and resumed, the same as well; another seed, another policy."""
+    whole = run(6 * ROUND).export(tmp_path / "whole", {}).with_suffix(".safetensors").read_bytes()
+    assert run(6 * ROUND).export(tmp_path / "again", {}).with_suffix(".safetensors").read_bytes() == whole
+    run(3 * ROUND, checkpoint=tmp_path / "check")
+    second = Learner(0, 0.99, SMALL, ROAD)
+    second.load(tmp_path / "check")
+    assert 3 * ROUND <= second.steps < 6 * ROUND and second.generation == len(second.curve) > 2
+    second.learn(6 * ROUND, lambda progress: None)
+    assert second.export(tmp_path / "resumed", {}).with_suffix(".safetensors").read_bytes() == whole
+    assert run(6 * ROUND, seed=1).export(tmp_path / "other", {}).with_suffix(".safetensors").read_bytes() != whole
+
+
+def test_a_checkpoint_that_does_not_fit(tmp_path):
+    """Damaged, of another seed, of another environment, of other settings: refused, and nothing is changed."""
+    run(ROUND, checkpoint=tmp_path / "check")
+    (tmp_path / "broken").write_bytes((tmp_path / "check").read_bytes()[:200])
+    (tmp_path / "text").write_text("nothing")
+    cases = [
+        ("broken", {}), ("text", {}), ("missing", {}), ("check", {"seed": 1}), ("check", {"environment": ROAD | {"value": -5.0}}),
+        ("check", {"config": Config(population=8, episodes=4, hidden=(5,))}),
+    ]
+    for name, changes in cases:
+        given = {"seed": 0, "config": SMALL, "environment": ROAD} | changes
+        learner = Learner(given["seed"], 0.99, given["config"], given["environment"])
+        with pytest.raises(InputError, match="checkpoint"):
+            learner.load(tmp_path / name)
+        assert learner.generation == 0 and not learner.curve
+
+
+def test_settings_that_do_not_fit():
+    """A population of one has no elite."""
+    with pytest.raises(InputError, match="population"):
+        Config(population=1).check()
