@@ -19,6 +19,7 @@ DEFENCES = tailgate.list_defences()
 ATTACKS = [name for name in tailgate.list_attacks() if name != "policy"]  # a policy needs a file
 SCENARIOS = list_scenarios()
 ONE = [name for name in SCENARIOS if load_scenario(name).plant.size[0] == 1]  # of many agents: tests/test_contract_many.py
+PLACE = {name: "radar-following-v0" if "probe" in entries("defence")[name].uses else "stop-and-go-v0" for name in DEFENCES}
 FAMILIES = ("defence", "filter", "detector", "mitigation", "attack", "plant", "sensor", "controller", "manoeuvre")
 ORDER = [5, 63, 0, 1017, 17, 9, 31]  # other companions in another order
 
@@ -50,7 +51,7 @@ def _play(play, *arguments, **options):
 @pytest.mark.parametrize("defence", DEFENCES)
 def test_rows_of_a_defence_do_not_depend_on_their_batch(defence, attack, short, play):
     """trace_hash of each seed is the same in batches of 1, 7 and 64."""
-    _batches(lambda seeds: _play(play, short(), defence, attack, seeds))
+    _batches(lambda seeds: _play(play, short(PLACE[defence]), defence, attack, seeds))
 
 
 @pytest.mark.parametrize("attack", ATTACKS)
@@ -75,11 +76,11 @@ def test_rows_of_a_scenario_do_not_depend_on_their_batch(name, short, play):
 @pytest.mark.parametrize("defence", DEFENCES)
 def test_outputs_are_finite_and_of_the_right_shape(defence, attack, short, play, loop_of):
     """Under every kind of attack, with the widest jammer, a defence returns finite arrays of the declared shapes and types."""
-    place = short(jam_range=(-1e6, 1e6))
+    place = short(PLACE[defence], jam_range=(-1e6, 1e6))
     loop = loop_of(place, defence)
     options = {"low": -1e6, "high": 1e6} if attack == "dos_jam" else {}
     trace = rollout(loop, tailgate.make_attack(attack, **options), keys("train", range(9)), terminate=False)
-    assert trace.estimate.shape == (60, 9, 1, 3) and trace.score.shape == trace.alarm.shape == trace.mode.shape == (60, 9, 1)
+    assert trace.estimate.shape == (60, 9, 1, loop.model.states) and trace.score.shape == trace.alarm.shape == trace.mode.shape == (60, 9, 1)
     assert trace.alarm.dtype == bool and set(np.unique(trace.mode)) <= {int(m) for m in Mode}
     assert all(np.isfinite(trace.signals[name]).all() for name in ("estimate", "score", "control", "gap", "wires", "value"))
 
@@ -142,19 +143,20 @@ def test_swapping_the_defence_leaves_the_world_draws(defence, short, play, monke
     traces, logs = [], []
     for name in (defence, "none"):
         log.clear()
-        traces.append(play(short(), name, "none", range(5), terminate=False))
+        traces.append(play(short(PLACE[defence]), name, "none", range(5), terminate=False))
         logs.append(list(log))
     assert logs[0] == logs[1] and len(logs[0]) > 120
     np.testing.assert_array_equal(traces[0].lead_speed, traces[1].lead_speed)
     noise = [t.clean[..., :2] - t.truth[..., :2] for t in traces]
-    np.testing.assert_allclose(noise[0], noise[1], atol=1e-9)
+    heard = traces[0].valid & traces[1].valid  # a challenge measures nothing; a radar's error grows with the distance
+    np.testing.assert_allclose(noise[0][..., :2][heard], noise[1][..., :2][heard], atol=1e-2 if traces[0].model.air else 1e-9)
 
 
 @pytest.mark.parametrize("batch", [1, 2, 3, 4, 10])
 @pytest.mark.parametrize("defence", DEFENCES)
 def test_restart(defence, batch, short, loop_of, same_tree):
     """Restarted rows equal fresh rows of the next episode, the others keep every bit, also when B equals another axis."""
-    loop = loop_of(short(onset=1), defence)
+    loop = loop_of(short(PLACE[defence], onset=1), defence)
     rival, rng = tailgate.make_attack("fdi_gaussian"), np.random.default_rng(batch)
     state = loop.start(keys("train", range(batch)))
     plan = rival.prepare(loop.brief)
@@ -178,7 +180,7 @@ def test_restart(defence, batch, short, loop_of, same_tree):
 @pytest.mark.parametrize("defence", DEFENCES)
 def test_a_restarted_row_plays_on_as_a_fresh_one(defence, short, loop_of):
     """The frames of a restarted row are those of the same episode started alone."""
-    loop = loop_of(short(), defence)
+    loop = loop_of(short(PLACE[defence]), defence)
     nothing = tailgate.make_attack("none")
     plan = nothing.prepare(loop.brief)
     state = loop.start(keys("train", range(4)))
@@ -198,7 +200,7 @@ def test_a_restarted_row_plays_on_as_a_fresh_one(defence, short, loop_of):
 @pytest.mark.parametrize("defence", DEFENCES)
 def test_a_white_box_may_look_ahead_at_will(defence, short, loop_of):
     """Playing with the defence's state that a view shows changes nothing of the episode."""
-    loop = loop_of(short(knowledge="white"), defence)
+    loop = loop_of(short(PLACE[defence], knowledge="white"), defence)
 
     class Curious(type(tailgate.make_attack("none"))):
         def decide(self, plan, state, view, draws):
@@ -227,14 +229,15 @@ def test_a_defence_gets_only_what_its_card_declares(defence, short):
             seen.append(received)
             return self.inner.step(plan, state, received, known_u, draws)
 
-    rollout(short().loop(Spy(), uses), tailgate.make_attack("fdi"), keys("train", [0]))
+    rollout(short(PLACE[defence]).loop(Spy(), uses), tailgate.make_attack("fdi"), keys("train", [0]))
     assert all((r.v2v is not None) == ("v2v" in uses) and (r.attacked is not None) == ("truth" in uses) for r in seen)
+    assert all((r.odometry is not None) == ("odometry" in uses) for r in seen)
 
 
 @pytest.mark.parametrize("defence", DEFENCES)
 def test_a_white_box_cannot_write_into_the_defence(defence, short, loop_of):
     """Whatever of plan and state can be written is a copy: an episode with a vandal equals the plain one."""
-    loop = loop_of(short(knowledge="white", horizon=40), defence)
+    loop = loop_of(short(PLACE[defence], knowledge="white", horizon=40), defence)
 
     def spoil(thing, seen):
         if id(thing) in seen:
