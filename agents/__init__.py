@@ -5,6 +5,7 @@ from .ghost import GhostState
 from .model_based import Covert, Stealth, ZeroDynamics
 from .policy import PolicyAttack, Yoked, load_policy, save_policy
 from .program import Program
+from .radio import EchoDelay, EchoPullOff, NoiseJam, RadarJam
 from .scripted import (
     Delay,
     Dropout,
@@ -29,6 +30,8 @@ __all__ = [
     "Covert",
     "Delay",
     "Dropout",
+    "EchoDelay",
+    "EchoPullOff",
     "GhostState",
     "Hold",
     "Inject",
@@ -41,8 +44,10 @@ __all__ = [
     "InjectUniform",
     "Jam",
     "NoAttack",
+    "NoiseJam",
     "PolicyAttack",
     "Program",
+    "RadarJam",
     "Replay",
     "Script",
     "Stealth",

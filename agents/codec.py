@@ -9,26 +9,34 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from tailgate import num
-from tailgate.core import Array, Command, Finite, Kind, Positive, PositiveCount, View, param
+from tailgate.core import AIRED, Array, Command, Finite, Kind, Positive, PositiveCount, View, param
 from tailgate.errors import InputError
 from tailgate.threat import Brief, KindName
 
+from .values import fit, receivers
+
 ActionName = Literal["timing", "mode", "ramp", "continuous", "increment"]
+VECTOR = (Kind.FDI, Kind.ECHO_DELAY, Kind.NOISE_JAM)  # kinds that a vector of values can carry, in the order of the trigger's shares
 
 
 @dataclass(frozen=True)
 class ActionSpec:
     """Which decisions the learner takes.
 
-    timing: {none, attack}, the attack is `kind` with `value`. mode: {none, then one per granted kind, +value and -value for fdi}.
-    ramp: as mode, but fdi has three: raise, keep or lower the value injected last by `rate`, from +-`value` at the start of a burst.
-    continuous: [trigger, value per wire] in [-1, 1], attack when trigger > 0, values in units of the bound. increment: the same, but
-    each value is the change since the value injected last, in units of `rate`.
+    timing: {none, attack}, the attack is `kind` with its value. mode: {none, then one per granted kind, +value and -value for fdi}.
+    ramp: as mode, but fdi and echo_delay have three: raise, keep or lower the value sent last by `rate`, from +-`value` or from `delay`
+    at the start of a burst. continuous: [trigger, value per wire] in [-1, 1], attack when trigger > 0, values in units of the bound.
+    increment: the same, but each value is the change since the value sent last, in units of `rate`.
+
+    Vectors carry the granted ones of fdi, echo_delay and noise_jam, in this order, which share (0, 1] of the trigger evenly. Both kinds
+    over the air read one more value per agent, after those of fdi: -1 is nothing and 1 the bound, an increment changes the delay alone.
     """
 
     action: ActionName = param("mode", "timing, mode, ramp, continuous or increment")
     kind: KindName = param("fdi", "timing: what an attack is")
     value: Finite = param(-4.0, "timing, mode, ramp: bias of fdi, jammer's value of dos_jam [unit of the wire]")
+    power: Positive = param(0.1, "timing, mode, ramp: power of noise_jam [W]")
+    delay: Positive = param(6.0, "timing, mode, ramp: extra range of echo_delay [m]")
     steps: PositiveCount = param(10, "age of a delay, window of a replay [steps]")
     rate: Positive = param(0.5, "ramp, increment: (largest) change per step [unit of the wire]")
     per_sensor: bool = param(False, "mode, ramp: also one mode per single wire")
@@ -55,7 +63,9 @@ class ActionCodec:
 
     def __post_init__(self) -> None:
         threat, value = self.brief.threat, self.spec.value
-        used = [self.spec.kind] if self.spec.action == "timing" else list(threat.kinds) if self.discrete else ["fdi"]
+        used: list[str] = [self.spec.kind] if self.spec.action == "timing" else list(threat.kinds)
+        if not self.discrete:
+            used = [kind.name.lower() for kind in self.carried] or ["fdi"]
         for name in used:
             if name not in threat.kinds:
                 granted = ", ".join(threat.kinds)
@@ -66,12 +76,25 @@ class ActionCodec:
             raise InputError("value", value, f"within the threat model's jam_range {threat.jam_range}")
         if self.discrete and {"delay", "replay"} & set(used) and self.spec.steps > threat.memory:
             raise InputError("steps", self.spec.steps, f"at most the threat model's memory ({threat.memory})")
+        for name, size, most, field in (
+            ("noise_jam", self.spec.power, threat.jam_power, "power"), ("echo_delay", self.spec.delay, threat.delay_bound, "delay"),
+        ):  # fmt: skip
+            if self.discrete and name in used and size > most:
+                bound = "jam_power" if name == "noise_jam" else "delay_bound"
+                raise InputError(field, size, f"at most the threat model's {bound} ({most})")
+            if name in used and not receivers(self.brief).any():
+                raise InputError("action", f"{self.spec.action} with {name}", "a granted sensor that listens to its own echo")
         if not self.brief.granted.any():
             raise InputError("threat_model.targets", threat.targets, "at least one wire")
 
     @property
     def discrete(self) -> bool:
         return self.spec.action in ("timing", "mode", "ramp")
+
+    @cached_property
+    def carried(self) -> tuple[Kind, ...]:
+        """The granted kinds that a vector can carry."""
+        return tuple(kind for kind in VECTOR if kind.name.lower() in self.brief.threat.kinds)
 
     @cached_property
     def wires(self) -> Array:
@@ -87,7 +110,7 @@ class ActionCodec:
     def modes(self) -> list[Mode]:
         """Discrete meanings, in the order of the action's number."""
         granted, value = self.brief.granted, self.spec.value
-        groups = [("", granted)]
+        groups = [("", granted)]  # of single wires: their names begin with a colon
         named = [(":" + self.brief.model.wires[w], np.arange(granted.shape[1]) == w) for w in self.wires] if self.spec.per_sensor else []
         agents = [(f"[{i}]", (np.arange(granted.shape[0]) == i)[:, None]) for i in self.victims] if self.spec.per_agent else []
         if len(named) > 1:
@@ -101,7 +124,9 @@ class ActionCodec:
         for suffix, target in groups:
             for name in kinds:
                 kind = Kind[name.upper()]
-                if kind == Kind.FDI and self.spec.action != "timing":
+                if kind in AIRED:
+                    out += [] if suffix.startswith(":") else self._aired(kind, suffix, target & receivers(self.brief))
+                elif kind == Kind.FDI and self.spec.action != "timing":
                     signs = {"+": 1, "-": -1} if self.spec.action == "mode" else {"+": 1, "=": 0, "-": -1}
                     out += [Mode(f"fdi{t}{suffix}", kind, target, sign * np.minimum(abs(value), bounds), sign) for t, sign in signs.items()]
                 elif kind in (Kind.FDI, Kind.DOS_JAM):  # what is too much for an actuator is cut
@@ -113,10 +138,23 @@ class ActionCodec:
                     out.append(Mode(name + suffix, kind, target, nothing + self.spec.steps * old))
         return out
 
+    def _aired(self, kind: Kind, suffix: str, target: Array) -> list[Mode]:
+        """The modes of a kind over the air, which reaches all that a receiver reads; none where `target` has no receiver."""
+        if not target.any():
+            return []
+        name = kind.name.lower()
+        value = np.full(target.shape[1], self.spec.power if kind == Kind.NOISE_JAM else self.spec.delay)
+        if kind == Kind.ECHO_DELAY and self.spec.action == "ramp":
+            return [Mode(f"{name}{t}{suffix}", kind, target, value, sign) for t, sign in (("+", 1), ("=", 0), ("-", -1))]
+        return [Mode(name + suffix, kind, target, value)]
+
     @property
     def size(self) -> int:
         """Number of discrete actions, or length of the continuous vector."""
-        return len(self.modes) if self.discrete else 1 + len(self.victims) * len(self.wires)
+        if self.discrete:
+            return len(self.modes)
+        radiates = any(kind in AIRED for kind in self.carried)
+        return 1 + len(self.victims) * (len(self.wires) * (Kind.FDI in self.carried) + radiates)
 
     def decode(self, action: Array, view: View) -> Command:
         """Discrete (B,) int or continuous (B, size) in [-1, 1] to a command."""
@@ -127,20 +165,40 @@ class ActionCodec:
             target = np.array([mode.target for mode in self.modes])[index]
             value = np.array([mode.value for mode in self.modes])[index][:, None, :]
             if self.spec.action == "ramp":
-                bound, sign = brief.bounds, np.array([mode.sign for mode in self.modes])[index][:, None, None]
-                grown = np.clip(view.last.value + self.spec.rate * sign, -bound, bound)
-                ramping = ((view.last.kind == Kind.FDI) & (kinds == Kind.FDI))[:, None, None]
-                value = np.where(ramping, grown, value)
+                sign = np.array([mode.sign for mode in self.modes])[index][:, None, None]
+                for kind in set(VECTOR) & {mode.kind for mode in self.modes} - {Kind.NOISE_JAM}:
+                    ramping = ((view.last.kind == kind) & (kinds == kind))[:, None, None]
+                    value = np.where(ramping, self._changed(kind, view.last.value, sign), value)
             return brief.command(index != 0, kinds, target, value)
         action = np.clip(np.asarray(action, np.float64), -1.0, 1.0)
-        values = action[:, 1:].reshape(len(action), len(self.victims), len(self.wires))
-        bound, held = brief.bounds[self.wires], (slice(None), self.victims[:, None], self.wires)
-        wide = num.zeros((len(action), *brief.granted.shape))
-        if self.spec.action == "increment":
-            wide[held] = np.clip(view.last.value[held] + self.spec.rate * values, -bound, bound)
+        on, count = action[:, 0] > 0.0, len(self.carried)
+        index = np.clip(np.ceil(action[:, 0] * count).astype(np.int64) - 1, 0, count - 1)
+        kinds, value, target = np.array(self.carried, np.int8)[index], num.zeros((len(action), *brief.granted.shape)), brief.granted
+        for kind in self.carried:
+            mine = (kinds == kind)[:, None, None]
+            value = np.where(mine, self._sent(kind, action[:, 1:], view), value)
+            target = np.where(mine, receivers(brief) if kind in AIRED else brief.granted, target)
+        return brief.command(on, kinds, target, value)
+
+    def _changed(self, kind: Kind, last: Array, change: Array) -> Array:
+        """The value sent last and a change of it, within the bounds of the kind."""
+        return fit(self.brief, kind, last + self.spec.rate * change)
+
+    def _sent(self, kind: Kind, action: Array, view: View) -> Array:
+        """(B, N, w) the values of `kind` in a vector (B, size - 1) in [-1, 1]."""
+        brief, batch, agents = self.brief, len(action), len(self.victims)
+        share = num.zeros((batch, *brief.granted.shape))
+        if kind == Kind.FDI:
+            per_wire = action[:, : agents * len(self.wires)].reshape(batch, agents, len(self.wires))
+            share[:, self.victims[:, None], self.wires] = per_wire
         else:
-            wide[held] = bound * values
-        return brief.command(action[:, 0] > 0.0, Kind.FDI, brief.granted, wide)
+            share[:, self.victims] = action[:, -agents:, None]
+        if self.spec.action == "increment" and kind != Kind.NOISE_JAM:
+            return self._changed(kind, np.where((view.last.kind == kind)[:, None, None], view.last.value, 0.0), share)
+        if kind == Kind.FDI:
+            return np.asarray(brief.bounds * share)
+        most = brief.threat.delay_bound if kind == Kind.ECHO_DELAY else brief.threat.jam_power
+        return fit(brief, kind, most * (0.5 + 0.5 * share))
 
     def mask(self, view: View) -> Array:
         """(B, size) bool of the discrete actions that the channel would accept."""

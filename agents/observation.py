@@ -11,11 +11,14 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from tailgate import num
-from tailgate.core import Array, Kind, View
+from tailgate.core import AIRED, Array, Kind, View
 from tailgate.threat import Brief
+
+from .values import receivers
 
 LIMIT = 10.0  # observations are clipped to +-LIMIT
 SHOWN = 24  # agents with components of their own in an observation, at most
+RADIATED = {Kind.NOISE_JAM: ("power", "jam_power"), Kind.ECHO_DELAY: ("delay", "delay_bound")}  # their component, and their bound
 T = TypeVar("T")
 
 
@@ -111,9 +114,17 @@ class ObservationCodec:
         """What the attacker did last to agent i, and (grey) what was commanded."""
         model, bounds = self.brief.model, self.brief.bounds
         scale = np.minimum(bounds, 10.0) if model.followers.any() else bounds
-        out: list[Column] = [
-            (f"last_{model.wires[w]}", _last(i, w, float(scale[w]))) for w in np.flatnonzero(self.brief.granted[i]).tolist()
-        ]  # fmt: skip
+        kinds = {Kind[name.upper()] for name in self.brief.threat.kinds}
+        radiated = [kind for kind in AIRED if kind in kinds and receivers(self.brief)[i].any()]
+        out: list[Column] = []
+        if not radiated or kinds - set(AIRED):
+            of = _last_wire if radiated else _last
+            out += [(f"last_{model.wires[w]}", of(i, w, float(scale[w]))) for w in np.flatnonzero(self.brief.granted[i]).tolist()]
+        for kind in radiated:
+            name, bound = RADIATED[kind]
+            out.append((f"last_{name}", _radiated(i, kind, getattr(self.brief.threat, bound))))
+        if model.air:
+            out.append(("probed", lambda s: _given(s.view.probed)[:, i]))
         if len(self.victims) > 1 and i in self.victims:
             out.append(("attacked", lambda s: np.any(s.view.last.target[:, i], axis=1)))
         if self.brief.threat.knowledge != "black" and (model.followers[i] or not model.followers.any()):
@@ -146,11 +157,16 @@ class ObservationCodec:
             return [off] if known else [("reading", lambda s: num.log(1.0 + _given(s.reading)[:, i] / self.spread))]
         sd = [1.0 if self.alone else math.sqrt(model.R[i, j, j]) for j in range(len(model.sensors))]
         read = {j: truth for j in range(len(model.sensors)) if (truth := self._read(i, j))}
-        return [(f"noise_{model.sensors[j]}", _off(i, j, truth, sd[j])) for j, truth in read.items()]
+        out: list[Column] = [(f"noise_{model.sensors[j]}", _off(i, j, truth, sd[j])) for j, truth in read.items()]
+        if model.air:
+            out.append(("silent", lambda s: ~np.any(_given(s.view.received).valid[:, i], axis=1)))
+        return out
 
     def _read(self, i: int, j: int) -> str:
-        """The part of the scene that sensor j of agent i reads: gap, speed or position; empty where it is none of them."""
+        """The part of the scene that sensor j of agent i reads: gap, speed, position or relative speed; empty where it is none of them."""
         model = self.brief.model
+        if model.air and model.sensors[j] == "relative_speed":
+            return "relative_speed"
         assert model.gap is not None and model.speed is not None
         rows = {"gap": model.gap[i], "position": -model.gap[i], "speed": model.speed[i]}
         return next((name for name, row in rows.items() if row.any() and np.array_equal(row, model.C[i, j])), "")
@@ -208,6 +224,16 @@ def _last(i: int, w: int, scale: float) -> Callable[[Sight], Array]:
     return lambda s: s.view.last.value[:, i, w] / scale
 
 
+def _last_wire(i: int, w: int, scale: float) -> Callable[[Sight], Array]:
+    """As `_last`; 0 where the last command was one over the air."""
+    return lambda s: np.where(np.isin(s.view.last.kind, AIRED), 0.0, s.view.last.value[:, i, w] / scale)
+
+
+def _radiated(i: int, kind: Kind, most: float) -> Callable[[Sight], Array]:
+    """The power or the delay last sent to agent i, in units of its bound."""
+    return lambda s: np.where(s.view.last.kind == kind, np.max(s.view.last.value[:, i], axis=1) / most, 0.0)
+
+
 def _control(i: int, j: int) -> Callable[[Sight], Array]:
     return lambda s: _given(s.view.control)[:, i, j] / 3.0
 
@@ -217,5 +243,11 @@ def _state_error(i: int, j: int) -> Callable[[Sight], Array]:
 
 
 def _off(i: int, j: int, truth: str, sd: float) -> Callable[[Sight], Array]:
-    """By how much sensor j of agent i is off the part `truth` of the scene, in standard deviations."""
-    return lambda s: (_given(s.view.received).y[:, i, j] - getattr(s.view.scene, truth)[:, i]) / sd
+    """By how much sensor j of agent i is off the part `truth` of the scene, in standard deviations; 0 without a reading."""
+
+    def off(s: Sight) -> Array:
+        scene, received = s.view.scene, _given(s.view.received)
+        true = scene.lead_speed - scene.speed if truth == "relative_speed" else getattr(scene, truth)
+        return np.where(received.valid[:, i, j], (received.y[:, i, j] - true[:, i]) / sd, 0.0)
+
+    return off

@@ -77,7 +77,7 @@ def choose(network: Network, codec: ActionCodec, observation: Array, draws: Draw
     if draws is not None and network.log_std is not None:
         out = out + num.exp(network.log_std) * draws.normal((out.shape[1],))
     if always:
-        out = np.concatenate([np.ones((len(out), 1)), out[:, 1:]], axis=1)
+        out = np.concatenate([np.maximum(out[:, :1], 1e-9), out[:, 1:]], axis=1)  # the nearest trigger that attacks
     return np.clip(out, -1.0, 1.0)
 
 

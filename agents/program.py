@@ -10,7 +10,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from tailgate.core import Array, Command, Count, Kind, PositiveCount, Probability, View, no_command, param
+from tailgate.core import AIRED, Array, Command, Count, Kind, PositiveCount, Probability, View, no_command, param
 from tailgate.draws import Draws
 from tailgate.errors import InputError, NotApplicable, unknown
 from tailgate.registry import register
@@ -19,11 +19,12 @@ from tailgate.schema import build, read_yaml
 from tailgate.threat import Brief, KindName
 from tailgate.tree import map_leaves
 
+from .radio import on_receivers
 from .scripted import chosen, require
 from .triggers import TRIGGERS, Timing, Trigger, TriggerState, idle, part, rearm
 from .values import TAGS, Law, PerWire, check_wires, fit, law_of
 
-VALUED = (Kind.DOS_JAM, Kind.FDI, Kind.DELAY, Kind.REPLAY)
+VALUED = (Kind.DOS_JAM, Kind.FDI, Kind.DELAY, Kind.REPLAY, *AIRED)
 HIT, FIRST = 0, TAGS  # tags of the draws: which wires are hit, and the values
 
 
@@ -195,8 +196,12 @@ def _ready(phase: Phase, brief: Brief, where: str) -> Ready:
     else:
         chances = np.full(len(wires), float(chance))
     require(brief, where, [phase.kind], target)
+    kind = Kind[phase.kind.upper()]
+    if kind in AIRED:
+        target = on_receivers(brief, where, target, bool(names))
+        target = target & (np.cumsum(target, axis=1) == 1)  # one draw of `probability` for all that a receiver reads
     try:
         timing = phase.trigger.prepare(brief)
     except InputError as error:  # the file is sound, but not for steps of this length
         raise NotApplicable(f"{where}: {error.field}", error.value, error.expected) from None
-    return Ready(phase, phase.trigger, timing, Kind[phase.kind.upper()], target, chances)
+    return Ready(phase, phase.trigger, timing, kind, target, chances)

@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import Field
 
 from tailgate import num
-from tailgate.core import Array, Finite, Kind, NonNegative, Positive, param
+from tailgate.core import AIRED, Array, Finite, Kind, NonNegative, Positive, param
 from tailgate.draws import Draws
 from tailgate.errors import InputError, unknown
 from tailgate.threat import Brief
@@ -141,6 +141,11 @@ def law_of(data: Any, where: str) -> Law:
     return law
 
 
+def receivers(brief: Brief) -> Array:
+    """(N, w) bool: the granted sensors that listen to their own echo, which the kinds over the air can reach."""
+    return np.asarray(brief.granted & brief.model.air & (np.arange(brief.granted.shape[1]) < len(brief.model.sensors)))
+
+
 def check_wires(law: Law, target: Array, brief: Brief, where: str) -> None:
     """Raise InputError where a law per wire names a wire that does not exist, or leaves out one of `target` (N, w)."""
     if not isinstance(law, PerWire):
@@ -164,6 +169,6 @@ def fit(brief: Brief, kind: Kind, value: Array) -> Array:
         return np.clip(value, np.where(brief.is_actuator, -strongest, low), np.where(brief.is_actuator, strongest, high))
     if kind in (Kind.DELAY, Kind.REPLAY):
         return np.clip(np.floor(value + 0.5), 1.0, float(threat.memory))
-    if kind in (Kind.NOISE_JAM, Kind.ECHO_DELAY):
+    if kind in AIRED:
         return np.clip(value, 1e-12, threat.jam_power if kind == Kind.NOISE_JAM else threat.delay_bound)
     return np.zeros_like(value)

@@ -32,6 +32,7 @@ from tailgate.threat import ThreatModel
 CAR_FOLLOWING = "tailgate/CarFollowing-v0"
 FACES: dict[str, dict[str, Any]] = {  # what each id is where nothing else is said: the one place of these defaults
     CAR_FOLLOWING: {"scenario": "stop-and-go-v0", "defence": "chi2_kf"},
+    "tailgate/RadarFollowing-v0": {"scenario": "radar-following-v0", "defence": "cra"},
     "tailgate/Platoon-v0": {"scenario": "platoon-braking-v0", "defence": "lasso_dkf"},
     "tailgate/SensorNetwork-v0": {"scenario": "thesis-ch5-v0", "defence": "norm_resilient", "reward": "error"},
 }

@@ -13,7 +13,7 @@ from tailgate.core import Array, Frame
 from tailgate.errors import InputError
 from tailgate.loop import Loop, LoopState
 
-from . import render_following, render_network, render_platoon
+from . import render_following, render_network, render_platoon, render_radar
 from .render_canvas import HEIGHT, WIDTH
 
 
@@ -23,6 +23,8 @@ def draw(loop: Loop, state: LoopState, frame: Frame | None, row: int) -> Array:
         return render_network.draw(loop, state, frame, row)
     if loop.model.agents > 1:
         return render_platoon.draw(loop, state, frame, row)
+    if loop.model.air:
+        return render_radar.draw(loop, state, frame, row)
     return render_following.draw(loop, state, frame, row)
 
 

@@ -36,7 +36,9 @@ WINDOW = ((0.2, 0.66), (0.3, 0.92), (0.59, 0.92), (0.7, 0.66))
 AXLES = (0.22, 0.78)
 UNITS = {
     "position": " m", "distance": " m", "velocity": " m/s", "acceleration": " m/s^2", "command": " m/s^2",  # the font has no raised two
-}  # fmt: skip
+    "speed": " m/s",
+}
+AIRED = {Kind.NOISE_JAM: "{:.3g} W", Kind.ECHO_DELAY: "{:.3g} m"}  # over the air: one value reaches all that a receiver reads  # fmt: skip
 
 CAR = 84.0  # length of a car [px]
 CAR_SHAPE, WHEEL_SHAPE = 34.0 / 84.0, 7.5 / 84.0  # its height and wheels, of its length
@@ -50,6 +52,8 @@ COMMANDS = {
     Kind.FDI: ("ATTACK: false data (FDI)", "adds "),
     Kind.DELAY: ("ATTACK: delay", "old readings, by steps: "),
     Kind.REPLAY: ("ATTACK: replay", "plays the last readings again, window in steps: "),
+    Kind.NOISE_JAM: ("ATTACK: noise jamming", "over the air: noise of "),
+    Kind.ECHO_DELAY: ("ATTACK: late echo", "over the air: the probe's answer comes back from farther away, by "),
 }
 metres = "{:,.1f} m".format
 
@@ -211,6 +215,9 @@ def _of(loop: Loop, agents: list[int]) -> str:
 def aimed(loop: Loop, last: Command, row: int) -> str:
     """The wires that a command hits, each with its value; of many their number and the range of the values."""
     kind, wires = Kind(int(last.kind[row])), loop.model.wires
+    if kind in AIRED:
+        sent = {i: AIRED[kind].format(last.value[row, i].max()) for i in np.flatnonzero(last.target[row].any(axis=1)).tolist()}
+        return "; ".join(value + _of(loop, [i for i in sent if sent[i] == value]) for value in dict.fromkeys(sent.values()))
     valued = {Kind.DOS_JAM: "{:+.4g}", Kind.FDI: "{:+.4g}", Kind.DELAY: "{:g}", Kind.REPLAY: "{:g}"}.get(kind)
     groups: dict[tuple[int, float], list[int]] = {}  # agents by wire and value
     for i, w in np.argwhere(last.target[row]).tolist():

@@ -49,7 +49,7 @@ TRUE_LINE, WHEELS, STRIP, BELIEVED_LINE, GHOST_WHEELS = 100.0, 144.0, 200.0, 250
 ROAD, CAR_HEIGHT = 14.0, CAR_SHAPE * CAR
 
 
-def _scale(gap: float, rear_gap: float) -> float:
+def scale_of(gap: float, rear_gap: float) -> float:
     """Pixels a metre: the least span that holds the leader, or the next one if that shows the car behind."""
     first = next((i for i, span in enumerate(SPANS) if gap <= span), len(SPANS) - 1)
     scales = [AHEAD / span for span in SPANS[first : first + 2]]
@@ -74,7 +74,8 @@ def _car(canvas: Canvas, nose: float, colour: str, name: str, speed: float, room
     canvas.text(middle, WHEELS + 45, f"{speed:.1f} m/s", colour, SMALL, "ms", True, room=room)
 
 
-def _truth(canvas: Canvas, road: dict[str, float], scale: float, ended: bool) -> None:
+def truth(canvas: Canvas, road: dict[str, float], scale: float, ended: bool) -> None:
+    """The upper strip: the road as it is, from the leaves of a scene."""
     leader, rear = NOSE + road["gap"] * scale, TAIL - road["rear_gap"] * scale
     canvas.text(MARGIN, HEADER + 17, "THE ROAD AS IT IS", GREY, SMALL)
     canvas.box(0, WHEELS, WIDTH, WHEELS + ROAD, LEADER)
@@ -97,7 +98,8 @@ def _truth(canvas: Canvas, road: dict[str, float], scale: float, ended: bool) ->
         canvas.text(middle, TRUE_LINE - 9, words, INK, LARGE, "ms", True, room=(edge + MARGIN, WIDTH - MARGIN))
 
 
-def _belief(canvas: Canvas, gap: float, believed: float, scale: float) -> None:
+def belief(canvas: Canvas, gap: float, believed: float, scale: float, words: str) -> None:
+    """The lower strip: the car where it believes to be behind the leader, and `words` on the line between."""
     leader, off = NOSE + gap * scale, gap - believed
     ghost = max(-FAR, min(NOSE + off * scale, FAR))
     canvas.box(0, STRIP, WIDTH, HEIGHT, BELIEF_PALE)
@@ -105,7 +107,7 @@ def _belief(canvas: Canvas, gap: float, believed: float, scale: float) -> None:
     canvas.line(0, GHOST_WHEELS, WIDTH, GHOST_WHEELS, BELIEF, 1, dash=3.0)
     canvas.line(leader, TRUE_LINE, leader, GHOST_WHEELS, LEADER, 1, dash=3.0)  # the same bumper in both strips
     canvas.text(MARGIN, STRIP + 17, "WHERE THE EGO BELIEVES IT IS", BELIEF, SMALL)
-    middle, words = canvas.gap(ghost, leader, BELIEVED_LINE, BELIEF, dash=5.0), f"believed gap {metres(believed)}"
+    middle = canvas.gap(ghost, leader, BELIEVED_LINE, BELIEF, dash=5.0)
     canvas.text(middle, BELIEVED_LINE - 11, words, BELIEF, LARGE, "ms", True, (MARGIN, WIDTH - MARGIN), BELIEF_PALE)
     if ghost > 0.0 and ghost - CAR < WIDTH:
         canvas.car(ghost, GHOST_WHEELS, BELIEF, ghost=True)
@@ -128,9 +130,10 @@ def draw(loop: Loop, state: LoopState, frame: Frame | None, row: int) -> Array:
         refused = bool(frame.refused[row])
         if "leader_position" in model.v2v:  # as the controller heard it
             leader = float(frame.wires[at][model.wires.index("leader_position")])
-    canvas, scale = Canvas(), _scale(road["gap"], road["rear_gap"])
+    canvas, scale = Canvas(), scale_of(road["gap"], road["rear_gap"])
     header(canvas, loop, state, row, refused)
-    _belief(canvas, road["gap"], leader - float(state.estimate.x[at][0]), scale)
-    _truth(canvas, road, scale, bool(state.ended[row]))
+    believed = leader - float(state.estimate.x[at][0])
+    belief(canvas, road["gap"], believed, scale, f"believed gap {metres(believed)}")
+    truth(canvas, road, scale, bool(state.ended[row]))
     ended_line(canvas, loop, state, frame, row)
     return canvas.done()

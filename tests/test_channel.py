@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tailgate.core import Command, Kind, Received
+from tailgate.core import AIRED, Command, Kind, Received
 from tailgate.errors import InputError
 from tailgate.scenario import load_scenario
 from tailgate.threat import Brief, Channel, ThreatModel
@@ -13,7 +13,6 @@ from tailgate.threat import Brief, Channel, ThreatModel
 ALL = ("dos_jam", "dos_hold", "dos_hold_fresh", "dropout", "fdi", "delay", "replay")
 P, V, LP, LV, ACC = range(5)  # wires: position, velocity, leader's position and velocity, the acceleration command
 OLD = (Kind.DELAY, Kind.REPLAY)
-AIRED = (Kind.NOISE_JAM, Kind.ECHO_DELAY)  # a sensor that listens to its echo: tests/test_air.py
 WIRED = [kind for kind in Kind if kind != Kind.NONE and kind not in AIRED]
 MODEL = load_scenario("stop-and-go-v0").brief().model
 EXPECTED = np.array([-1.0, -2.0, -3.0, -4.0, -5.0])

@@ -25,13 +25,18 @@ from tailgate.schema import fields_of
 
 ID = "tailgate/CarFollowing-v0"
 ROOT = Path(__file__).parents[1]
-PLATOON, NETWORK = "tailgate/Platoon-v0", "tailgate/SensorNetwork-v0"
+RADAR, PLATOON, NETWORK = "tailgate/RadarFollowing-v0", "tailgate/Platoon-v0", "tailgate/SensorNetwork-v0"
 ACTIONS = get_args(ActionName)
 KINDS = ["dos_jam", "dos_hold", "dropout", "fdi"]
 TINY = {  # scenarios of 40 steps, short enough for many episodes
     ID: {
         "plant": {"name": "car_following", "gap": 20.0}, "sensor": "odometry", "controller": "acc", "horizon": 40,
         "manoeuvre": {"name": "braking", "onset": [0.0, 1.0]}, "threat_model": {"kinds": KINDS, "onset": 3},
+    },
+    RADAR: {
+        "plant": {"name": "radar_following", "gap": 60.0, "rear": True}, "sensor": "fmcw_radar", "controller": "acc_radar", "horizon": 40,
+        "manoeuvre": {"name": "braking", "onset": [0.0, 1.0]},
+        "threat_model": {"kinds": ["noise_jam", "echo_delay", "fdi"], "onset": 3},
     },
     PLATOON: {
         "plant": {"name": "platoon", "followers": 2, "gap": 14.0}, "sensor": "platoon_sensors", "controller": "cacc", "horizon": 40,
@@ -90,9 +95,9 @@ def test_both_checkers_pass_without_a_warning(action, knowledge, strict, brief_s
 
 @pytest.mark.parametrize("knowledge, sees", [("black", True), ("white", False)])
 @pytest.mark.parametrize("action", ACTIONS)
-@pytest.mark.parametrize("name", [PLATOON, NETWORK])
+@pytest.mark.parametrize("name", [RADAR, PLATOON, NETWORK])
 def test_both_checkers_pass_on_every_system(name, action, knowledge, sees, strict, tiny):
-    """Platoon and network: modes of single agents and wires, vectors, intervals, every reward that can be earned there."""
+    """Radar, platoon and network: modes of single agents and wires, vectors, intervals, every reward that can be earned there."""
     sb3 = pytest.importorskip("stable_baselines3.common.env_checker")
     for reward in get_args(RewardName):
         if name == NETWORK and reward in ("min_gap", "collision"):
@@ -300,7 +305,7 @@ CHANGES = [
     {"threat": {"sees_measurement": True}}, {"action": "timing"}, {"kind": "dropout"}, {"value": -3.0}, {"rate": 0.4},
     {"per_sensor": True}, {"per_agent": True}, {"error_scale": 5.0}, {"interval": 2}, {"reward": "error"}, {"gap_shaping": 0.1}, {"error_shaping": 0.1}, {"gamma": 0.9},
     {"illegal_penalty": 0.2},
-    {"attack_cost": 0.1}, {"steps": 7},
+    {"attack_cost": 0.1}, {"steps": 7}, {"power": 0.05}, {"delay": 3.0},
 ]  # fmt: skip
 
 

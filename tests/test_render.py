@@ -162,7 +162,7 @@ def test_cars_stay_in_the_picture_or_are_said_to_be_out_of_it(made, monkeypatch,
 
 
 def test_scale_comes_from_a_fixed_set():
-    scales = {render_following._scale(gap, rear) for gap in np.linspace(-2.0, 2000.0, 400) for rear in (0.0, 10.0, 50.0, 1000.0, np.inf)}
+    scales = {render_following.scale_of(gap, rear) for gap in np.linspace(-2.0, 2000.0, 400) for rear in (0.0, 10.0, 50.0, 1000.0, np.inf)}
     assert scales == {render_following.AHEAD / span for span in render_following.SPANS}
 
 

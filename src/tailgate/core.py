@@ -56,7 +56,8 @@ class Kind(IntEnum):
     ECHO_DELAY = 9  # over the air: the receiver's own signal comes back `value` metres too late
 
 
-RADIATED = (Kind.DOS_JAM, Kind.NOISE_JAM, Kind.ECHO_DELAY)  # kinds that a receiver which falls silent still hears
+AIRED = (Kind.NOISE_JAM, Kind.ECHO_DELAY)  # over the air: one value reaches all that a receiver reads, and changes what it measures
+RADIATED = (Kind.DOS_JAM, *AIRED)  # kinds that a receiver which falls silent still hears
 
 
 class Mode(IntEnum):
@@ -239,6 +240,7 @@ class View(NamedTuple):
     cooldown: Array  # (B,) steps before the next burst may start
     allowed: Array  # (B,) bool: a legal command would be accepted now
     last: Command  # the last command that took effect
+    probed: Array | None = None  # (B, N) bool: the sensor's probe was heard in the step before; None of sensors that send none
     control: Array | None = None  # (B, N, m) grey: the input last commanded
     received: Received | None = None  # the defence's measurement, before this step's attack
     defence: WhiteBox | None = None  # white: the defence object, its plan and its state

@@ -86,6 +86,7 @@ class LoopState(NamedTuple):
     defence: Any
     channel: ChannelState
     estimate: Estimate
+    probed: Array  # (B, N) bool: the sensor's probe was sent in the step before
     control: Array  # (B, N, m) what was commanded last
     known_u: Array  # (B, N, model inputs)
     sent: Array  # (B, N, q+p)
@@ -154,7 +155,8 @@ class Loop:
         sent, received = self._measure(keys, k + 1, plant, controller, estimate)
         return LoopState(
             keys, k + 1, plant, manoeuvre, controller, self.defence.start(plan.defence, prior),
-            Channel().start(plan.channel, expected, u), estimate, u, known, sent, received, np.zeros(batch, bool),
+            Channel().start(plan.channel, expected, u), estimate, estimate.probe.copy(order="K"), u, known, sent, received,
+            np.zeros(batch, bool),
         )  # fmt: skip
 
     def restart(self, state: LoopState, mask: Array) -> LoopState:
@@ -188,6 +190,8 @@ class Loop:
             allowed=Channel().allowed(plan.channel, channel, state.k),
             last=channel.last,
         )
+        if self.model.air:  # a radio signal: whoever is near hears it
+            view = view._replace(probed=state.probed)
         if threat.knowledge in ("grey", "white"):
             view = view._replace(control=state.control)
         if threat.knowledge == "white":
@@ -231,8 +235,9 @@ class Loop:
         sent, fresh = self._measure(state.keys, state.k + 1, plant, controller, estimate)
         ended = state.ended | ((collided | rear_collided) & self.ends_on_collision)
         state = LoopState(
-            state.keys, state.k + 1, plant, manoeuvre, controller, defence, channel, estimate, u, known, sent, fresh, ended
-        )
+            state.keys, state.k + 1, plant, manoeuvre, controller, defence, channel, estimate, state.estimate.probe, u, known, sent,
+            fresh, ended,
+        )  # fmt: skip
         return state, frame
 
     def step(self, state: LoopState, attack: Attack, plan: Any, memory: Any) -> tuple[LoopState, Any, Frame]:

@@ -11,6 +11,7 @@ from pydantic import Field
 
 from tailgate import num
 from tailgate.core import (
+    AIRED,
     RADIATED,
     Air,
     Array,
@@ -29,7 +30,6 @@ from tailgate.errors import InputError, unknown
 
 KindName = Literal["dos_jam", "dos_hold", "dos_hold_fresh", "dropout", "fdi", "delay", "replay", "noise_jam", "echo_delay"]
 Span = Annotated[int, Field(ge=1, le=10_000)]
-_AIRED = (Kind.NOISE_JAM, Kind.ECHO_DELAY)  # they change what the sensor measures, and not what it sends
 Pair = Annotated[tuple[float, float], Field(min_length=2, max_length=2)]
 
 
@@ -204,7 +204,7 @@ class Channel:
         hit = command.target & charged[:, None, None]
         kind = np.where(charged, kind, 0).astype(np.int8)
         q, value = plan.sensors, command.value
-        aired = np.isin(kind, _AIRED)
+        aired = np.isin(kind, AIRED)
         if aired.any():  # who reaches a receiver over the air reaches all that it reads
             strength = np.max(np.where(hit, value, 0.0), axis=2, keepdims=True)
             whole = aired[:, None, None] & hit.any(axis=2, keepdims=True) & (np.arange(hit.shape[2]) < q)
@@ -257,7 +257,7 @@ class Channel:
         with np.errstate(invalid="ignore"):
             ok = np.where(kind3 == Kind.DOS_JAM, (value >= plan.low) & (value <= plan.high), True)
             ok &= np.where(kind3 == Kind.FDI, np.abs(value) <= plan.bounds, True)
-            for aired, most in zip(_AIRED, (plan.threat.jam_power, plan.threat.delay_bound), strict=True):
+            for aired, most in zip(AIRED, (plan.threat.jam_power, plan.threat.delay_bound), strict=True):
                 sensor = np.arange(value.shape[2]) < plan.sensors
                 ok &= np.where(kind3 == aired, plan.air & sensor & (value > 0.0) & (value <= most), True)
             old = (kind3 == Kind.DELAY) | (kind3 == Kind.REPLAY)
@@ -277,7 +277,7 @@ class Channel:
         """What arrives of `sent` (B, N, .), the part `wires` of all wires, under the command in force."""
         command, out = state.last, sent
         target, value = command.target[..., wires], command.value[..., wires]
-        for kind in sorted(set(command.kind[target.any(axis=(1, 2))].tolist()) - set(_AIRED)):
+        for kind in sorted(set(command.kind[target.any(axis=(1, 2))].tolist()) - set(AIRED)):
             hit = target & (command.kind == kind)[:, None, None]
             if kind == Kind.DOS_JAM:
                 changed = value

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from tailgate.core import Array, Kind, Mode
+from tailgate.core import AIRED, Array, Kind, Mode
 from tailgate.drawing import edges, hops, layout
 from tailgate.errors import InputError
 
@@ -18,7 +18,7 @@ DIGITS = 6  # of a curve; decisions are exact
 SHOWN = 24  # agents with curves of their own in a page, at most
 LANES = 8  # attacked wires with a lane each, at most; of more the agents have one
 METRE_S2 = "m/s\N{SUPERSCRIPT TWO}"
-WIRE_UNITS = {"position": "m", "distance": "m", "velocity": "m/s", "acceleration": METRE_S2, "command": METRE_S2}
+WIRE_UNITS = {"position": "m", "distance": "m", "velocity": "m/s", "acceleration": METRE_S2, "command": METRE_S2, "speed": "m/s"}
 KINDS = {  # what a reader sees of a kind: short name, name, what it does to the wire
     Kind.DOS_JAM: ("JAM", "DoS jam", "the receiver reads the jammer's value"),
     Kind.DOS_HOLD: ("HOLD", "DoS hold", "the receiver is stuck at the last reading before the first attack"),
@@ -27,8 +27,12 @@ KINDS = {  # what a reader sees of a kind: short name, name, what it does to the
     Kind.FDI: ("FDI", "false data injection", "the value is added"),
     Kind.DELAY: ("DELAY", "delay", "the receiver reads what was sent so many steps ago"),
     Kind.REPLAY: ("REPLAY", "replay", "the receiver reads the last so many samples over and over"),
+    Kind.NOISE_JAM: ("NOISE", "noise jamming", "noise of so much power reaches the receiver over the air"),
+    Kind.ECHO_DELAY: ("ECHO", "late echo", "the probe is answered late, so that the car ahead seems so much farther away"),
 }
-VALUED = {Kind.DOS_JAM: "", Kind.FDI: "", Kind.DELAY: "steps", Kind.REPLAY: "steps"}  # unit; empty: that of the wire
+VALUED = {  # unit; empty: that of the wire
+    Kind.DOS_JAM: "", Kind.FDI: "", Kind.DELAY: "steps", Kind.REPLAY: "steps", Kind.NOISE_JAM: "W", Kind.ECHO_DELAY: "m",
+}  # fmt: skip
 
 
 def curve(values: Array) -> list[float | None]:
@@ -79,7 +83,7 @@ def _believed_gap(replay: Replay, agent: int) -> Array:
     """(K,) the gap as the agent believes it; where its state is a position, the leader's one as it was heard, less the own one."""
     trace, model = replay.trace, replay.loop.model
     assert model.gap is not None
-    if model.agents > 1:
+    if model.agents > 1 or model.air:
         return np.asarray(trace.estimate[:, 0, agent] @ model.gap[agent])
     if "leader_position" in model.v2v:
         leader = trace.wires[:, 0, agent, model.wires.index("leader_position")]
@@ -91,6 +95,8 @@ def _believed_gap(replay: Replay, agent: int) -> Array:
 def _wires(replay: Replay) -> list[Data]:
     """The wires that were ever attacked, each with the kinds that hit it; of very many those of an agent together."""
     trace, model, hit = replay.trace, replay.loop.model, _hit(replay)
+    if np.isin(trace.kind[:, 0], AIRED).any():
+        return _receivers(replay)
     pairs = np.argwhere(hit.any(axis=0)).tolist()
     if len(pairs) <= LANES:
         out = []
@@ -109,6 +115,23 @@ def _wires(replay: Replay) -> list[Data]:
     return lanes
 
 
+def _receivers(replay: Replay) -> list[Data]:
+    """As `_wires`, where something was sent over the air: that reaches all readings of a receiver, and has one lane for them."""
+    trace, model, hit = replay.trace, replay.loop.model, _hit(replay)
+    aired = np.isin(trace.kind[:, 0], AIRED)
+    out = []
+    for i in range(model.agents):
+        whose = "" if model.agents == 1 else f" of {noun(replay)} {i}"
+        reached = hit[:, i].any(axis=1) & aired
+        if reached.any():
+            value = np.where(reached, trace.value[:, 0, i].max(axis=1), 0.0)
+            out.append(_lane(replay, f"receiver{whose}", "", reached) | {"value": value.tolist()})
+        for w in np.flatnonzero((hit[:, i] & ~aired[:, None]).any(axis=0)).tolist():
+            name, unit = model.wires[w].replace("_", " ") + whose, WIRE_UNITS.get(model.wires[w].split("_")[-1], "")
+            out.append(_lane(replay, name, unit, hit[:, i, w] & ~aired) | {"value": [float(v) for v in trace.value[:, 0, i, w]]})
+    return out
+
+
 def _lane(replay: Replay, name: str, unit: str, hit: Array) -> Data:
     return {"name": name, "unit": unit, "kinds": sorted(set(replay.trace.kind[hit, 0].tolist())), "hit": hit.astype(int).tolist()}
 
@@ -116,13 +139,15 @@ def _lane(replay: Replay, name: str, unit: str, hit: Array) -> Data:
 def _of_agent(replay: Replay, agent: int) -> Data:
     """The curves of one agent."""
     trace, model, follows = replay.trace, replay.loop.model, bool(replay.loop.model.followers[agent])
-    limit, score, alarm, gate = threshold(replay.loop.defence), trace.score[:, 0, agent], trace.alarm[:, 0, agent], replay.gate[:, agent]
+    limit = threshold(replay.loop.defence) or _energy_threshold(replay)
+    score, alarm, gate = trace.score[:, 0, agent], trace.alarm[:, 0, agent], replay.gate[:, agent]
     rear = _road(replay, "rear_gap", agent)
     out: Data = {
         "road": None, "rear": None, "desired": None, "believed": None, "errors": _errors(replay, agent),
         "score": curve(score), "alarm": alarm.astype(int).tolist(), "mode": trace.mode[:, 0, agent].tolist(),
         "threshold": None if limit is None else {"name": limit[0], "value": limit[1], "rules": bool(((score > limit[1]) == alarm).all())},
         "gate": curve(gate) if limit is None and np.isfinite(gate).any() else None, "control": None, "applied": None,
+        "radar": _radar(replay, agent) if model.air else None,
     }  # fmt: skip
     if follows:
         assert model.speed is not None
@@ -139,14 +164,42 @@ def _of_agent(replay: Replay, agent: int) -> Data:
     return out
 
 
+def _radar(replay: Replay, agent: int) -> Data:
+    """What the radar did and heard: muted (K,), energy over its noise [dB], and where the defence declares it the threshold [dB].
+
+    `then` (K,) is the true gap at the measurement, to which the belief of the step belongs.
+    """
+    trace = replay.trace
+    sent = np.concatenate([[True], trace.probe[:-1, 0, agent]])  # each step's probe is chosen in the step before
+    limit = _energy_threshold(replay)
+    return {
+        "muted": (~sent).astype(int).tolist(), "energy": curve(_decibels(trace.energy[:, 0, agent])),
+        "threshold": None if limit is None else float(_decibels(np.asarray(limit[1]))),
+        "then": curve(_road(replay, "gap", agent)[:-1]),
+    }  # fmt: skip
+
+
+def _energy_threshold(replay: Replay) -> tuple[str, float] | None:
+    """Name and value of the threshold on the energy at a challenge; None of defences that make none."""
+    value = getattr(replay.loop.plan.defence, "threshold", None) if "probe" in replay.loop.uses else None
+    return ("energy", float(value)) if isinstance(value, float) else None
+
+
+def _decibels(power: Array) -> Array:
+    return np.asarray(10.0 * np.log10(np.maximum(power, 1e-9)))
+
+
 def _errors(replay: Replay, agent: int) -> list[Data]:
     """The plots of an agent's errors: name, heading, unit, smallest span of the axis, values."""
     trace, model = replay.trace, replay.loop.model
     if model.agents == 1 and model.followers.any():
         off = trace.estimate[:, 0, 0] - trace.truth[:, 0, 0]
+        parts = [("position", "position", "m", 1.0), ("velocity", "velocity", "m/s", 0.5)]
+        if model.air:
+            parts = [("gap-error", "gap", "m", 1.0), ("relative-speed-error", "relative speed", "m/s", 0.5)]
         return [
-            {"name": name, "title": f"Estimation error of the {name}", "unit": WIRE_UNITS[name], "least": least, "values": curve(off[:, i])}
-            for i, (name, least) in enumerate((("position", 1.0), ("velocity", 0.5)))
+            {"name": name, "title": f"Estimation error of the {of}", "unit": unit, "least": least, "values": curve(off[:, i])}
+            for i, (name, of, unit, least) in enumerate(parts)
         ]
     if not model.followers.any():
         return []  # the errors of all agents stand in one plot

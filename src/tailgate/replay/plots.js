@@ -6,11 +6,11 @@ const buildPlots = (() => {
   // by number of the kind: colour and pattern, so that neither is needed alone
   const LOOKS = {
     1: ["#b34700", "cross"], 2: ["#0072b2", "across"], 3: ["#00694b", "dashes"], 4: ["#4d4d4d", "dots"], 5: ["#7a2a6b", "rising"],
-    6: ["#8a5a00", "falling"], 7: ["#1a1a1a", "upright"],
+    6: ["#8a5a00", "falling"], 7: ["#1a1a1a", "upright"], 8: ["#a3003c", "specks"], 9: ["#00606b", "waves"],
   };
   const PATTERNS = {
     cross: "M0 0 8 8M8 0 0 8", across: "M0 2H8M0 6H8", dashes: "M0 2H5M4 6H8M0 6H1", dots: "M1 2h2M5 6h2", rising: "M-2 2 2-2M0 8 8 0M6 10 10 6",
-    falling: "M-2 6 2 10M0 0 8 8M6-2 10 2", upright: "M2 0V8M6 0V8",
+    falling: "M-2 6 2 10M0 0 8 8M6-2 10 2", upright: "M2 0V8M6 0V8", specks: "M1 1h1M5 2h1M3 4h1M7 5h1M1 6h1M5 7h1", waves: "M0 4 2 1 4 4 6 7 8 4",
   };
 
   const make = (name, attributes = {}, parent = null, words = null) => {
@@ -77,7 +77,8 @@ const buildPlots = (() => {
 
   // of one agent alone everything; of many the plots of all (part "all") or those of one of them (part "one")
   return (box, episode, seek, part = "") => {
-    const { dt, length, road, believed, errors, wires, kinds } = episode;
+    const { dt, length, road, believed, errors, wires, kinds, radar } = episode;
+    const age = radar ? 0 : 1; // the steps of a radar are long: its beliefs stand at the time of the measurement
     const end = Math.max(length, 1) * dt, digits = dt >= 0.1 ? 1 : dt >= 0.01 ? 2 : 3;
     const attacked = runsOf(length, (s) => episode.kind[s - 1] !== 0);
     const alarms = runsOf(length, (s) => episode.alarm[s - 1]);
@@ -218,7 +219,7 @@ const buildPlots = (() => {
     }
     if (part !== "all" && road) chart("gap", "Gap to the car ahead", "m", [
       { name: "true", values: road.gap, offset: 0, ink: TRUTH, thick: 2.5 },
-      { name: "believed", values: believed.gap, offset: 1, ink: BELIEF, dash: "6 4", wild: true },
+      { name: "believed", values: believed.gap, offset: age, ink: BELIEF, dash: "6 4", wild: true },
       { name: "desired at the true speed", values: episode.desired, offset: 0, ink: DESIRED, dash: "2 3" },
     ], {
       include: [0], least: 5, height: 190,
@@ -227,10 +228,26 @@ const buildPlots = (() => {
     if (part !== "all" && road) chart("speed", "Speed", "m/s", [
       { name: part ? `car ${episode.number}` : "ego", values: road.speed, offset: 0, ink: EGO, thick: 2.5, digits: 2 },
       { name: part ? "car ahead" : "leader", values: road.lead_speed, offset: 0, ink: LEADER, dash: "10 3 2 3", digits: 2 },
-      { name: "believed own", values: believed.speed, offset: 1, ink: BELIEF, dash: "6 4", wild: true, digits: 2 },
+      { name: "believed own", values: believed.speed, offset: age, ink: BELIEF, dash: "6 4", wild: true, digits: 2 },
     ], { include: [0], least: 2 });
     if (part !== "all") for (const { name, title, unit, least, values } of errors) {
       chart(name, title, unit, [{ name: "estimate less truth", values, offset: 1, ink: BELIEF, digits: 2 }], { include: [0], least, height: 130 });
+    }
+
+    if (part !== "all" && radar && radar.muted.includes(1)) drawChallenges();
+    function drawChallenges() {
+      // a dot for each challenge, filled where more than the threshold was heard
+      const { muted, energy, threshold } = radar, heard = energy.map((v, i) => (muted[i] ? v : null)), loud = (v) => threshold !== null && v > threshold;
+      const curves = [{ name: "heard at a challenge", values: heard, offset: 1, ink: TRUTH, digits: 2 }];
+      if (threshold !== null) curves.push({ name: `threshold of the defence = ${short(threshold)} dB`, values: Array(length).fill(threshold), offset: 1, ink: ATTACK, dash: "7 4", level: true });
+      const one = chart("radar", "Energy that the silent radar hears, over its own noise", "dB", curves, {
+        include: [0], least: 3, height: 130,
+        over: (self, frame, y) => heard.forEach((v, i) => {
+          if (v !== null) make("circle", { cx: frame.x((i + 1) * dt), cy: y(v), r: 3.5, fill: loud(v) ? TRUTH : "#fff", stroke: TRUTH, "stroke-width": 1.5 }, self.svg);
+        }),
+      });
+      const all = heard.filter((v) => v !== null), above = all.filter(loud).length;
+      note(one, `${all.length} ${all.length === 1 ? "challenge" : "challenges"}${threshold === null ? "" : `, ${above} above the threshold (filled)`}`);
     }
 
     // score, threshold or gate, alarm

@@ -27,35 +27,50 @@ const drawRoad = (() => {
       sign(x, trueLine, words, from, to);
     };
 
-    const { road, rear, believed } = episode;
-    const gap = road.gap[s], rearGap = rear ? rear.rear_gap[s] : Infinity;
+    const { road, rear, believed, radar } = episode;
+    const shown = (x) => (radar ? Math.max(x, 0) : x); // a long step ends metres beyond a collision
+    const gap = shown(road.gap[s]), rearGap = rear ? shown(rear.rear_gap[s]) : Infinity;
     const first = SPANS.findIndex((metre) => gap <= metre), from = first < 0 ? SPANS.length - 1 : first;
     const scales = SPANS.slice(from, from + 2).map((metre) => ahead / metre);
     const scale = scales.find((each) => rearGap * each <= behind) ?? scales[0];
     const leader = nose + gap * scale, lane = ahead / 6;
 
     // the belief
-    const belief = s ? believed.gap[s - 1] : null;
+    const belief = s ? believed.gap[s - 1] : null, off = radar && s ? radar.then[s - 1] - belief : gap - belief; // of the time of the measurement
     pen.fillStyle = BELIEF_PALE;
     pen.fillRect(0, strip, width, height - strip);
     line(0, strip, width, strip, BELIEF, 1);
     line(0, ghostWheels, width, ghostWheels, BELIEF, 1, [3, 3]);
     text(margin, strip + small + 4, "WHERE THE EGO BELIEVES IT IS", { ink: BELIEF, room: [margin, width - margin] });
     if (belief !== null) {
-      const ghost = clamp(nose + (gap - belief) * scale, -FAR, FAR);
+      const ghost = clamp(nose + off * scale, -FAR, FAR);
       line(leader, trueLine, leader, ghostWheels, LEADER, 1, [3, 3]); // the same bumper in both strips
       const middle = span(ghost, leader, believedLine, BELIEF, [5, 5]);
-      text(middle, believedLine - 9, `believed gap ${metres(belief)}`, { ink: BELIEF, size: large, anchor: "m", bold: true, room: [margin, width - margin], ground: BELIEF_PALE });
+      text(middle, believedLine - 9, `believed gap ${metres(belief)}${radar ? ` (true then: ${metres(radar.then[s - 1])})` : ""}`, { ink: BELIEF, size: large, anchor: "m", bold: true, room: [margin, width - margin], ground: BELIEF_PALE });
       if (ghost > 0 && ghost - car < width) drawCar(ghost, ghostWheels, BELIEF, true, car);
       else {
         const way = ghost > 0 ? 1 : -1, x = way > 0 ? width - margin : margin, y = ghostWheels - tall / 2;
         head(x, y, way, BELIEF, 18);
-        text(x - way * 24, y + 5, `out of view: ${metres(Math.abs(gap - belief))} ${way > 0 ? "ahead of" : "behind"} where it really is`,
+        text(x - way * 24, y + 5, `out of view: ${metres(Math.abs(off))} ${way > 0 ? "ahead of" : "behind"} where it really is`,
           { ink: BELIEF, anchor: way > 0 ? "r" : "l", room: [margin + 24, width - margin - 24], ground: BELIEF_PALE });
       }
     } else text(width / 2, believedLine, "no measurement yet", { ink: BELIEF, anchor: "m" });
     span(margin, margin + lane, height - 8, GREY);
     text(margin + lane + 8, height - 4, `${+(lane / scale).toFixed(2)} m`, { ink: GREY });
+
+    if (radar && s) {
+      const muted = radar.muted[s - 1], level = radar.energy[s - 1].toFixed(1).replace("-", "−");
+      const words = narrow ? (muted ? "CHALLENGE, heard" : "radar on, heard") : muted ? "CHALLENGE: radar silent, heard" : "radar transmits, heard";
+      text(width - margin, height - 4, `${words} ${level} dB`, { ink: INK, anchor: "r", bold: Boolean(muted), room: [margin + lane + (narrow ? 50 : 80), width - margin] });
+      if (!muted && !(s === episode.hit)) for (const radius of [10, 17, 24]) { // the probe
+        let from = null;
+        for (let turn = -2; turn <= 2; turn += 1) {
+          const angle = turn * 0.35, to = [nose + radius * Math.cos(angle), wheels - tall / 2 + radius * Math.sin(angle)];
+          if (from) line(...from, ...to, EGO, 1.5);
+          from = to;
+        }
+      }
+    }
 
     // the truth
     text(margin, small + 4, "THE ROAD AS IT IS", { ink: GREY });

@@ -19,7 +19,7 @@ from tailgate.files import writable_directory, write_atomic
 
 from .claims import Claim, Report
 
-CHAPTERS = {name: f"tailgate.reproduce.{name}" for name in ("ch4", "ch5", "ch6")}
+CHAPTERS = {name: f"tailgate.reproduce.{name}" for name in ("ch3", "ch4", "ch5", "ch6")}
 
 
 def reproduce(chapter: str, seeds: int = 200, tick: Callable[[str], None] = lambda _: None, figures: bool = True) -> Report:
