@@ -32,8 +32,18 @@ def on_receivers(brief: Brief, attack: str, target: Array, named: bool) -> Array
     return np.asarray(target & reached)
 
 
-def _radiate(plan: ScriptPlan, on: Array, kind: Kind, law: Law, count: Array, draws: Draws) -> Command:
-    return plan.brief.command(on, kind, plan.target, fit(plan.brief, kind, law.sample(plan.brief, count, draws)))
+@dataclass(frozen=True)
+class OverTheAir(Script):
+    """Base of scripts that radiate."""
+
+    hop: bool = param(False, "radiate only after a step in which the probe was heard: silent where a muted probe is likely to stay so")
+
+    def radiate(self, plan: ScriptPlan, on: Array, kind: Kind, law: Law, count: Array, view: View, draws: Draws) -> Command:
+        """A law's values, in the rows `on` (B,)."""
+        if self.hop:
+            assert view.probed is not None
+            on = on & view.probed.any(axis=1)
+        return plan.brief.command(on, kind, plan.target, fit(plan.brief, kind, law.sample(plan.brief, count, draws)))
 
 
 def _aimed(script: Script, brief: Brief, kind: str) -> ScriptPlan:
@@ -46,7 +56,7 @@ def _aimed(script: Script, brief: Brief, kind: str) -> ScriptPlan:
 
 @register("attack", "noise_jam", reference="Dutta 2018, (3.10)")
 @dataclass(frozen=True)
-class NoiseJam(Script):
+class NoiseJam(OverTheAir):
     """A jammer's noise reaches the receiver, which measures worse, or nothing, as their powers decide."""
 
     power: Positive = param(0.1, "power of the jammer, cut at jam_power [W]")
@@ -55,12 +65,12 @@ class NoiseJam(Script):
         return _aimed(self, brief, "noise_jam")
 
     def command(self, plan: ScriptPlan, on: Array, count: Array, view: View, draws: Draws) -> Command:
-        return _radiate(plan, on, Kind.NOISE_JAM, Constant(self.power), count, draws)
+        return self.radiate(plan, on, Kind.NOISE_JAM, Constant(self.power), count, view, draws)
 
 
 @register("attack", "echo_delay", reference="Dutta 2018, section 3.5: 6 m more")
 @dataclass(frozen=True)
-class EchoDelay(Script):
+class EchoDelay(OverTheAir):
     """The probe is answered late: the car ahead seems to be farther away than it is."""
 
     delay: Positive = param(6.0, "extra range, cut at delay_bound [m]")
@@ -69,12 +79,12 @@ class EchoDelay(Script):
         return _aimed(self, brief, "echo_delay")
 
     def command(self, plan: ScriptPlan, on: Array, count: Array, view: View, draws: Draws) -> Command:
-        return _radiate(plan, on, Kind.ECHO_DELAY, Constant(self.delay), count, draws)
+        return self.radiate(plan, on, Kind.ECHO_DELAY, Constant(self.delay), count, view, draws)
 
 
 @register("attack", "echo_pull_off", reference="D. C. Schleher, Electronic Warfare in the Information Age, 1999: range-gate pull-off")
 @dataclass(frozen=True)
-class EchoPullOff(Script):
+class EchoPullOff(OverTheAir):
     """The probe is answered a little later in every step, slowly enough to look like a car that draws away."""
 
     base: Finite = param(0.0, "extra range before the first growth [m]")
@@ -84,12 +94,12 @@ class EchoPullOff(Script):
         return _aimed(self, brief, "echo_delay")
 
     def command(self, plan: ScriptPlan, on: Array, count: Array, view: View, draws: Draws) -> Command:
-        return _radiate(plan, on, Kind.ECHO_DELAY, Ramp(self.base, self.rate, plan.brief.threat.delay_bound), count, draws)
+        return self.radiate(plan, on, Kind.ECHO_DELAY, Ramp(self.base, self.rate, plan.brief.threat.delay_bound), count, view, draws)
 
 
 @register("attack", "radar_jam", reference="Dutta 2018, section 3.5: 'a very high value'; its numbers are not given there")
 @dataclass(frozen=True)
-class RadarJam(Script):
+class RadarJam(OverTheAir):
     """Denial of service as the thesis has it: a jammed radar reads random far distances and fast opening speeds."""
 
     distance: Span = param((180.0, 250.0), "the distance is uniform on this span [m]")
@@ -103,7 +113,7 @@ class RadarJam(Script):
 
     def prepare(self, brief: Brief) -> ScriptPlan:
         for name in WIRES:
-            if name not in brief.model.sensors:
+            if name not in brief.model.sensors or not brief.model.air:
                 raise NotApplicable("attack radar_jam", f"no sensor {name}", "a radar, which reads distance and relative speed")
         mine = np.isin(brief.model.wires, WIRES)
         target = chosen(brief, self.targets, brief.granted & mine, self.agents)
@@ -116,4 +126,4 @@ class RadarJam(Script):
         return ScriptPlan(brief, target, PerWire(tuple((name, Uniform(*getattr(self, name))) for name in WIRES)))
 
     def command(self, plan: ScriptPlan, on: Array, count: Array, view: View, draws: Draws) -> Command:
-        return _radiate(plan, on, Kind.DOS_JAM, plan.extra, count, draws)
+        return self.radiate(plan, on, Kind.DOS_JAM, plan.extra, count, view, draws)

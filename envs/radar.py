@@ -51,6 +51,10 @@ class FmcwRadar(Link):
         if self.reach[0] >= self.reach[1]:
             raise InputError("fmcw_radar.reach", self.reach, "two distances, the least first")
 
+    @property
+    def challenge(self) -> int:
+        return challenge_samples(self.window, self.bandwidth)
+
     def matrices(self, plant: Sized) -> tuple[tuple[str, ...], Array, Array]:
         if plant.size != (1, STATES):
             raise InputError("sensor fmcw_radar", type(plant).__name__, "the plant radar_following")
@@ -61,7 +65,7 @@ class FmcwRadar(Link):
         noise = self.noise_power
         echo, jam = float(self.echo_power(1.0)) / noise, self.passed * float(self.jam_power(1.0, 1.0)) / noise
         sd = np.array([self.range_sd, self.speed_sd])
-        return RadarSensorPlan(model.C[0], sd, echo, jam, challenge_samples(self.window, self.bandwidth))
+        return RadarSensorPlan(model.C[0], sd, echo, jam, self.challenge)
 
     def measure(self, plan: RadarSensorPlan, truth: Array, probe: Array, draws: Draws) -> Received:
         quiet = num.zeros(probe.shape)
@@ -95,11 +99,13 @@ class FmcwRadar(Link):
         return up, down
 
     def _energy(self, plan: RadarSensorPlan, probe: Array, jam: Array, tone: Array, air: Air, z: Array) -> Array:
-        """(B, N) mean power over the receiver's noise in a window of the length of a challenge."""
+        """(B, N) mean power over the receiver's noise, of a challenge; 0 where the probe is sent.
+
+        There it would be the echo's, of a target that does not fluctuate: a distance by the radar equation that no late echo changes.
+        """
         attacked = (air.power > 0.0) | (air.delay > 0.0)
         part = min(air.reaction, self.window) / self.window * plan.challenge  # samples, not always a whole number
         whole = max(1.0, float(np.ceil(part)))
-        cut = ~probe & attacked
-        heard, scale = np.where(cut, whole, float(plan.challenge)), np.where(cut, part / whole, 1.0)
-        tone = np.where(probe | (air.delay > 0.0), tone, 0.0)
-        return heard_energy(plan.challenge, heard, jam * scale, tone * scale, z)
+        heard, scale = np.where(attacked, whole, float(plan.challenge)), np.where(attacked, part / whole, 1.0)
+        tone = np.where(air.delay > 0.0, tone, 0.0)
+        return np.where(probe, 0.0, heard_energy(plan.challenge, heard, jam * scale, tone * scale, z))

@@ -75,7 +75,8 @@ class RadarFollowing:
         rows = np.eye(STATES)
         return Model(
             A=A, B=B, c=np.zeros(STATES), C=C, Q=np.diag(self.process_var), R=R, graph=np.eye(1, dtype=bool), dt=T, sensors=sensors,
-            actuators=("acceleration",), gap=rows[[GAP]], speed=rows[[OWN_SPEED]], air=isinstance(sensor, Receiver),
+            actuators=("acceleration",), gap=rows[[GAP]], speed=rows[[OWN_SPEED]],
+            challenge=sensor.challenge if isinstance(sensor, Receiver) else 0,
         )  # fmt: skip
 
     def start(self, plan: RadarPlan, draws: Draws) -> RadarState:

@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import Field
 
 from tailgate import num
-from tailgate.core import Array, Innovation, Positive, Probability, param
+from tailgate.core import Array, Innovation, Positive, PositiveCount, Probability, param
 from tailgate.registry import register
 
 from .challenge import WATCH, Challenger, Response
@@ -68,8 +68,11 @@ class PrintedRegression(Predictor):
 class AsPrinted(Challenger):
     """The thesis's Algorithms 1 and 2 as printed: after detection it drives on a fit to what the attacker sends, and fails."""
 
+    label = "algorithm2"
+
     challenge: Literal["random", "fixed"] = param("fixed", "random: each step with a probability; fixed: at the steps of a list")
     watch: Probability | None = param(None, WATCH)
+    quiet: PositiveCount = param(1, "challenges in a row that have to pass before an alarm ends")
     forgetting: Factor = param(0.95, "forgetting factor lambda of both fits [-]")
     delta: Positive = param(1.0, "P at first, over the unit matrix [-]")
 

@@ -15,7 +15,7 @@ a false alarm a challenge.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -23,8 +23,8 @@ from pydantic import Field
 from tailgate import num
 from tailgate.core import Array, Estimate, Model, NonNegative, Positive, PositiveCount, Prior, Probability, Received, param
 from tailgate.draws import Draws
-from tailgate.envs.fmcw import false_alarm_threshold
-from tailgate.errors import NotApplicable
+from tailgate.envs.fmcw import false_alarm_threshold, from_db
+from tailgate.errors import InputError, NotApplicable
 from tailgate.registry import imported, make_from, register
 from tailgate.schema import build
 from tailgate.tree import map_leaves
@@ -35,6 +35,7 @@ from .predictors import read_states
 Chance = Annotated[float, Field(gt=0, lt=1)]
 Steps = tuple[PositiveCount, ...]
 THESIS_TIMES = (15, 50, 175, 182)
+CHANCE = 0.1
 PREDICTOR = "joint_rls"
 FILTER = "filter that predicts: a name, or a mapping with name and parameters"
 WATCH = "probability of a challenge a step while alarmed, in place of the random ones or besides the list [-]; none: as without an alarm"
@@ -83,18 +84,28 @@ def pick(mask: Array, chosen: Any, other: Any) -> Any:
 class Challenger:
     """Base: when to challenge, and what is heard. A subclass says which filter predicts and what an alarm changes."""
 
+    label: ClassVar[str]  # its registered name
+
     challenge: Literal["random", "fixed"] = param("random", "random: each step with a probability; fixed: at the steps of a list")
-    probability: Probability = param(0.1, "probability of a random challenge a step [-]")
-    times: Steps = param(THESIS_TIMES, "steps of the fixed challenges")
-    watch: Probability | None = param(1.0, WATCH)
-    quiet: PositiveCount = param(1, "challenges in a row that have to pass before an alarm ends")
+    probability: Probability | None = param(None, f"random: probability of a challenge a step [-]; none: {CHANCE}")
+    times: Steps | None = param(None, f"fixed: steps of the challenges; none: the thesis's {', '.join(map(str, THESIS_TIMES))}")
+    watch: Probability | None = param(0.3, WATCH)
+    quiet: PositiveCount = param(3, "challenges in a row that have to pass before an alarm ends")
     suspicion: Positive | None = param(
         None, "r' S^-1 r of a reading above which the next step is a challenge, besides those of the schedule [-]; none: never"
     )
     false_alarm: Chance = param(1e-6, "probability of a false alarm a challenge [-]")
-    samples: PositiveCount = param(25600, "complex samples in the window of a challenge: 0.1 s at 256 kHz")
+    margin: NonNegative = param(0.0, "how much stronger than it is told the receiver's noise may be, on top of the threshold [dB]")
     mode: ModeName = param(AcceptAll.mode, "what is asked of the controller while alarmed: normal, widen, brake, stop or acc")
     linger: NonNegative = param(AcceptAll.linger, "time that the mode outlasts the last alarm [s]")
+
+    def __post_init__(self) -> None:
+        unused = "times" if self.challenge == "random" else "probability"
+        if getattr(self, unused) is not None:
+            raise InputError(f"defence {self.label}.{unused}", getattr(self, unused), f"none: challenges are {self.challenge}")
+        if self.times is not None and 1 in self.times:
+            raise InputError(f"defence {self.label}.times", self.times, "steps from 2 on: nobody is asked before the first")
+        self.predictor()  # a wrong name shall fail here
 
     def predictor(self) -> Filter:
         """The filter that predicts the readings."""
@@ -105,13 +116,14 @@ class Challenger:
         raise TypeError(f"{type(self).__name__} must define response()")
 
     def prepare(self, model: Model) -> ChallengePlan:
-        name = f"defence {type(self).__name__}"
+        name = f"defence {self.label}"
         if not model.air or model.agents != 1:
             raise NotApplicable(name, list(model.sensors), "one vehicle whose sensor listens to the echo of its own probe")
         predictor, reaction = self.predictor(), AcceptAll(mode=self.mode, linger=self.linger)
         return ChallengePlan(
             predictor, predictor.prepare(model), reaction, reaction.prepare(model), self.response(),
-            false_alarm_threshold(self.false_alarm, self.samples), read_states(model, name), np.array(self.times, np.int64),
+            from_db(self.margin) * false_alarm_threshold(self.false_alarm, model.challenge), read_states(model, name),
+            np.array(THESIS_TIMES if self.times is None else self.times, np.int64),
         )  # fmt: skip
 
     def start(self, plan: ChallengePlan, prior: Prior) -> ChallengeState:
@@ -159,7 +171,8 @@ class Challenger:
 
     def _due(self, plan: ChallengePlan, k: Array, alarm: Array, draws: Draws) -> Array:
         """(B, N) bool: step k (B,) is a challenge by the schedule, or by the watch that is kept during an alarm."""
-        u, usual = draws.uniform((1,)), self.probability if self.challenge == "random" else 0.0
+        chance = CHANCE if self.probability is None else self.probability
+        u, usual = draws.uniform((1,)), chance if self.challenge == "random" else 0.0
         due = u < (usual if self.watch is None else np.where(alarm, self.watch, usual))
         return np.asarray(due if self.challenge == "random" else due | np.isin(k, plan.times)[:, None])
 
@@ -190,15 +203,14 @@ def named_filter(data: Any, where: str) -> Filter:
 )  # fmt: skip
 @dataclass(frozen=True, kw_only=True)
 class ChallengeResponse(Challenger):
-    """Challenge-response authentication: an answer to a muted probe is an attack; the prediction is driven on until a challenge passes."""
+    """Challenge-response authentication: an answer to a muted probe is an attack; the prediction is driven on until challenges pass."""
+
+    label = "cra"
 
     filter: Any = param(PREDICTOR, FILTER)
     passes: bool = param(True, "without an attack the controller drives on the readings as they are, else on the filter's estimate")
     rollback: bool = param(True, "an alarm takes back what was used since the last challenge that passed")
     freeze: bool = param(True, "the filter uses no reading during an alarm")
-
-    def __post_init__(self) -> None:
-        self.predictor()  # a wrong name shall fail here
 
     def predictor(self) -> Filter:
         return named_filter(self.filter, "defence cra.filter")
@@ -215,11 +227,11 @@ class ChallengeResponse(Challenger):
 class PyCra(Challenger):
     """Challenge-response authentication that only tells of an attack: readings are believed, and predicted at challenges alone."""
 
-    watch: Probability | None = param(None, WATCH)
-    filter: Any = param(PREDICTOR, FILTER)
+    label = "pycra"
 
-    def __post_init__(self) -> None:
-        self.predictor()
+    watch: Probability | None = param(None, WATCH)
+    quiet: PositiveCount = param(1, "challenges in a row that have to pass before an alarm ends")
+    filter: Any = param(PREDICTOR, FILTER)
 
     def predictor(self) -> Filter:
         return named_filter(self.filter, "defence pycra.filter")

@@ -139,10 +139,10 @@ def _energies(loop, command, rows=32):
 
 @pytest.mark.parametrize("kind, value", [(Kind.NOISE_JAM, 0.1), (Kind.ECHO_DELAY, 6.0), (Kind.DOS_JAM, 200.0)])
 def test_a_silent_receiver_hears_whoever_radiates(kind, value, loop):
-    """At a challenge noise alone has its mean power; an attack of any kind over the air is far above it; readings are not valid."""
+    """At a challenge, and only there, power is heard: noise alone has its mean; an attack of any kind over the air is far above it; readings are not valid."""
     silent = np.isin(np.arange(1, 13), SILENT)
     quiet, loud = _energies(loop(), None), _energies(loop(), radiating(kind, value))
-    assert abs(quiet[silent] - 1.0).max() < 0.05 and quiet[~silent].min() > 2.0
+    assert abs(quiet[silent] - 1.0).max() < 0.05 and not quiet[~silent].any() and not loud[~silent].any()
     assert loud[silent].min() > 10.0
     for frame in run(loop(), radiating(kind, value)):
         assert frame.received.valid.any() == (frame.k[0] not in SILENT)
@@ -178,6 +178,18 @@ def test_the_budget_counts_what_is_radiated(loop):
     frames = run(loop(budget=5), radiating(Kind.NOISE_JAM, 0.1))
     assert [bool(frame.refused[0]) for frame in frames] == [k > 5 for k in range(1, 13)]
     assert frames[5].received.energy[0, 0] < 1.05 and frames[4].received.energy[0, 0] > 10.0  # both silent
+
+
+@pytest.mark.parametrize("kind, value", [(Kind.DOS_HOLD, 0.0), (Kind.DOS_HOLD_FRESH, 0.0), (Kind.DELAY, 1.0), (Kind.REPLAY, 3.0)])
+def test_what_a_silent_receiver_does_not_read_is_not_remembered(kind, value):
+    """Held, delayed and replayed samples are readings that there were, also when a muted step came right before: never its zero."""
+    wide = {"kinds": ("dos_hold", "dos_hold_fresh", "delay", "replay"), "onset": 7, "end": None, "budget": None}
+    held = load_scenario("radar-following-v0").with_threat(**wide).loop(Mute(), ("measurements", "probe"))  # 5, 6 and 9 are muted
+    frames = run(held, radiating(kind, value, when=lambda k: k >= 7))
+    for row in range(4):
+        read = {float(frame.clean[row, 0, 0]) for frame in frames} - {0.0} | {float(held.model.C[0, 0] @ held.start(keys("train", range(4))).estimate.x[row, 0])}
+        got = [float(frame.wires[row, 0, 0]) for frame in frames[6:]]
+        assert min(got) > 1.0 and set(got) <= read and len(set(got)) < 6
 
 
 # -- what an attacker sees

@@ -140,7 +140,7 @@ def test_a_late_change_of_the_leader_is_not_predicted():
 
 def test_the_belief_rolls_back_to_the_last_challenge_that_passed():
     """From detection on it is that of a filter that saw nothing since, with the odometry replayed; before, one that saw all readings."""
-    spy = Spy(make("defence", "cra", probability=0.2))
+    spy = Spy(make("defence", "cra", probability=0.2, watch=1.0, quiet=1))
     trace = played(spy, "radar_jam:start_step=60,length=30", 12, place_of(horizon=120), terminate=False)
     model = place_of().brief().model
     filter_ = make("filter", "joint_rls")
@@ -170,7 +170,7 @@ def test_the_belief_rolls_back_to_the_last_challenge_that_passed():
 
 def test_an_alarm_ends_at_the_first_quiet_challenge():
     """While alarmed every step is a challenge (watch = 1): the step after the attack is quiet, and readings are used from the next on."""
-    trace = played(FIXED, "radar_jam:start_step=182,length=20", 20)
+    trace = played(f"{FIXED},watch=1,quiet=1", "radar_jam:start_step=182,length=20", 20)
     assert trace.alarm[181:201].all() and not trace.alarm[201:].any()
     assert not trace.valid[181:202].any() and trace.valid[202:].all()
     np.testing.assert_array_equal(trace.estimate[202:, :, 0, :2], trace.wires[202:, :, 0, :2])
@@ -178,9 +178,9 @@ def test_an_alarm_ends_at_the_first_quiet_challenge():
 
 def test_several_quiet_challenges_may_be_asked_for():
     """With quiet=3 the alarm outlasts the attack by two challenges more; one in between that is heard starts the count again."""
-    trace = played(f"{FIXED},quiet=3", "radar_jam:start_step=182,length=20", 5)
+    trace = played(f"{FIXED},watch=1,quiet=3", "radar_jam:start_step=182,length=20", 5)
     assert trace.alarm[181:203].all() and not trace.alarm[203:].any()
-    spy = Spy(make("defence", "cra", quiet=2, filter="hold_last", probability=1.0))
+    spy = Spy(make("defence", "cra", quiet=2, watch=1.0, filter="hold_last", probability=1.0))
     plan, held = spy.prepare(place_of().brief().model), keys("tune", [0])
     state, alarms = spy.start(plan, Prior(np.ones((1, 1, 4)), np.eye(4)[None, None])), []
     for k, energy in enumerate([9.0, 9.0, 1.0, 9.0, 1.0, 1.0, 1.0, 9.0], start=1):
@@ -222,8 +222,8 @@ def test_false_alarms_come_as_often_as_asked_for():
     """Of noise alone, the mean of N exponentials, a share P_fa of the challenges raises an alarm, and nothing else does."""
     rng, batch, steps = np.random.default_rng(1), 400, 200
     for wanted, samples in ((0.02, 100), (0.1, 3)):
-        defence = make("defence", "cra", probability=0.5, false_alarm=wanted, samples=samples, watch=None, filter="hold_last")
-        plan, held = defence.prepare(place_of().brief().model), keys("tune", range(batch))
+        defence = make("defence", "cra", probability=0.5, false_alarm=wanted, watch=None, quiet=1, filter="hold_last")
+        plan, held = defence.prepare(dataclasses.replace(place_of().brief().model, challenge=samples)), keys("tune", range(batch))
         assert plan.threshold == pytest.approx(stats.gamma.isf(wanted, samples) / samples, rel=1e-9)
         state = defence.start(plan, Prior(np.ones((batch, 1, 4)), np.broadcast_to(np.eye(4), (batch, 1, 4, 4))))
         alarms = challenges = 0
@@ -255,8 +255,8 @@ def test_an_attacker_who_falls_silent_in_time_is_not_heard():
 
 def test_the_watch_and_the_list():
     """Fixed challenges come at their steps alone; watch adds its share of the alarmed steps, none of them with none."""
-    quiet = played(f"{FIXED},times=[1,2,7,300]", "none", 3)
-    assert (np.flatnonzero(~quiet.valid[:, 0, 0, 0]) + 1).tolist() == [2, 7, 300]  # the first probe is under way before the defence is asked
+    quiet = played(f"{FIXED},times=[2,7,300]", "none", 3)
+    assert (np.flatnonzero(~quiet.valid[:, 0, 0, 0]) + 1).tolist() == [2, 7, 300]
     for watch, share in (("none", 0.0), ("0.0", 0.0), ("0.3", 0.3), ("1.0", 1.0)):
         trace = played(f"{FIXED},times=[20],watch={watch}", "radar_jam:start_step=20,length=70", 100, place_of(horizon=90), terminate=False)
         held = ~trace.probe[20:88]
@@ -267,7 +267,7 @@ def test_the_watch_and_the_list():
 
 def test_the_mode_outlasts_the_alarm_by_the_linger():
     """While alarmed, and 3 s after, the controller is asked to brake; the car is then slower than without."""
-    trace = played(f"{FIXED},mode=brake,linger=3", "radar_jam:start_step=182,length=10", 5)
+    trace = played(f"{FIXED},watch=1,quiet=1,mode=brake,linger=3", "radar_jam:start_step=182,length=10", 5)
     braked = trace.mode[..., 0] == Mode.BRAKE
     assert (np.flatnonzero(braked[:, 0]) + 1).tolist() == list(range(182, 195)) and (braked == braked[:, :1]).all()
     assert (trace.speed[192] < played(FIXED, "radar_jam:start_step=182,length=10", 5).speed[192] - 1.0).all()
@@ -375,7 +375,7 @@ def test_a_plant_without_an_echo_is_refused(name, short):
     "field, value",
     [
         ("challenge", "sometimes"), ("probability", 1.5), ("probability", -0.1), ("times", [0]), ("watch", 2.0), ("suspicion", 0.0),
-        ("false_alarm", 0.0), ("false_alarm", 1.0), ("samples", 0), ("quiet", 0), ("mode", "fly"), ("linger", -1.0),
+        ("false_alarm", 0.0), ("false_alarm", 1.0), ("margin", -1.0), ("quiet", 0), ("mode", "fly"), ("linger", -1.0),
     ],
 )  # fmt: skip
 @pytest.mark.parametrize("name", ["cra", "pycra", "algorithm2"])
@@ -385,9 +385,21 @@ def test_parameters_out_of_range_are_refused(name, field, value):
         make("defence", name, **{field: value})
 
 
-def test_the_samples_are_those_of_the_published_radar():
-    """The threshold fits the window of the radar's challenge: N_c = 0.1 s x 256 kHz."""
-    sensor = load_scenario("radar-following-v0").sensor
-    assert sensor.prepare(place_of().brief().model).challenge == make("defence", "cra").samples
+@pytest.mark.parametrize("name", ["cra", "pycra", "algorithm2"])
+def test_what_would_be_ignored_is_refused(name):
+    """A list where challenges are random, a probability where they are fixed, and a challenge before anybody is asked."""
+    for field, value, challenge in (("times", (15, 50), "random"), ("probability", 0.3, "fixed"), ("times", (1, 15), "fixed")):
+        with pytest.raises(InputError, match=rf"defence {name}\.{field}"):
+            make("defence", name, challenge=challenge, **{field: value})
+
+
+def test_the_threshold_is_that_of_the_radars_own_samples():
+    """N_c = 0.1 s x 256 kHz, or what another radar takes; a margin of 3 dB doubles it, less 0.2 %."""
+    for sensor, samples in (({}, 25600), ({"window": 0.01}, 2560)):
+        model = dataclasses.replace(place_of(), sensor=make("sensor", "fmcw_radar", **sensor)).brief().model
+        assert model.challenge == samples
+        threshold = make("defence", "cra").prepare(model).threshold
+        assert threshold == pytest.approx(stats.gamma.isf(1e-6, samples) / samples, rel=1e-12)
+        assert make("defence", "cra", margin=3.0).prepare(model).threshold == pytest.approx(1.99526 * threshold, rel=1e-5)
     assert false_alarm_threshold(1e-6, 25600) == pytest.approx(stats.gamma.isf(1e-6, 25600) / 25600, rel=1e-12)
     assert tailgate.make_defence("cra").false_alarm == 1e-6

@@ -46,6 +46,16 @@ def test_the_pull_off_grows_by_its_rate_up_to_the_bound():
     assert late.value[9:13, 0, 0, 0] == pytest.approx([0.0, 0.0, 0.5, 1.0], abs=1e-9) and not late.refused.any()
 
 
+@pytest.mark.parametrize("attack", ["noise_jam", "echo_delay", "echo_pull_off", "radar_jam"])
+def test_who_hops_radiates_only_after_a_step_with_a_probe(attack):
+    """hop=true: silent in every step that follows a muted one, as the plain script is not; nothing is refused."""
+    for text, silent in ((f"{attack}:start_step=5,hop=true", True), (f"{attack}:start_step=5", False)):
+        trace = played(text, range(20), "pycra:probability=0.4")
+        muted = ~trace.valid[..., 0, 0] & (trace.energy[..., 0] > 0.0)  # at step k: its probe was not sent
+        after = np.concatenate([np.zeros_like(muted[:1]), muted[:-1]]) & trace.live
+        assert ((trace.kind[4:] != 0)[after[4:]].any() == (not silent)) and (trace.kind[4:] != 0)[~after[4:] & trace.live[4:]].all() and not trace.refused.any()
+
+
 def test_the_thesis_jammer_writes_high_values():
     """Uniform on 180 to 250 m and on 0 to 60 m/s, by each wire's own law; what the threat model does not allow is cut."""
     trace = played("radar_jam:start_step=10", seeds=range(100))
@@ -160,7 +170,8 @@ def test_the_fast_attacker_is_the_limit_of_the_challenge():
         spec = Spec("defence", "cra")
         attack = Spec("attack", "echo_delay:delay=60,trigger=near,threshold=50").make()
         trace = rollout(load_scenario(name).loop(spec.make(), spec.entry.uses), attack, keys("tune", range(60)))
-        heard[name] = (trace.alarm & (trace.gap > 30.0)).any(axis=(0, 2)).mean()
+        begins = trace.alarm & ~np.concatenate([np.zeros_like(trace.alarm[:1]), trace.alarm[:-1]])
+        heard[name] = (begins & (trace.gap > 30.0)).any(axis=(0, 2)).mean()
         crashed[name] = trace.collided.any(axis=0).mean()
     assert heard["radar-following-v0"] > 0.2 and heard["radar-fast-attacker-v0"] == 0.0
     assert crashed["radar-following-v0"] < 0.85 < 0.95 < crashed["radar-fast-attacker-v0"]

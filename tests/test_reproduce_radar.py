@@ -47,8 +47,8 @@ def test_the_figures_of_the_design(runs):
     for guard in ("none", "algorithm2"):
         assert all(runs["i", case, guard].collided.all() for case in ATTACKS)
     for case, second in (("DoS", 189), ("delay", 269)):
-        low, high = interval(runs["i", case, "none"].trace.length)
-        assert low - 1 <= second <= high + 1
+        low, high = interval(runs["i", case, "none"].trace.length + 1)  # step k ends at k + 1
+        assert low <= second <= high
         ours = runs["i", case, OURS]
         assert not ours.collided.any()
         low, high = interval(ours.error)
@@ -80,12 +80,14 @@ def test_detection_is_at_182_in_every_run(runs):
 
 def test_verdicts_can_go_the_other_way(runs):
     """A defence that does nothing in place of ours, and ours in place of nothing, turn the verdicts."""
-    assert [claim(runs).holds for claim in (ch3_cases._safety, ch3_cases._recovery, ch3_cases._algorithm1)] == ["yes", "yes", "no"]
+    assert [claim(runs).holds for claim in (ch3_cases._safety, ch3_cases._recovery, ch3_cases._algorithm1)] == ["partly", "yes", "no"]
     worse = runs | {(n, c, OURS): runs[n, c, "none"] for n in PLACES for c in ATTACKS}
-    assert ch3_cases._safety(worse).holds == "no" and ch3_cases._detection(worse).holds == "no" and ch3_cases._false_alarms(worse).holds == "yes"
+    assert ch3_cases._safety(worse).holds == "no" and ch3_cases._detection(worse).holds == "no" and ch3_cases._false_alarms(worse).holds == "no"
     deaf = runs["i", "delay", OURS]
     silent = Run(dataclasses.replace(deaf.trace, signals=deaf.trace.signals | {"alarm": np.zeros_like(deaf.trace.alarm)}), *deaf[1:])
     assert ch3_cases._false_alarms(runs | {("i", "delay", OURS): silent}).holds == "no"
+    harmed = runs | {("ii", "delay", "none"): runs["i", "delay", "none"]}
+    assert ch3_cases._safety(harmed).holds == "yes"
     better = runs | {("i", c, "algorithm2"): runs["i", c, OURS] for c in ATTACKS}
     assert ch3_cases._algorithm1(better).holds == "yes"
 
@@ -104,6 +106,13 @@ def test_a_list_that_is_known_loses():
         cells = claim.measured[f"DoS from {onset} s"]
         assert cells["list 15, 50, 175"] == 1.0 and cells["random, p = 0.3"] < 0.5
     assert claim.holds == "no"
+
+
+def test_who_listens_to_the_probe_beats_an_alarm_that_ends_at_once():
+    """Hopping collides in nearly every run where one quiet challenge ends the alarm; with several at random times in few."""
+    claim = ch3_limits._hopping(30)
+    cells = list(claim.measured.values())
+    assert claim.holds == "no" and cells[1]["delay, hopping"] > 0.7 and cells[3]["delay, hopping"] < 0.15 and cells[1]["delay"] < 0.1
 
 
 def test_where_half_are_detected():

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from enum import IntEnum
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
@@ -22,6 +21,10 @@ from pydantic import Field
 
 from tailgate.draws import Draws
 from tailgate.errors import InputError
+from tailgate.kinds import AIRED as AIRED
+from tailgate.kinds import RADIATED as RADIATED
+from tailgate.kinds import Kind as Kind
+from tailgate.kinds import Mode as Mode
 
 if TYPE_CHECKING:
     from tailgate.threat import Brief
@@ -41,35 +44,6 @@ def param(default: Any, doc: str) -> Any:
     return dataclasses.field(default=default, metadata={"doc": doc})
 
 
-class Kind(IntEnum):
-    """What a command does to the wires that it targets. The number is part of the published rows."""
-
-    NONE = 0
-    DOS_JAM = 1  # the receiver reads the jammer's value
-    DOS_HOLD = 2  # the receiver reads the last good sample before the first attack (6.18)
-    DOS_HOLD_FRESH = 3  # the receiver reads the last good sample before this burst
-    DROPOUT = 4  # nothing is received, and the receiver knows it
-    FDI = 5  # value is added (4.4)
-    DELAY = 6  # the receiver reads what was sent `value` steps ago
-    REPLAY = 7  # the receiver reads the last `value` samples before this replay, over and over
-    NOISE_JAM = 8  # over the air: noise of `value` watts reaches the receiver
-    ECHO_DELAY = 9  # over the air: the receiver's own signal comes back `value` metres too late
-
-
-AIRED = (Kind.NOISE_JAM, Kind.ECHO_DELAY)  # over the air: one value reaches all that a receiver reads, and changes what it measures
-RADIATED = (Kind.DOS_JAM, *AIRED)  # kinds that a receiver which falls silent still hears
-
-
-class Mode(IntEnum):
-    """What a defence asks of the controller."""
-
-    NORMAL = 0
-    WIDEN = 1  # a longer time headway
-    BRAKE = 2  # slow down gently
-    STOP = 3  # brake as hard as the vehicle can
-    ACC = 4  # use no message of other vehicles: cooperative cruise control falls back to the own sensors
-
-
 @dataclass(frozen=True, eq=False)
 class Model:
     """What is publicly known of the plant: x+ = A x + B u + c + w, y_i = C_i x + v_i, x being one state for all agents.
@@ -77,8 +51,8 @@ class Model:
     A (n, n), B (n, m), c (n,), C (N, q, n), Q = cov w (n, n), R = cov v (N, q, q); graph (N, N) bool, [i, j] when i hears j;
     dt [s]; `sensors` names the q rows of C, `v2v` the fields of the message that a controller hears, `actuators` what an agent commands.
     Row i of `gap` and `speed` (N, n) says how agent i's gap to the vehicle ahead and its own speed depend on x; a row of zeros, the
-    default, is an agent without a road. `air` says that the sensors listen to their own echo, so that noise_jam and echo_delay reach them
-    and a challenge is possible.
+    default, is an agent without a road. `challenge` is the number of complex samples that a sensor which listens to its own echo takes
+    while its probe is muted; 0, the default, is a sensor that does not: noise_jam and echo_delay reach only those that do (`air`).
     """
 
     A: Array
@@ -94,7 +68,7 @@ class Model:
     actuators: tuple[str, ...] = ()
     gap: Array | None = None
     speed: Array | None = None
-    air: bool = False
+    challenge: int = 0
 
     def __post_init__(self) -> None:
         for name in ("A", "B", "c", "C", "Q", "R", "graph", "gap", "speed"):  # public, and nobody's to change: own copies, read-only
@@ -121,6 +95,11 @@ class Model:
     def wires(self) -> tuple[str, ...]:
         """Everything that an attacker may touch: the sensors, then the V2V fields, then the actuators."""
         return self.sensors + self.v2v + self.actuators
+
+    @property
+    def air(self) -> bool:
+        """Whether the sensors listen to their own echo."""
+        return self.challenge > 0
 
     @property
     def followers(self) -> Array:
@@ -183,7 +162,7 @@ class Received(NamedTuple):
 
     y: Array  # (B, N, q) sensor readings
     valid: Array  # (B, N, q) bool, False where nothing arrived
-    energy: Array  # (B, N) mean power heard, over that of the receiver's noise; 0 of sensors that do not listen to an echo
+    energy: Array  # (B, N) mean power heard while the probe was muted, over that of the receiver's noise; 0 where it was not
     v2v: Array | None = None  # (B, N, p) the message of the car ahead
     odometry: Array | None = None  # (B, N, 2) trusted own odometry: position [m] and speed [m/s]
     attacked: Array | None = None  # (B, N, q) bool, the truth about the attack: the oracle's
@@ -355,6 +334,10 @@ class Sensor(Protocol):
 @runtime_checkable
 class Receiver(Sensor, Protocol):
     """A sensor that listens to the echo of its own probe, so that an attacker can reach it over the air."""
+
+    @property
+    def challenge(self) -> int:
+        """Complex samples that it takes while its probe is muted."""
 
     def disturbed(self, plan: Any, truth: Array, probe: Array, draws: Draws, air: Air) -> Received:
         """What `measure` gives under `air`, by the same draws: where nothing is radiated the two agree to the last bit."""

@@ -53,7 +53,7 @@ class ThreatModel:
     onset: PositiveCount = param(1, "first step at which an attack is accepted")
     end: PositiveCount | None = param(None, "last step at which an attack is accepted; none: the horizon")
     knowledge: Literal["black", "grey", "white"] = param("black", "black: the road; grey: + control; white: + defence")
-    sees_measurement: bool = param(False, "grants the measurement that the defence receives")
+    sees_measurement: bool = param(False, "grants the measurement that the defence receives; of a radar it shows which step is muted")
 
     def __post_init__(self) -> None:
         low, high = self.jam_range
@@ -225,18 +225,21 @@ class Channel:
             anchor = state.anchor.copy()
             anchor[begins] = state.taped[begins]
             state = state._replace(anchor=anchor, links=_copy_tape(state.links, begins), drives=_copy_tape(state.drives, begins))
-        heard = sent
+        heard, under = sent, received
         if again is not None and np.isin(kind, RADIATED).any():
             under, left = again(self._radiated(plan, last)), (kind == Kind.DOS_JAM)[:, None, None]
-            valid = np.where(left, received.valid, under.valid)  # what the jammer leaves is read wherever anything would be
-            received = under._replace(y=np.where(left, received.y, under.y), valid=valid)
-            heard = num.stack([received.y[..., i] for i in range(q)] + [sent[..., i] for i in range(q, sent.shape[-1])])
+            under = under._replace(valid=np.where(left, received.valid, under.valid))  # what a jammer leaves is read where anything is
+            heard = num.stack([under.y[..., i] for i in range(q)] + [sent[..., i] for i in range(q, sent.shape[-1])])
         links = self._arrive(plan, state, state.links, heard, slice(0, sent.shape[-1]))
         lost = hit & (kind == Kind.DROPOUT)[:, None, None]
-        out = received._replace(
-            y=links[..., :q], valid=received.valid & ~lost[..., :q], v2v=links[..., q:], attacked=hit[..., :q]
+        out = under._replace(
+            y=links[..., :q], valid=under.valid & ~lost[..., :q], v2v=links[..., q:], attacked=hit[..., :q]
         )
-        return state._replace(links=self._keep(plan, state, state.links, sent, hit[..., : sent.shape[-1]])), out, links, refused
+        good = sent
+        if not received.valid.all():  # a muted sensor's nothing is no sample: the last one stands for it
+            good = sent.copy(order="K")
+            good[..., :q] = np.where(received.valid, sent[..., :q], state.links.fresh[..., :q])
+        return state._replace(links=self._keep(plan, state, state.links, good, hit[..., : sent.shape[-1]])), out, links, refused
 
     def actuate(self, plan: ChannelPlan, state: ChannelState, u: Array) -> tuple[ChannelState, Array]:
         """-> state, u (B, N, m) as the actuators get it."""

@@ -115,7 +115,8 @@ def _detection(runs: Runs) -> Claim:
             share.append(np.mean(at == DETECTED))
     return Claim(
         "3.5-detection", "Both attacks are detected at k = 182 s, in both scenarios", DETECTED, found,
-        verdict(min(share) == 1.0, max(share) < 0.5), "challenges at 15, 50, 175 and 182; the delay begins at 180",
+        verdict(min(share) == 1.0, max(share) < 0.5), "challenges at 15, 50, 175 and 182; the delay begins at 180. The attacker does not "
+        "listen: one that only repeats the probe is silent by itself when it is muted",
     )  # fmt: skip
 
 
@@ -124,7 +125,7 @@ def _median(values: Array) -> float | None:
 
 
 def _false_alarms(runs: Runs) -> Claim:
-    positive = negative = challenges = 0
+    positive = negative = challenges = attacked = 0
     for number in PLACES:
         clean = runs[number, "clean", OURS].trace
         muted = _muted(clean)
@@ -133,12 +134,13 @@ def _false_alarms(runs: Runs) -> Claim:
         for case in ATTACKS:
             trace = runs[number, case, OURS].trace
             hit = _muted(trace) & (trace.kind != 0) & trace.live
+            attacked += int(hit.sum())
             negative += int((hit & ~trace.alarm[:, :, 0]).sum())
             challenges += int((_muted(trace) & trace.live).sum())
     return Claim(
         "3.5-errors", "The detection has no false positive and no false negative", "0 and 0",
-        {"false positives": positive, "false negatives": negative, "of challenges": challenges},
-        verdict(positive + negative == 0, negative > 0),
+        {"false positives": positive, "false negatives": negative, "of challenges": challenges, "of these under attack": attacked},
+        verdict(positive + negative == 0 and attacked > 0, positive + negative > 0 or attacked == 0),
         "at challenges, of an attacker who does not hear them; between challenges nothing is tested, which the row on latency shows",
     )  # fmt: skip
 
@@ -172,8 +174,8 @@ def _safety(runs: Runs) -> Claim:
             ours.append(shares[OURS])
     return Claim(
         "3.5-safety", "Without the defence the follower does not slow down as desired; with it it operates safely", "safe", found,
-        verdict(max(ours) == 0.0 and min(without[:2]) > 0.5, max(ours) > 0.5),
-        "share of runs that collide; in scenario (ii) the leader speeds up: 6 m more do no harm",
+        verdict(max(ours) == 0.0 and min(without) > 0.5, max(ours) > 0.5),
+        "share of runs that collide; in scenario (ii) the leader speeds up, and 6 m more do no harm: partly",
     )  # fmt: skip
 
 
@@ -199,7 +201,7 @@ def _table(runs: Runs, number: str, case: str) -> Table:
         seen = np.isfinite(run.error)
         gap = run.trace.gap[-1, ~run.collided, 0]
         rows.append((
-            words, f"{100 * run.collided.mean():.0f} %", f"{np.median(length):.0f}" if len(length) else "",
+            words, f"{100 * run.collided.mean():.0f} %", f"{np.median(length) + 1:.0f}" if len(length) else "",
             f"{100 * len(at) / len(run.alarm):.0f} %", f"{np.median(at):.0f}" if len(at) else "",
             str(Spread.of(run.error[seen])) if seen.any() else "", f"{np.median(gap):.2f}" if len(gap) else "",
         ))  # fmt: skip
