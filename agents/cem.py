@@ -100,12 +100,10 @@ class Learner:
         self.curve: list[dict[str, Any]] = []
 
     def learn(self, steps: int, report: Callable[[Progress], None], checkpoint: Path | None = None, every: int = 1_000_000) -> None:
-        """Train until `steps` decisions in total; calls `report` after each generation."""
-        saved = self.steps
+        """Train until at least `steps` decisions in total; calls `report` after each generation, and writes a checkpoint: it is small."""
         while self.steps < steps:
             report(self._generation())
-            if checkpoint is not None and (self.steps - saved >= every or self.steps >= steps):
-                saved = self.steps
+            if checkpoint is not None:
                 self.save(checkpoint)
 
     def export(self, path: Path, training: dict[str, Any]) -> Path:

@@ -6,8 +6,10 @@ from typing import Any
 import numpy as np
 
 from tailgate.core import Array, Estimate, Finite, Mode, Model, NonNegative, Positive, param
+from tailgate.errors import InputError
 from tailgate.registry import register
 
+LEADER = ("leader_position", "leader_velocity")  # what the leader sends
 WIDEN_FACTOR = 1.5  # Mode.WIDEN: time headway times this
 BRAKE_ACCEL = -2.0  # Mode.BRAKE: at most this acceleration [m/s^2]
 STOP_ACCEL = -5.0  # Mode.STOP [m/s^2], the braking limit of the thesis's follower (section 3.5)
@@ -49,7 +51,8 @@ class AdaptiveCruise:
     accel_max: Finite | None = param(2.0, "upper limit of the command [m/s^2]; none: unlimited")
 
     def prepare(self, model: Model) -> Any:
-        return None
+        if model.v2v[:2] != LEADER:
+            raise InputError("controller acc", list(model.v2v), "a car-following plant, whose leader sends its position and velocity")
 
     def start(self, plan: Any, batch: int) -> Any:
         return None

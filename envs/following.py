@@ -19,6 +19,7 @@ from tailgate.core import Array, Controller, Finite, Model, NonNegative, Positiv
 from tailgate.draws import Draws
 from tailgate.registry import register
 
+from .controllers import LEADER
 from .idm import Behind, BehindState
 from .vehicle import drive, lag
 
@@ -74,7 +75,7 @@ class CarFollowing:
         (A, B), (sensors, C, R) = self.dynamics(), sensor.matrices(self)
         return Model(
             A=A, B=B, c=np.zeros(3), C=C, Q=np.diag(self.process_var), R=R, graph=np.eye(1, dtype=bool), dt=self.dt,
-            sensors=sensors, v2v=("leader_position", "leader_velocity"), actuators=("acceleration",),
+            sensors=sensors, v2v=LEADER, actuators=("acceleration",),
             gap=np.array([[-1.0, 0.0, 0.0]]), speed=np.array([[0.0, 1.0, 0.0]]),
         )  # fmt: skip
 

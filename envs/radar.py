@@ -58,6 +58,8 @@ class FmcwRadar(Link):
     def matrices(self, plant: Sized) -> tuple[tuple[str, ...], Array, Array]:
         if plant.size != (1, STATES):
             raise InputError("sensor fmcw_radar", type(plant).__name__, "the plant radar_following")
+        if self.window > getattr(plant, "dt", np.inf):
+            raise InputError("sensor fmcw_radar.window", self.window, "a challenge no longer than the plant's step dt")
         C = np.eye(STATES)[None, :2]
         return ("distance", "relative_speed"), C, np.diag([self.range_sd**2, self.speed_sd**2])[None]
 

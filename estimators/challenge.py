@@ -103,8 +103,8 @@ class Challenger:
         unused = "times" if self.challenge == "random" else "probability"
         if getattr(self, unused) is not None:
             raise InputError(f"defence {self.label}.{unused}", getattr(self, unused), f"none: challenges are {self.challenge}")
-        if self.times is not None and 1 in self.times:
-            raise InputError(f"defence {self.label}.times", self.times, "steps from 2 on: nobody is asked before the first")
+        if self.times is not None and (1 in self.times or not self.times):
+            raise InputError(f"defence {self.label}.times", self.times, "at least one step, from 2 on: nobody is asked before the first")
         self.predictor()  # a wrong name shall fail here
 
     def predictor(self) -> Filter:

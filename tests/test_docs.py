@@ -54,6 +54,20 @@ def test_the_new_defence_plays_as_an_object(package: Path, monkeypatch: pytest.M
     sys.modules.pop("mydefence", None)
 
 
+def test_the_radar_example_challenges_and_hears(package: Path) -> None:
+    """A fifth of the steps are muted, and an attacker who radiates is heard."""
+    (package / "myradar.py").write_text(_blocks("docs/new-defence.md", "python")[2], encoding="utf-8")
+    command = [sys.executable, "-m", "tailgate.cli", "evaluate", "--scenario", "radar-following-v0", "--defence", "myradar:Listening"]
+    command += ["--attack", "none", "--attack", "echo_delay:start_step=60", "--seeds", "20", "--out", "rows.jsonl"]
+    done = subprocess.run(command, cwd=package, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    rows = [json.loads(line) for line in (package / "rows.jsonl").read_text(encoding="utf-8").splitlines()]
+    assert {row["status"] for row in rows} == {"ok"} and {row["dose"] for row in rows} == {10}  # the scenario's own
+    clean, attacked = ([row for row in rows if (row["attack"] == "none") == quiet] for quiet in (True, False))
+    assert 35 < sum(row["muted_steps"] for row in clean) / 20 < 60 and not any(row["alarm_onsets"] for row in clean)
+    assert sum(row["alarm_onsets"] > 0 for row in attacked) > 10
+
+
 @pytest.mark.parametrize("name", ["README.md", "CONTRIBUTING.md", *(f"docs/{name.name}" for name in sorted((ROOT / "docs").glob("*.md")))])
 def test_links_to_files_exist(name: str) -> None:
     text = (ROOT / name).read_text(encoding="utf-8")
@@ -92,6 +106,6 @@ def test_the_detector_of_the_documentation_plays(tmp_path: Path) -> None:
 
 def test_the_adapted_filter_of_the_documentation_plays(tmp_path: Path) -> None:
     """filterpy's fading-memory filter, named as module:Class with its parameter."""
-    (tmp_path / "myfilter.py").write_text(_blocks("docs/new-defence.md", "python")[2], encoding="utf-8")
+    (tmp_path / "myfilter.py").write_text(_blocks("docs/new-defence.md", "python")[3], encoding="utf-8")
     (entry,) = _evaluated(tmp_path, "--defence", "myfilter:Fading:alpha=1.05", "--attack", "none")
     assert entry["n"] == 4 and 0.3 < entry["rmse_position"]["median"] < 1.5  # type: ignore[index]

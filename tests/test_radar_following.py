@@ -220,3 +220,7 @@ def test_what_does_not_fit_is_refused():
             dataclasses.replace(load_scenario("stop-and-go-v0"), controller=make("controller", name)).loop(tailgate.make_defence("kf"))
     with pytest.raises(InputError, match="radar_following"):
         dataclasses.replace(load_scenario("stop-and-go-v0"), sensor=FmcwRadar()).loop(tailgate.make_defence("kf"))
+    with pytest.raises(InputError, match="controller acc"):
+        dataclasses.replace(load_scenario("thesis-ch3-v0"), controller=make("controller", "acc")).loop(tailgate.make_defence("kf"))
+    with pytest.raises(InputError, match="window"):
+        dataclasses.replace(load_scenario("thesis-ch3-v0"), sensor=FmcwRadar(window=5.0)).loop(tailgate.make_defence("kf"))

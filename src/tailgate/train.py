@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import time
@@ -147,6 +148,9 @@ def train(config: TrainConfig, progress: Callable[[int, Any], None], resume: boo
     module = learner_of(config.learner)
     settings = build(module.Config, dict(getattr(config, config.learner)), f"config.{config.learner}")
     settings.check()
+    for name in LEARNERS.keys() - {config.learner}:  # a typing error there as well, where that learner is installed
+        with contextlib.suppress(ImportError):
+            build(learner_of(name).Config, dict(getattr(config, name)), f"config.{name}")
     _check(config)
     if not resume and config.directory.is_dir() and any(config.directory.iterdir()):
         set_aside(config.directory)

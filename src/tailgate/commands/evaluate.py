@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
 import sys
 from pathlib import Path
@@ -23,11 +24,13 @@ def add(commands: Any) -> None:
         description="Play a suite, or the part of it that the options name. NAME: a registered component, NAME:key=value,key=value, "
         "module:Class, or (attacks) the JSON file of an exported policy or the YAML file of a program.",
     )  # fmt: skip
-    command.add_argument("--suite", default="quick-v0", metavar="NAME", help="suite by name or YAML file (default: quick-v0)")
+    command.add_argument(
+        "--suite", metavar="NAME", help="suite by name or YAML file (default: quick-v0; with --scenario its parts, at the scenario's own dose)"
+    )
     command.add_argument("--defence", action="append", metavar="NAME", help="a defence instead of the suite's (repeatable)")
     command.add_argument("--attack", action="append", metavar="NAME", help="an attack instead of the suite's (repeatable)")
     command.add_argument("--scenario", action="append", metavar="NAME", help="a scenario instead of the suite's (repeatable)")
-    command.add_argument("--dose", action="append", metavar="STEPS", help="attack budget instead of the suite's, or none (repeatable)")
+    command.add_argument("--dose", action="append", metavar="STEPS", help="attack budget; none: the scenario's own (repeatable)")
     command.add_argument("--threat", action="append", metavar="key=value", default=[], help="change the threat model (repeatable)")
     command.add_argument("--seeds", type=int, metavar="N", help="episodes per cell instead of the suite's")
     command.add_argument("--purpose", default="report", help="which seeds: train, tune, calibrate, select or report (default)")
@@ -42,6 +45,7 @@ def add(commands: Any) -> None:
 
 def _evaluate(options: argparse.Namespace) -> int:
     from tailgate.evaluation import evaluate
+    from tailgate.scenario import load_suite
     from tailgate.summary import summarise
 
     sys.path.insert(0, "")  # module:Class is looked for in the working directory, as `python -m` does
@@ -52,10 +56,13 @@ def _evaluate(options: argparse.Namespace) -> int:
             raise InputError("--threat", text, "key=value, for example fdi_bound=10")
         threat[key] = scalar(value)
     doses = None if options.dose is None else [scalar(d) for d in options.dose]
+    suite: Any = options.suite or "quick-v0"
+    if options.suite is None and options.scenario:  # a scenario by itself: what is not named is quick-v0's, but for the dose
+        suite = dataclasses.replace(load_suite(suite), name="custom", doses=(None,))
     before = _kept(options.out)
     with progress(Console(stderr=True)) as update:
         rows = evaluate(
-            options.suite, defences=options.defence, attacks=options.attack, scenarios=options.scenario, doses=doses,
+            suite, defences=options.defence, attacks=options.attack, scenarios=options.scenario, doses=doses,
             seeds=options.seeds, purpose=options.purpose, batch=options.batch, workers=options.workers,
             out=options.out, threat=threat, progress=lambda done, total: update("playing", done, total, cells(done, total)),
         )  # fmt: skip

@@ -22,7 +22,7 @@ def add(commands: Any) -> None:
         description="Reproduce a chapter of the thesis: a table of claims, a report (HTML, Markdown, JSON) and its figures.",
     )  # fmt: skip
     command.add_argument("chapter", metavar="CHAPTER", help=f"one of {', '.join(CHAPTERS)}")
-    command.add_argument("--seeds", type=int, default=200, metavar="N", help="episodes per figure (default 200)")
+    command.add_argument("--seeds", type=int, default=200, metavar="N", help="episodes per figure, at least 10 (default 200)")
     command.add_argument("--out", metavar="DIR", help="directory of the report (default reproduction/CHAPTER)")
     command.add_argument("--json", action="store_true", help="print the claims as JSON: id, claim, thesis, measured, holds, why")
     command.set_defaults(run=_reproduce)

@@ -44,7 +44,7 @@ def _train(options: argparse.Namespace) -> int:
     with _resumable(config.name), progress(errors) as update:
 
         def trained(seed: int, now: Any) -> None:
-            update(f"training, seed {seed}", now.steps, config.steps, train.figures(now))
+            update(f"training, seed {seed}", min(now.steps, config.steps), config.steps, train.figures(now))
 
         policies = train.train(config, trained, resume=options.resume)
         report = train.compare(config, policies, lambda done, total: update("comparing on fresh seeds", done, total, cells(done, total)))

@@ -201,7 +201,7 @@ def _table(runs: Runs, number: str, case: str) -> Table:
         seen = np.isfinite(run.error)
         gap = run.trace.gap[-1, ~run.collided, 0]
         rows.append((
-            words, f"{100 * run.collided.mean():.0f} %", f"{np.median(length) + 1:.0f}" if len(length) else "",
+            words, f"{100 * run.collided.mean():.3g} %", f"{np.median(length) + 1:.0f}" if len(length) else "",
             f"{100 * len(at) / len(run.alarm):.0f} %", f"{np.median(at):.0f}" if len(at) else "",
             str(Spread.of(run.error[seen])) if seen.any() else "", f"{np.median(gap):.2f}" if len(gap) else "",
         ))  # fmt: skip
