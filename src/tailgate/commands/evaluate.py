@@ -25,7 +25,7 @@ def add(commands: Any) -> None:
         "module:Class, or (attacks) the JSON file of an exported policy or the YAML file of a program.",
     )  # fmt: skip
     command.add_argument(
-        "--suite", metavar="NAME", help="suite by name or YAML file (default: quick-v0; with --scenario its parts, at the scenario's own dose)"
+        "--suite", metavar="NAME", help="suite by name or YAML file (default: quick-v0; with --scenario at the scenario's own dose)"
     )
     command.add_argument("--defence", action="append", metavar="NAME", help="a defence instead of the suite's (repeatable)")
     command.add_argument("--attack", action="append", metavar="NAME", help="an attack instead of the suite's (repeatable)")
