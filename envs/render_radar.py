@@ -30,9 +30,9 @@ def _probe(canvas: Canvas) -> None:
 
 
 def _sign(canvas: Canvas, muted: bool, energy: float, alarmed: bool) -> None:
-    """What the radar did in the step, and what it heard over its own noise."""
+    """What the radar did in the step, and at a challenge what it heard over its own noise."""
     left, top = WIDTH - MARGIN - BOX, HEIGHT - RISE - 2
-    words = f"{'CHALLENGE: radar silent' if muted else 'radar transmits'}, heard {10.0 * math.log10(max(energy, 1e-9)):+.1f} dB"
+    words = f"CHALLENGE: radar silent, heard {10.0 * math.log10(max(energy, 1e-9)):+.1f} dB" if muted else "radar transmits"
     canvas.box(left, top, left + BOX, top + RISE, WARNING if muted and alarmed else WHITE, INK, 2 if muted else 1)
     canvas.text(left + BOX / 2, top + 15, words, INK, SMALL, "ms", muted, (left + 4, left + BOX - 4))
 

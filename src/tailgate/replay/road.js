@@ -60,8 +60,8 @@ const drawRoad = (() => {
 
     if (radar && s) {
       const muted = radar.muted[s - 1], level = radar.energy[s - 1].toFixed(1).replace("-", "−");
-      const words = narrow ? (muted ? "CHALLENGE, heard" : "radar on, heard") : muted ? "CHALLENGE: radar silent, heard" : "radar transmits, heard";
-      text(width - margin, height - 4, `${words} ${level} dB`, { ink: INK, anchor: "r", bold: Boolean(muted), room: [margin + lane + (narrow ? 50 : 80), width - margin] });
+      const words = muted ? `CHALLENGE${narrow ? "" : ": radar silent"}, heard ${level} dB` : `radar ${narrow ? "on" : "transmits"}`;
+      text(width - margin, height - 4, words, { ink: INK, anchor: "r", bold: Boolean(muted), room: [margin + lane + (narrow ? 50 : 80), width - margin] });
       if (!muted && !(s === episode.hit)) for (const radius of [10, 17, 24]) { // the probe
         let from = null;
         for (let turn = -2; turn <= 2; turn += 1) {
