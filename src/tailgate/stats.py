@@ -22,12 +22,15 @@ def proportion(successes: int, n: int, level: float = 0.95) -> Interval:
     return Interval(successes / n, float(ci.low), float(ci.high))
 
 
-def paired_difference(a: Array, b: Array, level: float = 0.95, resamples: int = 4000, seed: int = 0) -> Interval:
+def paired_difference(a: Array, b: Array, level: float = 0.95, resamples: int = 4000, seed: int = 0, share: bool = False) -> Interval:
     """Mean of a - b on the same episodes, with an interval.
 
     a and b are (episodes,), or (training seeds, episodes). The part of the episodes comes from a bootstrap over them (a seed gives
     the same interval twice); that of the training seeds from Student's t over their means, as a bootstrap of three or five runs is too
     narrow. Both are added in squares. With one training seed the interval speaks of that policy alone.
+
+    share: a and b are 0 or 1. An interval is then never narrower than what differences of -1 and of 1 could make of it that happened not to
+    be among so many episodes: where all differences are equal the bootstrap has no width.
     """
     delta = np.atleast_2d(np.asarray(a, np.float64) - np.asarray(b, np.float64))
     runs, episodes = delta.shape
@@ -38,4 +41,6 @@ def paired_difference(a: Array, b: Array, level: float = 0.95, resamples: int = 
     spread = 0.0
     if runs > 1:
         spread = float(stats.t.ppf((1 + level) / 2, runs - 1) * delta.mean(axis=1).std(ddof=1) / np.sqrt(runs))
-    return Interval(value, value - float(np.hypot(value - low, spread)), value + float(np.hypot(high - value, spread)))
+    unseen = 1.0 - ((1.0 - level) / 2.0) ** (1.0 / episodes) if share else 0.0  # the most likely that what was never seen may be
+    below, above = max(value - low, unseen * (value + 1.0)), max(high - value, unseen * (1.0 - value))
+    return Interval(value, value - float(np.hypot(below, spread)), value + float(np.hypot(above, spread)))

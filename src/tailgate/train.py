@@ -246,6 +246,9 @@ def _report(
         """Of the outcomes (episodes,): of 0 and 1 the exact interval, of others the bootstrap's."""
         return proportion(int(x.sum()), x.size) if UNITS[outcome] == SHARE else paired_difference(x, np.zeros_like(x))
 
+    def difference(other: Array) -> Interval:
+        return paired_difference(learned, other, share=UNITS[outcome] == SHARE)
+
     items = [("no attack", mean(outcomes("none")), "")]
     if best is not None:
         items.append((best, mean(outcomes(best)), "best scripted attack of equal knowledge and dose, chosen on other seeds"))
@@ -254,9 +257,9 @@ def _report(
     items += [(name, mean(outcomes(name)), "white box, and no step of it alarms: knows more, dares less") for name in config.white_box]
 
     def over(attack: str) -> Interval:
-        return paired_difference(learned, np.broadcast_to(outcomes(attack), learned.shape))
+        return difference(np.broadcast_to(outcomes(attack), learned.shape))
 
-    versus = {"no attack": paired_difference(learned, none), "own yoked schedule": paired_difference(learned, yoked)}
+    versus = {"no attack": difference(none), "own yoked schedule": difference(yoked)}
     if best is not None:
         versus["best scripted attack"] = over(best)
     report = {

@@ -70,7 +70,7 @@ def _duty(seeds: int) -> tuple[Claim, Table]:
     tied: list[str] = []
     for guard in ("kf", "rkf"):
         theirs, ours = (np.concatenate(outcomes["crashed", name]) for name in (guard, "chi2_kf"))
-        gain = paired_difference(theirs, ours)
+        gain = paired_difference(theirs, ours, share=True)
         spared[f"than the {GUARDS[guard]}"] = [round(v, 4) for v in gain]
         (beaten if gain.low > 0.0 else tied if not theirs.any() and not ours.any() else []).append(GUARDS[guard])
     claim = Claim(
