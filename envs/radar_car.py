@@ -15,6 +15,12 @@ GAP, RELATIVE_SPEED, LEAD_ACCEL, OWN_SPEED = range(4)
 STATES = 4
 
 
+def kinematic(T: float) -> tuple[Array, Array]:
+    """A (4, 4) and B (4, 1) of x = [d, dv, a_L, v_F] for a step T [s], the input being the own speed at its end."""
+    A = np.array([[1.0, T, T * T / 2.0, T / 2.0], [0.0, 1.0, T, 1.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 0.0]])
+    return A, np.array([[-T / 2.0], [-1.0], [0.0], [1.0]])
+
+
 def check_radar_car(model: Model, where: str) -> None:
     """Raise InputError where the state is not [gap, relative speed, leader's acceleration, own speed]."""
     if model.agents != 1 or model.states != STATES or model.gap is None or not np.array_equal(model.gap, np.eye(STATES)[[GAP]]):

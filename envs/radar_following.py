@@ -22,7 +22,7 @@ from tailgate.draws import Draws
 from tailgate.registry import register
 
 from .idm import Behind, BehindState
-from .radar_car import GAP, OWN_SPEED, STATES
+from .radar_car import GAP, OWN_SPEED, STATES, kinematic
 
 Quadruple = Annotated[tuple[NonNegative, NonNegative, NonNegative, NonNegative], Field(min_length=4, max_length=4)]
 
@@ -70,9 +70,7 @@ class RadarFollowing:
 
     def model(self, sensor: Sensor, controller: Controller) -> Model:
         T, (sensors, C, R) = self.dt, sensor.matrices(self)
-        A = np.array([[1.0, T, T * T / 2.0, T / 2.0], [0.0, 1.0, T, 1.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 0.0]])
-        B = np.array([[-T / 2.0], [-1.0], [0.0], [1.0]])
-        rows = np.eye(STATES)
+        (A, B), rows = kinematic(T), np.eye(STATES)
         return Model(
             A=A, B=B, c=np.zeros(STATES), C=C, Q=np.diag(self.process_var), R=R, graph=np.eye(1, dtype=bool), dt=T, sensors=sensors,
             actuators=("acceleration",), gap=rows[[GAP]], speed=rows[[OWN_SPEED]],

@@ -23,22 +23,15 @@ from pydantic import Field
 
 from tailgate import num
 from tailgate.core import Array, Innovation, Model, NonNegative, Positive, Prior, Received, param
+from tailgate.envs.radar_car import GAP, LEAD_ACCEL, OWN_SPEED, RELATIVE_SPEED, STATES, kinematic
 from tailgate.errors import NotApplicable
 from tailgate.registry import register
 
 from .kalman import KalmanPlan, KalmanState, LinearFilter, alone
 
-GAP, RELATIVE_SPEED, LEAD_ACCEL, OWN_SPEED = range(4)
-STATES = 4
 LINE = LinearFilter()
 Window = Annotated[int, Field(ge=3, le=1000)]
 Forgetting = Annotated[float, Field(gt=0, le=1)]
-
-
-def kinematic(T: float) -> tuple[Array, Array]:
-    """A (4, 4) and B (4, 1) of x = [d, dv, a_L, v_F] for a step T [s], the input being the own speed at its end."""
-    A = np.array([[1.0, T, T * T / 2.0, T / 2.0], [0.0, 1.0, T, 1.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 0.0]])
-    return A, np.array([[-T / 2.0], [-1.0], [0.0], [1.0]])
 
 
 def require_kinematic(model: Model, where: str) -> None:
