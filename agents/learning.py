@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
-from tailgate.errors import unknown
+from safetensors import SafetensorError
+
+from tailgate.errors import InputError, unknown
 
 if TYPE_CHECKING:
     from tailgate.envs.faces import Seat
@@ -57,6 +60,20 @@ def learner_of(name: str) -> Any:
     if name not in LEARNERS:
         raise unknown("learner", name, LEARNERS)
     return import_module(f"tailgate.agents.{name}")
+
+
+def open_checkpoint(path: Path, wanted: dict[str, Any], load_tensors: Callable[[bytes], Any]) -> tuple[Any, dict[str, Any]]:
+    """Tensors and facts of a checkpoint. Raises InputError when it is damaged, or when its facts are not the `wanted` ones."""
+    try:
+        blob = path.read_bytes()
+        tensors, length = load_tensors(blob), int.from_bytes(blob[:8], "little")
+        facts = json.loads(json.loads(blob[8 : 8 + length])["__metadata__"]["facts"])
+        held = {key: facts.get(key) for key in wanted}
+    except (OSError, SafetensorError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise InputError("checkpoint", str(path), f"a checkpoint of this program ({type(error).__name__})") from None
+    if held != wanted:
+        raise InputError("checkpoint", f"{path}: {held}", f"one of this run: {wanted}")
+    return tensors, facts
 
 
 def header_of(seat: Seat, training: dict[str, Any]) -> dict[str, Any]:

@@ -22,7 +22,6 @@ try:
     from stable_baselines3.common.callbacks import BaseCallback
 except ImportError as error:
     raise ImportError("torch or Stable-Baselines3 is missing: pip install 'tailgate[train]'") from error
-from safetensors import SafetensorError
 from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
 
@@ -34,7 +33,7 @@ from tailgate.files import write_atomic
 from tailgate.schema import canonical
 from tailgate.tree import leaves, with_leaves
 
-from .learning import Progress, header_of
+from .learning import Progress, header_of, open_checkpoint
 from .policy import Network, save_policy
 
 FORMAT = "tailgate-ppo-checkpoint-1"
@@ -160,18 +159,9 @@ class Learner:
 
     def load(self, path: Path) -> None:
         """Continue from a checkpoint; raises InputError when it is damaged or of another run."""
-        try:
-            blob = path.read_bytes()
-            tensors = load_tensors(blob)
-            length = int.from_bytes(blob[:8], "little")
-            facts = json.loads(json.loads(blob[8 : 8 + length])["__metadata__"]["facts"])
-        except (OSError, SafetensorError, ValueError, KeyError, TypeError) as error:
-            raise InputError("checkpoint", str(path), f"a checkpoint of this program ({type(error).__name__})") from None
         batch, model = self.env.batch, self.model
         wanted = {"format": FORMAT, "seed": self.seed, "card": batch.card()["hash"], "learner": self.identity}
-        held = {key: facts.get(key) for key in wanted}
-        if held != wanted:
-            raise InputError("checkpoint", f"{path}: {held}", f"one of this run: {wanted}")
+        tensors, facts = open_checkpoint(path, wanted, load_tensors)
         try:
             self.env.reset()
             assert batch.state is not None

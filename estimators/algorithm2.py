@@ -18,7 +18,7 @@ from tailgate import num
 from tailgate.core import Array, Innovation, Positive, PositiveCount, Probability, param
 from tailgate.registry import register
 
-from .challenge import WATCH, Challenger, Response
+from .challenge import QUIET, WATCH, Challenger, Response
 from .compose import Filter
 from .predictors import Predictor, PredictorPlan, PredictorState
 
@@ -72,7 +72,7 @@ class AsPrinted(Challenger):
 
     challenge: Literal["random", "fixed"] = param("fixed", "random: each step with a probability; fixed: at the steps of a list")
     watch: Probability | None = param(None, WATCH)
-    quiet: PositiveCount = param(1, "challenges in a row that have to pass before an alarm ends")
+    quiet: PositiveCount = param(1, QUIET)
     forgetting: Factor = param(0.95, "forgetting factor lambda of both fits [-]")
     delta: Positive = param(1.0, "P at first, over the unit matrix [-]")
 

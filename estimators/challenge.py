@@ -38,6 +38,7 @@ THESIS_TIMES = (15, 50, 175, 182)
 CHANCE = 0.1
 PREDICTOR = "joint_rls"
 FILTER = "filter that predicts: a name, or a mapping with name and parameters"
+QUIET = "challenges in a row that have to pass before an alarm ends"
 WATCH = "probability of a challenge a step while alarmed, in place of the random ones or besides the list [-]; none: as without an alarm"
 
 
@@ -90,7 +91,7 @@ class Challenger:
     probability: Probability | None = param(None, f"random: probability of a challenge a step [-]; none: {CHANCE}")
     times: Steps | None = param(None, f"fixed: steps of the challenges; none: the thesis's {', '.join(map(str, THESIS_TIMES))}")
     watch: Probability | None = param(0.3, WATCH)
-    quiet: PositiveCount = param(3, "challenges in a row that have to pass before an alarm ends")
+    quiet: PositiveCount = param(3, QUIET)
     suspicion: Positive | None = param(
         None, "r' S^-1 r of a reading above which the next step is a challenge, besides those of the schedule [-]; none: never"
     )
@@ -230,7 +231,7 @@ class PyCra(Challenger):
     label = "pycra"
 
     watch: Probability | None = param(None, WATCH)
-    quiet: PositiveCount = param(1, "challenges in a row that have to pass before an alarm ends")
+    quiet: PositiveCount = param(1, QUIET)
     filter: Any = param(PREDICTOR, FILTER)
 
     def predictor(self) -> Filter:

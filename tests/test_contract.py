@@ -47,6 +47,12 @@ def _play(play, *arguments, **options):
         pytest.skip(str(error))
 
 
+def test_every_defence_applies_somewhere():
+    """On car following, or on the radar car where it mutes a probe: the skips below hide no defence."""
+    for name in DEFENCES:
+        load_scenario(PLACE[name]).loop(tailgate.make_defence(name), entries("defence")[name].uses)
+
+
 @pytest.mark.parametrize("attack", ["fdi", "dos_jam"])
 @pytest.mark.parametrize("defence", DEFENCES)
 def test_rows_of_a_defence_do_not_depend_on_their_batch(defence, attack, short, play):

@@ -12,7 +12,7 @@ import copy
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
@@ -252,9 +252,9 @@ class Loop:
 
     def _again(self, state: LoopState, truth: Array) -> Callable[[Air], Received] | None:
         """This step's measurement under what is radiated; None of sensors that receive nothing over the air."""
-        if not isinstance(self.sensor, Receiver):
+        if not self.model.air:
             return None
-        sensor, draws = self.sensor, state.keys.at(Role.SENSOR, state.k)
+        sensor, draws = cast(Receiver, self.sensor), state.keys.at(Role.SENSOR, state.k)
         return lambda air: sensor.disturbed(self.plan.sensor, truth, state.estimate.probe, draws, air)
 
     def _measure(self, keys: Keys, k: Array, plant: Any, controller: Any, estimate: Estimate) -> tuple[Array, Received]:

@@ -204,8 +204,7 @@ class Channel:
         hit = command.target & charged[:, None, None]
         kind = np.where(charged, kind, 0).astype(np.int8)
         q, value = plan.sensors, command.value
-        aired = np.isin(kind, AIRED)
-        if aired.any():  # who reaches a receiver over the air reaches all that it reads
+        if plan.air and (aired := np.isin(kind, AIRED)).any():  # who reaches a receiver over the air reaches all that it reads
             strength = np.max(np.where(hit, value, 0.0), axis=2, keepdims=True)
             whole = aired[:, None, None] & hit.any(axis=2, keepdims=True) & (np.arange(hit.shape[2]) < q)
             hit, value = hit | whole, np.where(whole, strength, value)
