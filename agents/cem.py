@@ -28,7 +28,7 @@ from safetensors.numpy import save as save_tensors
 
 from tailgate import draws
 from tailgate.core import Array, NonNegative, Positive, PositiveCount, Probability, param
-from tailgate.envs.faces import Seat
+from tailgate.envs.seat import Seat
 from tailgate.errors import InputError
 from tailgate.files import write_atomic
 from tailgate.schema import canonical
@@ -127,40 +127,28 @@ class Learner:
         self.mean = self.mean + config.step * (elite.mean(axis=0) - self.mean)
         self.sd = np.sqrt(elite.var(axis=0) + (left * config.extra) ** 2)
         self.generation += 1
-        road = bool(self.seat.loop.model.followers.any())
-        crash = float(crashed[0]) if road else None
+        crash = float(crashed[0]) if self.seat.road else None
         self.curve.append({"steps": self.steps, "seed": self.seed, "crash": crash, "reward": float(reward[0])})
         return Progress(self.steps, crash, float(reward[0]))
 
     def _play(self, theta: Array) -> tuple[Array, Array]:
         """Mean reward of an episode and share of collisions, (P,) each, of the weight vectors (P, length) on the generation's episodes."""
         seat, members, episodes = self.seat, len(theta), self.config.episodes
-        loop, interval = seat.loop, seat.action.spec.interval
         first = self.seed * SEED_STRIDE + self.generation * episodes
-        state = loop.start(draws.keys("train", list(range(first, first + episodes)) * members))
-        gap = loop.plant.scene(loop.plan.plant, state.plant).gap
-        least, potential = seat.reward.least(gap), seat.reward.potential(gap)
-        total, crashed = np.zeros(members * episodes), np.zeros(members * episodes, bool)
-        weight = np.ones(members * episodes)
-        layers = self.shape.layers(theta)
-        for begin in range(0, loop.horizon, interval):
+        state = seat.loop.start(draws.keys("train", list(range(first, first + episodes)) * members))
+        tally, layers, seen = seat.begin(state), self.shape.layers(theta), None
+        total, crashed, weight = np.zeros(members * episodes), np.zeros(members * episodes, bool), 1.0
+        for _ in range(seat.decisions):
             over = state.ended.copy()
             if over.all():
                 break
             self.steps += int(np.count_nonzero(~over))
-            action = self._act(layers, seat.observation.observe(loop.sense(state)).reshape(members, episodes, -1))
-            raw, before = np.zeros(len(total)), potential
-            for _ in range(min(interval, loop.horizon - begin)):
-                live = ~state.ended
-                state, frame = loop.advance(state, seat.action.decode(action, loop.sense(state)))
-                error = loop.model.gap_error(frame.estimate.x, frame.truth)
-                now = seat.reward.least(frame.scene.gap, least)
-                raw += np.where(live, seat.reward(loop.model, frame, least - now), 0.0)
-                potential = np.where(live, seat.reward.potential(frame.scene.gap, error), potential)
-                least = now
-                crashed |= live & (frame.collided | frame.rear_collided)
-            total += np.where(over, 0.0, weight * seat.reward.shaped(raw, before, potential, state.ended))
-            weight = weight * seat.reward.gamma
+            seen = seat.observation.observe(seat.loop.sense(state), seen)
+            action = self._act(layers, seen.reshape(members, episodes, -1))
+            state, tally, outcome, _ = seat.step(state, tally, action, over)
+            total += weight * outcome.reward
+            crashed |= outcome.terminated
+            weight *= seat.reward.gamma
         return total.reshape(members, episodes).mean(axis=1), crashed.reshape(members, episodes).mean(axis=1)
 
     def _act(self, layers: list[tuple[Array, Array]], observation: Array) -> Array:

@@ -14,7 +14,7 @@ from safetensors import SafetensorError
 from tailgate.errors import InputError, unknown
 
 if TYPE_CHECKING:
-    from tailgate.envs.faces import Seat
+    from tailgate.envs.seat import Seat
 
 LEARNERS = {"ppo": "PPO of Stable-Baselines3", "cem": "the cross-entropy method"}
 
@@ -81,5 +81,6 @@ def header_of(seat: Seat, training: dict[str, Any]) -> dict[str, Any]:
     threat = seat.loop.threat
     return {
         "action": seat.action.spec, "observation": seat.observation.names, "knowledge": threat.knowledge,
-        "sees_measurement": threat.sees_measurement, "agents": seat.loop.model.agents, "training": training,
+        "sees_measurement": threat.sees_measurement, "frames": seat.observation.frames,
+        "agents": seat.loop.model.agents, "training": training,
     }  # fmt: skip

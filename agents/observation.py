@@ -17,6 +17,7 @@ from tailgate.threat import Brief
 from .values import receivers
 
 LIMIT = 10.0  # observations are clipped to +-LIMIT
+FRAMES = 64  # decisions that an observation shows, at most
 SHOWN = 24  # agents with components of their own in an observation, at most
 RADIATED = {Kind.NOISE_JAM: ("power", "jam_power"), Kind.ECHO_DELAY: ("delay", "delay_bound")}  # their component, and their bound
 T = TypeVar("T")
@@ -42,13 +43,17 @@ class ObservationCodec:
 
     A road shows gaps, speeds and accelerations of the cars; without one there is nothing to see from outside. Of many agents the SHOWN
     that are nearest to the attacked ones have components of their own, tagged with their number; all count in the smallest gap.
+
+    With several `frames` the observation also shows what was seen at the last decisions, the newest first; `@1` is that of one before.
     """
 
     brief: Brief
+    frames: int = 1
 
     @property
     def names(self) -> tuple[str, ...]:
-        return tuple(name for name, _ in self.columns)
+        now = [name for name, _ in self.columns]
+        return tuple(name if age == 0 else f"{name}@{age}" for age in range(self.frames) for name in now)
 
     @cached_property
     def alone(self) -> bool:
@@ -181,12 +186,14 @@ class ObservationCodec:
             out.append(("largest_error", lambda s: num.log(1.0 + np.max(_given(s.error), axis=1) / self.spread)))
         return out
 
-    def observe(self, view: View) -> Array:
-        """(B, d) float32, d = len(names)."""
-        sight = self._sight(view)
-        out = np.empty((len(view.k), len(self.columns)), np.float32)
+    def observe(self, view: View, before: Array | None = None) -> Array:
+        """(B, d) float32, d = len(names); `before` (B, d) is the observation of the last decision, none at the first of an episode."""
+        sight, width = self._sight(view), len(self.columns)
+        out = np.empty((len(view.k), width * self.frames), np.float32)
         for j, (_, column) in enumerate(self.columns):
             out[:, j] = np.clip(column(sight), -LIMIT, LIMIT)
+        if self.frames > 1:
+            out[:, width:] = np.tile(out[:, :width], self.frames - 1) if before is None else before[:, :-width]
         return out
 
     def _sight(self, view: View) -> Sight:

@@ -47,6 +47,7 @@ class Header:
     observation: tuple[str, ...]
     knowledge: Literal["black", "grey", "white"]
     sees_measurement: bool = False
+    frames: PositiveCount = 1
     agents: PositiveCount | None = None  # of the system that it was trained on; files from before there were several have none
     training: dict[str, Any] = dataclasses.field(default_factory=dict)
 
@@ -139,6 +140,7 @@ def load_policy(path: Path) -> tuple[Header, Network]:
 
 class PolicyState(NamedTuple):
     action: Array  # (B,) or (B, size): the decision that holds
+    seen: Array  # (B, d) the observation that it was taken on
 
 
 class PolicyPlan(NamedTuple):
@@ -174,7 +176,7 @@ class PolicyAttack:
         if (1 if header.agents is None else header.agents) != agents:
             made = f"a policy for {_count(header.agents or 1)}"
             raise InputError(f"policy {self.path.name}", made, f"one for this scenario's {_count(agents)}")
-        action, observation = ActionCodec(header.action, brief), ObservationCodec(brief)
+        action, observation = ActionCodec(header.action, brief), ObservationCodec(brief, header.frames)
         if observation.names != header.observation:
             differing = sorted(set(header.observation) ^ set(observation.names)) or ["in another order"]
             shown = ", ".join(differing[:SOME]) + (f" and {len(differing) - SOME} more" if len(differing) > SOME else "")
@@ -185,7 +187,8 @@ class PolicyAttack:
         return PolicyPlan(network, action, observation)
 
     def start(self, plan: PolicyPlan, batch: int, draws: Draws) -> PolicyState:
-        return PolicyState(np.zeros(batch, np.int64) if plan.action.discrete else np.zeros((batch, plan.action.size)))
+        action = np.zeros(batch, np.int64) if plan.action.discrete else np.zeros((batch, plan.action.size))
+        return PolicyState(action, np.zeros((batch, len(plan.observation.names)), np.float32))
 
     def decide(self, plan: PolicyPlan, state: PolicyState, view: View, draws: Draws) -> tuple[PolicyState, Command]:
         state = self.consider(plan, state, view, draws)
@@ -197,8 +200,13 @@ class PolicyAttack:
         if not due.any():
             return state
         chance = policy_draws(draws) if self.stochastic else None
-        fresh = choose(plan.network, plan.action, plan.observation.observe(view), chance, always)
-        return PolicyState(np.where(due if fresh.ndim == 1 else due[:, None], fresh, state.action))
+        first = (view.k == 1)[:, None]
+        seen = plan.observation.observe(view, state.seen)
+        if plan.observation.frames > 1 and first.any():
+            seen = np.where(first, plan.observation.observe(view), seen)
+        fresh = choose(plan.network, plan.action, seen, chance, always)
+        action = np.where(due if fresh.ndim == 1 else due[:, None], fresh, state.action)
+        return PolicyState(action, np.where(due[:, None], seen, state.seen))
 
 
 def _count(agents: int) -> str:

@@ -26,8 +26,8 @@ from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
 
 from tailgate.core import NonNegative, Positive, PositiveCount, Probability, param
-from tailgate.envs.faces import Seat
 from tailgate.envs.sb3 import BatchVecEnv
+from tailgate.envs.seat import Seat, Tally
 from tailgate.errors import InputError
 from tailgate.files import write_atomic
 from tailgate.schema import canonical
@@ -140,11 +140,12 @@ class Learner:
         tensors: dict[str, Any] = {f"policy.{k}": v.contiguous() for k, v in model.policy.state_dict().items()}
         for i, state in model.policy.optimizer.state_dict()["state"].items():
             tensors |= {f"adam.{i}.{k}": v.contiguous() for k, v in state.items()}
-        assert batch.state is not None
-        arrays: dict[str, Any] = {f"loop.{k}": v for k, v in leaves(batch.state).items()}
+        state, tally = batch.state, batch.tally
+        assert state is not None and tally is not None
+        arrays: dict[str, Any] = {f"loop.{k}": v for k, v in leaves(state).items()}
         _, words, position, _, _ = np.random.get_state()  # noqa: NPY002 - Stable-Baselines3 shuffles with it
         arrays |= {
-            "env.potential": batch._potential, "env.least": batch._least, "env.returns": self.env._returns,
+            **{f"env.{name}": value for name, value in tally._asdict().items()}, "env.returns": self.env._returns,
             "env.lengths": self.env._lengths, "last_obs": model._last_obs, "last_starts": model._last_episode_starts, "numpy": words,
         }  # fmt: skip
         for name, array in arrays.items():
@@ -164,7 +165,7 @@ class Learner:
         tensors, facts = open_checkpoint(path, wanted, load_tensors)
         try:
             self.env.reset()
-            assert batch.state is not None
+            assert batch.state is not None and batch.tally is not None
             model.policy.load_state_dict({k[7:]: v for k, v in tensors.items() if k.startswith("policy.")})
             adam: dict[int, dict[str, Any]] = {}
             for name, value in tensors.items():
@@ -179,11 +180,11 @@ class Learner:
                 return raw.view(like.dtype).reshape(like.shape) if like.dtype.kind == "u" else raw.reshape(like.shape)
 
             batch.state = with_leaves(batch.state, {k: restored(f"loop.{k}", v) for k, v in leaves(batch.state).items()})
-            batch._potential = restored("env.potential", batch._potential).copy()
-            batch._least = restored("env.least", batch._least).copy()
+            batch.tally = Tally(*(restored(f"env.{name}", value).copy() for name, value in batch.tally._asdict().items()))
             self.env._returns[:] = tensors["env.returns"].numpy()
             self.env._lengths[:] = tensors["env.lengths"].numpy()
             model._last_obs = tensors["last_obs"].numpy().copy()
+            batch.observed = tensors["last_obs"].numpy().copy()
             model._last_episode_starts = tensors["last_starts"].numpy().copy()
             words = tensors["numpy"].numpy().view(np.uint32)
             np.random.set_state(("MT19937", words, facts["numpy_position"], 0, 0.0))  # noqa: NPY002 - see save
@@ -217,10 +218,10 @@ class _Reporter(BaseCallback):
     def _on_rollout_end(self) -> None:
         crash = reward = None
         seat = self.learner.env.batch.seat
-        whole = -(-seat.loop.horizon // seat.action.spec.interval) * self.learner.config.envs
+        whole = seat.decisions * self.learner.config.envs
         if self.learner.ended and self.num_timesteps > whole:  # until the first horizon only collisions have ended
             crash, reward = (float(np.mean(column)) for column in zip(*self.learner.ended, strict=True))
-            crash = crash if seat.loop.model.followers.any() else None
+            crash = crash if seat.road else None
             self.learner.curve.append({"steps": self.num_timesteps, "seed": self.learner.seed, "crash": crash, "reward": reward})
             if crash is not None:
                 self.logger.record("attack/crash_rate", crash)

@@ -7,9 +7,6 @@ episode counter.
 
 from __future__ import annotations
 
-import dataclasses
-import hashlib
-import json
 from typing import Any, ClassVar
 
 import gymnasium
@@ -18,83 +15,15 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from tailgate import draws
-from tailgate.agents.codec import ActionCodec, ActionSpec, action_space
-from tailgate.agents.observation import LIMIT, ObservationCodec
-from tailgate.agents.reward import Reward
+from tailgate.agents.codec import action_space
+from tailgate.agents.observation import LIMIT
 from tailgate.core import Array, Frame, View
 from tailgate.errors import InputError, unknown
-from tailgate.loop import Loop, LoopState
-from tailgate.registry import Spec
-from tailgate.scenario import load_scenario
-from tailgate.schema import as_data, build, canonical, fields_of
-from tailgate.threat import ThreatModel
+from tailgate.loop import LoopState
 
-CAR_FOLLOWING = "tailgate/CarFollowing-v0"
-FACES: dict[str, dict[str, Any]] = {  # what each id is where nothing else is said: the one place of these defaults
-    CAR_FOLLOWING: {"scenario": "stop-and-go-v0", "defence": "chi2_kf"},
-    "tailgate/RadarFollowing-v0": {"scenario": "radar-following-v0", "defence": "cra"},
-    "tailgate/Platoon-v0": {"scenario": "platoon-braking-v0", "defence": "lasso_dkf"},
-    "tailgate/SensorNetwork-v0": {"scenario": "thesis-ch5-v0", "defence": "norm_resilient", "reward": "error"},
-}
+from .seat import FACES, Seat, Tally
+
 _AUTORESET = {"next_step": AutoresetMode.NEXT_STEP, "same_step": AutoresetMode.SAME_STEP, "disabled": AutoresetMode.DISABLED}
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class Seat:
-    """Everything that an adversary environment is, apart from its episodes: loop, codecs and reward, from checked arguments."""
-
-    loop: Loop
-    action: ActionCodec
-    observation: ObservationCodec
-    reward: Reward
-    config: dict[str, Any]
-
-    @classmethod
-    def make(cls, scenario: Any = None, defence: Any = None, threat: dict[str, Any] | None = None, **options: Any) -> Seat:
-        """scenario: name or YAML file. defence: name (`chi2_kf:eta=15`) or object. threat: changes of the scenario's threat model.
-
-        options: the fields of ActionSpec and Reward, and `knowledge`. Scenario and defence are those of car following where they are None.
-        """
-        scenario = FACES[CAR_FOLLOWING]["scenario"] if scenario is None else scenario
-        defence = FACES[CAR_FOLLOWING]["defence"] if defence is None else defence
-        if threat is not None and not isinstance(threat, dict):
-            raise InputError("threat", threat, "a mapping of changes of the threat model")
-        threat = dict(threat or {})
-        if not isinstance(scenario, str):
-            raise InputError("scenario", scenario, "the name of a scenario, or of a YAML file")
-        if "knowledge" in options:
-            threat["knowledge"] = options.pop("knowledge")
-        known = fields_of(ActionSpec) | fields_of(Reward)
-        for key in options:
-            if key not in known:
-                raise unknown("environment argument", key, [*known, "scenario", "defence", "threat", "knowledge"])
-        for key in threat:
-            if key not in fields_of(ThreatModel):
-                raise unknown("threat: unknown field", key, fields_of(ThreatModel))
-        action = build(ActionSpec, {k: v for k, v in options.items() if k in fields_of(ActionSpec)}, "action")
-        reward = build(Reward, {k: v for k, v in options.items() if k in fields_of(Reward)}, "reward")
-        place = load_scenario(scenario).with_threat(**threat)
-        if isinstance(defence, str):
-            spec = Spec("defence", defence)
-            built, uses, named = spec.make(), spec.entry.uses, {"spec": defence, "parameters": as_data(spec.make())}
-        else:
-            if not all(hasattr(defence, name) for name in ("prepare", "start", "step")):
-                raise InputError("defence", defence, "a registered name, or an object with prepare, start and step")
-            built, uses = defence, tuple(getattr(defence, "uses", ("measurements",)))
-            named = {"spec": type(defence).__name__, "parameters": as_data(defence)}
-        loop = place.loop(built, uses)
-        reward.check(loop.model)
-        config = {"scenario": as_data(place), "defence": named, "action": as_data(action), "reward": as_data(reward)}
-        return cls(loop, ActionCodec(action, loop.brief), ObservationCodec(loop.brief), reward, config)
-
-    def card(self) -> dict[str, Any]:
-        """What papers and rows cite: the whole configuration, and its hash."""
-        from tailgate import __version__
-
-        digest = hashlib.blake2b(canonical(self.config).encode(), digest_size=8).hexdigest()
-        features, actions = list(self.observation.names), [mode.name for mode in self.action.modes] if self.action.discrete else None
-        card = self.config | {"observation": features, "actions": actions, "version": __version__, "hash": digest}
-        return json.loads(json.dumps(card))  # type: ignore[no-any-return]
 
 
 class AdversaryVectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
@@ -125,14 +54,10 @@ class AdversaryVectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.state: LoopState | None = None
+        self.tally: Tally | None = None
         self._done = np.zeros(num_envs, bool)
-        self._potential, self._least = np.zeros(num_envs), np.zeros(num_envs)  # of the reward
-        self._error = np.zeros(num_envs)  # the largest of an agent, where there is no road
+        self.observed = np.zeros((num_envs, features), np.float32)
         self.frame: Frame | None = None  # the last step, for rendering and curious readers
-
-    @property
-    def _road(self) -> bool:
-        return bool(self.seat.loop.model.followers.any())
 
     def card(self) -> dict[str, Any]:
         """JSON data that names this environment completely, with a hash."""
@@ -169,56 +94,34 @@ class AdversaryVectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
                 self.state = self.seat.loop.reseed(self.state, named, keys)
         self._done = self._done & ~rows
         self.frame = None
-        view = self.seat.loop.sense(self.state)
-        self._begin(rows)
+        view = self._begin(rows)
         quiet = np.zeros(self.num_envs, bool)
-        return self.seat.observation.observe(view), self._info(view, quiet, quiet, quiet)
+        return self.observed.copy(), self._info(view, quiet, quiet, quiet)
 
     def step(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
         """actions (B,) for discrete spaces, (B, size) for Box -> the Gymnasium five."""
-        if self.state is None:
+        if self.state is None or self.tally is None:
             raise InputError("step", "no episode", "reset() first")
         actions = self._checked(actions)
         over, resets = self._done, self.autoreset == AutoresetMode.NEXT_STEP
         if over.any() and self.autoreset == AutoresetMode.DISABLED:
             raise InputError("step", np.flatnonzero(over).tolist(), "rows that are over to be reset with options['reset_mask'] first")
-        loop, seat = self.seat.loop, self.seat
-        raw, potential = np.zeros(self.num_envs), self._potential
-        collided, rear, illegal = (np.zeros(self.num_envs, bool) for _ in range(3))
-        for _ in range(seat.action.spec.interval):
-            live = ~over & ~self.state.ended & (self.state.k <= loop.horizon)
-            self.state, frame = loop.advance(self.state, seat.action.decode(actions, loop.sense(self.state)))
-            self.frame = frame
-            error = loop.model.gap_error(frame.estimate.x, frame.truth)
-            least = seat.reward.least(frame.scene.gap, self._least)
-            gained = seat.reward(loop.model, frame, self._least - least)
-            raw += np.where(live, gained, 0.0)
-            potential = np.where(live, seat.reward.potential(frame.scene.gap, error), potential)
-            self._least = least
-            if not self._road:
-                self._error = np.where(live, np.max(loop.model.error(frame.estimate.x, frame.truth), axis=1), self._error)
-            collided, rear = collided | (frame.collided & live), rear | (frame.rear_collided & live)
-            illegal = illegal | (frame.refused & live)
-        terminated = self.state.ended & ~over
-        truncated = ~terminated & ~over & (self.state.k > loop.horizon)
-        reward = np.where(over, 0.0, seat.reward.shaped(raw, self._potential, potential, terminated))
-        self._potential = potential
-        if resets and over.any():  # these rows were over: this step is their reset
-            self._restart(over)
+        self.state, self.tally, outcome, self.frame = self.seat.step(self.state, self.tally, actions, over)
+        terminated, truncated = outcome.terminated, outcome.truncated
+        happened = (outcome.refused, outcome.collided, outcome.rear_collided)
         self._done = terminated | truncated
-        view = loop.sense(self.state)
-        observation = seat.observation.observe(view)
-        info = self._info(view, illegal, collided, rear)
+        view = self.seat.loop.sense(self.state)
+        self.observed = self.seat.observation.observe(view, self.observed)
+        if resets and over.any():  # these rows were over: this step is their reset
+            view = self._restart(over)
+        observation, info = self.observed.copy(), self._info(view, *happened)
         if self.autoreset == AutoresetMode.SAME_STEP and self._done.any():
-            done, final = self._done, observation
-            self._restart(done)
-            view = loop.sense(self.state)
-            observation = seat.observation.observe(view)
-            final_info = info
-            info = self._info(view, illegal, collided, rear)
+            done, final, final_info = self._done, observation, info
+            view = self._restart(done)
+            observation, info = self.observed.copy(), self._info(view, *happened)
             info |= {"final_obs": final, "_final_obs": done.copy(), "final_info": final_info, "_final_info": done.copy()}
             self._done = np.zeros_like(done)
-        return observation, reward, terminated, truncated, info
+        return observation, outcome.reward, terminated, truncated, info
 
     def action_masks(self) -> Array:
         """(B, actions) bool: what the channel would accept now. Discrete action spaces only."""
@@ -236,18 +139,20 @@ class AdversaryVectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
 
     # -- inside
 
-    def _restart(self, rows: Array) -> None:
+    def _restart(self, rows: Array) -> View:
+        """New episodes in `rows` (B,) bool."""
         assert self.state is not None
         self.state = self.seat.loop.restart(self.state, rows)
-        self._begin(rows)
+        return self._begin(rows)
 
-    def _begin(self, rows: Array) -> None:
+    def _begin(self, rows: Array) -> View:
+        """What belongs to an episode, of those that have just begun in `rows` (B,) bool."""
         assert self.state is not None
-        loop, reward = self.seat.loop, self.seat.reward
-        gap = loop.plant.scene(loop.plan.plant, self.state.plant).gap
-        self._potential = np.where(rows, reward.potential(gap), self._potential)
-        self._least = np.where(rows, reward.least(gap), self._least)
-        self._error = np.where(rows, 0.0, self._error)
+        fresh, view = self.seat.begin(self.state), self.seat.loop.sense(self.state)
+        held = fresh if self.tally is None else self.tally
+        self.tally = Tally(*(np.where(rows, new, old) for new, old in zip(fresh, held, strict=True)))
+        self.observed = np.where(rows[:, None], self.seat.observation.observe(view), self.observed)
+        return view
 
     def _checked(self, actions: Array) -> Array:
         actions = np.asarray(actions)
@@ -262,11 +167,12 @@ class AdversaryVectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
         return actions
 
     def _info(self, view: View, illegal: Array, collided: Array, rear: Array) -> dict[str, Any]:
+        assert self.tally is not None
         info: dict[str, Any] = {
             "illegal": illegal.copy(), "collided": collided.copy(), "rear_collided": rear.copy(), "allowed": view.allowed.copy(),
             "step": view.k.copy(),
         }  # fmt: skip
-        info |= {"gap": np.min(view.scene.gap, axis=1)} if self._road else {"error": self._error.copy()}
+        info |= {"gap": np.min(view.scene.gap, axis=1)} if self.seat.road else {"error": self.tally.error.copy()}
         if self.seat.action.discrete:
             info["action_mask"] = self.seat.action.mask(view).astype(np.int8)  # as Space.sample(mask) wants it
         everyone = np.ones(self.num_envs, bool)

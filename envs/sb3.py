@@ -15,7 +15,8 @@ except ImportError as error:
 from tailgate.core import Array
 from tailgate.errors import unknown
 
-from .faces import CAR_FOLLOWING, FACES, AdversaryVectorEnv
+from .faces import AdversaryVectorEnv
+from .seat import CAR_FOLLOWING, FACES
 
 
 class BatchVecEnv(VecEnv):

@@ -288,12 +288,15 @@ def test_error_pays_the_largest_error_of_an_agent(kind):
     x = truth + rng.normal(size=truth.shape) * np.array([0.1, 1.0, 3.0, 100.0])[:, None, None]
     alarm = np.zeros((4, model.agents), bool)
     alarm[1, -1] = True
-    frame, fall = _Frame(x, truth, alarm), np.zeros(4)
+    frame, fall, never = _Frame(x, truth, alarm), np.zeros(4), np.zeros(4, bool)
     off = x - truth
     sizes = np.abs(np.stack([off[:, i, 3 + 4 * (i - 1)] for i in range(1, 4)], axis=1)) if kind == "platoon" else np.sqrt((off**2).sum(axis=2))
     wanted = model.dt * np.minimum(sizes.max(axis=1) / 4.0, 1.0)
-    np.testing.assert_allclose(Reward(reward="error", error_scale=4.0)(model, frame, fall), wanted)
-    np.testing.assert_allclose(Reward(reward="stealth", error_scale=4.0)(model, frame, fall), wanted - model.dt * np.array([0, 1, 0, 0]))
+    np.testing.assert_allclose(Reward(reward="error", error_scale=4.0)(model, frame, fall, never), wanted)
+    np.testing.assert_allclose(Reward(reward="stealth", error_scale=4.0)(model, frame, fall, never), wanted - model.dt * np.array([0, 1, 0, 0]))
+    last = np.array([True, False, True, True])
+    final = np.where(last, (sizes.max(axis=1) / 4.0) ** 2, 0.0)
+    np.testing.assert_allclose(Reward(reward="final", error_scale=4.0)(model, frame, fall, last), final)
 
 
 def test_the_smallest_gap_of_any_car_counts():
@@ -311,7 +314,7 @@ def test_without_a_road_potentials_are_zero_and_nothing_collides():
     nobody = np.full((3, 5), np.inf)
     assert Reward().potential(nobody, model.gap_error(np.ones((3, 5, 4)), np.zeros((3, 5, 4)))).tolist() == [0.0, 0.0, 0.0]
     for name in ("min_gap", "collision"):
-        with pytest.raises(InputError, match=f"reward.*'{name}'.*error or stealth"):
+        with pytest.raises(InputError, match=f"reward.*'{name}'.*error, stealth or final"):
             AdversaryVectorEnv(2, scenario="thesis-ch5-v0", defence="dkf", reward=name)
 
 

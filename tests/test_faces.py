@@ -345,7 +345,8 @@ BAD = [
     ({"threat": {"bugdet": 1}}, ["threat", "'bugdet'", "did you mean 'budget'"]), ({"value": 1e3}, ["value", "1000.0", "fdi_bound (50.0)"]),
     ({"value": float("nan")}, ["value", "nan", "finite"]), ({"render_mode": "ansi"}, ["render_mode", "'ansi'", "rgb_array"]),
     ({"threat": {"kinds": ["fdi"]}, "action": "timing", "kind": "dropout"}, ["action", "dropout", "fdi"]),
-    ({"threat": {"agents": [1]}}, ["agents", "1", "0 to 0"]), ({"scenario": "thesis-ch5-v0", "defence": "dkf"}, ["reward", "'min_gap'", "error or stealth"]),
+    ({"frames": 0}, ["frames", "0", "1 to 64"]), ({"frames": 2.0}, ["frames", "2.0", "whole"]),
+    ({"threat": {"agents": [1]}}, ["agents", "1", "0 to 0"]), ({"scenario": "thesis-ch5-v0", "defence": "dkf"}, ["reward", "'min_gap'", "error, stealth or final"]),
     ({"threat": {"targets": ["speed"]}}, ["targets", "'speed'", "velocity"]), ({"gamma": 0}, ["gamma", "0", "greater than 0"]),
 ]  # fmt: skip
 
@@ -395,3 +396,28 @@ def test_the_documentation_runs_as_written(tmp_path):
     assert set(fields_of(ActionSpec)) | set(fields_of(Reward)) <= named
     for name, defaults in FACES.items():
         assert f"| `{name}` |" in text and f"| `{defaults['scenario']}` | `{defaults['defence']}` |" in text
+
+
+@pytest.mark.parametrize("autoreset", ["same_step", "next_step"])
+def test_frames_show_the_last_decisions(autoreset):
+    """The newest frame is the plain observation, frame j the one of j decisions before; an episode begins with its first in every place."""
+    config = {"scenario": "gusty-stop-and-go-v0", "defence": "kf", "interval": 40, "threat": {"kinds": ["fdi"], "fdi_bound": 30.0}, "value": -30.0}
+    plain, stacked = (AdversaryVectorEnv(6, autoreset=autoreset, **config, **more) for more in ({}, {"frames": 3}))
+    width = plain.single_observation_space.shape[0]
+    seen, observed = plain.reset(seed=4)[0], stacked.reset(seed=4)[0]
+    assert observed.shape == (6, 3 * width) and stacked.seat.observation.names[width] == stacked.seat.observation.names[0] + "@1"
+    history, ended, over = [[row] * 3 for row in seen], 0, np.zeros(6, bool)
+    for k in range(40):
+        for i in range(6):
+            assert np.array_equal(observed[i], np.concatenate(history[i]))
+        action = np.full(6, 2 if k % 3 else 0)
+        seen, _, terminated, truncated, info = plain.step(action)
+        observed, *_, other = stacked.step(action)
+        done = terminated | truncated
+        if autoreset == "same_step" and done.any():
+            for i in np.flatnonzero(done):
+                assert np.array_equal(other["final_obs"][i], np.concatenate([info["final_obs"][i], *history[i][:2]]))
+        fresh = done if autoreset == "same_step" else over
+        history = [[row] * 3 if fresh[i] else [row, *history[i][:2]] for i, row in enumerate(seen)]
+        ended, over = ended + fresh.sum(), done
+    assert ended > 6

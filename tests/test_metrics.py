@@ -57,6 +57,7 @@ CASES = {
     "rmse_position": [({"error": [3, 4, 3, -4]}, math.sqrt(12.5)), ({"error": [3, -3, 90, 90], "length": 2}, 3.0)],
     "rmse_velocity": [({"speed_error": [1, 1, 1, 5]}, math.sqrt(7.0))],
     "max_error": [({"error": [3, -4, 2, 0]}, 4.0), ({"error": [3, -4, 9, 0], "length": 2}, 4.0)],
+    "final_error": [({"error": [3, -4, 2, 0]}, 0.0), ({"error": [3, -4, 9, 0], "length": 2}, 4.0)],
     "recovery_time": [
         ({"kind": [0, 5, 0, 0], "gap": [35, 80, 38, 36.9]}, 1.0), ({"kind": [0, 5, 0, 0], "gap": [35, 35, 33, 37]}, 0.5),
         ({"kind": [0, 5, 0, 0]}, None), ({"gap": 35}, None), ({"kind": [0, 0, 0, 5], "gap": 35}, None),

@@ -35,16 +35,17 @@ def _place(knowledge: str, scenario: str = "gusty-stop-and-go-v0") -> Scenario:
     return load_scenario(scenario).with_threat(**threat, knowledge=knowledge)
 
 
-def _policy(path: Path, action: dict[str, Any], knowledge: str = "black", seed: int = 0, scenario: str = "gusty-stop-and-go-v0") -> Path:
+def _policy(path: Path, action: dict[str, Any], knowledge: str = "black", seed: int = 0, scenario: str = "gusty-stop-and-go-v0", frames: int = 1) -> Path:
     """A random network that attacks now and then."""
     brief = _place(knowledge, scenario).brief()
     spec = ActionSpec(**action)
-    codec, names = ActionCodec(spec, brief), ObservationCodec(brief).names
+    codec, names = ActionCodec(spec, brief), ObservationCodec(brief, frames).names
     rng = np.random.default_rng(seed)
     weights = (rng.normal(size=(len(names), 16)), rng.normal(size=(16, codec.size)))
     network = Network(weights, (rng.normal(size=16), rng.normal(size=codec.size)), None if codec.discrete else np.full(codec.size, -1.0))
     header = {
-        "action": spec, "observation": names, "knowledge": knowledge, "sees_measurement": False, "agents": brief.model.agents, "training": {},
+        "action": spec, "observation": names, "knowledge": knowledge, "sees_measurement": False, "frames": frames,
+        "agents": brief.model.agents, "training": {},
     }  # fmt: skip
     return save_policy(path / "policy", network, header)
 
@@ -56,6 +57,11 @@ def test_stepping_the_environment_and_playing_as_an_attack_give_one_trace(tmp_pa
     _same_trace(tmp_path, {"action": action, "interval": interval, "rate": 0.5}, knowledge, "gusty-stop-and-go-v0", {"threat": THREAT})
 
 
+def test_a_policy_of_several_frames_plays_as_it_was_trained(tmp_path: Path) -> None:
+    """What it remembers of earlier decisions is what the environment showed."""
+    _same_trace(tmp_path, {"action": "mode", "interval": 3}, "black", "gusty-stop-and-go-v0", {"threat": THREAT, "frames": 4})
+
+
 @pytest.mark.parametrize("scenario", MANY)
 @pytest.mark.parametrize(("action", "knowledge"), [({"action": "mode", "per_agent": True}, "black"), ({"action": "increment"}, "white")])
 def test_a_policy_of_many_agents_plays_as_it_was_trained(tmp_path: Path, scenario: str, action: dict[str, Any], knowledge: str) -> None:
@@ -64,7 +70,7 @@ def test_a_policy_of_many_agents_plays_as_it_was_trained(tmp_path: Path, scenari
 
 def _same_trace(tmp_path: Path, spec: dict[str, Any], knowledge: str, scenario: str, arguments: dict[str, Any]) -> None:
     """The environment stepped with a policy's choices, and the policy played as an attack: bit for bit."""
-    path = _policy(tmp_path, spec, knowledge, scenario=scenario)
+    path = _policy(tmp_path, spec, knowledge, scenario=scenario, frames=arguments.get("frames", 1))
     _, network = load_policy(path)
     env = AdversaryVectorEnv(len(SEEDS), scenario=scenario, knowledge=knowledge, autoreset="disabled", **arguments, **spec)
     loop, interval = env.seat.loop, spec["interval"]

@@ -151,6 +151,13 @@ def max_error(trace: Trace) -> Array:
     return np.asarray(np.max(np.where(trace.live[:, :, None], error, 0.0), axis=(0, 2)))
 
 
+@metric("m")
+def final_error(trace: Trace) -> Array:
+    """Error of the estimated position, or gap, at the episode's last step, the largest of an agent; without a road of the state's norm."""
+    error = np.max(trace.model.error(trace.estimate, trace.truth), axis=2)
+    return np.asarray(error[trace.length - 1, np.arange(trace.batch)])
+
+
 @metric("s")
 def recovery_time(trace: Trace) -> Array:
     """From the last attack step until all gap errors stay within 2 m; null without an attack, after a collision, or if it never does."""

@@ -121,7 +121,7 @@ def outcome_of(config: TrainConfig) -> str:
 
 def _check(config: TrainConfig) -> None:
     """Everything that a run will need, tried before anything is written: a typing error shall not cost an hour."""
-    from tailgate.envs.faces import Seat
+    from tailgate.envs.seat import Seat
 
     Seat.make(**environment_of(config))
     cells_of(_suite(config, (*config.rivals, *config.white_box)), threat=config.threat)

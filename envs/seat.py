@@ -1,0 +1,150 @@
+"""The attacker's seat: the loop with the attack left open, from checked arguments. Environments, learners and games sit on it."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from tailgate.agents.codec import ActionCodec, ActionSpec
+from tailgate.agents.observation import FRAMES, ObservationCodec
+from tailgate.agents.reward import Reward
+from tailgate.core import Array, Frame
+from tailgate.errors import InputError, unknown
+from tailgate.loop import Loop, LoopState
+from tailgate.registry import Spec
+from tailgate.scenario import load_scenario
+from tailgate.schema import as_data, build, canonical, fields_of
+from tailgate.threat import ThreatModel
+
+CAR_FOLLOWING = "tailgate/CarFollowing-v0"
+FACES: dict[str, dict[str, Any]] = {  # what each id is where nothing else is said: the one place of these defaults
+    CAR_FOLLOWING: {"scenario": "stop-and-go-v0", "defence": "chi2_kf"},
+    "tailgate/RadarFollowing-v0": {"scenario": "radar-following-v0", "defence": "cra"},
+    "tailgate/Platoon-v0": {"scenario": "platoon-braking-v0", "defence": "lasso_dkf"},
+    "tailgate/SensorNetwork-v0": {"scenario": "thesis-ch5-v0", "defence": "norm_resilient", "reward": "error"},
+}
+
+
+class Tally(NamedTuple):
+    """What the reward remembers of each episode, (B,) each."""
+
+    potential: Array  # of the shaping
+    least: Array  # smallest gap so far, within the reward's reach [m]
+    error: Array  # largest error of an agent, where there is no road
+
+
+class Outcome(NamedTuple):
+    """What a decision of the attacker brought, (B,) each; of rows that were over before it nothing."""
+
+    reward: Array
+    collided: Array
+    rear_collided: Array
+    refused: Array
+    terminated: Array  # a collision ended the episode
+    truncated: Array  # the horizon did
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Seat:
+    """Everything that an adversary environment is, apart from its episodes: loop, codecs and reward, from checked arguments."""
+
+    loop: Loop
+    action: ActionCodec
+    observation: ObservationCodec
+    reward: Reward
+    config: dict[str, Any]
+
+    @classmethod
+    def make(cls, scenario: Any = None, defence: Any = None, threat: dict[str, Any] | None = None, **options: Any) -> Seat:
+        """scenario: name or YAML file. defence: name (`chi2_kf:eta=15`) or object. threat: changes of the scenario's threat model.
+
+        options: the fields of ActionSpec and Reward, `knowledge`, and `frames`: how many decisions the observation shows at once. Scenario
+        and defence are those of car following where they are None.
+        """
+        scenario = FACES[CAR_FOLLOWING]["scenario"] if scenario is None else scenario
+        defence = FACES[CAR_FOLLOWING]["defence"] if defence is None else defence
+        if threat is not None and not isinstance(threat, dict):
+            raise InputError("threat", threat, "a mapping of changes of the threat model")
+        threat = dict(threat or {})
+        if not isinstance(scenario, str):
+            raise InputError("scenario", scenario, "the name of a scenario, or of a YAML file")
+        if "knowledge" in options:
+            threat["knowledge"] = options.pop("knowledge")
+        frames = options.pop("frames", 1)
+        if not isinstance(frames, int) or isinstance(frames, bool) or not 1 <= frames <= FRAMES:
+            raise InputError("frames", frames, f"a whole number from 1 to {FRAMES}")
+        known = fields_of(ActionSpec) | fields_of(Reward)
+        for key in options:
+            if key not in known:
+                raise unknown("environment argument", key, [*known, "scenario", "defence", "threat", "knowledge", "frames"])
+        for key in threat:
+            if key not in fields_of(ThreatModel):
+                raise unknown("threat: unknown field", key, fields_of(ThreatModel))
+        action = build(ActionSpec, {k: v for k, v in options.items() if k in fields_of(ActionSpec)}, "action")
+        reward = build(Reward, {k: v for k, v in options.items() if k in fields_of(Reward)}, "reward")
+        place = load_scenario(scenario).with_threat(**threat)
+        if isinstance(defence, str):
+            spec = Spec("defence", defence)
+            built, uses, named = spec.make(), spec.entry.uses, {"spec": defence, "parameters": as_data(spec.make())}
+        else:
+            if not all(hasattr(defence, name) for name in ("prepare", "start", "step")):
+                raise InputError("defence", defence, "a registered name, or an object with prepare, start and step")
+            built, uses = defence, tuple(getattr(defence, "uses", ("measurements",)))
+            named = {"spec": type(defence).__name__, "parameters": as_data(defence)}
+        loop = place.loop(built, uses)
+        reward.check(loop.model)
+        config = {"scenario": as_data(place), "defence": named, "action": as_data(action), "reward": as_data(reward)}
+        if frames > 1:  # cards from before there were several stay what they are
+            config["frames"] = frames
+        return cls(loop, ActionCodec(action, loop.brief), ObservationCodec(loop.brief, frames), reward, config)
+
+    def card(self) -> dict[str, Any]:
+        """What papers and rows cite: the whole configuration, and its hash."""
+        from tailgate import __version__
+
+        digest = hashlib.blake2b(canonical(self.config).encode(), digest_size=8).hexdigest()
+        features, actions = list(self.observation.names), [mode.name for mode in self.action.modes] if self.action.discrete else None
+        card = self.config | {"observation": features, "actions": actions, "version": __version__, "hash": digest}
+        return json.loads(json.dumps(card))  # type: ignore[no-any-return]
+
+    # -- playing
+
+    @property
+    def road(self) -> bool:
+        """Whether anybody drives here, and can collide."""
+        return bool(self.loop.model.followers.any())
+
+    @property
+    def decisions(self) -> int:
+        """Decisions of an episode that nothing ends early."""
+        return -(-self.loop.horizon // self.action.spec.interval)
+
+    def begin(self, state: LoopState) -> Tally:
+        """The reward's memory of episodes that have just begun."""
+        gap = self.loop.plant.scene(self.loop.plan.plant, state.plant).gap
+        return Tally(self.reward.potential(gap), self.reward.least(gap), np.zeros(len(gap)))
+
+    def step(self, state: LoopState, tally: Tally, action: Array, over: Array) -> tuple[LoopState, Tally, Outcome, Frame]:
+        """Play one decision, `interval` steps of the loop; rows that are `over` (B,) count for nothing. -> its last step as well."""
+        loop, reward = self.loop, self.reward
+        raw, potential, least, largest = np.zeros(len(over)), tally.potential, tally.least, tally.error
+        collided, rear, refused = (np.zeros(len(over), bool) for _ in range(3))
+        for _ in range(self.action.spec.interval):
+            live = ~over & ~state.ended & (state.k <= loop.horizon)
+            state, frame = loop.advance(state, self.action.decode(action, loop.sense(state)))
+            before, least = least, reward.least(frame.scene.gap, least)
+            raw += np.where(live, reward(loop.model, frame, before - least, frame.k == loop.horizon), 0.0)
+            gap_error = loop.model.gap_error(frame.estimate.x, frame.truth)
+            potential = np.where(live, reward.potential(frame.scene.gap, gap_error), potential)
+            if not self.road:
+                largest = np.where(live, np.max(loop.model.error(frame.estimate.x, frame.truth), axis=1), largest)
+            collided, rear = collided | (frame.collided & live), rear | (frame.rear_collided & live)
+            refused = refused | (frame.refused & live)
+        terminated = state.ended & ~over
+        truncated = ~terminated & ~over & (state.k > loop.horizon)
+        gained = np.where(over, 0.0, reward.shaped(raw, tally.potential, potential, terminated))
+        return state, Tally(potential, least, largest), Outcome(gained, collided, rear, refused, terminated, truncated), frame
