@@ -253,3 +253,18 @@ def test_a_fresh_start_forgets_the_run_before_and_resume_wants_the_same_learner(
     assert (run.with_name("quickstart.1") / "policy-7.json").read_text() == "{}"  # set aside, not lost
     (run / "config.json").write_text("{")
     assert "resume" in _command(*SMALL_RUN, "--resume", cwd=tmp_path).stderr
+
+
+def test_a_seed_trained_in_a_process_of_its_own_gives_the_same_policy(tmp_path: Path) -> None:
+    """Two seeds side by side, and one after the other: the same files, whatever ran beside them."""
+    files = []
+    for workers in (1, 2):
+        config = train.load_config(None, [
+            f"out={tmp_path / str(workers)}", "seeds=2", f"workers={workers}", "steps=1280", "environment.interval=20", "ppo.envs=16",
+            "ppo.rollout=20", "ppo.batch_size=160", "ppo.epochs=1", "tensorboard=false", "rivals=[none]",
+        ])  # fmt: skip
+        seen: set[int] = set()
+        policies = train.train(config, lambda seed, now, seen=seen: seen.add(seed))  # type: ignore[misc]
+        assert seen == {0, 1}
+        files.append([path.with_suffix(".safetensors").read_bytes() for path in policies])
+    assert files[0] == files[1] and files[0][0] != files[0][1]

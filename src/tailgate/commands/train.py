@@ -35,7 +35,7 @@ def add(commands: Any) -> None:
 
 
 def _train(options: argparse.Namespace) -> int:
-    from tailgate import train
+    from tailgate import comparison, train
 
     overrides = list(options.overrides) + ([f"first_seed={options.seed}"] if options.seed is not None else [])
     config = train.load_config(options.config, overrides, options.resume)
@@ -47,8 +47,12 @@ def _train(options: argparse.Namespace) -> int:
             update(f"training, seed {seed}", min(now.steps, config.steps), config.steps, train.figures(now))
 
         policies = train.train(config, trained, resume=options.resume)
-        report = train.compare(config, policies, lambda done, total: update("comparing on fresh seeds", done, total, cells(done, total)))
-    page = train.make_page(config, report)
+
+        def played(done: int, total: int) -> None:
+            update("comparing on fresh seeds", done, total, cells(done, total))
+
+        report = comparison.compare(config, policies, played)
+    page = comparison.make_page(config, report)
     if options.json:
         print(json.dumps(report | {"page": str(page)}, indent=1))
     else:
@@ -68,7 +72,7 @@ def _resumable(name: str) -> Iterator[None]:
 
 
 def _print_report(report: dict[str, Any]) -> None:
-    from tailgate.train import SHARE, shown
+    from tailgate.comparison import SHARE, shown
 
     threat = report["threat"]
     budget = "unlimited budget" if threat["budget"] is None else f"budget {threat['budget']} steps"

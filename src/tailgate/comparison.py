@@ -1,0 +1,161 @@
+"""The comparison of trained policies with scripts on fresh seeds, and its page."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tailgate import draws
+from tailgate.core import Array
+from tailgate.errors import InputError
+from tailgate.evaluation import cells_of, run
+from tailgate.files import write_atomic
+from tailgate.metrics import UNITS
+from tailgate.registry import Spec
+from tailgate.scenario import Suite, load_scenario
+from tailgate.schema import as_data, canonical
+from tailgate.stats import Interval, paired_difference, proportion
+from tailgate.train import TrainConfig, outcome_of, suite_of
+
+BATCH = 512  # episodes side by side
+SHARE = "0/1"  # unit of a metric that is yes or no
+SELECT_EPISODES = 1024  # that the best rival is chosen on: fewer would choose by chance
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """How one trained policy did on the report seeds: the outcome of each episode."""
+
+    seed: int
+    policy: Path
+    learned: Array
+    yoked: Array
+
+
+def _outcomes(rows: list[dict[str, Any]], outcome: str) -> Array:
+    bad = next((row for row in rows if row["status"] != "ok"), None)
+    if bad is not None:
+        raise InputError(f"attack {bad['attack']}", bad["status"], f"an attack that plays here ({bad['reason']})")
+    if any(row[outcome] is None for row in rows):
+        raise InputError("config.outcome", outcome, "a metric that every episode has")
+    return np.array([row[outcome] for row in rows], np.float64)
+
+
+def compare(config: TrainConfig, policies: list[Path], progress: Callable[[int, int], None] | None = None) -> dict[str, Any]:
+    """Play the policies and the scripted rivals on fresh report seeds; writes rows.jsonl and report.json; returns the report.
+
+    The best rival is chosen on select seeds and reported on report seeds, so that the choice does not favour it; every rival is
+    reported as well.
+    """
+    from tailgate.agents.policy import PolicyAttack, timing_advantage
+    threat = dict(config.threat)
+    names, outcome = [str(p) for p in policies], outcome_of(config)
+    guard = config.defence
+    best = next(iter(config.rivals), None)
+    if len(config.rivals) > 1:
+        choice = Suite(config.name, "", (config.scenario,), (None,), (guard,), config.rivals, SELECT_EPISODES)
+        selection = run(cells_of(choice, batch=BATCH, purpose="select", threat=threat), workers=config.workers)
+        best = max(config.rivals, key=lambda a: _outcomes([r for r in selection if r["attack"] == a], outcome).mean())
+
+    attacks = tuple(dict.fromkeys(("none", *config.rivals, *config.white_box, *names)))  # each once
+    cells = cells_of(suite_of(config, attacks), batch=BATCH, threat=threat)
+    rows = run(cells, config.directory / "rows.jsonl", config.workers, progress)
+
+    def outcomes(attack: str) -> Array:
+        return _outcomes([r for r in rows if r["attack"] == attack and r["defence"] == guard], outcome)
+
+    built, uses = Spec("defence", guard).make(), Spec("defence", guard).entry.uses
+    keys = draws.keys("report", range(config.episodes))
+    verdicts = []
+    for path, seed in zip(policies, range(config.first_seed, config.first_seed + config.seeds), strict=True):
+        policy = PolicyAttack(path)
+        place = load_scenario(config.scenario).with_threat(**(threat | {"knowledge": policy.knowledge}))
+        own, yoked = timing_advantage(place.loop(built, uses), policy, keys, outcome)
+        verdicts.append(Verdict(seed, path, own, yoked))
+    return _report(config, verdicts, outcomes, best, outcome)
+
+
+def _report(
+    config: TrainConfig, verdicts: list[Verdict], outcomes: Callable[[str], Array], best: str | None, outcome: str
+) -> dict[str, Any]:
+    learned = np.array([v.learned for v in verdicts])
+    yoked = np.array([v.yoked for v in verdicts])
+    none = np.broadcast_to(outcomes("none"), learned.shape)
+
+    def mean(x: Array) -> Interval:
+        """Of the outcomes (episodes,): of 0 and 1 the exact interval, of others the bootstrap's."""
+        return proportion(int(x.sum()), x.size) if UNITS[outcome] == SHARE else paired_difference(x, np.zeros_like(x))
+
+    def difference(other: Array) -> Interval:
+        return paired_difference(learned, other, share=UNITS[outcome] == SHARE)
+
+    items = [("no attack", mean(outcomes("none")), "")]
+    if best is not None:
+        items.append((best, mean(outcomes(best)), "best scripted attack of equal knowledge and dose, chosen on other seeds"))
+    items += [(f"learned, seed {v.seed}", mean(v.learned), "") for v in verdicts]
+    items += [(f"learned, seed {v.seed}, yoked", mean(v.yoked), "its own values at another episode's times") for v in verdicts]
+    items += [(name, mean(outcomes(name)), "white box, and no step of it alarms: knows more, dares less") for name in config.white_box]
+
+    def over(attack: str) -> Interval:
+        return difference(np.broadcast_to(outcomes(attack), learned.shape))
+
+    versus = {"no attack": difference(none), "own yoked schedule": difference(yoked)}
+    if best is not None:
+        versus["best scripted attack"] = over(best)
+    report = {
+        "name": config.name, "scenario": config.scenario, "defence": config.defence, "episodes": config.episodes, "steps": config.steps,
+        "outcome": outcome, "unit": UNITS[outcome],
+        "threat": as_data(load_scenario(config.scenario).with_threat(**config.threat).threat_model),
+        "config": json.loads(canonical(config)), "policies": [str(v.policy) for v in verdicts], "best_scripted": best,
+        "attacks": [{"label": label, **interval._asdict(), "note": note} for label, interval, note in items],
+        "advantage": {name: interval._asdict() for name, interval in versus.items()},
+        "rivals": {name: {"outcome": mean(outcomes(name))._asdict(), "advantage": over(name)._asdict()} for name in config.rivals},
+    }  # fmt: skip
+    write_atomic(config.directory / "report.json", json.dumps(report, indent=1, allow_nan=False).encode() + b"\n")
+    return report
+
+
+def shown(report: dict[str, Any], value: float, sign: str = "") -> str:
+    """An outcome, or with sign "+" a difference of two, as people read it."""
+    if report["unit"] != SHARE:
+        return f"{value:{sign}.3g}"
+    return f"{round(100 * value) + 0:+d}" if sign else f"{100 * value:.1f} %"
+
+
+def headline(report: dict[str, Any]) -> dict[str, Any]:
+    """The report as the page shows it at its top."""
+    share = report["unit"] == SHARE
+    points = " points" if share else ""
+    gains = "; ".join(
+        f"{shown(report, g['value'], '+')}{points} over {name} [{shown(report, g['low'], '+')}, {shown(report, g['high'], '+')}]"
+        for name, g in report["advantage"].items()
+    )
+    what = "Share of" if share else f"Mean {report['outcome']} of"
+    which = {"crashed": " that end in a collision"}.get(report["outcome"], f" with {report['outcome']}" if share else "")
+    runs = len(report["policies"])
+    speaks = "of this one policy: other training seeds differ" if runs == 1 else f"over {runs} training seeds"
+    text = (
+        f"An adversary was trained for {report['steps']:,} decisions against {report['defence']} on {report['scenario']}. "
+        f"{what} {report['episodes']} fresh episodes{which}: {gains} (paired, 95 %; {speaks})."
+    )
+    return {"text": text, "items": report["attacks"] if share else []}
+
+
+def make_page(config: TrainConfig, report: dict[str, Any]) -> Path:
+    """The page of a finished run."""
+    from tailgate.leaderboard.build import build as build_page
+    from tailgate.rows import read_rows
+
+    curve = [
+        point for seed in range(config.first_seed, config.first_seed + config.seeds)
+        for point in json.loads((config.directory / f"curve-{seed}.json").read_text())["curve"]
+    ]  # fmt: skip
+    rows = read_rows(config.directory / "rows.jsonl")
+    title = f"{config.name}: {config.defence} under attack"
+    drawn = curve if all(point["crash"] is not None for point in curve) else None
+    return build_page(rows, config.directory / "page", title=title, curve=drawn, headline=headline(report))
