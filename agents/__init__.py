@@ -3,6 +3,9 @@
 from .burst_loss import BurstLoss
 from .ghost import GhostState
 from .model_based import Covert, Stealth, ZeroDynamics
+from .optimal_dos import OptimalDos
+from .optimal_hold import OptimalHold
+from .optimal_stealth import OptimalStealth
 from .policy import PolicyAttack, Yoked, load_policy, save_policy
 from .program import Program
 from .radio import EchoDelay, EchoPullOff, NoiseJam, RadarJam
@@ -24,6 +27,7 @@ from .scripted import (
     Script,
     ThesisTimes,
 )  # fmt: skip
+from .zoo import ZooAttack
 
 __all__ = [
     "BurstLoss",
@@ -45,6 +49,9 @@ __all__ = [
     "Jam",
     "NoAttack",
     "NoiseJam",
+    "OptimalDos",
+    "OptimalHold",
+    "OptimalStealth",
     "PolicyAttack",
     "Program",
     "RadarJam",
@@ -54,6 +61,7 @@ __all__ = [
     "ThesisTimes",
     "Yoked",
     "ZeroDynamics",
+    "ZooAttack",
     "load_policy",
     "save_policy",
 ]  # fmt: skip

@@ -33,11 +33,10 @@ from tailgate.errors import InputError
 from tailgate.files import write_atomic
 from tailgate.schema import canonical
 
-from .learning import Progress, header_of, open_checkpoint
+from .learning import SEED_STRIDE, Progress, header_of, open_checkpoint
 from .policy import Network, save_policy
 
 FORMAT = "tailgate-cem-checkpoint-1"
-SEED_STRIDE = 1_000_000  # between the episodes of two training seeds
 Share = Annotated[float, Field(gt=0, le=1)]
 
 
@@ -84,19 +83,31 @@ class Shape(NamedTuple):
         return out
 
 
-class Learner:
-    """One training run of one seed."""
+class Search:
+    """The method, whoever's policy it is: a subclass says what is played. `lean`: an output of the first mean, and its bias."""
 
-    def __init__(self, seed: int, gamma: float, config: Config, environment: dict[str, Any], tensorboard: Path | None = None) -> None:
+    def __init__(self, seed: int, gamma: float, config: Config, sizes: tuple[int, ...], lean: tuple[int, float]) -> None:
         self.seed, self.config = seed, config
-        self.seat = Seat.make(gamma=gamma, **environment)
         self.identity = hashlib.blake2b(canonical([config, gamma]).encode(), digest_size=8).hexdigest()
-        sizes = (len(self.seat.observation.names), *config.hidden, self.seat.action.size)
         self.shape = Shape(tuple(itertools.pairwise(sizes)))
         self.mean, self.sd = np.zeros(self.shape.length), np.full(self.shape.length, config.sd)
-        self.mean[-sizes[-1]] = _rest(config.rest, sizes[-1], self.seat.action.discrete)
+        self.mean[self.shape.length - sizes[-1] + lean[0]] = lean[1]
         self.generation, self.steps = 0, 0
         self.curve: list[dict[str, Any]] = []
+
+    @property
+    def card(self) -> str:
+        """Hash of what is played: a checkpoint goes with it."""
+        raise TypeError(f"{type(self).__name__} must define card")
+
+    @property
+    def road(self) -> bool:
+        """Whether anybody can collide."""
+        raise TypeError(f"{type(self).__name__} must define road")
+
+    def episodes(self, layers: list[tuple[Array, Array]], members: int, keys: draws.Keys) -> tuple[Array, Array]:
+        """Reward and collision, (members x E,) each, of the policies in `layers` (members, ...) on the episodes of `keys`."""
+        raise TypeError(f"{type(self).__name__} must define episodes()")
 
     def learn(self, steps: int, report: Callable[[Progress], None], checkpoint: Path | None = None, every: int = 1_000_000) -> None:
         """Train until at least `steps` decisions in total; calls `report` after each generation, and writes a checkpoint: it is small."""
@@ -105,10 +116,11 @@ class Learner:
             if checkpoint is not None:
                 self.save(checkpoint)
 
-    def export(self, path: Path, training: dict[str, Any]) -> Path:
-        """Write the policy of the mean as safetensors + JSON."""
+    @property
+    def network(self) -> Network:
+        """The policy of the mean."""
         weights, biases = zip(*self.shape.layers(self.mean), strict=True)
-        return save_policy(path, Network(weights, biases), header_of(self.seat, training))
+        return Network(weights, biases)
 
     def close(self) -> None:
         """Nothing is held."""
@@ -127,52 +139,31 @@ class Learner:
         self.mean = self.mean + config.step * (elite.mean(axis=0) - self.mean)
         self.sd = np.sqrt(elite.var(axis=0) + (left * config.extra) ** 2)
         self.generation += 1
-        crash = float(crashed[0]) if self.seat.road else None
+        crash = float(crashed[0]) if self.road else None
         self.curve.append({"steps": self.steps, "seed": self.seed, "crash": crash, "reward": float(reward[0])})
         return Progress(self.steps, crash, float(reward[0]))
 
     def _play(self, theta: Array) -> tuple[Array, Array]:
         """Mean reward of an episode and share of collisions, (P,) each, of the weight vectors (P, length) on the generation's episodes."""
-        seat, members, episodes = self.seat, len(theta), self.config.episodes
+        members, episodes = len(theta), self.config.episodes
         first = self.seed * SEED_STRIDE + self.generation * episodes
-        state = seat.loop.start(draws.keys("train", list(range(first, first + episodes)) * members))
-        tally, layers, seen = seat.begin(state), self.shape.layers(theta), None
-        total, crashed, weight = np.zeros(members * episodes), np.zeros(members * episodes, bool), 1.0
-        for _ in range(seat.decisions):
-            over = state.ended.copy()
-            if over.all():
-                break
-            self.steps += int(np.count_nonzero(~over))
-            seen = seat.observation.observe(seat.loop.sense(state), seen)
-            action = self._act(layers, seen.reshape(members, episodes, -1))
-            state, tally, outcome, _ = seat.step(state, tally, action, over)
-            total += weight * outcome.reward
-            crashed |= outcome.terminated
-            weight *= seat.reward.gamma
+        keys = draws.keys("train", list(range(first, first + episodes)) * members)
+        total, crashed = self.episodes(self.shape.layers(theta), members, keys)
         return total.reshape(members, episodes).mean(axis=1), crashed.reshape(members, episodes).mean(axis=1)
-
-    def _act(self, layers: list[tuple[Array, Array]], observation: Array) -> Array:
-        """Actions of all rows, members first, from observations (P, E, d)."""
-        x = np.asarray(observation, np.float64)
-        for i, (weight, bias) in enumerate(layers):
-            x = np.matmul(x, weight) + bias[:, None]
-            x = np.tanh(x) if i + 1 < len(layers) else x
-        x = x.reshape(-1, x.shape[-1])
-        return np.argmax(x, axis=1) if self.seat.action.discrete else np.clip(x, -1.0, 1.0)
 
     # -- checkpoints
 
     def save(self, path: Path) -> None:
         """Write a checkpoint."""
         facts = {
-            "format": FORMAT, "seed": self.seed, "card": self.seat.card()["hash"], "learner": self.identity, "steps": self.steps,
+            "format": FORMAT, "seed": self.seed, "card": self.card, "learner": self.identity, "steps": self.steps,
             "generation": self.generation, "curve": self.curve,
         }  # fmt: skip
         write_atomic(path, save_tensors({"mean": self.mean, "sd": self.sd}, {"facts": json.dumps(facts)}))
 
     def load(self, path: Path) -> None:
         """Continue from a checkpoint; raises InputError when it is damaged or of another run."""
-        wanted = {"format": FORMAT, "seed": self.seed, "card": self.seat.card()["hash"], "learner": self.identity}
+        wanted = {"format": FORMAT, "seed": self.seed, "card": self.card, "learner": self.identity}
         tensors, facts = open_checkpoint(path, wanted, load_tensors)
         try:
             mean, sd = (tensors[name].reshape(self.mean.shape) for name in ("mean", "sd"))
@@ -182,7 +173,62 @@ class Learner:
         self.mean, self.sd, self.steps, self.generation, self.curve = mean, sd, steps, generation, curve
 
 
-def _rest(probability: float, actions: int, discrete: bool) -> float:
-    """Bias of the output that rests: of a discrete action's first, or of a continuous one's trigger."""
-    p = min(max(probability, 1e-6), 1.0 - 1e-6)
-    return float(np.log((actions - 1) * p / (1.0 - p))) if discrete else -p
+def outputs(layers: list[tuple[Array, Array]], observation: Array) -> Array:
+    """(P x E, o) of each policy's network, members first, from observations (P, E, d)."""
+    x = np.asarray(observation, np.float64)
+    for i, (weight, bias) in enumerate(layers):
+        x = np.matmul(x, weight) + bias[:, None]
+        x = np.tanh(x) if i + 1 < len(layers) else x
+    return x.reshape(-1, x.shape[-1])
+
+
+class Learner(Search):
+    """One training run of one seed: an attacker in a seat."""
+
+    def __init__(self, seed: int, gamma: float, config: Config, environment: dict[str, Any], tensorboard: Path | None = None) -> None:
+        self.seat = Seat.make(gamma=gamma, **environment)
+        actions = self.seat.action.size
+        sizes = (len(self.seat.observation.names), *config.hidden, actions)
+        rest = lean(config.rest, actions) if self.seat.action.discrete else -_inside(config.rest)
+        super().__init__(seed, gamma, config, sizes, (0, rest))
+
+    @property
+    def card(self) -> str:
+        return str(self.seat.card()["hash"])
+
+    @property
+    def road(self) -> bool:
+        return self.seat.road
+
+    def export(self, path: Path, training: dict[str, Any]) -> Path:
+        """Write the policy of the mean as safetensors + JSON."""
+        return save_policy(path, self.network, header_of(self.seat, training))
+
+    def episodes(self, layers: list[tuple[Array, Array]], members: int, keys: draws.Keys) -> tuple[Array, Array]:
+        seat, seen = self.seat, None
+        state = seat.loop.start(keys)
+        tally = seat.begin(state)
+        total, crashed, weight = np.zeros(len(keys.key)), np.zeros(len(keys.key), bool), 1.0
+        for _ in range(seat.decisions):
+            over = state.ended.copy()
+            if over.all():
+                break
+            self.steps += int(np.count_nonzero(~over))
+            seen = seat.observation.observe(seat.loop.sense(state), seen)
+            x = outputs(layers, seen.reshape(members, -1, seen.shape[1]))
+            action = np.argmax(x, axis=1) if seat.action.discrete else np.clip(x, -1.0, 1.0)
+            state, tally, outcome, _ = seat.step(state, tally, action, over)
+            total += weight * outcome.reward
+            crashed |= outcome.terminated
+            weight *= seat.reward.gamma
+        return total, crashed
+
+
+def lean(probability: float, actions: int) -> float:
+    """Bias of one of `actions` outputs that gives it this probability in a softmax with all others at 0."""
+    p = _inside(probability)
+    return float(np.log((actions - 1) * p / (1.0 - p)))
+
+
+def _inside(probability: float) -> float:
+    return min(max(probability, 1e-6), 1.0 - 1e-6)

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 from safetensors import SafetensorError
 
@@ -16,7 +16,20 @@ from tailgate.errors import InputError, unknown
 if TYPE_CHECKING:
     from tailgate.envs.seat import Seat
 
-LEARNERS = {"ppo": "PPO of Stable-Baselines3", "cem": "the cross-entropy method"}
+    from .teacher import Demonstration
+
+LEARNERS = {
+    "ppo": "PPO of Stable-Baselines3",
+    "cem": "the cross-entropy method",
+    "maskable_ppo": "PPO that chooses among what the channel accepts",
+    "recurrent_ppo": "PPO with an LSTM that remembers the episode",
+    "dqn": "deep Q-learning",
+    "sac": "soft actor-critic, for continuous actions",
+    "tqc": "soft actor-critic with truncated quantile critics",
+}
+SEED_STRIDE = 1_000_000  # between the episodes of two training seeds
+DISCRETE, CONTINUOUS = ("timing", "mode", "ramp"), ("continuous", "increment")
+ACTIONS = {"maskable_ppo": DISCRETE, "dqn": DISCRETE, "sac": CONTINUOUS, "tqc": CONTINUOUS}  # what a learner can decide; else: everything
 
 
 @dataclass(frozen=True)
@@ -55,11 +68,26 @@ class Learner(Protocol):
         """Free what it holds."""
 
 
+@runtime_checkable
+class Teachable(Protocol):
+    """A learner that can be shown somebody else's decisions before it learns."""
+
+    def imitate(self, shown: Demonstration) -> None:
+        """Make the first policy one that decides as in the demonstration."""
+
+
 def learner_of(name: str) -> Any:
     """The module of a learner, with its classes `Config` and `Learner`. Raises InputError for one that does not exist."""
     if name not in LEARNERS:
         raise unknown("learner", name, LEARNERS)
     return import_module(f"tailgate.agents.{name}")
+
+
+def check_action(name: str, seat: Seat) -> None:
+    """Raise InputError when the learner cannot decide on the actions of this seat."""
+    action = seat.action.spec.action
+    if action not in ACTIONS.get(name, (action,)):
+        raise InputError("learner", name, f"one for the action {action}, or for {name} one of: {', '.join(ACTIONS[name])}")
 
 
 def open_checkpoint(path: Path, wanted: dict[str, Any], load_tensors: Callable[[bytes], Any]) -> tuple[Any, dict[str, Any]]:

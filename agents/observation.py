@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -148,8 +148,36 @@ class ObservationCodec:
             out.append(("speed_error", lambda s: _given(s.speed_error)[:, i] / 5.0))
         else:
             out = [("error", lambda s: num.log(1.0 + _given(s.error)[:, i] / self.spread))]
+            out += self._foreseen() if model.agents == 1 else []
         score: Column = ("score", lambda s: _given(s.view.estimate).score[:, i] / 20.0)
         return [*out, score, ("alarm", lambda s: _given(s.view.estimate).alarm[:, i])]
+
+    def _foreseen(self) -> list[Column]:
+        """White, one agent alone: by how much the reading would surprise the model; of a closed loop also what is read, believed, between.
+
+        The surprise is y - C (A x + B u + c) with the value sent last on top, in the standard deviations of a step: what the defence's
+        innovation would be near, were that value sent again.
+        """
+        model, q = self.brief.model, range(len(self.brief.model.sensors))
+        C = model.C[0]
+        sd = [math.sqrt(float(num.dot(C[j], num.matvec(model.Q, C[j]))) + float(model.R[0, j, j])) for j in q]
+
+        def surprise(s: Sight, j: int) -> Array:
+            before, u = _given(s.view.estimate).x, _given(s.view.defence).known_u
+            x = num.matvec(model.A, before) + num.matvec(model.B, u) + model.c
+            off = _given(s.view.received).y[:, 0, j] - num.matvec(model.C, x)[:, 0, j]
+            return np.asarray((off + s.view.last.value[:, 0, j]) / sd[j])
+
+        def sizes(s: Sight) -> dict[str, Array]:
+            y, believed = _given(s.view.received).y, num.matvec(model.C, _given(s.view.estimate).x)
+            return {"reading": y, "moved": y - believed, "believed": believed}
+
+        def size(s: Sight, name: str) -> Array:
+            value = sizes(s)[name][:, 0]
+            return np.asarray(num.log(1.0 + np.sqrt(num.dot(value, value)) / self.spread))
+
+        out: list[Column] = [(f"innovation_{model.sensors[j]}", partial(surprise, j=j)) for j in q]
+        return out + [(name, partial(size, name=name)) for name in ("reading", "moved", "believed") if model.inputs]
 
     def _noise(self, i: int) -> list[Column]:
         """Where the measurement is granted: by how much agent i's readings of gap and speed are off; without a road sizes only."""

@@ -1,7 +1,8 @@
 """A learned policy as an attack: safetensors + JSON, played without torch, Stable-Baselines3 or pickle.
 
-The network is a tanh perceptron in float64 with a fixed order of summation, so that a trace does not depend on the batch.
-The JSON file names the tensor file, its SHA-256, the action and observation codecs, and how the policy was made.
+The network is a tanh perceptron in float64 with a fixed order of summation, so that a trace does not depend on the batch. An LSTM, which
+remembers the episode, may stand before it. The JSON file names the tensor file, its SHA-256, the action and observation codecs, and how
+the policy was made.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import json
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 from safetensors import SafetensorError
@@ -49,32 +50,88 @@ class Header:
     sees_measurement: bool = False
     frames: PositiveCount = 1
     agents: PositiveCount | None = None  # of the system that it was trained on; files from before there were several have none
+    squashed: bool = False  # the outputs go through tanh
+    masked: bool = False  # chooses among the actions that the channel would accept
+    recurrent: bool = False  # an LSTM stands before the perceptron
+    greedy: bool = False  # its outputs are no distribution that actions could be drawn from
     training: dict[str, Any] = dataclasses.field(default_factory=dict)
+
+
+class Memory(NamedTuple):
+    """What an LSTM remembers, (B, H) each."""
+
+    hidden: Array
+    cell: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Lstm:
+    """One layer of long short-term memory (Hochreiter and Schmidhuber 1997; forget gate: Gers et al. 2000).
+
+    weight (d + H, 4 H) for the input above the hidden state, bias (4 H,); columns: input gate, forget gate, cell, output gate.
+    """
+
+    weight: Array
+    bias: Array
+
+    @property
+    def size(self) -> int:
+        """H, the width of the memory."""
+        return len(self.bias) // 4
+
+    def blank(self, batch: int) -> Memory:
+        """The memory of episodes that begin."""
+        return Memory(np.zeros((batch, self.size)), np.zeros((batch, self.size)))
+
+    def __call__(self, observation: Array, memory: Memory) -> Memory:
+        """(B, d) float32 and the memory before it, to the memory after it."""
+        read = np.concatenate([np.asarray(observation, np.float64), memory.hidden], axis=1)
+        gates = num.dense(read, self.weight, self.bias, squash=False)
+        admit, keep, new, show = (np.ascontiguousarray(gates[:, n * self.size : (n + 1) * self.size]) for n in range(4))
+        cell = _sigmoid(keep) * memory.cell + _sigmoid(admit) * num.tanh(new)
+        return Memory(_sigmoid(show) * num.tanh(cell), cell)
+
+
+def _sigmoid(x: Array) -> Array:
+    return np.asarray(0.5 + 0.5 * num.tanh(0.5 * x))
 
 
 @dataclass(frozen=True, eq=False)
 class Network:
-    """weights[l] (i, o) and biases[l] (o,), tanh between layers; log_std (values,) for continuous actions."""
+    """weights[l] (i, o) and biases[l] (o,), tanh between layers; log_std (values,) for continuous actions.
+
+    With an `lstm` the perceptron reads its hidden state instead of the observation. `squashed`: tanh after the last layer as well.
+    """
 
     weights: tuple[Array, ...]
     biases: tuple[Array, ...]
     log_std: Array | None = None
+    lstm: Lstm | None = None
+    squashed: bool = False
 
     def __call__(self, observation: Array) -> Array:
-        """(B, d) float32 to (B, o): logits, or the mean of a continuous action."""
+        """What the perceptron reads, (B, d), to (B, o): logits or values of discrete actions, or the mean of a continuous action."""
         x: Array = np.asarray(observation, np.float64)
         for i, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
-            x = num.dense(x, weight, bias, squash=i + 1 < len(self.weights))
+            x = num.dense(x, weight, bias, squash=self.squashed or i + 1 < len(self.weights))
         return x
 
 
-def choose(network: Network, codec: ActionCodec, observation: Array, draws: Draws | None = None, always: bool = False) -> Array:
-    """Actions (B,) or (B, size): the likeliest, or drawn when `draws` is given. With `always`, the best one that attacks."""
+def choose(
+    network: Network, codec: ActionCodec, observation: Array, draws: Draws | None = None, always: bool = False, mask: Array | None = None
+) -> Array:
+    """Actions (B,) or (B, size): the likeliest, or drawn when `draws` is given. With `always`, the best one that attacks.
+
+    observation: what the perceptron reads, the hidden state of a network with an LSTM. mask (B, size) bool: the discrete actions that are
+    to be chosen from; `always` has none, as all attacks are allowed or none is.
+    """
     out = network(observation)
     if codec.discrete:
         if draws is not None:
             out = out - num.log(-num.log(np.ascontiguousarray(draws.uniform((out.shape[1],)))))
-        return np.asarray(1 + np.argmax(out[:, 1:], axis=1) if always else np.argmax(out, axis=1))
+        if always:
+            return np.asarray(1 + np.argmax(out[:, 1:], axis=1))
+        return np.asarray(np.argmax(out if mask is None else np.where(mask, out, -np.inf), axis=1))
     if draws is not None and network.log_std is not None:
         out = out + num.exp(network.log_std) * draws.normal((out.shape[1],))
     if always:
@@ -89,11 +146,15 @@ def save_policy(path: Path, network: Network, header: dict[str, Any]) -> Path:
         tensors |= {f"layer{i}.weight": np.ascontiguousarray(weight), f"layer{i}.bias": np.ascontiguousarray(bias)}
     if network.log_std is not None:
         tensors["log_std"] = np.ascontiguousarray(network.log_std)
+    kind: dict[str, Any] = {"squashed": True} if network.squashed else {}
+    if network.lstm is not None:
+        tensors |= {"lstm.weight": np.ascontiguousarray(network.lstm.weight), "lstm.bias": np.ascontiguousarray(network.lstm.bias)}
+        kind["recurrent"] = True
     blob = save_tensors(tensors)
     file = path.with_suffix(".safetensors")
     data = {"format": FORMAT, "tensors": file.name, "sha256": hashlib.sha256(blob).hexdigest(), "layers": len(network.weights)}
     write_atomic(file, blob)
-    write_atomic(path.with_suffix(".json"), json.dumps(data | as_data(header), indent=1).encode() + b"\n")
+    write_atomic(path.with_suffix(".json"), json.dumps(data | kind | as_data(header), indent=1).encode() + b"\n")
     return path.with_suffix(".json")
 
 
@@ -122,31 +183,50 @@ def load_policy(path: Path) -> tuple[Header, Network]:
         tensors = load_tensors(blob)
     except SafetensorError as error:
         raise InputError(f"{where}.tensors", header.tensors, f"a safetensors file ({error})") from None
-    weights, biases, width = [], [], len(header.observation)
-    for i in range(header.layers):
-        weight, bias = tensors.get(f"layer{i}.weight"), tensors.get(f"layer{i}.bias")
+    return header, _network(header, tensors, where)
+
+
+def _network(header: Header, tensors: dict[str, Array], where: str) -> Network:
+    """The network in a file's tensors; raises InputError where one is missing, not finite, or does not fit the others."""
+
+    def pair(name: str, inputs: str, fits: Any) -> tuple[Array, Array]:
+        weight, bias = tensors.get(f"{name}.weight"), tensors.get(f"{name}.bias")
         if (
-            weight is None or bias is None or weight.ndim != 2 or weight.shape[0] != width or bias.shape != weight.shape[1:]
+            weight is None or bias is None or weight.ndim != 2 or not fits(weight) or bias.shape != weight.shape[1:]
             or not (np.isfinite(weight).all() and np.isfinite(bias).all())
         ):  # fmt: skip
             shown = None if weight is None else weight.shape
-            raise InputError(f"{where}: layer{i}", shown, f"finite weights ({width}, outputs) and as many biases")
-        weights.append(np.ascontiguousarray(weight, np.float64))
-        biases.append(np.ascontiguousarray(bias, np.float64))
+            raise InputError(f"{where}: {name}", shown, f"finite weights ({inputs}) and as many biases")
+        return np.ascontiguousarray(weight, np.float64), np.ascontiguousarray(bias, np.float64)
+
+    width, lstm = len(header.observation), None
+    if header.recurrent:
+        lstm = Lstm(*pair("lstm", f"{width} + width, 4 width", lambda w: w.shape[1] > 0 and w.shape[1] == 4 * (w.shape[0] - width)))
+        width = lstm.size
+    weights, biases = [], []
+    for i in range(header.layers):
+        weight, bias = pair(f"layer{i}", f"{width}, outputs", lambda w, width=width: w.shape[0] == width)
+        weights.append(weight)
+        biases.append(bias)
         width = weight.shape[1]
     log_std = tensors.get("log_std")
-    return header, Network(tuple(weights), tuple(biases), None if log_std is None else log_std.astype(np.float64))
+    if log_std is not None and (log_std.shape != (width,) or not np.isfinite(log_std).all()):
+        raise InputError(f"{where}: log_std", log_std.shape, f"finite, ({width},)")
+    log_std = None if log_std is None else log_std.astype(np.float64)
+    return Network(tuple(weights), tuple(biases), log_std, lstm, header.squashed)
 
 
 class PolicyState(NamedTuple):
     action: Array  # (B,) or (B, size): the decision that holds
     seen: Array  # (B, d) the observation that it was taken on
+    memory: Memory | None = None  # of a network with an LSTM, after that observation
 
 
 class PolicyPlan(NamedTuple):
     network: Network
     action: ActionCodec
     observation: ObservationCodec
+    masked: bool = False
 
 
 @register("attack", "policy")
@@ -154,6 +234,7 @@ class PolicyPlan(NamedTuple):
 class PolicyAttack:
     """A learned policy from a JSON + safetensors file."""
 
+    learned: ClassVar[bool] = True
     path: Path = param(Path("policy.json"), "the JSON file of an exported policy")
     stochastic: bool = param(False, "draw actions from the policy instead of taking the likeliest")
 
@@ -184,11 +265,17 @@ class PolicyAttack:
         outputs = network.weights[-1].shape[1]
         if outputs != action.size:
             raise InputError(f"policy {self.path.name}", f"{outputs} actions", f"{action.size} actions under this threat model")
-        return PolicyPlan(network, action, observation)
+        if (header.masked and not action.discrete) or (header.squashed and action.discrete):
+            made = "masked" if header.masked else "squashed"
+            raise InputError(f"policy {self.path.name}.{made}", True, f"another kind of action than {header.action.action}")
+        if self.stochastic and header.greedy:
+            raise InputError("policy.stochastic", True, f"false: the outputs of {self.path.name} are no distribution to draw actions from")
+        return PolicyPlan(network, action, observation, header.masked)
 
     def start(self, plan: PolicyPlan, batch: int, draws: Draws) -> PolicyState:
         action = np.zeros(batch, np.int64) if plan.action.discrete else np.zeros((batch, plan.action.size))
-        return PolicyState(action, np.zeros((batch, len(plan.observation.names)), np.float32))
+        memory = None if plan.network.lstm is None else plan.network.lstm.blank(batch)
+        return PolicyState(action, np.zeros((batch, len(plan.observation.names)), np.float32), memory)
 
     def decide(self, plan: PolicyPlan, state: PolicyState, view: View, draws: Draws) -> tuple[PolicyState, Command]:
         state = self.consider(plan, state, view, draws)
@@ -204,9 +291,13 @@ class PolicyAttack:
         seen = plan.observation.observe(view, state.seen)
         if plan.observation.frames > 1 and first.any():
             seen = np.where(first, plan.observation.observe(view), seen)
-        fresh = choose(plan.network, plan.action, seen, chance, always)
-        action = np.where(due if fresh.ndim == 1 else due[:, None], fresh, state.action)
-        return PolicyState(action, np.where(due[:, None], seen, state.seen))
+        read, memory = seen, state.memory
+        if plan.network.lstm is not None and memory is not None:
+            fresh = plan.network.lstm(seen, Memory(*(np.where(first, 0.0, part) for part in memory)))
+            read, memory = fresh.hidden, Memory(*(np.where(due[:, None], new, old) for new, old in zip(fresh, memory, strict=True)))
+        chosen = choose(plan.network, plan.action, read, chance, always, plan.action.mask(view) if plan.masked else None)
+        action = np.where(due if chosen.ndim == 1 else due[:, None], chosen, state.action)
+        return PolicyState(action, np.where(due[:, None], seen, state.seen), memory)
 
 
 def _count(agents: int) -> str:

@@ -14,10 +14,12 @@ from .ploeg import Ploeg
 from .radar import FmcwRadar
 from .radar_car import RadarCruise
 from .radar_following import RadarFollowing
+from .scalar_loop import ExactReading, ScalarLoop, StateFeedback
 from .sensors import Odometry
 
 __all__ = [
-    "AdaptiveCruise", "Braking", "CarFollowing", "CarFollowingLiteral", "Consensus", "Constant", "FeedForward", "FmcwRadar",
-    "IntelligentDriver", "LinearPlatoon", "LinearSensors", "NoControl", "Odometry", "OrnsteinUhlenbeck", "Platoon", "PlatoonSensors",
-    "Ploeg", "Profile", "Pulse", "RadarCruise", "RadarFollowing", "RelativeDistance", "SensorNetwork", "Sine", "StopAndGo", "Switched",
+    "AdaptiveCruise", "Braking", "CarFollowing", "CarFollowingLiteral", "Consensus", "Constant", "ExactReading", "FeedForward",
+    "FmcwRadar", "IntelligentDriver", "LinearPlatoon", "LinearSensors", "NoControl", "Odometry", "OrnsteinUhlenbeck", "Platoon",
+    "PlatoonSensors", "Ploeg", "Profile", "Pulse", "RadarCruise", "RadarFollowing", "RelativeDistance", "ScalarLoop", "SensorNetwork",
+    "Sine", "StateFeedback", "StopAndGo", "Switched",
 ]  # fmt: skip

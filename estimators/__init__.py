@@ -34,6 +34,7 @@ from .robust import Outlier, RobustKalman, RobustKalmanFilter
 from .saturated import SaturatedDistributedKalman, SaturatedFilter
 from .sentinels import AlarmSentinel, BrakeSentinel, StandStillSentinel
 from .sparse import SparseChiSquare, SparseGatedKalman
+from .steered import Steered, SteeredChallenge
 from .trimmed import TrimmedConsensus, TrimmedFilter
 from .trust import TrustFilter, TrustingDistributedKalman
 
@@ -47,7 +48,7 @@ __all__ = [
     "KalmanFilter", "LassoFilter", "LassoKalman", "Latch", "Mewma", "MewmaKalman", "NamedParts", "NormResilient",
     "NormResilientFilter", "Oracle", "Outlier", "PerEpisode", "Polynomial", "Predictor", "PyCra", "Raw", "Reacquire",
     "ReacquiringKalman", "RobustKalman", "RobustKalmanFilter", "SaturatedDistributedKalman", "SaturatedFilter", "Score", "SlidingMode",
-    "SparseChiSquare", "SparseGatedKalman", "StandStillSentinel", "Stateless", "TailChiSquare", "TrimmedConsensus", "TrimmedFilter",
-    "TrustFilter", "TrustingDistributedKalman", "Verdict", "Widen", "WideningKalman", "WindowedChiSquare", "WindowedKalman",
-    "blame_all", "compose", "per_episode",
+    "SparseChiSquare", "SparseGatedKalman", "StandStillSentinel", "Stateless", "Steered", "SteeredChallenge", "TailChiSquare",
+    "TrimmedConsensus", "TrimmedFilter", "TrustFilter", "TrustingDistributedKalman", "Verdict", "Widen", "WideningKalman",
+    "WindowedChiSquare", "WindowedKalman", "blame_all", "compose", "per_episode",
 ]  # fmt: skip

@@ -23,7 +23,7 @@ from tailgate.summary import summarise
 from tailgate.threat import ThreatModel
 from tailgate.trace import rollout
 
-NETWORKS = [name for name in list_scenarios() if isinstance(load_scenario(name).plant, SensorNetwork)]
+NETWORKS = [name for name in list_scenarios() if isinstance(load_scenario(name).plant, SensorNetwork) and load_scenario(name).plant.agents > 1]
 NONE, STILL = make("controller", "none"), make("manoeuvre", "constant", value=0.0)
 
 

@@ -15,7 +15,7 @@ except PackageNotFoundError:  # a source tree that was never installed
 from tailgate.errors import InputError
 from tailgate.registry import entries, make
 
-__all__ = ["InputError", "evaluate", "list_attacks", "list_defences", "make_attack", "make_defence", "per_episode"]
+__all__ = ["InputError", "evaluate", "list_attacks", "list_defences", "make_attack", "make_defence", "parallel_env", "per_episode"]
 
 
 def make_defence(name: str, **params: Any) -> Any:
@@ -47,6 +47,10 @@ def __getattr__(name: str) -> Any:
         from tailgate.evaluation import evaluate
 
         return evaluate
+    if name == "parallel_env":
+        from tailgate.envs.parallel import parallel_env
+
+        return parallel_env
     raise AttributeError(f"module 'tailgate' has no attribute {name!r}")
 
 

@@ -14,7 +14,9 @@ import tailgate
 from tailgate.errors import InputError
 
 EXIT_INPUT = 2
-COMMANDS = ("train", "evaluate", "calibrate", "leaderboard", "replay", "reproduce", "list")
+COMMANDS = (
+    "train", "tune", "selfplay", "evaluate", "timing", "dose", "transfer", "zoo", "calibrate", "leaderboard", "replay", "reproduce", "list",
+)  # fmt: skip
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

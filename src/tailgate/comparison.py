@@ -12,19 +12,18 @@ import numpy as np
 
 from tailgate import draws
 from tailgate.core import Array
-from tailgate.errors import InputError
 from tailgate.evaluation import cells_of, run
 from tailgate.files import write_atomic
 from tailgate.metrics import UNITS
 from tailgate.registry import Spec
-from tailgate.scenario import Suite, load_scenario
+from tailgate.rivals import BATCH, best_of
+from tailgate.rivals import outcomes as outcomes_of
+from tailgate.scenario import load_scenario
 from tailgate.schema import as_data, canonical
 from tailgate.stats import Interval, paired_difference, proportion
-from tailgate.train import TrainConfig, outcome_of, suite_of
+from tailgate.train import TrainConfig, outcome_of, rivals_of, suite_of
 
-BATCH = 512  # episodes side by side
 SHARE = "0/1"  # unit of a metric that is yes or no
-SELECT_EPISODES = 1024  # that the best rival is chosen on: fewer would choose by chance
 
 
 @dataclass(frozen=True)
@@ -37,15 +36,6 @@ class Verdict:
     yoked: Array
 
 
-def _outcomes(rows: list[dict[str, Any]], outcome: str) -> Array:
-    bad = next((row for row in rows if row["status"] != "ok"), None)
-    if bad is not None:
-        raise InputError(f"attack {bad['attack']}", bad["status"], f"an attack that plays here ({bad['reason']})")
-    if any(row[outcome] is None for row in rows):
-        raise InputError("config.outcome", outcome, "a metric that every episode has")
-    return np.array([row[outcome] for row in rows], np.float64)
-
-
 def compare(config: TrainConfig, policies: list[Path], progress: Callable[[int, int], None] | None = None) -> dict[str, Any]:
     """Play the policies and the scripted rivals on fresh report seeds; writes rows.jsonl and report.json; returns the report.
 
@@ -56,18 +46,14 @@ def compare(config: TrainConfig, policies: list[Path], progress: Callable[[int, 
     threat = dict(config.threat)
     names, outcome = [str(p) for p in policies], outcome_of(config)
     guard = config.defence
-    best = next(iter(config.rivals), None)
-    if len(config.rivals) > 1:
-        choice = Suite(config.name, "", (config.scenario,), (None,), (guard,), config.rivals, SELECT_EPISODES)
-        selection = run(cells_of(choice, batch=BATCH, purpose="select", threat=threat), workers=config.workers)
-        best = max(config.rivals, key=lambda a: _outcomes([r for r in selection if r["attack"] == a], outcome).mean())
+    best = best_of(rivals_of(config), threat, outcome, "select", config.workers)
 
     attacks = tuple(dict.fromkeys(("none", *config.rivals, *config.white_box, *names)))  # each once
     cells = cells_of(suite_of(config, attacks), batch=BATCH, threat=threat)
     rows = run(cells, config.directory / "rows.jsonl", config.workers, progress)
 
     def outcomes(attack: str) -> Array:
-        return _outcomes([r for r in rows if r["attack"] == attack and r["defence"] == guard], outcome)
+        return outcomes_of([r for r in rows if r["attack"] == attack and r["defence"] == guard], outcome)
 
     built, uses = Spec("defence", guard).make(), Spec("defence", guard).entry.uses
     keys = draws.keys("report", range(config.episodes))
@@ -99,7 +85,7 @@ def _report(
         items.append((best, mean(outcomes(best)), "best scripted attack of equal knowledge and dose, chosen on other seeds"))
     items += [(f"learned, seed {v.seed}", mean(v.learned), "") for v in verdicts]
     items += [(f"learned, seed {v.seed}, yoked", mean(v.yoked), "its own values at another episode's times") for v in verdicts]
-    items += [(name, mean(outcomes(name)), "white box, and no step of it alarms: knows more, dares less") for name in config.white_box]
+    items += [(name, mean(outcomes(name)), _note(name)) for name in config.white_box]
 
     def over(attack: str) -> Interval:
         return difference(np.broadcast_to(outcomes(attack), learned.shape))
@@ -109,15 +95,27 @@ def _report(
         versus["best scripted attack"] = over(best)
     report = {
         "name": config.name, "scenario": config.scenario, "defence": config.defence, "episodes": config.episodes, "steps": config.steps,
-        "outcome": outcome, "unit": UNITS[outcome],
+        "outcome": outcome, "unit": UNITS[outcome], "learner": config.learner, "teacher": config.teacher,
         "threat": as_data(load_scenario(config.scenario).with_threat(**config.threat).threat_model),
         "config": json.loads(canonical(config)), "policies": [str(v.policy) for v in verdicts], "best_scripted": best,
         "attacks": [{"label": label, **interval._asdict(), "note": note} for label, interval, note in items],
         "advantage": {name: interval._asdict() for name, interval in versus.items()},
         "rivals": {name: {"outcome": mean(outcomes(name))._asdict(), "advantage": over(name)._asdict()} for name in config.rivals},
+        "ceilings": {
+            name: {"outcome": mean(outcomes(name))._asdict(), "reached": (learned.mean(axis=1) / outcomes(name).mean()).tolist()}
+            for name in config.white_box if Spec("attack", name).entry.optimal
+        },
     }  # fmt: skip
     write_atomic(config.directory / "report.json", json.dumps(report, indent=1, allow_nan=False).encode() + b"\n")
     return report
+
+
+def _note(attack: str) -> str:
+    """What is said of an attack beside the rivals."""
+    entry = Spec("attack", attack).entry
+    if entry.optimal:
+        return f"{entry.knowledge} box, the computed optimum: a ceiling and no rival"
+    return "white box, and no step of it alarms: knows more, dares less" if entry.name == "stealth" else f"{entry.knowledge} box"
 
 
 def shown(report: dict[str, Any], value: float, sign: str = "") -> str:

@@ -115,7 +115,7 @@ def _head(cell: Cell, place: Scenario, guard: Entry, rival: Entry, identity: str
         "suite": cell.suite, "scenario": place.name, "scenario_file": cell.scenario if cell.scenario.endswith((".yaml", ".yml")) else "",
         "threat_model": as_data(threat), "dose": threat.budget,
         "knowledge": threat.knowledge, "defence": cell.defence, "uses": list(guard.uses), "attack": cell.attack,
-        "learned": rival.name == "policy", "optimal": rival.optimal, "purpose": cell.purpose, "batch": cell.batch,
+        "learned": rival.learned, "optimal": rival.optimal, "purpose": cell.purpose, "batch": cell.batch,
         "engine": ENGINE, "versions": {"defence": guard.version, "attack": rival.version},
         "defence_digest": _digest("defence", cell.defence, identity), "attack_digest": _digest("attack", cell.attack, identity),
         "config_hash": place.config_hash, "version": tailgate.__version__, "cell": identity,

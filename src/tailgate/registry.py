@@ -55,6 +55,11 @@ class Entry:
     sentinel: str = ""
 
     @property
+    def learned(self) -> bool:
+        """Whether this attack plays trained policies."""
+        return bool(getattr(self.cls, "learned", False))
+
+    @property
     def summary(self) -> str:
         return (inspect.getdoc(self.cls) or "").split("\n\n")[0].replace("\n", " ")
 
@@ -67,7 +72,7 @@ class Entry:
         if self.family == "defence":
             out |= {"uses": list(self.uses), "sentinel": self.sentinel}
         if self.family == "attack":
-            out |= {"knowledge": self.knowledge, "optimal": self.optimal}
+            out |= {"knowledge": self.knowledge, "optimal": self.optimal, "learned": self.learned}
         return out | {"parameters": params}
 
 
@@ -214,11 +219,15 @@ class Spec:
 
     @property
     def digest(self) -> str:
-        """Of the files that somebody else's components come from; empty for registered ones, which carry a version."""
+        """Of the files that somebody else's components, or the zoo's, come from; empty for other registered ones: they carry a version."""
         head, params = self._parts()
         paths = [Path(inspect.getfile(imported(family, name).cls)) for family, name in self._imported()]
         if self.family == "attack":
             paths = [Path(str(text)) for text in (head, params.get("path")) if Path(str(text)).suffix in _FILES] or paths
+        if self.family == "defence" and (held := params.get("policy")) is not None:  # a defender that was trained
+            paths += [Path(str(path)) for path in (held if isinstance(held, list) else [held])]
+        if not paths and hasattr(self.entry.cls, "sources"):  # a name that stands for a file
+            paths = list(self.make().sources)
         blobs = [path.read_bytes() for path in paths if path.is_file()]
         return hashlib.sha256(b"".join(blobs)).hexdigest() if blobs else ""
 

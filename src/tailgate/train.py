@@ -19,14 +19,16 @@ from typing import Annotated, Any
 from pydantic import Field
 
 from tailgate.agents.codec import ActionSpec
-from tailgate.agents.learning import LEARNERS, Learner, Progress, learner_of
+from tailgate.agents.learning import DISCRETE, LEARNERS, Learner, Progress, Teachable, check_action, learner_of
 from tailgate.agents.reward import Reward
+from tailgate.agents.teacher import demonstrate
 from tailgate.core import Count, PositiveCount, param
 from tailgate.errors import InputError, unknown
 from tailgate.evaluation import cells_of
 from tailgate.files import set_aside, writable_directory, write_atomic
 from tailgate.metrics import METRICS
 from tailgate.registry import Spec
+from tailgate.rivals import SELECT_EPISODES, best_of
 from tailgate.scenario import Suite, config_path, load_scenario
 from tailgate.schema import as_data, build, fields_of, override, read_yaml
 
@@ -51,6 +53,7 @@ class TrainConfig:
     sac: dict[str, Any] = field(default_factory=dict, metadata={"doc": "hyper-parameters of SAC"})
     tqc: dict[str, Any] = field(default_factory=dict, metadata={"doc": "hyper-parameters of TQC"})
     cem: dict[str, Any] = field(default_factory=dict, metadata={"doc": "hyper-parameters of the cross-entropy method"})
+    teacher: str | None = param(None, "script that PPO imitates before it learns: one by name, or `best` of the rivals; none: from scratch")
     gamma: Discount = param(0.995, "discount, of the learner and of the shaping [-]")
     steps: PositiveCount = param(3_000_000, "decisions per training seed, over all environments")
     first_seed: Count = param(0, "first training seed")
@@ -101,7 +104,8 @@ def _checked(data: dict[str, Any]) -> TrainConfig:
         raise unknown("config.outcome", config.outcome, METRICS)
     for spec in [Spec("defence", config.defence), *(Spec("defence", name) for name in config.others)]:
         spec.refuse_imports("config")
-    for spec in (Spec("attack", name) for name in (*config.rivals, *config.white_box)):
+    shown = () if config.teacher in (None, "best") else (config.teacher,)
+    for spec in (Spec("attack", name) for name in (*config.rivals, *config.white_box, *shown)):
         spec.refuse_imports("config")
     return config
 
@@ -126,7 +130,11 @@ def _check(config: TrainConfig) -> None:
     """Everything that a run will need, tried before anything is written: a typing error shall not cost an hour."""
     from tailgate.envs.seat import Seat
 
-    Seat.make(**environment_of(config))
+    check_action(config.learner, Seat.make(**environment_of(config)))
+    if config.teacher is not None and not issubclass(learner_of(config.learner).Learner, Teachable):
+        raise InputError("config.teacher", config.teacher, f"none: {config.learner} is not shown anything; ppo and maskable_ppo are")
+    if config.teacher is not None and config.environment.get("action", "mode") not in DISCRETE:
+        raise InputError("config.teacher", config.teacher, f"none, or an action of {', '.join(DISCRETE)}: what is shown is one of a few")
     cells_of(suite_of(config, (*config.rivals, *config.white_box)), threat=config.threat)
 
 
@@ -134,6 +142,18 @@ def suite_of(config: TrainConfig, attacks: tuple[str, ...]) -> Suite:
     """The final comparison, with these attacks."""
     defences = tuple(dict.fromkeys((config.defence, *config.others)))  # each once
     return Suite(config.name, "", (config.scenario,), (None,), defences, attacks, config.episodes)
+
+
+def rivals_of(config: TrainConfig) -> Suite:
+    """The scripts against the defence, on as many episodes as a choice needs."""
+    return Suite(config.name, "", (config.scenario,), (None,), (config.defence,), config.rivals, SELECT_EPISODES)
+
+
+def teacher_of(config: TrainConfig) -> str | None:
+    """The script that the learner is shown; `best` is chosen on tune seeds."""
+    if config.teacher != "best":
+        return config.teacher
+    return best_of(rivals_of(config), dict(config.threat), outcome_of(config), "tune", config.workers)
 
 
 def train(config: TrainConfig, progress: Callable[[int, Any], None], resume: bool = False) -> list[Path]:
@@ -151,10 +171,10 @@ def train(config: TrainConfig, progress: Callable[[int, Any], None], resume: boo
     if resume and held.is_file():
         _same_run(held, config)
     write_atomic(held, snapshot)
-    seeds = range(config.first_seed, config.first_seed + config.seeds)
+    teacher, seeds = teacher_of(config), range(config.first_seed, config.first_seed + config.seeds)
     if min(config.workers, len(seeds)) == 1:
-        return [_train_seed(config, seed, resume, partial(progress, seed)) for seed in seeds]
-    return _train_apart(config, seeds, resume, progress)
+        return [_train_seed(config, teacher, seed, resume, partial(progress, seed)) for seed in seeds]
+    return _train_apart(config, teacher, seeds, resume, progress)
 
 
 def _settings(config: TrainConfig) -> tuple[Any, Any]:
@@ -165,8 +185,8 @@ def _settings(config: TrainConfig) -> tuple[Any, Any]:
     return module, settings
 
 
-def _train_seed(config: TrainConfig, seed: int, resume: bool, report: Callable[[Progress], None]) -> Path:
-    """Train the policy of one seed; returns its JSON file."""
+def _train_seed(config: TrainConfig, teacher: str | None, seed: int, resume: bool, report: Callable[[Progress], None]) -> Path:
+    """Train the policy of one seed, shown its teacher's decisions first; returns its JSON file."""
     module, settings = _settings(config)
     directory = config.directory
     board = directory / "tensorboard" if config.tensorboard else None
@@ -174,11 +194,14 @@ def _train_seed(config: TrainConfig, seed: int, resume: bool, report: Callable[[
     checkpoint = directory / f"checkpoint-{seed}.safetensors"
     if resume and checkpoint.exists():
         learner.load(checkpoint)
+    elif teacher is not None:
+        assert isinstance(learner, Teachable)
+        learner.imitate(demonstrate(learner.seat, Spec("attack", teacher).make(), seed))
     started = time.perf_counter()
     learner.learn(config.steps, report, checkpoint, config.checkpoint_every)
     facts = {
-        "learner": config.learner, "seed": seed, "steps": learner.steps, "config": as_data(config), config.learner: as_data(settings),
-        "environment": learner.seat.card()["hash"], "curve": learner.curve,
+        "learner": config.learner, "teacher": teacher, "seed": seed, "steps": learner.steps, "config": as_data(config),
+        config.learner: as_data(settings), "environment": learner.seat.card()["hash"], "curve": learner.curve,
     }  # fmt: skip
     policy = learner.export(directory / f"policy-{seed}", facts)
     curve = {"curve": learner.curve, "seconds": time.perf_counter() - started}
@@ -200,7 +223,7 @@ def _hold_line(queue: Any, stop: Any) -> None:
     _line = (queue, stop)
 
 
-def _train_in_child(config: TrainConfig, seed: int, resume: bool) -> Path:
+def _train_in_child(config: TrainConfig, teacher: str | None, seed: int, resume: bool) -> Path:
     queue, stop = _line
 
     def report(progress: Progress) -> None:
@@ -208,15 +231,17 @@ def _train_in_child(config: TrainConfig, seed: int, resume: bool) -> Path:
             raise Stopped(f"seed {seed}")
         queue.put((seed, progress))
 
-    return _train_seed(config, seed, resume, report)
+    return _train_seed(config, teacher, seed, resume, report)
 
 
-def _train_apart(config: TrainConfig, seeds: Sequence[int], resume: bool, progress: Callable[[int, Progress], None]) -> list[Path]:
+def _train_apart(
+    config: TrainConfig, teacher: str | None, seeds: Sequence[int], resume: bool, progress: Callable[[int, Progress], None]
+) -> list[Path]:
     """As many processes as there are workers, one training seed each. An interrupt stops them at their next report."""
     context = multiprocessing.get_context("spawn")  # a fork would copy the threads of compiled kernels
     queue, stop = context.Queue(), context.Event()
     with ProcessPoolExecutor(min(config.workers, len(seeds)), context, _hold_line, (queue, stop)) as pool:
-        futures = [pool.submit(_train_in_child, config, seed, resume) for seed in seeds]
+        futures = [pool.submit(_train_in_child, config, teacher, seed, resume) for seed in seeds]
         try:
             while not all(future.done() for future in futures):
                 with contextlib.suppress(Empty):

@@ -57,6 +57,9 @@ def names_of(texts: Iterable[str]) -> dict[str, Name]:
             while depth < len(paths[text]) and any(p[-depth:] == paths[text][-depth:] for p in rivals):
                 depth += 1
             out[text] = Name("/".join(paths[text][-depth:]), params, "policy", True)
+        elif head == "zoo":
+            name = next((p.removeprefix("name=") for p in params if p.startswith("name=")), "zoo")
+            out[text] = Name(name, tuple(p for p in params if not p.startswith("name=")), "zoo", True)
         elif found := re.fullmatch(r"(\w+)\((\{.*\})\)", head, re.DOTALL):  # an object that was evaluated from Python
             out[text] = Name(found[1], tuple(found[2].strip("{}").replace('"', "").split(",")) if found[2] != "{}" else ())
         else:

@@ -1,0 +1,139 @@
+"""One state that feedback holds near zero (dimensionless): the smallest loop in which it matters when a reading is held.
+
+    x+ = a x + b u + w          y = x          u = -g x^
+
+The reading is exact, so that a defence that believes it knows the state, and an attacker who holds it decides what the loop acts on.
+"""
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from tailgate import num
+from tailgate.core import (
+    Array,
+    Controller,
+    Estimate,
+    Finite,
+    Model,
+    NonNegative,
+    Positive,
+    Prior,
+    Received,
+    Scene,
+    Sensor,
+    Sized,
+    param,
+)  # fmt: skip
+from tailgate.draws import Draws
+from tailgate.errors import InputError
+from tailgate.registry import register
+
+WIRE, ACTUATOR = "y", "u"
+
+
+class ScalarState(NamedTuple):
+    """Every leaf has B first."""
+
+    x: Array  # (B,)
+
+
+@register("plant", "scalar_loop")
+@dataclass(frozen=True)
+class ScalarLoop:
+    """x+ = a x + b u + w, one state and one input, which starts near zero."""
+
+    a: Finite = param(1.0, "how much of the state lasts a step [-]")
+    b: Finite = param(1.0, "how much of the input arrives [-]")
+    noise_var: Positive = param(1.0, "variance of w, known to everybody")
+    initial_sd: NonNegative = param(1.0, "spread of the initial state about 0, which the defence takes it for")
+    dt: Positive = param(1.0, "step [s]; nothing depends on it")
+
+    @property
+    def size(self) -> tuple[int, int]:
+        return 1, 1
+
+    def prepare(self, model: Model) -> float:
+        return float(np.sqrt(self.noise_var))
+
+    def model(self, sensor: Sensor, controller: Controller) -> Model:
+        names, C, R = sensor.matrices(self)
+        return Model(
+            A=np.array([[self.a]]), B=np.array([[self.b]]), c=np.zeros(1), C=C, Q=np.array([[self.noise_var]]), R=R,
+            graph=np.eye(1, dtype=bool), dt=self.dt, sensors=names, actuators=(ACTUATOR,),
+        )  # fmt: skip
+
+    def start(self, plan: float, draws: Draws) -> ScalarState:
+        return ScalarState(self.initial_sd * draws.normal())
+
+    def prior(self, plan: float, state: ScalarState, held: Array, draws: Draws) -> Prior:
+        batch = len(state.x)
+        return Prior(num.zeros((batch, 1, 1)), num.full((batch, 1, 1, 1), max(self.initial_sd, 1e-6) ** 2))
+
+    def step(self, plan: float, state: ScalarState, u: Array, exo: Array, draws: Draws) -> ScalarState:
+        return ScalarState(self.a * state.x + self.b * u[:, 0, 0] + plan * draws.normal())
+
+    def known(self, plan: float, u: Array, exo: Array, state: Any) -> Array:
+        return u
+
+    def truth(self, plan: float, state: ScalarState, held: Array) -> Array:
+        return state.x[:, None, None]
+
+    def odometry(self, plan: float, state: ScalarState) -> Array:
+        return np.zeros((len(state.x), 1, 0))
+
+    def lead_speed_of(self, state: ScalarState) -> Array:
+        return np.zeros(len(state.x))
+
+    def scene(self, plan: float, state: ScalarState) -> Scene:
+        """Nothing drives."""
+        still = num.zeros((len(state.x), 1))
+        nobody = num.full(still.shape, np.inf)
+        return Scene(nobody, still, still, still, nobody, still, still)
+
+    def v2v(self, plan: float, state: ScalarState) -> Array:
+        return np.zeros((len(state.x), 1, 0))
+
+
+@register("sensor", "exact_reading")
+@dataclass(frozen=True)
+class ExactReading:
+    """y = x, the state of a scalar loop without noise."""
+
+    told_var: Positive = param(1.0, "noise variance that a filter is told")
+
+    def matrices(self, plant: Sized) -> tuple[tuple[str, ...], Array, Array]:
+        if not isinstance(plant, ScalarLoop):
+            raise InputError("sensor exact_reading", type(plant).__name__, "the plant scalar_loop")
+        return (WIRE,), np.ones((1, 1, 1)), np.full((1, 1, 1), self.told_var)
+
+    def prepare(self, model: Model) -> Any:
+        return None
+
+    def measure(self, plan: Any, truth: Array, probe: Array, draws: Draws) -> Received:
+        return Received(truth.copy(order="K"), num.full(truth.shape, True, bool), num.zeros(truth.shape[:2]))
+
+
+@register("controller", "state_feedback")
+@dataclass(frozen=True)
+class StateFeedback:
+    """u = -g x^ on the estimate of the one state."""
+
+    gain: Finite = param(0.25, "feedback gain g [-]")
+
+    def prepare(self, model: Model) -> Any:
+        if model.states != 1 or model.actuators != (ACTUATOR,):
+            raise InputError("controller state_feedback", list(model.actuators), f"the plant scalar_loop, whose actuator is {ACTUATOR}")
+
+    def start(self, plan: Any, batch: int) -> Any:
+        return None
+
+    def step(self, plan: Any, state: Any, estimate: Estimate, v2v: Array, odometry: Array) -> tuple[Any, Array]:
+        return None, -self.gain * estimate.x
+
+    def held(self, plan: Any, state: Any, batch: int) -> Array:
+        return np.zeros((batch, 1, 0))
+
+    def desired_gap(self, speed: Array) -> Array:
+        return np.zeros_like(speed)

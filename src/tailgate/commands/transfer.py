@@ -1,0 +1,88 @@
+"""tailgate transfer: policies trained against one defence, played against others."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from tailgate.progress import cells, console, progress
+
+
+def add(commands: Any) -> None:
+    command = commands.add_parser(
+        "transfer", help="the matrix trained on x played on of trained policies",
+        description="Play policies against defences that they were not trained on. Scenario and threat model are those of the training "
+        "unless given. An entry is the mean over the training seeds of what was trained on one defence.",
+    )  # fmt: skip
+    command.add_argument("policies", nargs="+", metavar="POLICY", help="JSON file of an exported policy, or zoo:name=NAME")
+    command.add_argument("--defence", action="append", metavar="NAME", default=[],
+                         help="a defence to play on (repeatable; default: those that the policies were trained on)")  # fmt: skip
+    command.add_argument("--scenario", metavar="NAME", help="scenario instead of the one that they were trained in")
+    command.add_argument("--threat", action="append", metavar="key=value", help="the threat model's changes instead of the training's")
+    command.add_argument("--dose", type=int, metavar="STEPS", help="attack budget instead of the training's")
+    command.add_argument("--episodes", type=int, default=400, metavar="N", help="episodes per policy and defence (default 400)")
+    command.add_argument("--outcome", metavar="METRIC", help="metric that is counted (default: the training's)")
+    command.add_argument("--purpose", default="report", help="which seeds: train, tune, calibrate, select or report (default)")
+    command.add_argument("--workers", type=int, default=1, metavar="N", help="processes (default 1); changes no result")
+    command.add_argument("--out", metavar="DIR", help="write rows.jsonl, transfer.json and transfer.png here; resumes")
+    command.add_argument("--json", action="store_true", help="print the report as JSON")
+    command.set_defaults(run=_transfer)
+
+
+def _transfer(options: argparse.Namespace) -> int:
+    from tailgate.strength.policies import changes, write_report
+    from tailgate.strength.transfer import transfer
+
+    threat = None if options.threat is None else changes(options.threat)
+    with progress(Console(stderr=True)) as update:
+        report = transfer(
+            options.policies, options.defence, scenario=options.scenario, threat=threat, dose=options.dose,
+            episodes=options.episodes, outcome=options.outcome, purpose=options.purpose, workers=options.workers,
+            rows_file=Path(options.out) / "rows.jsonl" if options.out else None,
+            progress=lambda done, total: update("playing", done, total, cells(done, total)),
+        )  # fmt: skip
+    if options.json:
+        print(json.dumps(report, indent=1, allow_nan=False))
+    else:
+        _print(report)
+    if options.out:
+        from tailgate.strength.figures import transfer_figure
+
+        for path in write_report(Path(options.out), "transfer", report, transfer_figure(report) if report["entries"] else None):
+            print(f"written: {path}", file=sys.stderr)
+    return 0
+
+
+def _print(report: dict[str, Any]) -> None:
+    from tailgate.strength.policies import between, shown
+
+    share, out = report["unit"] == "0/1", console()
+    held = {(entry["trained_on"], entry["played_on"]): entry for entry in report["entries"]}
+    table = Table(title=f"{report['scenario']}: {report['outcome']}, {report['episodes']} episodes", caption="95 % intervals")
+    table.add_column("trained on", overflow="fold")
+    for column in report["played_on"]:
+        table.add_column(f"on {escape(column)}", overflow="fold")
+    none = (shown(report["no_attack"][c], share) if c in report["no_attack"] else "-" for c in report["played_on"])
+    table.add_row("(no attack)", *none)
+    for row in report["trained_on"]:
+        texts = []
+        for column in report["played_on"]:
+            entry = held.get((row, column))
+            texts.append("-" if entry is None else f"{shown(entry['value'], share)} ({between(entry, share)})")
+        seeds = next((entry["seeds"] for entry in report["entries"] if entry["trained_on"] == row), 0)
+        table.add_row(f"{escape(row)}, {seeds} seed{'' if seeds == 1 else 's'}", *texts)
+    out.print(table)
+    for entry in report["entries"]:
+        for flag in entry.get("flags", ()):
+            gain = entry["over_own"]
+            out.print(f"flag: {flag}: {entry['trained_on']} on {entry['played_on']}, {shown(gain['value'], share, '+')} "
+                      f"({between(gain, share, '+')})", markup=False)  # fmt: skip
+    for item in report["skipped"]:
+        out.print(f"skipped: {item.get('policy', item.get('defence'))}: {item['reason']}", markup=False)

@@ -1,0 +1,282 @@
+"""Self-play: attacker and defender train in turns against growing pools; then a fresh attacker measures what the defender is worth.
+
+Round r trains attacker r against the uniform mixture of defenders 0 to r - 1, then defender r against the uniform mixture of attackers 1
+to r; defender 0 is the defence with its knobs at the menu's setting nearest to its own values. At the end the last defender is frozen,
+and an attacker with new seeds and the same budget is trained against it: the best response. The same is done for the best fixed setting.
+
+    exploitability = collisions under the fresh best response - collisions under the last attacker of self-play
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import json
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import Field
+
+from tailgate import draws
+from tailgate.agents.cem import Config
+from tailgate.agents.codec import ActionSpec
+from tailgate.agents.learning import LEARNERS, learner_of
+from tailgate.agents.policy import PolicyAttack
+from tailgate.agents.reward import Reward
+from tailgate.agents.selfplay import Learner, Played, constant, export, play
+from tailgate.core import Array, Attack, Count, PositiveCount, param
+from tailgate.envs.duel import Duel
+from tailgate.errors import InputError, unknown
+from tailgate.estimators.steered import Steered
+from tailgate.estimators.steering import nearest
+from tailgate.files import set_aside, writable_directory, write_atomic
+from tailgate.registry import Spec
+from tailgate.scenario import config_path
+from tailgate.schema import as_data, build, fields_of, override, read_yaml
+from tailgate.stats import paired_difference, proportion
+
+FRESH, DEFENDERS = 1000, 500  # added to the first seed: seeds of best responses and of defenders differ from those of self-play's attackers
+SELECT_EPISODES = 512  # that the best fixed setting is chosen on
+BATCH = 4096  # games side by side
+AS_IS, FIXED, TRAINED = "as it is", "best fixed setting", "trained"
+Discount = Annotated[float, Field(gt=0, le=1)]
+Update = Callable[[str, int, int, str], None]
+
+
+@dataclass(frozen=True)
+class GameConfig:
+    """What `tailgate selfplay` reads."""
+
+    name: str = param("selfplay", "name of the run; its files go to out/name")
+    out: str = param("runs", "directory of the runs")
+    scenario: str = param("gusty-stop-and-go-v0", "scenario, by name or YAML file")
+    defence: str = param("chi2_kf", "registered defence whose knobs the defender turns")
+    menu: dict[str, Any] = field(default_factory=dict, metadata={"doc": "settings of the knobs: thresholds, challenges, modes"})
+    payoff: dict[str, Any] = field(default_factory=dict, metadata={"doc": "what the defender is paid for"})
+    threat: dict[str, Any] = field(default_factory=dict, metadata={"doc": "changes of the scenario's threat model"})
+    environment: dict[str, Any] = field(default_factory=dict, metadata={"doc": "action and reward settings of the attacker"})
+    learner: str = param("cem", f"how the attacker learns: {', '.join(LEARNERS)}; the defender learns by cem")
+    attacker: dict[str, Any] = field(default_factory=dict, metadata={"doc": "hyper-parameters of the attacker's learner"})
+    defender: dict[str, Any] = field(default_factory=dict, metadata={"doc": "hyper-parameters of the defender's learner"})
+    gamma: Discount = param(0.99, "discount of both [-]")
+    rounds: PositiveCount = param(2, "rounds: an attacker and a defender each")
+    steps: PositiveCount = param(300_000, "decisions of a training, over all environments")
+    first_seed: Count = param(0, "first training seed")
+    fresh: PositiveCount = param(1, "fresh attackers against the frozen defender, one training seed each")
+    episodes: PositiveCount = param(1000, "report episodes per pair in the final table")
+    rivals: tuple[str, ...] = param((), "scripted attacks in the final table")
+
+    @property
+    def directory(self) -> Path:
+        return Path(self.out) / self.name
+
+
+def load_config(source: str | None, overrides: list[str], resume: bool = False) -> GameConfig:
+    """A preset by name or YAML file (default: selfplay) with `key=value` overrides; with `resume` the run's own configuration."""
+    path = config_path(".", source or "selfplay", "config")
+    config = _checked(override(read_yaml(path, "config"), overrides))
+    if not resume:
+        return config
+    held = config.directory / "config.json"
+    try:
+        started = json.loads(held.read_text(encoding="utf-8"))
+        del started["class"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError("resume", str(held), f"the configuration of a run ({error})") from None
+    return _checked(override(started, overrides))
+
+
+def _checked(data: dict[str, Any]) -> GameConfig:
+    for key in ("menu", "payoff", "threat", "environment", "attacker", "defender"):
+        if not isinstance(data.get(key, {}), dict):
+            raise InputError(f"config.{key}", data[key], "a mapping of fields")
+    config = build(GameConfig, data, "config")
+    if Path(config.name).name != config.name:
+        raise InputError("config.name", config.name, "the name of a directory, without a separator")
+    Spec("defence", config.defence).refuse_imports("config")
+    for name in config.rivals:
+        Spec("attack", name).refuse_imports("config")
+    known = (fields_of(ActionSpec) | fields_of(Reward)).keys() - {"gamma"}
+    for key in config.environment:
+        if key not in known:
+            raise unknown("config.environment: unknown field", key, known)
+    return config
+
+
+class Game:
+    """A run: what it plays, and the files that it keeps."""
+
+    def __init__(self, config: GameConfig, update: Update, resume: bool = False) -> None:
+        self.config, self.update = config, update
+        if "interval" in config.menu:
+            raise InputError("config.menu.interval", config.menu["interval"], "environment.interval: both decide at the same time")
+        self.duel = Duel.make(config.scenario, config.defence, config.menu, **config.payoff, **self._environment)
+        if not self.duel.seat.road:
+            raise InputError("config.scenario", config.scenario, "one with a road: outcomes are collisions")
+        module = learner_of(config.learner)
+        self.settings = build(module.Config, dict(config.attacker), "config.attacker")
+        self.settings.check()
+        self.defender = build(Config, dict(config.defender), "config.defender")
+        self.defender.check()
+        self.scripts = {name: Spec("attack", name).make() for name in ("none", *config.rivals)}
+        for name, attack in self.scripts.items():
+            if Spec("attack", name).entry.knowledge != "black":
+                raise InputError("config.rivals", name, "attacks that know no more than the learned one, which sees the road")
+            attack.prepare(self.duel.seat.loop.brief)
+        if not resume and config.directory.is_dir() and any(config.directory.iterdir()):
+            set_aside(config.directory)
+        self.directory = writable_directory(config.directory)
+        self._keep(resume)
+
+    def _keep(self, resume: bool) -> None:
+        """Writes the configuration, or raises InputError when the run that is resumed had another one."""
+        held, now = self.directory / "config.json", as_data(self.config)
+        if resume and held.is_file():
+            before, free = json.loads(held.read_text(encoding="utf-8")), ("rounds", "episodes", "fresh", "rivals")
+            changed = [key for key in now if key not in free and before.get(key) != now[key]]
+            if changed:
+                raise InputError("resume", ", ".join(changed), f"the configuration in {held}, apart from {', '.join(free)}")
+        write_atomic(held, json.dumps(now, indent=1).encode() + b"\n")
+
+    @property
+    def _environment(self) -> dict[str, Any]:
+        return {"threat": dict(self.config.threat), "gamma": self.config.gamma, **self.config.environment}
+
+    # -- training
+
+    def run(self) -> dict[str, Any]:
+        """Play all rounds and the fresh best responses; writes and returns the report. What a run has finished is not trained again."""
+        defenders, attackers = [self._as_it_is()], []
+        for r in range(1, self.config.rounds + 1):
+            pool = self._guard(policy=tuple(defenders))
+            attackers.append(self._attacker(f"attacker-{r}", self.config.first_seed + r, pool))
+            defenders.append(self._defender(r, tuple(PolicyAttack(path) for path in attackers)))
+        frozen = self._guard(policy=defenders[-1])
+        setting = self._best_setting(tuple(PolicyAttack(path) for path in attackers))
+        fixed = self._guard(setting=setting)
+        fresh = [self._fresh(f"fresh-{i}", i, frozen) for i in range(self.config.fresh)]
+        other = [self._fresh(f"fresh-fixed-{i}", i, fixed) for i in range(self.config.fresh)]
+        return self._report({AS_IS: self._guard(), FIXED: fixed, TRAINED: frozen}, attackers, fresh, other, setting)
+
+    def _guard(self, **who: Any) -> Steered:
+        """The defence in certain hands: a policy's, or those of a fixed setting."""
+        return dataclasses.replace(self.duel.guard, **who)
+
+    def _as_it_is(self) -> Path:
+        path = self.directory / "defender-0"
+        if path.with_suffix(".json").is_file():
+            return path.with_suffix(".json")
+        setting = nearest(self.duel.guard.hand.knobs)
+        return export(path, self.duel, constant(self.duel, setting), {"learner": "none", "setting": setting})
+
+    def _fresh(self, name: str, i: int, guard: Steered) -> Path:
+        return self._attacker(name, self.config.first_seed + FRESH + i, guard)
+
+    def _attacker(self, name: str, seed: int, guard: Steered) -> Path:
+        environment = {"scenario": self.config.scenario, "defence": guard, **self._environment}
+        del environment["gamma"]  # the learner's own
+        module = learner_of(self.config.learner)
+        facts = {"learner": self.config.learner, "seed": seed, "against": as_data(guard), "settings": as_data(self.settings)}
+        return self._train(name, lambda: module.Learner(seed, self.config.gamma, self.settings, environment), facts)
+
+    def _defender(self, r: int, attacks: tuple[Attack, ...]) -> Path:
+        seed = self.config.first_seed + DEFENDERS + r
+        facts = {"learner": "cem", "seed": seed, "against": as_data(attacks), "settings": as_data(self.defender)}
+        return self._train(f"defender-{r}", lambda: Learner(seed, self.config.gamma, self.defender, self.duel, attacks), facts)
+
+    def _train(self, name: str, make: Callable[[], Any], facts: dict[str, Any]) -> Path:
+        path, checkpoint, steps = self.directory / name, self.directory / f"checkpoint-{name}.safetensors", self.config.steps
+        if path.with_suffix(".json").is_file():
+            return path.with_suffix(".json")
+        learner = make()
+        if checkpoint.is_file():
+            learner.load(checkpoint)
+
+        def report(now: Any) -> None:
+            crash = "" if now.crash is None else f"collisions {100 * now.crash:4.1f} %"
+            self.update(name, min(now.steps, steps), steps, crash)
+
+        learner.learn(steps, report, checkpoint)
+        done: Path = learner.export(path, facts | {"steps": learner.steps, "curve": learner.curve})
+        learner.close()
+        checkpoint.unlink(missing_ok=True)
+        return done
+
+    # -- measuring
+
+    def _best_setting(self, attacks: tuple[Attack, ...]) -> int:
+        """The setting that pays best when held throughout, against self-play's attackers in equal shares on select seeds."""
+        count = len(self.duel.settings)
+        paid = np.zeros(count)
+        chunk = max(1, BATCH // SELECT_EPISODES)
+        for attack in attacks:
+            for start in range(0, count, chunk):
+                chosen = np.arange(start, min(start + chunk, count))
+                keys = draws.keys("select", list(range(SELECT_EPISODES)) * len(chosen))
+                held = np.repeat(chosen, SELECT_EPISODES)
+                out = play(self.duel, attack, keys, lambda _, held=held: held)  # type: ignore[misc]
+                paid[chosen] += out.paid.reshape(len(chosen), -1).mean(axis=1)
+            self.update("fixed settings", attacks.index(attack) + 1, len(attacks), "")
+        return int(np.argmax(paid))
+
+    def _play(self, guard: Steered, attack: Attack) -> Played:
+        """The report episodes of a pair."""
+        seat = dataclasses.replace(self.duel.seat, loop=dataclasses.replace(self.duel.seat.loop, defence=guard))
+        duel, last = dataclasses.replace(self.duel, seat=seat, guard=guard), self.config.episodes
+        parts = [play(duel, attack, draws.keys("report", range(at, min(at + BATCH, last)))) for at in range(0, last, BATCH)]
+        paid, crashed, cost = (np.concatenate([getattr(part, name) for part in parts]) for name in ("paid", "crashed", "cost"))
+        return Played(paid, crashed, cost, sum(part.decisions for part in parts))
+
+    def _report(
+        self, guards: dict[str, Steered], attackers: list[Path], fresh: list[Path], other: list[Path], setting: int
+    ) -> dict[str, Any]:
+        learned = {path.stem: PolicyAttack(path) for path in (*attackers, *fresh, *other)}
+        attacks: dict[str, Attack] = self.scripts | learned
+        crashed: dict[tuple[str, str], Array] = {}
+        table: list[dict[str, Any]] = []
+        total = len(guards) * len(attacks)
+        for (guard, defence), (name, attack) in itertools.product(guards.items(), attacks.items()):
+            out = self._play(defence, attack)
+            crashed[guard, name] = out.crashed.astype(np.float64)
+            share = proportion(int(np.count_nonzero(out.crashed)), len(out.crashed))
+            table.append({"defender": guard, "attack": name, "collisions": share._asdict(), "cost": float(out.cost.mean())})
+            self.update("final table", len(table), total, f"{len(table)} of {total} pairs")
+
+        def under(guard: str, names: list[Path]) -> Array:
+            return np.array([crashed[guard, path.stem] for path in names])
+
+        last = attackers[-1:]
+        own = {TRAINED: fresh, FIXED: other}
+
+        def gain(guard: str) -> dict[str, float]:
+            best = under(guard, own[guard])
+            return paired_difference(best, np.broadcast_to(under(guard, last), best.shape), share=True)._asdict()
+
+        worst = {
+            guard: max((row for row in table if row["defender"] == guard), key=lambda row: row["collisions"]["value"])["attack"]
+            for guard in guards
+        }  # fmt: skip
+        saved = paired_difference(under(FIXED, other), under(TRAINED, fresh), share=True)._asdict()
+        knobs = self.duel.guard.hand.knobs
+        values = {knob.name: float(value) for knob, value in zip(knobs, self.duel.settings[setting], strict=True)}
+        config = self.config
+        report = {
+            "name": config.name, "scenario": config.scenario, "defence": self.duel.guard.described, "episodes": config.episodes,
+            "config": as_data(config), "knobs": {knob.name: list(knob.levels) for knob in knobs},
+            "fixed": {"setting": setting, **values}, "defender": str(self.directory / f"defender-{config.rounds}.json"),
+            "self_play_attacker": last[0].stem, "table": table, "worst": worst,
+            "exploitability": {guard: gain(guard) for guard in own}, "fixed_minus_trained": saved,
+        }  # fmt: skip
+        write_atomic(self.directory / "report.json", json.dumps(report, indent=1, allow_nan=False).encode() + b"\n")
+        return report
+
+
+def parameters() -> list[dict[str, Any]]:
+    """Every field of the configuration with default and sentence, for --help."""
+    return [
+        {"name": f.name, "default": as_data(f.default if f.default is not dataclasses.MISSING else {}), "doc": f.metadata.get("doc", "")}
+        for f in dataclasses.fields(GameConfig)
+    ]

@@ -1,0 +1,118 @@
+"""Transfer: policies trained against one defence, played against others.
+
+A row of the matrix is what was trained on, a column what is played on; an entry is the mean over training seeds. On the diagonal stands
+what was trained against that very defence. Where a row from elsewhere does better than the diagonal, the attackers of that defence were
+not trained to its worst: the entry is flagged.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+from tailgate.core import Array
+from tailgate.errors import InputError
+from tailgate.evaluation import Cell, cells_of, run
+from tailgate.metrics import UNITS
+from tailgate.scenario import Suite, load_scenario
+from tailgate.schema import as_data, canonical
+from tailgate.stats import Interval, paired_difference
+
+from .policies import is_share, mean, misfit, outcome_for, required, trained
+
+LEVEL = 0.95
+
+
+def difference(a: Array, b: Array, share: bool = False) -> Interval:
+    """Mean of a (runs, episodes) less that of b (other runs, the same episodes), with an interval.
+
+    Episodes are paired, training seeds are not: their part is Welch's t over the runs' means, and missing where each side has one.
+    """
+    paired = paired_difference(a.mean(axis=0), b.mean(axis=0), LEVEL, share=share)
+    parts = [(float(x.mean(axis=1).var(ddof=1)) / len(x), len(x) - 1) for x in (a, b) if len(x) > 1]
+    variance, spread = sum(v for v, _ in parts), 0.0
+    if variance > 0.0:
+        freedom = variance**2 / sum(v**2 / n for v, n in parts)
+        spread = float(stats.t.ppf((1 + LEVEL) / 2, freedom)) * variance**0.5
+    low, high = paired.value - paired.low, paired.high - paired.value
+    return Interval(paired.value, paired.value - float(np.hypot(low, spread)), paired.value + float(np.hypot(high, spread)))
+
+
+def transfer(
+    texts: Sequence[str], defences: Sequence[str] = (), *, scenario: str | None = None, threat: dict[str, Any] | None = None,
+    dose: int | None = None, episodes: int = 400, outcome: str | None = None, purpose: str = "report", workers: int = 1,
+    rows_file: Path | None = None, progress: Callable[[int, int], None] | None = None,
+) -> dict[str, Any]:  # fmt: skip
+    """The report. Without `defences` the policies are played on those that they were trained on.
+
+    Scenario and threat model are those of the training, which have to agree where nothing else is given. A policy that does not fit them
+    (another observation or action) is skipped, with the reason.
+    """
+    members = [trained(text) for text in dict.fromkeys(texts)]
+    if not members:
+        raise InputError("policies", list(texts), "at least one")
+    where = scenario or _common("scenario", {who.name: required(who.scenario, "scenario", who) for who in members})
+    changed = _common("threat", {who.name: who.threat for who in members}) if threat is None else dict(threat)
+    counted = outcome_for(outcome or next((who.outcome for who in members if who.outcome), None), where)
+    origins = {who.text: required(who.defence, "defence", who) for who in members}
+    columns = tuple(dict.fromkeys(defences or origins.values()))
+    good, skipped = [], []
+    for who in members:
+        reason = misfit(Cell("transfer", where, dose, columns[0], who.text, episodes, purpose, threat=changed))
+        if reason:
+            skipped.append({"policy": who.name, "trained_on": origins[who.text], "reason": reason})
+        else:
+            good.append(who)
+    rivals = ("none", *(who.text for who in good))
+    cells = cells_of(Suite("transfer", "", (where,), (dose,), columns, rivals, episodes, changed), purpose=purpose)
+    rows = run(cells, rows_file, workers, progress)
+    held: dict[tuple[str, str], Array] = {}
+    for i, cell in enumerate(cells):
+        mine = rows[i * episodes : (i + 1) * episodes]
+        bad = next((row for row in mine if row["status"] != "ok" or row[counted] is None), None)
+        if bad is None:
+            held[cell.attack, cell.defence] = np.array([row[counted] for row in mine], np.float64)
+        elif cell.attack == "none":
+            reason = bad["reason"] or f"{counted} is undefined in some episodes"
+            skipped.append({"defence": cell.defence, "reason": reason})
+    origin_rows = dict.fromkeys(origins[who.text] for who in good)
+    entries: list[dict[str, Any]] = []
+    for column in columns:
+        played = {
+            origin: np.array([held[who.text, column] for who in good if origins[who.text] == origin and (who.text, column) in held])
+            for origin in origin_rows
+        }
+        for origin, values in played.items():
+            if not len(values):
+                continue
+            entry: dict[str, Any] = {
+                "trained_on": origin, "played_on": column, "seeds": len(values), **mean(values, counted)._asdict(),
+                "by_policy": {
+                    who.name: float(held[who.text, column].mean()) for who in good
+                    if origins[who.text] == origin and (who.text, column) in held
+                },
+            }  # fmt: skip
+            own = played.get(column)
+            if own is not None and len(own) and origin != column:
+                gain = difference(values, own, is_share(counted))
+                entry |= {"over_own": gain._asdict(), "flags": ["transferred beats own"] if gain.low > 0.0 else []}
+            entries.append(entry)
+    return {
+        "measure": "transfer", "scenario": where, "purpose": purpose, "episodes": episodes, "outcome": counted, "unit": UNITS[counted],
+        "threat_model": as_data(load_scenario(where).with_threat(**(changed | ({} if dose is None else {"budget": dose}))).threat_model),
+        "trained_on": list(origin_rows), "played_on": list(columns),
+        "no_attack": {column: float(held["none", column].mean()) for column in columns if ("none", column) in held},
+        "entries": entries, "skipped": skipped,
+    }  # fmt: skip
+
+
+def _common(field: str, values: dict[str, Any]) -> Any:
+    """The value that all policies agree on, or an InputError that names the option."""
+    different = {canonical(value) for value in values.values()}
+    if len(different) > 1:
+        raise InputError(field, " and ".join(sorted(different)), f"policies of one {field}, or --{field}")
+    return next(iter(values.values()))

@@ -1,0 +1,312 @@
+"""Measures of strength: twins of a schedule, monotone curves and critical doses, and the matrix of transfer."""
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+from tailgate import cli, draws
+from tailgate.agents.codec import ActionCodec, ActionSpec
+from tailgate.agents.observation import ObservationCodec
+from tailgate.agents.policy import Network, PolicyAttack, save_policy, timing_advantage
+from tailgate.agents.zoo import ZooAttack
+from tailgate.draws import Role
+from tailgate.errors import InputError
+from tailgate.scenario import load_scenario
+from tailgate.strength.dose import critical_dose, critical_interval, dose_response, fitted
+from tailgate.strength.figures import dose_figure, timing_figure, transfer_figure
+from tailgate.strength.policies import label, loop_for, mean, trained
+from tailgate.strength.timing import periodic, play, shuffled, timing
+from tailgate.strength.transfer import difference, transfer
+
+PLACE = "gusty-stop-and-go-v0"
+THREAT: dict[str, Any] = {"kinds": ["dos_jam", "fdi"], "budget": 20, "fdi_bound": 3.0}
+ZOO = f"zoo:name={ZooAttack().name}"
+
+
+@pytest.fixture(scope="module")
+def brief_place(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """The scenario cut to 60 steps, attacked from step 10 on."""
+    source = Path(__file__).parents[1] / "configs" / "scenarios" / f"{PLACE}.yaml"
+    data = yaml.safe_load(source.read_text())
+    data |= {"horizon": 60, "threat_model": data["threat_model"] | {"onset": 10, "end": None}}
+    path = tmp_path_factory.mktemp("scenario") / "brief.yaml"
+    path.write_text(yaml.safe_dump(data))
+    return str(path)
+
+
+def _always(directory: Path, name: str, value: float = -3.0, place: str = PLACE, seed: int = 0, **threat: Any) -> Path:
+    """A policy that attacks whenever it may, from the first step on, with the record of a training."""
+    changed = THREAT | threat
+    brief = load_scenario(PLACE).with_threat(**changed).brief()
+    names, spec = ObservationCodec(brief).names, ActionSpec(action="mode", value=value)
+    size = ActionCodec(spec, brief).size
+    bias = np.zeros(size)
+    bias[-1] = 1.0
+    config = {"scenario": place, "defence": "chi2_kf", "threat": changed, "outcome": None}
+    header = {
+        "action": spec, "observation": names, "knowledge": "black", "agents": 1,
+        "training": {"learner": "hand", "seed": seed, "config": config},
+    }  # fmt: skip
+    return save_policy(directory / name, Network((np.zeros((len(names), size)),), (bias,)), header)
+
+
+# -- twins of a schedule
+
+
+def test_twins_have_as_many_steps_within_the_granted_window() -> None:
+    """Shuffled and periodic: each episode's own number of steps, none outside of first..last, where the recorded ones stand at will."""
+    rng = np.random.default_rng(0)
+    recorded = np.zeros((90, 40), bool)
+    recorded[20:61] = rng.random((41, 40)) < rng.random(40)  # from none to all of steps 21..61
+    chance = draws.keys("train", range(40)).at(Role.POLICY, np.zeros(40, np.int64))
+    for twin in (shuffled(recorded, 21, 61, chance), periodic(recorded, 21, 61)):
+        assert np.array_equal(twin.sum(axis=0), recorded.sum(axis=0))
+        assert not twin[:20].any() and not twin[61:].any()
+
+
+@pytest.mark.parametrize(("steps", "gaps"), [(4, {10}), (3, {13, 14}), (40, {1})])
+def test_periodic_steps_are_evenly_spread(steps: int, gaps: set[int]) -> None:
+    """n of 40 steps lie 40 / n apart, rounded to whole steps."""
+    recorded = np.zeros((50, 1), bool)
+    recorded[5 : 5 + steps] = True
+    at = np.flatnonzero(periodic(recorded, 6, 45)[:, 0])
+    assert len(at) == steps and set(np.diff(at)) == gaps
+
+
+def test_shuffled_steps_fall_evenly_and_do_not_depend_on_companions() -> None:
+    """Each of 20 steps is hit in a quarter of 4000 episodes, within a 99.9 % interval; a row is the same alone."""
+    recorded = np.zeros((20, 4000), bool)
+    recorded[:5] = True
+    keys = draws.keys("train", range(4000))
+    twin = shuffled(recorded, 1, 20, keys.at(Role.POLICY, np.zeros(4000, np.int64)))
+    spread = 3.9 * math.sqrt(0.25 * 0.75 / 4000)  # of the largest of 20
+    assert np.abs(twin.mean(axis=1) - 0.25).max() < spread
+    alone = draws.keys("train", [17]).at(Role.POLICY, np.zeros(1, np.int64))
+    assert np.array_equal(shuffled(recorded[:, :1], 1, 20, alone)[:, 0], twin[:, 17])
+    assert not np.array_equal(twin[:, 17], twin[:, 18])
+
+
+def test_own_and_yoked_are_those_of_the_timing_advantage() -> None:
+    """One definition: play() agrees with policy.timing_advantage on every episode, and all schedules spend the same steps."""
+    who = trained(ZOO)
+    loop, keys = loop_for(who, PLACE, "chi2_kf", THREAT), draws.keys("report", range(24))
+    played = play(loop, who.policy, keys, "crashed")
+    own, yoked = timing_advantage(loop, who.policy, keys)
+    assert np.array_equal(played.outcome["own"], own) and np.array_equal(played.outcome["yoked"], yoked)
+    assert own.any()
+    assert all((steps <= 20).all() for steps in played.steps.values())
+
+
+def test_a_policy_without_timing_is_flagged(tmp_path: Path, brief_place: str) -> None:
+    """One that attacks in the same steps of every episode equals its yoked twin, and says so; two seeds of it are one entry."""
+    texts = [str(_always(tmp_path, f"p{i}", place=brief_place, seed=i)) for i in range(2)]
+    report = timing(texts, episodes=12)
+    (entry,) = report["entries"]
+    assert [p["seed"] for p in entry["policies"]] == [0, 1]
+    assert entry["advantage"]["yoked"]["value"] == 0.0 and entry["flags"] == ["yoked equals own"]
+    assert entry["attack_steps"] == {"own": 20.0, "yoked": 20.0, "shuffled": 20.0, "periodic": 20.0}
+    assert entry["threat_model"]["budget"] == 20 and entry["defence"] == "chi2_kf"
+
+
+def test_an_entry_is_of_one_cell(tmp_path: Path, brief_place: str) -> None:
+    """Policies of another training threat or action are entries of their own; a dose of one's own is played by all."""
+    changed: dict[str, dict[str, Any]] = {"a": {}, "b": {"budget": 10}, "c": {"value": -2.0}}
+    texts = [str(_always(tmp_path, name, place=brief_place, **changes)) for name, changes in changed.items()]
+    assert len(timing(texts, episodes=2)["entries"]) == 3
+    entries = timing(texts, episodes=2, dose=5, outcome="rmse_position")["entries"]
+    assert {e["threat_model"]["budget"] for e in entries} == {5} and {e["attack_steps"]["own"] for e in entries} == {5.0}
+    assert all(e["outcomes"]["own"]["value"] > 0.0 for e in entries)
+
+
+def test_what_a_file_does_not_say_has_to_be_said(tmp_path: Path, brief_place: str) -> None:
+    path = _always(tmp_path, "p")
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"training": {}}))
+    with pytest.raises(InputError, match="--scenario"):
+        timing([str(path)], episodes=2)
+    report = timing([str(path)], scenario=brief_place, defence="kf", threat=THREAT, episodes=2)
+    assert report["entries"][0]["trained_on"] is None
+    with pytest.raises(InputError, match="policy"):
+        trained("fdi")
+    with pytest.raises(InputError, match="outcome"):
+        timing([ZOO], outcome="crash", episodes=2)
+    with pytest.raises(InputError, match="at least 2"):
+        timing([ZOO], episodes=1)
+
+
+# -- dose-response
+
+
+def test_the_critical_dose_of_a_straight_curve_is_where_it_crosses() -> None:
+    """By hand: 0, 0.05, 0.25 at doses 0, 10, 20 cross 0.1 at 12.5; a curve that starts above is critical at once, one below never."""
+    doses = np.array([0.0, 10.0, 20.0])
+    assert critical_dose(doses, np.array([0.0, 0.05, 0.25]), 0.1) == pytest.approx(12.5)
+    assert critical_dose(doses, np.array([0.2, 0.2, 0.3]), 0.1) == 0.0
+    assert critical_dose(doses, np.array([0.0, 0.1, 0.1]), 0.1) == math.inf
+
+
+def test_the_curve_is_the_monotone_regression() -> None:
+    """Pool adjacent violators by hand: 1, 3, 2 become 1, 2.5, 2.5."""
+    assert fitted(np.array([1.0, 3.0, 2.0])) == pytest.approx([1.0, 2.5, 2.5])
+
+
+def test_the_bootstrap_interval_covers_the_critical_dose() -> None:
+    """Of 200 experiments with a known critical dose of 12.5 about 95 % cover it; 88 % is below the 99.9 % interval of that."""
+    doses, shares = np.array([0.0, 10.0, 20.0]), np.array([0.0, 0.05, 0.25])
+    rng = np.random.default_rng(1)
+    hits = 0
+    import tailgate.strength.dose as module
+
+    before, module.RESAMPLES = module.RESAMPLES, 200
+    try:
+        for _ in range(200):
+            low, high = critical_interval(doses, (rng.random((3, 150)) < shares[:, None]).astype(float), 0.1)
+            hits += low <= 12.5 <= high
+    finally:
+        module.RESAMPLES = before
+    assert hits >= 176
+
+
+def test_dose_response_of_a_scripted_attack(tmp_path: Path) -> None:
+    """Dose 0 is no attack, more steps do more, spent steps are the dose; the second call plays nothing again and says the same."""
+    attack = "fdi:trigger=near,threshold=40,value=-3"
+    played: list[int] = []
+    arguments: dict[str, Any] = {"episodes": 40, "threat": THREAT, "rows_file": tmp_path / "rows.jsonl"}
+    report = dose_response([attack], ["chi2_kf"], PLACE, [20, 5], **arguments, progress=lambda done, total: played.append(done))
+    (curve,) = report["curves"]
+    assert report["doses"] == [0, 5, 20] and len(played) == 3
+    assert [p["value"] for p in curve["points"]] == sorted(p["value"] for p in curve["points"])
+    assert curve["points"][0]["value"] == 0.0 and curve["points"][-1]["value"] > 0.3
+    assert curve["attack_steps"][0] == 0.0 and curve["attack_steps"][1] == 5.0
+    assert 5.0 < curve["critical_dose"]["low"] <= curve["critical_dose"]["value"] <= curve["critical_dose"]["high"] < 20.0
+    assert len((tmp_path / "rows.jsonl").read_text().splitlines()) == 120
+    assert dose_figure(report)[:4] == b"\x89PNG"
+
+
+def test_a_dose_response_of_an_error_counts_episodes_above_a_bound() -> None:
+    """Without a road: the mean has no critical dose until a limit is named, the share above a bound has one of 10 %."""
+    arguments: dict[str, Any] = {"episodes": 6, "threat": {"kinds": ["fdi"], "fdi_bound": 100.0}}
+    plain = dose_response(["fdi:value=100"], ["norm_resilient"], "thesis-ch5-v0", [10], **arguments)
+    assert plain["outcome"] == "rmse_position" and plain["limit"] is None and "critical_dose" not in plain["curves"][0]
+    clean, attacked = (point["value"] for point in plain["curves"][0]["points"])
+    assert attacked > clean > 0.0
+    shares = dose_response(["fdi:value=100"], ["norm_resilient"], "thesis-ch5-v0", [10], outcome="max_error", exceeds=0.0, **arguments)
+    assert shares["unit"] == "0/1" and shares["curves"][0]["critical_dose"]["value"] == 0.0  # every error is above 0
+    never = dose_response(["fdi:value=100"], ["norm_resilient"], "thesis-ch5-v0", [10], outcome="max_error", exceeds=1e9, **arguments)
+    assert never["curves"][0]["critical_dose"] == {"value": None, "low": None, "high": None}
+
+
+def test_what_cannot_be_played_is_skipped_with_the_reason(tmp_path: Path) -> None:
+    """A policy of another layout, and a defence that an attack has no use of; what is misspelt is an error."""
+    other = str(_always(tmp_path, "p", kinds=["fdi"]))
+    report = dose_response([other, "none"], ["kf"], PLACE, [5], episodes=2, threat=THREAT)
+    assert [("skipped" in c) for c in report["curves"]] == [False, True] and "actions" in report["curves"][1]["skipped"]
+    for bad in ([0], [], [2.5]):
+        with pytest.raises(InputError, match="doses"):
+            dose_response(["none"], ["kf"], PLACE, bad, episodes=2)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="yes or no"):
+        dose_response(["none"], ["kf"], PLACE, [5], episodes=2, exceeds=1.0)
+
+
+# -- transfer
+
+
+def test_a_difference_of_unequal_numbers_of_runs() -> None:
+    """Welch by hand: with equal episodes the interval is t times the root of s1^2 / n1 + s2^2 / n2."""
+    from scipy import stats
+
+    a, b = np.repeat([[0.6], [0.8], [0.7]], 50, axis=1), np.repeat([[0.1], [0.3]], 50, axis=1)
+    found = difference(a, b)
+    va, vb = 0.01 / 3, 0.02 / 2
+    freedom = (va + vb) ** 2 / (va**2 / 2 + vb**2 / 1)
+    assert found.value == pytest.approx(0.5)
+    assert found.high - found.value == pytest.approx(stats.t.ppf(0.975, freedom) * math.sqrt(va + vb))
+    single = difference(a[:1], b[:1])
+    assert single.low == single.high == pytest.approx(0.5)  # one policy each, and no difference among episodes
+
+
+def test_a_mean_over_seeds_stays_a_share() -> None:
+    """All ones: the interval ends at 1 and does not have zero width."""
+    found = mean(np.ones((3, 40)), "crashed")
+    assert found.value == found.high == 1.0 and 0.5 < found.low < 1.0
+
+
+def test_transferred_beats_own_is_flagged(tmp_path: Path) -> None:
+    """A policy 'trained on kf' that collides against chi2_kf beats one 'trained on chi2_kf' that injects nothing harmful."""
+    weak = [str(_always(tmp_path, f"weak{i}", value=0.01, seed=i)) for i in range(2)]
+    strong = _copy_as(tmp_path, "kf")
+    report = transfer([*weak, str(strong)], ["chi2_kf", "kf", "cra"], episodes=40)
+    held = {(e["trained_on"], e["played_on"]): e for e in report["entries"]}
+    assert held["kf", "chi2_kf"]["flags"] == ["transferred beats own"] and held["kf", "chi2_kf"]["over_own"]["low"] > 0.0
+    assert held["chi2_kf", "kf"]["flags"] == [] and "over_own" not in held["kf", "kf"]
+    assert held["chi2_kf", "chi2_kf"]["seeds"] == 2 and held["chi2_kf", "chi2_kf"]["value"] == 0.0
+    assert report["no_attack"] == {"chi2_kf": 0.0, "kf": 0.0}
+    assert [item["defence"] for item in report["skipped"]] == ["cra"]
+    assert transfer_figure(report)[:4] == b"\x89PNG"
+
+
+def _copy_as(directory: Path, defence: str) -> Path:
+    """The zoo's first policy with another record."""
+    source = PolicyAttack(trained(ZOO).policy.path).path
+    data = json.loads(source.read_text())
+    data["training"]["config"] |= {"defence": defence, "threat": THREAT}
+    (directory / data["tensors"]).write_bytes(source.with_suffix(".safetensors").read_bytes())
+    (directory / "strong.json").write_text(json.dumps(data))
+    return directory / "strong.json"
+
+
+def test_policies_of_different_cells_need_one_named(tmp_path: Path, brief_place: str) -> None:
+    """Their threat models differ: which one is meant has to be said, and what then does not fit is skipped."""
+    texts = [str(_always(tmp_path, "a", place=brief_place)), str(_always(tmp_path, "b", place=brief_place, kinds=["fdi"]))]
+    with pytest.raises(InputError, match="--threat"):
+        transfer(texts, episodes=2)
+    report = transfer(texts, threat=THREAT, episodes=2)
+    assert [item["policy"].split("/")[-1] for item in report["skipped"]] == ["b"] and "actions" in report["skipped"][0]["reason"]
+    assert [e["seeds"] for e in report["entries"]] == [1]
+
+
+# -- pictures and commands
+
+
+@pytest.mark.parametrize("text", ["fdi:trigger=near,threshold=40,value=-3", "composed:filter=kf,detector=cusum,mitigation=widen"])
+def test_long_names_break_at_commas_only(text: str) -> None:
+    lines = label(text, 14).split("\n")
+    assert len(lines) > 1 and "".join(lines).replace(" ", "") == text
+    assert all(line.endswith(",") for line in lines[:-1])
+
+
+def test_the_commands_write_reports_and_pictures(
+    tmp_path: Path, brief_place: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """JSON on standard output equals the file; every command has its picture."""
+    monkeypatch.chdir(tmp_path)
+    grants = [word for key in ("kinds=[dos_jam,fdi]", "fdi_bound=3") for word in ("--threat", key)]
+    policy = str(_always(tmp_path, "p", place=brief_place))
+    script = "fdi:trigger=near,threshold=40,value=-3"
+    commands = {
+        "timing": ["timing", policy, "--episodes", "6"],
+        "dose-response": ["dose-response", script, "--defence", "kf", "--scenario", brief_place, "--doses", "5,10", "--episodes", "4", *grants],
+        "transfer": ["transfer", policy, "--defence", "kf", "--episodes", "4"],
+    }
+    for name, words in commands.items():
+        assert cli.main([*words, "--out", "out", "--json"]) == 0
+        assert json.loads(capsys.readouterr().out) == json.loads((tmp_path / "out" / f"{name}.json").read_text())
+        assert (tmp_path / "out" / f"{name}.png").read_bytes()[:4] == b"\x89PNG"
+    assert cli.main(commands["timing"]) == 0
+    assert "yoked" in capsys.readouterr().out
+    assert cli.main(commands["transfer"]) == 0
+    assert "on kf" in capsys.readouterr().out
+    assert cli.main(commands["dose-response"]) == 0
+    assert "critical dose" in capsys.readouterr().out
+    assert cli.main(["dose-response", "none", "--defence", "kf", "--scenario", PLACE, "--doses", "5;10"]) == 2
+    assert "--doses" in capsys.readouterr().err
+
+
+def test_a_timing_picture_has_a_panel_per_outcome(tmp_path: Path, brief_place: str) -> None:
+    policy = str(_always(tmp_path, "p", place=brief_place))
+    entries = [*timing([policy], episodes=2)["entries"], *timing([policy], episodes=2, outcome="rmse_position")["entries"]]
+    assert timing_figure(entries)[:4] == b"\x89PNG" and len({e["unit"] for e in entries}) == 2
