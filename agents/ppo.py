@@ -21,7 +21,7 @@ from .stable import StableLearner, perceptron, rest_first
 from .teacher import Demonstration
 
 LOG_STD = -0.5  # of the first policy's continuous actions
-IMITATION_EPOCHS, IMITATION_BATCH, IMITATION_RATE = 6, 4096, 2e-3
+IMITATION_EPOCHS, IMITATION_BATCH, IMITATION_RATE = 6, 1024, 2e-3
 IMITATION_ENTROPY = 0.003  # what is imitated to the letter explores nothing
 
 

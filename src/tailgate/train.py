@@ -107,6 +107,8 @@ def _checked(data: dict[str, Any]) -> TrainConfig:
     shown = () if config.teacher in (None, "best") else (config.teacher,)
     for spec in (Spec("attack", name) for name in (*config.rivals, *config.white_box, *shown)):
         spec.refuse_imports("config")
+    if shown:
+        _ = Spec("attack", shown[0]).entry  # a name that exists
     return config
 
 

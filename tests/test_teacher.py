@@ -1,0 +1,105 @@
+"""What a learner is shown before it learns: the actions nearest to a script, what they brought, and a policy that decides like them."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tailgate import draws, train
+from tailgate.agents.learning import Teachable, learner_of
+from tailgate.agents.policy import PolicyAttack
+from tailgate.agents.ppo import Config, Learner
+from tailgate.agents.teacher import demonstrate, nearest
+from tailgate.core import Kind
+from tailgate.envs.seat import Seat
+from tailgate.errors import InputError
+from tailgate.metrics import crashed
+from tailgate.registry import Spec
+from tailgate.trace import rollout
+
+SCRIPT = "fdi_then_jam:trigger=near,threshold=40,inject=10"
+ENVIRONMENT: dict[str, Any] = {
+    "scenario": "gusty-stop-and-go-v0", "defence": "chi2_kf", "threat": {"kinds": ["dos_jam", "fdi"], "budget": 20, "fdi_bound": 3.0}, "value": -3.0,
+    "interval": 5, "reward": "collision", "gap_shaping": 0.0, "error_shaping": 0.0, "gamma": 0.9,
+}
+SMALL = Config(envs=16, rollout=24, batch_size=192, epochs=1, hidden=(16,))
+
+
+def attack(text: str) -> Any:
+    return Spec("attack", text).make()
+
+
+def test_the_nearest_action_has_the_commands_kind_targets_and_value() -> None:
+    """Every mode's own command is nearest to itself; of two values the nearer, of two targets the one that differs in fewer wires."""
+    seat = Seat.make(**(ENVIRONMENT | {"per_sensor": True, "interval": 1}))
+    view = seat.loop.sense(seat.loop.start(draws.keys("train", range(seat.action.size))))
+    actions = np.arange(seat.action.size)
+    command = seat.action.decode(actions, view)
+    assert nearest(seat.action, command).tolist() == actions.tolist()
+    shifted = command._replace(value=np.where(command.target, command.value + 0.4, 0.0))
+    assert nearest(seat.action, shifted).tolist() == actions.tolist()
+    other = command._replace(kind=np.where(command.kind == Kind.FDI, Kind.REPLAY, command.kind).astype(np.int8))
+    assert (nearest(seat.action, other)[command.kind == Kind.FDI] == 0).all()
+
+
+def test_a_demonstration_is_the_script_and_its_returns() -> None:
+    """Rest until the trigger, then ten steps of bias in two decisions, then jamming; a collision at the end is worth gamma to the steps before it."""
+    seat = Seat.make(**ENVIRONMENT)
+    shown = demonstrate(seat, attack(SCRIPT), 0, episodes=64)
+    names = [mode.name for mode in seat.action.modes]
+    counts = {name: int((shown.action == j).sum()) for j, name in enumerate(names)}
+    assert counts["fdi-"] == 2 * counts["dos_jam"] or abs(counts["fdi-"] - counts["dos_jam"]) <= 64  # some collide before they jam
+    assert counts["fdi+"] == 0 and 64 <= counts["fdi-"] <= 128 and counts["dos_jam"] > 0
+    left = shown.observation[:, seat.observation.names.index("budget_left")]
+    assert np.allclose(left[shown.action == names.index("fdi-")] % 0.25, 0.0)  # five steps of twenty a decision
+    powers = np.log(shown.gained[shown.gained > 0]) / np.log(0.9)
+    np.testing.assert_allclose(powers, np.round(powers), atol=1e-9)
+    assert demonstrate(seat, attack(SCRIPT), 0, episodes=64).action.tolist() == shown.action.tolist()
+    other = demonstrate(seat, attack(SCRIPT), 1, episodes=64)
+    assert not np.array_equal(other.observation[:64], shown.observation[:64])
+
+
+def test_who_was_shown_a_script_does_what_it_does(tmp_path: Path) -> None:
+    """Before any learning of its own the policy collides about as often as its teacher, where an untaught one does not collide at all."""
+    learner = Learner(0, 0.9, SMALL, {k: v for k, v in ENVIRONMENT.items() if k != "gamma"})
+    keys = draws.keys("tune", range(200))
+    before = learner.export(tmp_path / "before", {})
+    learner.imitate(demonstrate(learner.seat, attack(SCRIPT), 0, episodes=512))
+    after = learner.export(tmp_path / "after", {})
+    rates = [float(crashed(rollout(learner.seat.loop, rival, keys)).mean()) for rival in (PolicyAttack(before), PolicyAttack(after), attack(SCRIPT))]
+    assert rates[0] < 0.05 and rates[2] > 0.3 and rates[1] > 0.6 * rates[2], rates
+
+
+def test_a_taught_run_resumes_to_the_same_policy(tmp_path: Path) -> None:
+    """The lesson comes before the first decision, once: an interrupted run is not taught again."""
+    settings = [
+        "seeds=1", "workers=1", "environment.interval=20", "ppo.envs=16", "ppo.rollout=15", "ppo.batch_size=120", "ppo.epochs=1", "ppo.hidden=[8]",
+        "tensorboard=false", "checkpoint_every=240", f"teacher='{SCRIPT}'", "white_box=[]",
+    ]
+    whole = train.load_config(None, [f"out={tmp_path / 'whole'}", "steps=960", *settings])
+    straight = train.train(whole, lambda seed, now: None)[0].with_suffix(".safetensors").read_bytes()
+    parts = [f"out={tmp_path / 'parts'}", *settings]
+    train.train(train.load_config(None, ["steps=480", *parts]), lambda seed, now: None)
+    again = train.train(train.load_config(None, ["steps=960", *parts]), lambda seed, now: None, resume=True)
+    assert again[0].with_suffix(".safetensors").read_bytes() == straight
+    untaught = train.load_config(None, [f"out={tmp_path / 'own'}", "steps=960", *settings, "teacher=none"])
+    assert train.train(untaught, lambda seed, now: None)[0].with_suffix(".safetensors").read_bytes() != straight
+
+
+@pytest.mark.parametrize("learner", ["cem", "recurrent_ppo", "dqn", "sac", "tqc"])
+def test_learners_that_cannot_be_shown_anything_say_so(tmp_path: Path, learner: str) -> None:
+    assert not issubclass(learner_of(learner).Learner, Teachable)
+    action = "continuous" if learner in ("sac", "tqc") else "mode"
+    config = train.load_config(None, [f"out={tmp_path}", f"learner={learner}", f"environment.action={action}", f"teacher='{SCRIPT}'"])
+    with pytest.raises(InputError, match=r"config\.teacher"):
+        train.train(config, lambda seed, now: None)
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_is_shown_is_one_of_a_few_actions(tmp_path: Path) -> None:
+    config = train.load_config(None, [f"out={tmp_path}", "environment.action=continuous", f"teacher='{SCRIPT}'"])
+    with pytest.raises(InputError, match=r"config\.teacher.*timing, mode, ramp"):
+        train.train(config, lambda seed, now: None)
+    with pytest.raises(InputError, match="nosuch"):
+        train.load_config(None, ["teacher=nosuch"])
