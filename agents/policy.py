@@ -13,7 +13,7 @@ import json
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple, TypeVar
 
 import numpy as np
 from safetensors import SafetensorError
@@ -30,10 +30,12 @@ from tailgate.schema import as_data, build
 from tailgate.threat import Brief
 
 from .codec import ActionCodec, ActionSpec
-from .observation import ObservationCodec
+from .observation import FRAMES, ObservationCodec
 
 FORMAT = "tailgate-policy-1"
 SOME = 8  # names in an error, at most
+DEPTH = 64  # of lists and mappings in each other in a JSON file, at most
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -43,7 +45,7 @@ class Header:
     format: Literal["tailgate-policy-1"]
     tensors: str
     sha256: str
-    layers: int
+    layers: PositiveCount
     action: ActionSpec
     observation: tuple[str, ...]
     knowledge: Literal["black", "grey", "white"]
@@ -161,59 +163,84 @@ def save_policy(path: Path, network: Network, header: dict[str, Any]) -> Path:
 def load_policy(path: Path) -> tuple[Header, Network]:
     """Read a policy; raises InputError when a file is missing, damaged, or does not fit its header."""
     where = f"policy {path.name}"
+    header, tensors = read_trained(Header, FORMAT, path, "policy", where)
+    if header.frames > FRAMES:
+        raise InputError(f"{where}.frames", header.frames, f"at most {FRAMES}")
+    width, lstm = len(header.observation), None
+    if header.recurrent:
+        fits = f"{width} + width, 4 width"
+        lstm = Lstm(*_pair(tensors, "lstm", where, fits, lambda w: w.shape[1] > 0 and w.shape[1] == 4 * (w.shape[0] - width)))
+    weights, biases = perceptron(tensors, header.layers, width if lstm is None else lstm.size, where)
+    log_std, outputs = tensors.get("log_std"), len(biases[-1])
+    if log_std is not None:
+        if log_std.shape != (outputs,) or log_std.dtype.kind != "f" or not np.isfinite(log_std).all():
+            raise InputError(f"{where}: log_std", log_std.shape, f"finite, ({outputs},)")
+        log_std = log_std.astype(np.float64)
+    return header, Network(weights, biases, log_std, lstm, header.squashed)
+
+
+def read_trained(kind: type[T], form: str, path: Path, field: str, where: str) -> tuple[T, dict[str, Array]]:
+    """Header, of dataclass `kind` with `tensors` and `sha256`, and tensors of what was trained: a policy or a defender.
+
+    Reads data and runs nothing. Raises InputError, which names `where`, the field and its value, for whatever else may stand in the files.
+    """
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
+        shallow(data)
     except OSError as error:
-        raise InputError("policy", str(path), f"a readable file ({error.strerror})") from None
-    except (ValueError, UnicodeDecodeError) as error:
+        raise InputError(field, str(path), f"a readable file ({error.strerror})") from None
+    except RecursionError:
+        raise InputError(where, str(path), f"JSON whose lists and mappings are nested at most {DEPTH} deep") from None
+    except ValueError as error:
         raise InputError(where, str(path), f"valid JSON ({error})") from None
-    if not isinstance(data, dict) or data.get("format") != FORMAT:
+    if not isinstance(data, dict) or data.get("format") != form:
         shown = data.get("format") if isinstance(data, dict) else type(data).__name__
-        raise InputError(where, shown, f"a JSON object of format {FORMAT!r}")
-    header = build(Header, data, where)
-    if Path(header.tensors).name != header.tensors:
+        raise InputError(where, shown, f"a JSON object of format {form!r}")
+    header: Any = build(kind, data, where)
+    if not header.tensors or Path(header.tensors).name != header.tensors:
         raise InputError(f"{where}.tensors", header.tensors, "the name of a file beside the JSON file")
     try:
         blob = path.with_name(header.tensors).read_bytes()
-    except OSError as error:
-        raise InputError(f"{where}.tensors", header.tensors, f"a readable file ({error.strerror})") from None
+    except (OSError, ValueError) as error:  # ValueError: what no name of a file can hold
+        raise InputError(f"{where}.tensors", header.tensors, f"a readable file ({getattr(error, 'strerror', None) or error})") from None
     if hashlib.sha256(blob).hexdigest() != header.sha256:
         raise InputError(f"{where}.sha256", header.sha256, f"the digest of {header.tensors}: the file is damaged or another one")
     try:
-        tensors = load_tensors(blob)
-    except SafetensorError as error:
+        return header, load_tensors(blob)
+    except (SafetensorError, ValueError, KeyError, TypeError) as error:  # the last three: numbers that numpy has no type for
         raise InputError(f"{where}.tensors", header.tensors, f"a safetensors file ({error})") from None
-    return header, _network(header, tensors, where)
 
 
-def _network(header: Header, tensors: dict[str, Array], where: str) -> Network:
-    """The network in a file's tensors; raises InputError where one is missing, not finite, or does not fit the others."""
+def shallow(data: Any) -> None:
+    """Raise RecursionError where lists and mappings are nested more than DEPTH deep: what walks through them calls itself."""
+    held = [data]
+    for _ in range(DEPTH + 1):
+        outer = [value.values() if isinstance(value, dict) else value for value in held if isinstance(value, (dict, list))]
+        held = [value for values in outer for value in values]
+    if held:
+        raise RecursionError
 
-    def pair(name: str, inputs: str, fits: Any) -> tuple[Array, Array]:
-        weight, bias = tensors.get(f"{name}.weight"), tensors.get(f"{name}.bias")
-        if (
-            weight is None or bias is None or weight.ndim != 2 or not fits(weight) or bias.shape != weight.shape[1:]
-            or not (np.isfinite(weight).all() and np.isfinite(bias).all())
-        ):  # fmt: skip
-            shown = None if weight is None else weight.shape
-            raise InputError(f"{where}: {name}", shown, f"finite weights ({inputs}) and as many biases")
-        return np.ascontiguousarray(weight, np.float64), np.ascontiguousarray(bias, np.float64)
 
-    width, lstm = len(header.observation), None
-    if header.recurrent:
-        lstm = Lstm(*pair("lstm", f"{width} + width, 4 width", lambda w: w.shape[1] > 0 and w.shape[1] == 4 * (w.shape[0] - width)))
-        width = lstm.size
+def perceptron(tensors: dict[str, Array], layers: int, width: int, where: str) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
+    """Weights and biases of the layers in a file; raises InputError where one is missing, not finite, or does not fit the one before."""
     weights, biases = [], []
-    for i in range(header.layers):
-        weight, bias = pair(f"layer{i}", f"{width}, outputs", lambda w, width=width: w.shape[0] == width)
+    for i in range(layers):
+        weight, bias = _pair(tensors, f"layer{i}", where, f"{width}, outputs", lambda w, width=width: w.shape[0] == width)
         weights.append(weight)
         biases.append(bias)
-        width = weight.shape[1]
-    log_std = tensors.get("log_std")
-    if log_std is not None and (log_std.shape != (width,) or not np.isfinite(log_std).all()):
-        raise InputError(f"{where}: log_std", log_std.shape, f"finite, ({width},)")
-    log_std = None if log_std is None else log_std.astype(np.float64)
-    return Network(tuple(weights), tuple(biases), log_std, lstm, header.squashed)
+        width = len(bias)
+    return tuple(weights), tuple(biases)
+
+
+def _pair(tensors: dict[str, Array], name: str, where: str, inputs: str, fits: Any) -> tuple[Array, Array]:
+    weight, bias = tensors.get(f"{name}.weight"), tensors.get(f"{name}.bias")
+    if (
+        weight is None or bias is None or weight.ndim != 2 or not fits(weight) or bias.shape != weight.shape[1:]
+        or not all(x.dtype.kind == "f" and np.isfinite(x).all() for x in (weight, bias))
+    ):  # fmt: skip
+        shown = None if weight is None else weight.shape
+        raise InputError(f"{where}: {name}", shown, f"finite weights ({inputs}) and as many biases")
+    return np.ascontiguousarray(weight, np.float64), np.ascontiguousarray(bias, np.float64)
 
 
 class PolicyState(NamedTuple):
@@ -339,15 +366,10 @@ class Yoked:
 
 
 def timing_advantage(loop: Any, policy: PolicyAttack, keys: Keys, outcome: str = "crashed") -> tuple[Array, Array]:
-    """(own, yoked) outcomes (B,) of a policy, a metric: yoked plays the on and off runs of the next episode of the same policy.
-
-    The schedules are recorded with termination off, as an episode that ended early would else have a short one.
-    """
+    """(own, yoked) outcomes (B,) of a policy, a metric: yoked plays the on and off runs of another episode of the same policy."""
     from tailgate.metrics import METRICS
-    from tailgate.trace import rollout
+    from tailgate.strength.timing import played, recorded, yoked_to
 
-    count = METRICS[outcome]
-    own = count(rollout(loop, policy, keys))
-    schedule = rollout(loop, policy, keys, terminate=False).kind != 0
-    yoked = count(rollout(loop, Yoked(policy, np.roll(schedule, 1, axis=1)), keys))
+    schedules = (None, yoked_to(recorded(loop, policy, keys)))
+    own, yoked = (played(loop, policy, keys, schedule, [METRICS[outcome]])[0] for schedule in schedules)
     return own, yoked

@@ -8,7 +8,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from tailgate.core import Array, Command, Count, Finite, Kind, NonNegative, PositiveCount, Probability, View, no_command, param
-from tailgate.draws import Draws
+from tailgate.draws import Draws, constants
 from tailgate.errors import InputError, NotApplicable, unknown
 from tailgate.registry import register
 from tailgate.threat import Brief
@@ -89,6 +89,8 @@ class Script:
         "is above or below it; leader_braking: when the leader's deceleration is above it",
     )
     threshold: NonNegative = param(3.0, "what the trigger waits for: a speed [m/s], a gap [m] or a deceleration [m/s^2]")
+    burst: PositiveCount | None = param(None, "steps of a burst, in a window of bursts with pauses; none: one burst, the whole window")
+    pause: Count = param(10, "steps between two bursts")
 
     @cached_property
     def when(self) -> Trigger:
@@ -107,6 +109,8 @@ class Script:
         timing = Timing(plan.brief.threat.onset, plan.brief.model.dt)
         after, on, count = self.when.step(timing, state, view, draws)
         on = on & view.allowed  # a script that knows its budget does not ask for more
+        if self.burst is not None:
+            on = on & (count % (self.burst + self.pause) < self.burst)
         command = self.command(plan, on, count, view, draws)
         if self.chance < 1.0:
             hit = command.target & (draws.uniform((plan.brief.model.agents,), CHANCE) < self.chance)[..., None]
@@ -181,9 +185,17 @@ class Inject(Script):
     """False data injection: a constant bias, cut at the bound of the threat model."""
 
     value: Finite = param(-20.0, "bias [unit of the wire]")
+    signs: Count | None = param(None, "seed of a random sign for each wire of each agent; none: the bias has one sign everywhere")
+
+    def prepare(self, brief: Brief) -> ScriptPlan:
+        plan = super().prepare(brief)
+        if self.signs is None:
+            return plan
+        return plan._replace(extra=np.where(constants("fdi.signs", self.signs).uniform(brief.granted.shape)[0] < 0.5, -1.0, 1.0))
 
     def command(self, plan: ScriptPlan, on: Array, count: Array, view: View, draws: Draws) -> Command:
-        return inject(plan, on, Constant(self.value), count, draws)
+        sent = inject(plan, on, Constant(self.value), count, draws)
+        return sent if plan.extra is None else sent._replace(value=np.where(sent.target, sent.value * plan.extra, 0.0))
 
 
 @register("attack", "fdi_gaussian", reference="Dutta 2018, (6.17)")

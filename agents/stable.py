@@ -40,6 +40,8 @@ from .codec import ActionCodec
 from .learning import SEED_STRIDE, Progress, check_action, header_of, open_checkpoint
 from .policy import Network, save_policy
 
+# torch's words for a distribution whose parameters are not finite, for probabilities that are not, and for a step beyond single precision
+SPOILT = ("found invalid values", "probability tensor contains", "without overflow")
 COUNTERS = ("_n_updates", "_n_calls", "_episode_num")  # of the algorithms, those that they have
 
 
@@ -98,20 +100,34 @@ class StableLearner:
         return int(self.model.num_timesteps)
 
     def learn(self, steps: int, report: Callable[[Progress], None], checkpoint: Path | None = None, every: int = 1_000_000) -> None:
-        """Train until `steps` decisions in total; calls `report` after each round."""
+        """Train until `steps` decisions in total; calls `report` after each round. Raises InputError when the policy diverges."""
         remaining = steps - self.model.num_timesteps
         if remaining <= 0:
             return
-        self.model.learn(
-            remaining, callback=_Reporter(self, report, checkpoint, every), reset_num_timesteps=False, tb_log_name=f"seed{self.seed}",
-            progress_bar=False, **self.logging(),
-        )  # fmt: skip
+        try:
+            self.model.learn(
+                remaining, callback=_Reporter(self, report, checkpoint, every), reset_num_timesteps=False, tb_log_name=f"seed{self.seed}",
+                progress_bar=False, **self.logging(),
+            )  # fmt: skip
+        except (ValueError, RuntimeError) as error:
+            if self._finite() and not any(words in str(error) for words in SPOILT):
+                raise
+            raise self._diverged() from None
+        if not self._finite():
+            raise self._diverged()
         if checkpoint is not None:
             self.save(checkpoint)
 
     def logging(self) -> dict[str, Any]:
         """Further arguments of the algorithm's own `learn`."""
         return {}
+
+    def _finite(self) -> bool:
+        return all(bool(torch.isfinite(weights).all()) for weights in self.model.policy.parameters())
+
+    def _diverged(self) -> InputError:
+        rate = self.config.learning_rate
+        return InputError(f"config.{self.name}.learning_rate", rate, "hyper-parameters under which the policy stays finite")
 
     def export(self, path: Path, training: dict[str, Any]) -> Path:
         """Write the policy as safetensors + JSON."""

@@ -32,12 +32,13 @@ RISING = 0.05  # of the whole rise of the learning curve, that its last tenth ma
 def configured(name: str, cell: dict[str, Any], options: argparse.Namespace) -> train.TrainConfig:
     """The configuration of a cell."""
     own = [f"name={name}", f"out={options.runs}", f"seeds={options.seeds}", f"episodes={options.episodes}", "tensorboard=false"]
-    return train.load_config(cell["config"], [*cell["set"], *own])
+    lists = [f"{key}={json.dumps(cell[key])}" for key in ("rivals", "teacher") if key in cell]
+    return train.load_config(cell["config"], [*cell["set"], *lists, *own])
 
 
 def played(config: train.TrainConfig, console: Console) -> dict[str, Any]:
     """The report of a cell, trained and compared where that is not done yet."""
-    report, snapshot = config.directory / "report.json", config.directory / "config.json"
+    report, snapshot = config.directory / "cell.json", config.directory / "config.json"
     begun = snapshot.is_file() and json.loads(snapshot.read_text()) == json.loads(json.dumps(as_data(config)))
     if begun and report.is_file():
         return dict(json.loads(report.read_text()))
@@ -50,7 +51,7 @@ def played(config: train.TrainConfig, console: Console) -> dict[str, Any]:
         policies = train.train(config, learned, resume=begun)
         trained = time.perf_counter()
         done = comparison.compare(config, policies)
-    done["minutes"] = {"training": (trained - started) / 60, "comparison": (time.perf_counter() - trained) / 60}
+    done["minutes"] = {"training": (trained - started) / 60, "comparison": (time.perf_counter() - trained) / 60, "resumed": begun}
     write_atomic(report, json.dumps(done, indent=1).encode() + b"\n")
     return done
 
@@ -69,10 +70,14 @@ def flags(config: train.TrainConfig, report: dict[str, Any]) -> list[str]:
         curve = [p["reward"] for p in json.loads((config.directory / f"curve-{seed}.json").read_text())["curve"]]
         tenth = max(len(curve) // 10, 1)
         rise, late = np.mean(curve[-tenth:]) - np.mean(curve[:tenth]), np.mean(curve[-tenth:]) - np.mean(curve[-2 * tenth : -tenth])
-        if len(curve) >= 20 and rise > 0 and late > RISING * rise:
+        noise = np.std(curve[-2 * tenth :]) / np.sqrt(tenth)
+        if len(curve) >= 20 and rise > 0 and late > max(RISING * rise, 3.0 * noise):
             out.append(f"seed {seed} still rises: the last tenth brought {100 * late / rise:.0f} % of the rise")
     if report["advantage"]["own yoked schedule"]["low"] <= 0.0:
         out.append("yoked equals own: no timing was learned, or none is needed")
+    row = line(report)
+    if report["unit"] == comparison.SHARE and not 0.2 <= row["script"] <= 0.8:
+        out.append(f"dose: the best script does {100 * row['script']:.0f} % of the possible damage, which is not within 20 to 80 %")
     if max(learned) - min(learned) > 0.2 * max(abs(np.mean(learned)), 1e-12):
         out.append(f"seeds differ: {min(learned):.3g} to {max(learned):.3g}")
     return out
@@ -121,7 +126,7 @@ def markdown(reports: dict[str, dict[str, Any]], flagged: dict[str, list[str]]) 
     out += ["", "## Ceilings", "", "| cell | computed optimum | its outcome | share that each seed reaches |", "|---|---|---|---|"]
     for name, report in reports.items():
         for attack, ceiling in report.get("ceilings", {}).items():
-            reached = ", ".join(f"{100 * share:.1f} %" for share in ceiling["reached"])
+            reached = ", ".join(f"{100 * s['value']:.1f} % [{100 * s['low']:.1f}, {100 * s['high']:.1f}]" for s in ceiling["reached"])
             out.append(f"| {name} | `{attack}` | {comparison.shown(report, ceiling['outcome']['value'])} | {reached} |")
     out += ["", "## How each was trained", "", "| cell | learner | shown | decisions | threat model |", "|---|---|---|---|---|"]
     for name, report in reports.items():

@@ -10,21 +10,20 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
-from safetensors import SafetensorError
-from safetensors.numpy import load as load_tensors
 from safetensors.numpy import save as save_tensors
 
 from tailgate.core import Array, Count, Estimate, Model, PositiveCount, Prior, Received, param
 from tailgate.draws import Draws
-from tailgate.errors import InputError, NotApplicable
+from tailgate.errors import InputError, NotApplicable, unknown
 from tailgate.files import write_atomic
-from tailgate.registry import entry_for, make_from, register
+from tailgate.registry import entries, entry_for, register
 from tailgate.schema import as_data, build
 
 from .compose import Look
@@ -34,6 +33,7 @@ if TYPE_CHECKING:
     from tailgate.agents.policy import Network
 
 FORMAT = "tailgate-defender-1"
+SETTINGS = 1024  # that a menu has in all, at most
 TAG = 255  # of the draw that picks a policy: the steered defence draws with others
 POLICY = "JSON file of a trained defender, or several, of which each episode draws one; none: a fixed setting"
 
@@ -67,39 +67,11 @@ def save_defender(path: Path, network: Network, header: dict[str, Any]) -> Path:
 
 def load_defender(path: Path) -> tuple[Header, Network]:
     """Read a trained defender; raises InputError when a file is missing, damaged, or does not fit its header."""
-    from tailgate.agents.policy import Network
+    from tailgate.agents.policy import Network, perceptron, read_trained
 
     where = f"defender {path.name}"
-    try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError("steered.policy", str(path), f"a readable file ({error.strerror})") from None
-    except (ValueError, UnicodeDecodeError) as error:
-        raise InputError(where, str(path), f"valid JSON ({error})") from None
-    if not isinstance(data, dict) or data.get("format") != FORMAT:
-        shown = data.get("format") if isinstance(data, dict) else type(data).__name__
-        raise InputError(where, shown, f"a JSON object of format {FORMAT!r}")
-    header = build(Header, data, where)
-    if Path(header.tensors).name != header.tensors:
-        raise InputError(f"{where}.tensors", header.tensors, "the name of a file beside the JSON file")
-    try:
-        blob = path.with_name(header.tensors).read_bytes()
-        if hashlib.sha256(blob).hexdigest() != header.sha256:
-            raise InputError(f"{where}.sha256", header.sha256, f"the digest of {header.tensors}: the file is damaged or another one")
-        tensors = load_tensors(blob)
-    except (OSError, SafetensorError) as error:
-        raise InputError(f"{where}.tensors", header.tensors, f"a readable safetensors file ({error})") from None
-    weights, biases, width = [], [], len(header.observation)
-    for i in range(header.layers):
-        weight, bias = tensors.get(f"layer{i}.weight"), tensors.get(f"layer{i}.bias")
-        fits = weight is not None and bias is not None and weight.ndim == 2 and weight.shape[0] == width and bias.shape == weight.shape[1:]
-        if weight is None or bias is None or not fits or not (np.isfinite(weight).all() and np.isfinite(bias).all()):
-            shown = None if weight is None else weight.shape
-            raise InputError(f"{where}: layer{i}", shown, f"finite weights ({width}, outputs) and as many biases")
-        weights.append(np.ascontiguousarray(weight, np.float64))
-        biases.append(np.ascontiguousarray(bias, np.float64))
-        width = weight.shape[1]
-    return header, Network(tuple(weights), tuple(biases))
+    header, tensors = read_trained(Header, FORMAT, path, "steered.policy", where)
+    return header, Network(*perceptron(tensors, header.layers, len(header.observation), where))
 
 
 class SteeredPlan(NamedTuple):
@@ -124,8 +96,8 @@ class SteeredState(NamedTuple):
 
 def _imports(data: Any) -> bool:
     """Whether any text in the data names a class to import."""
-    if isinstance(data, dict):
-        return any(_imports(value) for value in data.values())
+    if isinstance(data, (dict, list, tuple)):
+        return any(_imports(value) for value in (data.values() if isinstance(data, dict) else data))
     return isinstance(data, str) and ":" in data
 
 
@@ -168,23 +140,30 @@ class Steered:
     @cached_property
     def guarded(self) -> Any:
         """The defence whose knobs are turned."""
-        data = self._loaded[0][0].defence if self._loaded else self.defence
-        if isinstance(data, dict):
-            data = {"name": type(self).__dataclass_fields__["defence"].default, **data}
-        if _imports(data):  # a configuration or a policy from elsewhere shall not run code
-            raise InputError("defence steered.defence", data, "registered names")
-        made = make_from("defence", data, "defence steered.defence")
-        entry = entry_for("defence", type(made))
-        if isinstance(made, Steered) or not set(entry.uses) <= {*self.uses}:
+        data, where = (self._loaded[0][0].defence, f"defender {self.paths[0].name}") if self._loaded else (self.defence, "defence steered")
+        where = f"{where}.defence"
+        params = dict(data) if isinstance(data, dict) else {"name": data}
+        name = params.pop("name", type(self).__dataclass_fields__["defence"].default)
+        if not isinstance(name, str) or _imports(data):  # a configuration or a policy from elsewhere shall not run code
+            raise InputError(where, data, "registered names")
+        known = entries("defence")
+        if name not in known:
+            raise unknown(where, name, known)
+        entry = known[name]
+        if issubclass(entry.cls, Steered) or not set(entry.uses) <= {*self.uses}:  # before it is made: a policy may name itself
             wanted = f"a defence that uses nothing but {', '.join(self.uses)}, and is not steered itself"
-            raise NotApplicable("defence steered.defence", entry.name, f"{wanted}; a challenge-response defence: steered_cra")
-        return made
+            raise NotApplicable(where, name, f"{wanted}; a challenge-response defence: steered_cra")
+        return build(entry.cls, params, f"{where} {name}")
 
     @cached_property
     def hand(self) -> Hand:
         """The defence with its knobs."""
-        menu = self.menu_used
-        return Hand.on(self.guarded, menu)
+        hand = Hand.on(self.guarded, self.menu_used)
+        count = math.prod(len(knob.levels) for knob in hand.knobs)
+        if count > SETTINGS:
+            where = f"defender {self.paths[0].name}" if self._loaded else "defence steered"
+            raise InputError(f"{where}.menu", f"{count} combinations of settings", f"at most {SETTINGS}")
+        return hand
 
     @property
     def described(self) -> dict[str, Any]:

@@ -145,6 +145,28 @@ def test_observations_are_finite_named_and_of_a_sensible_size(kind, knowledge, s
     assert "attacking" in moving
 
 
+@pytest.mark.parametrize("scenario, sizes", [("linear-stealth-v0", []), ("scalar-hold-v0", ["reading", "moved", "believed"])])
+def test_a_white_box_of_one_agent_shows_what_would_surprise(scenario, sizes):
+    """y - C (A x + B u + c), with the value sent last on top, in standard deviations; of a closed loop also what is read and believed."""
+    place = load_scenario(scenario).with_threat(knowledge="white")
+    loop = place.loop(Spec("defence", "kf" if scenario.startswith("linear") else "none").make())
+    codec, model = ObservationCodec(loop.brief), loop.model
+    assert [name for name in codec.names if name in ("reading", "moved", "believed")] == sizes
+    assert not {"innovation_" + model.sensors[0], "moved"} & set(ObservationCodec(place.with_threat(knowledge="black").brief()).names)
+    state = loop.start(keys("train", range(5)))
+    for _ in range(40):
+        view = loop.sense(state)
+        seen = dict(zip(codec.names, codec.observe(view).T, strict=True))
+        before = view.estimate.x[:, 0] @ model.A.T + view.defence.known_u[:, 0] @ model.B.T + model.c
+        sd = np.sqrt(model.C[0, 0] @ model.Q @ model.C[0, 0] + model.R[0, 0, 0])
+        off = (view.received.y[:, 0, 0] - before @ model.C[0, 0] + view.last.value[:, 0, 0]) / sd
+        np.testing.assert_allclose(seen["innovation_" + model.sensors[0]], np.clip(off, -LIMIT, LIMIT), rtol=1e-5, atol=1e-5)
+        if sizes:
+            np.testing.assert_allclose(seen["reading"], np.log1p(np.abs(view.received.y[:, 0, 0]) / codec.spread), rtol=1e-5)
+        name = loop.threat.kinds[0]
+        state, _ = loop.advance(state, ActionCodec(ActionSpec(action="timing", kind=name, value=2.0), loop.brief).decode(np.array([1, 0, 1, 0, 1]), view))
+
+
 def test_a_platoon_shows_the_road_of_each_car():
     """Followers have gap and closing speed, the leader only its own motion; each value is the scene's, scaled; no car behind is made up."""
     loop = _loop(_platoon(4))

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -228,6 +229,44 @@ def test_settings_that_do_not_fit_are_refused(name: str, field: str, value: Any,
     """By the name of learner and field."""
     with pytest.raises(InputError, match=rf"{name}\.{field}"):
         learner(name, paid, **{field: value})
+
+
+@pytest.mark.parametrize(
+    ("name", "action", "rate"),
+    [
+        ("ppo", "continuous", 1e30), ("ppo", "mode", 1e30), ("ppo", "mode", 1e38), ("maskable_ppo", "mode", 1e30),
+        ("sac", "continuous", 1e30),
+    ],
+)  # fmt: skip
+def test_a_policy_that_diverges_is_an_error_of_the_step_size(name: str, action: str, rate: float, paid: dict[str, Any], tmp_path: Path) -> None:
+    """Whatever torch says of it; no checkpoint is left at the end."""
+    run = learner(name, paid | {"action": action}, learning_rate=rate)
+    with pytest.raises(InputError, match=rf"config\.{name}\.learning_rate: got {re.escape(str(rate))}; expected .* stays finite"):
+        run.learn(4000, lambda progress: None, tmp_path / "c.safetensors")
+    assert not (tmp_path / "c.safetensors").exists()
+
+
+def test_a_policy_that_is_not_finite_is_found_where_nothing_fails(paid: dict[str, Any], tmp_path: Path) -> None:
+    """The largest of values that are no numbers is a choice like any other: DQN plays on, and its end says so."""
+    run = learner("dqn", paid)
+
+    def spoil(progress: Any) -> None:
+        with torch.no_grad():
+            run.model.q_net.q_net[-1].bias.fill_(torch.nan)
+
+    with pytest.raises(InputError, match=r"config\.dqn\.learning_rate: got 0\.001; expected .* stays finite"):
+        run.learn(2000, spoil, tmp_path / "c.safetensors")
+    assert run.steps >= 2000 and not (tmp_path / "c.safetensors").exists()
+
+
+def test_other_errors_in_training_stay_what_they_are(paid: dict[str, Any]) -> None:
+    """An error of a callback is not blamed on the step size."""
+
+    def report(progress: Any) -> None:
+        raise RuntimeError("the line is dead")
+
+    with pytest.raises(RuntimeError, match="the line is dead"):
+        learner("ppo", paid).learn(2000, report)
 
 
 @pytest.mark.parametrize("name", ["maskable_ppo", "recurrent_ppo", "dqn", "sac"])

@@ -294,6 +294,43 @@ def test_damaged_and_foreign_files(tmp_path):
             Steered(policy=tmp_path / name)
 
 
+@pytest.mark.parametrize("change, words", [
+    ({"tensors": ""}, r"\.tensors: got ''"), ({"tensors": "a\0b"}, r"\.tensors"), ({"layers": 0}, r"\.layers: got 0"), ({"layers": -1}, r"\.layers: got -1"),
+    ({"defence": {"name": "steered", "policy": "bad.json"}}, r"\.defence: got 'steered'"), ({"defence": {"name": "nothing"}}, r"\.defence: got 'nothing'"),
+    ({"defence": {"name": 5}}, r"\.defence: got"), ({"defence": {"name": "chi2_kf", "family": "x"}}, r"\.defence chi2_kf.*'family'"),
+    ({"defence": {"name": "chi2_kf", "eta": ["os:Mine"]}}, r"\.defence: got .*os:Mine"), ({"defence": 5}, r"\.defence: got 5"),
+    ({"menu": {"thresholds": list(range(1, 401)), "modes": ["normal", "widen", "brake"]}}, r"\.menu: got '1200 combinations of settings'.*1024"),
+    ({"training": {"x": [[[[]]]]}}, ""),
+])  # fmt: skip
+def test_a_bad_field_of_a_defender_is_one_clear_error(tmp_path, monkeypatch, change, words):
+    """It names the file, the field and the value; a policy that names itself as its defence is no endless loop."""
+    monkeypatch.chdir(tmp_path)
+    duel = Duel.make(**GUSTY)
+    path = export(tmp_path / "bad", duel, constant(duel, 1), {})
+    path.write_text(json.dumps(json.loads(path.read_text()) | change))
+    if not words:
+        assert Steered(policy=path).guarded
+        return
+    with pytest.raises(InputError, match=rf"bad\.json.*{words}"):
+        Steered(policy=path)
+
+
+def test_a_defender_nested_too_deep_is_one_clear_error(tmp_path):
+    """Also where the reader of JSON gives up before."""
+    for depth in (100, 100_000):
+        (tmp_path / "bad.json").write_text(f'{{"format": "tailgate-defender-1", "training": {"[" * depth}{"]" * depth}}}')
+        with pytest.raises(InputError, match=r"bad\.json.*nested"):
+            Steered(policy=tmp_path / "bad.json")
+
+
+def test_a_menu_has_a_thousand_settings_at_most():
+    """A thousand and twenty-four: of the knobs that the defence has."""
+    levels = tuple(float(n) for n in range(1, 1026))
+    assert Steered(menu=Menu(thresholds=levels[:1024], modes=("widen",))).hand.knobs
+    with pytest.raises(InputError, match="1025 combinations"):
+        Steered(menu=Menu(thresholds=levels, modes=("widen",)))
+
+
 def test_the_examples_of_the_documentation_run(capsys):
     """Both Python examples, as they stand; a game pays both."""
     text = (Path(__file__).parents[1] / "docs/two-players.md").read_text(encoding="utf-8")

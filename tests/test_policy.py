@@ -185,6 +185,60 @@ def test_a_damaged_policy_is_refused_with_one_clear_error(tmp_path: Path, how: s
         Spec("attack", str(path)).make().prepare(_place("black").brief())
 
 
+@pytest.mark.parametrize(
+    ("change", "field"),
+    [
+        ({"layers": 0}, "layers"), ({"layers": -1}, "layers"), ({"layers": 1.5}, "layers"), ({"layers": 10**30}, "layer2"),
+        ({"tensors": ""}, "tensors"), ({"tensors": "a\0b"}, "tensors"), ({"tensors": "\ud800"}, "tensors"), ({"tensors": ".."}, "tensors"),
+        ({"tensors": 5}, "tensors"), ({"frames": 10**9}, "frames"), ({"training": 5}, "training"), ({"observation": []}, "layer0"),
+        ({"training": {"x": [[[]]] * 3}}, ""),
+    ],
+)  # fmt: skip
+def test_a_bad_field_is_one_clear_error(tmp_path: Path, change: dict[str, Any], field: str) -> None:
+    """It names the file, the field and the value; what a record holds besides is nobody's business."""
+    path = _policy(tmp_path, {"action": "mode"})
+    path.write_text(json.dumps(json.loads(path.read_text()) | change))
+    if not field:
+        assert load_policy(path)[0].training == change["training"]
+        return
+    with pytest.raises(InputError, match=rf"policy\.json.*{field}.* got .*; expected"):
+        load_policy(path)
+
+
+@pytest.mark.parametrize("depth", [65, 900, 100_000])
+def test_deep_nesting_is_one_clear_error(tmp_path: Path, depth: int) -> None:
+    """Whether the reader of JSON gives up first or what would walk through the data; as deep as is allowed it is read."""
+    path = _policy(tmp_path, {"action": "mode"})
+    text = path.read_text().rstrip().removesuffix("}")
+    path.write_text(f'{text}, "knowledge": "black", "training": {{"x": {"[" * 62}{"]" * 62}}}}}')
+    assert load_policy(path)[0].training["x"]
+    path.write_text(f'{text}, "training": {{"x": {"[" * depth}{"]" * depth}}}}}')
+    with pytest.raises(InputError, match=r"policy\.json.*nested"):
+        load_policy(path)
+
+
+@pytest.mark.parametrize("kind", [np.int64, np.bool_, np.complex64])
+def test_weights_are_floating_point_numbers(tmp_path: Path, kind: Any) -> None:
+    path = _policy(tmp_path, {"action": "mode"})
+    tensors = load_tensors(path.with_suffix(".safetensors").read_bytes())
+    blob = save_tensors(tensors | {"layer1.bias": tensors["layer1.bias"].astype(kind)})
+    path.with_suffix(".safetensors").write_bytes(blob)
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"sha256": hashlib.sha256(blob).hexdigest()}))
+    with pytest.raises(InputError, match="layer1"):
+        load_policy(path)
+
+
+def test_a_type_of_number_that_numpy_lacks_is_one_clear_error(tmp_path: Path) -> None:
+    """Sixteen bits of brain floating point."""
+    path = _policy(tmp_path, {"action": "mode"})
+    head = json.dumps({"layer0.weight": {"dtype": "BF16", "shape": [1, 1], "data_offsets": [0, 2]}}).encode()
+    blob = len(head).to_bytes(8, "little") + head + b"\0\0"
+    path.with_suffix(".safetensors").write_bytes(blob)
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"sha256": hashlib.sha256(blob).hexdigest()}))
+    with pytest.raises(InputError, match=r"policy\.json"):
+        load_policy(path)
+
+
 @pytest.mark.parametrize("other", ["platoon-20-v0", "thesis-ch5-v0", "gusty-stop-and-go-v0"])
 def test_a_policy_of_another_size_is_refused(tmp_path: Path, other: str) -> None:
     """In one short line that says how many agents it was made for; also where the observations would agree."""

@@ -50,6 +50,23 @@ def test_a_window_of_time(sends):
     assert steps(sends("fdi", start_step=50)) == list(range(50, K + 1))
 
 
+def test_bursts_and_pauses(sends):
+    """Inside its window a script that pulses attacks `burst` steps, rests `pause` of them, and begins again."""
+    assert steps(sends("fdi", start_step=20, burst=2, pause=3, length=12)) == [20, 21, 25, 26, 30, 31]
+    assert steps(sends("dos_jam", start_step=50, burst=1, pause=4, threat={"budget": 2})) == [50, 55]
+    assert steps(sends("fdi", start_step=55, burst=3, pause=0)) == list(range(55, K + 1))
+
+
+def test_signs_are_the_wires_own(sends):
+    """With `signs` each wire has its own sign, the same in every step and episode; two seeds differ, without it all are alike."""
+    seen = {}
+    for seed in (None, *range(12)):
+        value = sends("fdi", value=4.0, signs=seed, threat={"fdi_bound": 5.0}).value[:, :, 0, :2]
+        assert (np.abs(value) == 4.0).all() and (value == value[0, 0]).all()
+        seen[seed] = tuple(np.sign(value[0, 0]).tolist())
+    assert seen[None] == (1.0, 1.0) and len(set(seen.values())) == 4
+
+
 def test_a_script_never_asks_in_vain(sends):
     """Budget, duration, cooldown and end silence a script: nothing is refused."""
     trace = sends("fdi", threat={"budget": 9, "duration": 4, "cooldown": 2, "end": 40})
@@ -340,13 +357,13 @@ def test_shaping_telescopes(reward, interval):
     total, discount = np.zeros(8), 1.0
     episode = _episode(reward=reward, gamma=0.97, interval=interval)
     (shaped, _), _ = next(episode)
-    start = shaped._potential.copy()
+    start = shaped.tally.potential.copy()
     assert start.min() > 0.05
     for _, (one, two) in episode:
         total += discount * (one[1] - two[1])
         discount *= 0.97
         terminated = one[2]
-    end = np.where(terminated, 0.0, shaped._potential)
+    end = np.where(terminated, 0.0, shaped.tally.potential)
     np.testing.assert_allclose(total, discount * end - start, atol=1e-12)
 
 

@@ -1,24 +1,30 @@
 """Self-play: the defender learns, resumes to the bit, and what it exports plays as it did in training; a run and its report."""
 
+import contextlib
 import dataclasses
+import hashlib
+import io
 import json
 import re
+import shutil
 
 import numpy as np
 import pytest
 
 import tailgate
-from tailgate import cli, draws
+from tailgate import cli, draws, selfplay
 from tailgate.agents.cem import Config
 from tailgate.agents.mixture import Mixture
-from tailgate.agents.selfplay import Learner, constant, play
+from tailgate.agents.policy import PolicyAttack
+from tailgate.agents.selfplay import Learner, Played, constant, play
+from tailgate.commands.selfplay import _print_report
 from tailgate.core import Kind
 from tailgate.envs.duel import Duel
 from tailgate.errors import InputError
 from tailgate.estimators import Steered
 from tailgate.registry import Spec
 from tailgate.scenario import config_path, load_scenario
-from tailgate.selfplay import GameConfig, load_config
+from tailgate.selfplay import Game, GameConfig, load_config
 from tailgate.trace import rollout
 
 ROAD = {"scenario": "gusty-stop-and-go-v0", "interval": 60, "menu": {"thresholds": [6.0, 1e9], "modes": ["normal", "brake"]}, "knowledge": "black"}
@@ -115,42 +121,153 @@ def test_it_begins_at_the_defence_as_it_is():
 
 
 TINY = [
-    "name=tiny", "steps=1", "rounds=1", "episodes=6", "rivals=[]", "environment.interval=50", "menu.thresholds=[8, 20]", "menu.modes=[normal]",
-    "attacker={population: 4, episodes: 2, hidden: [2]}", "defender={population: 4, episodes: 2, hidden: [2]}",
+    "name=tiny", "steps=1", "rounds=1", "episodes=6", "rivals=[dos_jam]", "environment.interval=50", "environment.frames=2", "menu.thresholds=[20, 1.0e+9]",
+    "menu.modes=[normal]", "attacker={population: 4, episodes: 2, hidden: [2]}", "defender={population: 4, episodes: 2, hidden: [2]}",
 ]  # fmt: skip
+GUARDS = ("as it is", "best fixed setting", "trained")
+NAMES = ("none", "dos_jam", "attacker-1", "fresh-0", "fresh-fixed-0")
 
 
-def test_a_run_from_the_command_line(brief, tmp_path, monkeypatch, capsys):
-    """Table and JSON agree; resumed with one round more it trains only that round; without --resume the run is set aside."""
-    import tailgate.selfplay as module
+@pytest.fixture(scope="module")
+def first(brief, tmp_path_factory):
+    """The directory in which a run of one round was played, and what the command printed."""
+    home, out = tmp_path_factory.mktemp("first"), io.StringIO()
+    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(out):
+        patch.chdir(home)
+        patch.setattr(selfplay, "SELECT_EPISODES", 8)
+        assert cli.main(["selfplay", *TINY, f"scenario={brief['scenario']}", "--json"]) == 0
+    return home, json.loads(out.getvalue())
 
+
+@pytest.fixture
+def tiny(first, tmp_path, monkeypatch, capsys):
+    """A copy of that run, its report, and how the command is called there."""
+    shutil.copytree(first[0] / "runs", tmp_path / "runs")
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(module, "SELECT_EPISODES", 8)
-    assert cli.main(["selfplay", *TINY, f"scenario={brief['scenario']}", "--json"]) == 0
-    out = json.loads(capsys.readouterr().out)
-    home = tmp_path / "runs/tiny"
+    monkeypatch.setattr(selfplay, "SELECT_EPISODES", 8)
+
+    def command(*words):
+        code = cli.main(["selfplay", *words])
+        return code, capsys.readouterr()
+
+    return tmp_path / "runs/tiny", first[1], command
+
+
+def test_a_run_from_the_command_line(tiny):
+    """Table and JSON agree, and every figure is that of the table; another configuration is not resumed."""
+    home, out, command = tiny
     assert out == json.loads((home / "report.json").read_text())
-    pairs = {(row["defender"], row["attack"]) for row in out["table"]}
-    assert pairs == {(g, a) for g in ("as it is", "best fixed setting", "trained") for a in ("none", "attacker-1", "fresh-0", "fresh-fixed-0")}
     share = {(row["defender"], row["attack"]): row["collisions"]["value"] for row in out["table"]}
+    assert set(share) == {(guard, name) for guard in GUARDS for name in NAMES}
     assert out["exploitability"]["trained"]["value"] == share["trained", "fresh-0"] - share["trained", "attacker-1"]
-    assert out["fixed_minus_trained"]["value"] == share["best fixed setting", "fresh-fixed-0"] - share["trained", "fresh-0"]
+    worst = {guard: out["worst"][guard]["attack"] for guard in GUARDS[1:]}
+    for guard, name in worst.items():
+        assert out["worst"][guard]["collisions"]["value"] == share[guard, name]
+    assert out["worst_fixed_minus_trained"]["value"] == pytest.approx(share[GUARDS[1], worst[GUARDS[1]]] - share["trained", worst["trained"]], abs=1e-12)
     assert not list(home.glob("checkpoint*"))
-    stamp = {name: (home / name).stat().st_mtime_ns for name in ("attacker-1.json", "defender-1.json", "fresh-fixed-0.json")}
-    assert cli.main(["selfplay", "--resume", "name=tiny", "rounds=2"]) == 0
-    text = capsys.readouterr().out
-    assert "exploitability, trained" in text and re.search(r"attacker-2 .*%", text)
+    code, said = command("--resume", "name=tiny", "gamma=0.5")
+    assert code == cli.EXIT_INPUT and "gamma" in said.err
+
+
+def test_the_worst_attack_is_chosen_on_select_seeds(tiny):
+    """Replayed one by one, no attack does more there than the one that is named, against the trained defender and the fixed setting."""
+    home, out, _ = tiny
+    place, most = load_scenario(out["config"]["scenario"]).with_threat(**out["config"]["threat"]), []
+    for guard, hand in {"trained": {"policy": home / "defender-1.json"}, "best fixed setting": {"setting": out["fixed"]["setting"]}}.items():
+        defence = dataclasses.replace(Duel.make(out["config"]["scenario"], "chi2_kf", out["config"]["menu"], interval=50).guard, **hand)
+        loop, shares = place.loop(defence, defence.uses), {}
+        for name in NAMES:
+            attack = PolicyAttack(home / f"{name}.json") if (home / f"{name}.json").is_file() else Spec("attack", name).make()
+            trace = rollout(loop, attack, draws.keys("select", range(8)))
+            shares[name] = float((trace.collided | trace.rear_collided).any(axis=0).mean())
+        assert out["worst"][guard]["select"]["value"] == shares[out["worst"][guard]["attack"]] == max(shares.values())
+        most.append(max(shares.values()))
+    assert max(most) > 0
+
+
+@pytest.mark.parametrize(
+    "select, report, worst, bound",
+    [  # collisions in 8 episodes of: none, the script, self-play's last attacker, fresh against trained, fresh against fixed
+        ([0, 3, 2, 5, 6], [0, 3, 2, 4, 4], ("fresh-fixed-0", "fresh-fixed-0"), True), ([0, 6, 2, 5, 5], [0, 3, 2, 4, 4], ("dos_jam", "dos_jam"), True),
+        ([0, 3, 2, 6, 5], [0, 3, 6, 4, 4], ("fresh-0", "fresh-0"), False), ([0, 0, 0, 0, 0], [0, 0, 0, 0, 0], ("none", "none"), True),
+    ],
+)  # fmt: skip
+def test_a_weak_search_is_said_to_be_one(select, report, worst, bound, brief, tmp_path, monkeypatch, capsys):
+    """No bound where self-play's last attacker does more than the fresh one; the worst attack is chosen on one purpose's seeds, reported on the other's."""
+    monkeypatch.chdir(tmp_path)
+    game = Game(load_config(None, [*TINY, "episodes=8", f"scenario={brief['scenario']}"]), lambda *_: None)
+    other = {"select": select, "report": report}
+
+    def played(guard, attack, purpose, episodes):
+        name = attack.path.stem if isinstance(attack, PolicyAttack) else next(n for n, made in game.scripts.items() if made is attack)
+        crashed = np.arange(8) < other[purpose][NAMES.index(name)] - (guard == "trained" and purpose == "report" and name == worst[0])
+        return Played(np.zeros(8), crashed, np.zeros(8), 8)
+
+    monkeypatch.setattr(game, "_play", played)
+    files = [tmp_path / f"{name}.json" for name in NAMES[2:]]
+    out = game._report({name: name for name in GUARDS}, files[:1], files[1:2], files[2:], 0)
+    assert (out["worst"]["trained"]["attack"], out["worst"]["best fixed setting"]["attack"]) == worst
+    assert out["worst"]["best fixed setting"]["collisions"]["value"] == report[NAMES.index(worst[1])] / 8
+    assert out["worst"]["trained"]["select"]["value"] == select[NAMES.index(worst[0])] / 8
+    assert out["worst_fixed_minus_trained"]["value"] == (report[NAMES.index(worst[0])] > 0) / 8
+    assert out["exploitability"]["best fixed setting"]["bound"] is bound
+    assert out["exploitability"]["best fixed setting"]["value"] == (report[4] - report[2]) / 8
+    _print_report(out)
+    said = " ".join(capsys.readouterr().out.split())
+    assert ("best fixed setting: " in said) and said.count("the fresh attacker is weaker than known attacks: not a bound") == (0 if bound else 2)
+
+
+def test_a_run_that_goes_on_trains_for_the_opponents_of_now(tiny):
+    """With a round more the pools are kept, and the fresh attackers are trained for the new defender; one trained for others is trained anew."""
+    home, _, command = tiny
+    stamp = {name: (home / name).stat().st_mtime_ns for name in ("attacker-1.json", "defender-1.json")}
+    (home / "checkpoint-fresh-0-00ff.safetensors").write_bytes(b"of another defender")
+    code, said = command("--resume", "name=tiny", "rounds=2")
+    assert code == 0 and re.search(r"attacker-2 .*%", said.out)
     assert {name: (home / name).stat().st_mtime_ns for name in stamp} == stamp
-    assert json.loads((home / "report.json").read_text())["defender"].endswith("defender-2.json")
-    assert cli.main(["selfplay", "--resume", "name=tiny", "gamma=0.5"]) == cli.EXIT_INPUT
-    assert "gamma" in capsys.readouterr().err
+    report = json.loads((home / "report.json").read_text())
+    assert report["defender"].endswith("defender-2.json") and not list(home.glob("checkpoint*"))
+
+    def digest(name):
+        return f"{name}#{hashlib.sha256((home / name).read_bytes()).hexdigest()[:16]}"
+
+    def against(name):
+        return json.loads((home / f"{name}.json").read_text())["training"]["against"]
+
+    assert against("fresh-0")["policy"] == digest("defender-2.json")
+    assert against("fresh-fixed-0")["setting"] == report["fixed"]["setting"]
+    assert against("attacker-2")["policy"] == [digest("defender-0.json"), digest("defender-1.json")]
+    assert [one["path"] for one in against("defender-2")] == [digest("attacker-1.json"), digest("attacker-2.json")]
+
+    first = (home / "attacker-1.json").read_text()
+    data = json.loads(first)
+    data["training"]["against"]["policy"] = ["defender-0.json#0123456789abcdef"]
+    (home / "attacker-1.json").write_text(json.dumps(data))
+    assert command("--resume", "name=tiny")[0] == 0
+    assert (home / "attacker-1.json").read_text() == first
+    (home / "attacker-1.json").write_text("[]")
+    code, said = command("--resume", "name=tiny")
+    assert code == cli.EXIT_INPUT and "attacker-1.json" in said.err
+
+
+@pytest.mark.parametrize("text", ["[]", "{", "3", '{"name": "tiny"}', "[" * 100_000], ids=["list", "cut off", "number", "no class", "deep"])
+def test_a_damaged_configuration_is_one_error(text, tmp_path, monkeypatch):
+    """Of the command and of the game."""
+    monkeypatch.chdir(tmp_path)
+    config = load_config(None, ["name=tiny"])
+    config.directory.mkdir(parents=True)
+    (config.directory / "config.json").write_text(text)
+    with pytest.raises(InputError, match=r"resume.*config\.json"):
+        load_config(None, ["name=tiny"], resume=True)
+    with pytest.raises(InputError, match=r"resume.*config\.json"):
+        Game(config, lambda *_: None, resume=True)
 
 
 @pytest.mark.parametrize("wrong, words", [
     (["defence=kf"], ["steered defence"]), (["learner=xyz"], ["learner", "cem"]), (["attacker.populations=3"], ["populations"]),
     (["menu.interval=3"], ["environment.interval"]), (["scenario=thesis-ch5-v0", "defence=chi2_dkf:eta=22.8"], ["reward"]), (["name=a/b"], ["name"]),
     (["rivals=[stealth]"], ["rivals"]), (["environment.scenario=x"], ["environment", "scenario"]), (["menu=3"], ["menu", "mapping"]),
-    (["defence=os:path"], ["command line only"]), (["roundss=3"], ["rounds"]), (["--resume", "name=nobody"], ["nobody"]),
+    (["defence=os:path"], ["command line only"]), (["roundss=3"], ["rounds"]), (["payoff.scenario=x"], ["config.payoff", "scenario"]), (["--resume", "name=nobody"], ["nobody"]),
 ])  # fmt: skip
 def test_bad_configurations(wrong, words, tmp_path, monkeypatch, capsys):
     """One clear line, and nothing is written."""

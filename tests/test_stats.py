@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tailgate.stats import paired_difference, proportion
+from tailgate.stats import paired_difference, paired_ratio, proportion
 
 
 def test_clopper_pearson_known_values() -> None:
@@ -52,3 +52,18 @@ def test_a_difference_of_shares_is_never_certain():
     assert paired_difference(zeros, zeros) == (0.0, 0.0, 0.0)
     a, b = (np.random.default_rng(2).uniform(size=(2, 400)) < np.array([[0.7], [0.4]])).astype(float)
     assert paired_difference(a, b, share=True) == paired_difference(a, b)
+
+
+def test_a_ratio_of_means():
+    """Of a and twice a it is a half without doubt; the interval of two noisy samples holds the true ratio, and a seed gives it twice."""
+    a = np.random.default_rng(0).uniform(0.5, 1.5, size=500)
+    assert paired_ratio(a, 2.0 * a) == pytest.approx((0.5, 0.5, 0.5))
+    held = 0
+    for i in range(100):
+        rng = np.random.default_rng(i)
+        x, y = rng.exponential(3.0, size=300), rng.exponential(4.0, size=300)
+        value, low, high = paired_ratio(x, y, resamples=500, seed=i)
+        held += low <= 0.75 <= high
+        assert low < value < high
+    assert held >= 88
+    assert paired_ratio(x, y) == paired_ratio(x, y)

@@ -2,6 +2,7 @@
 
 import json
 import math
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -12,16 +13,20 @@ import yaml
 from tailgate import cli, draws
 from tailgate.agents.codec import ActionCodec, ActionSpec
 from tailgate.agents.observation import ObservationCodec
-from tailgate.agents.policy import Network, PolicyAttack, save_policy, timing_advantage
+from tailgate.agents.policy import Network, PolicyAttack, Yoked, save_policy, timing_advantage
 from tailgate.agents.zoo import ZooAttack
 from tailgate.draws import Role
 from tailgate.errors import InputError
+from tailgate.metrics import METRICS
+from tailgate.registry import Spec
 from tailgate.scenario import load_scenario
+from tailgate.strength.collect import add_run
 from tailgate.strength.dose import critical_dose, critical_interval, dose_response, fitted
 from tailgate.strength.figures import dose_figure, timing_figure, transfer_figure
 from tailgate.strength.policies import label, loop_for, mean, trained
 from tailgate.strength.timing import periodic, play, shuffled, timing
 from tailgate.strength.transfer import difference, transfer
+from tailgate.trace import MEMORY, Trace, episodes_at_once, rollout
 
 PLACE = "gusty-stop-and-go-v0"
 THREAT: dict[str, Any] = {"kinds": ["dos_jam", "fdi"], "budget": 20, "fdi_bound": 3.0}
@@ -39,7 +44,7 @@ def brief_place(tmp_path_factory: pytest.TempPathFactory) -> str:
     return str(path)
 
 
-def _always(directory: Path, name: str, value: float = -3.0, place: str = PLACE, seed: int = 0, **threat: Any) -> Path:
+def _always(directory: Path, name: str, value: float = -3.0, seed: int = 0, **threat: Any) -> Path:
     """A policy that attacks whenever it may, from the first step on, with the record of a training."""
     changed = THREAT | threat
     brief = load_scenario(PLACE).with_threat(**changed).brief()
@@ -47,7 +52,7 @@ def _always(directory: Path, name: str, value: float = -3.0, place: str = PLACE,
     size = ActionCodec(spec, brief).size
     bias = np.zeros(size)
     bias[-1] = 1.0
-    config = {"scenario": place, "defence": "chi2_kf", "threat": changed, "outcome": None}
+    config = {"scenario": PLACE, "defence": "chi2_kf", "threat": changed, "outcome": None}
     header = {
         "action": spec, "observation": names, "knowledge": "black", "agents": 1,
         "training": {"learner": "hand", "seed": seed, "config": config},
@@ -104,8 +109,8 @@ def test_own_and_yoked_are_those_of_the_timing_advantage() -> None:
 
 def test_a_policy_without_timing_is_flagged(tmp_path: Path, brief_place: str) -> None:
     """One that attacks in the same steps of every episode equals its yoked twin, and says so; two seeds of it are one entry."""
-    texts = [str(_always(tmp_path, f"p{i}", place=brief_place, seed=i)) for i in range(2)]
-    report = timing(texts, episodes=12)
+    texts = [str(_always(tmp_path, f"p{i}", seed=i)) for i in range(2)]
+    report = timing(texts, scenario=brief_place, episodes=12)
     (entry,) = report["entries"]
     assert [p["seed"] for p in entry["policies"]] == [0, 1]
     assert entry["advantage"]["yoked"]["value"] == 0.0 and entry["flags"] == ["yoked equals own"]
@@ -116,9 +121,9 @@ def test_a_policy_without_timing_is_flagged(tmp_path: Path, brief_place: str) ->
 def test_an_entry_is_of_one_cell(tmp_path: Path, brief_place: str) -> None:
     """Policies of another training threat or action are entries of their own; a dose of one's own is played by all."""
     changed: dict[str, dict[str, Any]] = {"a": {}, "b": {"budget": 10}, "c": {"value": -2.0}}
-    texts = [str(_always(tmp_path, name, place=brief_place, **changes)) for name, changes in changed.items()]
-    assert len(timing(texts, episodes=2)["entries"]) == 3
-    entries = timing(texts, episodes=2, dose=5, outcome="rmse_position")["entries"]
+    texts = [str(_always(tmp_path, name, **changes)) for name, changes in changed.items()]
+    assert len(timing(texts, scenario=brief_place, episodes=2)["entries"]) == 3
+    entries = timing(texts, scenario=brief_place, episodes=2, dose=5, outcome="rmse_position")["entries"]
     assert {e["threat_model"]["budget"] for e in entries} == {5} and {e["attack_steps"]["own"] for e in entries} == {5.0}
     assert all(e["outcomes"]["own"]["value"] > 0.0 for e in entries)
 
@@ -136,6 +141,96 @@ def test_what_a_file_does_not_say_has_to_be_said(tmp_path: Path, brief_place: st
         timing([ZOO], outcome="crash", episodes=2)
     with pytest.raises(InputError, match="at least 2"):
         timing([ZOO], episodes=1)
+
+
+def test_many_episodes_are_played_as_memory_allows(monkeypatch: pytest.MonkeyPatch, brief_place: str) -> None:
+    """The timing advantage of 24 episodes, seven at a time, is that of all at once to the bit: each has the times of the one before it."""
+    who = trained(ZOO)
+    loop, keys = loop_for(who, PLACE, "chi2_kf", THREAT), draws.keys("report", range(24))
+    record = rollout(loop, who.policy, keys, terminate=False).kind != 0
+    twin = Yoked(who.policy, np.roll(record, 1, axis=1))
+    together = [METRICS["min_gap"](rollout(loop, attack, keys)) for attack in (who.policy, twin)]
+    sizes: list[int] = []
+
+    def counted(loop: Any, attack: Any, keys: Any, **options: Any) -> Trace:
+        sizes.append(len(keys.key))
+        return rollout(loop, attack, keys, **options)
+
+    monkeypatch.setattr("tailgate.strength.timing.rollout", counted)
+    monkeypatch.setattr("tailgate.trace.MEMORY", 7.5 * MEMORY / episodes_at_once(loop.model, loop.horizon, 10**9))
+    apart = timing_advantage(loop, who.policy, keys, "min_gap")
+    assert sizes == [7, 7, 7, 3] * 3
+    assert np.array_equal(apart, together) and not np.array_equal(*apart)
+    played = play(loop, who.policy, keys, "min_gap")
+    assert np.array_equal([played.outcome["own"], played.outcome["yoked"]], together)
+
+
+# -- what a record may name
+
+
+@pytest.fixture
+def module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The mark that somebody's module leaves when it is imported."""
+    mark = tmp_path / "ran"
+    (tmp_path / "somebodys.py").write_text(f"open({str(mark)!r}, 'w').close()\nclass D: pass\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.delitem(sys.modules, "somebodys", raising=False)
+    return mark
+
+
+def _recorded(path: Path, **fields: Any) -> Path:
+    """The policy with other fields in its training's configuration."""
+    data = json.loads(path.read_text())
+    data["training"]["config"] |= fields
+    path.write_text(json.dumps(data))
+    return path
+
+
+NAMES = [
+    ("defence", "somebodys:D"), ("defence", "composed:detector=somebodys:D"), ("defence", "cra:filter.name=somebodys:D"),
+    ("others", ["kf", "somebodys:D"]), ("rivals", ["somebodys:D:value=3"]), ("white_box", ["somebodys:D"]), ("teacher", "somebodys:D"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("field", "value"), NAMES)
+def test_a_record_that_names_code_runs_nothing(
+    tmp_path: Path, module: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, field: str, value: Any
+) -> None:
+    """One line that names the file and the field, from every command that reads records, even where another defence is asked for."""
+    monkeypatch.setattr("tailgate.strength.collect.FOLDER", tmp_path / "zoo")
+    policy = str(_recorded(_always(tmp_path, "policy-0"), **{field: value}))
+    for words in (
+        ["timing", policy], ["timing", policy, "--defence", "kf"], ["transfer", policy], ["transfer", policy, "--defence", "kf"],
+        ["zoo", "add", str(tmp_path), "--name", "x"],
+    ):  # fmt: skip
+        assert cli.main(words) == 2
+        error = capsys.readouterr().err.strip()
+        assert "\n" not in error and f"policy-0.json: training.config.{field}" in error and "somebodys:D" in error
+        assert not module.exists() and "somebodys" not in sys.modules
+    assert Spec("defence", "somebodys:D").entry  # what a command line names is imported: the module would have run
+    assert module.exists()
+
+
+def test_a_scenario_of_a_record_is_a_registered_one(tmp_path: Path, brief_place: str) -> None:
+    """A path is the user's to name."""
+    path = str(_recorded(_always(tmp_path, "policy-0"), scenario=brief_place))
+    for call in (lambda: timing([path], episodes=2), lambda: transfer([path], episodes=2), lambda: add_run(tmp_path, "x", episodes=2)):
+        with pytest.raises(InputError, match=r"policy-0: training\.config\.scenario.*brief\.yaml"):
+            call()
+    assert timing([path], scenario=brief_place, episodes=2)["entries"][0]["scenario"] == brief_place
+
+
+@pytest.mark.parametrize(
+    ("fields", "words"),
+    [
+        ({"defence": "chi2_kf:eta=" + "[" * 5000}, r"config\.defence"), ({"defence": "chi2_kf:eta=2020-13-45"}, r"config\.defence"),
+        ({"threat": {"self": 1}}, r"config\.threat.*'self'"), ({"scenario": "nowhere"}, "nowhere"), ({"scenario": 5}, "--scenario"),
+        ({"defence": "nothing"}, "nothing"), ({"defence": ["kf"]}, "--defence"), ({"outcome": "crash"}, "crash"),
+    ],
+)  # fmt: skip
+def test_a_record_that_makes_no_sense_is_one_clear_error(tmp_path: Path, fields: dict[str, Any], words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        timing([str(_recorded(_always(tmp_path, "policy-0"), **fields))], episodes=2)
 
 
 # -- dose-response
@@ -261,10 +356,10 @@ def _copy_as(directory: Path, defence: str) -> Path:
 
 def test_policies_of_different_cells_need_one_named(tmp_path: Path, brief_place: str) -> None:
     """Their threat models differ: which one is meant has to be said, and what then does not fit is skipped."""
-    texts = [str(_always(tmp_path, "a", place=brief_place)), str(_always(tmp_path, "b", place=brief_place, kinds=["fdi"]))]
+    texts = [str(_always(tmp_path, "a")), str(_always(tmp_path, "b", kinds=["fdi"]))]
     with pytest.raises(InputError, match="--threat"):
         transfer(texts, episodes=2)
-    report = transfer(texts, threat=THREAT, episodes=2)
+    report = transfer(texts, scenario=brief_place, threat=THREAT, episodes=2)
     assert [item["policy"].split("/")[-1] for item in report["skipped"]] == ["b"] and "actions" in report["skipped"][0]["reason"]
     assert [e["seeds"] for e in report["entries"]] == [1]
 
@@ -285,12 +380,12 @@ def test_the_commands_write_reports_and_pictures(
     """JSON on standard output equals the file; every command has its picture."""
     monkeypatch.chdir(tmp_path)
     grants = [word for key in ("kinds=[dos_jam,fdi]", "fdi_bound=3") for word in ("--threat", key)]
-    policy = str(_always(tmp_path, "p", place=brief_place))
+    policy = str(_always(tmp_path, "p"))
     script = "fdi:trigger=near,threshold=40,value=-3"
     commands = {
-        "timing": ["timing", policy, "--episodes", "6"],
+        "timing": ["timing", policy, "--scenario", brief_place, "--episodes", "6"],
         "dose-response": ["dose-response", script, "--defence", "kf", "--scenario", brief_place, "--doses", "5,10", "--episodes", "4", *grants],
-        "transfer": ["transfer", policy, "--defence", "kf", "--episodes", "4"],
+        "transfer": ["transfer", policy, "--scenario", brief_place, "--defence", "kf", "--episodes", "4"],
     }
     for name, words in commands.items():
         assert cli.main([*words, "--out", "out", "--json"]) == 0
@@ -307,6 +402,7 @@ def test_the_commands_write_reports_and_pictures(
 
 
 def test_a_timing_picture_has_a_panel_per_outcome(tmp_path: Path, brief_place: str) -> None:
-    policy = str(_always(tmp_path, "p", place=brief_place))
-    entries = [*timing([policy], episodes=2)["entries"], *timing([policy], episodes=2, outcome="rmse_position")["entries"]]
+    policy = str(_always(tmp_path, "p"))
+    arguments: dict[str, Any] = {"scenario": brief_place, "episodes": 2}
+    entries = [*timing([policy], **arguments)["entries"], *timing([policy], outcome="rmse_position", **arguments)["entries"]]
     assert timing_figure(entries)[:4] == b"\x89PNG" and len({e["unit"] for e in entries}) == 2

@@ -103,3 +103,20 @@ def test_what_is_shown_is_one_of_a_few_actions(tmp_path: Path) -> None:
         train.train(config, lambda seed, now: None)
     with pytest.raises(InputError, match="nosuch"):
         train.load_config(None, ["teacher=nosuch"])
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        (["teacher=best", "rivals=[]"], ["best", "rivals"]), (["teacher=optimal_dos"], ["optimal_dos", "computed optimum"]),
+        (["teacher='zoo:name=car-following-chi2_kf-0'"], ["zoo", "learned"]), (["teacher=stealth"], ["stealth", "knows no more"]),
+        (["teacher='fdi:targets=[nowhere]'"], ["nowhere"]),
+    ],
+)  # fmt: skip
+def test_a_teacher_is_a_script_that_knows_no_more(tmp_path: Path, changes: list[str], words: list[str]) -> None:
+    """Neither a computed optimum nor a trained policy, nothing that sees more than the learner, and nobody at all is an error, before anything is written."""
+    config = train.load_config(None, [f"out={tmp_path}", *changes])
+    with pytest.raises(InputError) as error:
+        train.train(config, lambda seed, now: None)
+    assert all(word in str(error.value) for word in words)
+    assert not list(tmp_path.iterdir())

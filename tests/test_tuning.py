@@ -132,6 +132,40 @@ def test_values_that_a_learner_refuses_cost_their_trial_only(tmp_path: Path) -> 
     assert tuning.tune(search) == report
 
 
+def test_a_policy_that_diverges_costs_its_trial_only(tmp_path: Path) -> None:
+    """A step size under which continuous actions are no longer numbers: said, not played again, and the search goes on."""
+    pytest.importorskip("stable_baselines3")
+    overrides = [
+        f"out={tmp_path}", "name=wild", "steps=1200", "outcome=rmse_position", "scenario=thesis-ch5-v0", "defence=dkf", "threat={kinds: [fdi], fdi_bound: 5.0}",
+        "environment={action: continuous, reward: error, error_scale: 30.0, interval: 10}", "ppo={envs: 16, rollout: 16, batch_size: 64, epochs: 2, hidden: [4]}",
+    ]  # fmt: skip
+    search = dataclasses.replace(tuning.make_search("quickstart", overrides, 4, episodes=3), space={"ppo.learning_rate": {"choices": [1e30, 1e-3]}})
+    report = tuning.tune(search)
+    failed = [entry for entry in report["trials"] if entry["state"] == "fail"]
+    assert 0 < len(failed) < 4 and all("ppo.learning_rate" in e["reason"] and e["parameters"]["ppo.learning_rate"] == 1e30 for e in failed)
+    assert report["best"]["parameters"] == {"ppo.learning_rate": 1e-3}
+    assert tuning.tune(search) == report
+
+
+@pytest.mark.parametrize("preset", ["car-following", "quickstart"])
+def test_what_was_tuned_is_what_trains(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, preset: str) -> None:
+    """A teacher that is the best of the rivals has them in each trial; best.yaml is the preset with the values found, to the last field."""
+    seen: list[Any] = []
+    monkeypatch.setattr(tuning, "train", lambda config, progress: seen.append(config) or [tmp_path / "none.json"])
+    monkeypatch.setattr(tuning, "objective", lambda config, policy, episodes: config.gamma)
+    overrides = [f"out={tmp_path}", "seeds=3", "white_box=[stealth]"]
+    search = dataclasses.replace(tuning.make_search(preset, overrides, 3), space={"gamma": {"choices": [0.9, 0.95]}})
+    report = tuning.tune(search)
+    whole = load_config(preset, overrides)
+    assert whole.rivals and (preset != "car-following" or whole.teacher == "best")
+    for config in seen:
+        assert (config.teacher, config.rivals) == (whole.teacher, whole.rivals if whole.teacher else ()) and (config.seeds, config.white_box) == (1, ())
+    found = report["best"]["parameters"]["gamma"]
+    assert load_config(report["config"], []) == dataclasses.replace(whole, name=f"{whole.name}-tuned", gamma=found)
+    fewer = dataclasses.replace(search, base=dataclasses.replace(search.base, rivals=whole.rivals[:1]))
+    assert (fewer.digest != search.digest) == (whole.teacher is not None)
+
+
 def test_trials_side_by_side(tmp_path: Path) -> None:
     """Two processes, one journal: every trial once."""
     report = tuning.tune(_search(tmp_path, 3), workers=2)

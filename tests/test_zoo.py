@@ -13,12 +13,15 @@ from tailgate import cli, draws
 from tailgate.agents import zoo
 from tailgate.agents.policy import PolicyAttack, load_policy
 from tailgate.agents.zoo import ZooAttack, zoo_card, zoo_names, zoo_path
+from tailgate.envs.seat import Seat
 from tailgate.errors import InputError
 from tailgate.evaluation import evaluate
 from tailgate.registry import Spec
+from tailgate.schema import build
 from tailgate.strength.collect import BYTES, POINTS, add_policy, add_run, single, thinned
 from tailgate.strength.policies import loop_for, trained
 from tailgate.trace import rollout
+from tailgate.train import TrainConfig, environment_of
 
 ROOT = Path(__file__).parents[1]
 RUN = ROOT / "results" / "quickstart-v0"
@@ -47,6 +50,14 @@ def test_every_policy_has_its_record_and_is_small(name: str) -> None:
     assert who.scenario is not None and who.defence is not None
     loop_for(who, who.scenario, who.defence, who.threat)
     assert {path.stem for path in zoo.FOLDER.glob("*.safetensors")} == set(zoo_names())
+
+
+@pytest.mark.parametrize("name", zoo_names())
+def test_the_recorded_environment_is_that_of_its_record(name: str) -> None:
+    """The hash is that of the environment which the training's configuration makes today: it can be trained again as it was."""
+    record = load_policy(zoo_path(name))[0].training
+    config = build(TrainConfig, {key: value for key, value in record["config"].items() if key != "class"}, name)
+    assert Seat.make(gamma=config.gamma, **environment_of(config)).card()["hash"] == record["environment"]
 
 
 def test_the_recorded_outcome_is_what_the_policy_does() -> None:
@@ -178,6 +189,19 @@ def test_nothing_is_replaced_unasked(tmp_path: Path) -> None:
 def test_a_directory_without_policies_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="training run"):
         add_run(tmp_path, "name")
+
+
+@pytest.mark.parametrize(("curve", "words"), [(5, "got 5"), ([1, 2], "points"), ({"a": 1}, "points"), ([{"reward": float("nan")}], "finite")])
+def test_a_curve_that_is_none_is_one_clear_error(tmp_path: Path, curve: Any, words: str) -> None:
+    """And nothing is written."""
+    for suffix in (".json", ".safetensors"):
+        shutil.copy(RUN / f"policy-0{suffix}", tmp_path)
+    path = tmp_path / "policy-0.json"
+    data = json.loads(path.read_text())
+    path.write_text(json.dumps(data | {"training": data["training"] | {"curve": curve}}))
+    with pytest.raises(InputError, match=rf"policy-0\.training.*{words}"):
+        add_policy(path, "one", "a sentence", episodes=2, folder=tmp_path / "zoo")
+    assert not (tmp_path / "zoo").exists()
 
 
 def test_list_shows_the_zoo(capsys: pytest.CaptureFixture[str]) -> None:

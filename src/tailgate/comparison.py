@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from tailgate import draws
+from tailgate.agents.policy import load_policy
 from tailgate.core import Array
 from tailgate.evaluation import cells_of, run
 from tailgate.files import write_atomic
@@ -20,7 +21,7 @@ from tailgate.rivals import BATCH, best_of
 from tailgate.rivals import outcomes as outcomes_of
 from tailgate.scenario import load_scenario
 from tailgate.schema import as_data, canonical
-from tailgate.stats import Interval, paired_difference, proportion
+from tailgate.stats import Interval, paired_difference, paired_ratio, proportion
 from tailgate.train import TrainConfig, outcome_of, rivals_of, suite_of
 
 SHARE = "0/1"  # unit of a metric that is yes or no
@@ -95,19 +96,25 @@ def _report(
         versus["best scripted attack"] = over(best)
     report = {
         "name": config.name, "scenario": config.scenario, "defence": config.defence, "episodes": config.episodes, "steps": config.steps,
-        "outcome": outcome, "unit": UNITS[outcome], "learner": config.learner, "teacher": config.teacher,
+        "outcome": outcome, "unit": UNITS[outcome], "learner": config.learner,
+        "teacher": load_policy(verdicts[0].policy)[0].training.get("teacher"),
         "threat": as_data(load_scenario(config.scenario).with_threat(**config.threat).threat_model),
         "config": json.loads(canonical(config)), "policies": [str(v.policy) for v in verdicts], "best_scripted": best,
         "attacks": [{"label": label, **interval._asdict(), "note": note} for label, interval, note in items],
         "advantage": {name: interval._asdict() for name, interval in versus.items()},
         "rivals": {name: {"outcome": mean(outcomes(name))._asdict(), "advantage": over(name)._asdict()} for name in config.rivals},
         "ceilings": {
-            name: {"outcome": mean(outcomes(name))._asdict(), "reached": (learned.mean(axis=1) / outcomes(name).mean()).tolist()}
+            name: {"outcome": mean(outcomes(name))._asdict(), "reached": [_reached(v.learned, outcomes(name))._asdict() for v in verdicts]}
             for name in config.white_box if Spec("attack", name).entry.optimal
         },
     }  # fmt: skip
     write_atomic(config.directory / "report.json", json.dumps(report, indent=1, allow_nan=False).encode() + b"\n")
     return report
+
+
+def _reached(learned: Array, optimum: Array) -> Interval:
+    """Share of what a computed optimum makes large, the mean square of the outcome, with the bootstrap's interval over episodes."""
+    return paired_ratio(learned**2, optimum**2)
 
 
 def _note(attack: str) -> str:

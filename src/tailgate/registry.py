@@ -151,7 +151,7 @@ def find(family: Family, name: str) -> Entry:
     return known[name]
 
 
-def make(family: Family, name: str, **params: Any) -> Any:
+def make(family: Family, name: str, /, **params: Any) -> Any:
     """A component by name, its parameters validated."""
     if not isinstance(name, str):
         raise InputError(f"{family}.name", name, "the name of a registered component")
@@ -165,7 +165,7 @@ def make_from(family: Family, data: Any, where: str) -> Any:
         data = {"name": data}
     if not isinstance(data, dict) or "name" not in data:
         raise InputError(where, data, "a name, or a mapping with a name and parameters")
-    return make(family, **data)
+    return make(family, data["name"], **{key: value for key, value in data.items() if key != "name"})
 
 
 @dataclass(frozen=True)

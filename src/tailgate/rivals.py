@@ -12,7 +12,6 @@ from tailgate.evaluation import cells_of, run
 from tailgate.scenario import Suite
 
 BATCH = 512  # episodes side by side
-SELECT_EPISODES = 1024  # that a choice is made on: fewer would choose by chance
 
 
 def outcomes(rows: list[dict[str, Any]], outcome: str) -> Array:

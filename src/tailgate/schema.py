@@ -97,7 +97,7 @@ def scalar(text: str) -> Any:
         return None
     try:
         value = yaml.safe_load(text)
-    except yaml.YAMLError:
+    except (yaml.YAMLError, ValueError, RecursionError):  # such as the 45th day of a month
         return text
     if isinstance(value, str):
         try:

@@ -5,11 +5,18 @@ to r; defender 0 is the defence with its knobs at the menu's setting nearest to 
 and an attacker with new seeds and the same budget is trained against it: the best response. The same is done for the best fixed setting.
 
     exploitability = collisions under the fresh best response - collisions under the last attacker of self-play
+
+The best answer there is does at least as much more. Where the search was too weak the difference is negative and bounds nothing: the report
+says so. The worst of all known attacks (scripts, pool, fresh; chosen on select seeds, reported on report seeds) is shown beside it, for the
+trained defender and for the best fixed setting, with their difference.
+
+A member is trained for certain opponents: a run that goes on trains anew what was trained for others.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import itertools
 import json
 from collections.abc import Callable
@@ -22,28 +29,28 @@ from pydantic import Field
 
 from tailgate import draws
 from tailgate.agents.cem import Config
-from tailgate.agents.codec import ActionSpec
 from tailgate.agents.learning import LEARNERS, learner_of
 from tailgate.agents.policy import PolicyAttack
-from tailgate.agents.reward import Reward
 from tailgate.agents.selfplay import Learner, Played, constant, export, play
 from tailgate.core import Array, Attack, Count, PositiveCount, param
-from tailgate.envs.duel import Duel
-from tailgate.errors import InputError, unknown
+from tailgate.envs.duel import Duel, Payoff
+from tailgate.errors import InputError
 from tailgate.estimators.steered import Steered
 from tailgate.estimators.steering import nearest
 from tailgate.files import set_aside, writable_directory, write_atomic
 from tailgate.registry import Spec
 from tailgate.scenario import config_path
-from tailgate.schema import as_data, build, fields_of, override, read_yaml
-from tailgate.stats import paired_difference, proportion
+from tailgate.schema import as_data, build, canonical, override, read_yaml
+from tailgate.stats import Interval, paired_difference, proportion
+from tailgate.train import TrainConfig, environment_of
 
 FRESH, DEFENDERS = 1000, 500  # added to the first seed: seeds of best responses and of defenders differ from those of self-play's attackers
-SELECT_EPISODES = 512  # that the best fixed setting is chosen on
+SELECT_EPISODES = 512  # that the best fixed setting and the worst attack are chosen on
 BATCH = 4096  # games side by side
 AS_IS, FIXED, TRAINED = "as it is", "best fixed setting", "trained"
 Discount = Annotated[float, Field(gt=0, le=1)]
 Update = Callable[[str, int, int, str], None]
+Crashed = dict[tuple[str, str], Array]  # by defender and attack: (episodes,) 0 or 1
 
 
 @dataclass(frozen=True)
@@ -80,13 +87,17 @@ def load_config(source: str | None, overrides: list[str], resume: bool = False) 
     config = _checked(override(read_yaml(path, "config"), overrides))
     if not resume:
         return config
-    held = config.directory / "config.json"
+    return _checked(override(_started(config.directory / "config.json"), overrides))
+
+
+def _started(held: Path) -> dict[str, Any]:
+    """The configuration that a run was started with."""
     try:
-        started = json.loads(held.read_text(encoding="utf-8"))
+        started: dict[str, Any] = json.loads(held.read_text(encoding="utf-8"))
         del started["class"]
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise InputError("resume", str(held), f"the configuration of a run ({error})") from None
-    return _checked(override(started, overrides))
+    return started
 
 
 def _checked(data: dict[str, Any]) -> GameConfig:
@@ -99,11 +110,15 @@ def _checked(data: dict[str, Any]) -> GameConfig:
     Spec("defence", config.defence).refuse_imports("config")
     for name in config.rivals:
         Spec("attack", name).refuse_imports("config")
-    known = (fields_of(ActionSpec) | fields_of(Reward)).keys() - {"gamma"}
-    for key in config.environment:
-        if key not in known:
-            raise unknown("config.environment: unknown field", key, known)
+    build(Payoff, dict(config.payoff), "config.payoff")
+    _seat_of(config)
     return config
+
+
+def _seat_of(config: GameConfig) -> dict[str, Any]:
+    """Arguments of the attacker's environment, checked as those of a training are."""
+    names = ("scenario", "defence", "threat", "environment")
+    return environment_of(TrainConfig(**{name: getattr(config, name) for name in names}))
 
 
 class Game:
@@ -113,7 +128,7 @@ class Game:
         self.config, self.update = config, update
         if "interval" in config.menu:
             raise InputError("config.menu.interval", config.menu["interval"], "environment.interval: both decide at the same time")
-        self.duel = Duel.make(config.scenario, config.defence, config.menu, **config.payoff, **self._environment)
+        self.duel = Duel.make(**_seat_of(config), menu=config.menu, gamma=config.gamma, **config.payoff)
         if not self.duel.seat.road:
             raise InputError("config.scenario", config.scenario, "one with a road: outcomes are collisions")
         module = learner_of(config.learner)
@@ -135,20 +150,19 @@ class Game:
         """Writes the configuration, or raises InputError when the run that is resumed had another one."""
         held, now = self.directory / "config.json", as_data(self.config)
         if resume and held.is_file():
-            before, free = json.loads(held.read_text(encoding="utf-8")), ("rounds", "episodes", "fresh", "rivals")
+            before, free = _started(held), ("class", "rounds", "episodes", "fresh", "rivals")
             changed = [key for key in now if key not in free and before.get(key) != now[key]]
             if changed:
-                raise InputError("resume", ", ".join(changed), f"the configuration in {held}, apart from {', '.join(free)}")
+                raise InputError("resume", ", ".join(changed), f"the configuration in {held}, apart from {', '.join(free[1:])}")
         write_atomic(held, json.dumps(now, indent=1).encode() + b"\n")
-
-    @property
-    def _environment(self) -> dict[str, Any]:
-        return {"threat": dict(self.config.threat), "gamma": self.config.gamma, **self.config.environment}
 
     # -- training
 
     def run(self) -> dict[str, Any]:
-        """Play all rounds and the fresh best responses; writes and returns the report. What a run has finished is not trained again."""
+        """Play all rounds and the fresh best responses; writes and returns the report.
+
+        What the run has finished is not trained again, as long as it was trained for the opponents of now.
+        """
         defenders, attackers = [self._as_it_is()], []
         for r in range(1, self.config.rounds + 1):
             pool = self._guard(policy=tuple(defenders))
@@ -166,18 +180,14 @@ class Game:
         return dataclasses.replace(self.duel.guard, **who)
 
     def _as_it_is(self) -> Path:
-        path = self.directory / "defender-0"
-        if path.with_suffix(".json").is_file():
-            return path.with_suffix(".json")
         setting = nearest(self.duel.guard.hand.knobs)
-        return export(path, self.duel, constant(self.duel, setting), {"learner": "none", "setting": setting})
+        return export(self.directory / "defender-0", self.duel, constant(self.duel, setting), {"learner": "none", "setting": setting})
 
     def _fresh(self, name: str, i: int, guard: Steered) -> Path:
         return self._attacker(name, self.config.first_seed + FRESH + i, guard)
 
     def _attacker(self, name: str, seed: int, guard: Steered) -> Path:
-        environment = {"scenario": self.config.scenario, "defence": guard, **self._environment}
-        del environment["gamma"]  # the learner's own
+        environment = _seat_of(self.config) | {"defence": guard}
         module = learner_of(self.config.learner)
         facts = {"learner": self.config.learner, "seed": seed, "against": as_data(guard), "settings": as_data(self.settings)}
         return self._train(name, lambda: module.Learner(seed, self.config.gamma, self.settings, environment), facts)
@@ -188,9 +198,12 @@ class Game:
         return self._train(f"defender-{r}", lambda: Learner(seed, self.config.gamma, self.defender, self.duel, attacks), facts)
 
     def _train(self, name: str, make: Callable[[], Any], facts: dict[str, Any]) -> Path:
-        path, checkpoint, steps = self.directory / name, self.directory / f"checkpoint-{name}.safetensors", self.config.steps
-        if path.with_suffix(".json").is_file():
+        """A member of the pools: trained now, unless it was with these facts, the digests of its opponents among them."""
+        path, steps = self.directory / name, self.config.steps
+        if _finished(path.with_suffix(".json"), facts):
             return path.with_suffix(".json")
+        digest = hashlib.blake2b(canonical(facts).encode(), digest_size=8).hexdigest()  # the run may have been cut off with other opponents
+        checkpoint = self.directory / f"checkpoint-{name}-{digest}.safetensors"
         learner = make()
         if checkpoint.is_file():
             learner.load(checkpoint)
@@ -202,7 +215,8 @@ class Game:
         learner.learn(steps, report, checkpoint)
         done: Path = learner.export(path, facts | {"steps": learner.steps, "curve": learner.curve})
         learner.close()
-        checkpoint.unlink(missing_ok=True)
+        for old in self.directory.glob(f"checkpoint-{name}-*.safetensors"):
+            old.unlink()
         return done
 
     # -- measuring
@@ -222,56 +236,80 @@ class Game:
             self.update("fixed settings", attacks.index(attack) + 1, len(attacks), "")
         return int(np.argmax(paid))
 
-    def _play(self, guard: Steered, attack: Attack) -> Played:
-        """The report episodes of a pair."""
+    def _play(self, guard: Steered, attack: Attack, purpose: str, episodes: int) -> Played:
+        """The first episodes of a pair on seeds of a purpose."""
         seat = dataclasses.replace(self.duel.seat, loop=dataclasses.replace(self.duel.seat.loop, defence=guard))
-        duel, last = dataclasses.replace(self.duel, seat=seat, guard=guard), self.config.episodes
-        parts = [play(duel, attack, draws.keys("report", range(at, min(at + BATCH, last)))) for at in range(0, last, BATCH)]
+        duel = dataclasses.replace(self.duel, seat=seat, guard=guard)
+        parts = [play(duel, attack, draws.keys(purpose, range(at, min(at + BATCH, episodes)))) for at in range(0, episodes, BATCH)]
         paid, crashed, cost = (np.concatenate([getattr(part, name) for part in parts]) for name in ("paid", "crashed", "cost"))
         return Played(paid, crashed, cost, sum(part.decisions for part in parts))
+
+    def _table(self, guards: dict[str, Steered], attacks: dict[str, Attack]) -> tuple[list[dict[str, Any]], Crashed]:
+        """Every defender against every attack on report seeds: the rows of the table, and who crashed in which episode."""
+        table: list[dict[str, Any]] = []
+        crashed: Crashed = {}
+        total = len(guards) * len(attacks)
+        for (guard, defence), (name, attack) in itertools.product(guards.items(), attacks.items()):
+            out = self._play(defence, attack, "report", self.config.episodes)
+            crashed[guard, name] = out.crashed.astype(np.float64)
+            table.append({"defender": guard, "attack": name, "collisions": _share(out.crashed)._asdict(), "cost": float(out.cost.mean())})
+            self.update("final table", len(table), total, f"{len(table)} of {total} pairs")
+        return table, crashed
+
+    def _worst(self, guard: str, defence: Steered, attacks: dict[str, Attack]) -> tuple[str, Interval]:
+        """The attack with the most collisions on select seeds, of equal ones the first, and its collisions there."""
+        shares = {}
+        for name, attack in attacks.items():
+            shares[name] = _share(self._play(defence, attack, "select", SELECT_EPISODES).crashed)
+            self.update(f"worst attack, {guard}", len(shares), len(attacks), "")
+        worst = max(shares, key=lambda name: shares[name].value)
+        return worst, shares[worst]
 
     def _report(
         self, guards: dict[str, Steered], attackers: list[Path], fresh: list[Path], other: list[Path], setting: int
     ) -> dict[str, Any]:
-        learned = {path.stem: PolicyAttack(path) for path in (*attackers, *fresh, *other)}
-        attacks: dict[str, Attack] = self.scripts | learned
-        crashed: dict[tuple[str, str], Array] = {}
-        table: list[dict[str, Any]] = []
-        total = len(guards) * len(attacks)
-        for (guard, defence), (name, attack) in itertools.product(guards.items(), attacks.items()):
-            out = self._play(defence, attack)
-            crashed[guard, name] = out.crashed.astype(np.float64)
-            share = proportion(int(np.count_nonzero(out.crashed)), len(out.crashed))
-            table.append({"defender": guard, "attack": name, "collisions": share._asdict(), "cost": float(out.cost.mean())})
-            self.update("final table", len(table), total, f"{len(table)} of {total} pairs")
-
-        def under(guard: str, names: list[Path]) -> Array:
-            return np.array([crashed[guard, path.stem] for path in names])
-
-        last = attackers[-1:]
-        own = {TRAINED: fresh, FIXED: other}
-
-        def gain(guard: str) -> dict[str, float]:
-            best = under(guard, own[guard])
-            return paired_difference(best, np.broadcast_to(under(guard, last), best.shape), share=True)._asdict()
-
-        worst = {
-            guard: max((row for row in table if row["defender"] == guard), key=lambda row: row["collisions"]["value"])["attack"]
-            for guard in guards
-        }  # fmt: skip
-        saved = paired_difference(under(FIXED, other), under(TRAINED, fresh), share=True)._asdict()
+        attacks: dict[str, Attack] = self.scripts | {path.stem: PolicyAttack(path) for path in (*attackers, *fresh, *other)}
+        table, crashed = self._table(guards, attacks)
+        last = attackers[-1].stem
+        worst: dict[str, dict[str, Any]] = {}
+        exploitability: dict[str, dict[str, Any]] = {}
+        for guard, own in {TRAINED: [path.stem for path in fresh], FIXED: [path.stem for path in other]}.items():
+            name, chosen = self._worst(guard, guards[guard], attacks)
+            reported = _share(crashed[guard, name])
+            worst[guard] = {"attack": name, "select": chosen._asdict(), "collisions": reported._asdict()}
+            best = np.array([crashed[guard, one] for one in own])
+            gain = paired_difference(best, np.broadcast_to(crashed[guard, last], best.shape), share=True)
+            exploitability[guard] = {**gain._asdict(), "bound": gain.value >= 0.0}
+        fixed, trained = (crashed[guard, worst[guard]["attack"]] for guard in (FIXED, TRAINED))
+        saved = paired_difference(fixed, trained, share=True)
         knobs = self.duel.guard.hand.knobs
         values = {knob.name: float(value) for knob, value in zip(knobs, self.duel.settings[setting], strict=True)}
         config = self.config
         report = {
             "name": config.name, "scenario": config.scenario, "defence": self.duel.guard.described, "episodes": config.episodes,
-            "config": as_data(config), "knobs": {knob.name: list(knob.levels) for knob in knobs},
+            "select_episodes": SELECT_EPISODES, "config": as_data(config), "knobs": {knob.name: list(knob.levels) for knob in knobs},
             "fixed": {"setting": setting, **values}, "defender": str(self.directory / f"defender-{config.rounds}.json"),
-            "self_play_attacker": last[0].stem, "table": table, "worst": worst,
-            "exploitability": {guard: gain(guard) for guard in own}, "fixed_minus_trained": saved,
+            "self_play_attacker": last, "table": table, "exploitability": exploitability, "worst": worst,
+            "worst_fixed_minus_trained": saved._asdict(),
         }  # fmt: skip
         write_atomic(self.directory / "report.json", json.dumps(report, indent=1, allow_nan=False).encode() + b"\n")
         return report
+
+
+def _share(crashed: Array) -> Interval:
+    """Share of the episodes (B,) with a collision."""
+    return proportion(int(np.count_nonzero(crashed)), len(crashed))
+
+
+def _finished(path: Path, facts: dict[str, Any]) -> bool:
+    """Whether a policy lies there whose record holds these facts."""
+    if not path.is_file():
+        return False
+    try:
+        held = json.loads(path.read_text(encoding="utf-8"))["training"]
+        return all(held.get(key) == value for key, value in facts.items())
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise InputError("resume", str(path), f"a policy of this run ({error})") from None
 
 
 def parameters() -> list[dict[str, Any]]:

@@ -44,3 +44,11 @@ def paired_difference(a: Array, b: Array, level: float = 0.95, resamples: int = 
     unseen = 1.0 - ((1.0 - level) / 2.0) ** (1.0 / episodes) if share else 0.0  # the most likely that what was never seen may be
     below, above = max(value - low, unseen * (value + 1.0)), max(high - value, unseen * (1.0 - value))
     return Interval(value, value - float(np.hypot(below, spread)), value + float(np.hypot(above, spread)))
+
+
+def paired_ratio(a: Array, b: Array, level: float = 0.95, resamples: int = 4000, seed: int = 0) -> Interval:
+    """Mean of a over mean of b (episodes,), on the same episodes, with a bootstrap interval over them; b has a mean above 0."""
+    rng, episodes = np.random.default_rng(seed), len(a)
+    drawn = rng.integers(episodes, size=(resamples, episodes))
+    low, high = np.quantile(a[drawn].mean(axis=1) / b[drawn].mean(axis=1), [(1 - level) / 2, (1 + level) / 2])
+    return Interval(float(a.mean() / b.mean()), float(low), float(high))

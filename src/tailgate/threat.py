@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple, get_args
 
 import numpy as np
 from pydantic import Field
@@ -29,6 +29,8 @@ from tailgate.core import (
 from tailgate.errors import InputError, unknown
 
 KindName = Literal["dos_jam", "dos_hold", "dos_hold_fresh", "dropout", "fdi", "delay", "replay", "noise_jam", "echo_delay"]
+Knowledge = Literal["black", "grey", "white"]
+KNOWLEDGE: tuple[Knowledge, ...] = get_args(Knowledge)  # each sees what the one before it sees, and more
 Span = Annotated[int, Field(ge=1, le=10_000)]
 Pair = Annotated[tuple[float, float], Field(min_length=2, max_length=2)]
 
@@ -52,7 +54,7 @@ class ThreatModel:
     cooldown: Count = param(0, "steps between two bursts")
     onset: PositiveCount = param(1, "first step at which an attack is accepted")
     end: PositiveCount | None = param(None, "last step at which an attack is accepted; none: the horizon")
-    knowledge: Literal["black", "grey", "white"] = param("black", "black: the road; grey: + control; white: + defence")
+    knowledge: Knowledge = param("black", "black: the road; grey: + control; white: + defence")
     sees_measurement: bool = param(False, "grants the measurement that the defence receives; of a radar it shows which step is muted")
 
     def __post_init__(self) -> None:

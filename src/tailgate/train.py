@@ -10,6 +10,7 @@ import signal
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -23,14 +24,16 @@ from tailgate.agents.learning import DISCRETE, LEARNERS, Learner, Progress, Teac
 from tailgate.agents.reward import Reward
 from tailgate.agents.teacher import demonstrate
 from tailgate.core import Count, PositiveCount, param
+from tailgate.envs.seat import Seat
 from tailgate.errors import InputError, unknown
 from tailgate.evaluation import cells_of
 from tailgate.files import set_aside, writable_directory, write_atomic
 from tailgate.metrics import METRICS
 from tailgate.registry import Spec
-from tailgate.rivals import SELECT_EPISODES, best_of
+from tailgate.rivals import best_of
 from tailgate.scenario import Suite, config_path, load_scenario
 from tailgate.schema import as_data, build, fields_of, override, read_yaml
+from tailgate.threat import KNOWLEDGE
 
 Discount = Annotated[float, Field(gt=0, le=1)]
 
@@ -58,10 +61,11 @@ class TrainConfig:
     steps: PositiveCount = param(3_000_000, "decisions per training seed, over all environments")
     first_seed: Count = param(0, "first training seed")
     seeds: PositiveCount = param(1, "training seeds, one policy each")
-    checkpoint_every: PositiveCount = param(500_000, "decisions between checkpoints")
+    checkpoint_every: PositiveCount = param(500_000, "decisions between checkpoints, or a tenth of `steps` where that is less")
     tensorboard: bool = param(True, "write TensorBoard event files")
     outcome: str | None = param(None, "metric that is compared, the larger the worse; none: crashed, or rmse_position without a road")
     episodes: PositiveCount = param(400, "fresh episodes per attack in the final comparison")
+    select_episodes: PositiveCount = param(1024, "other episodes, that the best rival is chosen on: fewer choose by chance")
     workers: PositiveCount = param(2, "processes, of the training seeds and of the comparison; change no result")
     rivals: tuple[str, ...] = param((), "scripted attacks of equal knowledge and dose to compare with")
     white_box: tuple[str, ...] = param(("stealth:trigger=near,threshold=40",), "attacks that know more, shown beside the others")
@@ -130,14 +134,28 @@ def outcome_of(config: TrainConfig) -> str:
 
 def _check(config: TrainConfig) -> None:
     """Everything that a run will need, tried before anything is written: a typing error shall not cost an hour."""
-    from tailgate.envs.seat import Seat
-
-    check_action(config.learner, Seat.make(**environment_of(config)))
-    if config.teacher is not None and not issubclass(learner_of(config.learner).Learner, Teachable):
-        raise InputError("config.teacher", config.teacher, f"none: {config.learner} is not shown anything; ppo and maskable_ppo are")
-    if config.teacher is not None and config.environment.get("action", "mode") not in DISCRETE:
-        raise InputError("config.teacher", config.teacher, f"none, or an action of {', '.join(DISCRETE)}: what is shown is one of a few")
+    seat = Seat.make(**environment_of(config))
+    check_action(config.learner, seat)
+    if config.teacher is not None:
+        _check_teacher(config, seat)
     cells_of(suite_of(config, (*config.rivals, *config.white_box)), threat=config.threat)
+
+
+def _check_teacher(config: TrainConfig, seat: Seat) -> None:
+    """Raise InputError unless the learner can be shown what is wanted, and a script is shown that knows no more than the learner."""
+    where, name = "config.teacher", config.teacher
+    if not issubclass(learner_of(config.learner).Learner, Teachable):
+        raise InputError(where, name, f"none: {config.learner} is not shown anything; ppo and maskable_ppo are")
+    if not seat.action.discrete:
+        raise InputError(where, name, f"none, or an action of {', '.join(DISCRETE)}: what is shown is one of a few")
+    if name == "best" and not config.rivals:
+        raise InputError(where, name, "rivals to choose it from; there are none")
+    granted = KNOWLEDGE.index(seat.loop.threat.knowledge)
+    for text in config.rivals if name == "best" else (str(name),):
+        spec = Spec("attack", text)
+        if spec.entry.optimal or spec.entry.learned or KNOWLEDGE.index(spec.entry.knowledge) > granted:
+            raise InputError(where, text, "a script that knows no more than the learner, and is neither learned nor a computed optimum")
+        spec.make().prepare(seat.loop.brief)
 
 
 def suite_of(config: TrainConfig, attacks: tuple[str, ...]) -> Suite:
@@ -148,7 +166,7 @@ def suite_of(config: TrainConfig, attacks: tuple[str, ...]) -> Suite:
 
 def rivals_of(config: TrainConfig) -> Suite:
     """The scripts against the defence, on as many episodes as a choice needs."""
-    return Suite(config.name, "", (config.scenario,), (None,), (config.defence,), config.rivals, SELECT_EPISODES)
+    return Suite(config.name, "", (config.scenario,), (None,), (config.defence,), config.rivals, config.select_episodes)
 
 
 def teacher_of(config: TrainConfig) -> str | None:
@@ -200,7 +218,7 @@ def _train_seed(config: TrainConfig, teacher: str | None, seed: int, resume: boo
         assert isinstance(learner, Teachable)
         learner.imitate(demonstrate(learner.seat, Spec("attack", teacher).make(), seed))
     started = time.perf_counter()
-    learner.learn(config.steps, report, checkpoint, config.checkpoint_every)
+    learner.learn(config.steps, report, checkpoint, min(config.checkpoint_every, max(config.steps // 10, 1)))
     facts = {
         "learner": config.learner, "teacher": teacher, "seed": seed, "steps": learner.steps, "config": as_data(config),
         config.learner: as_data(settings), "environment": learner.seat.card()["hash"], "curve": learner.curve,
@@ -248,12 +266,15 @@ def _train_apart(
             while not all(future.done() for future in futures):
                 with contextlib.suppress(Empty):
                     progress(*queue.get(timeout=0.2))
-                broken = next((future for future in futures if future.done() and future.exception() is not None), None)
-                if broken is not None:
-                    broken.result()
+                for future in futures:
+                    if future.done():
+                        future.result()  # raises what went wrong
             while not queue.empty():
                 progress(*queue.get())
             return [future.result() for future in futures]
+        except BrokenProcessPool:
+            expected = f"memory for {config.workers} of them (or workers=1); then: tailgate train --resume name={config.name}"
+            raise InputError("training", "a process that was killed", expected) from None
         finally:
             stop.set()
             for future in futures:

@@ -71,7 +71,7 @@ SAMPLER_STRIDE = 100_003  # between the sampler's seeds of two searches
 
 @dataclass(frozen=True)
 class Search:
-    """One search: what is trained, what is varied, and on how many episodes a trial is measured."""
+    """One search: what is trained (the preset under the search's name), what is varied, and on how many episodes a trial is measured."""
 
     base: TrainConfig
     space: Space
@@ -84,9 +84,15 @@ class Search:
         return self.base.directory
 
     @property
+    def trained(self) -> TrainConfig:
+        """What a trial trains: one seed, nothing that is for the comparison alone. A teacher may be the best of the rivals."""
+        rivals = self.base.rivals if self.base.teacher is not None else ()
+        return dataclasses.replace(self.base, seeds=1, workers=1, tensorboard=False, rivals=rivals, white_box=(), others=())
+
+    @property
     def digest(self) -> str:
         """Of everything that decides what a trial gives: a search goes on with the same one only."""
-        return hashlib.blake2b(canonical([self.base, self.space, self.episodes, self.seed]).encode(), digest_size=8).hexdigest()
+        return hashlib.blake2b(canonical([self.trained, self.space, self.episodes, self.seed]).encode(), digest_size=8).hexdigest()
 
 
 def optuna() -> Any:
@@ -140,9 +146,7 @@ def make_search(
     if trials < 1 or episodes < 1:
         raise InputError("trials and episodes", (trials, episodes), "whole numbers not below 1")
     config = load_config(source, overrides + ([f"learner={learner}"] if learner else []))
-    base = dataclasses.replace(
-        config, name=f"{config.name}-tune", seeds=1, workers=1, tensorboard=False, rivals=(), white_box=(), others=()
-    )  # fmt: skip
+    base = dataclasses.replace(config, name=f"{config.name}-tune")
     return Search(base, read_space(space, base.learner), trials, episodes, seed)
 
 
@@ -197,7 +201,7 @@ def _trial(search: Search, ordinal: int, report: Callable[[int, Any], None] | No
     trial.set_user_attr("ordinal", ordinal)
     values = propose(trial, search.space)
     started = time.perf_counter()
-    config = dataclasses.replace(configured(search.base, values), name=f"trial-{ordinal}", out=str(search.directory))
+    config = dataclasses.replace(configured(search.trained, values), name=f"trial-{ordinal}", out=str(search.directory))
     try:
         (policy,) = train(config, lambda seed, now: None if report is None else report(ordinal, now))
         value = objective(config, policy, search.episodes)
@@ -283,8 +287,7 @@ def _report(search: Search, study: Any) -> dict[str, Any]:
     if best is not None:
         name = search.base.name.removesuffix("-tune")
         data = as_data(dataclasses.replace(configured(search.base, best["parameters"]), name=f"{name}-tuned"))
-        left = ("class", "rivals", "white_box", "others", "workers", "tensorboard")  # of the search, not of what was found
-        kept = {key: value for key, value in data.items() if key not in left and value not in ({}, None)}
+        kept = {key: value for key, value in data.items() if key != "class" and value not in ({}, None)}
         path = search.directory / "best.yaml"
         write_atomic(path, yaml.safe_dump(kept, sort_keys=False).encode())
         report["config"] = str(path)

@@ -25,7 +25,10 @@ def add(commands: Any) -> None:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )  # fmt: skip
     command.add_argument("--config", metavar="FILE", help="preset by name, or YAML file")
-    command.add_argument("--resume", action="store_true", help="continue: what is finished is not trained again; rounds may grow")
+    command.add_argument(
+        "--resume", action="store_true",
+        help="continue: what is finished is not trained again, unless its opponents are others now; rounds may grow",
+    )  # fmt: skip
     command.add_argument("--json", action="store_true", help="print the report as JSON")
     command.add_argument("overrides", nargs="*", metavar="key=value", help="change a field of the configuration")
     command.set_defaults(run=_selfplay)
@@ -63,12 +66,12 @@ def _print_report(report: dict[str, Any]) -> None:
         table.add_row(escape(name), *(f"{_share(row['collisions'])}, {row['cost']:.3f}" for row in cells))
     out = console()
     out.print(table, highlight=False)
-    for guard, attack in report["worst"].items():
-        most = next(row for row in report["table"] if (row["defender"], row["attack"]) == (guard, attack))
-        out.print(f"most collisions, {guard}: {_share(most['collisions'])} by {escape(attack)}", highlight=False)
     for guard, gain in report["exploitability"].items():
-        out.print(f"exploitability, {guard}: {_points(gain)} (fresh best response less self-play's last attacker)", highlight=False)
-    out.print(f"fresh best responses, fixed less trained: {_points(report['fixed_minus_trained'])}", highlight=False)
+        weak = "" if gain["bound"] else "; the fresh attacker is weaker than known attacks: not a bound"
+        out.print(f"exploitability, {guard}: {_points(gain)} (fresh best response less self-play's last attacker){weak}", highlight=False)
+    for guard, most in report["worst"].items():
+        out.print(f"worst known attack, {guard}: {_share(most['collisions'])} by {escape(most['attack'])}", highlight=False)
+    out.print(f"worst known attacks, fixed less trained: {_points(report['worst_fixed_minus_trained'])}", highlight=False)
 
 
 def _share(interval: dict[str, float]) -> str:

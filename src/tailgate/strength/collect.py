@@ -20,9 +20,9 @@ from tailgate.files import writable_directory, write_atomic
 from tailgate.metrics import METRICS, UNITS
 from tailgate.registry import Spec
 from tailgate.schema import as_data
-from tailgate.trace import episodes_at_once, rollout
 
-from .policies import BATCH, loop_for, mean, outcome_for, required, trained
+from .policies import defence_of, loop_for, mean, outcome_for, place_of, trained
+from .timing import played
 
 POINTS = 50  # of a learning curve, at most
 BYTES = 40_000  # of a tensor file, at most
@@ -58,35 +58,38 @@ def add_policy(policy: Path, name: str, summary: str, *, episodes: int = EPISODE
         raise InputError("zoo.name", name, "a name that is not taken, or --replace")
     who = trained(str(policy))
     header = who.header
-    scenario, defence = required(who.scenario, "scenario", who), required(who.defence, "defence", who)
-    loop = loop_for(who, scenario, defence, who.threat)
+    scenario, record = place_of(who), header.training
+    curve = record.get("curve", [])
+    if not isinstance(curve, list) or not all(isinstance(point, dict) for point in curve):
+        raise InputError(f"policy {who.name}.training.curve", curve, "a list of points, a mapping each")
+    loop = loop_for(who, scenario, defence_of(who), who.threat)
     blob = save_tensors({key: single(x) for key, x in load_tensors(policy.with_name(header.tensors).read_bytes()).items()})
     if len(blob) > BYTES:
         raise InputError("zoo", f"a tensor file of {len(blob)} bytes", f"at most {BYTES}")
     keys = draws.keys("report", range(episodes))
     outcome = outcome_for(who.outcome, scenario)
-    size = episodes_at_once(loop.model, loop.horizon, BATCH)
 
-    def played(attack: Any) -> dict[str, float]:
-        parts = [draws.Keys(keys.key[i : i + size], keys.episode[i : i + size]) for i in range(0, episodes, size)]
-        values = np.concatenate([METRICS[outcome](rollout(loop, attack, part)) for part in parts])
-        return mean(values[None], outcome)._asdict()
+    def measured(attack: Any) -> dict[str, float]:
+        return mean(np.stack(played(loop, attack, keys, None, [METRICS[outcome]])), outcome)._asdict()
 
-    record = header.training
     training = record | {
-        "summary": summary, "curve": thinned(record.get("curve") or []), "threat_model": as_data(loop.threat),
+        "summary": summary, "curve": thinned(curve), "threat_model": as_data(loop.threat),
         "source_sha256": header.sha256,
         "measured": {
-            "outcome": outcome, "unit": UNITS[outcome], "purpose": "report", "episodes": episodes, **played(who.policy),
-            "no_attack": played(Spec("attack", "none").make()),
+            "outcome": outcome, "unit": UNITS[outcome], "purpose": "report", "episodes": episodes, **measured(who.policy),
+            "no_attack": measured(Spec("attack", "none").make()),
         },
     }  # fmt: skip
     data = json.loads(policy.read_text(encoding="utf-8")) | {
         "tensors": f"{name}.safetensors", "sha256": hashlib.sha256(blob).hexdigest(), "training": training,
     }  # fmt: skip
+    try:
+        text = json.dumps(data, indent=1, allow_nan=False)
+    except ValueError as error:
+        raise InputError(f"policy {who.name}.training", "nan or inf", f"finite numbers ({error})") from None
     file = writable_directory(folder, "zoo") / f"{name}.json"
     write_atomic(file.with_name(f"{name}.safetensors"), blob, "zoo")
-    write_atomic(file, json.dumps(data, indent=1, allow_nan=False).encode() + b"\n", "zoo")
+    write_atomic(file, text.encode() + b"\n", "zoo")
     return file
 
 

@@ -17,11 +17,17 @@ from tailgate.errors import InputError, unknown
 from tailgate.evaluation import Cell
 from tailgate.loop import Loop
 from tailgate.metrics import METRICS, UNITS
-from tailgate.registry import Spec
+from tailgate.registry import Family, Spec
+from tailgate.scenario import list_scenarios
+from tailgate.schema import fields_of
 from tailgate.stats import Interval, paired_difference, proportion
+from tailgate.threat import ThreatModel
 from tailgate.train import TrainConfig, outcome_of
 
 BATCH = 256  # episodes side by side; changes no result
+NAMED: tuple[tuple[Family, str], ...] = (  # what a record names, one or a list of each
+    ("defence", "defence"), ("defence", "others"), ("attack", "rivals"), ("attack", "white_box"), ("attack", "teacher"),
+)  # fmt: skip
 
 
 class Trained(NamedTuple):
@@ -71,20 +77,52 @@ def trained(text: str) -> Trained:
     record = header.training
     config = record.get("config", {})
     config = config if isinstance(config, dict) else {}
+    where = f"policy {policy.path.name}: training.config"
+    for family, key in NAMED:
+        _harmless(family, config.get(key), f"{where}.{key}")
     threat, seed = config.get("threat", {}), record.get("seed")
+    threat = dict(threat) if isinstance(threat, dict) else {}
+    for key in threat:
+        if key not in fields_of(ThreatModel):
+            raise unknown(f"{where}.threat: unknown field", key, fields_of(ThreatModel))
     return Trained(
         text, policy, header, str(record.get("learner", "unknown")), seed if isinstance(seed, int) else None,
-        _text(config.get("scenario")), _text(config.get("defence")), dict(threat) if isinstance(threat, dict) else {},
-        _text(config.get("outcome")),
+        _text(config.get("scenario")), _text(config.get("defence")), threat, _text(config.get("outcome")),
     )  # fmt: skip
+
+
+def _harmless(family: Family, held: Any, where: str) -> None:
+    """Raise InputError when a component that a record names would have to be imported: only a command line names code."""
+    for text in held if isinstance(held, list) else [held]:
+        try:
+            if isinstance(text, str):
+                Spec(family, text).refuse_imports(where)
+        except InputError:
+            raise InputError(where, text, f"a registered {family}") from None
+        except (ValueError, RecursionError) as error:  # what a YAML reader trips over
+            raise InputError(where, text, f"a component's text ({type(error).__name__})") from None
 
 
 def _text(value: Any) -> str | None:
     return value if isinstance(value, str) else None
 
 
-def required(value: str | None, option: str, who: Trained) -> str:
-    """The value, or an InputError that names the option that gives it."""
+def place_of(who: Trained, named: str | None = None) -> str:
+    """The scenario that the user names, or else that of the training: a registered one, as a record shall not choose a file."""
+    if named:
+        return named
+    found = _required(who.scenario, "scenario", who)
+    if found not in list_scenarios():
+        raise unknown(f"policy {who.name}: training.config.scenario, without --scenario", found, list_scenarios())
+    return found
+
+
+def defence_of(who: Trained, named: str | None = None) -> str:
+    """The defence that the user names, or else that of the training."""
+    return named or _required(who.defence, "defence", who)
+
+
+def _required(value: str | None, option: str, who: Trained) -> str:
     if value is None:
         raise InputError(f"policy {who.name}", f"no record of its {option}", f"--{option}")
     return value

@@ -23,9 +23,9 @@ from tailgate.loop import Loop
 from tailgate.metrics import METRICS, UNITS, attack_steps
 from tailgate.schema import as_data, canonical
 from tailgate.stats import Interval, paired_difference
-from tailgate.trace import episodes_at_once, rollout
+from tailgate.trace import Trace, episodes_at_once, rollout
 
-from .policies import BATCH, Trained, is_share, loop_for, mean, outcome_for, required, trained
+from .policies import BATCH, Trained, defence_of, is_share, loop_for, mean, outcome_for, place_of, trained
 
 TWINS = {  # each schedule, and what it is
     "own": "when the policy attacks",
@@ -61,31 +61,47 @@ def periodic(recorded: Array, first: int, last: int) -> Array:
     return out
 
 
+def recorded(loop: Loop, policy: PolicyAttack, keys: Keys) -> Array:
+    """(K, B) bool: the steps at which a policy attacks, to the horizon: an episode that ended early would have a short schedule."""
+    out = np.zeros((loop.horizon, len(keys.key)), bool)
+    for rows, part in _parts(loop, keys):
+        out[:, rows] = rollout(loop, policy, part, terminate=False).kind != 0
+    return out
+
+
+def played(loop: Loop, policy: Any, keys: Keys, schedule: Array | None, counts: Sequence[Callable[[Trace], Array]]) -> list[Array]:
+    """Metrics (B,) each of a policy at its own times, as of any attack, or where a `schedule` (K, B) is given at those."""
+    out = [np.empty(len(keys.key)) for _ in counts]
+    for rows, part in _parts(loop, keys):
+        trace = rollout(loop, policy if schedule is None else Yoked(policy, schedule[:, rows]), part)
+        for values, count in zip(out, counts, strict=True):
+            values[rows] = count(trace)
+    return out
+
+
+def _parts(loop: Loop, keys: Keys) -> list[tuple[slice, Keys]]:
+    """As many episodes at a time as the memory for their traces allows."""
+    size = episodes_at_once(loop.model, loop.horizon, BATCH)
+    rows = [slice(start, start + size) for start in range(0, len(keys.key), size)]
+    return [(part, Keys(keys.key[part], keys.episode[part])) for part in rows]
+
+
+def yoked_to(schedule: Array) -> Array:
+    """(K, B): each episode has the times of another one, the one before it."""
+    return np.roll(schedule, 1, axis=1)
+
+
 def play(loop: Loop, policy: PolicyAttack, keys: Keys, outcome: str) -> Played:
     """Play a policy at its own times and at those of its twins, the same episodes each."""
-    total = len(keys.key)
-    size = episodes_at_once(loop.model, loop.horizon, BATCH)
-    chunks = [slice(start, min(start + size, total)) for start in range(0, total, size)]
-    count = METRICS[outcome]
-
-    def part(chunk: slice) -> Keys:
-        return Keys(keys.key[chunk], keys.episode[chunk])
-
-    recorded = np.zeros((loop.horizon, total), bool)
-    for chunk in chunks:
-        recorded[:, chunk] = rollout(loop, policy, part(chunk), terminate=False).kind != 0
+    times = recorded(loop, policy, keys)
     first, last = loop.threat.onset, min(loop.threat.end or loop.horizon, loop.horizon)
-    chance = keys.at(Role.POLICY, np.zeros(total, np.int64))
-    others = {
-        "yoked": np.roll(recorded, 1, axis=1), "shuffled": shuffled(recorded, first, last, chance),
-        "periodic": periodic(recorded, first, last),
+    chance = keys.at(Role.POLICY, np.zeros(len(keys.key), np.int64))
+    schedules = {
+        "own": None, "yoked": yoked_to(times), "shuffled": shuffled(times, first, last, chance), "periodic": periodic(times, first, last),
     }  # fmt: skip
-    results = Played({name: np.empty(total) for name in TWINS}, {name: np.empty(total) for name in TWINS})
-    for chunk in chunks:
-        for name in TWINS:
-            rival = policy if name == "own" else Yoked(policy, others[name][:, chunk])
-            trace = rollout(loop, rival, part(chunk))
-            results.outcome[name][chunk], results.steps[name][chunk] = count(trace), attack_steps(trace)
+    results = Played({}, {})
+    for name, schedule in schedules.items():
+        results.outcome[name], results.steps[name] = played(loop, policy, keys, schedule, [METRICS[outcome], attack_steps])
     if any(np.isnan(values).any() for values in results.outcome.values()):
         raise InputError("outcome", outcome, "a metric that every episode has")
     return results
@@ -105,8 +121,7 @@ def timing(
     groups: dict[str, list[tuple[Trained, Loop, dict[str, Any]]]] = {}
     for text in dict.fromkeys(texts):
         who = trained(text)
-        where = required(scenario or who.scenario, "scenario", who)
-        guard = required(defence or who.defence, "defence", who)
+        where, guard = place_of(who, scenario), defence_of(who, defence)
         changed = who.threat | dict(threat or {})
         counted = outcome_for(outcome or who.outcome, where)
         loop = loop_for(who, where, guard, changed, dose)

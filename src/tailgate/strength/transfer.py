@@ -22,7 +22,7 @@ from tailgate.scenario import Suite, load_scenario
 from tailgate.schema import as_data, canonical
 from tailgate.stats import Interval, paired_difference
 
-from .policies import is_share, mean, misfit, outcome_for, required, trained
+from .policies import defence_of, is_share, mean, misfit, outcome_for, place_of, trained
 
 LEVEL = 0.95
 
@@ -55,10 +55,10 @@ def transfer(
     members = [trained(text) for text in dict.fromkeys(texts)]
     if not members:
         raise InputError("policies", list(texts), "at least one")
-    where = scenario or _common("scenario", {who.name: required(who.scenario, "scenario", who) for who in members})
+    where = scenario or _common("scenario", {who.name: place_of(who) for who in members})
     changed = _common("threat", {who.name: who.threat for who in members}) if threat is None else dict(threat)
     counted = outcome_for(outcome or next((who.outcome for who in members if who.outcome), None), where)
-    origins = {who.text: required(who.defence, "defence", who) for who in members}
+    origins = {who.text: defence_of(who) for who in members}
     columns = tuple(dict.fromkeys(defences or origins.values()))
     good, skipped = [], []
     for who in members:
