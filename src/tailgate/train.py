@@ -35,6 +35,7 @@ from tailgate.scenario import Suite, config_path, load_scenario
 from tailgate.schema import as_data, build, fields_of, override, read_yaml
 from tailgate.threat import KNOWLEDGE
 
+ENVIRONMENT = (fields_of(ActionSpec) | fields_of(Reward) | {"frames": None}).keys() - {"gamma"}  # that `environment` may hold
 Discount = Annotated[float, Field(gt=0, le=1)]
 
 
@@ -92,7 +93,7 @@ def load_config(source: str | None, overrides: list[str], resume: bool = False) 
     try:
         started = json.loads(held.read_text(encoding="utf-8"))
         del started["class"]
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise InputError("resume", str(held), f"the configuration of the run ({error})") from None
     return _checked(override(started, overrides))
 
@@ -118,10 +119,9 @@ def _checked(data: dict[str, Any]) -> TrainConfig:
 
 def environment_of(config: TrainConfig) -> dict[str, Any]:
     """Arguments of the adversary environment."""
-    known = (fields_of(ActionSpec) | fields_of(Reward) | {"frames": None}).keys() - {"gamma"}
     for key in config.environment:
-        if key not in known:  # the scenario, the defence, the threat model and gamma have a field of their own
-            raise unknown("config.environment: unknown field", key, known)
+        if key not in ENVIRONMENT:  # the scenario, the defence, the threat model and gamma have a field of their own
+            raise unknown("config.environment: unknown field", key, ENVIRONMENT)
     return {"scenario": config.scenario, "defence": config.defence, "threat": dict(config.threat), **config.environment}
 
 
@@ -247,7 +247,8 @@ def _train_in_child(config: TrainConfig, teacher: str | None, seed: int, resume:
     queue, stop = _line
 
     def report(progress: Progress) -> None:
-        if stop.is_set():
+        parent = multiprocessing.parent_process()
+        if stop.is_set() or parent is None or not parent.is_alive():  # killed without a word: nobody waits for this policy
             raise Stopped(f"seed {seed}")
         queue.put((seed, progress))
 
@@ -287,7 +288,7 @@ def _same_run(held: Path, config: TrainConfig) -> None:
     try:
         before = json.loads(held.read_text(encoding="utf-8"))
         changed = [key for key in now if key != "steps" and before.get(key) != now[key]]
-    except (OSError, ValueError, AttributeError) as error:
+    except (OSError, ValueError, AttributeError, RecursionError) as error:
         raise InputError("resume", str(held), f"the configuration of the run ({error})") from None
     if changed:
         raise InputError("resume", ", ".join(changed), f"the configuration in {held}, apart from steps")

@@ -28,10 +28,8 @@ import numpy as np
 import yaml
 
 from tailgate import draws
-from tailgate.agents.codec import ActionSpec
 from tailgate.agents.learning import learner_of
 from tailgate.agents.policy import PolicyAttack
-from tailgate.agents.reward import Reward
 from tailgate.errors import InputError, unknown
 from tailgate.evaluation import Cell
 from tailgate.files import writable_directory, write_atomic
@@ -39,7 +37,7 @@ from tailgate.metrics import METRICS
 from tailgate.registry import Spec
 from tailgate.schema import as_data, canonical, fields_of, read_yaml
 from tailgate.trace import episodes_at_once, rollout
-from tailgate.train import TrainConfig, load_config, outcome_of, train
+from tailgate.train import ENVIRONMENT, TrainConfig, load_config, outcome_of, train
 
 Space = dict[str, dict[str, Any]]
 SPACES: dict[str, Space] = {
@@ -132,7 +130,7 @@ def read_space(source: str, learner: str) -> Space:
 
 def _known_field(where: str, field: str, learner: str) -> None:
     """Raise InputError for a field that is none, or that would change what is attacked and not who learns."""
-    below = {learner: fields_of(learner_of(learner).Config), "environment": fields_of(ActionSpec) | fields_of(Reward) | {"frames": None}}
+    below = {learner: fields_of(learner_of(learner).Config), "environment": ENVIRONMENT}
     known = {"gamma"} | {f"{name}.{inner}" for name, fields in below.items() for inner in fields if inner != "gamma"}
     if field not in known:
         raise unknown(where, field, known)
