@@ -14,7 +14,7 @@ import gymnasium
 import numpy as np
 
 from tailgate import draws
-from tailgate.agents.codec import ActionCodec, ActionSpec
+from tailgate.agents.codec import ActionSpec
 from tailgate.agents.mixture import Mixture
 from tailgate.core import Array, Attack, Command, Frame, NonNegative, View, param
 from tailgate.draws import Keys, Role
@@ -51,17 +51,6 @@ class DuelState(NamedTuple):
     loop: LoopState
     tally: Tally
     seen: Array  # (B, d) float32: the attacker's observation
-
-
-@dataclass(frozen=True, eq=False)
-class Scripted(ActionCodec):
-    """An attack in the place of an action codec: what it decides is sent, whatever the action."""
-
-    rival: Rival | None = None
-
-    def decode(self, action: Array, view: View) -> Command:
-        assert self.rival is not None
-        return self.rival.decide(view)
 
 
 class Rival:
@@ -171,14 +160,11 @@ class Duel:
         attack: actions as the seat takes them, or an attack that plays. defend: numbers of the menu (B,), or vectors (B, K); None leaves
         the knobs where they are.
         """
-        loop, seat = state.loop, self.seat
+        loop = state.loop
         if defend is not None:
             loop = loop._replace(defence=self.guard.steer(self.plan, loop.defence, self.values(defend)))
-        if isinstance(attack, Rival):
-            seat = dataclasses.replace(seat, action=Scripted(seat.action.spec, seat.action.brief, attack))
-            attack = over  # what a script decides does not hang on it
-        before = loop
-        loop, tally, outcome, frame = seat.step(loop, state.tally, attack, over)
+        before, decision = loop, attack.decide if isinstance(attack, Rival) else attack
+        loop, tally, outcome, frame = self.seat.step(loop, state.tally, decision, over)
         seen = self.seat.observation.observe(self.seat.loop.sense(loop), state.seen)
         return DuelState(loop, tally, seen), outcome, self._paid(before, loop, outcome, over), frame
 

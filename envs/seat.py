@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,7 +13,7 @@ import numpy as np
 from tailgate.agents.codec import ActionCodec, ActionSpec
 from tailgate.agents.observation import FRAMES, ObservationCodec
 from tailgate.agents.reward import Reward
-from tailgate.core import Array, Frame
+from tailgate.core import Array, Command, Frame, View
 from tailgate.errors import InputError, unknown
 from tailgate.loop import Loop, LoopState
 from tailgate.registry import Spec
@@ -128,14 +129,20 @@ class Seat:
         gap = self.loop.plant.scene(self.loop.plan.plant, state.plant).gap
         return Tally(self.reward.potential(gap), self.reward.least(gap), np.zeros(len(gap)))
 
-    def step(self, state: LoopState, tally: Tally, action: Array, over: Array) -> tuple[LoopState, Tally, Outcome, Frame]:
-        """Play one decision, `interval` steps of the loop; rows that are `over` (B,) count for nothing. -> its last step as well."""
+    def step(
+        self, state: LoopState, tally: Tally, action: Array | Callable[[View], Command], over: Array
+    ) -> tuple[LoopState, Tally, Outcome, Frame]:
+        """Play one decision, `interval` steps of the loop; rows that are `over` (B,) count for nothing. -> its last step as well.
+
+        action: as `ActionCodec.decode` takes it, or somebody who decides in every step.
+        """
         loop, reward = self.loop, self.reward
         raw, potential, least, largest = np.zeros(len(over)), tally.potential, tally.least, tally.error
         collided, rear, refused = (np.zeros(len(over), bool) for _ in range(3))
         for _ in range(self.action.spec.interval):
             live = ~over & ~state.ended & (state.k <= loop.horizon)
-            state, frame = loop.advance(state, self.action.decode(action, loop.sense(state)))
+            view = loop.sense(state)
+            state, frame = loop.advance(state, action(view) if callable(action) else self.action.decode(action, view))
             before, least = least, reward.least(frame.scene.gap, least)
             raw += np.where(live, reward(loop.model, frame, before - least, frame.k == loop.horizon), 0.0)
             gap_error = loop.model.gap_error(frame.estimate.x, frame.truth)
