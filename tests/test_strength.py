@@ -223,7 +223,7 @@ def test_a_scenario_of_a_record_is_a_registered_one(tmp_path: Path, brief_place:
 @pytest.mark.parametrize(
     ("fields", "words"),
     [
-        ({"defence": "chi2_kf:eta=" + "[" * 5000}, r"config\.defence"), ({"defence": "chi2_kf:eta=2020-13-45"}, r"config\.defence"),
+        ({"defence": "chi2_kf:eta=" + "[" * 5000}, r"chi2_kf\.eta"), ({"defence": "chi2_kf:eta=2020-13-45"}, r"chi2_kf\.eta.*2020-13-45"),
         ({"threat": {"self": 1}}, r"config\.threat.*'self'"), ({"scenario": "nowhere"}, "nowhere"), ({"scenario": 5}, "--scenario"),
         ({"defence": "nothing"}, "nothing"), ({"defence": ["kf"]}, "--defence"), ({"outcome": "crash"}, "crash"),
     ],

@@ -13,6 +13,7 @@ import pytest
 from tailgate import train
 from tailgate.agents.ppo import Config, Learner
 from tailgate.errors import InputError
+from tailgate.rivals import outcomes
 from tailgate.schema import build
 from tailgate.tree import leaves
 
@@ -167,7 +168,7 @@ def test_an_outcome_is_a_metric_that_every_episode_has(tmp_path: Path) -> None:
     assert train.outcome_of(train.load_config("platoon", ["outcome=max_error"])) == "max_error"
     row = {"status": "ok", "attack": "fdi", "recovery_time": None}
     with pytest.raises(InputError, match="recovery_time"):
-        train._outcomes([row], "recovery_time")
+        outcomes([row], "recovery_time")
 
 
 def test_a_run_that_was_killed_and_resumed_gives_the_policy_of_an_uninterrupted_one(tmp_path: Path) -> None:

@@ -83,7 +83,7 @@ class GameConfig:
 
 def load_config(source: str | None, overrides: list[str], resume: bool = False) -> GameConfig:
     """A preset by name or YAML file (default: selfplay) with `key=value` overrides; with `resume` the run's own configuration."""
-    path = config_path(".", source or "selfplay", "config")
+    path = config_path("games", source or "selfplay", "config")
     config = _checked(override(read_yaml(path, "config"), overrides))
     if not resume:
         return config
