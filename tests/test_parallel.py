@@ -1,5 +1,6 @@
 """The game of two: PettingZoo's own tests, what each player sees and is paid, and knobs that change no bit until they are turned."""
 
+import ast
 import json
 import re
 import warnings
@@ -338,5 +339,5 @@ def test_the_examples_of_the_documentation_run(capsys):
     assert len(blocks) == 2
     for block in blocks:
         exec(block, {})
-    paid = eval(capsys.readouterr().out)
+    paid = ast.literal_eval(capsys.readouterr().out)
     assert set(paid) == {"attacker", "defender"} and paid["attacker"] != 0.0 and paid["defender"] < 0.0
