@@ -35,7 +35,9 @@ from tailgate.schema import canonical
 
 from .learning import SEED_STRIDE, Progress, header_of, open_checkpoint
 from .policy import Network, save_policy
+from .teacher import Demonstration
 
+IMITATION_ROUNDS, IMITATION_BATCH, IMITATION_RATE = 400, 4096, 0.03
 FORMAT = "tailgate-cem-checkpoint-1"
 Share = Annotated[float, Field(gt=0, le=1)]
 
@@ -204,6 +206,29 @@ class Learner(Search):
         """Write the policy of the mean as safetensors + JSON."""
         return save_policy(path, self.network, header_of(self.seat, training))
 
+    def imitate(self, shown: Demonstration) -> None:
+        """Make the first mean one that decides as shown (behaviour cloning: softmax regression through all layers, by Adam).
+
+        Only the largest output counts, so that the last layer has no scale of its own: it is given the root mean square 1, which makes
+        `sd` the size of a change relative to it.
+        """
+        rng = np.random.default_rng([self.seed, 0, len(shown.action)])
+        theta = rng.standard_normal(self.shape.length)
+        for weight, bias in self.shape.layers(theta):  # views
+            weight /= np.sqrt(len(weight))
+            bias[:] = 0.0
+        first, second = np.zeros_like(theta), np.zeros_like(theta)
+        for t in range(1, IMITATION_ROUNDS + 1):
+            some = rng.integers(0, len(shown.action), IMITATION_BATCH)
+            slope = _slope(self.shape, theta, shown.observation[some].astype(np.float64), shown.action[some])
+            first, second = 0.9 * first + 0.1 * slope, 0.999 * second + 0.001 * slope**2
+            theta -= IMITATION_RATE * (first / (1.0 - 0.9**t)) / (np.sqrt(second / (1.0 - 0.999**t)) + 1e-8)
+        weight, bias = self.shape.layers(theta)[-1]
+        scale = np.sqrt(np.mean(np.concatenate([weight.ravel(), bias]) ** 2))
+        weight /= scale
+        bias /= scale
+        self.mean = theta
+
     def episodes(self, layers: list[tuple[Array, Array]], members: int, keys: draws.Keys) -> tuple[Array, Array]:
         seat, seen = self.seat, None
         state = seat.loop.start(keys)
@@ -222,6 +247,22 @@ class Learner(Search):
             crashed |= outcome.terminated
             weight *= seat.reward.gamma
         return total, crashed
+
+
+def _slope(shape: Shape, theta: Array, seen: Array, action: Array) -> Array:
+    """Gradient (length,) of the mean cross-entropy of the actions (D,) under a softmax of the outputs for seen (D, d)."""
+    layers, inputs, out = shape.layers(theta), [seen], np.empty_like(theta)
+    for weight, bias in layers[:-1]:
+        inputs.append(np.tanh(inputs[-1] @ weight + bias))
+    x = inputs[-1] @ layers[-1][0] + layers[-1][1]
+    share = np.exp(x - x.max(axis=1, keepdims=True))
+    error = share / share.sum(axis=1, keepdims=True)
+    error[np.arange(len(action)), action] -= 1.0
+    error /= len(action)
+    for (weight, bias), (above, _), x in zip(shape.layers(out)[::-1], layers[::-1], inputs[::-1], strict=True):
+        weight[:], bias[:] = x.T @ error, error.sum(axis=0)
+        error = (error @ above.T) * (1.0 - x**2)
+    return out
 
 
 def lean(probability: float, actions: int) -> float:

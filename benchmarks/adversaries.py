@@ -2,67 +2,108 @@
 
     python benchmarks/adversaries.py [CELL ...] [--seeds 5] [--episodes 1000] [--out results/adversaries-v0] [--zoo]
 
-Trains every cell (one process per training seed; a finished cell is not trained again), plays it on report seeds, and writes report.json,
-report.md and a picture. `--zoo` puts the policies into the package. Best on an otherwise idle machine: training times are recorded.
+Trains each learner of every cell (one process per training seed; finished policies are not trained again), plays them on report seeds,
+and writes report.json, report.md and a picture. The learner that speaks for a cell is chosen on select seeds. `--zoo` puts its policies
+into the package. Best on an otherwise idle machine: training times are recorded.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from rich.console import Console
 
-from tailgate import comparison, train
+from tailgate import comparison, stats, train
 from tailgate.errors import unknown
+from tailgate.evaluation import cells_of, run
 from tailgate.files import write_atomic
 from tailgate.plots import canvas, png
 from tailgate.progress import progress
-from tailgate.rows import read_rows
-from tailgate.schema import as_data, read_yaml
+from tailgate.rivals import BATCH, outcomes
+from tailgate.schema import as_data, canonical, read_yaml
 
 HERE = Path(__file__).parent
 RISING = 0.05  # of the whole rise of the learning curve, that its last tenth may bring
+CHOICE = 256  # select episodes that the learner of a cell is chosen on
+QUESTIONS = ("no attack", "own yoked schedule", "best scripted attack")
 
 
-def configured(name: str, cell: dict[str, Any], options: argparse.Namespace) -> train.TrainConfig:
-    """The configuration of a cell."""
-    own = [f"name={name}", f"out={options.runs}", f"seeds={options.seeds}", f"episodes={options.episodes}", "tensorboard=false"]
+def configured(name: str, cell: dict[str, Any], learner: str, options: argparse.Namespace) -> train.TrainConfig:
+    """The configuration of a learner in a cell."""
+    own = [f"name={name}-{learner}", f"out={options.runs}", f"seeds={options.seeds}", "tensorboard=false", f"learner={learner}"]
     lists = [f"{key}={json.dumps(cell[key])}" for key in ("rivals", "teacher") if key in cell]
-    return train.load_config(cell["config"], [*cell["set"], *lists, *own])
+    changes = [f"episodes={options.episodes}", "others=[]", *(cell["set"] or []), *lists, *(cell["learners"][learner] or []), *own]
+    return train.load_config(cell["config"], changes)
 
 
-def played(config: train.TrainConfig, console: Console) -> dict[str, Any]:
-    """The report of a cell, trained and compared where that is not done yet."""
-    report, snapshot = config.directory / "cell.json", config.directory / "config.json"
-    begun = snapshot.is_file() and json.loads(snapshot.read_text()) == json.loads(json.dumps(as_data(config)))
-    if begun and report.is_file():
-        return dict(json.loads(report.read_text()))
+def trained(config: train.TrainConfig, console: Console) -> list[Path]:
+    """The policies of a learner, trained where that is not done yet."""
+    policies = [config.directory / f"policy-{seed}.json" for seed in range(config.first_seed, config.first_seed + config.seeds)]
+    free = train.COMPARED | {"outcome", "select_episodes", "rivals"}  # a policy that was trained stays so when its rivals change
+
+    def training(data: dict[str, Any]) -> str:
+        return canonical({key: value for key, value in data.items() if key not in free})
+
+    snapshot = config.directory / "config.json"
+    begun = snapshot.is_file() and training(json.loads(snapshot.read_text())) == training(json.loads(json.dumps(as_data(config))))
+    if begun and all(path.is_file() for path in policies):
+        return policies
     with progress(console) as update:
-        started = time.perf_counter()
-
-        def learned(seed: int, now: Any) -> None:
-            update(f"{config.name}, seed {seed}", min(now.steps, config.steps), config.steps, train.figures(now))
-
-        policies = train.train(config, learned, resume=begun)
-        trained = time.perf_counter()
-        done = comparison.compare(config, policies)
-    done["minutes"] = {"training": (trained - started) / 60, "comparison": (time.perf_counter() - trained) / 60, "resumed": begun}
-    write_atomic(report, json.dumps(done, indent=1).encode() + b"\n")
-    return done
+        return train.train(
+            config, lambda seed, now: update(f"{config.name}, seed {seed}", min(now.steps, config.steps), config.steps, train.figures(now)),
+            resume=begun and json.loads(snapshot.read_text()) == json.loads(json.dumps(as_data(config))),
+        )  # fmt: skip
 
 
-def flags(config: train.TrainConfig, report: dict[str, Any]) -> list[str]:
+def minutes(config: train.TrainConfig) -> float:
+    """Of all training seeds together, on so many processes at a time."""
+    seconds = [json.loads((config.directory / f"curve-{seed}.json").read_text())["seconds"] for seed in range(config.seeds)]
+    return float(np.sum(seconds) / 60.0 / min(config.workers, config.seeds))
+
+
+def played(name: str, cell: dict[str, Any], options: argparse.Namespace, console: Console) -> dict[str, Any]:
+    """The record of a cell: a report for each learner, and which one speaks for it."""
+    configs = {learner: configured(name, cell, learner, options) for learner in cell["learners"]}
+    policies = {learner: trained(config, console) for learner, config in configs.items()}
+    held = {learner: [json.loads(path.read_text())["sha256"] for path in found] for learner, found in policies.items()}
+    file, wanted = Path(options.runs) / name / "cell.json", json.loads(json.dumps([as_data(list(configs.values())), held]))
+    if file.is_file() and (kept := json.loads(file.read_text()))["of"] == wanted:
+        return dict(kept["cell"])
+    first = next(iter(configs.values()))
+    everyone = [path for found in policies.values() for path in found]
+    with progress(console) as update:
+        chosen = {learner: chosen_by(configs[learner], found) for learner, found in policies.items()}
+        scripts = comparison.play_scripts(first, everyone, lambda done, of: update(f"{name}: episodes", done, of))
+    reports = {}
+    for learner, config in configs.items():
+        reports[learner] = comparison.compare(config, policies[learner], scripts=scripts)
+        reports[learner] |= {"minutes": minutes(config), "select": chosen[learner], "flags": flags(config, reports[learner], scripts.rows)}
+    best = max(reports, key=lambda learner: float(np.mean(chosen[learner])))
+    out = {"best": best, "learners": reports}
+    file.parent.mkdir(parents=True, exist_ok=True)
+    write_atomic(file, json.dumps({"of": wanted, "cell": out}, indent=1).encode() + b"\n")
+    return out
+
+
+def chosen_by(config: train.TrainConfig, policies: list[Path]) -> list[float]:
+    """The mean outcome of each policy on select seeds."""
+    suite = train.Suite("choice", "", (config.scenario,), (None,), (config.defence,), tuple(map(str, policies)), CHOICE)
+    rows = run(cells_of(suite, batch=BATCH, purpose="select", threat=dict(config.threat)), workers=config.workers)
+    counted = train.outcome_of(config)
+    return [float(outcomes(rows[i * CHOICE : (i + 1) * CHOICE], counted).mean()) for i in range(len(policies))]
+
+
+def flags(config: train.TrainConfig, report: dict[str, Any], rows: list[dict[str, Any]]) -> list[str]:
     """What a reader should know before he believes a learned attack (spec of the scores)."""
     out = []
     learned = [item["value"] for item in report["attacks"] if item["label"].startswith("learned") and "yoked" not in item["label"]]
     budget = report["threat"]["budget"]
     names = {str(Path(path)) for path in report["policies"]}
-    rows = [row for row in read_rows(config.directory / "rows.jsonl") if row["attack"] in names and row["defence"] == config.defence]
+    rows = [row for row in rows if row["attack"] in names and row["defence"] == config.defence]
     spent = np.mean([row["attack_steps"] for row in rows if not row["crashed"]] or [np.nan])
     if budget is not None and spent < 0.9 * budget:
         out.append(f"unspent budget: {spent:.1f} of {budget} steps in episodes without a collision")
@@ -84,64 +125,107 @@ def flags(config: train.TrainConfig, report: dict[str, Any]) -> list[str]:
 
 
 def line(report: dict[str, Any]) -> dict[str, Any]:
-    """A cell as the table shows it."""
+    """A report as the tables show it."""
     values = {item["label"]: item["value"] for item in report["attacks"]}
     learned = [v for k, v in values.items() if k.startswith("learned") and not k.endswith("yoked")]
     yoked = [v for k, v in values.items() if k.endswith("yoked")]
     return {"none": values["no attack"], "script": values[report["best_scripted"]], "learned": learned, "yoked": yoked}
 
 
-def verdict(gain: dict[str, float]) -> str:
-    return "wins" if gain["low"] > 0 else "loses" if gain["high"] < 0 else "undecided"
+def judged(cells: dict[str, Any]) -> dict[str, dict[str, str]]:
+    """A verdict on each question of each cell's chosen learner, corrected after Holm for the cells that are asked it."""
+    out: dict[str, dict[str, str]] = {name: {} for name in cells}
+    for question in QUESTIONS:
+        gains = {name: cell["learners"][cell["best"]]["advantage"][question] for name, cell in cells.items()}
+        asked = [name for name, gain in gains.items() if gain["low"] < gain["high"]]
+        for name in gains.keys() - set(asked):
+            out[name][question] = "same"
+        adjusted = stats.holm([p_value(gains[name]) for name in asked])
+        for name, p in zip(asked, adjusted, strict=True):
+            out[name][question] = "undecided" if p >= 0.05 else "wins" if gains[name]["value"] > 0 else "loses"
+    return out
 
 
-def markdown(reports: dict[str, dict[str, Any]], flagged: dict[str, list[str]]) -> str:
+def p_value(gain: dict[str, float]) -> float:
+    """Two-sided, of a difference of 0, from the side of its 95 % interval that points there: below 0.05 where 0 is outside."""
+    from scipy.stats import norm
+
+    reach = gain["value"] - gain["low"] if gain["value"] > 0 else gain["high"] - gain["value"]
+    return float(2.0 * norm.sf(1.96 * abs(gain["value"]) / max(reach, 1e-12)))
+
+
+def learners_of(cells: dict[str, Any]) -> list[tuple[str, str, dict[str, Any]]]:
+    """(cell, learner, report) of all."""
+    return [(name, learner, report) for name, cell in cells.items() for learner, report in cell["learners"].items()]
+
+
+def spread(report: dict[str, Any], values: list[float]) -> str:
+    """The median, the least and the largest."""
+    low, mid, high = (comparison.shown(report, float(f(values))) for f in (np.min, np.median, np.max))
+    return f"{mid} ({low} to {high})"
+
+
+def markdown(cells: dict[str, Any]) -> str:
     """The record as people read it."""
     out = [
         "# Learned attacks, cell by cell", "",
         "`python benchmarks/adversaries.py` makes this page. Every figure is of fresh report seeds, at equal knowledge, bounds, dose.",
-        "Learned: the median over training seeds, with the least and the largest. Differences are paired, with 95 % intervals over",
-        "episodes and training seeds. The best script is chosen on select seeds.", "",
-        "| cell | dose | no attack | best script | learned | yoked | over no attack | over yoked | over the best script | training [min] |",
+        "Learned: the median over training seeds, with the least and the largest, of the learner that did best on select seeds. The best",
+        "script is chosen on select seeds. Differences are paired, with 95 % intervals over episodes and training seeds; each verdict is",
+        "corrected (Holm) for the cells of its column. *same*: no episode differs, as the attack's times are the same in all of them.", "",
+        "| cell | dose | no attack | best script | learned | by | yoked | over no attack | over yoked | over the best script |",
         "|---|---|---|---|---|---|---|---|---|---|",
     ]  # fmt: skip
-    for name, report in reports.items():
-        row = line(report)
-
-        def shown(value: float, report: dict[str, Any] = report) -> str:
-            return comparison.shown(report, value)
-
-        def gain(key: str, report: dict[str, Any] = report) -> str:
-            g = report["advantage"][key]
-            low, value, high = (comparison.shown(report, g[k], "+") for k in ("low", "value", "high"))
-            return f"{value} [{low}, {high}] **{verdict(g)}**"
-
-        spread = f"{shown(float(np.median(row['learned'])))} ({shown(min(row['learned']))} to {shown(max(row['learned']))})"
+    verdicts = judged(cells)
+    for name, cell in cells.items():
+        report = cell["learners"][cell["best"]]
+        row, gains = line(report), []
+        for question in QUESTIONS:
+            low, value, high = (comparison.shown(report, report["advantage"][question][k], "+") for k in ("low", "value", "high"))
+            gains.append(f"{value} [{low}, {high}] **{verdicts[name][question]}**")
         dose = report["threat"]["budget"] or "unlimited"
-        script = f"{shown(row['script'])}: `{report['best_scripted']}`"
-        gains = [gain(key) for key in ("no attack", "own yoked schedule", "best scripted attack")]
-        minutes = f"{report['minutes']['training']:.1f}"
-        yoked = shown(float(np.median(row["yoked"])))
-        out.append(f"| {' | '.join([name, str(dose), shown(row['none']), script, spread, yoked, *gains, minutes])} |")
-    out += ["", "## Ceilings", "", "| cell | computed optimum | its outcome | share that each seed reaches |", "|---|---|---|---|"]
-    for name, report in reports.items():
+        script = f"{comparison.shown(report, row['script'])}: `{report['best_scripted']}`"
+        yoked = comparison.shown(report, float(np.median(row["yoked"])))
+        none, learned = comparison.shown(report, row["none"]), spread(report, row["learned"])
+        out.append(f"| {' | '.join([name, str(dose), none, script, learned, cell['best'], yoked, *gains])} |")
+    counts = {question: [verdicts[name][question] for name in cells] for question in QUESTIONS}
+    for question, found in counts.items():
+        out += ["", f"Over {question}: {', '.join(f'{found.count(word)} {word}' for word in ('wins', 'same', 'undecided', 'loses'))}."]
+    out += [
+        "", "## Every learner", "",
+        "| cell | learner | shown first | decisions | learned | best on select | yoked | over the best script | training [min] |",
+        "|---|---|---|---|---|---|---|---|---|",
+    ]  # fmt: skip
+    for name, learner, report in learners_of(cells):
+        row, gain = line(report), report["advantage"]["best scripted attack"]
+        best = comparison.shown(report, row["learned"][int(np.argmax(report["select"]))])
+        low, value, high = (comparison.shown(report, gain[k], "+") for k in ("low", "value", "high"))
+        yoked = comparison.shown(report, float(np.median(row["yoked"])))
+        shown_first = f"`{report['teacher']}`" if report["teacher"] else "nothing"
+        parts = [
+            name, learner, shown_first, f"{report['steps']:,}", spread(report, row["learned"]), best, yoked, f"{value} [{low}, {high}]",
+            f"{report['minutes']:.1f}",
+        ]  # fmt: skip
+        out.append(f"| {' | '.join(parts)} |")
+    out += ["", "Training: minutes of all seeds together on two processes, without the choice of what is shown.", ""]
+    out += ["## Ceilings", "", "| cell | learner | computed optimum | its outcome | share that each seed reaches |"]
+    out += ["|---|---|---|---|---|"]
+    for name, learner, report in learners_of(cells):
         for attack, ceiling in report.get("ceilings", {}).items():
             reached = ", ".join(f"{100 * s['value']:.1f} % [{100 * s['low']:.1f}, {100 * s['high']:.1f}]" for s in ceiling["reached"])
-            out.append(f"| {name} | `{attack}` | {comparison.shown(report, ceiling['outcome']['value'])} | {reached} |")
-    out += ["", "## How each was trained", "", "| cell | learner | shown | decisions | threat model |", "|---|---|---|---|---|"]
-    for name, report in reports.items():
-        threat = report["threat"]
-        kinds = ", ".join(threat["kinds"])
-        shown_first = report["teacher"] or "nothing"
-        out.append(f"| {name} | {report['learner']} | {shown_first} | {report['steps']:,} | {threat['knowledge']} box; {kinds} |")
+            out.append(f"| {name} | {learner} | `{attack}` | {comparison.shown(report, ceiling['outcome']['value'])} | {reached} |")
+    out += ["", "## Threat models", "", "| cell | knowledge | kinds |", "|---|---|---|"]
+    for name, cell in cells.items():
+        threat = cell["learners"][cell["best"]]["threat"]
+        out.append(f"| {name} | {threat['knowledge']} box | {', '.join(threat['kinds'])} |")
     out += ["", "## Flags", ""]
-    out += [f"- {name}: {text}" for name, texts in flagged.items() for text in texts] or ["None."]
+    out += [f"- {name}, {learner}: {text}" for name, learner, report in learners_of(cells) for text in report["flags"]] or ["None."]
     return "\n".join(out) + "\n"
 
 
-def picture(reports: dict[str, dict[str, Any]]) -> bytes:
-    """A panel for each cell: no attack, yoked, best script, learned seeds, optimum."""
-    columns = 3
+def picture(cells: dict[str, Any]) -> bytes:
+    """A panel for each cell: no attack, yoked, best script, learned seeds of the chosen learner, optimum."""
+    columns, reports = 3, {name: cell["learners"][cell["best"]] for name, cell in cells.items()}
     rows = -(-len(reports) // columns)
     figure, axes = canvas(12.0, 1.0 + 1.75 * rows, rows, columns)
     for axis in axes.flat[len(reports) :]:
@@ -180,23 +264,22 @@ def main() -> None:
     for name in options.cells:
         if name not in cells:
             raise unknown("cell", name, cells)
-    reports, flagged = {}, {}
+    record = {}
     for name in options.cells or cells:
-        config = configured(name, cells[name], options)
-        reports[name] = played(config, console)
-        flagged[name] = flags(config, reports[name])
-        row = line(reports[name])
-        console.print(f"{name}: {row}", highlight=False)
+        record[name] = played(name, cells[name], options, console)
+        best = record[name]["best"]
+        console.print(f"{name}, {best}: {line(record[name]['learners'][best])}", highlight=False)
         if options.zoo:
             from tailgate.strength.collect import add_run
 
-            add_run(config.directory, name, episodes=options.episodes, replace=True)
+            add_run(Path(options.runs) / f"{name}-{best}", name, episodes=options.episodes, replace=True)
     out = Path(options.out)
     out.mkdir(parents=True, exist_ok=True)
-    kept = {name: {k: v for k, v in report.items() if k != "policies"} for name, report in reports.items()}
-    write_atomic(out / "report.json", json.dumps({"cells": kept, "flags": flagged}, indent=1).encode() + b"\n")
-    write_atomic(out / "report.md", markdown(reports, flagged).encode())
-    write_atomic(out / "adversaries.png", picture(reports))
+    for _, _, report in learners_of(record):
+        report.pop("policies", None)
+    write_atomic(out / "report.json", json.dumps(record, indent=1).encode() + b"\n")
+    write_atomic(out / "report.md", markdown(record).encode())
+    write_atomic(out / "adversaries.png", picture(record))
 
 
 if __name__ == "__main__":

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tailgate.stats import paired_difference, paired_ratio, proportion
+from tailgate.stats import holm, paired_difference, paired_ratio, proportion
 
 
 def test_clopper_pearson_known_values() -> None:
@@ -67,3 +67,11 @@ def test_a_ratio_of_means():
         assert low < value < high
     assert held >= 88
     assert paired_ratio(x, y) == paired_ratio(x, y)
+
+
+def test_holm_rejects_step_by_step() -> None:
+    """Adjusted values by hand, in the order given; ties and the cap at 1; never smaller than a smaller one's."""
+    assert holm([]) == []
+    assert holm([0.03]) == [0.03]
+    np.testing.assert_allclose(holm([0.01, 0.04, 0.03, 0.005]), [0.03, 0.06, 0.06, 0.02])
+    assert holm([0.6, 0.7]) == [1.0, 1.0]

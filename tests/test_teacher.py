@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from tailgate import draws, train
+from tailgate.agents import cem
 from tailgate.agents.learning import Teachable, learner_of
 from tailgate.agents.policy import PolicyAttack
 from tailgate.agents.ppo import Config, Learner
@@ -87,7 +88,38 @@ def test_a_taught_run_resumes_to_the_same_policy(tmp_path: Path) -> None:
     assert train.train(untaught, lambda seed, now: None)[0].with_suffix(".safetensors").read_bytes() != straight
 
 
-@pytest.mark.parametrize("learner", ["cem", "recurrent_ppo", "dqn", "sac", "tqc"])
+@pytest.mark.parametrize("hidden", [(), (8,)])
+def test_a_search_begins_at_what_it_was_shown(tmp_path: Path, hidden: tuple[int, ...]) -> None:
+    """The cross-entropy method's first mean decides as the script does, whatever the layers; its last layer has the scale 1."""
+    settings = {k: v for k, v in ENVIRONMENT.items() if k != "gamma"}
+    search = cem.Learner(0, 0.9, cem.Config(hidden=hidden), settings)
+    keys = draws.keys("tune", range(200))
+    shown = demonstrate(search.seat, attack(SCRIPT), 0, episodes=512)
+    search.imitate(shown)
+    rates = [float(crashed(rollout(search.seat.loop, rival, keys)).mean()) for rival in (PolicyAttack(search.export(tmp_path / "p", {})), attack(SCRIPT))]
+    assert rates[1] > 0.3 and rates[0] > 0.6 * rates[1], rates
+    last = np.concatenate([part.ravel() for part in search.shape.layers(search.mean)[-1]])
+    assert np.sqrt(np.mean(last**2)) == pytest.approx(1.0)
+    again = cem.Learner(0, 0.9, cem.Config(hidden=hidden), settings)
+    again.imitate(shown)
+    assert np.array_equal(again.mean, search.mean)
+
+
+def test_the_slope_of_an_imitation_is_that_of_its_loss() -> None:
+    """Backpropagation through tanh layers against central differences."""
+    rng = np.random.default_rng(0)
+    shape = cem.Shape(((3, 5), (5, 4), (4, 2)))
+    theta, seen, action = rng.standard_normal(shape.length), rng.standard_normal((7, 3)), rng.integers(0, 2, 7)
+
+    def loss(theta: np.ndarray) -> float:
+        x = cem.outputs([(w, b[None]) for w, b in shape.layers(theta)], seen[None])
+        return float(np.mean(np.log(np.exp(x).sum(axis=1)) - x[np.arange(7), action]))
+
+    numeric = [(loss(theta + 1e-6 * e) - loss(theta - 1e-6 * e)) / 2e-6 for e in np.eye(shape.length)]
+    np.testing.assert_allclose(cem._slope(shape, theta, seen, action), numeric, atol=1e-8)
+
+
+@pytest.mark.parametrize("learner", ["recurrent_ppo", "dqn", "sac", "tqc"])
 def test_learners_that_cannot_be_shown_anything_say_so(tmp_path: Path, learner: str) -> None:
     assert not issubclass(learner_of(learner).Learner, Teachable)
     action = "continuous" if learner in ("sac", "tqc") else "mode"

@@ -37,21 +37,35 @@ class Verdict:
     yoked: Array
 
 
-def compare(config: TrainConfig, policies: list[Path], progress: Callable[[int, int], None] | None = None) -> dict[str, Any]:
-    """Play the policies and the scripted rivals on fresh report seeds; writes rows.jsonl and report.json; returns the report.
+@dataclass(frozen=True)
+class Scripts:
+    """The best rival, chosen on select seeds, and the rows of everything that was played on report seeds."""
 
-    The best rival is chosen on select seeds and reported on report seeds, so that the choice does not favour it; every rival is
-    reported as well.
+    best: str | None
+    rows: list[dict[str, Any]]
+
+
+def play_scripts(config: TrainConfig, policies: list[Path], progress: Callable[[int, int], None] | None = None) -> Scripts:
+    """Choose the best rival on select seeds, so that the choice does not favour it, and play all, and policies, on fresh report seeds."""
+    best = best_of(rivals_of(config), dict(config.threat), outcome_of(config), "select", config.workers)
+    attacks = tuple(dict.fromkeys(("none", *config.rivals, *config.white_box, *map(str, policies))))  # each once
+    cells = cells_of(suite_of(config, attacks), batch=BATCH, threat=dict(config.threat))
+    return Scripts(best, run(cells, config.directory / "rows.jsonl", config.workers, progress))
+
+
+def compare(
+    config: TrainConfig, policies: list[Path], progress: Callable[[int, int], None] | None = None, scripts: Scripts | None = None
+) -> dict[str, Any]:
+    """Play the policies and the scripts on fresh report seeds; writes rows.jsonl and report.json; returns the report.
+
+    scripts: what `play_scripts` gave for these policies and rivals: it is not played again.
     """
     from tailgate.agents.policy import PolicyAttack, timing_advantage
-    threat = dict(config.threat)
-    names, outcome = [str(p) for p in policies], outcome_of(config)
-    guard = config.defence
-    best = best_of(rivals_of(config), threat, outcome, "select", config.workers)
 
-    attacks = tuple(dict.fromkeys(("none", *config.rivals, *config.white_box, *names)))  # each once
-    cells = cells_of(suite_of(config, attacks), batch=BATCH, threat=threat)
-    rows = run(cells, config.directory / "rows.jsonl", config.workers, progress)
+    threat, outcome = dict(config.threat), outcome_of(config)
+    guard = config.defence
+    scripts = scripts or play_scripts(config, policies, progress)
+    rows = scripts.rows
 
     def outcomes(attack: str) -> Array:
         return outcomes_of([r for r in rows if r["attack"] == attack and r["defence"] == guard], outcome)
@@ -64,7 +78,7 @@ def compare(config: TrainConfig, policies: list[Path], progress: Callable[[int, 
         place = load_scenario(config.scenario).with_threat(**(threat | {"knowledge": policy.knowledge}))
         own, yoked = timing_advantage(place.loop(built, uses), policy, keys, outcome)
         verdicts.append(Verdict(seed, path, own, yoked))
-    return _report(config, verdicts, outcomes, best, outcome)
+    return _report(config, verdicts, outcomes, scripts.best, outcome)
 
 
 def _report(

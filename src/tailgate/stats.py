@@ -1,5 +1,6 @@
 """Intervals. Proportions by Clopper and Pearson (scipy); paired differences by a bootstrap with its own seed."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -52,3 +53,13 @@ def paired_ratio(a: Array, b: Array, level: float = 0.95, resamples: int = 4000,
     drawn = rng.integers(episodes, size=(resamples, episodes))
     low, high = np.quantile(a[drawn].mean(axis=1) / b[drawn].mean(axis=1), [(1 - level) / 2, (1 + level) / 2])
     return Interval(float(a.mean() / b.mean()), float(low), float(high))
+
+
+def holm(p: Sequence[float]) -> list[float]:
+    """p-values adjusted for all of them together (Holm 1979): reject those below the level that one of them would be held to."""
+    order = sorted(range(len(p)), key=lambda i: p[i])
+    out, so_far = [0.0] * len(p), 0.0
+    for rank, i in enumerate(order):
+        so_far = max(so_far, min(1.0, (len(p) - rank) * p[i]))
+        out[i] = so_far
+    return out

@@ -36,6 +36,8 @@ from tailgate.schema import as_data, build, fields_of, override, read_yaml
 from tailgate.threat import KNOWLEDGE
 
 ENVIRONMENT = (fields_of(ActionSpec) | fields_of(Reward) | {"frames": None}).keys() - {"gamma"}  # that `environment` may hold
+COMPARED = {"episodes", "white_box", "others", "workers"}  # fields that change no policy; the next do where the best rival teaches
+CHOSEN = {"rivals", "select_episodes", "outcome"}
 Discount = Annotated[float, Field(gt=0, le=1)]
 
 
@@ -145,7 +147,7 @@ def _check_teacher(config: TrainConfig, seat: Seat) -> None:
     """Raise InputError unless the learner can be shown what is wanted, and a script is shown that knows no more than the learner."""
     where, name = "config.teacher", config.teacher
     if not issubclass(learner_of(config.learner).Learner, Teachable):
-        raise InputError(where, name, f"none: {config.learner} is not shown anything; ppo and maskable_ppo are")
+        raise InputError(where, name, f"none: {config.learner} is not shown anything; ppo, maskable_ppo and cem are")
     if not seat.action.discrete:
         raise InputError(where, name, f"none, or an action of {', '.join(DISCRETE)}: what is shown is one of a few")
     if name == "best" and not config.rivals:
@@ -217,6 +219,8 @@ def _train_seed(config: TrainConfig, teacher: str | None, seed: int, resume: boo
     elif teacher is not None:
         assert isinstance(learner, Teachable)
         learner.imitate(demonstrate(learner.seat, Spec("attack", teacher).make(), seed))
+    record = directory / f"curve-{seed}.json"
+    spent = json.loads(record.read_text()).get("seconds", 0.0) if resume and record.is_file() else 0.0
     started = time.perf_counter()
     learner.learn(config.steps, report, checkpoint, min(config.checkpoint_every, max(config.steps // 10, 1)))
     facts = {
@@ -224,8 +228,8 @@ def _train_seed(config: TrainConfig, teacher: str | None, seed: int, resume: boo
         config.learner: as_data(settings), "environment": learner.seat.card()["hash"], "curve": learner.curve,
     }  # fmt: skip
     policy = learner.export(directory / f"policy-{seed}", facts)
-    curve = {"curve": learner.curve, "seconds": time.perf_counter() - started}
-    write_atomic(directory / f"curve-{seed}.json", json.dumps(curve).encode() + b"\n")
+    curve = {"curve": learner.curve, "seconds": spent + time.perf_counter() - started}
+    write_atomic(record, json.dumps(curve).encode() + b"\n")
     learner.close()
     return policy
 
@@ -283,15 +287,15 @@ def _train_apart(
 
 
 def _same_run(held: Path, config: TrainConfig) -> None:
-    """Raise InputError when a run would be resumed with another configuration; only the number of steps may change."""
-    now = as_data(config)
+    """Raise InputError when a run would be resumed with another training; the number of steps and the comparison may change."""
+    now, free = as_data(config), COMPARED | {"steps"} | (set() if config.teacher == "best" else CHOSEN)
     try:
         before = json.loads(held.read_text(encoding="utf-8"))
-        changed = [key for key in now if key != "steps" and before.get(key) != now[key]]
+        changed = [key for key in now if key not in free and before.get(key) != now[key]]
     except (OSError, ValueError, AttributeError, RecursionError) as error:
         raise InputError("resume", str(held), f"the configuration of the run ({error})") from None
     if changed:
-        raise InputError("resume", ", ".join(changed), f"the configuration in {held}, apart from steps")
+        raise InputError("resume", ", ".join(changed), f"the configuration in {held}, apart from steps and the comparison's fields")
 
 
 def main(arguments: list[str] | None = None) -> int:
