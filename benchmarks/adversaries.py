@@ -60,7 +60,7 @@ def trained(config: train.TrainConfig, console: Console) -> list[Path]:
 
 
 def minutes(config: train.TrainConfig) -> float:
-    """Of all training seeds together, on so many processes at a time."""
+    """Of processor time for all training seeds, shared by so many processes at a time."""
     seconds = [json.loads((config.directory / f"curve-{seed}.json").read_text())["seconds"] for seed in range(config.seeds)]
     return float(np.sum(seconds) / 60.0 / min(config.workers, config.seeds))
 
@@ -207,7 +207,7 @@ def markdown(cells: dict[str, Any]) -> str:
             f"{report['minutes']:.1f}",
         ]  # fmt: skip
         out.append(f"| {' | '.join(parts)} |")
-    out += ["", "Training: minutes of all seeds together on two processes, without the choice of what is shown.", ""]
+    out += ["", "Training: minutes of processor time for all seeds, halved for two processes, without the choice of what is shown.", ""]
     out += ["## Ceilings", "", "| cell | learner | computed optimum | its outcome | share that each seed reaches |"]
     out += ["|---|---|---|---|---|"]
     for name, learner, report in learners_of(cells):

@@ -221,14 +221,14 @@ def _train_seed(config: TrainConfig, teacher: str | None, seed: int, resume: boo
         learner.imitate(demonstrate(learner.seat, Spec("attack", teacher).make(), seed))
     record = directory / f"curve-{seed}.json"
     spent = json.loads(record.read_text()).get("seconds", 0.0) if resume and record.is_file() else 0.0
-    started = time.perf_counter()
+    started = time.process_time()  # of this process alone: others on the machine do not count
     learner.learn(config.steps, report, checkpoint, min(config.checkpoint_every, max(config.steps // 10, 1)))
     facts = {
         "learner": config.learner, "teacher": teacher, "seed": seed, "steps": learner.steps, "config": as_data(config),
         config.learner: as_data(settings), "environment": learner.seat.card()["hash"], "curve": learner.curve,
     }  # fmt: skip
     policy = learner.export(directory / f"policy-{seed}", facts)
-    curve = {"curve": learner.curve, "seconds": spent + time.perf_counter() - started}
+    curve = {"curve": learner.curve, "seconds": spent + time.process_time() - started}
     write_atomic(record, json.dumps(curve).encode() + b"\n")
     learner.close()
     return policy
