@@ -9,7 +9,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from tailgate.core import Defence, PositiveCount, param
+from tailgate.core import Defence, Positive, PositiveCount, param
 from tailgate.errors import InputError, unknown
 from tailgate.loop import Loop
 from tailgate.registry import Spec, make_from
@@ -71,6 +71,10 @@ class Suite:
     seeds: PositiveCount = param(100, "episodes per cell")
     threat: dict[str, Any] = dataclasses.field(default_factory=dict, metadata={"doc": "changes of every scenario's threat model"})
     knowledge: str | None = param(None, "knowledge that every attacker is granted; none: the least that each needs")
+    shown: dict[int, str] = dataclasses.field(default_factory=dict, metadata={"doc": "doses that a board shows rates at, and why these"})
+    bound: Positive | None = param(None, "error above which an episode counts as damaged where nobody can collide [unit of max_error]")
+    robustness: tuple[str, ...] = param((), "those scenarios whose plant is not the one that a defence is told")
+    held_out: tuple[str, ...] = param((), "attacks, by name, that are kept out of logs for those who learn a detector")
 
 
 def _builtin(folder: str) -> dict[str, Path]:
@@ -129,4 +133,12 @@ def load_suite(name: str) -> Suite:
         Spec("defence", text).refuse_imports(f"suite {path.stem}")
     for text in suite.attacks:
         Spec("attack", text).refuse_imports(f"suite {path.stem}")
+    for name in suite.robustness:
+        if name not in suite.scenarios:
+            raise unknown(f"suite {path.stem}: robustness", name, suite.scenarios)
+    for dose in suite.shown:
+        if dose not in suite.doses:
+            raise InputError(f"suite {path.stem}: shown", dose, f"one of the doses {list(suite.doses)}")
+    for name in suite.held_out:
+        _ = Spec("attack", name).entry
     return suite
