@@ -96,7 +96,11 @@ class LoopState(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Loop:
-    """A closed loop of one plant under one defence, for B independent episodes."""
+    """A closed loop of one plant under one defence, for B independent episodes.
+
+    `told`: the model that defence, controller, channel and attacker go by, where the plant's and the sensor's own is another; `load`: the
+    vehicle's mass over the nominal one, by which a commanded acceleration is divided [-].
+    """
 
     plant: Plant
     sensor: Sensor
@@ -107,9 +111,15 @@ class Loop:
     defence: Defence
     uses: tuple[str, ...] = ("measurements",)
     ends_on_collision: bool = True
+    told: Model | None = None
+    load: float = 1.0
 
     @cached_property
     def model(self) -> Model:
+        return self.told or self._own_model
+
+    @cached_property
+    def _own_model(self) -> Model:
         return self.plant.model(self.sensor, self.controller)
 
     @cached_property
@@ -119,8 +129,8 @@ class Loop:
     @cached_property
     def plan(self) -> LoopPlan:
         return LoopPlan(
-            self.plant.prepare(self.model),
-            self.sensor.prepare(self.model),
+            self.plant.prepare(self._own_model),
+            self.sensor.prepare(self._own_model),
             self.controller.prepare(self.model),
             self.manoeuvre.prepare(self.model.dt),
             self.defence.prepare(self.model),
@@ -270,5 +280,6 @@ class Loop:
         manoeuvre, exo = self.manoeuvre.accel(
             plan.manoeuvre, manoeuvre, k, self.plant.lead_speed_of(plant), keys.at(Role.MANOEUVRE, k)
         )
-        plant = self.plant.step(plan.plant, plant, applied, exo, keys.at(Role.PROCESS, k))
+        driven = applied if self.load == 1.0 else applied / self.load
+        plant = self.plant.step(plan.plant, plant, driven, exo, keys.at(Role.PROCESS, k))
         return manoeuvre, plant, self.plant.known(plan.plant, applied if u is None else u, exo, plant)

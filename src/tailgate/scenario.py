@@ -21,7 +21,11 @@ _COMPONENTS = ("plant", "sensor", "controller", "manoeuvre")
 
 @dataclass(frozen=True)
 class Scenario:
-    """plant + sensor + controller + manoeuvre + horizon + threat model."""
+    """plant + sensor + controller + manoeuvre + horizon + threat model.
+
+    `truth` says where the vehicle is another than everyone is told, who knows `plant` and `sensor` as they stand here: changes of the
+    fields of either, and `load`, the mass over the nominal one, by which a commanded acceleration is divided.
+    """
 
     name: str
     plant: Any
@@ -32,15 +36,21 @@ class Scenario:
     threat_model: ThreatModel
     ends_on_collision: bool = True
     about: str = ""
+    truth: dict[str, Any] = dataclasses.field(default_factory=dict, metadata={"if_any": True})
 
     def loop(self, defence: Defence, uses: tuple[str, ...] = ("measurements",)) -> Loop:
+        where = f"scenario {self.name}: truth"
+        plant, sensor = (_changed(getattr(self, part), self.truth.get(part, {}), f"{where}.{part}") for part in ("plant", "sensor"))
+        told = self.plant.model(self.sensor, self.controller) if self.truth else None
         loop = Loop(
-            self.plant, self.sensor, self.controller, self.manoeuvre, self.threat_model, self.horizon, defence, uses,
-            self.ends_on_collision,
+            plant, sensor, self.controller, self.manoeuvre, self.threat_model, self.horizon, defence, uses, self.ends_on_collision, told,
+            self.truth.get("load", 1.0),
         )  # fmt: skip
         begins, drives = getattr(self.manoeuvre, "initial_speed", None), getattr(self.plant, "lead_speed", None)
         if begins is not None and drives is not None and abs(begins - drives) > 0.5:
             raise InputError(f"scenario {self.name}: plant.lead_speed", drives, f"the manoeuvre's first speed ({begins} m/s)")
+        if told is not None and told.C.shape != plant.model(sensor, self.controller).C.shape:
+            raise InputError(where, self.truth, "changes that keep the number of agents, states and sensors")
         _ = loop.plan  # refuses what does not fit (unknown targets, a damaged profile) here, not in the first step
         return loop
 
@@ -56,6 +66,26 @@ class Scenario:
     @property
     def config_hash(self) -> str:
         return hashlib.blake2b(canonical(self).encode(), digest_size=8).hexdigest()
+
+
+def _changed(part: Any, changes: Any, where: str) -> Any:
+    """A component with other values of some fields."""
+    if not isinstance(changes, dict):
+        raise InputError(where, changes, "a mapping of fields")
+    for key in changes:
+        if key not in fields_of(type(part)):
+            raise unknown(f"{where}: unknown field", key, fields_of(type(part)))
+    held = {f.name: getattr(part, f.name) for f in dataclasses.fields(part) if f.init}
+    return build(type(part), held | changes, where) if changes else part
+
+
+def _check_truth(truth: dict[str, Any], where: str) -> None:
+    for key in truth:
+        if key not in ("plant", "sensor", "load"):
+            raise unknown(f"{where}: unknown field", key, ("plant", "sensor", "load"))
+    load = truth.get("load", 1.0)
+    if isinstance(load, bool) or not isinstance(load, int | float) or not 0.1 <= load <= 10.0:
+        raise InputError(f"{where}.load", load, "the mass over the nominal one, 0.1 to 10")
 
 
 @dataclass(frozen=True)
@@ -118,8 +148,11 @@ def load_scenario(name: str) -> Scenario:
     threat = data.get("threat_model", {})
     if not isinstance(threat, dict):
         raise InputError(f"{where}.threat_model", threat, "a mapping of fields")
-    rest = {key: data[key] for key in ("horizon", "ends_on_collision", "about") if key in data} | {"name": data.get("name", path.stem)}
-    return build(Scenario, parts | rest | {"threat_model": build(ThreatModel, threat, f"{where}.threat_model")}, where)
+    rest: dict[str, Any] = {key: data[key] for key in ("horizon", "ends_on_collision", "about", "truth") if key in data}
+    rest |= {"name": data.get("name", path.stem), "threat_model": build(ThreatModel, threat, f"{where}.threat_model")}
+    scenario = build(Scenario, parts | rest, where)
+    _check_truth(scenario.truth, f"{where}.truth")
+    return scenario
 
 
 def load_suite(name: str) -> Suite:

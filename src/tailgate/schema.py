@@ -56,10 +56,11 @@ def build(cls: type[T], data: dict[str, Any], where: str) -> T:
 
 
 def as_data(value: Any) -> Any:
-    """Parameters as plain JSON data: the class, and every default written out."""
+    """Parameters as plain JSON data: the class, and every default written out, but for empty ones of fields marked `if_any`."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         kind = type(value)
-        fields = {f.name: as_data(getattr(value, f.name)) for f in dataclasses.fields(value) if f.init}
+        shown = [f.name for f in dataclasses.fields(value) if f.init and (getattr(value, f.name) or not f.metadata.get("if_any"))]
+        fields = {name: as_data(getattr(value, name)) for name in shown}
         return {"class": f"{kind.__module__}.{kind.__qualname__}", **fields}
     if isinstance(value, dict):
         return {str(k): as_data(v) for k, v in value.items()}
