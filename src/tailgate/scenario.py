@@ -104,6 +104,7 @@ class Suite:
     shown: dict[int, str] = dataclasses.field(default_factory=dict, metadata={"doc": "doses that a board shows rates at, and why these"})
     bound: Positive | None = param(None, "error above which an episode counts as damaged where nobody can collide [unit of max_error]")
     robustness: tuple[str, ...] = param((), "those scenarios whose plant is not the one that a defence is told")
+    adaptive: dict[str, Any] = dataclasses.field(default_factory=dict, metadata={"doc": "how attackers are trained against a defence"})
     held_out: tuple[str, ...] = param((), "attacks, by name, that are kept out of logs for those who learn a detector")
 
 

@@ -1,0 +1,48 @@
+"""tailgate leaderboard attack: train a suite's attackers against a defence, and play them on it."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from tailgate.progress import cells, progress
+
+
+def add(actions: Any) -> None:
+    command = actions.add_parser(
+        "attack", help="train a suite's attackers against a defence, and play them on it",
+        description="Train the learners that the suite names against the defence itself, black and grey box, and play their policies at "
+        "every dose and scenario. A defence without these rows takes no rank. Interrupted, the same command goes on.",
+    )  # fmt: skip
+    command.add_argument("defence", metavar="NAME", help="registered defence")
+    command.add_argument("--suite", required=True, metavar="NAME", help="suite that says what is trained")
+    command.add_argument("--out", required=True, metavar="DIR", help="policies go to DIR/policies, rows to DIR/NAME.jsonl")
+    command.add_argument("--seeds", type=int, metavar="N", help="training seeds instead of the suite's")
+    command.add_argument("--episodes", type=int, metavar="N", help="report episodes per cell instead of the suite's")
+    command.add_argument("--workers", type=int, default=2, metavar="N", help="processes (default 2); change no result")
+    command.add_argument("--set", action="append", default=[], metavar="key=value", help="change the training (repeatable): steps=10000")
+    command.set_defaults(run=_attack)
+
+
+def _attack(options: argparse.Namespace) -> int:
+    from tailgate.adaptive import configs_of, train_against
+    from tailgate.evaluation import evaluate
+    from tailgate.scenario import load_suite
+
+    suite, out = load_suite(options.suite), Path(options.out)
+    extra = (*options.set, f"workers={options.workers}")
+    configs = configs_of(suite, options.defence, out / "policies", seeds=options.seeds, extra=extra)
+    with progress(Console(stderr=True)) as update:
+        policies = train_against(configs, update)
+        file = out / f"{configs[0].name.rsplit('-', 2)[0]}.jsonl"
+        rows = evaluate(
+            suite, defences=[options.defence], attacks=[str(path) for path in policies], seeds=options.episodes, workers=options.workers,
+            out=file, progress=lambda done, total: update("playing", done, total, cells(done, total)),
+        )  # fmt: skip
+    print(file)
+    print(f"{len(policies)} policies, {len(rows)} rows", file=sys.stderr)
+    return 0

@@ -1,0 +1,62 @@
+"""Attackers that a suite trains against a defence."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from tailgate.adaptive import configs_of, plan_of, train_against
+from tailgate.errors import InputError
+from tailgate.evaluation import evaluate
+from tailgate.scenario import Suite
+
+PLAN = {
+    "config": "car-following", "dose": 12, "changes": ["environment.interval=20", "environment.frames=1"],
+    "learners": {"cem": ["teacher=null", "steps=600", "cem={population: 4, episodes: 5, hidden: []}"]}, "seeds": 2,
+}  # fmt: skip
+SUITE = Suite("own-v0", "", ("gusty-stop-and-go-v0", "stop-and-go-v0"), (12,), ("kf",), ("none",), 3, {"kinds": ["fdi"], "fdi_bound": 5.0}, adaptive=PLAN)
+
+
+def test_every_learner_is_trained_at_every_knowledge(tmp_path: Path) -> None:
+    """Two trainings on the first scenario, at the suite's dose and within its threat model, against the defence that is named."""
+    black, grey = configs_of(SUITE, "kf:gain=steady", tmp_path)
+    assert (black.name, grey.name) == ("kf_gain=steady-cem-black", "kf_gain=steady-cem-grey")
+    assert black.defence == "kf:gain=steady" and black.scenario == "gusty-stop-and-go-v0" and black.seeds == 2
+    assert black.threat == {"kinds": ["fdi"], "fdi_bound": 5.0, "budget": 12, "knowledge": "black"} and grey.threat["knowledge"] == "grey"
+    assert black.environment["interval"] == 20 and black.steps == 600 and black.teacher is None
+    assert configs_of(SUITE, "kf", tmp_path, seeds=1, extra=("steps=40",))[0].steps == 40
+
+
+def test_policies_play_as_attacks_and_are_trained_once(tmp_path: Path) -> None:
+    """A second call trains nothing; the policies play on every scenario of the suite, as learned attacks of their own knowledge."""
+    configs = configs_of(SUITE, "kf", tmp_path, extra=("workers=1",))
+    said: list[str] = []
+    policies = train_against(configs, lambda label, done, of, text: said.append(label))
+    assert len(policies) == 4 and said
+    before = [path.stat().st_mtime_ns for path in policies]
+    assert train_against(configs, lambda *args: pytest.fail("trained again")) == policies
+    assert [path.stat().st_mtime_ns for path in policies] == before
+    rows = evaluate(SUITE, attacks=[str(path) for path in policies])
+    assert len(rows) == 4 * 2 * 3 and all(row["status"] == "ok" and row["learned"] for row in rows)
+    assert {row["knowledge"] for row in rows} == {"black", "grey"}
+    assert json.loads(policies[0].read_text())["training"]["config"]["defence"] == "kf"
+
+
+@pytest.mark.parametrize(
+    ("plan", "words"),
+    [
+        ({}, ["adaptive", "learners"]), (PLAN | {"learners": {"ppoo": []}}, ["ppoo", "ppo"]), (PLAN | {"learners": {}}, ["learners"]),
+        (PLAN | {"knowledge": ["blck"]}, ["blck", "black"]), (PLAN | {"seed": 3}, ["seed", "seeds"]), (PLAN | {"dose": 0}, ["dose", "0"]),
+    ],
+)  # fmt: skip
+def test_a_plan_that_makes_no_sense_is_one_clear_error(plan: dict[str, object], words: list[str]) -> None:
+    """The field, the value and what was expected."""
+    with pytest.raises(InputError) as error:
+        plan_of(Suite("own-v0", adaptive=plan))
+    assert all(word in str(error.value) for word in words), str(error.value)
+
+
+def test_a_defence_is_never_imported_for_training(tmp_path: Path) -> None:
+    """Code is named on the command line only, and a configuration is written to disk."""
+    with pytest.raises(InputError, match="registered name"):
+        configs_of(SUITE, "somebody:Else", tmp_path)
