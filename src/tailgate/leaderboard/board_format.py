@@ -1,0 +1,254 @@
+"""The format `tailgate-board-1`, as the page reads it: docs/decisions/0014-boards.md says what the fields mean.
+
+Fields that are not named here are let through: a board may hold more than a page shows.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from tailgate.errors import InputError
+
+FORMAT = "tailgate-board-1"
+Level = Literal["black", "grey", "white"]
+LEVELS: tuple[Level, ...] = ("black", "grey", "white")  # what an attacker knows, from the least
+Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
+Share = Annotated[float, Field(strict=True, ge=0.0, le=1.0)]
+Text = Annotated[str, Field(strict=True)]
+Count = Annotated[int, Field(strict=True, ge=0)]
+Dose = Count | None  # None: the scenario's own budget
+
+
+class Part(BaseModel):
+    model_config = ConfigDict(extra="allow", strict=True)
+
+
+class ScenarioPart(Part):
+    name: Text
+    about: Text = ""
+    robustness: bool = False
+    hash: Text = ""
+
+
+class SuitePart(Part):
+    name: Text
+    about: Text = ""
+    version: Text | int = ""
+    doses: Annotated[list[Dose], Field(min_length=1)]
+    shown: dict[str, Text] = {}
+    limit: Share = 0.1
+    bound: Number | None = None
+    alpha: Share = 0.05
+    scenarios: list[ScenarioPart]
+    episodes: Count | None = None
+    purpose: Text = ""
+    rows: Count | None = None
+
+
+class AttackPart(Part):
+    attack: Text
+    knowledge: Level
+    learned: bool = False
+    optimal: bool = False
+    admitted: dict[str, Any] | None = None
+    note: Text = ""
+    withdrawn: bool = False
+
+
+class Worst(Part):
+    scenario: Text
+    attack: Text
+
+
+class Interval(Part):
+    value: Number
+    low: Number
+    high: Number
+
+
+class Limited(Part):
+    """A share with its lower limit."""
+
+    value: Share
+    low: Share
+
+
+class Gate(Part):
+    gate: Text
+    scenario: Text = ""
+    value: Number | None
+    limit: Number | None
+    passed: bool
+
+
+class Critical(Part):
+    """A dose; None: beyond the largest of the suite."""
+
+    value: Number | None
+    low: Number | None = None
+    high: Number | None = None
+    worst: Worst | None = None
+
+
+class Rate(Part):
+    dose: Dose
+    knowledge: Level
+    undamaged: Limited | None
+    worst: Worst | None = None
+    attacks: Count | None = None
+
+
+class Rank(Part):
+    best: Count
+    worst: Count
+
+
+class Spread(Part):
+    median: Number
+    q25: Number
+    q75: Number
+
+
+class Robust(Part):
+    scenario: Text
+    undamaged: Limited | Number | None
+    change: Number | None = None
+    worst: Worst | None = None
+
+
+class Stealth(Part):
+    hours: Number
+    threshold: Number | None = None
+    deviation: Number | None
+
+
+class EntryPart(Part):
+    defence: Text
+    card: dict[str, Any] | None = None
+    uses: list[Text] = []
+    class_: Text = Field("", alias="class")
+    status: Literal["ranked", "unattacked", "unranked"]
+    why: Text = ""
+    gates: list[Gate] = []
+    critical_dose: dict[Level, Critical | None] = {}
+    rates: list[Rate] = []
+    rank: Rank | None = None
+    clean: dict[str, Spread | None] = {}
+    flags: list[Text] = []
+    worst_episode: dict[str, Any] | None = None
+    robustness: list[Robust] = []
+    stealth: list[Stealth] | None = None
+
+
+class CellPart(Part):
+    scenario: Text
+    dose: Dose
+    defence: Text
+    attack: Text
+    knowledge: Level
+    learned: bool = False
+    optimal: bool = False
+    n: Count = 0
+    failed: Count = 0
+    reason: Text = ""
+    damage: Interval | None
+
+
+class Point(Part):
+    dose: Dose
+    value: Share
+    low: Share | None = None
+    high: Share | None = None
+    scenario: Text = ""
+    attack: Text = ""
+
+
+class CurvePart(Part):
+    defence: Text
+    knowledge: Level
+    points: list[Point]
+    fitted: list[Number] = []
+
+
+class Comparison(Part):
+    """Two defences on the same seeds; only_a: episodes in which a alone came to damage."""
+
+    class_: Text = Field("", alias="class")
+    a: Text
+    b: Text
+    only_a: Count
+    only_b: Count
+    p: Share
+    adjusted: Share
+
+
+class Detected(Part):
+    defence: Text
+    scenario: Text
+    attack: Text
+    hours: Number
+    threshold: Number | None = None
+    detected: Interval | None
+    delay: Number | None = None
+
+
+class Detection(Part):
+    hours: list[Number]
+    entries: list[Detected]
+
+
+class Board(Part):
+    format: Literal["tailgate-board-1"]
+    suite: SuitePart
+    attacks: list[AttackPart] = []
+    entries: list[EntryPart] = []
+    cells: list[CellPart] = []
+    curves: list[CurvePart] = []
+    comparisons: list[Comparison] = []
+    detection: Detection | None = None
+
+
+def read_board(data: Any, where: str = "board") -> Board:
+    """A board from JSON data; raises InputError that names the first field that is not of the format."""
+    if not isinstance(data, dict):
+        raise InputError(where, data, f"a mapping in the format {FORMAT}")
+    if data.get("format") != FORMAT:
+        raise InputError(f"{where}.format", data.get("format"), FORMAT)
+    try:
+        board = Board.model_validate(data)
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in first["loc"])
+        raise InputError(where + place, first["input"] if first["type"] != "missing" else None, first["msg"]) from None
+    _agree(board, where)
+    return board
+
+
+def _agree(board: Board, where: str) -> None:
+    """What one part of a board says of another: names that are there, and each only once."""
+    names = [entry.defence for entry in board.entries]
+    for i, name in enumerate(names):
+        if name in names[:i]:
+            raise InputError(f"{where}.entries[{i}].defence", name, "a defence that is named once")
+    known = {s.name for s in board.suite.scenarios}
+    for i, cell in enumerate(board.cells):
+        if cell.defence not in names:
+            raise InputError(f"{where}.cells[{i}].defence", cell.defence, "one of the entries' defences")
+        if cell.scenario not in known:
+            raise InputError(f"{where}.cells[{i}].scenario", cell.scenario, "one of the suite's scenarios")
+        if cell.dose not in board.suite.doses:
+            raise InputError(f"{where}.cells[{i}].dose", cell.dose, f"one of the suite's doses {board.suite.doses}")
+    for i, curve in enumerate(board.curves):
+        if curve.defence not in names:
+            raise InputError(f"{where}.curves[{i}].defence", curve.defence, "one of the entries' defences")
+        if curve.fitted and len(curve.fitted) != len(curve.points):
+            raise InputError(f"{where}.curves[{i}].fitted", curve.fitted, "a value per point, or none")
+    for i, duel in enumerate(board.comparisons):
+        for side in ("a", "b"):
+            if getattr(duel, side) not in names:
+                raise InputError(f"{where}.comparisons[{i}].{side}", getattr(duel, side), "one of the entries' defences")
+    for key in board.suite.shown:
+        if key not in {str(dose) for dose in board.suite.doses}:
+            raise InputError(f"{where}.suite.shown", key, f"one of the suite's doses {board.suite.doses}")

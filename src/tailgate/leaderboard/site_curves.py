@@ -1,0 +1,82 @@
+"""The charts of a board's site: dose-response curves of each defence and of all together, and stealth-impact curves."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from .board_format import LEVELS, CurvePart, EntryPart
+from .charts import STYLES, Axis, Dot, Line, chart, nice, path_of, ticks_at
+from .site_suite import Data, Suite, figure
+
+TOGETHER = STYLES  # defences with a line each in the chart of all: as many as there are line styles
+SCALES = ("log", "linear")
+
+
+def dots_of(curve: CurvePart) -> Line:
+    kept = [(p, i) for i, p in enumerate(curve.points) if p.dose is not None]
+    kept.sort(key=lambda item: item[0].dose or 0)
+    fitted = [curve.fitted[i] for _, i in kept] if curve.fitted else []
+    style = LEVELS.index(curve.knowledge)
+    dots = [Dot(float(p.dose or 0), p.value, p.low, p.high) for p, _ in kept]
+    return Line(curve.knowledge, style, dots, fitted)
+
+
+def curves_of(suite: Suite, wanted: Sequence[EntryPart] | None = None, gap: float = 14.0) -> list[Data]:
+    """One chart per defence on each scale, with a line per knowledge."""
+    out = []
+    for entry in suite.ordered() if wanted is None else wanted:
+        lines = [line for c in suite.board.curves if c.defence == entry.defence and (line := dots_of(c)).dots]
+        if lines:
+            lines.sort(key=lambda line: line.style)
+            charts = []
+            for scale in SCALES:
+                axis = suite.axis(scale)
+                drawn = chart(lines, axis, ticks_at(axis, suite.places, 16.0), gap=gap, limit=suite.board.suite.limit)
+                charts.append(drawn | {"scale": scale})
+            out.append({"name": suite.defences[entry.defence], "page": suite.pages.get(entry.defence, ""), "charts": charts})
+    return out
+
+
+def together_of(suite: Suite) -> Data | None:
+    """The black-box curves of all defences on one field: the first in the table with a line each, the others faint."""
+    by_defence = {c.defence: dots_of(c) for c in suite.board.curves if c.knowledge == "black"}
+    there = [(e, by_defence[e.defence]) for e in suite.ordered() if e.defence in by_defence and by_defence[e.defence].dots]
+    if not there:
+        return None
+    named = there[:TOGETHER]
+    charts = []
+    for scale in SCALES:
+        axis = suite.axis(scale)
+        lines = [Line(suite.defences[e.defence].full, i, line.dots, line.fitted) for i, (e, line) in enumerate(named)]
+        rest = []
+        for _, line in there:
+            heights = list(line.fitted) or [d.y for d in line.dots]
+            rest.append(path_of(axis, [(d.x, y) for d, y in zip(line.dots, heights, strict=True)]))
+        drawn = chart(lines, axis, ticks_at(axis, suite.places), limit=suite.board.suite.limit)
+        charts.append(drawn | {"scale": scale, "rest": rest[len(named) :], "all": rest})
+    return {"charts": charts, "named": len(named), "of": len(there)}
+
+
+def stealth_of(suite: Suite) -> Data | None:
+    """Deviation that a stealthy attacker reaches against the mean time between false alarms: a chart and a table."""
+    there = [e for e in suite.ordered() if e.stealth]
+    hours = sorted({s.hours for e in there for s in e.stealth or ()})
+    reached = [s.deviation for e in there for s in e.stealth or () if s.deviation is not None]
+    if not reached:
+        return None
+    axis, top = Axis(hours[0], hours[-1], "decades"), nice(max(reached))
+    lines = [
+        Line(suite.defences[e.defence].full, i, [Dot(s.hours, s.deviation) for s in sorted(e.stealth or (), key=lambda s: s.hours)
+                                                if s.deviation is not None])
+        for i, e in enumerate(there[:TOGETHER])
+    ]  # fmt: skip
+    drawn = chart(lines, axis, ticks_at(axis, hours), top=top)
+    for tick in drawn["yticks"]:
+        tick["text"] = figure(tick["value"], 3)
+    rows = []
+    for e in there:
+        by_hour = {s.hours: s for s in e.stealth or ()}
+        cells = [by_hour.get(h) for h in hours]
+        rows.append({"name": suite.defences[e.defence], "page": suite.pages.get(e.defence, ""),
+                     "cells": [figure(c.deviation if c else None, 3) for c in cells]})  # fmt: skip
+    return {"chart": drawn, "hours": [figure(h) for h in hours], "rows": rows, "named": min(len(there), TOGETHER), "of": len(there)}

@@ -1,0 +1,193 @@
+"""What the page of one entry shows: its card, gates, flags, worst attacks, curves, robustness and the replay of its worst episode."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from tailgate.errors import InputError
+from tailgate.metrics import METRICS, UNITS
+from tailgate.replay.page import VERDICTS, outcome, write_page
+from tailgate.replay.replay import play
+
+from .board_format import LEVELS, CellPart, EntryPart, Robust
+from .build import names_of, percent
+from .site_curves import curves_of
+from .site_index import comparisons_of
+from .site_suite import Data, Suite, critical_of, dose_text, figure, share_of, worse
+
+SHOWN = ("name", "summary", "parameters")  # of a card: shown in a place of their own
+ORDER = ("reference", "code", "licence", "license", "uses", "threat_model", "training_budget", "sentinel", "version")
+
+
+@dataclass(frozen=True)
+class Replayed:
+    """What came of playing the worst episode again: a page, or why there is none."""
+
+    page: str = ""
+    outcome: str = ""
+    check: str = ""
+    tone: str = ""
+    why: str = ""
+
+
+def replay_of(row: Mapping[str, Any] | None, out: Path, source: str) -> Replayed:
+    """Plays the row and writes its page to `out`.
+
+    A board may come from anybody: its row may be of another version, incomplete, or name a file or a class that is not here. Then the
+    reason is what is returned: one row must not cost the site.
+    """
+    if row is None:
+        return Replayed(why="The board holds no worst episode of this defence.")
+    try:
+        replay = play(dict(row))
+        page = write_page(replay, out, source)
+    except Exception as error:
+        return Replayed(why=_reason(error, row))
+    tone, title, why = VERDICTS[replay.verdict]
+    return Replayed(page.name, outcome(replay), f"{title}: {why}.", tone)
+
+
+def _reason(error: Exception, row: Mapping[str, Any]) -> str:
+    """The error in words, without the places of files on somebody's machine."""
+    if isinstance(error, KeyError):
+        return f"The row lacks the field {error}."
+    text = str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
+    for key in ("attack", "defence", "scenario_file"):
+        value = row.get(key)
+        if isinstance(value, str) and "/" in value:
+            text = text.replace(value, names_of([value])[value].label)
+    return text[:1].upper() + text[1:] + "."
+
+
+def _plain(value: Any) -> str:
+    """JSON data in a line."""
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, Mapping):
+        return "; ".join(f"{k}: {_plain(v)}" for k, v in value.items())
+    if isinstance(value, list | tuple):
+        return ", ".join(_plain(v) for v in value)
+    return "none" if value is None else str(value)
+
+
+def card_of(entry: EntryPart) -> Data:
+    """A card's fields in order: those that are known first, then the others as they stand."""
+    card = entry.card or {}
+    keys = [*(k for k in ORDER if k in card), *(k for k in card if k not in ORDER and k not in SHOWN)]
+    fields = [(key.replace("_", " ").capitalize(), _plain(card[key])) for key in keys if card[key] not in (None, "", [], {})]
+    if "uses" not in card and entry.uses:
+        fields.append(("Uses", ", ".join(entry.uses)))
+    given = card.get("parameters")
+    parameters = []
+    for name, item in given.items() if isinstance(given, Mapping) else ():
+        known = isinstance(item, Mapping) and "doc" in item
+        parameters.append((str(name), _plain(item.get("default")) if known else _plain(item), str(item["doc"]) if known else ""))
+    return {"known": bool(card), "summary": _plain(card.get("summary", "")), "fields": fields, "parameters": parameters}
+
+
+def _rates(suite: Suite, entry: EntryPart) -> list[Data]:
+    kept = {(r.dose, r.knowledge): r for r in entry.rates}
+    out = []
+    for dose in dict.fromkeys(r.dose for r in entry.rates):
+        cells = []
+        for level in LEVELS:
+            rate = kept.get((dose, level))
+            worst = suite.where(rate.worst.scenario, rate.worst.attack) if rate and rate.worst else ""
+            cells.append(share_of(rate.undamaged if rate else None) | {"worst": worst, "attacks": rate.attacks if rate else None})
+        out.append({"dose": dose_text(dose), "cells": cells})
+    return out
+
+
+def _worst(suite: Suite, entry: EntryPart) -> list[Data]:
+    """Per scenario and shown dose the attack that did most damage; computed optima do not count."""
+    mine = [c for c in suite.board.cells if c.defence == entry.defence and not c.optimal and c.attack != "none"]
+    out = []
+    for scenario in suite.board.suite.scenarios:
+        for dose in suite.shown:
+            cell = worse(c for c in mine if c.scenario == scenario.name and c.dose == dose)
+            if cell is not None:
+                out.append(_cell(suite, cell) | {"robustness": scenario.robustness})
+    return out
+
+
+def _cell(suite: Suite, cell: CellPart) -> Data:
+    damage = cell.damage
+    return {
+        "scenario": cell.scenario, "dose": dose_text(cell.dose), "dose_sort": "" if cell.dose is None else cell.dose,
+        "attack": suite.attacks[cell.attack], "knowledge": cell.knowledge, "n": cell.n, "failed": cell.failed, "reason": cell.reason,
+        "learned": cell.learned, "optimal": cell.optimal, "robustness": False,
+        "text": percent(damage.value) if damage else "n/a", "sort": f"{damage.value:.6g}" if damage else "",
+        "span": f"{percent(damage.low)} to {percent(damage.high)}" if damage else "",
+    }  # fmt: skip
+
+
+def _every(suite: Suite, mine: Sequence[CellPart]) -> list[Data]:
+    """All cells of a defence: a row per scenario and attack, a column per dose."""
+    rows: dict[tuple[str, str, str], dict[Any, CellPart]] = {}
+    for cell in mine:
+        rows.setdefault((cell.scenario, cell.attack, cell.knowledge), {})[cell.dose] = cell
+    out = []
+    for (scenario, attack, knowledge), by_dose in rows.items():
+        first = next(iter(by_dose.values()))
+        cells = [_cell(suite, by_dose[dose]) if dose in by_dose else None for dose in suite.board.suite.doses]
+        reason = next((c.reason for c in by_dose.values() if c.reason), "")
+        row = {"scenario": scenario, "attack": suite.attacks[attack], "knowledge": knowledge, "reason": reason, "cells": cells}
+        out.append(row | {"learned": first.learned, "optimal": first.optimal})
+    return out
+
+
+def _robust(suite: Suite, item: Robust) -> Data:
+    if isinstance(item.undamaged, float | int):
+        share: Data = {"text": percent(item.undamaged), "low": "", "sort": item.undamaged}
+    else:
+        share = share_of(item.undamaged)
+    change = "\N{EN DASH}" if item.change is None else percent(item.change) if item.change <= 0 else f"+{percent(item.change)}"
+    worst = suite.where("", item.worst.attack) if item.worst else ""
+    return {"scenario": item.scenario, "undamaged": share, "change": change, "worst": worst}
+
+
+def _clean(entry: EntryPart) -> list[Data]:
+    out = []
+    for name, spread in entry.clean.items():
+        about = " ".join((METRICS[name].__doc__ or "").split()) if name in METRICS else ""
+        numbers = [figure(x) for x in (spread.median, spread.q25, spread.q75)] if spread else ["\N{EN DASH}"] * 3
+        out.append({"name": name.replace("_", " "), "about": about, "unit": UNITS.get(name, ""), "numbers": numbers})
+    return out
+
+
+def _rank(suite: Suite, entry: EntryPart) -> str:
+    if entry.rank is None:
+        return ""
+    of = sum(e.class_ == entry.class_ and e.rank is not None for e in suite.board.entries)
+    best, worst = entry.rank.best, entry.rank.worst
+    return f"{best if best == worst else f'{best} to {worst}'} of {of}"
+
+
+def entry_page(suite: Suite, entry: EntryPart, replayed: Replayed | None, also: list[tuple[str, str]]) -> Data:
+    """All that an entry's page shows. also: names of other suites with an entry of the same text, and their pages."""
+    curves = curves_of(suite, [entry], gap=7.0)
+    mine = [c for c in suite.board.cells if c.defence == entry.defence]
+    detection = [
+        {"attack": suite.attacks[d.attack], "scenario": d.scenario, "hours": figure(d.hours), "threshold": figure(d.threshold),
+         "text": percent(d.detected.value) if d.detected else "n/a", "sort": f"{d.detected.value:.6g}" if d.detected else "",
+         "span": f"{percent(d.detected.low)} to {percent(d.detected.high)}" if d.detected else "", "delay": figure(d.delay, 3)}
+        for d in (suite.board.detection.entries if suite.board.detection else ()) if d.defence == entry.defence
+    ]  # fmt: skip
+    return {
+        "suite": suite.board.suite, "damage": suite.damage, "limit": percent(suite.board.suite.limit), "scale": suite.scale,
+        "name": suite.defences[entry.defence], "status": entry.status, "why": entry.why, "class": entry.class_ or "not stated",
+        "rank": _rank(suite, entry), "also": also, "card": card_of(entry), "flags": entry.flags, "levels": LEVELS,
+        "critical": [(level, critical_of(suite, entry.critical_dose.get(level))) for level in LEVELS],
+        "rates": _rates(suite, entry), "worst": _worst(suite, entry), "cells": _every(suite, mine),
+        "doses": [dose_text(d) for d in suite.board.suite.doses],
+        "gates": [{"gate": g.gate.replace("_", " "), "scenario": g.scenario, "value": figure(g.value), "limit": figure(g.limit),
+                   "passed": g.passed} for g in entry.gates],
+        "charts": curves[0]["charts"] if curves else [], "clean": _clean(entry),
+        "robustness": [_robust(suite, r) for r in entry.robustness],
+        "stealth": [{"hours": figure(s.hours), "threshold": figure(s.threshold), "deviation": figure(s.deviation, 3)}
+                    for s in entry.stealth or ()],
+        "detection": detection, "comparisons": comparisons_of(suite, entry.defence), "replay": replayed,
+    }  # fmt: skip

@@ -1,0 +1,153 @@
+"""What the first page of a board's site shows of one suite: headline table, heat map, detection and comparisons."""
+
+from __future__ import annotations
+
+from .board_format import LEVELS, CellPart, Level
+from .build import percent
+from .site_curves import curves_of, stealth_of, together_of
+from .site_suite import GROUPS, Data, Suite, cell_of, critical_of, dose_text, figure, gates_of, share_of, worse
+
+
+def _lines(suite: Suite) -> list[Data]:
+    ranked = [e for e in suite.board.entries if e.rank]
+    out = []
+    for i, entry in enumerate(suite.ordered()):
+        rates = {(r.dose, r.knowledge): share_of(r.undamaged) for r in entry.rates}
+        rank = {"text": "\N{EN DASH}", "sort": "", "of": 0}
+        if entry.rank:
+            best, worst = entry.rank.best, entry.rank.worst
+            rank["text"] = str(best) if best == worst else f"{best}\N{EN DASH}{worst}"
+            rank |= {"sort": f"{best + worst / 1000:.3f}", "of": sum(e.class_ == entry.class_ for e in ranked)}
+        out.append({
+            "index": i, "name": suite.defences[entry.defence], "page": suite.pages.get(entry.defence, ""),
+            "class": entry.class_ or "not stated", "rank": rank,
+            "critical": [critical_of(suite, entry.critical_dose.get(level)) for level in ("black", "white")],
+            "rates": [{level: rates.get((dose, level), share_of(None)) for level in LEVELS} for dose in suite.shown],
+            "gates": gates_of(entry), "flags": entry.flags, "status": entry.status, "why": entry.why,
+        })  # fmt: skip
+    return out
+
+
+def heat_of(suite: Suite) -> Data | None:
+    """The heat map: its heads and rows at the middle dose, and all figures for the menus."""
+    board = suite.board
+    if not board.cells:
+        return None
+    kept = {(c.scenario, c.dose, c.defence, c.attack, c.knowledge): c for c in board.cells}
+    withdrawn = {a.attack for a in board.attacks if a.withdrawn}
+    optimal = {(c.attack, c.knowledge) for c in board.cells if c.optimal}
+    apart = optimal | {(c.attack, c.knowledge) for c in board.cells if c.attack in withdrawn}
+    learned = {(c.attack, c.knowledge) for c in board.cells if c.learned}
+    columns = list(dict.fromkeys((c.attack, c.knowledge) for c in board.cells))
+    columns.sort(key=lambda c: (c in optimal, LEVELS.index(c[1])))
+    heads = [
+        {"name": suite.attacks[a], "knowledge": k, "learned": (a, k) in learned or suite.attacks[a].policy, "optimal": (a, k) in optimal}
+        for a, k in columns
+    ]
+    scenarios = [s.name for s in board.suite.scenarios]
+    entries = suite.ordered()
+    first = None if len(scenarios) > 1 else scenarios[0]  # None: the worst of all
+
+    def look(scenario: str | None, defence: str, column: tuple[str, Level]) -> CellPart | None:
+        return worse(kept.get((s, suite.middle, defence, *column)) for s in (scenarios if scenario is None else [scenario]))
+
+    rows = []
+    for i, entry in enumerate(entries):
+        parts = [look(first, entry.defence, column) for column in columns]
+        counted = worse(p for p, column in zip(parts, columns, strict=True) if column not in apart)
+        cells = [cell_of(p, board.suite.limit) for p in parts]
+        rows.append({"index": i, "name": suite.defences[entry.defence], "page": suite.pages.get(entry.defence, ""), "cells": cells,
+                     "worst": cell_of(counted, board.suite.limit), "status": entry.status})  # fmt: skip
+    reasons: dict[str, int] = {"": 0}
+    figures = []
+    for scenario in scenarios:
+        for dose in board.suite.doses:
+            grid = [_packed(kept.get((scenario, dose, e.defence, *c)), reasons) for e in entries for c in columns]
+            figures.append(grid)
+    data = {
+        "scenarios": len(scenarios), "doses": len(board.suite.doses), "columns": len(columns), "limit": board.suite.limit,
+        "apart": [int(c in apart) for c in columns], "reasons": list(reasons), "figures": figures,
+    }  # fmt: skip
+    doses = [{"text": dose_text(d), "chosen": d == suite.middle} for d in board.suite.doses]
+    groups = [(title, [r for r in rows if r["status"] == status]) for status, title, _ in GROUPS]
+    return {
+        "heads": heads, "groups": [g for g in groups if g[1]], "data": data, "doses": doses, "scenarios": scenarios, "all": first is None,
+        "apart": bool(apart),
+    }  # fmt: skip
+
+
+def _packed(cell: CellPart | None, reasons: dict[str, int]) -> int | list[float | int | None]:
+    """0 for no cell, else [share, low, high, episodes, failed, index of the reason]; the share is null where there are no figures."""
+    if cell is None:
+        return 0
+    reason = reasons.setdefault(cell.reason, len(reasons))
+    if cell.damage is None:
+        return [None, 0, 0, cell.n, cell.failed, reason]
+    return [cell.damage.value, round(cell.damage.low, 4), round(cell.damage.high, 4), cell.n, cell.failed, reason]
+
+
+def detection_of(suite: Suite) -> Data | None:
+    """The second board: per defence and time between false alarms the share detected of the attack that it detects least."""
+    if suite.board.detection is None or not suite.board.detection.entries:
+        return None
+    hours, cases = suite.board.detection.hours, suite.board.detection.entries
+    rows = []
+    for defence in dict.fromkeys(c.defence for c in cases):
+        cells = []
+        for hour in hours:
+            known = [c for c in cases if c.defence == defence and c.hours == hour and c.detected is not None]
+            least = min(known, key=lambda c: c.detected.value if c.detected else 0.0, default=None)
+            if least is None or least.detected is None:
+                cells.append({"text": "\N{EN DASH}", "sort": "", "low": "", "about": "", "delay": ""})
+                continue
+            cells.append({
+                "text": percent(least.detected.value), "sort": f"{least.detected.value:.6g}", "low": percent(least.detected.low),
+                "about": suite.where(least.scenario, least.attack), "delay": figure(least.delay, 3) if least.delay is not None else "",
+            })  # fmt: skip
+        rows.append({"name": suite.defences[defence], "page": suite.pages.get(defence, ""), "cells": cells})
+    return {"hours": [figure(h) for h in hours], "rows": rows}
+
+
+def comparisons_of(suite: Suite, defence: str | None = None) -> list[Data]:
+    """Pairs of a class: who came to damage less often where the two differ; of one defence only, those that it is in."""
+    out = []
+    for duel in suite.board.comparisons:
+        if defence in (None, duel.a, duel.b):
+            sure = duel.adjusted <= suite.board.suite.alpha and duel.only_a != duel.only_b
+            better = duel.a if duel.only_a < duel.only_b else duel.b
+            out.append({
+                "class": duel.class_ or "not stated", "a": suite.defences[duel.a], "b": suite.defences[duel.b],
+                "only_a": duel.only_a, "only_b": duel.only_b, "p": _small(duel.p), "adjusted": _small(duel.adjusted),
+                "sort": f"{duel.p:.6g}", "sort_adjusted": f"{duel.adjusted:.6g}", "better": suite.defences[better] if sure else None,
+            })  # fmt: skip
+    return out
+
+
+def _small(p: float) -> str:
+    return "< 0.0001" if p < 1e-4 else f"{p:.2g}" if p < 0.1 else f"{p:.2f}"
+
+
+def attacks_of(suite: Suite) -> list[Data]:
+    out = []
+    for attack in suite.board.attacks:
+        admitted = "with the suite" if attack.admitted is None else "; ".join(f"{k} {v}" for k, v in attack.admitted.items())
+        name = suite.attacks[attack.attack]
+        out.append({"name": name, "knowledge": attack.knowledge, "learned": attack.learned or name.policy, "optimal": attack.optimal,
+                    "admitted": admitted, "note": attack.note})  # fmt: skip
+    return out
+
+
+def section(suite: Suite) -> Data:
+    """All that index.html shows of a suite."""
+    board = suite.board
+    rows = _lines(suite)
+    groups = [{"title": t, "about": about, "rows": [r for r in rows if r["status"] == s]} for s, t, about in GROUPS]
+    doses = [{"text": dose_text(d), "why": board.suite.shown.get(str(d), "")} for d in suite.shown]
+    return {
+        "suite": board.suite, "damage": suite.damage, "folder": suite.folder, "count": len(rows), "doses": doses,
+        "all_doses": ", ".join(dose_text(d) for d in board.suite.doses), "limit": percent(board.suite.limit),
+        "groups": [g for g in groups if g["rows"]], "classes": sorted({r["class"] for r in rows}),
+        "statuses": [s for s, *_ in GROUPS if any(r["status"] == s for r in rows)], "levels": LEVELS,
+        "heat": heat_of(suite), "scale": suite.scale, "together": together_of(suite), "curves": curves_of(suite),
+        "stealth": stealth_of(suite), "detection": detection_of(suite), "comparisons": comparisons_of(suite), "attacks": attacks_of(suite),
+    }  # fmt: skip

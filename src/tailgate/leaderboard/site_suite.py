@@ -1,0 +1,170 @@
+"""A board with the words for it: names as people read them, doses, and figures as the pages of a site show them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import Any
+
+from .board_format import LEVELS, Board, CellPart, Critical, Dose, EntryPart, Limited
+from .build import Name, names_of, percent, shade
+from .charts import Axis
+
+Data = dict[str, Any]
+SPREAD = 16  # ratio of the largest dose to the smallest above which doses are drawn on a logarithmic axis at first
+GROUPS = (  # status, title, what it means
+    ("ranked", "Ranked", "with figures against every attack, and through every gate"),
+    ("unattacked", "Not attacked yet", "no attacker was trained against these: a good figure says little, and they take no rank"),
+    ("unranked", "Unranked, for comparison", "baselines, references and those that fail a gate or lack figures"),
+)
+
+
+def figure(value: float | None, digits: int = 4) -> str:
+    """A number, short; an en dash for none."""
+    if value is None:
+        return "\N{EN DASH}"
+    text = f"{value:.6f}".rstrip("0") if 1e-5 <= abs(value) < 1e-3 else f"{value:.{digits}g}"
+    return text.replace("-", "\N{MINUS SIGN}")
+
+
+def dose_text(dose: Dose) -> str:
+    return "the scenario's own" if dose is None else str(dose)
+
+
+@dataclass
+class Suite:
+    """A board and the words for it: names as people read them, the doses, and where each entry's page is."""
+
+    board: Board
+    folder: str
+    pages: dict[str, str] = field(default_factory=dict)  # defence: path of its page from index.html
+    defences: dict[str, Name] = field(init=False)
+    attacks: dict[str, Name] = field(init=False)
+
+    def __post_init__(self) -> None:
+        b = self.board
+        duels = [d for e in (b.detection.entries if b.detection else ()) for d in (e.defence,)]
+        self.defences = names_of(dict.fromkeys([*(e.defence for e in b.entries), *duels]))
+        worst = [w.attack for e in b.entries for c in (*e.critical_dose.values(), *e.rates) if c and (w := c.worst)]
+        points = [p.attack for c in b.curves for p in c.points]
+        robust = [r.worst.attack for e in b.entries for r in e.robustness if r.worst]
+        heard = [e.attack for e in (b.detection.entries if b.detection else ())]
+        own = [*(a.attack for a in b.attacks), *(c.attack for c in b.cells)]
+        self.attacks = names_of(dict.fromkeys([*own, *worst, *points, *heard, *robust]))
+
+    @property
+    def largest(self) -> int | None:
+        return max((d for d in self.board.suite.doses if d is not None), default=None)
+
+    @property
+    def shown(self) -> list[Dose]:
+        """The doses with a column in the headline table: those that the suite gives a reason for, else up to three."""
+        doses = self.board.suite.doses
+        named = [d for d in doses if str(d) in self.board.suite.shown]
+        return named or sorted({doses[0], doses[len(doses) // 2], doses[-1]}, key=doses.index)
+
+    @property
+    def middle(self) -> Dose:
+        return self.shown[len(self.shown) // 2]
+
+    @property
+    def scale(self) -> str:
+        numbers = [d for d in self.board.suite.doses if d]
+        return "log" if numbers and max(numbers) > SPREAD * min(numbers) else "linear"
+
+    @property
+    def damage(self) -> str:
+        bound = self.board.suite.bound
+        return "a collision, in front or behind" if bound is None else f"an error above {figure(bound)}"
+
+    @property
+    def places(self) -> list[float]:
+        """Doses with a tick on the axis of the curves, which may begin without an attack."""
+        doses = [*self.board.suite.doses, *(p.dose for c in self.board.curves for p in c.points)]
+        return sorted({float(d) for d in doses if d is not None})
+
+    def axis(self, scale: str) -> Axis:
+        places = self.places or [0.0]
+        return Axis(0.0 if scale == "linear" else places[0], places[-1], scale)
+
+    def where(self, scenario: str, attack: str) -> str:
+        name = self.attacks[attack].full if attack in self.attacks else attack
+        return f"{name}, {scenario}" if scenario else name
+
+    def ordered(self) -> list[EntryPart]:
+        """Entries as the tables list them: by group, then class, rank and critical dose."""
+        return sorted(self.board.entries, key=self._order)
+
+    def _order(self, entry: EntryPart) -> tuple[Any, ...]:
+        status = [name for name, *_ in GROUPS].index(entry.status)
+        rank = (entry.rank.best, entry.rank.worst) if entry.rank else (math.inf, math.inf)
+        doses = [-_sort_dose(entry.critical_dose.get(level)) for level in LEVELS]
+        return (status, entry.class_.count("+"), entry.class_, rank, doses)
+
+
+def _sort_dose(critical: Critical | None) -> float:
+    if critical is None:
+        return -1.0
+    return math.inf if critical.value is None else critical.value
+
+
+def critical_of(suite: Suite, critical: Critical | None) -> Data:
+    """A critical dose in words, and its interval as places on the dose axis."""
+    if critical is None:
+        why = "not every attack of this knowledge has full figures"
+        return {"text": "\N{EN DASH}", "sort": "", "span": "", "bar": None, "worst": "", "about": why}
+    largest = suite.largest
+    beyond = "not reached" if largest is None else f"> {largest}"
+    axis = Axis(0.0, float(largest or 1), suite.scale)
+
+    def words(x: float | None) -> str:
+        return beyond if x is None else figure(x, 3)
+
+    def at(x: float | None) -> float:
+        return 100.0 if x is None else min(max(axis.at(x), 0.0), 100.0)
+
+    span = "" if critical.low is None else f"{words(critical.low)} to {words(critical.high)}"
+    worst = suite.where(critical.worst.scenario, critical.worst.attack) if critical.worst else ""
+    bar = {"low": at(critical.low), "x": at(critical.value), "high": at(critical.high), "beyond": critical.value is None}
+    about = [f"{percent(1 - suite.board.suite.alpha)} interval {span}"] * bool(span) + [f"worst: {worst}"] * bool(worst)
+    sort = _sort_dose(critical)
+    return {
+        "text": words(critical.value), "sort": "Infinity" if sort == math.inf else f"{sort:.6g}", "span": span, "bar": bar, "worst": worst,
+        "about": "; ".join(about),
+    }  # fmt: skip
+
+
+def share_of(share: Limited | None) -> Data:
+    if share is None:
+        return {"text": "\N{EN DASH}", "low": "", "sort": ""}
+    return {"text": percent(share.value), "low": percent(share.low), "sort": f"{share.value:.6g}"}
+
+
+def gates_of(entry: EntryPart) -> Data:
+    failed = [g for g in entry.gates if not g.passed]
+    names = ", ".join(dict.fromkeys(g.gate.replace("_", " ") for g in failed))
+    if not entry.gates:
+        return {"text": "\N{EN DASH}", "failed": "", "sort": ""}
+    return {"text": f"{len(entry.gates) - len(failed)} of {len(entry.gates)}", "failed": names, "sort": len(failed)}
+
+
+def cell_of(cell: CellPart | None, limit: float) -> Data:
+    """A cell of the heat map: what stands in it, its shade, and the words for those who do not see it."""
+    if cell is None or cell.damage is None:
+        what = "not played" if cell is None or not (cell.reason or cell.failed) else "failed" if cell.failed else "skipped"
+        why = ": ".join(filter(None, (what, cell.reason if cell else "")))
+        return {"text": "n/a", "shade": "na", "label": why, "over": False, "lost": False}
+    damage = cell.damage
+    label = f"{percent(round(damage.low, 4))} to {percent(round(damage.high, 4))}, {cell.n} episodes"
+    if cell.failed:
+        label += f"; {cell.failed} more failed: {cell.reason}"
+    over = damage.value > limit
+    return {"text": percent(damage.value), "shade": shade(damage.value), "label": label, "over": over, "lost": cell.failed > 0}
+
+
+def worse(cells: Iterable[CellPart | None]) -> CellPart | None:
+    """The cell with the most damage; of equal ones the first. One without figures only where no other is."""
+    there = [c for c in cells if c is not None]
+    known = [c for c in there if c.damage is not None]
+    return max(known, key=lambda c: c.damage.value if c.damage else 0.0) if known else next(iter(there), None)

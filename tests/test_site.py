@@ -1,0 +1,284 @@
+"""The site of boards: what its pages say, and that nothing in a board becomes markup."""
+
+import copy
+import hashlib
+import importlib.util
+import json
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+from urllib.parse import unquote, urlsplit
+
+import pytest
+
+from tailgate.errors import InputError
+from tailgate.leaderboard.board_format import read_board
+from tailgate.leaderboard.build import percent
+from tailgate.leaderboard.charts import Axis, Dot, Line, chart, nice, spread, ticks_at
+from tailgate.leaderboard.site import build_site, slug
+from tailgate.leaderboard.site_entry import replay_of
+from tailgate.leaderboard.site_suite import figure
+
+spec = importlib.util.spec_from_file_location("boards", Path(__file__).with_name("boards.py"))
+boards = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(boards)
+make_board, network, entry, HOSTILE, LONG = boards.make_board, boards.network, boards.entry, boards.HOSTILE, boards.LONG
+
+
+class Outline(HTMLParser):
+    """Tags with their attributes, and the text of every table row by the table's class."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.tags, self.lines, self.table = [], [], None
+        self.feed(text.replace("<wbr>", ""))
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append((tag, dict(attrs)))
+        if tag == "table":
+            self.table = dict(attrs)["class"]
+        if tag == "tr":
+            self.lines.append([self.table, ""])
+
+    def handle_data(self, data):
+        if self.lines:
+            self.lines[-1][1] += " " + data
+
+    def rows(self, table):
+        return [re.sub(r"\s+", " ", text).strip() for kind, text in self.lines if kind == table]
+
+
+@pytest.fixture(scope="module")
+def worst_row():
+    return boards.crashed_row()
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory, worst_row):
+    return boards.make_site(tmp_path_factory.mktemp("site"), worst_row)
+
+
+@pytest.fixture(scope="module")
+def index(site):
+    return Outline(site.read_text(encoding="utf-8"))
+
+
+def test_every_file_is_listed_with_its_hash(site):
+    """The summary names every file of the site but itself, with the hash of what is there."""
+    data = json.loads((site.parent / "summary.json").read_text())
+    there = {str(p.relative_to(site.parent)) for p in site.parent.rglob("*") if p.is_file()}
+    assert set(data["sha256"]) == there - {"summary.json"} and data["suites"] == ["synthetic-v0", "network-v0"]
+    for name, digest in data["sha256"].items():
+        assert hashlib.sha256((site.parent / name).read_bytes()).hexdigest() == digest
+    assert json.loads((site.parent / "network-v0" / "board.json").read_text()) == network()
+    kf = next(e for e in data["entries"] if e["defence"] == "kf")
+    assert kf["replay"] == "synthetic-v0/kf-replay.html" and kf["replay"] in there and data["sha256"]["network-v0/board.json"][:16] in site.read_text()
+
+
+def test_the_same_boards_give_the_same_bytes(site, worst_row, tmp_path):
+    """Nothing of a time or a place gets into the site."""
+    again = boards.make_site(tmp_path, worst_row)
+    for path in site.parent.rglob("*.*"):
+        assert path.read_bytes() == (again.parent / path.relative_to(site.parent)).read_bytes(), path.name
+
+
+def test_groups_order_and_figures(index):
+    """Ranked entries come first by class and rank, then the unattacked, then the unranked with their reasons; figures are those of the board."""
+    rows = [row for row in index.rows("cells ranks") if row][1:]
+    heads = [i for i, row in enumerate(rows) if row.startswith(("Ranked", "Not attacked yet", "Unranked, for comparison"))]
+    assert heads[:3] == [0, 7, 10] and len(heads) == 4
+    assert [row.split()[0] for row in rows[1:7]] == ["kf", "chi2_kf", "cusum_kf", "reacquire_kf", "brake_kf", "cra"]
+    board = make_board()
+    kf = next(e for e in board["entries"] if e["defence"] == "kf")
+    dose = kf["critical_dose"]["black"]
+    assert f"{dose['value']:.3g} {dose['low']:.3g} to {dose['high']:.3g}" in rows[1] and "1 of 3" in rows[1]
+    rates = {(r["dose"], r["knowledge"]): r["undamaged"] for r in kf["rates"]}
+    for dose in (10, 20, 40):
+        assert f"{percent(rates[dose, 'white']['value'])} ≥ {percent(rates[dose, 'white']['low'])}" in rows[1]
+    brake = next(row for row in rows if row.startswith("brake_kf"))
+    assert "> 200" in brake and "to > 200" in brake  # beyond the largest dose
+    assert any(row.startswith("none baseline: no defence") for row in rows)
+    assert any(row.startswith("always_alarm sentinel") and "6 of 8 not false alarms" in row for row in rows)
+    last = rows[heads[3] :]
+    assert [row.split()[0] for row in last[1:]] == ["kf", "chi2_kf"] and "kf measurements 1 of 2 > 3 > 3" in last[1]
+
+
+def test_the_map_shows_the_worst_scenario_at_the_middle_dose(index):
+    """A cell of the first map is the largest share over the scenarios; the computed optimum is not in the worst of the row."""
+    board = make_board()
+    row = next(r for r in index.rows("heat map") if r.startswith("chi2_kf"))
+    cells = [c for c in board["cells"] if c["defence"] == "chi2_kf:eta=15" and c["dose"] == 20]
+    by_attack = {}
+    for c in cells:
+        by_attack[c["attack"]] = max(by_attack.get(c["attack"], 0), c["damage"]["value"])
+    shown = [float(x) / 100 for x in re.findall(r"(\d+)% ,", row)]
+    counted = [by_attack[a] for a, _, _, _, optimal in boards.ATTACKS if not optimal]
+    assert shown[0] == pytest.approx(max(counted), abs=0.0051) and by_attack["optimal_stealth"] > max(counted)
+    assert shown[1:] == pytest.approx([by_attack[a] for a, *_ in boards.ATTACKS], abs=0.0051)
+
+
+def test_a_board_without_a_road_names_its_bound(site):
+    """Where nobody can collide, damage is an error above the suite's bound."""
+    text = site.read_text(encoding="utf-8")
+    assert "an error above 25" in text and text.count("a collision, in front or behind") == 1
+    assert "an error above 25" in entry(site, "kf", "network-v0").read_text(encoding="utf-8")
+
+
+def test_an_entry_s_page_has_all_parts(site):
+    """Card, gates, flags, worst attacks, curves, robustness, stealth, detection, comparisons, and a link to the other suite."""
+    text = entry(site, "chi2_kf:eta=15").read_text(encoding="utf-8")
+    for part in ("https://example.org/paper", "Licence", "threshold of the gate [1]", "the budget was not spent", "car-following-heavy-v0", "\N{MINUS SIGN}7%", "false alarms",
+                 "Only A damaged", "steps: 20000", "../network-v0/chi2_kf", "other plant"):  # fmt: skip
+        assert part in text, part
+    assert text.count('class="plot ') == 2  # a chart on each scale
+    bare = entry(site, HOSTILE).read_text(encoding="utf-8")
+    assert "came without a card" in bare and "No replay. The board holds no worst episode" in bare and "Stealth and impact" not in bare
+
+
+def test_the_worst_episode_is_played_again(site, worst_row):
+    """The entry's page links a replay that is bit for bit the row's episode; a row that cannot be played says why."""
+    text = entry(site, "kf").read_text(encoding="utf-8")
+    assert 'href="kf-replay.html"' in text and "The same trace, bit for bit" in text and "Collision" in text
+    assert worst_row["trace_hash"] in (site.parent / "synthetic-v0" / "kf-replay.html").read_text(encoding="utf-8")
+    assert "No replay. The row lacks the field" in entry(site, "imm").read_text(encoding="utf-8")
+
+
+def test_rows_that_cannot_be_played(worst_row, tmp_path):
+    """A policy that is not here and a class to import are reasons, without the place of a file; nothing is imported or written."""
+    for change, reason in (
+        ({"attack": "/home/x/runs/sac-a/policy.json"}, "a file that is here"), ({"defence": "os:getcwd"}, "must not import code"),
+        ({"status": "error", "reason": "boom"}, "a row that was played"), ({"threat_model": None}, "a mapping of fields"), ({"seed": "x"}, "Error"),
+    ):  # fmt: skip
+        done = replay_of(worst_row | change, tmp_path / "r.html", "")
+        assert not done.page and reason in done.why and "/home/x" not in done.why
+    assert not list(tmp_path.iterdir())
+
+
+def test_without_replays_the_pages_say_so(tmp_path):
+    """No replay is written where none is asked for."""
+    page = build_site([network()], tmp_path, replays=False)
+    assert not list(tmp_path.rglob("*replay*")) and "Replays were not asked for." in entry(page, "kf", "network-v0").read_text()
+
+
+def test_an_empty_board_is_a_page(tmp_path):
+    """A suite without entries, cells and curves is drawn."""
+    board = make_board(defences=(), doses=[None])
+    board |= {"detection": None}
+    text = build_site([board], tmp_path).read_text(encoding="utf-8")
+    assert "This board has no entries yet" in text and "the scenario&#39;s own attacked steps" in text
+
+
+def test_a_suite_without_numbers_for_doses(tmp_path):
+    """Where a scenario's own budget is the only dose there is no axis and no largest dose, and the figures stand all the same."""
+    board = network()
+    board["suite"] |= {"doses": [None], "shown": {}}
+    board["curves"] = []
+    for part in (*board["cells"], *(rate for e in board["entries"] for rate in e["rates"])):
+        part["dose"] = None
+    for e in board["entries"]:
+        e["critical_dose"]["white"] = None
+    rows = Outline(build_site([board], tmp_path).read_text(encoding="utf-8")).rows("cells ranks")
+    kf = next(row for row in rows if row.startswith("kf"))
+    assert "1 of 2 not reached \N{EN DASH} " in kf and "≥" in kf
+
+
+def test_texts_of_a_board_become_no_markup(site):
+    """Names, reasons and cards are escaped on every page, and no place on somebody's machine is shown."""
+    for path in [site, *(p for p in site.parent.rglob("*.html") if "replay" not in p.name)]:
+        text = path.read_text(encoding="utf-8")
+        assert "<script>document" not in text and "<b>boom" not in text and "A &lt;small&gt; board" in text
+        assert "/home/x" not in text, path.name
+    assert "&lt;script&gt;document" in site.read_text(encoding="utf-8")
+
+
+def test_nothing_is_fetched(site):
+    """No element of a page asks for anything, and no style or handler hides in an attribute."""
+    for path in [site, entry(site, "kf"), entry(site, HOSTILE)]:
+        for tag, attrs in Outline(path.read_text(encoding="utf-8")).tags:
+            assert tag not in ("img", "iframe", "object", "embed", "base", "form")
+            assert "style" not in attrs and not any(name.startswith("on") for name in attrs)
+            for name in ("src", "srcset", "href", "action"):
+                value = attrs.get(name) or ""
+                assert not value.startswith(("http", "//")) or (tag == "a" and name == "href" and attrs["rel"] == "noopener noreferrer")
+            assert (attrs.get("href") or "").split(":")[0] != "javascript"
+
+
+def test_links_lead_somewhere(site):
+    """Every link to a file or to a place in a page resolves."""
+    pages = {path: Outline(path.read_text(encoding="utf-8")) for path in site.parent.rglob("*.html") if "replay" not in path.name}
+    count = 0
+    for path, outline in pages.items():
+        ids = {attrs["id"] for _, attrs in outline.tags if "id" in attrs}
+        assert len(ids) == sum("id" in attrs for _, attrs in outline.tags)
+        for tag, attrs in outline.tags:
+            href = attrs.get("href", "") if tag == "a" else ""
+            if href and not href.startswith("https://"):
+                parts = urlsplit(href)
+                assert not parts.path or (path.parent / unquote(parts.path)).is_file(), href
+                assert parts.path or parts.fragment in ids, href
+                count += 1
+    assert count > 50
+
+
+@pytest.mark.parametrize(
+    ("change", "field"),
+    [
+        (lambda b: b.update(format="tailgate-board-0"), "board.format"),
+        (lambda b: b.pop("suite"), "board.suite"),
+        (lambda b: b["suite"].update(doses=[]), "board.suite.doses"),
+        (lambda b: b["suite"].update(shown={"7": "why"}), "board.suite.shown"),
+        (lambda b: b["entries"][1].update(status="first"), "board.entries[1].status"),
+        (lambda b: b["entries"][1].update(defence="kf"), "board.entries[1].defence"),
+        (lambda b: b["entries"][0].update(flags="none"), "board.entries[0].flags"),
+        (lambda b: b["entries"][0]["critical_dose"]["black"].update(value="20"), "board.entries[0].critical_dose.black.value"),
+        (lambda b: b["cells"][3]["damage"].update(low=float("nan")), "board.cells[3].damage.low"),
+        (lambda b: b["cells"][3].update(scenario="nowhere"), "board.cells[3].scenario"),
+        (lambda b: b["cells"][3].update(defence="nobody"), "board.cells[3].defence"),
+        (lambda b: b["cells"][3].update(dose=True), "board.cells[3].dose"),
+        (lambda b: b["curves"][0]["points"][0].update(value=1.5), "board.curves[0].points[0].value"),
+        (lambda b: b["curves"][0].update(fitted=[0.1]), "board.curves[0].fitted"),
+        (lambda b: b["comparisons"][0].update(b="nobody"), "board.comparisons[0].b"),
+    ],
+)  # fmt: skip
+def test_what_is_not_of_the_format_names_its_field(change, field, tmp_path):
+    """The first field that is wrong is named, and nothing is written."""
+    board = copy.deepcopy(make_board())
+    change(board)
+    with pytest.raises(InputError) as error:
+        build_site([board], tmp_path)
+    assert error.value.field == field and not list(tmp_path.iterdir())
+
+
+def test_no_board_and_two_of_a_suite_are_input_errors(tmp_path):
+    """A site needs a board, and a suite one place."""
+    for given in ([], [network(), network()], [3]):
+        with pytest.raises(InputError):
+            build_site(given, tmp_path)
+    assert read_board(make_board() | {"more": 1}).suite.limit == 0.1  # what a page does not show is let through
+
+
+def test_file_names_are_safe_and_distinct():
+    """A plain name stays; any other gets a hash, so that no two meet and none leaves its folder."""
+    texts = ["kf", "KF", "kf:eta=1", "kf:eta=1.", "../../kf", HOSTILE, LONG, LONG + "x", "", "."]
+    names = [slug(text) for text in texts]
+    assert names[0] == "kf" and len({name.lower() for name in names}) == len(texts)
+    assert all(re.fullmatch(r"[a-z0-9_-]{1,70}", name) for name in names)
+
+
+def test_places_on_an_axis():
+    """Logarithmic axes have equal ratios of 1 + x, or of x, at equal distances; labels keep their gap and their order."""
+    log = Axis(0.0, 63.0, "log")
+    assert [log.at(x) for x in (0, 1, 7, 63)] == [0, 16.67, 50, 100] and Axis(0.1, 10, "decades").at(1) == 50 and Axis(5, 5).at(5) == 50
+    assert [t["text"] for t in ticks_at(Axis(0, 100), [0, 1, 50, 99, 100])] == ["0", "", "50", "", "100"]
+    assert spread([50, 50, 51], 10) == [50, 60, 70] and spread([99, 98, 0], 5) == [100, 95, 0] and spread([10, 10], 5, [2, 1]) == [15, 10]
+    assert [nice(x) for x in (0.0, 0.9, 11, 16, 51, 100)] == [1.0, 1.0, 15.0, 20.0, 100.0, 100.0]
+    drawn = chart([Line("a", 9, [Dot(0, 0.5, 0.4, 0.6), Dot(7, 1.0)], [0.25, 0.75]), Line("empty", 0, [])], log, [], limit=0.1)
+    assert len(drawn["lines"]) == 1 and drawn["limit"] == 90
+    line = drawn["lines"][0]
+    assert line["path"] == "0.0,750.0 500.0,250.0" and line["style"] == 1 and line["whiskers"] == [{"x": 0, "low": 60, "high": 40}]
+    assert [d["y"] for d in line["dots"]] == [50, 0]
+
+
+def test_numbers_in_words():
+    """Small numbers are written out, and none at all is a dash."""
+    assert [figure(x) for x in (None, 0.00008333, -0.5, 1234567.0, 0.0)] == ["\N{EN DASH}", "0.000083", "\N{MINUS SIGN}0.5", "1.235e+06", "0"]

@@ -1,0 +1,180 @@
+"""The site of boards in a browser: sorting, filters, menus, links, widths, colours, and that it asks for nothing."""
+
+import importlib.util
+import json
+from pathlib import Path
+
+import pytest
+
+from tailgate.leaderboard.build import percent
+
+spec = importlib.util.spec_from_file_location("boards", Path(__file__).with_name("boards.py"))
+boards = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(boards)
+make_board, entry, HOSTILE, LONG = boards.make_board, boards.entry, boards.HOSTILE, boards.LONG
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    return boards.make_site(tmp_path_factory.mktemp("site"), boards.crashed_row())
+
+
+@pytest.fixture
+def tab(browser, site):
+    """A fresh load of the first page at desktop size, in light colours."""
+    show(browser, 1280, "light")
+    for log in ("browser", "performance"):
+        browser.get_log(log)
+    browser.get(site.as_uri())
+    return browser
+
+
+def show(browser, width, scheme):
+    size = {"width": width, "height": 800, "deviceScaleFactor": 1, "mobile": width < 500}
+    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+    media = {"prefers-color-scheme": scheme, "prefers-reduced-motion": "reduce"}  # a click during a smooth scroll misses
+    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": [{"name": k, "value": v} for k, v in media.items()]})
+
+
+def groups(tab, column, key="sort"):
+    """Sort keys (or texts) of a column of the first suite's table, one list per group, of the rows that are shown."""
+    script = """return [...document.querySelectorAll('#suite-1 .ranks tbody:not([hidden])')].map(b => [...b.querySelectorAll('tr[data-row]:not([hidden])')]
+      .map(r => r.cells[arguments[0]].dataset[arguments[1]] ?? r.cells[arguments[0]].textContent.trim()))"""
+    return tab.execute_script(script, column, key)
+
+
+def texts(tab, selector):
+    return tab.execute_script(f"return [...document.querySelectorAll('{selector}')].map(x => x.textContent.trim())")
+
+
+@pytest.mark.page
+def test_every_heading_sorts_both_ways_within_groups(tab):
+    """Enter on a heading sorts each group up, again down; figures by value, dashes last, beyond the largest dose above all."""
+    buttons = tab.find_elements("css selector", "#suite-1 .ranks thead button")
+    assert len(buttons) == 10
+    names = [sorted(group) for group in groups(tab, 0)]
+    for column, button in enumerate(buttons):
+        key = "black" if column in (5, 6, 7) else "sort"
+        for direction in ("ascending", "descending"):
+            tab.execute_script("arguments[0].focus()", button)
+            tab.switch_to.active_element.send_keys("\ue007")  # Enter: the keyboard is enough
+            heads = tab.execute_script("return [...document.querySelectorAll('#suite-1 .ranks thead th')].map(h => h.getAttribute('aria-sort'))")
+            assert heads[column] == direction and heads.count("none") == 9
+            for group in groups(tab, column, key):
+                there = [x for x in group if x]
+                assert group == there + [""] * (len(group) - len(there))
+                if column > 1:
+                    numbers = [float(x) for x in there]
+                    assert numbers == sorted(numbers, reverse=direction == "descending")
+    assert [sorted(group) for group in groups(tab, 0)] == names
+    buttons[3].click()
+    assert groups(tab, 3)[0][-1] == "Infinity" and groups(tab, 0)[0][-1] == "brake_kf"
+
+
+@pytest.mark.page
+def test_filters_hide_rows_of_table_and_map(tab):
+    """Text, class and status each narrow both tables; a group without rows goes with its head."""
+    assert sum(len(group) for group in groups(tab, 0)) == 12
+    find = tab.find_element("css selector", "#suite-1 .find")
+    find.send_keys("KF")
+    kept = ["kf", "chi2_kf eta=15", "cusum_kf", "reacquire_kf", "brake_kf"]
+    assert groups(tab, 0) == [kept] and texts(tab, "#suite-1 .map tbody tr[data-row]:not([hidden]) .name")[0] == "kf"
+    assert len(texts(tab, "#suite-1 .map tbody tr[data-row]:not([hidden])")) == 5
+    assert tab.find_element("css selector", "#suite-1 output").text == "5 of 12 defences"
+    pick(tab, "#suite-1 [data-key=class]", "measurements")
+    assert groups(tab, 0) == [kept[:3]]
+    find.send_keys("\ue003\ue003")
+    pick(tab, "#suite-1 [data-key=status]", "unattacked")
+    assert [len(group) for group in groups(tab, 0)] == [2] and len(texts(tab, "#suite-1 .ranks tbody:not([hidden])")) == 1
+    assert len(texts(tab, "#suite-2 .ranks tr[data-row]:not([hidden])")) == 2  # the other suite keeps its rows
+
+
+def pick(tab, selector, value):
+    script = "const m = document.querySelector(arguments[0]); m.value = arguments[1]; m.dispatchEvent(new Event('change')); return m.value"
+    assert tab.execute_script(script, selector, value) == value
+
+
+@pytest.mark.page
+def test_the_map_follows_its_menus(tab):
+    """The script draws what the page was written with, and any other scenario and dose from the board's figures."""
+    look = "return [...document.querySelectorAll('#suite-1 .map td')].map(t => [t.textContent, t.className.trim(), t.title])"
+    first = tab.execute_script(look)
+    pick(tab, "#suite-1 select.dose", "4")
+    assert tab.execute_script(look) != first
+    pick(tab, "#suite-1 select.dose", "2")
+    assert [(a, b) for a, b in zip(tab.execute_script(look), first, strict=True) if a != b] == []
+    pick(tab, "#suite-1 select.scenario", "0")
+    pick(tab, "#suite-1 select.dose", "0")
+    assert texts(tab, "#suite-1 .told") == ["stop-and-go-v0, 5 attacked steps"]
+    cells = {(c["defence"], c["attack"]): c for c in make_board()["cells"] if c["scenario"] == "stop-and-go-v0" and c["dose"] == 5}
+    shown = tab.execute_script("return [...document.querySelectorAll('#suite-1 .map tr[data-row=\"0\"] td')].map(t => t.firstChild.textContent.trim())")
+    mine = [cells["kf", a]["damage"]["value"] for a, *_ in boards.ATTACKS]
+    assert shown == [percent(max(mine[:-1])), *(percent(x) for x in mine)]
+
+
+@pytest.mark.page
+def test_knowledge_and_scale_are_chosen(tab):
+    """The shares against a white box are shown and sorted by on demand; the dose axis turns linear."""
+    black = tab.execute_script("return document.querySelector('#suite-1 tr[data-row=\"0\"] td:nth-child(7)').innerText")
+    pick(tab, "#suite-1 .knows", "white")
+    white = tab.execute_script("return document.querySelector('#suite-1 tr[data-row=\"0\"] td:nth-child(7)').innerText")
+    assert float(white.split("%")[0]) < float(black.split("%")[0])
+    boxes = "#suite-1 .scale:not([hidden]) > .plot:not(.small)"
+    assert tab.execute_script(f"return document.querySelector('{boxes}').parentElement.className") == "scale log"
+    pick(tab, "#suite-1 select.axis", "linear")
+    assert tab.execute_script(f"return document.querySelector('{boxes}').parentElement.className") == "scale linear"
+    assert len(tab.find_elements("css selector", boxes)) == 1
+
+
+@pytest.mark.page
+def test_pages_are_quiet_and_links_work(tab, site):
+    """No script of a board runs, no console message comes, and no request leaves the file system, through a click to an entry and its replay."""
+    assert tab.title == "A <small> board"
+    tab.find_element("link text", "kf").click()
+    assert tab.current_url == entry(site, "kf").as_uri() and tab.title.startswith("kf, synthetic-v0")
+    tab.find_element("link text", "Replay of this episode").click()
+    assert tab.current_url.endswith("/synthetic-v0/kf-replay.html")
+    tab.get(entry(site, HOSTILE).as_uri())
+    assert tab.title.startswith("evil:") and tab.get_log("browser") == []
+    events = [json.loads(line["message"])["message"] for line in tab.get_log("performance")]
+    asked = {e["params"]["request"]["url"] for e in events if e["method"] == "Network.requestWillBeSent"} - {"data:,"}
+    assert len(asked) == 4 and all(url.startswith(site.parent.as_uri()) for url in asked)
+
+
+@pytest.mark.page
+@pytest.mark.parametrize("width", [390, 800, 1280])
+def test_only_tables_scroll_sideways(tab, site, width):
+    """No page is wider than its window, with all folded parts open."""
+    show(tab, width, "light")
+    for path in (site, entry(site, "chi2_kf:eta=15"), entry(site, LONG)):
+        tab.get(path.as_uri())
+        tab.execute_script("document.querySelectorAll('details').forEach(d => d.open = true)")
+        page, room = tab.execute_script("return [document.documentElement.scrollWidth, document.documentElement.clientWidth]")
+        assert page <= room <= width, path.name
+    tab.get(site.as_uri())
+    wide = tab.execute_script("const t = document.querySelector('#suite-1 .map'); return t.offsetWidth > t.parentElement.clientWidth")
+    assert wide or width > 390  # so that this does test something
+
+
+@pytest.mark.page
+def test_dark_light_and_numbers(tab):
+    """The ground follows the wish of the reader; figures stand to the right in figures of one width."""
+    ground = "return getComputedStyle(document.body).backgroundColor"
+    light = tab.execute_script(ground)
+    show(tab, 1280, "dark")
+    assert (light, tab.execute_script(ground)) == ("rgb(255, 255, 255)", "rgb(20, 22, 26)")
+    style = "const s = getComputedStyle(document.querySelector('.ranks td.num')); return [s.textAlign, s.fontVariantNumeric]"
+    assert tab.execute_script(style) == ["right", "tabular-nums"]
+
+
+@pytest.mark.page
+def test_without_scripts_the_page_stands(browser, site):
+    """Tables and the map at the middle dose are there; menus that would do nothing are not."""
+    browser.execute_cdp_cmd("Emulation.setScriptExecutionDisabled", {"value": True})
+    try:
+        browser.get(site.as_uri())
+        shown = [e.is_displayed() for e in browser.find_elements("css selector", ".filters")]
+        assert shown and not any(shown) and len(browser.find_elements("css selector", "#suite-1 .map tr[data-row]")) == 12
+        assert browser.find_element("css selector", "#suite-1 .told").text == "worst of all scenarios, 20 attacked steps"
+    finally:
+        browser.execute_cdp_cmd("Emulation.setScriptExecutionDisabled", {"value": False})
