@@ -24,6 +24,7 @@ from tailgate.files import write_atomic
 from tailgate.plots import canvas, png
 from tailgate.progress import progress
 from tailgate.rivals import BATCH, outcomes
+from tailgate.rows import read_rows
 from tailgate.schema import as_data, canonical, read_yaml
 
 HERE = Path(__file__).parent
@@ -89,6 +90,22 @@ def played(name: str, cell: dict[str, Any], options: argparse.Namespace, console
     return out
 
 
+def champion(name: str, cell: dict[str, Any], record: dict[str, Any], options: argparse.Namespace) -> dict[str, Any]:
+    """The one policy of a cell that did best on select seeds, against the script that did: both chosen alike, both on report seeds."""
+    configs = {learner: configured(name, cell, learner, options) for learner in cell["learners"]}
+    tried = [(learner, i, x) for learner, report in record["learners"].items() for i, x in enumerate(report["select"])]
+    learner, seed, _ = max(tried, key=lambda item: item[2])
+    config, report = configs[learner], record["learners"][learner]
+    rows = [row for row in read_rows(next(iter(configs.values())).directory / "rows.jsonl") if row["defence"] == config.defence]
+    counted = train.outcome_of(config)
+    own, script = (
+        outcomes([row for row in rows if row["attack"] == text], counted)
+        for text in (str(config.directory / f"policy-{seed}.json"), report["best_scripted"])
+    )
+    gain = stats.paired_difference(own, script, share=report["unit"] == comparison.SHARE)
+    return {"learner": learner, "seed": seed, "value": float(own.mean()), "gain": gain._asdict()}
+
+
 def chosen_by(config: train.TrainConfig, policies: list[Path]) -> list[float]:
     """The mean outcome of each policy on select seeds."""
     suite = train.Suite("choice", "", (config.scenario,), (None,), (config.defence,), tuple(map(str, policies)), CHOICE)
@@ -137,13 +154,19 @@ def judged(cells: dict[str, Any]) -> dict[str, dict[str, str]]:
     out: dict[str, dict[str, str]] = {name: {} for name in cells}
     for question in QUESTIONS:
         gains = {name: cell["learners"][cell["best"]]["advantage"][question] for name, cell in cells.items()}
-        asked = [name for name, gain in gains.items() if gain["low"] < gain["high"]]
-        for name in gains.keys() - set(asked):
-            out[name][question] = "same"
-        adjusted = stats.holm([p_value(gains[name]) for name in asked])
-        for name, p in zip(asked, adjusted, strict=True):
-            out[name][question] = "undecided" if p >= 0.05 else "wins" if gains[name]["value"] > 0 else "loses"
+        for name, word in corrected(gains).items():
+            out[name][question] = word
+    for name, word in corrected({name: cell["champion"]["gain"] for name, cell in cells.items()}).items():
+        out[name]["champion"] = word
     return out
+
+
+def corrected(gains: dict[str, dict[str, float]]) -> dict[str, str]:
+    """A word for each difference, after Holm for all of them together; `same` where no episode differs."""
+    asked = [name for name, gain in gains.items() if gain["low"] < gain["high"]]
+    adjusted = dict(zip(asked, stats.holm([p_value(gains[name]) for name in asked]), strict=True))
+    words = {name: "wins" if gain["value"] > 0 else "loses" for name, gain in gains.items()}
+    return {name: "same" if name not in adjusted else "undecided" if adjusted[name] >= 0.05 else words[name] for name in gains}
 
 
 def p_value(gain: dict[str, float]) -> float:
@@ -172,9 +195,10 @@ def markdown(cells: dict[str, Any]) -> str:
         "`python benchmarks/adversaries.py` makes this page. Every figure is of fresh report seeds, at equal knowledge, bounds, dose.",
         "Learned: the median over training seeds, with the least and the largest, of the learner that did best on select seeds. The best",
         "script is chosen on select seeds. Differences are paired, with 95 % intervals over episodes and training seeds; each verdict is",
-        "corrected (Holm) for the cells of its column. *same*: no episode differs, as the attack's times are the same in all of them.", "",
-        "| cell | dose | no attack | best script | learned | by | yoked | over no attack | over yoked | over the best script |",
-        "|---|---|---|---|---|---|---|---|---|---|",
+        "corrected (Holm) for the cells of its column. *same*: no episode differs, as the attack's times are the same in all of them.",
+        "Champion: of all learners and seeds the one policy that did best on select seeds, as the script was chosen.", "",
+        "| cell | dose | no attack | best script | learned | by | yoked | over no attack | over yoked | over script | champion over it |",
+        "|---|---|---|---|---|---|---|---|---|---|---|",
     ]  # fmt: skip
     verdicts = judged(cells)
     for name, cell in cells.items():
@@ -187,10 +211,13 @@ def markdown(cells: dict[str, Any]) -> str:
         script = f"{comparison.shown(report, row['script'])}: `{report['best_scripted']}`"
         yoked = comparison.shown(report, float(np.median(row["yoked"])))
         none, learned = comparison.shown(report, row["none"]), spread(report, row["learned"])
+        low, value, high = (comparison.shown(report, cell["champion"]["gain"][k], "+") for k in ("low", "value", "high"))
+        gains.append(f"{value} [{low}, {high}] **{verdicts[name]['champion']}**")
         out.append(f"| {' | '.join([name, str(dose), none, script, learned, cell['best'], yoked, *gains])} |")
-    counts = {question: [verdicts[name][question] for name in cells] for question in QUESTIONS}
-    for question, found in counts.items():
-        out += ["", f"Over {question}: {', '.join(f'{found.count(word)} {word}' for word in ('wins', 'same', 'undecided', 'loses'))}."]
+    for question in (*QUESTIONS, "champion"):
+        found = [verdicts[name][question] for name in cells]
+        what = "Champion over the best script" if question == "champion" else f"Over {question}"
+        out += ["", f"{what}: {', '.join(f'{found.count(word)} {word}' for word in ('wins', 'same', 'undecided', 'loses'))}."]
     out += [
         "", "## Every learner", "",
         "| cell | learner | shown first | decisions | learned | best on select | yoked | over the best script | training [min] |",
@@ -267,6 +294,7 @@ def main() -> None:
     record = {}
     for name in options.cells or cells:
         record[name] = played(name, cells[name], options, console)
+        record[name]["champion"] = champion(name, cells[name], record[name], options)
         best = record[name]["best"]
         console.print(f"{name}, {best}: {line(record[name]['learners'][best])}", highlight=False)
         if options.zoo:
