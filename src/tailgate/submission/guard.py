@@ -1,0 +1,201 @@
+"""The process between ours and a submission's: starts it, watches it, and leaves nothing of it running.
+
+Run as a plain script with the standard library alone, so that it is up in a moment. It is the subreaper of all that the submission
+starts: a process that changes its session, or outlives its parent, becomes the guard's own child and is found. When our end of the
+`life` pipe closes, whatever the cause, all of them are killed and the scratch directories removed.
+
+Standard input: lines of JSON, {"cpu": seconds granted so far}. Standard output: one line of JSON, {"why": .., "printed": ..}, at the end.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import os
+import select
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from contextlib import suppress
+from typing import Any
+
+_SUBREAPER = 36  # PR_SET_CHILD_SUBREAPER
+_TICK = 1.0 / os.sysconf("SC_CLK_TCK")
+_LOOK = 0.2  # [s] between two looks at the processes
+_TAIL = 1000  # [bytes] of what was printed last
+_KILLING = 20.0  # [s] after which the guard gives up
+
+
+def descendants() -> dict[int, list[str]]:
+    """Every process below this one: number to the fields of /proc/PID/stat behind the name (state, parent, ...)."""
+    stats: dict[int, list[str]] = {}
+    for name in os.listdir("/proc"):
+        if name.isdigit():
+            with suppress(OSError), open(f"/proc/{name}/stat") as file:
+                stats[int(name)] = file.read().rpartition(")")[2].split()
+    below: dict[int, list[int]] = {}
+    for pid, fields in stats.items():
+        below.setdefault(int(fields[1]), []).append(pid)
+    found, todo = {}, [os.getpid()]
+    while todo:
+        for pid in below.get(todo.pop(), ()):
+            found[pid] = stats[pid]
+            todo.append(pid)
+    return found
+
+
+def _memory(pids: list[int], limit: int) -> int:
+    """Bytes that the processes hold; what they share counts once, where the quick sum is above the limit."""
+    page, quick, exact = os.sysconf("SC_PAGE_SIZE"), 0, 0
+    for pid in pids:
+        with suppress(OSError, IndexError, ValueError), open(f"/proc/{pid}/statm") as file:
+            quick += int(file.read().split()[1]) * page
+    if quick <= limit:
+        return quick
+    for pid in pids:
+        with suppress(OSError, IndexError, ValueError), open(f"/proc/{pid}/smaps_rollup") as file:
+            exact += 1024 * next(int(text.split()[1]) for text in file if text.startswith("Pss:"))
+    return exact
+
+
+class Guard:
+    """One submission's process and all that it starts."""
+
+    def __init__(self, job: dict[str, Any]) -> None:
+        self.job = job
+        self.granted = float(job["cpu"])
+        self.reaped = 0.0  # [s] processor time of those that have ended
+        self.status: int | None = None
+        self.printed, self.tail = 0, b""
+        given, answers = job["pipes"]
+        self.prints, wrote = os.pipe()
+        self.life = sys.stdin.fileno()
+        self.listening = [self.life, self.prints]
+        # start_new_session: a signal from a terminal is for the user's process, which then closes the pipe
+        self.child = subprocess.Popen(
+            job["command"], stdin=given, stdout=answers, stderr=wrote, cwd=job["scratch"], env=job["environment"], start_new_session=True
+        )
+        for fd in (given, answers, wrote):
+            os.close(fd)
+
+    def reap(self) -> None:
+        """Collect who has ended, and the processor time that they took."""
+        while True:
+            try:
+                pid, status, usage = os.wait4(-1, os.WNOHANG)
+            except ChildProcessError:
+                return
+            if pid == 0:
+                return
+            self.reaped += usage.ru_utime + usage.ru_stime
+            if pid == self.child.pid:
+                self.status = status
+                self.child.returncode = status  # nobody else waits for it
+
+    def look(self) -> str:
+        """Why the submission has to end now, or nothing."""
+        found = {pid: fields for pid, fields in descendants().items() if fields[0] != "Z"}
+        if len(found) > self.job["processes"]:
+            return f"processes: {len(found)} at a time, {self.job['processes']} allowed"
+        held = _memory(list(found), self.job["memory"])
+        if held > self.job["memory"]:
+            return f"memory: {held / 2**30:.2f} GiB held, {self.job['memory'] / 2**30:.2f} GiB allowed"
+        used = self.reaped + sum(_TICK * sum(int(ticks) for ticks in fields[11:15]) for fields in found.values())
+        if used > self.granted:
+            return f"processor time: {used:.1f} s used, {self.granted:.1f} s allowed"
+        return ""
+
+    def read_output(self) -> str:
+        """Take what was printed; a reason to end when it is too much."""
+        text = os.read(self.prints, 1 << 16)
+        if not text:  # nobody is left who could print
+            self.listening.remove(self.prints)
+        self.printed += len(text)
+        self.tail = (self.tail + text)[-_TAIL:]
+        return f"output: more than {self.job['output']} bytes printed" if self.printed > self.job["output"] else ""
+
+    def watch(self) -> str:
+        """Wait until there is a reason to end; empty when our process has gone, or asks for it."""
+        buffer, next_look = b"", 0.0
+        while True:
+            ready, _, _ = select.select(self.listening, [], [], 0.02 if self.status is None else 0.0)
+            if self.prints in ready and (why := self.read_output()):
+                return why
+            if self.life in ready:
+                text = os.read(self.life, 1 << 12)
+                if not text:
+                    return ""
+                *lines, buffer = (buffer + text).split(b"\n")
+                for entry in lines:
+                    self.granted = float(json.loads(entry)["cpu"])
+            self.reap()
+            if self.status is not None and self.prints not in ready:
+                return self.ended(self.status)
+            if time.monotonic() >= next_look:
+                if why := self.look():
+                    return why
+                next_look = time.monotonic() + _LOOK
+
+    def ended(self, status: int) -> str:
+        """How the submission's own process ended."""
+        code = os.waitstatus_to_exitcode(status)
+        if code == -signal.SIGXCPU or (code == -signal.SIGKILL and self.reaped >= self.job["cpu_limit"]):
+            return f"processor time: more than {self.job['cpu_limit']} s in one process"
+        return f"the process ended with exit code {code}" if code >= 0 else f"the process was killed by signal {-code}"
+
+    def kill_all(self) -> None:
+        """Freeze every descendant until no new one appears, then kill them: a process that forks cannot run away."""
+        end = time.monotonic() + _KILLING
+        while time.monotonic() < end:
+            frozen: set[int] = set()
+            while new := set(descendants()) - frozen:
+                for pid in new:
+                    _signal(pid, signal.SIGSTOP)
+                frozen |= new
+            if not frozen:
+                return
+            for pid in frozen:
+                _signal(pid, signal.SIGKILL)
+            time.sleep(0.01)
+            self.reap()
+
+    def finish(self) -> None:
+        self.kill_all()
+        if self.job["after"]:  # what a container's client leaves behind
+            with suppress(OSError, subprocess.SubprocessError):
+                subprocess.run(self.job["after"], stdin=subprocess.DEVNULL, capture_output=True, timeout=_KILLING, check=False)
+        for path in self.job["remove"]:
+            shutil.rmtree(path, ignore_errors=True)
+
+
+def _signal(pid: int, number: int) -> None:
+    with suppress(ProcessLookupError, PermissionError):
+        os.kill(pid, number)
+
+
+def main() -> None:
+    job = json.loads(sys.argv[1])
+    if ctypes.CDLL(None, use_errno=True).prctl(_SUBREAPER, 1, 0, 0, 0) != 0:
+        raise OSError(ctypes.get_errno(), "prctl(PR_SET_CHILD_SUBREAPER)")
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGPIPE, signal.SIG_IGN)
+    try:
+        guard = Guard(job)
+    except OSError as error:
+        print(json.dumps({"why": f"it could not be started: {error}", "printed": ""}), flush=True)
+        for path in job["remove"]:
+            shutil.rmtree(path, ignore_errors=True)
+        return
+    why = ""
+    try:
+        why = guard.watch()
+    finally:
+        guard.finish()
+        with suppress(BrokenPipeError):
+            print(json.dumps({"why": why, "printed": guard.tail.decode(errors="replace")}), flush=True)
+
+
+if __name__ == "__main__":
+    main()

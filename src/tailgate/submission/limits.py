@@ -1,0 +1,34 @@
+"""What a submission may take, and the error of one that took more."""
+
+from dataclasses import dataclass
+
+from tailgate.core import Positive, PositiveCount, param
+
+FEWEST = 256  # rows of a batch, where there are as many
+
+
+class Lost(Exception):
+    """A submission's process failed or was ended; the text is the reason that its rows get."""
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What one process of a submission may take; who takes more is ended, and the rows of that batch get the reason.
+
+    Memory is limited as RLIMIT_DATA, which counts private memory that can be written. RLIMIT_AS would count address space that libraries
+    reserve and never touch (compilers, allocators of many threads) and hit honest programs. What RLIMIT_DATA does not see (shared
+    memory, several processes) is looked at five times a second.
+    """
+
+    memory: PositiveCount = param(4 * 2**30, "memory of all processes of the submission together [bytes]")
+    start_time: Positive = param(60.0, "processor time for importing, prepare and start [s]")
+    step_time: Positive = param(1.2e-3, "processor time per step, row and agent, on average: ten times what kf needs at batch 1 [s]")
+    cpu: PositiveCount = param(7200, "processor time of any one process, whatever it plays (RLIMIT_CPU) [s]")
+    silence: Positive = param(120.0, "longest wait for one answer; waits in all may last this and the processor time granted [s]")
+    output: PositiveCount = param(2**20, "what may be printed to standard output and error together [bytes]")
+    file_size: PositiveCount = param(64 * 2**20, "largest file that may be written (RLIMIT_FSIZE) [bytes]")
+    processes: PositiveCount = param(8, "processes at a time, the submission's own among them")
+
+    def steps(self, count: int, rows: int, agents: int) -> float:
+        """Processor time [s] that `count` steps of a batch grant. Fewer than FEWEST rows count as FEWEST: most of it is overhead."""
+        return self.step_time * count * max(rows, FEWEST) * agents

@@ -1,0 +1,137 @@
+"""The rows of a suite for one submission."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import hashlib
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import as_completed
+from pathlib import Path
+from typing import Any
+
+from tailgate.errors import InputError
+from tailgate.evaluation import Cell, _keep_others, _pool, cells_of
+from tailgate.files import remove, sweep, writable_directory, write_atomic
+from tailgate.rows import encode, read_rows
+from tailgate.scenario import Suite, load_suite
+from tailgate.submission.limits import Limits, Lost
+from tailgate.submission.mixed import Submission, part_of, play_mixed
+from tailgate.submission.process import Process
+from tailgate.submission.sandbox import Sandbox, sandbox_of
+from tailgate.submission.source import seeds_of, staged
+
+Rows = list[dict[str, Any]]
+
+
+def play_submission(
+    text: str,
+    suite: str | Suite,
+    *,
+    limits: Limits | None = None,
+    sandbox: str | Sandbox | None = None,
+    beacon: str | None = None,
+    workers: int = 1,
+    out: Path | str | None = None,
+    progress: Callable[[int, int], None] | None = None,
+    scenarios: Sequence[str] | None = None,
+    episodes: int | None = None,
+    purpose: str = "report",
+) -> Rows:
+    """Rows of a suite for one submission, "module:Class:key=value": one for each scenario, dose, attack of the suite and episode.
+
+    The class is imported in processes of its own only, from a copy of its files. With a beacon the episodes' seeds are `seeds_of` it,
+    without one they are the public ones 0, 1, ..., for development. Whatever goes wrong costs rows, with a reason: those of a cell
+    where a number is wrong, those of a scenario that are not finished where the process is lost. With `out` an interrupted run
+    resumes after the scenarios that it finished without an error. Raises InputError before anything is played.
+    """
+    base = load_suite(suite) if isinstance(suite, str) else suite
+    guard = sandbox_of(sandbox) if isinstance(sandbox, str) else sandbox
+    count = base.seeds if episodes is None else episodes
+    for name, value in (("episodes", count), ("workers", workers)):
+        if value < 1:
+            raise InputError(name, value, "a whole number not below 1")
+    named = dataclasses.replace(base, defences=("none",), seeds=count, scenarios=tuple(base.scenarios if scenarios is None else scenarios))
+    with staged(text) as source:
+        seeds = list(range(count)) if beacon is None else seeds_of(beacon, source.digest, purpose, count)
+        cells = [dataclasses.replace(cell, defence=source.text) for cell in cells_of(named, purpose=purpose)]
+        if not cells:
+            raise InputError("suite", base.name, "one with scenarios, doses and attacks")
+        held, lost = limits or Limits(), None
+        card: dict[str, Any] = {"uses": ("measurements",), "version": 1, "reference": ""}
+        try:
+            with Process(source.text, source.path, held, guard) as process:
+                card = process.card
+        except Lost as error:
+            lost = error
+        submission = Submission(source, card, held, guard, beacon or "")
+        jobs = [[cell for cell in cells if cell.scenario == name] for name in dict.fromkeys(named.scenarios)]
+        if lost is not None:
+            rows = [row for cell in cells for row in part_of(cell, submission, seeds).failed(seeds, lost)]
+            if out is not None:
+                write_atomic(Path(out), encode(rows))
+            return rows
+        return _run(jobs, submission, seeds, Path(out) if out is not None else None, workers, progress)
+
+
+def _run(
+    jobs: Sequence[Sequence[Cell]], submission: Submission, seeds: list[int], out: Path | None, workers: int,
+    progress: Callable[[int, int], None] | None,
+) -> Rows:  # fmt: skip
+    """Rows of all jobs, one scenario each, in their order."""
+    ids = [[str(part_of(cell, submission, seeds).head["cell"]) for cell in job] for job in jobs]
+    names = [hashlib.blake2b("".join(each).encode(), digest_size=12).hexdigest() for each in ids]
+    done: dict[int, Rows] = {}
+    parts = None
+    if out is not None:
+        if out.is_dir():
+            raise InputError("out", str(out), "a file, not a directory")
+        parts = writable_directory(out.with_name(f".{out.name}.parts"))
+        for place in (out, parts):
+            sweep(place)
+        for i, (name, cells) in enumerate(zip(names, ids, strict=True)):
+            if kept := _finished(parts / f"{name}.jsonl", [(cell, seed) for cell in cells for seed in seeds]):
+                done[i] = kept
+    missing = [i for i in range(len(jobs)) if i not in done]
+    for position, rows in _play([jobs[i] for i in missing], submission, seeds, workers):
+        done[missing[position]] = rows
+        if parts is not None:
+            write_atomic(parts / f"{names[missing[position]]}.jsonl", encode(rows))
+        if progress is not None:
+            progress(len(done), len(jobs))
+    rows = [row for i in range(len(jobs)) for row in done[i]]
+    if out is not None and parts is not None:
+        _keep_others(out, {cell for each in ids for cell in each})
+        write_atomic(out, encode(rows))
+        for name in names:
+            remove(parts / f"{name}.jsonl")
+        with contextlib.suppress(OSError):  # something else lies there: not ours to remove
+            parts.rmdir()
+    return rows
+
+
+def _finished(path: Path, wanted: list[tuple[str, int]]) -> Rows:
+    """The rows of a scenario that was played before; none where one is missing or failed, or where the file is damaged."""
+    try:
+        rows = read_rows(path) if path.is_file() else []
+    except InputError:
+        return []
+    whole = [(row.get("cell"), row["seed"]) for row in rows] == wanted
+    return rows if whole and all(row["status"] != "error" for row in rows) else []
+
+
+def _play(jobs: Sequence[Sequence[Cell]], submission: Submission, seeds: list[int], workers: int) -> Iterator[tuple[int, Rows]]:
+    if workers == 1 or len(jobs) < 2:
+        for i, job in enumerate(jobs):
+            yield i, play_mixed(job, submission, seeds)
+        return
+    with _pool(workers) as pool:
+        waiting = {pool.submit(play_mixed, job, submission, seeds): i for i, job in enumerate(jobs)}
+        try:
+            for future in as_completed(waiting):
+                yield waiting[future], future.result()
+        except BaseException:  # an interrupt shall not wait for what is still to play; the guards see that we are gone
+            pool.shutdown(wait=False, cancel_futures=True)
+            for process in list((pool._processes or {}).values()):
+                process.terminate()
+            raise
