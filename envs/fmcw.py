@@ -20,7 +20,7 @@ from typing import Annotated
 
 import numpy as np
 from pydantic import Field
-from scipy import stats
+from scipy import special
 
 from tailgate import num
 from tailgate.core import Array, Finite, Positive, param
@@ -174,7 +174,7 @@ def challenge_samples(window: float, bandwidth: float) -> int:
 
 def false_alarm_threshold(p_fa: float, samples: int) -> float:
     """Mean power E over the receiver's noise that noise alone exceeds with probability p_fa: 2 N_c E is chi-square with 2 N_c degrees."""
-    return float(stats.chi2.isf(p_fa, 2 * samples) / (2 * samples))
+    return float(special.chdtri(2 * samples, p_fa) / (2 * samples))
 
 
 def miss_probability(threshold: float, samples: int, jam: float = 0.0, tone: float = 0.0) -> float:
@@ -185,8 +185,8 @@ def miss_probability(threshold: float, samples: int, jam: float = 0.0, tone: flo
     """
     scale = 2.0 * samples / (1.0 + jam)
     if tone == 0.0:
-        return float(stats.chi2.cdf(scale * threshold, 2 * samples))
-    return float(stats.ncx2.cdf(scale * threshold, 2 * samples, scale * tone))
+        return float(special.chdtr(2 * samples, scale * threshold))
+    return float(special.chndtr(scale * threshold, 2 * samples, scale * tone))
 
 
 def heard_energy(samples: int, heard: Array, jam: Array, tone: Array, z: Array) -> Array:

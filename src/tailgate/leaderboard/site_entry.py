@@ -19,7 +19,7 @@ from .site_index import comparisons_of
 from .site_suite import Data, Suite, critical_of, dose_text, figure, share_of, worse
 
 SHOWN = ("name", "summary", "parameters")  # of a card: shown in a place of their own
-ORDER = ("reference", "code", "licence", "license", "uses", "threat_model", "training_budget", "sentinel", "version")
+ORDER = ("reference", "code", "licence", "uses", "authors", "threat_model", "training", "digest", "sentinel", "version")
 
 
 @dataclass(frozen=True)

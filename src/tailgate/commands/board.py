@@ -1,0 +1,156 @@
+"""tailgate leaderboard run, page and admit: boards from suites, the page of boards, and the list of attacks."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from tailgate.errors import InputError
+from tailgate.progress import cells, console, progress
+
+
+def add(actions: Any) -> None:
+    command = actions.add_parser(
+        "run", help="play suites, score them, and build the page of their boards",
+        description="Play every defence of the suites against every attack, score the rows, and build the page: OUT/SUITE/rows.jsonl.xz, "
+        "OUT/SUITE/board.json, OUT/page. Rows that `leaderboard attack` or `submit` put below OUT/SUITE count as well. Interrupted, the "
+        "same command goes on.",
+    )  # fmt: skip
+    command.add_argument("suites", nargs="+", metavar="SUITE", help="suites by name or YAML file")
+    command.add_argument("--out", required=True, metavar="DIR", help="folder of the boards")
+    command.add_argument("--defence", action="append", metavar="NAME", help="only these defences (repeatable)")
+    command.add_argument("--workers", type=int, default=2, metavar="N", help="processes (default 2); change no result")
+    command.add_argument("--score-only", action="store_true", help="play nothing: score the rows that are there")
+    command.add_argument("--detection", action="store_true", help="also the detection board and stealth-impact curves: calibrates, slow")
+    command.add_argument("--unattacked", action="store_true", help="also rank defences that no attack was trained against")
+    command.add_argument("--no-replays", action="store_true", help="leave out the replays of the worst episodes")
+    command.add_argument("--json", action="store_true", help="print the entries as JSON")
+    command.set_defaults(run=_run)
+    page = actions.add_parser("page", help="build the page of boards")
+    page.add_argument("boards", nargs="+", metavar="FILE", help="board.json files")
+    page.add_argument("--out", required=True, metavar="DIR", help="directory of the page")
+    page.add_argument("--title", help="title of the page")
+    page.add_argument("--no-replays", action="store_true", help="leave out the replays of the worst episodes")
+    page.set_defaults(run=_page)
+    admit = actions.add_parser(
+        "admit", help="put an attack on a suite's list if it beats the worst that is there",
+        description="Play an attack on select seeds against the worst of its knowledge, and append it to OUT/SUITE/attacks.jsonl if a "
+        "paired test says that it does more damage to at least one defence. Nothing is ever removed from the list; --erratum takes an "
+        "attack back.",
+    )  # fmt: skip
+    admit.add_argument("attack", metavar="ATTACK", help="attack, as on any command line")
+    admit.add_argument("--suite", required=True, metavar="NAME", help="suite by name or YAML file")
+    admit.add_argument("--out", required=True, metavar="DIR", help="folder of the boards")
+    admit.add_argument("--defence", action="append", metavar="NAME", help="only these defences (repeatable; default: the suite's)")
+    admit.add_argument("--date", metavar="YYYY-MM-DD", help="date of the line (default: today)")
+    admit.add_argument("--erratum", metavar="REASON", help="take the attack back, for this reason")
+    admit.set_defaults(run=_admit)
+
+
+def _run(options: argparse.Namespace) -> int:
+    from tailgate.leaderboard.run import board_of, play
+    from tailgate.leaderboard.site import build_site
+    from tailgate.scenario import load_suite
+
+    out, started = Path(options.out), time.perf_counter()
+    suites = [load_suite(name) for name in options.suites]
+    boards = []
+    with progress(Console(stderr=True)) as update:
+        for suite in suites:
+            folder = out / suite.name
+            if not options.score_only:
+                play(
+                    suite, folder, defences=options.defence, workers=options.workers,
+                    progress=lambda name, done, total: update(name, done, total, cells(done, total)),
+                )  # fmt: skip
+            board = board_of(suite, folder, require_adaptive=not options.unattacked)
+            boards.append(_detected(board, folder, update) if options.detection else board)
+    page = build_site(boards, out / "page", replays=not options.no_replays)
+    if options.json:
+        print(json.dumps([{"suite": b["suite"]["name"], "entries": b["entries"]} for b in boards], indent=1, allow_nan=False))
+    else:
+        for board in boards:
+            _print_board(board)
+    print(f"page: {page} ({(time.perf_counter() - started) / 60:.1f} min)", file=sys.stderr)
+    return 0
+
+
+def _detected(board: dict[str, Any], folder: Path, update: Any) -> dict[str, Any]:
+    """The board with detection and stealth impact, written again."""
+    from tailgate.files import write_atomic
+    from tailgate.scoring.detection import detection, stealth_impact, with_detection
+
+    guards = [e["defence"] for e in board["entries"] if e["status"] != "unranked"]
+    places = [s["name"] for s in board["suite"]["scenarios"] if not s["robustness"]]
+    scripts = [a for a in board["attacks"] if not a["optimal"] and not a["learned"]]
+    against = [a["attack"] for a in scripts if a["knowledge"] == "black"]
+
+    def told(label: str, done: int, total: int, text: str) -> None:
+        update(label, done, total, text)
+
+    found = detection(guards, places, against, progress=told)
+    stealth = {guard: stealth_impact(guard, places[:1], progress=told) for guard in guards}
+    board = with_detection(board, found, stealth)
+    write_atomic(folder / "board.json", json.dumps(board, indent=1, allow_nan=False).encode() + b"\n")
+    return board
+
+
+def _print_board(board: dict[str, Any]) -> None:
+    """The head of a board."""
+    suite = board["suite"]
+    doses = list(suite["shown"]) or [str(dose) for dose in suite["doses"]]
+    table = Table(title=f"{suite['name']}, {suite['episodes']} episodes a cell, black box")
+    for heading in ("defence", "class", "rank", "critical dose", *(f"undamaged at {dose}" for dose in doses), "why not"):
+        table.add_column(heading, overflow="fold")
+    for entry in sorted(board["entries"], key=lambda e: (e["rank"] is None, (e["rank"] or {}).get("best", 0))):
+        rank, critical = entry["rank"], entry["critical_dose"]["black"]
+        rates = {str(rate["dose"]): rate["undamaged"] for rate in entry["rates"] if rate["knowledge"] == "black"}
+        shown = [f"{100 * rates[d]['value']:.0f} % (at least {100 * rates[d]['low']:.0f})" if d in rates else "-" for d in doses]
+        place = "-" if rank is None else str(rank["best"]) if rank["best"] == rank["worst"] else f"{rank['best']} to {rank['worst']}"
+        dose = "-" if critical is None else _dose(critical, suite["doses"])
+        table.add_row(escape(entry["defence"]), entry["class"], place, dose, *shown, escape(entry["why"]))
+    console().print(table)
+
+
+def _dose(critical: dict[str, Any], doses: list[int | None]) -> str:
+    most = max((dose for dose in doses if dose is not None), default=0)
+    low, value, high = (f"> {most}" if critical[k] is None else f"{critical[k]:.3g}" for k in ("low", "value", "high"))
+    return f"{value} [{low}, {high}]"
+
+
+def _page(options: argparse.Namespace) -> int:
+    from tailgate.leaderboard.site import build_site
+
+    boards = []
+    for name in options.boards:
+        try:
+            boards.append(json.loads(Path(name).read_text(encoding="utf-8")))
+        except (OSError, ValueError) as error:
+            raise InputError("boards", name, f"a readable board.json ({error})") from None
+    print(build_site(boards, Path(options.out), title=options.title, replays=not options.no_replays))
+    return 0
+
+
+def _admit(options: argparse.Namespace) -> int:
+    from tailgate.leaderboard.run import LIST
+    from tailgate.scenario import load_suite
+    from tailgate.scoring.attacks import admit, withdraw
+
+    suite = load_suite(options.suite)
+    path = Path(options.out) / suite.name / LIST
+    date = options.date or datetime.now(UTC).date().isoformat()
+    if options.erratum is not None:
+        print(json.dumps(withdraw(options.attack, path, date, options.erratum).as_data(), indent=1))
+        return 0
+    line, evidence = admit(options.attack, suite, options.defence or suite.defences, path, date)
+    print(json.dumps({"admitted": line is not None, "evidence": evidence}, indent=1))
+    return 0 if line is not None else 1

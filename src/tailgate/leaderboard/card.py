@@ -1,0 +1,73 @@
+"""The card of an entry: what its authors say of it, beside the figures that they do not say."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from tailgate.core import param
+from tailgate.errors import InputError, unknown
+from tailgate.registry import USES
+from tailgate.schema import as_data, build
+
+
+@dataclass(frozen=True)
+class Card:
+    """One JSON file per entry. Nothing in it changes a figure."""
+
+    kind: Literal["defence", "attack"] = param("defence", "defence or attack")
+    text: str = param("", "the entry as it is named in rows")
+    name: str = param("", "its name as people say it")
+    authors: str = param("", "who made it")
+    reference: str = param("", "paper, with a link or DOI")
+    code: str = param("", "link to the code, https")
+    licence: str = param("", "licence of the code, as an SPDX identifier")
+    uses: tuple[str, ...] = param((), "what a defence uses: the words of its class; what an attack knows is in its rows")
+    threat_model: str = param("", "what the authors defend against, or what an attack assumes, in one sentence")
+    training: str = param("", "training budget: decisions or hours, hardware, seeds; `none`")
+    digest: str = param("", "of the submission, as `leaderboard submit --digest` prints it; empty for what comes with the package")
+
+    def check(self, where: str) -> None:
+        """Raise InputError for a field that is missing or makes no sense."""
+        for field in ("text", "name", "licence", "threat_model", "training"):
+            if not getattr(self, field).strip():
+                raise InputError(f"{where}.{field}", getattr(self, field), "some text")
+        if self.code and not self.code.startswith("https://"):
+            raise InputError(f"{where}.code", self.code, "a link that begins with https://")
+        for use in self.uses:
+            if use not in USES or use == "truth":
+                raise unknown(f"{where}.uses", use, [u for u in USES if u != "truth"])
+
+
+def read_card(path: Path) -> Card:
+    """A card, checked. Raises InputError that names the field."""
+    where = f"card {path.name}"
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputError(where, str(path), f"a readable JSON file ({error})") from None
+    if not isinstance(data, dict):
+        raise InputError(where, data, "a mapping of fields")
+    card = build(Card, data, where)
+    card.check(where)
+    return card
+
+
+def with_cards(board: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """The board with what the cards of a folder say of its defences and attacks. Raises InputError for two cards of one entry."""
+    cards: dict[tuple[str, str], Card] = {}
+    for path in sorted(folder.glob("*.json")):
+        card = read_card(path)
+        if cards.setdefault((card.kind, card.text), card) is not card:
+            raise InputError(f"card {path.name}", card.text, "an entry that has no other card")
+
+    def told(kind: str, item: dict[str, Any]) -> dict[str, Any]:
+        card = cards.get((kind, item[kind]))
+        if card is None:
+            return item
+        said = {key: value for key, value in as_data(card).items() if value and key not in ("class", "kind", "text")}
+        return item | {"card": (item.get("card") or {}) | said}
+
+    return board | {"entries": [told("defence", e) for e in board["entries"]], "attacks": [told("attack", a) for a in board["attacks"]]}

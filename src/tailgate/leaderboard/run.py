@@ -1,0 +1,45 @@
+"""From suites to boards and the page of them: every row that lies in a suite's folder counts."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from tailgate.errors import InputError
+from tailgate.evaluation import evaluate
+from tailgate.files import write_atomic
+from tailgate.rows import read_rows
+from tailgate.scenario import Suite
+from tailgate.scoring import attacks as admitted
+from tailgate.scoring.board import score
+
+from .card import with_cards
+
+OWN = "rows.jsonl.xz"  # what `run` plays; other files of rows beside it come from `attack` and `submit`
+LIST = "attacks.jsonl"
+CARDS = "cards"  # folder of what authors say of their entries
+Progress = Callable[[str, int, int], None]  # suite, done, total
+
+
+def play(suite: Suite, folder: Path, *, defences: Sequence[str] | None = None, workers: int = 1, progress: Progress | None = None) -> Path:
+    """The rows of a suite and of the attacks that were admitted since, against its defences; returns their file. It resumes."""
+    lines = admitted.standing(admitted.read(folder / LIST))
+    attacks = [*suite.attacks, *(text for text, line in lines.items() if line is not None)]
+    file = folder / OWN
+    update = None if progress is None else lambda done, total: progress(suite.name, done, total)
+    evaluate(suite, defences=defences, attacks=list(dict.fromkeys(attacks)), workers=workers, out=file, progress=update)
+    return file
+
+
+def board_of(suite: Suite, folder: Path, **options: Any) -> dict[str, Any]:
+    """The board of all rows in a folder; written there as board.json. Raises InputError where there are none."""
+    files = sorted(path for path in folder.glob("**/*") if path.name.endswith((".jsonl", ".jsonl.xz")) and not path.name.startswith("."))
+    files = [path for path in files if path.name != LIST and "policies" not in path.relative_to(folder).parts]
+    if not files:
+        raise InputError("rows", str(folder), "a folder with rows of `leaderboard run`")
+    rows = [row for path in files for row in read_rows(path)]
+    board = with_cards(score(rows, suite, attacks=admitted.read(folder / LIST), **options), folder / CARDS)
+    write_atomic(folder / "board.json", json.dumps(board, indent=1, allow_nan=False).encode() + b"\n")
+    return board

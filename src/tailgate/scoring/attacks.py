@@ -1,0 +1,178 @@
+"""The list of attacks that were admitted after a suite was published: results/SUITE/attacks.jsonl, which only ever grows.
+
+A line holds the hash of the line before it and its own, so that a line that was changed, moved or taken out between others is refused.
+An attack is admitted when it does surely more damage than the worst of those that know as much, on the same select seeds. One that turns
+out to be wrong stays, and a later line, an erratum, takes it back.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import fcntl
+import hashlib
+import json
+import os
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from datetime import date as day
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tailgate.errors import InputError, unknown
+from tailgate.evaluation import cells_of, run
+from tailgate.files import write_atomic
+from tailgate.registry import Spec
+from tailgate.scenario import Suite
+from tailgate.schema import build
+from tailgate.stats import holm
+
+from .damage import CLEAN, order, tabulate
+from .doses import Worst
+from .ranks import mcnemar
+
+
+@dataclass(frozen=True)
+class Admitted:
+    """A line of the list: an attack that was admitted, or, with a reason in `erratum`, one that is taken back."""
+
+    attack: str
+    digest: str  # of the file that it comes from; empty for a registered one
+    knowledge: str
+    date: str  # YYYY-MM-DD
+    evidence: tuple[dict[str, Any], ...] = ()  # the paired tests: defence, scenario, dose, worst, only_new, only_worst, p, adjusted
+    erratum: str = ""
+    before: str = ""  # hash of the line before
+    hash: str = ""  # of this line
+
+    def as_data(self) -> dict[str, Any]:
+        """JSON data of the line."""
+        return dataclasses.asdict(self) | {"evidence": list(self.evidence)}
+
+    def sealed(self, before: str) -> Admitted:
+        """The same line behind another, with the hashes that it has there."""
+        bare = dataclasses.replace(self, before=before, hash="")
+        text = json.dumps(bare.as_data(), sort_keys=True, separators=(",", ":"), allow_nan=False)
+        return dataclasses.replace(bare, hash=hashlib.blake2b(text.encode(), digest_size=16).hexdigest())
+
+
+def read(path: Path) -> list[Admitted]:
+    """The lines, checked; none where there is no file. Raises InputError that names the first line that is not as it was written."""
+    if not path.is_file():
+        return []
+    out: list[Admitted] = []
+    for number, text in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
+        where = f"{path.name}, line {number}"
+        try:
+            data = json.loads(text)
+        except ValueError:
+            raise InputError(where, text[:60], "a JSON object") from None
+        if not isinstance(data, dict):
+            raise InputError(where, text[:60], "a JSON object")
+        line = build(Admitted, data, where)
+        if line.sealed(out[-1].hash if out else "") != line:
+            raise InputError(where, line.attack, "the line as it was written, behind the one that was before it")
+        out.append(line)
+    return out
+
+
+def append(path: Path, line: Admitted) -> Admitted:
+    """Put a line at the end; the others are not touched. Returns it with its hashes."""
+    try:
+        day.fromisoformat(line.date)
+    except ValueError:
+        raise InputError("date", line.date, "a date, YYYY-MM-DD") from None
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with _alone(path.parent):
+        held = read(path)
+        line = line.sealed(held[-1].hash if held else "")
+        old = path.read_bytes() if held else b""
+        write_atomic(path, old + (json.dumps(line.as_data(), allow_nan=False) + "\n").encode())
+    return line
+
+
+@contextlib.contextmanager
+def _alone(folder: Path) -> Iterator[None]:
+    """Two writers at a time would lose the line of one."""
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(handle)
+
+
+def standing(lines: Sequence[Admitted]) -> dict[str, Admitted | None]:
+    """What holds of each attack that the list names: its line, or None where the last word is an erratum."""
+    return {line.attack: None if line.erratum else line for line in lines}
+
+
+def withdraw(attack: str, path: Path, date: str, reason: str) -> Admitted:
+    """An erratum: the attack counts no longer. Raises InputError for one that the list does not hold."""
+    held = standing(read(path))
+    line = held.get(attack)
+    if line is None:
+        raise unknown("attack", attack, [text for text, kept in held.items() if kept is not None])
+    if not reason.strip():
+        raise InputError("reason", reason, "a sentence")
+    return append(path, dataclasses.replace(line, date=date, evidence=(), erratum=reason))
+
+
+def knowledge_of(text: str, suite: Suite) -> str:
+    """What an attack is granted in a suite."""
+    spec = Spec("attack", text)
+    return suite.knowledge or str(getattr(spec.make(), "knowledge", spec.entry.knowledge))
+
+
+def admit(
+    attack: str, suite: Suite, defences: Sequence[str], path: Path, date: str, *, dose: int | None = None, alpha: float = 0.05,
+    episodes: int | None = None, workers: int = 1, rows_file: Path | None = None, progress: Callable[[int, int], None] | None = None,
+) -> tuple[Admitted | None, list[dict[str, Any]]]:  # fmt: skip
+    """Play an attack and all that are listed and know as much, on select seeds; append it if it wins. -> line or None, the tests.
+
+    It wins where it does more damage in some scenario than the worst of the others in any, against at least one defence, by the exact
+    paired test, adjusted after Holm for all defences and scenarios. dose: the middle one of those that the suite shows unless given.
+    """
+    lines = standing(read(path))
+    listed = list(dict.fromkeys([*suite.attacks, *(text for text, line in lines.items() if line is not None)]))
+    spec = Spec("attack", attack)
+    if attack in listed:
+        raise InputError("attack", attack, "one that is not on the list")
+    if spec.entry.optimal:
+        raise InputError("attack", attack, "a rival: a computed optimum is a ceiling")
+    doses = sorted(dose for dose in (suite.shown or suite.doses) if dose is not None)
+    at = dose if dose is not None or not doses else doses[len(doses) // 2]
+    level = knowledge_of(attack, suite)
+    rivals = [text for text in listed if text != CLEAN and not Spec("attack", text).entry.optimal]
+    rivals = [text for text in rivals if order(knowledge_of(text, suite)) <= order(level)]
+    part = dataclasses.replace(
+        suite, doses=(at,), shown={}, defences=tuple(defences), attacks=(*rivals, attack), seeds=episodes or suite.seeds
+    )  # fmt: skip
+    rows = run(cells_of(part, purpose="select"), rows_file, workers, progress)
+    table = tabulate(rows, part)
+    tests: list[dict[str, Any]] = []
+    for defence in defences:
+        worst = Worst(table, defence, level, alpha)
+        played = [k for k, pair in enumerate(worst.pairs) if pair not in worst.lost]
+        mine = [k for k in played if table.columns[worst.pairs[k][1]].attack == attack]
+        others = [k for k in played if k not in mine]
+        best = max(others, key=lambda k: float(worst.shares[k, 0]), default=None)
+        for k in mine:
+            seeds, x = worst.harm(k, 0)
+            held, y = worst.harm(best, 0) if best is not None else (seeds, np.zeros_like(x))
+            if held != seeds:
+                raise InputError(f"scenarios of {suite.name}", len(held), "the same seeds in each")
+            new, old = int(np.sum(x > y)), int(np.sum(y > x))
+            tests.append({
+                "defence": defence, "scenario": worst.pairs[k][0], "dose": at, "worst": None if best is None else worst.named(best),
+                "episodes": len(x), "only_new": new, "only_worst": old, "p": mcnemar(new, old),
+            })  # fmt: skip
+    if not tests:
+        raise InputError("attack", attack, "one that can be played against some of the defences")
+    for test, adjusted in zip(tests, holm([test["p"] for test in tests]), strict=True):
+        test["adjusted"] = adjusted
+    if not any(test["only_new"] > test["only_worst"] and test["adjusted"] <= alpha for test in tests):
+        return None, tests
+    return append(path, Admitted(attack, spec.digest, level, date, tuple(tests))), tests

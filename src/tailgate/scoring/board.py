@@ -1,0 +1,263 @@
+"""A board: every figure of a suite as JSON, a pure function of rows and the suite. docs/scoring.md says why each is made as it is."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+
+import tailgate
+from tailgate.errors import InputError
+from tailgate.registry import Entry, Spec, entries, split_text
+from tailgate.scenario import Suite
+from tailgate.stats import proportion
+from tailgate.strength.dose import CRITICAL
+from tailgate.strength.policies import is_policy, trained
+from tailgate.threat import KNOWLEDGE
+
+from .attacks import Admitted, standing
+from .damage import CLEAN, PLAYED, SKIPPED, Key, Row, Table, damaged, has_road, named, tabulate
+from .doses import Worst
+from .flags import flags
+from .gates import failure, gates
+from .ranks import class_of, compare
+
+FORMAT = "tailgate-board-1"
+CLEAN_METRICS = (
+    "time_gap_inflation", "rms_jerk", "distance_travelled", "max_decel", "min_gap", "rmse_position", "rmse_velocity", "max_error",
+    "alarm_rate", "alarm_onsets", "muted_steps",
+)  # fmt: skip
+Data = dict[str, Any]
+Levels = dict[str, dict[str, Worst]]  # by defence and knowledge
+
+
+def score(
+    rows: Iterable[Row], suite: Suite, *, attacks: Sequence[Admitted] | None = None, alpha: float = 0.05, require_adaptive: bool = True
+) -> Data:
+    """The board of a suite from its rows, in the format of decision record 14. The order of the rows changes nothing.
+
+    attacks: what joined the suite's attacks after it was published (`attacks.read`); every defence has to have met these too.
+    require_adaptive: rank only defences that met an attack which was trained against them.
+    Raises InputError for rows that do not belong together.
+    """
+    if not 0.0 < alpha < 1.0:
+        raise InputError("alpha", alpha, "a number above 0 and below 1")
+    lines = standing(attacks or ())
+    withdrawn = [text for text, line in lines.items() if line is None]
+    table = tabulate(rows, suite, [text for text in lines if text not in withdrawn], withdrawn)
+    trained_on = _origins(table)
+    slot = middle(table)
+    levels: Levels = {d: {k: Worst(table, d, k, alpha) for k in KNOWLEDGE} for d in table.defences}
+    found = [_entry(table, d, levels[d], slot, trained_on, require_adaptive) for d in table.defences]
+    comparisons = _rank(found, levels, slot, alpha)
+    return {
+        "format": FORMAT, "suite": _suite(table, alpha), "attacks": _attacks(table, lines, trained_on), "entries": found,
+        "cells": _cells(table),
+        "curves": [worst.curve() for d in table.defences for worst in levels[d].values() if worst.complete and worst.numbers],
+        "comparisons": comparisons, "detection": None,
+    }  # fmt: skip
+
+
+def middle(table: Table) -> int:
+    """Slot of the middle one of the doses that are shown; of all where none is named."""
+    chosen = shown(table)
+    return chosen[len(chosen) // 2]
+
+
+def shown(table: Table) -> list[int]:
+    """Slots of the doses that rates are shown at."""
+    return [slot for slot, dose in enumerate(table.doses) if dose in table.suite.shown] or list(range(len(table.doses)))
+
+
+def _suite(table: Table, alpha: float) -> Data:
+    suite = table.suite
+    return {
+        "name": suite.name, "about": suite.about, "version": tailgate.__version__, "doses": list(table.doses),
+        "shown": {str(dose): why for dose, why in suite.shown.items()}, "limit": CRITICAL, "bound": suite.bound, "alpha": alpha,
+        "scenarios": [
+            {"name": name, "about": place.about, "robustness": name in suite.robustness, "hash": place.config_hash}
+            for name, place in table.scenarios.items()
+        ],
+        "episodes": max(len(seeds) for seeds in table.seeds.values()), "purpose": table.purpose, "rows": table.rows,
+    }  # fmt: skip
+
+
+def _attacks(table: Table, lines: dict[str, Admitted | None], trained_on: dict[str, str]) -> list[Data]:
+    out = []
+    for i, column in enumerate(table.columns):
+        line = lines.get(column.attack)
+        left_out = [name for name in table.scenarios if (table.state[name][:, i] == SKIPPED).all()]
+        notes = [f"left out on {', '.join(left_out)}: {_reason(table, i)}"] if left_out else []
+        notes += ["a computed optimum: shown, and not counted"] if table.optimal[column] else []
+        notes += ["taken back by an erratum: not counted"] if column.attack in table.withdrawn else []
+        out.append({
+            "attack": column.attack, "knowledge": column.knowledge, "learned": table.learned[column], "optimal": table.optimal[column],
+            "trained_on": trained_on.get(column.attack), "admitted": None if line is None else line.as_data(), "note": "; ".join(notes),
+        })  # fmt: skip
+    return out
+
+
+def _reason(table: Table, i: int) -> str:
+    keys = (key for key in sorted(table.cells) if key.column == table.columns[i])
+    return next((row["reason"] for key in keys for row in table.cells[key] if row["status"] == "skipped"), "")
+
+
+def _origins(table: Table) -> dict[str, str]:
+    """The defence that each learned attack of the table was trained against, if its file is the one that was played."""
+    out = {}
+    for key in sorted(table.cells):
+        row, text = table.cells[key][0], key.column.attack
+        if row.get("learned") and text not in out:
+            try:
+                if is_policy(text) and Spec("attack", text).digest == row["attack_digest"] and (origin := trained(text).defence):
+                    out[text] = origin
+            except InputError:  # a file that is not here tells nothing
+                continue
+    return out
+
+
+def _entry(table: Table, defence: str, levels: dict[str, Worst], slot: int, trained_on: dict[str, str], require_adaptive: bool) -> Data:
+    rows = [row for key in sorted(table.cells) if key.defence == defence for row in table.cells[key]]
+    uses = [str(use) for use in rows[0]["uses"]]
+    card = _card(defence)
+    found = gates(table, defence)
+    why = _reference(defence, uses, card) or failure(found) or _incomplete(table, levels["black"])
+    status = "unranked" if why else "ranked"
+    if not why and require_adaptive and not _met_own(table, defence, trained_on):
+        status, why = "unattacked", "no attack that was trained against this defence is among the rows"
+    whole = {k: worst for k, worst in levels.items() if worst.complete}
+    critical: dict[tuple[tuple[str, int], ...], Data | None] = {}
+    for worst in whole.values():
+        if tuple(worst.pairs) not in critical:  # of classes with the same attacks once
+            critical[tuple(worst.pairs)] = worst.critical()
+    return {
+        "defence": defence, "card": None if card is None else card.card(), "uses": uses, "class": class_of(uses),
+        "status": status, "why": why, "gates": found,
+        "critical_dose": {k: critical[tuple(worst.pairs)] if k in whole else None for k, worst in levels.items()},
+        "rates": [worst.rate(s) for s in shown(table) for worst in whole.values()], "rank": None, "clean": _clean(table, defence),
+        "flags": flags(table, defence, levels, slot, trained_on), "worst_episode": _episode(table, whole, slot),
+        "robustness": _robustness(table, whole.get("black"), slot), "stealth": None,
+    }  # fmt: skip
+
+
+@functools.cache
+def _cards() -> dict[str, Entry]:
+    return entries("defence")
+
+
+def _card(defence: str) -> Entry | None:
+    """The card of a registered defence. The text is never resolved further: a board must not import what a row names."""
+    return _cards().get(split_text(defence)[0])
+
+
+def _reference(defence: str, uses: Sequence[str], card: Entry | None) -> str:
+    """Why a defence takes no rank whatever it does; empty where it may."""
+    if split_text(defence)[0] == CLEAN:
+        return "baseline: no defence"
+    if "truth" in uses:
+        return "reference: is told what is attacked"
+    return f"sentinel: useless by design ({card.sentinel})" if card is not None and card.sentinel else ""
+
+
+def _incomplete(table: Table, worst: Worst) -> str:
+    """Else a defence would gain by failing, or by not being attackable, where it is weak."""
+    if worst.complete:
+        return ""
+    if not worst.pairs:
+        return "incomplete: no attack was played"
+    name, i = worst.lost[0]
+    guard = table.defences.index(worst.defence)
+    slot = int(np.argmax(table.state[name][guard, i] != PLAYED))
+    key = Key(name, slot, worst.defence, table.columns[i])
+    reason = next((row["reason"] for row in table.cells.get(key, ()) if row["status"] != "ok"), "not played")
+    attacks = len({i for _, i in worst.lost})
+    return f"incomplete: {attacks} {'attack' if attacks == 1 else 'attacks'} without full figures, first {named(key)}: {reason}"
+
+
+def _met_own(table: Table, defence: str, trained_on: dict[str, str]) -> bool:
+    guard = table.defences.index(defence)
+    own = [i for i, column in enumerate(table.columns) if trained_on.get(column.attack) == defence and column.attack not in table.withdrawn]
+    return any((table.state[name][guard, i] == PLAYED).all() for name in table.scenarios for i in own)
+
+
+def _clean(table: Table, defence: str) -> dict[str, Data]:
+    """Medians and quartiles of the clean runs, of all nominal scenarios together."""
+    rows = [row for name in table.nominal() for row in table.clean.get((name, defence), ())]
+    out = {}
+    for metric in CLEAN_METRICS:
+        values = [row[metric] for row in rows if row[metric] is not None]
+        if values:
+            low, mid, high = np.quantile(np.sort(values), [0.25, 0.5, 0.75])
+            out[metric] = {"median": float(mid), "q25": float(low), "q75": float(high)}
+    return out
+
+
+def _episode(table: Table, whole: dict[str, Worst], slot: int) -> Row | None:
+    """An episode that the worst attack won at the middle dose: the smallest gap, or the largest error, the least knowing attacker first."""
+    for worst in whole.values():
+        pair, share = worst.at(slot)
+        if share > 0.0:
+            name, i = worst.pairs[pair]
+            rows = table.cells[Key(name, slot, worst.defence, table.columns[i])]
+            hit = [row for row, harm in zip(rows, worst.harm(pair, slot)[1], strict=True) if harm]
+            return min(hit, key=lambda row: row["min_gap"] if has_road(row) else -row["max_error"])
+    return None
+
+
+def _robustness(table: Table, worst: Worst | None, slot: int) -> list[Data]:
+    """The share of undamaged episodes where the plant is another one, and how it differs from the worst of the nominal scenarios."""
+    if worst is None:
+        return []
+    base = worst.undamaged(worst.at(slot, table.nominal())[0], slot)
+    out = []
+    for name in table.suite.robustness:
+        if any(scenario == name for scenario, _ in worst.pairs):
+            pair, _ = worst.at(slot, [name])
+            value, low = worst.undamaged(pair, slot), 1.0 - worst.bounds(slot, [name])[1]
+            out.append({
+                "scenario": name, "undamaged": {"value": value, "low": low}, "change": value - base, "worst": worst.named(pair),
+            })  # fmt: skip
+    return out
+
+
+_share = functools.cache(proportion)  # a board has few different counts
+
+
+def _cells(table: Table) -> list[Data]:
+    """Every cell that has rows, in the order of the suite, clean runs first."""
+    columns = [column.attack for column in table.columns]
+    order = sorted(table.cells, key=lambda key: (
+        list(table.scenarios).index(key.scenario), key.slot, table.defences.index(key.defence),
+        columns.index(key.column.attack) if key.column.attack in columns else -1, key.column.knowledge,
+    ))  # fmt: skip
+    out = []
+    for key in order:
+        rows = table.cells[key]
+        good = [damaged(row, table.suite) for row in rows if row["status"] == "ok"]
+        share = _share(sum(good), len(good))._asdict() if good else None
+        out.append({
+            "scenario": key.scenario, "dose": table.doses[key.slot], "defence": key.defence, "attack": key.column.attack,
+            "knowledge": key.column.knowledge, "learned": bool(rows[0].get("learned")), "optimal": bool(rows[0].get("optimal")),
+            "n": len(good), "failed": sum(row["status"] == "error" for row in rows),
+            "reason": next((row["reason"] for row in rows if row["status"] != "ok"), ""), "damage": share,
+        })  # fmt: skip
+    return out
+
+
+def _rank(found: list[Data], levels: Levels, slot: int, alpha: float) -> list[Data]:
+    """Comparisons within each class; puts the rank sets into the entries that take one."""
+    out = []
+    ranked = [entry for entry in found if entry["status"] == "ranked"]
+    for group in dict.fromkeys(entry["class"] for entry in ranked):
+        harm = {}
+        for entry in (e for e in ranked if e["class"] == group):
+            worst = levels[entry["defence"]]["black"]
+            harm[entry["defence"]] = worst.harm(worst.at(slot)[0], slot)
+        duels, ranks = compare(harm, group, alpha)
+        out += duels
+        for entry in ranked:
+            if entry["defence"] in ranks:
+                entry["rank"] = ranks[entry["defence"]]
+    return out

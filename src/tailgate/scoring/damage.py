@@ -1,0 +1,215 @@
+"""Damage, and the table of all rows by cell that the figures of a board are made of."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from tailgate.core import Array
+from tailgate.errors import InputError
+from tailgate.scenario import Scenario, Suite, load_scenario
+from tailgate.threat import KNOWLEDGE
+
+Row = dict[str, Any]
+CLEAN = "none"  # the attack that does nothing, and the defence that does
+PLAYED, MISSING, SKIPPED, FAILED = range(4)  # what became of a cell
+
+
+class Column(NamedTuple):
+    """An attack with the knowledge that it was granted."""
+
+    attack: str
+    knowledge: str
+
+
+class Key(NamedTuple):
+    """A cell: `slot` is the place of its dose among the suite's doses."""
+
+    scenario: str
+    slot: int
+    defence: str
+    column: Column
+
+
+def order(knowledge: str) -> int:
+    """0 for black box, and more for those who know more."""
+    return KNOWLEDGE.index(knowledge)
+
+
+def has_road(row: Row) -> bool:
+    """Whether somebody follows another in the episode of a row that was played."""
+    return row["distance_travelled"] is not None
+
+
+def damaged(row: Row, suite: Suite) -> bool:
+    """A collision in front or behind; without a road, an error above the suite's bound. Of a row that was played."""
+    if has_road(row):
+        return bool(row["crashed"])
+    if suite.bound is None:
+        raise InputError(f"suite {suite.name}: bound", None, f"an error that counts as damage: nobody drives in {row['scenario']}")
+    return bool(row["crashed"]) or row["max_error"] > suite.bound
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """Rows by cell, everything in a fixed order: that of the suite, then by name. The order of the rows changes nothing.
+
+    harm[scenario] (defences, columns, slots, episodes) is 1 for damage and 0 for none, NaN where nothing was played; state[scenario]
+    (defences, columns, slots) says why. Columns are attacks; clean rows stand apart in `clean`, by scenario and defence.
+    """
+
+    suite: Suite
+    scenarios: dict[str, Scenario]
+    doses: tuple[int | None, ...]  # ascending, none last
+    defences: tuple[str, ...]
+    columns: tuple[Column, ...]
+    seeds: dict[str, tuple[int, ...]]  # of each scenario
+    cells: dict[Key, list[Row]]  # rows by seed
+    clean: dict[tuple[str, str], list[Row]]
+    harm: dict[str, Array]
+    state: dict[str, Array]
+    optimal: dict[Column, bool]
+    learned: dict[Column, bool]
+    listed: tuple[str, ...]  # attacks that every defence has to have met
+    withdrawn: frozenset[str]  # attacks that an erratum took back
+    purpose: str
+    rows: int
+
+    def known(self, knowledge: str) -> list[int]:
+        """Columns of attacks that know no more than this. Computed optima are ceilings, and count nowhere."""
+        return [
+            i for i, column in enumerate(self.columns)
+            if order(column.knowledge) <= order(knowledge) and not self.optimal[column] and column.attack not in self.withdrawn
+        ]  # fmt: skip
+
+    def nominal(self) -> list[str]:
+        """Scenarios whose plant is the one that a defence is told; all of them where none is."""
+        return [name for name in self.scenarios if name not in self.suite.robustness] or list(self.scenarios)
+
+    def applies(self, scenario: str) -> Array:
+        """(columns,) bool: not left out in this scenario. One that has no meaning against any defence is, and one that nobody owes."""
+        state = self.state[scenario]
+        played = ~np.isin(state, (SKIPPED, MISSING)).all(axis=(0, 2))
+        listed = np.array([column.attack in self.listed for column in self.columns], bool)
+        return np.asarray(played | (listed & (state == MISSING).any(axis=(0, 2))))
+
+
+def tabulate(rows: Iterable[Row], suite: Suite, added: Sequence[str] = (), withdrawn: Iterable[str] = ()) -> Table:
+    """The table. A seed of a cell counts once, its last row; `added` are attacks that joined the suite's after it was published.
+
+    Raises InputError for rows that do not belong together.
+    """
+    rows = list(rows)
+    if not rows:
+        raise InputError("rows", rows, "at least one row of an evaluation")
+    if not suite.scenarios or not suite.doses:
+        raise InputError(f"suite {suite.name}", list(suite.scenarios), "at least one scenario and one dose")
+    places = {place.name: place for place in (load_scenario(name) for name in suite.scenarios)}
+    doses = tuple(sorted(set(suite.doses), key=_dose_order))
+    slots = {
+        (name, suite.threat.get("budget", place.threat_model.budget) if dose is None else dose): slot
+        for name, place in places.items() for slot, dose in reversed(list(enumerate(doses)))
+    }  # fmt: skip
+    held: dict[Key, dict[int, Row]] = {}
+    for row in rows:
+        _belongs(row, suite, places)
+        slot = slots.get((row["scenario"], row["dose"]))
+        if slot is None:
+            raise InputError(f"rows of {row['scenario']}: dose", row["dose"], f"one of the suite's doses {list(suite.doses)}")
+        key = Key(row["scenario"], slot, row["defence"], Column(row["attack"], row["knowledge"]))
+        by_seed = held.setdefault(key, {})
+        _same_cell(key, next(iter(by_seed.values()), row), row)
+        by_seed[row["seed"]] = row
+    for field in ("purpose", "version"):
+        found = sorted({row[field] for row in rows})
+        if len(found) > 1:
+            raise InputError(f"rows: {field}", found, "rows of one")
+    _same_component(rows)
+    cells = {key: [by_seed[seed] for seed in sorted(by_seed)] for key, by_seed in held.items()}
+    seeds = _seeds(cells)
+    defences = _ordered({key.defence for key in cells}, suite.defences)
+    listed = tuple(dict.fromkeys([*suite.attacks, *added]))
+    names = _ordered({key.column.attack for key in cells} | set(listed), listed)
+    granted = {name: {key.column.knowledge for key in cells if key.column.attack == name} for name in names}
+    columns = tuple(
+        Column(name, level) for name in names if name != CLEAN
+        for level in sorted(granted[name] or {"black"}, key=order)
+    )  # fmt: skip
+    clean: dict[tuple[str, str], list[Row]] = {}
+    for key in sorted(cells, key=lambda key: (key.slot, order(key.column.knowledge))):
+        if key.column.attack == CLEAN and all(row["status"] == "ok" for row in cells[key]):
+            clean.setdefault((key.scenario, key.defence), cells[key])  # the same at every dose
+    shape = (len(defences), len(columns), len(doses))
+    harm = {name: np.full((*shape, len(seeds.get(name, ()))), np.nan) for name in places}
+    state = {name: np.full(shape, MISSING) for name in places}
+    for key, members in cells.items():
+        if key.column.attack == CLEAN:
+            continue
+        at = defences.index(key.defence), columns.index(key.column), key.slot
+        statuses = {row["status"] for row in members}
+        state[key.scenario][at] = FAILED if "error" in statuses else SKIPPED if "skipped" in statuses else PLAYED
+        if statuses == {"ok"}:
+            harm[key.scenario][at] = [damaged(row, suite) for row in members]
+    marks = {
+        mark: {column: any(bool(m[0].get(mark)) for key, m in cells.items() if key.column.attack == column.attack) for column in columns}
+        for mark in ("optimal", "learned")
+    }  # fmt: skip
+    return Table(
+        suite, places, doses, defences, columns, seeds, cells, clean, harm, state, marks["optimal"], marks["learned"],
+        listed, frozenset(withdrawn), rows[0]["purpose"], sum(len(members) for members in cells.values()),
+    )  # fmt: skip
+
+
+def _dose_order(dose: int | None) -> tuple[bool, int]:
+    return dose is None, dose or 0
+
+
+def _ordered(names: set[str], first: Sequence[str]) -> tuple[str, ...]:
+    """The names in the order of the suite; those that it does not know come last, by name."""
+    return (*(name for name in dict.fromkeys(first) if name in names), *sorted(names - set(first)))
+
+
+def _belongs(row: Row, suite: Suite, places: dict[str, Scenario]) -> None:
+    if row["suite"] != suite.name:
+        raise InputError("rows: suite", row["suite"], f"rows of the suite {suite.name}")
+    if row["scenario"] not in places:
+        raise InputError("rows: scenario", row["scenario"], f"one of the suite's: {', '.join(places)}")
+    if row["knowledge"] not in KNOWLEDGE:
+        raise InputError("rows: knowledge", row["knowledge"], f"one of {', '.join(KNOWLEDGE)}")
+
+
+def _same_cell(key: Key, one: Row, other: Row) -> None:
+    for field in ("config_hash", "defence_digest", "attack_digest", "version"):
+        if one[field] != other[field]:
+            raise InputError(f"rows of {named(key)}: {field}", [one[field], other[field]], "rows of one")
+
+
+def named(key: Key) -> str:
+    """A cell as people read it, without its dose."""
+    return f"{key.scenario}, {key.defence}, {key.column.attack} ({key.column.knowledge})"
+
+
+def _same_component(rows: Sequence[Row]) -> None:
+    """Raise InputError where a defence or an attack is not the same one in all rows."""
+    for family in ("defence", "attack"):
+        first: dict[str, tuple[Any, Any]] = {}
+        for row in rows:
+            mine = row[f"{family}_digest"], row.get("versions", {}).get(family)
+            if first.setdefault(row[family], mine) != mine:
+                raise InputError(f"rows of the {family} {row[family]}: digest and version", [first[row[family]], mine], "rows of one")
+
+
+def _seeds(cells: dict[Key, list[Row]]) -> dict[str, tuple[int, ...]]:
+    """The seeds of each scenario, which all cells share: without that no comparison is paired."""
+    out: dict[str, tuple[tuple[int, ...], Key]] = {}
+    for key in sorted(cells):
+        mine = tuple(row["seed"] for row in cells[key])
+        seeds, first = out.setdefault(key.scenario, (mine, key))
+        if mine != seeds:
+            raise InputError(
+                f"rows of {named(key)}: seeds", f"{len(mine)} of them", f"the {len(seeds)} seeds of {first.defence}, {first.column.attack}"
+            )  # fmt: skip
+    return {name: seeds for name, (seeds, _) in out.items()}

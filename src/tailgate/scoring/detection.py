@@ -1,0 +1,129 @@
+"""The detection board, and what a stealthy attacker reaches: figures that need thresholds of their own, and so rows of their own.
+
+One threshold per defence, plant and wanted mean time between false alarms, found on clean runs of the plant's scenarios (calibrate).
+At that threshold attacks are played: what counts is whether the alarm comes within the metrics' deadline. The stealth attack aims just
+below the same threshold, so that a looser one lets it through with more.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from tailgate.calibrate import Bench, calibrate
+from tailgate.errors import InputError, NotApplicable
+from tailgate.evaluation import Cell, run_cell
+from tailgate.scenario import load_scenario
+from tailgate.stats import proportion
+
+HOURS = (0.1, 1.0, 10.0)
+ONSETS = 100  # false alarms that a threshold is found on: its mean time is known to 20 %
+STEPS = 8_000_000  # of the longest clean run: 20 alarms at 10 h in steps of 0.1 s
+Progress = Callable[[str, int, int, str], None]  # label, done, total, figures
+Data = dict[str, Any]
+
+
+def plants(scenarios: Sequence[str]) -> dict[str, tuple[str, ...]]:
+    """Scenarios by the plant that is driven: those of one plant share a threshold."""
+    out: dict[str, list[str]] = {}
+    for name in scenarios:
+        out.setdefault(type(load_scenario(name).plant).__name__, []).append(name)
+    return {plant: tuple(names) for plant, names in out.items()}
+
+
+@functools.lru_cache(maxsize=256)
+def threshold(defence: str, scenarios: tuple[str, ...], hours: float, onsets: int, most_steps: int) -> float:
+    """The threshold of a defence for a mean time between false alarms [h] on these clean runs.
+
+    Raises NotApplicable for a defence without one, and InputError where the time cannot be had in so many steps.
+    """
+    return calibrate(defence, hours, scenarios=scenarios, onsets=onsets, most_steps=most_steps).threshold
+
+
+def _found(defence: str, places: tuple[str, ...], hours: float, onsets: int, most_steps: int) -> tuple[float | None, str]:
+    """A threshold, or why there is none."""
+    try:
+        return threshold(defence, places, float(hours), onsets, most_steps), ""
+    except NotApplicable as error:
+        return None, str(error)
+    except InputError as error:
+        if error.field != "hours":
+            raise
+        return None, str(error)
+
+
+def detection(
+    defences: Sequence[str], scenarios: Sequence[str], attacks: Sequence[str], hours: Sequence[float] = HOURS, *, dose: int | None = None,
+    episodes: int = 100, onsets: int = ONSETS, most_steps: int = STEPS, purpose: str = "report", progress: Progress | None = None,
+) -> Data:  # fmt: skip
+    """The field `detection` of a board: the share of attacked episodes with an alarm within the deadline, and the median delay [steps].
+
+    `without` lists what takes no place here, and why: a defence without a threshold, a mean time that is out of reach.
+    """
+    update = progress or (lambda *_: None)
+    found: list[Data] = []
+    without: list[Data] = []
+    work = [(guard, plant, names, h) for plant, names in plants(scenarios).items() for guard in defences for h in hours]
+    for done, (guard, plant, names, h) in enumerate(work, start=1):
+        level, why = _found(guard, names, h, onsets, most_steps)
+        if level is None:
+            without.append({"defence": guard, "plant": plant, "hours": h, "reason": why})
+        else:
+            for name in names:
+                made = Bench.of(guard, [name], episodes, None).at(level)
+                for attack in attacks:
+                    rows = run_cell(Cell("detection", name, dose, guard, attack, episodes, purpose), made)
+                    head = {"defence": guard, "scenario": name, "attack": attack, "hours": h, "threshold": level}
+                    found.append(head | _detected(rows))
+        update("detection", done, len(work), guard)
+    return {"hours": list(hours), "entries": found, "without": without}
+
+
+def _detected(rows: Sequence[Data]) -> Data:
+    """Of the episodes in which an attack took effect."""
+    met = [row for row in rows if row["status"] == "ok" and row["missed_deadline"] is not None]
+    if not met or any(row["status"] == "error" for row in rows):
+        reason = next((row["reason"] for row in rows if row["status"] != "ok"), "no attack took effect")
+        return {"detected": None, "delay": None, "reason": reason}
+    delays = [row["detection_delay"] for row in met if row["detection_delay"] is not None]
+    share = proportion(sum(row["missed_deadline"] == 0.0 for row in met), len(met))
+    return {"detected": share._asdict(), "delay": float(np.median(delays)) if delays else None}
+
+
+def stealth_impact(
+    defence: str, scenarios: Sequence[str], hours: Sequence[float] = HOURS, *, attack: str = "stealth", dose: int | None = None,
+    episodes: int = 100, onsets: int = ONSETS, most_steps: int = STEPS, purpose: str = "report", progress: Progress | None = None,
+) -> list[Data] | None:  # fmt: skip
+    """The field `stealth` of an entry: by the mean time between false alarms, the error that the stealth attack reaches per time.
+
+    deviation [m/s]: the largest error of an episode over the time that it was attacked, the median of episodes, the most of scenarios.
+    None for a defence without a threshold. The scenarios are of one plant.
+    """
+    update = progress or (lambda *_: None)
+    if len(plants(scenarios)) != 1:
+        raise InputError("scenarios", list(scenarios), "scenarios of one plant")
+    out: list[Data] = []
+    for done, h in enumerate(hours, start=1):
+        level, _ = _found(defence, tuple(scenarios), h, onsets, most_steps)
+        if level is not None:
+            reached = [_reached(defence, level, name, attack, dose, episodes, purpose) for name in scenarios]
+            out.append({"hours": h, "threshold": level, "deviation": max((x for x in reached if x is not None), default=None)})
+        update(f"stealth against {defence}", done, len(hours), f"{h:g} h")
+    return out or None
+
+
+def _reached(defence: str, level: float, scenario: str, attack: str, dose: int | None, episodes: int, purpose: str) -> float | None:
+    made = Bench.of(defence, [scenario], episodes, None).at(level)
+    rows = run_cell(Cell("stealth", scenario, dose, defence, attack, episodes, purpose), made)
+    dt = load_scenario(scenario).brief().model.dt
+    values = [row["max_error"] / (row["attack_steps"] * dt) for row in rows if row["status"] == "ok" and row["attack_steps"]]
+    return float(np.median(values)) if values else None
+
+
+def with_detection(board: Data, found: Data, stealth: dict[str, list[Data] | None]) -> Data:
+    """A board with the field `detection`, and each entry with its own of `stealth` (by defence)."""
+    filled = [entry | {"stealth": stealth.get(entry["defence"])} for entry in board["entries"]]
+    return board | {"entries": filled, "detection": found}

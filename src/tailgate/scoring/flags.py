@@ -1,0 +1,88 @@
+"""Flags: what the rows of an entry say that a reader should know before believing its figures."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tailgate.core import Array
+
+from .damage import PLAYED, Key, Table
+from .doses import Worst
+from .ranks import mcnemar
+
+SPENT = 0.9  # of the budget, by the mean of the episodes without damage: those that end early leave some
+LEVEL = 0.05
+
+
+def flags(table: Table, defence: str, levels: dict[str, Worst], slot: int, trained_on: dict[str, str]) -> list[str]:
+    """Of one entry; `trained_on` says against which defence each learned attack was trained, as far as that is known."""
+    out = [*_failures(table, defence), *_unspent(table, levels, slot)]
+    for knowledge in levels:
+        out += _transferred(table, defence, levels[knowledge], slot, trained_on)
+    return [*dict.fromkeys(out), *_weaker(levels, slot)]
+
+
+def _failures(table: Table, defence: str) -> list[str]:
+    """Cells of which some rows failed: the reason says whether a batch's rows depended on one another."""
+    reasons: dict[str, int] = {}
+    for key, rows in sorted(table.cells.items()):
+        if key.defence == defence:
+            for row in rows:
+                if row["status"] == "error":
+                    reasons[row["reason"]] = reasons.get(row["reason"], 0) + 1
+    return [f"failed: {count} {'episode' if count == 1 else 'episodes'}: {reason}" for reason, count in reasons.items()]
+
+
+def _unspent(table: Table, levels: dict[str, Worst], slot: int) -> list[str]:
+    """The worst attack kept some of its budget back in episodes that it did not win."""
+    dose, out = table.doses[slot], []
+    for worst in levels.values():
+        if not dose or not worst.complete:
+            continue
+        pair, _ = worst.at(slot)
+        name, i = worst.pairs[pair]
+        rows = table.cells[Key(name, slot, worst.defence, table.columns[i])]
+        _, harm = worst.harm(pair, slot)
+        left = [row["attack_steps"] for row, hit in zip(rows, harm, strict=True) if not hit]
+        if left and float(np.mean(left)) < SPENT * dose:
+            spends = f"spends {np.mean(left):.1f} of {dose} steps where it does no damage"
+            out.append(f"unspent budget: the worst attack, {table.columns[i].attack} on {name}, {spends}")
+    return out
+
+
+def _transferred(table: Table, defence: str, worst: Worst, slot: int, trained_on: dict[str, str]) -> list[str]:
+    """A policy trained on another defence does surely more damage than every one that was trained on this one knowing as much."""
+    out = []
+    guard = table.defences.index(defence)
+    for name in table.scenarios:
+        mine: list[tuple[str, Array]] = []
+        others: list[tuple[str, Array]] = []
+        for i in (i for scenario, i in worst.pairs if scenario == name):
+            column = table.columns[i]
+            if column.knowledge != worst.knowledge or column.attack not in trained_on or table.state[name][guard, i, slot] != PLAYED:
+                continue
+            (mine if trained_on[column.attack] == defence else others).append((column.attack, table.harm[name][guard, i, slot]))
+        if not mine or not others:
+            continue
+        _, own = max(mine, key=lambda held: float(held[1].mean()))
+        for attack, harm in others:
+            more, less = int(np.sum(harm > own)), int(np.sum(own > harm))
+            if more > less and mcnemar(more, less) * len(others) <= LEVEL:
+                out.append(f"transferred beats own: {attack}, trained on {trained_on[attack]}, on {name} ({worst.knowledge} box)")
+    return out
+
+
+def _weaker(levels: dict[str, Worst], slot: int) -> list[str]:
+    """Attackers that know more do surely less than those of black box alone: they were not looked for."""
+    black, white = levels["black"], levels["white"]
+    if not (black.complete and white.complete):
+        return []
+    more = [k for k, (_, i) in enumerate(white.pairs) if white.table.columns[i].knowledge != "black"]
+    if not more:
+        return []
+    best = max(more, key=lambda k: float(white.shares[k, slot]))
+    pair, _ = black.at(slot)
+    (seeds, x), (others, y) = black.harm(pair, slot), white.harm(best, slot)
+    if seeds != others or mcnemar(int(np.sum(x > y)), int(np.sum(y > x))) > LEVEL or x.mean() <= y.mean():
+        return []
+    return ["black box beats grey and white box: those who know more were not made to use it"]

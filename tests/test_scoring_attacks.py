@@ -1,0 +1,111 @@
+"""The list of admitted attacks: it only grows, and who joins it has beaten the worst."""
+
+import dataclasses
+import json
+import threading
+
+import pytest
+
+from tailgate.errors import InputError
+from tailgate.rows import read_rows
+from tailgate.scenario import load_suite
+from tailgate.scoring import admit, read_attacks, score, withdraw
+from tailgate.scoring.attacks import Admitted, append, standing
+
+LINE = Admitted("fdi:value=-4", "", "black", "2026-11-22", ({"defence": "kf", "p": 0.01},))
+
+
+def test_a_line_is_added_and_those_before_it_keep_every_byte(tmp_path) -> None:
+    """The file before is the beginning of the file after."""
+    path, held = tmp_path / "list" / "attacks.jsonl", b""
+    for i in range(4):
+        append(path, dataclasses.replace(LINE, attack=f"a{i}"))
+        now = path.read_bytes()
+        assert now.startswith(held) and now.count(b"\n") == i + 1
+        held = now
+    lines = read_attacks(path)
+    assert [line.attack for line in lines] == ["a0", "a1", "a2", "a3"]
+    assert [line.before for line in lines] == ["", *(line.hash for line in lines[:3])]
+
+
+@pytest.mark.parametrize("damage", ["change", "swap", "take out", "cut", "first"])
+def test_a_line_that_is_not_as_it_was_written_is_refused(tmp_path, damage) -> None:
+    """Changed, moved, taken out, cut off in its middle: the line is named, and nothing is appended behind it."""
+    path = tmp_path / "attacks.jsonl"
+    for i in range(3):
+        append(path, dataclasses.replace(LINE, attack=f"a{i}"))
+    lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
+    bad = {
+        "change": [lines[0], lines[1], lines[2].replace("0.01", "0.02")], "swap": [lines[0], lines[2], lines[1]], "take out": [lines[0], lines[2]],
+        "cut": [*lines[:2], lines[2][:40]], "first": lines[1:],
+    }[damage]  # fmt: skip
+    path.write_text("".join(bad), encoding="utf-8")
+    before = path.read_bytes()
+    with pytest.raises(InputError, match=r"attacks.jsonl, line"):
+        append(path, LINE)
+    assert path.read_bytes() == before
+
+
+def test_two_writers_at_once_lose_no_line(tmp_path) -> None:
+    """Eight threads, one line each."""
+    path = tmp_path / "attacks.jsonl"
+    threads = [threading.Thread(target=append, args=(path, dataclasses.replace(LINE, attack=f"a{i}"))) for i in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert {line.attack for line in read_attacks(path)} == {f"a{i}" for i in range(8)}
+
+
+def test_an_erratum_takes_back_and_stays(tmp_path) -> None:
+    """The attack counts no longer, its line is still there, and it may come again."""
+    path = tmp_path / "attacks.jsonl"
+    append(path, LINE)
+    withdraw(LINE.attack, path, "2026-11-23", "its bound was not that of the suite")
+    assert standing(read_attacks(path)) == {LINE.attack: None} and len(read_attacks(path)) == 2
+    with pytest.raises(InputError, match="attack"):
+        withdraw(LINE.attack, path, "2026-11-23", "again")
+    append(path, LINE)
+    assert standing(read_attacks(path))[LINE.attack] is not None
+    with pytest.raises(InputError, match="date"):
+        append(path, dataclasses.replace(LINE, date="yesterday"))
+
+
+@pytest.fixture(scope="module")
+def part():
+    """quick-v0 cut to two defences, a weak attack and ten seeds."""
+    return dataclasses.replace(
+        load_suite("quick-v0"), scenarios=("gusty-stop-and-go-v0",), doses=(20,), defences=("none", "chi2_kf"), seeds=16,
+        attacks=("none", "fdi:start_step=480,value=-0.5"),
+    )  # fmt: skip
+
+
+def test_an_attack_is_admitted_by_what_it_does_on_select_seeds_and_else_not(part, tmp_path) -> None:
+    """A ramp at the right moment beats a small bias at a wrong one, and a small bias that widens the gap does not beat the ramp."""
+    path, rows = tmp_path / "attacks.jsonl", tmp_path / "rows.jsonl"
+    line, tests = admit("fdi_ramp:trigger=near,threshold=40,rate=-0.5", part, ["chi2_kf"], path, "2026-11-22", rows_file=rows)
+    assert line is not None and read_attacks(path) == [line] and {row["purpose"] for row in read_rows(rows)} == {"select"}
+    assert tests[0]["adjusted"] <= 0.05 and tests[0]["only_new"] > tests[0]["only_worst"]
+    worse, tests = admit("fdi:start_step=100,value=0.5", part, ["chi2_kf"], path, "2026-11-22")
+    assert worse is None and tests[0]["worst"]["attack"] == line.attack and len(read_attacks(path)) == 1
+    with pytest.raises(InputError, match="not on the list"):
+        admit(line.attack, part, ["chi2_kf"], path, "2026-11-22")
+    with pytest.raises(InputError, match="ceiling"):
+        admit("optimal_stealth", part, ["chi2_kf"], path, "2026-11-22")
+
+
+def test_a_board_asks_every_defence_for_what_was_admitted_and_forgets_what_was_taken_back(part) -> None:
+    """Without rows of an admitted attack a defence is incomplete; after an erratum its rows count no more."""
+    from tailgate.evaluation import evaluate
+
+    rows = evaluate(dataclasses.replace(part, seeds=10))
+    assert {e["defence"]: e["status"] for e in score(rows, part, require_adaptive=False)["entries"]} == {"none": "unranked", "chi2_kf": "ranked"}
+    asked = score(rows, part, attacks=[LINE], require_adaptive=False)
+    assert "not played" in next(e["why"] for e in asked["entries"] if e["defence"] == "chi2_kf")
+    assert next(a for a in asked["attacks"] if a["attack"] == LINE.attack)["admitted"]["date"] == LINE.date
+    hit = [row | {"attack": LINE.attack, "crashed": 1.0} for row in rows if row["attack"] != "none"]
+    for lines, value in (([LINE], 0.0), ([LINE, dataclasses.replace(LINE, erratum="wrong")], 1.0)):
+        made = score([*rows, *hit], part, attacks=lines, require_adaptive=False)
+        assert next(e for e in made["entries"] if e["defence"] == "chi2_kf")["rates"][0]["undamaged"]["value"] == value
+    assert "erratum" in next(a["note"] for a in made["attacks"] if a["attack"] == LINE.attack)
+    assert json.dumps(made, allow_nan=False)

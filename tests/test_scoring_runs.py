@@ -1,0 +1,102 @@
+"""Scoring of real runs: sentinels fail their gates, a small board, and the figures of detection."""
+
+import dataclasses
+import json
+import math
+
+import pytest
+
+from tailgate.errors import InputError
+from tailgate.evaluation import evaluate
+from tailgate.leaderboard.board_format import read_board
+from tailgate.registry import entries
+from tailgate.scenario import load_suite
+from tailgate.scoring import score
+from tailgate.scoring.detection import detection, plants, stealth_impact, threshold, with_detection
+
+SENTINELS = {name: e.sentinel for name, e in entries("defence").items() if e.sentinel}
+
+
+@pytest.fixture(scope="module")
+def small():
+    """quick-v0 cut to two defences and the sentinels, three attacks and ten seeds, and its rows."""
+    base = load_suite("quick-v0")
+    part = dataclasses.replace(
+        base, scenarios=("gusty-stop-and-go-v0",), defences=("none", "chi2_kf", *SENTINELS), attacks=(*base.attacks[:2], "stealth:trigger=near,threshold=40"),
+        seeds=10,
+    )  # fmt: skip
+    return part, evaluate(part)
+
+
+@pytest.mark.parametrize("name", SENTINELS)
+def test_each_sentinel_fails_the_gate_that_it_names(small, name) -> None:
+    """And takes no rank; the two real defences pass every gate."""
+    part, rows = small
+    made = {e["defence"]: e for e in score(rows, part)["entries"]}
+    assert SENTINELS[name] in {gate["gate"] for gate in made[name]["gates"] if not gate["passed"]}
+    assert made[name]["status"] == "unranked" and made[name]["rank"] is None
+    assert all(gate["passed"] for defence in ("none", "chi2_kf") for gate in made[defence]["gates"])
+
+
+def test_a_small_board_of_real_runs_is_of_the_format_and_says_what_the_rows_say(small) -> None:
+    """Shares are counts of the rows, the card is the registry's, and the white box beats the gate that it knows."""
+    part, rows = small
+    made = score(rows, part)
+    read_board(json.loads(json.dumps(made, allow_nan=False)))
+    assert json.dumps(score(rows, part)) == json.dumps(made)
+    held = {(c["defence"], c["attack"]): c for c in made["cells"]}
+    for (defence, attack), cell in held.items():
+        mine = [row for row in rows if row["defence"] == defence and row["attack"] == attack]
+        if cell["damage"] is not None:
+            assert cell["damage"]["value"] == sum(row["crashed"] for row in mine) / len(mine) and cell["n"] == 10
+    entry = next(e for e in made["entries"] if e["defence"] == "chi2_kf")
+    assert entry["card"]["name"] == "chi2_kf" and entry["status"] == "unattacked" and entry["class"] == "measurements"
+    white = next(r for r in entry["rates"] if r["knowledge"] == "white")
+    assert white["worst"]["attack"].startswith("stealth") and white["undamaged"]["value"] == 1.0 - held["chi2_kf", white["worst"]["attack"]]["damage"]["value"]
+    assert entry["worst_episode"]["crashed"] == 1.0 and "trace_hash" in entry["worst_episode"]
+
+
+def test_built_in_suites_name_doses_that_have_a_reason() -> None:
+    """Every new suite shows three doses, each with a sentence, and has the undefended car to compare with."""
+    for name in ("car-following-v0", "platoon-v0", "radar-v0", "network-v0", "thesis-v0"):
+        suite = load_suite(name)
+        assert len(suite.shown) == 3 and all(len(why) > 10 for why in suite.shown.values())
+        assert "none" in suite.attacks and ("none" in suite.defences or suite.bound is not None)
+
+
+WHERE = ("stop-and-go-v0",)
+FEW = {"onsets": 20, "most_steps": 80_000}
+
+
+def test_detection_holds_all_to_one_mean_time_between_false_alarms(monkeypatch) -> None:
+    """A bias of ten standard deviations is seen at once at either threshold; the looser one is the higher; a plain filter has none."""
+    found = detection(["chi2_kf", "none"], WHERE, ["fdi:start_step=100,value=-10"], (0.02, 0.1), dose=20, episodes=8, **FEW)
+    tight, loose = found["entries"]
+    assert tight["threshold"] < loose["threshold"] and [e["detected"]["value"] for e in (tight, loose)] == [1.0, 1.0]
+    assert tight["delay"] <= loose["delay"] <= 1.0 and 0.6 < tight["detected"]["low"] < 1.0
+    assert {(w["defence"], w["hours"]) for w in found["without"]} == {("none", 0.02), ("none", 0.1)} and "threshold" in found["without"][0]["reason"]
+
+
+def test_a_mean_time_that_is_out_of_reach_is_listed_and_not_an_error() -> None:
+    """10 h need more steps than were allowed."""
+    found = detection(["chi2_kf"], WHERE, ["none"], (10.0,), episodes=2, most_steps=1000)
+    assert not found["entries"] and "hours" in found["without"][0]["reason"]
+
+
+def test_the_looser_threshold_lets_a_stealthy_attacker_further() -> None:
+    """The curve of deviation against false-alarm time rises; it goes into the entry of the board."""
+    curve = stealth_impact("chi2_kf", WHERE, (0.02, 0.1), dose=100, episodes=8, **FEW)
+    assert [p["hours"] for p in curve] == [0.02, 0.1] and 0.0 < curve[0]["deviation"] < curve[1]["deviation"]
+    assert stealth_impact("none", WHERE, (0.02,), **FEW) is None
+    made = with_detection({"entries": [{"defence": "chi2_kf"}, {"defence": "none"}]}, {"hours": []}, {"chi2_kf": curve})
+    assert made["entries"][0]["stealth"] == curve and made["entries"][1]["stealth"] is None
+
+
+def test_scenarios_of_one_plant_share_a_threshold() -> None:
+    """Groups by what is driven; the curve of a defence is of one plant."""
+    assert plants(["stop-and-go-v0", "braking-v0", "thesis-ch5-v0"]) == {
+        "CarFollowing": ("stop-and-go-v0", "braking-v0"), "SensorNetwork": ("thesis-ch5-v0",),
+    }  # fmt: skip
+    with pytest.raises(InputError, match="one plant"):
+        stealth_impact("chi2_kf", ["stop-and-go-v0", "thesis-ch5-v0"])
+    assert math.isfinite(threshold("chi2_kf", WHERE, 0.02, 20, 80_000))
