@@ -315,7 +315,7 @@ SCENARIOS = (Path(__file__).parents[1] / "docs/scenarios.md").read_text(encoding
 
 def test_the_network_of_the_documentation_plays(tmp_path: Path) -> None:
     """As it stands; and nobody in it knows the state alone."""
-    (tmp_path / "mine.yaml").write_text(SCENARIOS.split("```yaml\n")[2].split("```")[0], encoding="utf-8")
+    (tmp_path / "mine.yaml").write_text(next(b for b in SCENARIOS.split("```yaml\n") if b.startswith("about: Five agents")).split("```")[0], encoding="utf-8")
     rows = tailgate.evaluate(scenarios=[str(tmp_path / "mine.yaml")], defences=["dkf"], attacks=["fdi"], seeds=2)
     assert {row["status"] for row in rows} == {"ok"} and rows[0]["attack_steps"] == 180.0
     model = load_scenario(str(tmp_path / "mine.yaml")).brief().model

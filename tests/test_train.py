@@ -173,7 +173,7 @@ def test_an_outcome_is_a_metric_that_every_episode_has(tmp_path: Path) -> None:
 
 def test_a_run_that_was_killed_and_resumed_gives_the_policy_of_an_uninterrupted_one(tmp_path: Path) -> None:
     """SIGKILL in the middle of a rollout, at no moment that the program chose."""
-    long_run = [*SMALL_RUN, "steps=12800", "checkpoint_every=640"]
+    long_run = [*SMALL_RUN, "steps=5120", "checkpoint_every=640"]
     for name in ("straight", "killed"):
         (tmp_path / name).mkdir()
     assert _command(*long_run, cwd=tmp_path / "straight").returncode == 0

@@ -15,7 +15,8 @@ from tailgate.errors import InputError
 
 EXIT_INPUT = 2
 COMMANDS = (
-    "train", "tune", "selfplay", "evaluate", "timing", "dose", "transfer", "zoo", "calibrate", "leaderboard", "replay", "reproduce", "list",
+    "train", "tune", "selfplay", "evaluate", "timing", "dose", "transfer", "zoo", "calibrate", "leaderboard", "log", "replay",
+    "reproduce", "list",
 )  # fmt: skip
 
 

@@ -10,7 +10,9 @@ import contextlib
 import dataclasses
 import hashlib
 import multiprocessing
+import os
 import sys
+import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
@@ -24,10 +26,10 @@ import tailgate
 from tailgate import draws
 from tailgate.core import Model
 from tailgate.errors import InputError, NotApplicable
-from tailgate.files import set_aside, writable_directory, write_atomic
+from tailgate.files import remove, set_aside, sweep, writable_directory, write_atomic
 from tailgate.metrics import METRICS, measure
 from tailgate.registry import Entry, Spec, entry_for, text_of
-from tailgate.rows import encode, read_rows
+from tailgate.rows import encode, packed, read_rows
 from tailgate.scenario import Scenario, Suite, load_scenario, load_suite
 from tailgate.schema import as_data, canonical
 from tailgate.threat import Brief
@@ -202,10 +204,10 @@ def run(
         if out.is_dir():
             raise InputError("out", str(out), "a file, not a directory")
         parts = writable_directory(out.with_name(f".{out.name}.parts"))
-        for i in ids:
-            part = parts / f"{i}.jsonl"
-            kept = read_rows(part) if part.is_file() else []
-            if kept and all(row["status"] != "error" for row in kept):
+        for place in (out, parts):
+            sweep(place)
+        for i, cell in zip(ids, cells, strict=True):
+            if kept := _finished(parts / f"{i}.jsonl", cell, i):
                 done[i] = kept
     missing = [(i, cell) for i, cell in zip(ids, cells, strict=True) if i not in done]
     for position, rows in _play([cell for _, cell in missing], workers):
@@ -217,12 +219,22 @@ def run(
     rows = [row for i in ids for row in done[i]]
     if out is not None and parts is not None:
         _keep_others(out, set(ids))
-        write_atomic(out, encode(rows))
+        write_atomic(out, packed(rows, out))
         for i in ids:
-            (parts / f"{i}.jsonl").unlink(missing_ok=True)
+            remove(parts / f"{i}.jsonl")
         with contextlib.suppress(OSError):  # something else lies there: not ours to remove
             parts.rmdir()
     return rows
+
+
+def _finished(part: Path, cell: Cell, identity: str) -> list[dict[str, Any]]:
+    """The rows of a cell that was played before; none where one is missing or failed, or where the file is damaged."""
+    try:
+        rows = read_rows(part) if part.is_file() else []
+    except InputError:  # what the disk kept of it: the cell is played again
+        return []
+    whole = [row["seed"] for row in rows] == list(_seeds(cell))
+    return rows if whole and all(row.get("cell") == identity and row["status"] != "error" for row in rows) else []
 
 
 def _keep_others(out: Path, ids: set[str]) -> None:
@@ -268,11 +280,21 @@ def _play(cells: Sequence[Cell], workers: int) -> Iterator[tuple[int, list[dict[
 
 def _pool(workers: int) -> ProcessPoolExecutor:
     context = multiprocessing.get_context("spawn")  # a fork after compiled parallel code can hang
-    return ProcessPoolExecutor(workers, mp_context=context, initializer=_same_path, initargs=(list(sys.path),))
+    return ProcessPoolExecutor(workers, mp_context=context, initializer=_begin, initargs=(list(sys.path),))
 
 
-def _same_path(path: list[str]) -> None:
+def _begin(path: list[str]) -> None:
+    """What a worker does first."""
     sys.path[:] = path  # a submission's module is found where the parent found it
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    """A parent that is killed tells nobody: its workers would wait for the next cell for ever."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
 
 
 def evaluate(
@@ -327,5 +349,5 @@ def evaluate(
                     cell = Cell(named.name, scenario, dose, *texts, named.seeds, purpose, 0, batch, named.threat | dict(threat or {}))
                     rows += run_cell(cell, guard, rival)
     if out is not None and len(rows) > sum(cell.seeds for cell in cells):
-        write_atomic(Path(out), encode(rows))  # with the rows of objects
+        write_atomic(Path(out), packed(rows, Path(out)))  # with the rows of objects
     return rows

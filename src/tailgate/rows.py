@@ -1,6 +1,7 @@
-"""Rows: one JSON object per episode and line, with everything that is needed to play it again."""
+"""Rows: one JSON object per episode and line, with everything that is needed to play it again. Files that end in .xz are compressed."""
 
 import json
+import lzma
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -15,6 +16,7 @@ KEYS = (
     "suite", "scenario", "dose", "knowledge", "defence", "attack", "purpose", "config_hash", "version", "defence_digest", "attack_digest",
 )  # fmt: skip
 
+LARGEST = 8_000_000_000  # bytes of rows in a compressed file
 _Text = Annotated[str, Field(strict=True)]
 _Number = Annotated[float, Field(strict=True, allow_inf_nan=False)] | None
 _FIELDS: dict[str, Any] = {
@@ -29,8 +31,9 @@ _Row = create_model("Row", __config__=ConfigDict(extra="allow"), **_FIELDS)
 def read_rows(path: Path) -> list[dict[str, Any]]:
     """Rows of a JSON Lines file, checked; raises InputError that names the line."""
     try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
+        held = path.read_bytes()
+        text = (_unpacked(held) if path.suffix == ".xz" else held).decode("utf-8")
+    except (OSError, UnicodeDecodeError, EOFError, lzma.LZMAError) as error:
         raise InputError("rows", str(path), f"a readable JSON Lines file ({error})") from None
     rows, lines = [], text.splitlines()
     for number, line in enumerate(lines, start=1):
@@ -51,6 +54,19 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
             raise InputError(f"{where}: crashed", row["crashed"], "0 or 1")
         rows.append(row)
     return rows
+
+
+def _unpacked(held: bytes) -> bytes:
+    """The text of a compressed file, of at most LARGEST bytes: a small file may hold a great many."""
+    out = lzma.LZMADecompressor().decompress(held, LARGEST + 1)
+    if len(out) > LARGEST:
+        raise OSError(f"more than {LARGEST} bytes")
+    return out
+
+
+def packed(rows: Sequence[dict[str, Any]], path: Path) -> bytes:
+    """What a file of rows holds: JSON Lines, compressed where its name ends in .xz. The same rows give the same bytes."""
+    return lzma.compress(encode(rows), preset=2) if path.suffix == ".xz" else encode(rows)
 
 
 def encode(rows: Sequence[dict[str, Any]]) -> bytes:

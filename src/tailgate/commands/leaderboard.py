@@ -1,4 +1,4 @@
-"""tailgate leaderboard: the static page."""
+"""tailgate leaderboard: boards, their page, submissions, and the check of rows."""
 
 from __future__ import annotations
 
@@ -6,11 +6,17 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from tailgate.commands import attack, board, submit, verify
+
 
 def add(commands: Any) -> None:
-    command = commands.add_parser("leaderboard", help="build the static page from rows")
+    command = commands.add_parser("leaderboard", help="score suites, attack and submit defences, verify rows, build pages")
     actions = command.add_subparsers(required=True, metavar="ACTION")
-    build = actions.add_parser("build", help="one self-contained HTML page from rows files")
+    board.add(actions)
+    attack.add(actions)
+    submit.add(actions)
+    verify.add(actions)
+    build = actions.add_parser("build", help="one self-contained HTML page from rows files, unranked")
     build.add_argument("--rows", nargs="+", required=True, metavar="FILE", help="JSON Lines files of `tailgate evaluate`")
     build.add_argument("--out", required=True, metavar="DIR", help="directory of the page")
     build.add_argument("--title", help="title of the page")

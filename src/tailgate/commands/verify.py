@@ -1,0 +1,80 @@
+"""tailgate leaderboard verify: rows played again."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from tailgate.progress import cells, console, progress
+
+SHOWN = 20  # rows that are listed, at most
+
+
+def add(actions: Any) -> None:
+    """Adds `verify` to the actions of a command."""
+    command = actions.add_parser(
+        "verify", help="play rows again and compare their hashes and figures",
+        description="Play rows again and compare hashes, metrics and all else that they record. Exit code 1 when a row differs, or when "
+        "none could be checked. A row never makes this command import code: registered names, the zoo, and files with the row's digest are "
+        "played.",
+    )  # fmt: skip
+    command.add_argument("--rows", nargs="+", required=True, metavar="FILE", help="JSON Lines files of `tailgate evaluate`")
+    command.add_argument("--sample", type=int, metavar="N", help="so many rows, drawn at random (default: all)")
+    command.add_argument("--sample-seed", type=int, default=0, metavar="N", help="which ones (default 0)")
+    command.add_argument("--workers", type=int, default=1, metavar="N", help="processes (default 1); changes no result")
+    command.add_argument("--batch", type=int, metavar="N", help="episodes side by side instead of the rows' number; changes no result")
+    command.add_argument("--trust-code", action="store_true", help="also import the classes that rows name; they run with your rights")
+    command.add_argument("--json", action="store_true", help="print the report as JSON")
+    command.set_defaults(run=_verify)
+
+
+def _verify(options: argparse.Namespace) -> int:
+    from tailgate.rows import read_rows
+    from tailgate.verify import verify
+
+    rows, origin = [], []
+    for name in options.rows:
+        held = read_rows(Path(name))
+        rows += held
+        origin += [(name, line) for line in range(1, len(held) + 1)]
+    if options.trust_code:
+        sys.path.insert(0, "")  # module:Class is looked for in the working directory, as `tailgate evaluate` does
+    with progress(Console(stderr=True)) as update:
+        report = verify(
+            rows, sample=options.sample, sample_seed=options.sample_seed, workers=options.workers, batch=options.batch,
+            trust_code=options.trust_code, progress=lambda done, total: update("playing", done, total, cells(done, total)),
+        )  # fmt: skip
+    for finding in report["findings"]:
+        finding["file"], finding["line"] = origin[finding["line"] - 1]
+    if options.json:
+        print(json.dumps(report, indent=1, allow_nan=False))
+    else:
+        _print(report)
+    return 1 if report["counts"]["differs"] or not report["counts"]["verified"] else 0
+
+
+def _print(report: dict[str, Any]) -> None:
+    out = console()
+    table = Table(title=f"{report['status']}: {report['asked']} of {report['rows']} rows played again")
+    for heading in ("defence", "status", "verified", "differs", "unchecked"):
+        table.add_column(heading, overflow="fold")
+    for entry in report["entries"]:
+        table.add_row(escape(entry["defence"]), entry["status"], *(str(entry[key]) for key in ("verified", "differs", "unchecked")))
+    out.print(table)
+    for reason in report["reasons"][:SHOWN]:
+        out.print(f"{reason['rows']} rows {reason['why']}", markup=False, highlight=False)
+    wrong = [finding for finding in report["findings"] if finding["verdict"] == "differs"]
+    for finding in wrong[:SHOWN]:
+        named = f"{finding['scenario']}, {finding['defence']}, {finding['attack']}, dose {finding['dose']}, seed {finding['seed']}"
+        out.print(f"{finding['file']}, line {finding['line']}: {named}", markup=False, highlight=False)
+        for part in finding["differences"]:
+            out.print(f"    {part['field']}: row {part['row']!r}, here {part['here']!r}", markup=False, highlight=False)
+    if len(wrong) > SHOWN:
+        out.print(f"and {len(wrong) - SHOWN} more; --json lists them all", highlight=False)

@@ -1,0 +1,251 @@
+"""Golden traces: fingerprints of a few episodes of every scenario that a suite uses, kept in the repository.
+
+A published suite never changes under its name. `check` plays 16 episodes x two defences x three attacks of each scenario again and says
+what moved; `write` records them anew, which is for a new version and never for an old one. A decision's hash is the same on every platform;
+a trace's is exact for one machine type with one numpy and numba, and is compared where those are the recorded ones.
+
+    python -m tailgate.golden --check [--scenario NAME ...]
+    python -m tailgate.golden --write
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import hashlib
+import json
+import platform
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numba
+import numpy as np
+from rich.console import Console
+
+from tailgate import draws
+from tailgate.agents.mixture import Mixture, MixtureState
+from tailgate.draws import Draws, Keys
+from tailgate.errors import InputError, NotApplicable, unknown
+from tailgate.files import write_atomic
+from tailgate.loop import Loop
+from tailgate.progress import progress
+from tailgate.registry import Spec
+from tailgate.scenario import Scenario, Suite, list_suites, load_scenario, load_suite
+from tailgate.schema import canonical
+from tailgate.trace import Trace, rollout
+
+FORMAT = "tailgate-golden-1"
+FILE = Path(str(files("tailgate.configs").joinpath("golden"))) / "golden.json"
+EPISODES = 16
+DEFENCES, ATTACKS = 2, 3
+PURPOSE = "report"  # the first episodes of a board
+WORDS = ("about", "shown")  # of a suite: what is read, not played
+
+
+@dataclass(frozen=True, eq=False)
+class _Blocks(Mixture):
+    """Each attack plays EPISODES rows of its own, in one batch: a row does not depend on its companions."""
+
+    def start(self, plan: tuple[Any, ...], batch: int, draws: Draws) -> MixtureState:
+        state = super().start(plan, batch, draws)
+        return state._replace(member=np.arange(batch) // EPISODES)
+
+
+def this_platform() -> str:
+    """What a trace's last bits may depend on."""
+    return f"{platform.machine()}, numpy {np.__version__}, numba {numba.__version__}"
+
+
+def suite_hash(suite: Suite) -> str:
+    """Of everything in a suite that is played; fields at their defaults leave no mark, so that a new field moves no old suite."""
+    blank = Suite()
+    held = {
+        f.name: getattr(suite, f.name) for f in dataclasses.fields(suite)
+        if f.name not in WORDS and getattr(suite, f.name) != getattr(blank, f.name)
+    }  # fmt: skip
+    held["shown"] = sorted(suite.shown)
+    return hashlib.blake2b(canonical(held).encode(), digest_size=8).hexdigest()
+
+
+def users() -> dict[str, Suite]:
+    """Every scenario that a built-in suite uses, and the first suite, by name, that does."""
+    out: dict[str, Suite] = {}
+    for suite in map(load_suite, list_suites()):
+        for scenario in suite.scenarios:
+            out.setdefault(scenario, suite)
+    return out
+
+
+def place_of(name: str, suite: Suite) -> Scenario:
+    """The scenario under the suite's threat model at its middle dose, for a black-box attacker unless the suite grants more."""
+    dose = suite.doses[len(suite.doses) // 2]
+    changes = suite.threat | {"knowledge": suite.knowledge or "black"} | ({} if dose is None else {"budget": dose})
+    return load_scenario(name).with_threat(**changes)
+
+
+def loops(place: Scenario, names: Sequence[str]) -> Iterator[tuple[str, Loop]]:
+    """Those of the defences that have a meaning here, with their loops."""
+    for name in dict.fromkeys(names):
+        spec = Spec("defence", name)
+        try:
+            yield name, place.loop(spec.make(), spec.entry.uses)
+        except NotApplicable:
+            continue
+
+
+def play(loop: Loop, attacks: Sequence[str]) -> Trace:
+    """EPISODES rows of each attack, one after the other in one batch."""
+    keys = draws.keys(PURPOSE, range(EPISODES))
+    some = Keys(np.tile(keys.key, (len(attacks), 1)), np.tile(keys.episode, len(attacks)))
+    return rollout(loop, _Blocks(tuple(Spec("attack", text).make() for text in attacks)), some)
+
+
+def cells(loop: Loop, defence: str, attacks: Sequence[str]) -> list[dict[str, str]]:
+    """The fingerprints under one defence, one entry for each attack."""
+    trace, out = play(loop, attacks), []
+    for i, attack in enumerate(attacks):
+        rows = range(i * EPISODES, (i + 1) * EPISODES)
+        hashes = {"decision": _all(map(trace.decision_hash, rows)), "trace": _all(map(trace.trace_hash, rows))}
+        out.append({"defence": defence, "attack": attack, **hashes})
+    return out
+
+
+def _all(hashes: Iterator[str]) -> str:
+    return hashlib.blake2b("".join(hashes).encode(), digest_size=16).hexdigest()
+
+
+def record(name: str, suite: Suite) -> dict[str, Any]:
+    """What is kept of a scenario: none, and the first two other attacks of the suite that need no more than is granted and take effect."""
+    place = place_of(name, suite)
+    chosen = list(_first(loops(place, ("kf", "none", *suite.defences)), DEFENCES))
+    if not chosen:
+        raise InputError("golden", name, "a scenario that one of its suite's defences can serve")
+    brief, able = place.brief(), ["none"]
+    for text in suite.attacks:
+        rival, entry = Spec("attack", text).make(), Spec("attack", text).entry
+        if text == "none" or getattr(rival, "knowledge", entry.knowledge) != "black" or entry.learned:
+            continue
+        try:
+            rival.prepare(brief)
+        except NotApplicable:
+            continue
+        able.append(text)
+    trace = play(chosen[0][1], able)
+    steps = ((trace.kind != 0) & trace.live).sum(axis=0).reshape(len(able), EPISODES).sum(axis=1)
+    acting = [text for text, n in zip(able, steps, strict=True) if n]
+    kinds = {Spec("attack", text).entry.name: text for text in reversed(acting)}  # of each sort the first
+    acting.sort(key=lambda text: text not in kinds.values())
+    attacks = ["none", *acting[: ATTACKS - 1]]
+    return {
+        "suite": suite.name, "hash": place.config_hash,
+        "cells": [cell for defence, loop in chosen for cell in cells(loop, defence, attacks)],
+    }  # fmt: skip
+
+
+def _first(items: Iterator[tuple[str, Loop]], most: int) -> Iterator[tuple[str, Loop]]:
+    for _, item in zip(range(most), items, strict=False):
+        yield item
+
+
+def read() -> dict[str, Any]:
+    """The recorded fingerprints."""
+    try:
+        held: dict[str, Any] = json.loads(FILE.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputError("golden", str(FILE), f"a readable JSON file ({error})") from None
+    if held.get("format") != FORMAT:
+        raise InputError("golden.format", held.get("format"), FORMAT)
+    return held
+
+
+def moved_suites(held: dict[str, Any]) -> list[str]:
+    """Which suites or scenarios are not the recorded ones, without playing."""
+    here, there = {name: suite_hash(load_suite(name)) for name in list_suites()}, held["suites"]
+    out = [f"suite {name} is not recorded: python -m tailgate.golden --write" for name in here if name not in there]
+    out += [f"suite {name} is recorded and gone" for name in there if name not in here]
+    changed = [name for name in here if there.get(name, here[name]) != here[name]]
+    out += [f"suite {name} has changed under its name: it needs a new version" for name in changed]
+    used = users()
+    out += [f"scenario {name} is not recorded" for name in used if name not in held["scenarios"]]
+    out += [f"scenario {name} is recorded, and no suite uses it" for name in held["scenarios"] if name not in used]
+    return out
+
+
+def check(name: str, held: dict[str, Any]) -> list[str]:
+    """What moved in a scenario, a sentence each; empty when nothing did. Traces are compared where the platform is the recorded one."""
+    entry = held["scenarios"].get(name)
+    if entry is None:
+        raise unknown("golden.scenario", name, held["scenarios"])
+    if entry["suite"] not in list_suites():
+        return [f"scenario {name}: its suite {entry['suite']} is gone"]
+    suite = load_suite(entry["suite"])
+    place = place_of(name, suite)
+    out = []
+    if place.config_hash != entry["hash"]:
+        out.append(f"scenario {name} of {suite.name} has changed under its name: it needs a new version")
+    exact = held["platform"] == this_platform()
+    for defence in dict.fromkeys(cell["defence"] for cell in entry["cells"]):
+        mine = [cell for cell in entry["cells"] if cell["defence"] == defence]
+        found = list(loops(place, (defence,)))
+        if not found:
+            out.append(f"scenario {name}: {defence} can no longer serve it")
+            continue
+        for was, now in zip(mine, cells(found[0][1], defence, [cell["attack"] for cell in mine]), strict=True):
+            where = f"{suite.name}, {name}, {defence} against {was['attack']}"
+            if was["decision"] != now["decision"]:
+                out.append(f"{where}: decisions (commands, alarms, modes, collisions) moved")
+            elif exact and was["trace"] != now["trace"]:
+                out.append(f"{where}: the trace moved, its decisions did not")
+    return out
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Exit code 0 when nothing moved, 1 when something did, 2 for bad input."""
+    parser = argparse.ArgumentParser(prog="python -m tailgate.golden", description="Golden traces of the published suites.")
+    what = parser.add_mutually_exclusive_group(required=True)
+    what.add_argument("--check", action="store_true", help="play them again and say what moved")
+    what.add_argument("--write", action="store_true", help="record them anew: for a new version")
+    parser.add_argument("--scenario", action="append", metavar="NAME", help="only this one (repeatable; with --check)")
+    options = parser.parse_args(arguments)
+    try:
+        return _write() if options.write else _check(options.scenario)
+    except InputError as error:
+        print(f"tailgate.golden: error: {error}", file=sys.stderr)
+        return 2
+
+
+def _check(only: list[str] | None) -> int:
+    held = read()
+    names, moved = only or sorted(held["scenarios"]), [] if only else moved_suites(held)
+    with progress(Console(stderr=True)) as update:
+        for done, name in enumerate(names, 1):
+            moved += check(name, held)
+            update("playing", done, len(names), f"{done} of {len(names)} scenarios")
+    for line in moved:
+        print(line)
+    compared = "decisions and traces" if held["platform"] == this_platform() else f"decisions only: traces are of {held['platform']}"
+    print(f"{len(names)} scenarios, {compared}: {f'{len(moved)} differences' if moved else 'nothing moved'}")
+    return 1 if moved else 0
+
+
+def _write() -> int:
+    used, scenarios = users(), {}
+    with progress(Console(stderr=True)) as update:
+        for done, name in enumerate(sorted(used), 1):
+            scenarios[name] = record(name, used[name])
+            update("playing", done, len(used), f"{done} of {len(used)} scenarios")
+    suites = {name: suite_hash(load_suite(name)) for name in list_suites()}
+    held = {
+        "format": FORMAT, "platform": this_platform(), "episodes": EPISODES, "purpose": PURPOSE, "suites": suites, "scenarios": scenarios,
+    }  # fmt: skip
+    write_atomic(FILE, json.dumps(held, indent=1).encode() + b"\n", "golden")
+    print(FILE)
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,102 @@
+"""A published suite keeps its traces: what moves needs a new version."""
+
+import copy
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tailgate import golden
+from tailgate.core import Kind
+from tailgate.evaluation import Cell, run_cell
+from tailgate.scenario import Suite, list_suites, load_suite
+
+HELD = golden.read()
+
+
+@pytest.mark.parametrize("name", sorted(HELD["scenarios"]))
+def test_nothing_moved(name: str) -> None:
+    """Decisions on every platform, traces where they were recorded on such a one. Moved on purpose? A new version of suite or scenario."""
+    assert golden.check(name, HELD) == []
+
+
+def test_every_suite_and_every_scenario_of_one_is_recorded_as_it_is() -> None:
+    assert golden.moved_suites(HELD) == []
+    assert set(HELD["suites"]) == set(list_suites())
+
+
+def test_every_scenario_has_two_defences_and_three_attacks() -> None:
+    """One of them none. Those of a scenario that grants one kind of attack may be of one kind, else they are of two."""
+    for name, entry in HELD["scenarios"].items():
+        pairs = [(cell["defence"], cell["attack"]) for cell in entry["cells"]]
+        defences, attacks = ({pair[i] for pair in pairs} for i in (0, 1))
+        assert len(pairs) == len(set(pairs)) == 6 and len(defences) == 2 and len(attacks) == 3 and "none" in attacks, name
+        by_defence = [[cell["trace"] for cell in entry["cells"] if cell["defence"] == defence] for defence in defences]
+        assert all(len(set(traces)) == 3 for traces in by_defence), name  # each attack takes effect
+
+
+def test_a_fingerprint_is_of_the_rows_of_a_board() -> None:
+    """Played in one batch with other attacks, the episodes have the hashes of rows that are played by themselves."""
+    name = "thesis-ch6-v0"
+    entry = HELD["scenarios"][name]
+    suite = load_suite(entry["suite"])
+    for cell in entry["cells"]:
+        dose = suite.doses[len(suite.doses) // 2]
+        rows = run_cell(Cell("s", name, dose, cell["defence"], cell["attack"], 16, "report", 0, 5, suite.threat))
+        assert golden._all(row["decision_hash"] for row in rows) == cell["decision"]
+        if HELD["platform"] == golden.this_platform():
+            assert golden._all(row["trace_hash"] for row in rows) == cell["trace"]
+
+
+def test_what_moved_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A decision anywhere, a trace only on the platform that it was recorded on; the scenario, the defence and the attack are said."""
+    name = "thesis-ch6-v0"
+    held: dict[str, Any] = copy.deepcopy(HELD)
+    held["platform"] = golden.this_platform()
+    one, two = held["scenarios"][name]["cells"][1:3]
+    one["decision"], two["trace"] = "0" * 32, "0" * 32
+    found = [line for line in golden.check(name, held) if "moved" in line]
+    assert any(f"{name}, {one['defence']} against {one['attack']}: decisions" in line for line in found)
+    assert any(f"{name}, {two['defence']} against {two['attack']}: the trace moved, its decisions did not" in line for line in found)
+    monkeypatch.setattr(golden, "this_platform", lambda: "another")
+    assert [line for line in golden.check(name, held) if "moved" in line] == [line for line in found if "decisions (" in line]
+
+
+def test_a_changed_suite_or_scenario_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Seeds, doses and threat count; words that explain do not."""
+    real = load_suite
+    name = HELD["scenarios"]["thesis-ch6-v0"]["suite"]
+    monkeypatch.setattr(golden, "load_suite", lambda asked: dataclasses.replace(real(asked), seeds=7, threat={"fdi_bound": 3.0}))
+    assert f"suite {name} has changed under its name: it needs a new version" in golden.moved_suites(HELD)
+    assert any("scenario thesis-ch6-v0" in line and "new version" in line for line in golden.check("thesis-ch6-v0", HELD))
+    suite = Suite("s", "one", ("braking-v0",), (5, 10), ("kf",), ("none",), 9, shown={5: "a"})
+    assert golden.suite_hash(suite) == golden.suite_hash(dataclasses.replace(suite, about="two", shown={5: "b"}))
+    for change in ({"seeds": 8}, {"doses": (5,)}, {"shown": {10: "a"}}, {"bound": 1.0}, {"held_out": ("fdi",)}, {"threat": {"budget": 1}}, {"attacks": ("fdi",)}):
+        assert golden.suite_hash(suite) != golden.suite_hash(dataclasses.replace(suite, **change)), change
+
+
+def test_the_attacks_that_are_recorded_take_effect() -> None:
+    """The two beside none are the first of the suite, of different sorts, that a black-box attacker may use here and that do something."""
+    suite = Suite("s", "", ("thesis-ch4-v0",), (None,), ("kf",), ("stealth", "fdi:start_step=149", "fdi:start_step=1000", "fdi:value=1", "delay", "dropout"), 16)
+    entry = golden.record("thesis-ch4-v0", suite)
+    assert [(cell["defence"], cell["attack"]) for cell in entry["cells"]] == [
+        (defence, attack) for defence in ("kf", "none") for attack in ("none", "fdi:start_step=149", "dropout")
+    ]
+    (loop,) = [loop for _, loop in golden.loops(golden.place_of("thesis-ch4-v0", suite), ("kf",))]
+    kind = golden.play(loop, ["none", "dropout"]).kind
+    assert not kind[:, :16].any() and (kind[:, 16:] == Kind.DROPOUT).all()
+
+
+def test_the_command_says_what_moved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    held = copy.deepcopy(HELD)
+    held["scenarios"]["thesis-ch5-v0"]["cells"][0]["decision"] = "0" * 32
+    path = tmp_path / "golden.json"
+    path.write_text(json.dumps(held))
+    monkeypatch.setattr(golden, "FILE", path)
+    assert golden.main(["--check", "--scenario", "thesis-ch5-v0"]) == 1
+    assert "thesis-ch5-v0" in capsys.readouterr().out
+    assert golden.main(["--check", "--scenario", "thesis-ch5-v9"]) == 2
+    path.write_text("{}")
+    assert golden.main(["--check"]) == 2
