@@ -206,8 +206,9 @@ def run(
         parts = writable_directory(out.with_name(f".{out.name}.parts"))
         for place in (out, parts):
             sweep(place)
+        before = _held(out)
         for i, cell in zip(ids, cells, strict=True):
-            if kept := _finished(parts / f"{i}.jsonl", cell, i):
+            if kept := _finished(parts / f"{i}.jsonl", cell, i) or _whole(before.get(i, []), cell, i):
                 done[i] = kept
     missing = [(i, cell) for i, cell in zip(ids, cells, strict=True) if i not in done]
     for position, rows in _play([cell for _, cell in missing], workers):
@@ -233,8 +234,22 @@ def _finished(part: Path, cell: Cell, identity: str) -> list[dict[str, Any]]:
         rows = read_rows(part) if part.is_file() else []
     except InputError:  # what the disk kept of it: the cell is played again
         return []
+    return _whole(rows, cell, identity)
+
+
+def _whole(rows: list[dict[str, Any]], cell: Cell, identity: str) -> list[dict[str, Any]]:
+    """The rows, if they are all of a cell's and none failed; else none."""
     whole = [row["seed"] for row in rows] == list(_seeds(cell))
     return rows if whole and all(row.get("cell") == identity and row["status"] != "error" for row in rows) else []
+
+
+def _held(out: Path) -> dict[str, list[dict[str, Any]]]:
+    """The rows of an earlier run by cell; none where there is no file that can be read."""
+    found: dict[str, list[dict[str, Any]]] = {}
+    with contextlib.suppress(InputError):
+        for row in read_rows(out) if out.is_file() else []:
+            found.setdefault(str(row.get("cell")), []).append(row)
+    return found
 
 
 def _keep_others(out: Path, ids: set[str]) -> None:

@@ -58,9 +58,12 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
 
 def _unpacked(held: bytes) -> bytes:
     """The text of a compressed file, of at most LARGEST bytes: a small file may hold a great many."""
-    out = lzma.LZMADecompressor().decompress(held, LARGEST + 1)
+    reader = lzma.LZMADecompressor()
+    out = reader.decompress(held, LARGEST + 1)
     if len(out) > LARGEST:
         raise OSError(f"more than {LARGEST} bytes")
+    if not reader.eof:
+        raise EOFError("the file was cut")
     return out
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -14,6 +15,7 @@ from tailgate.rows import read_rows
 from tailgate.scenario import Suite
 from tailgate.scoring import attacks as admitted
 from tailgate.scoring.board import score
+from tailgate.scoring.damage import CLEAN
 
 from .card import with_cards
 
@@ -27,7 +29,9 @@ def play(suite: Suite, folder: Path, *, defences: Sequence[str] | None = None, w
     """The rows of a suite and of the attacks that were admitted since, against its defences; returns their file. It resumes."""
     lines = admitted.standing(admitted.read(folder / LIST))
     attacks = [*suite.attacks, *(text for text, line in lines.items() if line is not None)]
-    file = folder / OWN
+    if defences is not None:
+        defences = list(dict.fromkeys([CLEAN, *defences]))  # the undefended car is what gates measure against
+    file = folder / (OWN if defences is None else f"rows-{hashlib.blake2b(repr(defences).encode(), digest_size=4).hexdigest()}.jsonl.xz")
     update = None if progress is None else lambda done, total: progress(suite.name, done, total)
     evaluate(suite, defences=defences, attacks=list(dict.fromkeys(attacks)), workers=workers, out=file, progress=update)
     return file
@@ -35,8 +39,9 @@ def play(suite: Suite, folder: Path, *, defences: Sequence[str] | None = None, w
 
 def board_of(suite: Suite, folder: Path, **options: Any) -> dict[str, Any]:
     """The board of all rows in a folder; written there as board.json. Raises InputError where there are none."""
-    files = sorted(path for path in folder.glob("**/*") if path.name.endswith((".jsonl", ".jsonl.xz")) and not path.name.startswith("."))
-    files = [path for path in files if path.name != LIST and "policies" not in path.relative_to(folder).parts]
+    found = sorted(path for path in folder.glob("**/*") if path.name.endswith((".jsonl", ".jsonl.xz")) and path.name != LIST)
+    within = [(path, path.relative_to(folder).parts) for path in found]
+    files = [path for path, parts in within if "policies" not in parts and not any(part.startswith(".") for part in parts)]
     if not files:
         raise InputError("rows", str(folder), "a folder with rows of `leaderboard run`")
     rows = [row for path in files for row in read_rows(path)]

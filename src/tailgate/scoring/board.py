@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Iterable, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 import tailgate
+from tailgate import train
+from tailgate.adaptive import configs_of
 from tailgate.errors import InputError
 from tailgate.registry import Entry, Spec, entries, split_text
 from tailgate.scenario import Suite
+from tailgate.schema import as_data, canonical
 from tailgate.stats import proportion
 from tailgate.strength.dose import CRITICAL
 from tailgate.strength.policies import is_policy, trained
@@ -44,7 +48,11 @@ def score(
     """
     if not 0.0 < alpha < 1.0:
         raise InputError("alpha", alpha, "a number above 0 and below 1")
-    lines = standing(attacks or ())
+    lines, rows = standing(attacks or ()), list(rows)
+    for row in rows:
+        line = lines.get(row["attack"])
+        if line is not None and row["attack_digest"] != line.digest:
+            raise InputError(f"rows of {row['attack']}: attack_digest", row["attack_digest"], f"{line.digest}, as it was admitted")
     withdrawn = [text for text, line in lines.items() if line is None]
     table = tabulate(rows, suite, [text for text in lines if text not in withdrawn], withdrawn)
     trained_on = _origins(table)
@@ -125,8 +133,10 @@ def _entry(table: Table, defence: str, levels: dict[str, Worst], slot: int, trai
     found = gates(table, defence)
     why = _reference(defence, uses, card) or failure(found) or _incomplete(table, levels["black"])
     status = "unranked" if why else "ranked"
-    if not why and require_adaptive and not _met_own(table, defence, trained_on):
-        status, why = "unattacked", "no attack that was trained against this defence is among the rows"
+    if not why and require_adaptive and (short := _draft(table)):
+        status, why = "unranked", short
+    if not why and require_adaptive and (missing := _unmet(table, defence, trained_on)):
+        status, why = "unattacked", missing
     whole = {k: worst for k, worst in levels.items() if worst.complete}
     critical: dict[tuple[tuple[str, int], ...], Data | None] = {}
     for worst in whole.values():
@@ -176,10 +186,43 @@ def _incomplete(table: Table, worst: Worst) -> str:
     return f"incomplete: {attacks} {'attack' if attacks == 1 else 'attacks'} without full figures, first {named(key)}: {reason}"
 
 
-def _met_own(table: Table, defence: str, trained_on: dict[str, str]) -> bool:
+def _draft(table: Table) -> str:
+    """Why rows are too few, or of seeds that anybody may tune on; empty where they are not."""
+    fewest = min(len(seeds) for seeds in table.seeds.values())
+    if table.purpose != "report":
+        return f"draft: seeds of the purpose {table.purpose}"
+    return f"draft: {fewest} of {table.suite.seeds} episodes" if fewest < table.suite.seeds else ""
+
+
+def _unmet(table: Table, defence: str, trained_on: dict[str, str]) -> str:
+    """What is missing of the attackers that the suite trains against a defence; empty where nothing is.
+
+    Of a suite with a plan (`adaptive`) every learner, knowledge and training seed is asked, trained as the plan says. Without one, any
+    policy that was trained against the defence will do.
+    """
     guard = table.defences.index(defence)
-    own = [i for i, column in enumerate(table.columns) if trained_on.get(column.attack) == defence and column.attack not in table.withdrawn]
-    return any((table.state[name][guard, i] == PLAYED).all() for name in table.scenarios for i in own)
+    met = [
+        column.attack for i, column in enumerate(table.columns)
+        if trained_on.get(column.attack) == defence and column.attack not in table.withdrawn
+        and all((table.state[name][guard, i] == PLAYED).all() for name in table.scenarios)
+    ]  # fmt: skip
+    if not met:
+        return "no attack that was trained against this defence is among the rows"
+    if not table.suite.adaptive:
+        return ""
+    found = {(_training(as_data(trained(text).header.training["config"])), trained(text).seed) for text in met}
+    wanted = [
+        (config, seed) for config in configs_of(table.suite, defence, Path("runs"))
+        for seed in range(config.first_seed, config.first_seed + config.seeds)
+    ]  # fmt: skip
+    missing = [f"{config.name} seed {seed}" for config, seed in wanted if (_training(as_data(config)), seed) not in found]
+    return f"{len(missing)} of {len(wanted)} of the suite's own trainings are missing, first {missing[0]}" if missing else ""
+
+
+def _training(config: Data) -> str:
+    """What decides a training, as text."""
+    free = train.COMPARED | {"out", "name", "rivals", "tensorboard", "checkpoint_every"}
+    return canonical({key: value for key, value in config.items() if key not in free})
 
 
 def _clean(table: Table, defence: str) -> dict[str, Data]:

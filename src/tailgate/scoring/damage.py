@@ -114,11 +114,18 @@ def tabulate(rows: Iterable[Row], suite: Suite, added: Sequence[str] = (), withd
         for name, place in places.items() for slot, dose in reversed(list(enumerate(doses)))
     }  # fmt: skip
     held: dict[Key, dict[int, Row]] = {}
+    hashes: dict[tuple[str, int | None, str], tuple[str, ...]] = {}
     for row in rows:
         _belongs(row, suite, places)
         slot = slots.get((row["scenario"], row["dose"]))
         if slot is None:
             raise InputError(f"rows of {row['scenario']}: dose", row["dose"], f"one of the suite's doses {list(suite.doses)}")
+        asked = row["scenario"], row["dose"], row["knowledge"]
+        if asked not in hashes:
+            hashes[asked] = hashes_of(places[row["scenario"]], suite, row["dose"], row["knowledge"])
+        if row["config_hash"] not in hashes[asked]:
+            what = f"rows of {row['scenario']}, {row['defence']}, {row['attack']}: config_hash"
+            raise InputError(what, row["config_hash"], f"{' or '.join(hashes[asked])}: the scenario under the suite's own threat model")
         key = Key(row["scenario"], slot, row["defence"], Column(row["attack"], row["knowledge"]))
         by_seed = held.setdefault(key, {})
         _same_cell(key, next(iter(by_seed.values()), row), row)
@@ -161,6 +168,13 @@ def tabulate(rows: Iterable[Row], suite: Suite, added: Sequence[str] = (), withd
         suite, places, doses, defences, columns, seeds, cells, clean, harm, state, marks["optimal"], marks["learned"],
         listed, frozenset(withdrawn), rows[0]["purpose"], sum(len(members) for members in cells.values()),
     )  # fmt: skip
+
+
+def hashes_of(place: Scenario, suite: Suite, dose: int | None, knowledge: str) -> tuple[str, ...]:
+    """What `config_hash` may be: of the scenario under the suite's threat model, with and without the readings in the attacker's sight."""
+    threat = suite.threat | {"knowledge": knowledge} | ({} if dose is None else {"budget": dose})
+    found = [place.with_threat(**threat | sight).config_hash for sight in ({}, {"sees_measurement": True})]
+    return tuple(dict.fromkeys(found))
 
 
 def _dose_order(dose: int | None) -> tuple[bool, int]:

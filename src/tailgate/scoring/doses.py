@@ -189,7 +189,8 @@ class Worst:
         drawn = np.sort(crossings(doses, monotone(self._drawn()), CRITICAL))
         low, high = math.floor((1 - LEVEL) / 2 * (RESAMPLES - 1)), math.ceil((1 + LEVEL) / 2 * (RESAMPLES - 1))
         first = next((point for point in self.points if point["value"] > CRITICAL), self.points[-1])
-        found = {"value": value, "low": float(drawn[low]), "high": float(drawn[high])}
+        # the worst of a resample is worse than that of the rows: what it says too low is widened to what was measured
+        found = {"value": value, "low": min(float(drawn[low]), value), "high": max(float(drawn[high]), value)}
         return {key: x if math.isfinite(x) else None for key, x in found.items()} | {
             "worst": {"scenario": first["scenario"], "attack": first["attack"]}
         }

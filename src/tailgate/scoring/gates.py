@@ -1,7 +1,12 @@
-"""Gates of the safety board: what a defence may cost when nobody attacks. Medians over episodes, paired with the undefended car's."""
+"""Gates of the safety board: what a defence may cost when nobody attacks, paired by episode with the undefended car.
+
+Of gap, jerk and distance both the median and the mean of the ratios count, whichever is worse: a median alone would allow a defence to ruin
+almost half of its episodes. And nearly all episodes have to get nearly as far.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -11,6 +16,8 @@ from .damage import CLEAN, Row, Table, damaged, has_road
 GAP = 0.10  # mean gap above that of the undefended car, as a share of it
 JERK = 1.2  # of the undefended car's
 DISTANCE = 0.98  # of the undefended car's
+TAIL = 0.95  # share of the episodes that may not be far off either
+FAR = 0.9  # of the undefended car's distance
 ALARMED = 0.5  # share of the time
 HOURS = 0.1  # mean time between alarm onsets [h]: the shortest that the detection board calibrates to
 HOUR = 3600.0  # [s]
@@ -33,13 +40,15 @@ def _of(table: Table, defence: str, scenario: str) -> list[Gate]:
         return [_gate("bound", scenario, float(harmed), 0.0, harmed == 0), *out]
     out = [_gate("collisions", scenario, float(harmed), 0.0, harmed == 0), *out]
     pairs = [] if bare is None else [(a, b) for a, b in zip(own, bare, strict=True) if not damaged(b, table.suite)]
-    gap = _median([(1.0 + a["time_gap_inflation"]) / (1.0 + b["time_gap_inflation"]) - 1.0 for a, b in pairs])
-    jerk = _median([a["rms_jerk"] / b["rms_jerk"] for a, b in pairs if b["rms_jerk"] > 0.0])
-    distance = _median([a["distance_travelled"] / b["distance_travelled"] for a, b in pairs if b["distance_travelled"] > 0.0])
+    gap = _worse(max, [(1.0 + a["time_gap_inflation"]) / (1.0 + b["time_gap_inflation"]) - 1.0 for a, b in pairs])
+    jerk = _worse(max, [a["rms_jerk"] / b["rms_jerk"] for a, b in pairs if b["rms_jerk"] > 0.0])
+    ratios = [a["distance_travelled"] / b["distance_travelled"] for a, b in pairs if b["distance_travelled"] > 0.0]
+    distance, far = _worse(min, ratios), sum(x >= FAR for x in ratios) / len(ratios) if ratios else None
     return [
         _gate("gap", scenario, gap, GAP, gap is not None and gap <= GAP),
         _gate("jerk", scenario, jerk, JERK, jerk is not None and jerk <= JERK),
         _gate("progress", scenario, distance, DISTANCE, distance is not None and distance >= DISTANCE),
+        _gate("every episode", scenario, far, TAIL, far is not None and far >= TAIL),
         *out,
     ]
 
@@ -53,8 +62,9 @@ def _false_alarms(table: Table, scenario: str, own: list[Row]) -> Gate:
     return _gate("false alarms", scenario, share, ALARMED, not (share > ALARMED and often))
 
 
-def _median(values: list[float]) -> float | None:
-    return float(np.median(values)) if values else None
+def _worse(of: Callable[[float, float], float], values: list[float]) -> float | None:
+    """The worse of median and mean."""
+    return of(float(np.median(values)), float(np.mean(values))) if values else None
 
 
 def _gate(name: str, scenario: str, value: float | None, limit: float | None, passed: bool) -> Gate:

@@ -13,7 +13,7 @@ from typing import Any
 from tailgate.errors import InputError
 from tailgate.evaluation import Cell, _keep_others, _pool, cells_of
 from tailgate.files import remove, sweep, writable_directory, write_atomic
-from tailgate.rows import encode, read_rows
+from tailgate.rows import encode, packed, read_rows
 from tailgate.scenario import Suite, load_suite
 from tailgate.submission.limits import Limits, Lost
 from tailgate.submission.mixed import Submission, part_of, play_mixed
@@ -69,7 +69,8 @@ def play_submission(
         if lost is not None:
             rows = [row for cell in cells for row in part_of(cell, submission, seeds).failed(seeds, lost)]
             if out is not None:
-                write_atomic(Path(out), encode(rows))
+                _keep_others(Path(out), {str(row["cell"]) for row in rows})
+                write_atomic(Path(out), packed(rows, Path(out)))
             return rows
         return _run(jobs, submission, seeds, Path(out) if out is not None else None, workers, progress)
 
@@ -102,7 +103,7 @@ def _run(
     rows = [row for i in range(len(jobs)) for row in done[i]]
     if out is not None and parts is not None:
         _keep_others(out, {cell for each in ids for cell in each})
-        write_atomic(out, encode(rows))
+        write_atomic(out, packed(rows, out))
         for name in names:
             remove(parts / f"{name}.jsonl")
         with contextlib.suppress(OSError):  # something else lies there: not ours to remove

@@ -1,0 +1,119 @@
+"""What a board refuses: rows of another threat model, drafts, other policies under an admitted name, and gates that half of the episodes pass."""
+
+import dataclasses
+import importlib.util
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tailgate.adaptive import configs_of, train_against
+from tailgate.errors import InputError
+from tailgate.evaluation import evaluate
+from tailgate.leaderboard.run import OWN, board_of, play
+from tailgate.rows import packed, read_rows
+from tailgate.scenario import Suite
+from tailgate.scoring import Admitted, score
+
+spec = importlib.util.spec_from_file_location("scored", Path(__file__).with_name("scored.py"))
+scored = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(scored)
+ROAD, board, cell, clean, entry, suite = scored.ROAD, scored.board, scored.cell, scored.clean, scored.entry, scored.suite
+PLAN = {
+    "config": "car-following", "dose": 12, "changes": ["environment.interval=20", "environment.frames=1", "teacher=null"], "seeds": 2,
+    "learners": {"cem": ["steps=600", "cem={population: 4, episodes: 5, hidden: []}"]}, "knowledge": ["black"],
+}  # fmt: skip
+SMALL = Suite("small-v0", "", (ROAD,), (12,), ("none", "kf"), ("none", "fdi:value=-4"), 3, {"kinds": ["fdi"], "fdi_bound": 5.0})
+
+
+def test_rows_of_another_threat_model_are_refused() -> None:
+    """A weaker attacker under the suite's name: the scenario's hash tells."""
+    rows = evaluate(SMALL)
+    assert score(rows, SMALL, require_adaptive=False)["suite"]["rows"] == len(rows)
+    weaker = evaluate(SMALL, threat={"fdi_bound": 4.0})
+    with pytest.raises(InputError, match=r"config_hash.*own threat model"):
+        score(weaker, SMALL)
+
+
+def test_a_draft_takes_no_rank() -> None:
+    """Too few episodes, or seeds of another purpose, are shown and not ranked."""
+    rows = [*clean("a"), *cell("none", "fdi"), *cell("a", "fdi")]
+    found = entry(score(rows, suite(seeds=100), require_adaptive=True), "a")
+    assert (found["status"], found["why"]) == ("unranked", "draft: 20 of 100 episodes")
+    tuned = [row | {"purpose": "tune"} for row in rows]
+    assert entry(score(tuned, suite(), require_adaptive=True), "a")["why"] == "draft: seeds of the purpose tune"
+
+
+def test_a_rank_takes_every_training_of_the_plan(tmp_path: Path) -> None:
+    """One of two seeds is not enough, a shorter training is none, and with both the defence is ranked."""
+    asked = dataclasses.replace(SMALL, adaptive=PLAN)
+    rows = evaluate(asked)
+
+    def status(policies: list[Path]) -> tuple[str, str]:
+        own = evaluate(asked, defences=["kf"], attacks=[str(path) for path in policies])
+        found = entry(score([*rows, *own], asked), "kf")
+        return found["status"], found["why"]
+
+    whole = train_against(configs_of(asked, "kf", tmp_path / "whole", extra=("workers=1",)), lambda *_: None)
+    short = train_against(configs_of(asked, "kf", tmp_path / "short", extra=("workers=1", "steps=100")), lambda *_: None)
+    assert status(whole) == ("ranked", "")
+    assert status(whole[:1]) == ("unattacked", "1 of 2 of the suite's own trainings are missing, first kf-cem-black seed 1")
+    assert status(short)[0] == "unattacked" and status(short)[1].startswith("2 of 2")
+
+
+def test_an_admitted_name_stands_for_one_file() -> None:
+    """Rows of another policy under the path that was admitted are refused."""
+    rows = [*clean("a"), *cell("none", "x.json"), *cell("a", "x.json")]
+    line = Admitted("x.json", "0123", "black", "2026-11-22")
+    with pytest.raises(InputError, match=r"attack_digest.*0123"):
+        score(rows, suite(), attacks=[line], require_adaptive=False)
+    same = [row | {"attack_digest": "0123"} if row["attack"] == "x.json" else row for row in rows]
+    assert score(same, suite(), attacks=[line], require_adaptive=False)
+
+
+@pytest.mark.parametrize(
+    ("changes", "gate"),
+    [({"distance_travelled": 200.0}, "progress"), ({"distance_travelled": 890.0}, "every episode"), ({"rms_jerk": 4.0}, "jerk"), ({"time_gap_inflation": 0.6}, "gap")],
+)  # fmt: skip
+def test_almost_half_of_the_episodes_cannot_be_ruined(changes: dict[str, float], gate: str) -> None:
+    """Nine of twenty: the medians of all gates are as before. Seven episodes of hundred at 89 % of the way are too many."""
+    share = 2 if gate == "every episode" else 9
+    rows = [*clean("a"), *cell("none", "fdi"), *cell("a", "fdi")]
+    for row in rows:
+        if row["defence"] == "a" and row["attack"] == "none" and row["seed"] < share:
+            row |= changes
+    found = entry(board(rows), "a")
+    assert found["status"] == "unranked" and gate in [g["gate"] for g in found["gates"] if not g["passed"]], found["gates"]
+
+
+def test_an_interval_holds_what_was_measured() -> None:
+    """Also where each resample finds a worse attack than the rows do."""
+    rng = np.random.default_rng(0)
+    attacks = [f"fdi:value={i}" for i in range(1, 13)]
+    rows = [*clean("a", n=100)]
+    for text in attacks:
+        hits = [rng.choice(100, size=n, replace=False).tolist() for n in (2, 5, 9)]
+        rows += cell("none", text, n=100) + cell("a", text, hits, n=100)
+    found = entry(board(rows, suite(attacks=("none", *attacks), seeds=100)), "a")["critical_dose"]["black"]
+    assert found["value"] is None and found["high"] is None and found["low"] is not None
+
+
+def test_a_folder_is_scored_and_half_done_work_is_not(tmp_path: Path) -> None:
+    """What lies in hidden folders and among policies counts not; a second run plays nothing again; a compressed file that was cut is refused."""
+    file = play(SMALL, tmp_path)
+    assert file.name == OWN and (first := board_of(SMALL, tmp_path, require_adaptive=False))["entries"]
+    for folder in (".rows.jsonl.xz.parts", "policies"):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "a.jsonl").write_text("{}\n")
+    assert board_of(SMALL, tmp_path, require_adaptive=False) == first
+    said: list[tuple[str, int, int]] = []
+    before = file.read_bytes()
+    play(SMALL, tmp_path, progress=lambda *args: said.append(args))
+    assert said == [] and file.read_bytes() == before
+    some = play(SMALL, tmp_path, defences=["kf"])
+    assert some != file and file.read_bytes() == before and {row["defence"] for row in read_rows(some)} == {"none", "kf"}
+    file.write_bytes(packed(read_rows(some), file)[:-40])
+    with pytest.raises(InputError, match="cut"):
+        read_rows(file)
+
+
