@@ -36,7 +36,7 @@ class Scenario:
     threat_model: ThreatModel
     ends_on_collision: bool = True
     about: str = ""
-    truth: dict[str, Any] = dataclasses.field(default_factory=dict, metadata={"if_any": True})
+    truth: dict[str, Any] = dataclasses.field(default_factory=dict, hash=False, metadata={"if_any": True})
 
     def loop(self, defence: Defence, uses: tuple[str, ...] = ("measurements",)) -> Loop:
         where = f"scenario {self.name}: truth"
