@@ -18,6 +18,7 @@ import numpy as np
 from rich.console import Console
 
 from tailgate import comparison, stats, train
+from tailgate.adaptive import train_against
 from tailgate.errors import unknown
 from tailgate.evaluation import cells_of, run
 from tailgate.files import write_atomic
@@ -25,7 +26,7 @@ from tailgate.plots import canvas, png
 from tailgate.progress import progress
 from tailgate.rivals import BATCH, outcomes
 from tailgate.rows import read_rows
-from tailgate.schema import as_data, canonical, read_yaml
+from tailgate.schema import as_data, read_yaml
 
 HERE = Path(__file__).parent
 RISING = 0.05  # of the whole rise of the learning curve, that its last tenth may bring
@@ -41,25 +42,6 @@ def configured(name: str, cell: dict[str, Any], learner: str, options: argparse.
     return train.load_config(cell["config"], changes)
 
 
-def trained(config: train.TrainConfig, console: Console) -> list[Path]:
-    """The policies of a learner, trained where that is not done yet."""
-    policies = [config.directory / f"policy-{seed}.json" for seed in range(config.first_seed, config.first_seed + config.seeds)]
-    free = train.COMPARED | {"outcome", "select_episodes", "rivals"}  # a policy that was trained stays so when its rivals change
-
-    def training(data: dict[str, Any]) -> str:
-        return canonical({key: value for key, value in data.items() if key not in free})
-
-    snapshot = config.directory / "config.json"
-    begun = snapshot.is_file() and training(json.loads(snapshot.read_text())) == training(json.loads(json.dumps(as_data(config))))
-    if begun and all(path.is_file() for path in policies):
-        return policies
-    with progress(console) as update:
-        return train.train(
-            config, lambda seed, now: update(f"{config.name}, seed {seed}", min(now.steps, config.steps), config.steps, train.figures(now)),
-            resume=begun and json.loads(snapshot.read_text()) == json.loads(json.dumps(as_data(config))),
-        )  # fmt: skip
-
-
 def minutes(config: train.TrainConfig) -> float:
     """Of processor time for all training seeds, shared by so many processes at a time."""
     seconds = [json.loads((config.directory / f"curve-{seed}.json").read_text())["seconds"] for seed in range(config.seeds)]
@@ -69,7 +51,8 @@ def minutes(config: train.TrainConfig) -> float:
 def played(name: str, cell: dict[str, Any], options: argparse.Namespace, console: Console) -> dict[str, Any]:
     """The record of a cell: a report for each learner, and which one speaks for it."""
     configs = {learner: configured(name, cell, learner, options) for learner in cell["learners"]}
-    policies = {learner: trained(config, console) for learner, config in configs.items()}
+    with progress(console) as update:
+        policies = {learner: train_against([config], update) for learner, config in configs.items()}
     held = {learner: [json.loads(path.read_text())["sha256"] for path in found] for learner, found in policies.items()}
     file, wanted = Path(options.runs) / name / "cell.json", json.loads(json.dumps([as_data(list(configs.values())), held]))
     if file.is_file() and (kept := json.loads(file.read_text()))["of"] == wanted:
@@ -277,6 +260,11 @@ def picture(cells: dict[str, Any]) -> bytes:
     return png(figure)
 
 
+def lines(record: dict[str, Any]) -> str:
+    """JSON, a line for each cell."""
+    return "{\n" + ",\n".join(f"{json.dumps(name)}: {json.dumps(cell)}" for name, cell in record.items()) + "\n}\n"
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("cells", nargs="*", metavar="CELL", help="only these")
@@ -305,7 +293,7 @@ def main() -> None:
     out.mkdir(parents=True, exist_ok=True)
     for _, _, report in learners_of(record):
         report.pop("policies", None)
-    write_atomic(out / "report.json", json.dumps(record, indent=1).encode() + b"\n")
+    write_atomic(out / "report.json", lines(record).encode())
     write_atomic(out / "report.md", markdown(record).encode())
     write_atomic(out / "adversaries.png", picture(record))
 

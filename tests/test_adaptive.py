@@ -35,6 +35,8 @@ def test_policies_play_as_attacks_and_are_trained_once(tmp_path: Path) -> None:
     assert len(policies) == 4 and said
     before = [path.stat().st_mtime_ns for path in policies]
     assert train_against(configs, lambda *args: pytest.fail("trained again")) == policies
+    more = configs_of(SUITE, "kf", tmp_path, extra=("workers=2", "episodes=7"))  # which change no policy
+    assert train_against(more, lambda *args: pytest.fail("trained again")) == policies
     assert [path.stat().st_mtime_ns for path in policies] == before
     rows = evaluate(SUITE, attacks=[str(path) for path in policies])
     assert len(rows) == 4 * 2 * 3 and all(row["status"] == "ok" and row["learned"] for row in rows)

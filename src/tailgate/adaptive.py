@@ -77,7 +77,7 @@ def train_against(configs: list[train.TrainConfig], progress: Progress) -> list[
     out = []
     for config in configs:
         held = config.directory / "config.json"
-        again = held.is_file() and json.loads(held.read_text(encoding="utf-8")) == json.loads(json.dumps(as_data(config)))
+        again = held.is_file() and train.training_of(json.loads(held.read_text(encoding="utf-8"))) == train.training_of(as_data(config))
         policies = [config.directory / f"policy-{seed}.json" for seed in range(config.first_seed, config.first_seed + config.seeds)]
         if not (again and all(path.is_file() for path in policies)):
 

@@ -32,7 +32,7 @@ from tailgate.metrics import METRICS
 from tailgate.registry import Spec
 from tailgate.rivals import best_of
 from tailgate.scenario import Suite, config_path, load_scenario
-from tailgate.schema import as_data, build, fields_of, override, read_yaml
+from tailgate.schema import as_data, build, canonical, fields_of, override, read_yaml
 from tailgate.threat import KNOWLEDGE
 
 ENVIRONMENT = (fields_of(ActionSpec) | fields_of(Reward) | {"frames": None}).keys() - {"gamma"}  # that `environment` may hold
@@ -286,9 +286,20 @@ def _train_apart(
                 future.cancel()
 
 
+def free_of(teacher: str | None) -> set[str]:
+    """Fields of a configuration that change no policy."""
+    return COMPARED | (set() if teacher == "best" else CHOSEN)
+
+
+def training_of(config: dict[str, Any]) -> str:
+    """What decides the policies of a configuration, as JSON data, in text that is the same for the same training wherever it lies."""
+    free = free_of(config.get("teacher")) | {"out", "name"}
+    return canonical({key: value for key, value in config.items() if key not in free})
+
+
 def _same_run(held: Path, config: TrainConfig) -> None:
     """Raise InputError when a run would be resumed with another training; the number of steps and the comparison may change."""
-    now, free = as_data(config), COMPARED | {"steps"} | (set() if config.teacher == "best" else CHOSEN)
+    now, free = as_data(config), free_of(config.teacher) | {"steps"}
     try:
         before = json.loads(held.read_text(encoding="utf-8"))
         changed = [key for key in now if key not in free and before.get(key) != now[key]]

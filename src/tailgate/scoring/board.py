@@ -15,7 +15,7 @@ from tailgate.adaptive import configs_of
 from tailgate.errors import InputError
 from tailgate.registry import Entry, Spec, entries, split_text
 from tailgate.scenario import Suite
-from tailgate.schema import as_data, canonical
+from tailgate.schema import as_data
 from tailgate.stats import proportion
 from tailgate.strength.dose import CRITICAL
 from tailgate.strength.policies import is_policy, trained
@@ -210,19 +210,13 @@ def _unmet(table: Table, defence: str, trained_on: dict[str, str]) -> str:
         return "no attack that was trained against this defence is among the rows"
     if not table.suite.adaptive:
         return ""
-    found = {(_training(as_data(trained(text).header.training["config"])), trained(text).seed) for text in met}
+    found = {(train.training_of(trained(text).header.training["config"]), trained(text).seed) for text in met}
     wanted = [
         (config, seed) for config in configs_of(table.suite, defence, Path("runs"))
         for seed in range(config.first_seed, config.first_seed + config.seeds)
     ]  # fmt: skip
-    missing = [f"{config.name} seed {seed}" for config, seed in wanted if (_training(as_data(config)), seed) not in found]
+    missing = [f"{config.name} seed {seed}" for config, seed in wanted if (train.training_of(as_data(config)), seed) not in found]
     return f"{len(missing)} of {len(wanted)} of the suite's own trainings are missing, first {missing[0]}" if missing else ""
-
-
-def _training(config: Data) -> str:
-    """What decides a training, as text."""
-    free = train.COMPARED | {"out", "name", "rivals", "tensorboard", "checkpoint_every"}
-    return canonical({key: value for key, value in config.items() if key not in free})
 
 
 def _clean(table: Table, defence: str) -> dict[str, Data]:
