@@ -32,7 +32,8 @@ def cell(defence, attack="none", hits=0, n=20, scenario=ROAD, doses=(10, 20, 40)
         for seed in range(n):
             row = dict.fromkeys(METRICS) | CLEAN | {
                 "suite": "s", "scenario": scenario, "dose": dose, "knowledge": "black", "defence": defence, "attack": attack, "purpose": "report",
-                "config_hash": hash_of(scenario, dose, changes.get("knowledge", "black")), "version": "1", "defence_digest": "", "attack_digest": "", "seed": seed, "status": "ok", "reason": "",
+                "config_hash": hash_of(scenario, dose, changes.get("knowledge", "black")), "version": "1", "defence_digest": "", "attack_digest": "",
+                "beacon": "0123456789abcdef", "submission": {"sandbox": "bwrap"}, "seed": seed, "status": "ok", "reason": "",
                 "uses": ["measurements"], "learned": False, "optimal": False, "crashed": float(seed in which), "attack_steps": 0.0 if attack == "none" else float(dose),
             }  # fmt: skip
             out.append(row | changes)

@@ -113,6 +113,26 @@ def test_mcnemar_counts_only_the_episodes_that_differ() -> None:
     assert mcnemar(6, 0) == pytest.approx(2 / 64) and mcnemar(0, 0) == 1.0 and mcnemar(3, 3) == 1.0
 
 
+def test_a_difference_counts_only_against_every_attack_of_the_other() -> None:
+    """b falls to jam in 20 episodes and to fdi in none; a falls to fdi in 20: neither is better. The price of the choice is 2 attacks."""
+    rows = [*clean("a", "b"), *cell("none", "fdi"), *cell("none", "jam"), *cell("a", "fdi", 20), *cell("a", "jam"), *cell("b", "fdi"), *cell("b", "jam", 20)]
+    where = suite(attacks=("none", "fdi", "jam"))
+    assert board(rows, where)["comparisons"][0]["p"] == 1.0
+    better = [row | {"crashed": 0.0} if (row["defence"], row["attack"]) == ("b", "jam") else row for row in rows]
+    made = board(better, where)["comparisons"][0]
+    assert made["weaker"] == "a" and made["p"] == pytest.approx(2 * 2 * 0.5**20)
+
+
+def test_a_strangers_class_is_ranked_only_from_a_sandbox_and_on_seeds_of_a_beacon() -> None:
+    """Whoever knows the seeds can take the noise away, and whoever runs free can read it."""
+    rows = [*clean("a"), *cell("none", "fdi"), *cell("a", "fdi")]
+    assert entry(board(rows), "a")["status"] == "ranked"
+    free = board([row | {"submission": {"sandbox": ""}} if row["defence"] == "a" else row for row in rows])
+    assert entry(free, "a")["why"].startswith("claimed: not played by") and entry(free, "a")["rank"] is None
+    public = board([row | {"beacon": ""} for row in rows])
+    assert entry(public, "a")["why"] == "claimed: played on public seeds"
+
+
 def test_holm_keeps_a_difference_from_counting_that_is_one_of_many() -> None:
     """6 to 0 alone is significant; with two more pairs it is not, as 3 x 2 / 64 exceeds 5 %."""
     two = [*clean("a", "b"), *cell("none", "fdi"), *cell("a", "fdi"), *cell("b", "fdi", 6)]
@@ -194,18 +214,19 @@ def test_an_attack_beyond_the_list_counts_where_it_was_played_and_is_asked_of_no
 
 
 def test_a_rank_asks_for_an_attack_that_was_trained_against_that_very_defence() -> None:
-    """A policy of the zoo that was trained against chi2_kf speaks for chi2_kf alone, and only while its file is the one that was played."""
+    """A policy of the zoo that was trained against chi2_kf speaks for chi2_kf alone, and only for the files that it was trained against."""
     from tailgate.registry import Spec
+    from tailgate.strength.policies import origin_of
 
     text = "zoo:name=car-following-chi2_kf-0"
-    mine = {"learned": True, "attack_digest": Spec("attack", text).digest}
+    mine = {"learned": True, "attack_digest": Spec("attack", text).digest, "trained": origin_of(text)}
     where = suite(attacks=("none", text))
     rows = [*clean("kf", "chi2_kf"), *(row for d in ("none", "kf", "chi2_kf") for row in cell(d, text, **mine))]
     made = score(rows, where)
     assert (entry(made, "chi2_kf")["status"], entry(made, "kf")["status"]) == ("ranked", "unattacked")
     assert entry(made, "kf")["rank"] is None and "trained against" in entry(made, "kf")["why"]
     assert made["attacks"][0]["trained_on"] == "chi2_kf"
-    other = [row | {"attack_digest": "x"} if row["attack"] == text else row for row in rows]
+    other = [row | {"defence_digest": "x"} if row["defence"] == "chi2_kf" else row for row in rows]
     assert entry(score(other, where), "chi2_kf")["status"] == "unattacked"
 
 
@@ -241,14 +262,12 @@ def test_the_worst_episode_is_a_damaged_one_with_the_smallest_gap() -> None:
     assert entry(made, "b")["worst_episode"] is None
 
 
-def test_flags_name_unspent_budgets_and_transfers_that_beat_own_training(monkeypatch) -> None:
+def test_flags_name_unspent_budgets_and_transfers_that_beat_own_training() -> None:
     """The worst attack spends 5 of 20 steps where it fails; a policy trained on b does more damage to a than the one trained on a."""
-    from tailgate.scoring import board as module
-
-    monkeypatch.setattr(module, "_origins", lambda table: {"mine": "a", "theirs": "b"})
     where = suite(attacks=("none", "mine", "theirs"))
-    rows = [*clean("a", "b"), *cell("none", "mine"), *cell("none", "theirs"), *cell("b", "mine"), *cell("b", "theirs"), *cell("a", "mine", 1)]
-    rows += cell("a", "theirs", 12, attack_steps=5.0)
+    mine, theirs = ({"trained": {"defence": name, "digest": "", "plan": "p", "seed": 0}} for name in "ab")
+    rows = [*clean("a", "b"), *cell("none", "mine", **mine), *cell("none", "theirs", **theirs), *cell("b", "mine", **mine)]
+    rows += [*cell("b", "theirs", **theirs), *cell("a", "mine", 1, **mine), *cell("a", "theirs", 12, attack_steps=5.0, **theirs)]
     found = entry(board(rows, where), "a")["flags"]
     assert any(f.startswith("unspent budget: the worst attack, theirs") and "5.0 of 20" in f for f in found)
     assert [f for f in found if f.startswith("transferred")] == [f"transferred beats own: theirs, trained on b, on {ROAD} (black box)"]
@@ -260,6 +279,7 @@ def test_flags_name_unspent_budgets_and_transfers_that_beat_own_training(monkeyp
     [
         ({"suite": "t"}, "suite"), ({"scenario": OTHER}, "scenario"), ({"dose": 11}, "dose"), ({"config_hash": "x"}, "config_hash"),
         ({"version": "2"}, "version"), ({"defence_digest": "x"}, "defence_digest"), ({"purpose": "select"}, "seeds"), ({"seed": 77}, "seeds"),
+        ({"beacon": "another beacon 1"}, "beacon"),
     ],
 )  # fmt: skip
 def test_rows_that_do_not_belong_together_are_refused_by_name(change, field) -> None:

@@ -57,7 +57,7 @@ def test_a_rank_takes_every_training_of_the_plan(tmp_path: Path) -> None:
     whole = train_against(configs_of(asked, "kf", tmp_path / "whole", extra=("workers=1",)), lambda *_: None)
     short = train_against(configs_of(asked, "kf", tmp_path / "short", extra=("workers=1", "steps=100")), lambda *_: None)
     assert status(whole) == ("ranked", "")
-    assert status(whole[:1]) == ("unattacked", "1 of 2 of the suite's own trainings are missing, first kf-cem-black seed 1")
+    assert status(whole[:1]) == ("unattacked", "1 of 2 of the suite's own trainings are missing, first cem-black seed 1")
     assert status(short)[0] == "unattacked" and status(short)[1].startswith("2 of 2")
 
 

@@ -10,7 +10,7 @@ from tailgate.errors import InputError
 from tailgate.evaluation import evaluate
 from tailgate.leaderboard.board_format import read_board
 from tailgate.registry import entries
-from tailgate.scenario import load_suite
+from tailgate.scenario import Suite, load_suite
 from tailgate.scoring import score
 from tailgate.scoring.detection import detection, plants, stealth_impact, threshold, with_detection
 
@@ -65,12 +65,13 @@ def test_built_in_suites_name_doses_that_have_a_reason() -> None:
 
 
 WHERE = ("stop-and-go-v0",)
+ROAD = Suite("s", "", WHERE)
 FEW = {"onsets": 20, "most_steps": 80_000}
 
 
 def test_detection_holds_all_to_one_mean_time_between_false_alarms(monkeypatch) -> None:
     """A bias of ten standard deviations is seen at once at either threshold; the looser one is the higher; a plain filter has none."""
-    found = detection(["chi2_kf", "none"], WHERE, ["fdi:start_step=100,value=-10"], (0.02, 0.1), dose=20, episodes=8, **FEW)
+    found = detection(ROAD, ["chi2_kf", "none"], ["fdi:start_step=100,value=-10"], (0.02, 0.1), dose=20, episodes=8, **FEW)
     tight, loose = found["entries"]
     assert tight["threshold"] < loose["threshold"] and [e["detected"]["value"] for e in (tight, loose)] == [1.0, 1.0]
     assert tight["delay"] <= loose["delay"] <= 1.0 and 0.6 < tight["detected"]["low"] < 1.0
@@ -79,15 +80,15 @@ def test_detection_holds_all_to_one_mean_time_between_false_alarms(monkeypatch) 
 
 def test_a_mean_time_that_is_out_of_reach_is_listed_and_not_an_error() -> None:
     """10 h need more steps than were allowed."""
-    found = detection(["chi2_kf"], WHERE, ["none"], (10.0,), episodes=2, most_steps=1000)
+    found = detection(ROAD, ["chi2_kf"], ["none"], (10.0,), episodes=2, most_steps=1000)
     assert not found["entries"] and "hours" in found["without"][0]["reason"]
 
 
 def test_the_looser_threshold_lets_a_stealthy_attacker_further() -> None:
     """The curve of deviation against false-alarm time rises; it goes into the entry of the board."""
-    curve = stealth_impact("chi2_kf", WHERE, (0.02, 0.1), dose=100, episodes=8, **FEW)
+    curve = stealth_impact(ROAD, "chi2_kf", (0.02, 0.1), dose=100, episodes=8, **FEW)
     assert [p["hours"] for p in curve] == [0.02, 0.1] and 0.0 < curve[0]["deviation"] < curve[1]["deviation"]
-    assert stealth_impact("none", WHERE, (0.02,), **FEW) is None
+    assert stealth_impact(ROAD, "none", (0.02,), **FEW) is None
     made = with_detection({"entries": [{"defence": "chi2_kf"}, {"defence": "none"}]}, {"hours": []}, {"chi2_kf": curve})
     assert made["entries"][0]["stealth"] == curve and made["entries"][1]["stealth"] is None
 
@@ -98,5 +99,5 @@ def test_scenarios_of_one_plant_share_a_threshold() -> None:
         "CarFollowing": ("stop-and-go-v0", "braking-v0"), "SensorNetwork": ("thesis-ch5-v0",),
     }  # fmt: skip
     with pytest.raises(InputError, match="one plant"):
-        stealth_impact("chi2_kf", ["stop-and-go-v0", "thesis-ch5-v0"])
+        stealth_impact(dataclasses.replace(ROAD, scenarios=("stop-and-go-v0", "thesis-ch5-v0")), "chi2_kf")
     assert math.isfinite(threshold("chi2_kf", WHERE, 0.02, 20, 80_000))

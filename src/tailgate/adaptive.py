@@ -72,6 +72,15 @@ def configs_of(suite: Suite, defence: str, out: Path, *, seeds: int | None = Non
     return found
 
 
+def asked_of(suite: Suite) -> list[tuple[str, str, int]]:
+    """(name, plan, seed) of every training that the suite asks for against each defence."""
+    configs = configs_of(suite, "none", Path("runs"))
+    return [
+        (config.name.removeprefix("none-"), train.plan_key(as_data(config)), seed)
+        for config in configs for seed in range(config.first_seed, config.first_seed + config.seeds)
+    ]  # fmt: skip
+
+
 def train_against(configs: list[train.TrainConfig], progress: Progress) -> list[Path]:
     """The policies of all trainings. A finished one is not trained again, and one that was interrupted goes on."""
     out = []

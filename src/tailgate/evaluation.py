@@ -29,6 +29,7 @@ from tailgate.errors import InputError, NotApplicable
 from tailgate.files import remove, set_aside, sweep, writable_directory, write_atomic
 from tailgate.metrics import METRICS, measure
 from tailgate.registry import Entry, Spec, entry_for, text_of
+from tailgate.rounds import numbered
 from tailgate.rows import encode, packed, read_rows
 from tailgate.scenario import Scenario, Suite, load_scenario, load_suite
 from tailgate.schema import as_data, canonical
@@ -52,6 +53,12 @@ class Cell:
     first_seed: int = 0
     batch: int = 256
     threat: dict[str, Any] = field(default_factory=dict)
+    beacon: str = ""
+
+    @property
+    def episodes(self) -> Sequence[int]:
+        """Seeds of its episodes: numbers, or those of the round of its beacon."""
+        return numbered(self.beacon, self.suite, self.purpose, self.first_seed, self.seeds)
 
     def place(self, attack: Any, knowledge: str) -> Scenario:
         """The scenario under the dose and the knowledge that the attack needs."""
@@ -80,13 +87,14 @@ def run_cell(cell: Cell, defence: Any = None, attack: Any = None) -> list[dict[s
     place = cell.place(rival, rival_entry.knowledge)
     head = _head(cell, place, guard_entry, rival_entry, cell_id(cell) if defence is None and attack is None else "")
     rows: list[dict[str, Any]] = []
+    seeds = cell.episodes
     try:
         loop = place.loop(guard, guard_entry.uses)
         size = episodes_at_once(loop.model, loop.horizon, cell.batch)
     except Exception as error:
-        return _failed(head, _seeds(cell), *_why(error))
+        return _failed(head, seeds, *_why(error))
     for start in range(0, cell.seeds, size):
-        chunk = _seeds(cell)[start : start + size]
+        chunk = seeds[start : start + size]
         try:
             trace = rollout(loop, rival, draws.keys(cell.purpose, chunk))
             values = measure(trace)
@@ -107,21 +115,25 @@ def _why(error: Exception) -> tuple[str, str]:
     return f"{type(error).__name__}: {error}", "error"
 
 
-def _seeds(cell: Cell) -> range:
-    return range(cell.first_seed, cell.first_seed + cell.seeds)
-
-
 def _head(cell: Cell, place: Scenario, guard: Entry, rival: Entry, identity: str) -> dict[str, Any]:
     threat = place.threat_model
     return {
         "suite": cell.suite, "scenario": place.name, "scenario_file": cell.scenario if cell.scenario.endswith((".yaml", ".yml")) else "",
         "threat_model": as_data(threat), "dose": threat.budget,
         "knowledge": threat.knowledge, "defence": cell.defence, "uses": list(guard.uses), "attack": cell.attack,
-        "learned": rival.learned, "optimal": rival.optimal, "purpose": cell.purpose, "batch": cell.batch,
+        "learned": rival.learned, "optimal": rival.optimal, "purpose": cell.purpose, "beacon": cell.beacon, "batch": cell.batch,
         "engine": ENGINE, "versions": {"defence": guard.version, "attack": rival.version},
         "defence_digest": _digest("defence", cell.defence, identity), "attack_digest": _digest("attack", cell.attack, identity),
         "config_hash": place.config_hash, "version": tailgate.__version__, "cell": identity,
+        "trained": origin(cell.attack) if identity else None,
     }  # fmt: skip
+
+
+def origin(attack: str) -> dict[str, Any] | None:
+    """How a learned attack was trained, as its file says."""
+    from tailgate.strength.policies import origin_of
+
+    return origin_of(attack)
 
 
 def _digest(family: Any, text: str, identity: str) -> str:
@@ -139,7 +151,7 @@ def failed_rows(cell: Cell, reason: str) -> list[dict[str, Any]]:
     """The rows of a cell that could not be played."""
     rival, entry = Spec("attack", cell.attack).make(), Spec("attack", cell.attack).entry
     head = _head(cell, cell.place(rival, entry.knowledge), Spec("defence", cell.defence).entry, entry, cell_id(cell))
-    return _failed(head, _seeds(cell), reason)
+    return _failed(head, cell.episodes, reason)
 
 
 def cell_id(cell: Cell) -> str:
@@ -163,13 +175,16 @@ def _sparing() -> Iterator[None]:
         return
 
 
-def cells_of(suite: Suite, *, batch: int = 256, purpose: str = "report", threat: dict[str, Any] | None = None) -> list[Cell]:
+def cells_of(
+    suite: Suite, *, batch: int = 256, purpose: str = "report", threat: dict[str, Any] | None = None, beacon: str = ""
+) -> list[Cell]:
     """Every cell of a suite, in its order. Raises InputError for anything that does not exist."""
     if purpose not in draws.PURPOSES:
         raise InputError("purpose", purpose, f"one of {', '.join(draws.PURPOSES)}")
-    changes = suite.threat | dict(threat or {}) | ({} if suite.knowledge is None else {"knowledge": suite.knowledge})
+    _ = numbered(beacon, suite.name, purpose, 0, 1)  # refuses a beacon that is none
+    changes = suite.granted | dict(threat or {})
     out = [
-        Cell(suite.name, scenario, dose, defence, attack, suite.seeds, purpose, 0, batch, changes)
+        Cell(suite.name, scenario, dose, defence, attack, suite.seeds, purpose, 0, batch, changes, beacon)
         for scenario in suite.scenarios for dose in suite.doses for defence in suite.defences for attack in suite.attacks
     ]  # fmt: skip
     models: dict[str, Model] = {}
@@ -239,7 +254,7 @@ def _finished(part: Path, cell: Cell, identity: str) -> list[dict[str, Any]]:
 
 def _whole(rows: list[dict[str, Any]], cell: Cell, identity: str) -> list[dict[str, Any]]:
     """The rows, if they are all of a cell's and none failed; else none."""
-    whole = [row["seed"] for row in rows] == list(_seeds(cell))
+    whole = [row["seed"] for row in rows] == list(cell.episodes)
     return rows if whole and all(row.get("cell") == identity and row["status"] != "error" for row in rows) else []
 
 
@@ -325,11 +340,13 @@ def evaluate(
     workers: int = 1,
     out: Path | str | None = None,
     threat: dict[str, Any] | None = None,
+    beacon: str = "",
     progress: Callable[[int, int], None] | None = None,
 ) -> list[dict[str, Any]]:
     """Rows of a suite, or of any part of it that is given here; defences and attacks by name or as objects.
 
-    `threat` changes the scenarios' threat models. Raises InputError before anything is played.
+    `threat` changes the scenarios' threat models; `beacon` names the round that the episodes belong to.
+    Raises InputError before anything is played.
     """
     base = load_suite(suite) if isinstance(suite, str) else suite if suite is not None else Suite(name="custom")
     guards = list(base.defences if defences is None else defences)
@@ -352,7 +369,7 @@ def evaluate(
     for dose in named.doses:
         if dose is not None and (not isinstance(dose, int) or dose < 0):
             raise InputError("dose", dose, "a whole number of attack steps, not below 0")
-    cells = cells_of(named, batch=batch, purpose=purpose, threat=threat)
+    cells = cells_of(named, batch=batch, purpose=purpose, threat=threat, beacon=beacon)
     rows = run(cells, Path(out) if out is not None else None, workers, progress) if cells else []
     for guard in guards:
         for rival in rivals:
@@ -361,7 +378,8 @@ def evaluate(
             texts = _component("defence", guard)[2], _component("attack", rival)[2]
             for scenario in named.scenarios:
                 for dose in named.doses:
-                    cell = Cell(named.name, scenario, dose, *texts, named.seeds, purpose, 0, batch, named.threat | dict(threat or {}))
+                    changes = named.threat | dict(threat or {})
+                    cell = Cell(named.name, scenario, dose, *texts, named.seeds, purpose, 0, batch, changes, beacon)
                     rows += run_cell(cell, guard, rival)
     if out is not None and len(rows) > sum(cell.seeds for cell in cells):
         write_atomic(Path(out), packed(rows, Path(out)))  # with the rows of objects

@@ -33,6 +33,7 @@ _MODULES = {
     "manoeuvre": "tailgate.envs",
 }
 _GROUPS = {"defence": "tailgate.estimators", "attack": "tailgate.agents"}
+SANDBOXES = ("bwrap", "docker")
 _FILES = {".json": "policy", ".yaml": "program", ".yml": "program"}  # attacks that are files
 PARTS: tuple[Family, ...] = ("filter", "detector", "mitigation")  # of the defence `composed`
 _entries: dict[str, dict[str, "Entry"]] = {family: {} for family in _MODULES}
@@ -173,7 +174,8 @@ class Spec:
     """A component as a user names it: text that a row can record and another process can rebuild.
 
     `name`, `name:key=value,key=value`, `module:Class`, `module:Class:key=value`, or (attacks) the JSON file of an exported policy or the
-    YAML file of a program. `part.key=value` is a parameter of the part that another parameter names.
+    YAML file of a program. `part.key=value` is a parameter of the part that another
+    parameter names. A defence may stand behind a sandbox: `bwrap/module:Class`.
     """
 
     family: Family
@@ -204,7 +206,23 @@ class Spec:
             raise InputError(f"{where}: {self.family}", self.text, "a registered name; code is named on the command line only")
 
     @property
+    def sandboxed(self) -> tuple[str, str] | None:
+        """Sandbox and class of a defence that is imported in a sandbox and nowhere else: `bwrap/module:Class`, `docker:IMAGE/...`."""
+        program, slash, text = self.text.partition("/")
+        found = slash and self.family == "defence" and program.partition(":")[0] in SANDBOXES
+        return (program, text) if found else None
+
+    @property
+    def target(self) -> str:
+        """The component itself, wherever it is played."""
+        return self.sandboxed[1] if self.sandboxed else self.text
+
+    @property
     def entry(self) -> Entry:
+        if self.sandboxed:
+            from tailgate.submission.sandboxed import entry_of as card_of
+
+            return card_of(*self.sandboxed)
         head, _ = self._parts()
         if self.family == "attack" and (kind := _FILES.get(Path(head).suffix)):
             return find("attack", kind)
@@ -214,12 +232,16 @@ class Spec:
 
     @property
     def imports(self) -> bool:
-        """Whether this names a class to import."""
-        return bool(self._imported())
+        """Whether this names a class to import, outside of any sandbox."""
+        return not self.sandboxed and bool(self._imported())
 
     @property
     def digest(self) -> str:
         """Of the files that somebody else's components, or the zoo's, come from; empty for other registered ones: they carry a version."""
+        if self.sandboxed:
+            from tailgate.submission.sandboxed import digest_of
+
+            return digest_of(self.sandboxed[1])
         head, params = self._parts()
         paths = [Path(inspect.getfile(imported(family, name).cls)) for family, name in self._imported()]
         if self.family == "attack":
@@ -232,6 +254,10 @@ class Spec:
         return hashlib.sha256(b"".join(blobs)).hexdigest() if blobs else ""
 
     def make(self) -> Any:
+        if self.sandboxed:
+            from tailgate.submission.sandboxed import Sandboxed
+
+            return Sandboxed(*self.sandboxed)
         head, params = self._parts()
         if self.family == "attack" and Path(head).suffix in _FILES:
             params = {"path": head, **params}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import hashlib
 import json
 import multiprocessing
 import signal
@@ -225,7 +226,8 @@ def _train_seed(config: TrainConfig, teacher: str | None, seed: int, resume: boo
     learner.learn(config.steps, report, checkpoint, min(config.checkpoint_every, max(config.steps // 10, 1)))
     facts = {
         "learner": config.learner, "teacher": teacher, "seed": seed, "steps": learner.steps, "config": as_data(config),
-        config.learner: as_data(settings), "environment": learner.seat.card()["hash"], "curve": learner.curve,
+        "defence_digest": Spec("defence", config.defence).digest, config.learner: as_data(settings),
+        "environment": learner.seat.card()["hash"], "curve": learner.curve,
     }  # fmt: skip
     policy = learner.export(directory / f"policy-{seed}", facts)
     curve = {"curve": learner.curve, "seconds": spent + time.process_time() - started}
@@ -295,6 +297,12 @@ def training_of(config: dict[str, Any]) -> str:
     """What decides the policies of a configuration, as JSON data, in text that is the same for the same training wherever it lies."""
     free = free_of(config.get("teacher")) | {"out", "name"}
     return canonical({key: value for key, value in config.items() if key not in free})
+
+
+def plan_key(config: dict[str, Any]) -> str:
+    """The training of a configuration but for the defence that it is against: what a suite's plan asks of everybody."""
+    text = training_of({key: value for key, value in config.items() if key != "defence"})
+    return hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
 
 
 def _same_run(held: Path, config: TrainConfig) -> None:

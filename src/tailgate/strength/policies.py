@@ -22,7 +22,7 @@ from tailgate.scenario import list_scenarios
 from tailgate.schema import fields_of
 from tailgate.stats import Interval, paired_difference, proportion
 from tailgate.threat import ThreatModel
-from tailgate.train import TrainConfig, outcome_of
+from tailgate.train import TrainConfig, outcome_of, plan_key
 
 BATCH = 256  # episodes side by side; changes no result
 NAMED: tuple[tuple[Family, str], ...] = (  # what a record names, one or a list of each
@@ -89,6 +89,17 @@ def trained(text: str) -> Trained:
         text, policy, header, str(record.get("learner", "unknown")), seed if isinstance(seed, int) else None,
         _text(config.get("scenario")), _text(config.get("defence")), threat, _text(config.get("outcome")),
     )  # fmt: skip
+
+
+def origin_of(text: str) -> dict[str, Any] | None:
+    """What the rows of a trained policy say of its training: against which defence (and digest), by which plan, and the training seed."""
+    if not is_policy(text):
+        return None
+    who = trained(text)
+    config, digest = who.header.training.get("config"), who.header.training.get("defence_digest", "")
+    if who.defence is None or not isinstance(config, dict) or not isinstance(digest, str):
+        return None
+    return {"defence": Spec("defence", who.defence).target, "digest": digest, "plan": plan_key(config), "seed": who.seed}
 
 
 def _harmless(family: Family, held: Any, where: str) -> None:

@@ -7,8 +7,8 @@ from typing import Any
 
 from tailgate.submission.limits import Limits
 
-__all__ = ["Isolated", "Limits", "digest_of", "play_mixed", "play_submission", "seeds_of"]
-_HOMES = {"Isolated": "isolated", "digest_of": "source", "seeds_of": "source", "play_mixed": "mixed", "play_submission": "play"}
+__all__ = ["Isolated", "Limits", "digest_of", "play_mixed", "play_submission"]
+_HOMES = {"Isolated": "isolated", "digest_of": "source", "play_mixed": "mixed", "play_submission": "play"}
 
 
 def __getattr__(name: str) -> Any:

@@ -15,7 +15,7 @@ import numpy as np
 import tailgate
 from tailgate import draws
 from tailgate.errors import InputError, NotApplicable
-from tailgate.evaluation import Cell, _failed, _head, _why
+from tailgate.evaluation import Cell, _failed, _head, _why, origin
 from tailgate.metrics import measure
 from tailgate.registry import Entry, Spec
 from tailgate.scenario import Scenario
@@ -23,13 +23,13 @@ from tailgate.schema import canonical
 from tailgate.submission.isolated import Isolated, IsolatedPlan
 from tailgate.submission.limits import FEWEST, Limits, Lost
 from tailgate.submission.sandbox import Sandbox
+from tailgate.submission.sandboxed import WHITE
 from tailgate.submission.source import Source
 from tailgate.submission.table import Seat, order_of, play_together
 from tailgate.trace import episodes_at_once, rollout
 
 ROWS = 4096  # rows of a batch at most: beyond that a step gains nothing
 COMPANIONS = 256  # rows that the companions test plays again, at most
-WHITE = "a submission's state stays in its own process: white-box attacks cannot look ahead through it, and would tell it who is attacked"
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,6 @@ class Submission:
     card: dict[str, Any]  # uses, version, reference
     limits: Limits = field(default_factory=Limits)
     sandbox: Sandbox | None = None
-    beacon: str = ""
 
     @property
     def entry(self) -> Entry:
@@ -96,8 +95,9 @@ def part_of(cell: Cell, submission: Submission, seeds: Sequence[int]) -> _Part:
     rival = spec.make()
     place = cell.place(rival, spec.entry.knowledge)
     head = _head(cell, place, entry, spec.entry, "") | {
-        "defence_digest": submission.source.digest, "attack_digest": spec.digest, "cell": identity(cell, submission, seeds, place),
-        "submission": {"beacon": submission.beacon, "sandbox": "" if submission.sandbox is None else submission.sandbox.program},
+        "defence_digest": submission.source.digest, "attack_digest": spec.digest, "trained": origin(cell.attack),
+        "cell": identity(cell, submission, seeds, place),
+        "submission": {"sandbox": "" if submission.sandbox is None else submission.sandbox.program},
     }  # fmt: skip
     return _Part(cell, place, rival, head, entry.uses)
 
@@ -109,9 +109,9 @@ def play_mixed(cells: Sequence[Cell], submission: Submission, seeds: Sequence[in
     nobody; each batch has a fresh process. Afterwards some rows are played again among others (the companions test): a submission
     whose rows then differ by a bit loses all of them. A lost process costs what it had not finished.
     """
-    if len({(cell.scenario, cell.first_seed, cell.seeds, cell.purpose) for cell in cells}) > 1:
-        raise InputError("cells", "cells that differ in scenario, seeds or purpose", "cells of one scenario and the same seeds")
-    chosen = list(range(cells[0].first_seed, cells[0].first_seed + cells[0].seeds) if seeds is None else seeds)
+    if len({(cell.scenario, cell.first_seed, cell.seeds, cell.purpose, cell.beacon) for cell in cells}) > 1:
+        raise InputError("cells", "cells that differ in scenario, seeds, purpose or beacon", "cells of one scenario and the same seeds")
+    chosen = list(cells[0].episodes if seeds is None else seeds)
     parts = [part_of(cell, submission, chosen) for cell in cells]
     rows: dict[tuple[int, int], dict[str, Any]] = {}
     fit = []

@@ -19,7 +19,7 @@ from tailgate.submission.limits import Limits, Lost
 from tailgate.submission.mixed import Submission, part_of, play_mixed
 from tailgate.submission.process import Process
 from tailgate.submission.sandbox import Sandbox, sandbox_of
-from tailgate.submission.source import seeds_of, staged
+from tailgate.submission.source import staged
 
 Rows = list[dict[str, Any]]
 
@@ -30,7 +30,7 @@ def play_submission(
     *,
     limits: Limits | None = None,
     sandbox: str | Sandbox | None = None,
-    beacon: str | None = None,
+    beacon: str = "",
     workers: int = 1,
     out: Path | str | None = None,
     progress: Callable[[int, int], None] | None = None,
@@ -40,9 +40,9 @@ def play_submission(
 ) -> Rows:
     """Rows of a suite for one submission, "module:Class:key=value": one for each scenario, dose, attack of the suite and episode.
 
-    The class is imported in processes of its own only, from a copy of its files. With a beacon the episodes' seeds are `seeds_of` it,
-    without one they are the public ones 0, 1, ..., for development. Whatever goes wrong costs rows, with a reason: those of a cell
-    where a number is wrong, those of a scenario that are not finished where the process is lost. With `out` an interrupted run
+    The class is imported in processes of its own only, from a copy of its files. The episodes' seeds are those of the beacon's round
+    (`tailgate.rounds`), without one the public ones 0, 1, ..., for development. Whatever goes wrong costs rows, with a reason: those of
+    a cell where a number is wrong, those of a scenario that are not finished where the process is lost. With `out` an interrupted run
     resumes after the scenarios that it finished without an error. Raises InputError before anything is played.
     """
     base = load_suite(suite) if isinstance(suite, str) else suite
@@ -53,10 +53,10 @@ def play_submission(
             raise InputError(name, value, "a whole number not below 1")
     named = dataclasses.replace(base, defences=("none",), seeds=count, scenarios=tuple(base.scenarios if scenarios is None else scenarios))
     with staged(text) as source:
-        seeds = list(range(count)) if beacon is None else seeds_of(beacon, source.digest, purpose, count)
-        cells = [dataclasses.replace(cell, defence=source.text) for cell in cells_of(named, purpose=purpose)]
+        cells = [dataclasses.replace(cell, defence=source.text) for cell in cells_of(named, purpose=purpose, beacon=beacon)]
         if not cells:
             raise InputError("suite", base.name, "one with scenarios, doses and attacks")
+        seeds = list(cells[0].episodes)
         held, lost = limits or Limits(), None
         card: dict[str, Any] = {"uses": ("measurements",), "version": 1, "reference": ""}
         try:
@@ -64,7 +64,7 @@ def play_submission(
                 card = process.card
         except Lost as error:
             lost = error
-        submission = Submission(source, card, held, guard, beacon or "")
+        submission = Submission(source, card, held, guard)
         jobs = [[cell for cell in cells if cell.scenario == name] for name in dict.fromkeys(named.scenarios)]
         if lost is not None:
             rows = [row for cell in cells for row in part_of(cell, submission, seeds).failed(seeds, lost)]

@@ -68,8 +68,9 @@ def bwrap(folder: Path, source: Path | None, limits: Limits) -> list[str]:
     out = ["bwrap", "--unshare-all", "--die-with-parent", "--new-session", "--cap-drop", "ALL", "--hostname", "submission"]
     for path in _SYSTEM:
         out += ["--ro-bind-try", path, path]
-    out += ["--proc", "/proc", "--dev", "/dev", "--size", str(limits.file_size), "--tmpfs", "/tmp"]
-    out += ["--size", str(limits.file_size), "--tmpfs", HOME]
+    out += ["--proc", "/proc", "--dev", "/dev"]
+    for path in ("/dev/shm", "/tmp", HOME):
+        out += ["--size", str(limits.file_size), "--tmpfs", path]
     for prefix in prefixes:
         if not any(prefix == path or prefix.startswith(f"{path}/") for path in _SYSTEM):
             out += ["--ro-bind", prefix, prefix]

@@ -1,4 +1,4 @@
-"""What is played: a copy of the submission's files, whose hash decides the episodes' seeds."""
+"""What is played: a copy of the submission's files, and its digest."""
 
 from __future__ import annotations
 
@@ -12,12 +12,10 @@ from dataclasses import dataclass
 from importlib.metadata import entry_points
 from pathlib import Path
 
-from tailgate.draws import PURPOSES
 from tailgate.errors import InputError
 from tailgate.registry import split_text
 
 LARGEST = 2**30  # [bytes] of a submission, weights included
-SEED_BITS = 53  # whole numbers that every reader of JSON keeps
 _LEFT_OUT = ("__pycache__", ".git")
 
 
@@ -103,23 +101,3 @@ def staged(text: str) -> Iterator[Source]:
             copies[-1].parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(path, copies[-1])
         yield Source(text, _digest(base, copies), Path(folder))
-
-
-def seeds_of(beacon: str, submission_digest: str, purpose: str, count: int) -> list[int]:
-    """Seeds of `count` episodes from a beacon, which became public after the submission, by keyed BLAKE2b: below 2^53, no two equal.
-
-    The key is the hash of the beacon; the message is digest, purpose and number. Who knows beacon and submission can make them again.
-    """
-    if purpose not in PURPOSES:
-        raise InputError("purpose", purpose, f"one of {', '.join(PURPOSES)}")
-    if len(beacon) < 16:
-        raise InputError("beacon", beacon, "at least 16 characters that nobody could know when the submission was made")
-    key = hashlib.blake2b(beacon.encode(), digest_size=32).digest()
-    seeds: dict[int, None] = {}
-    number = 0
-    while len(seeds) < count:
-        message = f"{submission_digest}/{purpose}/{number}".encode()
-        digest = hashlib.blake2b(message, key=key, digest_size=8).digest()
-        seeds[int.from_bytes(digest, "little") >> (64 - SEED_BITS)] = None
-        number += 1
-    return list(seeds)
