@@ -11,11 +11,13 @@ from typing import Any
 
 from tailgate.core import Defence, Positive, PositiveCount, param
 from tailgate.errors import InputError, unknown
+from tailgate.link import Link
 from tailgate.loop import Loop
 from tailgate.registry import Spec, make_from
 from tailgate.schema import build, canonical, fields_of, read_yaml
 from tailgate.threat import Brief, ThreatModel
 
+LINK = ("loss", "latency")
 _COMPONENTS = ("plant", "sensor", "controller", "manoeuvre")
 
 
@@ -24,7 +26,7 @@ class Scenario:
     """plant + sensor + controller + manoeuvre + horizon + threat model.
 
     `truth` says where the vehicle is another than everyone is told, who knows `plant` and `sensor` as they stand here: changes of the
-    fields of either, and `load`, the mass over the nominal one, by which a commanded acceleration is divided.
+    fields of either; `load`, the mass over the nominal one, by which a commanded acceleration is divided; `loss` and `latency` of readings.
     """
 
     name: str
@@ -44,11 +46,13 @@ class Scenario:
         told = self.plant.model(self.sensor, self.controller) if self.truth else None
         loop = Loop(
             plant, sensor, self.controller, self.manoeuvre, self.threat_model, self.horizon, defence, uses, self.ends_on_collision, told,
-            self.truth.get("load", 1.0),
+            self.truth.get("load", 1.0), build(Link, {key: self.truth[key] for key in LINK if key in self.truth}, where),
         )  # fmt: skip
         begins, drives = getattr(self.manoeuvre, "initial_speed", None), getattr(self.plant, "lead_speed", None)
         if begins is not None and drives is not None and abs(begins - drives) > 0.5:
             raise InputError(f"scenario {self.name}: plant.lead_speed", drives, f"the manoeuvre's first speed ({begins} m/s)")
+        if not loop.link.perfect and loop.model.air:
+            raise InputError(where, self.truth, "no loss or latency: a radar is read where it hears")
         if told is not None and told.C.shape != plant.model(sensor, self.controller).C.shape:
             raise InputError(where, self.truth, "changes that keep the number of agents, states and sensors")
         _ = loop.plan  # refuses what does not fit (unknown targets, a damaged profile) here, not in the first step
@@ -81,8 +85,8 @@ def _changed(part: Any, changes: Any, where: str) -> Any:
 
 def _check_truth(truth: dict[str, Any], where: str) -> None:
     for key in truth:
-        if key not in ("plant", "sensor", "load"):
-            raise unknown(f"{where}: unknown field", key, ("plant", "sensor", "load"))
+        if key not in ("plant", "sensor", "load", *LINK):
+            raise unknown(f"{where}: unknown field", key, ("plant", "sensor", "load", *LINK))
     load = truth.get("load", 1.0)
     if isinstance(load, bool) or not isinstance(load, int | float) or not 0.1 <= load <= 10.0:
         raise InputError(f"{where}.load", load, "the mass over the nominal one, 0.1 to 10")
@@ -106,6 +110,23 @@ class Suite:
     robustness: tuple[str, ...] = param((), "those scenarios whose plant is not the one that a defence is told")
     adaptive: dict[str, Any] = dataclasses.field(default_factory=dict, metadata={"doc": "how attackers are trained against a defence"})
     held_out: tuple[str, ...] = param((), "attacks, by name, that are kept out of logs for those who learn a detector")
+
+
+    @property
+    def nominal(self) -> tuple[str, ...]:
+        """Scenarios whose plant is the one that a defence is told; all of them where none is."""
+        return tuple(name for name in self.scenarios if name not in self.robustness) or self.scenarios
+
+    @property
+    def middle_dose(self) -> int | None:
+        """The middle one of the doses that are shown, or of all; none where none is a number."""
+        doses = sorted(dose for dose in (self.shown or self.doses) if dose is not None)
+        return doses[len(doses) // 2] if doses else None
+
+    @property
+    def granted(self) -> dict[str, Any]:
+        """Changes of every scenario's threat model, what the suite grants to know among them."""
+        return self.threat | ({} if self.knowledge is None else {"knowledge": self.knowledge})
 
 
 def _builtin(folder: str) -> dict[str, Path]:

@@ -16,6 +16,7 @@ from rich.table import Table
 
 from tailgate.errors import InputError
 from tailgate.progress import cells, console, progress
+from tailgate.scenario import Suite
 
 
 def add(actions: Any) -> None:
@@ -73,7 +74,7 @@ def _run(options: argparse.Namespace) -> int:
                     progress=lambda name, done, total: update(name, done, total, cells(done, total)),
                 )  # fmt: skip
             board = board_of(suite, folder, require_adaptive=not options.unattacked)
-            boards.append(_detected(board, folder, update) if options.detection else board)
+            boards.append(_detected(board, suite, folder, update) if options.detection else board)
     page = build_site(boards, out / "page", replays=not options.no_replays)
     if options.json:
         print(json.dumps([{"suite": b["suite"]["name"], "entries": b["entries"]} for b in boards], indent=1, allow_nan=False))
@@ -84,21 +85,21 @@ def _run(options: argparse.Namespace) -> int:
     return 0
 
 
-def _detected(board: dict[str, Any], folder: Path, update: Any) -> dict[str, Any]:
+def _detected(board: dict[str, Any], suite: Suite, folder: Path, update: Any) -> dict[str, Any]:
     """The board with detection and stealth impact, written again."""
     from tailgate.files import write_atomic
     from tailgate.scoring.detection import detection, stealth_impact, with_detection
 
-    guards = [e["defence"] for e in board["entries"] if e["status"] != "unranked"]
-    places = [s["name"] for s in board["suite"]["scenarios"] if not s["robustness"]]
+    guards = [e["defence"] for e in board["entries"] if e["card"] is not None and e["defence"] != "none" and "truth" not in e["uses"]]
     scripts = [a for a in board["attacks"] if not a["optimal"] and not a["learned"]]
     against = [a["attack"] for a in scripts if a["knowledge"] == "black"]
 
     def told(label: str, done: int, total: int, text: str) -> None:
         update(label, done, total, text)
 
-    found = detection(guards, places, against, progress=told)
-    stealth = {guard: stealth_impact(guard, places[:1], progress=told) for guard in guards}
+    beacon = board["suite"]["beacon"]
+    found = detection(suite, guards, against, beacon=beacon, progress=told)
+    stealth = {guard: stealth_impact(suite, guard, beacon=beacon, progress=told) for guard in guards}
     board = with_detection(board, found, stealth)
     write_atomic(folder / "board.json", json.dumps(board, indent=1, allow_nan=False).encode() + b"\n")
     return board
@@ -123,7 +124,12 @@ def _print_board(board: dict[str, Any]) -> None:
 
 def _dose(critical: dict[str, Any], doses: list[int | None]) -> str:
     most = max((dose for dose in doses if dose is not None), default=0)
-    low, value, high = (f"> {most}" if critical[k] is None else f"{critical[k]:.3g}" for k in ("low", "value", "high"))
+    least = min((dose for dose in doses if dose), default=0)
+
+    def words(x: float | None) -> str:
+        return f"> {most}" if x is None else f"<= {least}" if 0 < x <= least else f"{x:.3g}"
+
+    low, value, high = (words(critical[k]) for k in ("low", "value", "high"))
     return f"{value} [{low}, {high}]"
 
 

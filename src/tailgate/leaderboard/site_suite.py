@@ -115,11 +115,12 @@ def critical_of(suite: Suite, critical: Critical | None) -> Data:
         why = "not every attack of this knowledge has full figures"
         return {"text": "\N{EN DASH}", "sort": "", "span": "", "bar": None, "worst": "", "about": why}
     largest = suite.largest
+    least = min((d for d in suite.board.suite.doses if d), default=0)
     beyond = "not reached" if largest is None else f"> {largest}"
     axis = Axis(0.0, float(largest or 1), suite.scale)
 
     def words(x: float | None) -> str:
-        return beyond if x is None else figure(x, 3)
+        return beyond if x is None else f"\N{LESS-THAN OR EQUAL TO} {least:g}" if 0 < x <= least else figure(x, 3)
 
     def at(x: float | None) -> float:
         return 100.0 if x is None else min(max(axis.at(x), 0.0), 100.0)

@@ -142,8 +142,7 @@ def admit(
         raise InputError("attack", attack, "one that is not on the list")
     if spec.entry.optimal:
         raise InputError("attack", attack, "a rival: a computed optimum is a ceiling")
-    doses = sorted(dose for dose in (suite.shown or suite.doses) if dose is not None)
-    at = dose if dose is not None or not doses else doses[len(doses) // 2]
+    at = suite.middle_dose if dose is None else dose
     level = knowledge_of(attack, suite)
     rivals = [text for text in listed if text != CLEAN and not Spec("attack", text).entry.optimal]
     rivals = [text for text in rivals if order(knowledge_of(text, suite)) <= order(level)]

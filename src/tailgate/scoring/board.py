@@ -4,21 +4,17 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Iterable, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 import tailgate
-from tailgate import train
-from tailgate.adaptive import configs_of
+from tailgate.adaptive import asked_of
 from tailgate.errors import InputError
-from tailgate.registry import Entry, Spec, entries, split_text
+from tailgate.registry import Entry, entries, split_text
 from tailgate.scenario import Suite
-from tailgate.schema import as_data
 from tailgate.stats import proportion
 from tailgate.strength.dose import CRITICAL
-from tailgate.strength.policies import is_policy, trained
 from tailgate.threat import KNOWLEDGE
 
 from .attacks import Admitted, standing
@@ -55,13 +51,13 @@ def score(
             raise InputError(f"rows of {row['attack']}: attack_digest", row["attack_digest"], f"{line.digest}, as it was admitted")
     withdrawn = [text for text, line in lines.items() if line is None]
     table = tabulate(rows, suite, [text for text in lines if text not in withdrawn], withdrawn)
-    trained_on = _origins(table)
+    origins = _origins(table)
     slot = middle(table)
     levels: Levels = {d: {k: Worst(table, d, k, alpha) for k in KNOWLEDGE} for d in table.defences}
-    found = [_entry(table, d, levels[d], slot, trained_on, require_adaptive) for d in table.defences]
+    found = [_entry(table, d, levels[d], slot, origins, require_adaptive) for d in table.defences]
     comparisons = _rank(found, levels, slot, alpha)
     return {
-        "format": FORMAT, "suite": _suite(table, alpha), "attacks": _attacks(table, lines, trained_on), "entries": found,
+        "format": FORMAT, "suite": _suite(table, alpha), "attacks": _attacks(table, lines, origins), "entries": found,
         "cells": _cells(table),
         "curves": [worst.curve() for d in table.defences for worst in levels[d].values() if worst.complete and worst.numbers],
         "comparisons": comparisons, "detection": None,
@@ -88,11 +84,11 @@ def _suite(table: Table, alpha: float) -> Data:
             {"name": name, "about": place.about, "robustness": name in suite.robustness, "hash": place.config_hash}
             for name, place in table.scenarios.items()
         ],
-        "episodes": max(len(seeds) for seeds in table.seeds.values()), "purpose": table.purpose, "rows": table.rows,
+        "episodes": max(len(seeds) for seeds in table.seeds.values()), "purpose": table.purpose, "beacon": table.beacon, "rows": table.rows,
     }  # fmt: skip
 
 
-def _attacks(table: Table, lines: dict[str, Admitted | None], trained_on: dict[str, str]) -> list[Data]:
+def _attacks(table: Table, lines: dict[str, Admitted | None], origins: dict[str, Row]) -> list[Data]:
     out = []
     for i, column in enumerate(table.columns):
         line = lines.get(column.attack)
@@ -102,7 +98,8 @@ def _attacks(table: Table, lines: dict[str, Admitted | None], trained_on: dict[s
         notes += ["taken back by an erratum: not counted"] if column.attack in table.withdrawn else []
         out.append({
             "attack": column.attack, "knowledge": column.knowledge, "learned": table.learned[column], "optimal": table.optimal[column],
-            "trained_on": trained_on.get(column.attack), "admitted": None if line is None else line.as_data(), "note": "; ".join(notes),
+            "trained_on": origins.get(column.attack, {}).get("defence"),
+            "admitted": None if line is None else line.as_data(), "note": "; ".join(notes),
         })  # fmt: skip
     return out
 
@@ -112,21 +109,13 @@ def _reason(table: Table, i: int) -> str:
     return next((row["reason"] for key in keys for row in table.cells[key] if row["status"] == "skipped"), "")
 
 
-def _origins(table: Table) -> dict[str, str]:
-    """The defence that each learned attack of the table was trained against, if its file is the one that was played."""
-    out = {}
-    for key in sorted(table.cells):
-        row, text = table.cells[key][0], key.column.attack
-        if row.get("learned") and text not in out:
-            try:
-                if is_policy(text) and Spec("attack", text).digest == row["attack_digest"] and (origin := trained(text).defence):
-                    out[text] = origin
-            except InputError:  # a file that is not here tells nothing
-                continue
-    return out
+def _origins(table: Table) -> dict[str, Row]:
+    """How each learned attack of the table was trained: the rows' `trained`."""
+    found = ((key.column.attack, table.cells[key][0].get("trained")) for key in sorted(table.cells))
+    return {attack: origin for attack, origin in found if isinstance(origin, dict)}
 
 
-def _entry(table: Table, defence: str, levels: dict[str, Worst], slot: int, trained_on: dict[str, str], require_adaptive: bool) -> Data:
+def _entry(table: Table, defence: str, levels: dict[str, Worst], slot: int, origins: dict[str, Row], require_adaptive: bool) -> Data:
     rows = [row for key in sorted(table.cells) if key.defence == defence for row in table.cells[key]]
     uses = [str(use) for use in rows[0]["uses"]]
     card = _card(defence)
@@ -135,7 +124,9 @@ def _entry(table: Table, defence: str, levels: dict[str, Worst], slot: int, trai
     status = "unranked" if why else "ranked"
     if not why and require_adaptive and (short := _draft(table)):
         status, why = "unranked", short
-    if not why and require_adaptive and (missing := _unmet(table, defence, trained_on)):
+    if not why and card is None and (how := _claimed(rows)):
+        status, why = "unranked", how
+    if not why and require_adaptive and (missing := _unmet(table, defence, origins)):
         status, why = "unattacked", missing
     whole = {k: worst for k, worst in levels.items() if worst.complete}
     critical: dict[tuple[tuple[str, int], ...], Data | None] = {}
@@ -147,7 +138,7 @@ def _entry(table: Table, defence: str, levels: dict[str, Worst], slot: int, trai
         "status": status, "why": why, "gates": found,
         "critical_dose": {k: critical[tuple(worst.pairs)] if k in whole else None for k, worst in levels.items()},
         "rates": [worst.rate(s) for s in shown(table) for worst in whole.values()], "rank": None, "clean": _clean(table, defence),
-        "flags": flags(table, defence, levels, slot, trained_on), "worst_episode": _episode(table, whole, slot),
+        "flags": flags(table, defence, levels, slot, origins), "worst_episode": _episode(table, whole, slot),
         "robustness": _robustness(table, whole.get("black"), slot), "stealth": None,
     }  # fmt: skip
 
@@ -194,28 +185,33 @@ def _draft(table: Table) -> str:
     return f"draft: {fewest} of {table.suite.seeds} episodes" if fewest < table.suite.seeds else ""
 
 
-def _unmet(table: Table, defence: str, trained_on: dict[str, str]) -> str:
+def _claimed(rows: list[Row]) -> str:
+    """Why rows of somebody else's class stand for nothing yet: who made them could have tuned on the episodes, or have run free."""
+    if not all((row.get("submission") or {}).get("sandbox") for row in rows):
+        return "claimed: not played by `leaderboard submit` in a sandbox"
+    return "" if all(row.get("beacon") for row in rows) else "claimed: played on public seeds"
+
+
+def _unmet(table: Table, defence: str, origins: dict[str, Row]) -> str:
     """What is missing of the attackers that the suite trains against a defence; empty where nothing is.
 
-    Of a suite with a plan (`adaptive`) every learner, knowledge and training seed is asked, trained as the plan says. Without one, any
-    policy that was trained against the defence will do.
+    Of a suite with a plan (`adaptive`) every learner, knowledge and training seed is asked, trained as the plan says, and against these
+    very files of the defence. Without one, any policy that was trained against the defence will do.
     """
     guard = table.defences.index(defence)
+    digest = next(rows[0]["defence_digest"] for key, rows in table.cells.items() if key.defence == defence)
     met = [
-        column.attack for i, column in enumerate(table.columns)
-        if trained_on.get(column.attack) == defence and column.attack not in table.withdrawn
+        origins[column.attack] for i, column in enumerate(table.columns)
+        if column.attack in origins and column.attack not in table.withdrawn
+        and (origins[column.attack]["defence"], origins[column.attack]["digest"]) == (defence, digest)
         and all((table.state[name][guard, i] == PLAYED).all() for name in table.scenarios)
     ]  # fmt: skip
     if not met:
         return "no attack that was trained against this defence is among the rows"
     if not table.suite.adaptive:
         return ""
-    found = {(train.training_of(trained(text).header.training["config"]), trained(text).seed) for text in met}
-    wanted = [
-        (config, seed) for config in configs_of(table.suite, defence, Path("runs"))
-        for seed in range(config.first_seed, config.first_seed + config.seeds)
-    ]  # fmt: skip
-    missing = [f"{config.name} seed {seed}" for config, seed in wanted if (train.training_of(as_data(config)), seed) not in found]
+    found, wanted = {(origin["plan"], origin["seed"]) for origin in met}, asked_of(table.suite)
+    missing = [f"{name} seed {seed}" for name, plan, seed in wanted if (plan, seed) not in found]
     return f"{len(missing)} of {len(wanted)} of the suite's own trainings are missing, first {missing[0]}" if missing else ""
 
 
@@ -291,7 +287,7 @@ def _rank(found: list[Data], levels: Levels, slot: int, alpha: float) -> list[Da
         harm = {}
         for entry in (e for e in ranked if e["class"] == group):
             worst = levels[entry["defence"]]["black"]
-            harm[entry["defence"]] = worst.harm(worst.at(slot)[0], slot)
+            harm[entry["defence"]] = worst.all_harm(slot)
         duels, ranks = compare(harm, group, alpha)
         out += duels
         for entry in ranked:

@@ -76,6 +76,7 @@ class Table:
     listed: tuple[str, ...]  # attacks that every defence has to have met
     withdrawn: frozenset[str]  # attacks that an erratum took back
     purpose: str
+    beacon: str  # of the round; empty for public seeds
     rows: int
 
     def known(self, knowledge: str) -> list[int]:
@@ -86,8 +87,8 @@ class Table:
         ]  # fmt: skip
 
     def nominal(self) -> list[str]:
-        """Scenarios whose plant is the one that a defence is told; all of them where none is."""
-        return [name for name in self.scenarios if name not in self.suite.robustness] or list(self.scenarios)
+        """Scenarios whose plant is the one that a defence is told."""
+        return list(self.suite.nominal)
 
     def applies(self, scenario: str) -> Array:
         """(columns,) bool: not left out in this scenario. One that has no meaning against any defence is, and one that nobody owes."""
@@ -130,8 +131,8 @@ def tabulate(rows: Iterable[Row], suite: Suite, added: Sequence[str] = (), withd
         by_seed = held.setdefault(key, {})
         _same_cell(key, next(iter(by_seed.values()), row), row)
         by_seed[row["seed"]] = row
-    for field in ("purpose", "version"):
-        found = sorted({row[field] for row in rows})
+    for field in ("purpose", "version", "beacon"):
+        found = sorted({str(row.get(field, "")) for row in rows})
         if len(found) > 1:
             raise InputError(f"rows: {field}", found, "rows of one")
     _same_component(rows)
@@ -166,7 +167,7 @@ def tabulate(rows: Iterable[Row], suite: Suite, added: Sequence[str] = (), withd
     }  # fmt: skip
     return Table(
         suite, places, doses, defences, columns, seeds, cells, clean, harm, state, marks["optimal"], marks["learned"],
-        listed, frozenset(withdrawn), rows[0]["purpose"], sum(len(members) for members in cells.values()),
+        listed, frozenset(withdrawn), rows[0]["purpose"], str(rows[0].get("beacon", "")), sum(len(members) for members in cells.values()),
     )  # fmt: skip
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from tailgate.calibrate import Bench, calibrate
 from tailgate.errors import InputError, NotApplicable
 from tailgate.evaluation import Cell, run_cell
-from tailgate.scenario import load_scenario
+from tailgate.scenario import Suite, load_scenario
 from tailgate.stats import proportion
 
 HOURS = (0.1, 1.0, 10.0)
@@ -56,17 +56,19 @@ def _found(defence: str, places: tuple[str, ...], hours: float, onsets: int, mos
 
 
 def detection(
-    defences: Sequence[str], scenarios: Sequence[str], attacks: Sequence[str], hours: Sequence[float] = HOURS, *, dose: int | None = None,
-    episodes: int = 100, onsets: int = ONSETS, most_steps: int = STEPS, purpose: str = "report", progress: Progress | None = None,
+    suite: Suite, defences: Sequence[str], attacks: Sequence[str], hours: Sequence[float] = HOURS, *, dose: int | None = None,
+    episodes: int = 100, onsets: int = ONSETS, most_steps: int = STEPS, beacon: str = "", progress: Progress | None = None,
 ) -> Data:  # fmt: skip
     """The field `detection` of a board: the share of attacked episodes with an alarm within the deadline, and the median delay [steps].
 
-    `without` lists what takes no place here, and why: a defence without a threshold, a mean time that is out of reach.
+    In the suite's scenarios of the told plant, under its threat model, at its middle dose unless given; thresholds are found on the clean
+    runs of all scenarios of a plant together. `without` lists what takes no place here, and why: a defence without a threshold, a mean
+    time that is out of reach.
     """
     update = progress or (lambda *_: None)
     found: list[Data] = []
     without: list[Data] = []
-    work = [(guard, plant, names, h) for plant, names in plants(scenarios).items() for guard in defences for h in hours]
+    work = [(guard, plant, names, h) for plant, names in plants(suite.nominal).items() for guard in defences for h in hours]
     for done, (guard, plant, names, h) in enumerate(work, start=1):
         level, why = _found(guard, names, h, onsets, most_steps)
         if level is None:
@@ -75,11 +77,17 @@ def detection(
             for name in names:
                 made = Bench.of(guard, [name], episodes, None).at(level)
                 for attack in attacks:
-                    rows = run_cell(Cell("detection", name, dose, guard, attack, episodes, purpose), made)
+                    rows = run_cell(_cell(suite, name, dose, guard, attack, episodes, beacon), made)
                     head = {"defence": guard, "scenario": name, "attack": attack, "hours": h, "threshold": level}
                     found.append(head | _detected(rows))
         update("detection", done, len(work), guard)
     return {"hours": list(hours), "entries": found, "without": without}
+
+
+def _cell(suite: Suite, scenario: str, dose: int | None, defence: str, attack: str, episodes: int, beacon: str) -> Cell:
+    """The suite's own cell, played with another threshold."""
+    budget = suite.middle_dose if dose is None else dose
+    return Cell(suite.name, scenario, budget, defence, attack, episodes, threat=suite.granted, beacon=beacon)
 
 
 def _detected(rows: Sequence[Data]) -> Data:
@@ -94,31 +102,31 @@ def _detected(rows: Sequence[Data]) -> Data:
 
 
 def stealth_impact(
-    defence: str, scenarios: Sequence[str], hours: Sequence[float] = HOURS, *, attack: str = "stealth", dose: int | None = None,
-    episodes: int = 100, onsets: int = ONSETS, most_steps: int = STEPS, purpose: str = "report", progress: Progress | None = None,
+    suite: Suite, defence: str, hours: Sequence[float] = HOURS, *, attack: str = "stealth", dose: int | None = None,
+    episodes: int = 100, onsets: int = ONSETS, most_steps: int = STEPS, beacon: str = "", progress: Progress | None = None,
 ) -> list[Data] | None:  # fmt: skip
     """The field `stealth` of an entry: by the mean time between false alarms, the error that the stealth attack reaches per time.
 
     deviation [m/s]: the largest error of an episode over the time that it was attacked, the median of episodes, the most of scenarios.
-    None for a defence without a threshold. The scenarios are of one plant.
+    None for a defence without a threshold. In the scenarios, under the threat model and at the dose of `detection`.
     """
     update = progress or (lambda *_: None)
-    if len(plants(scenarios)) != 1:
-        raise InputError("scenarios", list(scenarios), "scenarios of one plant")
+    if len(plants(suite.nominal)) != 1:
+        raise InputError(f"suite {suite.name}: scenarios", list(suite.nominal), "scenarios of one plant")
     out: list[Data] = []
     for done, h in enumerate(hours, start=1):
-        level, _ = _found(defence, tuple(scenarios), h, onsets, most_steps)
+        level, _ = _found(defence, suite.nominal, h, onsets, most_steps)
         if level is not None:
-            reached = [_reached(defence, level, name, attack, dose, episodes, purpose) for name in scenarios]
+            reached = [_reached(level, _cell(suite, name, dose, defence, attack, episodes, beacon)) for name in suite.nominal]
             out.append({"hours": h, "threshold": level, "deviation": max((x for x in reached if x is not None), default=None)})
         update(f"stealth against {defence}", done, len(hours), f"{h:g} h")
     return out or None
 
 
-def _reached(defence: str, level: float, scenario: str, attack: str, dose: int | None, episodes: int, purpose: str) -> float | None:
-    made = Bench.of(defence, [scenario], episodes, None).at(level)
-    rows = run_cell(Cell("stealth", scenario, dose, defence, attack, episodes, purpose), made)
-    dt = load_scenario(scenario).brief().model.dt
+def _reached(level: float, cell: Cell) -> float | None:
+    made = Bench.of(cell.defence, [cell.scenario], cell.seeds, None).at(level)
+    rows = run_cell(cell, made)
+    dt = load_scenario(cell.scenario).brief().model.dt
     values = [row["max_error"] / (row["attack_steps"] * dt) for row in rows if row["status"] == "ok" and row["attack_steps"]]
     return float(np.median(values)) if values else None
 

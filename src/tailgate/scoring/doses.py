@@ -17,9 +17,11 @@ import numpy as np
 from scipy import stats
 
 from tailgate.core import Array
+from tailgate.errors import InputError
 from tailgate.strength.dose import CRITICAL, LEVEL, critical_dose, fitted
 
 from .damage import MISSING, PLAYED, Table, damaged
+from .ranks import Harm
 
 RESAMPLES = 1000
 Data = dict[str, Any]
@@ -127,6 +129,13 @@ class Worst:
         name, i = self.pairs[pair]
         return self.table.seeds[name], self._harm(name, i)[slot]
 
+    def all_harm(self, slot: int) -> Harm:
+        """Of all pairs at a dose. Raises InputError where the scenarios have not the same seeds: nothing would be paired."""
+        found = {self.table.seeds[name] for name, _ in self.pairs}
+        if len(found) != 1:
+            raise InputError(f"rows of {self.defence}: seeds", f"{len(found)} sets of them", "the same seeds in every scenario")
+        return Harm(found.pop(), np.stack([self._harm(name, i)[slot] for name, i in self.pairs]), self.at(slot)[0])
+
     def bounds(self, slot: int, scenarios: list[str] | None = None, sides: int = 1) -> tuple[float, float]:
         """Limits of the worst share of damage that hold together for all pairs: alpha over their number, and over the sides."""
         chosen = [k for k, (name, _) in enumerate(self.pairs) if scenarios is None or name in scenarios]
@@ -181,18 +190,25 @@ class Worst:
         return {"defence": self.defence, "knowledge": self.knowledge, "points": self.points, "fitted": line}
 
     def critical(self) -> Data | None:
-        """The critical dose with its bootstrap interval; values are null beyond the largest dose. None where no dose is a number."""
+        """The critical dose with its bootstrap interval. None where no dose is a number.
+
+        Values are null beyond the largest dose; the smallest dose stands for any up to it, and 0 for damage that needs no attack.
+        """
         if not self.numbers:
             return None
         doses = np.array([point["dose"] for point in self.points], np.float64)
-        value = critical_dose(doses, fitted(np.array([point["value"] for point in self.points])), CRITICAL)
-        drawn = np.sort(crossings(doses, monotone(self._drawn()), CRITICAL))
+        first = len(doses) - len(self.numbers)  # below the smallest dose nothing was played: a line down to no attack would be a guess
+        line, lines = fitted(np.array([point["value"] for point in self.points])), monotone(self._drawn())
+        clean = line[:first].max(initial=0.0) > CRITICAL
+        value = 0.0 if clean else critical_dose(doses[first:], line[first:], CRITICAL)
+        cleans = lines[:first].max(axis=0, initial=0.0) > CRITICAL
+        drawn = np.sort(np.where(cleans, 0.0, crossings(doses[first:], lines[first:], CRITICAL)))
         low, high = math.floor((1 - LEVEL) / 2 * (RESAMPLES - 1)), math.ceil((1 + LEVEL) / 2 * (RESAMPLES - 1))
-        first = next((point for point in self.points if point["value"] > CRITICAL), self.points[-1])
+        at = next((point for point in self.points if point["value"] > CRITICAL), self.points[-1])
         # the worst of a resample is worse than that of the rows: what it says too low is widened to what was measured
         found = {"value": value, "low": min(float(drawn[low]), value), "high": max(float(drawn[high]), value)}
         return {key: x if math.isfinite(x) else None for key, x in found.items()} | {
-            "worst": {"scenario": first["scenario"], "attack": first["attack"]}
+            "worst": {"scenario": at["scenario"], "attack": at["attack"]}
         }
 
     def _drawn(self) -> Array:

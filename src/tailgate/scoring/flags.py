@@ -6,7 +6,7 @@ import numpy as np
 
 from tailgate.core import Array
 
-from .damage import PLAYED, Key, Table
+from .damage import PLAYED, Key, Row, Table
 from .doses import Worst
 from .ranks import mcnemar
 
@@ -14,11 +14,11 @@ SPENT = 0.9  # of the budget, by the mean of the episodes without damage: those 
 LEVEL = 0.05
 
 
-def flags(table: Table, defence: str, levels: dict[str, Worst], slot: int, trained_on: dict[str, str]) -> list[str]:
-    """Of one entry; `trained_on` says against which defence each learned attack was trained, as far as that is known."""
+def flags(table: Table, defence: str, levels: dict[str, Worst], slot: int, origins: dict[str, Row]) -> list[str]:
+    """Of one entry; `origins` says how each learned attack was trained, as far as that is known."""
     out = [*_failures(table, defence), *_unspent(table, levels, slot)]
     for knowledge in levels:
-        out += _transferred(table, defence, levels[knowledge], slot, trained_on)
+        out += _transferred(table, defence, levels[knowledge], slot, origins)
     return [*dict.fromkeys(out), *_weaker(levels, slot)]
 
 
@@ -50,7 +50,7 @@ def _unspent(table: Table, levels: dict[str, Worst], slot: int) -> list[str]:
     return out
 
 
-def _transferred(table: Table, defence: str, worst: Worst, slot: int, trained_on: dict[str, str]) -> list[str]:
+def _transferred(table: Table, defence: str, worst: Worst, slot: int, origins: dict[str, Row]) -> list[str]:
     """A policy trained on another defence does surely more damage than every one that was trained on this one knowing as much."""
     out = []
     guard = table.defences.index(defence)
@@ -59,16 +59,16 @@ def _transferred(table: Table, defence: str, worst: Worst, slot: int, trained_on
         others: list[tuple[str, Array]] = []
         for i in (i for scenario, i in worst.pairs if scenario == name):
             column = table.columns[i]
-            if column.knowledge != worst.knowledge or column.attack not in trained_on or table.state[name][guard, i, slot] != PLAYED:
+            if column.knowledge != worst.knowledge or column.attack not in origins or table.state[name][guard, i, slot] != PLAYED:
                 continue
-            (mine if trained_on[column.attack] == defence else others).append((column.attack, table.harm[name][guard, i, slot]))
+            (mine if origins[column.attack]["defence"] == defence else others).append((column.attack, table.harm[name][guard, i, slot]))
         if not mine or not others:
             continue
         _, own = max(mine, key=lambda held: float(held[1].mean()))
         for attack, harm in others:
             more, less = int(np.sum(harm > own)), int(np.sum(own > harm))
             if more > less and mcnemar(more, less) * len(others) <= LEVEL:
-                out.append(f"transferred beats own: {attack}, trained on {trained_on[attack]}, on {name} ({worst.knowledge} box)")
+                out.append(f"transferred beats own: {attack}, trained on {origins[attack]['defence']}, on {name} ({worst.knowledge} box)")
     return out
 
 
