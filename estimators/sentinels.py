@@ -1,12 +1,12 @@
 """Sentinels: degenerate defences that a sound score must fail. Each names the gate that it has to fail."""
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from tailgate import num
-from tailgate.core import Innovation, Mode, Received
+from tailgate.core import Array, Innovation, Mode, Model, PositiveCount, Received, param
 from tailgate.registry import register
 
 from .compose import AcceptAll, Composed, Decision, Detector, Filter, Mitigation, Score, Stateless, Verdict, blame_all
@@ -35,6 +35,27 @@ class AlwaysMode(Stateless):
         return None, Decision(received.valid, num.full(verdict.alarm.shape, self.mode, np.int8))
 
 
+class CoastPlan(NamedTuple):
+    steps: int
+
+
+@dataclass(frozen=True)
+class AcceptFirst(Mitigation):
+    """Uses what is received in the first steps, and nothing after them."""
+
+    steps: PositiveCount = param(20, "steps")
+
+    def prepare(self, model: Model) -> CoastPlan:
+        return CoastPlan(self.steps)
+
+    def start(self, plan: CoastPlan, batch: int) -> Array:
+        return np.zeros(batch, np.int64)
+
+    def step(self, plan: CoastPlan, state: Array, verdict: Verdict, received: Received) -> tuple[Array, Decision]:
+        use = received.valid & (state < plan.steps)[:, None, None]
+        return state + 1, Decision(use, num.full(verdict.alarm.shape, Mode.NORMAL, np.int8))
+
+
 @register("defence", "always_alarm", sentinel="false alarms")
 @dataclass(frozen=True)
 class AlarmSentinel(Composed):
@@ -60,3 +81,14 @@ class StandStillSentinel(Composed):
 
     def parts(self) -> tuple[Filter, Detector, Mitigation]:
         return KalmanFilter(), Score(), AlwaysMode(Mode.STOP)
+
+
+@register("defence", "coast", sentinel="collisions")
+@dataclass(frozen=True)
+class CoastSentinel(Composed):
+    """Kalman filter that reads nothing after its first steps: no attack that comes later can touch it, and nothing else can."""
+
+    steps: PositiveCount = param(20, "steps in which it reads")
+
+    def parts(self) -> tuple[Filter, Detector, Mitigation]:
+        return KalmanFilter(), Score(), AcceptFirst(self.steps)

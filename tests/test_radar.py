@@ -225,7 +225,8 @@ def test_the_channel_hands_the_power_to_the_radar():
             return None, plan.command(view.k > 15, Kind.NOISE_JAM, plan.granted, 0.1)
 
     defence = tailgate.make_defence("pycra", probability=0.5)
-    trace = rollout(place.loop(defence), Jam(), keys("train", range(3)))
+    trace = rollout(place.loop(defence, ("measurements", "probe")), Jam(), keys("train", range(3)))
+    assert rollout(place.loop(defence), Jam(), keys("train", range(3))).probe.all(), "who does not say that it mutes the probe cannot"
     muted = np.concatenate([np.zeros((1, 3), bool), ~trace.probe[:-1, :, 0]])
     d = trace.truth[:, :, 0, 0]
     jam = np.where(np.arange(1, 31)[:, None] > 15, LINK.passed * LINK.jam_power(d, 0.1), 0.0)

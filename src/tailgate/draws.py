@@ -32,6 +32,7 @@ class Role(IntEnum):
     MANOEUVRE = 3
     TRAFFIC = 4
     V2V = 5
+    LINK = 6
     ATTACK = 16
     POLICY = 17
     DEFENCE = 32

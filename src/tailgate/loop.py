@@ -37,10 +37,12 @@ from tailgate.core import (
     WhiteBox,
 )  # fmt: skip
 from tailgate.draws import Keys, Role
-from tailgate.errors import InputError
+from tailgate.errors import InputError, NotApplicable
+from tailgate.link import Link, LinkState
 from tailgate.threat import Brief, Channel, ChannelPlan, ChannelState, ThreatModel
 from tailgate.tree import duplicate, frozen, lock, put_rows
 
+PERFECT = Link()
 _START = np.uint32(0xFFFFFFFF)  # the step under which start() draws: no episode reaches it
 
 
@@ -92,6 +94,7 @@ class LoopState(NamedTuple):
     sent: Array  # (B, N, q+p)
     received: Received
     ended: Array  # (B,) bool: collided
+    link: LinkState | None = None  # where readings are lost or late
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +102,7 @@ class Loop:
     """A closed loop of one plant under one defence, for B independent episodes.
 
     `told`: the model that defence, controller, channel and attacker go by, where the plant's and the sensor's own is another; `load`: the
-    vehicle's mass over the nominal one, by which a commanded acceleration is divided [-].
+    vehicle's mass over the nominal one, by which a commanded acceleration is divided [-]; `link`: readings that are lost or late.
     """
 
     plant: Plant
@@ -113,6 +116,7 @@ class Loop:
     ends_on_collision: bool = True
     told: Model | None = None
     load: float = 1.0
+    link: Link = PERFECT
 
     @cached_property
     def model(self) -> Model:
@@ -128,6 +132,8 @@ class Loop:
 
     @cached_property
     def plan(self) -> LoopPlan:
+        if self.threat.knowledge == "white" and (why := getattr(self.defence, "opaque", "")):
+            raise NotApplicable("attack", "white box", f"a black or grey box: {why}")
         return LoopPlan(
             self.plant.prepare(self._own_model),
             self.sensor.prepare(self._own_model),
@@ -163,10 +169,11 @@ class Loop:
         controller, u = self.controller.step(plan.controller, controller, estimate, v2v, odometry)
         manoeuvre, plant, known = self._move(keys, k, manoeuvre, plant, u)
         sent, received = self._measure(keys, k + 1, plant, controller, estimate)
+        link = None if self.link.perfect else self.link.start(sent)
         return LoopState(
             keys, k + 1, plant, manoeuvre, controller, self.defence.start(plan.defence, prior),
             Channel().start(plan.channel, expected, u), estimate, estimate.probe.copy(order="K"), u, known, sent, received,
-            np.zeros(batch, bool),
+            np.zeros(batch, bool), link,
         )  # fmt: skip
 
     def restart(self, state: LoopState, mask: Array) -> LoopState:
@@ -228,6 +235,8 @@ class Loop:
             plan.defence, state.defence, frozen(heard), frozen(state.known_u), state.keys.at(Role.DEFENCE, state.k)
         )
         check_estimate(estimate, self.model, len(state.k))
+        if "probe" not in self.uses:  # who does not say that it switches the probe off cannot
+            estimate = estimate._replace(probe=num.full(estimate.probe.shape, True, bool))
         assert received.v2v is not None
         controller, u = self.controller.step(plan.controller, state.controller, estimate, received.v2v, odometry)
         if estimate.limits is not None:
@@ -243,10 +252,13 @@ class Loop:
             rear_collided,
         )
         sent, fresh = self._measure(state.keys, state.k + 1, plant, controller, estimate)
+        link = state.link
+        if link is not None:
+            link, sent, fresh = self.link.step(link, sent, fresh, state.keys.at(Role.LINK, state.k + 1))
         ended = state.ended | ((collided | rear_collided) & self.ends_on_collision)
         state = LoopState(
             state.keys, state.k + 1, plant, manoeuvre, controller, defence, channel, estimate, state.estimate.probe, u, known, sent,
-            fresh, ended,
+            fresh, ended, link,
         )  # fmt: skip
         return state, frame
 
