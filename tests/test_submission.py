@@ -13,9 +13,10 @@ import pytest
 from tailgate.commands import submit
 from tailgate.errors import InputError
 from tailgate.evaluation import Cell, cells_of, run_cell
+from tailgate.rounds import seeds_of
 from tailgate.rows import read_rows
 from tailgate.scenario import Suite
-from tailgate.submission import Isolated, digest_of, mixed, play, play_submission, seeds_of
+from tailgate.submission import Isolated, digest_of, mixed, play, play_submission
 from tailgate.submission.source import staged
 
 KALMAN = "tailgate.estimators:Kalman"
@@ -127,8 +128,8 @@ def test_two_workers_give_the_rows_of_one_on_the_seeds_of_a_beacon(places: tuple
     """Each row's seed is one of the beacon's; playing it by itself gives the same trace."""
     suite, beacon = _suite(*places, seeds=1, attacks=("none",)), "0123456789abcdef"
     rows = play_submission(KALMAN, suite, beacon=beacon, workers=2, out=tmp_path / "rows.jsonl")
-    assert [row["seed"] for row in rows] == 2 * seeds_of(beacon, "", "report", 1)
-    assert {row["submission"]["beacon"] for row in rows} == {beacon}
+    assert [row["seed"] for row in rows] == 2 * seeds_of(beacon, "small", "report", 1)
+    assert {row["beacon"] for row in rows} == {beacon}
     again = [run_cell(Cell("small", place, 30, KALMAN, "none", 1, first_seed=rows[0]["seed"])) for place in places]
     assert [row["trace_hash"] for row in rows] == [row["trace_hash"] for (row,) in again]
 

@@ -9,9 +9,10 @@ from typing import Any
 import pytest
 
 from tailgate.evaluation import Cell
+from tailgate.rounds import seeds_of
 from tailgate.rows import read_rows
 from tailgate.scenario import Suite
-from tailgate.submission import Limits, play_mixed, play_submission, seeds_of
+from tailgate.submission import Limits, play_mixed, play_submission
 from tailgate.submission.mixed import Submission
 from tailgate.submission.source import staged
 

@@ -18,8 +18,9 @@ import tailgate
 from tailgate.core import Prior
 from tailgate.draws import keys
 from tailgate.errors import InputError
+from tailgate.rounds import seeds_of
 from tailgate.scenario import Scenario, load_scenario
-from tailgate.submission import Isolated, Limits, digest_of, mixed, seeds_of
+from tailgate.submission import Isolated, Limits, digest_of, mixed
 from tailgate.submission.sandbox import bwrap, docker, sandbox_of
 from tailgate.submission.source import staged
 from tailgate.submission.table import order_of
@@ -82,17 +83,17 @@ def test_arrays_keep_their_layout_and_cannot_be_written() -> None:
             found[name].flags.writeable = True
 
 
-def test_seeds_are_made_of_beacon_digest_and_purpose() -> None:
-    """The same three give the same seeds, a longer list begins with a shorter one, and any other beacon, digest or purpose has other seeds."""
-    seeds = seeds_of("beacon of the day", "ab" * 32, "report", 1000)
-    assert seeds == seeds_of("beacon of the day", "ab" * 32, "report", 1000) and seeds[:10] == seeds_of("beacon of the day", "ab" * 32, "report", 10)
+def test_seeds_are_made_of_beacon_suite_and_purpose() -> None:
+    """The same three give the same seeds, a longer list begins with a shorter one, and any other beacon, suite or purpose has other seeds."""
+    seeds = seeds_of("beacon of the day", "quick-v0", "report", 1000)
+    assert seeds == seeds_of("beacon of the day", "quick-v0", "report", 1000) and seeds[:10] == seeds_of("beacon of the day", "quick-v0", "report", 10)
     assert len(set(seeds)) == 1000 and all(0 <= seed < 2**53 for seed in seeds)
     assert abs(np.mean(seeds) / 2**53 - 0.5) < 3.2905 / np.sqrt(12 * 1000)  # 99.9 % of the mean of 1000 uniforms
-    others = [seeds_of("beacon of the dax", "ab" * 32, "report", 99), seeds_of("beacon of the day", "ac" * 32, "report", 99)]
-    others.append(seeds_of("beacon of the day", "ab" * 32, "select", 99))
+    others = [seeds_of("beacon of the dax", "quick-v0", "report", 99), seeds_of("beacon of the day", "radar-v0", "report", 99)]
+    others.append(seeds_of("beacon of the day", "quick-v0", "select", 99))
     assert not any(set(seeds) & set(other) for other in others)
     with pytest.raises(InputError, match="at least 16 characters"):
-        seeds_of("2026", "ab" * 32, "report", 1)
+        seeds_of("2026", "quick-v0", "report", 1)
 
 
 def test_what_is_played_is_a_copy_of_what_was_hashed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

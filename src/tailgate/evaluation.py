@@ -9,12 +9,8 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import hashlib
-import multiprocessing
-import os
-import sys
-import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -28,6 +24,7 @@ from tailgate.core import Model
 from tailgate.errors import InputError, NotApplicable
 from tailgate.files import remove, set_aside, sweep, writable_directory, write_atomic
 from tailgate.metrics import METRICS, measure
+from tailgate.pool import abandon, processes
 from tailgate.registry import Entry, Spec, entry_for, text_of
 from tailgate.rounds import numbered
 from tailgate.rows import encode, packed, read_rows
@@ -286,7 +283,7 @@ def _play(cells: Sequence[Cell], workers: int) -> Iterator[tuple[int, list[dict[
             yield i, run_cell(cell)
         return
     lost = []
-    with _pool(workers) as pool:
+    with processes(workers) as pool:
         waiting = {pool.submit(run_cell, cell): i for i, cell in enumerate(cells)}
         try:
             for future in as_completed(waiting):
@@ -295,36 +292,15 @@ def _play(cells: Sequence[Cell], workers: int) -> Iterator[tuple[int, list[dict[
                 except BrokenProcessPool:  # one cell killed its process, and the pool with it: which one shows below
                     lost.append(waiting[future])
         except BaseException:  # an interrupt shall not wait for what is still to play
-            pool.shutdown(wait=False, cancel_futures=True)
-            for process in list((pool._processes or {}).values()):
-                process.terminate()
+            abandon(pool)
             raise
     for i in sorted(lost):
-        with _pool(1) as pool:
+        with processes(1) as pool:
             try:
                 rows = pool.submit(run_cell, cells[i]).result()
             except BrokenProcessPool:
                 rows = failed_rows(cells[i], "the process that played this cell died")
         yield i, rows
-
-
-def _pool(workers: int) -> ProcessPoolExecutor:
-    context = multiprocessing.get_context("spawn")  # a fork after compiled parallel code can hang
-    return ProcessPoolExecutor(workers, mp_context=context, initializer=_begin, initargs=(list(sys.path),))
-
-
-def _begin(path: list[str]) -> None:
-    """What a worker does first."""
-    sys.path[:] = path  # a submission's module is found where the parent found it
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-
-
-def _end_with_parent() -> None:
-    """A parent that is killed tells nobody: its workers would wait for the next cell for ever."""
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)
 
 
 def evaluate(

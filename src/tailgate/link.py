@@ -1,7 +1,7 @@
 """The link between a sensor and who reads it, where it is another than everyone is told: readings are lost, or come late.
 
-Nobody attacks here. A reading that is lost is known to be lost (`valid`), and its wire keeps the last value that arrived, as in an attack of
-that kind; one that is late is not known to be.
+Nobody attacks here. A reading that is lost is known to be lost (`valid`), and its wire keeps the last value that arrived, as in an attack
+of that kind; one that is late is not known to be.
 """
 
 from __future__ import annotations

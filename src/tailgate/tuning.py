@@ -34,6 +34,7 @@ from tailgate.errors import InputError, unknown
 from tailgate.evaluation import Cell
 from tailgate.files import writable_directory, write_atomic
 from tailgate.metrics import METRICS
+from tailgate.pool import abandon
 from tailgate.registry import Spec
 from tailgate.schema import as_data, canonical, fields_of, read_yaml
 from tailgate.trace import episodes_at_once, rollout
@@ -251,9 +252,7 @@ def tune(search: Search, workers: int = 1, progress: Callable[[int, Any], None] 
                     if progress is not None:
                         progress(futures[future], None)
             except BaseException:  # an interrupt shall not wait for what is still to train
-                pool.shutdown(wait=False, cancel_futures=True)
-                for process in list((pool._processes or {}).values()):
-                    process.terminate()
+                abandon(pool)
                 raise
     return _report(search, _open(search))
 

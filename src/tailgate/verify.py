@@ -7,6 +7,7 @@ version, a file that is not here) is said to be so: it is neither verified nor w
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -17,7 +18,8 @@ from tailgate import draws
 from tailgate.draws import constants
 from tailgate.errors import InputError
 from tailgate.evaluation import ENGINE, Cell, run
-from tailgate.registry import Spec
+from tailgate.registry import SANDBOXES, Spec
+from tailgate.rounds import seeds_of
 from tailgate.scenario import list_scenarios, load_scenario
 from tailgate.schema import build, canonical
 from tailgate.threat import ThreatModel
@@ -26,6 +28,7 @@ HASHES = ("trace_hash", "decision_hash")
 # What a row says of itself that is not compared: who its companions were, the words of a failure, and what the row alone can say.
 FREE = frozenset({"batch", "cell", "reason", "seed", "suite", "purpose"})
 BYTES = 10_000_000  # of a file that a row names, at most
+ROUND = 4096  # episodes of a round that are looked through for a seed
 YAML = (".yaml", ".yml")
 Row = dict[str, Any]
 Verdict = Literal["verified", "differs", "unchecked"]
@@ -49,14 +52,17 @@ def verify(
     workers: int = 1,
     batch: int | None = None,
     trust_code: bool = False,
+    submissions: Sequence[str] = (),
     progress: Callable[[int, int], None] | None = None,
 ) -> dict[str, Any]:
     """Play rows again and compare hashes, metrics and everything else that they record.
 
     `sample`: so many rows, drawn by `sample_seed`; None: all. `batch`: episodes side by side instead of the row's own number, which
     changes no result. The report has `status` (verified: every row that was asked for agrees; else claimed), `counts`, `entries` (the
-    same for each defence), `findings` (rows that differ or could not be checked, lines counted from 1) and `reasons`.
+    same for each defence), `findings` (rows that differ or could not be checked, lines counted from 1) and `reasons`. `submissions`:
+    classes that rows of `leaderboard submit` are about, each in a sandbox, "bwrap/module:Class".
     """
+    apart = {_target(text): text for text in submissions}
     for name, value in (("sample", sample), ("batch", batch)):
         if value is not None and value < 1:
             raise InputError(name, value, "a whole number not below 1")
@@ -67,12 +73,18 @@ def verify(
     for i in asked:
         key = _key(rows[i])
         if key not in places:
-            places[key] = _cell(rows[i], batch, trust_code)
+            places[key] = _cell(rows[i], batch, trust_code, apart)
         cell = places[key]
+        if not isinstance(cell, str) and rows[i].get("beacon") and rows[i]["seed"] not in _places_of(rows[i]):
+            cell = f"the seed is none of the first {ROUND} of the row's round"
         if isinstance(cell, str):
             found[i] = Finding(i + 1, "unchecked", cell)
         else:
             groups.setdefault(key, (cell, []))[1].append(i)
+    strange = [(cell, held) for cell, held in groups.values() if rows[held[0]].get("submission")]
+    for (_, members), again in zip(strange, _again(strange, rows, apart), strict=True):
+        found |= {i: _compared(i + 1, rows[i], row) for i, row in zip(members, again, strict=True)}
+    groups = {key: held for key, held in groups.items() if not rows[held[1][0]].get("submission")}
     spans = [(part, members) for cell, held in groups.values() for part, members in _spans(cell, held, rows)]
     here = run([cell for cell, _ in spans], workers=workers, progress=progress) if spans else []
     at = 0
@@ -82,12 +94,47 @@ def verify(
         at += cell.seeds
         for i in members:
             if played[rows[i]["seed"]]["status"] == "error" and cell.seeds > 1:  # a failure costs its companions: once more by itself
-                alone.append((i, replace(cell, first_seed=rows[i]["seed"], seeds=1)))
+                alone.append((i, replace(cell, first_seed=position(rows[i]), seeds=1)))
             else:
                 found[i] = _compared(i + 1, rows[i], played[rows[i]["seed"]])
     for (i, _), row in zip(alone, run([cell for _, cell in alone], workers=workers) if alone else [], strict=True):
         found[i] = _compared(i + 1, rows[i], row)
     return _report(rows, [(i, found[i]) for i in asked], sample)
+
+
+def _target(text: str) -> str:
+    """The class that stands behind a sandbox. Raises InputError for any other text."""
+    spec = Spec("defence", text)
+    if spec.sandboxed is None:
+        raise InputError("submission", text, f"a class in a sandbox: {' or '.join(f'{name}/module:Class' for name in SANDBOXES)}")
+    return spec.target
+
+
+def _again(groups: Sequence[tuple[Cell, list[int]]], rows: Sequence[Row], apart: dict[str, str]) -> list[list[Row]]:
+    """The rows of submissions as they come out here, group by group."""
+    out: dict[int, list[Row]] = {}
+    for target, text in apart.items():
+        mine = [i for i, (cell, _) in enumerate(groups) if cell.defence == target]
+        if mine:
+            from tailgate.submission.verified import replay
+
+            played = replay(text, [(groups[i][0], [rows[k]["seed"] for k in groups[i][1]]) for i in mine])
+            out |= dict(zip(mine, played, strict=True))
+    return [out[i] for i in range(len(groups))]
+
+
+def position(row: Row) -> int:
+    """Number of a row's episode: its seed, or the seed's place in the round of a beacon."""
+    return _places_of(row)[row["seed"]] if row.get("beacon") else int(row["seed"])
+
+
+def _places_of(row: Row) -> dict[int, int]:
+    return _places(str(row["beacon"]), str(row["suite"]), str(row["purpose"]))
+
+
+@functools.lru_cache(maxsize=16)
+def _places(beacon: str, suite: str, purpose: str) -> dict[int, int]:
+    return {seed: i for i, seed in enumerate(seeds_of(beacon, suite, purpose, ROUND))}
 
 
 def _sampled(total: int, sample: int | None, seed: int) -> list[int]:
@@ -101,11 +148,11 @@ def _sampled(total: int, sample: int | None, seed: int) -> list[int]:
 def _key(row: Row) -> str:
     """What rows of one cell share."""
     names = ("suite", "scenario", "scenario_file", "threat_model", "defence", "attack", "purpose", "config_hash", "version", "engine",
-             "defence_digest", "attack_digest", "versions", "batch")  # fmt: skip
+             "defence_digest", "attack_digest", "versions", "batch", "beacon", "submission")  # fmt: skip
     return canonical([row.get(name) for name in names])
 
 
-def _cell(row: Row, batch: int | None, trust_code: bool) -> Cell | str:
+def _cell(row: Row, batch: int | None, trust_code: bool, apart: dict[str, str]) -> Cell | str:
     """The cell that the row belongs to, without its seeds; or why it cannot be checked here."""
     lacks = [name for name in (*HASHES, "threat_model", "engine", "versions") if name not in row]
     if lacks:
@@ -128,17 +175,19 @@ def _cell(row: Row, batch: int | None, trust_code: bool) -> Cell | str:
         changes = {name: value for name, value in threat.items() if name != "class"}
         cell = Cell(
             row["suite"], source, None, row["defence"], row["attack"], 1, row["purpose"], 0,
-            batch or _batch(row.get("batch")), changes,
-        )  # fmt: skip
+            batch or _batch(row.get("batch")), changes, str(row.get("beacon", "")),
+        )
+        _ = cell.episodes  # refuses a beacon that is none  # fmt: skip
         granted = build(ThreatModel, changes, "the row's threat_model")
         for family in ("defence", "attack"):
-            if why := _refused(family, row, trust_code):
+            if why := _unlike(row, apart) if family == "defence" and row.get("submission") else _refused(family, row, trust_code):
                 return why
         place = load_scenario(source)
         if row.get("scenario_file") and replace(place, threat_model=granted).config_hash != row["config_hash"]:
             return f"the file {source!r} holds another scenario than the row's"
         spec = Spec("attack", row["attack"])
-        Spec("defence", row["defence"]).make()
+        if not row.get("submission"):
+            Spec("defence", row["defence"]).make()
         cell.place(spec.make(), spec.entry.knowledge)
     except Exception as error:  # a row can hold anything
         return str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
@@ -173,6 +222,17 @@ def _refused(family: str, row: Row, trust_code: bool) -> str:
     return ""
 
 
+def _unlike(row: Row, apart: dict[str, str]) -> str:
+    """Why a submission is not played; empty where its files are here, in a sandbox."""
+    text = apart.get(row["defence"])
+    if text is None:
+        return f"{row['defence']!r} is a submission: give --submission bwrap/{row['defence']} with its files"
+    digest = Spec("defence", text).digest
+    if digest != row["defence_digest"]:
+        return f"the submission {row['defence']!r} has the digest {digest[:12]} here and {str(row['defence_digest'])[:12]} in the row"
+    return ""
+
+
 def _files(spec: Spec) -> list[Path]:
     """Files that the text itself names; the digest says whether they are the row's."""
     head, params = spec._parts()
@@ -186,8 +246,8 @@ def _files(spec: Spec) -> list[Path]:
 def _spans(cell: Cell, members: list[int], rows: Sequence[Row]) -> list[tuple[Cell, list[int]]]:
     """Cells of neighbouring seeds that cover the rows. Seeds between two of them are played along: side by side they cost little."""
     out: list[tuple[Cell, list[int]]] = []
-    for i in sorted(members, key=lambda i: int(rows[i]["seed"])):
-        seed = int(rows[i]["seed"])
+    for i in sorted(members, key=lambda i: position(rows[i])):
+        seed = position(rows[i])
         if out and seed - out[-1][0].first_seed < cell.batch:
             first, held = out[-1]
             out[-1] = replace(first, seeds=seed - first.first_seed + 1), [*held, i]

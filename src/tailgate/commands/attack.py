@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import sys
 from pathlib import Path
 from typing import Any
@@ -18,11 +19,12 @@ def add(actions: Any) -> None:
         description="Train the learners that the suite names against the defence itself, black and grey box, and play their policies at "
         "every dose and scenario. A defence without these rows takes no rank. Interrupted, the same command goes on.",
     )  # fmt: skip
-    command.add_argument("defence", metavar="NAME", help="registered defence")
+    command.add_argument("defence", metavar="NAME", help="registered defence, or a class in a sandbox: bwrap/module:Class")
     command.add_argument("--suite", required=True, metavar="NAME", help="suite that says what is trained")
     command.add_argument("--out", required=True, metavar="DIR", help="policies go to DIR/policies, rows to DIR/NAME.jsonl")
     command.add_argument("--seeds", type=int, metavar="N", help="training seeds instead of the suite's")
     command.add_argument("--episodes", type=int, metavar="N", help="report episodes per cell instead of the suite's")
+    command.add_argument("--beacon", default="", metavar="TEXT", help="the round of the board: its seeds are played")
     command.add_argument("--workers", type=int, default=2, metavar="N", help="processes (default 2); change no result")
     command.add_argument("--set", action="append", default=[], metavar="key=value", help="change the training (repeatable): steps=10000")
     command.set_defaults(run=_attack)
@@ -31,7 +33,11 @@ def add(actions: Any) -> None:
 def _attack(options: argparse.Namespace) -> int:
     from tailgate.adaptive import configs_of, train_against
     from tailgate.evaluation import evaluate
+    from tailgate.registry import Spec
     from tailgate.scenario import load_suite
+    from tailgate.submission import play_submission
+
+    sys.path.insert(0, "")  # module:Class is looked for in the working directory, as `leaderboard submit` does
 
     suite, out = load_suite(options.suite), Path(options.out)
     extra = (*options.set, f"workers={options.workers}")
@@ -39,10 +45,21 @@ def _attack(options: argparse.Namespace) -> int:
     with progress(Console(stderr=True)) as update:
         policies = train_against(configs, update)
         file = out / f"{configs[0].name.rsplit('-', 2)[0]}.jsonl"
-        rows = evaluate(
-            suite, defences=[options.defence], attacks=[str(path) for path in policies], seeds=options.episodes, workers=options.workers,
-            out=file, progress=lambda done, total: update("playing", done, total, cells(done, total)),
-        )  # fmt: skip
+        attacks = [str(path) for path in policies]
+
+        def told(done: int, total: int) -> None:
+            update("playing", done, total, cells(done, total))
+
+        if apart := Spec("defence", options.defence).sandboxed:
+            rows = play_submission(
+                apart[1], dataclasses.replace(suite, attacks=tuple(attacks)), sandbox=apart[0], beacon=options.beacon,
+                episodes=options.episodes, workers=options.workers, out=file, progress=told,
+            )  # fmt: skip
+        else:
+            rows = evaluate(
+                suite, defences=[options.defence], attacks=attacks, seeds=options.episodes, workers=options.workers, out=file,
+                beacon=options.beacon, progress=told,
+            )  # fmt: skip
     print(file)
     print(f"{len(policies)} policies, {len(rows)} rows", file=sys.stderr)
     return 0

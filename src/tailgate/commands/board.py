@@ -30,6 +30,7 @@ def add(actions: Any) -> None:
     command.add_argument("--out", required=True, metavar="DIR", help="folder of the boards")
     command.add_argument("--defence", action="append", metavar="NAME", help="only these defences (repeatable)")
     command.add_argument("--workers", type=int, default=2, metavar="N", help="processes (default 2); change no result")
+    command.add_argument("--beacon", default="", metavar="TEXT", help="the round: random text of after the submissions (default: none)")
     command.add_argument("--score-only", action="store_true", help="play nothing: score the rows that are there")
     command.add_argument("--detection", action="store_true", help="also the detection board and stealth-impact curves: calibrates, slow")
     command.add_argument("--unattacked", action="store_true", help="also rank defences that no attack was trained against")
@@ -70,7 +71,7 @@ def _run(options: argparse.Namespace) -> int:
             folder = out / suite.name
             if not options.score_only:
                 play(
-                    suite, folder, defences=options.defence, workers=options.workers,
+                    suite, folder, defences=options.defence, workers=options.workers, beacon=options.beacon,
                     progress=lambda name, done, total: update(name, done, total, cells(done, total)),
                 )  # fmt: skip
             board = board_of(suite, folder, require_adaptive=not options.unattacked)

@@ -27,7 +27,7 @@ def add(actions: Any) -> None:
     command.add_argument("--scenario", action="append", metavar="NAME", help="a scenario instead of the suite's (repeatable)")
     command.add_argument("--episodes", type=int, metavar="N", help="episodes per cell instead of the suite's")
     command.add_argument("--sandbox", metavar="PROGRAM", help="bwrap, docker or docker:IMAGE: what a row needs to count as verified")
-    command.add_argument("--beacon", metavar="TEXT", help="random text of after the submission, of which the seeds are made")
+    command.add_argument("--beacon", default="", metavar="TEXT", help="random text of after the submission, of which the seeds are made")
     command.add_argument("--purpose", default="report", help="which seeds: train, tune, calibrate, select or report (default)")
     command.add_argument("--limit", action="append", metavar="key=value", default=[], help="change a limit, such as memory or step_time")
     command.add_argument("--workers", type=int, default=1, metavar="N", help="scenarios side by side (default 1); changes no result")
@@ -54,7 +54,7 @@ def _submit(options: argparse.Namespace) -> int:
             raise InputError("--limit", text, "key=value, for example memory=1e9")
         changes[key] = scalar(value)
     limits = build(Limits, dataclasses.asdict(Limits()) | changes, "limit")
-    if options.beacon is None:
+    if not options.beacon:
         print("tailgate: without --beacon the seeds are public ones: for development, not for a board", file=sys.stderr)
     with progress(Console(stderr=True)) as update:
         rows = play_submission(
@@ -67,7 +67,7 @@ def _submit(options: argparse.Namespace) -> int:
     reasons = list(dict.fromkeys(row["reason"] for row in failed))
     if options.json:
         first = rows[0]
-        head = {"defence": first["defence"], "digest": first["defence_digest"], "uses": first["uses"], **first["submission"]}
+        head = {key: first[key] for key in ("defence", "uses", "beacon")} | {"digest": first["defence_digest"], **first["submission"]}
         print(json.dumps(head | {"rows": len(rows), "failed": len(failed), "reasons": reasons, "table": table}, indent=1, allow_nan=False))
     else:
         _print_summary(table)

@@ -31,6 +31,10 @@ def add(actions: Any) -> None:
     command.add_argument("--workers", type=int, default=1, metavar="N", help="processes (default 1); changes no result")
     command.add_argument("--batch", type=int, metavar="N", help="episodes side by side instead of the rows' number; changes no result")
     command.add_argument("--trust-code", action="store_true", help="also import the classes that rows name; they run with your rights")
+    command.add_argument(
+        "--submission", action="append", default=[], metavar="SANDBOX/module:Class",
+        help="class that rows of `leaderboard submit` are about, played again in a sandbox: bwrap/mydefence:Saturated (repeatable)",
+    )  # fmt: skip
     command.add_argument("--json", action="store_true", help="print the report as JSON")
     command.set_defaults(run=_verify)
 
@@ -44,12 +48,13 @@ def _verify(options: argparse.Namespace) -> int:
         held = read_rows(Path(name))
         rows += held
         origin += [(name, line) for line in range(1, len(held) + 1)]
-    if options.trust_code:
+    if options.trust_code or options.submission:
         sys.path.insert(0, "")  # module:Class is looked for in the working directory, as `tailgate evaluate` does
     with progress(Console(stderr=True)) as update:
         report = verify(
             rows, sample=options.sample, sample_seed=options.sample_seed, workers=options.workers, batch=options.batch,
-            trust_code=options.trust_code, progress=lambda done, total: update("playing", done, total, cells(done, total)),
+            trust_code=options.trust_code, submissions=options.submission,
+            progress=lambda done, total: update("playing", done, total, cells(done, total)),
         )  # fmt: skip
     for finding in report["findings"]:
         finding["file"], finding["line"] = origin[finding["line"] - 1]

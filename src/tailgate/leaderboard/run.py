@@ -25,7 +25,10 @@ CARDS = "cards"  # folder of what authors say of their entries
 Progress = Callable[[str, int, int], None]  # suite, done, total
 
 
-def play(suite: Suite, folder: Path, *, defences: Sequence[str] | None = None, workers: int = 1, progress: Progress | None = None) -> Path:
+def play(
+    suite: Suite, folder: Path, *, defences: Sequence[str] | None = None, workers: int = 1, beacon: str = "",
+    progress: Progress | None = None,
+) -> Path:  # fmt: skip
     """The rows of a suite and of the attacks that were admitted since, against its defences; returns their file. It resumes."""
     lines = admitted.standing(admitted.read(folder / LIST))
     attacks = [*suite.attacks, *(text for text, line in lines.items() if line is not None)]
@@ -33,7 +36,7 @@ def play(suite: Suite, folder: Path, *, defences: Sequence[str] | None = None, w
         defences = list(dict.fromkeys([CLEAN, *defences]))  # the undefended car is what gates measure against
     file = folder / (OWN if defences is None else f"rows-{hashlib.blake2b(repr(defences).encode(), digest_size=4).hexdigest()}.jsonl.xz")
     update = None if progress is None else lambda done, total: progress(suite.name, done, total)
-    evaluate(suite, defences=defences, attacks=list(dict.fromkeys(attacks)), workers=workers, out=file, progress=update)
+    evaluate(suite, defences=defences, attacks=list(dict.fromkeys(attacks)), workers=workers, out=file, beacon=beacon, progress=update)
     return file
 
 
@@ -41,7 +44,8 @@ def board_of(suite: Suite, folder: Path, **options: Any) -> dict[str, Any]:
     """The board of all rows in a folder; written there as board.json. Raises InputError where there are none."""
     found = sorted(path for path in folder.glob("**/*") if path.name.endswith((".jsonl", ".jsonl.xz")) and path.name != LIST)
     within = [(path, path.relative_to(folder).parts) for path in found]
-    files = [path for path, parts in within if "policies" not in parts and not any(part.startswith(".") for part in parts)]
+    others = {"policies", "trust"}
+    files = [path for path, parts in within if not others & set(parts) and not any(part.startswith(".") for part in parts)]
     if not files:
         raise InputError("rows", str(folder), "a folder with rows of `leaderboard run`")
     rows = [row for path in files for row in read_rows(path)]

@@ -132,6 +132,16 @@ def play_mixed(cells: Sequence[Cell], submission: Submission, seeds: Sequence[in
     return [rows[i, seed] for i in range(len(parts)) for seed in chosen]
 
 
+def play_again(cells: Sequence[tuple[Cell, Sequence[int]]], submission: Submission) -> list[list[dict[str, Any]]]:
+    """Rows of some seeds of each cell, all of one scenario, played side by side: what `verify` compares with somebody's rows."""
+    parts = [part_of(cell, submission, seeds) for cell, seeds in cells]
+    rows, lost = _play(parts, submission, {i: list(seeds) for i, (_, seeds) in enumerate(cells)})
+    return [
+        [rows[i, seed] if (i, seed) in rows else parts[i].failed([seed], lost or Lost("not played"))[0] for seed in seeds]
+        for i, (_, seeds) in enumerate(cells)
+    ]  # fmt: skip
+
+
 def _by_seed(i: int, rows: Sequence[dict[str, Any]]) -> dict[tuple[int, int], dict[str, Any]]:
     return {(i, row["seed"]): row for row in rows}
 

@@ -11,8 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from tailgate.errors import InputError
-from tailgate.evaluation import Cell, _keep_others, _pool, cells_of
+from tailgate.evaluation import Cell, _keep_others, cells_of
 from tailgate.files import remove, sweep, writable_directory, write_atomic
+from tailgate.pool import abandon, processes
 from tailgate.rows import encode, packed, read_rows
 from tailgate.scenario import Suite, load_suite
 from tailgate.submission.limits import Limits, Lost
@@ -126,13 +127,11 @@ def _play(jobs: Sequence[Sequence[Cell]], submission: Submission, seeds: list[in
         for i, job in enumerate(jobs):
             yield i, play_mixed(job, submission, seeds)
         return
-    with _pool(workers) as pool:
+    with processes(workers) as pool:
         waiting = {pool.submit(play_mixed, job, submission, seeds): i for i, job in enumerate(jobs)}
         try:
             for future in as_completed(waiting):
                 yield waiting[future], future.result()
         except BaseException:  # an interrupt shall not wait for what is still to play; the guards see that we are gone
-            pool.shutdown(wait=False, cancel_futures=True)
-            for process in list((pool._processes or {}).values()):
-                process.terminate()
+            abandon(pool)
             raise

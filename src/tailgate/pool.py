@@ -1,0 +1,37 @@
+"""Worker processes: spawned, never forked, and none outlives its parent."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import sys
+import threading
+from concurrent.futures import ProcessPoolExecutor
+
+
+def abandon(pool: ProcessPoolExecutor) -> None:
+    """End the workers at once."""
+    workers = list((pool._processes or {}).values())  # a shutdown forgets them
+    pool.shutdown(wait=False, cancel_futures=True)
+    for process in workers:
+        process.terminate()
+
+
+def processes(workers: int) -> ProcessPoolExecutor:
+    """A pool of so many workers, which import from where this process does."""
+    context = multiprocessing.get_context("spawn")  # a fork after compiled parallel code can hang
+    return ProcessPoolExecutor(workers, mp_context=context, initializer=_begin, initargs=(list(sys.path),))
+
+
+def _begin(path: list[str]) -> None:
+    """What a worker does first."""
+    sys.path[:] = path  # a submission's module is found where the parent found it
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    """A parent that is killed tells nobody: its workers would wait for the next cell for ever."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
