@@ -128,12 +128,14 @@ def knowledge_of(text: str, suite: Suite) -> str:
 
 def admit(
     attack: str, suite: Suite, defences: Sequence[str], path: Path, date: str, *, dose: int | None = None, alpha: float = 0.05,
-    episodes: int | None = None, workers: int = 1, rows_file: Path | None = None, progress: Callable[[int, int], None] | None = None,
+    episodes: int | None = None, workers: int = 1, rows_file: Path | None = None, beacon: str = "",
+    progress: Callable[[int, int], None] | None = None,
 ) -> tuple[Admitted | None, list[dict[str, Any]]]:  # fmt: skip
     """Play an attack and all that are listed and know as much, on select seeds; append it if it wins. -> line or None, the tests.
 
     It wins where it does more damage in some scenario than the worst of the others in any, against at least one defence, by the exact
-    paired test, adjusted after Holm for all defences and scenarios. dose: the middle one of those that the suite shows unless given.
+    paired test, adjusted after Holm for all defences and scenarios. dose: the middle one of those that the suite shows unless given. beacon:
+    of whose round the seeds are; an attack that is tried again on the same seeds has been chosen on them.
     """
     lines = standing(read(path))
     listed = list(dict.fromkeys([*suite.attacks, *(text for text, line in lines.items() if line is not None)]))
@@ -149,7 +151,7 @@ def admit(
     part = dataclasses.replace(
         suite, doses=(at,), shown={}, defences=tuple(defences), attacks=(*rivals, attack), seeds=episodes or suite.seeds
     )  # fmt: skip
-    rows = run(cells_of(part, purpose="select"), rows_file, workers, progress)
+    rows = run(cells_of(part, purpose="select", beacon=beacon), rows_file, workers, progress)
     table = tabulate(rows, part)
     tests: list[dict[str, Any]] = []
     for defence in defences:
