@@ -1,0 +1,200 @@
+"""Statistical model checking of a suite: cells to rows, and rows to what they say of each defence.
+
+The trust of a defence is a lower bound: in the worst of these scenarios, doses and attacks, a closed list that is named, a run satisfies
+all properties together with at least this probability. One boolean a run, so that nothing is assumed of how properties depend on each
+other: a product of their probabilities would be wrong, and Frechet's bound is all that they allow. alpha is split over the cells.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import shlex
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import as_completed
+from concurrent.futures.process import BrokenProcessPool
+from pathlib import Path
+from typing import Any
+
+from tailgate.errors import InputError
+from tailgate.evaluation import cells_of, run_cell
+from tailgate.files import remove, set_aside, sweep, writable_directory, write_atomic
+from tailgate.pool import abandon, processes
+from tailgate.registry import Spec
+from tailgate.rows import encode
+from tailgate.scenario import Suite, load_scenario
+from tailgate.schema import as_data
+
+from .cells import Job, Row, check_cell, failed, single
+from .properties import Demands, own
+from .report import FORMAT, report
+from .signals import SafeDistance
+from .statistics import Sequential, Sprt
+
+ROWS, FAILURES, REPORT = "cells.jsonl", "failures.jsonl", "trust.json"
+BATCH = 2048
+Progress = Callable[[int, int], None]
+
+
+def jobs_of(
+    suite: Suite, *, runs: int, formulas: Sequence[str] = (), purpose: str = "report", batch: int = BATCH,
+    threat: dict[str, Any] | None = None, safe: SafeDistance | None = None, asked: Demands | None = None,
+    rule: Sequential | Sprt | None = None,
+) -> list[Job]:  # fmt: skip
+    """Every cell of a suite with what is asked of it. Raises InputError for anything that does not exist or cannot be read."""
+    for name, value in (("runs", runs), ("batch", batch)):
+        if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+            raise InputError(name, value, "a whole number not below 1")
+    for name, held in (("scenarios", suite.scenarios), ("defences", suite.defences), ("attacks", suite.attacks)):
+        if not held:
+            raise InputError(name, list(held), "at least one")
+    for dose in suite.doses:
+        if dose is not None and (isinstance(dose, bool) or not isinstance(dose, int) or dose < 0):
+            raise InputError("dose", dose, "a whole number of attack steps, not below 0")
+    for name in suite.scenarios:
+        own(load_scenario(name), formulas)
+    cells = cells_of(dataclasses.replace(suite, seeds=runs), batch=batch, purpose=purpose, threat=threat)
+    return [Job(cell, tuple(formulas), suite.bound, safe or SafeDistance(), asked or Demands(), rule) for cell in cells]
+
+
+def play(jobs: Sequence[Job], folder: Path | None = None, workers: int = 1, progress: Progress | None = None) -> list[Row]:
+    """The row of each job. With `folder` finished cells are kept there: an interrupted run resumes, and other rows are set aside."""
+    ids = [job.identity for job in jobs]
+    done: dict[str, Row] = {}
+    parts = out = None
+    if folder is not None:
+        out, parts = writable_directory(folder) / ROWS, writable_directory(folder / f".{ROWS}.parts")
+        for place in (out, parts):
+            sweep(place)
+        kept = [row for path in (out, *sorted(parts.glob("*.json"))) for row in _read(path)]
+        done = {row["cell"]: row for row in kept if row.get("cell") in ids and row.get("status") != "error"}
+    missing = [job for job, i in zip(jobs, ids, strict=True) if i not in done]
+    for row in _played(missing, workers):
+        done[row["cell"]] = row
+        if parts is not None:
+            write_atomic(parts / f"{row['cell']}.json", encode([row]))
+        if progress is not None:
+            progress(len(done), len(set(ids)))
+    rows = [done[i] for i in ids]
+    if out is not None and parts is not None:
+        if out.is_file() and any(row["cell"] not in ids for row in _read(out)):  # somebody's result
+            set_aside(out)
+        write_atomic(out, encode(rows))
+        for i in ids:
+            remove(parts / f"{i}.json")
+        if not any(parts.iterdir()):
+            parts.rmdir()
+    return rows
+
+
+def _read(path: Path) -> list[Row]:
+    """The rows of a file that an earlier run wrote; none of a damaged one: its cells are played again."""
+    try:
+        rows = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+    except (OSError, ValueError):
+        return []
+    return [row for row in rows if isinstance(row, dict) and {"cell", "status", "properties", "conjunctions"} <= set(row)]
+
+
+def _played(jobs: Sequence[Job], workers: int) -> Iterator[Row]:
+    """Rows as they are finished. Somebody's own code plays in a process of its own."""
+    foreign = any(Spec("defence", job.cell.defence).imports or Spec("attack", job.cell.attack).imports for job in jobs)
+    if not foreign and (workers == 1 or len(jobs) < 2):
+        yield from map(check_cell, jobs)
+        return
+    lost = []
+    with processes(workers) as pool:
+        waiting = {pool.submit(check_cell, job): job for job in jobs}
+        try:
+            for future in as_completed(waiting):
+                try:
+                    yield future.result()
+                except BrokenProcessPool:  # one cell killed its process, and the pool with it: which one shows below
+                    lost.append(waiting[future])
+        except BaseException:  # an interrupt shall not wait for what is still to play
+            abandon(pool)
+            raise
+    for job in lost:
+        with processes(1) as pool:
+            try:
+                row = pool.submit(check_cell, job).result()
+            except BrokenProcessPool:
+                row = failed(job, "the process that played this cell died")
+        yield row
+
+
+def check(
+    suite: Suite, *, runs: int | None = None, formulas: Sequence[str] = (), alpha: float = 0.05, purpose: str = "report",
+    batch: int = BATCH, workers: int = 1, folder: Path | None = None, threat: dict[str, Any] | None = None,
+    safe: SafeDistance | None = None, asked: Demands | None = None, rule: Sequential | Sprt | None = None,
+    progress: Progress | None = None,
+) -> dict[str, Any]:  # fmt: skip
+    """The report on a suite's defences, in the format tailgate-trust-1; docs/trust.md says what its fields mean.
+
+    runs: of each cell, the suite's number of seeds unless given; with a rule the most that it may take. formulas: in place of the built-in
+    properties. With `folder` it is also written there as trust.json, beside the rows of cells and the worst failing episode of each
+    defence, as rows for `tailgate replay`. Raises InputError before anything is played.
+    """
+    if not 0.0 < alpha < 1.0:
+        raise InputError("alpha", alpha, "a number above 0 and below 1")
+    if workers < 1:
+        raise InputError("workers", workers, "a whole number not below 1")
+    most = suite.seeds if runs is None else runs
+    jobs = jobs_of(suite, runs=most, formulas=formulas, purpose=purpose, batch=batch, threat=threat, safe=safe, asked=asked, rule=rule)
+    rows = play(jobs, folder, workers, progress)
+    settings = {"runs": most, "rule": rule_data(rule), "unsafe": _plain(safe or SafeDistance()), "demands": _plain(asked or Demands())}
+    found = report(rows, suite, alpha=alpha, settings=settings)
+    if folder is not None:
+        _keep_failures(found, jobs, folder)
+        write_atomic(folder / REPORT, json.dumps(found, indent=1, allow_nan=False).encode() + b"\n")
+    return found
+
+
+def rule_data(rule: Sequential | Sprt | None) -> dict[str, Any]:
+    """A rule as JSON data."""
+    return {"name": "fixed"} if rule is None else {"name": type(rule).__name__.lower(), **_plain(rule)}
+
+
+def _plain(value: Any) -> dict[str, Any]:
+    return {key: held for key, held in as_data(value).items() if key != "class"}
+
+
+def _keep_failures(found: dict[str, Any], jobs: Sequence[Job], folder: Path) -> None:
+    """Writes the row of each defence's worst failing run, and puts its line into the report."""
+    rows: list[Row] = []
+    by_identity = {job.identity: job for job in jobs}
+    for entry in found["defences"]:
+        worst = entry["worst"]
+        if worst is not None:
+            rows += run_cell(single(by_identity[worst["cell"]], worst["seed"]))
+            worst["replay"] = replay_command(entry["defence"], worst["attack"], folder, len(rows))
+    path = folder / FAILURES
+    if rows:
+        write_atomic(path, encode(rows))
+    else:
+        remove(path)
+
+
+def replay_command(defence: str, attack: str, folder: Path, line: int) -> str:
+    """What plays a line of the failures again. A row must not import code: who wants it names the class."""
+    named = [(family, text) for family, text in (("defence", defence), ("attack", attack)) if Spec(family, text).imports]  # type: ignore[arg-type]
+    words = ["tailgate", "replay", str(folder / FAILURES), "--line", str(line), "--out", str(folder / f"failure-{line}.html")]
+    return shlex.join(words + [word for family, text in named for word in (f"--{family}", text)])
+
+
+def with_trust(board: dict[str, Any], found: dict[str, Any]) -> dict[str, Any]:
+    """A board with the field `trust`: of each entry by what the attacker knows, and of the board what the bounds are about.
+
+    Raises InputError for a report of another suite, of another version, of a user's own formulas or of runs that a rule stopped.
+    """
+    if found.get("format") != FORMAT:
+        raise InputError("trust: format", found.get("format"), FORMAT)
+    for name, mine, other in (
+        ("suite", found["suite"]["name"], board["suite"]["name"]), ("version", found["version"], board["suite"]["version"]),
+        ("formulas", found["formulas"], []), ("rule", found["rule"]["name"], "fixed"),
+    ):  # fmt: skip
+        if mine != other:
+            raise InputError(f"trust: {name}", mine, repr(other))
+    by_name = {entry["defence"]: entry["trust"] for entry in found["defences"]}
+    head = {key: found[key] for key in ("alpha", "runs", "purpose", "attacks", "scenarios", "doses", "unsafe", "demands")}
+    return board | {"trust": head, "entries": [entry | {"trust": by_name.get(entry["defence"])} for entry in board["entries"]]}

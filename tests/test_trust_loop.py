@@ -1,0 +1,335 @@
+"""Model checking of the closed loop: properties against metrics, bounds against their definition, resumption, replay, the command line."""
+
+import copy
+import dataclasses
+import json
+import re
+import shlex
+from concurrent.futures import Future
+from concurrent.futures.process import BrokenProcessPool
+from pathlib import Path
+from typing import Any, ClassVar, Self
+
+import numpy as np
+import pytest
+
+from tailgate import cli, draws
+from tailgate.errors import InputError
+from tailgate.evaluation import run_cell
+from tailgate.metrics import measure
+from tailgate.registry import Spec
+from tailgate.scenario import Suite, load_scenario, load_suite
+from tailgate.scoring.ranks import mcnemar
+from tailgate.trace import rollout
+from tailgate.trust import run as trust_run
+from tailgate.trust.cells import Job, check_cell, outcome, runs_of, single
+from tailgate.trust.logic import Samples, holds
+from tailgate.trust.properties import Demands, built_in, own
+from tailgate.trust.run import check, jobs_of, with_trust
+from tailgate.trust.signals import SIGNALS, SafeDistance, sample
+from tailgate.trust.statistics import Sequential, Sprt, lower
+
+RAMP = "fdi_ramp:trigger=near,threshold=40,rate=-0.5"
+JAM = "dos_jam:trigger=near,threshold=40"
+SHORT = """
+about: 12 s behind a leader that brakes to a stop.
+plant: {name: car_following, gap: 50.0, lead_speed: 20.0, position: 0.0, speed: 20.0, accel: 0.0, process_var: [1.0e-3, 4.0e-3, 2.5e-2]}
+sensor: {name: odometry, noise_var: [1.0, 1.0]}
+controller: {name: acc}
+manoeuvre: {name: braking, onset: [1.0, 3.0]}
+horizon: 120
+threat_model: {kinds: [dos_jam, fdi], fdi_bound: 50.0, jam_range: [-108.0, 3000.0], onset: 10, end: 100, budget: 12}
+"""
+HORIZON = 120
+N = 24
+
+
+@pytest.fixture(scope="module")
+def short(tmp_path_factory: pytest.TempPathFactory) -> str:
+    path = tmp_path_factory.mktemp("scenario") / "short.yaml"
+    path.write_text(SHORT, encoding="utf-8")
+    return str(path)
+
+
+def _suite(short: str, **changes: Any) -> Suite:
+    return dataclasses.replace(
+        Suite(name="small", scenarios=(short,), doses=(12,), defences=("kf", "chi2_kf"), attacks=("none", JAM, RAMP), seeds=N), **changes
+    )
+
+
+Found = tuple[dict[str, Any], Path]
+
+
+@pytest.fixture(scope="module")
+def found(tmp_path_factory: pytest.TempPathFactory, short: str) -> Found:
+    folder = tmp_path_factory.mktemp("trust")
+    return check(_suite(short), folder=folder), folder
+
+
+def _rows(folder: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in (folder / "cells.jsonl").read_text(encoding="utf-8").splitlines()]
+
+
+def test_a_run_counts_as_the_metrics_of_its_episode_say(found: Found, short: str) -> None:
+    """A property that is off by a step, or of another car, would count other runs than the board does."""
+    for job, row in zip(jobs_of(_suite(short), runs=N), _rows(found[1]), strict=True):
+        episodes = run_cell(job.cell)
+        by_name = {p["name"]: p for p in row["properties"]}
+        assert row["n"] == N and by_name["no_collision"]["k"] == sum(e["crashed"] == 0.0 for e in episodes)
+        attacked = [e for e in episodes if e["missed_deadline"] is not None]
+        assert by_name["detects"]["asked"] == len(attacked)
+        assert by_name["detects"]["answered"] == sum(e["missed_deadline"] == 0.0 for e in attacked)
+        safe = runs_of(row, "safety")
+        assert not any(ok and e["crashed"] for ok, e in zip(safe, episodes, strict=True)) and safe.sum() == row["conjunctions"]["safety"]["k"]
+
+
+def test_braking_is_asked_where_and_when_the_documentation_says(short: str) -> None:
+    """The antecedent, the deadline or the threshold would not be those that are written down."""
+    place, safe = load_scenario(short), SafeDistance()
+    trace = rollout(place.loop(Spec("defence", "kf").make()), Spec("attack", JAM).make(), draws.keys("report", range(N)))
+    (known,) = (p for p in built_in(place) if p.name == "brakes")
+    result = outcome(known, trace, safe)
+    for b in range(trace.batch):
+        n = int(trace.length[b])
+        v, lead = trace.speed[:n, b, 0], trace.lead_speed[:n, b, 0]
+        distance = np.maximum(0.6 * v + 0.5 * 2.0 * 0.36 + (v + 1.2) ** 2 / 10.0 - lead**2 / 10.0, 0.0)
+        threat = (np.cumsum(trace.kind[:n, b] != 0) > 0) & (trace.gap[:n, b, 0] < distance)
+        brakes = (trace.applied[:n, b, 0, 0] <= -2.0) | (v <= 0.1)
+        asked = [k for k in range(n) if threat[k] and k <= HORIZON - 1 - 6]
+        assert result.asked[b] == bool(asked) and result.instants[b] == threat.sum()
+        assert result.holds[b] == all(brakes[k : k + 7].any() for k in asked)
+    assert 0 < (result.holds & result.asked).sum() < result.asked.sum()
+
+
+def test_the_safe_distance_is_one_to_stop_in() -> None:
+    """A car that keeps it would hit one that brakes at its hardest, or could have driven closer."""
+    v, lead, safe, dt = 25.0, 20.0, SafeDistance(), 1e-4
+    gap = float(safe.of(np.array([v]), np.array([lead]))[0])
+    t = np.arange(0.0, 12.0, dt)
+    own = np.where(t < safe.response, v + safe.accel * t, np.maximum(v + safe.accel * safe.response - safe.brake * (t - safe.response), 0.0))
+    ahead = np.maximum(lead - safe.lead_brake * t, 0.0)
+    assert np.min(gap + np.cumsum(ahead - own) * dt) == pytest.approx(0.0, abs=0.02)
+    assert safe.of(np.array([5.0]), np.array([30.0]))[0] == 0.0
+
+
+def test_a_bound_is_the_least_of_its_cells_and_no_part_is_below_the_whole(found: Found, short: str) -> None:
+    """Trust would be more than alpha allows, or more than that of one of its properties."""
+    report, folder = found
+    rows = _rows(folder)
+    for entry in report["defences"]:
+        mine = [row for row in rows if row["defence"] == entry["defence"]]
+        for name in ("trust", "safety"):
+            bound = entry[name]["black"]
+            assert bound["cells"] == 3 and bound["lower"] == min(lower(r["conjunctions"][name]["k"], N, 0.05 / 3) for r in mine)
+            assert bound["attacks"] == [JAM, RAMP] and bound["n"] == N
+        assert entry["trust"]["black"]["lower"] <= entry["safety"]["black"]["lower"]
+        for row in mine:  # Frechet's bounds hold of the counts themselves
+            parts = [p["k"] for p in row["properties"] if p["formula"] is not None]
+            assert sum(parts) - N * (len(parts) - 1) <= row["conjunctions"]["trust"]["k"] <= min(parts)
+    assert report["defences"][0]["safety"]["black"]["attack"] == JAM and report["defences"][1]["safety"]["black"]["attack"] == RAMP
+
+
+def test_defences_are_compared_on_the_same_seeds(found: Found, short: str) -> None:
+    """A comparison would miss that most of the chance is common to both defences."""
+    one = check(_suite(short, attacks=(JAM,)), runs=N)
+    (duel,) = (d for d in one["comparisons"] if d["of"] == "safety")
+    a, b = (next(e for e in one["defences"] if e["defence"] == duel[side])["safety"]["black"]["k"] for side in ("a", "b"))
+    assert duel["only_b"] - duel["only_a"] == a - b != 0
+    assert duel["p"] == pytest.approx(mcnemar(duel["only_a"], duel["only_b"]))
+
+
+def test_rows_depend_on_nothing_but_their_seeds(found: Found, short: str) -> None:
+    """Another batch would give other counts for the same seeds."""
+    for job, row in list(zip(jobs_of(_suite(short), runs=N, batch=16), _rows(found[1]), strict=True))[1:3]:
+        again = check_cell(job)
+        for key in ("n", "properties", "conjunctions", "worst"):
+            assert again[key] == row[key]
+
+
+def test_an_interrupted_run_goes_on_where_it_was(found: Found, short: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Finished cells would be played again, or the result would differ from that of a run in peace."""
+    played: list[str] = []
+
+    def once(job: Job) -> dict[str, Any]:
+        played.append(job.identity)
+        if len(played) == 4:
+            raise KeyboardInterrupt
+        return check_cell(job)
+
+    monkeypatch.setattr(trust_run, "check_cell", once)
+    with pytest.raises(KeyboardInterrupt):
+        check(_suite(short), folder=tmp_path)
+    damaged = next((tmp_path / ".cells.jsonl.parts").glob("*.json"))
+    damaged.write_bytes(damaged.read_bytes()[:40])
+    check(_suite(short), folder=tmp_path)
+    assert len(played) == 4 + 4 and len(set(played)) == 6
+    for name in ("cells.jsonl", "trust.json"):
+        ours, theirs = ((folder / name).read_text().replace(str(folder), "") for folder in (tmp_path, found[1]))
+        assert ours == theirs
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["cells.jsonl", "failures.jsonl", "trust.json"]
+    check(_suite(short, defences=("kf",), attacks=("none",)), runs=3, formulas=["G gap > 0"], folder=tmp_path)
+    assert (tmp_path / "cells.jsonl.1").is_file()
+
+
+@pytest.mark.parametrize(
+    ("scenario", "bound", "reasons"),
+    [
+        ("radar-following-v0", None, {"brakes": "a step of 1 s is too coarse", "error": "cars"}),
+        ("thesis-ch5-v0", None, {"no_collision": "nobody drives", "brakes": "nobody drives", "error": "no bound"}),
+        ("thesis-ch5-v0", 10.0, {"no_collision": "nobody drives", "brakes": "nobody drives"}),
+        ("platoon-gusty-v0", None, {"error": "cars"}),
+    ],
+)
+def test_a_property_without_a_meaning_says_why(scenario: str, bound: float | None, reasons: dict[str, str]) -> None:
+    """A step of a second would time a deadline of 0.6 s, or a network would be asked about collisions."""
+    found = {p.name: p for p in built_in(load_scenario(scenario), bound)}
+    assert {name for name, p in found.items() if p.formula is None} == set(reasons)
+    assert all(words in found[name].reason for name, words in reasons.items())
+
+
+def test_every_car_of_a_platoon_is_asked_for_itself() -> None:
+    """A car that brakes would answer for another one that is too close."""
+    place = load_scenario("platoon-gusty-v0")
+    (brakes,) = (p for p in built_in(place, None, Demands(deadline=0.5)) if p.name == "brakes")
+    followers = np.flatnonzero(place.brief().model.followers)
+    assert {f"margin@{i}" for i in followers} | {f"applied@{i}" for i in followers} <= brakes.signals
+    quiet = {name: np.full((20, 1), 1.0 if name == "attacked" else 5.0) for name in brakes.signals}
+    for braking, answered in ((followers[1], False), (followers[0], True)):
+        near = quiet | {f"margin@{followers[0]}": np.full((20, 1), -1.0), f"applied@{braking}": np.full((20, 1), -3.0)}
+        assert brakes.formula is not None and holds(brakes.formula, Samples(0.1, np.array([20]), near))[0] == answered
+    place = dataclasses.replace(place, horizon=20)
+    trace = rollout(place.loop(Spec("defence", "none").make()), Spec("attack", "none").make(), draws.keys("report", range(2)))
+    held = sample(trace, ["gap", "gap@2", "time"], SafeDistance())
+    assert (held.values["gap@2"] == trace.gap[:, :, 2]).all() and (held.values["gap"] <= held.values["gap@2"]).all()
+    assert held.values["time"][0, 0] == pytest.approx(place.brief().model.dt)
+
+
+def test_a_network_is_asked_about_its_error() -> None:
+    """The suite's bound would not be what decides."""
+    suite = dataclasses.replace(load_suite("network-v0"), scenarios=("thesis-ch5-v0",), doses=(5,), defences=("dkf",), attacks=("none", "fdi:value=100"))
+    (entry,) = check(suite, runs=6)["defences"]
+    share = {p["name"]: p["share"] for p in entry["properties"]}
+    bad = run_cell(jobs_of(suite, runs=6)[1].cell)
+    assert share["error"]["k"] == sum(row["max_error"] <= suite.bound for row in bad) < 6 and entry["safety"]["black"]["of"] == ["error"]
+
+
+def test_a_defence_that_was_not_attacked_has_no_bound(short: str) -> None:
+    """It would be trusted for not being attackable, or for a crash."""
+    found = check(_suite(short, defences=("none", "chi2_kf"), attacks=("none", JAM, "stealth:trigger=near,threshold=40")), runs=4)
+    bare, gated = found["defences"]
+    assert bare["safety"]["white"] is None and "stealth" in bare["why"] and bare["safety"]["black"]["lower"] > 0.0
+    assert gated["safety"]["white"]["k"] == 0 and gated["safety"]["black"]["attacks"] == [JAM]
+
+
+class _Pool:
+    """Stands for processes: one that plays chi2_kf dies, and takes what it had with it."""
+
+    _processes: ClassVar[dict[int, Any]] = {}
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        return None
+
+    def submit(self, function: Any, job: Job) -> Future[Any]:
+        out: Future[Any] = Future()
+        if job.cell.defence == "chi2_kf":
+            out.set_exception(BrokenProcessPool())
+        else:
+            out.set_result(function(copy.deepcopy(job)))  # what crosses to another process is a copy
+        return out
+
+
+def test_a_process_that_dies_costs_its_own_cells(short: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A defence that kills its process would take the rows of others with it, or be trusted."""
+    monkeypatch.setattr(trust_run, "processes", lambda workers: _Pool())
+    kf, deadly = check(_suite(short, attacks=("none",)), runs=2, workers=2)["defences"]
+    assert kf["safety"]["black"]["k"] == 2 and deadly["safety"]["black"] is None and "died" in deadly["why"]
+
+
+def test_rules_that_stop_early_give_no_bound(short: str) -> None:
+    """A figure of an exploration would be published as one of a fixed number of runs."""
+    suite = _suite(short, defences=("kf",), attacks=("none",))
+    narrow = check(suite, runs=500, formulas=["G gap > 0"], rule=Sequential(0.1))
+    assert narrow["cells"][0]["n"] == 36 and narrow["defences"][0]["trust"]["black"] is None
+    settled = check(suite, runs=500, formulas=["G gap < 0"], rule=Sprt(0.85, 0.9))["cells"][0]
+    assert settled["verdict"] is False and settled["n"] < 10
+    assert check(suite, runs=3, formulas=["G gap > 0"], rule=Sequential(0.1))["cells"][0]["n"] == 3
+
+
+def test_the_board_takes_the_bounds_of_its_own_suite_alone(found: Found, short: str) -> None:
+    """A column would show bounds of other scenarios, other formulas, or of runs that were stopped."""
+    report, _ = found
+    board = {"suite": {"name": "small", "version": report["version"]}, "entries": [{"defence": "chi2_kf"}, {"defence": "other"}]}
+    filled = with_trust(board, report)
+    assert filled["entries"][0]["trust"] == report["defences"][1]["trust"] and filled["entries"][1]["trust"] is None
+    assert filled["trust"]["alpha"] == 0.05 and [a["attack"] for a in filled["trust"]["attacks"]] == ["none", JAM, RAMP]
+    json.dumps(filled, allow_nan=False)
+    for change in ({"suite": {"name": "custom"}}, {"version": "0"}, {"formulas": ["G gap > 0"]}, {"rule": {"name": "sprt"}}, {"format": "x"}):
+        with pytest.raises(InputError, match="trust: "):
+            with_trust(board, report | change)
+
+
+def test_the_worst_failing_run_is_replayed_by_the_command_that_is_printed(tmp_path: Path, short: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """The page would show another episode than the one that failed."""
+    monkeypatch.chdir(tmp_path)
+    part = ["--scenario", short, "--dose", "12", "--defence", "chi2_kf", "--attack", RAMP, "--runs", "8", "--out", "out"]
+    assert cli.main(["trust", *part]) == 0
+    printed = capsys.readouterr().out
+    words, command = next(line for line in printed.splitlines() if "tailgate replay" in line).split(": tailgate ")
+    assert cli.main([*shlex.split(command), "--json"]) == 0
+    shown = json.loads(capsys.readouterr().out)
+    assert shown["verdict"] == "same" and Path(shown["page"]).is_file() and f"seed {shown['seed']}" in words
+    assert "fails no_collision" in words and shown["metrics"]["crashed"] == 1.0
+    assert cli.main(["trust", *part, "--json"]) == 0  # resumes
+    assert json.loads(capsys.readouterr().out)["defences"][0]["worst"]["seed"] == shown["seed"]
+
+
+def test_a_formula_of_ones_own_is_decided(short: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """The thesis's query, braking within 600 ms of a gap below 20 m, fails a healthy car that drives slowly; the one here does not."""
+    literal, ours = "G[0,11.3] (gap < 20 -> F[0,0.6] applied <= -2)", "G[0,11.3] (margin < 0 -> F[0,0.6] applied <= -2)"
+    part = ["trust", "--scenario", short, "--defence", "kf", "--attack", "none", "--runs", "12"]
+    assert cli.main([*part, "--property", literal, "--property", ours, "--json"]) == 0
+    (entry,) = json.loads(capsys.readouterr().out)["defences"]
+    assert [p["share"]["k"] for p in entry["properties"]] == [0, 12]
+    assert cli.main([*part, "--property", "G gap > 0", "--width", "0.9"]) == 0
+    assert "exploring" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--property", "G[0,60] gap"], "one of >"), (["--property", "G gapp > 0"], "did you mean 'gap'"), (["--property", "G[61,62] gap > 0"], "horizon"),
+        (["--unsafe", "brakes=5"], "did you mean 'brake'"), (["--demand", "deadline"], "key=value"), (["--alpha", "0"], "alpha"), (["--runs", "0"], "runs"),
+        (["--precision", "2"], "precision"), (["--test", "0.04"], "low"), (["--dose", "x"], "dose"), (["--defence", "kff"], "kff"), (["--workers", "0"], "workers"),
+    ],
+)  # fmt: skip
+def test_bad_input_is_refused_before_anything_is_played(arguments: list[str], words: str, short: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """A mistake would cost minutes before it shows, or end in a traceback."""
+    assert cli.main(["trust", "--scenario", short, "--attack", "none", *arguments]) == 2
+    error = capsys.readouterr().err
+    assert words in error and error.count("\n") == 1
+
+
+def test_the_formulas_and_signals_of_the_documentation_are_those_that_are_read(short: str) -> None:
+    """Somebody who copies a line of it would get an error, or miss a signal."""
+    text = (Path(__file__).parents[1] / "docs" / "trust.md").read_text(encoding="utf-8").split("## A formula of one's own")[1]
+    lines = [re.split(r"\s{3,}", line.strip())[0] for line in text.splitlines() if line.startswith("    ")]
+    assert len(lines) == 5 and len(own(dataclasses.replace(load_scenario(short), horizon=600), lines)) == 5
+    named = {name for line in text.splitlines() if line.startswith("| `") for name in re.findall(r"`(\w+)`", line.split("|")[1])}
+    assert named == set(SIGNALS)
+
+
+def test_a_signal_that_a_scenario_has_not_is_a_reason() -> None:
+    """A formula about gaps would stop a suite that also holds a network."""
+    (known,) = own(load_scenario("thesis-ch5-v0"), ["G gap > 0"])
+    assert known.formula is None and "follows another" in known.reason
+
+
+def test_one_episode_is_that_of_its_cell(short: str) -> None:
+    """The run that is kept for replay would be another one than was checked."""
+    (job,) = jobs_of(_suite(short, defences=("chi2_kf",), attacks=(RAMP,)), runs=8)
+    (row,) = run_cell(single(job, 5))
+    values = measure(rollout(load_scenario(short).loop(Spec("defence", "chi2_kf").make()), Spec("attack", RAMP).make(), draws.keys("report", range(8))))
+    assert row["seed"] == 5 and row["min_gap"] == values["min_gap"][5]
