@@ -19,6 +19,7 @@ from tailgate.scoring import score
 from tailgate.scoring.doses import crossings, limits, monotone
 from tailgate.scoring.ranks import mcnemar
 from tailgate.strength.dose import critical_dose, fitted
+from tailgate.strength.policies import rising
 
 spec = importlib.util.spec_from_file_location("scored", Path(__file__).with_name("scored.py"))
 scored = importlib.util.module_from_spec(spec)
@@ -272,6 +273,17 @@ def test_flags_name_unspent_budgets_and_transfers_that_beat_own_training() -> No
     assert any(f.startswith("unspent budget: the worst attack, theirs") and "5.0 of 20" in f for f in found)
     assert [f for f in found if f.startswith("transferred")] == [f"transferred beats own: theirs, trained on b, on {ROAD} (black box)"]
     assert not [f for f in entry(board(rows, where), "b")["flags"] if f.startswith("transferred")]
+
+
+def test_flags_name_trainings_that_had_not_ended_and_seeds_that_differ() -> None:
+    """Two seeds of one plan do 0 and 12 of 20 damage, and one of them was still learning."""
+    first, second = ({"trained": {"defence": "a", "digest": "", "plan": "p", "seed": seed, "rising": seed == 1}} for seed in (0, 1))
+    rows = [*clean("a"), *cell("none", "x", **first), *cell("none", "y", **second), *cell("a", "x", **first), *cell("a", "y", 12, **second)]
+    found = entry(board(rows, suite(attacks=("none", "x", "y"))), "a")["flags"]
+    assert "still learning: the curves of 1 of 2 attackers rose when training ended" in found
+    assert f"seeds differ: 2 trainings of one plan (black box) do 0 to 60 % damage on {ROAD}" in found
+    flat, steep = ([{"reward": level} for level in levels] for levels in ([0.0, 1.0] * 8 + [1.0, 0.9] * 8, [0.1 * k for k in range(32)]))
+    assert rising(steep) and not rising(flat) and not rising(steep[:12]) and not rising(None)
 
 
 @pytest.mark.parametrize(

@@ -134,8 +134,8 @@ def admit(
     """Play an attack and all that are listed and know as much, on select seeds; append it if it wins. -> line or None, the tests.
 
     It wins where it does more damage in some scenario than the worst of the others in any, against at least one defence, by the exact
-    paired test, adjusted after Holm for all defences and scenarios. dose: the middle one of those that the suite shows unless given. beacon:
-    of whose round the seeds are; an attack that is tried again on the same seeds has been chosen on them.
+    paired test, adjusted after Holm for all defences and scenarios. dose: the middle one of those that the suite shows unless given.
+    beacon: of whose round the seeds are; an attack that is tried again on the same seeds has been chosen on them.
     """
     lines = standing(read(path))
     listed = list(dict.fromkeys([*suite.attacks, *(text for text, line in lines.items() if line is not None)]))

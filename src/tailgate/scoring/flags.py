@@ -12,6 +12,7 @@ from .ranks import mcnemar
 
 SPENT = 0.9  # of the budget, by the mean of the episodes without damage: those that end early leave some
 LEVEL = 0.05
+SPREAD = 0.2  # between the training seeds of one plan, of the share of damage
 
 
 def flags(table: Table, defence: str, levels: dict[str, Worst], slot: int, origins: dict[str, Row]) -> list[str]:
@@ -19,7 +20,24 @@ def flags(table: Table, defence: str, levels: dict[str, Worst], slot: int, origi
     out = [*_failures(table, defence), *_unspent(table, levels, slot)]
     for knowledge in levels:
         out += _transferred(table, defence, levels[knowledge], slot, origins)
-    return [*dict.fromkeys(out), *_weaker(levels, slot)]
+    return [*dict.fromkeys(out), *_weaker(levels, slot), *_trainings(table, defence, slot, origins)]
+
+
+def _trainings(table: Table, defence: str, slot: int, origins: dict[str, Row]) -> list[str]:
+    """What the attackers that were trained on this defence say of their training: unfinished, or a matter of the seed's luck."""
+    mine = [i for i, column in enumerate(table.columns) if origins.get(column.attack, {}).get("defence") == defence]
+    rising = sum(bool(origins[table.columns[i].attack].get("rising")) for i in mine)
+    out = [f"still learning: the curves of {rising} of {len(mine)} attackers rose when training ended"] if rising else []
+    guard, plans = table.defences.index(defence), dict.fromkeys(origins[table.columns[i].attack].get("plan") for i in mine)
+    for name in table.nominal()[:1]:
+        for plan in plans:
+            same = [i for i in mine if origins[table.columns[i].attack].get("plan") == plan and table.state[name][guard, i, slot] == PLAYED]
+            shares = [float(table.harm[name][guard, i, slot].mean()) for i in same]
+            if len(shares) > 1 and max(shares) - min(shares) > SPREAD:
+                span = f"{100 * min(shares):.0f} to {100 * max(shares):.0f} %"
+                level = table.columns[same[0]].knowledge
+                out.append(f"seeds differ: {len(shares)} trainings of one plan ({level} box) do {span} damage on {name}")
+    return out
 
 
 def _failures(table: Table, defence: str) -> list[str]:

@@ -24,6 +24,7 @@ from tailgate.stats import Interval, paired_difference, proportion
 from tailgate.threat import ThreatModel
 from tailgate.train import TrainConfig, outcome_of, plan_key
 
+LEAST = 4  # points of the last quarter of a learning curve, below which nothing is said of it
 BATCH = 256  # episodes side by side; changes no result
 NAMED: tuple[tuple[Family, str], ...] = (  # what a record names, one or a list of each
     ("defence", "defence"), ("defence", "others"), ("attack", "rivals"), ("attack", "white_box"), ("attack", "teacher"),
@@ -99,7 +100,25 @@ def origin_of(text: str) -> dict[str, Any] | None:
     config, digest = who.header.training.get("config"), who.header.training.get("defence_digest", "")
     if who.defence is None or not isinstance(config, dict) or not isinstance(digest, str):
         return None
-    return {"defence": Spec("defence", who.defence).target, "digest": digest, "plan": plan_key(config), "seed": who.seed}
+    return {
+        "defence": Spec("defence", who.defence).target, "digest": digest, "plan": plan_key(config), "seed": who.seed,
+        "rising": rising(who.header.training.get("curve")),
+    }  # fmt: skip
+
+
+def rising(curve: Any) -> bool:
+    """Whether a learning curve still rose when training ended: the line through its last quarter, by more than two standard errors of its
+    slope, and by more than a twentieth of all that was learned."""
+    rewards = [point.get("reward") for point in curve if isinstance(point, dict)] if isinstance(curve, list) else []
+    y = np.array([x for x in rewards if isinstance(x, int | float)], np.float64)
+    last = y[-(len(y) // 4) :] if len(y) >= 4 * LEAST else y[:0]
+    if not len(last) or not np.isfinite(y).all():
+        return False
+    k = np.arange(len(last)) - 0.5 * (len(last) - 1)
+    slope = float(k @ last / (k @ k))
+    left = last - last.mean() - slope * k
+    error = float(np.sqrt(left @ left / (len(last) - 2) / (k @ k)))
+    return slope > 2.0 * error and slope * (len(last) - 1) > 0.05 * float(np.ptp(y))
 
 
 def _harmless(family: Family, held: Any, where: str) -> None:
