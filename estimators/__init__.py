@@ -30,7 +30,9 @@ from .oracle import DistributedOracle, Oracle
 from .per_episode import EpisodeByEpisode, PerEpisode, per_episode
 from .predictors import Autoregressive, HoldLast, Polynomial, Predictor
 from .raw import Raw
+from .reactive_brake import SafeState, SafeStateBrake
 from .robust import Outlier, RobustKalman, RobustKalmanFilter
+from .safe_state import SafeSet
 from .saturated import SaturatedDistributedKalman, SaturatedFilter
 from .sentinels import AlarmSentinel, BrakeSentinel, StandStillSentinel
 from .sparse import SparseChiSquare, SparseGatedKalman
@@ -47,8 +49,9 @@ __all__ = [
     "GatedDistributedKalman", "GatedKalman", "Hold", "HoldLast", "InputClip", "InteractingModels", "JointRegression", "Kalman",
     "KalmanFilter", "LassoFilter", "LassoKalman", "Latch", "Mewma", "MewmaKalman", "NamedParts", "NormResilient",
     "NormResilientFilter", "Oracle", "Outlier", "PerEpisode", "Polynomial", "Predictor", "PyCra", "Raw", "Reacquire",
-    "ReacquiringKalman", "RobustKalman", "RobustKalmanFilter", "SaturatedDistributedKalman", "SaturatedFilter", "Score", "SlidingMode",
-    "SparseChiSquare", "SparseGatedKalman", "StandStillSentinel", "Stateless", "Steered", "SteeredChallenge", "TailChiSquare",
+    "ReacquiringKalman", "RobustKalman", "RobustKalmanFilter", "SafeSet", "SafeState", "SafeStateBrake",
+    "SaturatedDistributedKalman", "SaturatedFilter", "Score", "SlidingMode", "SparseChiSquare",
+    "SparseGatedKalman", "StandStillSentinel", "Stateless", "Steered", "SteeredChallenge", "TailChiSquare",
     "TrimmedConsensus", "TrimmedFilter", "TrustFilter", "TrustingDistributedKalman", "Verdict", "Widen", "WideningKalman",
     "WindowedChiSquare", "WindowedKalman", "blame_all", "compose", "per_episode",
 ]  # fmt: skip
