@@ -22,12 +22,13 @@ import tailgate
 from tailgate import draws
 from tailgate.core import Model
 from tailgate.errors import InputError, NotApplicable
-from tailgate.files import remove, set_aside, sweep, writable_directory, write_atomic
+from tailgate.files import write_atomic
 from tailgate.metrics import METRICS, measure
+from tailgate.parts import Parts
 from tailgate.pool import abandon, processes
 from tailgate.registry import Entry, Spec, entry_for, text_of
 from tailgate.rounds import numbered
-from tailgate.rows import encode, packed, read_rows
+from tailgate.rows import packed
 from tailgate.scenario import Scenario, Suite, load_scenario, load_suite
 from tailgate.schema import as_data, canonical
 from tailgate.threat import Brief
@@ -210,70 +211,20 @@ def run(
     if workers < 1:
         raise InputError("workers", workers, "a whole number not below 1")
     ids = [cell_id(cell) for cell in cells]
-    done: dict[str, list[dict[str, Any]]] = {}
-    parts = None
-    if out is not None:
-        if out.is_dir():
-            raise InputError("out", str(out), "a file, not a directory")
-        parts = writable_directory(out.with_name(f".{out.name}.parts"))
-        for place in (out, parts):
-            sweep(place)
-        before = _held(out)
-        for i, cell in zip(ids, cells, strict=True):
-            if kept := _finished(parts / f"{i}.jsonl", cell, i) or _whole(before.get(i, []), cell, i):
-                done[i] = kept
+    pieces = {i: [(i, seed) for seed in cell.episodes] for i, cell in zip(ids, cells, strict=True)}
+    parts = None if out is None else Parts(out)
+    done = {} if parts is None else parts.finished(pieces)
     missing = [(i, cell) for i, cell in zip(ids, cells, strict=True) if i not in done]
     for position, rows in _play([cell for _, cell in missing], workers):
         done[missing[position][0]] = rows
         if parts is not None:
-            write_atomic(parts / f"{missing[position][0]}.jsonl", encode(rows))
+            parts.put(missing[position][0], rows)
         if progress is not None:
             progress(len(done), len(cells))
     rows = [row for i in ids for row in done[i]]
-    if out is not None and parts is not None:
-        _keep_others(out, set(ids))
-        write_atomic(out, packed(rows, out))
-        for i in ids:
-            remove(parts / f"{i}.jsonl")
-        with contextlib.suppress(OSError):  # something else lies there: not ours to remove
-            parts.rmdir()
+    if parts is not None:
+        parts.finish(rows, pieces)
     return rows
-
-
-def _finished(part: Path, cell: Cell, identity: str) -> list[dict[str, Any]]:
-    """The rows of a cell that was played before; none where one is missing or failed, or where the file is damaged."""
-    try:
-        rows = read_rows(part) if part.is_file() else []
-    except InputError:  # what the disk kept of it: the cell is played again
-        return []
-    return _whole(rows, cell, identity)
-
-
-def _whole(rows: list[dict[str, Any]], cell: Cell, identity: str) -> list[dict[str, Any]]:
-    """The rows, if they are all of a cell's and none failed; else none."""
-    whole = [row["seed"] for row in rows] == list(cell.episodes)
-    return rows if whole and all(row.get("cell") == identity and row["status"] != "error" for row in rows) else []
-
-
-def _held(out: Path) -> dict[str, list[dict[str, Any]]]:
-    """The rows of an earlier run by cell; none where there is no file that can be read."""
-    found: dict[str, list[dict[str, Any]]] = {}
-    with contextlib.suppress(InputError):
-        for row in read_rows(out) if out.is_file() else []:
-            found.setdefault(str(row.get("cell")), []).append(row)
-    return found
-
-
-def _keep_others(out: Path, ids: set[str]) -> None:
-    """Set a file aside that holds anything but rows of these cells: it is somebody's result."""
-    if not out.is_file():
-        return
-    try:
-        held = {row.get("cell") for row in read_rows(out)}
-    except InputError:
-        held = {None}
-    if not held <= ids:
-        set_aside(out)
 
 
 def _play(cells: Sequence[Cell], workers: int) -> Iterator[tuple[int, list[dict[str, Any]]]]:

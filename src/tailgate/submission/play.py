@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import hashlib
 from collections.abc import Callable, Iterator, Sequence
@@ -11,10 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from tailgate.errors import InputError
-from tailgate.evaluation import Cell, _keep_others, cells_of
-from tailgate.files import remove, sweep, writable_directory, write_atomic
+from tailgate.evaluation import Cell, cells_of
+from tailgate.parts import Parts
 from tailgate.pool import abandon, processes
-from tailgate.rows import encode, packed, read_rows
 from tailgate.scenario import Suite, load_suite
 from tailgate.submission.limits import Limits, Lost
 from tailgate.submission.mixed import Submission, part_of, play_mixed
@@ -70,8 +68,7 @@ def play_submission(
         if lost is not None:
             rows = [row for cell in cells for row in part_of(cell, submission, seeds).failed(seeds, lost)]
             if out is not None:
-                _keep_others(Path(out), {str(row["cell"]) for row in rows})
-                write_atomic(Path(out), packed(rows, Path(out)))
+                Parts(Path(out)).finish(rows, {"all": [(str(row["cell"]), row["seed"]) for row in rows]})
             return rows
         return _run(jobs, submission, seeds, Path(out) if out is not None else None, workers, progress)
 
@@ -83,43 +80,21 @@ def _run(
     """Rows of all jobs, one scenario each, in their order."""
     ids = [[str(part_of(cell, submission, seeds).head["cell"]) for cell in job] for job in jobs]
     names = [hashlib.blake2b("".join(each).encode(), digest_size=12).hexdigest() for each in ids]
-    done: dict[int, Rows] = {}
-    parts = None
-    if out is not None:
-        if out.is_dir():
-            raise InputError("out", str(out), "a file, not a directory")
-        parts = writable_directory(out.with_name(f".{out.name}.parts"))
-        for place in (out, parts):
-            sweep(place)
-        for i, (name, cells) in enumerate(zip(names, ids, strict=True)):
-            if kept := _finished(parts / f"{name}.jsonl", [(cell, seed) for cell in cells for seed in seeds]):
-                done[i] = kept
-    missing = [i for i in range(len(jobs)) if i not in done]
+    pieces = {name: [(cell, seed) for cell in cells for seed in seeds] for name, cells in zip(names, ids, strict=True)}
+    parts = None if out is None else Parts(out)
+    done = {} if parts is None else parts.finished(pieces)
+    missing = [i for i, name in enumerate(names) if name not in done]
     for position, rows in _play([jobs[i] for i in missing], submission, seeds, workers):
-        done[missing[position]] = rows
+        name = names[missing[position]]
+        done[name] = rows
         if parts is not None:
-            write_atomic(parts / f"{names[missing[position]]}.jsonl", encode(rows))
+            parts.put(name, rows)
         if progress is not None:
             progress(len(done), len(jobs))
-    rows = [row for i in range(len(jobs)) for row in done[i]]
-    if out is not None and parts is not None:
-        _keep_others(out, {cell for each in ids for cell in each})
-        write_atomic(out, packed(rows, out))
-        for name in names:
-            remove(parts / f"{name}.jsonl")
-        with contextlib.suppress(OSError):  # something else lies there: not ours to remove
-            parts.rmdir()
+    rows = [row for name in names for row in done[name]]
+    if parts is not None:
+        parts.finish(rows, pieces)
     return rows
-
-
-def _finished(path: Path, wanted: list[tuple[str, int]]) -> Rows:
-    """The rows of a scenario that was played before; none where one is missing or failed, or where the file is damaged."""
-    try:
-        rows = read_rows(path) if path.is_file() else []
-    except InputError:
-        return []
-    whole = [(row.get("cell"), row["seed"]) for row in rows] == wanted
-    return rows if whole and all(row["status"] != "error" for row in rows) else []
 
 
 def _play(jobs: Sequence[Sequence[Cell]], submission: Submission, seeds: list[int], workers: int) -> Iterator[tuple[int, Rows]]:
