@@ -81,11 +81,13 @@ def curve(cells, defence, level, doses):
 
 def critical(line, limit):
     """Where the curve crosses the limit, between doses in a straight line; None beyond the largest."""
+    least = line["points"][0]["dose"]  # below it nothing was played
+
     def cross(key):
         before = (0, 0.0)
         for p in line["points"]:
             if p[key] > limit:
-                return before[0] + (p["dose"] - before[0]) * (limit - before[1]) / (p[key] - before[1])
+                return max(least, before[0] + (p["dose"] - before[0]) * (limit - before[1]) / (p[key] - before[1]))
             before = (p["dose"], p[key])
         return None
 
@@ -94,7 +96,43 @@ def critical(line, limit):
     return {"value": cross("value"), "low": cross("high"), "high": cross("low"), "worst": worst}
 
 
-def make_board(name="synthetic-v0", *, bound=None, defences=DEFENCES, attacks=ATTACKS, scenarios=SCENARIOS, doses=DOSES):
+def bound_of(attacks, scenarios, dose, level, k, n=200):
+    """A lower bound (a rough one: a page only draws it) of k runs of n in the worst cell; the clean run is a cell too."""
+    met = [a for a, knowledge, _, _, optimal in attacks if not optimal and LEVELS.index(knowledge) <= LEVELS.index(level)]
+    return {"lower": max(0.0, k / n - 0.0625), "k": k, "n": n, "of": ["no_collision", "brakes"], "scenario": scenarios[-1], "dose": dose,
+            "attack": met[-1] if k < n else "none", "cells": (1 + len(met)) * len(scenarios), "alpha": 0.05, "alpha_cell": 0.001, "attacks": met}
+
+
+def trust_of(text, attacks, scenarios, dose):
+    """Bounds of an entry: full ones, of none at white box, of none at all, and null where it was not checked."""
+    if text == LONG:
+        return None
+    held = {"safety": {}, "all": {}}
+    for i, level in enumerate(LEVELS):
+        k = 200 if text == "oracle" else 190 - 40 * i - (len(text) * 7) % 20
+        lost = text == HOSTILE or (text == "none" and level == "white")
+        for name, runs in (("safety", k), ("all", k // 3)):
+            held[name][level] = None if lost else bound_of(attacks, scenarios, dose, level, runs)
+    for bound in filter(None, held["all"].values()):
+        bound["of"] = ["no_collision", "brakes", "detects"]
+    return held | {"why": "incomplete: /home/x/runs/sac-a/policy.json on a-v0: <b>boom</b>" if text == HOSTILE else "incomplete: stealth: no gate to pass" if text == "none" else ""}
+
+
+def about_trust(attacks, scenarios, doses):
+    return {
+        "alpha": 0.05, "runs": 200, "purpose": "report", "beacon": "", "scenarios": scenarios, "doses": doses,
+        "attacks": [{"attack": "none", "knowledge": "black", "note": ""}]
+        + [{"attack": a, "knowledge": k, "note": "a computed optimum: shown, and not counted" if o else ""} for a, k, _, _, o in attacks],
+        "unsafe": {"response": 0.6, "accel": 2.0, "brake": 5.0, "lead_brake": 5.0}, "demands": {"deadline": 0.6, "steps": 4, "braking": 2.0, "stands": 0.1, "detection": 10},
+        "properties": [
+            {"name": "no_collision", "about": "no collision, in front or behind, until the horizon", "safety": True},
+            {"name": "brakes", "about": "brakes within 600 ms whenever it is too close to stop after an attack began", "safety": True},
+            {"name": "detects", "about": "an alarm within 10 steps of the first attack step", "safety": False},
+        ],
+    }  # fmt: skip
+
+
+def make_board(name="synthetic-v0", *, bound=None, beacon="", trusted=True, defences=DEFENCES, attacks=ATTACKS, scenarios=SCENARIOS, doses=DOSES):
     cells = cells_of(defences, attacks, scenarios, doses)
     curves = [curve(cells, text, level, doses) for text, *_ in defences for level in LEVELS]
     entries, ranks = [], {}
@@ -126,6 +164,7 @@ def make_board(name="synthetic-v0", *, bound=None, defences=DEFENCES, attacks=AT
             "robustness": [{"scenario": scenarios[-1], "undamaged": {"value": 0.8, "low": 0.74}, "change": -0.07}],
             "stealth": [{"hours": h, "threshold": 9.0 + h, "deviation": strength * 0 + 1.5 + math.log10(h) + 40 / strength} for h in (0.1, 1, 10)]
             if text in ("kf", "chi2_kf:eta=15", "cusum_kf", "reacquire_kf") else None,
+            "trust": trust_of(text, attacks, scenarios, doses[-1]) if trusted else None,
         })  # fmt: skip
     ranked = [e["defence"] for e in entries if e["rank"] and e["class"] == "measurements"]
     duels = [(a, b) for i, a in enumerate(ranked) for b in ranked[i + 1 :]]
@@ -138,20 +177,21 @@ def make_board(name="synthetic-v0", *, bound=None, defences=DEFENCES, attacks=AT
         "suite": {
             "name": name, "about": "A made-up suite.", "version": "1", "doses": doses, "shown": {str(d): f"why {d}" for d in doses[1:4]}, "limit": 0.1,
             "bound": bound, "alpha": 0.05, "scenarios": [{"name": s, "about": "", "robustness": "heavy" in s, "hash": "ab12"} for s in scenarios],
-            "episodes": 200, "purpose": "report", "rows": 200 * len(cells),
+            "episodes": 200, "purpose": "report", "beacon": beacon, "rows": 200 * len(cells),
         },
-        "attacks": [{"attack": a, "knowledge": k, "learned": l, "optimal": o, "admitted": None if i else {"date": "2026-11-22", "p": 0.001}}
+        "attacks": [{"attack": a, "knowledge": k, "learned": l, "optimal": o, "trained_on": "chi2_kf:eta=15" if l else None, "admitted": None if i else {"date": "2026-11-22", "p": 0.001}}
                     for i, (a, k, _, l, o) in enumerate(attacks)],
         "entries": entries, "cells": cells, "curves": curves,
-        "comparisons": [{"class": "measurements", "a": a, "b": b, "only_a": 42, "only_b": 3 + 30 * i, "p": 1e-7 if i == 0 else 0.3, "adjusted": 1e-6 if i == 0 else 0.6}
+        "comparisons": [{"class": "measurements", "a": a, "b": b, "only_a": 42, "only_b": 3 + 30 * i, "weaker": a if i < 2 else b, "p": 1e-7 if i == 0 else 0.3, "adjusted": 1e-6 if i == 0 else 0.6}
                         for i, (a, b) in enumerate(duels)],
         "detection": {"hours": [0.1, 1, 10], "entries": seen},
+        "trust": about_trust(attacks, scenarios, doses) if trusted else None,
     }  # fmt: skip
 
 
 def network():
-    """A board without a road, of two defences and one scenario, where damage is an error above a bound."""
-    return make_board("network-v0", bound=25.0, defences=DEFENCES[:2], attacks=ATTACKS[:3], scenarios=["net-v0"], doses=[3])
+    """A board without a road, of two defences and one scenario, where damage is an error above a bound; of a round, and without trust."""
+    return make_board("network-v0", bound=25.0, beacon="drand <3> 5f1c", trusted=False, defences=DEFENCES[:2], attacks=ATTACKS[:3], scenarios=["net-v0"], doses=[3])
 
 
 def crashed_row():

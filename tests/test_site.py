@@ -4,6 +4,7 @@ import copy
 import hashlib
 import importlib.util
 import json
+import math
 import re
 from html.parser import HTMLParser
 from pathlib import Path
@@ -18,6 +19,7 @@ from tailgate.leaderboard.charts import Axis, Dot, Line, chart, nice, spread, ti
 from tailgate.leaderboard.site import build_site, slug
 from tailgate.leaderboard.site_entry import replay_of
 from tailgate.leaderboard.site_suite import figure
+from tailgate.leaderboard.site_trust import at_least
 
 spec = importlib.util.spec_from_file_location("boards", Path(__file__).with_name("boards.py"))
 boards = importlib.util.module_from_spec(spec)
@@ -90,8 +92,9 @@ def test_groups_order_and_figures(index):
     assert [row.split()[0] for row in rows[1:7]] == ["kf", "chi2_kf", "cusum_kf", "reacquire_kf", "brake_kf", "cra"]
     board = make_board()
     kf = next(e for e in board["entries"] if e["defence"] == "kf")
-    dose = kf["critical_dose"]["black"]
-    assert f"{dose['value']:.3g} {dose['low']:.3g} to {dose['high']:.3g}" in rows[1] and "1 of 3" in rows[1]
+    assert kf["critical_dose"]["black"]["value"] == 5 and "\N{LESS-THAN OR EQUAL TO} 5 \N{LESS-THAN OR EQUAL TO} 5 to" in rows[1] and "1 of 3" in rows[1]
+    dose = next(e for e in board["entries"] if e["defence"].startswith("chi2_kf"))["critical_dose"]["black"]
+    assert f"{dose['value']:.3g} {dose['low']:.3g} to {dose['high']:.3g}" in rows[2]
     rates = {(r["dose"], r["knowledge"]): r["undamaged"] for r in kf["rates"]}
     for dose in (10, 20, 40):
         assert f"{percent(rates[dose, 'white']['value'])} ≥ {percent(rates[dose, 'white']['low'])}" in rows[1]
@@ -133,6 +136,53 @@ def test_an_entry_s_page_has_all_parts(site):
     assert text.count('class="plot ') == 2  # a chart on each scale
     bare = entry(site, HOSTILE).read_text(encoding="utf-8")
     assert "came without a card" in bare and "No replay. The board holds no worst episode" in bare and "Stealth and impact" not in bare
+
+
+def cell_of(site, path, defence):
+    """Text and title of the trust cell of a defence, and the heads of the tables that it stands in."""
+    found = re.search(rf'<th scope="row" data-sort="{defence}">.*?<td class="num" data-sort="([^"]*)" title="([^"]*)"><b>([^<]*)</b></td>\n<td', path.read_text(), re.DOTALL)
+    return found.groups()
+
+
+def test_trust_names_its_attacks_and_is_never_rounded_up(site):
+    """The column is of safety at black box, its title of all properties; a dash says why; the entry's page has every bound with its worst cell."""
+    board = make_board()
+    by_name = {e["defence"]: e["trust"] for e in board["entries"]}
+    black = by_name["kf"]["safety"]["black"]
+    sort, about, text = cell_of(site, site, "kf")
+    assert float(sort) == pytest.approx(black["lower"]) and text == f"{math.floor(1000 * black['lower']) / 10:.1f}%" and at_least(0.99999) == "99.9%"
+    assert f"{black['k']} of 200 runs: radar-ppo-3" in about and "all properties" in about
+    assert cell_of(site, site, "oracle")[1].startswith("200 of 200 runs: no attack, car-following-heavy-v0, dose 200")
+    lines = Outline(entry(site, "none").read_text(encoding="utf-8")).rows("plain trust")
+    assert lines[2].startswith(f"black box {at_least(by_name['none']['safety']['black']['lower'])} {by_name['none']['safety']['black']['k']} of 200 5 0.05 / 12 radar-ppo-3")
+    assert lines[4] == "white box " + " ".join("\N{EN DASH}" * 4) and lines[5] == "All properties : no collision, brakes, detects" and len(lines) == 9
+    text = entry(site, "none").read_text(encoding="utf-8")
+    for part in ("incomplete: stealth: no gate to pass", "5 black box, 2 grey box, 3 white box", "a computed optimum: shown", "brakes within 600 ms", "detection 10 steps"):
+        assert part in text, part
+    assert "incomplete: sac-a/policy on a-v0: &lt;b&gt;boom" in entry(site, HOSTILE).read_text(encoding="utf-8")
+    assert "No bound where there is a dash: not among the defences that were checked" in entry(site, LONG).read_text(encoding="utf-8")
+    assert 'id="trust"' not in entry(site, "kf", "network-v0").read_text(encoding="utf-8")
+
+
+def test_round_and_weaker_are_said(site, index):
+    """Public seeds would pass for those of a round, or the wrong one of a pair for the weaker."""
+    text = site.read_text(encoding="utf-8")
+    assert text.count("public seeds: for development") == 1 and "seeds of the beacon drand &lt;3&gt; 5f1c" in text
+    pairs = [row for row in index.rows("cells") if row.startswith(("kf chi2_kf", "kf cusum_kf"))]
+    assert pairs[0].endswith("< 0.0001 < 0.0001 kf") and pairs[1].endswith("0.60 undecided") and text.count("(intersection-union)") == 2
+    assert any(row.startswith("radar-ppo-3 black box learned chi2_kf eta=15") for row in index.rows("cells"))
+
+
+def test_a_board_of_before_these_fields_is_drawn(tmp_path):
+    """Without round, trust, trainings and weaker nothing is claimed of them; no dose at all is damage without an attack."""
+    board = make_board(trusted=False)
+    for part, key in ((board["suite"], "beacon"), *((a, "trained_on") for a in board["attacks"]), *((c, "weaker") for c in board["comparisons"]), (board, "trust")):
+        del part[key]
+    board["entries"][0]["critical_dose"]["black"] |= {"value": 0.0, "low": 0.0}
+    text = build_site([board], tmp_path, replays=False).read_text(encoding="utf-8")
+    assert "public seeds" not in text and "Trust" not in text and "intersection" not in text and "McNemar" in text
+    assert 'title="damage without any attack; 95% interval 0 to' in text
+    assert "damage without any attack" in entry(tmp_path / "index.html", "kf").read_text(encoding="utf-8")
 
 
 def test_the_worst_episode_is_played_again(site, worst_row):
@@ -238,6 +288,15 @@ def test_links_lead_somewhere(site):
         (lambda b: b["curves"][0]["points"][0].update(value=1.5), "board.curves[0].points[0].value"),
         (lambda b: b["curves"][0].update(fitted=[0.1]), "board.curves[0].fitted"),
         (lambda b: b["comparisons"][0].update(b="nobody"), "board.comparisons[0].b"),
+        (lambda b: b["comparisons"][0].update(weaker="cra"), "board.comparisons[0].weaker"),
+        (lambda b: b["suite"].update(beacon=7), "board.suite.beacon"),
+        (lambda b: b["attacks"][0].update(trained_on=["kf"]), "board.attacks[0].trained_on"),
+        (lambda b: b.update(trust=None), "board.entries[0].trust"),
+        (lambda b: b["trust"].update(alpha="5 %"), "board.trust.alpha"),
+        (lambda b: b["entries"][0]["trust"].pop("safety"), "board.entries[0].trust.safety"),
+        (lambda b: b["entries"][0]["trust"]["all"]["grey"].update(lower=1.5), "board.entries[0].trust.all.grey.lower"),
+        (lambda b: b["entries"][0]["trust"]["all"]["grey"].update(k=201), "board.entries[0].trust.all.grey.k"),
+        (lambda b: b["entries"][0]["trust"]["all"]["grey"].update(attacks=["x"]), "board.entries[0].trust.all.grey.attacks"),
     ],
 )  # fmt: skip
 def test_what_is_not_of_the_format_names_its_field(change, field, tmp_path):

@@ -5,6 +5,7 @@ import dataclasses
 import json
 import re
 import shlex
+import shutil
 from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
@@ -14,8 +15,12 @@ import numpy as np
 import pytest
 
 from tailgate import cli, draws
+from tailgate.commands.board import _print_board
 from tailgate.errors import InputError
-from tailgate.evaluation import run_cell
+from tailgate.evaluation import evaluate, run_cell
+from tailgate.leaderboard.board_format import read_board
+from tailgate.leaderboard.run import board_of
+from tailgate.leaderboard.site_trust import at_least
 from tailgate.metrics import measure
 from tailgate.registry import Spec
 from tailgate.scenario import Suite, load_scenario, load_suite
@@ -262,13 +267,38 @@ def test_the_board_takes_the_bounds_of_its_own_suite_alone(found: Found, short: 
     """A column would show bounds of other scenarios, other formulas, or of runs that were stopped."""
     report, _ = found
     board = {"suite": {"name": "small", "version": report["version"]}, "entries": [{"defence": "chi2_kf"}, {"defence": "other"}]}
-    filled = with_trust(board, report)
-    assert filled["entries"][0]["trust"] == report["defences"][1]["trust"] and filled["entries"][1]["trust"] is None
+    filled, mine = with_trust(board, report), report["defences"][1]
+    assert filled["entries"][0]["trust"] == {"all": mine["trust"], "safety": mine["safety"], "why": ""} and filled["entries"][1]["trust"] is None
+    assert {p["name"]: p["safety"] for p in filled["trust"]["properties"]} == {"no_collision": True, "brakes": True, "detects": False}
     assert filled["trust"]["alpha"] == 0.05 and [a["attack"] for a in filled["trust"]["attacks"]] == ["none", JAM, RAMP]
     json.dumps(filled, allow_nan=False)
     for change in ({"suite": {"name": "custom"}}, {"version": "0"}, {"formulas": ["G gap > 0"]}, {"rule": {"name": "sprt"}}, {"format": "x"}):
         with pytest.raises(InputError, match="trust: "):
             with_trust(board, report | change)
+    for broken in (3, {"format": report["format"]}, report | {"defences": [3]}, report | {"cells": None}):
+        with pytest.raises(InputError, match=r"x\.json"):
+            with_trust(board, broken, "trust x.json")
+
+
+def test_a_board_takes_up_the_report_that_lies_beside_its_rows(found: Found, short: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The bounds would be lost between the commands, a table would show an empty column, or a file that was cut would end in a traceback."""
+    suite = _suite(short)
+    evaluate(suite, out=tmp_path / "rows.jsonl")
+    bare = board_of(suite, tmp_path)
+    _print_board(bare)
+    words = " ".join(capsys.readouterr().out.split())
+    assert "trust" not in words and "public seeds: for development" in words and "trust" not in bare
+    shutil.copytree(found[1], tmp_path / "trust")
+    board = board_of(suite, tmp_path)
+    assert board == with_trust(bare, found[0]) == json.loads((tmp_path / "board.json").read_text()) and read_board(board).trust is not None
+    board["suite"]["beacon"] = "[b]1"
+    _print_board(board)
+    words = " ".join(capsys.readouterr().out.split())
+    assert "trust" in words and "seeds of the beacon [b]1" in words and at_least(found[0]["defences"][0]["safety"]["black"]["lower"]) in words
+    for text in ("{", "[]", '{"a": NaN}', json.dumps(found[0] | {"version": "0"})):
+        (tmp_path / "trust" / "trust.json").write_text(text)
+        with pytest.raises(InputError, match=r"trust\.json"):
+            board_of(suite, tmp_path)
 
 
 def test_the_worst_failing_run_is_replayed_by_the_command_that_is_printed(tmp_path: Path, short: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:

@@ -110,8 +110,10 @@ def _print_board(board: dict[str, Any]) -> None:
     """The head of a board."""
     suite = board["suite"]
     doses = list(suite["shown"]) or [str(dose) for dose in suite["doses"]]
-    table = Table(title=f"{suite['name']}, {suite['episodes']} episodes a cell, black box")
-    for heading in ("defence", "class", "rank", "critical dose", *(f"undamaged at {dose}" for dose in doses), "why not"):
+    seeds = f"seeds of the beacon {suite['beacon']}" if suite["beacon"] else "public seeds: for development"
+    table = Table(title=escape(f"{suite['name']}, {suite['episodes']} episodes a cell, black box, {seeds}"))
+    trust = ["trust (safety)"] if any(entry.get("trust") for entry in board["entries"]) else []
+    for heading in ("defence", "class", "rank", "critical dose", *(f"undamaged at {dose}" for dose in doses), *trust, "why not"):
         table.add_column(heading, overflow="fold")
     for entry in sorted(board["entries"], key=lambda e: (e["rank"] is None, (e["rank"] or {}).get("best", 0))):
         rank, critical = entry["rank"], entry["critical_dose"]["black"]
@@ -119,8 +121,17 @@ def _print_board(board: dict[str, Any]) -> None:
         shown = [f"{100 * rates[d]['value']:.0f} % (at least {100 * rates[d]['low']:.0f})" if d in rates else "-" for d in doses]
         place = "-" if rank is None else str(rank["best"]) if rank["best"] == rank["worst"] else f"{rank['best']} to {rank['worst']}"
         dose = "-" if critical is None else _dose(critical, suite["doses"])
+        if trust:
+            shown.append(_trust(entry["trust"]))
         table.add_row(escape(entry["defence"]), entry["class"], place, dose, *shown, escape(entry["why"]))
     console().print(table)
+
+
+def _trust(held: dict[str, Any] | None) -> str:
+    from tailgate.leaderboard.site_trust import at_least
+
+    bound = held["safety"]["black"] if held else None
+    return "-" if bound is None else f"at least {at_least(bound['lower'])}"
 
 
 def _dose(critical: dict[str, Any], doses: list[int | None]) -> str:

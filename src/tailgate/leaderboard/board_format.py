@@ -44,6 +44,7 @@ class SuitePart(Part):
     scenarios: list[ScenarioPart]
     episodes: Count | None = None
     purpose: Text = ""
+    beacon: Text | None = None  # empty: public seeds; None: not stated
     rows: Count | None = None
 
 
@@ -52,6 +53,7 @@ class AttackPart(Part):
     knowledge: Level
     learned: bool = False
     optimal: bool = False
+    trained_on: Text | None = None
     admitted: dict[str, Any] | None = None
     note: Text = ""
     withdrawn: bool = False
@@ -124,6 +126,29 @@ class Stealth(Part):
     deviation: Number | None
 
 
+class Bound(Part):
+    """A lower bound of the probability that a run keeps to properties, and the cell that it comes from."""
+
+    lower: Share
+    k: Count
+    n: Count
+    of: list[Text]
+    scenario: Text
+    dose: Dose
+    attack: Text
+    cells: Count
+    alpha: Share
+    attacks: list[Text]
+
+
+class EntryTrust(Part):
+    """Bounds of all properties together, and of those without detection; None where a cell has no figure, `why` says which."""
+
+    all: dict[Level, Bound | None]
+    safety: dict[Level, Bound | None]
+    why: Text = ""
+
+
 class EntryPart(Part):
     defence: Text
     card: dict[str, Any] | None = None
@@ -140,6 +165,7 @@ class EntryPart(Part):
     worst_episode: dict[str, Any] | None = None
     robustness: list[Robust] = []
     stealth: list[Stealth] | None = None
+    trust: EntryTrust | None = None
 
 
 class CellPart(Part):
@@ -173,7 +199,7 @@ class CurvePart(Part):
 
 
 class Comparison(Part):
-    """Two defences on the same seeds; only_a: episodes in which a alone came to damage."""
+    """Two defences on the same seeds; only_a: episodes in which a alone came to damage; weaker: the side that p speaks of."""
 
     class_: Text = Field("", alias="class")
     a: Text
@@ -182,6 +208,7 @@ class Comparison(Part):
     only_b: Count
     p: Share
     adjusted: Share
+    weaker: Text | None = None
 
 
 class Detected(Part):
@@ -199,6 +226,33 @@ class Detection(Part):
     entries: list[Detected]
 
 
+class TrustAttack(Part):
+    attack: Text
+    knowledge: Level
+    note: Text = ""
+
+
+class TrustProperty(Part):
+    name: Text
+    about: Text = ""
+    safety: bool
+
+
+class TrustPart(Part):
+    """What the bounds of all entries are about."""
+
+    alpha: Share
+    runs: Count
+    purpose: Text = ""
+    beacon: Text = ""
+    attacks: list[TrustAttack]
+    scenarios: list[Text] = []
+    doses: list[Dose] = []
+    unsafe: dict[str, Number] = {}
+    demands: dict[str, Number] = {}
+    properties: list[TrustProperty] = []
+
+
 class Board(Part):
     format: Literal["tailgate-board-1"]
     suite: SuitePart
@@ -208,6 +262,7 @@ class Board(Part):
     curves: list[CurvePart] = []
     comparisons: list[Comparison] = []
     detection: Detection | None = None
+    trust: TrustPart | None = None
 
 
 def read_board(data: Any, where: str = "board") -> Board:
@@ -249,6 +304,26 @@ def _agree(board: Board, where: str) -> None:
         for side in ("a", "b"):
             if getattr(duel, side) not in names:
                 raise InputError(f"{where}.comparisons[{i}].{side}", getattr(duel, side), "one of the entries' defences")
+        if duel.weaker not in (None, duel.a, duel.b):
+            raise InputError(f"{where}.comparisons[{i}].weaker", duel.weaker, f"{duel.a} or {duel.b}")
+    for i, entry in enumerate(board.entries):
+        if entry.trust is not None:
+            _bounded(board, entry.trust, f"{where}.entries[{i}].trust")
     for key in board.suite.shown:
         if key not in {str(dose) for dose in board.suite.doses}:
             raise InputError(f"{where}.suite.shown", key, f"one of the suite's doses {board.suite.doses}")
+
+
+def _bounded(board: Board, trust: EntryTrust, where: str) -> None:
+    """Bounds are of attacks that the board names, and of no more successes than runs."""
+    if board.trust is None:
+        raise InputError(where, "bounds", "null, as the board has no field trust")
+    known = {a.attack for a in board.trust.attacks}
+    for name, held in (("all", trust.all), ("safety", trust.safety)):
+        for level, bound in held.items():
+            if bound is None:
+                continue
+            if bound.k > bound.n:
+                raise InputError(f"{where}.{name}.{level}.k", bound.k, f"at most {bound.n}, the number of runs")
+            if missing := {bound.attack, *bound.attacks} - known:
+                raise InputError(f"{where}.{name}.{level}.attacks", min(missing), "one of the attacks in the board's trust")

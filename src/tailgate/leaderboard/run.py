@@ -16,12 +16,14 @@ from tailgate.scenario import Suite
 from tailgate.scoring import attacks as admitted
 from tailgate.scoring.board import score
 from tailgate.scoring.damage import CLEAN
+from tailgate.trust.run import REPORT, with_trust
 
 from .card import with_cards
 
 OWN = "rows.jsonl.xz"  # what `run` plays; other files of rows beside it come from `attack` and `submit`
 LIST = "attacks.jsonl"
 CARDS = "cards"  # folder of what authors say of their entries
+TRUST = "trust"  # folder that `tailgate trust` wrote
 Progress = Callable[[str, int, int], None]  # suite, done, total
 
 
@@ -41,14 +43,29 @@ def play(
 
 
 def board_of(suite: Suite, folder: Path, **options: Any) -> dict[str, Any]:
-    """The board of all rows in a folder; written there as board.json. Raises InputError where there are none."""
+    """The board of all rows in a folder, with the bounds of its trust/trust.json; written there as board.json.
+
+    Raises InputError where there are no rows, and for a report that cannot be read or is of something else.
+    """
     found = sorted(path for path in folder.glob("**/*") if path.name.endswith((".jsonl", ".jsonl.xz")) and path.name != LIST)
     within = [(path, path.relative_to(folder).parts) for path in found]
-    others = {"policies", "trust"}
+    others = {"policies", TRUST}
     files = [path for path, parts in within if not others & set(parts) and not any(part.startswith(".") for part in parts)]
     if not files:
         raise InputError("rows", str(folder), "a folder with rows of `leaderboard run`")
     rows = [row for path in files for row in read_rows(path)]
     board = with_cards(score(rows, suite, attacks=admitted.read(folder / LIST), **options), folder / CARDS)
+    if (report := folder / TRUST / REPORT).is_file():
+        board = with_trust(board, _report(report), f"trust {report}")
     write_atomic(folder / "board.json", json.dumps(board, indent=1, allow_nan=False).encode() + b"\n")
     return board
+
+
+def _report(path: Path) -> Any:
+    def refuse(constant: str) -> None:
+        raise ValueError(f"{constant} is no number of JSON")
+
+    try:
+        return json.loads(path.read_text(encoding="utf-8"), parse_constant=refuse)
+    except (OSError, ValueError) as error:
+        raise InputError("trust", str(path), f"a readable JSON file ({error})") from None

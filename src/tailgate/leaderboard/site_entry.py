@@ -15,8 +15,9 @@ from tailgate.replay.replay import play
 from .board_format import LEVELS, CellPart, EntryPart, Robust
 from .build import names_of, percent
 from .site_curves import curves_of
-from .site_index import comparisons_of
+from .site_index import compared_how, comparisons_of
 from .site_suite import Data, Suite, critical_of, dose_text, figure, share_of, worse
+from .site_trust import trust_of, trust_page
 
 SHOWN = ("name", "summary", "parameters")  # of a card: shown in a place of their own
 ORDER = ("reference", "code", "licence", "uses", "authors", "threat_model", "training", "digest", "sentinel", "version")
@@ -189,5 +190,6 @@ def entry_page(suite: Suite, entry: EntryPart, replayed: Replayed | None, also: 
         "robustness": [_robust(suite, r) for r in entry.robustness],
         "stealth": [{"hours": figure(s.hours), "threshold": figure(s.threshold), "deviation": figure(s.deviation, 3)}
                     for s in entry.stealth or ()],
-        "detection": detection, "comparisons": comparisons_of(suite, entry.defence), "replay": replayed,
+        "detection": detection, "comparisons": comparisons_of(suite, entry.defence), "how": compared_how(suite),
+        "round": suite.round, "about_trust": trust_of(suite), "trust": trust_page(suite, entry), "replay": replayed,
     }  # fmt: skip

@@ -6,6 +6,7 @@ from .board_format import LEVELS, CellPart, Level
 from .build import percent
 from .site_curves import curves_of, stealth_of, together_of
 from .site_suite import GROUPS, Data, Suite, cell_of, critical_of, dose_text, figure, gates_of, share_of, worse
+from .site_trust import trust_cell, trust_of
 
 
 def _lines(suite: Suite) -> list[Data]:
@@ -23,7 +24,7 @@ def _lines(suite: Suite) -> list[Data]:
             "class": entry.class_ or "not stated", "rank": rank,
             "critical": [critical_of(suite, entry.critical_dose.get(level)) for level in ("black", "white")],
             "rates": [{level: rates.get((dose, level), share_of(None)) for level in LEVELS} for dose in suite.shown],
-            "gates": gates_of(entry), "flags": entry.flags, "status": entry.status, "why": entry.why,
+            "trust": trust_cell(suite, entry), "gates": gates_of(entry), "flags": entry.flags, "status": entry.status, "why": entry.why,
         })  # fmt: skip
     return out
 
@@ -109,18 +110,30 @@ def detection_of(suite: Suite) -> Data | None:
 
 
 def comparisons_of(suite: Suite, defence: str | None = None) -> list[Data]:
-    """Pairs of a class: who came to damage less often where the two differ; of one defence only, those that it is in."""
+    """Pairs of a class, and which of the two is surely weaker; of one defence only, those that it is in."""
     out = []
     for duel in suite.board.comparisons:
         if defence in (None, duel.a, duel.b):
-            sure = duel.adjusted <= suite.board.suite.alpha and duel.only_a != duel.only_b
-            better = duel.a if duel.only_a < duel.only_b else duel.b
+            weaker = duel.weaker or (duel.a if duel.only_a > duel.only_b else duel.b)
+            sure = duel.adjusted <= suite.board.suite.alpha and (duel.weaker is not None or duel.only_a != duel.only_b)
             out.append({
                 "class": duel.class_ or "not stated", "a": suite.defences[duel.a], "b": suite.defences[duel.b],
                 "only_a": duel.only_a, "only_b": duel.only_b, "p": _small(duel.p), "adjusted": _small(duel.adjusted),
-                "sort": f"{duel.p:.6g}", "sort_adjusted": f"{duel.adjusted:.6g}", "better": suite.defences[better] if sure else None,
+                "sort": f"{duel.p:.6g}", "sort_adjusted": f"{duel.adjusted:.6g}", "weaker": suite.defences[weaker] if sure else None,
             })  # fmt: skip
     return out
+
+
+def compared_how(suite: Suite) -> str:
+    """The test of the comparisons in a sentence; boards that do not say who is weaker were made with a simpler one."""
+    alpha = figure(suite.board.suite.alpha)
+    if not any(duel.weaker for duel in suite.board.comparisons):
+        return f"Each at its own worst case at the middle dose, on the same seeds: McNemar's exact test, corrected after Holm, at {alpha}."
+    return (
+        "One is surely weaker where its worst attack at the middle dose does more damage than every attack of the other does to that one, "
+        "on the same seeds: McNemar's exact tests, the largest p of them (intersection-union), times the number of attacks that the worst "
+        f"was chosen from (Bonferroni), two-sided, and corrected after Holm for the pairs of the class, at {alpha}."
+    )
 
 
 def _small(p: float) -> str:
@@ -132,8 +145,9 @@ def attacks_of(suite: Suite) -> list[Data]:
     for attack in suite.board.attacks:
         admitted = "with the suite" if attack.admitted is None else "; ".join(f"{k} {v}" for k, v in attack.admitted.items())
         name = suite.attacks[attack.attack]
+        on = suite.defences[attack.trained_on] if attack.trained_on else None
         out.append({"name": name, "knowledge": attack.knowledge, "learned": attack.learned or name.policy, "optimal": attack.optimal,
-                    "admitted": admitted, "note": attack.note})  # fmt: skip
+                    "trained_on": on, "admitted": admitted, "note": attack.note})  # fmt: skip
     return out
 
 
@@ -144,10 +158,12 @@ def section(suite: Suite) -> Data:
     groups = [{"title": t, "about": about, "rows": [r for r in rows if r["status"] == s]} for s, t, about in GROUPS]
     doses = [{"text": dose_text(d), "why": board.suite.shown.get(str(d), "")} for d in suite.shown]
     return {
-        "suite": board.suite, "damage": suite.damage, "folder": suite.folder, "count": len(rows), "doses": doses,
+        "suite": board.suite, "round": suite.round, "trust": trust_of(suite), "damage": suite.damage, "folder": suite.folder,
+        "count": len(rows), "doses": doses,
         "all_doses": ", ".join(dose_text(d) for d in board.suite.doses), "limit": percent(board.suite.limit),
         "groups": [g for g in groups if g["rows"]], "classes": sorted({r["class"] for r in rows}),
         "statuses": [s for s, *_ in GROUPS if any(r["status"] == s for r in rows)], "levels": LEVELS,
         "heat": heat_of(suite), "scale": suite.scale, "together": together_of(suite), "curves": curves_of(suite),
         "stealth": stealth_of(suite), "detection": detection_of(suite), "comparisons": comparisons_of(suite), "attacks": attacks_of(suite),
+        "how": compared_how(suite),
     }  # fmt: skip

@@ -45,13 +45,15 @@ class Suite:
     def __post_init__(self) -> None:
         b = self.board
         duels = [d for e in (b.detection.entries if b.detection else ()) for d in (e.defence,)]
-        self.defences = names_of(dict.fromkeys([*(e.defence for e in b.entries), *duels]))
+        taught = [a.trained_on for a in b.attacks if a.trained_on]
+        self.defences = names_of(dict.fromkeys([*(e.defence for e in b.entries), *duels, *taught]))
         worst = [w.attack for e in b.entries for c in (*e.critical_dose.values(), *e.rates) if c and (w := c.worst)]
         points = [p.attack for c in b.curves for p in c.points]
         robust = [r.worst.attack for e in b.entries for r in e.robustness if r.worst]
         heard = [e.attack for e in (b.detection.entries if b.detection else ())]
         own = [*(a.attack for a in b.attacks), *(c.attack for c in b.cells)]
-        self.attacks = names_of(dict.fromkeys([*own, *worst, *points, *heard, *robust]))
+        trusted = [a.attack for a in b.trust.attacks] if b.trust else []
+        self.attacks = names_of(dict.fromkeys([*own, *worst, *points, *heard, *robust, *trusted]))
 
     @property
     def largest(self) -> int | None:
@@ -87,6 +89,12 @@ class Suite:
     def axis(self, scale: str) -> Axis:
         places = self.places or [0.0]
         return Axis(0.0 if scale == "linear" else places[0], places[-1], scale)
+
+    @property
+    def round(self) -> str:
+        """Whose seeds the episodes are of; empty where the board does not say."""
+        beacon = self.board.suite.beacon
+        return "" if beacon is None else f"seeds of the beacon {beacon}" if beacon else "public seeds: for development"
 
     def where(self, scenario: str, attack: str) -> str:
         name = self.attacks[attack].full if attack in self.attacks else attack
@@ -126,9 +134,11 @@ def critical_of(suite: Suite, critical: Critical | None) -> Data:
         return 100.0 if x is None else min(max(axis.at(x), 0.0), 100.0)
 
     span = "" if critical.low is None else f"{words(critical.low)} to {words(critical.high)}"
-    worst = suite.where(critical.worst.scenario, critical.worst.attack) if critical.worst else ""
+    clean = critical.value == 0.0  # then no attack is to blame
+    worst = suite.where(critical.worst.scenario, critical.worst.attack) if critical.worst and not clean else ""
     bar = {"low": at(critical.low), "x": at(critical.value), "high": at(critical.high), "beyond": critical.value is None}
-    about = [f"{percent(1 - suite.board.suite.alpha)} interval {span}"] * bool(span) + [f"worst: {worst}"] * bool(worst)
+    about = ["damage without any attack"] * clean
+    about += [f"{percent(1 - suite.board.suite.alpha)} interval {span}"] * bool(span) + [f"worst: {worst}"] * bool(worst)
     sort = _sort_dose(critical)
     return {
         "text": words(critical.value), "sort": "Infinity" if sort == math.inf else f"{sort:.6g}", "span": span, "bar": bar, "worst": worst,

@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import shlex
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import as_completed
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
@@ -26,7 +26,7 @@ from tailgate.scenario import Suite, load_scenario
 from tailgate.schema import as_data
 
 from .cells import Job, Row, check_cell, failed, single
-from .properties import Demands, own
+from .properties import CONJUNCTIONS, Demands, own
 from .report import FORMAT, report
 from .signals import SafeDistance
 from .statistics import Sequential, Sprt
@@ -182,19 +182,31 @@ def replay_command(defence: str, attack: str, folder: Path, line: int) -> str:
     return shlex.join(words + [word for family, text in named for word in (f"--{family}", text)])
 
 
-def with_trust(board: dict[str, Any], found: dict[str, Any]) -> dict[str, Any]:
-    """A board with the field `trust`: of each entry by what the attacker knows, and of the board what the bounds are about.
+def with_trust(board: dict[str, Any], found: Any, where: str = "trust") -> dict[str, Any]:
+    """A board with the field `trust`: of the board what the bounds are about; of each entry its bounds by what the attacker knows, of `all`
+    properties together and of `safety`, those without detection. An entry that the report does not know has null.
 
-    Raises InputError for a report of another suite, of another version, of a user's own formulas or of runs that a rule stopped.
+    Raises InputError for what is no report, and for one of another suite or version, of own formulas or of runs that a rule stopped.
     """
-    if found.get("format") != FORMAT:
-        raise InputError("trust: format", found.get("format"), FORMAT)
-    for name, mine, other in (
-        ("suite", found["suite"]["name"], board["suite"]["name"]), ("version", found["version"], board["suite"]["version"]),
-        ("formulas", found["formulas"], []), ("rule", found["rule"]["name"], "fixed"),
-    ):  # fmt: skip
-        if mine != other:
-            raise InputError(f"trust: {name}", mine, repr(other))
-    by_name = {entry["defence"]: entry["trust"] for entry in found["defences"]}
-    head = {key: found[key] for key in ("alpha", "runs", "purpose", "attacks", "scenarios", "doses", "unsafe", "demands")}
-    return board | {"trust": head, "entries": [entry | {"trust": by_name.get(entry["defence"])} for entry in board["entries"]]}
+    if not isinstance(found, Mapping) or found.get("format") != FORMAT:
+        raise InputError(f"{where}: format", found.get("format") if isinstance(found, Mapping) else found, FORMAT)
+    try:
+        for name, mine, other in (
+            ("suite", found["suite"]["name"], board["suite"]["name"]), ("version", found["version"], board["suite"]["version"]),
+            ("formulas", found["formulas"], []), ("rule", found["rule"]["name"], "fixed"),
+        ):  # fmt: skip
+            if mine != other:
+                raise InputError(f"{where}: {name}", mine, repr(other))
+        head = {key: found[key] for key in ("alpha", "runs", "purpose", "attacks", "scenarios", "doses", "unsafe", "demands")}
+        head |= {"beacon": found.get("beacon", ""), "properties": _asked(found)}
+        bounds = {e["defence"]: {"all": e["trust"], "safety": e["safety"], "why": e["why"]} for e in found["defences"]}
+    except (KeyError, TypeError) as error:
+        raise InputError(where, f"{type(error).__name__}: {error}", "a whole report of `tailgate trust`") from None
+    return board | {"trust": head, "entries": [entry | {"trust": bounds.get(entry["defence"])} for entry in board["entries"]]}
+
+
+def _asked(found: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """The properties that have a meaning in some scenario of a report, and which of them are of safety."""
+    asked = {p["name"] for cell in found["cells"] for p in cell["properties"] if p["formula"] is not None}
+    about = {p["name"]: p["about"] for entry in found["defences"] for p in entry["properties"]}
+    return [{"name": name, "about": text, "safety": name in CONJUNCTIONS["safety"]} for name, text in about.items() if name in asked]
