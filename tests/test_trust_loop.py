@@ -23,6 +23,7 @@ from tailgate.leaderboard.run import board_of
 from tailgate.leaderboard.site_trust import at_least
 from tailgate.metrics import measure
 from tailgate.registry import Spec
+from tailgate.rounds import seeds_of
 from tailgate.scenario import Suite, load_scenario, load_suite
 from tailgate.scoring.ranks import mcnemar
 from tailgate.trace import rollout
@@ -363,3 +364,16 @@ def test_one_episode_is_that_of_its_cell(short: str) -> None:
     (row,) = run_cell(single(job, 5))
     values = measure(rollout(load_scenario(short).loop(Spec("defence", "chi2_kf").make()), Spec("attack", RAMP).make(), draws.keys("report", range(8))))
     assert row["seed"] == 5 and row["min_gap"] == values["min_gap"][5]
+
+
+def test_the_round_of_a_beacon_is_checked_on_its_own_seeds() -> None:
+    """Every seed of the report is one of the round's, and a report of another round is refused by a board."""
+    suite = dataclasses.replace(load_suite("quick-v0"), scenarios=("gusty-stop-and-go-v0",), defences=("kf",), attacks=("none", "dos_jam:trigger=near,threshold=40"))
+    found = check(suite, runs=4, beacon="0123456789abcdef")
+    seeds = seeds_of("0123456789abcdef", "quick-v0", "report", 4)
+    assert found["beacon"] == "0123456789abcdef" and found["defences"][0]["worst"]["seed"] in seeds
+    assert {p["seed"] for cell in found["cells"] for p in cell["properties"] if p.get("seed") is not None} <= set(seeds)
+    board = {"suite": {"name": "quick-v0", "version": found["version"], "beacon": ""}, "entries": []}
+    with pytest.raises(InputError, match="beacon"):
+        with_trust(board, found)
+    assert with_trust(board | {"suite": board["suite"] | {"beacon": "0123456789abcdef"}}, found)["trust"]["beacon"]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
+import math
 import sys
 from pathlib import Path
 from typing import Any
@@ -48,6 +49,7 @@ def add(commands: Any) -> None:
     early.add_argument("--width", type=float, metavar="W", help="explore: stop a cell when its 95 %% interval is no wider than W")
     early.add_argument("--test", type=float, metavar="P", help="explore: stop a cell when a sequential test of P >= this is decided")
     command.add_argument("--indifference", type=float, default=0.05, metavar="D", help="the test's other hypothesis lies so far below")
+    command.add_argument("--beacon", default="", metavar="TEXT", help="the round of a board: its seeds are played")
     command.add_argument("--purpose", default="report", help="which seeds: train, tune, calibrate, select or report (default)")
     command.add_argument("--batch", type=int, default=2048, metavar="N", help="episodes side by side (default 2048); changes no result")
     command.add_argument("--workers", type=int, default=1, metavar="N", help="processes (default 1); changes no result")
@@ -106,7 +108,8 @@ def _trust(options: argparse.Namespace) -> int:
         runs = 10_000
     with progress(Console(stderr=True)) as update:
         found = check(
-            suite, runs=runs, formulas=options.property, alpha=options.alpha, purpose=options.purpose, batch=options.batch,
+            suite, runs=runs, formulas=options.property, alpha=options.alpha, purpose=options.purpose, beacon=options.beacon,
+            batch=options.batch,
             workers=options.workers, folder=Path(options.out) if options.out else None, threat=_values("--threat", options.threat),
             safe=build(SafeDistance, _values("--unsafe", options.unsafe), "--unsafe"),
             asked=build(Demands, _values("--demand", options.demand), "--demand"), rule=rule,
@@ -124,6 +127,11 @@ def _trust(options: argparse.Namespace) -> int:
     for cell in lost:
         print(f"tailgate: {cell['defence']} against {cell['attack']} on {cell['scenario']} failed: {cell['reason']}", file=sys.stderr)
     return 1 if lost else 0
+
+
+def at_least(share: float) -> str:
+    """A lower bound in percent, never rounded up."""
+    return f"{math.floor(1000 * share + 1e-9) / 10:.1f} %"
 
 
 def _percent(value: float) -> str:
@@ -152,7 +160,7 @@ def _print_bounds(found: dict[str, Any]) -> None:
             figures: list[str] = []
             for name in names:
                 held = entry[name][level]
-                shown = ["-", "-", "-"] if held is None else [_percent(held["lower"]), f"{held['k']} of {held['n']}", _place(held)]
+                shown = ["-", "-", "-"] if held is None else [at_least(held["lower"]), f"{held['k']} of {held['n']}", _place(held)]
                 figures += shown
             table.add_row(escape(entry["defence"]), level, *figures, escape(entry["why"]) if "-" in figures else "")
     out.print(table)

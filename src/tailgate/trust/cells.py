@@ -113,8 +113,7 @@ def _played(job: Job, loop: Loop, attack: Any, known: Sequence[Property]) -> dic
     size = episodes_at_once(loop.model, loop.horizon, cell.batch if job.rule is None else min(cell.batch, 64))
     parts: dict[str, list[Outcome]] = {p.name: [] for p in known}
     for start in range(0, cell.seeds, size):
-        seeds = range(cell.first_seed + start, cell.first_seed + min(start + size, cell.seeds))
-        trace = rollout(loop, attack, draws.keys(cell.purpose, seeds))
+        trace = rollout(loop, attack, draws.keys(cell.purpose, cell.episodes[start : start + size]))
         for p in known:
             parts[p.name].append(outcome(p, trace, job.safe))
         if job.rule is not None and known:
@@ -139,12 +138,12 @@ def _summary(job: Job, known: Sequence[Property], found: dict[str, Outcome]) -> 
             together[name] = {"of": list(members), "k": int(runs.sum()), "runs": np.packbits(runs).tobytes().hex()}
     verdict = job.rule.stop(_bits(together["trust"]["runs"], n)) if job.rule is not None and together else None
     return {
-        "n": n, "properties": [_property(p, found.get(p.name), job.cell.first_seed) for p in known], "conjunctions": together,
-        "verdict": None if verdict is None else verdict.holds, "worst": _worst(known, found, job.cell.first_seed),
+        "n": n, "properties": [_property(p, found.get(p.name), job.cell) for p in known], "conjunctions": together,
+        "verdict": None if verdict is None else verdict.holds, "worst": _worst(known, found, job.cell),
     }  # fmt: skip
 
 
-def _property(known: Property, found: Outcome | None, first: int) -> Row:
+def _property(known: Property, found: Outcome | None, cell: Cell) -> Row:
     """k of n runs satisfy it; its antecedent held in `asked` of them, of which `answered` satisfy it, at a share `instants` of steps."""
     out: Row = {"name": known.name, "about": known.about, "reason": known.reason, "formula": None}
     if found is None:
@@ -156,7 +155,7 @@ def _property(known: Property, found: Outcome | None, first: int) -> Row:
         "asked": int(found.asked.sum()) if conditional else None,
         "answered": int((found.holds & found.asked).sum()) if conditional else None,
         "instants": float(found.instants.sum() / found.steps.sum()) if conditional else None,
-        "least": _finite(found.robustness[least]), "seed": first + least,
+        "least": _finite(found.robustness[least]), "seed": cell.episodes[least],
     }  # fmt: skip
 
 
@@ -164,13 +163,13 @@ def _finite(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None
 
 
-def _worst(known: Sequence[Property], found: dict[str, Outcome], first: int) -> Row | None:
+def _worst(known: Sequence[Property], found: dict[str, Outcome], cell: Cell) -> Row | None:
     """The run that fails the first of the properties that any run fails, by the most."""
     for p in known:
         if p.name in found and not found[p.name].holds.all():
             of = found[p.name]
             i = int(np.argmin(np.where(of.holds, np.inf, of.robustness)))
-            return {"property": p.name, "seed": first + i, "robustness": _finite(of.robustness[i])}
+            return {"property": p.name, "run": i, "seed": cell.episodes[i], "robustness": _finite(of.robustness[i])}
     return None
 
 
@@ -183,6 +182,6 @@ def runs_of(row: Row, conjunction: str) -> Array:
     return _bits(row["conjunctions"][conjunction]["runs"], row["n"])
 
 
-def single(job: Job, seed: int) -> Cell:
-    """The cell of one episode of a job: its trace is the one that was checked, as a row does not depend on the episodes beside it."""
-    return replace(job.cell, first_seed=seed, seeds=1)
+def single(job: Job, run: int) -> Cell:
+    """The cell of one run of a job, by its number. Its trace is the one that was checked: a row does not depend on those beside it."""
+    return replace(job.cell, first_seed=job.cell.first_seed + run, seeds=1)

@@ -30,7 +30,8 @@ def report(rows: Sequence[Row], suite: Suite, *, alpha: float, settings: Data) -
     entries = [_entry(defence, counted, rows, alpha, names, fixed) for defence in suite.defences]
     return {
         "format": FORMAT, "suite": {"name": suite.name, "bound": suite.bound}, "version": tailgate.__version__, "alpha": alpha,
-        "purpose": rows[0]["purpose"], **settings, "scenarios": list(suite.scenarios), "doses": list(suite.doses),
+        "purpose": rows[0]["purpose"], "beacon": rows[0]["beacon"], **settings,
+        "scenarios": list(suite.scenarios), "doses": list(suite.doses),
         "attacks": [{"attack": name, "knowledge": _knowledge(rows, name), "note": _note(rows, counted, name)} for name in suite.attacks],
         "formulas": formulas, "defences": entries, "cells": [_cell(row, alpha, names) for row in rows],
         "comparisons": [duel for name in names for duel in _compared(entries, counted, name, alpha)] if fixed else [],
@@ -158,7 +159,7 @@ def _compared(entries: Sequence[Data], counted: Sequence[Row], name: str, alpha:
         harm = {}
         for entry in (e for e in ready if e["class"] == group):
             mine = [row for row in counted if row["defence"] == entry["defence"] and row["knowledge"] == KNOWLEDGE[0]]
-            seeds = tuple(range(mine[0]["first_seed"], mine[0]["first_seed"] + mine[0]["n"]))
+            seeds = tuple(range(mine[0]["n"]))  # numbers of the runs, of the same seeds for all
             fails = np.array([~runs_of(row, name) for row in mine], np.float64)
             harm[entry["defence"]] = Harm(seeds, fails, int(np.argmax(fails.sum(axis=1))))
         out += [{"of": name, **duel} for duel in compare(harm, group, alpha)[0]]

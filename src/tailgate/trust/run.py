@@ -37,8 +37,8 @@ Progress = Callable[[int, int], None]
 
 
 def jobs_of(
-    suite: Suite, *, runs: int, formulas: Sequence[str] = (), purpose: str = "report", batch: int = BATCH,
-    threat: dict[str, Any] | None = None, safe: SafeDistance | None = None, asked: Demands | None = None,
+    suite: Suite, *, runs: int, formulas: Sequence[str] = (), purpose: str = "report", beacon: str = "",
+    batch: int = BATCH, threat: dict[str, Any] | None = None, safe: SafeDistance | None = None, asked: Demands | None = None,
     rule: Sequential | Sprt | None = None,
 ) -> list[Job]:  # fmt: skip
     """Every cell of a suite with what is asked of it. Raises InputError for anything that does not exist or cannot be read."""
@@ -53,7 +53,7 @@ def jobs_of(
             raise InputError("dose", dose, "a whole number of attack steps, not below 0")
     for name in suite.scenarios:
         own(load_scenario(name), formulas)
-    cells = cells_of(dataclasses.replace(suite, seeds=runs), batch=batch, purpose=purpose, threat=threat)
+    cells = cells_of(dataclasses.replace(suite, seeds=runs), batch=batch, purpose=purpose, threat=threat, beacon=beacon)
     return [Job(cell, tuple(formulas), suite.bound, safe or SafeDistance(), asked or Demands(), rule) for cell in cells]
 
 
@@ -125,7 +125,7 @@ def _played(jobs: Sequence[Job], workers: int) -> Iterator[Row]:
 
 def check(
     suite: Suite, *, runs: int | None = None, formulas: Sequence[str] = (), alpha: float = 0.05, purpose: str = "report",
-    batch: int = BATCH, workers: int = 1, folder: Path | None = None, threat: dict[str, Any] | None = None,
+    beacon: str = "", batch: int = BATCH, workers: int = 1, folder: Path | None = None, threat: dict[str, Any] | None = None,
     safe: SafeDistance | None = None, asked: Demands | None = None, rule: Sequential | Sprt | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Any]:  # fmt: skip
@@ -140,7 +140,9 @@ def check(
     if workers < 1:
         raise InputError("workers", workers, "a whole number not below 1")
     most = suite.seeds if runs is None else runs
-    jobs = jobs_of(suite, runs=most, formulas=formulas, purpose=purpose, batch=batch, threat=threat, safe=safe, asked=asked, rule=rule)
+    jobs = jobs_of(
+        suite, runs=most, formulas=formulas, purpose=purpose, beacon=beacon, batch=batch, threat=threat, safe=safe, asked=asked, rule=rule
+    )
     rows = play(jobs, folder, workers, progress)
     settings = {"runs": most, "rule": rule_data(rule), "unsafe": _plain(safe or SafeDistance()), "demands": _plain(asked or Demands())}
     found = report(rows, suite, alpha=alpha, settings=settings)
@@ -166,7 +168,7 @@ def _keep_failures(found: dict[str, Any], jobs: Sequence[Job], folder: Path) -> 
     for entry in found["defences"]:
         worst = entry["worst"]
         if worst is not None:
-            rows += run_cell(single(by_identity[worst["cell"]], worst["seed"]))
+            rows += run_cell(single(by_identity[worst["cell"]], worst["run"]))
             worst["replay"] = replay_command(entry["defence"], worst["attack"], folder, len(rows))
     path = folder / FAILURES
     if rows:
@@ -186,19 +188,20 @@ def with_trust(board: dict[str, Any], found: Any, where: str = "trust") -> dict[
     """A board with the field `trust`: of the board what the bounds are about; of each entry its bounds by what the attacker knows, of `all`
     properties together and of `safety`, those without detection. An entry that the report does not know has null.
 
-    Raises InputError for what is no report, and for one of another suite or version, of own formulas or of runs that a rule stopped.
+    Raises InputError for what is no report, and for one of another suite, version or round, of own formulas or of runs that a rule stopped.
     """
     if not isinstance(found, Mapping) or found.get("format") != FORMAT:
         raise InputError(f"{where}: format", found.get("format") if isinstance(found, Mapping) else found, FORMAT)
     try:
         for name, mine, other in (
             ("suite", found["suite"]["name"], board["suite"]["name"]), ("version", found["version"], board["suite"]["version"]),
+            ("beacon", found["beacon"], board["suite"].get("beacon", "")),
             ("formulas", found["formulas"], []), ("rule", found["rule"]["name"], "fixed"),
         ):  # fmt: skip
             if mine != other:
                 raise InputError(f"{where}: {name}", mine, repr(other))
         head = {key: found[key] for key in ("alpha", "runs", "purpose", "attacks", "scenarios", "doses", "unsafe", "demands")}
-        head |= {"beacon": found.get("beacon", ""), "properties": _asked(found)}
+        head |= {"beacon": found["beacon"], "properties": _asked(found)}
         bounds = {e["defence"]: {"all": e["trust"], "safety": e["safety"], "why": e["why"]} for e in found["defences"]}
     except (KeyError, TypeError) as error:
         raise InputError(where, f"{type(error).__name__}: {error}", "a whole report of `tailgate trust`") from None
