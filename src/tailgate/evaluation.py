@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 import tailgate
-from tailgate import draws
+from tailgate import draws, sources
 from tailgate.core import Model
 from tailgate.errors import InputError, NotApplicable
 from tailgate.files import write_atomic
@@ -157,7 +157,7 @@ def cell_id(cell: Cell) -> str:
     data = dataclasses.asdict(cell)
     data["sources"] = [Spec("defence", cell.defence).digest, Spec("attack", cell.attack).digest]
     data["scenario"] = load_scenario(cell.scenario).config_hash
-    return hashlib.blake2b(f"{tailgate.__version__}/{canonical(data)}".encode(), digest_size=12).hexdigest()
+    return hashlib.blake2b(f"{tailgate.__version__}/{sources.own()}/{canonical(data)}".encode(), digest_size=12).hexdigest()
 
 
 @contextlib.contextmanager

@@ -53,7 +53,8 @@ def _replay(options: argparse.Namespace) -> int:
         from tailgate.replay.video import check_format, write_video
 
         check_format(video)
-    if Spec("defence", options.defence or "none").imports or Spec("attack", options.attack or "none").imports:
+    guard = Spec("defence", options.defence or "none")
+    if guard.imports or guard.sandboxed or Spec("attack", options.attack or "none").imports:
         sys.path.insert(0, "")  # the class that the user names is looked for in the working directory, and nothing else is
     wanted = Filter(options.line, options.scenario, options.defence, options.attack, _dose(options.dose), options.seed)
     source = Path(options.rows)

@@ -88,9 +88,9 @@ def _rule(options: argparse.Namespace) -> Any:
     from tailgate.trust.statistics import Sequential, Sprt
 
     if options.width is not None:
-        return Sequential(options.width)
+        return Sequential(options.width, 1.0 - options.alpha)
     if options.test is not None:
-        return Sprt(options.test - options.indifference, options.test)
+        return Sprt(options.test - options.indifference, options.test, options.alpha, options.alpha)
     return None
 
 

@@ -56,7 +56,7 @@ def board_of(suite: Suite, folder: Path, **options: Any) -> dict[str, Any]:
     rows = [row for path in files for row in read_rows(path)]
     board = with_cards(score(rows, suite, attacks=admitted.read(folder / LIST), **options), folder / CARDS)
     if (report := folder / TRUST / REPORT).is_file():
-        board = with_trust(board, _report(report), f"trust {report}")
+        board = with_trust(board, _report(report), f"trust {report}", suite)
     write_atomic(folder / "board.json", json.dumps(board, indent=1, allow_nan=False).encode() + b"\n")
     return board
 

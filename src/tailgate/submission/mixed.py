@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 import tailgate
-from tailgate import draws
+from tailgate import draws, sources
 from tailgate.errors import InputError, NotApplicable
 from tailgate.evaluation import Cell, _failed, _head, _why, origin
 from tailgate.metrics import measure
@@ -86,7 +86,7 @@ def identity(cell: Cell, submission: Submission, seeds: Sequence[int], place: Sc
     data = dataclasses.asdict(cell) | {"seeds": list(seeds), "digest": submission.source.digest, "scenario": place.config_hash}
     data |= {"attack_digest": Spec("attack", cell.attack).digest, "limits": dataclasses.asdict(submission.limits)}
     sandbox = "" if submission.sandbox is None else submission.sandbox.program
-    return hashlib.blake2b(f"{tailgate.__version__}/{sandbox}/{canonical(data)}".encode(), digest_size=12).hexdigest()
+    return hashlib.blake2b(f"{tailgate.__version__}/{sources.own()}/{sandbox}/{canonical(data)}".encode(), digest_size=12).hexdigest()
 
 
 def part_of(cell: Cell, submission: Submission, seeds: Sequence[int]) -> _Part:

@@ -23,7 +23,7 @@ from tailgate.schema import canonical
 from tailgate.trace import Trace, episodes_at_once, rollout
 
 from .logic import Eventually, Interval, along, holds, robustness
-from .properties import Demands, Property, built_in, conjunctions, own
+from .properties import CONJUNCTIONS, Demands, Property, built_in, conjunctions, own
 from .signals import SafeDistance, sample
 from .statistics import Sequential, Sprt
 
@@ -164,8 +164,8 @@ def _finite(value: float) -> float | None:
 
 
 def _worst(known: Sequence[Property], found: dict[str, Outcome], cell: Cell) -> Row | None:
-    """The run that fails the first of the properties that any run fails, by the most."""
-    for p in known:
+    """The run that fails the first of the properties that any run fails, by the most; those of safety come first."""
+    for p in sorted(known, key=lambda p: p.name not in CONJUNCTIONS["safety"]):
         if p.name in found and not found[p.name].holds.all():
             of = found[p.name]
             i = int(np.argmin(np.where(of.holds, np.inf, of.robustness)))

@@ -136,7 +136,13 @@ class _Reader:
     def _number(self) -> float:
         if self.kind != 1:
             raise self.error("a number")
-        return float(self.next())
+        return self._finite()
+
+    def _finite(self) -> float:
+        value = float(self.next())
+        if math.isinf(value):
+            raise self.error("a number that can be held")
+        return value
 
     def _atom(self) -> Formula:
         left = self._sum()
@@ -167,7 +173,7 @@ class _Reader:
         if sign := self.take("-"):
             factor = -1.0
         if self.kind == 1:
-            factor *= float(self.next())
+            factor *= self._finite()
             if not self.take("*"):
                 return "", factor
         if self.kind != 2 or self.token in _WORDS:

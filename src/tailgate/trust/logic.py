@@ -22,6 +22,7 @@ from tailgate.core import Array
 from tailgate.errors import InputError
 
 SLACK = 1e-6  # of a step: 0.6 s is six steps of 0.1 s, whatever 0.6 / 0.1 rounds to
+FAR = 1e9  # samples: beyond them lies no episode's end
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,8 +62,10 @@ class Interval:
 
     def steps(self, dt: float) -> tuple[int, int | None]:
         """First and last sample, counted from the one that is read; None: to the end. Raises InputError where no sample lies within."""
+        if self.first / dt > FAR:
+            raise InputError("interval", f"{self}", f"one that begins within {FAR:g} samples")
         low = math.ceil(self.first / dt - SLACK)
-        if math.isinf(self.last):
+        if self.last / dt > FAR:
             return low, None
         high = math.floor(self.last / dt + SLACK)
         if high < low:

@@ -1,7 +1,8 @@
 """What is asked of a run: the built-in properties of a scenario as formulas, and a user's own.
 
     no_collision   G (gap > 0 and rear_gap > 0)
-    brakes         whenever a gap is unsafe once an attack has begun, that car brakes, or stands, within 0.6 s
+    brakes         whenever a gap is unsafe once an attack has begun, that car begins to brake within 0.6 s, strictly later, and
+                   brakes on for 0.5 s, or stands, or is safe again
     detects        an alarm within ten steps of the first step of an attack
     error          G (error <= bound), where nobody drives
 
@@ -24,7 +25,7 @@ from tailgate.metrics import DETECTION_DEADLINE
 from tailgate.scenario import Scenario
 
 from .formula import parse
-from .logic import Always, And, Atom, Formula, Or, response
+from .logic import Always, And, Atom, Eventually, Formula, Interval, Not, Or, implies, response
 from .signals import FLAGS, check_names
 
 
@@ -33,6 +34,7 @@ class Demands:
     """The numbers in the built-in properties."""
 
     deadline: Positive = param(0.6, "time to brake after a threat [s]; thesis 7.4")
+    hold: Positive = param(0.5, "time that the braking has to last [s]; thesis 7.4: the actuator's limit")
     steps: PositiveCount = param(4, "steps that the deadline spans at least: with fewer a step is too coarse to time it")
     braking: Positive = param(-BRAKE_ACCEL, "deceleration from which an applied command counts as braking [m/s^2]; that of the mode BRAKE")
     stands: Positive = param(0.1, "speed below which a car counts as standing, and need not brake [m/s]")
@@ -79,8 +81,8 @@ def _no_collision(model: Model) -> Property:
 
 
 def _brakes(model: Model, horizon: int, asked: Demands) -> Property:
-    about = f"brakes within {1000 * asked.deadline:g} ms whenever it is too close to stop after an attack began"
-    last = (horizon - 1) * model.dt - asked.deadline
+    about = f"brakes within {1000 * asked.deadline:g} ms, and on, whenever it is too close to stop after an attack began"
+    last = (horizon - 1) * model.dt - asked.deadline - asked.hold
     if not model.followers.any():
         return _none("brakes", about, "nobody drives behind another")
     if model.dt * asked.steps > asked.deadline * (1.0 + 1e-9):
@@ -90,8 +92,13 @@ def _brakes(model: Model, horizon: int, asked: Demands) -> Property:
     each, threats = [], []
     for i in np.flatnonzero(model.followers):
         threat = And((_over("attacked", 1.0, 0.5), _over(f"margin@{i}", -1.0, 0.0)))
-        answer = Or((_over(f"applied@{i}", -1.0, asked.braking, False), _over(f"speed@{i}", -1.0, -asked.stands, False)))
-        each.append(response(threat, answer, asked.deadline, last))
+        safe = _over(f"margin@{i}", 1.0, 0.0, False)
+        answer = Or((_over(f"applied@{i}", -1.0, asked.braking, False), _over(f"speed@{i}", -1.0, -asked.stands, False), safe))
+        lasting = Always(answer, Interval(0.0, asked.hold))
+        # the command of the step that led into the threat is no answer to it: the next step's is the first
+        soon = Interval(model.dt, asked.deadline)
+        over = Not(Eventually(And(()), soon))  # the episode ended with the threat: what became of it, `no_collision` says
+        each.append(Always(implies(threat, Or((Eventually(lasting, soon), over))), Interval(0.0, last)))
         threats.append(threat)
     return Property("brakes", about, And(tuple(each)) if len(each) > 1 else each[0], Or(tuple(threats)), until=last)
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 import tailgate
-from tailgate.scenario import Suite
+from tailgate.scenario import Suite, list_suites, load_suite
 from tailgate.scoring.damage import CLEAN, order
 from tailgate.scoring.ranks import Harm, class_of, compare
 from tailgate.threat import KNOWLEDGE
@@ -26,7 +26,7 @@ def report(rows: Sequence[Row], suite: Suite, *, alpha: float, settings: Data) -
     formulas = [p["name"] for p in rows[0]["properties"]] if rows and _own(rows) else []
     names = ("trust",) if formulas else tuple(CONJUNCTIONS)
     fixed = settings["rule"]["name"] == "fixed"
-    counted = _counted(rows)
+    counted = _counted(rows, _whole(suite))
     entries = [_entry(defence, counted, rows, alpha, names, fixed) for defence in suite.defences]
     return {
         "format": FORMAT, "suite": {"name": suite.name, "bound": suite.bound}, "version": tailgate.__version__, "alpha": alpha,
@@ -43,9 +43,15 @@ def _own(rows: Sequence[Row]) -> bool:
     return not {p["name"] for row in rows for p in row["properties"]} <= set(CONJUNCTIONS["trust"])
 
 
-def _counted(rows: Sequence[Row]) -> list[Row]:
-    """The rows that bounds are over. Computed optima are ceilings; an attack that fits no defence in a scenario is left out there."""
-    fits = {(row["scenario"], row["attack"]) for row in rows if row["status"] != "skipped"}
+def _whole(suite: Suite) -> bool:
+    """Whether all defences of the suite of this name are in it: what does not fit some of them may fit the others."""
+    return suite.name not in list_suites() or set(load_suite(suite.name).defences) <= set(suite.defences)
+
+
+def _counted(rows: Sequence[Row], whole: bool) -> list[Row]:
+    """The rows that bounds are over. Computed optima are ceilings; an attack that fits no defence of the suite in a scenario is left out
+    there, which only a report on all of them can tell."""
+    fits = {(row["scenario"], row["attack"]) for row in rows if row["status"] != "skipped" or not whole}
     return [row for row in rows if not row["optimal"] and (row["scenario"], row["attack"]) in fits]
 
 

@@ -177,16 +177,21 @@ def _keep_failures(found: dict[str, Any], jobs: Sequence[Job], folder: Path) -> 
         remove(path)
 
 
+def _foreign(spec: Spec) -> bool:
+    return spec.imports or spec.sandboxed is not None
+
+
 def replay_command(defence: str, attack: str, folder: Path, line: int) -> str:
     """What plays a line of the failures again. A row must not import code: who wants it names the class."""
-    named = [(family, text) for family, text in (("defence", defence), ("attack", attack)) if Spec(family, text).imports]  # type: ignore[arg-type]
+    named = [(family, text) for family, text in (("defence", defence), ("attack", attack)) if _foreign(Spec(family, text))]  # type: ignore[arg-type]
     words = ["tailgate", "replay", str(folder / FAILURES), "--line", str(line), "--out", str(folder / f"failure-{line}.html")]
     return shlex.join(words + [word for family, text in named for word in (f"--{family}", text)])
 
 
-def with_trust(board: dict[str, Any], found: Any, where: str = "trust") -> dict[str, Any]:
+def with_trust(board: dict[str, Any], found: Any, where: str = "trust", suite: Suite | None = None) -> dict[str, Any]:
     """A board with the field `trust`: of the board what the bounds are about; of each entry its bounds by what the attacker knows, of `all`
-    properties together and of `safety`, those without detection. An entry that the report does not know has null.
+    properties together and of `safety`, those without detection. An entry that the report does not know has null, and so has one that is
+    not built in: here nobody mixes its rows with others, so that it could tell from its batch who is attacked.
 
     Raises InputError for what is no report, and for one of another suite, version or round, of own formulas or of runs that a rule stopped.
     """
@@ -200,12 +205,31 @@ def with_trust(board: dict[str, Any], found: Any, where: str = "trust") -> dict[
         ):  # fmt: skip
             if mine != other:
                 raise InputError(f"{where}: {name}", mine, repr(other))
+        if suite is not None:
+            _of_suite(found, suite, board["suite"]["alpha"], where)
         head = {key: found[key] for key in ("alpha", "runs", "purpose", "attacks", "scenarios", "doses", "unsafe", "demands")}
         head |= {"beacon": found["beacon"], "properties": _asked(found)}
         bounds = {e["defence"]: {"all": e["trust"], "safety": e["safety"], "why": e["why"]} for e in found["defences"]}
     except (KeyError, TypeError) as error:
         raise InputError(where, f"{type(error).__name__}: {error}", "a whole report of `tailgate trust`") from None
-    return board | {"trust": head, "entries": [entry | {"trust": bounds.get(entry["defence"])} for entry in board["entries"]]}
+    known = {entry["defence"] for entry in board["entries"] if entry.get("card") is not None}
+    return board | {
+        "trust": head,
+        "entries": [e | {"trust": bounds.get(e["defence"]) if e["defence"] in known else None} for e in board["entries"]],
+    }  # fmt: skip
+
+
+def _of_suite(found: Mapping[str, Any], suite: Suite, alpha: float, where: str) -> None:
+    """Raise InputError unless a report is of all that the suite asks for, and of nothing easier."""
+    for name, mine, other in (
+        ("purpose", found["purpose"], "report"), ("alpha", found["alpha"], alpha), ("demands", found["demands"], _plain(Demands())),
+        ("unsafe", found["unsafe"], _plain(SafeDistance())), ("scenarios", found["scenarios"], list(suite.scenarios)),
+        ("doses", found["doses"], list(suite.doses)), ("attacks", [a["attack"] for a in found["attacks"]], list(suite.attacks)),
+    ):  # fmt: skip
+        if mine != other:
+            raise InputError(f"{where}: {name}", mine, repr(other))
+    if found["runs"] < suite.seeds:
+        raise InputError(f"{where}: runs", found["runs"], f"at least {suite.seeds}")
 
 
 def _asked(found: Mapping[str, Any]) -> list[dict[str, Any]]:

@@ -86,8 +86,8 @@ class Sequential:
 
     def __post_init__(self) -> None:
         _share("width", self.width), _share("level", self.level)
-        if self.width < 0.01:
-            raise InputError("width", self.width, "at least 0.01")
+        if self.width < 0.05:
+            raise InputError("width", self.width, "at least 0.05: for less, a fixed number of runs")
 
     def _narrow(self, k: Array, n: int) -> Array:
         low, high = limits(k, np.full(len(k), n), (1.0 - self.level) / 2.0)
