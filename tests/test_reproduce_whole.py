@@ -9,11 +9,13 @@ import pytest
 
 from tailgate import cli
 from tailgate.errors import InputError
-from tailgate.reproduce import ch7_automata, ch7_loop, ch7_signals, ch7_trust, whole, whole_theorems
+from tailgate.reproduce import ch7_automata, ch7_cost, ch7_loop, ch7_ratings, ch7_signals, ch7_trust, ch7_width, whole, whole_theorems
 from tailgate.reproduce.claims import Claim, Figure, Report, Table
-from tailgate.reproduce.run import CHAPTERS, read, write
+from tailgate.reproduce.run import CHAPTERS, flat, read, write
 from tailgate.reproduce.whole import Item, check_coverage, load_coverage, reproduce_whole, sources, write_whole
 from tailgate.scenario import load_scenario
+from tailgate.stats import proportion
+from tailgate.trust.cells import Outcome
 
 ROOT = Path(__file__).parents[1]
 PNG = b"\x89PNG\r\n\x1a\n" + bytes(20)
@@ -25,15 +27,18 @@ def chapter_7():
     monkey = pytest.MonkeyPatch()
     short = dataclasses.replace(load_scenario(ch7_loop.SCENARIO), horizon=70)
     monkey.setattr(ch7_loop, "load_scenario", lambda name: short)
-    few = [ch7_loop.JUMPS[0], ch7_loop.RAMPS[1]]
-    monkey.setattr(ch7_loop, "ATTACKS", {k: v.replace("threshold=20", "threshold=28").replace("start_step=100", "start_step=45") for k, v in ch7_loop.ATTACKS.items() if k in ("none", *few)})
-    monkey.setattr(ch7_loop, "JUMPS", few[:1])
-    monkey.setattr(ch7_loop, "RAMPS", few[1:])
+    few = ("none", ch7_loop.SPOOFED, ch7_loop.RAMPS[2])
+    monkey.setattr(ch7_loop, "ATTACKS", {k: ch7_loop.ATTACKS[k].replace("threshold=20", "threshold=28") for k in few})
+    monkey.setattr(ch7_loop, "OTHER", few[1])
+    monkey.setattr(ch7_loop, "RAMPS", few[2:])
     monkey.setattr(ch7_loop, "GUARDS", {k: v for k, v in ch7_loop.GUARDS.items() if k != "chi-square gate"})
+    monkey.setattr(ch7_width, "load_scenario", lambda name: short)
+    monkey.setattr(ch7_cost, "WITHIN", 5.0)
     monkey.setattr(ch7_automata, "LIMITS", {"Intermediate": (100.0,), "braking": (100.0, 500.0)})
     monkey.setattr(ch7_automata, "_limits", lambda curves: None)
     runs = ch7_automata.play(3)
     made = [ch7_automata.report(runs, 3)[0], ch7_signals.report(), ch7_trust.report(runs), ch7_loop.report(8, lambda _: None)]
+    made += [ch7_ratings.report(runs, 10), ch7_width.report(8), ch7_cost.report()]
     monkey.undo()
     return {claim.id: claim for part in made for claim in part.claims}
 
@@ -50,6 +55,33 @@ def test_chapter_7(chapter_7):
     assert chapter_7["7.3.5-coverage"].measured["least coverage"] == pytest.approx(0.936, abs=5e-4)
     assert chapter_7["7.3.2-interval"].measured["alarms without an attack"] == 0
     assert all(claim.why and claim.measured for claim in chapter_7.values())
+    assert held["7.4-verified"] == "partly" and held["7.3.5-sum"] == "no" and held["7.4-notified"] == held["7.4-prevented"] == "yes"
+    assert "too few runs" in chapter_7["7.4-prevented"].why and "too few runs" not in chapter_7["7.4-monitor"].why
+    sized = chapter_7["7.3.2-size"].measured["interval over the same lidar's accuracy"]
+    assert sized["x 0.5"]["runs with a false alarm"]["share"] == 1.0 and sized["x 1"]["runs with a false alarm"]["share"] == 0.0
+    moves = list(chapter_7["7.3.4-size"].measured["moves of a run"].values())
+    assert moves[0] < moves[1] < moves[2]
+
+
+def test_a_threat_that_never_came_about_is_not_answered(chapter_7):
+    """A property that held because its antecedent did not is no measurement."""
+    told = chapter_7["7.4-600-threat"].measured
+    none = [said for said in told.values() if said["answered"] is None]
+    assert none and all(said["asked"].startswith("0 of") and said["reason"] for said in none) and "not measured" in flat(told)
+    held, asked = np.array([True, True, False, False]), np.array([True, False, True, False])
+    blank = ch7_loop.Run(*[np.zeros(4)] * 4, None, Outcome(held, np.zeros(4), asked, asked * 1, asked * 1))
+    share = ch7_loop.answered(blank)
+    assert share.value == 0.5 and share == proportion(1, 2)
+    assert ch7_loop.answered(blank._replace(threat=blank.threat._replace(asked=~(asked | ~asked)))) is None
+
+
+def test_the_number_of_runs_is_no_verdict():
+    """Few runs without a failure, and one failure in a hundred, count for the claim; an interval below it counts against it."""
+    few, one, half, none = proportion(20, 20), proportion(99, 100), proportion(14, 20), proportion(0, 20)
+    assert ch7_trust.judge([few], 0.95) == ("yes", "; too few runs: a 95 % interval has 0.95 inside")
+    assert ch7_trust.judge([one], 0.95)[0] == "yes" and ch7_trust.judge([proportion(100, 100)], 0.95) == ("yes", "")
+    assert ch7_trust.judge([half], 0.95)[0] == ch7_trust.judge([few, none], 0.95)[0] == "partly"
+    assert ch7_trust.judge([none], 0.95) == ("no", "") and "0.5 inside" in ch7_trust.judge([half], 0.95)[1]
 
 
 @pytest.mark.parametrize(("chapter", "expected"), [("ch5", {"5.3.2": "yes", "5.3.5": "no"}), ("ch6", {"6.5.1": "yes", "6.5.2": "yes", "6.5.5": "no"})])

@@ -5,8 +5,9 @@ from xml.etree import ElementTree
 
 import pytest
 
+from tailgate.errors import InputError
 from tailgate.trust.automata import Atom, Edge, load_network, network_of
-from tailgate.trust.uppaal import DTD, ENTRY, RESERVED, document, identifier, write_uppaal
+from tailgate.trust.uppaal import DTD, ENTRY, RESERVED, document, identifier, names_of, write_uppaal
 
 # The part of flat-1_6.dtd that is written: children of each element, in order.
 CHILDREN = {
@@ -117,3 +118,48 @@ def test_markup_in_a_text_stays_text(tmp_path):
     changed = made.with_location("one", "a", invariant=(Atom("c", "<", 2.5),))
     assert "c &lt; 2.5" in document(changed) and "exponentialrate" not in document(changed) and "0.25" in path.read_text()
     assert Edge("a", "a", sync="x!").channel == "x"
+
+
+def _hostile():
+    """Names and texts that mean something to UPPAAL, or that the export would otherwise make twice."""
+    place = {"a": {"rates": {"c": [1, 2]}, "invariant": [["c", "<=", 3]]}, "entry_": {}, "int": {}, "int_": {}}
+    edges = [{"source": "a", "target": "entry_", "sync": "simulate!"}, {"source": "entry_", "target": "int", "assign": {"rate_c": 7}}]
+    first = {"name": "doorA", "clocks": ["c"], "variables": {"rate_c": 5, "abs": 0, "abs_": 0}, "initial": "a", "locations": place, "edges": edges}
+    second = {"name": "doora", "initial": "E", "locations": {"E": {}, "control": {}}, "variables": {"doorA_template": 1}}
+    return {"name": "m", "about": "one line\nclock x;\r\u2028int y;\\", "components": [first, second], "queries": [{"name": "q", "within": 10, "holds": [["abs", "=", 1], ["abs_", "=", 0]]}]}
+
+
+def test_no_two_names_become_one():
+    """Else a template, a variable or a location is declared twice, or one hides another."""
+    made = network_of(_hostile())
+    root, names = ElementTree.fromstring(document(made)), names_of(made)
+    shared = [*names.shared.values(), *names.rates.values(), *names.templates, *names.processes]
+    assert len(set(shared)) == len(shared) and not set(shared) & RESERVED
+    assert names.shared["rate_c"] == "rate_c" and names.rates["c"] == "rate_c_" and names.shared["abs_"] == "abs_" and names.shared["abs"] == "abs__"
+    for template in root.findall("template"):
+        places = [location.find("name").text for location in template.findall("location")]
+        assert len(set(places)) == len(places) and not set(places) & (set(shared) | RESERVED)
+    first = root.find("template")
+    assert [p.find("name").text for p in first.findall("location")] == ["a", "entry_", "int__", "int_", "entry__"]
+    assert "c' == rate_c_" in _labels(first.find("location"))["invariant"]
+    assert [_labels(t).get("assignment") for t in first.findall("transition")] == ["rate_c_ = 1 + random(1)", None, "rate_c = 7"]
+    assert root.find("queries/query/formula").text == "Pr[<=10](<> abs__ == 1 && abs_ == 0)"
+    assert names.templates == ("doorA_template_", "doora_template") and root.find("system").text.startswith("doorA_process = doorA_template_();")
+    assert {"abs", "A", "E", "simulate", "control", "fabs", "Pr"} <= RESERVED
+
+
+def test_a_text_of_two_lines_stays_a_comment():
+    """What follows the first line would become code."""
+    lines = ElementTree.fromstring(document(network_of(_hostile()))).find("declaration").text.split("\n")
+    assert lines[0] == "// m: one line clock x; int y;" and lines[1] == "clock time, c;" and len("\n".join(lines).splitlines()) == len(lines)
+
+
+@pytest.mark.parametrize(("variables", "assign"), [({"n": 32768}, {}), ({"n": -32769}, {}), ({"n": 0}, {"n": 40000})])
+def test_an_integer_beyond_those_of_uppaal_is_refused(variables, assign):
+    """It would wrap round or stop the run there."""
+    edges = [{"source": "a", "target": "a", "assign": {"c": 1e5, **assign}}]
+    made = {"name": "m", "components": [{"name": "one", "clocks": ["c"], "variables": variables, "initial": "a", "locations": {"a": {}}, "edges": edges}]}
+    with pytest.raises(InputError, match="32767"):
+        document(network_of(made))
+    made["components"][0] |= {"variables": {"n": 32767}, "edges": [{"source": "a", "target": "a", "assign": {"c": 1e10, "n": -32768}}]}
+    assert "c = 10000000000.0, n = -32768" in document(network_of(made))

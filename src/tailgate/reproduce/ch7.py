@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from . import ch7_automata, ch7_figures, ch7_loop, ch7_signals, ch7_trust
+from . import ch7_automata, ch7_cost, ch7_figures, ch7_loop, ch7_ratings, ch7_signals, ch7_trust, ch7_width
 from .ch4_cases import Tick
 from .claims import Report
 
@@ -20,6 +20,8 @@ def reproduce(seeds: int, tick: Tick, figures: bool) -> Report:
         "loop": ch7_loop.ABOUT,
         "UPPAAL": "the model is exported to its format; verifyta is not part of this comparison",
         "intervals": "Clopper-Pearson, 95 %, fixed number of runs",
+        "verdicts on shares": "a share that reaches its level counts for the claim, an interval below it against; `why` says where the "
+        "runs are too few to decide",
         "not given in the thesis": "rates of exponential delays, which limits are invariants and which guards, when apply_break is set",
     }
     out = Report("ch7", TITLE, settings)
@@ -29,7 +31,12 @@ def reproduce(seeds: int, tick: Tick, figures: bool) -> Report:
     out.add(ch7_signals.report())
     tick("intervals")
     out.add(ch7_trust.report(runs))
+    out.add(ch7_ratings.report(runs, seeds))
     out.add(ch7_loop.report(seeds, tick))
+    tick("widths of the interval")
+    out.add(ch7_width.report(seeds))
+    tick("what a run costs")
+    out.add(ch7_cost.report())
     if figures:
         tick("pictures")
         out.figures += ch7_figures.all_figures(curves)

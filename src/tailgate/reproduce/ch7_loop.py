@@ -10,7 +10,7 @@ from tailgate import draws
 from tailgate.core import Array
 from tailgate.registry import Spec
 from tailgate.scenario import load_scenario
-from tailgate.stats import proportion
+from tailgate.stats import Interval, proportion
 from tailgate.trace import Trace, rollout
 from tailgate.trust.cells import Outcome, outcome
 from tailgate.trust.properties import Demands, Property, built_in
@@ -18,8 +18,8 @@ from tailgate.trust.properties import own as own_properties
 from tailgate.trust.signals import SafeDistance
 
 from .ch4_cases import Tick
-from .ch7_trust import interval
-from .claims import Claim, Report, Table, verdict
+from .ch7_trust import THESIS, interval, judge
+from .claims import Claim, Report, Table
 
 SCENARIO = "ch7-v0"
 ABOUT = f"{SCENARIO}: 30 s of stop and go at dt = 0.05 s, a lidar accurate to 0.3 m, readings of its gap attacked"
@@ -29,18 +29,22 @@ ATTACKS = {
     "none": "none",
     "20 m farther, below 20 m": "fdi:trigger=near,threshold=20,value=-20",
     "20 m farther, from 5 s on": "fdi:start_step=100,value=-20",
-    "0.3 m/s farther and farther": "fdi_ramp:start_step=100,rate=-0.015",
-    "0.6 m/s farther and farther": "fdi_ramp:start_step=100,rate=-0.03",
+    "0.3 m/s farther and farther": "fdi_ramp:start_step=40,rate=-0.015",
+    "0.36 m/s farther and farther": "fdi_ramp:start_step=40,rate=-0.018",
+    "0.6 m/s farther and farther": "fdi_ramp:start_step=40,rate=-0.03",
 }
-JUMPS, RAMPS = list(ATTACKS)[1:3], list(ATTACKS)[3:]
+SPOOFED, OTHER = list(ATTACKS)[1], list(ATTACKS)[2]  # the thesis's: shown beyond 20 m while it is nearer; the same at another time
+RAMPS = list(ATTACKS)[3:]  # which the thesis does not describe
 GUARDS = {
     "no monitor": "kf",
     "chi-square gate": "chi2_kf",
     "monitor": "safe_state",
     "monitor and brake": "safe_state_brake",
+    "monitor at the lidar's accuracy, and brake": "safe_state_brake:sigmas=1.7321",
     "monitor, brakes below 20 m": "safe_state_brake:distance=20",
 }
 BRAKES = list(GUARDS)[3:]
+LEVEL = 0.95  # that a share has to reach
 
 
 class Run(NamedTuple):
@@ -92,96 +96,148 @@ def play(seeds: int, tick: Tick) -> Runs:
 
 def report(seeds: int, tick: Tick) -> Report:
     runs, out = play(max(10, seeds // 2), tick), Report("ch7", "", {})
-    out.claims += [_collision(runs), _interval(runs), _notified(runs), _prevented(runs), _brakes(runs)]
+    out.claims += [_collision(runs), _interval(runs), _notified(runs), _prevented(runs), _ramps(runs), _brakes(runs), _threat(runs)]
     out.tables.append(_table(runs))
     return out
 
 
-def _share(good: Array) -> dict[str, float]:
-    return interval(proportion(int(np.count_nonzero(good)), len(good)))
+def _share(good: Array) -> Interval:
+    return proportion(int(np.count_nonzero(good)), len(good))
 
 
 def _collision(runs: Runs) -> Claim:
     found = {attack: _share(runs[attack, "no monitor"].collided) for attack in ATTACKS}
-    jumps = [found[attack]["low"] for attack in JUMPS]
+    holds, note = judge([found[SPOOFED]], LEVEL)
     return Claim(
-        "7.4-collision", "With spoofed lidar signals the controller cannot brake in time, and the car collides", "a collision", found,
-        verdict(min(jumps) > 0.9, max(jumps) < 0.5), "share of runs that collide without a monitor: a Kalman filter believes the lidar",
+        "7.4-collision", "With spoofed lidar signals the controller cannot brake in time, and the car collides", "a collision",
+        {attack: interval(share) for attack, share in found.items()}, holds,
+        f"share of runs that collide without a monitor: a Kalman filter believes the lidar; decided by {SPOOFED}{note}",
     )  # fmt: skip
 
 
 def _interval(runs: Runs) -> Claim:
+    hits = {attack: interval(_share(runs[attack, "monitor"].alarms > 0)) for attack in (SPOOFED, OTHER, *RAMPS)}
+    exact = _share(runs["none", BRAKES[1]].alarms == 0)
+    holds, note = judge([_share(runs["none", "monitor"].alarms == 0), exact], LEVEL)
     alarms = runs["none", "monitor"].alarms
-    hits = {attack: _share(runs[attack, "monitor"].alarms > 0) for attack in JUMPS + RAMPS}
+    found = {
+        "alarms without an attack": int(alarms.sum()), "in runs": len(alarms),
+        "runs without a false alarm at the lidar's accuracy": interval(exact), "runs with an alarm under attack": hits,
+    }  # fmt: skip
     return Claim(
         "7.3.2-interval", "Anything outside the interval of the sensor's specification and the dynamics is an attack", "outside: bad",
-        {"alarms without an attack": int(alarms.sum()), "in runs": len(alarms), "runs with an alarm under attack": hits},
-        verdict(int(alarms.sum()) == 0, int(alarms.sum()) > 0),
-        "no false alarm, as noise and disturbances are bounded; the converse, that what is inside is good, does not follow",
+        found, holds,
+        "the lidar's noise is bounded, the process noise is Gaussian and is not: the set takes three standard deviations of it, so that a "
+        f"false alarm is rare and not impossible; the converse, that what is inside is good, does not follow{note}",
     )  # fmt: skip
 
 
+def _noticed(run: Run) -> tuple[Interval | None, dict[str, Any]]:
+    """Of the runs in which the attack began; of none, None."""
+    notice = run.notice[~np.isnan(run.notice)]
+    if not len(notice):
+        return None, {"runs in which it began": 0}
+    share, median = _share(notice <= NOTICE + 1e-9), float(np.median(notice))
+    return share, {f"within {1000 * NOTICE:g} ms": interval(share), "median [s]": median if np.isfinite(median) else "never"}
+
+
 def _notified(runs: Runs) -> Claim:
-    found: dict[str, Any] = {}
-    for attack in JUMPS + RAMPS:
-        notice = runs[attack, "monitor"].notice
-        notice = notice[~np.isnan(notice)]
-        if not len(notice):  # in no run did it begin
-            continue
-        median = float(np.median(notice))
-        found[attack] = {
-            f"within {1000 * NOTICE:g} ms": _share(notice <= NOTICE + 1e-9),
-            "median [s]": median if np.isfinite(median) else "never",
-        }
-    lows = [found[attack][f"within {1000 * NOTICE:g} ms"]["low"] for attack in found] or [0.0]
+    share, _ = _noticed(runs[SPOOFED, "monitor"])
+    holds, note = judge([share], LEVEL) if share else ("partly", "; it began in no run")
     return Claim(
-        "7.4-notified", "Safe state estimation detects the fault and notifies the controller within the desired time", "notified", found,
-        verdict(min(lows) > 0.9, max(lows) < 0.5),
-        "from the first attacked step to the first alarm: a jump leaves the set at once, what grows slowly after seconds, or never",
+        "7.4-notified", "Safe state estimation detects the fault and notifies the controller within the desired time", "notified",
+        {attack: _noticed(runs[attack, "monitor"])[1] for attack in (SPOOFED, OTHER)}, holds,
+        f"from the first attacked step to the first alarm: a jump leaves the set at once; decided by {SPOOFED}{note}",
     )  # fmt: skip
 
 
 def _prevented(runs: Runs) -> Claim:
-    guards = [guard for guard in GUARDS if guard != "no monitor"]
-    found = {attack: {guard: _share(~runs[attack, guard].collided) for guard in guards} for attack in JUMPS + RAMPS}
-    lows = {attack: found[attack]["monitor and brake"]["low"] for attack in found}
+    holds, note = judge([_share(~runs[SPOOFED, "monitor and brake"].collided)], LEVEL)
     return Claim(
-        "7.4-prevented", "Monitor and reactive controller prevent the collision", "prevented", found,
-        verdict(min(lows.values()) > 0.95, max(lows.values()) < 0.5),
-        "share of runs without a collision; dropping what is outside the set is enough against a jump, a chi-square gate does the same",
+        "7.4-prevented", "Monitor and reactive controller prevent the collision", "prevented",
+        {attack: _unharmed(runs, attack) for attack in (SPOOFED, OTHER)}, holds,
+        "share of runs without a collision; dropping what is outside the set is enough against a jump, a chi-square gate does the same; "
+        f"decided by {SPOOFED}{note}",
+    )  # fmt: skip
+
+
+def _unharmed(runs: Runs, attack: str) -> dict[str, Any]:
+    return {guard: interval(_share(~runs[attack, guard].collided)) for guard in GUARDS if guard != "no monitor"}
+
+
+def _ramps(runs: Runs) -> Claim:
+    cells, found = [], {}
+    for attack in RAMPS:
+        share, told = _noticed(runs[attack, "monitor"])
+        cells += [share] if share else []
+        cells.append(_share(~runs[attack, "monitor and brake"].collided))
+        found[attack] = {"notified": told, "without a collision": _unharmed(runs, attack)}
+    holds, note = judge(cells, LEVEL)
+    return Claim(
+        "7.4-ramps", "The same where the distance grows slowly: the fault is detected in time and the collision prevented",
+        "any spoofed lidar", found, holds,
+        "an attack that the thesis does not describe: what grows within the set's width is heard after seconds, or never; the narrower set "
+        f"of the lidar's own accuracy (0.3 m, in place of four standard deviations) hears it sooner{note}",
     )  # fmt: skip
 
 
 def _brakes(runs: Runs) -> Claim:
-    found: dict[str, Any] = {}
-    for attack, guard in (("none", "no monitor"), *((attack, guard) for attack in (JUMPS[0], RAMPS[-1]) for guard in BRAKES)):
-        run = runs[attack, guard]
-        found[f"{attack}; {guard}"] = {
-            "as worded": _share(run.literal.holds), "if under attack and unsafe": _share(run.threat.holds),
-            "runs in which that came about": float(run.threat.asked.mean()),
-        }  # fmt: skip
-    worded = [runs[attack, "monitor, brakes below 20 m"].literal.holds.mean() for attack in (JUMPS[0], RAMPS[-1])]
-    healthy = runs["none", "no monitor"].literal.holds.mean()
+    guard = "monitor, brakes below 20 m"
+    shares = {(attack, guard): _share(runs[attack, guard].literal.holds) for attack in (SPOOFED, "none")}
+    beside = {(attack, g): _share(runs[attack, g].literal.holds) for attack, g in (("none", "no monitor"), (SPOOFED, "monitor and brake"))}
+    holds, note = judge(list(shares.values()), LEVEL)
     return Claim(
-        "7.4-600-loop", "When the distance is below 20 m the controller brakes within 600 ms to avoid a collision", "600 ms", found,
-        verdict(bool(min(*worded, healthy) > 0.95), bool(max(*worded, healthy) < 0.5)),
-        "as worded it is the wrong demand: a healthy car that creeps at 10 m has no reason to brake. Beside it: of cars under attack and "
-        "too close to stop behind a braking leader (RSS), with how often that came about",
+        "7.4-600-loop", "When the distance is below 20 m the reactive controller brakes within 600 ms", "600 ms",
+        {f"{attack}; {g}": interval(share) for (attack, g), share in (shares | beside).items()}, holds,
+        "as worded it is the wrong demand: a healthy car that creeps at 10 m has no reason to brake; decided by the brake below 20 m, "
+        f"under {SPOOFED} and without an attack{note}",
+    )  # fmt: skip
+
+
+def answered(run: Run) -> Interval | None:
+    """Share of the runs in which the threat came about that answer it; None where it came about in none."""
+    asked = run.threat.asked
+    return _share(run.threat.holds[asked]) if asked.any() else None
+
+
+def _threat(runs: Runs) -> Claim:
+    """A run in which the threat never came about says nothing of the answer, and does not count."""
+    cells, found = [], {}
+    for attack in (SPOOFED, OTHER, *RAMPS):
+        for guard in ("no monitor", *BRAKES):
+            run = runs[attack, guard]
+            share = answered(run)
+            said: dict[str, Any] = {"asked": f"{int(run.threat.asked.sum())} of {len(run.collided)}"}
+            said["answered"] = interval(share) if share else None
+            if share is None:
+                said["reason"] = "never unsafe under attack"
+            elif guard == "monitor and brake":
+                cells.append(share)
+            found[f"{attack}; {guard}"] = said
+    holds, note = judge(cells, THESIS[0]) if cells else ("partly", "; the threat came about in no run")
+    return Claim(
+        "7.4-600-threat", "Where an attack brings the car too close, the reactive controller brakes within 600 ms",
+        "600 ms, in [0.9026, 1]", found, holds,
+        "of the runs in which a car under attack is too close to stop behind a braking leader (RSS): those in which it begins to brake "
+        "in time, after the threat, and brakes on; the thesis's jump never brings a car with a monitor there, and what grows slowly, which "
+        f"the thesis does not describe, gets it there unheard if the set is wider than the lidar's accuracy; decided by {BRAKES[0]}{note}",
     )  # fmt: skip
 
 
 def _table(runs: Runs) -> Table:
     rows = []
     for (attack, guard), run in runs.items():
-        told = run.notice[~np.isnan(run.notice)]
+        told, share = run.notice[~np.isnan(run.notice)], answered(run)
         heard = told[np.isfinite(told)]
         rows.append((
             attack, guard, f"{100 * run.collided.mean():.1f} %", f"{np.median(run.gap):.1f}",
             f"{100 * len(heard) / len(told):.0f} %" if len(told) else "", f"{np.median(heard):.2f}" if len(heard) else "",
-            f"{100 * run.literal.holds.mean():.0f} %", f"{100 * run.threat.holds.mean():.0f} %", f"{100 * run.threat.asked.mean():.0f} %",
+            f"{100 * run.literal.holds.mean():.0f} %",
+            f"{100 * share.value:.0f} % [{100 * share.low:.0f}, {100 * share.high:.0f}]" if share else "never unsafe",
+            f"{int(run.threat.asked.sum())} of {len(run.collided)}",
         ))  # fmt: skip
     heads = (
         "attack", "defence", "collisions", "smallest gap [m], median", "alarms", "after [s], median", "brakes in 600 ms below 20 m",
-        "brakes in 600 ms if attacked and unsafe", "runs in which it was",
+        "brakes in 600 ms, of runs attacked and unsafe", "which were",
     )  # fmt: skip
     return Table("The lidar's gap spoofed, in the loop", heads, tuple(rows))

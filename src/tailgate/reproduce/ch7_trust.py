@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +12,7 @@ from tailgate.core import Array
 from tailgate.stats import Interval, proportion
 from tailgate.trust.statistics import Sequential
 
-from .claims import Claim, Report, Table, verdict
+from .claims import Claim, Holds, Report, Table, verdict
 
 if TYPE_CHECKING:
     from .ch7_automata import Played
@@ -25,6 +26,18 @@ LEVELS = (0.9, 0.95, 0.99, 0.999)
 
 def interval(i: Interval) -> dict[str, float]:
     return {"share": round(i.value, 4), "low": round(i.low, 4), "high": round(i.high, 4)}
+
+
+def judge(cells: Sequence[Interval], level: float, floor: float = 0.5) -> tuple[Holds, str]:
+    """The verdict on shares that have to reach a level, and what to add to `why` where an interval does not decide it.
+
+    A share that reaches the level counts for the claim even if its interval goes below, so that neither the number of runs nor one failure
+    decides; one whose whole interval is below `floor` against it.
+    """
+    holds = verdict(all(i.value >= level for i in cells), all(i.high < floor for i in cells))
+    open_ = sorted({bound for i in cells for bound in (level, floor) if i.low < bound <= i.high})
+    note = f"; too few runs: a 95 % interval has {' and '.join(f'{bound:g}' for bound in open_)} inside" if open_ else ""
+    return holds, note
 
 
 def first(hit: Array) -> Array:
@@ -94,6 +107,7 @@ def _all(runs: Played) -> Claim:
     """Trust in the vehicle needs all three at once."""
     hit = np.isfinite(runs.declared.hit)
     every = proportion(int(hit.all(axis=0).sum()), runs.many)
+    holds, note = judge([every], THESIS[0], THESIS[0])
     split = (0.05 / len(hit)) ** (1.0 / RUNS)
     measured: dict[str, Any] = {
         "three times 36 of 36, 5 % split over them": round(frechet([split] * len(hit)), 4),
@@ -101,9 +115,9 @@ def _all(runs: Played) -> Claim:
     }
     return Claim(
         "7.4-overall", "Based on the results of the three automata, the overall trust is that of each", PRINTED, measured,
-        verdict(every.low >= THESIS[0], every.high < THESIS[0]),
+        holds,
         "of three statements only their joint probability counts: without independence 1 less the sum of what is missing (Frechet), or all "
-        "three counted run by run",
+        f"three counted run by run{note}",
     )  # fmt: skip
 
 

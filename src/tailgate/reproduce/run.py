@@ -59,6 +59,8 @@ def flat(value: Any) -> str:
         return "; ".join(parts)
     if isinstance(value, list):
         return ", ".join(flat(v) for v in value)
+    if value is None:
+        return "not measured"
     return _number(value) if isinstance(value, float) else str(value)
 
 

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Container
 from pathlib import Path
+from typing import NamedTuple
 from xml.etree import ElementTree
 
+from tailgate.errors import InputError
 from tailgate.files import write_atomic
 
 from .automata import TIME, Atom, Component, Edge, Location, Network, Query, Speed
@@ -14,34 +17,87 @@ DTD = "<!DOCTYPE nta PUBLIC '-//Uppaal Team//DTD Flat System 1.6//EN' 'http://ww
 ENTRY = "entry_"  # a committed location before the first one, where that one draws clock rates
 WORDS = (
     "chan clock bool int double string commit committed const urgent broadcast init initial process state guard sync assign system trans "
-    "deadlock and or not imply true false for forall exists while do if else return typedef struct rate before_update after_update meta "
-    "priority progress scalar select void default switch case continue break enum random hybrid sum inf sup bounds simulation"
+    "deadlock and or xor not imply true false for forall exists foreach while do if else return typedef struct rate before_update "
+    "after_update meta priority progress scalar select void default switch case continue break enum hybrid sum inf sup bounds "
+    "simulation invariant location branchpoint template import dynamic spawn exit numOf gantt IO assert "
+    "A E M R U W Pr simulate control control_t acontrol strategy under sat consistency refinement specification implementation "
+    "minE maxE minPr maxPr minexp maxexp loadStrategy saveStrategy min max query probability"
 )
-RESERVED = frozenset(WORDS.split())  # names that mean something to UPPAAL
+FUNCTIONS = (
+    "abs fabs fmod fma fmax fmin fdim fint exp exp2 expm1 ln log log10 log2 log1p pow sqrt cbrt hypot sin cos tan asin acos atan atan2 "
+    "sinh cosh tanh asinh acosh atanh erf erfc tgamma lgamma ceil floor trunc round ldexp ilogb logb nextafter copysign signbit "
+    "isfinite isinf isnan isnormal isunordered random random_arcsine random_beta random_gamma random_normal random_poisson random_tri "
+    "random_weibull"
+)
+RESERVED = frozenset((WORDS + " " + FUNCTIONS).split())  # names that mean something to UPPAAL
+INT = 32767  # largest value of its integers, which begin at -INT - 1
+LITERAL = 2**31 - 1  # largest whole number that may be written without a point
 SPREAD = 160  # between locations of the drawing
 
 
-def identifier(name: str) -> str:
-    """A name as UPPAAL takes it: its own words get an underscore."""
-    return f"{name}_" if name in RESERVED else name
+class Names(NamedTuple):
+    """The identifier of everything that is written. Those that are shared are distinct, and no location has one of them."""
+
+    shared: dict[str, str]  # of clocks, variables and channels
+    rates: dict[str, str]  # by clock: the variable that holds the rate which was drawn
+    templates: tuple[str, ...]  # by component
+    processes: tuple[str, ...]
+    places: tuple[dict[str, str], ...]  # of locations, by component
+    entries: tuple[str, ...]
+
+
+def identifier(name: str, taken: Container[str] = ()) -> str:
+    """A name as UPPAAL takes it: its own words, and what is taken, get an underscore."""
+    while name in RESERVED or name in taken:
+        name += "_"
+    return name
+
+
+def _named(wanted: list[str], taken: set[str]) -> dict[str, str]:
+    """Identifiers in the order of the names; they become taken. A name that need not change keeps itself, whatever stands before it."""
+    kept = [name for name in wanted if name not in RESERVED and name not in taken]
+    taken.update(kept)
+    out = {}
+    for name in wanted:
+        out[name] = name if name in kept else identifier(name, taken)
+        taken.add(out[name])
+    return out
+
+
+def names_of(network: Network) -> Names:
+    taken: set[str] = set()
+    shared = _named([TIME, *network.clocks, *network.variables, *network.channels], taken)
+    drawn = dict.fromkeys(clock for c in network.components for place in c.locations for clock in draws_of(place))
+    rates = {clock: _named([f"rate_{clock}"], taken)[f"rate_{clock}"] for clock in drawn}
+    parts = [c.name for c in network.components]
+    templates = tuple(_named([f"{name}_template" for name in parts], taken).values())
+    processes = tuple(_named([f"{name}_process" for name in parts], taken).values())
+    places, entries = [], []
+    for component in network.components:
+        local = set(taken)  # a location's name would hide a shared one
+        places.append(_named([place.name for place in component.locations], local))
+        entries.append(identifier(ENTRY, local))
+    return Names(shared, rates, templates, processes, tuple(places), tuple(entries))
 
 
 def number(value: float) -> str:
-    return str(int(value)) if value == int(value) else repr(float(value))
+    return str(int(value)) if value == int(value) and abs(value) <= LITERAL else repr(float(value))
 
 
-def condition(atoms: tuple[Atom, ...]) -> str:
+def whole(where: str, value: float) -> str:
+    """A value of an integer variable. Raises InputError for one that UPPAAL's integers do not hold."""
+    if not -INT - 1 <= value <= INT:
+        raise InputError(where, value, f"from {-INT - 1} to {INT}, as UPPAAL's integers are")
+    return str(int(value))
+
+
+def condition(atoms: tuple[Atom, ...], names: Names) -> str:
     """A guard, an invariant or a state formula."""
-    return " && ".join(f"{identifier(a.name)} {'==' if a.op == '=' else a.op} {number(a.value)}" for a in atoms)
+    return " && ".join(f"{names.shared[a.name]} {'==' if a.op == '=' else a.op} {number(a.value)}" for a in atoms)
 
 
-def formula(query: Query) -> str:
-    return f"Pr[<={number(query.within)}](<> {condition(query.holds)})"
-
-
-def rate_name(clock: str) -> str:
-    """The variable that holds the rate which was drawn for a clock."""
-    return f"rate_{clock}"
+def formula(query: Query, names: Names) -> str:
+    return f"Pr[<={number(query.within)}](<> {condition(query.holds, names)})"
 
 
 def draws_of(place: Location) -> dict[str, tuple[float, float]]:
@@ -49,82 +105,81 @@ def draws_of(place: Location) -> dict[str, tuple[float, float]]:
     return {clock: speed for clock, speed in place.rates.items() if isinstance(speed, tuple)}
 
 
-def invariant(place: Location) -> str:
+def invariant(place: Location, names: Names) -> str:
     """Limits, and the rates of clocks that do not run at 1."""
-    rates = [f"{identifier(clock)}' == {_speed(clock, speed)}" for clock, speed in place.rates.items()]
-    return " && ".join([*([condition(place.invariant)] if place.invariant else []), *rates])
+    rates = [f"{names.shared[clock]}' == {_speed(clock, speed, names)}" for clock, speed in place.rates.items()]
+    return " && ".join([*([condition(place.invariant, names)] if place.invariant else []), *rates])
 
 
-def _speed(clock: str, speed: Speed) -> str:
-    return rate_name(clock) if isinstance(speed, tuple) else number(speed)
+def _speed(clock: str, speed: Speed, names: Names) -> str:
+    return names.rates[clock] if isinstance(speed, tuple) else number(speed)
 
 
-def assignment(edge: Edge, component: Component) -> str:
+def assignment(edge: Edge, component: Component, names: Names) -> str:
     """What is set, and what is drawn for the location that is entered."""
-    sets = [f"{identifier(name)} = {number(value)}" for name, value in edge.assign.items()]
-    return ", ".join([*sets, *_drawn(component.location(edge.target))])
+    sets = []
+    for name, value in edge.assign.items():
+        text = number(value) if name in component.clocks else whole(f"component {component.name}: assign.{name}", value)
+        sets.append(f"{names.shared[name]} = {text}")
+    return ", ".join([*sets, *_drawn(component.location(edge.target), names)])
 
 
-def _drawn(place: Location) -> list[str]:
-    return [f"{rate_name(clock)} = {number(low)} + random({number(high - low)})" for clock, (low, high) in draws_of(place).items()]
+def _drawn(place: Location, names: Names) -> list[str]:
+    return [f"{names.rates[clock]} = {number(low)} + random({number(high - low)})" for clock, (low, high) in draws_of(place).items()]
 
 
-def declaration(network: Network) -> str:
+def declaration(network: Network, names: Names) -> str:
     """Clocks, variables and broadcast channels, all of them global."""
-    clocks = ", ".join(map(identifier, (TIME, *network.clocks)))
-    lines = [f"// {network.name}: {network.about}".rstrip(": "), f"clock {clocks};"]
-    lines += [f"int {identifier(name)} = {value};" for name, value in network.variables.items()]
-    drawn = dict.fromkeys(clock for c in network.components for place in c.locations for clock in draws_of(place))
-    lines += [f"double {rate_name(clock)} = 1.0;" for clock in drawn]
-    lines += [f"broadcast chan {', '.join(map(identifier, network.channels))};"] if network.channels else []
+    shared = names.shared
+    lines = ["// " + " ".join(f"{network.name}: {network.about}".split()).rstrip(": \\")]  # one line, whatever the text holds
+    lines += [f"clock {', '.join(shared[name] for name in (TIME, *network.clocks))};"]
+    lines += [f"int {shared[name]} = {whole(f'variable {name}', value)};" for name, value in network.variables.items()]
+    lines += [f"double {name} = 1.0;" for name in names.rates.values()]
+    lines += [f"broadcast chan {', '.join(shared[name] for name in network.channels)};"] if network.channels else []
     return "\n".join(lines)
 
 
 def element(network: Network) -> ElementTree.Element:
-    """The whole document, elements in the order of the DTD."""
-    root = ElementTree.Element("nta")
-    _text(root, "declaration", declaration(network))
-    for i, component in enumerate(network.components):
-        root.append(_template(component, f"c{i}"))
-    names = [identifier(c.name) for c in network.components]
-    system = [f"{name}_process = {_template_name(c)}();" for name, c in zip(names, network.components, strict=True)]
-    _text(root, "system", "\n".join([*system, f"system {', '.join(f'{name}_process' for name in names)};"]))
+    """The whole document, elements in the order of the DTD. Raises InputError for a value that UPPAAL's integers do not hold."""
+    root, names = ElementTree.Element("nta"), names_of(network)
+    _text(root, "declaration", declaration(network, names))
+    for i in range(len(network.components)):
+        root.append(_template(network, i, names))
+    system = [f"{process} = {template}();" for process, template in zip(names.processes, names.templates, strict=True)]
+    _text(root, "system", "\n".join([*system, f"system {', '.join(names.processes)};"]))
     queries = ElementTree.SubElement(root, "queries")
     for query in network.queries:
         held = ElementTree.SubElement(queries, "query")
-        _text(held, "formula", formula(query))
+        _text(held, "formula", formula(query, names))
         _text(held, "comment", query.name)
     return root
 
 
-def _template_name(component: Component) -> str:
-    return f"{component.name.capitalize()}_template"
-
-
-def _template(component: Component, prefix: str) -> ElementTree.Element:
+def _template(network: Network, which: int, names: Names) -> ElementTree.Element:
+    component, prefix, places = network.components[which], f"c{which}", names.places[which]
     out = ElementTree.Element("template")
-    _text(out, "name", _template_name(component))
+    _text(out, "name", names.templates[which])
     ids = {place.name: f"{prefix}_{j}" for j, place in enumerate(component.locations)}
     first, count = component.location(component.initial), len(component.locations)
     entry = f"{prefix}_{ENTRY}" if draws_of(first) else ""
     for j, place in enumerate(component.locations):
         turn = 2.0 * math.pi * j / count
         x, y = round(SPREAD * math.sin(turn)), round(-SPREAD * math.cos(turn))
-        held = _place(out, ids[place.name], identifier(place.name), x, y)
+        held = _place(out, ids[place.name], places[place.name], x, y)
         if place.rates or place.invariant:
-            _text(held, "label", invariant(place), kind="invariant")
+            _text(held, "label", invariant(place, names), kind="invariant")
         if not place.invariant and not place.committed:
             _text(held, "label", number(place.rate), kind="exponentialrate")
         if place.committed:
             ElementTree.SubElement(held, "committed")
     if entry:
-        ElementTree.SubElement(_place(out, entry, ENTRY, -2 * SPREAD, -2 * SPREAD), "committed")
+        ElementTree.SubElement(_place(out, entry, names.entries[which], -2 * SPREAD, -2 * SPREAD), "committed")
     ElementTree.SubElement(out, "init", ref=entry or ids[component.initial])
     if entry:
-        _transition(out, entry, ids[first.name], {"assignment": ", ".join(_drawn(first))})
+        _transition(out, entry, ids[first.name], {"assignment": ", ".join(_drawn(first, names))})
     for edge in component.edges:
-        sync = f"{identifier(edge.channel)}{edge.sync[-1]}" if edge.sync else ""
-        labels = {"guard": condition(edge.guard), "synchronisation": sync, "assignment": assignment(edge, component)}
+        sync = f"{names.shared[edge.channel]}{edge.sync[-1]}" if edge.sync else ""
+        labels = {"guard": condition(edge.guard, names), "synchronisation": sync, "assignment": assignment(edge, component, names)}
         _transition(out, ids[edge.source], ids[edge.target], labels)
     return out
 
@@ -156,6 +211,6 @@ def document(network: Network) -> str:
 
 
 def write_uppaal(network: Network, path: Path) -> Path:
-    """Writes the model; returns its path. Raises InputError when it cannot be written."""
+    """Writes the model; returns its path. Raises InputError when it cannot be written, or holds an integer beyond UPPAAL's."""
     write_atomic(path, document(network).encode())
     return path
