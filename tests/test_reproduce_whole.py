@@ -12,8 +12,9 @@ from tailgate.errors import InputError
 from tailgate.reproduce import ch7_automata, ch7_cost, ch7_loop, ch7_ratings, ch7_signals, ch7_trust, ch7_width, whole, whole_theorems
 from tailgate.reproduce.claims import Claim, Figure, Report, Table
 from tailgate.reproduce.run import CHAPTERS, flat, read, write
-from tailgate.reproduce.whole import Item, check_coverage, load_coverage, reproduce_whole, sources, write_whole
+from tailgate.reproduce.whole import Item, check_coverage, load_coverage, reproduce_whole, write_whole
 from tailgate.scenario import load_scenario
+from tailgate.sources import fingerprint
 from tailgate.stats import proportion
 from tailgate.trust.cells import Outcome
 
@@ -200,13 +201,13 @@ def test_a_report_is_read_back_as_it_was_written(tmp_path):
 def test_sources_are_a_hash_of_what_figures_depend_on(tmp_path):
     """A changed, moved or new source changes it, a page does not."""
     (tmp_path / "a.py").write_text("1", encoding="utf-8")
-    first = sources(tmp_path)
+    first = fingerprint(tmp_path)
     (tmp_path / "page.html").write_text("1", encoding="utf-8")
-    assert sources(tmp_path) == first
+    assert fingerprint(tmp_path) == first
     (tmp_path / "a.py").rename(tmp_path / "b.py")
-    moved = sources(tmp_path)
+    moved = fingerprint(tmp_path)
     (tmp_path / "c.yaml").write_text("", encoding="utf-8")
-    assert len({first, moved, sources(tmp_path)}) == 3
+    assert len({first, moved, fingerprint(tmp_path)}) == 3
 
 
 def test_the_command_without_a_chapter(tmp_path, covered, monkeypatch, capsys):

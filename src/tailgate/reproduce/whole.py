@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import json
-import os
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -13,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import tailgate
+from tailgate import sources
 from tailgate.core import param
 from tailgate.errors import InputError
 from tailgate.files import sweep, writable_directory, write_atomic
@@ -22,7 +21,6 @@ from .claims import Claim, Report
 from .run import CHAPTERS, as_json, body, check_seeds, page, read, reproduce, rows, summary, write
 
 TITLE = "Security of Autonomous Systems under Physical Attacks, claim by claim"
-DATA = (".py", ".yaml", ".json", ".csv", ".safetensors")  # what figures may depend on
 Play = Callable[..., Report]
 
 
@@ -51,17 +49,6 @@ class Whole:
     @property
     def claims(self) -> list[Claim]:
         return [claim for report in self.reports for claim in report.claims]
-
-
-def sources(root: Path | None = None) -> str:
-    """A hash of every file of the package that a figure may depend on."""
-    top = Path(tailgate.__file__).parent if root is None else root
-    found = [Path(folder) / name for folder, _, names in os.walk(top, followlinks=True) for name in names if name.endswith(DATA)]
-    digest = hashlib.blake2b(digest_size=16)
-    for path in sorted(found):
-        content = path.read_bytes()
-        digest.update(f"{path.relative_to(top).as_posix()}\0{len(content)}\0".encode() + content)
-    return digest.hexdigest()
 
 
 def load_coverage() -> list[Item]:
@@ -93,7 +80,7 @@ def reproduce_whole(
     """Every chapter into its own folder of `directory`. One that an earlier run of the same version, sources and seeds finished is kept."""
     check_seeds(seeds)
     writable_directory(directory)
-    stamp = {"seeds": seeds, "sources": sources()}
+    stamp = {"seeds": seeds, "sources": sources.own()}
     wanted = {"version": tailgate.__version__, **stamp}
     out = Whole(seeds, str(stamp["sources"]), [], {}, (), load_coverage())
     for chapter in chapters:
