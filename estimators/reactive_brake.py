@@ -6,6 +6,9 @@ which the own car still speeds up (the distance of responsibility-sensitive safe
 
     d < clearance + v rho + a' rho^2 / 2 + stop(v + a' rho, a') - w^2 / (2 b_lead)
 
+It does so while a reading is distrusted or missing, and for `watch` seconds after: what slowed the car down left it where its controller,
+which accelerates to close the gap while the car ahead stops, may be unsafe by itself.
+
 stop(v, a) is the way to a standstill of a first-order lag tau whose command is -b from now on, with c = a + b:
 
     v(t) = v - b t + c tau (1 - e),        way(t) = v t - b t^2 / 2 + c tau t - c tau^2 (1 - e),        e = exp(-t / tau)
@@ -53,6 +56,7 @@ class SafePlan(NamedTuple):
     off: float  # by how much the own acceleration may be above the box's [m/s^2]
     lag: float  # tau [s]
     reaction: float  # rho, not shorter than a step [s]
+    watch: int  # steps for which the brake stays armed
 
 
 class SafeMemory(NamedTuple):
@@ -60,6 +64,7 @@ class SafeMemory(NamedTuple):
 
     filter: Any
     set: SetState
+    armed: Array  # (B, N) int64: steps for which the brake still acts though nothing is distrusted
 
 
 @register("defence", "safe_state", reference="Dutta 2018, section 7.3.2: set-membership safe states", uses=("measurements", "v2v"))
@@ -82,10 +87,11 @@ class SafeState(SafeSet):
         off, tau = (limits.road.off, limits.road.lag) if isinstance(limits.road, OwnCommand) else (0.0, LAG)
         assert model.speed is not None
         speeds = tuple((i, j) for i, j in zip(*np.nonzero(model.speed), strict=True))
-        return SafePlan(f, f.prepare(model), limits, len(model.actuators), model.followers, speeds, off, tau, 0.0)
+        return SafePlan(f, f.prepare(model), limits, len(model.actuators), model.followers, speeds, off, tau, 0.0, 0)
 
     def start(self, plan: SafePlan, prior: Prior) -> SafeMemory:
-        return SafeMemory(plan.filter.start(plan.filter_plan, prior), self.widest(plan.set_plan, len(prior.mean)))
+        held = self.widest(plan.set_plan, len(prior.mean))
+        return SafeMemory(plan.filter.start(plan.filter_plan, prior), held, num.zeros(held.lo.shape[:2], np.int64))
 
     def step(self, plan: SafePlan, state: SafeMemory, received: Received, known_u: Array, draws: Draws) -> tuple[SafeMemory, Estimate]:
         held, found = self.enclose(plan.set_plan, state.set, received, known_u)
@@ -95,7 +101,8 @@ class SafeState(SafeSet):
         belief = self._inside(plan, belief, found)
         mode = num.full(found.alarm.shape, Mode.NORMAL, np.int8)
         estimate = Estimate(plan.filter.estimate(belief), found.score, found.alarm, mode, np.ones_like(found.alarm))
-        return SafeMemory(belief, held), estimate._replace(limits=self.limits(plan, found))
+        armed, limits = self.limits(plan, found, state.armed)
+        return SafeMemory(belief, held, armed), estimate._replace(limits=limits)
 
     def _inside(self, plan: SafePlan, belief: Any, found: Finding) -> Any:
         """A filter's state with the own speeds in the set: a linear one that knows of a hard brake would reverse a car that stands."""
@@ -107,9 +114,9 @@ class SafeState(SafeSet):
             x[:, i, j] = np.minimum(np.maximum(x[:, i, j], found.box.lo[:, i, SPEED]), found.box.hi[:, i, SPEED])
         return belief._replace(x=x)
 
-    def limits(self, plan: SafePlan, found: Finding) -> Array | None:
-        """The least and the largest command (B, N, m, 2); None where the controller may do as it likes."""
-        return None
+    def limits(self, plan: SafePlan, found: Finding, armed: Array) -> tuple[Array, Array | None]:
+        """`armed` for the next step, and the least and largest command (B, N, m, 2); None where the controller may do as it likes."""
+        return armed, None
 
 
 @register(
@@ -127,15 +134,16 @@ class SafeStateBrake(SafeState):
     reaction: NonNegative = param(0.1, "time before the brake acts; at least a step [s]")
     clearance: NonNegative = param(0.5, "gap that is left when both stand [m]")
     distance: NonNegative = param(0.0, "also brake below this gap while a reading is distrusted or missing; the thesis's is 20 [m]")
+    watch: NonNegative = param(30.0, "time after an alarm, or a brake while a reading was missing, in which it acts without one [s]")
     when: Literal["alarmed", "always"] = param(
-        "alarmed", "alarmed: brake only while a reading is distrusted or missing; always: whenever the worst case is unsafe"
+        "alarmed", "alarmed: only while a reading is distrusted or missing, and for `watch`; always: whenever the worst case is unsafe"
     )
 
     def prepare(self, model: Model) -> SafePlan:
         if len(model.actuators) != 1:
             raise NotApplicable("defence safe_state_brake: actuators", list(model.actuators), "cars that command an acceleration")
         plan = super().prepare(model)
-        return plan._replace(reaction=max(self.reaction, model.dt), lag=self.lag or plan.lag)
+        return plan._replace(reaction=max(self.reaction, model.dt), lag=self.lag or plan.lag, watch=round(self.watch / model.dt))
 
     def needed(self, plan: SafePlan, found: Finding) -> Array:
         """The smallest safe gap (B, N) [m] for the worst of the box."""
@@ -146,10 +154,12 @@ class SafeStateBrake(SafeState):
         ahead = w * w / (2.0 * max(self.lead_brake, self.brake))  # the formula takes the end of the braking for the closest
         return np.asarray(self.clearance + 0.5 * rho * (v + fast) + stopping_distance(fast, a, self.brake, plan.lag) - ahead)
 
-    def limits(self, plan: SafePlan, found: Finding) -> Array:
+    def limits(self, plan: SafePlan, found: Finding, armed: Array) -> tuple[Array, Array]:
         gap = found.worst.lo[..., GAP]
-        some = found.missing if self.when == "alarmed" else np.ones_like(found.missing)
-        unsafe = plan.follows & ((some & (gap < self.needed(plan, found))) | (found.missing & (gap < self.distance)))
+        short, near = gap < self.needed(plan, found), found.missing & (gap < self.distance)
+        some = found.missing | (armed > 0) if self.when == "alarmed" else np.ones_like(found.missing)
+        unsafe = plan.follows & ((some & short) | near)
         out = num.full((*unsafe.shape, plan.actuators, 2), np.array([-np.inf, np.inf]))
         out[..., 1] = np.where(unsafe, -self.brake, np.inf)[..., None]
-        return out
+        caused = found.alarm | (unsafe & found.missing)  # a brake that nothing asked for ends far from where the controller drives
+        return np.where(caused, plan.watch, np.maximum(armed - 1, 0)), out

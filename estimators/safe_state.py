@@ -16,7 +16,7 @@ Where nobody tells w it is told by the gaps. With h_j = d - j dt w,
 
 import math
 from dataclasses import dataclass
-from typing import Annotated, Any, NamedTuple, Protocol
+from typing import Annotated, Any, Literal, NamedTuple, Protocol
 
 import numpy as np
 from pydantic import Field
@@ -75,7 +75,8 @@ class Road(Protocol):
 class OwnCommand:
     """A car that knows its command and lag, and hears where its leader is and how fast (car following).
 
-    The box holds the acceleration that the lag gives without a disturbance: the true one is off by at most `off`.
+    The box holds the acceleration that the lag gives without a disturbance: the true one is off by at most `off`, the bound of every sum
+    |E^(k-j) w_j + ... + E w_(k-1) + w_k|, E the lag's factor in a step, w the disturbance of the acceleration.
     """
 
     A: Array
@@ -194,7 +195,10 @@ class SafeSet:
 
     sigmas: Positive = param(4.0, "a sensor is accurate to so many standard deviations; of uniform noise 3^0.5 [-]")
     accuracy: tuple[Positive, ...] | None = param(None, "accuracy e of each sensor [its unit]; none: by sigmas")
-    disturbance: NonNegative = param(3.0, "process noise, and what a lag makes of it in the long run, is at most so many sigmas [-]")
+    disturbance: NonNegative = param(3.0, "process noise in a step is at most so many sigmas [-]")
+    adds_up: Literal["spread", "worst"] = param(
+        "spread", "what a lag E makes of it is at most `disturbance` times its sigma in the long run, 1 / (1 - E^2)^0.5; worst: 1 / (1 - E)"
+    )
     accel_limits: Limits = param((-9.0, 4.0), "least and largest acceleration of any car [m/s^2]")
     speed_max: Positive = param(60.0, "highest speed of any car [m/s]")
     recover: NonNegative = param(2.0, "time for which a distrusted sensor's readings have to pass before one is believed [s]")
@@ -230,7 +234,8 @@ class SafeSet:
     def _road(self, model: Model, spread: Array, gust: Array) -> tuple[Road, tuple[int, ...]]:
         if model.sensors == ("position", "velocity") and model.v2v == LEADER and model.actuators == ("acceleration",):
             tau = -model.dt / float(num.log(model.A[2, 2]))
-            off = float(spread[2]) / math.sqrt(1.0 - model.A[2, 2] * model.A[2, 2])  # what the lag makes of it in the long run
+            E = float(model.A[2, 2])
+            off = float(spread[2]) / (1.0 - E if self.adds_up == "worst" else math.sqrt(1.0 - E * E))
             return OwnCommand(model.A, model.B, spread * np.array([1.0, 1.0, 0.0]), off, tau), (GAP, SPEED)
         if model.sensors == ("distance", "velocity", "acceleration") and model.v2v == V2V:
             return OwnAccelerometer(model.dt, model.followers, self.accel_limits, gust), (GAP, SPEED, ACCEL)

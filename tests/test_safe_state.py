@@ -43,16 +43,27 @@ def push(rng, a, low, high, speed):
     return np.minimum(np.where(rng.random(a.shape) < 0.05, new, a), np.where(speed > 38.0, -1.0, high))
 
 
-def following(model, sigmas, kicks, batch, steps, seed=0):
-    """A car behind a leader that uses all of its acceleration limits; noise and disturbances fill their bounds."""
+def following(model, sigmas, kicks, batch, steps, seed=0, adds_up="spread"):
+    """A car behind a leader that uses all of its acceleration limits; noise and disturbances fill their bounds.
+
+    The acceleration's disturbance is as free as the bound that is stated: `kicks` sigma in each step, and where they do not simply add up
+    ("worst") cut off only where a sum of them through the lag, from any step on, would exceed its bound.
+    """
     rng, dt, (A, B) = np.random.default_rng(seed), model.dt, (model.A, model.B)
     e, spread = sigmas * np.sqrt(model.R[0].diagonal()), kicks * np.sqrt(model.Q.diagonal())
-    spread[2] *= (1.0 - A[2, 2]) / math.sqrt(1.0 - A[2, 2] ** 2)  # so that what the lag makes of it stays within the same bound
+    E = A[2, 2]
+    off = spread[2] / (1.0 - E if adds_up == "worst" else math.sqrt(1.0 - E * E))
+    up, down, wind = np.zeros(batch), np.zeros(batch), np.ones(batch)  # the largest and the smallest sum that ends now; which way it blows
     x, v, a, lead, w = np.zeros(batch), np.full(batch, 20.0), np.zeros(batch), np.full(batch, 100.0), np.full(batch, 20.0)
     u, p = np.zeros(batch), np.zeros(batch)
     for _ in range(steps):
         u, p = push(rng, u, -5.0, 2.0, v), push(rng, p, -9.0, 4.0, w)
-        x, v, a = drive(A, B, x, v, a, u, spread[:, None] * unit(rng, (batch, 3)).T)
+        kick = spread[:, None] * unit(rng, (batch, 3)).T
+        wind = np.where(rng.random(batch) < 0.03, -wind, wind)
+        push_a = np.where(np.arange(batch) % 4 < 2, kick[2], spread[2] * wind)  # half of the rows: gusts that last
+        kick[2] = np.clip(push_a, -off - np.minimum(E * down, 0.0), off - np.maximum(E * up, 0.0))
+        up, down = np.maximum(E * up, 0.0) + kick[2], np.minimum(E * down, 0.0) + kick[2]
+        x, v, a = drive(A, B, x, v, a, u, kick)
         w, before = np.maximum(w + p * dt, 0.0), w
         lead = lead + 0.5 * dt * (w + before)
         y = np.stack([x, v], axis=-1) + e * unit(rng, (batch, 2))
@@ -112,14 +123,23 @@ def outside(found, truth, off=0.0):
 GUARD = SafeSet(sigmas=ROOT3, disturbance=3.0)
 
 
-def test_no_false_alarm_in_a_million_steps_of_bounded_noise():
-    """A healthy car whose noise, disturbances and leader go to their bounds would be called attacked."""
+@pytest.mark.parametrize("adds_up", ["spread", "worst"])
+def test_no_false_alarm_in_half_a_million_steps_each_of_bounded_noise(adds_up):
+    """A healthy car whose noise, disturbances and leader go to the bounds that are stated would be called attacked."""
     model, count = model_of("stop-and-go-v0"), 0
-    for plan, found, step in enclosed(GUARD, model, following(model, ROOT3, 3.0, 5000, 200)):
+    guard = dataclasses.replace(GUARD, adds_up=adds_up)
+    for plan, found, step in enclosed(guard, model, following(model, ROOT3, 3.0, 5000, 100, adds_up=adds_up)):
         assert not found.alarm.any() and not found.missing.any() and (found.score <= 1.0 + 1e-9).all()
         assert outside(found, step.truth, plan.road.off).max() <= 1e-6
         count += found.alarm.size
-    assert count == 1_000_000
+    assert count == 500_000
+
+
+def test_disturbances_beyond_the_stated_sum_do_raise_alarms():
+    """The test above would not reach the bound, and would pass whatever bound is stated."""
+    model = model_of("stop-and-go-v0")
+    world = following(model, ROOT3, 3.0, 500, 200, adds_up="worst")
+    assert sum(found.alarm.sum() for _, found, _ in enclosed(GUARD, model, world)) > 500
 
 
 @pytest.mark.parametrize("name, world", [("platoon-v2v-v0", string), ("radar-following-v0", radar)])
@@ -145,26 +165,18 @@ def test_the_speed_at_the_end_of_the_step_breaks_it(monkeypatch):
     assert sum(found.alarm.sum() for _, found, _ in enclosed(GUARD, model, radar(model, ROOT3, 50, 60))) > 50
 
 
-@pytest.mark.parametrize("sign", [-1.0, 1.0])
-def test_a_reading_one_percent_outside_alarms_in_the_same_step(sign):
-    """n = 1: a reading is tested on its own, so 0.99 of the bound has to pass and 1.01 has to alarm, whatever came before."""
-    model = model_of("stop-and-go-v0")
-    plan, world = GUARD.limits_of(model), list(following(model, ROOT3, 3.0, 8, 60))
-    state = GUARD.widest(plan, 8)
+def test_offsets_below_the_sure_bound_alarm_as_often_as_the_documentation_says():
+    """The share of lies that are seen at once, of true gaps and uniform noise, would not be the published one."""
+    model, onset, shares = model_of("stop-and-go-v0"), 40, {0.0: 0.0, 1.0: 0.29, 2.0: 0.78, 3.0: 0.999}
+    plan, world = GUARD.limits_of(model), list(following(model, ROOT3, 3.0, 2000, onset + 1, seed=3))
+    state = GUARD.widest(plan, 2000)
     for step in world[:-1]:
         state, _ = GUARD.enclose(plan, state, step.received, step.known_u)
-    last = world[-1]
-    blind = last.received._replace(valid=np.zeros_like(last.received.valid))
-    predicted = GUARD.enclose(plan, state, blind, last.known_u)[1].box
-    for column, sensor in ((GAP, 0), (SPEED, 1)):
-        half = 0.5 * (predicted.hi - predicted.lo)[..., column] + plan.accuracy[:, column]
-        for share in (0.99, 1.01):
-            y, at = last.received.y.copy(), predicted.lo[..., column] + half - plan.accuracy[:, column] + sign * share * half
-            y[..., sensor] = last.received.v2v[..., 0] - at if column == GAP else at
-            _, found = GUARD.enclose(plan, state, last.received._replace(y=y), last.known_u)
-            assert (found.alarm == (share > 1.0)).all() and (found.score >= share - 1e-6).all()
-            assert share < 1.0 or found.score == pytest.approx(1.01, rel=1e-6)
-            assert (found.trusted[..., column] == (share < 1.0)).all()
+    for offset, share in shares.items():
+        y = world[-1].received.y.copy()
+        y[..., 0] -= offset * plan.accuracy[:, GAP]
+        _, found = GUARD.enclose(plan, state, world[-1].received._replace(y=y), world[-1].known_u)
+        assert found.alarm[::2].mean() == pytest.approx(share, abs=0.04 if share else 0.0)
 
 
 def test_an_offset_above_the_sure_bound_alarms_at_once_in_every_row():
@@ -303,7 +315,7 @@ def test_chapter_7_a_hidden_gap_collides_undefended_and_not_behind_the_brake():
 
 
 def test_chapter_7_is_free_of_false_alarms():
-    """Its noise is bounded, and the defence knows the bounds."""
+    """The bounds of its sensors' noise would be too sharp; its process noise is Gaussian, so that this is measured and not certain."""
     place = load_scenario("ch7-v0")
     trace = played(place, f"safe_state_brake:sigmas={ROOT3},when=always", seeds=16)
     assert not trace.alarm.any() and not struck(trace).any() and trace.score.max() <= 1.0 + 1e-9
@@ -320,6 +332,14 @@ def test_the_brake_keeps_clear_of_a_leader_that_brakes_as_hard_as_it_reckons_wit
     assert struck(played(risky, "kf")).mean() > 0.9
     trace = played(risky, f"safe_state_brake:sigmas={ROOT3},when=always,lead_brake=8.0")
     assert not struck(trace).any() and metrics.min_gap(trace).min() > 0.4
+
+
+def test_a_false_reading_far_from_danger_does_not_make_it_collide_later():
+    """The brake would slow the car, look away, and let the controller that closes the gap run into a leader that stops 15 s later."""
+    place = dataclasses.replace(load_scenario("gusty-stop-and-go-v0"), horizon=420).with_threat(budget=20)
+    attack, seeds = Spec("attack", "fdi:start_step=100,value=30").make(), keys("select", [8, 9, 11, 15, 24, 25])
+    traces = [rollout(place.loop(SafeStateBrake(watch=watch), USES), attack, seeds) for watch in (0.0, 30.0)]
+    assert struck(traces[0]).all() and not struck(traces[1]).any()
 
 
 @pytest.mark.parametrize("name", ["gusty-stop-and-go-v0", "braking-v0"])
