@@ -10,6 +10,7 @@ from tailgate.agents.cem import Config, Learner, Shape
 from tailgate.agents.policy import PolicyAttack
 from tailgate.errors import InputError
 from tailgate.metrics import measure
+from tailgate.scenario import config_path
 from tailgate.trace import rollout
 
 ROAD = {
@@ -17,10 +18,19 @@ ROAD = {
     "reward": "min_gap", "gap_shaping": 0.0, "error_shaping": 0.0,
 }
 SMALL = Config(population=8, episodes=4, hidden=(4,))
-ROUND = 8 * 4 * 20  # decisions of a generation without a collision
+ROUND = 8 * 4 * 10  # decisions of a generation of `brief` without a collision
 
 
-def run(steps, seed=0, config=SMALL, environment=ROAD, **options):
+@pytest.fixture(scope="module")
+def brief(tmp_path_factory):
+    """The environment of ROAD with half of its time, in ten decisions, of which some collide."""
+    path = tmp_path_factory.mktemp("scenario") / "brief.yaml"
+    text = config_path("scenarios", ROAD["scenario"], "scenario").read_text().replace("horizon: 600", "horizon: 300")
+    path.write_text(text.replace("end: 500", "end: 300").replace("onset: 50", "onset: 10"))
+    return ROAD | {"scenario": str(path)}
+
+
+def run(environment, steps, seed=0, config=SMALL, **options):
     learner = Learner(seed, 0.99, config, environment)
     learner.learn(steps, lambda progress: None, **options)
     return learner
@@ -39,13 +49,13 @@ def test_a_weight_vector_is_its_layers():
     assert sorted(np.concatenate([part.ravel() for layer in one for part in layer])) == sorted(theta[2])
 
 
-def test_it_learns():
+def test_it_learns(brief):
     """In ten generations the mean's reward on fresh seeds doubles that of rest, and beats the first generation's by far."""
     config = Config(population=24, episodes=12, hidden=(8,), extra_until=8)
-    learner = Learner(0, 0.99, config, ROAD)
+    learner = Learner(0, 0.99, config, brief)
     first, _ = learner._play(learner.mean[None])
     learner.generation = 0
-    learner.learn(10 * 24 * 12 * 20, lambda progress: None)
+    learner.learn(10 * 24 * 12 * 10, lambda progress: None)
     before, after = first[0], np.mean([entry["reward"] for entry in learner.curve[-3:]])
     assert after > before + 0.3
     assert [entry["steps"] for entry in learner.curve] == sorted({entry["steps"] for entry in learner.curve})
@@ -66,10 +76,10 @@ def test_the_elite_is_the_best():
     assert learner.steps == twin.steps and learner.generation == 1
 
 
-@pytest.mark.parametrize("environment", [ROAD, ROAD | {"action": "continuous"}], ids=["discrete", "continuous"])
-def test_what_is_exported_plays_as_in_training(environment, tmp_path):
+@pytest.mark.parametrize("action", ["mode", "continuous"], ids=["discrete", "continuous"])
+def test_what_is_exported_plays_as_in_training(brief, action, tmp_path):
     """The mean's reward and collisions in training are those of the exported policy on the same episodes."""
-    learner = run(3 * ROUND, environment=environment)
+    learner = run(brief | {"action": action}, 3 * ROUND)
     first = learner.seed * 1_000_000 + learner.generation * SMALL.episodes
     reward, crashed = learner._play(learner.mean[None])
     attack = PolicyAttack(learner.export(tmp_path / "policy", {"learner": "cem"}))
@@ -80,30 +90,30 @@ def test_what_is_exported_plays_as_in_training(environment, tmp_path):
     assert json.loads((tmp_path / "policy.json").read_text())["training"]["learner"] == "cem"
 
 
-def test_two_runs_of_a_seed_and_a_resumed_one_agree(tmp_path):
+def test_two_runs_of_a_seed_and_a_resumed_one_agree(brief, tmp_path):
     """Same seed, same policy file; interrupted and resumed, the same as well; another seed, another policy."""
-    whole = run(6 * ROUND).export(tmp_path / "whole", {}).with_suffix(".safetensors").read_bytes()
-    assert run(6 * ROUND).export(tmp_path / "again", {}).with_suffix(".safetensors").read_bytes() == whole
-    run(3 * ROUND, checkpoint=tmp_path / "check")
-    second = Learner(0, 0.99, SMALL, ROAD)
+    whole = run(brief, 4 * ROUND).export(tmp_path / "whole", {}).with_suffix(".safetensors").read_bytes()
+    assert run(brief, 4 * ROUND).export(tmp_path / "again", {}).with_suffix(".safetensors").read_bytes() == whole
+    run(brief, 2 * ROUND, checkpoint=tmp_path / "check")
+    second = Learner(0, 0.99, SMALL, brief)
     second.load(tmp_path / "check")
-    assert 3 * ROUND <= second.steps < 6 * ROUND and second.generation == len(second.curve) > 2
-    second.learn(6 * ROUND, lambda progress: None)
+    assert 2 * ROUND <= second.steps < 4 * ROUND and second.generation == len(second.curve) > 1
+    second.learn(4 * ROUND, lambda progress: None)
     assert second.export(tmp_path / "resumed", {}).with_suffix(".safetensors").read_bytes() == whole
-    assert run(6 * ROUND, seed=1).export(tmp_path / "other", {}).with_suffix(".safetensors").read_bytes() != whole
+    assert run(brief, 4 * ROUND, seed=1).export(tmp_path / "other", {}).with_suffix(".safetensors").read_bytes() != whole
 
 
-def test_a_checkpoint_that_does_not_fit(tmp_path):
+def test_a_checkpoint_that_does_not_fit(brief, tmp_path):
     """Damaged, of another seed, of another environment, of other settings: refused, and nothing is changed."""
-    run(ROUND, checkpoint=tmp_path / "check")
+    run(brief, ROUND, checkpoint=tmp_path / "check")
     (tmp_path / "broken").write_bytes((tmp_path / "check").read_bytes()[:200])
     (tmp_path / "text").write_text("nothing")
     cases = [
-        ("broken", {}), ("text", {}), ("missing", {}), ("check", {"seed": 1}), ("check", {"environment": ROAD | {"value": -5.0}}),
+        ("broken", {}), ("text", {}), ("missing", {}), ("check", {"seed": 1}), ("check", {"environment": brief | {"value": -5.0}}),
         ("check", {"config": Config(population=8, episodes=4, hidden=(5,))}),
     ]
     for name, changes in cases:
-        given = {"seed": 0, "config": SMALL, "environment": ROAD} | changes
+        given = {"seed": 0, "config": SMALL, "environment": brief} | changes
         learner = Learner(given["seed"], 0.99, given["config"], given["environment"])
         with pytest.raises(InputError, match="checkpoint"):
             learner.load(tmp_path / name)

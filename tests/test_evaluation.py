@@ -25,7 +25,8 @@ from tailgate.scenario import Scenario, Suite, load_scenario
 from tailgate.summary import summarise
 from tailgate.trace import Trace, episodes_at_once, rollout
 
-SUITE = Suite("small", "", ("gusty-stop-and-go-v0",), (12,), ("kf", "chi2_kf"), ("none", "fdi:trigger=near,threshold=30,value=-4"), 9)
+PLACE = "thesis-ch4-v0"  # a short one
+SUITE = Suite("small", "", (PLACE,), (12,), ("kf", "chi2_kf"), ("none", "fdi:start_step=60,value=-4"), 9)
 
 
 def _results(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -94,7 +95,7 @@ class Faulty(Kalman):
 
 @pytest.mark.parametrize(("how", "reason"), [("raise", "broken"), ("nan", "NaN"), ("shape", "score"), ("type", "alarm")])
 def test_a_defence_that_fails_costs_its_own_rows_only(how: str, reason: str) -> None:
-    rows = tailgate.evaluate(scenarios=["gusty-stop-and-go-v0"], defences=["kf", Faulty(how=how)], attacks=["none"], seeds=3)
+    rows = tailgate.evaluate(scenarios=[PLACE], defences=["kf", Faulty(how=how)], attacks=["none"], seeds=3)
     assert [row["status"] for row in rows] == ["ok"] * 3 + ["error"] * 3
     assert reason in rows[-1]["reason"] and rows[-1]["crashed"] is None and rows[-1]["trace_hash"] is None
     good, bad = summarise(rows)
@@ -107,7 +108,7 @@ def test_a_defence_that_kills_its_process_costs_its_own_rows_only(tmp_path: Path
         "class Deadly(Kalman):\n    def step(self, *arguments):\n        os._exit(3)\n"
     )
     monkeypatch.syspath_prepend(tmp_path)
-    cells = [Cell("s", "gusty-stop-and-go-v0", None, name, "none", 2) for name in ("kf", "deadly:Deadly", "chi2_kf")]
+    cells = [Cell("s", PLACE, None, name, "none", 2) for name in ("kf", "deadly:Deadly", "chi2_kf")]
     rows = run(cells, workers=2)
     assert [row["status"] for row in rows] == ["ok", "ok", "error", "error", "ok", "ok"]
     assert "died" in rows[2]["reason"]
@@ -115,21 +116,21 @@ def test_a_defence_that_kills_its_process_costs_its_own_rows_only(tmp_path: Path
 
 
 def test_a_pairing_without_meaning_is_skipped_with_the_reason() -> None:
-    rows = tailgate.evaluate(scenarios=["gusty-stop-and-go-v0"], defences=["none"], attacks=["stealth"], seeds=2)
+    rows = tailgate.evaluate(scenarios=[PLACE], defences=["none"], attacks=["stealth"], seeds=2)
     assert {row["status"] for row in rows} == {"skipped"} and "look" in rows[0]["reason"]
 
 
 def test_objects_keep_their_card() -> None:
     """The oracle as an object is the oracle by name, down to the last bit."""
-    attack = "fdi:trigger=near,threshold=30,value=-4"
-    by_object = tailgate.evaluate(scenarios=["gusty-stop-and-go-v0"], defences=[Oracle()], attacks=[attack], seeds=3)
-    by_name = tailgate.evaluate(scenarios=["gusty-stop-and-go-v0"], defences=["oracle"], attacks=[attack], seeds=3)
+    attack = "fdi:start_step=60,value=-4"
+    by_object = tailgate.evaluate(scenarios=[PLACE], defences=[Oracle()], attacks=[attack], seeds=3)
+    by_name = tailgate.evaluate(scenarios=[PLACE], defences=["oracle"], attacks=[attack], seeds=3)
     assert by_object[0]["uses"] == ["measurements", "truth"]
     assert [row["trace_hash"] for row in by_object] == [row["trace_hash"] for row in by_name]
 
 
 def test_a_seed_counts_once_in_the_summary() -> None:
-    rows = run_cell(Cell("s", "gusty-stop-and-go-v0", None, "kf", "none", 4))
+    rows = run_cell(Cell("s", PLACE, None, "kf", "none", 4))
     assert summarise(rows + rows)[0]["n"] == 4
 
 
@@ -145,7 +146,7 @@ def test_a_seed_counts_once_in_the_summary() -> None:
     ],
 )  # fmt: skip
 def test_bad_input_is_refused_before_anything_is_played(change: dict[str, Any], words: list[str], tmp_path: Path) -> None:
-    arguments: dict[str, Any] = {"scenarios": ["gusty-stop-and-go-v0"], "defences": ["kf"], "attacks": ["none"], "seeds": 1}
+    arguments: dict[str, Any] = {"scenarios": [PLACE], "defences": ["kf"], "attacks": ["none"], "seeds": 1}
     with pytest.raises(InputError) as caught:
         tailgate.evaluate(**(arguments | change), out=tmp_path / "rows.jsonl")
     message = str(caught.value)
@@ -160,7 +161,7 @@ def test_an_unwritable_output_is_refused_before_anything_is_played(tmp_path: Pat
 
 
 def test_damaged_rows_are_refused_with_their_line(tmp_path: Path) -> None:
-    rows = run_cell(Cell("s", "gusty-stop-and-go-v0", None, "kf", "none", 1))
+    rows = run_cell(Cell("s", PLACE, None, "kf", "none", 1))
     path = tmp_path / "rows.jsonl"
     path.write_text(json.dumps(rows[0]) + "\n{broken\n")
     with pytest.raises(InputError, match="line 2"):
@@ -178,7 +179,7 @@ def test_a_suite_file_never_imports_code(tmp_path: Path) -> None:
 
 def test_rows_of_objects_are_written_too(tmp_path: Path) -> None:
     out = tmp_path / "rows.jsonl"
-    rows = tailgate.evaluate(scenarios=["gusty-stop-and-go-v0"], defences=["kf", Oracle()], attacks=["none"], seeds=2, out=out)
+    rows = tailgate.evaluate(scenarios=[PLACE], defences=["kf", Oracle()], attacks=["none"], seeds=2, out=out)
     assert len(rows) == 4 and read_rows(out) == rows
 
 
@@ -196,7 +197,7 @@ def test_an_output_directory_is_refused_and_strangers_files_are_kept(tmp_path: P
     ("field", "value"), [("min_gap", float("nan")), ("min_gap", "x"), ("seed", [1]), ("scenario", {}), ("uses", 5), ("crashed", 0.5), ("dose", "abc")]
 )
 def test_a_row_with_a_wrong_value_is_refused_with_its_line(tmp_path: Path, field: str, value: Any) -> None:
-    (row,) = run_cell(Cell("s", "gusty-stop-and-go-v0", None, "kf", "none", 1))
+    (row,) = run_cell(Cell("s", PLACE, None, "kf", "none", 1))
     (tmp_path / "rows.jsonl").write_text(json.dumps(row | {field: value}))
     with pytest.raises(InputError, match=f"line 1: {field}"):
         read_rows(tmp_path / "rows.jsonl")
@@ -208,7 +209,7 @@ def test_different_defences_never_share_an_identity() -> None:
     from tailgate.estimators import AcceptAll, ChiSquare, GateOut, KalmanFilter, Score, compose
 
     plain, gated = compose(KalmanFilter(), Score(), AcceptAll()), compose(KalmanFilter(), ChiSquare(), GateOut())
-    rows = tailgate.evaluate(scenarios=["gusty-stop-and-go-v0"], defences=[plain, gated], attacks=["none"], seeds=2)
+    rows = tailgate.evaluate(scenarios=[PLACE], defences=[plain, gated], attacks=["none"], seeds=2)
     assert len(summarise(rows)) == 2
     assert AdversaryEnv(defence=plain).card()["hash"] != AdversaryEnv(defence=gated).card()["hash"]
 
@@ -220,7 +221,7 @@ def test_a_mode_that_does_not_exist_is_refused() -> None:
             state, estimate = super().step(plan, state, received, known_u, draws)
             return state, estimate._replace(mode=np.full_like(estimate.mode, 9))
 
-    rows = tailgate.evaluate(scenarios=["gusty-stop-and-go-v0"], defences=[Ninth()], attacks=["none"], seeds=1)
+    rows = tailgate.evaluate(scenarios=[PLACE], defences=[Ninth()], attacks=["none"], seeds=1)
     assert "mode" in rows[0]["reason"] and "NORMAL" in rows[0]["reason"]
 
 

@@ -19,12 +19,16 @@ FIELDS = {"id", "claim", "thesis", "measured", "holds", "why"}
 
 @pytest.fixture(scope="module")
 def chapter_4(tmp_path_factory):
-    """The command on 20 seeds: exit code, claims by id, directory."""
+    """The command on 20 seeds, with three values of eta: exit code, claims by id, directory."""
     import contextlib
     import io
 
-    out, text = tmp_path_factory.mktemp("ch4"), io.StringIO()
-    with contextlib.redirect_stdout(text):
+    from tailgate.reproduce import ch4_figures, ch4_theory
+
+    out, text, etas = tmp_path_factory.mktemp("ch4"), io.StringIO(), ch4_theory.ETAS[::3]
+    with contextlib.redirect_stdout(text), pytest.MonkeyPatch.context() as patch:
+        for module in (ch4_theory, ch4_figures):
+            patch.setattr(module, "ETAS", etas)
         code = cli.main(["reproduce", "ch4", "--seeds", "20", "--out", str(out), "--json"])
     return code, {claim["id"]: claim for claim in json.loads(text.getvalue())}, out
 

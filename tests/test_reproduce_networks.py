@@ -1,5 +1,6 @@
 """Chapters 5 and 6: the measured figures of the design on seeds of their own, and the reports."""
 
+import dataclasses
 import json
 from importlib import import_module
 
@@ -39,8 +40,8 @@ def holds(values, figure, digits):
 
 @pytest.fixture(scope="module")
 def systems():
-    """Errors of both estimators on 40 fresh systems."""
-    seeds = seeds_of("test_chapter_5", 40)
+    """Errors of both estimators on 30 fresh systems."""
+    seeds = seeds_of("test_chapter_5", 30)
     attack = ch5_cases.random_attack(ch5_cases.COMPROMISED)
     out = {
         name: np.concatenate([ch5_cases.errors(ch5_cases.fresh(s), ch5_cases.defence(name), attack, [s]) for s in seeds], axis=1)
@@ -111,8 +112,20 @@ def test_the_scalar_counter_example(kind):
     assert ch5_theory.scalar_convergence(1.0, kind) and not ch5_theory.scalar_convergence(1.999, kind)
 
 
+@pytest.fixture
+def brief_chapters(monkeypatch):
+    """Runs that end a few steps after the attack's onset, and fewer rows of the two longest tables."""
+    fresh = ch5_cases.fresh
+    for module in (ch5_cases, ch5_theory):
+        monkeypatch.setattr(module, "fresh", lambda seed, **plant: dataclasses.replace(fresh(seed, **plant), horizon=26))
+    monkeypatch.setattr(ch5_theory, "LONG", 26)
+    monkeypatch.setattr(ch5_theory, "RADII", (0.9, 1.0))
+    monkeypatch.setattr(ch6_loop, "load_scenario", lambda name: dataclasses.replace(load_scenario(name), horizon=220))
+    monkeypatch.setattr(ch6_loop, "LAMS", (1.0, 5.0))
+
+
 @pytest.mark.parametrize(("chapter", "claims", "figures"), [("ch5", 10, 4), ("ch6", 18, 5)])
-def test_a_report(chapter, claims, figures, tmp_path):
+def test_a_report(chapter, claims, figures, tmp_path, brief_chapters):
     """Four seeds give every claim with a verdict and a reason, tables and figures."""
     report = import_module(f"tailgate.reproduce.{chapter}").reproduce(4, lambda _: None, True)  # ten are the least from outside
     page = write(report, tmp_path)

@@ -33,15 +33,26 @@ THREAT: dict[str, Any] = {"kinds": ["dos_jam", "fdi"], "budget": 20, "fdi_bound"
 ZOO = f"zoo:name={ZooAttack().name}"
 
 
+def _cut(directory: Path, horizon: int, **threat: Any) -> str:
+    """The scenario cut to so many steps, as a file."""
+    source = Path(__file__).parents[1] / "configs" / "scenarios" / f"{PLACE}.yaml"
+    data = yaml.safe_load(source.read_text())
+    data |= {"horizon": horizon, "threat_model": data["threat_model"] | {"end": None} | threat}
+    path = directory / "brief.yaml"
+    path.write_text(yaml.safe_dump(data))
+    return str(path)
+
+
 @pytest.fixture(scope="module")
 def brief_place(tmp_path_factory: pytest.TempPathFactory) -> str:
     """The scenario cut to 60 steps, attacked from step 10 on."""
-    source = Path(__file__).parents[1] / "configs" / "scenarios" / f"{PLACE}.yaml"
-    data = yaml.safe_load(source.read_text())
-    data |= {"horizon": 60, "threat_model": data["threat_model"] | {"onset": 10, "end": None}}
-    path = tmp_path_factory.mktemp("scenario") / "brief.yaml"
-    path.write_text(yaml.safe_dump(data))
-    return str(path)
+    return _cut(tmp_path_factory.mktemp("scenario"), 60, onset=10)
+
+
+@pytest.fixture(scope="module")
+def half_place(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """The first 320 steps, within which the zoo's policy attacks and some of its episodes collide."""
+    return _cut(tmp_path_factory.mktemp("scenario"), 320)
 
 
 def _always(directory: Path, name: str, value: float = -3.0, seed: int = 0, **threat: Any) -> Path:
@@ -96,10 +107,10 @@ def test_shuffled_steps_fall_evenly_and_do_not_depend_on_companions() -> None:
     assert not np.array_equal(twin[:, 17], twin[:, 18])
 
 
-def test_own_and_yoked_are_those_of_the_timing_advantage() -> None:
+def test_own_and_yoked_are_those_of_the_timing_advantage(half_place: str) -> None:
     """One definition: play() agrees with policy.timing_advantage on every episode, and all schedules spend the same steps."""
     who = trained(ZOO)
-    loop, keys = loop_for(who, PLACE, "chi2_kf", THREAT), draws.keys("report", range(24))
+    loop, keys = loop_for(who, half_place, "chi2_kf", THREAT), draws.keys("report", range(24))
     played = play(loop, who.policy, keys, "crashed")
     own, yoked = timing_advantage(loop, who.policy, keys)
     assert np.array_equal(played.outcome["own"], own) and np.array_equal(played.outcome["yoked"], yoked)
@@ -143,10 +154,10 @@ def test_what_a_file_does_not_say_has_to_be_said(tmp_path: Path, brief_place: st
         timing([ZOO], episodes=1)
 
 
-def test_many_episodes_are_played_as_memory_allows(monkeypatch: pytest.MonkeyPatch, brief_place: str) -> None:
-    """The timing advantage of 24 episodes, seven at a time, is that of all at once to the bit: each has the times of the one before it."""
+def test_many_episodes_are_played_as_memory_allows(monkeypatch: pytest.MonkeyPatch, half_place: str) -> None:
+    """The timing advantage of 17 episodes, seven at a time, is that of all at once to the bit: each has the times of the one before it."""
     who = trained(ZOO)
-    loop, keys = loop_for(who, PLACE, "chi2_kf", THREAT), draws.keys("report", range(24))
+    loop, keys = loop_for(who, half_place, "chi2_kf", THREAT), draws.keys("report", range(17))
     record = rollout(loop, who.policy, keys, terminate=False).kind != 0
     twin = Yoked(who.policy, np.roll(record, 1, axis=1))
     together = [METRICS["min_gap"](rollout(loop, attack, keys)) for attack in (who.policy, twin)]
@@ -159,7 +170,7 @@ def test_many_episodes_are_played_as_memory_allows(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr("tailgate.strength.timing.rollout", counted)
     monkeypatch.setattr("tailgate.trace.MEMORY", 7.5 * MEMORY / episodes_at_once(loop.model, loop.horizon, 10**9))
     apart = timing_advantage(loop, who.policy, keys, "min_gap")
-    assert sizes == [7, 7, 7, 3] * 3
+    assert sizes == [7, 7, 3] * 3
     assert np.array_equal(apart, together) and not np.array_equal(*apart)
     played = play(loop, who.policy, keys, "min_gap")
     assert np.array_equal([played.outcome["own"], played.outcome["yoked"]], together)
@@ -330,11 +341,11 @@ def test_a_mean_over_seeds_stays_a_share() -> None:
     assert found.value == found.high == 1.0 and 0.5 < found.low < 1.0
 
 
-def test_transferred_beats_own_is_flagged(tmp_path: Path) -> None:
+def test_transferred_beats_own_is_flagged(tmp_path: Path, half_place: str) -> None:
     """A policy 'trained on kf' that collides against chi2_kf beats one 'trained on chi2_kf' that injects nothing harmful."""
     weak = [str(_always(tmp_path, f"weak{i}", value=0.01, seed=i)) for i in range(2)]
     strong = _copy_as(tmp_path, "kf")
-    report = transfer([*weak, str(strong)], ["chi2_kf", "kf", "cra"], episodes=40)
+    report = transfer([*weak, str(strong)], ["chi2_kf", "kf", "cra"], scenario=half_place, episodes=40)
     held = {(e["trained_on"], e["played_on"]): e for e in report["entries"]}
     assert held["kf", "chi2_kf"]["flags"] == ["transferred beats own"] and held["kf", "chi2_kf"]["over_own"]["low"] > 0.0
     assert held["chi2_kf", "kf"]["flags"] == [] and "over_own" not in held["kf", "kf"]

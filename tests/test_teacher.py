@@ -17,6 +17,7 @@ from tailgate.envs.seat import Seat
 from tailgate.errors import InputError
 from tailgate.metrics import crashed
 from tailgate.registry import Spec
+from tailgate.scenario import config_path
 from tailgate.trace import rollout
 
 SCRIPT = "fdi_then_jam:trigger=near,threshold=40,inject=10"
@@ -74,12 +75,18 @@ def test_who_was_shown_a_script_does_what_it_does(tmp_path: Path) -> None:
 
 def test_a_taught_run_resumes_to_the_same_policy(tmp_path: Path) -> None:
     """The lesson comes before the first decision, once: an interrupted run is not taught again."""
+    place = config_path("scenarios", ENVIRONMENT["scenario"], "scenario").read_text()
+    for whole, part in (("horizon: 600", "horizon: 120"), ("onset: 50", "onset: 10"), ("end: 500", "end: 120")):
+        assert whole in place
+        place = place.replace(whole, part)
+    (tmp_path / "brief.yaml").write_text(place)
+    script = "fdi_then_jam:start_step=30,inject=20"
     settings = [
         "seeds=1", "workers=1", "environment.interval=20", "ppo.envs=16", "ppo.rollout=15", "ppo.batch_size=120", "ppo.epochs=1", "ppo.hidden=[8]",
-        "tensorboard=false", "checkpoint_every=240", f"teacher='{SCRIPT}'", "white_box=[]",
+        "tensorboard=false", "checkpoint_every=240", f"teacher='{script}'", "white_box=[]", f"scenario={tmp_path / 'brief.yaml'}",
     ]
-    whole = train.load_config(None, [f"out={tmp_path / 'whole'}", "steps=960", *settings])
-    straight = train.train(whole, lambda seed, now: None)[0].with_suffix(".safetensors").read_bytes()
+    entire = train.load_config(None, [f"out={tmp_path / 'whole'}", "steps=960", *settings])
+    straight = train.train(entire, lambda seed, now: None)[0].with_suffix(".safetensors").read_bytes()
     parts = [f"out={tmp_path / 'parts'}", *settings]
     train.train(train.load_config(None, ["steps=480", *parts]), lambda seed, now: None)
     again = train.train(train.load_config(None, ["steps=960", *parts]), lambda seed, now: None, resume=True)

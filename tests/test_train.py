@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 
-from tailgate import train
+from tailgate import cli, train
 from tailgate.agents.ppo import Config, Learner
 from tailgate.errors import InputError
 from tailgate.rivals import outcomes
@@ -99,18 +100,34 @@ def test_the_learner_rests_first() -> None:
         assert share == pytest.approx(0.1, abs=0.03)
 
 
-def _command(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, "-m", "tailgate.cli", "train", *arguments], cwd=cwd, capture_output=True, text=True, check=False)
-
-
 SMALL_RUN = (
-    "steps=1280", "ppo={envs: 16, rollout: 40, batch_size: 160, epochs: 1}", "episodes=12", "rivals=['fdi:trigger=near,threshold=30']", "others=[kf]",
-    "tensorboard=false",
+    "steps=1280", "ppo={envs: 16, rollout: 40, batch_size: 160, epochs: 1}", "episodes=12", "rivals=['fdi:trigger=near,threshold=30']", "others=[]",
+    "white_box=[]", "tensorboard=false", "workers=1",
 )  # fmt: skip
+COMMAND = (sys.executable, "-m", "tailgate.cli", "train")
 
 
-def test_the_command_trains_compares_and_writes_a_page(tmp_path: Path) -> None:
-    done = _command(*SMALL_RUN, "--json", cwd=tmp_path)
+@pytest.fixture(scope="module")
+def small_run(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, ...]:
+    """SMALL_RUN on the preset's scenario cut to 120 steps, attacked from step 10 on."""
+    source = Path(__file__).parents[1] / "configs" / "scenarios" / f"{ENVIRONMENT['scenario']}.yaml"
+    data = yaml.safe_load(source.read_text())
+    data |= {"horizon": 120, "threat_model": data["threat_model"] | {"onset": 10, "end": None}}
+    path = tmp_path_factory.mktemp("scenario") / "brief.yaml"
+    path.write_text(yaml.safe_dump(data))
+    return (*SMALL_RUN, f"scenario={path}")
+
+
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The directory of the test is the working directory."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_the_command_trains_compares_and_writes_a_page(here: Path, tmp_path: Path, small_run: tuple[str, ...]) -> None:
+    arguments = [*small_run, "others=[kf]", "workers=2", "--json"]
+    done = subprocess.run([*COMMAND, *arguments], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     report = json.loads(done.stdout)
     assert set(report["advantage"]) == {"no attack", "own yoked schedule", "best scripted attack"}
@@ -121,8 +138,7 @@ def test_the_command_trains_compares_and_writes_a_page(tmp_path: Path) -> None:
     assert ("chi2_kf", str(Path("runs/quickstart/policy-0.json"))) in played and ("kf", "none") in played
     page = (run / "page" / "index.html").read_text(encoding="utf-8")
     assert "quickstart" in page and "learned" in page
-    again = _command("steps=1920", "--resume", cwd=tmp_path)  # the rest of the configuration is the run's own
-    assert again.returncode == 0, again.stderr
+    assert cli.main(["train", "steps=1920", "--resume"]) == 0  # the rest of the configuration is the run's own
     assert json.loads((run / "policy-0.json").read_text())["training"]["steps"] == 1920
 
 
@@ -140,13 +156,12 @@ def test_every_preset_can_be_played(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", SYSTEMS)
-def test_the_command_trains_on_every_system(tmp_path: Path, name: str) -> None:
+def test_the_command_trains_on_every_system(here: Path, tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]) -> None:
     """Policy, comparison by the system's own outcome, yoked twin and page; the policy plays in an evaluation of its scenario."""
     config = train.load_config(name, [])
     small = ["steps=560", "ppo.envs=16", "ppo.rollout=35", "ppo.batch_size=140", "ppo.epochs=1", "episodes=6", f"rivals=['{config.rivals[0]}']", "others=[]"]
-    done = _command("--config", name, *small, "tensorboard=false", "workers=1", "--json", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    report = json.loads(done.stdout)
+    assert cli.main(["train", "--config", name, *small, "tensorboard=false", "workers=1", "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
     assert report["outcome"] == SYSTEMS[name] and report["attacks"][0]["label"] == "no attack"
     assert {"learned, seed 0", "learned, seed 0, yoked"} <= {item["label"] for item in report["attacks"]}
     assert all(item["low"] <= item["value"] <= item["high"] for item in report["attacks"])
@@ -171,14 +186,16 @@ def test_an_outcome_is_a_metric_that_every_episode_has(tmp_path: Path) -> None:
         outcomes([row], "recovery_time")
 
 
-def test_a_run_that_was_killed_and_resumed_gives_the_policy_of_an_uninterrupted_one(tmp_path: Path) -> None:
+def test_a_run_that_was_killed_and_resumed_gives_the_policy_of_an_uninterrupted_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, small_run: tuple[str, ...]
+) -> None:
     """SIGKILL in the middle of a rollout, at no moment that the program chose."""
-    long_run = [*SMALL_RUN, "steps=5120", "checkpoint_every=640"]
+    long_run = [*small_run, "steps=5120", "checkpoint_every=640"]
     for name in ("straight", "killed"):
         (tmp_path / name).mkdir()
-    assert _command(*long_run, cwd=tmp_path / "straight").returncode == 0
-    command = [sys.executable, "-m", "tailgate.cli", "train", *long_run]
-    process = subprocess.Popen(command, cwd=tmp_path / "killed", stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    monkeypatch.chdir(tmp_path / "straight")
+    assert cli.main(["train", *long_run]) == 0
+    process = subprocess.Popen([*COMMAND, *long_run], cwd=tmp_path / "killed", stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     run = tmp_path / "killed" / "runs" / "quickstart"
     while not (run / "checkpoint-0.safetensors").exists():
         assert process.poll() is None
@@ -187,10 +204,20 @@ def test_a_run_that_was_killed_and_resumed_gives_the_policy_of_an_uninterrupted_
     process.kill()
     process.wait()
     assert not (run / "policy-0.json").exists()
-    done = _command("--resume", cwd=tmp_path / "killed")
-    assert done.returncode == 0, done.stderr
+    monkeypatch.chdir(tmp_path / "killed")
+    assert cli.main(["train", "--resume"]) == 0
     one, two = ((tmp_path / name / "runs" / "quickstart" / "policy-0.safetensors").read_bytes() for name in ("straight", "killed"))
     assert one == two
+
+
+def _refused(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
+    """What the command says on standard error of an input that it refuses; the first of them in a process of its own."""
+    if "stepz=10" in arguments:
+        done = subprocess.run([*COMMAND, *arguments], capture_output=True, text=True, check=False)
+        assert done.returncode == 2, done.stderr
+        return done.stderr
+    assert cli.main(["train", *arguments]) == 2
+    return capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -204,7 +231,9 @@ def test_a_run_that_was_killed_and_resumed_gives_the_policy_of_an_uninterrupted_
         (["threat.knowledge=gray"], ["knowledge", "gray"]), (["ppo.batch_size=1"], ["batch_size", "1"]),
     ],
 )  # fmt: skip
-def test_bad_input_is_one_clear_error_and_leaves_nothing(tmp_path: Path, arguments: list[str], words: list[str]) -> None:
+def test_bad_input_is_one_clear_error_and_leaves_nothing(
+    here: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], words: list[str]
+) -> None:
     (tmp_path / "bad.yaml").write_text("a: [1\n")
     (tmp_path / "file").write_text("")
     (tmp_path / "nan.csv").write_text("t,v\n0,20\n1,nan\n")
@@ -212,10 +241,9 @@ def test_bad_input_is_one_clear_error_and_leaves_nothing(tmp_path: Path, argumen
         "plant: car_following\nsensor: odometry\ncontroller: acc\nmanoeuvre: {name: profile, path: nan.csv}\nhorizon: 10\n"
     )
     before = sorted(p.name for p in tmp_path.rglob("*"))
-    done = _command(*SMALL_RUN, *arguments, cwd=tmp_path)
-    assert done.returncode == 2, done.stderr
-    error = [line for line in done.stderr.splitlines() if line.startswith("tailgate: error: ")]
-    assert len(error) == 1 and "Traceback" not in done.stderr
+    said = _refused([*SMALL_RUN, *arguments], capsys)
+    error = [line for line in said.splitlines() if line.startswith("tailgate: error: ")]
+    assert len(error) == 1 and "Traceback" not in said
     assert all(word in error[0] for word in words) and "expected" in error[0]
     assert sorted(p.name for p in tmp_path.rglob("*")) == before
 
@@ -237,7 +265,9 @@ def test_training_seeds_share_no_environment() -> None:
     assert not keys[0] & keys[1]
 
 
-def test_a_fresh_start_forgets_the_run_before_and_resume_wants_the_same_learner(tmp_path: Path) -> None:
+def test_a_fresh_start_forgets_the_run_before_and_resume_wants_the_same_learner(
+    here: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], small_run: tuple[str, ...]
+) -> None:
     """A policy of one configuration must not end up beside the JSON of another."""
     learner = _learner()
     learner.learn(UPDATE, lambda progress: None, tmp_path / "c.safetensors")
@@ -248,12 +278,13 @@ def test_a_fresh_start_forgets_the_run_before_and_resume_wants_the_same_learner(
     run.mkdir(parents=True)
     (run / "checkpoint-0.safetensors").write_bytes(b"of an older run")
     (run / "policy-7.json").write_text("{}")
-    done = _command(*SMALL_RUN, cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+    assert cli.main(["train", *small_run]) == 0
     assert not (run / "policy-7.json").exists()
     assert (run.with_name("quickstart.1") / "policy-7.json").read_text() == "{}"  # set aside, not lost
     (run / "config.json").write_text("{")
-    assert "resume" in _command(*SMALL_RUN, "--resume", cwd=tmp_path).stderr
+    capsys.readouterr()
+    assert cli.main(["train", *small_run, "--resume"]) == 2
+    assert "resume" in capsys.readouterr().err
 
 
 def test_a_seed_trained_in_a_process_of_its_own_gives_the_same_policy(tmp_path: Path) -> None:
