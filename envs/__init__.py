@@ -4,6 +4,7 @@ from .cacc import FeedForward
 from .consensus_cacc import Consensus
 from .controllers import AdaptiveCruise
 from .following import CarFollowing
+from .highway import Highway
 from .idm import IntelligentDriver
 from .linear_platoon import LinearPlatoon
 from .literal import CarFollowingLiteral, RelativeDistance
@@ -19,7 +20,7 @@ from .sensors import Odometry
 
 __all__ = [
     "AdaptiveCruise", "Braking", "CarFollowing", "CarFollowingLiteral", "Consensus", "Constant", "ExactReading", "FeedForward",
-    "FmcwRadar", "IntelligentDriver", "LinearPlatoon", "LinearSensors", "NoControl", "Odometry", "OrnsteinUhlenbeck", "Platoon",
+    "FmcwRadar", "Highway", "IntelligentDriver", "LinearPlatoon", "LinearSensors", "NoControl", "Odometry", "OrnsteinUhlenbeck", "Platoon",
     "PlatoonSensors", "Ploeg", "Profile", "Pulse", "RadarCruise", "RadarFollowing", "RelativeDistance", "ScalarLoop", "SensorNetwork",
     "Sine", "StateFeedback", "StopAndGo", "Switched",
 ]  # fmt: skip

@@ -27,6 +27,7 @@ FACES: dict[str, dict[str, Any]] = {  # what each id is where nothing else is sa
     "tailgate/RadarFollowing-v0": {"scenario": "radar-following-v0", "defence": "cra"},
     "tailgate/Platoon-v0": {"scenario": "platoon-braking-v0", "defence": "lasso_dkf"},
     "tailgate/SensorNetwork-v0": {"scenario": "thesis-ch5-v0", "defence": "norm_resilient", "reward": "error"},
+    "tailgate/Highway-v0": {"scenario": "highway-v0", "defence": "chi2_kf"},
 }
 
 
