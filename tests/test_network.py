@@ -358,9 +358,14 @@ def test_published_networks(name):
     held = place.brief().model
     assert blind(held) == [] and 0 < place.brief().granted.any(axis=1).sum() < held.agents
     assert place.threat_model.onset < place.horizon <= 300
-    trace = rollout(place.loop(tailgate.make_defence("dkf")), tailgate.make_attack("none"), keys("train", range(4)))
-    error = held.error(trace.estimate, trace.truth)
-    assert error[place.threat_model.onset :].max() < 0.6 * error[0].max()
+
+    def errors(defence):
+        trace = rollout(place.loop(tailgate.make_defence(defence)), tailgate.make_attack("none"), keys("train", range(4)))
+        return held.error(trace.estimate, trace.truth)
+
+    error = errors("dkf")
+    unknown = errors("coast")[-1] if place.plant.noise_var >= 0.1 else error[0]  # a system that is never at rest is soon lost by who does not read
+    assert error[place.threat_model.onset :].max() < 0.6 * unknown.max()
 
 
 def test_the_alarm_of_a_group_is_on_while_any_agent_alarms():
