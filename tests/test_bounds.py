@@ -123,9 +123,10 @@ def test_lemma_4_5_4(model):
     r = np.random.default_rng(3).normal(size=(300, len(S)))
     r /= np.linalg.norm(r, axis=1)[:, None]
     axes = np.linalg.eigh(S)[1].T
-    for i, unit in enumerate([*r, axes[0], axes[-1]]):
-        assert feed(model, [c1 * (1 + 1e-9) * unit])[1].all(), i
-        assert not feed(model, [c2 * (1 - 1e-9) * unit])[1].any(), i
+    units, rest = np.array([*r, axes[0], axes[-1]]), bounds.steady_state(model).after
+    for size, alarmed in ((c1 * (1 + 1e-9), True), (c2 * (1 - 1e-9), False)):
+        alarm = probe.feed(GatedKalman(eta=ETA), model, rest, innovations=size * units[None]).alarm
+        assert alarm.shape == (1, 302) and (alarm == alarmed).all(), np.flatnonzero(alarm != alarmed)
     assert not feed(model, [c1 * (1 - 1e-9) * axes[-1]])[1].any()
     assert feed(model, [c2 * (1 + 1e-9) * axes[0]])[1].all()
 

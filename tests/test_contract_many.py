@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 import tailgate
-from tailgate.core import Mode
+from tailgate.agents.mixture import Mixture
+from tailgate.core import Kind, Mode
 from tailgate.draws import Keys, Role, keys
 from tailgate.errors import NotApplicable
 from tailgate.estimators import EpisodeByEpisode
@@ -61,19 +62,21 @@ def test_a_defence_runs_and_its_rows_do_not_depend_on_their_batch(defence, place
     loop = loop_of(place, defence)
     model, sensors = loop.model, loop.model.sensors
     count = 3 if slow(defence) else 16
-    for attack in (
+    falsified, lost = (
         tailgate.make_attack("fdi_gaussian", sd=20.0, chance=0.5, targets=sensors),
         tailgate.make_attack("dropout", probability=0.5, targets=sensors),
-    ):
-        whole = play(loop, attack, range(count))
-        assert whole.estimate.shape == whole.truth.shape == (STEPS, count, model.agents, model.states)
-        assert whole.score.shape == whole.alarm.shape == whole.mode.shape == (STEPS, count, model.agents)
-        assert whole.alarm.dtype == bool and set(np.unique(whole.mode)) <= {int(m) for m in Mode}
-        assert all(np.isfinite(whole.signals[name]).all() for name in ("estimate", "score", "control", "wires", "value"))
-        known = [whole.trace_hash(i) for i in range(count)]
-        assert len(set(known)) == count and whole.kind[ONSET - 1 :].any()
-        some, alone = play(loop, attack, [2, 0, 77][: 2 if slow(defence) else 3]), play(loop, attack, [1])
-        assert [some.trace_hash(0), some.trace_hash(1), alone.trace_hash(0)] == [known[2], known[0], known[1]]
+    )
+    mix = Mixture((falsified, lost))  # by its own draws seeds 0 and 5 are falsified, 1 to 4 lost
+    whole = play(loop, mix, range(count))
+    assert whole.estimate.shape == whole.truth.shape == (STEPS, count, model.agents, model.states)
+    assert whole.score.shape == whole.alarm.shape == whole.mode.shape == (STEPS, count, model.agents)
+    assert whole.alarm.dtype == bool and set(np.unique(whole.mode)) <= {int(m) for m in Mode}
+    assert all(np.isfinite(whole.signals[name]).all() for name in ("estimate", "score", "control", "wires", "value"))
+    known = [whole.trace_hash(i) for i in range(count)]
+    assert len(set(known)) == count
+    assert (whole.kind[ONSET - 1 :, 0] == Kind.FDI).any() and (whole.kind[ONSET - 1 :, 1] == Kind.DROPOUT).any()
+    some, alone = play(loop, mix, [2, 0, 77][: 2 if slow(defence) else 3]), play(loop, mix, [1])
+    assert [some.trace_hash(0), some.trace_hash(1), alone.trace_hash(0)] == [known[2], known[0], known[1]]
 
 
 @each

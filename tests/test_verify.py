@@ -47,7 +47,7 @@ def test_a_row_is_the_same_with_other_workers_batches_and_companions(tmp_path: P
     for workers, batch in ((1, 256), (2, 256), (1, 4096)):
         report = verify(held, workers=workers, batch=batch)
         assert report["counts"] == {"verified": 300, "differs": 0, "unchecked": 0}, (workers, batch)
-    assert verify(held[::-1][:40], batch=1)["counts"]["verified"] == 40
+    assert verify(held[::-1][:12], batch=1)["counts"]["verified"] == 12
     assert verify(held, sample=7, batch=4)["counts"] == {"verified": 7, "differs": 0, "unchecked": 0}
     other = Cell(**(dataclasses.asdict(cell) | {"attack": "none", "seeds": 2}))
     real, calls = run_cell, []
