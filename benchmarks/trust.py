@@ -77,6 +77,17 @@ def processor_seconds() -> float:
     return sum(used.ru_utime + used.ru_stime for used in map(resource.getrusage, (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)))
 
 
+def by_lines(record: dict[str, Any]) -> str:
+    """JSON with a line for each field, and for each entry of a list."""
+    fields = []
+    for key, value in record.items():
+        held = json.dumps(value, allow_nan=False)
+        if isinstance(value, list) and value:
+            held = "[\n" + ",\n".join(json.dumps(entry, allow_nan=False) for entry in value) + "\n]"
+        fields.append(f"{json.dumps(key)}: {held}")
+    return "{\n" + ",\n".join(fields) + "\n}\n"
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--precision", type=float, default=0.03, help="how far a share may be off")
@@ -127,7 +138,7 @@ def main() -> None:
             "load": [round(x, 2) for x in os.getloadavg()], "python": platform.python_version(), "numpy": np.__version__,
             "commit": subprocess.run(["git", "rev-parse", "HEAD"], capture_output=True, text=True, check=False).stdout.strip(),
         }  # fmt: skip
-        write_atomic(options.out, json.dumps(found, indent=1, allow_nan=False).encode() + b"\n")
+        write_atomic(options.out, by_lines(found).encode())
 
 
 if __name__ == "__main__":
