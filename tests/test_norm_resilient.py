@@ -124,7 +124,7 @@ def test_the_gradient_vanishes_where_nothing_fits_exactly(family):
     pull = lam * np.einsum("pqn,bpq->bpn", M, e) / np.where(far, size, 1.0)[..., None]
     miss = np.linalg.norm(2.0 * np.einsum("pnm,bpm->bpn", Q, d) - pull, axis=-1)
     norms = np.linalg.norm(Q, 2, axis=(1, 2)) * np.linalg.norm(d, axis=-1) + lam * np.linalg.norm(M, 2, axis=(1, 2))
-    assert (miss[far] <= 1e-11 * np.maximum(norms, 1.0)[far]).all()
+    assert (miss[far] <= 1e-10 * np.maximum(norms, 1.0)[far]).all()
 
 
 @pytest.mark.parametrize("family", FAMILIES)
