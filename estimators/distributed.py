@@ -18,7 +18,6 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
-from scipy import stats
 
 from tailgate import num
 from tailgate.core import Array, Innovation, Model, Positive, Prior, Probability, Received, param
@@ -324,6 +323,8 @@ class TailChiSquare(Stateless):
         """eta."""
         if not 0.0 < self.tail < 1.0:
             raise InputError("detector chi2_tail.tail", self.tail, "a probability between 0 and 1")
+        from scipy import stats  # takes as long to load as all the rest
+
         return float(stats.chi2.isf(self.tail, len(model.sensors)))
 
     def step(self, plan: float, state: Any, innovation: Innovation) -> tuple[Any, Verdict]:

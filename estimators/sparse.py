@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
-from scipy import stats
 
 from tailgate import num
 from tailgate.core import Array, Innovation, Model, Positive, param
@@ -34,6 +33,8 @@ class SparseChiSquare(Stateless):
 
     def prepare(self, model: Model) -> Array:
         """(q + 1,) threshold on r' S^-1 r of m sensors, m = 0, ..., q."""
+        from scipy import stats  # takes as long to load as all the rest
+
         q = len(model.sensors)
         tail = stats.chi2.sf(self.eta, q)
         fewer = [min(float(stats.chi2.isf(tail, m)), self.eta) for m in range(1, q)]  # the minimum: of a tail that is 0 in float64

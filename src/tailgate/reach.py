@@ -5,7 +5,6 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
-from scipy.sparse.csgraph import connected_components
 
 from tailgate.core import Array, Model
 from tailgate.errors import InputError
@@ -28,6 +27,8 @@ def eigenvalues(A: Array) -> Array:
 
     In a long string of vehicles the same poles come again in every vehicle. Taken all together, their rounding spreads them far apart.
     """
+    from scipy.sparse.csgraph import connected_components
+
     count, part = connected_components(A != 0.0, directed=True, connection="strong")
     return np.concatenate([np.linalg.eigvals(A[np.ix_(part == i, part == i)]) for i in range(count)])
 
