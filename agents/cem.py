@@ -28,6 +28,7 @@ from safetensors.numpy import save as save_tensors
 
 from tailgate import draws
 from tailgate.core import Array, NonNegative, Positive, PositiveCount, Probability, param
+from tailgate.envs.batches import framed, side_by_side
 from tailgate.envs.seat import Seat
 from tailgate.errors import InputError
 from tailgate.files import write_atomic
@@ -231,20 +232,21 @@ class Learner(Search):
 
     def episodes(self, layers: list[tuple[Array, Array]], members: int, keys: draws.Keys) -> tuple[Array, Array]:
         seat, seen = self.seat, None
-        state = seat.loop.start(keys)
-        tally = seat.begin(state)
+        play = side_by_side(seat)
+        play.begin(keys)
+        over = np.zeros(len(keys.key), bool)
         total, crashed, weight = np.zeros(len(keys.key)), np.zeros(len(keys.key), bool), 1.0
         for _ in range(seat.decisions):
-            over = state.ended.copy()
             if over.all():
                 break
             self.steps += int(np.count_nonzero(~over))
-            seen = seat.observation.observe(seat.loop.sense(state), seen)
+            seen = framed(play.seen(), seen, seat.observation.frames)
             x = outputs(layers, seen.reshape(members, -1, seen.shape[1]))
             action = np.argmax(x, axis=1) if seat.action.discrete else np.clip(x, -1.0, 1.0)
-            state, tally, outcome, _ = seat.step(state, tally, action, over)
+            outcome = play.decide(action, over, restart=False)
             total += weight * outcome.reward
             crashed |= outcome.terminated
+            over = over | outcome.terminated
             weight *= seat.reward.gamma
         return total, crashed
 

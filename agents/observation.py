@@ -20,6 +20,11 @@ LIMIT = 10.0  # observations are clipped to +-LIMIT
 FRAMES = 64  # decisions that an observation shows, at most
 SHOWN = 24  # agents with components of their own in an observation, at most
 RADIATED = {Kind.NOISE_JAM: ("power", "jam_power"), Kind.ECHO_DELAY: ("delay", "delay_bound")}  # their component, and their bound
+SCALES = {  # what is about 1: steps, metres, metres per second, metres per second squared
+    "burst": 50.0, "cooldown": 50.0, "gap": 50.0, "speed": 15.0, "lead_speed": 15.0, "closing": 5.0, "accel": 3.0, "rear_gap": 50.0,
+    "rear_closing": 5.0, "control": 3.0,
+}  # fmt: skip
+LAST_SCALE = 10.0  # of the value sent last, where its bound is larger [unit of the wire]
 T = TypeVar("T")
 
 
@@ -86,7 +91,7 @@ class ObservationCodec:
         """Every component in its order."""
         out: list[Column] = [
             ("progress", lambda s: s.view.progress), ("allowed", lambda s: s.view.allowed), ("budget_left", _left),
-            ("burst", lambda s: s.view.burst / 50.0), ("cooldown", lambda s: s.view.cooldown / 50.0),
+            ("burst", lambda s: s.view.burst / SCALES["burst"]), ("cooldown", lambda s: s.view.cooldown / SCALES["cooldown"]),
         ]  # fmt: skip
         for i in self.shown:
             tag = "" if self.brief.model.agents == 1 else f"[{i}]"
@@ -100,25 +105,25 @@ class ObservationCodec:
     def _road(self, i: int) -> list[Column]:
         """What anyone beside the road sees of car i."""
         model = self.brief.model
-        speed: list[Column] = [("speed", lambda s: s.view.scene.speed[:, i] / 15.0)]
-        accel: list[Column] = [("accel", lambda s: s.view.scene.accel[:, i] / 3.0)]
+        speed: list[Column] = [("speed", lambda s: s.view.scene.speed[:, i] / SCALES["speed"])]
+        accel: list[Column] = [("accel", lambda s: s.view.scene.accel[:, i] / SCALES["accel"])]
         if not model.followers[i]:
             return speed + accel if model.speed is not None and model.speed[i].any() else []
-        gap: list[Column] = [("gap", lambda s: s.view.scene.gap[:, i] / 50.0)]
-        closing: list[Column] = [("closing", lambda s: (s.view.scene.speed[:, i] - s.view.scene.lead_speed[:, i]) / 5.0)]
+        gap: list[Column] = [("gap", lambda s: s.view.scene.gap[:, i] / SCALES["gap"])]
+        closing: list[Column] = [("closing", lambda s: (s.view.scene.speed[:, i] - s.view.scene.lead_speed[:, i]) / SCALES["closing"])]
         if not self.alone:  # the car ahead and the one behind have components of their own
             return gap + speed + closing + accel
-        lead: list[Column] = [("lead_speed", lambda s: s.view.scene.lead_speed[:, i] / 15.0)]
+        lead: list[Column] = [("lead_speed", lambda s: s.view.scene.lead_speed[:, i] / SCALES["lead_speed"])]
         rear: list[Column] = [
-            ("rear_gap", lambda s: s.view.scene.rear_gap[:, i] / 50.0),
-            ("rear_closing", lambda s: (s.view.scene.rear_speed[:, i] - s.view.scene.speed[:, i]) / 5.0),
+            ("rear_gap", lambda s: s.view.scene.rear_gap[:, i] / SCALES["rear_gap"]),
+            ("rear_closing", lambda s: (s.view.scene.rear_speed[:, i] - s.view.scene.speed[:, i]) / SCALES["rear_closing"]),
         ]
         return gap + speed + lead + closing + accel + rear
 
     def _commands(self, i: int) -> list[Column]:
         """What the attacker did last to agent i, and (grey) what was commanded."""
         model, bounds = self.brief.model, self.brief.bounds
-        scale = np.minimum(bounds, 10.0) if model.followers.any() else bounds
+        scale = np.minimum(bounds, LAST_SCALE) if model.followers.any() else bounds
         kinds = {Kind[name.upper()] for name in self.brief.threat.kinds}
         radiated = [kind for kind in AIRED if kind in kinds and receivers(self.brief)[i].any()]
         out: list[Column] = []
@@ -270,7 +275,7 @@ def _radiated(i: int, kind: Kind, most: float) -> Callable[[Sight], Array]:
 
 
 def _control(i: int, j: int) -> Callable[[Sight], Array]:
-    return lambda s: _given(s.view.control)[:, i, j] / 3.0
+    return lambda s: _given(s.view.control)[:, i, j] / SCALES["control"]
 
 
 def _state_error(i: int, j: int) -> Callable[[Sight], Array]:

@@ -8,10 +8,29 @@ from typing import Literal
 import numpy as np
 
 from tailgate.core import Array, Frame, Kind, Model, NonNegative, Positive, param
+from tailgate.elementwise import clip
 from tailgate.errors import InputError
 
 RewardName = Literal["collision", "min_gap", "error", "stealth", "final"]
 NEAR = 20.0  # min_gap: a smaller gap than this counts [m]
+
+
+def closeness(gap: Array) -> Array:
+    """How near the car ahead is, elementwise: 0 from 100 m on, 1 at a gap of 0."""
+    out: Array = 1.0 - clip(gap, 0.0, 100.0) / 100.0
+    return out
+
+
+def fooled(belief: Array) -> Array:
+    """What a car believes that it has on top of its gap [m], elementwise: in units of 10 m, 2 at most."""
+    out: Array = clip(belief, 0.0, 20.0) / 10.0
+    return out
+
+
+def small(gap: Array) -> Array:
+    """The gap [m] within what `min_gap` pays for, elementwise."""
+    out: Array = clip(gap, 0.0, NEAR)
+    return out
 
 
 @dataclass(frozen=True)
@@ -36,13 +55,12 @@ class Reward:
 
     def potential(self, gap: Array, belief: Array | float = 0.0) -> Array:
         """(B,) potential of a gap (B, N) [m], infinite where nobody is ahead, and of what a car believes it has on top of it (B, N) [m]."""
-        near = 1.0 - np.clip(np.min(gap, axis=1), 0.0, 100.0) / 100.0
-        fooled = np.max(np.clip(belief, 0.0, 20.0) / 10.0 + np.zeros_like(gap), axis=1)
-        return np.asarray(self.gap_shaping * near + self.error_shaping * fooled)
+        most = np.max(fooled(np.asarray(belief)) + np.zeros_like(gap), axis=1)
+        return np.asarray(self.gap_shaping * closeness(np.min(gap, axis=1)) + self.error_shaping * most)
 
     def least(self, gap: Array, before: Array | float = NEAR) -> Array:
         """(B,) smallest gap so far, within [0, NEAR], from a gap (B, N) and the smallest one before [m]."""
-        return np.asarray(np.minimum(np.clip(np.min(gap, axis=1), 0.0, NEAR), before))
+        return np.asarray(np.minimum(small(np.min(gap, axis=1)), before))
 
     def check(self, model: Model) -> None:
         """Raise InputError for a reward that nothing can earn under this model."""

@@ -30,11 +30,10 @@ from scipy.stats import norm
 
 from tailgate.core import Array, Positive, PositiveCount, Probability, param
 from tailgate.envs.sb3 import BatchVecEnv
-from tailgate.envs.seat import Seat, Tally
+from tailgate.envs.seat import Seat
 from tailgate.errors import InputError
 from tailgate.files import write_atomic
 from tailgate.schema import canonical
-from tailgate.tree import leaves, with_leaves
 
 from .codec import ActionCodec
 from .learning import SEED_STRIDE, Progress, check_action, header_of, open_checkpoint
@@ -162,11 +161,9 @@ class StableLearner:
         for name, optimiser in optimisers.items():
             for i, state in optimiser.state_dict()["state"].items():
                 tensors |= {f"optimiser/{name}/{i}/{k}": v.contiguous() for k, v in state.items()}
-        state, tally = batch.state, batch.tally
-        assert state is not None and tally is not None
         _, words, position, _, _ = np.random.get_state()  # noqa: NPY002 - Stable-Baselines3 shuffles and samples with it
         arrays: dict[str, Any] = {
-            **{f"loop.{k}": v for k, v in leaves(state).items()}, **{f"env.{name}": value for name, value in tally._asdict().items()},
+            **{f"batch.{name}": value for name, value in batch.episodes.held().items()},
             "env.returns": self.env._returns, "env.lengths": self.env._lengths, "last_obs": model._last_obs,
             "last_starts": model._last_episode_starts, "numpy": words, **{f"held.{name}": value for name, value in self.held().items()},
         }  # fmt: skip
@@ -217,14 +214,12 @@ class StableLearner:
 
     def _restore_batch(self, tensors: dict[str, Any]) -> None:
         batch, model = self.env.batch, self.model
-        assert batch.state is not None and batch.tally is not None
 
         def restored(name: str, like: Any) -> Any:
             raw = tensors[name].numpy()
-            return raw.view(like.dtype).reshape(like.shape) if like.dtype.kind == "u" else raw.reshape(like.shape)
+            return raw.view(like.dtype).reshape(like.shape).copy() if like.dtype.kind == "u" else raw.reshape(like.shape).copy()
 
-        batch.state = with_leaves(batch.state, {k: restored(f"loop.{k}", v) for k, v in leaves(batch.state).items()})
-        batch.tally = Tally(*(restored(f"env.{name}", value).copy() for name, value in batch.tally._asdict().items()))
+        batch.episodes.put({name: restored(f"batch.{name}", value) for name, value in batch.episodes.held().items()})
         self.env._returns[:] = tensors["env.returns"].numpy()
         self.env._lengths[:] = tensors["env.lengths"].numpy()
         model._last_obs = tensors["last_obs"].numpy().copy()

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from tailgate import num
 from tailgate.core import Array, Estimate, Finite, Mode, Model, NonNegative, Positive, param
 from tailgate.errors import InputError
 from tailgate.registry import register
@@ -12,24 +13,34 @@ from tailgate.registry import register
 LEADER = ("leader_position", "leader_velocity")  # what the leader sends
 WIDEN_FACTOR = 1.5  # Mode.WIDEN: time headway times this
 BRAKE_ACCEL = -2.0  # Mode.BRAKE: at most this acceleration [m/s^2]
+WIDEN, BRAKE, STOP = (int(mode) for mode in (Mode.WIDEN, Mode.BRAKE, Mode.STOP))  # a compiled lane knows numbers only
 STOP_ACCEL = -5.0  # Mode.STOP [m/s^2], the braking limit of the thesis's follower (section 3.5)
 
 
 def widened(headway: float, mode: Array) -> Array:
     """The time headway [s] under a mode that the defence asks for."""
-    return np.where(mode == Mode.WIDEN, WIDEN_FACTOR * headway, headway)
+    out: Array = num.select(mode == WIDEN, WIDEN_FACTOR * headway, headway)
+    return out
 
 
 def obeyed(a: Array, mode: Array) -> Array:
     """The command [m/s^2] under a mode that the defence asks for."""
-    a = np.where(mode == Mode.BRAKE, np.minimum(a, BRAKE_ACCEL), a)
-    return np.where(mode == Mode.STOP, STOP_ACCEL, a)
+    a = num.select(mode == BRAKE, np.minimum(a, BRAKE_ACCEL), a)
+    out: Array = num.select(mode == STOP, STOP_ACCEL, a)
+    return out
 
 
 def limited(a: Array, low: float | None, high: float | None) -> Array:
     """The command within its limits; none: unlimited."""
     a = a if low is None else np.maximum(a, low)
     return a if high is None else np.minimum(a, high)
+
+
+def spaced(x: Array, v: Array, lead_x: Array, lead_v: Array, headway: Array, standstill: float, gamma: float) -> Array:
+    """(4.14): the acceleration [m/s^2] that keeps the gap d_r + h v, elementwise."""
+    gap_error = lead_x - x - standstill - headway * v
+    out: Array = ((lead_v - v) + gamma * gap_error) / headway
+    return out
 
 
 @register("controller", "acc", reference="Dutta 2018, (4.13) and (4.14), corrected")
@@ -61,8 +72,7 @@ class AdaptiveCruise:
         """estimate.x (B, N, 3) = [x, v, a] and v2v (B, N, 2) = [x_l, v_l] to the command a_des (B, N, 1) [m/s^2]."""
         x, v, mode = estimate.x[..., 0], estimate.x[..., 1], estimate.mode
         headway = widened(self.headway, mode)
-        gap_error = v2v[..., 0] - x - self.standstill - headway * v
-        a = ((v2v[..., 1] - v) + self.gamma * gap_error) / headway
+        a = spaced(x, v, v2v[..., 0], v2v[..., 1], headway, self.standstill, self.gamma)
         if self.set_speed is not None:
             a = np.minimum(a, (self.set_speed - v) / headway)
         return None, limited(obeyed(a, mode), self.accel_min, self.accel_max)[..., None]

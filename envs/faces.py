@@ -17,24 +17,29 @@ from gymnasium.vector.utils import batch_space
 from tailgate import draws
 from tailgate.agents.codec import action_space
 from tailgate.agents.observation import LIMIT
-from tailgate.core import Array, Frame, View
+from tailgate.core import Array, Frame
 from tailgate.errors import InputError, unknown
 from tailgate.loop import LoopState
 
+from .batches import FusedEpisodes, PlainEpisodes, framed, side_by_side
+from .render_viewer import Viewer
 from .seat import FACES, Seat, Tally
 
 _AUTORESET = {"next_step": AutoresetMode.NEXT_STEP, "same_step": AutoresetMode.SAME_STEP, "disabled": AutoresetMode.DISABLED}
 
 
 class AdversaryVectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
-    """B adversary environments stepped as one batch; see `Seat.make` for the arguments."""
+    """B adversary environments stepped as one batch; arguments as `Seat.make`, viewer, size as `Viewer`, engine as `batches`."""
 
     metadata: dict[str, Any] = {  # noqa: RUF012 - Gymnasium's own annotation
         "render_modes": ["rgb_array"], "render_fps": 10, "autoreset_mode": AutoresetMode.NEXT_STEP,
     }  # fmt: skip
     purpose: ClassVar[str] = "train"
 
-    def __init__(self, num_envs: int = 1, *, render_mode: str | None = None, autoreset: str = "next_step", **arguments: Any) -> None:
+    def __init__(
+        self, num_envs: int = 1, *, render_mode: str | None = None, autoreset: str = "next_step", viewer: str = "auto",
+        size: tuple[int, int] | None = None, engine: str = "auto", threads: int = 1, **arguments: Any,
+    ) -> None:  # fmt: skip
         if not isinstance(num_envs, (int, np.integer)) or num_envs < 1:
             raise InputError("num_envs", num_envs, "a whole number not below 1")
         num_envs = int(num_envs)
@@ -45,7 +50,7 @@ class AdversaryVectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
             raise InputError("render_mode", render_mode, f"None or 'rgb_array'{why}")
         self.seat = Seat.make(**arguments)
         self.num_envs = num_envs
-        self.render_mode = render_mode
+        self.render_mode, self.viewer = render_mode, Viewer(viewer, size)
         self.autoreset = _AUTORESET[autoreset]
         self.metadata = self.metadata | {"autoreset_mode": self.autoreset, "render_fps": round(1.0 / self.seat.loop.model.dt)}
         features = len(self.seat.observation.names)
@@ -53,11 +58,36 @@ class AdversaryVectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
         self.single_action_space = action_space(self.seat.action)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self.state: LoopState | None = None
-        self.tally: Tally | None = None
-        self._done = np.zeros(num_envs, bool)
+        self.episodes = side_by_side(self.seat, engine, render_mode is not None, threads)
+        self.begun = False
+        self.over, self._everyone = np.zeros(num_envs, bool), np.ones(num_envs, bool)
+        self._frames = self.seat.observation.frames
         self.observed = np.zeros((num_envs, features), np.float32)
-        self.frame: Frame | None = None  # the last step, for rendering and curious readers
+
+    @property
+    def engine(self) -> str:
+        """Who plays: fused or plain. What is played is the same."""
+        return self.episodes.engine
+
+    @property
+    def episode(self) -> Array:
+        """(B,) the number of each row's episode, from 0, under its seed."""
+        return self.episodes.number
+
+    @property
+    def state(self) -> LoopState | None:
+        """The plain loop's state, for rendering and curious readers; None before the first episode, and in the fused engine."""
+        return self.episodes.state if isinstance(self.episodes, PlainEpisodes) else None
+
+    @property
+    def tally(self) -> Tally | None:
+        """What the plain loop's reward remembers; None before the first episode, and in the fused engine."""
+        return self.episodes.tally if isinstance(self.episodes, PlainEpisodes) else None
+
+    @property
+    def frame(self) -> Frame | None:
+        """The plain loop's last step; None before it, and in the fused engine."""
+        return self.episodes.frame if isinstance(self.episodes, PlainEpisodes) else None
 
     def card(self) -> dict[str, Any]:
         """JSON data that names this environment completely, with a hash."""
@@ -82,52 +112,53 @@ class AdversaryVectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
             rows = np.asarray(mask)
             if rows.dtype != bool or rows.shape != (self.num_envs,) or not rows.any():
                 raise InputError("options.reset_mask", mask, f"a bool array of shape ({self.num_envs},) with at least one True")
-        if self.state is None:
+        if not self.begun:
             fresh = [int(self.np_random.integers(2**31)) if s is None else s for s in seeds]
-            self.state = self.seat.loop.start(draws.keys(self.purpose, fresh))
+            self.episodes.begin(draws.keys(self.purpose, fresh))
+            self.begun = True
         else:
             again = rows & np.array([s is None for s in seeds])
-            self.state = self.seat.loop.restart(self.state, again)
-            named = np.flatnonzero(rows & ~again)
-            if len(named):
-                keys = draws.keys(self.purpose, [s for s in (seeds[i] for i in named) if s is not None])
-                self.state = self.seat.loop.reseed(self.state, named, keys)
-        self._done = self._done & ~rows
-        self.frame = None
-        view = self._begin(rows)
-        quiet = np.zeros(self.num_envs, bool)
-        return self.observed.copy(), self._info(view, quiet, quiet, quiet)
+            if again.any():
+                self.episodes.again(again)
+            if (named := rows & ~again).any():
+                keys = draws.keys(self.purpose, [s for s in (seeds[i] for i in np.flatnonzero(named)) if s is not None])
+                self.episodes.again(named, keys)
+        self.over = self.over & ~rows
+        if isinstance(self.episodes, PlainEpisodes):
+            self.episodes.frame = None
+        self._begin(rows)
+        return self._shown(), self._info(*np.zeros((3, self.num_envs), bool))
 
     def step(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
         """actions (B,) for discrete spaces, (B, size) for Box -> the Gymnasium five."""
-        if self.state is None or self.tally is None:
+        if not self.begun:
             raise InputError("step", "no episode", "reset() first")
-        actions = self._checked(actions)
-        over, resets = self._done, self.autoreset == AutoresetMode.NEXT_STEP
+        actions = self.checked(actions)
+        over, resets = self.over, self.autoreset == AutoresetMode.NEXT_STEP
         if over.any() and self.autoreset == AutoresetMode.DISABLED:
             raise InputError("step", np.flatnonzero(over).tolist(), "rows that are over to be reset with options['reset_mask'] first")
-        self.state, self.tally, outcome, self.frame = self.seat.step(self.state, self.tally, actions, over)
+        outcome = self.episodes.decide(actions, over, resets)
         terminated, truncated = outcome.terminated, outcome.truncated
         happened = (outcome.refused, outcome.collided, outcome.rear_collided)
-        self._done = terminated | truncated
-        view = self.seat.loop.sense(self.state)
-        self.observed = self.seat.observation.observe(view, self.observed)
-        if resets and over.any():  # these rows were over: this step is their reset
-            view = self._restart(over)
-        observation, info = self.observed.copy(), self._info(view, *happened)
-        if self.autoreset == AutoresetMode.SAME_STEP and self._done.any():
-            done, final, final_info = self._done, observation, info
-            view = self._restart(done)
-            observation, info = self.observed.copy(), self._info(view, *happened)
+        self.over = terminated | truncated
+        self.observed = framed(self.episodes.seen(), self.observed, self._frames)
+        if resets and self._frames > 1 and over.any():  # these rows were over: this step is their reset
+            self._begin(over)
+        observation, info = self._shown(), self._info(*happened)
+        if self.autoreset == AutoresetMode.SAME_STEP and self.over.any():
+            done, final, final_info = self.over, observation, info
+            self.episodes.again(done)
+            self._begin(done)
+            observation, info = self._shown(), self._info(*happened)
             info |= {"final_obs": final, "_final_obs": done.copy(), "final_info": final_info, "_final_info": done.copy()}
-            self._done = np.zeros_like(done)
+            self.over = np.zeros_like(done)
         return observation, outcome.reward, terminated, truncated, info
 
     def action_masks(self) -> Array:
         """(B, actions) bool: what the channel would accept now. Discrete action spaces only."""
-        if self.state is None or not self.seat.action.discrete:
+        if not self.begun or not self.seat.action.discrete:
             raise InputError("action_masks", self.seat.action.spec.action, "a running episode with a discrete action space")
-        return self.seat.action.mask(self.seat.loop.sense(self.state))
+        return self.episodes.mask()
 
     def render(self) -> tuple[Array, ...] | None:
         """One (H, W, 3) uint8 picture per row: the road or the graph, what is believed, attack, alarm."""
@@ -135,52 +166,45 @@ class AdversaryVectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
             return None
         from .render import draw
 
-        return tuple(draw(self.seat.loop, self.state, self.frame, row) for row in range(self.num_envs))
+        return tuple(draw(self.seat.loop, self.state, self.frame, row, self.viewer) for row in range(self.num_envs))
 
     # -- inside
 
-    def _restart(self, rows: Array) -> View:
-        """New episodes in `rows` (B,) bool."""
-        assert self.state is not None
-        self.state = self.seat.loop.restart(self.state, rows)
-        return self._begin(rows)
+    def _begin(self, rows: Array) -> None:
+        """What is seen of episodes that have just begun in `rows` (B,) bool: every frame shows their first."""
+        now = self.episodes.seen()  # of one frame: what the other rows have seen already
+        self.observed = now if self._frames == 1 else np.where(rows[:, None], framed(now, None, self._frames), self.observed)
 
-    def _begin(self, rows: Array) -> View:
-        """What belongs to an episode, of those that have just begun in `rows` (B,) bool."""
-        assert self.state is not None
-        fresh, view = self.seat.begin(self.state), self.seat.loop.sense(self.state)
-        held = fresh if self.tally is None else self.tally
-        self.tally = Tally(*(np.where(rows, new, old) for new, old in zip(fresh, held, strict=True)))
-        self.observed = np.where(rows[:, None], self.seat.observation.observe(view), self.observed)
-        return view
+    def _shown(self) -> Array:
+        """The observation as its reader's own."""
+        return self.observed if self._frames == 1 else self.observed.copy()
 
-    def _checked(self, actions: Array) -> Array:
+    def checked(self, actions: Array) -> Array:
+        """Actions of the right shape, kind and size; raises InputError."""
         actions = np.asarray(actions)
         shape = self.action_space.shape
         if actions.shape != shape:
             raise InputError("actions", f"shape {actions.shape}", f"shape {shape}")
         if self.seat.action.discrete:
-            if actions.dtype.kind not in "iu" or ((actions < 0) | (actions >= self.seat.action.size)).any():
+            if actions.dtype.kind not in "iu" or actions.min() < 0 or actions.max() >= self.seat.action.size:
                 raise InputError("actions", actions.tolist(), f"whole numbers from 0 to {self.seat.action.size - 1}")
         elif not np.isfinite(actions).all():
             raise InputError("actions", actions.tolist(), "finite numbers in [-1, 1]")
         return actions
 
-    def _info(self, view: View, illegal: Array, collided: Array, rear: Array) -> dict[str, Any]:
-        assert self.tally is not None
+    def _info(self, illegal: Array, collided: Array, rear: Array) -> dict[str, Any]:
+        facts = self.episodes.facts()
         info: dict[str, Any] = {
-            "illegal": illegal.copy(), "collided": collided.copy(), "rear_collided": rear.copy(), "allowed": view.allowed.copy(),
-            "step": view.k.copy(),
+            "illegal": illegal, "collided": collided, "rear_collided": rear, "allowed": facts.allowed, "step": facts.step,
+            "gap" if self.seat.road else "error": facts.damage,
         }  # fmt: skip
-        info |= {"gap": np.min(view.scene.gap, axis=1)} if self.seat.road else {"error": self.tally.error.copy()}
         if self.seat.action.discrete:
-            info["action_mask"] = self.seat.action.mask(view).astype(np.int8)  # as Space.sample(mask) wants it
-        everyone = np.ones(self.num_envs, bool)
-        return info | {f"_{key}": everyone for key in info}
+            info["action_mask"] = self.episodes.mask().view(np.int8)  # as Space.sample(mask) wants it
+        return info | {f"_{key}": self._everyone for key in info}
 
 
 class AdversaryEnv(gymnasium.Env[Array, Any]):
-    """One adversary environment; see `Seat.make` for the arguments."""
+    """One adversary environment; see `Seat.make` for the arguments, `Viewer` for viewer and size."""
 
     metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array"], "render_fps": 10}  # noqa: RUF012 - Gymnasium's own annotation
 
@@ -193,6 +217,11 @@ class AdversaryEnv(gymnasium.Env[Array, Any]):
         self.batch = AdversaryVectorEnv(1, render_mode=drawn, autoreset="disabled", **arguments)
         self.render_mode = render_mode
         self.metadata = self.metadata | {"render_fps": self.batch.metadata["render_fps"]}
+        played = self.batch.episodes
+        self._quick = played if isinstance(played, FusedEpisodes) and self.batch.seat.observation.frames == 1 else None
+        actions = self.batch.seat.action.size if self.batch.seat.action.discrete else 0
+        self._actions, self._over = actions, False  # discrete actions, 0 where there are none; the episode is over
+        self._masks = np.eye(1, actions, dtype=np.int8)[0], np.ones(actions, np.int8)  # nothing allowed, all allowed
         self._window: Any = None
         self._shown: LoopState | None = None  # in the window
         self.observation_space = self.batch.single_observation_space
@@ -204,18 +233,39 @@ class AdversaryEnv(gymnasium.Env[Array, Any]):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Array, dict[str, Any]]:
         super().reset(seed=seed)
-        if self.batch.state is None and seed is None:
+        if not self.batch.begun and seed is None:
             seed = int(self.np_random.integers(2**31))
         observation, info = self.batch.reset(seed=seed)
+        self._over = False
         if self.render_mode == "human":
             self.render()
         return observation[0], self._row(info)
 
     def step(self, action: Any) -> tuple[Array, float, bool, bool, dict[str, Any]]:
+        if self._quick is not None and self.batch.begun:
+            return self._step_alone(action, self._quick)
         observation, reward, terminated, truncated, info = self.batch.step(np.asarray(action)[None])
         if self.render_mode == "human":
             self.render()
         return observation[0], float(reward[0]), bool(terminated[0]), bool(truncated[0]), self._row(info)
+
+    def _step_alone(self, action: Any, episodes: FusedEpisodes) -> tuple[Array, float, bool, bool, dict[str, Any]]:
+        """What `step` of a batch of one comes to, without its arrays."""
+        batch, actions = self.batch, self._actions
+        if self._over:
+            raise InputError("step", [0], "an episode that is not over: reset() first")
+        if not (type(action) is int and 0 <= action < actions):
+            action = batch.checked(np.asarray(action)[None])[0]
+        reward, terminated, truncated, illegal, collided, rear, allowed, step, gap = episodes.decide_alone(action)
+        observation: Array = episodes.seen()[0]
+        self._over = ended = terminated != 0.0 or truncated != 0.0
+        info: dict[str, Any] = {
+            "illegal": illegal != 0.0, "collided": collided != 0.0, "rear_collided": rear != 0.0, "allowed": allowed != 0.0,
+            "step": int(step), "gap": gap,
+        }  # fmt: skip
+        if actions:
+            info["action_mask"] = self._masks[int(allowed)].copy()
+        return observation, reward, ended and terminated != 0.0, ended and truncated != 0.0, info
 
     def action_masks(self) -> Array:
         """(actions,) bool: what the channel would accept now. Discrete action spaces only."""

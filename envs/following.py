@@ -21,7 +21,7 @@ from tailgate.registry import register
 
 from .controllers import LEADER
 from .idm import Behind, BehindState
-from .vehicle import drive, lag
+from .vehicle import drive, lag, roll
 
 Triple = Annotated[tuple[NonNegative, NonNegative, NonNegative], Field(min_length=3, max_length=3)]
 
@@ -92,12 +92,10 @@ class CarFollowing:
         return FollowingState(np.full(batch, self.position + self.gap), np.full(batch, self.lead_speed), ego, behind)
 
     def step(self, plan: FollowingPlan, state: FollowingState, u: Array, exo: Array, draws: Draws) -> FollowingState:
-        dt, half = self.dt, 0.5 * self.dt
         noise = plan.noise_sd[:, None] * np.moveaxis(draws.normal((3,)), 0, -1)  # (3, B)
         x, v = state.ego[:, 0, 0], state.ego[:, 0, 1]
         ego = self.move(plan, state.ego, u, noise)
-        lead_v = np.maximum(0.0, state.lead_v + exo * dt)
-        lead_x = state.lead_x + half * (state.lead_v + lead_v)
+        lead_x, lead_v = roll(state.lead_x, state.lead_v, exo, self.dt)
         behind = plan.behind.step(state.behind, x, v) if plan.behind and state.behind else None
         return FollowingState(lead_x, lead_v, ego, behind)
 

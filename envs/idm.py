@@ -14,6 +14,7 @@ from tailgate.registry import register
 
 from .controllers import limited, obeyed, widened
 from .radar_car import GAP, RELATIVE_SPEED, check_radar_car
+from .vehicle import roll
 
 # The driver behind.
 IDM_SPEED = 33.3  # desired speed [m/s]
@@ -30,13 +31,14 @@ def idm(gap: Array, v: Array, lead: Array, v0: float, headway: Array | float, s0
     wanted = s0 + np.maximum(0.0, v * headway + closing)
     free = (v / v0) * (v / v0)
     near = wanted / np.maximum(gap, 0.1)
-    return np.asarray(accel * (1.0 - free * free - near * near))
+    out: Array = accel * (1.0 - free * free - near * near)
+    return out
 
 
 def idm_accel(gap: Array, speed: Array, lead_speed: Array) -> Array:
     """Acceleration [m/s^2] of the driver behind for gap [m] and speeds [m/s], elementwise."""
-    a = idm(gap, speed, lead_speed, IDM_SPEED, IDM_HEADWAY, IDM_GAP, IDM_ACCEL, IDM_DECEL)
-    return np.asarray(np.clip(a, -IDM_BRAKE, IDM_ACCEL))
+    out: Array = num.clip(idm(gap, speed, lead_speed, IDM_SPEED, IDM_HEADWAY, IDM_GAP, IDM_ACCEL, IDM_DECEL), -IDM_BRAKE, IDM_ACCEL)
+    return out
 
 
 class BehindState(NamedTuple):
@@ -73,8 +75,7 @@ class Behind:
             slot = (slot + 1) % self.reaction
         else:
             made = decided
-        v_next = np.maximum(0.0, state.v + made * self.dt)
-        return BehindState(state.x + 0.5 * self.dt * (state.v + v_next), v_next, intent, slot)
+        return BehindState(*roll(state.x, state.v, made, self.dt), intent, slot)
 
 
 @register("controller", "idm", reference="Treiber, Hennecke, Helbing, Congested traffic states in empirical observations, 2000")

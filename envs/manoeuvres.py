@@ -27,6 +27,40 @@ def _check_span(where: str, span: tuple[float, float]) -> None:
         raise InputError(where, span, "two times [s], the smaller first")
 
 
+def between(t: Array, begin: float, end: float, value: float, otherwise: float) -> Array:
+    """`value` [m/s^2] from the time `begin` until `end` [s], `otherwise` before and after, elementwise."""
+    out: Array = num.select((t >= begin) & (t < end), value, otherwise)
+    return out
+
+
+def halt(t: Array, onset: Array, decel: float, speed: Array, dt: float) -> Array:
+    """Braking with `decel` from the time `onset` [s] until the vehicle stands, elementwise [m/s^2]."""
+    out: Array = num.select(t >= onset, np.maximum(-decel, -speed / dt), 0.0)
+    return out
+
+
+CRUISE, BRAKE, DWELL, SPEED_UP = 0, 1, 2, 3  # phases of stop and go, in this order
+
+
+def phase_over(phase: Array, clock: Array, speed: Array, low: float, high: float) -> Array:
+    """Whether a phase of stop and go ends, elementwise: braking and speeding up at a speed [m/s], the others by the clock."""
+    out: Array = num.select(phase == BRAKE, speed <= low, num.select(phase == SPEED_UP, speed >= high, clock <= 0.0))
+    return out
+
+
+def stop_and_go(phase: Array, speed: Array, low: float, high: float, decel: float, rate: float, dt: float) -> Array:
+    """Acceleration in a phase of stop and go [m/s^2], elementwise; no more than it takes to the speed at which the phase ends."""
+    slow, fast = np.maximum(-decel, (low - speed) / dt), np.minimum(rate, (high - speed) / dt)
+    out: Array = num.select(phase == BRAKE, slow, num.select(phase == SPEED_UP, fast, 0.0))
+    return out
+
+
+def drawn_back(a: Array, speed: Array, mean_speed: float, pull: float, limit: float) -> Array:
+    """A random acceleration a and the return to the mean speed, within the limit [m/s^2], elementwise."""
+    out: Array = num.clip(a + pull * (mean_speed - speed), -limit, limit)
+    return out
+
+
 @register("manoeuvre", "constant", reference="Dutta 2018, (4.11), (4.12)")
 @dataclass(frozen=True)
 class Constant:
@@ -63,8 +97,7 @@ class Pulse:
         return None
 
     def accel(self, plan: float, state: Any, k: Array, speed: Array, draws: Draws) -> tuple[Any, Array]:
-        t = k * plan
-        return None, np.where((t >= self.begin) & (t < self.end), self.value, 0.0)
+        return None, between(k * plan, self.begin, self.end, self.value, 0.0)
 
 
 @register("manoeuvre", "switched", reference="Dutta 2018, section 3.5.2, scenario (ii)")
@@ -83,7 +116,7 @@ class Switched:
         return None
 
     def accel(self, plan: float, state: Any, k: Array, speed: Array, draws: Draws) -> tuple[Any, Array]:
-        return None, np.where(k * plan < self.at, self.value, self.then)
+        return None, between(k * plan, 0.0, self.at, self.value, self.then)
 
 
 class SinePlan(NamedTuple):
@@ -141,11 +174,11 @@ class Braking:
         return BrakingState(_within(self.onset, draws.uniform()))
 
     def accel(self, plan: float, state: BrakingState, k: Array, speed: Array, draws: Draws) -> tuple[Any, Array]:
-        return state, np.where(k * plan >= state.onset, np.maximum(-self.decel, -speed / plan), 0.0)
+        return state, halt(k * plan, state.onset, self.decel, speed, plan)
 
 
 class StopAndGoState(NamedTuple):
-    phase: Array  # (B,) 0 cruise, 1 brake, 2 dwell, 3 accelerate
+    phase: Array  # (B,) int8
     clock: Array  # (B,) [s] left of a cruise or a dwell
 
 
@@ -177,17 +210,14 @@ class StopAndGo:
     def accel(self, plan: float, state: StopAndGoState, k: Array, speed: Array, draws: Draws) -> tuple[Any, Array]:
         dt = plan
         phase, clock = state.phase, state.clock - dt
-        done = np.where(
-            phase == 1, speed <= self.low_speed, np.where(phase == 3, speed >= self.cruise_speed, clock <= 0.0)
-        )
+        done = phase_over(phase, clock, speed, self.low_speed, self.cruise_speed)
         if done.any():
             u = draws.uniform()
             phase = np.where(done, (phase + 1) % 4, phase).astype(np.int8)
-            fresh = np.where(phase == 0, _within(self.cruise, u), _within(self.dwell, u))
+            fresh = np.where(phase == CRUISE, _within(self.cruise, u), _within(self.dwell, u))
             clock = np.where(done, fresh, clock)
-        slow = np.maximum(-self.decel, (self.low_speed - speed) / dt)
-        fast = np.minimum(self.accel_rate, (self.cruise_speed - speed) / dt)
-        return StopAndGoState(phase, clock), np.where(phase == 1, slow, np.where(phase == 3, fast, 0.0))
+        accel = stop_and_go(phase, speed, self.low_speed, self.cruise_speed, self.decel, self.accel_rate, dt)
+        return StopAndGoState(phase, clock), accel
 
 
 class OrnsteinUhlenbeckPlan(NamedTuple):
@@ -221,8 +251,7 @@ class OrnsteinUhlenbeck:
         self, plan: OrnsteinUhlenbeckPlan, state: OrnsteinUhlenbeckState, k: Array, speed: Array, draws: Draws
     ) -> tuple[Any, Array]:
         a = plan.keep * state.accel + plan.kick * draws.normal()
-        total = np.clip(a + self.pull * (self.mean_speed - speed), -self.limit, self.limit)
-        return OrnsteinUhlenbeckState(a), total
+        return OrnsteinUhlenbeckState(a), drawn_back(a, speed, self.mean_speed, self.pull, self.limit)
 
 
 class ProfilePlan(NamedTuple):

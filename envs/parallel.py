@@ -19,6 +19,7 @@ from tailgate.core import Array, Frame
 from tailgate.errors import InputError
 
 from .duel import Duel, DuelState, checked, next_game
+from .render_viewer import Viewer
 
 ATTACKER, GUARD = "attacker", "defender"
 
@@ -28,10 +29,12 @@ class DuelEnv(ParallelEnv[str, Array, Any]):  # type: ignore[misc]
 
     metadata: dict[str, Any] = {"name": "tailgate_duel_v0", "render_modes": ["rgb_array"], "is_parallelizable": True}  # noqa: RUF012 - PettingZoo's own annotation
 
-    def __init__(self, *, render_mode: str | None = None, **arguments: Any) -> None:
+    def __init__(
+        self, *, render_mode: str | None = None, viewer: str = "auto", size: tuple[int, int] | None = None, **arguments: Any
+    ) -> None:
         if render_mode not in (None, "rgb_array"):
             raise InputError("render_mode", render_mode, "None or 'rgb_array'")
-        self.duel, self.render_mode = Duel.make(**arguments), render_mode
+        self.duel, self.render_mode, self.viewer = Duel.make(**arguments), render_mode, Viewer(viewer, size)
         self.possible_agents = [ATTACKER, GUARD]
         self.agents: list[str] = []
         sight, act = self.duel.defender_spaces()
@@ -85,7 +88,7 @@ class DuelEnv(ParallelEnv[str, Array, Any]):  # type: ignore[misc]
             return None
         from .render import draw
 
-        return draw(self.duel.seat.loop, self.game.loop, self.frame, 0)
+        return draw(self.duel.seat.loop, self.game.loop, self.frame, 0, self.viewer)
 
     def _observed(self) -> dict[str, Array]:
         assert self.game is not None

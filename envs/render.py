@@ -1,6 +1,6 @@
 """One picture of one episode for render_mode "rgb_array", and the window that shows it for "human" (extra: viz).
 
-Nothing is told by colour alone, and the same state always gives the same picture.
+Nothing is told by colour alone, the same state always gives the same picture, and no picture changes a state.
 """
 
 from __future__ import annotations
@@ -12,13 +12,18 @@ import numpy as np
 from tailgate.core import Array, Frame
 from tailgate.errors import InputError
 from tailgate.loop import Loop, LoopState
+from tailgate.registry import entry_for
 
 from . import render_following, render_network, render_platoon, render_radar
-from .render_canvas import HEIGHT, WIDTH
+from .render_canvas import HEIGHT as HEIGHT
+from .render_canvas import WIDTH as WIDTH
+from .render_viewer import Viewer
+
+AUTO = Viewer()
 
 
-def draw(loop: Loop, state: LoopState, frame: Frame | None, row: int) -> Array:
-    """(H, W, 3) uint8: row `row` after `frame`. frame is None right after a reset, be it of other rows."""
+def plain(loop: Loop, state: LoopState, frame: Frame | None, row: int) -> Array:
+    """(HEIGHT, WIDTH, 3) uint8: the road from the side, or the graph of a network. Arguments as of `draw`."""
     if not loop.model.followers.any():
         return render_network.draw(loop, state, frame, row)
     if loop.model.agents > 1:
@@ -26,6 +31,19 @@ def draw(loop: Loop, state: LoopState, frame: Frame | None, row: int) -> Array:
     if loop.model.air:
         return render_radar.draw(loop, state, frame, row)
     return render_following.draw(loop, state, frame, row)
+
+
+def draw(loop: Loop, state: LoopState, frame: Frame | None, row: int, viewer: Viewer = AUTO, caption: str = "") -> Array:
+    """(H, W, 3) uint8: row `row` after `frame`. frame is None right after a reset, be it of other rows.
+
+    caption: a line about who plays, on HighwayEnv's road; the defence's name where nothing is said.
+    """
+    if not viewer.on_road(loop):
+        return plain(loop, state, frame, row)
+    from . import render_highway
+
+    caption = caption or f"defence {entry_for('defence', type(loop.defence)).name}"
+    return render_highway.draw(loop, state, frame, row, viewer.size, caption)
 
 
 class Window:
@@ -42,15 +60,17 @@ class Window:
         """Show a picture (H, W, 3) uint8, no sooner than the frame rate allows. Raises InputError where there is no screen."""
         if self.dismissed:
             return
-        if not self.open or self._pygame.display.get_surface() is None:  # also where another environment has closed the one display
-            self._start()
+        size = (picture.shape[1], picture.shape[0])
+        screen = self._pygame.display.get_surface() if self.open else None
+        if screen is None or screen.get_size() != size:  # also where another environment has closed or changed the one display
+            self._start(size)
         pygame = self._pygame
         if any(event.type in (pygame.QUIT, pygame.WINDOWCLOSE) for event in pygame.event.get()):
             self.dismissed = True
             self.close()
             return
         screen = pygame.display.get_surface()
-        screen.blit(pygame.image.frombuffer(np.ascontiguousarray(picture), (WIDTH, HEIGHT), "RGB"), (0, 0))
+        screen.blit(pygame.image.frombuffer(np.ascontiguousarray(picture), size, "RGB"), (0, 0))
         pygame.display.flip()
         self._clock.tick(self.fps)
 
@@ -60,14 +80,14 @@ class Window:
             self.open = False
             self._pygame.display.quit()
 
-    def _start(self) -> None:
+    def _start(self, size: tuple[int, int]) -> None:
         try:
             import pygame
         except ImportError as error:
             raise ImportError("pygame is missing, which opens the window: pip install 'tailgate[viz]'") from error
         try:
             pygame.display.init()
-            pygame.display.set_mode((WIDTH, HEIGHT))
+            pygame.display.set_mode(size)
         except pygame.error as error:
             raise InputError("render_mode", "human", f"a screen for the window ({error}); 'rgb_array' needs none") from None
         pygame.display.set_caption("Tailgate")

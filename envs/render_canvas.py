@@ -66,8 +66,9 @@ def _font(size: int) -> ImageFont.ImageFont | ImageFont.FreeTypeFont:
 class Canvas:
     """Pillow's drawing in picture coordinates, whatever the zoom."""
 
-    def __init__(self) -> None:
-        self.image = Image.new("RGB", (WIDTH * ZOOM, HEIGHT * ZOOM), WHITE)
+    def __init__(self, width: int = WIDTH, height: int = HEIGHT) -> None:
+        self.width, self.height = width, height
+        self.image = Image.new("RGB", (width * ZOOM, height * ZOOM), WHITE)
         self.pen = ImageDraw.Draw(self.image)
 
     def box(self, x0: float, y0: float, x1: float, y1: float, fill: str, edge: str | None = None, width: int = 1) -> None:
@@ -156,6 +157,10 @@ class Canvas:
         points = ((0.0, 0.0), (0.75, -1.1), (0.2, -1.0), (0.6, -2.0), (-0.6, -0.85), (-0.05, -0.95))
         self.shape([(x + a * size, y + b * size) for a, b in points], ATTACK, INK)
 
+    def paste(self, picture: Array, top: int) -> None:
+        """A picture (H ZOOM, W ZOOM, 3) uint8, as wide as the canvas, from row `top` [px] down."""
+        self.image.paste(Image.fromarray(np.ascontiguousarray(picture)), (0, top * ZOOM))
+
     def done(self) -> Array:
         """The picture (H, W, 3) uint8."""
         return np.array(self.image.reduce(ZOOM), np.uint8)
@@ -176,11 +181,7 @@ def header(canvas: Canvas, loop: Loop, state: LoopState, row: int, refused: bool
     if loop.threat.budget is not None:
         canvas.text(BUDGET, FIRST, f"{loop.threat.budget - int(state.channel.used[row])} of {loop.threat.budget}", bold=True)
         canvas.text(BUDGET, SECOND, "attack steps left", GREY, SMALL)
-    alarms, modes = np.flatnonzero(state.estimate.alarm[row]).tolist(), state.estimate.mode[row].tolist()
-    asked = {mode: [i for i, held in enumerate(modes) if held == mode] for mode in Mode if mode and mode in modes}
-    words = "; ".join(f"{mode.name}{_of(loop, asked[mode])}" for mode in asked)
-    lines = ([f"defence's mode: {words}"] if asked else []) + ([_of(loop, alarms).removeprefix(" of ")] if alarms else [])
-    second = "; ".join(line for line in reversed(lines) if line)
+    alarms, second = state.estimate.alarm[row].any(), alarmed(loop, state, row)
     if alarms:
         canvas.box(LAMP - 2 * LAMP_SIZE, 5, WIDTH - 6, HEADER - 5, WARNING, INK, 2)
     canvas.alarm(LAMP, HEADER / 2, LAMP_SIZE, bool(alarms))
@@ -189,14 +190,28 @@ def header(canvas: Canvas, loop: Loop, state: LoopState, row: int, refused: bool
     canvas.text(LAMP_TEXT, SECOND, second, INK, SMALL, room=(LAMP_TEXT, WIDTH - MARGIN))
 
 
+def alarmed(loop: Loop, state: LoopState, row: int) -> str:
+    """Who alarms, and the modes that the defence asks for; nothing of a single calm agent."""
+    alarms, modes = np.flatnonzero(state.estimate.alarm[row]).tolist(), state.estimate.mode[row].tolist()
+    asked = {mode: [i for i, held in enumerate(modes) if held == mode] for mode in Mode if mode and mode in modes}
+    words = "; ".join(f"{mode.name}{_of(loop, asked[mode])}" for mode in asked)
+    lines = ([f"defence's mode: {words}"] if asked else []) + ([_of(loop, alarms).removeprefix(" of ")] if alarms else [])
+    return "; ".join(line for line in reversed(lines) if line)
+
+
+def ended(loop: Loop, state: LoopState, frame: Frame | None, row: int) -> str:
+    """Words about the collision of the episode that an autoreset has just replaced; nothing where there was none."""
+    if frame is None or frame.k[row] + 1 == state.k[row] or frame.k[row] > loop.horizon:
+        return ""
+    if not (frame.collided[row] | frame.rear_collided[row]):
+        return ""
+    return f"new episode; the last one ended in a {'COLLISION' if frame.collided[row] else 'REAR COLLISION'}"
+
+
 def ended_line(canvas: Canvas, loop: Loop, state: LoopState, frame: Frame | None, row: int) -> None:
     """A line about the collision of the episode that an autoreset has just replaced, if there was one."""
-    if frame is None or frame.k[row] + 1 == state.k[row] or frame.k[row] > loop.horizon:
-        return
-    if not (frame.collided[row] | frame.rear_collided[row]):
-        return
-    words = "COLLISION" if frame.collided[row] else "REAR COLLISION"
-    canvas.text(WIDTH - MARGIN, HEADER + 17, f"new episode; the last one ended in a {words}", INK, SMALL, "rs", True)
+    if words := ended(loop, state, frame, row):
+        canvas.text(WIDTH - MARGIN, HEADER + 17, words, INK, SMALL, "rs", True)
 
 
 def noun(loop: Loop) -> str:

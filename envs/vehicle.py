@@ -25,11 +25,17 @@ def lag(dt: float, tau: float) -> tuple[Array, Array]:
 
 def drive(A: Array, B: Array, x: Array, v: Array, a: Array, u: Array, noise: Array) -> tuple[Array, Array, Array]:
     """x, v, a one step later, under u [m/s^2] and noise (3, ...), elementwise."""
-    x_next = x + A[0, 1] * v + A[0, 2] * a + B[0, 0] * u + noise[0]
-    v_next = v + A[1, 2] * a + B[1, 0] * u + noise[1]
-    a_next = A[2, 2] * a + B[2, 0] * u + noise[2]
+    x_next = x + A[0][1] * v + A[0][2] * a + B[0][0] * u + noise[0]
+    v_next = v + A[1][2] * a + B[1][0] * u + noise[1]
+    a_next = A[2][2] * a + B[2][0] * u + noise[2]
     halted = v_next <= 0.0  # a car that stands neither rolls back nor decelerates
     v_next = np.maximum(v_next, 0.0)
-    a_next = np.where(halted, np.maximum(a_next, 0.0), a_next)
-    x_next = np.where(halted, np.maximum(x_next, x), x_next)
+    a_next = num.select(halted, np.maximum(a_next, 0.0), a_next)
+    x_next = num.select(halted, np.maximum(x_next, x), x_next)
     return x_next, v_next, a_next
+
+
+def roll(x: Array, v: Array, a: Array, dt: float) -> tuple[Array, Array]:
+    """x and v one step later of a vehicle without lag, under its acceleration a [m/s^2], elementwise; it does not drive backwards."""
+    v_next = np.maximum(0.0, v + a * dt)
+    return x + 0.5 * dt * (v + v_next), v_next

@@ -157,7 +157,7 @@ def test_swapping_the_defence_leaves_the_world_draws(defence, short, play, monke
     traces, logs = [], []
     for name in (defence, "none"):
         log.clear()
-        traces.append(play(short(PLACE[defence]), name, "none", range(5), terminate=False))
+        traces.append(play(short(PLACE[defence]), name, "none", range(5), terminate=False, plain=True))
         logs.append(list(log))
     assert logs[0] == logs[1] and len(logs[0]) > 120
     np.testing.assert_array_equal(traces[0].lead_speed, traces[1].lead_speed)

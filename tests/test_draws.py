@@ -180,7 +180,7 @@ def test_swapping_the_defence_or_the_attack_leaves_every_world_draw(short, play,
     seen = []
     for defence, attack in (("kf", "none"), ("stand_still", "none"), ("chi2_kf", "dos_jam")):
         log.clear()
-        play(short(), defence, tailgate.make_attack(attack), range(5), terminate=False)
+        play(short(), defence, tailgate.make_attack(attack), range(5), terminate=False, plain=True)
         seen.append([entry for entry in log if entry[0] < 16])
     assert len(seen[0]) > 120
     assert seen[0] == seen[1] == seen[2]

@@ -235,7 +235,7 @@ def test_next_step_same_step_and_disabled_are_one_core(name, tiny, same_bits):
         fresh, _ = faces["disabled"].reset(options={"reset_mask": done})
         assert same_bits(fresh, same[0])
         faces["next_step"].reset(options={"reset_mask": done})
-    assert ended >= 12 and len({tuple(f.state.keys.episode) for f in faces.values()}) == 1
+    assert ended >= 12 and len({tuple(f.episode) for f in faces.values()}) == 1
 
 
 def test_next_step_ignores_the_action_of_a_resetting_row(brief_scenario):
@@ -246,10 +246,10 @@ def test_next_step_ignores_the_action_of_a_resetting_row(brief_scenario):
         out = vec.step(np.ones(3, np.int64))
         if (done := out[2] | out[3]).any():
             break
-    assert vec.state.keys.episode.max() == 0
+    assert vec.episode.max() == 0
     after = vec.step(np.ones(3, np.int64))
     assert not after[1][done].any() and not (after[2] | after[3])[done].any() and not after[4]["illegal"][done].any()
-    assert (after[4]["step"][done] == 1).all() and (vec.state.keys.episode == done).all()
+    assert (after[4]["step"][done] == 1).all() and (vec.episode == done).all()
 
 
 @pytest.mark.parametrize("mask", [[True], np.zeros(3, bool), np.ones(3), np.ones((3, 1), bool), "all"])
@@ -278,14 +278,14 @@ def test_a_reset_with_seeds_by_row(brief_scenario, same_bits):
 def test_masks_are_what_the_channel_accepts(action, brief_scenario):
     """An action is illegal exactly where its mask was False, under a budget, a duration, a cooldown and an end."""
     threat = {"budget": 9, "duration": 3, "cooldown": 2, "end": 35, "fdi_bound": 10.0}
-    vec = AdversaryVectorEnv(16, scenario=brief_scenario, action=action, threat=threat, per_sensor=action != "timing")
+    vec = AdversaryVectorEnv(16, scenario=brief_scenario, action=action, threat=threat, per_sensor=action != "timing", engine="plain")
     _, info = vec.reset(seed=0)
     rng, seen = np.random.default_rng(1), {True: 0, False: 0}
     for _ in range(90):
         mask = vec.action_masks()
         assert np.array_equal(mask, info["action_mask"]) and mask[:, 0].all()
         actions = rng.integers(0, mask.shape[1], 16)
-        over = vec._done.copy()
+        over = vec.over.copy()
         *_, info = vec.step(actions)
         legal = mask[np.arange(16), actions]
         assert np.array_equal(info["illegal"][~over], ~legal[~over])

@@ -11,11 +11,15 @@ import yaml
 
 import tailgate
 from tailgate import draws
+from tailgate.agents.codec import ActionCodec, ActionSpec
+from tailgate.agents.observation import ObservationCodec
 from tailgate.core import Kind, no_command
 from tailgate.draws import Role
 from tailgate.envs import FmcwRadar, Highway, RadarCruise
 from tailgate.errors import InputError
-from tailgate.scenario import load_scenario
+from tailgate.evaluation import Cell, evaluate
+from tailgate.scenario import load_scenario, load_suite
+from tailgate.strength.policies import misfit
 from tailgate.trace import rollout
 
 pytest.importorskip("highway_env")
@@ -72,7 +76,7 @@ class Adds:
 
 
 def test_nothing_heavy_is_imported_and_a_missing_library_is_named():
-    """`import tailgate`, a scenario and its public model do without HighwayEnv and pygame; playing without them names the extra."""
+    """`import tailgate`, a scenario and its public model do without HighwayEnv and pygame; playing without them names the extra, rows too."""
     code = (
         "import sys; sys.modules['highway_env'] = None\n"
         "import tailgate\nfrom tailgate.scenario import load_scenario\n"
@@ -80,10 +84,12 @@ def test_nothing_heavy_is_imported_and_a_missing_library_is_named():
         "print([m for m in sys.modules if m.split('.')[0] in ('pygame', 'highway_env') and sys.modules[m]])\n"
         "try: place.plant.prepare(place.brief().model)\n"
         "except ImportError as error: print(error)\n"
+        "from tailgate.evaluation import evaluate\n"
+        "print(*evaluate('highway-v0', scenarios=['highway-v0'], defences=['kf'], attacks=['none'], seeds=1)[0]['reason'].split('\\n'))\n"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
-    quiet, said = done.stdout.splitlines()
-    assert quiet == "[]" and said.endswith("pip install 'tailgate[highway]'"), done.stderr
+    quiet, *said = done.stdout.splitlines()
+    assert quiet == "[]" and len(said) == 2 and all(line.endswith("pip install 'tailgate[highway]'") for line in said), done.stderr
 
 
 def test_the_numbers_are_all_that_the_cars_remember():
@@ -232,6 +238,27 @@ def test_what_does_not_fit_is_refused():
         plant.step(plan, state, np.zeros((1, 1, 1)), np.ones(1), at(1))
     with pytest.raises(RuntimeError, match="drew uniform"):
         plan.bench.road.np_random.uniform()
+
+
+def test_the_suite_grants_what_its_attacks_need():
+    """An attack of the suite spends its whole budget where the car ahead brakes; what is granted is what its scripts send, and no more."""
+    suite = load_suite("highway-v0")
+    rows = evaluate("highway-v0", scenarios=["highway-braking-v0"], defences=["none"], attacks=[suite.attacks[1]], seeds=2)
+    assert {(row["status"], row["attack_steps"], row["refused_commands"], row["dose"]) for row in rows} == {("ok", 30.0, 0.0, 30)}
+    assert {row["threat_model"]["delay_bound"] for row in rows} == {60.0} and "none" in suite.defences
+
+
+def test_who_was_trained_behind_a_radar_fits_and_who_read_positions_does_not():
+    """Observation and actions are those of RadarFollowing under the same threat model; a policy of CarFollowing is refused with a word."""
+    held = {"kinds": ["noise_jam", "echo_delay"], "delay_bound": 60.0}
+    cell = Cell("s", "highway-cut-in-v0", 30, "none", "zoo:name=radar-following-cra-0", 1, threat=held)
+    assert misfit(cell) == ""
+    assert "last_position" in misfit(dataclasses.replace(cell, attack="zoo:name=car-following-chi2_kf-0", threat={"kinds": ["dos_jam", "fdi"]}))
+    granted = load_suite("highway-v0").threat
+    here, there = (load_scenario(name).with_threat(**granted).brief() for name in ("highway-v0", "radar-following-v0"))
+    assert ObservationCodec(here).names == ObservationCodec(there).names
+    one, two = ([mode.name for mode in ActionCodec(ActionSpec(value=30.0), brief).modes] for brief in (here, there))
+    assert one == two and "echo_delay" in one
 
 
 def test_both_checkers_pass(tmp_path):

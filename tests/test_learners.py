@@ -18,7 +18,6 @@ from tailgate.envs.seat import Seat
 from tailgate.errors import InputError
 from tailgate.schema import build
 from tailgate.trace import rollout
-from tailgate.tree import leaves
 
 TASK = """
 plant: car_following
@@ -59,7 +58,7 @@ def learner(name: str, environment: dict[str, Any], seed: int = 0, **changes: An
 
 def earned(path: Path | None, environment: dict[str, Any], action: str) -> float:
     """Mean return of fresh episodes under an exported policy, or at rest."""
-    env = AdversaryVectorEnv(EPISODES, autoreset="disabled", **({"action": action} | environment))
+    env = AdversaryVectorEnv(EPISODES, autoreset="disabled", engine="plain", **({"action": action} | environment))
     env.reset(seed=500_000_000)
     loop, total = env.seat.loop, np.zeros(EPISODES)
     rest = np.zeros(EPISODES, int) if env.seat.action.discrete else np.full((EPISODES, env.seat.action.size), -1.0)
@@ -105,7 +104,7 @@ def test_a_resumed_run_gives_the_policy_of_an_uninterrupted_one(name: str, paid:
     straight.learn(whole, lambda progress: None)
     first = learner(name, paid)
     first.learn(part, lambda progress: None, tmp_path / "c.safetensors")
-    assert part <= first.steps < whole and (first.env.batch.state.k > 1).any()
+    assert part <= first.steps < whole and (first.env.batch.episodes.facts().step > 1).any()
     second = learner(name, paid)
     np.random.rand(5)  # noqa: NPY002 - a restarted process has other global states
     torch.rand(3)
@@ -120,7 +119,7 @@ def test_a_resumed_run_gives_the_policy_of_an_uninterrupted_one(name: str, paid:
     assert optimisers and all(torch.equal(value, others[key]) for key, value in single.items())
     one, two = straight.held(), second.held()
     assert one.keys() == two.keys() and all(same_bits(one[key], two[key]) for key in one)
-    one, two = leaves(straight.env.batch.state), leaves(second.env.batch.state)
+    one, two = straight.env.batch.episodes.held(), second.env.batch.episodes.held()
     assert all(same_bits(one[key], two[key]) for key in one)
     assert straight.curve == second.curve and straight.curve and straight.ended == second.ended
     a, b = straight.export(tmp_path / "a", {}), second.export(tmp_path / "b", {})
@@ -167,7 +166,7 @@ def test_what_is_exported_is_what_torch_predicts(name: str, action: str, paid: d
     header, network = load_policy(path)
     assert header.masked == (name == "maskable_ppo") and header.recurrent == (name == "recurrent_ppo") and header.squashed == (name in ("sac", "tqc"))
     rows = 24
-    env = AdversaryVectorEnv(rows, autoreset="disabled", **environment)
+    env = AdversaryVectorEnv(rows, autoreset="disabled", engine="plain", **environment)
     attack, keys = PolicyAttack(path), draws.keys("train", range(rows))
     observation, _ = env.reset(seed=0)
     plan, start = attack.prepare(env.seat.loop.brief), keys.at(draws.Role.ATTACK, np.zeros(rows))
@@ -193,14 +192,15 @@ def test_the_masks_in_training_are_those_of_the_channel(paid: dict[str, Any]) ->
     refused = {}
     for name in ("maskable_ppo", "ppo"):
         run = learner(name, paid, rest=0.5)
-        step, count = run.env.batch.seat.step, []
+        episodes: Any = run.env.batch.episodes
+        decide, count = episodes.decide, []
 
-        def counted(*given: Any, step: Any = step, count: Any = count) -> Any:
-            out = step(*given)
-            count.append(out[2].refused.sum())
+        def counted(*given: Any, decide: Any = decide, count: Any = count) -> Any:
+            out = decide(*given)
+            count.append(out.refused.sum())
             return out
 
-        object.__setattr__(run.env.batch.seat, "step", counted)
+        episodes.decide = counted
         run.learn(2000, lambda progress: None)
         refused[name] = sum(count)
     assert refused["maskable_ppo"] == 0 < refused["ppo"]

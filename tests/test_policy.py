@@ -75,7 +75,7 @@ def _same_trace(tmp_path: Path, spec: dict[str, Any], knowledge: str, scenario: 
     """The environment stepped with a policy's choices, and the policy played as an attack: bit for bit."""
     path = _policy(tmp_path, spec, knowledge, scenario=scenario, frames=arguments.get("frames", 1))
     _, network = load_policy(path)
-    env = AdversaryVectorEnv(len(SEEDS), scenario=scenario, knowledge=knowledge, autoreset="disabled", **arguments, **spec)
+    env = AdversaryVectorEnv(len(SEEDS), scenario=scenario, knowledge=knowledge, autoreset="disabled", engine="plain", **arguments, **spec)
     loop, interval = env.seat.loop, spec["interval"]
     played = rollout(loop, PolicyAttack(path), draws.keys("train", SEEDS))
 
@@ -94,7 +94,7 @@ def _same_trace(tmp_path: Path, spec: dict[str, Any], knowledge: str, scenario: 
     object.__setattr__(loop, "advance", recorded)
     for _ in range(-(-loop.horizon // interval)):
         observation, *_ = env.step(choose(network, env.seat.action, observation))
-        env._done[:] = False  # play on: the recorder knows which rows are over
+        env.over[:] = False  # play on: the recorder knows which rows are over
     stepped = recorder.trace()
     assert (played.kind != 0).any()
     assert [stepped.trace_hash(i) for i in range(len(SEEDS))] == [played.trace_hash(i) for i in range(len(SEEDS))]
@@ -301,7 +301,7 @@ def test_a_policy_of_every_kind_plays_alone_as_in_company_and_steps_as_it_plays(
     together = rollout(loop, PolicyAttack(path), keys)
     assert (together.kind != 0).any() and len({together.trace_hash(i) for i in range(64)}) == 64
     assert [rollout(loop, PolicyAttack(path), draws.keys("train", [i])).trace_hash(0) for i in (0, 1, 63)] == [together.trace_hash(i) for i in (0, 1, 63)]
-    env = AdversaryVectorEnv(64, scenario="gusty-stop-and-go-v0", defence="kf", threat=THREAT, autoreset="disabled", action=header.action.action, interval=3)
+    env = AdversaryVectorEnv(64, scenario="gusty-stop-and-go-v0", defence="kf", threat=THREAT, autoreset="disabled", engine="plain", action=header.action.action, interval=3)
     observation, _ = env.reset(seed=0)
     memory = None if network.lstm is None else network.lstm.blank(64)
     attacked = []
@@ -313,7 +313,7 @@ def test_a_policy_of_every_kind_plays_alone_as_in_company_and_steps_as_it_plays(
         mask = env.action_masks() if header.masked else None
         observation, *_ = env.step(choose(network, env.seat.action, read, mask=mask))
         attacked.append(env.frame.command.kind)
-        env._done[:] = False
+        env.over[:] = False
     alive = rollout(loop, PolicyAttack(path), keys, terminate=False)
     assert same_bits(np.array(attacked), alive.kind[2::3])
 

@@ -26,7 +26,7 @@ LAMP = np.s_[:HEADER, LEFT_OF_LAMP:]
 ROAD = np.s_[HEADER : int(render_following.STRIP)]
 BELIEF = np.s_[int(render_following.STRIP) + 2 :]
 REGIONS = {"badge": BADGE, "budget": BUDGET, "lamp": LAMP, "road": ROAD, "belief": BELIEF}
-ROLLS = {"scenario": "stop-and-go-v0", "defence": "kf"}
+ROLLS = {"scenario": "stop-and-go-v0", "defence": "kf", "viewer": "plain"}
 CRASHES = {"value": -30.0, "threat": {"onset": 1}} | ROLLS  # an unguarded filter: 30 m of false data end in a collision
 
 
@@ -50,7 +50,7 @@ def made():
 
 
 def picture(env, state=None, frame=None, row=0):
-    return render.draw(env.seat.loop, state or env.state, frame or env.frame, row)
+    return render.plain(env.seat.loop, state or env.state, frame or env.frame, row)
 
 
 def with_command(state, kind, value=0.0):
@@ -250,7 +250,7 @@ def test_gymnasium_accepts_it(monkeypatch):
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        env = gymnasium.make("tailgate:tailgate/CarFollowing-v0", render_mode="rgb_array")
+        env = gymnasium.make("tailgate:tailgate/CarFollowing-v0", render_mode="rgb_array", viewer="plain")
         check_env(env.unwrapped)
         env.reset(seed=0)
         env.step(env.action_space.sample())

@@ -11,7 +11,7 @@ from tailgate.envs import render, render_canvas, render_network, render_platoon
 from tailgate.envs.faces import AdversaryVectorEnv
 from tailgate.tree import duplicate
 
-PLATOON = {"scenario": "platoon-braking-v0", "defence": "dkf", "threat": {"onset": 1, "targets": ["distance", "velocity"]}}
+PLATOON = {"scenario": "platoon-braking-v0", "defence": "dkf", "viewer": "plain", "threat": {"onset": 1, "targets": ["distance", "velocity"]}}
 NETWORK = {"scenario": "thesis-ch5-v0", "defence": "dkf", "reward": "error", "threat": {"onset": 1}}
 HEADER = int(render_canvas.HEADER)
 LEFT_OF_LAMP = int(render_canvas.LAMP - 2 * render_canvas.LAMP_SIZE)
@@ -29,7 +29,7 @@ def _differ(a, b, regions):
 
 
 def picture(env, state=None, frame=None, row=0):
-    return render.draw(env.seat.loop, state or env.state, frame or env.frame, row)
+    return render.plain(env.seat.loop, state or env.state, frame or env.frame, row)
 
 
 def with_estimate(state, **leaves):

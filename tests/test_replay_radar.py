@@ -45,7 +45,7 @@ def env(tiny):
     """An environment after some steps, the attack (0: none) of each."""
 
     def make(actions, defence=GUARD):
-        env = AdversaryVectorEnv(1, render_mode="rgb_array", scenario=tiny, defence=defence, value=8.0, delay=8.0)
+        env = AdversaryVectorEnv(1, render_mode="rgb_array", viewer="plain", scenario=tiny, defence=defence, value=8.0, delay=8.0)
         env.reset(seed=3)
         for action in actions:
             env.step(np.array([action]))
@@ -61,7 +61,7 @@ def test_the_picture_shows_the_challenge(env):
     assert silent.state.probed.tolist() == [[False]] and sent.state.probed.tolist() == [[True]]
     assert (pictures["start"][SIGN] != pictures["sent"][SIGN]).any() and (pictures["sent"][SIGN] != pictures["silent"][SIGN]).any()
     muted = sent.state._replace(probed=~sent.state.probed)
-    other = render.draw(sent.seat.loop, muted, sent.frame, 0)
+    other = render.plain(sent.seat.loop, muted, sent.frame, 0)
     road = np.s_[int(render_canvas.HEADER) : int(render_following.STRIP)]
     assert (other[road] != pictures["sent"][road]).any() and (other[SIGN] != pictures["sent"][SIGN]).any()
 
@@ -73,7 +73,7 @@ def test_a_true_belief_lies_under_the_car(env):
     exact = frame.truth[..., 0]
     x = state.estimate.x.copy()
     x[..., 0] = exact
-    drawn = render.draw(loop, state._replace(estimate=state.estimate._replace(x=x)), frame, 0)
+    drawn = render.plain(loop, state._replace(estimate=state.estimate._replace(x=x)), frame, 0)
     purple = (np.abs(drawn.astype(int) - [0x7A, 0x2A, 0x6B]) < 12).all(axis=2)
     ghost = np.flatnonzero(purple[270:285].any(axis=0))
     assert abs(ghost[0] - render_following.TAIL) <= 3 and abs(ghost[-1] - render_following.NOSE) <= 3

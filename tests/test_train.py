@@ -16,7 +16,6 @@ from tailgate.agents.ppo import Config, Learner
 from tailgate.errors import InputError
 from tailgate.rivals import outcomes
 from tailgate.schema import build
-from tailgate.tree import leaves
 
 ENVIRONMENT: dict[str, Any] = {
     "scenario": "gusty-stop-and-go-v0", "defence": "kf", "threat": {"kinds": ["dos_jam", "fdi"], "budget": 30}, "interval": 5,
@@ -43,9 +42,9 @@ def test_a_resumed_run_gives_the_policy_of_an_uninterrupted_one(tmp_path: Path, 
     assert second.model.num_timesteps == 7 * UPDATE
     for name, value in straight.model.policy.state_dict().items():
         assert np.array_equal(value.numpy(), second.model.policy.state_dict()[name].numpy()), name
-    assert straight.env.batch.state is not None and second.env.batch.state is not None
-    for name, leaf in leaves(straight.env.batch.state).items():
-        assert np.array_equal(leaf, leaves(second.env.batch.state)[name]), name
+    held, again = (learner.env.batch.episodes.held() for learner in (straight, second))
+    for name, leaf in held.items():
+        assert np.array_equal(leaf, again[name]), name
     assert straight.curve == second.curve
     a, b = straight.export(tmp_path / "a", {}), second.export(tmp_path / "b", {})
     assert a.with_suffix(".safetensors").read_bytes() == b.with_suffix(".safetensors").read_bytes()
@@ -258,7 +257,7 @@ def test_training_seeds_share_no_environment() -> None:
     """Stable-Baselines3 numbers the rows of seed s from s on: two training seeds must not meet there."""
     keys = []
     for seed in (0, 1):
-        learner = _learner(seed)
+        learner = _learner(seed, engine="plain")
         learner.learn(UPDATE, lambda progress: None)
         assert learner.env.batch.state is not None
         keys.append({int(k) for k in learner.env.batch.state.keys.key[:, 0]})

@@ -16,7 +16,7 @@ from tailgate.errors import InputError
 EXIT_INPUT = 2
 COMMANDS = (
     "train", "tune", "selfplay", "evaluate", "timing", "dose", "transfer", "zoo", "calibrate", "leaderboard", "log", "replay",
-    "reproduce", "trust", "list",
+    "reproduce", "trust", "bench", "list",
 )  # fmt: skip
 
 

@@ -1,11 +1,12 @@
 """Golden traces: fingerprints of a few episodes of every scenario that a suite uses, kept in the repository.
 
-A published suite never changes under its name. `check` plays 16 episodes x two defences x three attacks of each scenario again and says
-what moved; `write` records them anew, which is for a new version and never for an old one. A decision's hash is the same on every platform;
-a trace's is exact for one machine type with one numpy and numba, and is compared where those are the recorded ones.
+A published suite never changes under its name. `check` plays 16 episodes (fewer of a slow plant, or of a suite with fewer) x two defences
+x three attacks of each scenario again and says what moved; `write` records them anew, which is for a new version and never for an old one.
+A decision's hash is the same on every platform; a trace's is exact for one machine type with one numpy and numba, and is compared where
+those are the recorded ones.
 
     python -m tailgate.golden --check [--scenario NAME ...]
-    python -m tailgate.golden --write
+    python -m tailgate.golden --write [--suite NAME ...]
 """
 
 from __future__ import annotations
@@ -41,6 +42,7 @@ from tailgate.trace import Trace, rollout
 FORMAT = "tailgate-golden-1"
 FILE = Path(str(files("tailgate.configs").joinpath("golden"))) / "golden.json"
 EPISODES = 16
+FEW = {"Highway": 2}  # of a plant that steps its episodes one by one
 DEFENCES, ATTACKS = 2, 3
 PURPOSE = "report"  # the first episodes of a board
 WORDS = ("about", "shown")  # of a suite: what is read, not played
@@ -48,11 +50,11 @@ WORDS = ("about", "shown")  # of a suite: what is read, not played
 
 @dataclass(frozen=True, eq=False)
 class _Blocks(Mixture):
-    """Each attack plays EPISODES rows of its own, in one batch: a row does not depend on its companions."""
+    """Each attack plays as many rows of its own, in one batch: a row does not depend on its companions."""
 
     def start(self, plan: tuple[Any, ...], batch: int, draws: Draws) -> MixtureState:
         state = super().start(plan, batch, draws)
-        return state._replace(member=np.arange(batch) // EPISODES)
+        return state._replace(member=np.arange(batch) // (batch // len(plan)))
 
 
 def this_platform() -> str:
@@ -97,18 +99,23 @@ def loops(place: Scenario, names: Sequence[str]) -> Iterator[tuple[str, Loop]]:
             continue
 
 
-def play(loop: Loop, attacks: Sequence[str]) -> Trace:
-    """EPISODES rows of each attack, one after the other in one batch."""
-    keys = draws.keys(PURPOSE, range(EPISODES))
+def episodes_of(place: Scenario, suite: Suite) -> int:
+    """How many of a cell are recorded: never more than a board of the suite has."""
+    return min(FEW.get(type(place.plant).__name__, EPISODES), suite.seeds)
+
+
+def play(loop: Loop, attacks: Sequence[str], episodes: int = EPISODES) -> Trace:
+    """So many rows of each attack, one after the other in one batch."""
+    keys = draws.keys(PURPOSE, range(episodes))
     some = Keys(np.tile(keys.key, (len(attacks), 1)), np.tile(keys.episode, len(attacks)))
     return rollout(loop, _Blocks(tuple(Spec("attack", text).make() for text in attacks)), some)
 
 
-def cells(loop: Loop, defence: str, attacks: Sequence[str]) -> list[dict[str, str]]:
+def cells(loop: Loop, defence: str, attacks: Sequence[str], episodes: int = EPISODES) -> list[dict[str, str]]:
     """The fingerprints under one defence, one entry for each attack."""
-    trace, out = play(loop, attacks), []
+    trace, out = play(loop, attacks, episodes), []
     for i, attack in enumerate(attacks):
-        rows = range(i * EPISODES, (i + 1) * EPISODES)
+        rows = range(i * episodes, (i + 1) * episodes)
         hashes = {"decision": _all(map(trace.decision_hash, rows)), "trace": _all(map(trace.trace_hash, rows))}
         out.append({"defence": defence, "attack": attack, **hashes})
     return out
@@ -121,6 +128,7 @@ def _all(hashes: Iterator[str]) -> str:
 def record(name: str, suite: Suite) -> dict[str, Any]:
     """What is kept of a scenario: none, and the first two other attacks of the suite that need no more than is granted and take effect."""
     place = place_of(name, suite)
+    episodes = episodes_of(place, suite)
     chosen = list(_first(loops(place, ("kf", "none", *suite.defences)), DEFENCES))
     if not chosen:
         raise InputError("golden", name, "a scenario that one of its suite's defences can serve")
@@ -134,15 +142,15 @@ def record(name: str, suite: Suite) -> dict[str, Any]:
         except NotApplicable:
             continue
         able.append(text)
-    trace = play(chosen[0][1], able)
-    steps = ((trace.kind != 0) & trace.live).sum(axis=0).reshape(len(able), EPISODES).sum(axis=1)
+    trace = play(chosen[0][1], able, episodes)
+    steps = ((trace.kind != 0) & trace.live).sum(axis=0).reshape(len(able), episodes).sum(axis=1)
     acting = [text for text, n in zip(able, steps, strict=True) if n]
     kinds = {Spec("attack", text).entry.name: text for text in reversed(acting)}  # of each sort the first
     acting.sort(key=lambda text: text not in kinds.values())
     attacks = ["none", *acting[: ATTACKS - 1]]
     return {
-        "suite": suite.name, "hash": place.config_hash,
-        "cells": [cell for defence, loop in chosen for cell in cells(loop, defence, attacks)],
+        "suite": suite.name, "hash": place.config_hash, **({} if episodes == EPISODES else {"episodes": episodes}),
+        "cells": [cell for defence, loop in chosen for cell in cells(loop, defence, attacks, episodes)],
     }  # fmt: skip
 
 
@@ -175,8 +183,11 @@ def moved_suites(held: dict[str, Any]) -> list[str]:
     return out
 
 
-def check(name: str, held: dict[str, Any]) -> list[str]:
-    """What moved in a scenario, a sentence each; empty when nothing did. Traces are compared where the platform is the recorded one."""
+def check(name: str, held: dict[str, Any], defences: Sequence[str] | None = None) -> list[str]:
+    """What moved in a scenario, a sentence each; empty when nothing did. Traces are compared where the platform is the recorded one.
+
+    With `defences`, only cells of these are played. Raises ImportError where the scenario needs what is not installed.
+    """
     entry = held["scenarios"].get(name)
     if entry is None:
         raise unknown("golden.scenario", name, held["scenarios"])
@@ -188,13 +199,15 @@ def check(name: str, held: dict[str, Any]) -> list[str]:
     if place.config_hash != entry["hash"]:
         out.append(f"scenario {name} of {suite.name} has changed under its name: it needs a new version")
     exact = held["platform"] == this_platform()
-    for defence in dict.fromkeys(cell["defence"] for cell in entry["cells"]):
+    played = [name for name in dict.fromkeys(cell["defence"] for cell in entry["cells"]) if defences is None or name in defences]
+    for defence in played:
         mine = [cell for cell in entry["cells"] if cell["defence"] == defence]
         found = list(loops(place, (defence,)))
         if not found:
             out.append(f"scenario {name}: {defence} can no longer serve it")
             continue
-        for was, now in zip(mine, cells(found[0][1], defence, [cell["attack"] for cell in mine]), strict=True):
+        attacks, episodes = [cell["attack"] for cell in mine], entry.get("episodes", EPISODES)
+        for was, now in zip(mine, cells(found[0][1], defence, attacks, episodes), strict=True):
             where = f"{suite.name}, {name}, {defence} against {was['attack']}"
             if was["decision"] != now["decision"]:
                 out.append(f"{where}: decisions (commands, alarms, modes, collisions) moved")
@@ -210,35 +223,53 @@ def main(arguments: Sequence[str] | None = None) -> int:
     what.add_argument("--check", action="store_true", help="play them again and say what moved")
     what.add_argument("--write", action="store_true", help="record them anew: for a new version")
     parser.add_argument("--scenario", action="append", metavar="NAME", help="only this one (repeatable; with --check)")
+    parser.add_argument("--suite", action="append", metavar="NAME", help="only this one, a new one (repeatable; with --write)")
     options = parser.parse_args(arguments)
     try:
-        return _write() if options.write else _check(options.scenario)
-    except InputError as error:
+        if options.scenario and options.write:
+            raise InputError("--scenario", options.scenario, "--check; --write takes --suite")
+        if options.suite and options.check:
+            raise InputError("--suite", options.suite, "--write; --check takes --scenario")
+        return _write(options.suite) if options.write else _check(options.scenario)
+    except (InputError, ImportError) as error:
         print(f"tailgate.golden: error: {error}", file=sys.stderr)
         return 2
 
 
 def _check(only: list[str] | None) -> int:
     held = read()
-    names, moved = only or sorted(held["scenarios"]), [] if only else moved_suites(held)
+    names, moved, left = only or sorted(held["scenarios"]), [] if only else moved_suites(held), []
     with progress(Console(stderr=True)) as update:
         for done, name in enumerate(names, 1):
-            moved += check(name, held)
+            try:
+                moved += check(name, held)
+            except ImportError as error:
+                left.append(f"scenario {name} is not played: {error}")
             update("playing", done, len(names), f"{done} of {len(names)} scenarios")
-    for line in moved:
+    for line in [*left, *moved]:
         print(line)
     compared = "decisions and traces" if held["platform"] == this_platform() else f"decisions only: traces are of {held['platform']}"
-    print(f"{len(names)} scenarios, {compared}: {f'{len(moved)} differences' if moved else 'nothing moved'}")
+    print(f"{len(names) - len(left)} scenarios, {compared}: {f'{len(moved)} differences' if moved else 'nothing moved'}")
     return 1 if moved else 0
 
 
-def _write() -> int:
-    used, scenarios = users(), {}
+def _write(only: list[str] | None) -> int:
+    """Everything, or the suites `only` beside what is recorded of the others: their scenarios that no other suite has recorded."""
+    for name in only or ():
+        if name not in list_suites():
+            raise unknown("--suite", name, list_suites())
+    used = {name: suite for name, suite in users().items() if only is None or suite.name in only}
+    if only is not None and (platform_of := read()["platform"]) != this_platform():
+        raise InputError("--suite", this_platform(), f"the platform of the other suites' traces ({platform_of}), or all of them anew")
+    scenarios = {}
     with progress(Console(stderr=True)) as update:
         for done, name in enumerate(sorted(used), 1):
             scenarios[name] = record(name, used[name])
             update("playing", done, len(used), f"{done} of {len(used)} scenarios")
-    suites = {name: suite_hash(load_suite(name)) for name in list_suites()}
+    suites = {name: suite_hash(load_suite(name)) for name in only or list_suites()}
+    if only is not None:
+        others = read()
+        suites, scenarios = (dict(sorted((others[key] | new).items())) for key, new in (("suites", suites), ("scenarios", scenarios)))
     held = {
         "format": FORMAT, "platform": this_platform(), "episodes": EPISODES, "purpose": PURPOSE, "suites": suites, "scenarios": scenarios,
     }  # fmt: skip

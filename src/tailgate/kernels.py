@@ -16,6 +16,9 @@ LN2_HI = 6.93147180369123816490e-01  # ln 2, its last bits zero: n * LN2_HI is e
 LN2_LO = 1.90821492927058770002e-10
 LOG2_E = 1.44269504088896338700e00
 TWO_PI = 6.283185307179586
+# A whole number below 2**52 becomes a float by its bits alone: the conversion has no vector instruction on most processors.
+TWO_52, TWO_52_BITS = 4503599627370496.0, np.int64(0x4330000000000000)
+ONE_BITS = np.uint64(0x3FF0000000000000)
 
 _jit = numba.njit(cache=True, fastmath=False, error_model="numpy")
 
@@ -55,13 +58,13 @@ def _log(x: float) -> float:
     if x == math.inf:
         return x
     small = x < 2.2250738585072014e-308  # denormal: scale it up first
-    e = np.int64(-54) if small else np.int64(0)
+    e = -1022.0 - (54.0 if small else 0.0)
     x = x * (18014398509481984.0 if small else 1.0)
     bits = np.float64(x).view(np.int64)
-    e += ((bits >> 52) & 0x7FF) - 1022
+    e += np.int64(((bits >> 52) & 0x7FF) | TWO_52_BITS).view(np.float64) - TWO_52
     m = np.int64((bits & 0x000FFFFFFFFFFFFF) | 0x3FE0000000000000).view(np.float64)  # in [1/2, 1)
-    if m < 0.7071067811865476:
-        m, e = 2.0 * m, e - 1
+    low = m < 0.7071067811865476
+    m, e = 2.0 * m if low else m, e - 1.0 if low else e
     s = (m - 1.0) / (m + 1.0)
     z = s * s
     p = 1.0 / 23.0
@@ -103,14 +106,9 @@ def _sincos_turn(u: float) -> tuple[float, float]:
     c = c * z + 1.0 / 24.0
     c = c * z - 0.5
     c = c * z + 1.0
-    q = int(quarter) & 3
-    if q == 0:
-        return s, c
-    if q == 1:
-        return c, -s
-    if q == 2:
-        return -s, -c
-    return -c, s
+    first, second, third = quarter == 1.0, quarter == 2.0, quarter == 3.0
+    sine, cosine = c if first or third else s, s if first or third else c
+    return -sine if second or third else sine, -cosine if first or second else cosine
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
@@ -159,9 +157,10 @@ def _uniform_pair(key, episode, step, stream, block):
         np.uint64(episode), np.uint64(block), np.uint64(step), np.uint64(stream),
         np.uint64(key) & np.uint64(0xFFFFFFFF), np.uint64(key) >> np.uint64(32),
     )  # fmt: skip
-    a = ((w0 << np.uint64(32)) | w1) >> np.uint64(12)
-    b = ((w2 << np.uint64(32)) | w3) >> np.uint64(12)
-    return (float(a) + 0.5) * 2.220446049250313e-16, (float(b) + 0.5) * 2.220446049250313e-16
+    a = (((w0 << np.uint64(32)) | w1) >> np.uint64(12)) | ONE_BITS  # the mantissa of a number in [1, 2)
+    b = (((w2 << np.uint64(32)) | w3) >> np.uint64(12)) | ONE_BITS
+    half = 1.1102230246251565e-16
+    return (np.uint64(a).view(np.float64) - 1.0) + half, (np.uint64(b).view(np.float64) - 1.0) + half
 
 
 @_jit

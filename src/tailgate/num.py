@@ -16,6 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tailgate import kernels
+from tailgate.elementwise import clip as clip
+from tailgate.elementwise import select as select
 
 Array = NDArray[Any]
 

@@ -11,6 +11,8 @@ import numpy as np
 
 from tailgate.core import Array, Attack, Frame, Model
 from tailgate.draws import Keys, Role
+from tailgate.fused import Constants, fuse
+from tailgate.fused.play import play
 from tailgate.loop import Loop, LoopState
 
 MEMORY = 1e9  # [bytes] that a trace may take: who plays many episodes plays so many at a time
@@ -121,8 +123,13 @@ class Recorder:
         return Trace(loop.model, loop.horizon, self.length, signals, self.first, loop.controller.desired_gap)
 
 
-def rollout(loop: Loop, attack: Attack, keys: Keys, *, terminate: bool = True) -> Trace:
-    """Play one episode per key. With `terminate` an episode ends at its first collision, else it runs to the horizon."""
+def rollout(loop: Loop, attack: Attack, keys: Keys, *, terminate: bool = True, plain: bool = False) -> Trace:
+    """Play one episode per key. With `terminate` an episode ends at its first collision, else it runs to the horizon.
+
+    A loop whose parts have lanes is played by the fused engine, to the same bits; with `plain` it is not.
+    """
+    if not plain and isinstance(fused := fuse(loop), Constants):
+        return Trace(loop.model, loop.horizon, *play(loop, fused, attack, keys, terminate), loop.controller.desired_gap)
     state = loop.start(keys)
     plan = attack.prepare(loop.brief)
     memory: Any = attack.start(plan, len(keys.key), keys.at(Role.ATTACK, np.zeros(len(keys.key), np.int64)))

@@ -30,6 +30,8 @@ def add(commands: Any) -> None:
     command.add_argument("--agent", type=int, metavar="N", help="the car or agent to look at first (default: the one attacked most)")
     command.add_argument("--out", required=True, metavar="PATH", help="the page: a file that ends in .html, or a directory")
     command.add_argument("--video", metavar="FILE", help="also a film: .gif, .webp or .mp4")
+    command.add_argument("--viewer", default="auto", choices=["auto", "plain", "highway"], help="what the film is drawn with")
+    command.add_argument("--size", metavar="WxH", help="of a film on the road, for example 480x160 [px]")
     command.add_argument("--json", action="store_true", help="print what was played and checked as JSON")
     command.set_defaults(run=_replay)
 
@@ -42,7 +44,17 @@ def _dose(text: str | None) -> int | Literal["none"] | None:
     return int(text)
 
 
+def _size(text: str | None) -> tuple[int, int] | None:
+    if text is None:
+        return None
+    width, _, height = text.partition("x")
+    if not (width.isdecimal() and height.isdecimal()):
+        raise InputError("--size", text, "width x height in pixels, such as 480x160")
+    return int(width), int(height)
+
+
 def _replay(options: argparse.Namespace) -> int:
+    from tailgate.envs.render_viewer import Viewer
     from tailgate.registry import Spec
     from tailgate.replay.page import outcome, write_page
     from tailgate.replay.replay import Filter, choose, play
@@ -53,6 +65,9 @@ def _replay(options: argparse.Namespace) -> int:
         from tailgate.replay.video import check_format, write_video
 
         check_format(video)
+    elif options.size is not None or options.viewer != "auto":
+        raise InputError("--video", None, "a file: --viewer and --size are those of a film")
+    viewer = Viewer(options.viewer, _size(options.size))
     guard = Spec("defence", options.defence or "none")
     if guard.imports or guard.sandboxed or Spec("attack", options.attack or "none").imports:
         sys.path.insert(0, "")  # the class that the user names is looked for in the working directory, and nothing else is
@@ -61,7 +76,7 @@ def _replay(options: argparse.Namespace) -> int:
     chosen = choose(read_rows(source), wanted)
     replay = play(chosen.row, wanted)
     page = write_page(replay, Path(options.out), f"line {chosen.line} of {source.name}", options.agent)
-    film = write_video(replay, video) if video is not None else None
+    film = write_video(replay, video, viewer) if video is not None else None
     row = chosen.row
     report = {
         "line": chosen.line, "matched": chosen.matched, "chosen": chosen.why,

@@ -14,8 +14,10 @@ from pathlib import Path
 from typing import Any
 
 from tailgate.core import Array
+from tailgate.envs.render_viewer import Viewer
 from tailgate.errors import InputError
 from tailgate.files import writable_directory, write_atomic
+from tailgate.leaderboard.build import names_of
 
 from .replay import Replay, episode
 
@@ -24,6 +26,7 @@ FASTEST = 20  # frames a second
 MOST = 600  # frames of an animated picture, which is put together in memory
 SHORTEST = 10.0  # [s]: an episode that lasts less is slowed down
 HOLD = 2.0  # [s] that the last frame stays
+AUTO = Viewer()
 
 
 def check_format(path: Path) -> None:
@@ -41,23 +44,25 @@ def pace(dt: float, length: int, most: float = math.inf) -> tuple[int, float]:
     return stride, min(1.0 / (dt * stride), float(FASTEST))
 
 
-def frames(replay: Replay, stride: int) -> Iterator[Array]:
-    """(H, W, 3) uint8 pictures of the start, every `stride`-th step, and the last one."""
+def frames(replay: Replay, stride: int, viewer: Viewer = AUTO) -> Iterator[Array]:
+    """(H, W, 3) uint8 pictures of the start, every `stride`-th step, and the last one, with who plays below the road."""
     from tailgate.envs.render import draw
 
-    last = int(replay.trace.length[0])
+    last, row = int(replay.trace.length[0]), replay.row
+    texts = names_of([row["defence"], row["attack"]])  # of a file its name, not its place on somebody's machine
+    caption = f"{row['scenario']}: {texts[row['defence']].full} against {texts[row['attack']].full}"
     for step, (state, frame) in enumerate(episode(replay.loop, replay.attack, replay.keys)):
         if step % stride == 0 or step == last:
-            yield draw(replay.loop, state, frame, 0)
+            yield draw(replay.loop, state, frame, 0, viewer, caption)
 
 
-def write_video(replay: Replay, path: Path) -> str:
+def write_video(replay: Replay, path: Path, viewer: Viewer = AUTO) -> str:
     """Writes the film in the format that the file's ending names, and returns a sentence about it."""
     check_format(path)
     dt, length = replay.trace.dt, int(replay.trace.length[0])
     kind = FORMATS[path.suffix.lower()]
     stride, rate = pace(dt, length, math.inf if kind == "MP4" else MOST)
-    pictures = frames(replay, stride)
+    pictures = frames(replay, stride, viewer)
     count = len(range(0, length, stride)) + 1
     if kind == "MP4":
         _write_mp4(pictures, path, rate)
@@ -75,7 +80,7 @@ def _write_animation(pictures: Iterator[Array], path: Path, kind: str, rate: flo
 
     pause = round(1000.0 / rate)
     durations = [pause] * (count - 1) + [round(1000.0 * HOLD)]
-    options: dict[str, Any] = {"lossless": True, "method": 0, "quality": 40} if kind == "WEBP" else {"optimize": False}
+    options: dict[str, Any] = {"lossless": True, "method": 2, "quality": 40} if kind == "WEBP" else {"optimize": False}
     out = BytesIO()
     first = reduced(next(pictures))
     first.save(out, kind, save_all=True, append_images=[reduced(picture) for picture in pictures], duration=durations, loop=0, **options)
@@ -91,7 +96,8 @@ def _write_mp4(pictures: Iterator[Array], path: Path, rate: float) -> None:
     os.close(handle)
     try:
         size = (first.shape[1], first.shape[0])
-        encoder = imageio_ffmpeg.write_frames(name, size, fps=rate, codec="libx264", quality=7, ffmpeg_log_level="error")
+        options: dict[str, Any] = {"codec": "libx264", "quality": 7, "macro_block_size": 2, "ffmpeg_log_level": "error"}
+        encoder = imageio_ffmpeg.write_frames(name, size, fps=rate, **options)
         encoder.send(None)
         picture = first
         for picture in chain([first], pictures):

@@ -1,0 +1,212 @@
+"""Episodes that an environment plays side by side, in either engine: the same decisions, rewards and observations to the last bit."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+
+from tailgate.core import Array, Frame, View
+from tailgate.draws import Keys
+from tailgate.errors import InputError, unknown
+from tailgate.fused import Refused
+from tailgate.fused.cockpit import Cockpit, fuse_seat
+from tailgate.fused.rows import EPISODE
+from tailgate.loop import LoopState
+from tailgate.tree import leaves, with_leaves
+
+from .seat import Outcome, Seat, Tally
+
+ENGINES = ("auto", "fused", "plain")
+
+
+class Facts(NamedTuple):
+    """What the information of a step says of the state that it led to, (B,) each."""
+
+    allowed: Array  # bool
+    step: Array  # int64
+    damage: Array  # smallest gap [m], or largest error where there is no road
+
+
+class Episodes(Protocol):
+    """B rows of episodes, each with its own seed."""
+
+    engine: str
+
+    @property
+    def number(self) -> Array:
+        """(B,) uint32: the episode of each row under its key."""
+
+    def begin(self, keys: Keys) -> None:
+        """All rows begin."""
+
+    def again(self, rows: Array, keys: Keys | None = None) -> None:
+        """The next episode in `rows` (B,) bool, or that of the keys, of as many rows."""
+
+    def decide(self, actions: Array, over: Array, restart: bool) -> Outcome:
+        """One decision; rows that are `over` (B,) bool count for nothing, and with `restart` begin their next episode instead."""
+
+    def seen(self) -> Array:
+        """(B, d) float32: what is to be seen now, of one frame."""
+
+    def facts(self) -> Facts: ...
+
+    def mask(self) -> Array:
+        """(B, actions) bool: the discrete actions that the channel would accept."""
+
+    def held(self) -> dict[str, Array]:
+        """All that changes from step to step, by name."""
+
+    def put(self, held: dict[str, Array]) -> None:
+        """What `held` gave, of the same number of rows."""
+
+
+def framed(now: Array, before: Array | None, frames: int) -> Array:
+    """(B, frames d) what is seen now (B, d) on top of what was seen before (B, frames d); none before: the first of an episode."""
+    if frames == 1:
+        return now
+    return np.tile(now, frames) if before is None else np.concatenate([now, before[:, : -now.shape[1]]], axis=1)
+
+
+def side_by_side(seat: Seat, engine: str = "auto", drawn: bool = False, threads: int = 1) -> Episodes:
+    """In the engine that is asked for; auto: fused where it is possible and nothing is `drawn`, as only the plain loop shows its parts.
+
+    The fused engine plays 2048 episodes and more to each of several `threads`.
+    """
+    if not isinstance(threads, int) or isinstance(threads, bool) or threads < 1:
+        raise InputError("threads", threads, "a whole number not below 1")
+    if engine not in ENGINES:
+        raise unknown("engine", engine, ENGINES)
+    if engine == "plain" or (engine == "auto" and drawn):
+        return PlainEpisodes(seat)
+    constants = fuse_seat(seat)
+    if isinstance(constants, Refused) or drawn:
+        if engine == "fused":
+            why = constants.why if isinstance(constants, Refused) else "a picture needs the plain loop's parts"
+            raise InputError("engine", engine, f"plain, or auto: {why}")
+        return PlainEpisodes(seat)
+    return FusedEpisodes(seat, constants, threads)
+
+
+class PlainEpisodes:
+    """The plain loop, which plays everything."""
+
+    engine = "plain"
+
+    def __init__(self, seat: Seat) -> None:
+        self.seat = seat
+        self.state: LoopState | None = None
+        self.tally: Tally | None = None
+        self.frame: Frame | None = None  # the last step
+        self._looked: tuple[LoopState, View] | None = None  # the last state that was looked at, and what was seen
+
+    @property
+    def number(self) -> Array:
+        return self._state.keys.episode
+
+    def begin(self, keys: Keys) -> None:
+        self.state = self.seat.loop.start(keys)
+        self.tally, self.frame = self.seat.begin(self.state), None
+
+    def again(self, rows: Array, keys: Keys | None = None) -> None:
+        state, loop = self._state, self.seat.loop
+        self.state = loop.restart(state, rows) if keys is None else loop.reseed(state, np.flatnonzero(rows), keys)
+        fresh, held = self.seat.begin(self.state), self.tally
+        assert held is not None
+        self.tally = Tally(*(np.where(rows, new, old) for new, old in zip(fresh, held, strict=True)))
+
+    def decide(self, actions: Array, over: Array, restart: bool) -> Outcome:
+        assert self.tally is not None
+        self.state, self.tally, outcome, self.frame = self.seat.step(self._state, self.tally, actions, over)
+        if restart and over.any():
+            self.again(over)
+        return outcome
+
+    def seen(self) -> Array:
+        return self.seat.observation.observe(self._view)[:, : len(self.seat.observation.columns)]
+
+    def facts(self) -> Facts:
+        view, tally = self._view, self.tally
+        assert tally is not None
+        return Facts(view.allowed.copy(), view.k.copy(), np.min(view.scene.gap, axis=1) if self.seat.road else tally.error.copy())
+
+    def mask(self) -> Array:
+        return self.seat.action.mask(self._view)
+
+    def held(self) -> dict[str, Array]:
+        assert self.tally is not None
+        return {f"loop.{k}": v for k, v in leaves(self._state).items()} | {f"tally.{k}": v for k, v in self.tally._asdict().items()}
+
+    def put(self, held: dict[str, Array]) -> None:
+        assert self.tally is not None
+        self.state = with_leaves(self._state, {k[5:]: v for k, v in held.items() if k.startswith("loop.")})
+        self.tally = Tally(*(held[f"tally.{name}"] for name in self.tally._fields))
+
+    @property
+    def _state(self) -> LoopState:
+        assert self.state is not None
+        return self.state
+
+    @property
+    def _view(self) -> View:
+        if self._looked is None or self._looked[0] is not self._state:  # observation, information and mask are of one look
+            self._looked = self._state, self.seat.loop.sense(self._state)
+        return self._looked[1]
+
+
+class FusedEpisodes:
+    """The fused engine."""
+
+    engine = "fused"
+
+    def __init__(self, seat: Seat, constants: Any, threads: int) -> None:
+        self.seat, self.constants, self.threads = seat, constants, threads
+        self.cockpit: Cockpit | None = None
+
+    @property
+    def number(self) -> Array:
+        return self._cockpit.word(EPISODE).astype(np.uint32)
+
+    def begin(self, keys: Keys) -> None:
+        if self.cockpit is None or self.cockpit.batch != len(keys.key):
+            self.cockpit = Cockpit(self.seat, self.constants, keys, self.threads)
+        else:
+            self.cockpit.take(keys)
+        self.cockpit.begin()
+
+    def again(self, rows: Array, keys: Keys | None = None) -> None:
+        self._cockpit.reseed(rows, keys)
+
+    def decide(self, actions: Array, over: Array, restart: bool) -> Outcome:
+        cockpit = self._cockpit
+        cockpit.decide(actions, restart)
+        paid = cockpit.paid
+        terminated, truncated, refused, collided, rear = paid[1:6] != 0.0
+        return Outcome(paid[0].copy(), collided, rear, refused, terminated, truncated)
+
+    def decide_alone(self, action: Any) -> list[float]:
+        """`Cockpit.decide_alone`."""
+        return self._cockpit.decide_alone(action)
+
+    def seen(self) -> Array:
+        return self._cockpit.seen
+
+    def facts(self) -> Facts:
+        paid = self._cockpit.paid
+        return Facts(paid[6] != 0.0, paid[7].astype(np.int64), paid[8].copy())
+
+    def mask(self) -> Array:
+        out = np.repeat((self._cockpit.paid[6] != 0.0)[:, None], self.seat.action.size, axis=1)
+        out[:, 0] = True
+        return out
+
+    def held(self) -> dict[str, Array]:
+        return self._cockpit.held()
+
+    def put(self, held: dict[str, Array]) -> None:
+        self._cockpit.put(held)
+
+    @property
+    def _cockpit(self) -> Cockpit:
+        assert self.cockpit is not None
+        return self.cockpit

@@ -1,0 +1,52 @@
+"""Which picture of an episode is drawn, and how large: nothing heavy is imported to say so."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib.util import find_spec
+
+import numpy as np
+
+from tailgate.errors import InputError, NotApplicable, unknown
+from tailgate.loop import Loop
+
+VIEWERS = ("auto", "plain", "highway")
+SIZE = (960, 240)  # of a picture on HighwayEnv's road [px]
+SMALLEST, LARGEST = (400, 144), (3840, 2160)
+
+
+@dataclass(frozen=True)
+class Viewer:
+    """name: "plain", "highway" (HighwayEnv's road), or "auto": highway where HighwayEnv is installed and cars drive, else plain.
+
+    size (width, height) [px], even numbers, is that of a picture on HighwayEnv's road; None is 960 x 240.
+    """
+
+    name: str = "auto"
+    size: tuple[int, int] | None = None
+
+    def __post_init__(self) -> None:
+        if self.name not in VIEWERS:
+            raise unknown("viewer", self.name, VIEWERS)
+        if self.size is None:
+            return
+        if self.name == "plain":
+            raise InputError("size", self.size, "none with viewer 'plain', whose picture is always 960 x 320")
+        whole = isinstance(self.size, (tuple, list)) and len(self.size) == 2 and all(isinstance(n, (int, np.integer)) for n in self.size)
+        if not whole or not all(low <= n <= high and n % 2 == 0 for n, low, high in zip(self.size, SMALLEST, LARGEST, strict=True)):
+            least, most = (f"{w} x {h}" for w, h in (SMALLEST, LARGEST))
+            raise InputError("size", self.size, f"(width, height) in pixels, even whole numbers from {least} to {most}")
+
+    def on_road(self, loop: Loop) -> bool:
+        """Whether this loop is drawn on HighwayEnv's road. Raises ImportError or NotApplicable where it is asked for and cannot be."""
+        asked, drives = self.name == "highway" or self.size is not None, bool(loop.model.followers.any())
+        if self.name == "plain" or not (drives or asked):
+            return False
+        if not drives:
+            raise NotApplicable("viewer", self.name if self.size is None else self.size, "cars on a road; 'plain' draws a network")
+        if find_spec("highway_env") is None:
+            if asked:
+                where = "pip install 'tailgate[highway,viz]' (viewer 'plain' does without)"
+                raise ImportError(f"highway-env is missing, which draws the road: {where}")
+            return False
+        return True

@@ -1,0 +1,65 @@
+"""What a measurement is: a line with a name, a unit, and something that runs for about so many seconds."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+RATE, SECONDS, BYTES, SHARE, NUMBER = "1/s", "s", "bytes", "share", "number"
+
+
+class Missing(Exception):
+    """What a line needs is not installed on this machine: says what, and how to get it."""
+
+
+class Sample(NamedTuple):
+    """One measurement is amount / per: steps and seconds for a rate, seconds and starts for a duration."""
+
+    amount: float
+    per: float
+
+    @property
+    def value(self) -> float:
+        return self.amount / self.per
+
+
+def only(cores: int) -> None:
+    """Compiled parallel loops use so many cores from now on, where the machine has them."""
+    import numba
+
+    numba.set_num_threads(min(cores, int(numba.config.NUMBA_NUM_THREADS)))  # type: ignore[attr-defined]
+
+
+Go = Callable[[float], Sample]  # runs for about so many seconds
+
+
+@dataclass(frozen=True)
+class Line:
+    """One thing that is measured. `make` sets it up, and raises Missing where it cannot be had."""
+
+    name: str
+    what: str
+    make: Callable[[], Go]
+    unit: str = RATE
+    of: str = "steps"  # what is counted
+    ours: bool = True
+    cores: int = 1
+    most: int | None = None  # rounds, where one takes long or all give the same
+
+
+def repeated(chunk: Callable[[], int]) -> Go:
+    """Calls `chunk`, which returns how much it did, until the seconds are over, at least once: how much in how much processor time.
+
+    Of this process, all its threads together, so that others on the machine do not count, and nobody gains by a second core.
+    """
+
+    def go(seconds: float) -> Sample:
+        done, spent, until = 0, time.process_time(), time.perf_counter() + seconds
+        while True:
+            done += chunk()
+            if time.perf_counter() >= until:
+                return Sample(done, max(time.process_time() - spent, 1e-9))
+
+    return go

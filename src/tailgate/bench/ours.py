@@ -1,0 +1,302 @@
+"""What this package does: one small function for each thing that is measured, all against the public interface."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import subprocess
+import sys
+import tempfile
+import time
+import tracemalloc
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import gymnasium
+import numpy as np
+
+from tailgate import draws, num
+from tailgate.core import Array, Command, Estimate, Mode, View
+from tailgate.draws import Role
+from tailgate.envs.seat import Seat
+from tailgate.fused import Constants
+from tailgate.fused.cockpit import Cockpit, fuse_seat
+from tailgate.registry import Spec
+from tailgate.scenario import Scenario, load_scenario
+from tailgate.tree import put_rows
+
+from .lines import Go, Missing, Sample, repeated
+from .peers import at_random, batched, stepped
+
+CAR_FOLLOWING, SCENARIO = "tailgate:tailgate/CarFollowing-v0", "stop-and-go-v0"
+INJECTION = "fdi:value=-4"  # what the attacker does where no learner plays
+SMALL, LARGE = 2048, 6144  # batches whose difference is what an episode takes
+
+
+# -- environments
+
+
+def single() -> Go:
+    """tailgate/CarFollowing-v0 through gymnasium.make, as everybody makes it; random actions."""
+    env = gymnasium.make(CAR_FOLLOWING)
+    return stepped(env, at_random(env))
+
+
+def vector(episodes: int) -> Go:
+    """The native vector environment; random actions."""
+    return batched(gymnasium.make_vec(CAR_FOLLOWING, num_envs=episodes))
+
+
+# -- the whole step without a learner's interface
+
+
+class Playing(NamedTuple):
+    """A seat whose attacker is a script, and what a step of it needs."""
+
+    seat: Seat
+    attack: Any
+    plan: Any
+
+
+def playing(defence: Any, place: str | Scenario = SCENARIO, attack: str = INJECTION, reward: str = "min_gap") -> Playing:
+    """A scenario by name, or one that was changed."""
+    seat = Seat.make(scenario=place if isinstance(place, str) else place.name, defence=defence, reward=reward)
+    if not isinstance(place, str):
+        seat = dataclasses.replace(seat, loop=place.loop(seat.loop.defence, seat.loop.uses))
+    script = Spec("attack", attack).make()
+    return Playing(seat, script, script.prepare(seat.loop.brief))
+
+
+def played(held: Playing, episodes: int) -> Go:
+    """Steps per second of whole steps: leader, readings, attack, defence, controller, reward, autoreset, random numbers."""
+    seat, attack, plan = held
+    state = seat.loop.start(draws.keys("tune", range(episodes)))
+    tally, over = seat.begin(state), np.zeros(episodes, bool)
+    memory = attack.start(plan, episodes, state.keys.at(Role.ATTACK, state.k))
+    steps = max(1, 16 // episodes)
+
+    def decide(view: View) -> Command:
+        nonlocal memory
+        memory, command = attack.decide(plan, memory, view, state.keys.at(Role.ATTACK, view.k))
+        return command  # type: ignore[no-any-return]
+
+    def chunk() -> int:
+        nonlocal state, tally, memory
+        for _ in range(steps):
+            state, tally, outcome, _ = seat.step(state, tally, decide, over)
+            ended = outcome.terminated | outcome.truncated
+            if ended.any():
+                rows = np.flatnonzero(ended)
+                state = seat.loop.restart(state, ended)
+                fresh = seat.begin(state)
+                tally = type(tally)(*(np.where(ended, new, old) for new, old in zip(fresh, tally, strict=True)))
+                begun = attack.start(plan, len(rows), state.keys.at(Role.ATTACK, state.k))
+                memory = put_rows(memory, rows, begun)
+        return steps * episodes
+
+    return repeated(chunk)
+
+
+HELD = 16  # steps of one call: rewards in each, an observation and restarts after the last
+
+
+def flown(episodes: int, threads: int = 1) -> Cockpit:
+    """Car following in the fused engine, with injection by the learner's action; begun."""
+    options: dict[str, Any] = {"action": "timing", "kind": "fdi", "value": -4.0, "interval": HELD, "reward": "min_gap"}
+    seat = Seat.make(scenario=SCENARIO, defence="chi2_kf", **options)
+    constants = fuse_seat(seat)
+    assert isinstance(constants, Constants)
+    cockpit = Cockpit(seat, constants, draws.keys("tune", range(episodes)), threads)
+    cockpit.begin()
+    return cockpit
+
+
+def batch(episodes: int, threads: int = 1) -> Go:
+    """Whole steps of car following under a learner's action: rewards included, an observation and restarts every HELD steps."""
+    cockpit, attack = flown(episodes, threads), np.ones(episodes, np.int64)
+
+    def chunk() -> int:
+        cockpit.decide(attack, restart=True)
+        return HELD * episodes
+
+    return repeated(chunk)
+
+
+def platoon(episodes: int, followers: int = 4, defence: str = "dkf") -> Go:
+    """Whole steps of a platoon; each car has an estimator of the whole state."""
+    place = load_scenario("platoon-braking-v0").with_threat(agents=(min(2, followers),))
+    place = dataclasses.replace(place, plant=dataclasses.replace(place.plant, followers=followers))
+    return played(playing(defence, place, "fdi:value=60,targets=[distance]"), episodes)
+
+
+def network(episodes: int, sensors: int) -> Go:
+    """Whole steps of the network of chapter 5, ten agents with so many sensors each, under the norm-penalised estimator."""
+    place = load_scenario("thesis-ch5-v0")
+    place = dataclasses.replace(place, sensor=dataclasses.replace(place.sensor, sensors=sensors))
+    return played(playing("norm_resilient", place, "none", "error"), episodes)
+
+
+# -- a defence by somebody else
+
+
+class _Belief(NamedTuple):
+    x: Array  # (B, N, n)
+
+
+@dataclass(frozen=True)
+class Saturated:
+    """A steady observer whose correction saturates, in plain numpy: the plug-in of docs/new-defence.md."""
+
+    gain: float = 0.2
+    limit: float = 0.5
+
+    def prepare(self, model: Any) -> Any:
+        return model
+
+    def start(self, plan: Any, prior: Any) -> _Belief:
+        return _Belief(prior.mean)
+
+    def step(self, plan: Any, state: _Belief, received: Any, known_u: Array, draws: Any) -> tuple[_Belief, Estimate]:
+        x = num.matvec(plan.A, state.x) + num.matvec(plan.B, known_u) + plan.c
+        r = np.where(received.valid, received.y - num.matvec(plan.C, x), 0.0)
+        x = x + num.matvec(np.swapaxes(plan.C, -1, -2), np.clip(self.gain * r, -self.limit, self.limit))
+        score = num.dot(r, r)
+        quiet = np.zeros(score.shape, bool)
+        return _Belief(x), Estimate(x, score, quiet, num.full(score.shape, Mode.NORMAL, np.int8), ~quiet)
+
+
+def plug_in(episodes: int) -> Go:
+    """Whole steps with a defence that is plain numpy."""
+    return played(playing(Saturated()), episodes)
+
+
+# -- cores
+
+
+def on_cores(episodes: int, cores: int) -> Go:
+    """Whole steps on so many cores at once, by the wall clock: one thread for each, which plays its share of the blocks."""
+    if (os.cpu_count() or 1) < cores:
+        raise Missing(f"this machine has {os.cpu_count()} cores, not {cores}")
+    cockpit, attack = flown(episodes, cores), np.ones(episodes, np.int64)
+
+    def go(seconds: float) -> Sample:
+        done, started = 0, time.perf_counter()
+        while done == 0 or time.perf_counter() - started < seconds:
+            cockpit.decide(attack, restart=True)
+            done += HELD * episodes
+        return Sample(done, time.perf_counter() - started)
+
+    return go
+
+
+def unequal(episodes: int = 4096, threads: int = 2) -> Go:
+    """How many numbers of so many episodes differ in any bit between one thread and several."""
+
+    def go(seconds: float) -> Sample:
+        one, several = flown(episodes), flown(episodes, threads)
+        for cockpit in (one, several):
+            for _ in range(4):
+                cockpit.decide(np.ones(episodes, np.int64), restart=True)
+        return Sample(int(np.count_nonzero(one.memory.floats.view(np.int64) != several.memory.floats.view(np.int64))), 1.0)
+
+    return go
+
+
+# -- what is not a rate
+
+_FIRST = """
+import time
+started = time.perf_counter()
+import gymnasium
+env = gymnasium.make("tailgate:tailgate/CarFollowing-v0")
+env.reset(seed=0)
+env.step(env.action_space.sample())
+print(time.perf_counter() - started)
+"""
+
+
+def _first_step(cache: str) -> float:
+    """Seconds in a fresh process from the first import to the end of the first step, compiled code being cached in this folder."""
+    environment = os.environ | {"NUMBA_CACHE_DIR": cache}
+    done = subprocess.run([sys.executable, "-c", _FIRST], capture_output=True, text=True, check=True, env=environment)
+    return float(done.stdout)
+
+
+def start_cached() -> Go:
+    """Import and first step where the kernels were compiled before."""
+    folder = tempfile.TemporaryDirectory(prefix="tailgate-")
+    _first_step(folder.name)
+
+    def go(seconds: float) -> Sample:
+        return Sample(_first_step(folder.name), 1.0)
+
+    return go
+
+
+def start_cold() -> Go:
+    """Import and first step with an empty cache of compiled code."""
+
+    def go(seconds: float) -> Sample:
+        with tempfile.TemporaryDirectory(prefix="tailgate-") as folder:
+            return Sample(_first_step(folder), 1.0)
+
+    return go
+
+
+def _peak(episodes: int) -> int:
+    """Bytes that a vector environment takes at most, from its making to its third step."""
+    tracemalloc.start()
+    try:
+        env: Any = gymnasium.make_vec(CAR_FOLLOWING, num_envs=episodes)
+        env.reset(seed=0)
+        for _ in range(3):
+            env.step(env.action_space.sample())
+        return tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+
+
+def memory() -> Go:
+    """Bytes an episode of a vector environment takes at most, temporaries and all: the difference between two batches."""
+
+    def go(seconds: float) -> Sample:
+        return Sample(_peak(LARGE) - _peak(SMALL), LARGE - SMALL)
+
+    return go
+
+
+class _Timed:
+    """A method that is timed."""
+
+    def __init__(self, method: Any) -> None:
+        self.method, self.seconds = method, 0.0
+
+    def __call__(self, *arguments: Any) -> Any:
+        started = time.process_time()
+        try:
+            return self.method(*arguments)
+        finally:
+            self.seconds += time.process_time() - started
+
+
+def environment_share() -> Go:
+    """The environment's share of the processor time of training: PPO of Stable-Baselines3, 1024 x 32 steps, batches of 8192, 4 epochs."""
+    try:
+        from tailgate.agents.ppo import Config, Learner
+    except ImportError as error:
+        raise Missing(str(error)) from None
+    config = Config(envs=1024, rollout=32, batch_size=8192, epochs=4)
+    learner = Learner(0, 0.99, config, {"scenario": SCENARIO, "defence": "chi2_kf"})
+    env: Any = learner.env
+    env.step_wait = timed = _Timed(env.step_wait)
+    learner.learn(learner.round, lambda progress: None)
+
+    def go(seconds: float) -> Sample:
+        timed.seconds, started, until = 0.0, time.process_time(), time.perf_counter() + seconds
+        while timed.seconds == 0.0 or time.perf_counter() < until:
+            learner.learn(learner.steps + learner.round, lambda progress: None)
+        return Sample(timed.seconds, time.process_time() - started)
+
+    return go
+
+

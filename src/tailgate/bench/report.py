@@ -1,0 +1,205 @@
+"""What is made of a record: a table for people, a page in Markdown, and plots of the scalings (extra: viz)."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from tailgate.errors import InputError
+from tailgate.files import writable_directory, write_atomic
+
+from .lines import BYTES, NUMBER, RATE, SECONDS, SHARE
+
+RECORD, PAGE = "speed.json", "speed.md"
+Record = dict[str, Any]
+
+
+def shown(value: float, unit: str) -> str:
+    """A figure with three digits and its unit."""
+    if unit == RATE:
+        for size, letter in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
+            if value >= 0.9995 * size:
+                return f"{_digits(value / size)} {letter}/s"
+        return f"{_digits(value)} /s"
+    if unit == SECONDS:
+        return f"{_digits(value)} s"
+    if unit == BYTES:
+        return f"{value:.0f} bytes"
+    if unit == SHARE:
+        return f"{100.0 * value:.1f} %"
+    return f"{value:.3g}"
+
+
+def _digits(value: float) -> str:
+    return f"{value:.0f}" if value >= 99.95 else f"{value:.1f}" if value >= 9.995 else f"{value:.2f}"
+
+
+def _ratio(value: float) -> str:
+    return f"{_digits(value) if value >= 0.1 else f'{value:.2g}'} x"
+
+
+def figure(target: Record, record: Record, key: str = "value") -> str:
+    """A target's figure, or one end of its interval."""
+    if target[key] is None:
+        return ""
+    if target["right"] is not None:
+        return _ratio(target[key])
+    return shown(target[key], record["lines"][target["left"]]["unit"])
+
+
+def bound(target: Record, record: Record) -> str:
+    """What is asked."""
+    if target["bound"] is None:
+        return ""
+    unit = record["lines"].get(target["left"], {}).get("unit", NUMBER)
+    words = f"{target['bound']:g} x" if target["right"] is not None else shown(target["bound"], unit)
+    return f"at {target['at']} {words}"
+
+
+def verdict(target: Record) -> str:
+    """met, missed, not asked, or why it is not known."""
+    if target["value"] is None:
+        return f"not measured: {target['why']}"
+    return "" if target["met"] is None else "met" if target["met"] else "missed"
+
+
+def between(target: Record, record: Record) -> str:
+    """The interval over rounds."""
+    if target["value"] is None or target["low"] == target["high"]:
+        return ""
+    return f"{figure(target, record, 'low')} to {figure(target, record, 'high')}"
+
+
+def print_tables(record: Record, out: Console) -> None:
+    """Lines, then targets, on a console."""
+    table = Table(title=f"medians of {record['rounds']} rounds of {record['seconds']:g} s")
+    for heading in ("line", "what", "median", "quartiles"):
+        table.add_column(heading, overflow="fold")
+    for name, line in record["lines"].items():
+        spread = "" if line["q25"] == line["q75"] else f"{shown(line['q25'], line['unit'])} to {shown(line['q75'], line['unit'])}"
+        table.add_row(name, escape(line["what"]), shown(line["median"], line["unit"]), spread)
+    if record["lines"]:
+        out.print(table)
+    if record["targets"]:
+        table = Table(title="targets")
+        for heading in ("target", "what", "measured", "interval", "asked", "verdict"):
+            table.add_column(heading, overflow="fold")
+        for target in record["targets"]:
+            row = (figure(target, record), between(target, record), bound(target, record), verdict(target))
+            table.add_row(target["name"], escape(target["what"]), *map(escape, row))
+        out.print(table)
+    for plot in record["scalings"]:
+        table = Table(title=escape(plot["what"]))
+        sizes = sorted({point["at"] for curve in plot["curves"].values() for point in curve})
+        for heading in (plot["axis"], *plot["curves"]):
+            table.add_column(escape(heading), overflow="fold")
+        for n in sizes:
+            at = [next((shown(p["median"], RATE) for p in curve if p["at"] == n), "") for curve in plot["curves"].values()]
+            table.add_row(str(n), *at)
+        out.print(table)
+    for name, why in record["missing"].items():
+        out.print(f"missing: {name}: {why}", markup=False, highlight=False)
+
+
+def page(record: Record, plots: list[str]) -> str:
+    """The record as a page in Markdown, with the names of the plots beside it."""
+    machine = record["machine"]
+    packages = ", ".join(f"{name} {number}" for name, number in machine["packages"].items())
+    load = "" if record["load"] is None else f" The load over the last minute was {record['load'][0]} at the end."
+    sure = min((target["coverage"] for target in record["targets"] if target["coverage"]), default=0.0)
+    covers = f" An interval covers its median with {100.0 * sure:.0f} % or more." if sure else ""
+    out = [
+        "# Speed", "", "Written by `tailgate bench`; docs/speed.md says how it is measured.", "",
+        f"{machine['processor']} ({machine['vectors']}), {machine['cores']} cores, {machine['system']}, Python {machine['python']}, "
+        f"{packages}; compiler: {machine['compiler'] or 'none'}. "
+        f"tailgate {record['version']}, commit {record['commit'] or 'unknown'}, {record['date']}. "
+        f"Medians of {record['rounds']} rounds of {record['seconds']:g} s.{covers}{load}", "",
+        "## Targets", "", "| what | measured | interval over rounds | asked | |", "|---|---|---|---|---|",
+    ]  # fmt: skip
+    for target in record["targets"]:
+        cells = (target["what"], figure(target, record), between(target, record), bound(target, record), verdict(target))
+        out.append(f"| {' | '.join(cells)} |")
+    out += ["", "## Lines", "", "| what | median | quartiles |", "|---|---|---|"]
+    for line in record["lines"].values():
+        spread = "" if line["q25"] == line["q75"] else f"{shown(line['q25'], line['unit'])} to {shown(line['q75'], line['unit'])}"
+        counted = f", {line['of']}" if line["unit"] == RATE and line["of"] != "steps" else ""
+        out.append(f"| {line['what']}{counted} | {shown(line['median'], line['unit'])} | {spread} |")
+    if record["missing"]:
+        out += ["", "## Not measured", "", *(f"- {name}: {why}" for name, why in record["missing"].items())]
+    if plots:
+        out += ["", "## Scaling"]
+        for plot in record["scalings"]:
+            name = plot_name(plot)
+            if name in plots:
+                out += ["", f"![{plot['what']}]({name})"]
+    return "\n".join(out) + "\n"
+
+
+def plot_name(plot: Record) -> str:
+    return f"speed-{plot['name'].removeprefix('scaling-')}.png"
+
+
+def draw(plot: Record) -> bytes:
+    """One scaling as a picture: medians, and quartiles as bars."""
+    from matplotlib.ticker import NullLocator
+
+    from tailgate.plots import MARKERS, canvas, png
+
+    made, axes = canvas(6.4, 4.2)
+    ax = axes[0, 0]
+    sizes = sorted({point["at"] for curve in plot["curves"].values() for point in curve})
+    for i, (name, curve) in enumerate(plot["curves"].items()):
+        x, y = [p["at"] for p in curve], [p["median"] for p in curve]
+        spread = [[p["median"] - p["q25"] for p in curve], [p["q75"] - p["median"] for p in curve]]
+        ax.errorbar(x, y, spread, marker=MARKERS[i], markersize=5, capsize=3, label=name, color=f"C{i}")
+    if plot["axis"] == "cores":
+        for curve in plot["curves"].values():  # what as many cores would do if none waited for another
+            ax.plot(sizes, [curve[0]["median"] * n / curve[0]["at"] for n in sizes], ":", color="grey", label="in proportion")
+        ax.set_ylim(bottom=0.0)
+        ax.set_xlim(0.5, max(sizes) + 0.5)
+    else:
+        ax.set(xscale="log", yscale="log")
+    ax.set_xticks(sizes, [str(n) for n in sizes], minor=False)
+    ax.xaxis.set_minor_locator(NullLocator())
+    ax.set(xlabel=plot["axis"], ylabel="steps per second")
+    ax.set_title(plot["what"], fontsize=10)
+    ax.grid(alpha=0.3, which="both")
+    ax.legend(fontsize=8, loc="lower right" if plot["axis"] == "episodes" else "lower left")
+    return png(made)
+
+
+def check_place(directory: Path, wanted: set[str]) -> None:
+    """Raise InputError where a record of more lines or plots would be overwritten, or nothing can be written."""
+    writable_directory(directory)
+    try:
+        held = json.loads((directory / RECORD).read_text(encoding="utf-8"))
+        more = {*held["lines"], *held["missing"], *(plot["name"] for plot in held["scalings"])} - wanted
+    except (OSError, ValueError, KeyError, TypeError):
+        return
+    if more:
+        expected = f"another directory: this one holds a record with more ({len(more)} lines that --only leaves out)"
+        raise InputError("out", str(directory), expected)
+
+
+def write(record: Record, directory: Path) -> tuple[list[Path], str | None]:
+    """The record, its page and its plots; returns the paths, and why there are no plots."""
+    paths, plots, why = [], [], None
+    for plot in record["scalings"]:
+        if not plot["curves"]:
+            continue
+        try:
+            picture = draw(plot)
+        except ImportError as error:
+            why = f"no plots: {error}"
+            break
+        write_atomic(directory / plot_name(plot), picture)
+        plots.append(plot_name(plot))
+        paths.append(directory / plot_name(plot))
+    write_atomic(directory / PAGE, page(record, plots).encode())
+    write_atomic(directory / RECORD, json.dumps(record, indent=1, allow_nan=False).encode() + b"\n")
+    return [directory / RECORD, directory / PAGE, *paths], why

@@ -1,0 +1,240 @@
+"""Whether a loop can be fused, and its constants if it can.
+
+What is not known here, to the exact type, is played by the plain loop: a subclass may mean something else.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from tailgate.core import Array, Kind, Mode
+from tailgate.envs import manoeuvres as drives
+from tailgate.envs.controllers import AdaptiveCruise
+from tailgate.envs.following import CarFollowing
+from tailgate.envs.idm import IDM_GAP, IDM_HEADWAY
+from tailgate.envs.sensors import Odometry
+from tailgate.estimators.chi_square import ChiSquare
+from tailgate.estimators.compose import AcceptAll, Composed, GateOut, Score
+from tailgate.estimators.detectors import Cusum, Mewma, WindowedChiSquare
+from tailgate.estimators.kalman import KalmanFilter
+from tailgate.estimators.mitigations import Brake, Latch, Reacquire, Widen
+from tailgate.estimators.oracle import RejectAttacked
+from tailgate.estimators.raw import Raw
+from tailgate.estimators.robust import RobustKalmanFilter
+from tailgate.estimators.sentinels import AcceptFirst, AlwaysAlarm, AlwaysMode
+from tailgate.estimators.sparse import SparseChiSquare
+from tailgate.loop import Loop
+
+from . import constants as of
+
+_FUSED_KINDS = {Kind.DOS_JAM, Kind.DOS_HOLD, Kind.DOS_HOLD_FRESH, Kind.DROPOUT, Kind.FDI}
+_STRUCTURE = np.array([[True, True, True], [False, True, True], [False, False, True]])  # of A: where it is not zero
+
+
+class Constants(NamedTuple):
+    """A loop as the lanes read it."""
+
+    c: Array  # (NUMBERS,) float64
+    f: Array  # (CHOICES,) int64
+    table: Array  # speeds of a profile [m/s], else one zero
+    window: int  # rows of the detector's window
+    intents: int  # rows of the rear driver's intents
+
+
+@dataclass(frozen=True)
+class Refused:
+    """Why a loop is not fused, in a few words."""
+
+    why: str
+
+
+def fuse(loop: Loop) -> Constants | Refused:
+    """The constants of a loop, or why the plain loop plays it."""
+    plan, parts = loop.plan, (loop.plant, loop.sensor, loop.controller)
+    for part, known in zip(parts, (CarFollowing, Odometry, AdaptiveCruise), strict=True):
+        if type(part) is not known:
+            return Refused(f"{type(part).__name__} has no lane")
+    if not loop.link.perfect:
+        return Refused("readings are lost or late")
+    if loop.threat.knowledge == "white":
+        return Refused("a white-box attacker holds the defence itself")
+    if not {Kind[name.upper()] for name in loop.threat.kinds} <= _FUSED_KINDS:
+        return Refused("delay, replay and what is radiated have no lane")
+    c, f = of.blank()
+    for fill in (_vehicle, _told, _cruise, _defence, _threat):
+        if why := fill(loop, c, f):
+            return Refused(why)
+    table = _way(loop, c, f)
+    if table is None:
+        return Refused(f"manoeuvre {type(loop.manoeuvre).__name__} has no lane")
+    intents = plan.plant.behind.reaction if plan.plant.behind else 0
+    return Constants(c, f, table, max(int(f[of.WINDOW]) - 1, 0), intents)
+
+
+def _put(c: Array, at: int, values: Any) -> None:
+    flat = np.asarray(values, np.float64).ravel()
+    c[at : at + len(flat)] = flat
+
+
+def _vehicle(loop: Loop, c: Array, f: Array) -> str:
+    plant, plan = loop.plant, loop.plan.plant
+    assert isinstance(plant, CarFollowing)
+    _put(c, of.DT, plant.dt)
+    _put(c, of.LOAD, loop.load)
+    _put(c, of.OWN_A, plan.A)
+    _put(c, of.OWN_B, plan.B)
+    _put(c, of.PROCESS_SD, plan.noise_sd)
+    _put(c, of.SENSOR_SD, loop.plan.sensor.sd)
+    _put(c, of.START, (plant.position, plant.speed, plant.accel))
+    _put(c, of.START_SD, plant.initial_sd)
+    _put(c, of.MEAN, (plant.position, plant.speed, plant.accel))
+    _put(c, of.PRIOR, np.diag(plant.prior_var))
+    _put(c, of.LEAD_START, (plant.position + plant.gap, plant.lead_speed))
+    _put(c, of.REAR_START, (IDM_GAP + IDM_HEADWAY * plant.speed, plant.speed))
+    f[of.REAR] = plant.rear
+    f[of.REACTION] = plan.behind.reaction if plan.behind else 0
+    f[of.ENDS] = loop.ends_on_collision
+    f[of.UNIFORM_NOISE] = getattr(loop.sensor, "noise", None) is not None
+    return ""
+
+
+def _told(loop: Loop, c: Array, f: Array) -> str:
+    model = loop.model
+    if not np.array_equal(model.A != 0.0, _STRUCTURE) or (model.B == 0.0).any():
+        return "the model's matrices have another structure"
+    if not np.array_equal(model.C[0], np.eye(3)[:2]) or model.A[0, 0] != 1.0 or model.A[1, 1] != 1.0:
+        return "the model's matrices have another structure"
+    for at, value in ((of.A, model.A), (of.B, model.B), (of.C0, model.c), (of.Q, model.Q), (of.RNOISE, model.R)):
+        _put(c, at, value)
+    return ""
+
+
+def _cruise(loop: Loop, c: Array, f: Array) -> str:
+    acc = loop.controller
+    assert isinstance(acc, AdaptiveCruise)
+    _put(c, of.HEADWAY, (acc.headway, acc.standstill, acc.gamma))
+    free = [
+        value if given is None else given for given, value in ((acc.set_speed, np.inf), (acc.accel_min, -np.inf), (acc.accel_max, np.inf))
+    ]
+    _put(c, of.SET_SPEED, free)
+    return ""
+
+
+def _defence(loop: Loop, c: Array, f: Array) -> str:
+    defence = loop.defence
+    if type(defence) is Raw:
+        f[of.RAW] = 1
+        return ""
+    if not isinstance(defence, Composed):
+        return f"defence {type(defence).__name__} has no lane"
+    if "step" in vars(type(defence)) or type(defence).step is not Composed.step or type(defence).start is not Composed.start:
+        return f"defence {type(defence).__name__} has a step of its own"
+    parts, plan = defence.parts(), loop.plan.defence
+    for fill, part in zip((_filter, _detector, _mitigation), parts, strict=True):
+        if why := fill(part, plan, loop, c, f):
+            return why
+    if f[of.MITIGATION] == of.REACQUIRE and f[of.STEADY]:
+        return "a steady filter that forgets has no lane"
+    return ""
+
+
+def _filter(part: Any, plan: Any, loop: Loop, c: Array, f: Array) -> str:
+    if type(part) is RobustKalmanFilter:
+        if part.solver != "exact":
+            return "the solver is not the exact one"
+        f[of.ROBUST], f[of.PER_SIGMA], c[of.PRICE] = 1, part.unit == "sigma", part.lam
+    elif type(part) is not KalmanFilter:
+        return f"filter {type(part).__name__} has no lane"
+    f[of.STEADY] = part.steady
+    if part.steady:
+        _put(c, of.PRIOR, plan.filter_plan.held[0])
+    _put(c, of.BROAD, plan.filter_plan.broad)
+    return ""
+
+
+def _detector(part: Any, plan: Any, loop: Loop, c: Array, f: Array) -> str:
+    kinds = {
+        Score: of.SCORE_ONLY, ChiSquare: of.CHI2, WindowedChiSquare: of.WINDOWED, Cusum: of.CUSUM, Mewma: of.MEWMA, AlwaysAlarm: of.ALWAYS,
+        SparseChiSquare: of.SPARSE,
+    }  # fmt: skip
+    kind = kinds.get(type(part))
+    if kind is None:
+        return f"detector {type(part).__name__} has no lane"
+    f[of.DETECTOR] = kind
+    if isinstance(part, SparseChiSquare):
+        c[of.FEWER] = plan.detector_plan[1]
+    name = getattr(part, "threshold_field", None)
+    c[of.THRESHOLD] = np.inf if name is None else getattr(part, name)
+    if isinstance(part, WindowedChiSquare):
+        f[of.WINDOW] = part.window
+    elif isinstance(part, Cusum):
+        c[of.DRIFT], f[of.RESET] = plan.detector_plan.drift, part.reset
+    elif isinstance(part, Mewma):
+        c[of.WEIGHT], c[of.LIMIT] = part.weight, part.weight / (2.0 - part.weight)
+        f[of.RESET], f[of.EXACT] = part.reset, part.exact
+    return ""
+
+
+def _mitigation(part: Any, plan: Any, loop: Loop, c: Array, f: Array) -> str:
+    kinds = {
+        AcceptAll: of.ACCEPT_ALL, GateOut: of.GATE_OUT, Latch: of.GATE_OUT, Widen: of.GATE_OUT, Brake: of.GATE_OUT,
+        Reacquire: of.REACQUIRE, AcceptFirst: of.ACCEPT_FIRST, AlwaysMode: of.ALWAYS_MODE,
+        RejectAttacked: of.ACCEPT_HONEST,
+    }  # fmt: skip
+    kind = kinds.get(type(part))
+    if kind is None:
+        return f"mitigation {type(part).__name__} has no lane"
+    f[of.MITIGATION] = kind
+    if kind == of.ACCEPT_FIRST:
+        c[of.AFTER] = part.steps
+    elif kind == of.ALWAYS_MODE:
+        c[of.ASKED] = part.mode
+    elif kind == of.ACCEPT_HONEST:
+        return "" if "truth" in loop.uses else "nobody tells who is attacked"
+    else:
+        c[of.LATCH], c[of.AFTER] = getattr(part, "latch", 0), getattr(part, "after", 0)
+        c[of.LINGER], c[of.ASKED] = plan.mitigation_plan.linger, Mode[part.mode.upper()]
+        f[of.MODED] = part.mode != "normal"
+    return ""
+
+
+def _threat(loop: Loop, c: Array, f: Array) -> str:
+    plan, threat = loop.plan.channel, loop.threat
+    most = [np.inf if value is None else float(value) for value in (threat.budget, threat.duration)]
+    _put(c, of.ONSET, (threat.onset, plan.last_step, *most, threat.cooldown))
+    _put(c, of.GRANTED, plan.kinds)
+    _put(c, of.WIRE, plan.granted)
+    for at, values in ((of.BOUND, plan.bounds), (of.LOW, plan.low), (of.HIGH, plan.high)):
+        _put(c, at, np.broadcast_to(values, 5))
+    f[of.ACTUATED] = plan.granted[0, 4]
+    return ""
+
+
+def _way(loop: Loop, c: Array, f: Array) -> Array | None:
+    """Number of the manoeuvre and its parameters as `road.way` reads them; -> the table of a profile, None of an unknown one."""
+    way, plan, table = loop.manoeuvre, loop.plan.manoeuvre, np.zeros(1)
+    match way:
+        case drives.Constant():
+            kind, values = of.CONSTANT, [way.value]
+        case drives.Pulse():
+            kind, values = of.PULSE, [way.value, way.begin, way.end]
+        case drives.Switched():
+            kind, values = of.SWITCHED, [way.value, way.then, way.at]
+        case drives.Sine():
+            kind, values = of.SINE, [way.amplitude, plan.cos, plan.sin]
+        case drives.Braking():
+            kind, values = of.BRAKING, [way.decel, 0.0, 0.0, 0.0, *way.onset]
+        case drives.StopAndGo():
+            kind, values = of.STOP_AND_GO, [way.low_speed, way.cruise_speed, way.decel, way.accel_rate, *way.cruise, *way.dwell]
+        case drives.OrnsteinUhlenbeck():
+            kind, values = of.RANDOM, [plan.keep, plan.kick, way.mean_speed, way.pull, way.limit, way.sd]
+        case drives.Profile():
+            kind, values, table = of.PROFILE, [], np.ascontiguousarray(plan.speed, np.float64)
+        case _:
+            return None
+    f[of.WAY] = kind
+    _put(c, of.WAY_PARAM, values)
+    return table

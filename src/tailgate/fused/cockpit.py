@@ -1,0 +1,119 @@
+"""The attacker's seat in the fused engine: episodes in which a decision is an action, as `tailgate.envs.seat.Seat` plays them."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from tailgate.agents.observation import LAST_SCALE, LIMIT, SCALES
+from tailgate.core import Array
+from tailgate.draws import Keys
+
+from . import constants as of
+from . import kernel
+from . import rows as at
+from . import seat as lane
+from .build import Constants, Refused, fuse
+from .lanes import Lanes, not_finite
+from .memory import SEATED, TICK
+
+if TYPE_CHECKING:
+    from tailgate.envs.seat import Seat
+
+_ACTIONS = {"timing": of.DISCRETE, "mode": of.DISCRETE, "ramp": of.RAMPING, "continuous": of.CONTINUOUS, "increment": of.INCREMENT}
+_REWARDS = {"collision": of.CRASH, "min_gap": of.MIN_GAP, "error": of.ERROR, "stealth": of.STEALTH, "final": of.FINAL}
+
+
+def fuse_seat(seat: Seat) -> Constants | Refused:
+    """The constants of a seat, or why the plain loop plays it."""
+    k = fuse(seat.loop)
+    if isinstance(k, Refused):
+        return k
+    c, f, action, paid, threat = k.c, k.f, seat.action, seat.reward, seat.loop.threat
+    columns = [name for name, _ in seat.observation.columns]
+    if len(columns) > of.COMPONENTS or (action.discrete and action.size > of.MODES):
+        return Refused("too many components or actions")
+    f[of.ACTION], f[of.ACTIONS] = _ACTIONS[action.spec.action], 1 if action.discrete else action.size
+    f[of.REWARD], f[of.FEATURES] = _REWARDS[paid.reward], len(columns)
+    c[of.RATE], c[of.HORIZON], c[of.SEEN_MOST] = action.spec.rate, seat.loop.horizon, LIMIT
+    if action.discrete:
+        for i, mode in enumerate(action.modes):
+            row = np.concatenate([[mode.kind, mode.sign], mode.target[0], mode.value])
+            c[of.TABLE + of.MODE_WIDTH * i : of.TABLE + of.MODE_WIDTH * (i + 1)] = row
+    c[of.REWARD_SCALE], c[of.GAP_SHAPING], c[of.ERROR_SHAPING] = paid.error_scale, paid.gap_shaping, paid.error_shaping
+    c[of.GAMMA_PAID], c[of.ILLEGAL], c[of.COST] = paid.gamma, paid.illegal_penalty, paid.attack_cost
+    c[of.BUDGET_SHARE] = threat.budget or 1.0
+    scales = SCALES | {"progress": float(seat.loop.horizon)}
+    bounds = dict(zip(seat.loop.model.wires, seat.action.brief.bounds.tolist(), strict=True))
+    for j, name in enumerate(columns):
+        rows = (lane.QUANTITIES if f[of.REAR] else lane.QUANTITIES | lane.ALONE).get(name)
+        if rows is None:
+            return Refused(f"the observation's {name} has no lane")
+        f[of.SEEN + j], f[of.FROM + j] = rows
+        c[of.SEEN_SCALE + j] = min(bounds[name[5:]], LAST_SCALE) if name.startswith("last_") else scales.get(name.removesuffix("0"), 1.0)
+    return k
+
+
+class Cockpit(Lanes):
+    """B episodes of a seat. `seen` (B, features) float32 is new with each decision, `paid` (PAID, B) a view of the last."""
+
+    def __init__(self, seat: Seat, constants: Constants, keys: Keys, threads: int = 1) -> None:
+        super().__init__(seat.loop, constants, keys, threads=threads)
+        self.interval = seat.action.spec.interval
+        self._alone = (False, self.interval, SEATED, False, 0, False)  # the orders of `decide_alone`
+        self.paid, self.features = self.memory.paid, int(constants.f[of.FEATURES])
+
+    def run(self, *arguments: Any, **orders: Any) -> int:
+        self.seen = np.empty((self.batch, self.features), np.float32)
+        return super().run(*arguments, **orders)
+
+    def begin(self) -> None:
+        """All episodes begin."""
+        self.run(SEATED, 0, fresh=True)
+
+    def decide(self, actions: Array, restart: bool = False) -> None:
+        """One decision of each row, (B,) or (B, size); with `restart`, rows that were over begin their next episode instead."""
+        self.memory.action[...] = actions if actions.ndim == 2 else actions[:, None]
+        self.run(SEATED, self.interval, restart=restart)
+
+    def decide_alone(self, action: Any) -> list[float]:
+        """The decision of a single row; -> its column of `paid`. As `decide`, with nothing on the way that a batch would hide."""
+        self.memory.action[0] = action
+        if self._asked != self._alone:
+            self.run(SEATED, self.interval)
+        else:
+            self.seen = np.empty((1, self.features), np.float32)
+            if kernel.run(*self._arrays, self.seen, 0, 1) < 0:
+                raise not_finite()
+            self.memory.order[TICK] += self.interval
+        out: list[float] = self.paid[:, 0].tolist()
+        return out
+
+    def again(self) -> None:
+        """The next episode in every row that is over."""
+        self.run(SEATED, 0, restart=True)
+
+    def reseed(self, where: Array, keys: Keys | None = None) -> None:
+        """New episodes in the rows `where` (B,) bool: the next of their own, or those of the given keys of as many rows."""
+        if keys is not None:
+            for name, value in ((at.WORLD_KEY, keys.key[:, 0]), (at.ATTACK_KEY, keys.key[:, 1]), (at.EPISODE, keys.episode)):
+                held = self.word(name).copy()
+                held[where] = value.astype(np.uint64) - np.uint64(name == at.EPISODE)  # `again` counts one further
+                self.set_word(name, held)
+        self.set_row(at.OVER, where)
+        self.again()
+
+    def held(self) -> dict[str, Array]:
+        """Everything that changes, by name: copies."""
+        memory = self.memory
+        return {
+            "floats": memory.floats.copy(),
+            "words": memory.flat_words.view(np.int64).copy(),
+            "tick": memory.order[TICK : TICK + 1].copy(),
+        }
+
+    def put(self, held: dict[str, Array]) -> None:
+        """What `held` gave."""
+        self.memory.floats[:], self.memory.order[TICK] = held["floats"], held["tick"][0]
+        self.memory.flat_words.view(np.int64)[:] = held["words"]

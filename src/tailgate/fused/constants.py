@@ -1,0 +1,79 @@
+"""What is the same for all episodes of a lane: numbers `c` and choices `f`, each in one flat array, by name.
+
+They are arguments of the compiled functions. Were they constants of them, every scenario would be compiled anew.
+"""
+
+import numpy as np
+
+MODES, COMPONENTS = 64, 32  # discrete actions, and components of an observation, at most
+MODE_WIDTH = 12  # of an action in the table: kind, sign, five targets, five values
+
+_numbers: list[str] = []
+_choices: list[str] = []
+
+
+def _number(name: str, width: int = 1) -> int:
+    _numbers.extend([name] * width)
+    return len(_numbers) - width
+
+
+def _choice(name: str, width: int = 1) -> int:
+    _choices.extend([name] * width)
+    return len(_choices) - width
+
+
+# plant
+DT, LOAD = _number("dt"), _number("load")
+OWN_A, OWN_B = _number("own_A", 9), _number("own_B", 3)  # of the vehicle itself
+PROCESS_SD, SENSOR_SD = _number("process_sd", 3), _number("sensor_sd", 2)
+START_SD = _number("start_sd", 3)
+START = _number("start", 3)  # x, v, a
+LEAD_START, REAR_START = _number("lead_start", 2), _number("rear_start", 2)
+WAY_PARAM = _number("way_param", 8)  # of the manoeuvre, see `road.way`
+# what everyone is told
+A, B, C0 = _number("A", 9), _number("B", 3), _number("c", 3)
+Q, RNOISE = _number("Q", 9), _number("R", 4)
+MEAN, PRIOR = _number("mean", 3), _number("prior", 9)
+BROAD = _number("broad", 3)
+# controller
+HEADWAY, STANDSTILL, GAMMA = _number("headway"), _number("standstill"), _number("gamma")
+SET_SPEED, ACCEL_MIN, ACCEL_MAX = _number("set_speed"), _number("accel_min"), _number("accel_max")
+# defence
+PRICE = _number("price")  # lam of the robust filter
+THRESHOLD, FEWER = _number("threshold"), _number("fewer")  # of all sensors, and of one that is left
+DRIFT, WEIGHT, LIMIT = _number("drift"), _number("weight"), _number("limit")
+LATCH, AFTER, LINGER, ASKED = _number("latch"), _number("after"), _number("linger"), _number("asked")  # ASKED: the mode
+# threat model
+ONSET, LAST, BUDGET, LONGEST, PAUSE = _number("onset"), _number("last"), _number("budget"), _number("longest"), _number("pause")
+GRANTED = _number("granted", 10)  # by kind
+WIRE = _number("wire", 5)  # whether it may be attacked
+BOUND, LOW, HIGH = _number("bound", 5), _number("low", 5), _number("high", 5)
+# seat: what is decided, what is paid
+RATE, TABLE = _number("rate"), _number("mode", MODE_WIDTH * MODES)  # of a ramp; the discrete actions
+REWARD_SCALE, GAP_SHAPING, ERROR_SHAPING = _number("reward_scale"), _number("gap_shaping"), _number("error_shaping")
+GAMMA_PAID, ILLEGAL, COST = _number("gamma_paid"), _number("illegal"), _number("cost")
+SEEN_SCALE, SEEN_MOST = _number("seen_scale", COMPONENTS), _number("seen_most")  # of each component of the observation; where it is cut
+HORIZON, BUDGET_SHARE = _number("horizon"), _number("budget_share")
+NUMBERS = len(_numbers)
+
+WAY, REACTION, REAR = _choice("way"), _choice("reaction"), _choice("rear")
+UNIFORM_NOISE = _choice("uniform_noise")
+RAW, STEADY, ROBUST, PER_SIGMA = _choice("raw"), _choice("steady"), _choice("robust"), _choice("per_sigma")
+DETECTOR, WINDOW, RESET, EXACT = _choice("detector"), _choice("window"), _choice("reset"), _choice("exact")
+MITIGATION, MODED = _choice("mitigation"), _choice("moded")
+ENDS, ACTUATED = _choice("ends"), _choice("actuated")
+ACTION, ACTIONS, REWARD, FEATURES = _choice("action"), _choice("actions"), _choice("reward"), _choice("features")
+SEEN, FROM = _choice("seen", COMPONENTS), _choice("from", COMPONENTS)  # the two rows of each component of the observation
+CHOICES = len(_choices)
+
+# manoeuvres, detectors, mitigations
+CONSTANT, PULSE, SWITCHED, SINE, BRAKING, STOP_AND_GO, RANDOM, PROFILE = range(8)
+SCORE_ONLY, CHI2, WINDOWED, CUSUM, MEWMA, ALWAYS, SPARSE = range(7)
+ACCEPT_ALL, GATE_OUT, REACQUIRE, ACCEPT_FIRST, ALWAYS_MODE, ACCEPT_HONEST = range(6)
+DISCRETE, RAMPING, CONTINUOUS, INCREMENT = range(4)  # actions
+CRASH, MIN_GAP, ERROR, STEALTH, FINAL = range(5)  # rewards
+
+
+def blank() -> tuple[np.ndarray, np.ndarray]:
+    """Arrays for `c` and `f`, all zero."""
+    return np.zeros(NUMBERS), np.zeros(CHOICES, np.int64)

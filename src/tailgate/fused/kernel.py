@@ -1,0 +1,166 @@
+"""What is compiled: one function that plays a batch block by block, so that a block's rows stay in the processor's cache."""
+
+import numpy as np
+
+from . import constants as of
+from . import memory as at
+from . import script, seat, step
+from .compiled import compiled, phase
+from .rows import ENDED, EPISODE, LANES, OVER, ROWS, SCORE, STATE, WANT_KIND, WIRES, WORDS, X
+
+_1, _2 = np.uint64(LANES), np.uint64(2 * LANES)
+
+
+@phase
+def obey(s, asked, first, n):
+    """The command of asked (ASKED, B) into the rows WANT_*. -> whether there is any."""
+    some = 0.0
+    for j in range(at.ASKED):
+        row, counts = WANT_KIND + np.uint64(j * LANES), j <= WIRES  # kind and targets
+        for i in range(n):
+            s[row + i] = asked[j, first + i]
+            some += abs(s[row + i]) if counts else 0.0
+    return some > 0.0
+
+
+@phase
+def sound(s, n):
+    """Whether estimate and score are finite."""
+    worst = 0.0
+    for i in range(n):
+        worst += 0.0 * (s[X + i] + s[X + _1 + i] + s[X + _2 + i] + s[SCORE + i])
+    return worst == 0.0
+
+
+@phase
+def keep(s, columns, record, t, first, n):
+    """The rows `columns` of a block into record (K, columns, B) at step t."""
+    for j in range(len(columns)):
+        row = np.uint64(columns[j])
+        for i in range(n):
+            record[t, j, first + i] = s[row + i]
+
+
+@phase
+def living(s, n):
+    """Whether any episode of a block goes on."""
+    left = 0.0
+    for i in range(n):
+        left += 1.0 - s[ENDED + i]
+    return left > 0.0
+
+
+@phase
+def carry(source, goal, n):
+    """The state of a block from one place to another."""
+    for j in range(STATE):
+        row = np.uint64(j * LANES)
+        for i in range(n):
+            goal[row + i] = source[row + i]
+
+
+@phase
+def everyone(s, g, n):
+    """All rows are over, and so begin: under the episode number that they have."""
+    for i in range(n):
+        s[OVER + i] = 1.0
+        g[EPISODE + i] -= np.uint64(1)
+
+
+@phase
+def begin_again(s, g, window, intent, c, f, table, tick, fresh, words, new_window, new_intent, n):
+    """The next episode in every row that is over: played apart in a block of its own, then put in its place."""
+    count = np.uint64(0)
+    for i in range(n):
+        if s[OVER + i] != 0.0:
+            for j in range(WORDS):
+                words[np.uint64(j * LANES) + count] = g[np.uint64(j * LANES) + i]
+            words[EPISODE + count] += np.uint64(1)
+            count += np.uint64(1)
+    if count == np.uint64(0):
+        return
+    step.start(fresh, words, new_window, new_intent, c, f, table, tick, count)
+    seat.begin(fresh, c, count)
+    k = np.uint64(0)
+    for i in range(n):
+        if s[OVER + i] != 0.0:
+            for j in range(STATE):
+                s[np.uint64(j * LANES) + i] = fresh[np.uint64(j * LANES) + k]
+            for j in range(WORDS):
+                g[np.uint64(j * LANES) + i] = words[np.uint64(j * LANES) + k]
+            for j in range(len(window) // LANES):
+                window[np.uint64(j * LANES) + i] = new_window[np.uint64(j * LANES) + k]
+            for j in range(len(intent) // LANES):
+                intent[np.uint64(j * LANES) + i] = new_intent[np.uint64(j * LANES) + k]
+            k += np.uint64(1)
+
+
+@compiled
+def run(floats, whole, words, columns, record, seen, first_block, last_block):
+    """What the orders in `whole` ask for (`memory`), in blocks from the first to before the last.
+
+    Recorded in record (K, columns, B); what a seat sees in the end goes into seen (B, FEATURES) float32.
+
+    -> steps played, or -1 where an estimate is not finite.
+    """
+    o, f = whole[: at.ORDERS], whole[at.ORDERS :]
+    batch, how, steps, tick = o[at.BATCH], o[at.HOW], o[at.STEPS], o[at.TICK]
+    c = floats[o[at.AT_C] : o[at.AT_C] + of.NUMBERS]
+    table = floats[o[at.AT_TABLE] : o[at.AT_TABLE] + o[at.TABLE]]
+    p = floats[o[at.AT_SCRIPT] : o[at.AT_SCRIPT] + script.PLACES]
+    asked = floats[o[at.AT_ASKED] : o[at.AT_ASKED] + at.ASKED * batch].reshape(at.ASKED, batch)
+    action = floats[o[at.AT_ACTION] : o[at.AT_PAID]].reshape(batch, max(f[of.ACTIONS], 1))
+    paid = floats[o[at.AT_PAID] : o[at.AT_PAID] + at.PAID * batch].reshape(at.PAID, batch)
+    wide, long = o[at.WINDOW] * LANES, o[at.INTENT] * LANES
+    seated, fresh, longest = how == at.SEATED, o[at.FRESH] != 0, 0
+    restart = fresh or o[at.RESTART] != 0
+    spare = np.empty(ROWS * LANES if restart else 0)
+    spare_words, spare_window, spare_intent = np.empty(WORDS * LANES if restart else 0, np.uint64), np.empty(wide), np.empty(long)
+    deep = o[at.DEEP] * LANES
+    alone = deep == ROWS * LANES
+    desk = np.zeros(0 if alone else ROWS * LANES)
+    for b in range(first_block, last_block):
+        n, first = np.uint64(min(LANES, batch - b * LANES)), np.uint64(b * LANES)
+        held = floats[o[at.AT_ROWS] + b * deep : o[at.AT_ROWS] + (b + 1) * deep]
+        s = held if alone else desk
+        if not alone:
+            carry(held, desk, n)
+        g = words[b * WORDS * LANES : (b + 1) * WORDS * LANES]
+        window = floats[o[at.AT_WINDOW] + b * wide : o[at.AT_WINDOW] + (b + 1) * wide]
+        intent = floats[o[at.AT_INTENT] + b * long : o[at.AT_INTENT] + (b + 1) * long]
+        now = tick
+        if fresh:
+            everyone(s, g, n)
+            now += 1
+        if seated and steps > 0:
+            seat.before(s, n)
+        for t in range(steps):
+            if o[at.TERMINATE] != 0 and not living(s, n):
+                break
+            if seated:
+                seat.alive(s, c, n)
+                wanted = seat.decode(s, c, f, action, first, n)
+            elif how == at.SCRIPTED:
+                wanted = script.decide(s, g, c, p, n)
+            else:
+                wanted = obey(s, asked, first, n)
+            step.advance(s, g, window, intent, c, f, table, now, wanted, n)
+            now += 1
+            if not sound(s, n):
+                return -1
+            if seated:
+                seat.pay(s, c, f, n)
+            keep(s, columns, record, o[at.FIRST_STEP] + t, first, n)
+            longest = max(longest, t + 1)
+        if seated and steps > 0:
+            seat.settle(s, c, paid, first, n)
+        if restart:
+            begin_again(s, g, window, intent, c, f, table, now - 1, spare, spare_words, spare_window, spare_intent, n)
+        if seated:
+            if steps > 0:
+                seat.close(s, paid, first, n)
+            seat.look(s, c, paid, first, n)
+            seat.observe(s, c, f, seen, first, n)
+        if not alone:
+            carry(desk, held, n)
+    return longest

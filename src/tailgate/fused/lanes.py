@@ -1,0 +1,164 @@
+"""A batch in the fused engine: its arrays, what they mean as the nouns of the plain loop, and its steps."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from tailgate.core import Array, Command, Received, Scene, View
+from tailgate.draws import Draws, Keys, Role
+from tailgate.envs.following import FollowingState
+from tailgate.envs.idm import BehindState
+from tailgate.errors import InputError
+from tailgate.loop import Loop
+from tailgate.threat import Channel
+
+from . import constants as of
+from . import kernel
+from . import rows as at
+from .build import Constants
+from .memory import FIRST_STEP, FRESH, HOW, OBEY, RESTART, STEPS, TERMINATE, TICK, Memory
+from .rows import LANES, LINKS, SENSORS, WIRES
+
+NOTHING = np.zeros(0, np.uint64)
+UNSEEN = np.zeros((0, 0), np.float32)
+WORTH = 2048  # episodes that are worth a thread
+
+
+class _Spent(NamedTuple):
+    """The part of `ChannelState` by which the channel says what is allowed."""
+
+    used: Array
+    burst: Array
+    cooldown: Array
+
+
+@cache
+def _pool(threads: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(threads)
+
+
+class Lanes:
+    """B episodes of one loop. The arrays are this object's own, and change with every step."""
+
+    def __init__(self, loop: Loop, constants: Constants, keys: Keys, columns: Array = NOTHING, steps: int = 0, threads: int = 1) -> None:
+        """`columns` of every step are kept in `record` (steps, columns, B). Many episodes may share several `threads`."""
+        self.threads = max(1, min(threads, len(keys.key) // WORTH))
+        self.loop, self.constants, self.batch = loop, constants, len(keys.key)
+        self.memory = Memory(self.batch, constants.c, constants.f, constants.table, constants.window, constants.intents)
+        self.rows, self.columns, self.record = self.memory.rows, columns.astype(np.int64), np.empty((steps, len(columns), self.batch))
+        self._asked: tuple[int, ...] = ()
+        self._arrays = (self.memory.floats, self.memory.whole, self.memory.flat_words, self.columns, self.record)
+        self.seen = UNSEEN
+        self.take(keys)
+
+    def take(self, keys: Keys) -> None:
+        """The keys of the episodes that begin next."""
+        self.keys = keys
+        for word, value in ((at.WORLD_KEY, keys.key[:, 0]), (at.ATTACK_KEY, keys.key[:, 1]), (at.EPISODE, keys.episode)):
+            self.set_word(word, value)
+
+    # -- rows by name
+
+    def row(self, name: np.uint64, offset: int = 0) -> Array:
+        """(B,) float64: a copy, or a view where all episodes are in one block."""
+        first = int(name) + offset * LANES
+        return self.rows[:, first : first + LANES].reshape(-1)[: self.batch]
+
+    def stack(self, name: np.uint64, width: int) -> Array:
+        """(B, 1, width): rows that follow each other."""
+        return np.moveaxis(np.stack([self.row(name, j) for j in range(width)]), 0, -1)[:, None, :]
+
+    def set_row(self, name: np.uint64, values: Array) -> None:
+        """One number for each episode."""
+        held = np.zeros(len(self.rows) * LANES)
+        held[: self.batch] = values
+        self.rows[:, int(name) : int(name) + LANES] = held.reshape(-1, LANES)
+
+    def word(self, name: np.uint64) -> Array:
+        """(B,) uint64"""
+        return self.memory.words[:, int(name) : int(name) + LANES].reshape(-1)[: self.batch]
+
+    def set_word(self, name: np.uint64, values: Array) -> None:
+        """One whole number for each episode."""
+        held = np.zeros(len(self.rows) * LANES, np.uint64)
+        held[: self.batch] = values
+        self.memory.words[:, int(name) : int(name) + LANES] = held.reshape(-1, LANES)
+
+    # -- playing
+
+    def run(self, how: int, steps: int, fresh: bool = False, terminate: bool = False, first_step: int = 0, restart: bool = False) -> int:
+        """Steps under whoever decides; -> how many there were. Raises InputError where an estimate is not finite, as the loop does."""
+        order, arrays = self.memory.order, (*self._arrays, self.seen)
+        asked = (fresh, steps, how, terminate, first_step, restart)
+        if asked != self._asked:  # mostly the same again
+            order[[FRESH, STEPS, HOW, TERMINATE, FIRST_STEP, RESTART]] = self._asked = asked
+        if self.threads == 1:
+            played = [kernel.run(*arrays, 0, len(self.rows))]
+        else:  # blocks share nothing, so that the order in which they are played does not matter
+            edges = [len(self.rows) * part // self.threads for part in range(self.threads + 1)]
+            played = list(_pool(self.threads).map(lambda first, last: kernel.run(*arrays, first, last), edges[:-1], edges[1:]))
+        order[TICK] += fresh + steps
+        if min(played) < 0:
+            raise not_finite()
+        return int(max(played))
+
+    def start(self) -> None:
+        """All episodes begin, at k = 1, measured."""
+        self.run(OBEY, 0, fresh=True)
+
+    def advance(self, command: Command, t: int = 0) -> None:
+        """One step under a command, kept at t of the record."""
+        asked = self.memory.asked
+        asked[0] = command.kind
+        asked[1 : 1 + WIRES] = np.moveaxis(command.target[:, 0], 0, -1)
+        asked[1 + WIRES :] = np.moveaxis(command.value[:, 0], 0, -1)
+        self.run(OBEY, 1, first_step=t)
+
+    @property
+    def ended(self) -> Array:
+        return np.asarray(self.row(at.ENDED) != 0.0)
+
+    @property
+    def k(self) -> Array:
+        return self.row(at.K).astype(np.int64)
+
+    def draws(self, role: Role) -> Draws:
+        """The draws of a role at each row's own step."""
+        return self.keys.at(role, self.k)
+
+    def view(self) -> View:
+        """What the threat model lets an attacker see now: `Loop.sense`."""
+        threat, plan, k = self.loop.threat, self.loop.plan.channel, self.k
+        spent: Any = _Spent(*(self.row(name).astype(np.int64) for name in (at.USED, at.BURST, at.COOLDOWN)))
+        left, allowed = Channel().budget_left(plan, spent), Channel().allowed(plan, spent, k)
+        budget = np.full(self.batch, np.inf if threat.budget is None else float(threat.budget))
+        last = Command(self.row(at.KIND).astype(np.int8), self.stack(at.TARGET, WIRES) != 0.0, self.stack(at.VALUE, WIRES))
+        view = View(k, k / self.loop.horizon, self.scene(), left, budget, spent.burst, spent.cooldown, allowed, last)
+        if threat.knowledge == "grey":
+            view = view._replace(control=self.row(at.U)[:, None, None].copy())
+        if threat.sees_measurement:
+            view = view._replace(received=self._received())
+        return view
+
+    def scene(self) -> Scene:
+        """The road now."""
+        nothing = np.zeros((self.batch, 0))  # the driver's intents, which nobody sees
+        behind = (
+            BehindState(self.row(at.REAR_X).copy(), self.row(at.REAR_V).copy(), nothing, nothing) if self.constants.f[of.REAR] else None
+        )
+        state = FollowingState(self.row(at.LEAD_X).copy(), self.row(at.LEAD_V).copy(), self.stack(at.EGO, 3), behind)
+        return self.loop.plant.scene(self.loop.plan.plant, state)
+
+    def _received(self) -> Received:
+        sent = self.stack(at.SENT, LINKS)
+        y = sent[..., :SENSORS]
+        return Received(y, np.ones(y.shape, bool), np.zeros(y.shape[:2]), sent[..., SENSORS:])
+
+
+def not_finite() -> InputError:
+    """What the plain loop says of an estimate that is NaN or infinite."""
+    return InputError("defence output x", "NaN or infinity", "finite numbers")

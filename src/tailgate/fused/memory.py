@@ -1,0 +1,67 @@
+"""All arrays of a batch in three: floats, whole numbers, and words for the random numbers, each flat.
+
+An argument costs a compiled function as much as some episodes' step: it is called with few, and finds the rest by the offsets in `o`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tailgate.core import Array
+
+from . import constants as of
+from .rows import LANES, ROWS, STATE, WIRES, WORDS
+from .script import PLACES
+
+_orders: list[str] = []
+
+
+def _order(name: str) -> int:
+    _orders.append(name)
+    return len(_orders) - 1
+
+
+# What is to be done, in the order that the kernel asks.
+BATCH, TICK = _order("batch"), _order("tick")
+FRESH, STEPS, HOW, TERMINATE, FIRST_STEP, RESTART = (
+    _order("fresh"), _order("steps"), _order("how"), _order("terminate"), _order("first_step"), _order("restart"),
+)  # fmt: skip
+# Where things are in the floats, and how long they are where that differs.
+AT_ROWS, AT_WINDOW, AT_INTENT, AT_C, AT_TABLE, AT_SCRIPT, AT_ASKED, AT_ACTION, AT_PAID = (
+    _order(name) for name in ("rows", "window", "intent", "c", "table", "script", "asked", "action", "paid")
+)
+DEEP, WINDOW, INTENT, TABLE = _order("rows of a block"), _order("window rows"), _order("intent rows"), _order("table length")
+ORDERS = len(_orders)
+
+ASKED = 1 + 2 * WIRES  # rows of a command: kind, targets, values
+OBEY, SCRIPTED, SEATED = range(3)  # who decides
+PAID = 9  # rows of what a decision brought: reward, terminated, truncated, refused, collided, rear, allowed, k, gap
+
+
+class Memory:
+    """The arrays of B episodes; every attribute but the flat ones is a view of them."""
+
+    def __init__(self, batch: int, c: Array, f: Array, table: Array, window: int, intents: int) -> None:
+        blocks = -(-batch // LANES)
+        actions = max(int(f[of.ACTIONS]), 1)
+        deep = ROWS if blocks == 1 else STATE  # many blocks share one place to work at, which stays in the cache
+        sizes = {
+            AT_ROWS: blocks * deep * LANES, AT_WINDOW: blocks * window * LANES, AT_INTENT: blocks * intents * LANES, AT_C: len(c),
+            AT_TABLE: len(table), AT_SCRIPT: PLACES, AT_ASKED: ASKED * batch, AT_ACTION: actions * batch,
+            AT_PAID: PAID * batch,
+        }  # fmt: skip
+        self.whole = np.zeros(ORDERS + len(f), np.int64)
+        self.order = self.whole[:ORDERS]
+        self.floats = np.zeros(sum(sizes.values()))
+        held, at = {}, 0
+        for name, size in sizes.items():
+            self.order[name], held[name] = at, self.floats[at : at + size]
+            at += size
+        self.order[[BATCH, DEEP, WINDOW, INTENT, TABLE]] = batch, deep, window, intents, len(table)
+        self.whole[ORDERS:] = f
+        held[AT_C][:], held[AT_TABLE][:] = c, table
+        self.rows, self.script = held[AT_ROWS].reshape(blocks, deep * LANES), held[AT_SCRIPT]
+        self.asked, self.action = held[AT_ASKED].reshape(ASKED, batch), held[AT_ACTION].reshape(batch, actions)
+        self.paid = held[AT_PAID].reshape(PAID, batch)
+        self.words = np.zeros((blocks, WORDS * LANES), np.uint64)
+        self.flat_words = self.words.reshape(-1)

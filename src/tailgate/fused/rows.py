@@ -1,0 +1,75 @@
+"""Where a lane keeps what: rows of LANES numbers in one flat array, one number for each episode of a block.
+
+A row's name is its offset: `s[K + i]` is the step of episode i. The offsets are literals to the compiler, which so sees that no two rows
+overlap, and can take several episodes in one instruction; they are unsigned, as a signed index would be checked for being negative.
+Whatever is a whole number or a truth value elsewhere is a float here, exact up to 2^53.
+"""
+
+import numpy as np
+
+LANES = 64  # episodes of a block: its rows stay in the processor's cache while they are played
+SENSORS, LINKS, WIRES = 2, 4, 5  # position, velocity; + the leader's, by V2V; + the actuator
+
+_names: list[str] = []
+
+
+def _row(name: str, width: int = 1) -> np.uint64:
+    first = np.uint64(LANES * len(_names))
+    _names.extend([name] + [f"{name}{i}" for i in range(1, width)])
+    return first
+
+
+# The state between two steps.
+K = _row("k")
+ENDED = _row("ended")
+LEAD_X, LEAD_V = _row("lead_x"), _row("lead_v")
+EGO = _row("ego", 3)  # x, v, a
+REAR_X, REAR_V = _row("rear_x"), _row("rear_v")
+WAY = _row("way", 2)  # the manoeuvre's own
+X = _row("x", 3)  # the filter's mean, which is the estimate
+P = _row("P", 9)  # and its covariance, row by row
+SUM = _row("sum", 3)  # what a detector sums up
+LEFT = _row("left")  # steps that a mode still lasts
+SHUT = _row("shut", SENSORS)  # steps that a gate stays shut
+REJECTED = _row("rejected", SENSORS)
+U = _row("u")  # commanded last
+SENT = _row("sent", LINKS)
+USED, BURST, COOLDOWN = _row("used"), _row("burst"), _row("cooldown")
+HELD, FRESH = _row("held", WIRES), _row("fresh", WIRES)
+KIND = _row("kind")  # of the command in force
+TARGET, VALUE = _row("target", WIRES), _row("value", WIRES)
+MODE = _row("mode")  # asked of the controller
+LENGTH = _row("length")  # steps that the episode has lasted
+OPENED, ELAPSED, SEEN = _row("opened"), _row("elapsed"), _row("seen")  # a script's trigger: `tailgate.agents.triggers`
+OVER = _row("over")  # of a seat: the row was over before this decision
+POTENTIAL, LEAST = _row("potential"), _row("least")  # and what its reward remembers
+STATE = len(_names)  # rows of a state: what is kept of an episode between two calls
+
+# What a step computes on its way.
+SCORE, ALARM = _row("score"), _row("alarm")
+WANT_KIND = _row("want_kind")  # the command that was asked for
+WANT_TARGET, WANT_VALUE = _row("want_target", WIRES), _row("want_value", WIRES)
+REFUSED = _row("refused")
+ARRIVED = _row("arrived", LINKS)
+VALID = _row("valid", SENSORS)
+R = _row("r", SENSORS)  # the innovation
+S = _row("S", 4)  # its covariance, row by row
+CROSS = _row("cross", 6)  # C P-
+SUSPECT = _row("suspect", SENSORS)
+ACCEPT = _row("accept", SENSORS)
+FORGET = _row("forget")
+EXO = _row("exo")  # the leader's acceleration
+APPLIED = _row("applied")
+DRAW = _row("draw", 4)
+TRUTH = _row("truth", 3)
+CLEAN = _row("clean", LINKS)
+HIT, REAR_HIT = _row("hit"), _row("rear_hit")
+ON, DRAWN = _row("on"), _row("drawn", 6)  # of a script
+LIVE, RAW, BEFORE = _row("live"), _row("raw"), _row("before")  # of a seat: this step counts; what it pays; the potential before
+ANY_REFUSED, ANY_HIT, ANY_REAR = _row("any_refused"), _row("any_hit"), _row("any_rear")
+LEFT_OVER, ATTACKING, ZERO, INFINITE = _row("left_over"), _row("attacking"), _row("zero"), _row("infinite")  # of an observation
+ROWS = len(_names)
+
+# Whole numbers, in an array of their own: what the random numbers are drawn by.
+WORLD_KEY, ATTACK_KEY, EPISODE, STEP = (np.uint64(LANES * i) for i in range(4))
+WORDS = 4

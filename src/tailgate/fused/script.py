@@ -1,0 +1,170 @@
+"""Scripted attacks as a lane: a trigger, a law of the values, and the wires that they reach (`tailgate.agents.scripted`)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from tailgate.agents import scripted
+from tailgate.agents.triggers import Closing, Fast, LeaderBraking, Near, Slow, Trigger
+from tailgate.core import Array, Kind
+from tailgate.draws import Role
+from tailgate.elementwise import clip
+
+from . import channel, road
+from . import constants as of
+from .compiled import phase
+from .rows import (
+    ATTACK_KEY,
+    DRAWN,
+    EGO,
+    ELAPSED,
+    LANES,
+    LEAD_V,
+    LEAD_X,
+    ON,
+    OPENED,
+    SEEN,
+    WANT_KIND,
+    WANT_TARGET,
+    WANT_VALUE,
+    WIRES,
+    K,
+)
+
+# A script as numbers: what each place of the array holds.
+WHEN, THRESHOLD, BEGIN, WINDOW, ON_FOR, OFF_FOR, CHANCE = range(7)
+WHAT, LAW, FIRST, SECOND, LIMIT, HIT, TURN = range(7, 14)
+AIM, SIGN = 14, 19  # five places each: the wires, and a factor for each
+PLACES = 24
+TIME, NEAR, CLOSING, FAST, SLOW, LEADER_BRAKING = range(6)
+NOTHING, CONSTANT, UNIFORM, GAUSSIAN, RAMP = range(5)
+
+_WHEN = {Trigger: TIME, Near: NEAR, Closing: CLOSING, Fast: FAST, Slow: SLOW, LeaderBraking: LEADER_BRAKING}
+_ATTACK = np.uint64(int(Role.ATTACK) << 16)
+_CHANCE = np.uint64(int(Role.ATTACK) << 16 | scripted.CHANCE)
+_1 = np.uint64(LANES)
+_JAM, _FDI = float(Kind.DOS_JAM), float(Kind.FDI)
+
+
+def numbers(attack: Any, plan: Any) -> Array | None:
+    """A script as (PLACES,) numbers, None where it has no lane."""
+    p = np.zeros(PLACES)
+    p[[WINDOW, ON_FOR, CHANCE, HIT, TURN, LIMIT]] = np.inf, np.inf, 1.0, 2.0, np.inf, np.inf
+    p[SIGN:] = 1.0
+    if type(attack) is scripted.NoAttack:
+        p[BEGIN] = np.inf
+        return p
+    kind = type(attack)
+    if kind is scripted.Jam:
+        p[WHAT], p[LAW], p[FIRST], p[SECOND] = Kind.DOS_JAM, UNIFORM, attack.low, attack.high
+    elif kind is scripted.Hold:
+        p[WHAT] = Kind.DOS_HOLD_FRESH if attack.fresh else Kind.DOS_HOLD
+    elif kind is scripted.Dropout:
+        p[WHAT], p[HIT] = Kind.DROPOUT, attack.probability
+    elif kind is scripted.Inject:
+        p[WHAT], p[LAW], p[FIRST] = Kind.FDI, CONSTANT, attack.value
+        p[SIGN:] = 1.0 if plan.extra is None else plan.extra[0]
+    elif kind is scripted.InjectGaussian:
+        p[WHAT], p[LAW], p[FIRST], p[SECOND] = Kind.FDI, GAUSSIAN, attack.mean, attack.sd
+    elif kind is scripted.InjectBernoulli:
+        p[WHAT], p[LAW], p[FIRST], p[HIT] = Kind.FDI, CONSTANT, attack.value, attack.probability
+    elif kind is scripted.InjectRamp:
+        p[WHAT], p[LAW], p[FIRST], p[SECOND], p[LIMIT] = Kind.FDI, RAMP, attack.base, attack.rate, attack.limit
+    elif kind is scripted.InjectThenJam:
+        p[WHAT], p[LAW], p[FIRST], p[TURN] = Kind.FDI, CONSTANT, attack.value, attack.inject
+    elif kind is scripted.InjectUniform:
+        p[WHAT], p[LAW], p[FIRST], p[SECOND] = Kind.FDI, UNIFORM, attack.low, attack.high
+    else:
+        return None
+    when = attack.when
+    p[WHEN], p[THRESHOLD], p[BEGIN] = _WHEN[type(when)], getattr(when, "threshold", 0.0), max(when.start, plan.brief.threat.onset)
+    p[WINDOW] = np.inf if when.window is None else when.window
+    p[ON_FOR], p[OFF_FOR] = (np.inf, 0.0) if attack.burst is None else (attack.burst, attack.pause)
+    p[CHANCE] = attack.chance
+    p[AIM : AIM + WIRES] = plan.target[0]
+    return p
+
+
+@phase
+def _when(s, c, p, n):
+    """Row ON: whether the window is open; the trigger's memory one step later."""
+    kind, threshold, begin, window = p[WHEN], p[THRESHOLD], p[BEGIN], p[WINDOW]
+    dt, on_for, off_for = c[of.DT], p[ON_FOR], p[OFF_FOR]
+    for i in range(n):
+        gap, speed, lead = s[LEAD_X + i] - s[EGO + i], s[EGO + _1 + i], s[LEAD_V + i]
+        holds = kind == TIME
+        holds |= (kind == NEAR) & (gap < threshold)
+        holds |= (kind == CLOSING) & (speed - lead > threshold)
+        holds |= (kind == FAST) & (speed > threshold)
+        holds |= (kind == SLOW) & (speed < threshold)
+        holds |= (kind == LEADER_BRAKING) & ((s[SEEN + i] - lead) / dt > threshold)
+        opened = (s[OPENED + i] != 0.0) | (holds & (s[K + i] >= begin))
+        count = s[ELAPSED + i]
+        s[ON + i] = opened & (count < window)
+        s[OPENED + i] = opened
+        s[ELAPSED + i] = count + s[OPENED + i]
+        s[SEEN + i] = lead
+    if on_for < np.inf:
+        whole = on_for + off_for
+        for i in range(n):
+            count = s[ELAPSED + i] - s[OPENED + i]
+            s[ON + i] = s[ON + i] if count - whole * np.floor(count / whole) < on_for else 0.0
+
+
+@phase
+def decide(s, g, c, p, n):
+    """The command of the script into the rows WANT_*. -> whether there is any."""
+    _when(s, c, p, n)
+    channel.allowed(s, c, WANT_KIND, n)
+    some = 0.0
+    for i in range(n):
+        s[ON + i] = s[ON + i] if s[WANT_KIND + i] != 0.0 else 0.0
+        some += s[ON + i]
+        s[WANT_KIND + i] = 0.0
+    if some == 0.0:
+        return False
+    for w in range(WIRES):
+        row = np.uint64(w * LANES)
+        for i in range(n):
+            s[WANT_TARGET + row + i] = s[WANT_VALUE + row + i] = 0.0
+    kind, law, first, second, limit, turn = p[WHAT], p[LAW], p[FIRST], p[SECOND], p[LIMIT], p[TURN]
+    hit = p[HIT]
+    if law == UNIFORM or hit < 2.0:
+        for b in range(3):
+            road.uniforms(s, g, ATTACK_KEY, _ATTACK, np.uint64(b), DRAWN + np.uint64(2 * b * LANES), n)
+    elif law == GAUSSIAN:
+        for b in range(3):
+            road.normals(s, g, ATTACK_KEY, _ATTACK, np.uint64(b), DRAWN + np.uint64(2 * b * LANES), n)
+    for w in range(WIRES):
+        row, aim, sign = np.uint64(w * LANES), p[AIM + w], p[SIGN + w]
+        bound, low, high = c[of.BOUND + w], c[of.LOW + w], c[of.HIGH + w]
+        for i in range(n):
+            count, u = s[ELAPSED + i] - 1.0, s[DRAWN + row + i]
+            value = first
+            value = first + (second - first) * u if law == UNIFORM else value
+            value = first + second * u if law == GAUSSIAN else value
+            value = clip(first + second * (count + 1.0), -limit, limit) if law == RAMP else value
+            jams = (kind == _JAM) | (count >= turn)
+            value = clip(value, low, high) if jams else clip(value, -bound, bound)
+            on = (s[ON + i] != 0.0) & (aim != 0.0) & ((hit >= 2.0) | (u < hit))
+            s[WANT_TARGET + row + i] = on
+            s[WANT_VALUE + row + i] = value * sign if on & (law != NOTHING) else 0.0
+            s[WANT_KIND + i] = (_JAM if (kind == _FDI) & (count >= turn) else kind) if on else s[WANT_KIND + i]
+    if p[CHANCE] < 1.0:
+        _spare(s, g, p[CHANCE], n)
+    return True
+
+
+@phase
+def _spare(s, g, chance, n):
+    """Without luck nothing is sent."""
+    road.uniforms(s, g, ATTACK_KEY, _CHANCE, np.uint64(0), DRAWN, n)
+    for i in range(n):
+        s[WANT_KIND + i] = s[WANT_KIND + i] if s[DRAWN + i] < chance else 0.0
+    for w in range(WIRES):
+        row = np.uint64(w * LANES)
+        for i in range(n):
+            s[WANT_TARGET + row + i] = s[WANT_TARGET + row + i] if s[DRAWN + i] < chance else 0.0
+            s[WANT_VALUE + row + i] = s[WANT_VALUE + row + i] if s[DRAWN + i] < chance else 0.0

@@ -1,0 +1,219 @@
+"""The attacker's seat as a lane: actions to commands, rewards, observations (`tailgate.agents.codec`, `reward`, `observation`)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tailgate.agents import reward
+from tailgate.agents.reward import NEAR
+from tailgate.elementwise import clip
+from tailgate.kinds import Kind
+
+from . import channel
+from . import constants as of
+from .compiled import formula, phase
+from .rows import (
+    ALARM,
+    ANY_HIT,
+    ANY_REAR,
+    ANY_REFUSED,
+    ATTACKING,
+    BEFORE,
+    BURST,
+    COOLDOWN,
+    EGO,
+    ENDED,
+    HIT,
+    INFINITE,
+    KIND,
+    LANES,
+    LEAD_V,
+    LEAD_X,
+    LEAST,
+    LEFT_OVER,
+    LIVE,
+    ON,
+    OVER,
+    POTENTIAL,
+    RAW,
+    REAR_HIT,
+    REAR_V,
+    REAR_X,
+    REFUSED,
+    SENT,
+    TRUTH,
+    USED,
+    VALUE,
+    WANT_KIND,
+    WANT_TARGET,
+    WANT_VALUE,
+    WIRES,
+    ZERO,
+    K,
+    U,
+    X,
+)
+
+closeness, fooled, small = formula(reward.closeness), formula(reward.fooled), formula(reward.small)
+_1, _2, _3, _4 = (np.uint64(LANES * i) for i in range(1, 5))
+_FDI = float(Kind.FDI)
+
+# What an observation shows: the difference of two rows, the second of which is mostly 0.
+QUANTITIES = {
+    "progress": (K, ZERO), "allowed": (ON, ZERO), "budget_left": (LEFT_OVER, ZERO), "burst": (BURST, ZERO), "cooldown": (COOLDOWN, ZERO),
+    "gap": (LEAD_X, EGO), "speed": (EGO + _1, ZERO), "lead_speed": (LEAD_V, ZERO), "closing": (EGO + _1, LEAD_V), "accel": (EGO + _2, ZERO),
+    "rear_gap": (EGO, REAR_X), "rear_closing": (REAR_V, EGO + _1), "control0": (U, ZERO), "noise_position": (SENT, EGO),
+    "noise_velocity": (SENT + _1, EGO + _1), "attacking": (ATTACKING, ZERO), "last_position": (VALUE, ZERO),
+    "last_velocity": (VALUE + _1, ZERO),
+    "last_leader_position": (VALUE + _2, ZERO), "last_leader_velocity": (VALUE + _3, ZERO), "last_acceleration": (VALUE + _4, ZERO),
+}  # fmt: skip
+ALONE = {"rear_gap": (INFINITE, ZERO), "rear_closing": (ZERO, ZERO)}  # without a driver behind
+
+
+@phase
+def decode(s, c, f, action, first, n):
+    """Actions (B, ACTIONS), of this block from `first` on, into the rows WANT_*. -> whether there is any command."""
+    kind, rate = f[of.ACTION], c[of.RATE]
+    some = 0.0
+    for i in range(n):
+        s[WANT_KIND + i] = 0.0
+        some += action[first + i, 0] if action[first + i, 0] > 0.0 else 0.0  # the trigger, or the number of the action: 0 is none
+    if some == 0.0:
+        return False
+    if kind == of.DISCRETE or kind == of.RAMPING:
+        for i in range(n):
+            row = of.TABLE + of.MODE_WIDTH * np.int64(action[first + i, 0])
+            wanted, sign = c[row], c[row + 1]
+            ramps = (kind == of.RAMPING) & (wanted == _FDI) & (s[KIND + i] == _FDI)
+            s[WANT_KIND + i] = wanted
+            for w in range(WIRES):
+                at = np.uint64(w * LANES) + i
+                aimed, value = c[row + 2 + w], c[row + 7 + w]
+                if ramps:
+                    value = clip(s[VALUE + at] + rate * sign, -c[of.BOUND + w], c[of.BOUND + w])
+                s[WANT_TARGET + at] = aimed
+                s[WANT_VALUE + at] = value if aimed != 0.0 else 0.0
+        return True
+    for i in range(n):
+        s[ON + i] = clip(action[first + i, 0], -1.0, 1.0) > 0.0
+        s[WANT_KIND + i] = _FDI if s[ON + i] != 0.0 else 0.0
+    place: int = 1
+    for w in range(WIRES):
+        down, bound, mine = np.uint64(w * LANES), c[of.BOUND + w], c[of.WIRE + w] != 0.0
+        for i in range(n):
+            share = clip(action[first + i, place if mine else 0], -1.0, 1.0)
+            before = s[VALUE + down + i] if s[KIND + i] == _FDI else 0.0
+            value = clip(before + rate * share, -bound, bound) if kind == of.INCREMENT else bound * share
+            on = mine & (s[ON + i] != 0.0)
+            s[WANT_TARGET + down + i] = on
+            s[WANT_VALUE + down + i] = value if on else 0.0
+        place += int(mine)
+    return True
+
+
+@phase
+def potential(s, c, believed, out, n):
+    """The reward's potential of the gap, and with `believed` of what the car believes that it has on top, into row `out`."""
+    gap_shaping, error_shaping = c[of.GAP_SHAPING], c[of.ERROR_SHAPING]
+    for i in range(n):
+        gap = s[LEAD_X + i] - s[EGO + i]
+        near = closeness(gap)
+        belief = 0.0 + -1.0 * (s[X + i] - s[TRUTH + i]) if believed else 0.0
+        s[out + i] = gap_shaping * near + error_shaping * (fooled(belief) + 0.0)
+
+
+@phase
+def begin(s, c, n):
+    """The reward's memory of episodes that have just begun."""
+    potential(s, c, False, POTENTIAL, n)
+    for i in range(n):
+        s[LEAST + i] = np.minimum(small(s[LEAD_X + i] - s[EGO + i]), NEAR)
+        s[OVER + i] = 0.0
+
+
+@phase
+def before(s, n):
+    """Before a decision is played."""
+    for i in range(n):
+        s[RAW + i] = s[ANY_REFUSED + i] = s[ANY_HIT + i] = s[ANY_REAR + i] = 0.0
+        s[BEFORE + i] = s[POTENTIAL + i]
+
+
+@phase
+def alive(s, c, n):
+    """Before a step of it: whether the step counts."""
+    horizon = c[of.HORIZON]
+    for i in range(n):
+        s[LIVE + i] = (s[OVER + i] == 0.0) & (s[ENDED + i] == 0.0) & (s[K + i] <= horizon)
+
+
+@phase
+def pay(s, c, f, n):
+    """After a step of it: its reward, and what happened."""
+    kind, illegal, cost, scale, dt, horizon = f[of.REWARD], c[of.ILLEGAL], c[of.COST], c[of.REWARD_SCALE], c[of.DT], c[of.HORIZON]
+    potential(s, c, True, ON, n)
+    for i in range(n):
+        live = s[LIVE + i] != 0.0
+        least = np.minimum(small(s[LEAD_X + i] - s[EGO + i]), s[LEAST + i])
+        fall = s[LEAST + i] - least
+        crashed = 1.0 if (s[HIT + i] != 0.0) | (s[REAR_HIT + i] != 0.0) else 0.0
+        out = -illegal * s[REFUSED + i] - cost * (1.0 if s[KIND + i] != 0.0 else 0.0)
+        error = abs(0.0 + -1.0 * (s[X + i] - s[TRUTH + i])) / scale
+        if kind == of.CRASH or kind == of.MIN_GAP:
+            out = out + crashed
+            out = out + fall / NEAR if kind == of.MIN_GAP else out
+        elif kind == of.FINAL:
+            out = out + (error * error if s[K + i] - 1.0 == horizon else 0.0)
+        else:
+            out = out + dt * np.minimum(error, 1.0)
+            out = out - dt * s[ALARM + i] if kind == of.STEALTH else out
+        s[RAW + i] += out if live else 0.0
+        s[LEAST + i] = least
+        s[POTENTIAL + i] = s[ON + i] if live else s[POTENTIAL + i]
+        s[ANY_REFUSED + i] = 1.0 if live & (s[REFUSED + i] != 0.0) else s[ANY_REFUSED + i]
+        s[ANY_HIT + i] = 1.0 if live & (s[HIT + i] != 0.0) else s[ANY_HIT + i]
+        s[ANY_REAR + i] = 1.0 if live & (s[REAR_HIT + i] != 0.0) else s[ANY_REAR + i]
+
+
+@phase
+def settle(s, c, paid, first, n):
+    """After a decision: what it brought, into paid (PAID, B); of rows that were over before it nothing."""
+    gamma, horizon = c[of.GAMMA_PAID], c[of.HORIZON]
+    for i in range(n):
+        open_row = s[OVER + i] == 0.0
+        terminated = open_row & (s[ENDED + i] != 0.0)
+        truncated = open_row & (not terminated) & (s[K + i] > horizon)
+        after = 0.0 if terminated else s[POTENTIAL + i]
+        paid[0, first + i] = s[RAW + i] + gamma * after - s[BEFORE + i] if open_row else 0.0
+        paid[1, first + i], paid[2, first + i] = terminated, truncated
+        paid[3, first + i], paid[4, first + i], paid[5, first + i] = s[ANY_REFUSED + i], s[ANY_HIT + i], s[ANY_REAR + i]
+
+
+@phase
+def close(s, paid, first, n):
+    """Which rows are over now."""
+    for i in range(n):
+        s[OVER + i] = paid[1, first + i] + paid[2, first + i]
+
+
+@phase
+def look(s, c, paid, first, n):
+    """What the information of a step shows of the state that it led to, and what the observation needs of it."""
+    channel.allowed(s, c, ON, n)
+    budget, share = c[of.BUDGET], c[of.BUDGET_SHARE]
+    bounded = budget < np.inf
+    for i in range(n):
+        paid[6, first + i], paid[7, first + i], paid[8, first + i] = s[ON + i], s[K + i], s[LEAD_X + i] - s[EGO + i]
+        s[LEFT_OVER + i] = (budget - s[USED + i]) / share if bounded else 1.0
+        s[ATTACKING + i] = 1.0 if s[KIND + i] != 0.0 else 0.0
+        s[ZERO + i], s[INFINITE + i] = 0.0, np.inf
+
+
+@phase
+def observe(s, c, f, seen, first, n):
+    """The observation, seen (B, FEATURES), of the rows that `look` has filled."""
+    limit = c[of.SEEN_MOST]
+    for j in range(f[of.FEATURES]):
+        row, other, scale = np.uint64(f[of.SEEN + j]), np.uint64(f[of.FROM + j]), c[of.SEEN_SCALE + j]
+        for i in range(n):
+            seen[first + i, j] = clip((s[row + i] - s[other + i]) / scale, -limit, limit)

@@ -1,0 +1,288 @@
+"""The fused engine against the plain loop: the same bits, lane by lane and over a covering set of pairs, over whole episodes."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from tailgate import draws
+from tailgate.envs.faces import AdversaryEnv, AdversaryVectorEnv
+from tailgate.errors import InputError
+from tailgate.fused import Constants, Refused, compiled, fuse, script
+from tailgate.fused.lanes import Lanes
+from tailgate.fused.memory import SCRIPTED
+from tailgate.fused.rows import ROWS, STATE
+from tailgate.registry import Spec
+from tailgate.scenario import load_scenario
+from tailgate.trace import rollout
+
+# Every filter, detector, mitigation, manoeuvre, kind, law and trigger at least once.
+CELLS = [
+    ("stop-and-go-v0", "chi2_kf", "none"),
+    ("gusty-stop-and-go-v0", "kf", "fdi:trigger=near,threshold=30,value=-4"),
+    ("gusty-stop-and-go-v0", "windowed_chi2_kf", "fdi_gaussian:trigger=near,threshold=40,sd=4"),
+    ("gusty-stop-and-go-v0", "windowed_chi2_kf:window=1", "dos_jam:trigger=near,threshold=40"),
+    ("stop-and-go-v0", "cusum_kf:latch=4", "fdi_bernoulli:trigger=near,threshold=40,value=-4"),
+    ("gusty-stop-and-go-v0", "mewma_kf", "fdi_ramp:trigger=near,threshold=40,rate=-0.5"),
+    ("gusty-stop-and-go-v0", "reacquire_kf", "dropout:trigger=closing,threshold=2,probability=0.5"),
+    ("gusty-stop-and-go-v0", "reacquire_kf:after=3", "dos_jam:start_step=60"),
+    ("braking-v0", "rkf", "dos_jam:trigger=leader_braking,threshold=2,burst=5,pause=7"),
+    ("braking-v0", "rkf:unit=sensor", "fdi:start_step=100,value=6,signs=3"),
+    ("stop-and-go-v0", "cusum_reacquire_kf", "fdi_then_jam:trigger=near,threshold=35,inject=15"),
+    ("car-following-heavy-v0", "brake_kf", "dos_hold:trigger=slow,threshold=5,chance=0.5"),
+    ("ornstein-uhlenbeck-v0", "widen_kf", "fdi_uniform:start_step=100,length=50"),
+    ("thesis-ch4-v0", "chi2_kf:gain=steady", "dos_hold:fresh=true"),
+    ("ch7-v0", "coast", "fdi:trigger=speed,threshold=10"),
+    ("gusty-stop-and-go-v0", "always_brake", "program:path=burst_jamming"),
+    ("gusty-stop-and-go-v0", "oracle", "fdi_bernoulli:start_step=60,value=-9"),
+    ("gusty-stop-and-go-v0", "none", "dropout:start_step=60,probability=0.5"),
+    ("gusty-stop-and-go-v0", "chi2_kf_sparse", "fdi:start_step=60,targets=[position],value=-8"),
+    ("stop-and-go-v0", "chi2_kf_sparse:eta=4", "fdi_bernoulli:start_step=60,value=-6"),
+    ("car-following-noisy-v0", "always_alarm", "fdi_sparse:start_step=70"),
+    ("thesis-ch4-v0", "composed:detector=chi2,mitigation=latch", "thesis_times"),
+]
+
+
+def _loop(scenario, defence, attack, horizon=200, **threat):
+    made = Spec("attack", attack)
+    changes = {"knowledge": getattr(made.make(), "knowledge", made.entry.knowledge)} | threat
+    guard = Spec("defence", defence)
+    place = load_scenario(scenario).with_threat(**changes)
+    loop = place.loop(guard.make(), guard.entry.uses)
+    object.__setattr__(loop, "horizon", min(horizon, place.horizon))
+    return loop, made.make()
+
+
+@pytest.mark.parametrize(("scenario", "defence", "attack"), CELLS)
+def test_a_trace_is_the_plain_loops_to_the_last_bit(scenario, defence, attack):
+    """Episodes in two blocks, one of them not full: every signal's hash, and the lengths."""
+    loop, rival = _loop(scenario, defence, attack)
+    assert isinstance(fuse(loop), Constants)
+    keys = draws.keys("report", range(67))
+    fused, plain = rollout(loop, rival, keys), rollout(loop, rival, keys, plain=True)
+    assert np.array_equal(fused.length, plain.length)
+    assert [fused.trace_hash(b) for b in range(67)] == [plain.trace_hash(b) for b in range(67)]
+    assert {name: column.dtype for name, column in fused.signals.items()} == {name: column.dtype for name, column in plain.signals.items()}
+
+
+def test_a_run_to_the_horizon_goes_on_after_a_collision():
+    """Without an end at a collision the attack goes on as well, to the last bit."""
+    loop, rival = _loop("gusty-stop-and-go-v0", "chi2_kf", "fdi:trigger=near,threshold=30,value=-4", horizon=600)
+    keys = draws.keys("report", range(20))
+    fused, plain = (rollout(loop, rival, keys, terminate=False, plain=engine) for engine in (False, True))
+    crashed = (plain.collided | plain.rear_collided)[:450].any(axis=0)
+    assert (plain.kind[450:500, crashed] != 0).any()
+    assert [fused.trace_hash(b) for b in range(20)] == [plain.trace_hash(b) for b in range(20)]
+
+
+ENVIRONMENTS = [
+    {"scenario": "stop-and-go-v0", "defence": "chi2_kf", "autoreset": "next_step"},
+    {"scenario": "gusty-stop-and-go-v0", "defence": "reacquire_kf", "autoreset": "same_step", "action": "ramp", "reward": "stealth", "frames": 3,
+     "threat": {"budget": 50, "cooldown": 3, "duration": 9}},
+    {"scenario": "braking-v0", "defence": "rkf", "action": "continuous", "reward": "final", "interval": 7, "knowledge": "grey",
+     "threat": {"sees_measurement": True, "targets": ["position", "leader_position", "acceleration"]}},
+    {"scenario": "ch7-v0", "defence": "windowed_chi2_kf", "autoreset": "same_step", "action": "increment", "reward": "error",
+     "attack_cost": 0.1, "illegal_penalty": 0.2},
+    {"scenario": "car-following-heavy-v0", "defence": "brake_kf", "action": "timing", "kind": "dos_jam", "reward": "collision"},
+]  # fmt: skip
+
+
+def _same(one, two):
+    if isinstance(one, dict):
+        assert one.keys() == two.keys()
+        for key in one:
+            _same(one[key], two[key])
+    else:
+        assert one.dtype == two.dtype and np.array_equal(one, two, equal_nan=True)
+
+
+@pytest.mark.parametrize("arguments", ENVIRONMENTS, ids=lambda a: a["scenario"])
+def test_an_environment_is_the_plain_one_to_the_last_bit(arguments, tmp_path):
+    """Observations, rewards, flags and information, over restarts, a masked reset and what was held."""
+    text = (load_path := tmp_path / "short.yaml")
+    held = _short(arguments["scenario"])
+    load_path.write_text(held)
+    one, two = (AdversaryVectorEnv(5, engine=engine, **(arguments | {"scenario": str(text)})) for engine in ("fused", "plain"))
+    assert (one.engine, two.engine) == ("fused", "plain")
+    for first, second in zip(one.reset(seed=3), two.reset(seed=3), strict=True):
+        _same(first, second)
+    rng, ended = np.random.default_rng(0), 0
+    for t in range(130):
+        if one.seat.action.discrete:
+            actions = np.where(rng.random(5) < 0.6, 0, rng.integers(0, one.seat.action.size, 5))
+        else:
+            actions = rng.uniform(-1.2, 1.2, (5, one.seat.action.size)).astype(np.float32)
+        results = one.step(actions), two.step(actions)
+        for first, second in zip(*results, strict=True):
+            _same(np.asarray(first) if not isinstance(first, dict) else first, np.asarray(second) if not isinstance(second, dict) else second)
+        ended += int((results[0][2] | results[0][3]).sum())
+        if t == 60:
+            mask = np.array([False, True, True, False, False])
+            for first, second in zip(one.reset(seed=[None, 8, None, None, None], options={"reset_mask": mask}),
+                                     two.reset(seed=[None, 8, None, None, None], options={"reset_mask": mask}), strict=True):  # fmt: skip
+                _same(first, second)
+        if t == 90:
+            kept = one.episodes.held()
+            one.step(actions)
+            one.episodes.put(kept)
+            one.observed = two.observed.copy()
+    assert ended >= 5 and np.array_equal(one.episode, two.episode)
+
+
+@pytest.mark.parametrize("action", ["mode", "continuous"])
+def test_a_single_environment_is_a_batch_of_one(action):
+    """The short way through a single environment gives the results, types and errors of the long one."""
+    one, two = (AdversaryEnv(engine=engine, action=action, threat={"budget": 30}) for engine in ("fused", "plain"))
+    assert [env.batch.engine for env in (one, two)] == ["fused", "plain"]
+    rng, over, chosen = np.random.default_rng(3), False, None
+    _same(*(env.reset(seed=5)[0] for env in (one, two)))
+    for _ in range(700):
+        if over:
+            for env in (one, two):
+                with pytest.raises(InputError, match="step: got"):
+                    env.step(chosen)
+            _same(*(env.reset()[0] for env in (one, two)))
+            break
+        chosen = int(rng.integers(0, 4)) if action == "mode" else rng.uniform(-1, 1, one.batch.seat.action.size).astype(np.float32)
+        first, second = one.step(chosen), two.step(chosen)
+        _same(first[0], second[0])
+        assert [type(value) for value in first] == [type(value) for value in second] and first[1:4] == second[1:4]
+        assert {k: type(v) for k, v in first[4].items()} == {k: type(v) for k, v in second[4].items()}
+        assert all(np.array_equal(value, second[4][key]) for key, value in first[4].items())
+        over = first[2] or first[3]
+    assert over
+    with pytest.raises(InputError, match="actions: got"):
+        one.step(99 if action == "mode" else np.full(3, np.nan, np.float32))
+
+
+def _short(name):
+    """A scenario of 60 steps, so that rows begin again."""
+    from importlib.resources import files
+
+    import yaml
+
+    data = yaml.safe_load(files("tailgate.configs").joinpath(f"scenarios/{name}.yaml").read_text())
+    data["horizon"] = 60
+    data["threat_model"] = data["threat_model"] | {"onset": 5, "end": 55}
+    return yaml.safe_dump(data)
+
+
+def test_threads_and_blocks_change_no_bit():
+    """4200 episodes in one thread, in two, and apart."""
+    loop, _ = _loop("stop-and-go-v0", "chi2_kf", "none", horizon=3)
+    constants, keys = fuse(loop), draws.keys("report", range(4200))
+    held = []
+    for threads in (1, 2):
+        lanes = Lanes(loop, constants, keys, threads=threads)
+        assert lanes.threads == threads
+        lanes.start()
+        for _ in range(3):
+            lanes.advance(loop.brief.command(np.zeros(4200, bool), 0, np.zeros(5, bool), 0.0))
+        held.append(lanes.rows.copy())
+    assert np.array_equal(*held)
+    alone = Lanes(loop, constants, draws.keys("report", [4111]))
+    alone.start()
+    for _ in range(3):
+        alone.advance(loop.brief.command(np.zeros(1, bool), 0, np.zeros(5, bool), 0.0))
+    block, lane = divmod(4111, 64)
+    assert np.array_equal(held[0][block].reshape(STATE, 64)[:, lane], alone.rows[0].reshape(ROWS, 64)[:STATE, 0])
+
+
+@pytest.mark.parametrize(("scenario", "defence", "threat", "why"), [
+    ("radar-following-v0", "kf", {}, "RadarFollowing"), ("car-following-lossy-v0", "kf", {}, "lost or late"),
+    ("stop-and-go-v0", "kf", {"knowledge": "white"}, "white-box"), ("stop-and-go-v0", "kf", {"kinds": ["delay"]}, "delay"),
+    ("stop-and-go-v0", "imm", {}, "no lane"), ("stop-and-go-v0", "safe_state_brake", {}, "no lane"),
+])  # fmt: skip
+def test_what_has_no_lane_is_played_by_the_plain_loop(scenario, defence, threat, why):
+    """And says why."""
+    guard = Spec("defence", defence)
+    found = fuse(load_scenario(scenario).with_threat(**threat).loop(guard.make(), guard.entry.uses))
+    assert isinstance(found, Refused) and why in found.why
+    with pytest.raises(InputError, match="engine: got 'fused'"):
+        AdversaryVectorEnv(1, scenario=scenario, defence=defence, threat=threat, engine="fused")
+    with pytest.raises(InputError, match="engine"):
+        AdversaryVectorEnv(1, engine="quick")
+
+
+def test_somebody_elses_filter_of_the_same_base_is_not_taken_for_it():
+    """A subclass may mean something else: only the exact types have lanes."""
+    from tailgate.estimators.chi_square import ChiSquare
+    from tailgate.estimators.compose import AcceptAll, compose
+    from tailgate.estimators.kalman import KalmanFilter
+
+    class Mine(KalmanFilter):
+        pass
+
+    loop = load_scenario("stop-and-go-v0").loop(compose(Mine(), ChiSquare(), AcceptAll()))
+    assert isinstance(fuse(loop), Refused)
+    assert isinstance(fuse(load_scenario("stop-and-go-v0").loop(compose(KalmanFilter(), ChiSquare(), AcceptAll()))), Constants)
+
+
+def test_what_is_not_finite_is_refused_as_in_the_plain_loop():
+    """A measurement of 1e308 makes the estimate infinite."""
+    loop, _ = _loop("stop-and-go-v0", "kf", "none", fdi_bound=1.7e308, onset=1)
+    lanes = Lanes(loop, fuse(loop), draws.keys("report", range(3)))
+    lanes.start()
+    command = loop.brief.command(np.ones(3, bool), 5, np.array([True, True, False, False, False]), 1.7e308)
+    with pytest.raises(InputError, match="defence output x: got 'NaN or infinity'"):
+        for _ in range(5):
+            lanes.advance(command)
+
+
+def test_kept_code_is_of_these_sources(monkeypatch, tmp_path):
+    """The key on disk changes with a formula in another file."""
+    before = compiled.digest()
+    for package in compiled._SOURCES:
+        (tmp_path / package).mkdir()
+        for path in compiled.files(package).iterdir():
+            if path.name.endswith(".py"):
+                (tmp_path / package / path.name).write_bytes(path.read_bytes())
+    monkeypatch.setattr(compiled, "files", lambda package: tmp_path / package)
+    compiled.digest.cache_clear()
+    assert compiled.digest() == before
+    (tmp_path / "tailgate.envs" / "vehicle.py").write_text("x = 1\n")
+    compiled.digest.cache_clear()
+    assert compiled.digest() != before
+    compiled.digest.cache_clear()
+
+
+def test_the_phases_are_vectorised():
+    """Packed against single multiplications in what is compiled of the filter's update and of the vehicle's move: a guard, and not a time."""
+    import re
+
+    import numba
+
+    from tailgate.fused import kalman, road
+
+    @numba.njit(error_model="numpy")
+    def both(s, g, intent, c, f, n):
+        kalman.update(s, f, n)
+        road.move(s, g, intent, c, f, np.uint64(0), 0, n)
+
+    floats, words = np.zeros(ROWS * 64), np.zeros(4 * 64, np.uint64)
+    constants = fuse(load_scenario("stop-and-go-v0").loop(Spec("defence", "kf").make()))
+    both(floats, words, np.zeros(640), constants.c, constants.f, np.uint64(64))
+    (code,) = both.inspect_asm().values()
+    packed, single = len(re.findall(r"\bv?f?n?m?[a-z]*mul[a-z0-9]*pd\b", code)), len(re.findall(r"\bv?mulsd\b", code))
+    if not re.search(r"\bv?mul[sp]d\b", code):
+        pytest.skip("not an x86 processor")
+    assert packed > 0.7 * single and packed > 60
+
+
+def test_a_calm_road_does_not_slow_down():
+    """Without noise, and after the filter has settled, no number is so small that the processor takes its slow path."""
+    import time
+
+    place = load_scenario("thesis-ch4-v0")
+    data = {"process_var": (0.0, 0.0, 0.0)}
+    plant, sensor = dataclasses.replace(place.plant, **data), dataclasses.replace(place.sensor, noise_var=(1e-6, 1e-6))
+    loop = dataclasses.replace(place, plant=plant, sensor=sensor, horizon=30_000).loop(Spec("defence", "mewma_kf").make())
+    lanes = Lanes(loop, fuse(loop), draws.keys("report", range(64)))
+    lanes.memory.script[:] = script.numbers(Spec("attack", "none").make(), None)
+    lanes.start()
+    took = []
+    for _ in range(10):
+        started = time.process_time()
+        lanes.run(SCRIPTED, 1000)
+        took.append(time.process_time() - started)
+    assert min(took[5:]) < 3.0 * min(took[:5])
