@@ -10,7 +10,7 @@ from tailgate.errors import InputError
 from tailgate.rows import read_rows
 from tailgate.scenario import load_suite
 from tailgate.scoring import admit, read_attacks, score, withdraw
-from tailgate.scoring.attacks import Admitted, append, standing
+from tailgate.scoring.attacks import Admitted, append, next_level, standing
 
 LINE = Admitted("fdi:value=-4", "", "black", "2026-11-22", ({"defence": "kf", "p": 0.01},))
 
@@ -71,6 +71,16 @@ def test_an_erratum_takes_back_and_stays(tmp_path) -> None:
         append(path, dataclasses.replace(LINE, date="yesterday"))
 
 
+def test_every_try_costs_the_next_one(tmp_path) -> None:
+    """Over any number of tries the levels add up to alpha; an erratum is no try."""
+    levels, lines = [], []
+    for _ in range(400):
+        levels.append(next_level(lines, 0.05))
+        lines.append(dataclasses.replace(LINE, refused=True))
+    assert levels[:3] == [0.05 / 2, 0.05 / 6, 0.05 / 12] and 0.0498 < sum(levels) < 0.05
+    assert next_level([LINE, dataclasses.replace(LINE, erratum="wrong bound")], 0.05) == levels[1]
+
+
 @pytest.fixture(scope="module")
 def part():
     """quick-v0 cut to two defences, a weak attack and ten seeds."""
@@ -87,7 +97,9 @@ def test_an_attack_is_admitted_by_what_it_does_on_select_seeds_and_else_not(part
     assert line is not None and read_attacks(path) == [line] and {row["purpose"] for row in read_rows(rows)} == {"select"}
     assert tests[0]["adjusted"] <= 0.05 and tests[0]["only_new"] > tests[0]["only_worst"]
     worse, tests = admit("fdi:start_step=100,value=0.5", part, ["chi2_kf"], path, "2026-11-22")
-    assert worse is None and tests[0]["worst"]["attack"] == line.attack and len(read_attacks(path)) == 1
+    assert worse is None and tests[0]["worst"]["attack"] == line.attack
+    lines = read_attacks(path)
+    assert [held.refused for held in lines] == [False, True] and standing(lines)["fdi:start_step=100,value=0.5"] is None
     with pytest.raises(InputError, match="not on the list"):
         admit(line.attack, part, ["chi2_kf"], path, "2026-11-22")
     with pytest.raises(InputError, match="ceiling"):

@@ -1,8 +1,9 @@
 """The list of attacks that were admitted after a suite was published: results/SUITE/attacks.jsonl, which only ever grows.
 
 A line holds the hash of the line before it and its own, so that a line that was changed, moved or taken out between others is refused.
-An attack is admitted when it does surely more damage than the worst of those that know as much, on the same select seeds. One that turns
-out to be wrong stays, and a later line, an erratum, takes it back.
+An attack is admitted when it does surely more damage than the worst of those that know as much, on the same select seeds. One that does
+not is a line too: who tries often enough wins once by chance, so the j-th try of a list is tested at alpha / (j (j + 1)), which over any
+number of tries adds up to alpha. One that turns out to be wrong stays, and a later line, an erratum, takes it back.
 """
 
 from __future__ import annotations
@@ -36,13 +37,14 @@ from .ranks import mcnemar
 
 @dataclass(frozen=True)
 class Admitted:
-    """A line of the list: an attack that was admitted, or, with a reason in `erratum`, one that is taken back."""
+    """A line of the list: an attack that was admitted, or was tried and refused, or, with a reason in `erratum`, is taken back."""
 
     attack: str
     digest: str  # of the file that it comes from; empty for a registered one
     knowledge: str
     date: str  # YYYY-MM-DD
-    evidence: tuple[dict[str, Any], ...] = ()  # the paired tests: defence, scenario, dose, worst, only_new, only_worst, p, adjusted
+    evidence: tuple[dict[str, Any], ...] = ()  # the paired tests: defence, scenario, dose, worst, only_new, only_worst, p, adjusted, level
+    refused: bool = False
     erratum: str = ""
     before: str = ""  # hash of the line before
     hash: str = ""  # of this line
@@ -105,8 +107,14 @@ def _alone(folder: Path) -> Iterator[None]:
 
 
 def standing(lines: Sequence[Admitted]) -> dict[str, Admitted | None]:
-    """What holds of each attack that the list names: its line, or None where the last word is an erratum."""
-    return {line.attack: None if line.erratum else line for line in lines}
+    """What holds of each attack that the list names: its line, or None where it was refused or the last word is an erratum."""
+    return {line.attack: None if line.erratum or line.refused else line for line in lines}
+
+
+def next_level(lines: Sequence[Admitted], alpha: float) -> float:
+    """At which the next try is tested."""
+    tries = 1 + sum(not line.erratum for line in lines)
+    return alpha / (tries * (tries + 1))
 
 
 def withdraw(attack: str, path: Path, date: str, reason: str) -> Admitted:
@@ -131,13 +139,14 @@ def admit(
     episodes: int | None = None, workers: int = 1, rows_file: Path | None = None, beacon: str = "",
     progress: Callable[[int, int], None] | None = None,
 ) -> tuple[Admitted | None, list[dict[str, Any]]]:  # fmt: skip
-    """Play an attack and all that are listed and know as much, on select seeds; append it if it wins. -> line or None, the tests.
+    """Play an attack and all that are listed and know as much, on select seeds; append what came of it. -> line (None: refused), tests.
 
     It wins where it does more damage in some scenario than the worst of the others in any, against at least one defence, by the exact
-    paired test, adjusted after Holm for all defences and scenarios. dose: the middle one of those that the suite shows unless given.
-    beacon: of whose round the seeds are; an attack that is tried again on the same seeds has been chosen on them.
+    paired test, adjusted after Holm for all defences and scenarios, at `next_level` of alpha. dose: the middle one of those that the suite
+    shows unless given. beacon: of whose round the seeds are.
     """
-    lines = standing(read(path))
+    tried = read(path)
+    lines, asked = standing(tried), next_level(tried, alpha)
     listed = list(dict.fromkeys([*suite.attacks, *(text for text, line in lines.items() if line is not None)]))
     spec = Spec("attack", attack)
     if attack in listed:
@@ -173,7 +182,7 @@ def admit(
     if not tests:
         raise InputError("attack", attack, "one that can be played against some of the defences")
     for test, adjusted in zip(tests, holm([test["p"] for test in tests]), strict=True):
-        test["adjusted"] = adjusted
-    if not any(test["only_new"] > test["only_worst"] and test["adjusted"] <= alpha for test in tests):
-        return None, tests
-    return append(path, Admitted(attack, spec.digest, level, date, tuple(tests))), tests
+        test["adjusted"], test["level"] = adjusted, asked
+    wins = any(test["only_new"] > test["only_worst"] and test["adjusted"] <= asked for test in tests)
+    line = append(path, Admitted(attack, spec.digest, level, date, tuple(tests), refused=not wins))
+    return line if wins else None, tests
