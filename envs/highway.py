@@ -18,12 +18,12 @@ import numpy as np
 from pydantic import Field
 
 from tailgate import num
-from tailgate.core import Array, Controller, Count, Model, NonNegative, Positive, PositiveCount, Prior, Receiver, Scene, Sensor, param
+from tailgate.core import Array, Controller, Count, Model, NonNegative, Positive, PositiveCount, Prior, Scene, Sensor, param
 from tailgate.draws import Draws
 from tailgate.errors import InputError
 from tailgate.registry import register
 
-from .radar_car import GAP, OWN_SPEED, STATES, kinematic
+from .radar_car import STATES, radar_model
 from .vehicle import drive, lag
 
 if TYPE_CHECKING:
@@ -120,13 +120,7 @@ class Highway:
         return HighwayPlan(*lag(self.dt, self.tau), bench)
 
     def model(self, sensor: Sensor, controller: Controller) -> Model:
-        T, (sensors, C, R) = self.dt, sensor.matrices(self)
-        (A, B), rows = kinematic(T), np.eye(STATES)
-        return Model(
-            A=A, B=B, c=np.zeros(STATES), C=C, Q=np.diag(self.process_var), R=R, graph=np.eye(1, dtype=bool), dt=T, sensors=sensors,
-            actuators=("acceleration",), gap=rows[[GAP]], speed=rows[[OWN_SPEED]],
-            challenge=sensor.challenge if isinstance(sensor, Receiver) else 0,
-        )  # fmt: skip
+        return radar_model(self, sensor, self.dt, self.process_var)
 
     def start(self, plan: HighwayPlan, draws: Draws) -> HighwayState:
         from .highway_scene import FEATURES

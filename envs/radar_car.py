@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from tailgate.core import Array, Estimate, Finite, Model, NonNegative, Positive, param
+from tailgate.core import Array, Estimate, Finite, Model, NonNegative, Plant, Positive, Receiver, Sensor, param
 from tailgate.errors import InputError
 from tailgate.registry import register
 
@@ -19,6 +19,16 @@ def kinematic(T: float) -> tuple[Array, Array]:
     """A (4, 4) and B (4, 1) of x = [d, dv, a_L, v_F] for a step T [s], the input being the own speed at its end."""
     A = np.array([[1.0, T, T * T / 2.0, T / 2.0], [0.0, 1.0, T, 1.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 0.0]])
     return A, np.array([[-T / 2.0], [-1.0], [0.0], [1.0]])
+
+
+def radar_model(plant: Plant, sensor: Sensor, T: float, process_var: tuple[float, ...]) -> Model:
+    """What a defence of a car with a radar is told, of steps of T [s] and variances of the process noise (4,)."""
+    (sensors, C, R), (A, B), rows = sensor.matrices(plant), kinematic(T), np.eye(STATES)
+    return Model(
+        A=A, B=B, c=np.zeros(STATES), C=C, Q=np.diag(process_var), R=R, graph=np.eye(1, dtype=bool), dt=T, sensors=sensors,
+        actuators=("acceleration",), gap=rows[[GAP]], speed=rows[[OWN_SPEED]],
+        challenge=sensor.challenge if isinstance(sensor, Receiver) else 0,
+    )  # fmt: skip
 
 
 def check_radar_car(model: Model, where: str) -> None:

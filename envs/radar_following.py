@@ -17,12 +17,12 @@ import numpy as np
 from pydantic import Field
 
 from tailgate import num
-from tailgate.core import Array, Controller, Model, NonNegative, Positive, Prior, Receiver, Scene, Sensor, param
+from tailgate.core import Array, Controller, Model, NonNegative, Positive, Prior, Scene, Sensor, param
 from tailgate.draws import Draws
 from tailgate.registry import register
 
 from .idm import Behind, BehindState
-from .radar_car import GAP, OWN_SPEED, STATES, kinematic
+from .radar_car import STATES, radar_model
 
 Quadruple = Annotated[tuple[NonNegative, NonNegative, NonNegative, NonNegative], Field(min_length=4, max_length=4)]
 
@@ -69,13 +69,7 @@ class RadarFollowing:
         return RadarPlan(float(num.exp(-self.dt / self.tau)), behind)
 
     def model(self, sensor: Sensor, controller: Controller) -> Model:
-        T, (sensors, C, R) = self.dt, sensor.matrices(self)
-        (A, B), rows = kinematic(T), np.eye(STATES)
-        return Model(
-            A=A, B=B, c=np.zeros(STATES), C=C, Q=np.diag(self.process_var), R=R, graph=np.eye(1, dtype=bool), dt=T, sensors=sensors,
-            actuators=("acceleration",), gap=rows[[GAP]], speed=rows[[OWN_SPEED]],
-            challenge=sensor.challenge if isinstance(sensor, Receiver) else 0,
-        )  # fmt: skip
+        return radar_model(self, sensor, self.dt, self.process_var)
 
     def start(self, plan: RadarPlan, draws: Draws) -> RadarState:
         batch = len(draws.key)

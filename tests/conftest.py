@@ -1,6 +1,7 @@
 """Shared builders: short scenarios, rollouts, linear models, and equality to the last bit."""
 
 import dataclasses
+import json
 import os
 import shutil
 from itertools import combinations
@@ -150,5 +151,45 @@ def browser(tmp_path_factory):
         options.add_argument(f"--{flag}")
     options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
     window = webdriver.Chrome(options=options, service=Service(executable_path=driver))
+    window.get("about:blank")  # its own first page would go on loading
     yield window
     window.quit()
+
+
+@pytest.fixture
+def show(browser):
+    """A function that shows what is loaded at a width [px], in light or dark colours."""
+
+    def resize(width, scheme="light"):
+        size = {"width": width, "height": 800, "deviceScaleFactor": 1, "mobile": width < 500}
+        browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+        media = {"prefers-color-scheme": scheme, "prefers-reduced-motion": "reduce"}  # a click during a smooth scroll misses
+        browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": [{"name": k, "value": v} for k, v in media.items()]})
+
+    return resize
+
+
+@pytest.fixture
+def load(browser, show):
+    """A function that loads a file at a width [px] with empty logs, and returns the browser."""
+
+    def fresh(path, width=1280):
+        show(width)
+        for log in ("browser", "performance"):
+            browser.get_log(log)
+        browser.get(path.as_uri())
+        return browser
+
+    return fresh
+
+
+@pytest.fixture
+def asked(browser):
+    """A function that gives the addresses that were asked for since it was called last, data: left out."""
+
+    def addresses():
+        events = [json.loads(entry["message"])["message"] for entry in browser.get_log("performance")]
+        urls = {e["params"]["request"]["url"] for e in events if e["method"] == "Network.requestWillBeSent"}
+        return {url for url in urls if not url.startswith("data:")}
+
+    return addresses

@@ -245,20 +245,9 @@ def test_text_stands_out_on_every_shade_and_shades_are_in_order(mode):
 
 
 @pytest.fixture
-def tab(browser, page):
+def tab(load, page):
     """A fresh load of the page at desktop size, in light colours."""
-    show(browser, 1280, "light")
-    for log in ("browser", "performance"):
-        browser.get_log(log)
-    browser.get(page.as_uri())
-    return browser
-
-
-def show(browser, width, scheme):
-    size = {"width": width, "height": 800, "deviceScaleFactor": 1, "mobile": width < 500}
-    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
-    media = {"prefers-color-scheme": scheme, "prefers-reduced-motion": "reduce"}  # a click during a smooth scroll misses
-    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": [{"name": k, "value": v} for k, v in media.items()]})
+    return load(page)
 
 
 def column(tab, number):
@@ -302,19 +291,17 @@ def test_filters_hide_rows(tab):
 
 
 @pytest.mark.page
-def test_the_page_is_quiet(tab, page):
+def test_the_page_is_quiet(tab, page, asked):
     """No script of the rows runs, no console message, and no request but for the file itself."""
     assert tab.title == "A <small> board"
     assert tab.get_log("browser") == []
-    events = [json.loads(entry["message"])["message"] for entry in tab.get_log("performance")]
-    asked = {e["params"]["request"]["url"] for e in events if e["method"] == "Network.requestWillBeSent"}
-    assert asked - {"data:,"} == {page.as_uri()}
+    assert asked() == {page.as_uri()}
 
 
 @pytest.mark.page
 @pytest.mark.parametrize("width", [375, 800, 1280])
-def test_only_tables_scroll_sideways(tab, width):
-    show(tab, width, "light")
+def test_only_tables_scroll_sideways(tab, width, show):
+    show(width, "light")
     wide = "return [document.documentElement.scrollWidth, document.body.scrollWidth, document.documentElement.clientWidth]"
     page, body, room = tab.execute_script(wide)
     assert page <= room <= width and body <= room
@@ -323,9 +310,9 @@ def test_only_tables_scroll_sideways(tab, width):
 
 
 @pytest.mark.page
-def test_dark_and_light(tab):
+def test_dark_and_light(tab, show):
     ground = "return getComputedStyle(document.body).backgroundColor"
     light = tab.execute_script(ground)
-    show(tab, 1280, "dark")
+    show(1280, "dark")
     dark = tab.execute_script(ground)
     assert (light, dark) == ("rgb(255, 255, 255)", "rgb(20, 22, 26)")

@@ -153,17 +153,11 @@ def test_bad_input(arguments, named, capsys):
 
 @pytest.mark.page
 @pytest.mark.parametrize("width", [360, 1280])
-def test_the_page_in_a_browser(chapter_4, browser, width):
+def test_the_page_in_a_browser(chapter_4, load, asked, width):
     """No message, no request but for the file, every figure decoded, and nothing wider than the window but the tables, which scroll."""
     page = chapter_4[2] / "index.html"
-    size = {"width": width, "height": 800, "deviceScaleFactor": 1, "mobile": width < 500}
-    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
-    for log in ("browser", "performance"):
-        browser.get_log(log)
-    browser.get(page.as_uri())
+    browser = load(page, width)
     assert browser.get_log("browser") == []
-    events = [json.loads(entry["message"])["message"] for entry in browser.get_log("performance")]
-    asked = {e["params"]["request"]["url"] for e in events if e["method"] == "Network.requestWillBeSent"}
-    assert {url for url in asked if not url.startswith("data:")} == {page.as_uri()}
+    assert asked() == {page.as_uri()}
     assert browser.execute_script("return [...document.images].every(i => i.naturalWidth > 300) && document.images.length") == 5
     assert browser.execute_script("return document.documentElement.scrollWidth") <= width

@@ -1,7 +1,6 @@
 """The site of boards in a browser: sorting, filters, menus, links, widths, colours, and that it asks for nothing."""
 
 import importlib.util
-import json
 from pathlib import Path
 
 import pytest
@@ -20,20 +19,9 @@ def site(tmp_path_factory):
 
 
 @pytest.fixture
-def tab(browser, site):
+def tab(load, site):
     """A fresh load of the first page at desktop size, in light colours."""
-    show(browser, 1280, "light")
-    for log in ("browser", "performance"):
-        browser.get_log(log)
-    browser.get(site.as_uri())
-    return browser
-
-
-def show(browser, width, scheme):
-    size = {"width": width, "height": 800, "deviceScaleFactor": 1, "mobile": width < 500}
-    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
-    media = {"prefers-color-scheme": scheme, "prefers-reduced-motion": "reduce"}  # a click during a smooth scroll misses
-    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": [{"name": k, "value": v} for k, v in media.items()]})
+    return load(site)
 
 
 def groups(tab, column, key="sort"):
@@ -130,7 +118,7 @@ def test_knowledge_and_scale_are_chosen(tab):
 
 
 @pytest.mark.page
-def test_pages_are_quiet_and_links_work(tab, site):
+def test_pages_are_quiet_and_links_work(tab, site, asked):
     """No script of a board runs, no console message comes, and no request leaves the file system, through a click to an entry and its replay."""
     assert tab.title == "A <small> board"
     tab.find_element("link text", "kf").click()
@@ -139,16 +127,15 @@ def test_pages_are_quiet_and_links_work(tab, site):
     assert tab.current_url.endswith("/synthetic-v0/kf-replay.html")
     tab.get(entry(site, HOSTILE).as_uri())
     assert tab.title.startswith("evil:") and tab.get_log("browser") == []
-    events = [json.loads(line["message"])["message"] for line in tab.get_log("performance")]
-    asked = {e["params"]["request"]["url"] for e in events if e["method"] == "Network.requestWillBeSent"} - {"data:,"}
-    assert len(asked) == 4 and all(url.startswith(site.parent.as_uri()) for url in asked)
+    urls = asked()
+    assert len(urls) == 4 and all(url.startswith(site.parent.as_uri()) for url in urls)
 
 
 @pytest.mark.page
 @pytest.mark.parametrize("width", [375, 800, 1280])
-def test_only_tables_scroll_sideways(tab, site, width):
+def test_only_tables_scroll_sideways(tab, site, width, show):
     """No page is wider than its window, with all folded parts open."""
-    show(tab, width, "light")
+    show(width, "light")
     for path in (site, entry(site, "chi2_kf:eta=15"), entry(site, LONG)):
         tab.get(path.as_uri())
         tab.execute_script("document.querySelectorAll('details').forEach(d => d.open = true)")
@@ -160,11 +147,11 @@ def test_only_tables_scroll_sideways(tab, site, width):
 
 
 @pytest.mark.page
-def test_dark_light_and_numbers(tab):
+def test_dark_light_and_numbers(tab, show):
     """The ground follows the wish of the reader; figures stand to the right in figures of one width."""
     ground = "return getComputedStyle(document.body).backgroundColor"
     light = tab.execute_script(ground)
-    show(tab, 1280, "dark")
+    show(1280, "dark")
     assert (light, tab.execute_script(ground)) == ("rgb(255, 255, 255)", "rgb(20, 22, 26)")
     style = "const s = getComputedStyle(document.querySelector('.ranks td.num')); return [s.textAlign, s.fontVariantNumeric]"
     assert tab.execute_script(style) == ["right", "tabular-nums"]
