@@ -18,7 +18,7 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from tailgate import kernels, num
+from tailgate import linear, num
 from tailgate.core import Array, Innovation, Model, Positive, param
 from tailgate.registry import register
 
@@ -83,7 +83,7 @@ def _pivot(r: Array, S: Array, W: Array, half: Array, rows: tuple[Array, ...]) -
     shared = W.ndim == 4 and W.strides[0] == 0  # the same for the whole batch
     blocks, which = (W[0], rows[1]) if shared else (W[rows], np.arange(len(r)))
     y = np.empty_like(r)
-    left = kernels.pivot_each(r, np.ascontiguousarray(blocks), which, half, size, TOLERANCE, ROUNDING, PATIENCE, ROUNDS, y)
+    left = linear.pivot_each(r, np.ascontiguousarray(blocks), which, half, size, TOLERANCE, ROUNDING, PATIENCE, ROUNDS, y)
     if left:
         raise ArithmeticError(f"believed: {left} problems of {r.shape[1]} sensors are not solved after {ROUNDS} rounds of pivoting")
     return y

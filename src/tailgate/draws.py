@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tailgate import kernels
+from tailgate import kernels, num
 from tailgate.errors import InputError
 
 Array = NDArray[Any]
@@ -77,7 +77,7 @@ class Draws(NamedTuple):
         size = math.prod(shape)
         out = np.empty((size, len(self.key)))
         fill(np.ascontiguousarray(self.key), self.episode, self.step, self.stream << 16 | tag, out)
-        return np.moveaxis(out.reshape(*shape, len(self.key)), -1, 0)
+        return num.last_to_first(out.reshape(*shape, len(self.key)))
 
     def normal(self, shape: tuple[int, ...] = (), tag: int = 0) -> Array:
         """Standard normals (B, *shape)."""

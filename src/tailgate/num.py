@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tailgate import kernels
+from tailgate import kernels, linear
 from tailgate.elementwise import clip as clip
 from tailgate.elementwise import select as select
 
@@ -26,14 +26,28 @@ log = kernels.log
 tanh = kernels.tanh
 
 
+_TO_LAST = [(*range(1, n), 0) if n else () for n in range(12)]  # for each number of axes; np.moveaxis takes longer than a small product
+_TO_FIRST = [(n - 1, *range(n - 1)) if n else () for n in range(12)]
+
+
+def first_to_last(x: Array) -> Array:
+    """(B, ...) to (..., B), a view."""
+    return x.transpose(_TO_LAST[x.ndim])
+
+
+def last_to_first(x: Array) -> Array:
+    """(..., B) to (B, ...), a view."""
+    return x.transpose(_TO_FIRST[x.ndim])
+
+
 def batch_last(x: Array) -> Array:
     """The same (B, ...) array with B contiguous in memory."""
-    return np.moveaxis(np.ascontiguousarray(np.moveaxis(x, 0, -1)), -1, 0)
+    return last_to_first(np.ascontiguousarray(first_to_last(x)))
 
 
 def zeros(shape: Sequence[int], dtype: Any = np.float64) -> Array:
     """A (B, ...) array of zeros, B contiguous in memory."""
-    return np.moveaxis(np.zeros((*shape[1:], shape[0]), dtype), -1, 0)
+    return last_to_first(np.zeros((*shape[1:], shape[0]), dtype))
 
 
 def full(shape: Sequence[int], value: Any, dtype: Any = np.float64) -> Array:
@@ -45,7 +59,7 @@ def full(shape: Sequence[int], value: Any, dtype: Any = np.float64) -> Array:
 
 def stack(columns: Sequence[Array]) -> Array:
     """F arrays (B, ...) to (B, ..., F), B contiguous in memory."""
-    return np.moveaxis(np.stack([np.moveaxis(c, 0, -1) for c in columns], axis=-2), -1, 0)
+    return last_to_first(np.stack([first_to_last(c) for c in columns], axis=-2))
 
 
 def _constant(x: Array) -> Array | None:
@@ -53,36 +67,42 @@ def _constant(x: Array) -> Array | None:
     return x if x.ndim == 2 else x[0] if x.ndim == 3 and x.shape[0] == 1 else None
 
 
+def _last(x: Array) -> Array:
+    """(B, ..., p, q) as (M, p, q, B) in memory: all axes but the first and the last two are one."""
+    moved = np.ascontiguousarray(first_to_last(x), np.float64)
+    return moved.reshape(math.prod(moved.shape[:-3]), *moved.shape[-3:])
+
+
 def matmul(x: Array, y: Array) -> Array:
-    """(..., i, k) times (..., k, j), summed over k in ascending order."""
+    """(..., i, k) times (..., k, j), summed over k in ascending order; (B, ..., i, j) has B contiguous in memory.
+
+    One matrix x for a whole batch: its structural zeros count for nothing, whatever y holds there.
+    """
     fixed = _constant(x)
     if fixed is not None and y.ndim > 3:
-        out = zeros((*y.shape[:-2], fixed.shape[0], y.shape[-1]))
-        for i, k in zip(*np.nonzero(fixed), strict=True):  # row by row: structural zeros cost nothing
-            out[..., i, :] += fixed[i, k] * y[..., k, :]
-        return out
+        flat = _last(y)
+        m, k, j, b = flat.shape
+        held = np.empty((m, len(fixed), j * b))
+        linear.constant_times(np.ascontiguousarray(fixed, np.float64), flat.reshape(m, k, j * b), held)
+        return last_to_first(held.reshape(*y.shape[1:-2], len(fixed), j, b))
     batch = np.broadcast_shapes(x.shape[:-2], y.shape[:-2])
-    out = zeros((*batch, x.shape[-2], y.shape[-1])) if batch else np.zeros((x.shape[-2], y.shape[-1]))
-    np.multiply(x[..., :, 0, None], y[..., 0, None, :], out=out)
-    for k in range(1, x.shape[-1]):
-        out += x[..., :, k, None] * y[..., k, None, :]
-    return out
+    first, *middle = batch or (1,)
+    out = np.zeros((math.prod(middle), x.shape[-2], y.shape[-1], first))
+    linear.times_each(_last(_spread(x, middle)), _last(_spread(y, middle)), out)
+    full_out = last_to_first(out.reshape(*middle, *out.shape[1:]))
+    return full_out if batch else full_out[0]
+
+
+def _spread(x: Array, middle: Sequence[int]) -> Array:
+    """x with all axes, (B or 1, *middle, p, q), or (B or 1, 1, p, q) where it is the same along the only one in the middle."""
+    out = x[(None,) * (len(middle) + 3 - x.ndim)]
+    alike = len(middle) == 1 and out.shape[1] == 1
+    return out if alike or list(out.shape[1:-2]) == list(middle) else np.broadcast_to(out, (len(out), *middle, *out.shape[-2:]))
 
 
 def matvec(x: Array, v: Array) -> Array:
-    """(..., i, k) times (..., k), summed over k in ascending order."""
-    fixed = _constant(x)
-    if fixed is not None and v.ndim > 2:
-        out = zeros((*v.shape[:-1], fixed.shape[0]))
-        for i, k in zip(*np.nonzero(fixed), strict=True):
-            out[..., i] += fixed[i, k] * v[..., k]
-        return out
-    batch = np.broadcast_shapes(x.shape[:-2], v.shape[:-1])
-    out = zeros((*batch, x.shape[-2])) if batch else np.zeros(x.shape[-2])
-    np.multiply(x[..., :, 0], v[..., 0, None], out=out)
-    for k in range(1, x.shape[-1]):
-        out += x[..., :, k] * v[..., k, None]
-    return out
+    """(..., i, k) times (..., k), summed over k in ascending order, as `matmul` does."""
+    return np.asarray(matmul(x, v[..., None])[..., 0])
 
 
 def dot(x: Array, y: Array) -> Array:
@@ -120,17 +140,17 @@ def inverse(s: Array) -> Array:
         return np.broadcast_to(inverse(s[:1]), s.shape)
     flat = np.array(s, np.float64, order="C").reshape(-1, q, q)
     flat_out = np.empty_like(flat)
-    kernels.invert_each(flat, flat_out)
+    linear.invert_each(flat, flat_out)
     full_out = flat_out.reshape(s.shape)
     return batch_last(full_out) if s.ndim > 2 else full_out
 
 
 def apply(matrices: Array, x: Array) -> Array:
     """Each agent's own matrix, `transposed` (N, k, i), times its vector in x (B, N, k): (B, N, i), summed over k in ascending order."""
-    flat = np.ascontiguousarray(np.moveaxis(x, 0, -1))
+    flat = np.ascontiguousarray(first_to_last(x))
     out = np.empty((flat.shape[0], matrices.shape[2], flat.shape[2]))
-    kernels.apply_each(matrices, flat, out)
-    return np.moveaxis(out, -1, 0)
+    linear.apply_each(matrices, flat, out)
+    return last_to_first(out)
 
 
 def transposed(matrices: Array) -> Array:
@@ -140,12 +160,12 @@ def transposed(matrices: Array) -> Array:
 
 def product(x: Array, y: Array) -> Array:
     """One (i, k) times one (k, j) of any size, compiled; summed over k in ascending order."""
-    return np.asarray(kernels.product(np.ascontiguousarray(x, np.float64), np.ascontiguousarray(y, np.float64)))
+    return np.asarray(linear.product(np.ascontiguousarray(x, np.float64), np.ascontiguousarray(y, np.float64)))
 
 
 def solve(m: Array, y: Array) -> Array:
     """M^-1 Y for one (n, n) and one (n, k), by elimination with row pivots in fixed order."""
-    return np.asarray(kernels.solve(np.array(m, np.float64, order="C"), np.array(y, np.float64, order="C")))
+    return np.asarray(linear.solve(np.array(m, np.float64, order="C"), np.array(y, np.float64, order="C")))
 
 
 def orthogonal(x: Array, y: Array) -> tuple[Array, Array]:
@@ -155,7 +175,7 @@ def orthogonal(x: Array, y: Array) -> tuple[Array, Array]:
     """
     n = x.shape[-1]
     both = np.ascontiguousarray(np.concatenate([x, y], axis=-1), np.float64)
-    kernels.turn_rows(both, n)
+    linear.turn_rows(both, n)
     return both[..., :n], both[..., n:]
 
 
@@ -168,10 +188,10 @@ def root(s: Array) -> tuple[Array, Array]:
 
 def in_ball(w: Array, c: Array) -> Array:
     """u_k = w_k / (c_k + mu) with the least mu >= 0 at which |u| <= 1, for w (B, P, q) and c (P, q) >= 0: (B, P, q). 0/0 counts as 0."""
-    flat = np.ascontiguousarray(np.moveaxis(w, 0, -1))
+    flat = np.ascontiguousarray(first_to_last(w))
     out = np.empty_like(flat)
-    kernels.ball_each(flat, np.ascontiguousarray(c), out)
-    return np.moveaxis(out, -1, 0)
+    linear.ball_each(flat, np.ascontiguousarray(c), out)
+    return last_to_first(out)
 
 
 def expm(m: Array) -> Array:

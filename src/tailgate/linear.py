@@ -1,0 +1,238 @@
+"""Compiled kernels of matrices: products, inverses and solutions for each row of a batch by itself.
+
+As in `tailgate.kernels`, every sum has a fixed order and nothing is contracted, so that a row has the same bits in every batch.
+"""
+
+import math
+
+import numba
+import numpy as np
+
+_jit = numba.njit(cache=True, fastmath=False, error_model="numpy")
+
+
+@_jit
+def apply_each(matrix: np.ndarray, x: np.ndarray, out: np.ndarray) -> None:
+    """out (N, i, B) = matrix[n] x[n], with the matrices transposed, (N, k, i), and x (N, k, B); sums run over k in ascending order."""
+    batch = x.shape[2]
+    for n in range(matrix.shape[0]):
+        if batch < 8:  # the order of the loops changes no sum's order
+            for b in range(batch):
+                for i in range(matrix.shape[2]):
+                    out[n, i, b] = 0.0
+                for k in range(matrix.shape[1]):
+                    v = x[n, k, b]
+                    for i in range(matrix.shape[2]):
+                        out[n, i, b] += matrix[n, k, i] * v
+        else:
+            for i in range(matrix.shape[2]):
+                for b in range(batch):
+                    out[n, i, b] = 0.0
+                for k in range(matrix.shape[1]):
+                    m = matrix[n, k, i]
+                    for b in range(batch):
+                        out[n, i, b] += m * x[n, k, b]
+
+
+@_jit
+def constant_times(x: np.ndarray, y: np.ndarray, out: np.ndarray) -> None:
+    """out (M, i, c) = x y[m] for one x (i, k) and y (M, k, c).
+
+    Sums run from 0 over k in ascending order, and zeros of x count for nothing.
+    """
+    for m in range(y.shape[0]):
+        for first in range(0, y.shape[2], 256):  # so many columns of y[m] stay in the cache
+            last = min(first + 256, y.shape[2])
+            for i in range(x.shape[0]):
+                total = out[m, i, first:last]  # a slice is indexed from 0, which the compiler sees: it takes several at a time
+                total[:] = 0.0
+                for k in range(x.shape[1]):
+                    v = x[i, k]
+                    if v != 0.0:
+                        row = y[m, k, first:last]
+                        for c in range(len(total)):
+                            total[c] += v * row[c]
+
+
+@_jit
+def times_each(x: np.ndarray, y: np.ndarray, out: np.ndarray) -> None:
+    """out (M, i, j, B) = x (M, i, k, B) times y (M, k, j, B), summed over k in ascending order. M, B of x or y may be 1: alike for all."""
+    for m in range(out.shape[0]):
+        mx, my = m if x.shape[0] > 1 else 0, m if y.shape[0] > 1 else 0
+        for i in range(out.shape[1]):
+            for j in range(out.shape[2]):
+                for k in range(x.shape[2]):
+                    first, last = x[mx, i, k], y[my, k, j]
+                    total = out[m, i, j]
+                    if len(first) == 1:
+                        v = first[0]
+                        if len(last) == 1:
+                            for b in range(len(total)):
+                                total[b] = v * last[0] if k == 0 else total[b] + v * last[0]
+                        else:
+                            for b in range(len(total)):
+                                total[b] = v * last[b] if k == 0 else total[b] + v * last[b]
+                    elif len(last) == 1:
+                        v = last[0]
+                        for b in range(len(total)):
+                            total[b] = first[b] * v if k == 0 else total[b] + first[b] * v
+                    else:
+                        for b in range(len(total)):
+                            total[b] = first[b] * last[b] if k == 0 else total[b] + first[b] * last[b]
+
+
+@_jit
+def invert_each(s: np.ndarray, out: np.ndarray) -> None:
+    """Inverses out (M, q, q) of symmetric positive definite s (M, q, q) by Gauss-Jordan without pivots; s is used up."""
+    q = s.shape[1]
+    for m in range(s.shape[0]):
+        left, right = s[m], out[m]
+        right[:] = np.eye(q)
+        for p in range(q):
+            scale = 1.0 / left[p, p]
+            for j in range(p, q):  # left of column p the left half is done, right of it the right half is still zero
+                left[p, j] *= scale
+            for j in range(p + 1):
+                right[p, j] *= scale
+            for i in range(q):
+                if i != p:
+                    factor = left[i, p]
+                    for j in range(p, q):
+                        left[i, j] -= factor * left[p, j]
+                    for j in range(p + 1):
+                        right[i, j] -= factor * right[p, j]
+
+
+@_jit
+def product(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """x (i, k) times y (k, j), summed over k in ascending order."""
+    out = np.zeros((x.shape[0], y.shape[1]))
+    for i in range(x.shape[0]):
+        for k in range(x.shape[1]):
+            v = x[i, k]
+            if v != 0.0:
+                for j in range(y.shape[1]):
+                    out[i, j] += v * y[k, j]
+    return out
+
+
+@_jit
+def solve(m: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """m^-1 y for m (n, n) and y (n, k), by Gauss-Jordan elimination with row pivots; both are used up."""
+    n = m.shape[0]
+    for p in range(n):
+        best = p
+        for i in range(p + 1, n):
+            if abs(m[i, p]) > abs(m[best, p]):
+                best = i
+        if best != p:
+            for j in range(n):
+                m[p, j], m[best, j] = m[best, j], m[p, j]
+            for j in range(y.shape[1]):
+                y[p, j], y[best, j] = y[best, j], y[p, j]
+        for i in range(n):
+            if i != p:
+                factor = m[i, p] / m[p, p]
+                if factor != 0.0:
+                    for j in range(p, n):
+                        m[i, j] -= factor * m[p, j]
+                    for j in range(y.shape[1]):
+                        y[i, j] -= factor * y[p, j]
+    for i in range(n):
+        for j in range(y.shape[1]):
+            y[i, j] /= m[i, i]
+    return y
+
+
+@_jit
+def turn_rows(x: np.ndarray, n: int) -> None:
+    """Rotates the rows of each x (M, q, p) until their first n entries are orthogonal: Jacobi's rotations from one side, pair by pair."""
+    for m in range(x.shape[0]):
+        turned, sweep = True, 0
+        while turned and sweep < 60:
+            turned, sweep = False, sweep + 1
+            for i in range(x.shape[1] - 1):
+                for j in range(i + 1, x.shape[1]):
+                    a = b = g = 0.0
+                    for k in range(n):
+                        v, w = x[m, i, k], x[m, j, k]
+                        a, b, g = a + v * v, b + w * w, g + v * w
+                    if abs(g) <= 1e-15 * math.sqrt(a * b):
+                        continue
+                    turned, half = True, (b - a) / (2.0 * g)
+                    t = (1.0 if half >= 0.0 else -1.0) / (abs(half) + math.sqrt(half * half + 1.0))
+                    c = 1.0 / math.sqrt(t * t + 1.0)
+                    for k in range(x.shape[2]):
+                        v, w = x[m, i, k], x[m, j, k]
+                        x[m, i, k], x[m, j, k] = c * (v - t * w), c * (w + t * v)
+
+
+@_jit
+def ball_each(w: np.ndarray, c: np.ndarray, u: np.ndarray) -> None:
+    """u (P, q, B): w_k / (c_k + mu) with the least mu >= 0 at which |u| <= 1, for w (P, q, B) and c (P, q) >= 0; 0/0 counts as 0."""
+    x = np.empty(w.shape[1])
+    for p in range(w.shape[0]):
+        for b in range(w.shape[2]):
+            mu = length = s = 0.0
+            for k in range(len(x)):
+                x[k] = w[p, k, b]
+                mu, length = max(mu, abs(x[k]) - c[p, k]), length + x[k] * x[k]
+                s += (x[k] / c[p, k]) ** 2 if x[k] != 0.0 else 0.0
+            mu, size = max(mu, math.sqrt(length) - np.max(c[p])) if s > 1.0 else 0.0, 1.0
+            for _ in range(100 if s > 1.0 else 0):  # Newton on 1 / |u|, monotone from below; each row ends by itself
+                s = t = 0.0
+                for k in range(len(x)):
+                    z = x[k] / (c[p, k] + mu) if x[k] != 0.0 else 0.0
+                    s, t = s + z * z, t + (z * z / (c[p, k] + mu) if z != 0.0 else 0.0)
+                size = math.sqrt(s)
+                step = s * (size - 1.0) / t
+                if not step > 1e-15 * mu:
+                    break
+                mu += step
+            for k in range(len(x)):
+                u[p, k, b] = x[k] / (c[p, k] + mu) / size if x[k] != 0.0 else 0.0
+
+
+@_jit
+def pivot_each(r, W, which, half, size, tolerance, rounding, patience, rounds, y):
+    """Block principal pivoting (robust.py) of r (M, q) with W (K, q, q) at which (M,) into y (M, q); returns how many are left unsolved."""
+    q, unsolved = r.shape[1], 0
+    z, g, wrong, L = np.empty(q), np.empty(q), np.empty(q, np.bool_), np.empty((q, q))
+    for m in range(r.shape[0]):
+        w, fewest, left, count = W[which[m]], q + 1, patience, 1
+        sign = np.where(np.abs(r[m]) > half[m] * size[m], np.sign(r[m]), 0.0)  # what each sensor alone would say
+        for _ in range(rounds):
+            y[m] = np.where(sign == 0.0, r[m], 0.0)
+            for i in range(q):  # L L' = W of the outliers, 1 for the others
+                for j in range(i + 1):
+                    both = sign[i] != 0.0 and sign[j] != 0.0
+                    L[i, j] = w[i, j] if both else (1.0 if i == j else 0.0)
+                    for k in range(j if both else 0):
+                        L[i, j] -= L[i, k] * L[j, k]
+                    L[i, j] = L[i, j] / L[j, j] if i != j else math.sqrt(L[i, i])
+            for _again in range(2):  # the second time mends the rounding of the first
+                for i in range(q):
+                    z[i] = sign[i] * half[m, i]
+                    for j in range(q if sign[i] != 0.0 else 0):
+                        z[i] -= w[i, j] * y[m, j] + (L[i, j] * z[j] if j < i else 0.0)
+                    z[i] /= L[i, i]
+                for i in range(q - 1, -1, -1):
+                    for k in range(i + 1, q):
+                        z[i] -= L[k, i] * z[k]
+                    z[i] /= L[i, i]
+                y[m] += z
+            last, count = -1, 0
+            for i in range(q):
+                g[i] = largest = 0.0
+                for j in range(q):
+                    g[i], largest = g[i] + w[i, j] * y[m, j], max(largest, abs(w[i, j] * y[m, j]))
+                beyond = abs(g[i]) > half[m, i] + (tolerance * half[m, i] + rounding * largest)
+                slack = tolerance * half[m, i] * size[m, i] + rounding * (abs(r[m, i]) + abs(y[m, i]))
+                wrong[i] = beyond if sign[i] == 0.0 else sign[i] * (r[m, i] - y[m, i]) < -slack
+                last, count = (i, count + 1) if wrong[i] else (last, count)
+            if count == 0:
+                break
+            left, fewest = patience if count < fewest else left - 1, min(count, fewest)
+            sign = np.where(wrong & (np.arange(q) >= (0 if left >= 0 else last)), np.where(sign == 0.0, np.sign(g), 0.0), sign)
+        unsolved += count > 0
+    return unsolved
