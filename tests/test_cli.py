@@ -3,15 +3,27 @@
 import json
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from tailgate import cli
 
+Run = Callable[..., tuple[int, str, str]]
 
-def _run(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, "-m", "tailgate.cli", *arguments], cwd=cwd, capture_output=True, text=True, check=False)
+
+@pytest.fixture
+def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
+    """A function that runs the command in a directory of its own: exit code, output, errors."""
+    monkeypatch.chdir(tmp_path)
+
+    def command(*arguments: str) -> tuple[int, str, str]:
+        code = cli.main(list(arguments))
+        said = capsys.readouterr()
+        return code, said.out, said.err
+
+    return command
 
 
 def test_list_shows_every_component_with_its_parameters(capsys: pytest.CaptureFixture[str]) -> None:
@@ -46,8 +58,11 @@ def test_a_failing_component_is_exit_code_1_and_its_rows_say_why(tmp_path: Path)
     (tmp_path / "bad.py").write_text(
         "class Bad:\n    def prepare(self, model):\n        raise RuntimeError('out of order')\n    def start(self): ...\n    def step(self, plan, state, received, known_u, draws): ...\n"
     )
-    done = _run("evaluate", "--scenario", "gusty-stop-and-go-v0", "--defence", "kf", "--defence", "bad:Bad", "--attack", "none",
-                "--seeds", "2", "--out", "rows.jsonl", cwd=tmp_path)  # fmt: skip
+    command = (
+        sys.executable, "-m", "tailgate.cli", "evaluate", "--scenario", "gusty-stop-and-go-v0", "--defence", "kf", "--defence", "bad:Bad",
+        "--attack", "none", "--seeds", "2", "--out", "rows.jsonl",
+    )  # fmt: skip
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 1, done.stderr
     rows = [json.loads(line) for line in (tmp_path / "rows.jsonl").read_text().splitlines()]
     assert [row["status"] for row in rows] == ["ok", "ok", "error", "error"] and "out of order" in rows[-1]["reason"]
@@ -67,15 +82,15 @@ def test_a_failing_component_is_exit_code_1_and_its_rows_say_why(tmp_path: Path)
         (["train", "--config", "missing"], ["config", "missing", "quickstart"]),
     ],
 )  # fmt: skip
-def test_bad_input_is_exit_code_2_and_one_line(tmp_path: Path, arguments: list[str], words: list[str]) -> None:
+def test_bad_input_is_exit_code_2_and_one_line(run: Run, tmp_path: Path, arguments: list[str], words: list[str]) -> None:
     (tmp_path / "file").write_text("")
     (tmp_path / "bad.jsonl").write_text("{]\n")
     (tmp_path / "bad.yaml").write_text("scenarios: [braking-v0]\nseedz: 3\n")
     before = sorted(p.name for p in tmp_path.rglob("*"))
-    done = _run(*arguments, cwd=tmp_path)
-    assert done.returncode == 2, done.stderr
-    error = [line for line in done.stderr.splitlines() if line.startswith("tailgate: error: ")]
-    assert len(error) == 1 and "Traceback" not in done.stderr
+    code, _, said = run(*arguments)
+    assert code == 2, said
+    error = [line for line in said.splitlines() if line.startswith("tailgate: error: ")]
+    assert len(error) == 1 and "Traceback" not in said
     assert all(word in error[0] for word in words) and "expected" in error[0]
     assert sorted(p.name for p in tmp_path.rglob("*")) == before
 
@@ -86,20 +101,20 @@ def test_an_unknown_command_explains_itself(capsys: pytest.CaptureFixture[str]) 
     assert stop.value.code == 2 and "evaluate" in capsys.readouterr().err
 
 
-def test_a_file_of_other_rows_is_kept(tmp_path: Path) -> None:
+def test_a_file_of_other_rows_is_kept(run: Run, tmp_path: Path) -> None:
     """The same command replaces its own rows; another one sets them aside and says where."""
-    run = ["evaluate", "--scenario", "thesis-ch4-v0", "--dose", "none", "--attack", "none", "--seeds", "2", "--out", "rows.jsonl"]
+    part = ["evaluate", "--scenario", "thesis-ch4-v0", "--dose", "none", "--attack", "none", "--seeds", "2", "--out", "rows.jsonl"]
     for defence, kept in (("kf", 0), ("kf", 0), ("chi2_kf", 1), ("kf", 2)):
-        done = _run(*run, "--defence", defence, cwd=tmp_path)
-        assert done.returncode == 0, done.stderr
+        code, _, said = run(*part, "--defence", defence)
+        assert code == 0, said
         assert len(list(tmp_path.glob("rows.jsonl.*"))) == kept
-    assert "rows.jsonl.2" in done.stderr and '"kf"' in (tmp_path / "rows.jsonl.1").read_text()
+    assert "rows.jsonl.2" in said and '"kf"' in (tmp_path / "rows.jsonl.1").read_text()
 
 
-def test_a_detector_is_no_defence(tmp_path: Path) -> None:
+def test_a_detector_is_no_defence(run: Run) -> None:
     """Named as a defence, it is refused with the way to use it; an attack that is granted nothing is marked in the table."""
-    run = ["evaluate", "--scenario", "thesis-ch4-v0", "--dose", "none", "--attack", "dos_jam", "--seeds", "2", "--threat", "kinds=[fdi]"]
-    done = _run(*run, "--defence", "tailgate.estimators:Cusum", cwd=tmp_path)
-    assert done.returncode == 2 and "composed:detector=module:Class" in done.stderr
-    done = _run(*run, "--defence", "kf", cwd=tmp_path)
-    assert done.returncode == 0 and "not granted" in " ".join(done.stdout.split())
+    part = ["evaluate", "--scenario", "thesis-ch4-v0", "--dose", "none", "--attack", "dos_jam", "--seeds", "2", "--threat", "kinds=[fdi]"]
+    code, _, said = run(*part, "--defence", "tailgate.estimators:Cusum")
+    assert code == 2 and "composed:detector=module:Class" in said
+    code, table, _ = run(*part, "--defence", "kf")
+    assert code == 0 and "not granted" in " ".join(table.split())

@@ -337,7 +337,7 @@ def _episode(interval=1, **options):
     for extra in ({}, {"gap_shaping": 0.0, "error_shaping": 0.0}):
         options |= {"scenario": "gusty-stop-and-go-v0", "value": -20.0, "interval": interval}
         env = AdversaryVectorEnv(8, engine="plain", autoreset="disabled", **options, **extra)
-        env.seat = dataclasses.replace(env.seat, loop=dataclasses.replace(env.seat.loop, horizon=240))
+        env.seat = env.episodes.seat = dataclasses.replace(env.seat, loop=dataclasses.replace(env.seat.loop, horizon=240))
         env.reset(seed=0)
         envs.append(env)
     yield envs, None
