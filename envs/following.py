@@ -92,7 +92,7 @@ class CarFollowing:
         return FollowingState(np.full(batch, self.position + self.gap), np.full(batch, self.lead_speed), ego, behind)
 
     def step(self, plan: FollowingPlan, state: FollowingState, u: Array, exo: Array, draws: Draws) -> FollowingState:
-        noise = plan.noise_sd[:, None] * np.moveaxis(draws.normal((3,)), 0, -1)  # (3, B)
+        noise = plan.noise_sd[:, None] * num.first_to_last(draws.normal((3,)))  # (3, B)
         x, v = state.ego[:, 0, 0], state.ego[:, 0, 1]
         ego = self.move(plan, state.ego, u, noise)
         lead_x, lead_v = roll(state.lead_x, state.lead_v, exo, self.dt)

@@ -195,7 +195,7 @@ class Platoon(String):
         applied = u[..., 0].copy(order="K")
         applied[:, 0] = exo
         noise = plan.noise_sd * draws.normal((self.size[0], 3)) if plan.noise_sd.any() else np.zeros((1, 1, 3))
-        x, v, a = drive(plan.A, plan.B, state.x, state.v, state.a, applied, np.moveaxis(noise, -1, 0))
+        x, v, a = drive(plan.A, plan.B, state.x, state.v, state.a, applied, num.last_to_first(noise))
         return PlatoonState(x, v, a, applied)
 
     def truth(self, plan: PlatoonPlan, state: PlatoonState, held: Array) -> Array:

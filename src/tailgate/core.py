@@ -374,6 +374,6 @@ def no_command(batch: int, agents: int, wires: int) -> Command:
     """The command that does nothing."""
     return Command(
         np.zeros(batch, np.int8),
-        np.moveaxis(np.zeros((agents, wires, batch), bool), -1, 0),
-        np.moveaxis(np.zeros((agents, wires, batch)), -1, 0),
+        np.zeros((agents, wires, batch), bool).transpose(2, 0, 1),
+        np.zeros((agents, wires, batch)).transpose(2, 0, 1),
     )

@@ -28,6 +28,13 @@ from tailgate.core import (
 )  # fmt: skip
 from tailgate.errors import InputError, unknown
 
+# Plain numbers: in every comparison with a member of an enumeration numpy looks for array methods of it.
+NONE, DOS_JAM, DOS_HOLD, DOS_HOLD_FRESH, DROPOUT, FDI, DELAY, REPLAY, NOISE_JAM, ECHO_DELAY = map(int, Kind)
+_VALUED, _ON_AIR, _RADIATED = (
+    np.isin(np.arange(len(Kind)), kinds, invert=invert)
+    for kinds, invert in (((NONE, DOS_HOLD, DOS_HOLD_FRESH, DROPOUT), True), (AIRED, False), (RADIATED, False))
+)
+
 KindName = Literal["dos_jam", "dos_hold", "dos_hold_fresh", "dropout", "fdi", "delay", "replay", "noise_jam", "echo_delay"]
 Knowledge = Literal["black", "grey", "white"]
 KNOWLEDGE: tuple[Knowledge, ...] = get_args(Knowledge)  # each sees what the one before it sees, and more
@@ -158,7 +165,7 @@ class Channel:
         low, high = (
             np.where(brief.is_actuator, sign * threat.actuator_bound, end) for sign, end in zip((-1.0, 1.0), threat.jam_range, strict=True)
         )
-        recorded = threat.memory if kinds[Kind.DELAY] or kinds[Kind.REPLAY] else 0
+        recorded = threat.memory if kinds[DELAY] or kinds[REPLAY] else 0
         return ChannelPlan(threat, brief.granted, kinds, brief.bounds, low, high, last, len(brief.model.sensors), brief.model.air, recorded)
 
     def start(self, plan: ChannelPlan, expected: Array, u: Array) -> ChannelState:
@@ -198,19 +205,19 @@ class Channel:
         `sent` (B, N, q+p) holds the sensor readings and the V2V message before the attack; `again` measures under what is radiated.
         """
         threat, kind, aimed = plan.threat, command.kind, command.target.any(axis=(1, 2))
-        charged = (kind != Kind.NONE) & aimed
+        charged = (kind != NONE) & aimed
         if charged.any():
             charged = charged & self._legal(plan, command) & self.allowed(plan, state, k)
-        refused = ((kind != Kind.NONE) | aimed) & ~charged
+        refused = ((kind != NONE) | aimed) & ~charged
 
         hit = command.target & charged[:, None, None]
         kind = np.where(charged, kind, 0).astype(np.int8)
         q, value = plan.sensors, command.value
-        if plan.air and (aired := np.isin(kind, AIRED)).any():  # who reaches a receiver over the air reaches all that it reads
+        if plan.air and (aired := _ON_AIR[kind]).any():  # who reaches a receiver over the air reaches all that it reads
             strength = np.max(np.where(hit, value, 0.0), axis=2, keepdims=True)
             whole = aired[:, None, None] & hit.any(axis=2, keepdims=True) & (np.arange(hit.shape[2]) < q)
             hit, value = hit | whole, np.where(whole, strength, value)
-        valued = ~np.isin(kind, (Kind.NONE, Kind.DOS_HOLD, Kind.DOS_HOLD_FRESH, Kind.DROPOUT))[:, None, None]
+        valued = _VALUED[kind][:, None, None]
         last = Command(kind, hit, np.where(hit & valued, value, 0.0))
         first = charged & (state.used == 0)
         ended = (state.burst > 0) & ~charged
@@ -221,18 +228,18 @@ class Channel:
         )  # fmt: skip
         if first.any():
             state = state._replace(links=_hold(state.links, first), drives=_hold(state.drives, first))
-        begins = np.flatnonzero((kind == Kind.REPLAY) & (state.played == 0))
+        begins = np.flatnonzero((kind == REPLAY) & (state.played == 0))
         if len(begins):
             anchor = state.anchor.copy()
             anchor[begins] = state.taped[begins]
             state = state._replace(anchor=anchor, links=_copy_tape(state.links, begins), drives=_copy_tape(state.drives, begins))
         heard, under = sent, received
-        if again is not None and np.isin(kind, RADIATED).any():
-            under, left = again(self._radiated(plan, last)), (kind == Kind.DOS_JAM)[:, None, None]
+        if again is not None and _RADIATED[kind].any():
+            under, left = again(self._radiated(plan, last)), (kind == DOS_JAM)[:, None, None]
             under = under._replace(valid=np.where(left, received.valid, under.valid))  # what a jammer leaves is read where anything is
             heard = num.stack([under.y[..., i] for i in range(q)] + [sent[..., i] for i in range(q, sent.shape[-1])])
         links = self._arrive(plan, state, state.links, heard, slice(0, sent.shape[-1]))
-        lost = hit & (kind == Kind.DROPOUT)[:, None, None]
+        lost = hit & (kind == DROPOUT)[:, None, None]
         out = under._replace(
             y=links[..., :q], valid=under.valid & ~lost[..., :q], v2v=links[..., q:], attacked=hit[..., :q]
         )
@@ -249,7 +256,7 @@ class Channel:
         if plan.granted[:, wires].any():
             applied = self._arrive(plan, state, state.drives, u, wires)
             drives = self._keep(plan, state, state.drives, u, state.last.target[..., wires])
-        played = np.where(state.last.kind == Kind.REPLAY, state.played + 1, 0)
+        played = np.where(state.last.kind == REPLAY, state.played + 1, 0)
         return state._replace(drives=drives, played=played, taped=state.taped + 1), applied
 
     def _legal(self, plan: ChannelPlan, command: Command) -> Array:
@@ -257,25 +264,35 @@ class Channel:
         kind, value = command.kind, command.value
         known = (kind >= 0) & (kind < len(plan.kinds))
         legal = known & plan.kinds[np.where(known, kind, 0)]
-        kind3 = kind[:, None, None]
+        ok = plan.granted
         with np.errstate(invalid="ignore"):
-            ok = np.where(kind3 == Kind.DOS_JAM, (value >= plan.low) & (value <= plan.high), True)
-            ok &= np.where(kind3 == Kind.FDI, np.abs(value) <= plan.bounds, True)
-            for aired, most in zip(AIRED, (plan.threat.jam_power, plan.threat.delay_bound), strict=True):
-                sensor = np.arange(value.shape[2]) < plan.sensors
-                ok &= np.where(kind3 == aired, plan.air & sensor & (value > 0.0) & (value <= most), True)
-            old = (kind3 == Kind.DELAY) | (kind3 == Kind.REPLAY)
-            ok &= np.where(old, (value >= 1) & (value <= plan.threat.memory) & (value == np.floor(value)), True)
-        return np.asarray(legal & ~(command.target & ~(plan.granted & ok)).any(axis=(1, 2)))
+            for one in set(kind.tolist()):
+                fits = self._fits(plan, one, value)
+                ok = ok if fits is None else ok & ((kind != one)[:, None, None] | fits)
+        return np.asarray(legal & ~(command.target & ~ok).any(axis=(1, 2)))
+
+    def _fits(self, plan: ChannelPlan, kind: int, value: Array) -> Array | None:
+        """(B, N, w) bool: the value is granted with that kind; None of kinds without a value."""
+        threat = plan.threat
+        if kind == DOS_JAM:
+            return np.asarray((value >= plan.low) & (value <= plan.high))
+        if kind == FDI:
+            return np.asarray(np.abs(value) <= plan.bounds)
+        if kind in AIRED:
+            most, sensor = threat.jam_power if kind == NOISE_JAM else threat.delay_bound, np.arange(value.shape[2]) < plan.sensors
+            return np.asarray(plan.air & sensor & (value > 0.0) & (value <= most))
+        if kind in (DELAY, REPLAY):
+            return np.asarray((value >= 1) & (value <= threat.memory) & (value == np.floor(value)))
+        return None
 
     def _radiated(self, plan: ChannelPlan, command: Command) -> Air:
         """What a command in force radiates at each receiver."""
         hit = command.target[..., : plan.sensors].any(axis=2)
         strength = np.max(command.value[..., : plan.sensors], axis=2)
         kind = command.kind[:, None]
-        power = np.where(kind == Kind.NOISE_JAM, strength, np.where(kind == Kind.DOS_JAM, plan.threat.jam_power, 0.0))
+        power = np.where(kind == NOISE_JAM, strength, np.where(kind == DOS_JAM, plan.threat.jam_power, 0.0))
         reaction = np.inf if plan.threat.reaction is None else plan.threat.reaction
-        return Air(np.where(hit, power, 0.0), np.where(hit & (kind == Kind.ECHO_DELAY), strength, 0.0), reaction)
+        return Air(np.where(hit, power, 0.0), np.where(hit & (kind == ECHO_DELAY), strength, 0.0), reaction)
 
     def _arrive(self, plan: ChannelPlan, state: ChannelState, memory: Memory, sent: Array, wires: slice) -> Array:
         """What arrives of `sent` (B, N, .), the part `wires` of all wires, under the command in force."""
@@ -283,13 +300,13 @@ class Channel:
         target, value = command.target[..., wires], command.value[..., wires]
         for kind in sorted(set(command.kind[target.any(axis=(1, 2))].tolist()) - set(AIRED)):
             hit = target & (command.kind == kind)[:, None, None]
-            if kind == Kind.DOS_JAM:
+            if kind == DOS_JAM:
                 changed = value
-            elif kind == Kind.FDI:
+            elif kind == FDI:
                 changed = sent + value
-            elif kind == Kind.DOS_HOLD:
+            elif kind == DOS_HOLD:
                 changed = memory.held
-            elif kind in (Kind.DELAY, Kind.REPLAY):
+            elif kind in (DELAY, REPLAY):
                 changed = self._taped(plan, state, memory, np.where(hit, value, 1.0).astype(np.int64), kind)
             else:  # a receiver that hears nothing keeps its last value, as one that holds it does
                 changed = memory.fresh
@@ -298,7 +315,7 @@ class Channel:
 
     def _taped(self, plan: ChannelPlan, state: ChannelState, memory: Memory, span: Array, kind: int) -> Array:
         """The sample of `span` (B, N, .) steps ago, or the one that a replayed window of that length has come to."""
-        if kind == Kind.REPLAY:
+        if kind == REPLAY:
             ring, last = memory.tape, state.anchor[:, None, None] + state.played[:, None, None] % span
         else:
             ring, last = memory.history, state.taped[:, None, None]
