@@ -3,13 +3,16 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test lint bench clean
+.PHONY: demo test test-long lint bench clean
 
 demo: $(VENV)/.ready  ## train an adversary against a gated Kalman filter, compare it with scripted attacks, write the page
 	$(BIN)/python train.py
 
 test: $(VENV)/.ready lint  ## lint, types, tests
 	$(BIN)/python -m pytest -n 2 --dist worksteal
+
+test-long: $(VENV)/.ready lint  ## and the tests that take a minute each, as before a release
+	$(BIN)/python -m pytest -n 2 --dist worksteal --long
 
 lint: $(VENV)/.ready
 	$(BIN)/ruff check .

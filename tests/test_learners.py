@@ -76,7 +76,10 @@ def earned(path: Path | None, environment: dict[str, Any], action: str) -> float
     return float(total.mean())
 
 
-@pytest.mark.parametrize(("name", "decisions"), [("ppo", 14_000), ("maskable_ppo", 14_000), ("recurrent_ppo", 12_000), ("dqn", 24_000)])
+@pytest.mark.parametrize(("name", "decisions"), [
+    ("ppo", 14_000), ("maskable_ppo", 14_000), pytest.param("recurrent_ppo", 12_000, marks=pytest.mark.long),
+    pytest.param("dqn", 24_000, marks=pytest.mark.long),
+])  # fmt: skip
 def test_it_learns_when_to_attack(name: str, decisions: int, paid: dict[str, Any], tmp_path: Path) -> None:
     """An attack at the last decision earns 0.68, one before it at most 0.45, rest 0.005: above 0.47 the timing is learned."""
     run = learner(name, paid)

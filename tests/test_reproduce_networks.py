@@ -124,6 +124,7 @@ def brief_chapters(monkeypatch):
     monkeypatch.setattr(ch6_loop, "LAMS", (1.0, 5.0))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("chapter", "claims", "figures"), [("ch5", 10, 4), ("ch6", 18, 5)])
 def test_a_report(chapter, claims, figures, tmp_path, brief_chapters):
     """Four seeds give every claim with a verdict and a reason, tables and figures."""

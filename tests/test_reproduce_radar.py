@@ -99,6 +99,7 @@ def test_the_radars_claims():
     assert claim.holds == "no" and curve["follows the chirp"][1:].min() > 0.5 and curve["fills the band"].max() < 0.05
 
 
+@pytest.mark.long
 def test_a_list_that_is_known_loses():
     """With challenges at 15, 50 and 175 s an attack from 51, 100 or 150 s collides in every run; random challenges spare some."""
     claim = ch3_limits._predictable(30)
@@ -108,6 +109,7 @@ def test_a_list_that_is_known_loses():
     assert claim.holds == "no"
 
 
+@pytest.mark.long
 def test_who_listens_to_the_probe_beats_an_alarm_that_ends_at_once():
     """Hopping collides in nearly every run where one quiet challenge ends the alarm; with several at random times in few."""
     claim = ch3_limits._hopping(30)

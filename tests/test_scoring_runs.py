@@ -69,6 +69,7 @@ ROAD = Suite("s", "", WHERE)
 FEW = {"onsets": 20, "most_steps": 80_000}
 
 
+@pytest.mark.long
 def test_detection_holds_all_to_one_mean_time_between_false_alarms(monkeypatch) -> None:
     """A bias of ten standard deviations is seen at once at either threshold; the looser one is the higher; a plain filter has none."""
     found = detection(ROAD, ["chi2_kf", "none"], ["fdi:start_step=100,value=-10"], (0.02, 0.1), dose=20, episodes=8, **FEW)

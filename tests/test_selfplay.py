@@ -65,6 +65,7 @@ def test_a_mixture_draws_one_attack_per_episode(short):
     assert alone == whole.trace_hash(7) == members[[Kind.FDI, Kind.DOS_JAM].index(kinds[0, 7])]
 
 
+@pytest.mark.long
 def test_the_defender_learns():
     """Against one injection that the open gate lets through, the payoff after a few generations comes near that of the best fixed setting."""
     duel = Duel.make(**ROAD)

@@ -166,6 +166,7 @@ def test_what_was_tuned_is_what_trains(tmp_path: Path, monkeypatch: pytest.Monke
     assert (fewer.digest != search.digest) == (whole.teacher is not None)
 
 
+@pytest.mark.long
 def test_trials_side_by_side(tmp_path: Path) -> None:
     """Two processes, one journal: every trial once."""
     report = tuning.tune(_search(tmp_path, 3), workers=2)
