@@ -13,6 +13,7 @@ from urllib.parse import unquote, urlsplit
 import pytest
 
 from tailgate.errors import InputError
+from tailgate.leaderboard import head
 from tailgate.leaderboard.board_format import read_board
 from tailgate.leaderboard.build import percent
 from tailgate.leaderboard.charts import Axis, Dot, Line, chart, nice, spread, ticks_at
@@ -341,3 +342,20 @@ def test_places_on_an_axis():
 def test_numbers_in_words():
     """Small numbers are written out, and none at all is a dash."""
     assert [figure(x) for x in (None, 0.00008333, -0.5, 1234567.0, 0.0)] == ["\N{EN DASH}", "0.000083", "\N{MINUS SIGN}0.5", "1.235e+06", "0"]
+
+
+def test_the_head_in_words_is_the_board_in_figures():
+    """A line for each defence, those with a rank first, cut where it is asked; a bar in a name does not end a cell."""
+    board = make_board()
+    board["entries"][0]["defence"] = "a|b"
+    heading, *body = head.lines(board)
+    assert len(body) == len(board["entries"]) and all(len(line) == len(heading) for line in body)
+    ranked = [line[2] != "-" for line in body]
+    assert ranked == sorted(ranked, reverse=True) and any(ranked)
+    by_name = {entry["defence"]: entry for entry in board["entries"]}
+    for line in body:
+        rates = {str(r["dose"]): r["undamaged"]["value"] for r in by_name[line[0]]["rates"] if r["knowledge"] == "black"}
+        shown = [float(cell.split(" %")[0]) for cell in line[4 : 4 + len(board["suite"]["shown"])] if cell != "-"]
+        assert shown == [round(100 * rates[dose]) for dose in board["suite"]["shown"] if dose in rates]
+    text = head.markdown(board, 2).splitlines()
+    assert len(text) == 4 and "a\\|b" in head.markdown(board) and set(text[1]) <= set("|- ")

@@ -1,4 +1,4 @@
-"""tailgate leaderboard run, page and admit: boards from suites, the page of boards, and the list of attacks."""
+"""tailgate leaderboard run, page, head and admit: boards from suites, the page of boards, and the list of attacks."""
 
 from __future__ import annotations
 
@@ -43,6 +43,10 @@ def add(actions: Any) -> None:
     page.add_argument("--title", help="title of the page")
     page.add_argument("--no-replays", action="store_true", help="leave out the replays of the worst episodes")
     page.set_defaults(run=_page)
+    head = actions.add_parser("head", help="print the head of a board as a Markdown table")
+    head.add_argument("board", metavar="FILE", help="board.json")
+    head.add_argument("--most", type=int, metavar="N", help="so many defences at most (default: all)")
+    head.set_defaults(run=_head)
     admit = actions.add_parser(
         "admit", help="put an attack on a suite's list if it beats the worst that is there",
         description="Play an attack on select seeds against the worst of its knowledge, and append it to OUT/SUITE/attacks.jsonl if a "
@@ -107,54 +111,38 @@ def _detected(board: dict[str, Any], suite: Suite, folder: Path, update: Any) ->
 
 
 def _print_board(board: dict[str, Any]) -> None:
-    """The head of a board."""
-    suite = board["suite"]
-    doses = list(suite["shown"]) or [str(dose) for dose in suite["doses"]]
-    seeds = f"seeds of the beacon {suite['beacon']}" if suite["beacon"] else "public seeds: for development"
-    table = Table(title=escape(f"{suite['name']}, {suite['episodes']} episodes a cell, black box, {seeds}"))
-    trust = ["trust (safety)"] if any(entry.get("trust") for entry in board["entries"]) else []
-    for heading in ("defence", "class", "rank", "critical dose", *(f"undamaged at {dose}" for dose in doses), *trust, "why not"):
+    from tailgate.leaderboard.head import lines, title
+
+    headings, *rows = lines(board)
+    table = Table(title=escape(title(board)))
+    for heading in headings:
         table.add_column(heading, overflow="fold")
-    for entry in sorted(board["entries"], key=lambda e: (e["rank"] is None, (e["rank"] or {}).get("best", 0))):
-        rank, critical = entry["rank"], entry["critical_dose"]["black"]
-        rates = {str(rate["dose"]): rate["undamaged"] for rate in entry["rates"] if rate["knowledge"] == "black"}
-        shown = [f"{100 * rates[d]['value']:.0f} % (at least {100 * rates[d]['low']:.0f})" if d in rates else "-" for d in doses]
-        place = "-" if rank is None else str(rank["best"]) if rank["best"] == rank["worst"] else f"{rank['best']} to {rank['worst']}"
-        dose = "-" if critical is None else _dose(critical, suite["doses"])
-        if trust:
-            shown.append(_trust(entry["trust"]))
-        table.add_row(escape(entry["defence"]), entry["class"], place, dose, *shown, escape(entry["why"]))
+    for row in rows:
+        table.add_row(*map(escape, row))
     console().print(table)
 
 
-def _trust(held: dict[str, Any] | None) -> str:
-    from tailgate.leaderboard.site_trust import at_least
+def _read(name: str) -> dict[str, Any]:
+    try:
+        held: dict[str, Any] = json.loads(Path(name).read_text(encoding="utf-8"))
+        return held
+    except (OSError, ValueError) as error:
+        raise InputError("boards", name, f"a readable board.json ({error})") from None
 
-    bound = held["safety"]["black"] if held else None
-    return "-" if bound is None else f"at least {at_least(bound['lower'])}"
 
+def _head(options: argparse.Namespace) -> int:
+    from tailgate.leaderboard.head import markdown
 
-def _dose(critical: dict[str, Any], doses: list[int | None]) -> str:
-    most = max((dose for dose in doses if dose is not None), default=0)
-    least = min((dose for dose in doses if dose), default=0)
-
-    def words(x: float | None) -> str:
-        return f"> {most}" if x is None else f"<= {least}" if 0 < x <= least else f"{x:.3g}"
-
-    low, value, high = (words(critical[k]) for k in ("low", "value", "high"))
-    return f"{value} [{low}, {high}]"
+    if options.most is not None and options.most < 1:
+        raise InputError("most", options.most, "a whole number not below 1")
+    print(markdown(_read(options.board), options.most), end="")
+    return 0
 
 
 def _page(options: argparse.Namespace) -> int:
     from tailgate.leaderboard.site import build_site
 
-    boards = []
-    for name in options.boards:
-        try:
-            boards.append(json.loads(Path(name).read_text(encoding="utf-8")))
-        except (OSError, ValueError) as error:
-            raise InputError("boards", name, f"a readable board.json ({error})") from None
-    print(build_site(boards, Path(options.out), title=options.title, replays=not options.no_replays))
+    print(build_site([_read(name) for name in options.boards], Path(options.out), title=options.title, replays=not options.no_replays))
     return 0
 
 

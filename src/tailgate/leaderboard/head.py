@@ -1,0 +1,58 @@
+"""The head of a board: a line for each defence, as text cells."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from .site_trust import at_least
+
+Board = dict[str, Any]
+
+
+def title(board: Board) -> str:
+    """Suite, episodes, and whose seeds they are."""
+    suite = board["suite"]
+    seeds = f"seeds of the beacon {suite['beacon']}" if suite["beacon"] else "public seeds: for development"
+    return f"{suite['name']}, {suite['episodes']} episodes a cell, black box, {seeds}"
+
+
+def lines(board: Board) -> list[tuple[str, ...]]:
+    """Headings, then the defences, those with a rank first: rank, critical dose, least share of undamaged episodes at the shown doses."""
+    suite = board["suite"]
+    doses = list(suite["shown"]) or [str(dose) for dose in suite["doses"]]
+    trusted = any(entry.get("trust") for entry in board["entries"])
+    out: list[tuple[str, ...]] = [
+        ("defence", "class", "rank", "critical dose", *(f"undamaged at {dose}" for dose in doses), *["trust (safety)"] * trusted, "why not")
+    ]  # fmt: skip
+    for entry in sorted(board["entries"], key=lambda e: (e["rank"] is None, (e["rank"] or {}).get("best", 0))):
+        rank, critical = entry["rank"], entry["critical_dose"]["black"]
+        rates = {str(rate["dose"]): rate["undamaged"] for rate in entry["rates"] if rate["knowledge"] == "black"}
+        shown = [f"{100 * rates[d]['value']:.0f} % (at least {100 * rates[d]['low']:.0f})" if d in rates else "-" for d in doses]
+        place = "-" if rank is None else str(rank["best"]) if rank["best"] == rank["worst"] else f"{rank['best']} to {rank['worst']}"
+        dose = "-" if critical is None else _dose(critical, suite["doses"])
+        bound = [_trust(entry.get("trust"))] * trusted
+        out.append((entry["defence"], entry["class"], place, dose, *shown, *bound, entry["why"]))
+    return out
+
+
+def markdown(board: Board, most: int | None = None) -> str:
+    """The head as a Markdown table, of so many defences at most."""
+    heading, *body = [[cell.replace("|", "\\|") for cell in line] for line in lines(board)]
+    rows = [heading, ["---"] * len(heading), *body[:most]]
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in rows) + "\n"
+
+
+def _trust(held: Board | None) -> str:
+    bound = held["safety"]["black"] if held else None
+    return "-" if bound is None else f"at least {at_least(bound['lower'])}"
+
+
+def _dose(critical: Board, doses: list[int | None]) -> str:
+    most = max((dose for dose in doses if dose is not None), default=0)
+    least = min((dose for dose in doses if dose), default=0)
+
+    def words(x: float | None) -> str:
+        return f"> {most}" if x is None else f"<= {least}" if 0 < x <= least else f"{x:.3g}"
+
+    low, value, high = (words(critical[k]) for k in ("low", "value", "high"))
+    return f"{value} [{low}, {high}]"
