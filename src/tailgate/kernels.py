@@ -52,16 +52,10 @@ def _exp(x: float) -> float:
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def _log(x: float) -> float:
-    if not x > 0.0:
-        return -math.inf if x == 0.0 else math.nan
-    if x == math.inf:
-        return x
-    small = x < 2.2250738585072014e-308  # denormal: scale it up first
-    e = -1022.0 - (54.0 if small else 0.0)
-    x = x * (18014398509481984.0 if small else 1.0)
+def _log_normal(x: float, e: float) -> float:
+    """Of x 2^e, for an x that is a normal positive number."""
     bits = np.float64(x).view(np.int64)
-    e += np.int64(((bits >> 52) & 0x7FF) | TWO_52_BITS).view(np.float64) - TWO_52
+    e += np.int64(((bits >> 52) & 0x7FF) | TWO_52_BITS).view(np.float64) - (TWO_52 + 1022.0)
     m = np.int64((bits & 0x000FFFFFFFFFFFFF) | 0x3FE0000000000000).view(np.float64)  # in [1/2, 1)
     low = m < 0.7071067811865476
     m, e = 2.0 * m if low else m, e - 1.0 if low else e
@@ -83,9 +77,19 @@ def _log(x: float) -> float:
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
+def _log(x: float) -> float:
+    if not x > 0.0:
+        return -math.inf if x == 0.0 else math.nan
+    if x == math.inf:
+        return x
+    small = x < 2.2250738585072014e-308  # denormal: scale it up first
+    return _log_normal(x * (18014398509481984.0 if small else 1.0), -54.0 if small else 0.0)
+
+
+@numba.njit(cache=True, inline="always", error_model="numpy")
 def _sincos_turn(u: float) -> tuple[float, float]:
     """Sine and cosine of 2 pi u, u in turns within [0, 1)."""
-    quarter = math.floor(4.0 * u + 0.5)
+    quarter = np.floor(4.0 * u + 0.5)
     t = TWO_PI * (u - 0.25 * quarter)  # |t| <= pi/4
     z = t * t
     s = 1.0 / 355687428096000.0
@@ -141,13 +145,13 @@ def _philox(c0, c1, c2, c3, k0, k1):
     """Philox4x32-10. Counter and key words are uint64 holding 32 bits each."""
     mask = np.uint64(0xFFFFFFFF)
     shift = np.uint64(32)
-    for _ in range(10):
-        p0 = np.uint64(0xD2511F53) * c0
-        p1 = np.uint64(0xCD9E8D57) * c2
-        c0, c1, c2, c3 = (p1 >> shift) ^ c1 ^ k0, p1 & mask, (p0 >> shift) ^ c3 ^ k1, p0 & mask
-        k0 = (k0 + np.uint64(0x9E3779B9)) & mask
-        k1 = (k1 + np.uint64(0xBB67AE85)) & mask
-    return c0, c1, c2, c3
+    for _ in range(10):  # whatever stands above 32 bits does not reach them; a product of two halves is one vector instruction
+        p0 = np.uint64(0xD2511F53) * (c0 & mask)
+        p1 = np.uint64(0xCD9E8D57) * (c2 & mask)
+        c0, c1, c2, c3 = (p1 >> shift) ^ c1 ^ k0, p1, (p0 >> shift) ^ c3 ^ k1, p0
+        k0 += np.uint64(0x9E3779B9)
+        k1 += np.uint64(0xBB67AE85)
+    return c0 & mask, c1 & mask, c2 & mask, c3 & mask
 
 
 @numba.njit(cache=True, inline="always")
@@ -194,7 +198,7 @@ def fill_normal(keys, episode, step, stream, out):
     for j in range((out.shape[0] + 1) // 2):
         for b in range(out.shape[1]):
             u0, u1 = _uniform_pair(keys[b], episode[b], step[b], stream, j)
-            radius = math.sqrt(-2.0 * _log(u0))
+            radius = math.sqrt(-2.0 * _log_normal(u0, 0.0))
             s, c = _sincos_turn(u1)
             out[2 * j, b] = radius * c
             if 2 * j + 1 < out.shape[0]:

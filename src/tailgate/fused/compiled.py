@@ -6,6 +6,7 @@ Numba's own key is the file that holds the function alone: after a change of a f
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import hashlib
 from collections.abc import Callable
 from functools import cache
@@ -13,12 +14,58 @@ from importlib.resources import files
 from typing import Any
 
 import numba
-from numba.core import caching
+from numba import _dynfunc
+from numba.core import caching, codegen, compiler, compiler_machinery, typed_passes
+
+
+class _PartLibrary(codegen.CPUCodeLibrary):
+    """Code that is only ever a part of other code: optimised there, and never turned into machine code by itself."""
+
+    def _optimize_final_module(self) -> None:
+        pass
+
+    def _finalize_final_module(self) -> None:
+        self._finalize_dynamic_globals()
+        self._finalized = True
+
+    def _finalize_specific(self) -> None:
+        pass
+
+
+@compiler_machinery.register_pass(mutates_CFG=False, analysis_only=False)
+class _MakeKnown(compiler_machinery.LoweringPass):
+    """Lets other compiled code call a part; Python's call raises TypeError."""
+
+    _name = "make_known"
+
+    def __init__(self) -> None:
+        compiler_machinery.LoweringPass.__init__(self)
+
+    def run_pass(self, state: Any) -> bool:
+        refuse = ctypes.cast(ctypes.pythonapi.PyErr_BadArgument, ctypes.c_void_p).value
+        entry = _dynfunc.make_function(state.cr.fndesc.lookup_module(), state.func_id.func_name, "", refuse, state.cr.env, ())
+        state.targetctx.insert_user_function(entry, state.cr.fndesc, [state.library])
+        state.cr = state.cr._replace(cfunc=entry)
+        return True
+
+
+class _Part(compiler.Compiler):
+    """The usual passes, into a library of that kind."""
+
+    def define_pipelines(self) -> list[Any]:
+        state = self.state
+        state.library = _PartLibrary(state.targetctx.codegen(), state.func_id.func_qualname)
+        state.flags.no_compile = True
+        (passes,) = super().define_pipelines()
+        passes.add_pass_after(_MakeKnown, typed_passes.NativeLowering)
+        passes.finalize()
+        return [passes]
+
 
 _OPTIONS: dict[str, Any] = {"error_model": "numpy"}  # no fast-math: the bits are the plain loop's
-_INNER: dict[str, Any] = {"no_cfunc_wrapper": True}
+_INNER: dict[str, Any] = {"no_cfunc_wrapper": True, "no_cpython_wrapper": True, "pipeline_class": _Part}
 phase = numba.njit(**_OPTIONS, **_INNER)  # a loop over the episodes of a block
-formula = numba.njit(**_OPTIONS, forceinline=True)  # of one episode: part of the loop that calls it
+formula = numba.njit(**_OPTIONS, **_INNER, forceinline=True)  # of one episode, part of the loop that calls it; or a loop over given rows
 
 _SOURCES = {  # by package, which may lie in folders of their own
     "tailgate.fused": ("",), "tailgate": ("elementwise.py", "kernels.py", "kinds.py", "draws.py"),

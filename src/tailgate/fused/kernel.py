@@ -26,10 +26,10 @@ def obey(s, asked, first, n):
 @phase
 def sound(s, n):
     """Whether estimate and score are finite."""
-    worst = 0.0
+    not_finite = 0
     for i in range(n):
-        worst += 0.0 * (s[X + i] + s[X + _1 + i] + s[X + _2 + i] + s[SCORE + i])
-    return worst == 0.0
+        not_finite += 1 if 0.0 * (s[X + i] + s[X + _1 + i] + s[X + _2 + i] + s[SCORE + i]) != 0.0 else 0
+    return not_finite == 0
 
 
 @phase
@@ -44,10 +44,10 @@ def keep(s, columns, record, t, first, n):
 @phase
 def living(s, n):
     """Whether any episode of a block goes on."""
-    left = 0.0
+    left = 0
     for i in range(n):
-        left += 1.0 - s[ENDED + i]
-    return left > 0.0
+        left += 1 if s[ENDED + i] == 0.0 else 0
+    return left > 0
 
 
 @phase
@@ -128,7 +128,7 @@ def run(floats, whole, words, columns, record, seen, first_block, last_block):
         g = words[b * WORDS * LANES : (b + 1) * WORDS * LANES]
         window = floats[o[at.AT_WINDOW] + b * wide : o[at.AT_WINDOW] + (b + 1) * wide]
         intent = floats[o[at.AT_INTENT] + b * long : o[at.AT_INTENT] + (b + 1) * long]
-        now = tick
+        now, wanted = tick, False
         if fresh:
             everyone(s, g, n)
             now += 1
@@ -139,7 +139,8 @@ def run(floats, whole, words, columns, record, seen, first_block, last_block):
                 break
             if seated:
                 seat.alive(s, c, n)
-                wanted = seat.decode(s, c, f, action, first, n)
+                if t == 0 or f[of.ACTION] == of.RAMPING or f[of.ACTION] == of.INCREMENT:  # which depend on the last command
+                    wanted = seat.decode(s, c, f, action, first, n)
             elif how == at.SCRIPTED:
                 wanted = script.decide(s, g, c, p, n)
             else:

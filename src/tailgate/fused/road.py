@@ -4,7 +4,7 @@ import numpy as np
 from numba.extending import register_jitable
 
 from tailgate.envs import controllers, idm, manoeuvres, vehicle
-from tailgate.kernels import _log, _sincos_turn, _uniform_pair
+from tailgate.kernels import _log_normal, _sincos_turn, _uniform_pair
 
 from . import constants as of
 from .compiled import formula, phase
@@ -45,30 +45,22 @@ phase_over, stop_and_go = formula(manoeuvres.phase_over), formula(manoeuvres.sto
 
 
 @phase
-def normals(s, g, key, stream, block, out, n):
-    """Two standard normals for each episode, elements 2 block and 2 block + 1 of its draw, into the row `out` and the next."""
-    for i in range(n):
-        u0, u1 = _uniform_pair(g[key + i], g[EPISODE + i], g[STEP + i], stream, block)
-        radius = np.sqrt(-2.0 * _log(u0))
-        sine, cosine = _sincos_turn(u1)
-        s[out + i] = radius * cosine
-        s[out + _1 + i] = radius * sine
-
-
-@phase
-def normal(s, g, key, stream, block, out, n):
-    """The first of the two standard normals of a block alone."""
-    for i in range(n):
-        u0, u1 = _uniform_pair(g[key + i], g[EPISODE + i], g[STEP + i], stream, block)
-        _, cosine = _sincos_turn(u1)
-        s[out + i] = np.sqrt(-2.0 * _log(u0)) * cosine
-
-
-@phase
 def uniforms(s, g, key, stream, block, out, n):
-    """Two uniforms on (0, 1) for each episode into the row `out` and the next."""
+    """Two uniforms on (0, 1) for each episode, elements 2 block and 2 block + 1 of its draw, into the row `out` and the next."""
     for i in range(n):
         s[out + i], s[out + _1 + i] = _uniform_pair(g[key + i], g[EPISODE + i], g[STEP + i], stream, block)
+
+
+@phase
+def normals(s, g, key, stream, block, out, n):
+    """Two standard normals likewise. Three short loops: the steps of a long sum wait for each other, those of several episodes do not."""
+    uniforms(s, g, key, stream, block, out, n)
+    for i in range(n):
+        s[out + i] = np.sqrt(-2.0 * _log_normal(s[out + i], 0.0))
+    for i in range(n):
+        radius = s[out + i]
+        sine, cosine = _sincos_turn(s[out + _1 + i])
+        s[out + i], s[out + _1 + i] = radius * cosine, radius * sine
 
 
 @phase
@@ -95,13 +87,13 @@ def way(s, g, c, f, table, stream, n):
         for i in range(n):
             s[EXO + i] = halt(s[K + i] * dt, s[WAY + i], a, s[LEAD_V + i], dt)
     elif kind == of.STOP_AND_GO:
-        some = 0.0
+        some = 0
         for i in range(n):
             s[WAY + _1 + i] -= dt
             over = phase_over(s[WAY + i], s[WAY + _1 + i], s[LEAD_V + i], a, b)
             s[EXO + i] = 1.0 if over else 0.0
-            some = max(some, s[EXO + i])
-        if some > 0.0:
+            some += 1 if over else 0
+        if some > 0:
             uniforms(s, g, WORLD_KEY, stream, np.uint64(0), DRAW, n)
             for i in range(n):
                 over, u, after = s[EXO + i] > 0.0, s[DRAW + i], s[WAY + i] + 1.0
@@ -113,7 +105,7 @@ def way(s, g, c, f, table, stream, n):
         for i in range(n):
             s[EXO + i] = stop_and_go(s[WAY + i], s[LEAD_V + i], a, b, d, e, dt)
     elif kind == of.RANDOM:
-        normal(s, g, WORLD_KEY, stream, np.uint64(0), DRAW, n)
+        normals(s, g, WORLD_KEY, stream, np.uint64(0), DRAW, n)
         for i in range(n):
             s[WAY + i] = a * s[WAY + i] + b * s[DRAW + i]
             s[EXO + i] = drawn_back(s[WAY + i], s[LEAD_V + i], d, e, h)
@@ -146,7 +138,7 @@ def move(s, g, intent, c, f, stream, tick, n):
                 decided = idm_accel(s[EGO + i] - s[REAR_X + i], s[REAR_V + i], s[EGO + _1 + i])
                 s[REAR_X + i], s[REAR_V + i] = roll(s[REAR_X + i], s[REAR_V + i], decided, dt)
     normals(s, g, WORLD_KEY, stream, np.uint64(0), DRAW, n)
-    normal(s, g, WORLD_KEY, stream, np.uint64(1), DRAW + _2, n)
+    normals(s, g, WORLD_KEY, stream, np.uint64(1), DRAW + _2, n)
     for i in range(n):
         noise = (sd0 * s[DRAW + i], sd1 * s[DRAW + _1 + i], sd2 * s[DRAW + _2 + i])
         x, v, a = drive(A, B, s[EGO + i], s[EGO + _1 + i], s[EGO + _2 + i], s[APPLIED + i] / load, noise)

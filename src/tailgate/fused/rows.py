@@ -66,6 +66,7 @@ CLEAN = _row("clean", LINKS)
 HIT, REAR_HIT = _row("hit"), _row("rear_hit")
 ON, DRAWN = _row("on"), _row("drawn", 6)  # of a script
 LIVE, RAW, BEFORE = _row("live"), _row("raw"), _row("before")  # of a seat: this step counts; what it pays; the potential before
+EARNED, PART = _row("earned"), _row("part")  # this step's pay, and a part of it
 ANY_REFUSED, ANY_HIT, ANY_REAR = _row("any_refused"), _row("any_hit"), _row("any_rear")
 LEFT_OVER, ATTACKING, ZERO, INFINITE = _row("left_over"), _row("attacking"), _row("zero"), _row("infinite")  # of an observation
 ROWS = len(_names)

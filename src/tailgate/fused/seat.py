@@ -21,6 +21,7 @@ from .rows import (
     BEFORE,
     BURST,
     COOLDOWN,
+    EARNED,
     EGO,
     ENDED,
     HIT,
@@ -34,6 +35,7 @@ from .rows import (
     LIVE,
     ON,
     OVER,
+    PART,
     POTENTIAL,
     RAW,
     REAR_HIT,
@@ -74,11 +76,11 @@ ALONE = {"rear_gap": (INFINITE, ZERO), "rear_closing": (ZERO, ZERO)}  # without 
 def decode(s, c, f, action, first, n):
     """Actions (B, ACTIONS), of this block from `first` on, into the rows WANT_*. -> whether there is any command."""
     kind, rate = f[of.ACTION], c[of.RATE]
-    some = 0.0
+    some = 0
     for i in range(n):
         s[WANT_KIND + i] = 0.0
-        some += action[first + i, 0] if action[first + i, 0] > 0.0 else 0.0  # the trigger, or the number of the action: 0 is none
-    if some == 0.0:
+        some += 1 if action[first + i, 0] > 0.0 else 0  # the trigger, or the number of the action: 0 is none
+    if some == 0:
         return False
     if kind == of.DISCRETE or kind == of.RAMPING:
         for i in range(n):
@@ -151,28 +153,36 @@ def alive(s, c, n):
 def pay(s, c, f, n):
     """After a step of it: its reward, and what happened."""
     kind, illegal, cost, scale, dt, horizon = f[of.REWARD], c[of.ILLEGAL], c[of.COST], c[of.REWARD_SCALE], c[of.DT], c[of.HORIZON]
-    potential(s, c, True, ON, n)
     for i in range(n):
-        live = s[LIVE + i] != 0.0
-        least = np.minimum(small(s[LEAD_X + i] - s[EGO + i]), s[LEAST + i])
-        fall = s[LEAST + i] - least
-        crashed = 1.0 if (s[HIT + i] != 0.0) | (s[REAR_HIT + i] != 0.0) else 0.0
-        out = -illegal * s[REFUSED + i] - cost * (1.0 if s[KIND + i] != 0.0 else 0.0)
-        error = abs(0.0 + -1.0 * (s[X + i] - s[TRUTH + i])) / scale
-        if kind == of.CRASH or kind == of.MIN_GAP:
-            out = out + crashed
-            out = out + fall / NEAR if kind == of.MIN_GAP else out
-        elif kind == of.FINAL:
-            out = out + (error * error if s[K + i] - 1.0 == horizon else 0.0)
+        s[EARNED + i] = -illegal * s[REFUSED + i] - cost * (1.0 if s[KIND + i] != 0.0 else 0.0)
+    if kind == of.CRASH or kind == of.MIN_GAP:
+        for i in range(n):
+            before, gap = s[LEAST + i], s[LEAD_X + i] - s[EGO + i]
+            s[LEAST + i] = np.minimum(small(gap), before)
+            s[PART + i] = before - s[LEAST + i]
+            s[EARNED + i] += 1.0 if (s[HIT + i] != 0.0) | (s[REAR_HIT + i] != 0.0) else 0.0
+        for i in range(n if kind == of.MIN_GAP else np.uint64(0)):
+            s[EARNED + i] += s[PART + i] / NEAR
+    else:
+        for i in range(n):
+            s[PART + i] = abs(0.0 + -1.0 * (s[X + i] - s[TRUTH + i])) / scale
+        if kind == of.FINAL:
+            for i in range(n):
+                s[EARNED + i] += s[PART + i] * s[PART + i] if s[K + i] - 1.0 == horizon else 0.0
         else:
-            out = out + dt * np.minimum(error, 1.0)
-            out = out - dt * s[ALARM + i] if kind == of.STEALTH else out
-        s[RAW + i] += out if live else 0.0
-        s[LEAST + i] = least
-        s[POTENTIAL + i] = s[ON + i] if live else s[POTENTIAL + i]
-        s[ANY_REFUSED + i] = 1.0 if live & (s[REFUSED + i] != 0.0) else s[ANY_REFUSED + i]
-        s[ANY_HIT + i] = 1.0 if live & (s[HIT + i] != 0.0) else s[ANY_HIT + i]
-        s[ANY_REAR + i] = 1.0 if live & (s[REAR_HIT + i] != 0.0) else s[ANY_REAR + i]
+            for i in range(n):
+                s[EARNED + i] += dt * np.minimum(s[PART + i], 1.0)
+            for i in range(n if kind == of.STEALTH else np.uint64(0)):
+                s[EARNED + i] -= dt * s[ALARM + i]
+    potential(s, c, True, PART, n)
+    for i in range(n):
+        live, refused, hit, rear = s[LIVE + i] != 0.0, s[REFUSED + i] != 0.0, s[HIT + i] != 0.0, s[REAR_HIT + i] != 0.0
+        now, before = s[PART + i], s[POTENTIAL + i]
+        s[RAW + i] += s[EARNED + i] if live else 0.0
+        s[POTENTIAL + i] = now if live else before
+        s[ANY_REFUSED + i] = 1.0 if (live & refused) | (s[ANY_REFUSED + i] != 0.0) else 0.0
+        s[ANY_HIT + i] = 1.0 if (live & hit) | (s[ANY_HIT + i] != 0.0) else 0.0
+        s[ANY_REAR + i] = 1.0 if (live & rear) | (s[ANY_REAR + i] != 0.0) else 0.0
 
 
 @phase
@@ -215,5 +225,7 @@ def observe(s, c, f, seen, first, n):
     limit = c[of.SEEN_MOST]
     for j in range(f[of.FEATURES]):
         row, other, scale = np.uint64(f[of.SEEN + j]), np.uint64(f[of.FROM + j]), c[of.SEEN_SCALE + j]
+        for i in range(n):  # apart from what follows, which goes to every FEATURES-th place and so is not vectorised
+            s[PART + i] = clip((s[row + i] - s[other + i]) / scale, -limit, limit)
         for i in range(n):
-            seen[first + i, j] = clip((s[row + i] - s[other + i]) / scale, -limit, limit)
+            seen[first + i, j] = s[PART + i]

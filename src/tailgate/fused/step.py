@@ -92,7 +92,7 @@ def start(s, g, window, intent, c, f, table, tick, n):
         for i in range(n):
             intent[row + i] = 0.0
     road.normals(s, g, WORLD_KEY, _PRIOR, np.uint64(0), DRAW, n)
-    road.normal(s, g, WORLD_KEY, _PRIOR, np.uint64(1), DRAW + _2, n)
+    road.normals(s, g, WORLD_KEY, _PRIOR, np.uint64(1), DRAW + _2, n)
     for j in range(3):
         row, at, sd, mean = np.uint64(j * LANES), c[of.START + j], c[of.START_SD + j], c[of.MEAN + j]
         for i in range(n):
@@ -128,7 +128,7 @@ def _begin(s, g, c, f, n):
         for i in range(n):
             s[WAY + i], s[WAY + _1 + i] = 1.0, 0.0
     elif kind == of.RANDOM:
-        road.normal(s, g, WORLD_KEY, _WAY, np.uint64(0), DRAW, n)
+        road.normals(s, g, WORLD_KEY, _WAY, np.uint64(0), DRAW, n)
         for i in range(n):
             s[WAY + i], s[WAY + _1 + i] = c[p + 5] * s[DRAW + i], 0.0
     else:
