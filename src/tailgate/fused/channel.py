@@ -65,15 +65,9 @@ def rest(s, c, n):
 
 @formula
 def _judge(s, c, wire, row, n):
-    """Counts a wire that is aimed at in APPLIED, and in REFUSED where it is not granted or the value is not."""
+    """Counts in REFUSED a wire that is aimed at with a value that is not granted."""
     bound, low, high = c[of.BOUND + wire], c[of.LOW + wire], c[of.HIGH + wire]
-    for i in range(n):
-        s[APPLIED + i] += 1.0 if s[WANT_TARGET + row + i] != 0.0 else 0.0
-    if c[of.WIRE + wire] == 0.0:
-        for i in range(n):
-            s[REFUSED + i] += 1.0 if s[WANT_TARGET + row + i] != 0.0 else 0.0
-        return
-    for i in range(n):
+    for i in range(n if c[of.WIRE + wire] != 0.0 else np.uint64(0)):
         kind, value, aimed = s[WANT_KIND + i], s[WANT_VALUE + row + i], s[WANT_TARGET + row + i] != 0.0
         fits = ((kind != JAM) | ((value >= low) & (value <= high))) & ((kind != FDI) | (abs(value) <= bound))
         s[REFUSED + i] += 1.0 if aimed & (not fits) else 0.0
@@ -84,8 +78,13 @@ def decide(s, c, n):
     """From the command that was asked for to the one in force, and what it costs."""
     onset, last, budget, longest, pause = c[of.ONSET], c[of.LAST], c[of.BUDGET], c[of.LONGEST], c[of.PAUSE]
     jam, hold, fresh, dropout, fdi = c[of.GRANTED + 1], c[of.GRANTED + 2], c[of.GRANTED + 3], c[of.GRANTED + 4], c[of.GRANTED + 5]
-    for i in range(n):
-        s[APPLIED + i] = s[REFUSED + i] = 0.0
+    m0, m1, m2, m3, m4 = c[of.WIRE], c[of.WIRE + 1], c[of.WIRE + 2], c[of.WIRE + 3], c[of.WIRE + 4]
+    for i in range(n):  # how many wires are aimed at, for now, and how many of them without being granted
+        t0, t1, t2, t3, t4 = (
+            s[WANT_TARGET + i], s[WANT_TARGET + _1 + i], s[WANT_TARGET + _2 + i], s[WANT_TARGET + _3 + i], s[WANT_TARGET + _4 + i],
+        )  # fmt: skip
+        s[APPLIED + i] = t0 + t1 + t2 + t3 + t4
+        s[REFUSED + i] = t0 * (1.0 - m0) + t1 * (1.0 - m1) + t2 * (1.0 - m2) + t3 * (1.0 - m3) + t4 * (1.0 - m4)
     _judge(s, c, 0, _0, n)
     _judge(s, c, 1, _1, n)
     _judge(s, c, 2, _2, n)
@@ -104,7 +103,7 @@ def decide(s, c, n):
         charged = aimed & (granted != 0.0) & open_now & (s[REFUSED + i] == 0.0)
         first = charged & (used == 0.0)  # of the episode
         firsts += 1 if first else 0
-        s[APPLIED + i] = 1.0 if first else 0.0  # for now
+        s[APPLIED + i] = 1.0 if first else 0.0
         s[REFUSED + i] = 1.0 if (aimed | (kind != 0.0)) & (not charged) else 0.0
         s[KIND + i] = kind if charged else 0.0
         s[COOLDOWN + i] = max(pause - 1.0, 0.0) if (burst > 0.0) & (not charged) else max(cooldown - 1.0, 0.0)
@@ -140,22 +139,26 @@ def _altered(sent, kind, value, held, fresh):
 
 
 @formula
-def _deliver(s, row, n):
+def _deliver(s, c, wire, row, n):
     """What arrives at a link."""
+    if c[of.WIRE + wire] == 0.0:
+        for i in range(n):
+            s[CLEAN + row + i] = s[ARRIVED + row + i] = s[FRESH + row + i] = s[SENT + row + i]
+        return
     for i in range(n):
         sent, fresh, hit = s[SENT + row + i], s[FRESH + row + i], s[TARGET + row + i] != 0.0
-        s[CLEAN + row + i] = sent
-        s[ARRIVED + row + i] = _altered(sent, s[KIND + i], s[VALUE + row + i], s[HELD + row + i], fresh) if hit else sent
+        changed = _altered(sent, s[KIND + i], s[VALUE + row + i], s[HELD + row + i], fresh)
+        s[CLEAN + row + i], s[ARRIVED + row + i] = sent, changed if hit else sent
         s[FRESH + row + i] = fresh if hit else sent
 
 
 @phase
-def arrive(s, n):
+def arrive(s, c, n):
     """What arrives of the sensor readings and of the V2V message under the command in force."""
-    _deliver(s, _0, n)
-    _deliver(s, _1, n)
-    _deliver(s, _2, n)
-    _deliver(s, _3, n)
+    _deliver(s, c, 0, _0, n)
+    _deliver(s, c, 1, _1, n)
+    _deliver(s, c, 2, _2, n)
+    _deliver(s, c, 3, _3, n)
     for i in range(n):
         drops = s[KIND + i] == DROPOUT
         s[VALID + i] = 0.0 if (s[TARGET + i] != 0.0) & drops else 1.0
@@ -170,8 +173,8 @@ def actuate(s, f, n):
         return
     for i in range(n):
         u, fresh, hit = s[U + i], s[FRESH + _4 + i], s[TARGET + _4 + i] != 0.0
-        s[APPLIED + i] = _altered(u, s[KIND + i], s[VALUE + _4 + i], s[HELD + _4 + i], fresh) if hit else u
-        s[FRESH + _4 + i] = fresh if hit else u
+        changed = _altered(u, s[KIND + i], s[VALUE + _4 + i], s[HELD + _4 + i], fresh)
+        s[APPLIED + i], s[FRESH + _4 + i] = changed if hit else u, fresh if hit else u
 
 
 @phase

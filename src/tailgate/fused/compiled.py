@@ -63,7 +63,7 @@ class _Part(compiler.Compiler):
 
 
 _OPTIONS: dict[str, Any] = {"error_model": "numpy"}  # no fast-math: the bits are the plain loop's
-_INNER: dict[str, Any] = {"no_cfunc_wrapper": True, "no_cpython_wrapper": True, "pipeline_class": _Part}
+_INNER: dict[str, Any] = {"no_cfunc_wrapper": True, "no_cpython_wrapper": True, "_nrt": False, "pipeline_class": _Part}
 phase = numba.njit(**_OPTIONS, **_INNER)  # a loop over the episodes of a block
 formula = numba.njit(**_OPTIONS, **_INNER, forceinline=True)  # of one episode, part of the loop that calls it; or a loop over given rows
 

@@ -81,12 +81,12 @@ def innovation(s, c, n):
     r00, r01, r10, r11 = c[of.RNOISE], c[of.RNOISE + 1], c[of.RNOISE + 2], c[of.RNOISE + 3]
     for i in range(n):
         first, second = s[VALID + i] != 0.0, s[VALID + _1 + i] != 0.0
-        s[R + i] = s[ARRIVED + i] - (0.0 + s[X + i]) if first else 0.0
-        s[R + _1 + i] = s[ARRIVED + _1 + i] - (0.0 + s[X + _1 + i]) if second else 0.0
+        r0, r1 = s[ARRIVED + i] - (0.0 + s[X + i]), s[ARRIVED + _1 + i] - (0.0 + s[X + _1 + i])
+        S01, S10 = (0.0 + s[P + _3 + i]) + r01, (0.0 + s[P + _1 + i]) + r10
         both = first & second
+        s[R + i], s[R + _1 + i] = r0 if first else 0.0, r1 if second else 0.0
         s[S + i] = (0.0 + s[P + i]) + r00
-        s[S + _1 + i] = (0.0 + s[P + _3 + i]) + r01 if both else 0.0
-        s[S + _2 + i] = (0.0 + s[P + _1 + i]) + r10 if both else 0.0
+        s[S + _1 + i], s[S + _2 + i] = S01 if both else 0.0, S10 if both else 0.0
         s[S + _3 + i] = (0.0 + s[P + _4 + i]) + r11
         s[CROSS + i], s[CROSS + _1 + i], s[CROSS + _2 + i] = 0.0 + s[P + i], 0.0 + s[P + _1 + i], 0.0 + s[P + _2 + i]
         s[CROSS + _3 + i], s[CROSS + _4 + i], s[CROSS + _5 + i] = 0.0 + s[P + _3 + i], 0.0 + s[P + _4 + i], 0.0 + s[P + _5 + i]
@@ -290,35 +290,42 @@ def take_out(s, c, f, n):
         s[R + i], s[R + _1 + i] = y0, y1
 
 
+@formula
+def _correct(s, i):
+    """x, with the accepted readings: the others have no row in C and no covariance in S. -> rows of C P-, columns of K."""
+    a0, a1 = s[ACCEPT + i], s[ACCEPT + _1 + i]
+    c00, c01, c02 = s[CROSS + i] * a0, s[CROSS + _1 + i] * a0, s[CROSS + _2 + i] * a0
+    c10, c11, c12 = s[CROSS + _3 + i] * a1, s[CROSS + _4 + i] * a1, s[CROSS + _5 + i] * a1
+    r0, r1 = s[R + i] * a0, s[R + _1 + i] * a1
+    w00, w01, w11 = inverse(s[S + i], s[S + _1 + i] * (a0 * a1), s[S + _3 + i])
+    k00, k01 = w00 * c00 + w01 * c10, w01 * c00 + w11 * c10
+    k10, k11 = w00 * c01 + w01 * c11, w01 * c01 + w11 * c11
+    k20, k21 = w00 * c02 + w01 * c12, w01 * c02 + w11 * c12
+    s[X + i] += k00 * r0 + k01 * r1
+    s[X + _1 + i] += k10 * r0 + k11 * r1
+    s[X + _2 + i] += k20 * r0 + k21 * r1
+    return (c00, c01, c02), (c10, c11, c12), (k00, k10, k20), (k01, k11, k21)
+
+
 @phase
 def update(s, f, n):
-    """x and P, with the accepted readings: the others have no row in C and no covariance in S."""
-    moves = f[of.STEADY] == 0
+    """x and P."""
+    if f[of.STEADY] != 0:
+        for i in range(n):
+            _correct(s, i)
+        return
     for i in range(n):
-        a0, a1 = s[ACCEPT + i], s[ACCEPT + _1 + i]
-        c00, c01, c02 = s[CROSS + i] * a0, s[CROSS + _1 + i] * a0, s[CROSS + _2 + i] * a0
-        c10, c11, c12 = s[CROSS + _3 + i] * a1, s[CROSS + _4 + i] * a1, s[CROSS + _5 + i] * a1
-        r0, r1 = s[R + i] * a0, s[R + _1 + i] * a1
-        w00, w01, w11 = inverse(s[S + i], s[S + _1 + i] * (a0 * a1), s[S + _3 + i])
-        k00, k01 = w00 * c00 + w01 * c10, w01 * c00 + w11 * c10  # K, whose rows are those of x
-        k10, k11 = w00 * c01 + w01 * c11, w01 * c01 + w11 * c11
-        k20, k21 = w00 * c02 + w01 * c12, w01 * c02 + w11 * c12
-        s[X + i] += k00 * r0 + k01 * r1
-        s[X + _1 + i] += k10 * r0 + k11 * r1
-        s[X + _2 + i] += k20 * r0 + k21 * r1
-        if moves:
-            p00, p11, p22 = (
-                s[P + i] - (k00 * c00 + k01 * c10),
-                s[P + _4 + i] - (k10 * c01 + k11 * c11),
-                s[P + _8 + i] - (k20 * c02 + k21 * c12),
-            )
-            p01, p10 = s[P + _1 + i] - (k00 * c01 + k01 * c11), s[P + _3 + i] - (k10 * c00 + k11 * c10)
-            p02, p20 = s[P + _2 + i] - (k00 * c02 + k01 * c12), s[P + _6 + i] - (k20 * c00 + k21 * c10)
-            p12, p21 = s[P + _5 + i] - (k10 * c02 + k11 * c12), s[P + _7 + i] - (k20 * c01 + k21 * c11)
-            s[P + i], s[P + _4 + i], s[P + _8 + i] = 0.5 * (p00 + p00), 0.5 * (p11 + p11), 0.5 * (p22 + p22)
-            s[P + _1 + i] = s[P + _3 + i] = 0.5 * (p01 + p10)
-            s[P + _2 + i] = s[P + _6 + i] = 0.5 * (p02 + p20)
-            s[P + _5 + i] = s[P + _7 + i] = 0.5 * (p12 + p21)
+        (c00, c01, c02), (c10, c11, c12), (k00, k10, k20), (k01, k11, k21) = _correct(s, i)
+        p00, p11, p22 = (
+            s[P + i] - (k00 * c00 + k01 * c10), s[P + _4 + i] - (k10 * c01 + k11 * c11), s[P + _8 + i] - (k20 * c02 + k21 * c12),
+        )  # fmt: skip
+        p01, p10 = s[P + _1 + i] - (k00 * c01 + k01 * c11), s[P + _3 + i] - (k10 * c00 + k11 * c10)
+        p02, p20 = s[P + _2 + i] - (k00 * c02 + k01 * c12), s[P + _6 + i] - (k20 * c00 + k21 * c10)
+        p12, p21 = s[P + _5 + i] - (k10 * c02 + k11 * c12), s[P + _7 + i] - (k20 * c01 + k21 * c11)
+        s[P + i], s[P + _4 + i], s[P + _8 + i] = 0.5 * (p00 + p00), 0.5 * (p11 + p11), 0.5 * (p22 + p22)
+        s[P + _1 + i] = s[P + _3 + i] = 0.5 * (p01 + p10)
+        s[P + _2 + i] = s[P + _6 + i] = 0.5 * (p02 + p20)
+        s[P + _5 + i] = s[P + _7 + i] = 0.5 * (p12 + p21)
 
 
 @phase

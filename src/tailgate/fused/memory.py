@@ -38,6 +38,13 @@ OBEY, SCRIPTED, SEATED = range(3)  # who decides
 PAID = 9  # rows of what a decision brought: reward, terminated, truncated, refused, collided, rear, allowed, k, gap
 
 
+def _lined_up(size: int, dtype: type) -> Array:
+    """Zeros of 8 bytes each that begin with a cache line, as a vector that lies in two of them takes twice as long."""
+    out = np.zeros(size + 8, dtype)
+    first = -(out.ctypes.data // 8) % 8
+    return out[first : first + size]
+
+
 class Memory:
     """The arrays of B episodes; every attribute but the flat ones is a view of them."""
 
@@ -52,7 +59,7 @@ class Memory:
         }  # fmt: skip
         self.whole = np.zeros(ORDERS + len(f), np.int64)
         self.order = self.whole[:ORDERS]
-        self.floats = np.zeros(sum(sizes.values()))
+        self.floats = _lined_up(sum(sizes.values()), np.float64)
         held, at = {}, 0
         for name, size in sizes.items():
             self.order[name], held[name] = at, self.floats[at : at + size]
@@ -63,5 +70,5 @@ class Memory:
         self.rows, self.script = held[AT_ROWS].reshape(blocks, deep * LANES), held[AT_SCRIPT]
         self.asked, self.action = held[AT_ASKED].reshape(ASKED, batch), held[AT_ACTION].reshape(batch, actions)
         self.paid = held[AT_PAID].reshape(PAID, batch)
-        self.words = np.zeros((blocks, WORDS * LANES), np.uint64)
-        self.flat_words = self.words.reshape(-1)
+        self.flat_words = _lined_up(blocks * WORDS * LANES, np.uint64)
+        self.words = self.flat_words.reshape(blocks, WORDS * LANES)

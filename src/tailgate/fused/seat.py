@@ -177,8 +177,8 @@ def pay(s, c, f, n):
     potential(s, c, True, PART, n)
     for i in range(n):
         live, refused, hit, rear = s[LIVE + i] != 0.0, s[REFUSED + i] != 0.0, s[HIT + i] != 0.0, s[REAR_HIT + i] != 0.0
-        now, before = s[PART + i], s[POTENTIAL + i]
-        s[RAW + i] += s[EARNED + i] if live else 0.0
+        now, before, earned = s[PART + i], s[POTENTIAL + i], s[EARNED + i]
+        s[RAW + i] += earned if live else 0.0
         s[POTENTIAL + i] = now if live else before
         s[ANY_REFUSED + i] = 1.0 if (live & refused) | (s[ANY_REFUSED + i] != 0.0) else 0.0
         s[ANY_HIT + i] = 1.0 if (live & hit) | (s[ANY_HIT + i] != 0.0) else 0.0

@@ -143,7 +143,7 @@ def advance(s, g, window, intent, c, f, table, tick, asked, n):
     """A step under the command in the rows WANT_*, if any is `asked` for. What a Frame shows stands in the rows afterwards."""
     if asked:
         channel.decide(s, c, n)
-        channel.arrive(s, n)
+        channel.arrive(s, c, n)
     else:
         channel.rest(s, c, n)
     if f[of.RAW] != 0:
