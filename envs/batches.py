@@ -162,6 +162,7 @@ class FusedEpisodes:
     def __init__(self, seat: Seat, constants: Any, threads: int) -> None:
         self.seat, self.constants, self.threads = seat, constants, threads
         self.cockpit: Cockpit | None = None
+        self._actions = seat.action.size
 
     @property
     def number(self) -> Array:
@@ -196,7 +197,9 @@ class FusedEpisodes:
         return Facts(paid[6] != 0.0, paid[7].astype(np.int64), paid[8].copy())
 
     def mask(self) -> Array:
-        out = np.repeat((self._cockpit.paid[6] != 0.0)[:, None], self.seat.action.size, axis=1)
+        paid = self._cockpit.paid
+        out = np.empty((paid.shape[1], self._actions), bool)
+        out[...] = (paid[6] != 0.0)[:, None]
         out[:, 0] = True
         return out
 

@@ -25,6 +25,7 @@ from .batches import FusedEpisodes, PlainEpisodes, framed, side_by_side
 from .render_viewer import Viewer
 from .seat import FACES, Seat, Tally
 
+_WHOLE = (int, np.int64)  # an action's usual types
 _AUTORESET = {"next_step": AutoresetMode.NEXT_STEP, "same_step": AutoresetMode.SAME_STEP, "disabled": AutoresetMode.DISABLED}
 
 
@@ -62,6 +63,9 @@ class AdversaryVectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
         self.begun = False
         self.over, self._everyone = np.zeros(num_envs, bool), np.ones(num_envs, bool)
         self._frames = self.seat.observation.frames
+        self._modes = self.seat.action.size if self.seat.action.discrete else 0  # discrete actions, 0 where there are none
+        self._facts = ("illegal", "collided", "rear_collided", "allowed", "step", "gap" if self.seat.road else "error")
+        self._present = {f"_{key}": self._everyone for key in (*self._facts, *(("action_mask",) if self._modes else ()))}
         self.observed = np.zeros((num_envs, features), np.float32)
 
     @property
@@ -135,7 +139,7 @@ class AdversaryVectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
             raise InputError("step", "no episode", "reset() first")
         actions = self.checked(actions)
         over, resets = self.over, self.autoreset == AutoresetMode.NEXT_STEP
-        if over.any() and self.autoreset == AutoresetMode.DISABLED:
+        if self.autoreset == AutoresetMode.DISABLED and over.any():
             raise InputError("step", np.flatnonzero(over).tolist(), "rows that are over to be reset with options['reset_mask'] first")
         outcome = self.episodes.decide(actions, over, resets)
         terminated, truncated = outcome.terminated, outcome.truncated
@@ -185,22 +189,22 @@ class AdversaryVectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
         shape = self.action_space.shape
         if actions.shape != shape:
             raise InputError("actions", f"shape {actions.shape}", f"shape {shape}")
-        if self.seat.action.discrete:
-            if actions.dtype.kind not in "iu" or actions.min() < 0 or actions.max() >= self.seat.action.size:
-                raise InputError("actions", actions.tolist(), f"whole numbers from 0 to {self.seat.action.size - 1}")
+        if self._modes:
+            if actions.dtype == np.int64:  # the usual kind: a number below 0 is among the largest without a sign
+                wrong = np.maximum.reduce(actions.view(np.uint64)) >= self._modes
+            else:
+                wrong = actions.dtype.kind not in "iu" or actions.min() < 0 or actions.max() >= self._modes
+            if wrong:
+                raise InputError("actions", actions.tolist(), f"whole numbers from 0 to {self._modes - 1}")
         elif not np.isfinite(actions).all():
             raise InputError("actions", actions.tolist(), "finite numbers in [-1, 1]")
         return actions
 
     def _info(self, illegal: Array, collided: Array, rear: Array) -> dict[str, Any]:
-        facts = self.episodes.facts()
-        info: dict[str, Any] = {
-            "illegal": illegal, "collided": collided, "rear_collided": rear, "allowed": facts.allowed, "step": facts.step,
-            "gap" if self.seat.road else "error": facts.damage,
-        }  # fmt: skip
-        if self.seat.action.discrete:
+        info: dict[str, Any] = dict(zip(self._facts, (illegal, collided, rear, *self.episodes.facts()), strict=True))
+        if self._modes:
             info["action_mask"] = self.episodes.mask().view(np.int8)  # as Space.sample(mask) wants it
-        return info | {f"_{key}": self._everyone for key in info}
+        return info | self._present
 
 
 class AdversaryEnv(gymnasium.Env[Array, Any]):
@@ -219,9 +223,8 @@ class AdversaryEnv(gymnasium.Env[Array, Any]):
         self.metadata = self.metadata | {"render_fps": self.batch.metadata["render_fps"]}
         played = self.batch.episodes
         self._quick = played if isinstance(played, FusedEpisodes) and self.batch.seat.observation.frames == 1 else None
-        actions = self.batch.seat.action.size if self.batch.seat.action.discrete else 0
-        self._actions, self._over = actions, False  # discrete actions, 0 where there are none; the episode is over
-        self._masks = np.eye(1, actions, dtype=np.int8)[0], np.ones(actions, np.int8)  # nothing allowed, all allowed
+        self._actions, self._over = self.batch._modes, False  # the second: the episode is over
+        self._masks = np.eye(1, self._actions, dtype=np.int8)[0], np.ones(self._actions, np.int8)  # nothing allowed, all allowed
         self._window: Any = None
         self._shown: LoopState | None = None  # in the window
         self.observation_space = self.batch.single_observation_space
@@ -254,11 +257,11 @@ class AdversaryEnv(gymnasium.Env[Array, Any]):
         batch, actions = self.batch, self._actions
         if self._over:
             raise InputError("step", [0], "an episode that is not over: reset() first")
-        if not (type(action) is int and 0 <= action < actions):
+        if not (type(action) in _WHOLE and 0 <= action < actions):
             action = batch.checked(np.asarray(action)[None])[0]
         reward, terminated, truncated, illegal, collided, rear, allowed, step, gap = episodes.decide_alone(action)
         observation: Array = episodes.seen()[0]
-        self._over = ended = terminated != 0.0 or truncated != 0.0
+        self._over = ended = terminated + truncated != 0.0
         info: dict[str, Any] = {
             "illegal": illegal != 0.0, "collided": collided != 0.0, "rear_collided": rear != 0.0, "allowed": allowed != 0.0,
             "step": int(step), "gap": gap,

@@ -63,6 +63,7 @@ class Cockpit(Lanes):
         self.interval = seat.action.spec.interval
         self._alone = (False, self.interval, SEATED, False, 0, False)  # the orders of `decide_alone`
         self.paid, self.features = self.memory.paid, int(constants.f[of.FEATURES])
+        self._paid, self._order = self.paid.reshape(-1), self.memory.order  # the first: of a single row
 
     def run(self, *arguments: Any, **orders: Any) -> int:
         self.seen = np.empty((self.batch, self.features), np.float32)
@@ -86,8 +87,8 @@ class Cockpit(Lanes):
             self.seen = np.empty((1, self.features), np.float32)
             if kernel.run(*self._arrays, self.seen, 0, 1) < 0:
                 raise not_finite()
-            self.memory.order[TICK] += self.interval
-        out: list[float] = self.paid[:, 0].tolist()
+            self._order[TICK] += self.interval
+        out: list[float] = self._paid.tolist()
         return out
 
     def again(self) -> None:

@@ -51,12 +51,10 @@ def living(s, n):
 
 
 @phase
-def carry(source, goal, n):
+def carry(source, goal):
     """The state of a block from one place to another."""
-    for j in range(STATE):
-        row = np.uint64(j * LANES)
-        for i in range(n):
-            goal[row + i] = source[row + i]
+    for i in range(np.uint64(STATE * LANES)):
+        goal[i] = source[i]
 
 
 @phase
@@ -124,7 +122,7 @@ def run(floats, whole, words, columns, record, seen, first_block, last_block):
         held = floats[o[at.AT_ROWS] + b * deep : o[at.AT_ROWS] + (b + 1) * deep]
         s = held if alone else desk
         if not alone:
-            carry(held, desk, n)
+            carry(held, desk)
         g = words[b * WORDS * LANES : (b + 1) * WORDS * LANES]
         window = floats[o[at.AT_WINDOW] + b * wide : o[at.AT_WINDOW] + (b + 1) * wide]
         intent = floats[o[at.AT_INTENT] + b * long : o[at.AT_INTENT] + (b + 1) * long]
@@ -163,5 +161,5 @@ def run(floats, whole, words, columns, record, seen, first_block, last_block):
             seat.look(s, c, paid, first, n)
             seat.observe(s, c, f, seen, first, n)
         if not alone:
-            carry(desk, held, n)
+            carry(desk, held)
     return longest

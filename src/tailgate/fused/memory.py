@@ -33,6 +33,7 @@ AT_ROWS, AT_WINDOW, AT_INTENT, AT_C, AT_TABLE, AT_SCRIPT, AT_ASKED, AT_ACTION, A
 DEEP, WINDOW, INTENT, TABLE = _order("rows of a block"), _order("window rows"), _order("intent rows"), _order("table length")
 ORDERS = len(_orders)
 
+FEW = 4  # blocks that stay in the cache with all that a step computes on its way
 ASKED = 1 + 2 * WIRES  # rows of a command: kind, targets, values
 OBEY, SCRIPTED, SEATED = range(3)  # who decides
 PAID = 9  # rows of what a decision brought: reward, terminated, truncated, refused, collided, rear, allowed, k, gap
@@ -51,7 +52,7 @@ class Memory:
     def __init__(self, batch: int, c: Array, f: Array, table: Array, window: int, intents: int) -> None:
         blocks = -(-batch // LANES)
         actions = max(int(f[of.ACTIONS]), 1)
-        deep = ROWS if blocks == 1 else STATE  # many blocks share one place to work at, which stays in the cache
+        deep = ROWS if blocks <= FEW else STATE  # many blocks share one place to work at, which stays in the cache
         sizes = {
             AT_ROWS: blocks * deep * LANES, AT_WINDOW: blocks * window * LANES, AT_INTENT: blocks * intents * LANES, AT_C: len(c),
             AT_TABLE: len(table), AT_SCRIPT: PLACES, AT_ASKED: ASKED * batch, AT_ACTION: actions * batch,
