@@ -64,8 +64,9 @@ def rest(s, c, n):
 
 
 @formula
-def _judge(s, c, wire, row, n):
+def _judge(s, c, row, n):
     """Counts in REFUSED a wire that is aimed at with a value that is not granted."""
+    wire = np.int64(row) // LANES
     bound, low, high = c[of.BOUND + wire], c[of.LOW + wire], c[of.HIGH + wire]
     for i in range(n if c[of.WIRE + wire] != 0.0 else np.uint64(0)):
         kind, value, aimed = s[WANT_KIND + i], s[WANT_VALUE + row + i], s[WANT_TARGET + row + i] != 0.0
@@ -85,11 +86,11 @@ def decide(s, c, n):
         )  # fmt: skip
         s[APPLIED + i] = t0 + t1 + t2 + t3 + t4
         s[REFUSED + i] = t0 * (1.0 - m0) + t1 * (1.0 - m1) + t2 * (1.0 - m2) + t3 * (1.0 - m3) + t4 * (1.0 - m4)
-    _judge(s, c, 0, _0, n)
-    _judge(s, c, 1, _1, n)
-    _judge(s, c, 2, _2, n)
-    _judge(s, c, 3, _3, n)
-    _judge(s, c, 4, _4, n)
+    _judge(s, c, _0, n)
+    _judge(s, c, _1, n)
+    _judge(s, c, _2, n)
+    _judge(s, c, _3, n)
+    _judge(s, c, _4, n)
     firsts = 0
     for i in range(n):
         kind, used, burst, cooldown = s[WANT_KIND + i], s[USED + i], s[BURST + i], s[COOLDOWN + i]
@@ -109,11 +110,11 @@ def decide(s, c, n):
         s[COOLDOWN + i] = max(pause - 1.0, 0.0) if (burst > 0.0) & (not charged) else max(cooldown - 1.0, 0.0)
         s[USED + i] = used + 1.0 if charged else used
         s[BURST + i] = burst + 1.0 if charged else 0.0
-    _enforce(s, c, 0, _0, n)
-    _enforce(s, c, 1, _1, n)
-    _enforce(s, c, 2, _2, n)
-    _enforce(s, c, 3, _3, n)
-    _enforce(s, c, 4, _4, n)
+    _enforce(s, c, _0, n)
+    _enforce(s, c, _1, n)
+    _enforce(s, c, _2, n)
+    _enforce(s, c, _3, n)
+    _enforce(s, c, _4, n)
     for w in range(WIRES if firsts > 0 else 0):
         row = np.uint64(w * LANES)
         for i in range(n):
@@ -121,9 +122,9 @@ def decide(s, c, n):
 
 
 @formula
-def _enforce(s, c, wire, row, n):
+def _enforce(s, c, row, n):
     """What is in force at a wire; at one that is not granted there never is anything."""
-    for i in range(n if c[of.WIRE + wire] != 0.0 else np.uint64(0)):
+    for i in range(n if c[of.WIRE + np.int64(row) // LANES] != 0.0 else np.uint64(0)):
         kind, value = s[KIND + i], s[WANT_VALUE + row + i]
         hit = (s[WANT_TARGET + row + i] != 0.0) & (kind != 0.0)
         s[TARGET + row + i] = 1.0 if hit else 0.0
@@ -139,9 +140,9 @@ def _altered(sent, kind, value, held, fresh):
 
 
 @formula
-def _deliver(s, c, wire, row, n):
+def _deliver(s, c, row, n):
     """What arrives at a link."""
-    if c[of.WIRE + wire] == 0.0:
+    if c[of.WIRE + np.int64(row) // LANES] == 0.0:
         for i in range(n):
             s[CLEAN + row + i] = s[ARRIVED + row + i] = s[FRESH + row + i] = s[SENT + row + i]
         return
@@ -155,10 +156,10 @@ def _deliver(s, c, wire, row, n):
 @phase
 def arrive(s, c, n):
     """What arrives of the sensor readings and of the V2V message under the command in force."""
-    _deliver(s, c, 0, _0, n)
-    _deliver(s, c, 1, _1, n)
-    _deliver(s, c, 2, _2, n)
-    _deliver(s, c, 3, _3, n)
+    _deliver(s, c, _0, n)
+    _deliver(s, c, _1, n)
+    _deliver(s, c, _2, n)
+    _deliver(s, c, _3, n)
     for i in range(n):
         drops = s[KIND + i] == DROPOUT
         s[VALID + i] = 0.0 if (s[TARGET + i] != 0.0) & drops else 1.0

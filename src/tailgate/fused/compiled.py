@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import gc
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import cache
 from importlib.resources import files
 from typing import Any
@@ -16,6 +17,7 @@ from typing import Any
 import numba
 from numba import _dynfunc
 from numba.core import caching, codegen, compiler, compiler_machinery, typed_passes
+from numba.core.types.functions import BaseFunction
 
 
 class _PartLibrary(codegen.CPUCodeLibrary):
@@ -102,9 +104,41 @@ class _Cache(caching.FunctionCache):
     _impl_class = _Implementation
 
 
+@contextlib.contextmanager
+def _remembering() -> Iterator[None]:
+    """While this compiles, what an operator or a function of numpy makes of some types is found out once, and not at every place.
+
+    Nor is garbage looked for among what will be needed to the end.
+
+    Compilers take turns by numba's own lock, so nobody else's code is compiled meanwhile.
+    """
+    resolve, known = BaseFunction.get_call_type, {}  # type: ignore[var-annotated]
+
+    def remembered(self: Any, context: Any, args: Any, kws: Any) -> Any:
+        key = (self.typing_key, args)
+        if kws or key not in known:
+            found = resolve(self, context, args, kws)  # type: ignore[no-untyped-call]
+            if kws or found is None:
+                return found
+            known[key] = found, self._impl_keys[found.args]
+        found, implementation = known[key]
+        self._impl_keys[found.args] = implementation
+        return found
+
+    BaseFunction.get_call_type, collects = remembered, gc.isenabled()  # type: ignore[method-assign]
+    gc.disable()
+    try:
+        yield
+    finally:
+        if collects:
+            gc.enable()
+        BaseFunction.get_call_type = resolve  # type: ignore[method-assign]
+
+
 def compiled(function: Callable[..., Any]) -> Any:
     """The function, compiled at its first call of a kind; without a place to keep it, in every process anew."""
     out = numba.njit(**_OPTIONS, nogil=True)(function)
+    out._compiler.compile = _remembering()(out._compiler.compile)
     with contextlib.suppress(RuntimeError):  # no directory to write to
         out._cache = _Cache(function)  # type: ignore[no-untyped-call]
     return out
