@@ -20,7 +20,6 @@ from typing import Annotated
 
 import numpy as np
 from pydantic import Field
-from scipy import special
 
 from tailgate import num
 from tailgate.core import Array, Finite, Positive, param
@@ -174,6 +173,8 @@ def challenge_samples(window: float, bandwidth: float) -> int:
 
 def false_alarm_threshold(p_fa: float, samples: int) -> float:
     """Mean power E over the receiver's noise that noise alone exceeds with probability p_fa: 2 N_c E is chi-square with 2 N_c degrees."""
+    from scipy import special  # not loaded where no radar is
+
     return float(special.chdtri(2 * samples, p_fa) / (2 * samples))
 
 
@@ -183,6 +184,8 @@ def miss_probability(threshold: float, samples: int, jam: float = 0.0, tone: flo
     Both are over the receiver's noise, and last for the whole challenge: 2 N_c E/(1 + jam) is chi-square with 2 N_c degrees of freedom and
     noncentrality 2 N_c tone/(1 + jam). For an answer that stops after a share r of it, tone = r times its power is exact.
     """
+    from scipy import special
+
     scale = 2.0 * samples / (1.0 + jam)
     if tone == 0.0:
         return float(special.chdtr(2 * samples, scale * threshold))

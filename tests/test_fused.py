@@ -246,6 +246,14 @@ def test_kept_code_is_of_these_sources(monkeypatch, tmp_path):
     compiled.digest.cache_clear()
 
 
+def test_a_part_is_called_by_compiled_code_alone():
+    """It has no machine code of its own; Python is told so."""
+    from tailgate.fused import kernel
+
+    with pytest.raises(TypeError, match="bad argument"):
+        kernel.living(np.zeros(ROWS * 64), np.uint64(64))
+
+
 def test_the_phases_are_vectorised():
     """Packed against single multiplications in what is compiled of the filter's update and of the vehicle's move: a guard, and not a time."""
     import re

@@ -8,6 +8,9 @@ Sources: Salmon et al., *Parallel random numbers: as easy as 1, 2, 3*, SC11 (Phi
 """
 
 import math
+from collections.abc import Callable
+from functools import cache
+from typing import Any
 
 import numba
 import numpy as np
@@ -125,17 +128,27 @@ def _tanh(x: float) -> float:
     return 1.0 - 2.0 / (_exp(2.0 * x) + 1.0)
 
 
-@numba.vectorize(["float64(float64)"], cache=True)
+def _elementwise(function: Callable[[float], float]) -> Callable[..., Any]:
+    """A universal function of numpy, compiled or loaded at its first call."""
+
+    @cache
+    def made() -> Any:
+        return numba.vectorize(["float64(float64)"], cache=True)(function)
+
+    return lambda x: made()(x)
+
+
+@_elementwise
 def exp(x: float) -> float:
     return _exp(x)
 
 
-@numba.vectorize(["float64(float64)"], cache=True)
+@_elementwise
 def log(x: float) -> float:
     return _log(x)
 
 
-@numba.vectorize(["float64(float64)"], cache=True)
+@_elementwise
 def tanh(x: float) -> float:
     return _tanh(x)
 

@@ -15,33 +15,36 @@ from importlib.resources import files
 from typing import Any
 
 import numba
-from numba import _dynfunc
+from numba import _dynfunc  # type: ignore[attr-defined]
 from numba.core import caching, codegen, compiler, compiler_machinery, typed_passes
 from numba.core.types.functions import BaseFunction
 
 
 class _PartLibrary(codegen.CPUCodeLibrary):
-    """Code that is only ever a part of other code: optimised there, and never turned into machine code by itself."""
+    """Code that is only ever a part of other code: optimised there, and never turned into machine code by itself.
+
+    Numba would do both for each function that another one calls, and again for all of them in each that calls those.
+    """
 
     def _optimize_final_module(self) -> None:
         pass
 
     def _finalize_final_module(self) -> None:
-        self._finalize_dynamic_globals()
+        self._finalize_dynamic_globals()  # type: ignore[no-untyped-call]
         self._finalized = True
 
     def _finalize_specific(self) -> None:
         pass
 
 
-@compiler_machinery.register_pass(mutates_CFG=False, analysis_only=False)
+@compiler_machinery.register_pass(mutates_CFG=False, analysis_only=False)  # type: ignore[no-untyped-call]
 class _MakeKnown(compiler_machinery.LoweringPass):
     """Lets other compiled code call a part; Python's call raises TypeError."""
 
     _name = "make_known"
 
     def __init__(self) -> None:
-        compiler_machinery.LoweringPass.__init__(self)
+        compiler_machinery.LoweringPass.__init__(self)  # type: ignore[no-untyped-call]
 
     def run_pass(self, state: Any) -> bool:
         refuse = ctypes.cast(ctypes.pythonapi.PyErr_BadArgument, ctypes.c_void_p).value
@@ -56,9 +59,9 @@ class _Part(compiler.Compiler):
 
     def define_pipelines(self) -> list[Any]:
         state = self.state
-        state.library = _PartLibrary(state.targetctx.codegen(), state.func_id.func_qualname)
+        state.library = _PartLibrary(state.targetctx.codegen(), state.func_id.func_qualname)  # type: ignore[no-untyped-call]
         state.flags.no_compile = True
-        (passes,) = super().define_pipelines()
+        (passes,) = super().define_pipelines()  # type: ignore[no-untyped-call]
         passes.add_pass_after(_MakeKnown, typed_passes.NativeLowering)
         passes.finalize()
         return [passes]
@@ -112,12 +115,12 @@ def _remembering() -> Iterator[None]:
 
     Compilers take turns by numba's own lock, so nobody else's code is compiled meanwhile.
     """
-    resolve, known = BaseFunction.get_call_type, {}  # type: ignore[var-annotated]
+    resolve, known = BaseFunction.get_call_type, {}
 
     def remembered(self: Any, context: Any, args: Any, kws: Any) -> Any:
         key = (self.typing_key, args)
         if kws or key not in known:
-            found = resolve(self, context, args, kws)  # type: ignore[no-untyped-call]
+            found = resolve(self, context, args, kws)
             if kws or found is None:
                 return found
             known[key] = found, self._impl_keys[found.args]

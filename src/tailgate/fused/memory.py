@@ -41,7 +41,7 @@ PAID = 9  # rows of what a decision brought: reward, terminated, truncated, refu
 
 def _lined_up(size: int, dtype: type) -> Array:
     """Zeros of 8 bytes each that begin with a cache line, as a vector that lies in two of them takes twice as long."""
-    out = np.zeros(size + 8, dtype)
+    out: Array = np.zeros(size + 8, dtype)
     first = -(out.ctypes.data // 8) % 8
     return out[first : first + size]
 
