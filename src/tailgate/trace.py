@@ -128,7 +128,7 @@ def rollout(loop: Loop, attack: Attack, keys: Keys, *, terminate: bool = True, p
 
     A loop whose parts have lanes is played by the fused engine, to the same bits; with `plain` it is not.
     """
-    if not plain and isinstance(fused := fuse(loop), Constants):
+    if not plain and isinstance(fused := fuse(loop, attack), Constants):
         return Trace(loop.model, loop.horizon, *play(loop, fused, attack, keys, terminate), loop.controller.desired_gap)
     state = loop.start(keys)
     plan = attack.prepare(loop.brief)

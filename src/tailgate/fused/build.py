@@ -11,7 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tailgate import num
-from tailgate.core import Array, Kind, Mode
+from tailgate.agents.model_based import Stealth
+from tailgate.core import Array, Attack, Kind, Mode
 from tailgate.envs import manoeuvres as drives
 from tailgate.envs.controllers import AdaptiveCruise
 from tailgate.envs.following import CarFollowing
@@ -32,7 +33,7 @@ from tailgate.estimators.sparse import SparseChiSquare
 from tailgate.loop import Loop
 
 from . import constants as of
-from . import imm, monitor
+from . import imm, monitor, script
 
 _FUSED_KINDS = {Kind.DOS_JAM, Kind.DOS_HOLD, Kind.DOS_HOLD_FRESH, Kind.DROPOUT, Kind.FDI}
 _STRUCTURE = np.array([[True, True, True], [False, True, True], [False, False, True]])  # of A: where it is not zero
@@ -55,16 +56,16 @@ class Refused:
     why: str
 
 
-def fuse(loop: Loop) -> Constants | Refused:
-    """The constants of a loop, or why the plain loop plays it."""
+def fuse(loop: Loop, attack: Attack | None = None) -> Constants | Refused:
+    """The constants of a loop, or why the plain loop plays it, under an attack that is given, or under any that does not hold the defence."""
     plan, parts = loop.plan, (loop.plant, loop.sensor, loop.controller)
     for part, known in zip(parts, (CarFollowing, Odometry, AdaptiveCruise), strict=True):
         if type(part) is not known:
             return Refused(f"{type(part).__name__} has no lane")
     if not loop.link.perfect:
         return Refused("readings are lost or late")
-    if loop.threat.knowledge == "white":
-        return Refused("a white-box attacker holds the defence itself")
+    if loop.threat.knowledge == "white" and (why := _white(loop, attack)):
+        return Refused(why)
     if not {Kind[name.upper()] for name in loop.threat.kinds} <= _FUSED_KINDS:
         return Refused("delay, replay and what is radiated have no lane")
     c, f = of.blank()
@@ -83,6 +84,14 @@ def _remembered(f: Array) -> int:
     if f[of.MODELED]:
         return imm.rows(int(f[of.MODELED]))
     return monitor.ROWS if f[of.BOXED] else max(int(f[of.WINDOW]) - 1, 0)
+
+
+def _white(loop: Loop, attack: Attack | None) -> str:
+    """A script sees the road and no more; the one that looks into the defence does it in its lane, where there is something to see."""
+    if type(attack) is Stealth:
+        shows = getattr(type(loop.defence), "look", None) is Composed.look
+        return "" if shows else f"{type(loop.defence).__name__} shows no innovation to a lane"
+    return "" if script.known(attack) else "a white-box attacker holds the defence itself"
 
 
 def _put(c: Array, at: int, values: Any) -> None:

@@ -141,7 +141,7 @@ def run(floats, whole, words, columns, record, seen, first_block, last_block):
                 seat.alive(s, c, n)
                 wanted = seat.decode(s, c, f, action, first, n)
             elif how == at.SCRIPTED:
-                wanted = script.decide(s, g, c, p, n)
+                wanted = script.decide(s, g, window, c, f, p, n)
             else:
                 wanted = obey(s, asked, first, n)
             step.advance(s, g, window, intent, c, f, table, now, wanted, n)
