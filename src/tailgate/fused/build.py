@@ -57,7 +57,7 @@ class Refused:
 
 
 def fuse(loop: Loop, attack: Attack | None = None) -> Constants | Refused:
-    """The constants of a loop, or why the plain loop plays it, under an attack that is given, or under any that does not hold the defence."""
+    """The constants of a loop, or why the plain loop plays it: under the given attack, or under any that does not hold the defence."""
     plan, parts = loop.plan, (loop.plant, loop.sensor, loop.controller)
     for part, known in zip(parts, (CarFollowing, Odometry, AdaptiveCruise), strict=True):
         if type(part) is not known:
@@ -150,7 +150,7 @@ def _defence(loop: Loop, c: Array, f: Array) -> str:
         return ""
     if type(defence) is InteractingModels:
         return _models(defence, loop.plan.defence, c, f)
-    if type(defence) in (SafeState, SafeStateBrake):
+    if isinstance(defence, SafeState) and type(defence) in (SafeState, SafeStateBrake):
         return _safe_set(defence, loop, c, f)
     if not isinstance(defence, Composed):
         return f"defence {type(defence).__name__} has no lane"

@@ -178,7 +178,7 @@ def needed(s, c, n):
 
 @phase
 def watch(s, m, c, f, n):
-    """The largest command: the brake's where the worst of the box is unsafe while a reading is distrusted or missing, and for a while after."""
+    """The largest command: the brake's where the worst of the box is unsafe while a reading is distrusted or missing, or was of late."""
     always, brake, distance, long = f[of.ALWAYS_ARMED] != 0, c[of.HARD], c[of.DISTANCE], c[of.WATCH]
     anyone = 0.0
     for i in range(n):

@@ -100,8 +100,8 @@ def gate(s, ring, c, f, given, n):
 def push(s, sign, first, second, bound, n):
     """What moves the state farthest without leaving the gate, on the readings that are aimed at, into WANT_VALUE.
 
-    Row PASSES tells whether what is then received stays inside: (r + a)' W (r + a) over the attacked readings is least at -centre, and there
-    leaves `spent` of the gate.
+    (r + a)' W (r + a) over the attacked readings is least at -centre, and there leaves `spent` of the gate. Row PASSES tells whether what
+    is then received stays inside.
     """
     for i in range(n):
         r0, r1, g = s[R + i], s[R + _1 + i], s[GATE + i]
