@@ -53,10 +53,9 @@ def _exp(x: float) -> float:
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
 def _log(x: float) -> float:
-    if not x > 0.0:
-        return -math.inf if x == 0.0 else math.nan
-    if x == math.inf:
-        return x
+    plain = (x > 0.0) & (x < math.inf)
+    other = x if x > 0.0 else -math.inf if x == 0.0 else math.nan
+    x = x if plain else 1.0  # without a branch, so that a loop over many is vectorised
     small = x < 2.2250738585072014e-308  # denormal: scale it up first
     e = -1022.0 - (54.0 if small else 0.0)
     x = x * (18014398509481984.0 if small else 1.0)
@@ -79,7 +78,8 @@ def _log(x: float) -> float:
     p = p * z + 1.0 / 5.0
     p = p * z + 1.0 / 3.0
     p = p * z + 1.0
-    return e * LN2_HI + (2.0 * s * p + e * LN2_LO)
+    out = e * LN2_HI + (2.0 * s * p + e * LN2_LO)
+    return out if plain else other
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")

@@ -72,6 +72,7 @@ PASSED, ACCEL, AHEAD = _row("passed", 2), _row("accel", 2), _row("ahead", 2)  # 
 WORST_LO, WORST_HI = _row("worst_lo", 3), _row("worst_hi", 3)  # the box, and what is read outside of it
 MISSING, MOST = _row("missing"), _row("most")  # a quantity that nobody tells; the largest command
 PIVOT = _row("pivot", 2)  # of the elimination of S
+TOTAL, TOP, RIVAL, WEIGHT = _row("total"), _row("top"), _row("rival"), _row("weight")  # of models that are weighed
 STOP = _row("stop", 4)  # of a stop: speed, acceleration above braking, time, exp(-time / lag)
 LIVE, RAW, BEFORE = _row("live"), _row("raw"), _row("before")  # of a seat: this step counts; what it pays; the potential before
 ANY_REFUSED, ANY_HIT, ANY_REAR = _row("any_refused"), _row("any_hit"), _row("any_rear")
