@@ -56,9 +56,9 @@ def _log(x: float) -> float:
     plain = (x > 0.0) & (x < math.inf)
     other = x if x > 0.0 else -math.inf if x == 0.0 else math.nan
     x = x if plain else 1.0  # without a branch, so that a loop over many is vectorised
-    small = x < 2.2250738585072014e-308  # denormal: scale it up first
+    small = np.float64(x).view(np.int64) < 0x0010000000000000  # denormal: scale it up first
     e = -1022.0 - (54.0 if small else 0.0)
-    x = x * (18014398509481984.0 if small else 1.0)
+    x = min(x, 1.0) * 18014398509481984.0 if small else x  # of every x in a vectorised loop: it shall not overflow
     bits = np.float64(x).view(np.int64)
     e += np.int64(((bits >> 52) & 0x7FF) | TWO_52_BITS).view(np.float64) - TWO_52
     m = np.int64((bits & 0x000FFFFFFFFFFFFF) | 0x3FE0000000000000).view(np.float64)  # in [1/2, 1)
