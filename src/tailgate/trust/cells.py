@@ -9,7 +9,7 @@ import hashlib
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -167,7 +167,7 @@ def _played(job: Job, loop: Loop, attack: Any, known: Sequence[Property]) -> Fou
     together = {name: members for name, members in conjunctions(known, job.formulas).items() if members}
     found = Found({p.name: Tally() for p in known}, together, {name: [] for name in together})
     for start in range(0, cell.seeds, size):
-        outcomes = _outcomes(job, loop, attack, known, draws.keys(cell.purpose, episodes[start : start + size]))
+        outcomes = _outcomes(job, loop, attack, known, _keys(cell.purpose, tuple(episodes[start : start + size])))
         verdict = None
         if job.rule is not None and together:
             trust = np.all([outcomes[name].holds for name in together["trust"]], axis=0)
@@ -178,6 +178,12 @@ def _played(job: Job, loop: Loop, attack: Any, known: Sequence[Property]) -> Fou
         if verdict is not None:
             break
     return found
+
+
+@lru_cache(maxsize=16)
+def _keys(purpose: str, seeds: tuple[int, ...]) -> draws.Keys:
+    """Of runs that every cell plays: their digests take longer than some steps."""
+    return draws.keys(purpose, seeds)
 
 
 def _outcomes(job: Job, loop: Loop, attack: Any, known: Sequence[Property], keys: draws.Keys) -> dict[str, Outcome]:
