@@ -20,6 +20,7 @@ from .rows import (
     AHEAD,
     ALARM,
     ARRIVED,
+    FASTEST,
     HEARD,
     LANES,
     MISSING,
@@ -27,11 +28,12 @@ from .rows import (
     PASSED,
     READ,
     SCORE,
+    SLOWEST,
     SPAN,
     STOP,
     VALID,
-    WORST_HI,
-    WORST_LO,
+    WAIT,
+    WORST,
     U,
     X,
 )
@@ -110,11 +112,16 @@ def test(s, m, column, e, recover, n):
         near0, near1 = np.maximum(lo, y - e) if use else lo, np.minimum(hi, y + e) if use else hi
         lo, hi = np.minimum(near0, near1), np.maximum(near0, near1)  # two that touch may cross by rounding
         doubted = heard & (left != 0.0)
-        m[LEFT + column + i], m[LO + column + i], m[HI + column + i] = left, lo, hi
-        s[WORST_LO + column + i] = np.minimum(lo, y - e) if doubted else lo
-        s[WORST_HI + column + i] = np.maximum(hi, y + e) if doubted else hi
+        s[WAIT + i], s[SPAN + i], s[SPAN + _1 + i] = left, lo, hi
+        s[WORST + i], s[WORST + _1 + i] = np.minimum(lo, y - e) if doubted else lo, np.maximum(hi, y + e) if doubted else hi
         s[SCORE + i] = np.maximum(s[SCORE + i], ratio)
         s[MISSING + i] = s[MISSING + i] if use else 1.0
+    for i in range(n):  # each place by itself, so that the compiler sees that they do not overlap
+        m[LEFT + column + i] = s[WAIT + i]
+    for i in range(n):
+        m[LO + column + i] = s[SPAN + i]
+    for i in range(n):
+        m[HI + column + i] = s[SPAN + _1 + i]
 
 
 @phase
@@ -138,6 +145,9 @@ def enclose(s, m, c, n):
             for i in range(n):
                 s[READ + i], s[HEARD + i] = s[ARRIVED + _2 + i] - s[ARRIVED + i], s[VALID + i]
         test(s, m, column, c[of.ACCURATE + 2 - j], recover, n)
+        for i in range(n):  # what the brake goes by: the highest speed, the lowest of the car ahead, the smallest gap
+            s[FASTEST + i] = s[WORST + _1 + i] if j == 0 else s[FASTEST + i]
+            s[SLOWEST + i] = s[WORST + i] if j == 1 else s[SLOWEST + i]
     for i in range(n):
         s[ALARM + i] = s[SCORE + i] > 1.0 + ROUNDING
         s[ACCEPT + i] = (s[VALID + i] != 0.0) & (m[LEFT + GAP + i] == 0.0)
@@ -158,7 +168,7 @@ def needed(s, c, n):
     off, response, clearance = c[of.OWN_OFF], c[of.RESPONSE], c[of.CLEARANCE]
     speed, above, time, fallen = STOP, STOP + _1, STOP + _2, STOP + _3
     for i in range(n):
-        v, a, w = s[WORST_HI + SPEED + i], s[ACCEL + _1 + i] + off, np.maximum(s[WORST_LO + LEAD + i], 0.0)
+        v, a, w = s[FASTEST + i], s[ACCEL + _1 + i] + off, np.maximum(s[SLOWEST + i], 0.0)
         a = a + eased * np.maximum(response - a, 0.0)
         fast = np.maximum(v + np.maximum(a, 0.0) * rho, 0.0)
         s[SPAN + i], s[SPAN + _1 + i] = clearance + 0.5 * rho * (v + fast), w * w / harder
@@ -188,7 +198,7 @@ def watch(s, m, c, f, n):
         return
     needed(s, c, n)
     for i in range(n):
-        gap, missing, armed = s[WORST_LO + GAP + i], s[MISSING + i] != 0.0, m[ARMED + i]
+        gap, missing, armed = s[WORST + i], s[MISSING + i] != 0.0, m[ARMED + i]
         some = always | missing | (armed > 0.0)
         unsafe = (some & (gap < s[READ + i])) | (missing & (gap < distance))
         s[MOST + i] = -brake if unsafe else np.inf
