@@ -47,14 +47,14 @@ def allowed(s, c, out, n):
 @phase
 def rest(s, c, n):
     """What `decide` and `arrive` come to where no command is asked for."""
-    pause, attacked = c[of.PAUSE], 0.0
+    pause, attacked = c[of.PAUSE], False
     for i in range(n):
-        attacked += s[KIND + i]
+        attacked |= s[KIND + i] != 0.0
         s[KIND + i] = s[REFUSED + i] = 0.0
         s[COOLDOWN + i] = max(pause - 1.0, 0.0) if s[BURST + i] > 0.0 else max(s[COOLDOWN + i] - 1.0, 0.0)
         s[BURST + i] = 0.0
         s[VALID + i] = s[VALID + np.uint64(LANES) + i] = 1.0
-    for w in range(WIRES if attacked > 0.0 else 0):  # without a kind there is no target and no value
+    for w in range(WIRES if attacked else 0):  # without a kind there is no target and no value
         row = np.uint64(w * LANES)
         for i in range(n):
             s[TARGET + row + i] = s[VALUE + row + i] = 0.0

@@ -133,12 +133,13 @@ def decide(s, g, window, c, f, p, n):
     """The command of the script into the rows WANT_*. -> whether there is any."""
     _when(s, c, p, n)
     channel.allowed(s, c, WANT_KIND, n)
-    some = 0.0
+    some = False
     for i in range(n):
-        s[ON + i] = s[ON + i] if s[WANT_KIND + i] != 0.0 else 0.0
-        some += s[ON + i]
+        on = (s[ON + i] != 0.0) & (s[WANT_KIND + i] != 0.0)
+        s[ON + i] = on
         s[WANT_KIND + i] = 0.0
-    if some == 0.0:
+        some |= on
+    if not some:
         return False
     for w in range(WIRES):
         row = np.uint64(w * LANES)
