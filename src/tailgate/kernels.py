@@ -53,6 +53,7 @@ def _exp(x: float) -> float:
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
 def _log(x: float) -> float:
+    x = x if x == x else -1.0  # an ordered comparison with NaN raises a flag
     plain = (x > 0.0) & (x < math.inf)
     other = x if x > 0.0 else -math.inf if x == 0.0 else math.nan
     x = x if plain else 1.0  # without a branch, so that a loop over many is vectorised
