@@ -40,10 +40,20 @@ def stopping_distance(v: Array, a: Array, brake: float, tau: float) -> Array:
     c = np.maximum(a + brake, 0.0)
     t = (v + c * tau) / brake
     for _ in range(ROUNDS):
-        e = num.exp(-t / tau)
-        t = t - (v - brake * t + c * tau * (1.0 - e)) / (c * e - brake)
-    e = num.exp(-t / tau)
-    return np.asarray(v * t - 0.5 * brake * t * t + c * tau * t - c * tau * tau * (1.0 - e))
+        t = sooner(t, num.exp(-t / tau), v, c, brake, tau)
+    return way_until(t, num.exp(-t / tau), v, c, brake, tau)
+
+
+def sooner(t: Array, e: Array, v: Array, c: Array, brake: float, tau: float) -> Array:
+    """A step of Newton's method for the time of the stop, elementwise."""
+    out: Array = t - (v - brake * t + c * tau * (1.0 - e)) / (c * e - brake)
+    return out
+
+
+def way_until(t: Array, e: Array, v: Array, c: Array, brake: float, tau: float) -> Array:
+    """way(t), elementwise."""
+    out: Array = v * t - 0.5 * brake * t * t + c * tau * t - c * tau * tau * (1.0 - e)
+    return out
 
 
 class SafePlan(NamedTuple):

@@ -40,6 +40,27 @@ CELLS = [
     ("stop-and-go-v0", "chi2_kf_sparse:eta=4", "fdi_bernoulli:start_step=60,value=-6"),
     ("car-following-noisy-v0", "always_alarm", "fdi_sparse:start_step=70"),
     ("thesis-ch4-v0", "composed:detector=chi2,mitigation=latch", "thesis_times"),
+    ("gusty-stop-and-go-v0", "imm", "dropout:trigger=near,threshold=40,probability=0.5"),
+    ("stop-and-go-v0", "imm:factors=[1,30,10000],threshold=1", "fdi_bernoulli:trigger=near,threshold=40,value=-4"),
+    ("braking-v0", "imm:factors=[2]", "dos_jam:start_step=60"),
+    ("gusty-stop-and-go-v0", "safe_state_brake", "fdi_bernoulli:trigger=near,threshold=40,value=-4"),
+    ("stop-and-go-v0", "safe_state_brake:when=always,distance=20,lag=0.5,watch=3", "dropout:trigger=near,threshold=40,probability=0.7"),
+    ("car-following-heavy-v0", "safe_state:accuracy=[1,0.5],recover=0.3", "fdi_gaussian:trigger=near,threshold=40,sd=4"),
+    ("braking-v0", "safe_state_brake:filter=rkf,adds_up=worst", "fdi:start_step=60,value=3"),
+]
+# The white-box script against each detector's gate, and aimed at one reading or at both.
+STEALTH = [
+    ("gusty-stop-and-go-v0", "chi2_kf", "stealth:trigger=near,threshold=40"),
+    ("gusty-stop-and-go-v0", "kf", "stealth:start_step=50,state_index=2"),
+    ("gusty-stop-and-go-v0", "windowed_chi2_kf", "stealth:start_step=30,targets=[position]"),
+    ("stop-and-go-v0", "windowed_chi2_kf:window=1", "stealth:start_step=30,targets=[velocity],state_index=1,sign=1"),
+    ("stop-and-go-v0", "cusum_reacquire_kf", "stealth:trigger=near,threshold=40,burst=4,pause=3"),
+    ("gusty-stop-and-go-v0", "mewma_kf", "stealth:trigger=near,threshold=40,chance=0.7"),
+    ("gusty-stop-and-go-v0", "composed:detector=mewma,detector.exact=false", "stealth:start_step=60"),
+    ("braking-v0", "rkf", "stealth:start_step=60"),
+    ("gusty-stop-and-go-v0", "chi2_kf_sparse", "stealth:start_step=60,gate=25"),
+    ("thesis-ch4-v0", "chi2_kf:gain=steady", "stealth"),
+    ("car-following-noisy-v0", "always_alarm", "stealth:start_step=70"),
 ]
 
 
@@ -53,11 +74,11 @@ def _loop(scenario, defence, attack, horizon=200, **threat):
     return loop, made.make()
 
 
-@pytest.mark.parametrize(("scenario", "defence", "attack"), CELLS)
+@pytest.mark.parametrize(("scenario", "defence", "attack"), CELLS + STEALTH)
 def test_a_trace_is_the_plain_loops_to_the_last_bit(scenario, defence, attack):
     """Episodes in two blocks, one of them not full: every signal's hash, and the lengths."""
     loop, rival = _loop(scenario, defence, attack)
-    assert isinstance(fuse(loop), Constants)
+    assert isinstance(fuse(loop, rival), Constants)
     keys = draws.keys("report", range(67))
     fused, plain = rollout(loop, rival, keys), rollout(loop, rival, keys, plain=True)
     assert np.array_equal(fused.length, plain.length)
@@ -84,6 +105,9 @@ ENVIRONMENTS = [
     {"scenario": "ch7-v0", "defence": "windowed_chi2_kf", "autoreset": "same_step", "action": "increment", "reward": "error",
      "attack_cost": 0.1, "illegal_penalty": 0.2},
     {"scenario": "car-following-heavy-v0", "defence": "brake_kf", "action": "timing", "kind": "dos_jam", "reward": "collision"},
+    {"scenario": "stop-and-go-v0", "defence": "imm", "autoreset": "same_step"},
+    {"scenario": "gusty-stop-and-go-v0", "defence": "safe_state_brake", "autoreset": "next_step", "action": "continuous",
+     "threat": {"targets": ["position", "leader_position", "leader_velocity"]}},
 ]  # fmt: skip
 
 
@@ -96,7 +120,7 @@ def _same(one, two):
         assert one.dtype == two.dtype and np.array_equal(one, two, equal_nan=True)
 
 
-@pytest.mark.parametrize("arguments", ENVIRONMENTS, ids=lambda a: a["scenario"])
+@pytest.mark.parametrize("arguments", ENVIRONMENTS, ids=lambda a: f"{a['scenario']}-{a['defence']}")
 def test_an_environment_is_the_plain_one_to_the_last_bit(arguments, tmp_path):
     """Observations, rewards, flags and information, over restarts, a masked reset and what was held."""
     text = (load_path := tmp_path / "short.yaml")
@@ -191,7 +215,7 @@ def test_threads_and_blocks_change_no_bit():
 @pytest.mark.parametrize(("scenario", "defence", "threat", "why"), [
     ("radar-following-v0", "kf", {}, "RadarFollowing"), ("car-following-lossy-v0", "kf", {}, "lost or late"),
     ("stop-and-go-v0", "kf", {"knowledge": "white"}, "white-box"), ("stop-and-go-v0", "kf", {"kinds": ["delay"]}, "delay"),
-    ("stop-and-go-v0", "imm", {}, "no lane"), ("stop-and-go-v0", "safe_state_brake", {}, "no lane"),
+    ("stop-and-go-v0", "steered", {}, "no lane"), ("stop-and-go-v0", "imm:factors=[1,2,3,4,5]", {}, "more than 4 models"),
 ])  # fmt: skip
 def test_what_has_no_lane_is_played_by_the_plain_loop(scenario, defence, threat, why):
     """And says why."""

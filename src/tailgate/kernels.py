@@ -81,12 +81,14 @@ def _log_normal(x: float, e: float) -> float:
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
 def _log(x: float) -> float:
-    if not x > 0.0:
-        return -math.inf if x == 0.0 else math.nan
-    if x == math.inf:
-        return x
-    small = x < 2.2250738585072014e-308  # denormal: scale it up first
-    return _log_normal(x * (18014398509481984.0 if small else 1.0), -54.0 if small else 0.0)
+    x = x if x == x else -1.0  # an ordered comparison with NaN raises a flag
+    plain = (x > 0.0) & (x < math.inf)
+    other = x if x > 0.0 else -math.inf if x == 0.0 else math.nan
+    x = x if plain else 1.0  # without a branch, so that a loop over many is vectorised
+    small = np.float64(x).view(np.int64) < 0x0010000000000000  # denormal: scale it up first
+    x = min(x, 1.0) * 18014398509481984.0 if small else x  # of every x in a vectorised loop: it shall not overflow
+    out = _log_normal(x, -54.0 if small else 0.0)
+    return out if plain else other
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")

@@ -12,6 +12,7 @@ import numpy as np
 from tailgate.core import Array, Attack, Frame, Model
 from tailgate.draws import Keys, Role
 from tailgate.fused import Constants, fuse
+from tailgate.fused.play import nearest as _nearest
 from tailgate.fused.play import play
 from tailgate.loop import Loop, LoopState
 
@@ -128,7 +129,7 @@ def rollout(loop: Loop, attack: Attack, keys: Keys, *, terminate: bool = True, p
 
     A loop whose parts have lanes is played by the fused engine, to the same bits; with `plain` it is not.
     """
-    if not plain and isinstance(fused := fuse(loop), Constants):
+    if not plain and isinstance(fused := fuse(loop, attack), Constants):
         return Trace(loop.model, loop.horizon, *play(loop, fused, attack, keys, terminate), loop.controller.desired_gap)
     state = loop.start(keys)
     plan = attack.prepare(loop.brief)
@@ -141,3 +142,13 @@ def rollout(loop: Loop, attack: Attack, keys: Keys, *, terminate: bool = True, p
         state, memory, frame = loop.step(state, attack, plan, memory)
         recorder.add(frame, live)
     return recorder.trace()
+
+
+def nearest(loop: Loop, attack: Attack, keys: Keys) -> tuple[Array, dict[str, Array]] | None:
+    """Lengths (B,), and the smallest `gap` and `rear_gap` (B,) [m], of the episodes that `rollout` would record.
+
+    In a memory that the horizon does not add to. None of a loop or an attack without lanes: their gaps are in the trace.
+    """
+    fused = fuse(loop, attack)
+    found = _nearest(loop, fused, attack, keys) if isinstance(fused, Constants) else None
+    return None if found is None else (found[0], dict(zip(("gap", "rear_gap"), found[1], strict=True)))

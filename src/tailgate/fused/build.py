@@ -10,7 +10,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tailgate.core import Array, Kind, Mode
+from tailgate import num
+from tailgate.agents.model_based import Stealth
+from tailgate.core import Array, Attack, Kind, Mode
 from tailgate.envs import manoeuvres as drives
 from tailgate.envs.controllers import AdaptiveCruise
 from tailgate.envs.following import CarFollowing
@@ -19,16 +21,19 @@ from tailgate.envs.sensors import Odometry
 from tailgate.estimators.chi_square import ChiSquare
 from tailgate.estimators.compose import AcceptAll, Composed, GateOut, Score
 from tailgate.estimators.detectors import Cusum, Mewma, WindowedChiSquare
+from tailgate.estimators.imm import InteractingModels
 from tailgate.estimators.kalman import KalmanFilter
 from tailgate.estimators.mitigations import Brake, Latch, Reacquire, Widen
 from tailgate.estimators.oracle import RejectAttacked
 from tailgate.estimators.raw import Raw
+from tailgate.estimators.reactive_brake import SafeState, SafeStateBrake
 from tailgate.estimators.robust import RobustKalmanFilter
 from tailgate.estimators.sentinels import AcceptFirst, AlwaysAlarm, AlwaysMode
 from tailgate.estimators.sparse import SparseChiSquare
 from tailgate.loop import Loop
 
 from . import constants as of
+from . import imm, monitor, script
 
 _FUSED_KINDS = {Kind.DOS_JAM, Kind.DOS_HOLD, Kind.DOS_HOLD_FRESH, Kind.DROPOUT, Kind.FDI}
 _STRUCTURE = np.array([[True, True, True], [False, True, True], [False, False, True]])  # of A: where it is not zero
@@ -40,7 +45,7 @@ class Constants(NamedTuple):
     c: Array  # (NUMBERS,) float64
     f: Array  # (CHOICES,) int64
     table: Array  # speeds of a profile [m/s], else one zero
-    window: int  # rows of the detector's window
+    window: int  # rows of the detector's window, or of what else a defence remembers
     intents: int  # rows of the rear driver's intents
 
 
@@ -51,16 +56,16 @@ class Refused:
     why: str
 
 
-def fuse(loop: Loop) -> Constants | Refused:
-    """The constants of a loop, or why the plain loop plays it."""
+def fuse(loop: Loop, attack: Attack | None = None) -> Constants | Refused:
+    """The constants of a loop, or why the plain loop plays it: under the given attack, or under any that does not hold the defence."""
     plan, parts = loop.plan, (loop.plant, loop.sensor, loop.controller)
     for part, known in zip(parts, (CarFollowing, Odometry, AdaptiveCruise), strict=True):
         if type(part) is not known:
             return Refused(f"{type(part).__name__} has no lane")
     if not loop.link.perfect:
         return Refused("readings are lost or late")
-    if loop.threat.knowledge == "white":
-        return Refused("a white-box attacker holds the defence itself")
+    if loop.threat.knowledge == "white" and (why := _white(loop, attack)):
+        return Refused(why)
     if not {Kind[name.upper()] for name in loop.threat.kinds} <= _FUSED_KINDS:
         return Refused("delay, replay and what is radiated have no lane")
     c, f = of.blank()
@@ -71,7 +76,22 @@ def fuse(loop: Loop) -> Constants | Refused:
     if table is None:
         return Refused(f"manoeuvre {type(loop.manoeuvre).__name__} has no lane")
     intents = plan.plant.behind.reaction if plan.plant.behind else 0
-    return Constants(c, f, table, max(int(f[of.WINDOW]) - 1, 0), intents)
+    return Constants(c, f, table, _remembered(f), intents)
+
+
+def _remembered(f: Array) -> int:
+    """Rows that the defence keeps beside those of every defence."""
+    if f[of.MODELED]:
+        return imm.rows(int(f[of.MODELED]))
+    return monitor.ROWS if f[of.BOXED] else max(int(f[of.WINDOW]) - 1, 0)
+
+
+def _white(loop: Loop, attack: Attack | None) -> str:
+    """A script sees the road and no more; the one that looks into the defence does it in its lane, where there is something to see."""
+    if type(attack) is Stealth:
+        shows = getattr(type(loop.defence), "look", None) is Composed.look
+        return "" if shows else f"{type(loop.defence).__name__} shows no innovation to a lane"
+    return "" if script.known(attack) else "a white-box attacker holds the defence itself"
 
 
 def _put(c: Array, at: int, values: Any) -> None:
@@ -128,6 +148,10 @@ def _defence(loop: Loop, c: Array, f: Array) -> str:
     if type(defence) is Raw:
         f[of.RAW] = 1
         return ""
+    if type(defence) is InteractingModels:
+        return _models(defence, loop.plan.defence, c, f)
+    if isinstance(defence, SafeState) and type(defence) in (SafeState, SafeStateBrake):
+        return _safe_set(defence, loop, c, f)
     if not isinstance(defence, Composed):
         return f"defence {type(defence).__name__} has no lane"
     if "step" in vars(type(defence)) or type(defence).step is not Composed.step or type(defence).start is not Composed.start:
@@ -138,6 +162,40 @@ def _defence(loop: Loop, c: Array, f: Array) -> str:
             return why
     if f[of.MITIGATION] == of.REACQUIRE and f[of.STEADY]:
         return "a steady filter that forgets has no lane"
+    return ""
+
+
+def _models(defence: InteractingModels, plan: Any, c: Array, f: Array) -> str:
+    models = len(plan.models)
+    if models > of.MODELS:
+        return f"more than {of.MODELS} models have no lane"
+    f[of.MODELED], c[of.THRESHOLD] = models, defence.threshold
+    for i in range(models):
+        _put(c, of.MOVES + of.MODELS * i, plan.moves[i])
+        _put(c, of.NOISES + 4 * i, plan.models[i].R)
+    _put(c, of.SHARES, plan.start)
+    return ""
+
+
+def _safe_set(defence: SafeState, loop: Loop, c: Array, f: Array) -> str:
+    plan = loop.plan.defence
+    held, road = plan.set_plan, plan.set_plan.road
+    if "v2v" not in loop.uses:
+        return "a safe set that hears no leader has no lane"
+    if why := _filter(plan.filter, plan, loop, c, f):
+        return why
+    f[of.BOXED] = 1
+    _put(c, of.ACCURATE, held.accuracy[0, :3])
+    _put(c, of.BOX_LO, held.least)
+    _put(c, of.BOX_HI, held.most)
+    low, high = defence.accel_limits
+    _put(c, of.AHEAD_LO, (low * held.dt, high * held.dt, held.recover))
+    _put(c, of.OWN_OFF, (road.off, road.noise[0] + road.A[0, 2] * road.off, road.noise[1] + road.A[1, 2] * road.off))
+    if isinstance(defence, SafeStateBrake):
+        f[of.BRAKES], f[of.ALWAYS_ARMED] = 1, defence.when == "always"
+        eased = 1.0 - float(num.exp(-plan.reaction / plan.lag))
+        _put(c, of.HARD, (defence.brake, 2.0 * max(defence.lead_brake, defence.brake), plan.lag, plan.reaction, eased))
+        _put(c, of.RESPONSE, (defence.response, defence.clearance, defence.distance, plan.watch))
     return ""
 
 

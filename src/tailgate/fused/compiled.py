@@ -75,6 +75,7 @@ formula = numba.njit(**_OPTIONS, **_INNER, forceinline=True)  # of one episode, 
 _SOURCES = {  # by package, which may lie in folders of their own
     "tailgate.fused": ("",), "tailgate": ("elementwise.py", "kernels.py", "kinds.py", "draws.py"),
     "tailgate.agents": ("reward.py", "scripted.py", "triggers.py"),
+    "tailgate.estimators": ("detectors.py", "imm.py", "reactive_brake.py", "safe_state.py"),
     "tailgate.envs": ("vehicle.py", "idm.py", "controllers.py", "manoeuvres.py"),
 }  # fmt: skip
 

@@ -5,6 +5,7 @@ They are arguments of the compiled functions. Were they constants of them, every
 
 import numpy as np
 
+MODELS = 4  # of several, at most
 MODES, COMPONENTS = 64, 32  # discrete actions, and components of an observation, at most
 MODE_WIDTH = 12  # of an action in the table: kind, sign, five targets, five values
 
@@ -54,11 +55,22 @@ REWARD_SCALE, GAP_SHAPING, ERROR_SHAPING = _number("reward_scale"), _number("gap
 GAMMA_PAID, ILLEGAL, COST = _number("gamma_paid"), _number("illegal"), _number("cost")
 SEEN_SCALE, SEEN_MOST = _number("seen_scale", COMPONENTS), _number("seen_most")  # of each component of the observation; where it is cut
 HORIZON, BUDGET_SHARE = _number("horizon"), _number("budget_share")
+# several models of the noise of the readings
+MOVES, SHARES = _number("moves", MODELS * MODELS), _number("shares", MODELS)  # from row to column; before the first reading
+NOISES = _number("noises", 4 * MODELS)
+# safe set: of gap, speed ahead, own speed
+ACCURATE, BOX_LO, BOX_HI = _number("accurate", 3), _number("box_lo", 4), _number("box_hi", 4)  # of the box also the own acceleration
+OWN_OFF, OWN_WAY, OWN_SPEED = _number("own_off"), _number("own_way"), _number("own_speed")  # bounds of what moves the car otherwise
+AHEAD_LO, AHEAD_HI, RECOVER = _number("ahead_lo"), _number("ahead_hi"), _number("recover")  # accelerations of the car ahead; steps
+# the brake that acts on it
+HARD, HARDER, LAG, RHO, EASED = _number("hard"), _number("harder"), _number("lag"), _number("rho"), _number("eased")
+RESPONSE, CLEARANCE, DISTANCE, WATCH = _number("response"), _number("clearance"), _number("distance"), _number("watch")
 NUMBERS = len(_numbers)
 
 WAY, REACTION, REAR = _choice("way"), _choice("reaction"), _choice("rear")
 UNIFORM_NOISE = _choice("uniform_noise")
 RAW, STEADY, ROBUST, PER_SIGMA = _choice("raw"), _choice("steady"), _choice("robust"), _choice("per_sigma")
+MODELED, BOXED, BRAKES, ALWAYS_ARMED = _choice("modeled"), _choice("boxed"), _choice("brakes"), _choice("always_armed")
 DETECTOR, WINDOW, RESET, EXACT = _choice("detector"), _choice("window"), _choice("reset"), _choice("exact")
 MITIGATION, MODED = _choice("mitigation"), _choice("moded")
 ENDS, ACTUATED = _choice("ends"), _choice("actuated")

@@ -76,9 +76,12 @@ def predict(s, c, f, n):
 
 
 @phase
-def innovation(s, c, n):
-    """r, S, and C P-, the first two rows of P-. A reading that is missing has r = 0 and no covariance with the other."""
-    r00, r01, r10, r11 = c[of.RNOISE], c[of.RNOISE + 1], c[of.RNOISE + 2], c[of.RNOISE + 3]
+def innovation(s, c, noise, n):
+    """r, S, and C P-, the first two rows of P-. A reading that is missing has r = 0 and no covariance with the other.
+
+    `noise`: where in c the covariance of the readings begins.
+    """
+    r00, r01, r10, r11 = c[noise], c[noise + 1], c[noise + 2], c[noise + 3]
     for i in range(n):
         first, second = s[VALID + i] != 0.0, s[VALID + _1 + i] != 0.0
         r0, r1 = s[ARRIVED + i] - (0.0 + s[X + i]), s[ARRIVED + _1 + i] - (0.0 + s[X + _1 + i])

@@ -6,7 +6,7 @@ from . import constants as of
 from . import memory as at
 from . import script, seat, step
 from .compiled import compiled, phase
-from .rows import ENDED, EPISODE, LANES, OVER, ROWS, SCORE, STATE, WANT_KIND, WIRES, WORDS, X
+from .rows import EGO, ENDED, EPISODE, LANES, LEAD_X, LENGTH, OVER, REAR_X, ROWS, SCORE, STATE, WANT_KIND, WIRES, WORDS, K, X
 
 _1, _2 = np.uint64(LANES), np.uint64(2 * LANES)
 
@@ -39,6 +39,17 @@ def keep(s, columns, record, t, first, n):
         row = np.uint64(columns[j])
         for i in range(n):
             record[t, j, first + i] = s[row + i]
+
+
+@phase
+def nearest(s, f, record, first, n):
+    """The smallest gaps of a block so far, in front and behind, into record (1, 2, B): of the steps that belong to the episodes."""
+    rear = f[of.REAR] != 0
+    for i in range(n):
+        live = s[LENGTH + i] == s[K + i] - 1.0
+        gap, behind = s[LEAD_X + i] - s[EGO + i], s[EGO + i] - s[REAR_X + i] if rear else np.inf
+        record[0, 0, first + i] = min(record[0, 0, first + i], gap if live else np.inf)
+        record[0, 1, first + i] = min(record[0, 1, first + i], behind if live else np.inf)
 
 
 @phase
@@ -97,7 +108,7 @@ def begin_again(s, g, window, intent, c, f, table, tick, fresh, words, new_windo
 def run(floats, whole, words, columns, record, seen, first_block, last_block):
     """What the orders in `whole` ask for (`memory`), in blocks from the first to before the last.
 
-    Recorded in record (K, columns, B); what a seat sees in the end goes into seen (B, FEATURES) float32.
+    Recorded in record (K, columns, B), or in (1, 2, B) the smallest gaps; what a seat sees in the end goes into seen (B, FEATURES) float32.
 
     -> steps played, or -1 where an estimate is not finite.
     """
@@ -140,7 +151,7 @@ def run(floats, whole, words, columns, record, seen, first_block, last_block):
                 if t == 0 or f[of.ACTION] == of.RAMPING or f[of.ACTION] == of.INCREMENT:  # which depend on the last command
                     wanted = seat.decode(s, c, f, action, first, n)
             elif how == at.SCRIPTED:
-                wanted = script.decide(s, g, c, p, n)
+                wanted = script.decide(s, g, window, c, f, p, n)
             else:
                 wanted = obey(s, asked, first, n)
             step.advance(s, g, window, intent, c, f, table, now, wanted, n)
@@ -149,7 +160,10 @@ def run(floats, whole, words, columns, record, seen, first_block, last_block):
                 return -1
             if seated:
                 seat.pay(s, c, f, n)
-            keep(s, columns, record, o[at.FIRST_STEP] + t, first, n)
+            if o[at.LEAST] != 0:
+                nearest(s, f, record, first, n)
+            else:
+                keep(s, columns, record, o[at.FIRST_STEP] + t, first, n)
             longest = max(longest, t + 1)
         if seated and steps > 0:
             seat.settle(s, c, paid, first, n)

@@ -23,6 +23,7 @@ def _order(name: str) -> int:
 
 # What is to be done, in the order that the kernel asks.
 BATCH, TICK = _order("batch"), _order("tick")
+LEAST = _order("least")  # record the smallest gaps of an episode, and no rows of its steps
 FRESH, STEPS, HOW, TERMINATE, FIRST_STEP, RESTART = (
     _order("fresh"), _order("steps"), _order("how"), _order("terminate"), _order("first_step"), _order("restart"),
 )  # fmt: skip

@@ -15,7 +15,7 @@ from . import rows as at
 from . import script
 from .build import Constants
 from .lanes import Lanes
-from .memory import SCRIPTED
+from .memory import LEAST, SCRIPTED
 from .rows import LANES, LINKS, SENSORS, WIRES
 
 _GROUPS: dict[str, tuple[np.uint64, int]] = {  # what a step leaves, and in how many rows
@@ -78,6 +78,22 @@ def play(loop: Loop, k: Constants, attack: Attack, keys: Keys, terminate: bool) 
         steps = lanes.run(SCRIPTED, loop.horizon, terminate=terminate)
     length = lanes.row(at.LENGTH).astype(np.int64) if terminate else np.full(lanes.batch, steps)
     return length, signals(lanes.record[:steps], k.f), first
+
+
+def nearest(loop: Loop, k: Constants, attack: Attack, keys: Keys) -> tuple[Array, Array] | None:
+    """-> lengths (B,) and the smallest gaps (2, B) [m], in front and behind, of episodes that end with a collision.
+
+    Nothing else is kept of them: many at a time take little memory. None where the attack has no lane.
+    """
+    written = script.numbers(attack, attack.prepare(loop.brief))
+    if written is None:
+        return None
+    lanes = Lanes(loop, k, keys, np.zeros(2, np.uint64), 1)
+    lanes.record[:] = np.inf
+    lanes.memory.script[:], lanes.memory.order[LEAST] = written, 1
+    lanes.start()
+    lanes.run(SCRIPTED, loop.horizon, terminate=True)
+    return lanes.row(at.LENGTH).astype(np.int64), lanes.record[0]
 
 
 def _step_by_step(lanes: Lanes, attack: Attack, plan: Any, terminate: bool) -> int:

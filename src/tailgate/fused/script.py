@@ -7,12 +7,13 @@ from typing import Any
 import numpy as np
 
 from tailgate.agents import scripted
+from tailgate.agents.model_based import Stealth
 from tailgate.agents.triggers import Closing, Fast, LeaderBraking, Near, Slow, Trigger
 from tailgate.core import Array, Kind
 from tailgate.draws import Role
 from tailgate.elementwise import clip
 
-from . import channel, road
+from . import channel, road, stealth
 from . import constants as of
 from .compiled import phase
 from .rows import (
@@ -25,6 +26,7 @@ from .rows import (
     LEAD_X,
     ON,
     OPENED,
+    PASSES,
     SEEN,
     WANT_KIND,
     WANT_TARGET,
@@ -37,22 +39,34 @@ from .rows import (
 WHEN, THRESHOLD, BEGIN, WINDOW, ON_FOR, OFF_FOR, CHANCE = range(7)
 WHAT, LAW, FIRST, SECOND, LIMIT, HIT, TURN = range(7, 14)
 AIM, SIGN = 14, 19  # five places each: the wires, and a factor for each
-PLACES = 24
+PUSHED, TOWARDS, GATE = 24, 25, 26  # of the white-box attack: a state, a sign, and a gate; NaN: the defence's own
+PLACES = 27
 TIME, NEAR, CLOSING, FAST, SLOW, LEADER_BRAKING = range(6)
-NOTHING, CONSTANT, UNIFORM, GAUSSIAN, RAMP = range(5)
+NOTHING, CONSTANT, UNIFORM, GAUSSIAN, RAMP, STEALTH = range(6)
 
 _WHEN = {Trigger: TIME, Near: NEAR, Closing: CLOSING, Fast: FAST, Slow: SLOW, LeaderBraking: LEADER_BRAKING}
 _ATTACK = np.uint64(int(Role.ATTACK) << 16)
 _CHANCE = np.uint64(int(Role.ATTACK) << 16 | scripted.CHANCE)
 _1 = np.uint64(LANES)
 _JAM, _FDI = float(Kind.DOS_JAM), float(Kind.FDI)
+_LANES = {
+    scripted.NoAttack, scripted.Jam, scripted.Hold, scripted.Dropout, scripted.Inject, scripted.InjectGaussian, scripted.InjectBernoulli,
+    scripted.InjectRamp, scripted.InjectThenJam, scripted.InjectUniform, Stealth,
+}  # fmt: skip
+
+
+def known(attack: Any) -> bool:
+    """Whether an attack is a script that has a lane."""
+    return type(attack) in _LANES
 
 
 def numbers(attack: Any, plan: Any) -> Array | None:
     """A script as (PLACES,) numbers, None where it has no lane."""
+    if not known(attack):
+        return None
     p = np.zeros(PLACES)
     p[[WINDOW, ON_FOR, CHANCE, HIT, TURN, LIMIT]] = np.inf, np.inf, 1.0, 2.0, np.inf, np.inf
-    p[SIGN:] = 1.0
+    p[SIGN : SIGN + WIRES] = 1.0
     if type(attack) is scripted.NoAttack:
         p[BEGIN] = np.inf
         return p
@@ -65,7 +79,7 @@ def numbers(attack: Any, plan: Any) -> Array | None:
         p[WHAT], p[HIT] = Kind.DROPOUT, attack.probability
     elif kind is scripted.Inject:
         p[WHAT], p[LAW], p[FIRST] = Kind.FDI, CONSTANT, attack.value
-        p[SIGN:] = 1.0 if plan.extra is None else plan.extra[0]
+        p[SIGN : SIGN + WIRES] = 1.0 if plan.extra is None else plan.extra[0]
     elif kind is scripted.InjectGaussian:
         p[WHAT], p[LAW], p[FIRST], p[SECOND] = Kind.FDI, GAUSSIAN, attack.mean, attack.sd
     elif kind is scripted.InjectBernoulli:
@@ -77,7 +91,8 @@ def numbers(attack: Any, plan: Any) -> Array | None:
     elif kind is scripted.InjectUniform:
         p[WHAT], p[LAW], p[FIRST], p[SECOND] = Kind.FDI, UNIFORM, attack.low, attack.high
     else:
-        return None
+        p[WHAT], p[LAW], p[PUSHED], p[TOWARDS] = Kind.FDI, STEALTH, attack.state_index, attack.sign
+        p[GATE] = np.nan if attack.gate is None else attack.gate
     when = attack.when
     p[WHEN], p[THRESHOLD], p[BEGIN] = _WHEN[type(when)], getattr(when, "threshold", 0.0), max(when.start, plan.brief.threat.onset)
     p[WINDOW] = np.inf if when.window is None else when.window
@@ -114,21 +129,50 @@ def _when(s, c, p, n):
 
 
 @phase
-def decide(s, g, c, p, n):
+def decide(s, g, window, c, f, p, n):
     """The command of the script into the rows WANT_*. -> whether there is any."""
     _when(s, c, p, n)
     channel.allowed(s, c, WANT_KIND, n)
-    some = 0.0
+    some = False
     for i in range(n):
-        s[ON + i] = s[ON + i] if s[WANT_KIND + i] != 0.0 else 0.0
-        some += s[ON + i]
+        on = (s[ON + i] != 0.0) & (s[WANT_KIND + i] != 0.0)
+        s[ON + i] = on
         s[WANT_KIND + i] = 0.0
-    if some == 0.0:
+        some |= on
+    if not some:
         return False
     for w in range(WIRES):
         row = np.uint64(w * LANES)
         for i in range(n):
             s[WANT_TARGET + row + i] = s[WANT_VALUE + row + i] = 0.0
+    if p[LAW] == STEALTH:
+        _push(s, window, c, f, p, n)
+    else:
+        _sample(s, g, c, p, n)
+    if p[CHANCE] < 1.0:
+        _spare(s, g, p[CHANCE], n)
+    return True
+
+
+@phase
+def _push(s, window, c, f, p, n):
+    """The white-box attack's command."""
+    sign, bound, aim0, aim1, own = p[TOWARDS], c[of.BOUND], p[AIM] != 0.0, p[AIM + 1] != 0.0, p[GATE]
+    stealth.look(s, c, f, np.int64(p[PUSHED]), n)
+    stealth.gate(s, window, c, f, own, n)
+    stealth.push(s, sign, aim0, aim1, bound, n)
+    for w in range(WIRES):
+        row, aimed = np.uint64(w * LANES), p[AIM + w] != 0.0
+        for i in range(n):
+            on = (s[ON + i] != 0.0) & (s[PASSES + i] != 0.0) & aimed
+            s[WANT_TARGET + row + i] = on
+            s[WANT_VALUE + row + i] = s[WANT_VALUE + row + i] if on else 0.0
+            s[WANT_KIND + i] = _FDI if on else s[WANT_KIND + i]
+
+
+@phase
+def _sample(s, g, c, p, n):
+    """What the law of the values says."""
     kind, law, first, second, limit, turn = p[WHAT], p[LAW], p[FIRST], p[SECOND], p[LIMIT], p[TURN]
     hit = p[HIT]
     if law == UNIFORM or hit < 2.0:
@@ -152,9 +196,6 @@ def decide(s, g, c, p, n):
             s[WANT_TARGET + row + i] = on
             s[WANT_VALUE + row + i] = value * sign if on & (law != NOTHING) else 0.0
             s[WANT_KIND + i] = (_JAM if (kind == _FDI) & (count >= turn) else kind) if on else s[WANT_KIND + i]
-    if p[CHANCE] < 1.0:
-        _spare(s, g, p[CHANCE], n)
-    return True
 
 
 @phase

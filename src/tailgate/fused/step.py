@@ -8,7 +8,7 @@ import numpy as np
 
 from tailgate.draws import Role
 
-from . import channel, kalman, road
+from . import channel, imm, kalman, monitor, road
 from . import constants as of
 from .compiled import phase
 from .rows import (
@@ -102,6 +102,10 @@ def start(s, g, window, intent, c, f, table, tick, n):
         row, var = np.uint64(j * LANES), c[of.PRIOR + j]
         for i in range(n):
             s[P + row + i] = var
+    if f[of.MODELED] != 0:
+        imm.begin(s, window, c, f[of.MODELED], n)
+    elif f[of.BOXED] != 0:
+        monitor.begin(window, c, n)
     for i in range(n):
         s[REAR_X + i], s[REAR_V + i] = s[EGO + i] - c[of.REAR_START], c[of.REAR_START + 1]
     _begin(s, g, c, f, n)
@@ -148,18 +152,28 @@ def advance(s, g, window, intent, c, f, table, tick, asked, n):
         channel.rest(s, c, n)
     if f[of.RAW] != 0:
         kalman.read(s, n)
+    elif f[of.MODELED] != 0:
+        imm.step(s, window, c, f, n)
     else:
         kalman.predict(s, c, f, n)
-        kalman.innovation(s, c, n)
-        kalman.detect(s, window, c, f, n)
-        kalman.suspect(s, c, f, n)
-        kalman.mitigate(s, c, f, n)
-        if f[of.MITIGATION] == of.REACQUIRE and kalman.forget(s, c, n):
-            kalman.innovation(s, c, n)
+        kalman.innovation(s, c, of.RNOISE, n)
+        if f[of.BOXED] != 0:
+            monitor.enclose(s, window, c, n)
+        else:
+            kalman.detect(s, window, c, f, n)
+            kalman.suspect(s, c, f, n)
+            kalman.mitigate(s, c, f, n)
+            if f[of.MITIGATION] == of.REACQUIRE and kalman.forget(s, c, n):
+                kalman.innovation(s, c, of.RNOISE, n)
         if f[of.ROBUST] != 0:
             kalman.take_out(s, c, f, n)
         kalman.update(s, f, n)
+        if f[of.BOXED] != 0:
+            monitor.inside(s, window, n)
     road.control(s, _MESSAGE, c, n)
+    if f[of.BRAKES] != 0:
+        monitor.watch(s, window, c, f, n)
+        monitor.hold_back(s, n)
     channel.actuate(s, f, n)
     road.remember(s, n)
     move_and_measure(s, g, intent, c, f, table, tick, n)

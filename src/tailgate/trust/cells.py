@@ -6,9 +6,10 @@ Seeds are those of an evaluation: a seed is the same world for every defence, so
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,9 +21,9 @@ from tailgate.loop import Loop
 from tailgate.registry import Spec
 from tailgate.scenario import Scenario, load_scenario
 from tailgate.schema import canonical
-from tailgate.trace import Trace, episodes_at_once, rollout
+from tailgate.trace import Trace, episodes_at_once, nearest, rollout
 
-from .logic import Eventually, Interval, along, holds, robustness
+from .logic import Eventually, Interval, Samples, along, holds, robustness
 from .properties import CONJUNCTIONS, Demands, Property, built_in, conjunctions, own
 from .signals import SafeDistance, sample
 from .statistics import Sequential, Sprt
@@ -73,9 +74,61 @@ def outcome(known: Property, trace: Trace, safe: SafeDistance) -> Outcome:
     return Outcome(holds(known.formula, samples), robustness(known.formula, samples), asked, instants, trace.length)
 
 
-def joined(parts: Sequence[Outcome]) -> Outcome:
-    """The outcomes of runs that were played one after the other."""
-    return Outcome(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+def outcome_by_gaps(known: Property, length: Array, least: dict[str, Array], dt: float) -> Outcome:
+    """A property that the smallest gaps decide (`Property.by_gaps`), in runs of which only these are known."""
+    assert known.formula is not None
+    values = {name: least[name.partition("@")[0]][None, :] for name in known.signals}
+    samples = Samples(dt, np.ones_like(length), values)
+    asked, instants = np.ones(len(length), bool), np.zeros(len(length), np.int64)
+    return Outcome(holds(known.formula, samples), robustness(known.formula, samples), asked, instants, length)
+
+
+@dataclass
+class Tally:
+    """What is known of a property after n runs; they themselves are not kept."""
+
+    n: int = 0
+    k: int = 0  # runs that hold
+    asked: int = 0
+    answered: int = 0  # of those asked the ones that hold
+    instants: int = 0
+    steps: int = 0
+    least: float = math.inf  # robustness, and the run that has it
+    least_run: int = 0
+    failing: float = math.inf  # the least of those that fail
+    failing_run: int | None = None
+
+    def add(self, found: Outcome) -> None:
+        """The next runs."""
+        worst = np.where(found.holds, np.inf, found.robustness)
+        low, lost = int(np.argmin(found.robustness)), int(np.argmin(worst))
+        if found.robustness[low] < self.least:
+            self.least, self.least_run = float(found.robustness[low]), self.n + low
+        if not found.holds.all() and (self.failing_run is None or worst[lost] < self.failing):
+            self.failing, self.failing_run = float(worst[lost]), self.n + lost
+        self.n, self.k, self.asked = self.n + len(found.holds), self.k + int(found.holds.sum()), self.asked + int(found.asked.sum())
+        self.answered += int((found.holds & found.asked).sum())
+        self.instants, self.steps = self.instants + int(found.instants.sum()), self.steps + int(found.steps.sum())
+
+
+@dataclass
+class Found:
+    """What is known of a cell: a tally of each property, and of each conjunction whether a run keeps to it, one byte a run."""
+
+    tallies: dict[str, Tally]
+    together: dict[str, tuple[str, ...]]  # names of the conjunctions and of what they are made of
+    runs: dict[str, list[Array]]
+
+    def add(self, outcomes: dict[str, Outcome]) -> None:
+        """The next runs."""
+        for name, of in outcomes.items():
+            self.tallies[name].add(of)
+        for name, members in self.together.items():
+            self.runs[name].append(np.all([outcomes[member].holds for member in members], axis=0))
+
+    def of(self, conjunction: str) -> Array:
+        """(n,) bool"""
+        return np.concatenate([np.zeros(0, bool), *self.runs[conjunction]])
 
 
 def check_cell(job: Job) -> Row:
@@ -107,55 +160,65 @@ def _blank(job: Job, place: Scenario) -> Row:
     }  # fmt: skip
 
 
-def _played(job: Job, loop: Loop, attack: Any, known: Sequence[Property]) -> dict[str, Outcome]:
+def _played(job: Job, loop: Loop, attack: Any, known: Sequence[Property]) -> Found:
     """The outcome of each property in the order of the seeds, up to where the rule stops."""
-    cell = job.cell
+    cell, episodes = job.cell, job.cell.episodes
     size = episodes_at_once(loop.model, loop.horizon, cell.batch if job.rule is None else min(cell.batch, 64))
-    parts: dict[str, list[Outcome]] = {p.name: [] for p in known}
+    together = {name: members for name, members in conjunctions(known, job.formulas).items() if members}
+    found = Found({p.name: Tally() for p in known}, together, {name: [] for name in together})
     for start in range(0, cell.seeds, size):
-        trace = rollout(loop, attack, draws.keys(cell.purpose, cell.episodes[start : start + size]))
-        for p in known:
-            parts[p.name].append(outcome(p, trace, job.safe))
-        if job.rule is not None and known:
-            found = {name: joined(of) for name, of in parts.items()}
-            verdict = job.rule.stop(_all(found, conjunctions(known, job.formulas)["trust"]))
-            if verdict is not None:
-                return {name: Outcome(*(x[: verdict.runs] for x in of)) for name, of in found.items()}
-    return {name: joined(of) for name, of in parts.items()}
+        outcomes = _outcomes(job, loop, attack, known, _keys(cell.purpose, tuple(episodes[start : start + size])))
+        verdict = None
+        if job.rule is not None and together:
+            trust = np.all([outcomes[name].holds for name in together["trust"]], axis=0)
+            verdict = job.rule.stop(np.concatenate([found.of("trust"), trust]))
+        if verdict is not None:
+            outcomes = {name: Outcome(*(x[: verdict.runs - start] for x in of)) for name, of in outcomes.items()}
+        found.add(outcomes)
+        if verdict is not None:
+            break
+    return found
 
 
-def _all(found: dict[str, Outcome], names: Sequence[str]) -> Array:
-    """(B,) bool: all these properties hold."""
-    return np.asarray(np.all([found[name].holds for name in names], axis=0))
+@lru_cache(maxsize=16)
+def _keys(purpose: str, seeds: tuple[int, ...]) -> draws.Keys:
+    """Of runs that every cell plays: their digests take longer than some steps."""
+    return draws.keys(purpose, seeds)
 
 
-def _summary(job: Job, known: Sequence[Property], found: dict[str, Outcome]) -> Row:
-    n = len(next(iter(found.values())).holds) if found else 0
+def _outcomes(job: Job, loop: Loop, attack: Any, known: Sequence[Property], keys: draws.Keys) -> dict[str, Outcome]:
+    """Of the runs of these keys. Where the smallest gaps decide everything, no trace is made."""
+    if all(p.by_gaps for p in known) and (found := nearest(loop, attack, keys)) is not None:
+        return {p.name: outcome_by_gaps(p, *found, loop.model.dt) for p in known}
+    trace = rollout(loop, attack, keys)
+    return {p.name: outcome(p, trace, job.safe) for p in known}
+
+
+def _summary(job: Job, known: Sequence[Property], found: Found) -> Row:
+    n = max((tally.n for tally in found.tallies.values()), default=0)
     together: dict[str, Any] = {}
-    for name, members in conjunctions(known, job.formulas).items():
-        if members:
-            runs = _all(found, members)
-            together[name] = {"of": list(members), "k": int(runs.sum()), "runs": np.packbits(runs).tobytes().hex()}
-    verdict = job.rule.stop(_bits(together["trust"]["runs"], n)) if job.rule is not None and together else None
+    for name, members in found.together.items():
+        runs = found.of(name)
+        together[name] = {"of": list(members), "k": int(runs.sum()), "runs": np.packbits(runs).tobytes().hex()}
+    verdict = job.rule.stop(found.of("trust")) if job.rule is not None and together else None
     return {
-        "n": n, "properties": [_property(p, found.get(p.name), job.cell) for p in known], "conjunctions": together,
-        "verdict": None if verdict is None else verdict.holds, "worst": _worst(known, found, job.cell),
+        "n": n, "properties": [_property(p, found.tallies.get(p.name), job.cell.episodes) for p in known], "conjunctions": together,
+        "verdict": None if verdict is None else verdict.holds, "worst": _worst(known, found, job.cell.episodes),
     }  # fmt: skip
 
 
-def _property(known: Property, found: Outcome | None, cell: Cell) -> Row:
+def _property(known: Property, found: Tally | None, seeds: Sequence[int]) -> Row:
     """k of n runs satisfy it; its antecedent held in `asked` of them, of which `answered` satisfy it, at a share `instants` of steps."""
     out: Row = {"name": known.name, "about": known.about, "reason": known.reason, "formula": None}
     if found is None:
         return out
     conditional = known.trigger is not None
-    least = int(np.argmin(found.robustness))
     return out | {
-        "formula": str(known.formula), "k": int(found.holds.sum()), "n": len(found.holds),
-        "asked": int(found.asked.sum()) if conditional else None,
-        "answered": int((found.holds & found.asked).sum()) if conditional else None,
-        "instants": float(found.instants.sum() / found.steps.sum()) if conditional else None,
-        "least": _finite(found.robustness[least]), "seed": cell.episodes[least],
+        "formula": str(known.formula), "k": found.k, "n": found.n,
+        "asked": found.asked if conditional else None,
+        "answered": found.answered if conditional else None,
+        "instants": found.instants / found.steps if conditional else None,
+        "least": _finite(found.least), "seed": seeds[found.least_run],
     }  # fmt: skip
 
 
@@ -163,13 +226,12 @@ def _finite(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None
 
 
-def _worst(known: Sequence[Property], found: dict[str, Outcome], cell: Cell) -> Row | None:
+def _worst(known: Sequence[Property], found: Found, seeds: Sequence[int]) -> Row | None:
     """The run that fails the first of the properties that any run fails, by the most; those of safety come first."""
     for p in sorted(known, key=lambda p: p.name not in CONJUNCTIONS["safety"]):
-        if p.name in found and not found[p.name].holds.all():
-            of = found[p.name]
-            i = int(np.argmin(np.where(of.holds, np.inf, of.robustness)))
-            return {"property": p.name, "run": i, "seed": cell.episodes[i], "robustness": _finite(of.robustness[i])}
+        of = found.tallies.get(p.name)
+        if of is not None and of.failing_run is not None:
+            return {"property": p.name, "run": of.failing_run, "seed": seeds[of.failing_run], "robustness": _finite(of.failing)}
     return None
 
 
