@@ -1,4 +1,4 @@
-"""The record of thesis chapter 4: its reproduction, and every defence against every attack on minutes of driving.
+"""Beside the reproduction of thesis chapter 4: every defence against every attack on minutes of driving.
 
     python benchmarks/ch4.py [--seeds 100] [--out results/ch4-v0]
 """
@@ -16,7 +16,6 @@ from tailgate.evaluation import evaluate
 from tailgate.files import write_atomic
 from tailgate.plots import write_overview
 from tailgate.progress import cells, progress
-from tailgate.reproduce import reproduce, write
 from tailgate.scenario import load_suite
 from tailgate.summary import summarise
 
@@ -56,11 +55,7 @@ def main():
     parser.add_argument("--out", default="results/ch4-v0")
     options = parser.parse_args()
     out, errors = Path(options.out), Console(stderr=True)
-    begun = time.perf_counter()
-    page = write(reproduce("ch4", 200, lambda text: errors.print(text, highlight=False)), out)
-    page.unlink()  # the pictures and the text are beside it
-    seconds = {"reproduce": time.perf_counter() - begun}
-    table = []
+    seconds, table = {}, []
     for name in SUITES:
         begun = time.perf_counter()
         with progress(errors) as update:
