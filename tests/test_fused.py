@@ -1,6 +1,9 @@
 """The fused engine against the plain loop: the same bits, lane by lane and over a covering set of pairs, over whole episodes."""
 
 import dataclasses
+import os
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -276,6 +279,24 @@ def test_a_part_is_called_by_compiled_code_alone():
 
     with pytest.raises(TypeError, match="bad argument"):
         kernel.living(np.zeros(ROWS * 64), np.uint64(64))
+
+
+@pytest.mark.long
+def test_another_version_of_numba_compiles_it_in_its_own_way(tmp_path):
+    """Without what is known of this version's inner workings the code is made anew, and plays the same."""
+    code = """
+import numba
+numba.__version__ = "99.0"
+from tailgate import draws, make_attack, make_defence
+from tailgate.scenario import load_scenario
+from tailgate.trace import rollout
+loop = load_scenario("stop-and-go-v0").loop(make_defence("chi2_kf"))
+one, two = (rollout(loop, make_attack("none"), draws.keys("train", [3]), plain=plain).trace_hash(0) for plain in (False, True))
+from tailgate.fused import compiled
+assert one == two and not compiled._INSIDE
+"""
+    done = subprocess.run([sys.executable, "-c", code], env=os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
 
 
 def test_the_phases_are_vectorised():
