@@ -64,7 +64,7 @@ def fuse(loop: Loop, attack: Attack | None = None) -> Constants | Refused:
             return Refused(f"{type(part).__name__} has no lane")
     if not loop.link.perfect:
         return Refused("readings are lost or late")
-    if loop.threat.knowledge == "white" and (why := _white(loop, attack)):
+    if why := _white(loop, attack):
         return Refused(why)
     if not {Kind[name.upper()] for name in loop.threat.kinds} <= _FUSED_KINDS:
         return Refused("delay, replay and what is radiated have no lane")
@@ -88,10 +88,13 @@ def _remembered(f: Array) -> int:
 
 def _white(loop: Loop, attack: Attack | None) -> str:
     """A script sees the road and no more; the one that looks into the defence does it in its lane, where there is something to see."""
+    granted = loop.threat.knowledge == "white"
     if type(attack) is Stealth:
+        if not granted:
+            return "attack stealth needs a white box"  # which the plain loop says
         shows = getattr(type(loop.defence), "look", None) is Composed.look
         return "" if shows else f"{type(loop.defence).__name__} shows no innovation to a lane"
-    return "" if script.known(attack) else "a white-box attacker holds the defence itself"
+    return "" if not granted or script.known(attack) else "a white-box attacker holds the defence itself"
 
 
 def _put(c: Array, at: int, values: Any) -> None:
