@@ -1,5 +1,6 @@
 """The command line: exit codes, one clear error, tables and JSON."""
 
+import importlib
 import json
 import subprocess
 import sys
@@ -118,3 +119,20 @@ def test_a_detector_is_no_defence(run: Run) -> None:
     assert code == 2 and "composed:detector=module:Class" in said
     code, table, _ = run(*part, "--defence", "kf")
     assert code == 0 and "not granted" in " ".join(table.split())
+
+
+@pytest.mark.parametrize(
+    ("code", "words"),
+    [
+        ("def (\n", ["syntax", "line 1"]), ("\nx = nothing\n", ["NameError", "theirs.py, line 2"]),
+        ("class Mine:\n    pass\n", ["prepare"]),
+    ],
+)  # fmt: skip
+def test_a_module_that_cannot_be_loaded_is_one_line(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: str, words: list[str]) -> None:
+    """The file of somebody's first defence: what is wrong with it, and where."""
+    (tmp_path / "theirs.py").write_text(code)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "theirs", raising=False)
+    importlib.invalidate_caches()
+    done, _, said = run("evaluate", "--scenario", "thesis-ch4-v0", "--dose", "none", "--defence", "theirs:Mine", "--attack", "none", "--seeds", "2")
+    assert done == 2 and "Traceback" not in said and len(said.strip().splitlines()) == 1 and all(word in said for word in words)

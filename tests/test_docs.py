@@ -109,3 +109,17 @@ def test_the_adapted_filter_of_the_documentation_plays(tmp_path: Path) -> None:
     (tmp_path / "myfilter.py").write_text(_blocks("docs/new-defence.md", "python")[3], encoding="utf-8")
     (entry,) = _evaluated(tmp_path, "--defence", "myfilter:Fading:alpha=1.05", "--attack", "none")
     assert entry["n"] == 4 and 0.3 < entry["rmse_position"]["median"] < 1.5  # type: ignore[index]
+
+
+def test_the_published_head_is_that_of_the_published_board() -> None:
+    """Figure for figure; and no board speaks of another machine's directories."""
+    from tailgate.leaderboard.head import markdown
+
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    found = re.findall(r"<!-- head: (\S+) -->\n(.*?)<!-- end -->", text, flags=re.S)
+    assert found
+    for name, table in found:
+        board = (ROOT / name).read_text(encoding="utf-8")
+        ranked = sum(entry["rank"] is not None for entry in json.loads(board)["entries"])
+        assert ranked >= 10 and table.strip() == markdown(json.loads(board), ranked).strip()
+        assert '"/' not in board

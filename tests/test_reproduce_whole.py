@@ -168,6 +168,19 @@ def test_chapters_resume(tmp_path, covered):
     assert play.played[8:] == list(CHAPTERS)
 
 
+def test_a_chapter_by_itself_is_the_whole_ones(tmp_path, covered):
+    """What one command finished the other keeps, both ways; a file in place of the folder is refused before anything is played."""
+    play = Chapters()
+    assert not whole.chapter("ch4", 20, tmp_path / "ch4", play=play)[2]
+    assert whole.chapter("ch4", 20, tmp_path / "ch4", play=play)[2] and play.played == ["ch4"]
+    assert reproduce_whole(20, tmp_path, play=play).kept == ("ch4",)
+    assert whole.chapter("ch5", 20, tmp_path / "ch5", play=play)[2]
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="writable"):
+        whole.chapter("ch3", 20, tmp_path / "file", play=play)
+    assert play.played == ["ch4", "ch3", "ch5", "ch6", "ch7"]
+
+
 def test_one_report(tmp_path, covered):
     """Page, text and data hold every claim, table, figure and item; markup is shown, not run; nothing is fetched."""
     page = write_whole(reproduce_whole(20, tmp_path, play=Chapters()), tmp_path).read_text()

@@ -26,7 +26,7 @@ from tailgate.files import write_atomic
 from tailgate.metrics import METRICS, measure
 from tailgate.parts import Parts
 from tailgate.pool import abandon, processes
-from tailgate.registry import Entry, Spec, entry_for, text_of
+from tailgate.registry import Entry, Spec, entry_for, said, text_of
 from tailgate.rounds import numbered
 from tailgate.rows import packed
 from tailgate.scenario import Scenario, Suite, load_scenario, load_suite
@@ -110,7 +110,7 @@ def _why(error: Exception) -> tuple[str, str]:
     """Reason and status of the rows that an error costs."""
     if isinstance(error, NotApplicable):
         return str(error), "skipped"
-    return f"{type(error).__name__}: {error}", "error"
+    return said(error), "error"
 
 
 def _head(cell: Cell, place: Scenario, guard: Entry, rival: Entry, identity: str) -> dict[str, Any]:

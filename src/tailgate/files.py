@@ -104,6 +104,11 @@ def writable_directory(path: Path, field: str = "out") -> Path:
     return path
 
 
+def aside(path: Path | str | None) -> set[str]:
+    """What was set aside for a file."""
+    return {str(earlier) for earlier in Path(path).parent.glob(f"{Path(path).name}.[0-9]*")} if path else set()
+
+
 def set_aside(path: Path, field: str = "out") -> Path:
     """Rename a file or directory to name.1, name.2, ...: nothing is lost. Returns the new path."""
     number = next(n for n in itertools.count(1) if not path.with_name(f"{path.name}.{n}").exists())

@@ -9,6 +9,7 @@ import importlib
 import inspect
 import json
 import re
+import traceback
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -273,6 +274,13 @@ class Spec:
         return made
 
 
+def said(error: Exception) -> str:
+    """An error of somebody's code in a line: its type, its words, and the file and line that raised it."""
+    frames = traceback.extract_tb(error.__traceback__)
+    place = f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})" if frames else ""
+    return f"{type(error).__name__}: {error}{place}"
+
+
 def imported(family: Family, text: str) -> Entry:
     """The entry of a class that the user names as module:Class."""
     module, _, name = text.partition(":")
@@ -284,6 +292,10 @@ def imported(family: Family, text: str) -> Entry:
         raise InputError(family, text, f"an importable module ({error})") from None
     except AttributeError:
         raise InputError(family, text, f"a class that module {module} defines") from None
+    except SyntaxError as error:
+        raise InputError(family, text, f"a module without syntax errors ({error.msg}, line {error.lineno})") from None
+    except Exception as error:  # whatever its first lines do
+        raise InputError(family, text, f"a module that can be imported ({said(error)})") from None
     if not isinstance(cls, type):
         raise InputError(family, text, "a class")
     return entry_of(family, text, cls)

@@ -14,6 +14,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from tailgate.errors import InputError
+from tailgate.files import aside
 from tailgate.progress import cells, console, progress
 from tailgate.schema import scalar
 
@@ -59,14 +60,14 @@ def _evaluate(options: argparse.Namespace) -> int:
     suite: Any = options.suite or "quick-v0"
     if options.suite is None and options.scenario:  # a scenario by itself: what is not named is quick-v0's, but for the dose
         suite = dataclasses.replace(load_suite(suite), name="custom", doses=(None,))
-    before = _kept(options.out)
+    before = aside(options.out)
     with progress(Console(stderr=True)) as update:
         rows = evaluate(
             suite, defences=options.defence, attacks=options.attack, scenarios=options.scenario, doses=doses,
             seeds=options.seeds, purpose=options.purpose, batch=options.batch, workers=options.workers,
             out=options.out, threat=threat, progress=lambda done, total: update("playing", done, total, cells(done, total)),
         )  # fmt: skip
-    for earlier in sorted(_kept(options.out) - before):
+    for earlier in sorted(aside(options.out) - before):
         print(f"tailgate: {options.out} held other rows; they are in {earlier}", file=sys.stderr)
     table = summarise(rows)
     if options.json:
@@ -82,11 +83,6 @@ def _evaluate(options: argparse.Namespace) -> int:
     if failed:
         print(f"tailgate: {failed} of {len(rows)} rows failed; their reasons are in the rows", file=sys.stderr)
     return 1 if failed else 0
-
-
-def _kept(out: str | None) -> set[str]:
-    """Files that were set aside for this one."""
-    return {str(path) for path in Path(out).parent.glob(f"{Path(out).name}.[0-9]*")} if out else set()
 
 
 def _print_summary(table: list[dict[str, Any]]) -> None:

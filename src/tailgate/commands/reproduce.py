@@ -31,7 +31,8 @@ def add(commands: Any) -> None:
 
 
 def _reproduce(options: argparse.Namespace) -> int:
-    from tailgate.reproduce.run import as_json, flat, reproduce, summary, write
+    from tailgate.reproduce.run import as_json, flat, summary
+    from tailgate.reproduce.whole import chapter
 
     errors = Console(stderr=True)
 
@@ -40,8 +41,9 @@ def _reproduce(options: argparse.Namespace) -> int:
 
     if options.chapter is None:
         return _whole(options, tick)
-    report = reproduce(options.chapter, options.seeds, tick)
-    page = write(report, Path(options.out) if options.out else Path("reproduction") / options.chapter)
+    place = Path(options.out) if options.out else Path("reproduction") / options.chapter
+    report = chapter(options.chapter, options.seeds, place, tick)[0]
+    page = place / "index.html"
     if options.json:
         print(json.dumps(as_json(report), indent=1, allow_nan=False))
     else:

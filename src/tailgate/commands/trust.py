@@ -15,6 +15,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from tailgate.errors import InputError
+from tailgate.files import aside
 from tailgate.progress import cells, console, progress
 from tailgate.schema import scalar
 
@@ -97,7 +98,7 @@ def _rule(options: argparse.Namespace) -> Any:
 def _trust(options: argparse.Namespace) -> int:
     from tailgate.schema import build
     from tailgate.trust.properties import Demands
-    from tailgate.trust.run import check
+    from tailgate.trust.run import ROWS, check
     from tailgate.trust.signals import SafeDistance
     from tailgate.trust.statistics import runs_for
 
@@ -106,6 +107,8 @@ def _trust(options: argparse.Namespace) -> int:
     runs = runs_for(options.precision, options.confidence) if options.precision is not None else options.runs
     if runs is None and rule is not None:
         runs = 10_000
+    place = Path(options.out) / ROWS if options.out else None
+    before = aside(place)
     with progress(Console(stderr=True)) as update:
         found = check(
             suite, runs=runs, formulas=options.property, alpha=options.alpha, purpose=options.purpose, beacon=options.beacon,
@@ -115,6 +118,8 @@ def _trust(options: argparse.Namespace) -> int:
             asked=build(Demands, _values("--demand", options.demand), "--demand"), rule=rule,
             progress=lambda done, total: update("model checking", done, total, cells(done, total)),
         )  # fmt: skip
+    for earlier in sorted(aside(place) - before):
+        print(f"tailgate: {options.out} held other cells; they are in {earlier}", file=sys.stderr)
     if options.json:
         print(json.dumps(found, indent=1, allow_nan=False))
     elif rule is None:
@@ -166,7 +171,8 @@ def _print_bounds(found: dict[str, Any]) -> None:
     out.print(table)
     for name in names:
         members = sorted({p for entry in found["defences"] for held in entry[name].values() if held for p in held["of"]})
-        out.print(f"{name}: {' and '.join(members) or 'nothing is defined here'}, in one run", markup=False, highlight=False)
+        parts = " and ".join(map(_bracketed, members)) or "nothing is defined here"
+        out.print(f"{name}: {parts}, in one run", markup=False, highlight=False)
     against = ", ".join(f"{a['attack']} ({a['knowledge']}{'; ' + a['note'] if a['note'] else ''})" for a in attacks)
     out.print(f"attacks: {against or 'none'}", markup=False, highlight=False)
     out.print(f"scenarios: {', '.join(found['scenarios'])}", markup=False, highlight=False)
@@ -215,3 +221,8 @@ def _print_cells(found: dict[str, Any]) -> None:
         verdict = {None: "-", True: f"P >= {rule.get('high', 0):g}", False: f"P <= {rule.get('low', 0):g}"}[cell["verdict"]]
         table.add_row(*head, str(cell["n"]), str(held["k"]), f"{_percent(held['low'])} to {_percent(held['high'])}", verdict)
     console().print(table)
+
+
+def _bracketed(formula: str) -> str:
+    """As a part of a conjunction; names of properties stand by themselves."""
+    return f"({formula})" if " " in formula else formula

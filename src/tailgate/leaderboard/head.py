@@ -36,9 +36,11 @@ def lines(board: Board) -> list[tuple[str, ...]]:
 
 
 def markdown(board: Board, most: int | None = None) -> str:
-    """The head as a Markdown table, of so many defences at most."""
-    heading, *body = [[cell.replace("|", "\\|") for cell in line] for line in lines(board)]
-    rows = [heading, ["---"] * len(heading), *body[:most]]
+    """The head as a Markdown table, of so many defences at most; a column with nothing in it is left out."""
+    heading, *body = lines(board)
+    told = [i for i in range(len(heading)) if any(line[i] for line in body[:most])]
+    rows = [[line[i].replace("|", "\\|") for i in told] for line in (heading, *body[:most])]
+    rows.insert(1, ["---"] * len(told))
     return "\n".join(f"| {' | '.join(cells)} |" for cells in rows) + "\n"
 
 

@@ -25,14 +25,18 @@ CHAPTERS = {name: f"tailgate.reproduce.{name}" for name in ("ch3", "ch4", "ch5",
 
 def reproduce(chapter: str, seeds: int = 200, tick: Callable[[str], None] = lambda _: None, figures: bool = True) -> Report:
     """Reproduce one chapter. Raises InputError for one that does not exist."""
-    if chapter not in CHAPTERS:
-        raise unknown("chapter", chapter, CHAPTERS)
+    check_chapter(chapter)
     check_seeds(seeds)
     report: Report = import_module(CHAPTERS[chapter]).reproduce(seeds, tick, figures)
     if chapter in whole_theorems.CHAPTERS:
         tick("theorems without a figure")
         report.add(whole_theorems.report(chapter, seeds))
     return report
+
+
+def check_chapter(chapter: str) -> None:
+    if chapter not in CHAPTERS:
+        raise unknown("chapter", chapter, CHAPTERS)
 
 
 def check_seeds(seeds: int) -> None:

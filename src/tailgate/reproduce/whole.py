@@ -18,7 +18,7 @@ from tailgate.files import sweep, writable_directory, write_atomic
 from tailgate.schema import build, read_yaml
 
 from .claims import Claim, Report
-from .run import CHAPTERS, as_json, body, check_seeds, page, read, reproduce, rows, summary, write
+from .run import CHAPTERS, as_json, body, check_chapter, check_seeds, page, read, reproduce, rows, summary, write
 
 TITLE = "Security of Autonomous Systems under Physical Attacks, claim by claim"
 Play = Callable[..., Report]
@@ -80,26 +80,34 @@ def reproduce_whole(
     """Every chapter into its own folder of `directory`. One that an earlier run of the same version, sources and seeds finished is kept."""
     check_seeds(seeds)
     writable_directory(directory)
-    stamp = {"seeds": seeds, "sources": sources.own()}
-    wanted = {"version": tailgate.__version__, **stamp}
-    out = Whole(seeds, str(stamp["sources"]), [], {}, (), load_coverage())
-    for chapter in chapters:
-        place = directory / chapter
-        found = read(place) if place.is_dir() else None
-        if found and all(found[1].get(key) == value for key, value in wanted.items()):
-            tick(f"{chapter}: finished before, in {found[1]['seconds']:.0f} s")
-            report, seconds = found[0], float(found[1]["seconds"])
-            out.kept += (chapter,)
-        else:
-            begin = time.monotonic()
-            report = play(chapter, seeds, lambda text, chapter=chapter: tick(f"{chapter}: {text}"))
-            seconds = round(time.monotonic() - begin, 1)
-            write(report, place, **stamp, seconds=seconds)
-            sweep(place)
-            tick(f"{chapter}: {summary(report)}; {seconds:.0f} s")
+    out = Whole(seeds, sources.own(), [], {}, (), load_coverage())
+    for name in chapters:
+        report, seconds, kept = chapter(name, seeds, directory / name, tick, play)
         out.reports.append(report)
-        out.seconds[chapter] = seconds
+        out.seconds[name] = seconds
+        out.kept += (name,) * kept
     return out
+
+
+def chapter(
+    name: str, seeds: int, place: Path, tick: Callable[[str], None] = lambda _: None, play: Play = reproduce
+) -> tuple[Report, float, bool]:
+    """A chapter into its folder: the report, the seconds that it took, and whether an earlier run had finished it."""
+    check_chapter(name)
+    check_seeds(seeds)
+    writable_directory(place)
+    stamp = {"seeds": seeds, "sources": sources.own()}
+    found = read(place)
+    if found and all(found[1].get(key) == value for key, value in {"version": tailgate.__version__, **stamp}.items()):
+        tick(f"{name}: finished before, in {found[1]['seconds']:.0f} s")
+        return found[0], float(found[1]["seconds"]), True
+    begin = time.monotonic()
+    report = play(name, seeds, lambda text: tick(f"{name}: {text}"))
+    seconds = round(time.monotonic() - begin, 1)
+    write(report, place, **stamp, seconds=seconds)
+    sweep(place)
+    tick(f"{name}: {summary(report)}; {seconds:.0f} s")
+    return report, seconds, False
 
 
 def facts(whole: Whole) -> dict[str, str]:
