@@ -227,12 +227,16 @@ def test_what_is_asked_for_is_checked():
         load_network("reactive-braking").query("brake")
 
 
-def test_the_examples_of_the_documentation(tmp_path, capsys):
-    """The declaration loads and is met as often as it can be told; the code runs as it stands."""
+def test_the_examples_of_the_documentation(tmp_path, capsys, monkeypatch):
+    """The declaration loads and is met as often as it can be told; the code runs as it stands, and writes a picture and a file for UPPAAL."""
+    pytest.importorskip("matplotlib")
+    monkeypatch.chdir(tmp_path)
     text = (Path(__file__).parents[1] / "docs/automata.md").read_text(encoding="utf-8")
-    yaml, code = (re.findall(rf"```{kind}\n(.*?)```", text, re.DOTALL)[0] for kind in ("yaml", "python"))
+    (yaml,), codes = (re.findall(rf"```{kind}\n(.*?)```", text, re.DOTALL) for kind in ("yaml", "python"))
     (tmp_path / "door.yaml").write_text(yaml, encoding="utf-8")
     hit = simulate(load_network(str(tmp_path / "door.yaml")), range(300)).hit[0]
     assert np.nanmin(hit) > 0.5 and 0.3 < np.isfinite(hit).mean() < 0.95 and np.nanmax(hit) < 2.0
-    exec(code.replace("400", "20"), {})
+    for code in codes:
+        exec(code.replace("400", "20"), {})
     assert "<>[<= 1000] time < 100 and obs = 1" in capsys.readouterr().out
+    assert (tmp_path / "automata.png").read_bytes().startswith(b"\x89PNG") and "<nta>" in (tmp_path / "reactive-braking.xml").read_text()
