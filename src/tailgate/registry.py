@@ -9,6 +9,7 @@ import importlib
 import inspect
 import json
 import re
+import sys
 import traceback
 import warnings
 from collections.abc import Callable
@@ -275,9 +276,12 @@ class Spec:
 
 
 def said(error: Exception) -> str:
-    """An error of somebody's code in a line: its type, its words, and the file and line that raised it."""
-    frames = traceback.extract_tb(error.__traceback__)
-    place = f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})" if frames else ""
+    """An error of somebody's code in a line: its type, its words, and the last line of that code on the way to it."""
+    place = ""
+    for frame, line in traceback.walk_tb(error.__traceback__):
+        file, package = frame.f_code.co_filename, str(frame.f_globals.get("__name__", "")).partition(".")[0]
+        if package != "tailgate" and package not in sys.stdlib_module_names and "site-packages" not in file:
+            place = f" ({Path(file).name}, line {line})"
     return f"{type(error).__name__}: {error}{place}"
 
 
