@@ -141,11 +141,15 @@ class Canvas:
         turns = [(math.pi * i / 9, size * 10.0 / 24.0 if i % 2 else size) for i in range(18)]
         self.shape([(x + r * math.cos(a), y + r * math.sin(a)) for a, r in turns], WARNING, INK)
 
-    def sign(self, left: float, top: float, words: str) -> None:
-        """Large words on yellow."""
-        length = _font(LARGE).getbbox(words)[2] / ZOOM + 2 * MARGIN
-        self.box(left, top, left + length, top + 28, WARNING, INK, 3)
-        self.text(left + MARGIN, top + 21, words, size=LARGE, bold=True)
+    def sign(self, left: float, top: float, words: str, size: int = LARGE) -> None:
+        """Large words on yellow, in a box of `sign_size`."""
+        width, height = self.sign_size(words, size)
+        self.box(left, top, left + width, top + height, WARNING, INK, 3)
+        self.text(left + 0.6 * size, top + 1.05 * size, words, size=size, bold=True)
+
+    def sign_size(self, words: str, size: int = LARGE) -> tuple[float, float]:
+        """Width and height of a sign [px]."""
+        return self.length(words, size) + 1.2 * size, 1.4 * size
 
     def alarm(self, x: float, y: float, size: float = LAMP_SIZE, on: bool = True) -> None:
         """A lamp: black with an exclamation mark where it is on."""

@@ -82,9 +82,9 @@ def truth(canvas: Canvas, road: dict[str, float], scale: float, ended: bool) -> 
     for x in np.arange(-(road["position"] * scale) % LANE - LANE, WIDTH, LANE):  # the dashes stand on the road: the car passes them
         canvas.box(x, WHEELS + ROAD / 2 - 1, x + LANE / 2, WHEELS + ROAD / 2 + 1, WHITE)
     if math.isfinite(road["rear_gap"]):
-        _car(canvas, rear, HUMAN, "human driver", road["rear_speed"], (MARGIN, TAIL - 4))
-    _car(canvas, leader + CAR, LEADER, "leader", road["lead_speed"], (NOSE + 2, WIDTH - MARGIN))
-    _car(canvas, NOSE, EGO, "ego (ACC)", road["speed"], (TAIL, NOSE))
+        _car(canvas, rear, HUMAN, "behind", road["rear_speed"], (MARGIN, TAIL - 4))
+    _car(canvas, leader + CAR, LEADER, "ahead", road["lead_speed"], (NOSE + 2, WIDTH - MARGIN))
+    _car(canvas, NOSE, EGO, "ego", road["speed"], (TAIL, NOSE))
     edge = TAIL + CAR / 4  # keeps the texts apart where both gaps are small
     if road["rear_gap"] <= 0.0:
         _crash(canvas, TAIL, TAIL - 2 * CAR, "REAR COLLISION")

@@ -20,7 +20,7 @@ LENGTH, LANE = 5.0, 4.0  # a car and the width of a lane, as HighwayEnv has them
 
 
 class Car(NamedTuple):
-    """A car by its middle [m], heading [rad] and speed [m/s]; role: defended, leader or driver."""
+    """A car by its middle [m], heading [rad] and speed [m/s]; role: defended, leader (who drives a manoeuvre) or driver."""
 
     x: float
     y: float
@@ -28,6 +28,7 @@ class Car(NamedTuple):
     speed: float
     role: str
     name: str = ""
+    doing: str = ""
     crashed: bool = False
 
     @property
@@ -103,7 +104,7 @@ def _string(loop: Loop, state: LoopState, frame: Frame | None, row: int) -> Stag
             nose -= LENGTH + max(float(gaps[i]), 0.0)
         hit = bool((gaps[i : i + 2] <= 0.0).any())
         role, name = ("defended", f"car {i}") if i else ("leader", "leader")
-        cars.append(Car(nose - LENGTH / 2.0, 0.0, 0.0, v, role, name, hit))
+        cars.append(Car(nose - LENGTH / 2.0, 0.0, 0.0, v, role, name, crashed=hit))
         if i:
             sign = "COLLISION" if gaps[i] <= 0.0 else ""
             followers.append(_follower(loop, state, frame, row, i, i, max(float(gaps[i]), 0.0), False, sign))
@@ -120,11 +121,11 @@ def _pair(loop: Loop, state: LoopState, frame: Frame | None, row: int) -> Stage:
     gap, rear_gap = max(road["gap"], 0.0), max(road["rear_gap"], 0.0)  # a step may end metres beyond a collision
     nose = START + road["position"]
     cars = [
-        Car(nose - LENGTH / 2.0, 0.0, 0.0, road["speed"], "defended", "ego", hit or rear_hit),
-        Car(nose + gap + LENGTH / 2.0, 0.0, 0.0, road["lead_speed"], "leader", "leader", hit),
+        Car(nose - LENGTH / 2.0, 0.0, 0.0, road["speed"], "defended", "ego", crashed=hit or rear_hit),
+        Car(nose + gap + LENGTH / 2.0, 0.0, 0.0, road["lead_speed"], "leader", "ahead", crashed=hit),
     ]
     if math.isfinite(rear_gap):
-        cars.append(Car(nose - 1.5 * LENGTH - rear_gap, 0.0, 0.0, road["rear_speed"], "driver", "driver", rear_hit))
+        cars.append(Car(nose - 1.5 * LENGTH - rear_gap, 0.0, 0.0, road["rear_speed"], "driver", "behind", crashed=rear_hit))
     sign = "REAR COLLISION" if rear_hit else "COLLISION" if hit else ""
     return Stage(1, 0.0, 1.0, tuple(cars), (_follower(loop, state, frame, row, 0, 0, gap, False, sign),), 0)
 
@@ -136,20 +137,23 @@ def _traffic(loop: Loop, state: LoopState, frame: Frame | None, row: int, plant:
     seen, numbers = state.plant.seen, state.plant.cars[row].tolist()
     gap, rear_gap, own = float(seen.gap[row]), float(seen.rear_gap[row]), numbers[0]
     free, over = gap >= plant.reach, bool(state.plant.over[row])
+    hit = ("REAR COLLISION" if rear_gap <= 0.0 else "COLLISION") if over else ""
+    crashed = [bool(car[CRASHED] or car[HIT]) for car in numbers]
+    partner = min((i for i in range(1, len(numbers)) if hit and crashed[i]), key=lambda i: abs(numbers[i][X] - own[X]), default=0)
     cars = []
     for i, car in enumerate(numbers):
         off, name = car[X] - own[X], ""
         if i == 0:
             name = "ego"
+        elif i == partner:  # the gap is then no place
+            name = "behind" if rear_gap <= 0.0 else "ahead"
         elif not free and abs(off - LENGTH - gap) < 1e-6:
             name = "ahead"
         elif abs(-off - LENGTH - rear_gap) < 1e-6:
             name = "behind"
-        what = "brakes hard" if car[BRAKING] > 0.0 else "changes lanes" if car[TARGET] != car[LANE] else ""
+        doing = "" if crashed[i] else "brakes hard" if car[BRAKING] > 0.0 else "changes lanes" if car[TARGET] != car[LANE] else ""
         role = "driver" if i else "defended"
-        words = ", ".join(word for word in (name, what) if word)
-        cars.append(Car(car[X], car[Y], car[HEADING], car[SPEED], role, words, bool(car[CRASHED] or car[HIT])))
-    hit = ("REAR COLLISION" if rear_gap <= 0.0 else "COLLISION") if over else ""
+        cars.append(Car(car[X], car[Y], car[HEADING], car[SPEED], role, name, doing, crashed[i]))
     follower = _follower(loop, state, frame, row, 0, 0, max(gap, 0.0), free, hit)
     return Stage(plant.lanes, plant.bend, plant.period, tuple(cars), (follower,), 0)
 

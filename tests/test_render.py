@@ -155,10 +155,10 @@ def test_cars_stay_in_the_picture_or_are_said_to_be_out_of_it(made, monkeypatch,
     monkeypatch.setattr(canvas, "text", lambda self, x, y, said, *a, **k: (words.append(said), text(self, x, y, said, *a, **k))[1])
     monkeypatch.setattr(canvas, "car", lambda self, nose, *a, **k: (noses.append(nose), car(self, nose, *a, **k))[1])
     picture(env, with_gaps(env.state, gap, rear_gap))
-    out = sum(said in ("leader (out of view)", "human driver (out of view)") for said in words)
+    out = sum(said in ("ahead (out of view)", "behind (out of view)") for said in words)
     real = [nose for nose in noses[-(3 - out) :]]  # the ghost is drawn before them
     assert all(render_canvas.CAR <= nose <= render.WIDTH for nose in real) and len(real) + out == 3
-    assert ("leader (out of view)" in words) == (gap > render_following.SPANS[-1])
+    assert ("ahead (out of view)" in words) == (gap > render_following.SPANS[-1])
 
 
 def test_scale_comes_from_a_fixed_set():

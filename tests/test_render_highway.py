@@ -182,7 +182,7 @@ def test_an_attack_an_alarm_and_a_mode_are_marked_without_colour_alone(said):
     assert "ALARM" in said and said.count("!") == 2 and (alarm[60:180] != calm[60:180]).any()
     said.clear()
     picture(env)
-    assert {"NO ATTACK", "no alarm", "ego", "leader"} <= set(said)
+    assert {"NO ATTACK", "no alarm", "ego", "ahead"} <= set(said)
     picture(env, None, None, env.frame._replace(refused=np.ones(1, bool)))
     assert any("refused" in line for line in said)
 
@@ -215,7 +215,7 @@ def test_a_challenge_is_marked(said):
 def test_collisions_are_marked(monkeypatch):
     """A sign with the word, and HighwayEnv's red for the cars that touched; of a platoon the sign names the car."""
     signs, sign = [], render_canvas.Canvas.sign
-    monkeypatch.setattr(render_canvas.Canvas, "sign", lambda self, left, top, words: (signs.append(words), sign(self, left, top, words))[1])
+    monkeypatch.setattr(render_canvas.Canvas, "sign", lambda self, left, top, words, size: (signs.append(words), sign(self, left, top, words, size))[1])
     env = made()
     x = env.state.plant.ego[:, 0, 0]
     for plant in (env.state.plant._replace(lead_x=x - 0.5), env.state.plant._replace(behind=env.state.plant.behind._replace(x=x + 0.5))):
@@ -237,6 +237,8 @@ def test_a_collision_among_traffic_is_marked(said):
             break
     shot = picture(env, (1280, 360))
     assert "COLLISION" in said and near(shot, VehicleGraphics.RED, 30).sum() > 100
+    cars = {car.name: car for car in stage_of(env.seat.loop, env.state, env.frame, 0).cars}
+    assert cars["ahead"].crashed and cars["ego"].crashed and cars["ahead"].x > cars["ego"].x and not cars["ahead"].doing
 
 
 def test_nobody_ahead_is_said(said):
