@@ -253,6 +253,14 @@ def test_texts_of_the_row_stay_texts(pick):
     assert not set("<>&\u2028") & set(blob) and json.loads(blob) == {"x": HOSTILE}
 
 
+def test_a_failed_property_is_said_and_stays_text(pick):
+    """What a row of `tailgate trust` says that its run fails; nothing without it; a stranger's words are no markup."""
+    assert 'id="failed"' not in render(play(pick()))
+    page = render(play(pick() | {"failed": {"property": HOSTILE, "about": "a < b", "formula": "G gap > 2"}}))
+    assert "a &lt; b" in page and "<code>G gap &gt; 2</code>" in page and HOSTILE not in page
+    assert 'id="failed"' not in render(play(pick() | {"failed": [1]}))
+
+
 def test_the_page_says_everything_about_the_episode(pick):
     """Every metric with its unit, every parameter of scenario, threat model, defence and attack, and the row's identity."""
     replay = play(pick("chi2_kf:eta=9", "fdi_then_jam:start_step=10,inject=4,value=-1.5"))

@@ -11,7 +11,7 @@ from tailgate.errors import InputError
 from tailgate.evaluation import Cell, run_cell
 from tailgate.replay import episode
 from tailgate.replay.episode import episode_of, shown, watched
-from tailgate.replay.page import outcome, render, write_page
+from tailgate.replay.page import context_of, outcome, render, write_page
 from tailgate.replay.replay import Filter, choose, play
 from tailgate.rows import encode
 
@@ -99,6 +99,13 @@ def test_the_data_of_a_network_have_no_road(replays):
     assert [wire["name"] for wire in data["wires"]] == [f"6 readings of agent {i}" for i in (1, 3, 4)]
     assert all(wire["value"] is None and sum(wire["hit"]) for wire in data["wires"])
     json.dumps(data, allow_nan=False)
+
+
+def test_the_norm_of_a_networks_error_has_no_unit_of_length(replays):
+    """Metres of a gap on a road; without one the states have any unit."""
+    units = {name: {metric: unit for metric, _, unit, *_ in context_of(replays[name], "")["metrics"]} for name in ("platoon", "network")}
+    for metric in ("rmse position", "max error", "final error"):
+        assert units["platoon"][metric] == "m" and units["network"][metric] == "-"
 
 
 def test_whom_the_page_looks_at(replays):

@@ -148,3 +148,42 @@ def test_the_page_in_a_browser(name, width, replays, tmp_path, browser):
     if name == "attacked":
         badge = browser.find_element("id", "attack").text
         assert "ATTACK: late echo" in badge and "receiver 8 m" in badge
+
+
+ROAD = {
+    "about": "Short.", "plant": {"name": "highway", "ahead": 1, "behind": 1}, "sensor": "fmcw_radar", "controller": "acc_radar", "horizon": 30,
+    "manoeuvre": {"name": "constant", "value": 0.0}, "threat_model": {"kinds": ["echo_delay"], "onset": 3, "delay_bound": 20.0},
+}  # fmt: skip
+
+
+@pytest.mark.page
+@pytest.mark.parametrize("name", ["radar", "highway"])
+def test_the_picture_says_what_the_plots_say(name, replays, tmp_path, browser):
+    """One belief at a step, whoever says it, the start too; the cars have the names of the other pictures."""
+    if name == "radar":
+        replay = replays["attacked"]
+    else:
+        pytest.importorskip("highway_env")
+        path = tmp_path / "road.yaml"
+        path.write_text(yaml.safe_dump(ROAD))
+        replay = play(run_cell(Cell("s", str(path), None, "kf", "echo_delay:start_step=10,delay=15", 1))[0])
+    data = episode_of(replay)
+    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", {"width": 1280, "height": 800, "deviceScaleFactor": 1, "mobile": False})
+    browser.get(write_page(replay, tmp_path / "page.html").as_uri())
+    browser.execute_script("""
+        window.said = [];
+        const fill = CanvasRenderingContext2D.prototype.fillText;
+        CanvasRenderingContext2D.prototype.fillText = function (words, ...rest) { window.said.push(words); fill.call(this, words, ...rest); };""")
+    move = "window.said = []; const s = document.getElementById('slider'); s.value = arguments[0]; s.dispatchEvent(new Event('input')); return window.said"
+    key = "return [...document.querySelectorAll('#plot-gap li')].find(li => li.textContent.startsWith('believed')).querySelector('output').textContent"
+    for step in (14, 0):
+        said, shown, beliefs = browser.execute_script(move, step), browser.execute_script(key), data["believed"]["gap"]
+        assert {"ego", "ahead", "behind"} <= {words.removesuffix(" (out of view)") for words in said}
+        if step:
+            assert any(words.startswith(f"believed gap {beliefs[step - 1]:.1f} m") for words in said)
+        if name == "highway":  # short steps: the plots and the picture give the belief of the step
+            assert "nothing is measured before step 1" in said if not step else float(shown) == pytest.approx(beliefs[step - 1], abs=0.051)
+            assert step or shown == "\N{EN DASH}"
+        else:  # long ones: the plots give what is believed of this time
+            assert float(shown) == pytest.approx(beliefs[step], abs=0.051)
+            assert step or f"this gap is measured in step 1, and then believed to be {beliefs[0]:.1f} m" in said

@@ -321,6 +321,10 @@ def test_the_worst_failing_run_is_replayed_by_the_command_that_is_printed(tmp_pa
     shown = json.loads(capsys.readouterr().out)
     assert shown["verdict"] == "same" and Path(shown["page"]).is_file() and f"seed {shown['seed']}" in words
     assert "fails no_collision" in words and shown["metrics"]["crashed"] == 1.0
+    assert shown["failed"] == {"property": "no_collision", "about": "no collision, in front or behind, until the horizon", "formula": "G ((gap > 0) and (rear_gap > 0))"}
+    page = Path(shown["page"]).read_text(encoding="utf-8")
+    assert "The row says that this run fails no_collision" in page and "G ((gap &gt; 0) and (rear_gap &gt; 0))" in page
+    assert cli.main(shlex.split(command)) == 0 and "failed  no_collision: no collision" in " ".join(capsys.readouterr().out.split("\n"))
     assert cli.main(["trust", *part, "--json"]) == 0  # resumes
     assert json.loads(capsys.readouterr().out)["defences"][0]["worst"]["seed"] == shown["seed"]
 

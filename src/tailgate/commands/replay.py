@@ -56,7 +56,7 @@ def _size(text: str | None) -> tuple[int, int] | None:
 def _replay(options: argparse.Namespace) -> int:
     from tailgate.envs.render_viewer import Viewer
     from tailgate.registry import Spec
-    from tailgate.replay.page import outcome, write_page
+    from tailgate.replay.page import failed, outcome, write_page
     from tailgate.replay.replay import Filter, choose, play
     from tailgate.rows import read_rows
 
@@ -81,7 +81,7 @@ def _replay(options: argparse.Namespace) -> int:
     report = {
         "line": chosen.line, "matched": chosen.matched, "chosen": chosen.why,
         **{key: row[key] for key in ("scenario", "defence", "attack", "dose", "purpose", "seed")},
-        "outcome": outcome(replay), "verdict": replay.verdict,
+        "outcome": outcome(replay), "failed": failed(row), "verdict": replay.verdict,
         "trace_hash": replay.checks[0].here, "decision_hash": replay.checks[1].here,
         "differences": [{"name": c.name, "row": c.row, "here": c.here} for c in replay.differences],
         "metrics": replay.metrics, "page": str(page), "video": str(video) if video is not None else None,
@@ -102,6 +102,7 @@ def _print(report: dict[str, Any], film: str | None) -> None:
         ("row", f"line {report['line']}, {report['chosen']}{matched}"),
         ("played", f"{report['defence']} against {report['attack']}, {report['scenario']}, seed {report['seed']} ({report['purpose']})"),
         ("outcome", report["outcome"]),
+        *(("failed", f"{held['property']}: {held['about']}, as the row says") for held in [report["failed"]] if held),
         ("check", f"{title}: {why}"),
         *(("", f"{d['name']}: row {d['row'] or 'not recorded'}, here {d['here'] or 'none'}") for d in report["differences"]),
         ("page", report["page"]),

@@ -154,7 +154,7 @@ def _of_agent(replay: Replay, agent: int) -> Data:
         speed = trace.estimate[:, 0, agent] @ model.speed[agent]
         out |= {
             "road": {name: curve(_road(replay, name, agent)) for name in ("gap", "speed", "lead_speed", "position")},
-            "rear": {name: curve(_road(replay, name, agent)) for name in ("rear_gap", "rear_speed")} if np.isfinite(rear).all() else None,
+            "rear": {name: curve(_road(replay, name, agent)) for name in ("rear_gap", "rear_speed")} if np.isfinite(rear).any() else None,
             "desired": curve(np.asarray(trace.desired_gap(_road(replay, "speed", agent)))),
             "believed": {"gap": curve(_believed_gap(replay, agent)), "speed": curve(np.asarray(speed))},
         }

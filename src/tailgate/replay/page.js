@@ -142,8 +142,8 @@
   for (const [runs, y, ink] of [[alarms, 0, "#1a1a1a"], [attacked, 5, "#b34700"]]) {
     for (const [a, b] of runs) {
       const bar = document.createElementNS("http://www.w3.org/2000/svg", "rect");
-      const width = Math.max(b - a + 1, length / 300);
-      for (const [name, value] of Object.entries({ x: Math.max(0, a - 0.5), y, width, height: 4, fill: ink })) bar.setAttribute(name, value);
+      const x = Math.max(0, a - 0.5), width = Math.max(Math.min(b + 0.5, length) - x, length / 300);
+      for (const [name, value] of Object.entries({ x, y, width, height: 4, fill: ink, "shape-rendering": "crispEdges" })) bar.setAttribute(name, value);
       marks.append(bar);
     }
   }
@@ -153,5 +153,5 @@
     menu.addEventListener("change", () => choose(Number(menu.value)));
   }
   new ResizeObserver(() => drawScene(canvas, episode, now, agent)).observe(canvas);
-  show(0);
+  show(Number.parseInt(location.hash.slice(1), 10) || 0); // page.html#290: from step 290 on
 })();

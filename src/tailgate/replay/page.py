@@ -31,6 +31,7 @@ VERDICTS = {
     "unknown": ("warn", "Cannot be checked", "the row records no hash"),
 }  # fmt: skip
 NO_ENTRY = "not recorded"
+NORMS = ("rmse_position", "max_error", "final_error")
 LABELS = {"version": "version of Tailgate", "config_hash": "configuration (config_hash)", "versions": "versions of the components"}
 
 
@@ -86,7 +87,7 @@ def _named(text: str) -> str:
 
 def _identity(replay: Replay) -> list[tuple[str, str]]:
     """The row's own words about what it is: all but the figures and the threat model."""
-    skipped = {*METRICS, "threat_model", "status", "reason"}
+    skipped = {*METRICS, "threat_model", "status", "reason", "failed"}
     shown: dict[str, Callable[[Any], str]] = {"defence": _named, "attack": _named, "scenario_file": _file_name}
     row = replay.row.items()
     return [(key.replace("_", " "), shown.get(key, _text)(value)) for key, value in row if key not in skipped and value not in ("", None)]
@@ -111,7 +112,7 @@ def context_of(replay: Replay, source: str) -> Data:
     tone, title, why = VERDICTS[replay.verdict]
     tone_of = "plain" if picture == "graph" else "bad" if replay.metrics["crashed"] else "good"
     metrics = [
-        (name.replace("_", " "), _measured(value), UNITS[name], " ".join((METRICS[name].__doc__ or "").split()),
+        (name.replace("_", " "), _measured(value), _unit(replay, name), " ".join((METRICS[name].__doc__ or "").split()),
          _measured(row[name]) if row[name] != value else "")
         for name, value in replay.metrics.items()
     ]  # fmt: skip
@@ -120,6 +121,7 @@ def context_of(replay: Replay, source: str) -> Data:
         "source": source, "picture": PICTURES[picture], "many": model.agents > 1, "noun": noun(replay),
         "defence": _named(row["defence"]), "attack": _named(row["attack"]), "seed": row["seed"], "purpose": row["purpose"],
         "check": {"tone": tone, "title": title, "why": why}, "tone": tone_of, "outcome": outcome(replay), "metrics": metrics,
+        "failed": failed(row),
         "differences": [(LABELS.get(c.name, c.name.replace("_", " ")), c.row or NO_ENTRY, c.here or "none") for c in replay.differences],
         "hashes": [(c.name, c.row or NO_ENTRY, c.here, c.same) for c in replay.checks[:2]],
         "identity": _identity(replay),
@@ -130,6 +132,17 @@ def context_of(replay: Replay, source: str) -> Data:
         "threat": _card("threat model", place.threat_model),
         "players": [_card("defence", replay.loop.defence, _named(row["defence"])), _card("attack", replay.attack, _named(row["attack"]))],
     }  # fmt: skip
+
+
+def _unit(replay: Replay, name: str) -> str:
+    """A metric's unit; without a road an estimate's error is a norm over states of any unit."""
+    return "-" if name in NORMS and not replay.loop.model.followers.any() else UNITS[name]
+
+
+def failed(row: Data) -> Data | None:
+    """The property that the run of a row fails, as `tailgate trust` wrote it there."""
+    held = row.get("failed")
+    return {key: str(held.get(key) or "") for key in ("property", "about", "formula")} if isinstance(held, dict) else None
 
 
 def _measured(value: float | None) -> str:

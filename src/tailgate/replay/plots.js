@@ -78,7 +78,7 @@ const buildPlots = (() => {
   // of one agent alone everything; of many the plots of all (part "all") or those of one of them (part "one")
   return (box, episode, seek, part = "") => {
     const { dt, length, road, believed, errors, wires, kinds, radar } = episode;
-    const age = radar ? 0 : 1; // the steps of a radar are long: its beliefs stand at the time of the measurement
+    const age = radar && dt > 0.5 ? 0 : 1, of = age ? "" : " (of this time)"; // where steps are long, a belief stands at the time of its measurement
     const end = Math.max(length, 1) * dt, digits = dt >= 0.1 ? 1 : dt >= 0.01 ? 2 : 3;
     const attacked = runsOf(length, (s) => episode.kind[s - 1] !== 0);
     const alarms = runsOf(length, (s) => episode.alarm[s - 1]);
@@ -219,7 +219,7 @@ const buildPlots = (() => {
     }
     if (part !== "all" && road) chart("gap", "Gap to the car ahead", "m", [
       { name: "true", values: road.gap, offset: 0, ink: TRUTH, thick: 2.5 },
-      { name: "believed", values: believed.gap, offset: age, ink: BELIEF, dash: "6 4", wild: true },
+      { name: `believed${of}`, values: believed.gap, offset: age, ink: BELIEF, dash: "6 4", wild: true },
       { name: "desired at the true speed", values: episode.desired, offset: 0, ink: DESIRED, dash: "2 3" },
     ], {
       include: [0], least: 5, height: 190,
@@ -227,8 +227,8 @@ const buildPlots = (() => {
     });
     if (part !== "all" && road) chart("speed", "Speed", "m/s", [
       { name: part ? `car ${episode.number}` : "ego", values: road.speed, offset: 0, ink: EGO, thick: 2.5, digits: 2 },
-      { name: part ? "car ahead" : "leader", values: road.lead_speed, offset: 0, ink: LEADER, dash: "10 3 2 3", digits: 2 },
-      { name: "believed own", values: believed.speed, offset: age, ink: BELIEF, dash: "6 4", wild: true, digits: 2 },
+      { name: "ahead", values: road.lead_speed, offset: 0, ink: LEADER, dash: "10 3 2 3", digits: 2 },
+      { name: `believed own${of}`, values: believed.speed, offset: age, ink: BELIEF, dash: "6 4", wild: true, digits: 2 },
     ], { include: [0], least: 2 });
     if (part !== "all") for (const { name, title, unit, least, values } of errors) {
       chart(name, title, unit, [{ name: "estimate less truth", values, offset: 1, ink: BELIEF, digits: 2 }], { include: [0], least, height: 130 });

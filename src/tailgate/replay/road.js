@@ -19,15 +19,15 @@ const drawRoad = (() => {
       const middle = way ? (way > 0 ? width - margin : margin) : x - car / 2;
       if (way) head(middle, wheels - tall / 2, way, ink, car * 0.19);
       else drawCar(x, wheels, ink, false, car);
-      text(middle, wheels + roadHeight + small + 2, name + (way ? (narrow ? ", far" : " (out of view)") : ""), { ink, anchor: "m", room });
-      text(middle, wheels + roadHeight + 2 * small + 5, `${speed.toFixed(1)} m/s`, { ink, anchor: "m", bold: true, room });
+      text(middle, wheels + roadHeight + small + 2, name + (way ? (narrow ? ", far" : " (out of view)") : ""), { ink, anchor: "m", room, ground: WHITE });
+      text(middle, wheels + roadHeight + 2 * small + 5, `${speed.toFixed(1)} m/s`, { ink, anchor: "m", bold: true, room, ground: WHITE });
     };
     const crash = (x, words, from, to) => {
       burst(x, wheels - tall / 2, 0.29 * car);
       sign(x, trueLine, words, from, to);
     };
 
-    const { road, rear, believed, radar } = episode;
+    const { road, believed, radar } = episode, rear = episode.rear && episode.rear.rear_gap[s] !== null ? episode.rear : null; // among traffic there may be nobody
     const shown = (x) => (radar ? Math.max(x, 0) : x); // a long step ends metres beyond a collision
     const gap = shown(road.gap[s]), rearGap = rear ? shown(rear.rear_gap[s]) : Infinity;
     const first = SPANS.findIndex((metre) => gap <= metre), from = first < 0 ? SPANS.length - 1 : first;
@@ -41,7 +41,6 @@ const drawRoad = (() => {
     pen.fillRect(0, strip, width, height - strip);
     line(0, strip, width, strip, BELIEF, 1);
     line(0, ghostWheels, width, ghostWheels, BELIEF, 1, [3, 3]);
-    text(margin, strip + small + 4, "WHERE THE EGO BELIEVES IT IS", { ink: BELIEF, room: [margin, width - margin] });
     if (belief !== null) {
       const ghost = clamp(nose + off * scale, -FAR, FAR);
       line(leader, trueLine, leader, ghostWheels, LEADER, 1, [3, 3]); // the same bumper in both strips
@@ -54,7 +53,12 @@ const drawRoad = (() => {
         text(x - way * 24, y + 5, `out of view: ${metres(Math.abs(off))} ${way > 0 ? "ahead of" : "behind"} where it really is`,
           { ink: BELIEF, anchor: way > 0 ? "r" : "l", room: [margin + 24, width - margin - 24], ground: BELIEF_PALE });
       }
-    } else text(width / 2, believedLine, "no measurement yet", { ink: BELIEF, anchor: "m" });
+    } else {
+      const first = radar && episode.dt > 0.5 && believed.gap.length; // the plots show it at this time
+      const words = first ? `this gap is measured in step 1, and then believed to be ${metres(believed.gap[0])}` : "nothing is measured before step 1";
+      text(width / 2, believedLine, words, { ink: BELIEF, anchor: "m", room: [margin, width - margin] });
+    }
+    text(margin, strip + small + 4, "WHERE THE EGO BELIEVES IT IS", { ink: BELIEF, room: [margin, width - margin], ground: BELIEF_PALE });
     span(margin, margin + lane, height - 8, GREY);
     text(margin + lane + 8, height - 4, `${+(lane / scale).toFixed(2)} m`, { ink: GREY });
 
@@ -80,16 +84,16 @@ const drawRoad = (() => {
     const shift = ((-(road.position[s] * scale) % lane) + lane) % lane;
     for (let x = shift - lane; x < width; x += lane) pen.fillRect(x, wheels + roadHeight / 2 - 1, lane / 2, 2);
     const behindHit = rear && rearGap <= 0, frontHit = gap <= 0 || (s > 0 && s === episode.hit);
-    if (rear) vehicle(tail - rearGap * scale, HUMAN, "human driver", rear.rear_speed[s], [margin, tail - 4]);
-    vehicle(leader + car, LEADER, "leader", road.lead_speed[s], [nose + 2, width - margin]);
-    vehicle(nose, EGO, narrow ? "ego" : "ego (ACC)", road.speed[s], [tail, nose]);
+    if (rear) vehicle(tail - rearGap * scale, HUMAN, "behind", rear.rear_speed[s], [margin, tail - 4]);
+    vehicle(leader + car, LEADER, "ahead", road.lead_speed[s], [nose + 5, width - margin]);
+    vehicle(nose, EGO, "ego", road.speed[s], [tail, nose]);
     const edge = tail + car / 4; // keeps the texts apart where both gaps are small
     if (behindHit) crash(tail, "REAR COLLISION", 2, nose - margin);
     else if (rear) {
       const middle = span(tail, tail - rearGap * scale, trueLine, HUMAN);
       text(middle, trueLine - 9, `${narrow ? "behind" : "gap behind"} ${metres(rearGap)}`, { ink: HUMAN, anchor: "m", room: [margin, edge] });
     }
-    if (frontHit) crash(nose, "COLLISION", behindHit ? nose + 2 : 2, width - 2);
+    if (frontHit) crash(nose, "COLLISION", behindHit ? nose + 2 : rear ? edge + 4 : 2, width - 2);
     else {
       const middle = span(nose, leader, trueLine, INK);
       text(middle, trueLine - 9, `true gap ${metres(gap)}`, { size: large, anchor: "m", bold: true, room: [behindHit ? nose + 4 : edge + margin, width - margin] });

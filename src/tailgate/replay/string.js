@@ -6,7 +6,7 @@ const drawString = (() => {
   return (canvas, episode, s, agent) => {
     const tools = makePen(canvas);
     if (!tools) return;
-    const { pen, width, height, margin, small, metres, clamp, font, line, text, head, span, drawCar, burst, sign, bolt, lamp } = tools;
+    const { pen, width, height, margin, small, large, metres, clamp, font, line, fitted, text, head, span, drawCar, burst, sign, bolt, lamp } = tools;
     const { gap: gaps, speed, position, believed } = episode.string;
     const count = gaps.length, gap = gaps.map((values) => values[s]);
     const attacked = s ? episode.attacked[s - 1] : gap.map(() => 0), alarmed = s ? episode.alarms[s - 1] : gap.map(() => 0);
@@ -51,13 +51,18 @@ const drawString = (() => {
         text(x - way * 22, ghostWheels - 5, `car ${i} is out of view: ${metres(Math.abs(belief - gap[i]))} off`, { ink: BELIEF, anchor: way > 0 ? "r" : "l", room: [margin + 22, width - margin - 22], ground: BELIEF_PALE });
       }
     }
-    if (!s) text(width / 2, believedLine + 14, "no measurement yet", { ink: BELIEF, anchor: "m" });
+    if (!s) text(width / 2, believedLine + 14, "nothing is measured before step 1", { ink: BELIEF, anchor: "m" });
     const unit = [500, 200, 100, 50, 20, 10, 5, 2, 1].find((metre) => metre * scale < 0.13 * width) ?? 1;
     span(margin, margin + unit * scale, height - 10, GREY);
     text(margin + unit * scale + 8, height - 6, `${unit} m`, { ink: GREY });
     text(width - margin, height - 6, "WHERE EACH CAR BELIEVES IT IS", { ink: BELIEF, anchor: "r", room: [margin + unit * scale + 60, width - margin] });
 
-    // the truth
+    // the truth; a sign of a collision leaves no room for the words of the gaps behind it
+    const hits = [...gap.keys()].filter((i) => i && gap[i] !== null && gap[i] <= 0);
+    const behind = (x) => hits.some((i) => {
+      const length = fitted(`COLLISION: car ${i}`, large, true, [0, FAR]) + 2 * margin;
+      return Math.abs(x - clamp(nose[i], 2 + length / 2, width - 2 - length / 2)) < length / 2 + 2 * small;
+    });
     text(margin, small + 4, "THE ROAD AS IT IS", { ink: GREY });
     pen.fillStyle = LEADER;
     pen.fillRect(0, wheels, width, roadHeight);
@@ -70,19 +75,18 @@ const drawString = (() => {
       drawCar(nose[i], wheels, ink, false, car);
       const pitch = car + Math.min(i ? gap[i] : FAR, i + 1 < count ? gap[i + 1] : FAR) * scale;
       const name = i === 0 ? "leader" : `car ${i}`, short = wide(name, 9) < pitch ? name : String(i);
-      if (wide(short, 9) < pitch) text(middle, wheels + roadHeight + small + 2, short, { ink, size: wide(short, small) < pitch ? small : 9, anchor: "m", bold: true, room: [2, width - 2] });
+      if (wide(short, 9) < pitch) text(middle, wheels + roadHeight + small + 2, short, { ink, size: wide(short, small) < pitch ? small : 9, anchor: "m", bold: true, room: [2, width - 2], ground: WHITE });
       const moves = `${speed[i][s].toFixed(1)} m/s`;
-      if (wide(moves, 9) < pitch) text(middle, wheels + roadHeight + 2 * small + 4, moves, { ink, size: wide(moves, small - 1) < pitch ? small - 1 : 9, anchor: "m", room: [2, width - 2] });
+      if (wide(moves, 9) < pitch) text(middle, wheels + roadHeight + 2 * small + 4, moves, { ink, size: wide(moves, small - 1) < pitch ? small - 1 : 9, anchor: "m", room: [2, width - 2], ground: WHITE });
       if (i === agent) line(nose[i] - car, wheels + roadHeight + 2, nose[i], wheels + roadHeight + 2, ink, 2); // whom the plots follow
       const size = clamp(car / 5, 4, 8), top = wheels - tall - 3, both = attacked[i] && alarmed[i] ? size : 0;
       if (attacked[i]) bolt(middle - both, top, size);
       if (alarmed[i]) lamp(middle + both, top - size, size);
-      if (i && gap[i] > 0) dimension(nose[i - 1] - car, nose[i], trueLine, metres(gap[i]), INK, [], i === nearest && car < 28);
+      if (i && gap[i] > 0) dimension(nose[i - 1] - car, nose[i], trueLine, behind((nose[i] + nose[i - 1] - car) / 2) ? "" : metres(gap[i]), INK, [], i === nearest && car < 28);
     }
-    gap.forEach((metre, i) => {
-      if (!i || metre === null || metre > 0) return;
+    hits.forEach((i) => {
       burst(nose[i], wheels - tall / 2, Math.max(10, car * 0.3));
-      sign(nose[i], trueLine + 10, `COLLISION: car ${i}`, 2, width - 2);
+      sign(nose[i], trueLine + 2, `COLLISION: car ${i}`, 2, width - 2);
     });
   };
 })();

@@ -168,13 +168,21 @@ def _keep_failures(found: dict[str, Any], jobs: Sequence[Job], folder: Path) -> 
     for entry in found["defences"]:
         worst = entry["worst"]
         if worst is not None:
-            rows += run_cell(single(by_identity[worst["cell"]], worst["run"]))
+            job = by_identity[worst["cell"]]
+            rows += [row | {"failed": _failed(job, worst["property"])} for row in run_cell(single(job, worst["run"]))]
             worst["replay"] = replay_command(entry["defence"], worst["attack"], folder, len(rows))
     path = folder / FAILURES
     if rows:
         write_atomic(path, encode(rows))
     else:
         remove(path)
+
+
+def _failed(job: Job, name: str) -> dict[str, str]:
+    """The property of this name in words and as a formula, for who replays a run that fails it."""
+    rival = Spec("attack", job.cell.attack)
+    known = job.properties(job.cell.place(rival.make(), rival.entry.knowledge))
+    return next({"property": p.name, "about": p.about, "formula": str(p.formula)} for p in known if p.name == name)
 
 
 def _foreign(spec: Spec) -> bool:
