@@ -5,7 +5,7 @@ Nothing is told by colour alone, the same state always gives the same picture, a
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -47,7 +47,9 @@ def draw(loop: Loop, state: LoopState, frame: Frame | None, row: int, viewer: Vi
 
 
 class Window:
-    """A window on the screen, opened by its first picture. One that its reader has closed stays closed."""
+    """A window on the screen, opened by its first picture, which fills it as far as it can. One that its reader has closed stays closed."""
+
+    shown: ClassVar[tuple[int, int] | None] = None  # size of the pictures that the one display was opened for
 
     def __init__(self, fps: int) -> None:
         self.fps = fps
@@ -62,7 +64,7 @@ class Window:
             return
         size = (picture.shape[1], picture.shape[0])
         screen = self._pygame.display.get_surface() if self.open else None
-        if screen is None or screen.get_size() != size:  # also where another environment has closed or changed the one display
+        if screen is None or Window.shown != size:  # also where another environment has closed or changed the one display
             self._start(size)
         pygame = self._pygame
         if any(event.type in (pygame.QUIT, pygame.WINDOWCLOSE) for event in pygame.event.get()):
@@ -70,7 +72,12 @@ class Window:
             self.close()
             return
         screen = pygame.display.get_surface()
-        screen.blit(pygame.image.frombuffer(np.ascontiguousarray(picture), size, "RGB"), (0, 0))
+        image, room = pygame.image.frombuffer(np.ascontiguousarray(picture), size, "RGB"), screen.get_size()
+        if room != size:  # its reader has made it larger or smaller
+            scale = min(room[0] / size[0], room[1] / size[1])
+            image = pygame.transform.smoothscale(image, (max(1, round(size[0] * scale)), max(1, round(size[1] * scale))))
+            screen.fill(0)
+        screen.blit(image, ((room[0] - image.get_width()) // 2, (room[1] - image.get_height()) // 2))
         pygame.display.flip()
         self._clock.tick(self.fps)
 
@@ -87,8 +94,8 @@ class Window:
             raise ImportError("pygame is missing, which opens the window: pip install 'tailgate[viz]'") from error
         try:
             pygame.display.init()
-            pygame.display.set_mode(size)
+            pygame.display.set_mode(size, pygame.RESIZABLE)
         except pygame.error as error:
             raise InputError("render_mode", "human", f"a screen for the window ({error}); 'rgb_array' needs none") from None
         pygame.display.set_caption("Tailgate")
-        self._pygame, self._clock, self.open = pygame, pygame.time.Clock(), True
+        self._pygame, self._clock, self.open, Window.shown = pygame, pygame.time.Clock(), True, size

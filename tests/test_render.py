@@ -360,6 +360,25 @@ def test_two_environments_share_the_one_display(watched, screen):
     other.close()
 
 
+def test_the_picture_follows_the_size_of_the_window(watched, screen):
+    """A reader who makes it smaller sees all of the picture, its shape kept; another environment's size is its own."""
+    env, twin = watched(), AdversaryEnv(render_mode="rgb_array", **ROLLS)
+    env.reset(seed=5), twin.reset(seed=5)
+    assert screen.display.get_surface().get_flags() & screen.RESIZABLE
+    screen.display.set_mode((render.WIDTH // 2, render.HEIGHT // 2 + 200), screen.RESIZABLE)
+    env.step(1), twin.step(1)
+    seen, wanted = shown(screen), twin.render()
+    assert seen.shape == (render.HEIGHT // 2 + 200, render.WIDTH // 2, 3) and not seen[:100].any() and not seen[-100:].any()
+    small = wanted.astype(float).reshape(render.HEIGHT // 2, 2, render.WIDTH // 2, 2, 3).mean(axis=(1, 3))
+    assert np.abs(small - seen[100:-100]).max() < 2.0
+    road = gymnasium.make("tailgate:tailgate/CarFollowing-v0", render_mode="human", viewer="highway", size=(640, 200))
+    road.unwrapped.metadata["render_fps"] = 10_000
+    if importlib.util.find_spec("highway_env"):
+        road.reset(seed=5)
+        assert screen.display.get_surface().get_size() == (640, 200)
+    env.close(), road.close()
+
+
 def test_without_pygame_the_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "pygame", None)
     env = AdversaryEnv(render_mode="human", **ROLLS)
