@@ -83,6 +83,16 @@ def test_the_slider_moves_the_playhead_and_the_words(tab):
 
 
 @pytest.mark.page
+@pytest.mark.parametrize(("name", "step"), [("11", 11), ("metrics", 0), ("9999", 40)])
+def test_an_address_opens_at_its_step(tab, pages, name, step):
+    """page.html#11 begins at step 11; a name of a part of the page is no step, and the last one is the end."""
+    page = tab("quiet")
+    page.get("about:blank")
+    page.get(f"{pages['quiet'].as_uri()}#{name}")
+    assert text_of(page, "step") == f"step {step} of 40"
+
+
+@pytest.mark.page
 def test_the_keyboard_is_enough(tab):
     """Arrows step, Shift makes it ten, Home and End go to the ends on the slider, space plays and halts."""
     page = tab()
