@@ -106,8 +106,11 @@ def test_no_word_covers_another_or_a_car(name, size, episodes, witness):
         for car, seat in seats(stage, sheet):
             assert [one for one, box in road if box.meets(seat)] == [], car
         said = [one for one, _ in road]
-        for follower in stage.followers:
-            assert "!" in said or not follower.alarm
+        seen = [follower for follower in stage.followers if 0.0 <= sheet.column(stage.cars[follower.car].x) <= size[0]]
+        discs = [disc for disc in witness[-2].discs if sheet.above < disc.y0 and disc.y1 < sheet.below]  # this sheet has the last pen
+        silent = sum(follower.muted is True and not follower.hit for follower in seen)
+        assert said.count("!") == sum(follower.alarm for follower in seen)
+        assert len(discs) == silent + sum(follower.attacked + follower.alarm for follower in seen)
         watched = stage.followers[stage.watched]
         if not watched.hit and not watched.free:
             assert any(f"{watched.gap:,.1f} m" in one or one == f"{watched.gap:.0f}" for one in said), said
