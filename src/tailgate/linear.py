@@ -5,10 +5,11 @@ As in `tailgate.kernels`, every sum has a fixed order and nothing is contracted,
 
 import math
 
-import numba
 import numpy as np
 
-_jit = numba.njit(cache=True, fastmath=False, error_model="numpy")
+from tailgate.jit import jit
+
+_jit = jit(cache=True)
 
 
 @_jit

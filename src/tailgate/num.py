@@ -85,12 +85,16 @@ def matmul(x: Array, y: Array) -> Array:
         held = np.empty((m, len(fixed), j * b))
         linear.constant_times(np.ascontiguousarray(fixed, np.float64), flat.reshape(m, k, j * b), held)
         return last_to_first(held.reshape(*y.shape[1:-2], len(fixed), j, b))
+    if x.ndim == y.ndim == 2:  # of what is computed once: numba is not worth its import
+        out = x[:, :1] * y[:1]
+        for k in range(1, len(y)):
+            out = out + x[:, k : k + 1] * y[k : k + 1]
+        return np.asarray(out, np.float64)
     batch = np.broadcast_shapes(x.shape[:-2], y.shape[:-2])
-    first, *middle = batch or (1,)
+    first, *middle = batch
     out = np.zeros((math.prod(middle), x.shape[-2], y.shape[-1], first))
     linear.times_each(_last(_spread(x, middle)), _last(_spread(y, middle)), out)
-    full_out = last_to_first(out.reshape(*middle, *out.shape[1:]))
-    return full_out if batch else full_out[0]
+    return last_to_first(out.reshape(*middle, *out.shape[1:]))
 
 
 def _spread(x: Array, middle: Sequence[int]) -> Array:

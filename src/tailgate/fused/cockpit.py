@@ -16,7 +16,7 @@ from . import rows as at
 from . import seat as lane
 from .build import Constants, Refused, fuse
 from .lanes import Lanes, not_finite
-from .memory import SEATED, TICK
+from .memory import AT_SEEN, SEATED, TICK
 
 if TYPE_CHECKING:
     from tailgate.envs.seat import Seat
@@ -61,13 +61,17 @@ class Cockpit(Lanes):
     def __init__(self, seat: Seat, constants: Constants, keys: Keys, threads: int = 1) -> None:
         super().__init__(seat.loop, constants, keys, threads=threads)
         self.interval = seat.action.spec.interval
+        self._enter = kernel.run.entry
         self._alone = (False, self.interval, SEATED, False, 0, False)  # the orders of `decide_alone`
         self.paid, self.features = self.memory.paid, int(constants.f[of.FEATURES])
         self._paid, self._order = self.paid.reshape(-1), self.memory.order  # the first: of a single row
+        self._seen = np.zeros((self.batch, self.features), np.float32)  # what the compiled function writes
+        self.memory.put(AT_SEEN, self._seen)
 
     def run(self, *arguments: Any, **orders: Any) -> int:
-        self.seen = np.empty((self.batch, self.features), np.float32)
-        return super().run(*arguments, **orders)
+        played = super().run(*arguments, **orders)
+        self.seen = self._seen.copy()
+        return played
 
     def begin(self) -> None:
         """All episodes begin."""
@@ -84,9 +88,9 @@ class Cockpit(Lanes):
         if self._asked != self._alone:
             self.run(SEATED, self.interval)
         else:
-            self.seen = np.empty((1, self.features), np.float32)
-            if kernel.run(*self._arrays, self.seen, 0, 1) < 0:
+            if self._enter(self._places, 0, 1, 0) < 0:
                 raise not_finite()
+            self.seen = self._seen.copy()
             self._order[TICK] += self.interval
         out: list[float] = self._paid.tolist()
         return out
