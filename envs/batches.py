@@ -185,10 +185,6 @@ class FusedEpisodes:
         terminated, truncated, refused, collided, rear = paid[1:6] != 0.0
         return Outcome(paid[0].copy(), collided, rear, refused, terminated, truncated)
 
-    def decide_alone(self, action: Any) -> list[float]:
-        """`Cockpit.decide_alone`."""
-        return self._cockpit.decide_alone(action)
-
     def seen(self) -> Array:
         return self._cockpit.seen
 

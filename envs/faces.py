@@ -19,6 +19,7 @@ from tailgate.agents.codec import action_space
 from tailgate.agents.observation import LIMIT
 from tailgate.core import Array, Frame
 from tailgate.errors import InputError, unknown
+from tailgate.fused.cockpit import Cockpit
 from tailgate.loop import LoopState
 
 from .batches import FusedEpisodes, PlainEpisodes, framed, side_by_side
@@ -221,9 +222,9 @@ class AdversaryEnv(gymnasium.Env[Array, Any]):
         self.batch = AdversaryVectorEnv(1, render_mode=drawn, autoreset="disabled", **arguments)
         self.render_mode = render_mode
         self.metadata = self.metadata | {"render_fps": self.batch.metadata["render_fps"]}
-        played = self.batch.episodes
-        self._quick = played if isinstance(played, FusedEpisodes) and self.batch.seat.observation.frames == 1 else None
+        self._cockpit: Cockpit | None = None  # where nothing stands between
         self._actions, self._over = self.batch._modes, False  # the second: the episode is over
+        self._usual = frozenset(range(self._actions))
         self._masks = np.eye(1, self._actions, dtype=np.int8)[0], np.ones(self._actions, np.int8)  # nothing allowed, all allowed
         self._window: Any = None
         self._shown: LoopState | None = None  # in the window
@@ -238,37 +239,45 @@ class AdversaryEnv(gymnasium.Env[Array, Any]):
         super().reset(seed=seed)
         if not self.batch.begun and seed is None:
             seed = int(self.np_random.integers(2**31))
+        played, self._over = self.batch.episodes, False
+        if seed is None and self._cockpit is not None:
+            seen, paid = self._cockpit.again_alone()
+            return seen, self._told(paid)
         observation, info = self.batch.reset(seed=seed)
-        self._over = False
+        if isinstance(played, FusedEpisodes) and self.batch.seat.observation.frames == 1:
+            self._cockpit = played.cockpit
         if self.render_mode == "human":
             self.render()
         return observation[0], self._row(info)
 
     def step(self, action: Any) -> tuple[Array, float, bool, bool, dict[str, Any]]:
-        if self._quick is not None and self.batch.begun:
-            return self._step_alone(action, self._quick)
-        observation, reward, terminated, truncated, info = self.batch.step(np.asarray(action)[None])
-        if self.render_mode == "human":
-            self.render()
-        return observation[0], float(reward[0]), bool(terminated[0]), bool(truncated[0]), self._row(info)
-
-    def _step_alone(self, action: Any, episodes: FusedEpisodes) -> tuple[Array, float, bool, bool, dict[str, Any]]:
-        """What `step` of a batch of one comes to, without its arrays."""
-        batch, actions = self.batch, self._actions
+        if self._cockpit is None:
+            return self._step_as_batch(action)
         if self._over:
             raise InputError("step", [0], "an episode that is not over: reset() first")
-        if not (type(action) in _WHOLE and 0 <= action < actions):
-            action = batch.checked(np.asarray(action)[None])[0]
-        reward, terminated, truncated, illegal, collided, rear, allowed, step, gap = episodes.decide_alone(action)
-        observation: Array = episodes.seen()[0]
-        self._over = ended = terminated + truncated != 0.0
+        if not (type(action) in _WHOLE and action in self._usual):
+            action = self.batch.checked(np.asarray(action)[None])[0]
+        seen, paid = self._cockpit.decide_alone(action)
+        terminated, truncated = paid[1] != 0.0, paid[2] != 0.0
+        self._over = terminated or truncated
+        return seen, paid[0], terminated, truncated, self._told(paid)
+
+    def _told(self, paid: list[float]) -> dict[str, Any]:
+        """The information, from what `Cockpit.decide_alone` gave."""
+        _, _, _, illegal, collided, rear, allowed, step, gap = paid
         info: dict[str, Any] = {
             "illegal": illegal != 0.0, "collided": collided != 0.0, "rear_collided": rear != 0.0, "allowed": allowed != 0.0,
             "step": int(step), "gap": gap,
         }  # fmt: skip
-        if actions:
-            info["action_mask"] = self._masks[int(allowed)].copy()
-        return observation, reward, ended and terminated != 0.0, ended and truncated != 0.0, info
+        if self._actions:
+            info["action_mask"] = self._masks[allowed != 0.0].copy()
+        return info
+
+    def _step_as_batch(self, action: Any) -> tuple[Array, float, bool, bool, dict[str, Any]]:
+        observation, reward, terminated, truncated, info = self.batch.step(np.asarray(action)[None])
+        if self.render_mode == "human":
+            self.render()
+        return observation[0], float(reward[0]), bool(terminated[0]), bool(truncated[0]), self._row(info)
 
     def action_masks(self) -> Array:
         """(actions,) bool: what the channel would accept now. Discrete action spaces only."""

@@ -61,17 +61,17 @@ class Cockpit(Lanes):
     def __init__(self, seat: Seat, constants: Constants, keys: Keys, threads: int = 1) -> None:
         super().__init__(seat.loop, constants, keys, threads=threads)
         self.interval = seat.action.spec.interval
-        self._enter = kernel.run.entry
-        self._alone = (False, self.interval, SEATED, False, 0, False)  # the orders of `decide_alone`
         self.paid, self.features = self.memory.paid, int(constants.f[of.FEATURES])
-        self._paid, self._order = self.paid.reshape(-1), self.memory.order  # the first: of a single row
-        self._seen = np.zeros((self.batch, self.features), np.float32)  # what the compiled function writes
-        self.memory.put(AT_SEEN, self._seen)
+        # of a single row
+        self._enter, self._alone, self._anew = kernel.run.entry, (0, self.interval, SEATED, 0, 0, 0), (0, 0, SEATED, 0, 0, 1)
+        self._row, self._paid, self._action = np.zeros(self.features, np.float32), self.paid.reshape(-1), self.memory.action[0]
+        self._single = len(self._action) == 1
 
     def run(self, *arguments: Any, **orders: Any) -> int:
-        played = super().run(*arguments, **orders)
-        self.seen = self._seen.copy()
-        return played
+        self.seen = np.empty((self.batch, self.features), np.float32)
+        self.memory.put(AT_SEEN, self.seen)
+        self._asked = ()
+        return super().run(*arguments, **orders)
 
     def begin(self) -> None:
         """All episodes begin."""
@@ -82,18 +82,30 @@ class Cockpit(Lanes):
         self.memory.action[...] = actions if actions.ndim == 2 else actions[:, None]
         self.run(SEATED, self.interval, restart=restart)
 
-    def decide_alone(self, action: Any) -> list[float]:
-        """The decision of a single row; -> its column of `paid`. As `decide`, with nothing on the way that a batch would hide."""
-        self.memory.action[0] = action
-        if self._asked != self._alone:
-            self.run(SEATED, self.interval)
+    def decide_alone(self, action: Any) -> tuple[Array, list[float]]:
+        """The decision of a single row; -> what it sees then (features,), and its column of `paid`. `seen` stays as it was.
+
+        As `decide`, with nothing on the way that a batch would hide.
+        """
+        if self._single:
+            self._action[0] = action
         else:
-            if self._enter(self._places, 0, 1, 0) < 0:
-                raise not_finite()
-            self.seen = self._seen.copy()
-            self._order[TICK] += self.interval
-        out: list[float] = self._paid.tolist()
-        return out
+            self._action[:] = action
+        return self._play_alone(self._alone)
+
+    def again_alone(self) -> tuple[Array, list[float]]:
+        """The next episode of a single row; -> as `decide_alone`, of a decision that brought nothing."""
+        self.rows[0, at.OVER] = 1.0
+        self._paid[:6] = 0.0
+        return self._play_alone(self._anew)
+
+    def _play_alone(self, orders: tuple[int, ...]) -> tuple[Array, list[float]]:
+        if self._asked is not orders:
+            self.order(orders)
+            self.memory.put(AT_SEEN, self._row)
+        if self._enter(self._places, 0, 1, 0) < 0:
+            raise not_finite()
+        return self._row.copy(), self._paid.tolist()
 
     def again(self) -> None:
         """The next episode in every row that is over."""

@@ -21,7 +21,7 @@ from . import constants as of
 from . import kernel
 from . import rows as at
 from .build import Constants
-from .memory import AT_COLUMNS, AT_RECORD, COLUMNS, FIRST_STEP, FRESH, HOW, KEPT, OBEY, RESTART, STEPS, TERMINATE, TICK, Memory
+from .memory import AT_COLUMNS, AT_RECORD, COLUMNS, FRESH, KEPT, OBEY, RESTART, TICK, Memory
 from .rows import LANES, LINKS, SENSORS, WIRES
 
 NOTHING = np.zeros(0, np.uint64)
@@ -94,19 +94,22 @@ class Lanes:
 
     def run(self, how: int, steps: int, fresh: bool = False, terminate: bool = False, first_step: int = 0, restart: bool = False) -> int:
         """Steps under whoever decides; -> how many there were. Raises InputError where an estimate is not finite, as the loop does."""
-        order, places = self.memory.order, self._places
-        asked = (fresh, steps, how, terminate, first_step, restart)
+        places, asked = self._places, (fresh, steps, how, terminate, first_step, restart)  # as `memory` orders them
         if asked != self._asked:  # mostly the same again
-            order[[FRESH, STEPS, HOW, TERMINATE, FIRST_STEP, RESTART]] = self._asked = asked
+            self.order(asked)
         if self.threads == 1:
             played = [kernel.run(places, 0, len(self.rows), 0)]
         else:  # blocks share nothing, so that the order in which they are played does not matter
             edges = [len(self.rows) * part // self.threads for part in range(self.threads + 1)]
             played = list(_pool(self.threads).map(kernel.run, repeat(places), edges[:-1], edges[1:], range(self.threads)))
-        order[TICK] += fresh + steps
+            self.memory.order[TICK] += fresh + steps
         if min(played) < 0:
             raise not_finite()
         return int(max(played))
+
+    def order(self, asked: tuple[int, ...]) -> None:
+        """What is to be done from now on."""
+        self.memory.order[FRESH : RESTART + 1] = self._asked = asked
 
     def start(self) -> None:
         """All episodes begin, at k = 1, measured."""
