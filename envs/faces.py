@@ -67,7 +67,7 @@ class AdversaryVectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
         self._modes = self.seat.action.size if self.seat.action.discrete else 0  # discrete actions, 0 where there are none
         self._facts = ("illegal", "collided", "rear_collided", "allowed", "step", "gap" if self.seat.road else "error")
         self._present = {f"_{key}": self._everyone for key in (*self._facts, *(("action_mask",) if self._modes else ()))}
-        self.observed = np.zeros((num_envs, features), np.float32)
+        self.observed = np.zeros((num_envs, features if self._frames > 1 else 0), np.float32)  # of several frames
 
     @property
     def engine(self) -> str:
@@ -146,9 +146,10 @@ class AdversaryVectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
         terminated, truncated = outcome.terminated, outcome.truncated
         happened = (outcome.refused, outcome.collided, outcome.rear_collided)
         self.over = terminated | truncated
-        self.observed = framed(self.episodes.seen(), self.observed, self._frames)
-        if resets and self._frames > 1 and over.any():  # these rows were over: this step is their reset
-            self._begin(over)
+        if self._frames > 1:
+            self.observed = framed(self.episodes.seen(), self.observed, self._frames)
+            if resets and over.any():  # these rows were over: this step is their reset
+                self._begin(over)
         observation, info = self._shown(), self._info(*happened)
         if self.autoreset == AutoresetMode.SAME_STEP and self.over.any():
             done, final, final_info = self.over, observation, info
@@ -163,7 +164,7 @@ class AdversaryVectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
         """(B, actions) bool: what the channel would accept now. Discrete action spaces only."""
         if not self.begun or not self.seat.action.discrete:
             raise InputError("action_masks", self.seat.action.spec.action, "a running episode with a discrete action space")
-        return self.episodes.mask()
+        return self.episodes.mask().copy()
 
     def render(self) -> tuple[Array, ...] | None:
         """One (H, W, 3) uint8 picture per row: the road or the graph, what is believed, attack, alarm."""
@@ -177,12 +178,12 @@ class AdversaryVectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
 
     def _begin(self, rows: Array) -> None:
         """What is seen of episodes that have just begun in `rows` (B,) bool: every frame shows their first."""
-        now = self.episodes.seen()  # of one frame: what the other rows have seen already
-        self.observed = now if self._frames == 1 else np.where(rows[:, None], framed(now, None, self._frames), self.observed)
+        if self._frames > 1:
+            self.observed = np.where(rows[:, None], framed(self.episodes.seen(), None, self._frames), self.observed)
 
     def _shown(self) -> Array:
         """The observation as its reader's own."""
-        return self.observed if self._frames == 1 else self.observed.copy()
+        return self.episodes.seen() if self._frames == 1 else self.observed.copy()
 
     def checked(self, actions: Array) -> Array:
         """Actions of the right shape, kind and size; raises InputError."""
@@ -225,7 +226,6 @@ class AdversaryEnv(gymnasium.Env[Array, Any]):
         self._cockpit: Cockpit | None = None  # where nothing stands between
         self._actions, self._over = self.batch._modes, False  # the second: the episode is over
         self._usual = frozenset(range(self._actions))
-        self._masks = np.eye(1, self._actions, dtype=np.int8)[0], np.ones(self._actions, np.int8)  # nothing allowed, all allowed
         self._window: Any = None
         self._shown: LoopState | None = None  # in the window
         self.observation_space = self.batch.single_observation_space
@@ -241,8 +241,8 @@ class AdversaryEnv(gymnasium.Env[Array, Any]):
             seed = int(self.np_random.integers(2**31))
         played, self._over = self.batch.episodes, False
         if seed is None and self._cockpit is not None:
-            seen, paid = self._cockpit.again_alone()
-            return seen, self._told(paid)
+            _, gap, step, _, _, illegal, collided, rear, allowed, seen, mask = self._cockpit.again_alone()
+            return seen, self._told(illegal, collided, rear, allowed, step, gap, mask)
         observation, info = self.batch.reset(seed=seed)
         if isinstance(played, FusedEpisodes) and self.batch.seat.observation.frames == 1:
             self._cockpit = played.cockpit
@@ -257,21 +257,13 @@ class AdversaryEnv(gymnasium.Env[Array, Any]):
             raise InputError("step", [0], "an episode that is not over: reset() first")
         if not (type(action) in _WHOLE and action in self._usual):
             action = self.batch.checked(np.asarray(action)[None])[0]
-        seen, paid = self._cockpit.decide_alone(action)
-        terminated, truncated = paid[1] != 0.0, paid[2] != 0.0
+        reward, gap, step, terminated, truncated, illegal, collided, rear, allowed, seen, mask = self._cockpit.decide_alone(action)
         self._over = terminated or truncated
-        return seen, paid[0], terminated, truncated, self._told(paid)
+        return seen, reward, terminated, truncated, self._told(illegal, collided, rear, allowed, step, gap, mask)
 
-    def _told(self, paid: list[float]) -> dict[str, Any]:
-        """The information, from what `Cockpit.decide_alone` gave."""
-        _, _, _, illegal, collided, rear, allowed, step, gap = paid
-        info: dict[str, Any] = {
-            "illegal": illegal != 0.0, "collided": collided != 0.0, "rear_collided": rear != 0.0, "allowed": allowed != 0.0,
-            "step": int(step), "gap": gap,
-        }  # fmt: skip
-        if self._actions:
-            info["action_mask"] = self._masks[allowed != 0.0].copy()
-        return info
+    def _told(self, illegal: bool, collided: bool, rear: bool, allowed: bool, step: int, gap: float, mask: Array) -> dict[str, Any]:
+        info = {"illegal": illegal, "collided": collided, "rear_collided": rear, "allowed": allowed, "step": step, "gap": gap}
+        return info | {"action_mask": mask} if self._actions else info
 
     def _step_as_batch(self, action: Any) -> tuple[Array, float, bool, bool, dict[str, Any]]:
         observation, reward, terminated, truncated, info = self.batch.step(np.asarray(action)[None])

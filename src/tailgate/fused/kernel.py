@@ -108,7 +108,8 @@ def begin_again(s, g, window, intent, c, f, table, tick, fresh, words, new_windo
 def run(places, first_block, last_block, part):
     """What the orders ask for (`memory`), in blocks from the first to before the last, at the desk of a `part` of the threads.
 
-    Recorded in record (K, columns, B), or in (1, 2, B) the smallest gaps; what a seat sees in the end goes into seen (B, FEATURES) float32.
+    Recorded in record (K, columns, B), or in (1, 2, B) the smallest gaps. What a seat is shown in the end goes into its sheet
+    (`cockpit.SHEET`).
 
     -> steps played, or -1 where an estimate is not finite.
     """
@@ -124,7 +125,8 @@ def run(places, first_block, last_block, part):
     words = array_at(places[at.AT_WORDS], blocks * WORDS * LANES, np.uint64)
     asked = array_at(places[at.AT_ASKED], (at.ASKED, batch), np.float64)
     action = array_at(places[at.AT_ACTION], (batch, f[of.ACTIONS]), np.float64)
-    paid = array_at(places[at.AT_PAID], (at.PAID, batch), np.float64)
+    paid, flags = array_at(places[at.AT_PAID], (at.PAID, batch), np.float64), array_at(places[at.AT_FLAGS], (at.FLAGS, batch), np.bool_)
+    count, mask = array_at(places[at.AT_COUNT], batch, np.int64), array_at(places[at.AT_MASK], (batch, o[at.MASKED]), np.int8)
     seen = array_at(places[at.AT_SEEN], (batch, f[of.FEATURES]), np.float32)
     columns = array_at(places[at.AT_COLUMNS], o[at.COLUMNS], np.int64)
     record = array_at(places[at.AT_RECORD], (o[at.KEPT], o[at.COLUMNS], batch), np.float64)
@@ -172,13 +174,13 @@ def run(places, first_block, last_block, part):
                 keep(s, columns, record, o[at.FIRST_STEP] + t, first, n)
             longest = max(longest, t + 1)
         if seated and steps > 0:
-            seat.settle(s, c, paid, first, n)
+            seat.settle(s, c, paid, flags, first, n)
         if restart:
             begin_again(s, g, window, intent, c, f, table, now - 1, spare, spare_words, spare_window, spare_intent, n)
         if seated:
             if steps > 0:
-                seat.close(s, paid, first, n)
-            seat.look(s, c, paid, first, n)
+                seat.close(s, flags, first, n)
+            seat.look(s, c, paid, flags, count, mask, first, n)
             seat.observe(s, c, f, seen, first, n)
         if not alone:
             carry(desk, held)

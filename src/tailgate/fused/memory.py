@@ -33,12 +33,14 @@ FRESH, STEPS, HOW, TERMINATE, FIRST_STEP, RESTART = (
 # How long things are that differ.
 DEEP, WINDOW, INTENT, TABLE = _order("rows of a block"), _order("window rows"), _order("intent rows"), _order("table length")
 COLUMNS, KEPT = _order("recorded columns"), _order("recorded steps")
+MASKED = _order("actions of a mask")
 ORDERS = len(_orders)
 
 # Where things are, by the number of their address.
 AT_ORDERS, AT_ROWS, AT_WINDOW, AT_INTENT, AT_WORDS = (_place(name) for name in ("orders", "rows", "window", "intent", "words"))
 AT_C, AT_TABLE, AT_SCRIPT = _place("c"), _place("table"), _place("script")
-AT_ASKED, AT_ACTION, AT_PAID, AT_SEEN = _place("asked"), _place("action"), _place("paid"), _place("seen")
+AT_ASKED, AT_ACTION = _place("asked"), _place("action")
+AT_PAID, AT_COUNT, AT_SEEN, AT_FLAGS, AT_MASK = (_place(name) for name in ("paid", "count", "seen", "flags", "mask"))  # `cockpit.SHEET`
 AT_COLUMNS, AT_RECORD = _place("columns"), _place("record")
 AT_DESK, AT_DESK_WORDS = _place("desk"), _place("desk words")  # of each thread one: room to work at
 
@@ -46,7 +48,8 @@ FEW = 4  # blocks that stay in the cache with all that a step computes on its wa
 ASKED = 1 + 2 * WIRES  # rows of a command: kind, targets, values
 OBEY, SCRIPTED, SEATED = range(3)  # who decides
 DESKS = 2  # rooms of ROWS at a desk: for a block that is played, and for episodes that begin
-PAID = 9  # rows of what a decision brought: reward, terminated, truncated, refused, collided, rear, allowed, k, gap
+PAID = 2  # rows of numbers of what a decision brought: reward, gap
+FLAGS = 6  # and of truth values: terminated, truncated, refused, collided, rear, allowed
 
 
 def _lined_up(size: int, dtype: type) -> Array:
@@ -65,7 +68,6 @@ class Memory:
         sizes = {
             AT_ROWS: blocks * deep * LANES, AT_WINDOW: blocks * window * LANES, AT_INTENT: blocks * intents * LANES, AT_C: len(c),
             AT_TABLE: len(table), AT_SCRIPT: PLACES, AT_ASKED: 0 if actions else ASKED * batch, AT_ACTION: actions * batch,
-            AT_PAID: PAID * batch if actions else 0,
         }  # fmt: skip
         self.places, self._placed = np.zeros(len(_places), np.uintp), [np.zeros(0)] * len(_places)
         self.whole = np.zeros(ORDERS + len(f), np.int64)
@@ -80,7 +82,6 @@ class Memory:
         held[AT_C][:], held[AT_TABLE][:] = c, table
         self.rows, self.script = held[AT_ROWS].reshape(blocks, deep * LANES), held[AT_SCRIPT]
         self.asked, self.action = held[AT_ASKED].reshape(ASKED, -1), held[AT_ACTION].reshape(-1, max(actions, 1))
-        self.paid = held[AT_PAID].reshape(PAID, -1)
         self.flat_words = _lined_up(blocks * WORDS * LANES, np.uint64)
         self.words = self.flat_words.reshape(blocks, WORDS * LANES)
         self.put(AT_ORDERS, self.whole)
