@@ -130,6 +130,8 @@ def quadratic(x: Array, weight: Array) -> Array:
 def inverse(s: Array) -> Array:
     """Inverse of symmetric positive definite (..., q, q): closed form for q <= 2, else Gauss-Jordan in fixed order."""
     q = s.shape[-1]
+    if s.ndim > 2 and len(s) > 1 and s.strides[0] == 0:  # the same for the whole batch
+        return np.broadcast_to(inverse(s[:1]), s.shape)
     if q == 1:
         return np.asarray(1.0 / s)
     if q == 2:
@@ -140,8 +142,6 @@ def inverse(s: Array) -> Array:
         out[..., 1, 1] = a * scale
         out[..., 0, 1] = out[..., 1, 0] = -b * scale
         return out
-    if s.ndim > 2 and len(s) > 1 and s.strides[0] == 0:  # the same for the whole batch
-        return np.broadcast_to(inverse(s[:1]), s.shape)
     flat = np.array(s, np.float64, order="C").reshape(-1, q, q)
     flat_out = np.empty_like(flat)
     linear.invert_each(flat, flat_out)
