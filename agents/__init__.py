@@ -1,67 +1,19 @@
 """Attacks: scripted ones, learned policies, and the learners."""
 
-from .burst_loss import BurstLoss
-from .ghost import GhostState
-from .model_based import Covert, Stealth, ZeroDynamics
-from .optimal_dos import OptimalDos
-from .optimal_hold import OptimalHold
-from .optimal_stealth import OptimalStealth
-from .policy import PolicyAttack, Yoked, load_policy, save_policy
-from .program import Program
-from .radio import EchoDelay, EchoPullOff, NoiseJam, RadarJam
-from .scripted import (
-    Delay,
-    Dropout,
-    Hold,
-    Inject,
-    InjectActuator,
-    InjectBernoulli,
-    InjectGaussian,
-    InjectRamp,
-    InjectSparse,
-    InjectThenJam,
-    InjectUniform,
-    Jam,
-    NoAttack,
-    Replay,
-    Script,
-    ThesisTimes,
-)  # fmt: skip
-from .zoo import ZooAttack
+from tailgate.lazy import exported
 
-__all__ = [
-    "BurstLoss",
-    "Covert",
-    "Delay",
-    "Dropout",
-    "EchoDelay",
-    "EchoPullOff",
-    "GhostState",
-    "Hold",
-    "Inject",
-    "InjectActuator",
-    "InjectBernoulli",
-    "InjectGaussian",
-    "InjectRamp",
-    "InjectSparse",
-    "InjectThenJam",
-    "InjectUniform",
-    "Jam",
-    "NoAttack",
-    "NoiseJam",
-    "OptimalDos",
-    "OptimalHold",
-    "OptimalStealth",
-    "PolicyAttack",
-    "Program",
-    "RadarJam",
-    "Replay",
-    "Script",
-    "Stealth",
-    "ThesisTimes",
-    "Yoked",
-    "ZeroDynamics",
-    "ZooAttack",
-    "load_policy",
-    "save_policy",
-]  # fmt: skip
+HOMES = {  # modules, and what they give to the package
+    "burst_loss": "BurstLoss",
+    "ghost": "GhostState",
+    "model_based": "Covert Stealth ZeroDynamics",
+    "optimal_dos": "OptimalDos",
+    "optimal_hold": "OptimalHold",
+    "optimal_stealth": "OptimalStealth",
+    "policy": "PolicyAttack Yoked load_policy save_policy",
+    "program": "Program",
+    "radio": "EchoDelay EchoPullOff NoiseJam RadarJam",
+    "scripted": "Delay Dropout Hold Inject InjectActuator InjectBernoulli InjectGaussian InjectRamp InjectSparse InjectThenJam "
+    "InjectUniform Jam NoAttack Replay Script ThesisTimes",
+    "zoo": "ZooAttack",
+}
+__getattr__, __all__ = exported(__name__, HOMES)

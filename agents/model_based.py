@@ -7,7 +7,6 @@ from itertools import combinations
 from typing import Literal, NamedTuple
 
 import numpy as np
-from scipy import linalg
 
 from tailgate import num
 from tailgate.core import Array, Command, Count, Finite, Kind, Model, NonNegative, Positive, View, param
@@ -138,6 +137,8 @@ def invariant_zeros(A: Array, B: Array, C: Array) -> list[Zero]:
     Where the Rosenbrock pencil [A - z I, B; C, 0] loses rank. With more outputs than inputs, zeros of m of them are candidates, and those
     that silence the others as well are kept.
     """
+    from scipy import linalg  # takes long to import
+
     n, m = B.shape
     right = np.zeros((n + m, n + m))
     right[:n, :n] = np.eye(n)

@@ -1,26 +1,24 @@
 """Plants, sensors, controllers and manoeuvres, and the Gymnasium faces over the loop."""
 
-from .cacc import FeedForward
-from .consensus_cacc import Consensus
-from .controllers import AdaptiveCruise
-from .following import CarFollowing
-from .highway import Highway
-from .idm import IntelligentDriver
-from .linear_platoon import LinearPlatoon
-from .literal import CarFollowingLiteral, RelativeDistance
-from .manoeuvres import Braking, Constant, OrnsteinUhlenbeck, Profile, Pulse, Sine, StopAndGo, Switched
-from .network import LinearSensors, NoControl, SensorNetwork
-from .platoon import Platoon, PlatoonSensors
-from .ploeg import Ploeg
-from .radar import FmcwRadar
-from .radar_car import RadarCruise
-from .radar_following import RadarFollowing
-from .scalar_loop import ExactReading, ScalarLoop, StateFeedback
-from .sensors import Odometry
+from tailgate.lazy import exported
 
-__all__ = [
-    "AdaptiveCruise", "Braking", "CarFollowing", "CarFollowingLiteral", "Consensus", "Constant", "ExactReading", "FeedForward",
-    "FmcwRadar", "Highway", "IntelligentDriver", "LinearPlatoon", "LinearSensors", "NoControl", "Odometry", "OrnsteinUhlenbeck", "Platoon",
-    "PlatoonSensors", "Ploeg", "Profile", "Pulse", "RadarCruise", "RadarFollowing", "RelativeDistance", "ScalarLoop", "SensorNetwork",
-    "Sine", "StateFeedback", "StopAndGo", "Switched",
-]  # fmt: skip
+HOMES = {  # modules, and what they give to the package
+    "cacc": "FeedForward",
+    "consensus_cacc": "Consensus",
+    "controllers": "AdaptiveCruise",
+    "following": "CarFollowing",
+    "highway": "Highway",
+    "idm": "IntelligentDriver",
+    "linear_platoon": "LinearPlatoon",
+    "literal": "CarFollowingLiteral RelativeDistance",
+    "manoeuvres": "Braking Constant OrnsteinUhlenbeck Profile Pulse Sine StopAndGo Switched",
+    "network": "LinearSensors NoControl SensorNetwork",
+    "platoon": "Platoon PlatoonSensors",
+    "ploeg": "Ploeg",
+    "radar": "FmcwRadar",
+    "radar_car": "RadarCruise",
+    "radar_following": "RadarFollowing",
+    "scalar_loop": "ExactReading ScalarLoop StateFeedback",
+    "sensors": "Odometry",
+}
+__getattr__, __all__ = exported(__name__, HOMES)

@@ -63,8 +63,6 @@ class Episodes(Protocol):
 
 def framed(now: Array, before: Array | None, frames: int) -> Array:
     """(B, frames d) what is seen now (B, d) on top of what was seen before (B, frames d); none before: the first of an episode."""
-    if frames == 1:
-        return now
     return np.tile(now, frames) if before is None else np.concatenate([now, before[:, : -now.shape[1]]], axis=1)
 
 
@@ -162,7 +160,6 @@ class FusedEpisodes:
     def __init__(self, seat: Seat, constants: Any, threads: int) -> None:
         self.seat, self.constants, self.threads = seat, constants, threads
         self.cockpit: Cockpit | None = None
-        self._actions = seat.action.size
 
     @property
     def number(self) -> Array:
@@ -181,27 +178,18 @@ class FusedEpisodes:
     def decide(self, actions: Array, over: Array, restart: bool) -> Outcome:
         cockpit = self._cockpit
         cockpit.decide(actions, restart)
-        paid = cockpit.paid
-        terminated, truncated, refused, collided, rear = paid[1:6] != 0.0
-        return Outcome(paid[0].copy(), collided, rear, refused, terminated, truncated)
-
-    def decide_alone(self, action: Any) -> list[float]:
-        """`Cockpit.decide_alone`."""
-        return self._cockpit.decide_alone(action)
+        flags = cockpit.flags
+        return Outcome(cockpit.paid[0], flags[3], flags[4], flags[2], flags[0], flags[1])
 
     def seen(self) -> Array:
         return self._cockpit.seen
 
     def facts(self) -> Facts:
-        paid = self._cockpit.paid
-        return Facts(paid[6] != 0.0, paid[7].astype(np.int64), paid[8].copy())
+        cockpit = self._cockpit
+        return Facts(cockpit.flags[5], cockpit.count, cockpit.paid[1])
 
     def mask(self) -> Array:
-        paid = self._cockpit.paid
-        out = np.empty((paid.shape[1], self._actions), bool)
-        out[...] = (paid[6] != 0.0)[:, None]
-        out[:, 0] = True
-        return out
+        return self._cockpit.mask.view(bool)
 
     def held(self) -> dict[str, Array]:
         return self._cockpit.held()

@@ -19,6 +19,7 @@ from tailgate.agents.codec import action_space
 from tailgate.agents.observation import LIMIT
 from tailgate.core import Array, Frame
 from tailgate.errors import InputError, unknown
+from tailgate.fused.cockpit import Cockpit
 from tailgate.loop import LoopState
 
 from .batches import FusedEpisodes, PlainEpisodes, framed, side_by_side
@@ -66,7 +67,7 @@ class AdversaryVectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
         self._modes = self.seat.action.size if self.seat.action.discrete else 0  # discrete actions, 0 where there are none
         self._facts = ("illegal", "collided", "rear_collided", "allowed", "step", "gap" if self.seat.road else "error")
         self._present = {f"_{key}": self._everyone for key in (*self._facts, *(("action_mask",) if self._modes else ()))}
-        self.observed = np.zeros((num_envs, features), np.float32)
+        self.observed = np.zeros((num_envs, features if self._frames > 1 else 0), np.float32)  # of several frames
 
     @property
     def engine(self) -> str:
@@ -145,9 +146,10 @@ class AdversaryVectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
         terminated, truncated = outcome.terminated, outcome.truncated
         happened = (outcome.refused, outcome.collided, outcome.rear_collided)
         self.over = terminated | truncated
-        self.observed = framed(self.episodes.seen(), self.observed, self._frames)
-        if resets and self._frames > 1 and over.any():  # these rows were over: this step is their reset
-            self._begin(over)
+        if self._frames > 1:
+            self.observed = framed(self.episodes.seen(), self.observed, self._frames)
+            if resets and over.any():  # these rows were over: this step is their reset
+                self._begin(over)
         observation, info = self._shown(), self._info(*happened)
         if self.autoreset == AutoresetMode.SAME_STEP and self.over.any():
             done, final, final_info = self.over, observation, info
@@ -162,7 +164,7 @@ class AdversaryVectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
         """(B, actions) bool: what the channel would accept now. Discrete action spaces only."""
         if not self.begun or not self.seat.action.discrete:
             raise InputError("action_masks", self.seat.action.spec.action, "a running episode with a discrete action space")
-        return self.episodes.mask()
+        return self.episodes.mask().copy()
 
     def render(self) -> tuple[Array, ...] | None:
         """One (H, W, 3) uint8 picture per row: the road or the graph, what is believed, attack, alarm."""
@@ -176,12 +178,12 @@ class AdversaryVectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
 
     def _begin(self, rows: Array) -> None:
         """What is seen of episodes that have just begun in `rows` (B,) bool: every frame shows their first."""
-        now = self.episodes.seen()  # of one frame: what the other rows have seen already
-        self.observed = now if self._frames == 1 else np.where(rows[:, None], framed(now, None, self._frames), self.observed)
+        if self._frames > 1:
+            self.observed = np.where(rows[:, None], framed(self.episodes.seen(), None, self._frames), self.observed)
 
     def _shown(self) -> Array:
         """The observation as its reader's own."""
-        return self.observed if self._frames == 1 else self.observed.copy()
+        return self.episodes.seen() if self._frames == 1 else self.observed.copy()
 
     def checked(self, actions: Array) -> Array:
         """Actions of the right shape, kind and size; raises InputError."""
@@ -221,10 +223,9 @@ class AdversaryEnv(gymnasium.Env[Array, Any]):
         self.batch = AdversaryVectorEnv(1, render_mode=drawn, autoreset="disabled", **arguments)
         self.render_mode = render_mode
         self.metadata = self.metadata | {"render_fps": self.batch.metadata["render_fps"]}
-        played = self.batch.episodes
-        self._quick = played if isinstance(played, FusedEpisodes) and self.batch.seat.observation.frames == 1 else None
+        self._cockpit: Cockpit | None = None  # where nothing stands between
         self._actions, self._over = self.batch._modes, False  # the second: the episode is over
-        self._masks = np.eye(1, self._actions, dtype=np.int8)[0], np.ones(self._actions, np.int8)  # nothing allowed, all allowed
+        self._usual = frozenset(range(self._actions))
         self._window: Any = None
         self._shown: LoopState | None = None  # in the window
         self.observation_space = self.batch.single_observation_space
@@ -238,37 +239,37 @@ class AdversaryEnv(gymnasium.Env[Array, Any]):
         super().reset(seed=seed)
         if not self.batch.begun and seed is None:
             seed = int(self.np_random.integers(2**31))
+        played, self._over = self.batch.episodes, False
+        if seed is None and self._cockpit is not None:
+            _, gap, step, _, _, illegal, collided, rear, allowed, seen, mask = self._cockpit.again_alone()
+            return seen, self._told(illegal, collided, rear, allowed, step, gap, mask)
         observation, info = self.batch.reset(seed=seed)
-        self._over = False
+        if isinstance(played, FusedEpisodes) and self.batch.seat.observation.frames == 1:
+            self._cockpit = played.cockpit
         if self.render_mode == "human":
             self.render()
         return observation[0], self._row(info)
 
     def step(self, action: Any) -> tuple[Array, float, bool, bool, dict[str, Any]]:
-        if self._quick is not None and self.batch.begun:
-            return self._step_alone(action, self._quick)
+        if self._cockpit is None:
+            return self._step_as_batch(action)
+        if self._over:
+            raise InputError("step", [0], "an episode that is not over: reset() first")
+        if not (type(action) in _WHOLE and action in self._usual):
+            action = self.batch.checked(np.asarray(action)[None])[0]
+        reward, gap, step, terminated, truncated, illegal, collided, rear, allowed, seen, mask = self._cockpit.decide_alone(action)
+        self._over = terminated or truncated
+        return seen, reward, terminated, truncated, self._told(illegal, collided, rear, allowed, step, gap, mask)
+
+    def _told(self, illegal: bool, collided: bool, rear: bool, allowed: bool, step: int, gap: float, mask: Array) -> dict[str, Any]:
+        info = {"illegal": illegal, "collided": collided, "rear_collided": rear, "allowed": allowed, "step": step, "gap": gap}
+        return info | {"action_mask": mask} if self._actions else info
+
+    def _step_as_batch(self, action: Any) -> tuple[Array, float, bool, bool, dict[str, Any]]:
         observation, reward, terminated, truncated, info = self.batch.step(np.asarray(action)[None])
         if self.render_mode == "human":
             self.render()
         return observation[0], float(reward[0]), bool(terminated[0]), bool(truncated[0]), self._row(info)
-
-    def _step_alone(self, action: Any, episodes: FusedEpisodes) -> tuple[Array, float, bool, bool, dict[str, Any]]:
-        """What `step` of a batch of one comes to, without its arrays."""
-        batch, actions = self.batch, self._actions
-        if self._over:
-            raise InputError("step", [0], "an episode that is not over: reset() first")
-        if not (type(action) in _WHOLE and 0 <= action < actions):
-            action = batch.checked(np.asarray(action)[None])[0]
-        reward, terminated, truncated, illegal, collided, rear, allowed, step, gap = episodes.decide_alone(action)
-        observation: Array = episodes.seen()[0]
-        self._over = ended = terminated + truncated != 0.0
-        info: dict[str, Any] = {
-            "illegal": illegal != 0.0, "collided": collided != 0.0, "rear_collided": rear != 0.0, "allowed": allowed != 0.0,
-            "step": int(step), "gap": gap,
-        }  # fmt: skip
-        if actions:
-            info["action_mask"] = self._masks[int(allowed)].copy()
-        return observation, reward, ended and terminated != 0.0, ended and truncated != 0.0, info
 
     def action_masks(self) -> Array:
         """(actions,) bool: what the channel would accept now. Discrete action spaces only."""

@@ -18,18 +18,17 @@ so that other machines may differ in the last bits.
 """
 
 import math
-from typing import Any
 
-import numba
 import numpy as np
 
 from tailgate.core import Array
+from tailgate.jit import jit
 
 from .fmcw import LIGHT, Link
 
 _SPLIT = 4  # a window of root-MUSIC is the fourth part of the samples: of 1/16 to 1/4 the one with the least variance and threshold
 _TURN = 2.0 * math.pi
-_jit: Any = numba.njit(cache=True, fastmath=False, error_model="numpy")
+_jit = jit(cache=True)
 
 
 def read(link: Link, d: Array, dv: Array, late: Array, snr: Array, noise: Array, normals: Array) -> tuple[Array, Array]:
@@ -81,7 +80,7 @@ def _beats(link: Link, d: Array, dv: Array, late: Array, snr: Array, noise: Arra
     return out
 
 
-@_jit  # type: ignore[untyped-decorator]
+@_jit
 def _chirp(d: float, dv: float, late: float, side: float, carrier: float, slope: float, rate: float, out: Array) -> None:
     """Transmit x conj(delayed echo) into out (M, 2); the sweep's middle is t = 0 and the phase is counted in turns."""
     count = out.shape[0]
@@ -96,7 +95,7 @@ def _chirp(d: float, dv: float, late: float, side: float, carrier: float, slope:
         out[n, 1] = side * (b * c - a * s)
 
 
-@_jit  # type: ignore[untyped-decorator]
+@_jit
 def _covariance(x: Array, m: int) -> Array:
     """The real (m, m) matrix that the forward-backward covariance of the windows of x (M, 2) is unitarily similar to."""
     span, half = x.shape[0] - m + 1, m // 2
@@ -123,7 +122,7 @@ def _covariance(x: Array, m: int) -> Array:
     return out
 
 
-@_jit  # type: ignore[untyped-decorator]
+@_jit
 def _first_eigenvector(c: Array) -> Array:
     """Of a real symmetric, positive semidefinite (m, m); as far as 500 steps lead, where two eigenvalues nearly tie."""
     m, best, level = c.shape[0], 0, 0.0
@@ -153,7 +152,7 @@ def _first_eigenvector(c: Array) -> Array:
     return u
 
 
-@_jit  # type: ignore[untyped-decorator]
+@_jit
 def _frequency(x: Array, m: int) -> float:
     """Root-MUSIC's frequency of the tone in x (M, 2), in cycles per sample, with windows of m samples."""
     u, half, grid = _first_eigenvector(_covariance(x, m)), m // 2, 8 * m

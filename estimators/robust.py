@@ -36,6 +36,8 @@ ROUNDING = 8 * np.finfo(np.float64).eps  # of a sum, relative to its largest ter
 def believed(r: Array, S: Array, lam: Array) -> Array:
     """y = r - z (B, N, q) for r and lam (B, N, q) and S (B, N, q, q). A sensor without outlier keeps every bit of its r."""
     W = num.inverse(S)
+    if r.shape[-1] == 2:
+        return _pair(r, S, W, 0.5 * lam)
     rows = np.nonzero((2.0 * np.abs(num.matvec(W, r)) > lam).any(axis=-1))
     if not len(rows[0]):
         return r
@@ -43,32 +45,20 @@ def believed(r: Array, S: Array, lam: Array) -> Array:
     if r.shape[-1] > 2:
         y[rows] = _pivot(r, S, W, half, rows)
     else:
-        solve = _single if r.shape[-1] == 1 else _pair
-        y[rows] = solve(r[rows], S[rows], W[rows], half[rows])
+        y[rows] = _single(r[rows], S[rows], half[rows])
     return y
 
 
-def _single(r: Array, S: Array, W: Array, half: Array) -> Array:
+def _single(r: Array, S: Array, half: Array) -> Array:
     return np.clip(r, -half * S[..., 0], half * S[..., 0])
 
 
 def _pair(r: Array, S: Array, W: Array, half: Array) -> Array:
-    """Two sensors, in closed form: both have outliers, with one of four pairs of signs s and y = S (s lam) / 2, or one has."""
-    best, y = np.full(len(r), -np.inf), r
-    for signs in ((1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0)):
-        s = np.array(signs)
-        both = num.matvec(S, s * half)
-        both = both + num.matvec(S, s * half - num.matvec(W, both))  # mends the rounding
-        z = s * (r - both)
-        least = np.minimum(z[:, 0], z[:, 1])  # negative where a sign is wrong
-        y = np.where((least > best)[:, None], both, y)
-        best = np.maximum(least, best)
-    for i, j in ((0, 1), (1, 0)):
-        one = r.copy()
-        b = W[:, i, j] * r[:, j]
-        one[:, i] = np.clip(r[:, i], (-half[:, i] - b) / W[:, i, i], (half[:, i] - b) / W[:, i, i])
-        inside = np.abs(num.matvec(W, one)[:, j]) <= half[:, j]
-        y = np.where(inside[:, None], one, y)
+    """Two sensors, compiled: r and lam/2 (B, N, 2), S and W (B, N, 2, 2)."""
+    one = slice(None, 1) if S.strides[0] == 0 else slice(None)  # the same for the whole batch
+    given = (np.ascontiguousarray(num.first_to_last(x)) for x in (r, S[one], W[one], half))
+    y = num.zeros(r.shape)
+    linear.pair_each(*given, num.first_to_last(y))
     return y
 
 

@@ -19,7 +19,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy import linalg
 
 from tailgate import num
 from tailgate.core import Array, Count, Model, param
@@ -111,6 +110,8 @@ def _complement(X: Array) -> Array:
 
 def clusters(A: Array) -> list[tuple[complex, int]]:
     """The eigenvalues of A that do not die out, with imaginary part >= 0, rounded; and how many states belong to each."""
+    from scipy import linalg  # takes long to import
+
     left = sorted((complex(v) for v in linalg.eigvals(A) if v.imag >= -CLUSTER), key=lambda v: (v.real, v.imag))
     out = []
     while left:

@@ -7,7 +7,6 @@ for tests, not part of the scored path.
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import solve_discrete_are
 
 from tailgate.core import Array, Model
 
@@ -23,6 +22,8 @@ class Steady(NamedTuple):
 
 def steady_state(model: Model, agent: int = 0) -> Steady:
     """The steady-state filter of one agent on its own sensors. Raises LinAlgError where none exists."""
+    from scipy.linalg import solve_discrete_are  # takes long to import, and most attacks do without
+
     C, R = model.C[agent], model.R[agent]
     return updated(solve_discrete_are(model.A.T, C.T, model.Q, R), C, R)
 

@@ -3,7 +3,8 @@
 from typing import Any
 
 import numpy as np
-from numba.extending import overload
+
+from tailgate.jit import compiled_as
 
 
 def select(where: Any, x: Any, y: Any) -> Any:
@@ -16,11 +17,11 @@ def clip(x: Any, low: Any, high: Any) -> Any:
     return np.minimum(np.maximum(x, low), high)
 
 
-@overload(select, jit_options={"forceinline": True})
+@compiled_as(select)
 def _select(where, x, y):
     return lambda where, x, y: x if where else y
 
 
-@overload(clip, jit_options={"forceinline": True})
+@compiled_as(clip)
 def _clip(x, low, high):
     return lambda x, low, high: np.minimum(np.maximum(x, low), high)

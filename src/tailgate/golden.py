@@ -19,11 +19,11 @@ import platform
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from importlib.metadata import version
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-import numba
 import numpy as np
 from rich.console import Console
 
@@ -59,7 +59,7 @@ class _Blocks(Mixture):
 
 def this_platform() -> str:
     """What a trace's last bits may depend on."""
-    return f"{platform.machine()}, numpy {np.__version__}, numba {numba.__version__}"
+    return f"{platform.machine()}, numpy {np.__version__}, numba {version('numba')}"
 
 
 def suite_hash(suite: Suite) -> str:

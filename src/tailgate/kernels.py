@@ -12,8 +12,9 @@ from collections.abc import Callable
 from functools import cache
 from typing import Any
 
-import numba
 import numpy as np
+
+from tailgate.jit import jit, numba
 
 LN2_HI = 6.93147180369123816490e-01  # ln 2, its last bits zero: n * LN2_HI is exact for |n| < 2**20
 LN2_LO = 1.90821492927058770002e-10
@@ -23,10 +24,10 @@ TWO_PI = 6.283185307179586
 TWO_52, TWO_52_BITS = 4503599627370496.0, np.int64(0x4330000000000000)
 ONE_BITS = np.uint64(0x3FF0000000000000)
 
-_jit = numba.njit(cache=True, fastmath=False, error_model="numpy")
+_jit, _inline = jit(cache=True), jit(cache=True, inline="always")
 
 
-@numba.njit(cache=True, inline="always", error_model="numpy")
+@_inline
 def _exp(x: float) -> float:
     z = x if x == x else 0.0
     y = min(max(z, -708.0), 709.7)  # what is computed raises no flag, whatever x is
@@ -54,7 +55,7 @@ def _exp(x: float) -> float:
     return p if z >= -708.0 else 0.0  # below the normal range: flushed, no denormals on the scored path
 
 
-@numba.njit(cache=True, inline="always", error_model="numpy")
+@_inline
 def _log_normal(x: float, e: float) -> float:
     """Of x 2^e, for an x that is a normal positive number."""
     bits = np.float64(x).view(np.int64)
@@ -79,7 +80,7 @@ def _log_normal(x: float, e: float) -> float:
     return e * LN2_HI + (2.0 * s * p + e * LN2_LO)
 
 
-@numba.njit(cache=True, inline="always", error_model="numpy")
+@_inline
 def _log(x: float) -> float:
     x = x if x == x else -1.0  # an ordered comparison with NaN raises a flag
     plain = (x > 0.0) & (x < math.inf)
@@ -91,7 +92,7 @@ def _log(x: float) -> float:
     return out if plain else other
 
 
-@numba.njit(cache=True, inline="always", error_model="numpy")
+@_inline
 def _sincos_turn(u: float) -> tuple[float, float]:
     """Sine and cosine of 2 pi u, u in turns within [0, 1)."""
     quarter = np.floor(4.0 * u + 0.5)
@@ -120,42 +121,31 @@ def _sincos_turn(u: float) -> tuple[float, float]:
     return -sine if second or third else sine, -cosine if first or second else cosine
 
 
-@numba.njit(cache=True, inline="always", error_model="numpy")
+@_inline
 def _tanh(x: float) -> float:
     """Absolute error below 4e-16."""
     if x > 20.0:
         return 1.0
     if x < -20.0:
         return -1.0
-    return 1.0 - 2.0 / (_exp(2.0 * x) + 1.0)
+    out: float = 1.0 - 2.0 / (_exp(2.0 * x) + 1.0)
+    return out
 
 
-def _elementwise(function: Callable[[float], float]) -> Callable[..., Any]:
-    """A universal function of numpy, compiled or loaded at its first call."""
+def _elementwise(function: Any) -> Callable[..., Any]:
+    """A universal function of numpy, compiled or loaded at its first array; a single number is computed in Python, to the same bits."""
 
     @cache
     def made() -> Any:
-        return numba.vectorize(["float64(float64)"], cache=True)(function)
+        return numba().vectorize(["float64(float64)"], cache=True)(function.py_func)
 
-    return lambda x: made()(x)
-
-
-@_elementwise
-def exp(x: float) -> float:
-    return _exp(x)
+    return lambda x: np.float64(function.py_func(x)) if isinstance(x, float) else made()(x)
 
 
-@_elementwise
-def log(x: float) -> float:
-    return _log(x)
+exp, log, tanh = _elementwise(_exp), _elementwise(_log), _elementwise(_tanh)
 
 
-@_elementwise
-def tanh(x: float) -> float:
-    return _tanh(x)
-
-
-@numba.njit(cache=True, inline="always")
+@_inline
 def _philox(c0, c1, c2, c3, k0, k1):
     """Philox4x32-10. Counter and key words are uint64 holding 32 bits each."""
     mask = np.uint64(0xFFFFFFFF)
@@ -169,7 +159,7 @@ def _philox(c0, c1, c2, c3, k0, k1):
     return c0 & mask, c1 & mask, c2 & mask, c3 & mask
 
 
-@numba.njit(cache=True, inline="always")
+@_inline
 def _uniform_pair(key, episode, step, stream, block):
     """Two uniforms in (0, 1), 52 bits each, never 0 nor 1."""
     w0, w1, w2, w3 = _philox(

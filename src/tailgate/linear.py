@@ -5,10 +5,11 @@ As in `tailgate.kernels`, every sum has a fixed order and nothing is contracted,
 
 import math
 
-import numba
 import numpy as np
 
-_jit = numba.njit(cache=True, fastmath=False, error_model="numpy")
+from tailgate.jit import jit
+
+_jit = jit(cache=True)
 
 
 @_jit
@@ -191,6 +192,45 @@ def ball_each(w: np.ndarray, c: np.ndarray, u: np.ndarray) -> None:
                 mu += step
             for k in range(len(x)):
                 u[p, k, b] = x[k] / (c[p, k] + mu) / size if x[k] != 0.0 else 0.0
+
+
+@_jit
+def pair_each(r, S, W, half, y):
+    """The part of r (N, 2, B) that is believed (robust.py) into y, in closed form; S and W = S^-1 (N, 2, 2, B or 1), lam/2 (N, 2, B).
+
+    Nothing is an outlier, or both are, with one of four pairs of signs s and y = S (s lam) / 2, or one is.
+    """
+    for n in range(r.shape[0]):
+        for b in range(r.shape[2]):
+            at = b if S.shape[3] > 1 else 0
+            r0, r1, half0, half1 = r[n, 0, b], r[n, 1, b], half[n, 0, b], half[n, 1, b]
+            S00, S01, S10, S11 = S[n, 0, 0, at], S[n, 0, 1, at], S[n, 1, 0, at], S[n, 1, 1, at]
+            W00, W01, W10, W11 = W[n, 0, 0, at], W[n, 0, 1, at], W[n, 1, 0, at], W[n, 1, 1, at]
+            y[n, 0, b], y[n, 1, b], best = r0, r1, -np.inf
+            if not (abs(W00 * r0 + W01 * r1) > half0 or abs(W10 * r0 + W11 * r1) > half1):
+                continue
+            for pair in range(4):
+                s0, s1 = 1.0 if pair < 2 else -1.0, 1.0 if pair % 2 == 0 else -1.0
+                price0, price1 = s0 * half0, s1 * half1
+                y0, y1 = S00 * price0 + S01 * price1, S10 * price0 + S11 * price1
+                left0, left1 = price0 - (W00 * y0 + W01 * y1), price1 - (W10 * y0 + W11 * y1)
+                y0, y1 = y0 + (S00 * left0 + S01 * left1), y1 + (S10 * left0 + S11 * left1)  # mends the rounding
+                least = np.minimum(s0 * (r0 - y0), s1 * (r1 - y1))  # negative where a sign is wrong
+                if least > best:
+                    y[n, 0, b], y[n, 1, b] = y0, y1
+                best = np.maximum(least, best)
+            one = _within(r0, (-half0 - W01 * r1) / W00, (half0 - W01 * r1) / W00)
+            if abs(W10 * one + W11 * r1) <= half1:
+                y[n, 0, b], y[n, 1, b] = one, r1
+            one = _within(r1, (-half1 - W10 * r0) / W11, (half1 - W10 * r0) / W11)
+            if abs(W00 * r0 + W01 * one) <= half0:
+                y[n, 0, b], y[n, 1, b] = r0, one
+
+
+@_jit
+def _within(x, low, high):
+    x = low if x <= low else x
+    return high if x >= high else x
 
 
 @_jit

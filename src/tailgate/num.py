@@ -85,12 +85,16 @@ def matmul(x: Array, y: Array) -> Array:
         held = np.empty((m, len(fixed), j * b))
         linear.constant_times(np.ascontiguousarray(fixed, np.float64), flat.reshape(m, k, j * b), held)
         return last_to_first(held.reshape(*y.shape[1:-2], len(fixed), j, b))
+    if x.ndim == y.ndim == 2:  # of what is computed once: numba is not worth its import
+        out = x[:, :1] * y[:1]
+        for k in range(1, len(y)):
+            out = out + x[:, k : k + 1] * y[k : k + 1]
+        return np.asarray(out, np.float64)
     batch = np.broadcast_shapes(x.shape[:-2], y.shape[:-2])
-    first, *middle = batch or (1,)
+    first, *middle = batch
     out = np.zeros((math.prod(middle), x.shape[-2], y.shape[-1], first))
     linear.times_each(_last(_spread(x, middle)), _last(_spread(y, middle)), out)
-    full_out = last_to_first(out.reshape(*middle, *out.shape[1:]))
-    return full_out if batch else full_out[0]
+    return last_to_first(out.reshape(*middle, *out.shape[1:]))
 
 
 def _spread(x: Array, middle: Sequence[int]) -> Array:
@@ -126,6 +130,8 @@ def quadratic(x: Array, weight: Array) -> Array:
 def inverse(s: Array) -> Array:
     """Inverse of symmetric positive definite (..., q, q): closed form for q <= 2, else Gauss-Jordan in fixed order."""
     q = s.shape[-1]
+    if s.ndim > 2 and len(s) > 1 and s.strides[0] == 0:  # the same for the whole batch
+        return np.broadcast_to(inverse(s[:1]), s.shape)
     if q == 1:
         return np.asarray(1.0 / s)
     if q == 2:
@@ -136,8 +142,6 @@ def inverse(s: Array) -> Array:
         out[..., 1, 1] = a * scale
         out[..., 0, 1] = out[..., 1, 0] = -b * scale
         return out
-    if s.ndim > 2 and len(s) > 1 and s.strides[0] == 0:  # the same for the whole batch
-        return np.broadcast_to(inverse(s[:1]), s.shape)
     flat = np.array(s, np.float64, order="C").reshape(-1, q, q)
     flat_out = np.empty_like(flat)
     linear.invert_each(flat, flat_out)

@@ -14,7 +14,9 @@ import traceback
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from importlib.metadata import entry_points
+from importlib.resources import files
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
@@ -99,8 +101,25 @@ def put(entry: Entry) -> None:
     _entries[entry.family][entry.name] = entry
 
 
+@cache
+def _sources(package: str) -> dict[str, str]:
+    """The text of each module of a package whose modules are imported when they are asked for."""
+    return {module: files(package).joinpath(f"{module}.py").read_text("utf-8") for module in importlib.import_module(package).HOMES}
+
+
+def _at_home(family: Family, name: str) -> Entry | None:
+    """A built-in component, for which its own module alone is imported; None where no module says that it has it."""
+    if name not in _entries[family]:
+        said = re.compile(rf'@register\(\s*"{family}",\s*"{re.escape(name)}"')
+        for module, text in _sources(_MODULES[family]).items():
+            if said.search(text):
+                importlib.import_module(f"{_MODULES[family]}.{module}")
+    return _entries[family].get(name)
+
+
 def _load(family: Family) -> dict[str, Entry]:
-    importlib.import_module(_MODULES[family])
+    for module in importlib.import_module(_MODULES[family]).HOMES:
+        importlib.import_module(f"{_MODULES[family]}.{module}")
     group = _GROUPS.get(family)
     if group and group not in _plugins_loaded:
         for point in entry_points(group=group):
@@ -148,6 +167,8 @@ def entries(family: Family) -> dict[str, Entry]:
 
 
 def find(family: Family, name: str) -> Entry:
+    if found := _at_home(family, name):
+        return found
     known = _load(family)
     if name not in known:
         raise unknown(family, name, known)

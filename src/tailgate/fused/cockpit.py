@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+import struct
+from itertools import accumulate
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,8 +18,8 @@ from . import kernel
 from . import rows as at
 from . import seat as lane
 from .build import Constants, Refused, fuse
-from .lanes import Lanes, not_finite
-from .memory import SEATED, TICK
+from .lanes import NOTHING, Lanes, not_finite
+from .memory import AT_COUNT, AT_FLAGS, AT_MASK, AT_PAID, AT_SEEN, FLAGS, MASKED, PAID, SEATED, TICK
 
 if TYPE_CHECKING:
     from tailgate.envs.seat import Seat
@@ -55,18 +58,44 @@ def fuse_seat(seat: Seat) -> Constants | Refused:
     return k
 
 
+SHEET = {  # what a decision brought, (B,) of each: number, information; the observation; truth values; what the channel would accept
+    AT_PAID: np.float64, AT_COUNT: np.int64, AT_SEEN: np.float32, AT_FLAGS: np.bool_, AT_MASK: np.int8,
+}  # fmt: skip
+
+
 class Cockpit(Lanes):
-    """B episodes of a seat. `seen` (B, features) float32 is new with each decision, `paid` (PAID, B) a view of the last."""
+    """B episodes of a seat, and what the last decision brought, in arrays that are new with each.
+
+    paid (PAID, B), count (B,): the step. seen (B, features) float32. flags (FLAGS, B) bool. mask (B, actions) int8, none of actions that
+    are not discrete.
+    """
 
     def __init__(self, seat: Seat, constants: Constants, keys: Keys, threads: int = 1) -> None:
         super().__init__(seat.loop, constants, keys, threads=threads)
-        self.interval = seat.action.spec.interval
-        self._alone = (False, self.interval, SEATED, False, 0, False)  # the orders of `decide_alone`
-        self.paid, self.features = self.memory.paid, int(constants.f[of.FEATURES])
-        self._paid, self._order = self.paid.reshape(-1), self.memory.order  # the first: of a single row
+        self.interval, batch, features = seat.action.spec.interval, self.batch, int(constants.f[of.FEATURES])
+        actions = seat.action.size if seat.action.discrete else 0
+        self.memory.order[MASKED] = actions
+        shapes: tuple[tuple[int, ...], ...] = (PAID, batch), (batch,), (batch, features), (FLAGS, batch), (batch, actions)
+        parts = [(shape, np.dtype(kind)) for shape, kind in zip(shapes, SHEET.values(), strict=True)]
+        *self._starts, self._size = accumulate((math.prod(shape) * kind.itemsize for shape, kind in parts), initial=0)
+        self._parts = list(zip(parts, self._starts, strict=True))
+        self._sheet: Any = NOTHING
+        # of a single row
+        self._enter, self._alone, self._anew = kernel.run.entry, (0, self.interval, SEATED, 0, 0, 0), (0, 0, SEATED, 0, 0, 1)
+        self._action, self._single = self.memory.action[0], seat.action.discrete
+        self._told = struct.Struct(f"=ddq{4 * features}x6?").unpack_from
+
+    def _turn(self) -> None:
+        """A new sheet for what the compiled function tells."""
+        self._sheet = self.paid = self.count = self.seen = self.flags = self.mask = NOTHING  # the last goes, where nobody else holds it
+        self._sheet = np.empty(self._size, np.uint8)
+        first, buffer = self._sheet.ctypes.data, memoryview(self._sheet)
+        self.memory.places[AT_PAID : AT_MASK + 1] = [first + start for start in self._starts]
+        self.paid, self.count, self.seen, self.flags, self.mask = (np.ndarray(*part, buffer, at) for part, at in self._parts)
 
     def run(self, *arguments: Any, **orders: Any) -> int:
-        self.seen = np.empty((self.batch, self.features), np.float32)
+        self._turn()
+        self._shared, self._asked = True, ()
         return super().run(*arguments, **orders)
 
     def begin(self) -> None:
@@ -78,18 +107,32 @@ class Cockpit(Lanes):
         self.memory.action[...] = actions if actions.ndim == 2 else actions[:, None]
         self.run(SEATED, self.interval, restart=restart)
 
-    def decide_alone(self, action: Any) -> list[float]:
-        """The decision of a single row; -> its column of `paid`. As `decide`, with nothing on the way that a batch would hide."""
-        self.memory.action[0] = action
-        if self._asked != self._alone:
-            self.run(SEATED, self.interval)
+    def decide_alone(self, action: Any) -> tuple[Any, ...]:
+        """The decision of a single row; -> the numbers of its sheet in their order, its observation and its mask.
+
+        As `decide`, with nothing on the way that a batch would hide.
+        """
+        if self._single:
+            self._action[0] = action
         else:
-            self.seen = np.empty((1, self.features), np.float32)
-            if kernel.run(*self._arrays, self.seen, 0, 1) < 0:
-                raise not_finite()
-            self._order[TICK] += self.interval
-        out: list[float] = self._paid.tolist()
-        return out
+            self._action[:] = action
+        return self._play_alone(self._alone)
+
+    def again_alone(self) -> tuple[Any, ...]:
+        """The next episode of a single row; -> as `decide_alone`, of a decision that brought nothing."""
+        self.rows[0, at.OVER] = 1.0
+        _, gap, step, _, _, _, _, _, *rest = self._play_alone(self._anew)
+        return 0.0, gap, step, False, False, False, False, False, *rest
+
+    def _play_alone(self, orders: tuple[int, ...]) -> tuple[Any, ...]:
+        if self._shared:  # the last sheet is its reader's; from now on there is one, of which copies are given
+            self._turn()
+            self._row, self._allowed, self._shared = self.seen[0], self.mask[0], False
+        if self._asked is not orders:
+            self.order(orders)
+        if self._enter(self._places, 0, 1, 0) < 0:
+            raise not_finite()
+        return *self._told(self._sheet), self._row.copy(), self._allowed.copy()
 
     def again(self) -> None:
         """The next episode in every row that is over."""
@@ -112,9 +155,12 @@ class Cockpit(Lanes):
             "floats": memory.floats.copy(),
             "words": memory.flat_words.view(np.int64).copy(),
             "tick": memory.order[TICK : TICK + 1].copy(),
+            "sheet": self._sheet.copy(),
         }
 
     def put(self, held: dict[str, Array]) -> None:
         """What `held` gave."""
+        self._turn()
+        self._sheet[:], self._shared = held["sheet"], True
         self.memory.floats[:], self.memory.order[TICK] = held["floats"], held["tick"][0]
         self.memory.flat_words.view(np.int64)[:] = held["words"]

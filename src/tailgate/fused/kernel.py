@@ -5,7 +5,7 @@ import numpy as np
 from . import constants as of
 from . import memory as at
 from . import script, seat, step
-from .compiled import compiled, phase
+from .compiled import Kernel, array_at, phase
 from .rows import EGO, ENDED, EPISODE, LANES, LEAD_X, LENGTH, OVER, REAR_X, ROWS, SCORE, STATE, WANT_KIND, WIRES, WORDS, K, X
 
 _1, _2 = np.uint64(LANES), np.uint64(2 * LANES)
@@ -104,39 +104,47 @@ def begin_again(s, g, window, intent, c, f, table, tick, fresh, words, new_windo
             k += np.uint64(1)
 
 
-@compiled
-def run(floats, whole, words, columns, record, seen, first_block, last_block):
-    """What the orders in `whole` ask for (`memory`), in blocks from the first to before the last.
+@Kernel
+def run(places, first_block, last_block, part):
+    """What the orders ask for (`memory`), in blocks from the first to before the last, at the desk of a `part` of the threads.
 
-    Recorded in record (K, columns, B), or in (1, 2, B) the smallest gaps; what a seat sees in the end goes into seen (B, FEATURES) float32.
+    Recorded in record (K, columns, B), or in (1, 2, B) the smallest gaps. What a seat is shown in the end goes into its sheet
+    (`cockpit.SHEET`).
 
     -> steps played, or -1 where an estimate is not finite.
     """
+    whole = array_at(places[at.AT_ORDERS], at.ORDERS + of.CHOICES, np.int64)
     o, f = whole[: at.ORDERS], whole[at.ORDERS :]
     batch, how, steps, tick = o[at.BATCH], o[at.HOW], o[at.STEPS], o[at.TICK]
-    c = floats[o[at.AT_C] : o[at.AT_C] + of.NUMBERS]
-    table = floats[o[at.AT_TABLE] : o[at.AT_TABLE] + o[at.TABLE]]
-    p = floats[o[at.AT_SCRIPT] : o[at.AT_SCRIPT] + script.PLACES]
-    asked = floats[o[at.AT_ASKED] : o[at.AT_ASKED] + at.ASKED * batch].reshape(at.ASKED, batch)
-    action = floats[o[at.AT_ACTION] : o[at.AT_PAID]].reshape(batch, max(f[of.ACTIONS], 1))
-    paid = floats[o[at.AT_PAID] : o[at.AT_PAID] + at.PAID * batch].reshape(at.PAID, batch)
-    wide, long = o[at.WINDOW] * LANES, o[at.INTENT] * LANES
+    blocks, wide, long, deep = (batch + LANES - 1) // LANES, o[at.WINDOW] * LANES, o[at.INTENT] * LANES, o[at.DEEP] * LANES
+    c = array_at(places[at.AT_C], of.NUMBERS, np.float64)
+    table = array_at(places[at.AT_TABLE], o[at.TABLE], np.float64)
+    p = array_at(places[at.AT_SCRIPT], script.PLACES, np.float64)
+    rows = array_at(places[at.AT_ROWS], blocks * deep, np.float64)
+    windows, intents = array_at(places[at.AT_WINDOW], blocks * wide, np.float64), array_at(places[at.AT_INTENT], blocks * long, np.float64)
+    words = array_at(places[at.AT_WORDS], blocks * WORDS * LANES, np.uint64)
+    asked = array_at(places[at.AT_ASKED], (at.ASKED, batch), np.float64)
+    action = array_at(places[at.AT_ACTION], (batch, f[of.ACTIONS]), np.float64)
+    paid, flags = array_at(places[at.AT_PAID], (at.PAID, batch), np.float64), array_at(places[at.AT_FLAGS], (at.FLAGS, batch), np.bool_)
+    count, mask = array_at(places[at.AT_COUNT], batch, np.int64), array_at(places[at.AT_MASK], (batch, o[at.MASKED]), np.int8)
+    seen = array_at(places[at.AT_SEEN], (batch, f[of.FEATURES]), np.float32)
+    columns = array_at(places[at.AT_COLUMNS], o[at.COLUMNS], np.int64)
+    record = array_at(places[at.AT_RECORD], (o[at.KEPT], o[at.COLUMNS], batch), np.float64)
+    room = at.DESKS * ROWS * LANES + wide + long
+    desk = array_at(places[at.AT_DESK], (part + 1) * room, np.float64)[part * room :]
+    spare, spare_window, spare_intent = desk[ROWS * LANES : 2 * ROWS * LANES], desk[2 * ROWS * LANES : room - long], desk[room - long :]
+    spare_words = array_at(places[at.AT_DESK_WORDS], (part + 1) * WORDS * LANES, np.uint64)[part * WORDS * LANES :]
     seated, fresh, longest = how == at.SEATED, o[at.FRESH] != 0, 0
-    restart = fresh or o[at.RESTART] != 0
-    spare = np.empty(ROWS * LANES if restart else 0)
-    spare_words, spare_window, spare_intent = np.empty(WORDS * LANES if restart else 0, np.uint64), np.empty(wide), np.empty(long)
-    deep = o[at.DEEP] * LANES
-    alone = deep == ROWS * LANES
-    desk = np.zeros(0 if alone else ROWS * LANES)
+    restart, alone = fresh or o[at.RESTART] != 0, deep == ROWS * LANES
     for b in range(first_block, last_block):
         n, first = np.uint64(min(LANES, batch - b * LANES)), np.uint64(b * LANES)
-        held = floats[o[at.AT_ROWS] + b * deep : o[at.AT_ROWS] + (b + 1) * deep]
+        held = rows[b * deep : (b + 1) * deep]
         s = held if alone else desk
         if not alone:
             carry(held, desk)
         g = words[b * WORDS * LANES : (b + 1) * WORDS * LANES]
-        window = floats[o[at.AT_WINDOW] + b * wide : o[at.AT_WINDOW] + (b + 1) * wide]
-        intent = floats[o[at.AT_INTENT] + b * long : o[at.AT_INTENT] + (b + 1) * long]
+        window = windows[b * wide : (b + 1) * wide]
+        intent = intents[b * long : (b + 1) * long]
         now, wanted = tick, False
         if fresh:
             everyone(s, g, n)
@@ -166,14 +174,16 @@ def run(floats, whole, words, columns, record, seen, first_block, last_block):
                 keep(s, columns, record, o[at.FIRST_STEP] + t, first, n)
             longest = max(longest, t + 1)
         if seated and steps > 0:
-            seat.settle(s, c, paid, first, n)
+            seat.settle(s, c, paid, flags, first, n)
         if restart:
             begin_again(s, g, window, intent, c, f, table, now - 1, spare, spare_words, spare_window, spare_intent, n)
         if seated:
             if steps > 0:
-                seat.close(s, paid, first, n)
-            seat.look(s, c, paid, first, n)
+                seat.close(s, flags, first, n)
+            seat.look(s, c, paid, flags, count, mask, first, n)
             seat.observe(s, c, f, seen, first, n)
         if not alone:
             carry(desk, held)
+    if last_block - first_block == blocks:  # nobody else reads it
+        o[at.TICK] += o[at.FRESH] + steps
     return longest

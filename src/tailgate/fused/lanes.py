@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
+from itertools import repeat
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,11 +21,10 @@ from . import constants as of
 from . import kernel
 from . import rows as at
 from .build import Constants
-from .memory import FIRST_STEP, FRESH, HOW, OBEY, RESTART, STEPS, TERMINATE, TICK, Memory
+from .memory import AT_COLUMNS, AT_RECORD, COLUMNS, FRESH, KEPT, OBEY, RESTART, TICK, Memory
 from .rows import LANES, LINKS, SENSORS, WIRES
 
 NOTHING = np.zeros(0, np.uint64)
-UNSEEN = np.zeros((0, 0), np.float32)
 WORTH = 2048  # episodes that are worth a thread
 
 
@@ -48,11 +48,13 @@ class Lanes:
         """`columns` of every step are kept in `record` (steps, columns, B). Many episodes may share several `threads`."""
         self.threads = max(1, min(threads, len(keys.key) // WORTH))
         self.loop, self.constants, self.batch = loop, constants, len(keys.key)
-        self.memory = Memory(self.batch, constants.c, constants.f, constants.table, constants.window, constants.intents)
-        self.rows, self.columns, self.record = self.memory.rows, columns.astype(np.int64), np.empty((steps, len(columns), self.batch))
+        self.memory = Memory(self.batch, constants.c, constants.f, constants.table, constants.window, constants.intents, self.threads)
+        self.rows, self.record = self.memory.rows, np.empty((steps, len(columns), self.batch))
         self._asked: tuple[int, ...] = ()
-        self._arrays = (self.memory.floats, self.memory.whole, self.memory.flat_words, self.columns, self.record)
-        self.seen = UNSEEN
+        self.memory.put(AT_COLUMNS, columns.astype(np.int64))
+        self.memory.put(AT_RECORD, self.record)
+        self.memory.order[[COLUMNS, KEPT]] = len(columns), steps
+        self._places = self.memory.places.ctypes.data
         self.take(keys)
 
     def take(self, keys: Keys) -> None:
@@ -92,19 +94,22 @@ class Lanes:
 
     def run(self, how: int, steps: int, fresh: bool = False, terminate: bool = False, first_step: int = 0, restart: bool = False) -> int:
         """Steps under whoever decides; -> how many there were. Raises InputError where an estimate is not finite, as the loop does."""
-        order, arrays = self.memory.order, (*self._arrays, self.seen)
-        asked = (fresh, steps, how, terminate, first_step, restart)
+        places, asked = self._places, (fresh, steps, how, terminate, first_step, restart)  # as `memory` orders them
         if asked != self._asked:  # mostly the same again
-            order[[FRESH, STEPS, HOW, TERMINATE, FIRST_STEP, RESTART]] = self._asked = asked
+            self.order(asked)
         if self.threads == 1:
-            played = [kernel.run(*arrays, 0, len(self.rows))]
+            played = [kernel.run(places, 0, len(self.rows), 0)]
         else:  # blocks share nothing, so that the order in which they are played does not matter
             edges = [len(self.rows) * part // self.threads for part in range(self.threads + 1)]
-            played = list(_pool(self.threads).map(lambda first, last: kernel.run(*arrays, first, last), edges[:-1], edges[1:]))
-        order[TICK] += fresh + steps
+            played = list(_pool(self.threads).map(kernel.run, repeat(places), edges[:-1], edges[1:], range(self.threads)))
+            self.memory.order[TICK] += fresh + steps
         if min(played) < 0:
             raise not_finite()
         return int(max(played))
+
+    def order(self, asked: tuple[int, ...]) -> None:
+        """What is to be done from now on."""
+        self.memory.order[FRESH : RESTART + 1] = self._asked = asked
 
     def start(self) -> None:
         """All episodes begin, at k = 1, measured."""

@@ -1,9 +1,9 @@
 """The road as a lane: manoeuvre, vehicles, driver behind, sensors and cruise control. Every formula is the one that the plain loop uses."""
 
 import numpy as np
-from numba.extending import register_jitable
 
 from tailgate.envs import controllers, idm, manoeuvres, vehicle
+from tailgate.jit import compilable
 from tailgate.kernels import _log_normal, _sincos_turn, _uniform_pair
 
 from . import constants as of
@@ -37,7 +37,7 @@ from .rows import (
 _1, _2, _3 = (np.uint64(LANES * i) for i in range(1, 4))
 
 drive, roll = formula(vehicle.drive), formula(vehicle.roll)
-register_jitable(forceinline=True)(idm.idm)  # which idm_accel calls
+compilable(idm.idm)  # which idm_accel calls
 idm_accel = formula(idm.idm_accel)
 spaced, widened, obeyed = formula(controllers.spaced), formula(controllers.widened), formula(controllers.obeyed)
 between, halt, drawn_back = formula(manoeuvres.between), formula(manoeuvres.halt), formula(manoeuvres.drawn_back)

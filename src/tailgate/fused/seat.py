@@ -186,8 +186,8 @@ def pay(s, c, f, n):
 
 
 @phase
-def settle(s, c, paid, first, n):
-    """After a decision: what it brought, into paid (PAID, B); of rows that were over before it nothing."""
+def settle(s, c, paid, flags, first, n):
+    """After a decision: what it brought, into paid (PAID, B) and flags (FLAGS, B); of rows that were over before it nothing."""
     gamma, horizon = c[of.GAMMA_PAID], c[of.HORIZON]
     for i in range(n):
         open_row = s[OVER + i] == 0.0
@@ -195,25 +195,32 @@ def settle(s, c, paid, first, n):
         truncated = open_row & (not terminated) & (s[K + i] > horizon)
         after = 0.0 if terminated else s[POTENTIAL + i]
         paid[0, first + i] = s[RAW + i] + gamma * after - s[BEFORE + i] if open_row else 0.0
-        paid[1, first + i], paid[2, first + i] = terminated, truncated
-        paid[3, first + i], paid[4, first + i], paid[5, first + i] = s[ANY_REFUSED + i], s[ANY_HIT + i], s[ANY_REAR + i]
+        flags[0, first + i], flags[1, first + i] = terminated, truncated
+    for i in range(n):
+        flags[2, first + i], flags[3, first + i] = s[ANY_REFUSED + i] != 0.0, s[ANY_HIT + i] != 0.0
+        flags[4, first + i] = s[ANY_REAR + i] != 0.0
 
 
 @phase
-def close(s, paid, first, n):
+def close(s, flags, first, n):
     """Which rows are over now."""
     for i in range(n):
-        s[OVER + i] = paid[1, first + i] + paid[2, first + i]
+        s[OVER + i] = flags[0, first + i] | flags[1, first + i]
 
 
 @phase
-def look(s, c, paid, first, n):
+def look(s, c, paid, flags, count, mask, first, n):
     """What the information of a step shows of the state that it led to, and what the observation needs of it."""
     channel.allowed(s, c, ON, n)
     budget, share = c[of.BUDGET], c[of.BUDGET_SHARE]
     bounded = budget < np.inf
     for i in range(n):
-        paid[6, first + i], paid[7, first + i], paid[8, first + i] = s[ON + i], s[K + i], s[LEAD_X + i] - s[EGO + i]
+        paid[1, first + i] = s[LEAD_X + i] - s[EGO + i]
+        flags[5, first + i], count[first + i] = s[ON + i] != 0.0, np.int64(s[K + i])
+    for j in range(mask.shape[1]):
+        for i in range(n):
+            mask[first + i, j] = flags[5, first + i] | (j == 0)
+    for i in range(n):
         s[LEFT_OVER + i] = (budget - s[USED + i]) / share if bounded else 1.0
         s[ATTACKING + i] = 1.0 if s[KIND + i] != 0.0 else 0.0
         s[ZERO + i], s[INFINITE + i] = 0.0, np.inf

@@ -9,7 +9,9 @@ from scipy import stats
 
 from tailgate import bounds
 from tailgate.core import Array, Model, Received
-from tailgate.estimators import AcceptAll, ChiSquare, GatedKalman, KalmanFilter, compose
+from tailgate.estimators.chi_square import ChiSquare, GatedKalman
+from tailgate.estimators.compose import AcceptAll, compose
+from tailgate.estimators.kalman import KalmanFilter
 from tailgate.metrics import measure
 from tailgate.scenario import load_scenario
 

@@ -9,7 +9,7 @@ import numpy as np
 from tailgate import num
 from tailgate.core import Array, Model, Prior, Received
 from tailgate.draws import Role, keys
-from tailgate.estimators import Composed
+from tailgate.estimators.compose import Composed
 
 DRAWS = keys("report", [0]).at(Role.DEFENCE, np.zeros(1, np.int64))  # a composed filter draws nothing
 
