@@ -100,14 +100,19 @@ class FmcwRadar(Link):
         down = np.where(u[..., 2] < lost, self.lowest + self.bandwidth * u[..., 3], down + sd * z[..., 1])
         return up, down
 
+    def heard(self, reaction: float) -> tuple[float, float]:
+        """Samples of a challenge in which an attacker with this reaction time [s] is heard, and the share of its power in them."""
+        part = min(reaction, self.window) / self.window * self.challenge  # samples, not always a whole number
+        whole = max(1.0, float(np.ceil(part)))
+        return whole, part / whole
+
     def _energy(self, plan: RadarSensorPlan, probe: Array, jam: Array, tone: Array, air: Air, z: Array) -> Array:
         """(B, N) mean power over the receiver's noise, of a challenge; 0 where the probe is sent.
 
         There it would be the echo's, of a target that does not fluctuate: a distance by the radar equation that no late echo changes.
         """
         attacked = (air.power > 0.0) | (air.delay > 0.0)
-        part = min(air.reaction, self.window) / self.window * plan.challenge  # samples, not always a whole number
-        whole = max(1.0, float(np.ceil(part)))
-        heard, scale = np.where(attacked, whole, float(plan.challenge)), np.where(attacked, part / whole, 1.0)
+        whole, share = self.heard(air.reaction)
+        heard, scale = np.where(attacked, whole, float(plan.challenge)), np.where(attacked, share, 1.0)
         tone = np.where(air.delay > 0.0, tone, 0.0)
         return np.where(probe, 0.0, heard_energy(plan.challenge, heard, jam * scale, tone * scale, z))
