@@ -18,7 +18,7 @@ from .radar_car import STATES
 
 Span = Annotated[tuple[Positive, Positive], Field(min_length=2, max_length=2)]
 NEAREST = 0.1  # closer than this [m] the radar equation means nothing: powers are those at this distance
-_UNIFORM, _SAMPLES = 1, 2  # tags of the draws
+UNIFORM, SAMPLED = 1, 2  # tags of the draws
 
 
 class RadarSensorPlan(NamedTuple):
@@ -84,11 +84,11 @@ class FmcwRadar(Link):
         up, down = self.beats(d + air.delay, dv)
         seen = probe & self.within_band(up, down)  # else the IF filter leaves nothing of the echo
         if self.path == "signal":
-            noise = draws.normal((1, 2, self.samples, 2), tag=_SAMPLES)
+            noise = draws.normal((1, 2, self.samples, 2), tag=SAMPLED)
             y = num.stack(fmcw_signal.read(self, d, dv, air.delay, tone, 1.0 + jam, noise))
         else:
             x = self.samples * tone / (1.0 + jam)
-            y = num.stack(self.range_speed(*self._estimated(up, down, x, z[..., 2:4], draws.uniform((1, 4), tag=_UNIFORM))))
+            y = num.stack(self.range_speed(*self._estimated(up, down, x, z[..., 2:4], draws.uniform((1, 4), tag=UNIFORM))))
         valid = num.full(y.shape, True, bool)
         valid &= (seen & (y[..., 0] >= self.reach[0]) & (y[..., 0] <= self.reach[1]))[..., None]
         return Received(np.where(valid, y, 0.0), valid, self._energy(plan, probe, jam, tone, air, z[..., 4:7]))

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tailgate.agents.observation import LAST_SCALE, LIMIT, SCALES
-from tailgate.core import Array
+from tailgate.core import Array, Kind
 from tailgate.draws import Keys
 
 from . import constants as of
-from . import kernel
+from . import radar
 from . import rows as at
 from . import seat as lane
 from .build import Constants, Refused, fuse
@@ -38,20 +38,27 @@ def fuse_seat(seat: Seat) -> Constants | Refused:
     f[of.REWARD], f[of.FEATURES] = _REWARDS[paid.reward], len(columns)
     c[of.RATE], c[of.HORIZON], c[of.SEEN_MOST] = action.spec.rate, seat.loop.horizon, LIMIT
     if action.discrete:
+        mine = np.array(at.wires_of(len(seat.loop.model.wires)))
         for i, mode in enumerate(action.modes):
-            row = np.concatenate([[mode.kind, mode.sign], mode.target[0], mode.value])
-            c[of.TABLE + of.MODE_WIDTH * i : of.TABLE + of.MODE_WIDTH * (i + 1)] = row
+            row = of.TABLE + of.MODE_WIDTH * i
+            c[[row, row + 1]], c[row + 2 + mine], c[row + 2 + at.WIRES + mine] = (mode.kind, mode.sign), mode.target[0], mode.value
+    elif set(action.carried) - {Kind.FDI}:
+        return Refused("vectors of values over the air have no lane")
     c[of.REWARD_SCALE], c[of.GAP_SHAPING], c[of.ERROR_SHAPING] = paid.error_scale, paid.gap_shaping, paid.error_shaping
     c[of.GAMMA_PAID], c[of.ILLEGAL], c[of.COST] = paid.gamma, paid.illegal_penalty, paid.attack_cost
     c[of.BUDGET_SHARE] = threat.budget or 1.0
+    assert seat.loop.model.gap is not None
+    c[of.BELIEF] = seat.loop.model.gap[0, 0]
     scales = SCALES | {"progress": float(seat.loop.horizon)}
-    bounds = dict(zip(seat.loop.model.wires, seat.action.brief.bounds.tolist(), strict=True))
+    most = {wire: min(bound, LAST_SCALE) for wire, bound in zip(seat.loop.model.wires, seat.action.brief.bounds.tolist(), strict=True)}
+    most |= {"power": threat.jam_power, "delay": threat.delay_bound}
+    quantities = lane.QUANTITIES | (radar.QUANTITIES if f[of.AIRED] else {}) | ({} if f[of.REAR] else lane.ALONE)
     for j, name in enumerate(columns):
-        rows = (lane.QUANTITIES if f[of.REAR] else lane.QUANTITIES | lane.ALONE).get(name)
+        rows = quantities.get(name)
         if rows is None:
             return Refused(f"the observation's {name} has no lane")
         f[of.SEEN + j], f[of.FROM + j] = rows
-        c[of.SEEN_SCALE + j] = min(bounds[name[5:]], LAST_SCALE) if name.startswith("last_") else scales.get(name.removesuffix("0"), 1.0)
+        c[of.SEEN_SCALE + j] = most[name[5:]] if name.startswith("last_") else scales.get(name.removesuffix("0"), 1.0)
     return k
 
 
@@ -85,7 +92,7 @@ class Cockpit(Lanes):
             self.run(SEATED, self.interval)
         else:
             self.seen = np.empty((1, self.features), np.float32)
-            if kernel.run(*self._arrays, self.seen, 0, 1) < 0:
+            if self.play(*self._arrays, self.seen, 0, 1) < 0:
                 raise not_finite()
             self._order[TICK] += self.interval
         out: list[float] = self._paid.tolist()

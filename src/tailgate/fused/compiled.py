@@ -24,12 +24,13 @@ if _INSIDE:
     _INNER |= {"no_cpython_wrapper": True, "_nrt": False, "pipeline_class": Part}
 phase = numba.njit(**_OPTIONS, **_INNER)  # a loop over the episodes of a block
 formula = numba.njit(**_OPTIONS, **_INNER, forceinline=True)  # of one episode, part of the loop that calls it; or a loop over given rows
+written_in = numba.njit(**_OPTIONS, inline="always")  # as if its text stood where it is called
 
 _SOURCES = {  # by package, which may lie in folders of their own
     "tailgate.fused": ("",), "tailgate": ("elementwise.py", "kernels.py", "kinds.py", "draws.py"),
-    "tailgate.agents": ("reward.py", "scripted.py", "triggers.py"),
+    "tailgate.agents": ("reward.py", "scripted.py", "triggers.py", "values.py"),
     "tailgate.estimators": ("detectors.py", "imm.py", "reactive_brake.py", "safe_state.py"),
-    "tailgate.envs": ("vehicle.py", "idm.py", "controllers.py", "manoeuvres.py"),
+    "tailgate.envs": ("vehicle.py", "idm.py", "controllers.py", "manoeuvres.py", "fmcw.py", "radar_car.py", "radar_following.py"),
 }  # fmt: skip
 
 

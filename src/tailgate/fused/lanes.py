@@ -12,16 +12,17 @@ from tailgate.core import Array, Command, Received, Scene, View
 from tailgate.draws import Draws, Keys, Role
 from tailgate.envs.following import FollowingState
 from tailgate.envs.idm import BehindState
+from tailgate.envs.radar_following import RadarState
 from tailgate.errors import InputError
 from tailgate.loop import Loop
 from tailgate.threat import Channel
 
 from . import constants as of
-from . import kernel
+from . import kernel, radar_kernel
 from . import rows as at
 from .build import Constants
 from .memory import FIRST_STEP, FRESH, HOW, OBEY, RESTART, STEPS, TERMINATE, TICK, Memory
-from .rows import LANES, LINKS, SENSORS, WIRES
+from .rows import LANES, SENSORS, WIRES, wires_of
 
 NOTHING = np.zeros(0, np.uint64)
 UNSEEN = np.zeros((0, 0), np.float32)
@@ -50,6 +51,9 @@ class Lanes:
         self.loop, self.constants, self.batch = loop, constants, len(keys.key)
         self.memory = Memory(self.batch, constants.c, constants.f, constants.table, constants.window, constants.intents)
         self.rows, self.columns, self.record = self.memory.rows, columns.astype(np.int64), np.empty((steps, len(columns), self.batch))
+        self.aired = bool(constants.f[of.AIRED])
+        self.play = (radar_kernel if self.aired else kernel).run
+        self.wires = np.array(wires_of(len(loop.model.wires)))
         self._asked: tuple[int, ...] = ()
         self._arrays = (self.memory.floats, self.memory.whole, self.memory.flat_words, self.columns, self.record)
         self.seen = UNSEEN
@@ -70,7 +74,15 @@ class Lanes:
 
     def stack(self, name: np.uint64, width: int) -> Array:
         """(B, 1, width): rows that follow each other."""
-        return np.moveaxis(np.stack([self.row(name, j) for j in range(width)]), 0, -1)[:, None, :]
+        return self._side_by_side([self.row(name, j) for j in range(width)])
+
+    def of_wires(self, name: np.uint64) -> Array:
+        """(B, 1, w): of each wire of the model."""
+        return self._side_by_side([self.row(name, j) for j in self.wires])
+
+    @staticmethod
+    def _side_by_side(rows: list[Array]) -> Array:
+        return np.moveaxis(np.stack(rows), 0, -1)[:, None, :]
 
     def set_row(self, name: np.uint64, values: Array) -> None:
         """One number for each episode."""
@@ -97,10 +109,10 @@ class Lanes:
         if asked != self._asked:  # mostly the same again
             order[[FRESH, STEPS, HOW, TERMINATE, FIRST_STEP, RESTART]] = self._asked = asked
         if self.threads == 1:
-            played = [kernel.run(*arrays, 0, len(self.rows))]
+            played = [self.play(*arrays, 0, len(self.rows))]
         else:  # blocks share nothing, so that the order in which they are played does not matter
             edges = [len(self.rows) * part // self.threads for part in range(self.threads + 1)]
-            played = list(_pool(self.threads).map(lambda first, last: kernel.run(*arrays, first, last), edges[:-1], edges[1:]))
+            played = list(_pool(self.threads).map(lambda first, last: self.play(*arrays, first, last), edges[:-1], edges[1:]))
         order[TICK] += fresh + steps
         if min(played) < 0:
             raise not_finite()
@@ -114,8 +126,8 @@ class Lanes:
         """One step under a command, kept at t of the record."""
         asked = self.memory.asked
         asked[0] = command.kind
-        asked[1 : 1 + WIRES] = np.moveaxis(command.target[:, 0], 0, -1)
-        asked[1 + WIRES :] = np.moveaxis(command.value[:, 0], 0, -1)
+        asked[1 + self.wires] = np.moveaxis(command.target[:, 0], 0, -1)
+        asked[1 + WIRES + self.wires] = np.moveaxis(command.value[:, 0], 0, -1)
         self.run(OBEY, 1, first_step=t)
 
     @property
@@ -136,8 +148,10 @@ class Lanes:
         spent: Any = _Spent(*(self.row(name).astype(np.int64) for name in (at.USED, at.BURST, at.COOLDOWN)))
         left, allowed = Channel().budget_left(plan, spent), Channel().allowed(plan, spent, k)
         budget = np.full(self.batch, np.inf if threat.budget is None else float(threat.budget))
-        last = Command(self.row(at.KIND).astype(np.int8), self.stack(at.TARGET, WIRES) != 0.0, self.stack(at.VALUE, WIRES))
+        last = Command(self.row(at.KIND).astype(np.int8), self.of_wires(at.TARGET) != 0.0, self.of_wires(at.VALUE))
         view = View(k, k / self.loop.horizon, self.scene(), left, budget, spent.burst, spent.cooldown, allowed, last)
+        if self.aired:
+            view = view._replace(probed=self.row(at.PROBED)[:, None] != 0.0)
         if threat.knowledge == "grey":
             view = view._replace(control=self.row(at.U)[:, None, None].copy())
         if threat.sees_measurement:
@@ -150,13 +164,17 @@ class Lanes:
         behind = (
             BehindState(self.row(at.REAR_X).copy(), self.row(at.REAR_V).copy(), nothing, nothing) if self.constants.f[of.REAR] else None
         )
-        state = FollowingState(self.row(at.LEAD_X).copy(), self.row(at.LEAD_V).copy(), self.stack(at.EGO, 3), behind)
+        x, v, own = self.row(at.LEAD_X).copy(), self.row(at.LEAD_V).copy(), self.stack(at.EGO, 3)
+        state = RadarState(x, v, self.row(at.LEAD_A).copy(), own, behind) if self.aired else FollowingState(x, v, own, behind)
         return self.loop.plant.scene(self.loop.plan.plant, state)
 
     def _received(self) -> Received:
-        sent = self.stack(at.SENT, LINKS)
+        sent = self.stack(at.SENT, len(self.wires) - 1)  # all but the actuator
         y = sent[..., :SENSORS]
-        return Received(y, np.ones(y.shape, bool), np.zeros(y.shape[:2]), sent[..., SENSORS:])
+        if not self.aired:
+            return Received(y, np.ones(y.shape, bool), np.zeros(y.shape[:2]), sent[..., SENSORS:])
+        valid = np.repeat(self.row(at.HEARS)[:, None, None] != 0.0, SENSORS, axis=2)
+        return Received(y, valid, self.row(at.ENERGY)[:, None].copy(), sent[..., SENSORS:])
 
 
 def not_finite() -> InputError:
