@@ -43,6 +43,18 @@ CELLS = [
     ("radar-following-v0", "rkf:unit=sensor", "actuator_fdi:start_step=20,value=1.0", DRIVEN),
     ("radar-following-v0", "composed:detector=chi2,mitigation=latch", "noise_jam:start_step=20,targets=[distance],power=60", ONE),
     ("radar-following-v0", "chi2_kf", "dos_jam:start_step=20,low=0,high=100", ONE),
+    ("radar-following-v0", "cra", "noise_jam:start_step=60", {}),
+    ("radar-following-v0", "cra", "dos_jam:start_step=20,low=5,high=100,burst=9,pause=9", ANY),
+    ("radar-following-v0", "cra:challenge=fixed,times=[15,50,175]", "echo_delay:trigger=near,threshold=60,delay=60", ANY),
+    ("radar-heavy-v0", "cra:probability=0.3,quiet=5,mode=brake", "echo_delay:trigger=near,threshold=60,delay=60,hop=true", ANY),
+    ("thesis-ch3-v0", "cra:suspicion=20,watch=none", "noise_jam:start_step=60", {}),
+    ("thesis-ch3-switched-v0", "cra:margin=1", "radar_jam:start_step=51", {}),
+    ("radar-fast-attacker-v0", "cra", "noise_jam:start_step=60,power=0.1", {}),
+    ("radar-braking-v0", "cra:rollback=false,freeze=false", "dropout:start_step=20,probability=0.6", ANY),
+    ("radar-braking-v0", "cra:passes=false", "fdi_gaussian:start_step=20,sd=8,chance=0.5", DRIVEN),
+    ("radar-following-v0", "cra:filter.window=5,filter.forgetting=0.9,filter.threshold=4", "echo_pull_off:start_step=40,rate=2", ANY),
+    ("radar-following-v0", "pycra", "echo_delay:trigger=near,threshold=60,delay=60", ANY),
+    ("radar-following-v0", "pycra:challenge=fixed,filter.threshold=none", "dos_hold:start_step=30", ANY),
 ]
 
 
@@ -69,6 +81,9 @@ ENVIRONMENTS = [
      "threat": {"kinds": ["fdi", "echo_delay", "dropout"]}, "attack_cost": 0.1, "illegal_penalty": 0.2, "per_sensor": True},
     {"scenario": "radar-following-v0", "defence": "none", "action": "increment", "reward": "collision", "autoreset": "next_step",
      "threat": {"kinds": ["fdi"], "targets": ["distance", "acceleration"]}},
+    {"scenario": "radar-following-v0", "defence": "cra", "autoreset": "same_step", "delay": 60.0, "knowledge": "grey",
+     "threat": {"budget": None, "sees_measurement": True}},
+    {"scenario": "radar-braking-v0", "defence": "pycra:suspicion=20", "autoreset": "next_step", "action": "ramp", "interval": 2},
     {"scenario": "radar-following-v0", "defence": "kf", "action": "timing", "kind": "echo_delay", "autoreset": "same_step"},
 ]  # fmt: skip
 
@@ -123,6 +138,7 @@ def test_threads_and_blocks_change_no_bit():
 @pytest.mark.parametrize(("scenario", "defence", "threat", "why"), [
     ("radar-following-v0", "imm", {}, "InteractingModels"), ("radar-following-v0", "kf", {"kinds": ["noise_jam", "replay"]}, "delay and replay"),
     ("radar-following-v0", "kf", {"knowledge": "white"}, "white-box"), ("radar-following-v0", "algorithm2", {}, "no lane"),
+    ("radar-following-v0", "cra:filter=hold_last", {}, "filter HoldLast"),
     ("highway-v0", "kf", {}, "no lane"),
 ])  # fmt: skip
 def test_what_has_no_lane_is_played_by_the_plain_loop(scenario, defence, threat, why):

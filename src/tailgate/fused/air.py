@@ -4,6 +4,7 @@ A step measures twice where anybody radiates: before the attack, for the next st
 """
 
 import numpy as np
+from numba.extending import register_jitable
 
 from tailgate.draws import Role
 from tailgate.envs import fmcw
@@ -24,6 +25,7 @@ from .rows import (
     EGO,
     ENERGY,
     FRESH,
+    HEARD,
     HEARS,
     HELD,
     KIND,
@@ -48,12 +50,22 @@ from .rows import (
     WORLD_KEY,
 )
 
+register_jitable(forceinline=True)(fmcw.gamma)  # which mean_power calls
+mean_power = formula(fmcw.mean_power)
 beats, range_speed, passes = formula(fmcw.beats), formula(fmcw.range_speed), formula(fmcw.passes)
 tone_variance, outlier_odds = formula(fmcw.tone_variance), formula(fmcw.outlier_odds)
 _charge = channel.charging(aired=True)
 _SENSOR = np.uint64(int(Role.SENSOR) << 16)
 _UNIFORM = np.uint64(int(Role.SENSOR) << 16 | UNIFORM)
 _0, _1, _2, _3, _4 = (np.uint64(LANES * i) for i in range(5))  # rows further down
+
+
+@formula
+def _received(gap, power, echo, jammed):
+    """What a radar receives from a gap [m], over its noise: of a jammer, and of its own echo."""
+    near = np.maximum(gap, NEAREST)
+    square = near * near
+    return jammed * power / square, echo / (square * square)
 
 
 @phase
@@ -69,9 +81,7 @@ def measure(s, g, c, f, n):
     road.uniforms(s, g, WORLD_KEY, _UNIFORM, np.uint64(1), DEALT + _2, n)
     for i in range(n):
         gap, speed = 0.0 + (s[LEAD_X + i] - s[EGO + i]), 0.0 + (s[LEAD_V + i] - s[EGO + _1 + i])
-        near = np.maximum(gap, NEAREST)
-        square = near * near
-        jam, tone = jammed * s[POWER + i] / square, echo / (square * square)
+        jam, tone = _received(gap, s[POWER + i], echo, jammed)
         s[SNR + i] = samples * tone / (1.0 + jam)
         up, down = beats(gap + sd0 * s[DRAW + i] + s[DELAY + i], speed + sd1 * s[DRAW + _1 + i], per_metre, per_speed)
         s[BEAT + i], s[BEAT + _1 + i] = up, down
@@ -90,7 +100,28 @@ def measure(s, g, c, f, n):
         there = (s[UNDER_HEARS + i] != 0.0) & (d >= least) & (d <= most)
         s[UNDER_HEARS + i] = there
         s[UNDER + i], s[UNDER + _1 + i] = d if there else 0.0, dv if there else 0.0
+    silent = 0
+    for i in range(n):
         s[UNDER_ENERGY + i] = 0.0
+        silent += 1 if s[PROBE + i] == 0.0 else 0
+    if silent > 0:
+        _hear(s, g, c, n)
+
+
+@phase
+def _hear(s, g, c, n):
+    """What a silent radar hears, into UNDER_ENERGY."""
+    echo, jammed, samples, loud, share = c[of.ECHO], c[of.JAMMED], c[of.LISTENED], c[of.LOUD], c[of.LOUD_SHARE]
+    road.normals(s, g, WORLD_KEY, _SENSOR, np.uint64(2), DRAW, n)
+    road.normals(s, g, WORLD_KEY, _SENSOR, np.uint64(3), DRAW + _2, n)
+    for i in range(n):
+        power, delay = s[POWER + i], s[DELAY + i]
+        jam, tone = _received(0.0 + (s[LEAD_X + i] - s[EGO + i]), power, echo, jammed)
+        attacked = (power > 0.0) | (delay > 0.0)
+        heard, scale = loud if attacked else samples, share if attacked else 1.0
+        tone = tone if delay > 0.0 else 0.0
+        energy = mean_power(samples, heard, jam * scale, tone * scale, s[DRAW + i], s[DRAW + _1 + i], s[DRAW + _2 + i])
+        s[UNDER_ENERGY + i] = energy if s[PROBE + i] == 0.0 else 0.0
 
 
 @phase
@@ -116,7 +147,7 @@ def rest(s, c, n):
             s[VALID + row + i] = hears
             s[FRESH + row + i] = sent if hears else s[FRESH + row + i]
     for i in range(n):
-        s[UNDER_ENERGY + i] = s[ENERGY + i]
+        s[HEARD + i] = s[ENERGY + i]
 
 
 @phase
@@ -189,5 +220,7 @@ def arrive(s, g, c, f, n):
         for i in range(n):
             s[UNDER + i], s[UNDER + _1 + i], s[UNDER_HEARS + i] = s[SENT + i], s[SENT + _1 + i], s[HEARS + i]
             s[UNDER_ENERGY + i] = s[ENERGY + i]
+    for i in range(n):
+        s[HEARD + i] = s[UNDER_ENERGY + i]
     _deliver(s, _0, n)
     _deliver(s, _1, n)

@@ -15,7 +15,7 @@ from . import radar
 from . import rows as at
 from . import seat as lane
 from .build import Constants, Refused, fuse
-from .lanes import Lanes, not_finite
+from .lanes import Lanes, not_finite, words_of
 from .memory import SEATED, TICK
 
 if TYPE_CHECKING:
@@ -105,12 +105,14 @@ class Cockpit(Lanes):
     def reseed(self, where: Array, keys: Keys | None = None) -> None:
         """New episodes in the rows `where` (B,) bool: the next of their own, or those of the given keys of as many rows."""
         if keys is not None:
-            for name, value in ((at.WORLD_KEY, keys.key[:, 0]), (at.ATTACK_KEY, keys.key[:, 1]), (at.EPISODE, keys.episode)):
+            for name, value in words_of(keys):
                 held = self.word(name).copy()
                 held[where] = value.astype(np.uint64) - np.uint64(name == at.EPISODE)  # `again` counts one further
                 self.set_word(name, held)
+        over = self.row(at.OVER).copy()  # of the others, which begin when they are asked to
         self.set_row(at.OVER, where)
         self.again()
+        self.set_row(at.OVER, np.where(where, 0.0, over))
 
     def held(self) -> dict[str, Array]:
         """Everything that changes, by name: copies."""

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 MODELS = 4  # of several, at most
+MOMENTS = 64  # challenges at fixed steps, at most
 MODES, COMPONENTS = 64, 32  # discrete actions, and components of an observation, at most
 MODE_WIDTH = 12  # of an action in the table: kind, sign, five targets, five values
 
@@ -41,6 +42,13 @@ LOWER_TAU, LOWER_GAIN, SAMPLE = _number("lower_tau"), _number("lower_gain"), _nu
 ECHO, JAMMED, SAMPLES = _number("echo"), _number("jammed"), _number("samples")
 PER_METRE, PER_SPEED, LOWEST, HIGHEST = _number("per_metre"), _number("per_speed"), _number("lowest"), _number("highest")
 IF_BAND, LEAST_BOUND, WIDEST, REACH = _number("if_band"), _number("least_bound"), _number("widest"), _number("reach", 2)
+LISTENED, LOUD, LOUD_SHARE = _number("listened"), _number("loud"), _number("loud_share")  # samples of a challenge; with an attacker
+# a challenge: when, what is too loud, and how long it is remembered
+USUAL, WATCHED, SUSPICION, QUIET = _number("usual"), _number("watched"), _number("suspicion"), _number("quiet")
+TIMES = _number("times", MOMENTS)
+# its regression
+RIDGE, FADING, SURPRISE, ALLOWANCE = _number("ridge"), _number("fading"), _number("surprise"), _number("allowance")
+SAMPLE_WEIGHT = _number("sample_weight", 2)
 STRONGEST, LATEST = _number("strongest"), _number("latest")  # what may be radiated: power, delay
 # what everyone is told
 A, B, C0 = _number("A", 9), _number("B", 3), _number("c", 3)
@@ -80,6 +88,8 @@ RESPONSE, CLEARANCE, DISTANCE, WATCH = _number("response"), _number("clearance")
 NUMBERS = len(_numbers)
 
 AIRED = _choice("aired")  # a car with a radar
+CHALLENGED, FIXED, SAMPLED = _choice("challenged"), _choice("fixed"), _choice("sampled")  # its times; steps whose samples are kept
+PASSES, STOPS, FREEZES, ROLLS_BACK = _choice("passes"), _choice("stops"), _choice("freezes"), _choice("rolls_back")
 WAY, REACTION, REAR = _choice("way"), _choice("reaction"), _choice("rear")
 UNIFORM_NOISE = _choice("uniform_noise")
 RAW, STEADY, ROBUST, PER_SIGMA = _choice("raw"), _choice("steady"), _choice("robust"), _choice("per_sigma")

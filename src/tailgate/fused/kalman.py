@@ -94,7 +94,7 @@ def predicting(rides):
     return predict
 
 
-predict = predicting(rides=False)
+predict, predict_known = predicting(rides=False), predicting(rides=True)
 
 
 @phase

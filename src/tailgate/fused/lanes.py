@@ -29,6 +29,12 @@ UNSEEN = np.zeros((0, 0), np.float32)
 WORTH = 2048  # episodes that are worth a thread
 
 
+def words_of(keys: Keys) -> tuple[tuple[np.uint64, Array], ...]:
+    """What the episodes of these keys draw by, and the row of each."""
+    world, attack, defence = (keys.key[:, i] for i in range(3))
+    return (at.WORLD_KEY, world), (at.ATTACK_KEY, attack), (at.DEFENCE_KEY, defence), (at.EPISODE, keys.episode)
+
+
 class _Spent(NamedTuple):
     """The part of `ChannelState` by which the channel says what is allowed."""
 
@@ -62,7 +68,7 @@ class Lanes:
     def take(self, keys: Keys) -> None:
         """The keys of the episodes that begin next."""
         self.keys = keys
-        for word, value in ((at.WORLD_KEY, keys.key[:, 0]), (at.ATTACK_KEY, keys.key[:, 1]), (at.EPISODE, keys.episode)):
+        for word, value in words_of(keys):
             self.set_word(word, value)
 
     # -- rows by name

@@ -25,7 +25,7 @@ _GROUPS: dict[str, tuple[np.uint64, int]] = {  # what a step leaves, and in how 
     "target": (at.TARGET, WIRES), "alarm": (at.ALARM, 1), "mode": (at.MODE, 1), "refused": (at.REFUSED, 1), "hit": (at.HIT, 1),
     "rear_hit": (at.REAR_HIT, 1),
 }  # fmt: skip
-_RADAR_GROUPS = _GROUPS | {"own": (at.OWN, 1), "energy": (at.UNDER_ENERGY, 1), "probe": (at.PROBE, 1)}
+_RADAR_GROUPS = _GROUPS | {"own": (at.OWN, 1), "energy": (at.HEARD, 1), "probe": (at.PROBE, 1)}
 
 
 def _groups(f: Array) -> dict[str, tuple[np.uint64, int]]:

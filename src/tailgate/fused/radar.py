@@ -10,7 +10,7 @@ from tailgate.draws import Role
 from tailgate.envs import radar_car, radar_following
 from tailgate.kinds import Kind
 
-from . import air, channel, kalman, road, script, seat, step
+from . import air, challenge, channel, kalman, road, script, seat, step
 from . import constants as of
 from .compiled import formula, phase
 from .rows import (
@@ -53,9 +53,6 @@ lagged, wanted = formula(radar_following.lagged), formula(radar_car.wanted)
 _1, _2, _3, _4 = (np.uint64(LANES * i) for i in range(1, 5))
 _WAY = np.uint64(int(Role.MANOEUVRE) << 16)
 _NOISE_JAM, _ECHO_DELAY = float(Kind.NOISE_JAM), float(Kind.ECHO_DELAY)
-
-
-_predict = kalman.predicting(rides=True)
 
 
 @phase
@@ -104,6 +101,8 @@ def start(s, g, window, intent, c, f, table, tick, n):
     _remember(s, n)
     for i in range(n):
         s[X + i], s[X + _1 + i], s[X + _2 + i] = s[TRUTH + i], s[TRUTH + _1 + i], s[TRUTH + _2 + i]
+    if f[of.CHALLENGED] != 0:
+        challenge.begin(s, window, f, n)
     step.begin_way(s, g, c, f, n)
     for i in range(n):
         s[K + i] = 0.0
@@ -134,8 +133,10 @@ def advance(s, g, window, intent, c, f, table, tick, asked, n):
         kalman.read(s, n)
         for i in range(n):
             s[OWN + i] = 0.0 + s[EGO + _1 + i]
+    elif f[of.CHALLENGED] != 0:
+        challenge.step(s, g, window, c, f, n)
     else:
-        _predict(s, c, f, n)
+        kalman.predict_known(s, c, f, n)
         kalman.innovation(s, c, of.RNOISE, n)
         kalman.weigh(s, window, c, f, n)
         if f[of.MITIGATION] == of.REACQUIRE:

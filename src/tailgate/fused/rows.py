@@ -95,8 +95,13 @@ BEAT, SNR, DEALT = _row("beat", 2), _row("snr"), _row("dealt", 4)  # how it meas
 UNDER, UNDER_HEARS, UNDER_ENERGY = _row("under", SENSORS), _row("under_hears"), _row("under_energy")  # what it reads under that
 LAST_POWER, LAST_DELAY, LAST = _row("last_power"), _row("last_delay"), _row("last", SENSORS)  # of an observation: what was sent last
 NOISE, SILENT = _row("noise", SENSORS), _row("silent")  # by how much readings are off, and whether there are none
+HEARD = _row("heard_now")  # what it heard in this step
+MUTED, BACK, CALM = _row("muted"), _row("back"), _row("calm")  # of a challenge: whether there is one; whether it fails, and passes
+FORMER, MOVED, AGE, CUSUM = _row("former"), _row("moved"), _row("age"), _row("cusum", 4)  # of its regression; the speed before, and the way
+AT_STOP, HALTED, FORESEEN, CHANGED = _row("at_stop"), _row("halted"), _row("foreseen", SENSORS), _row("changed")
+ASIDE = _row("aside", 2)  # two numbers that change places
 ROWS = len(_names)
 
 # Whole numbers, in an array of their own: what the random numbers are drawn by.
-WORLD_KEY, ATTACK_KEY, EPISODE, STEP = (np.uint64(LANES * i) for i in range(4))
-WORDS = 4
+WORLD_KEY, ATTACK_KEY, EPISODE, STEP, DEFENCE_KEY = (np.uint64(LANES * i) for i in range(5))
+WORDS = 5
