@@ -55,6 +55,11 @@ CELLS = [
     ("radar-following-v0", "cra:filter.window=5,filter.forgetting=0.9,filter.threshold=4", "echo_pull_off:start_step=40,rate=2", ANY),
     ("radar-following-v0", "pycra", "echo_delay:trigger=near,threshold=60,delay=60", ANY),
     ("radar-following-v0", "pycra:challenge=fixed,filter.threshold=none", "dos_hold:start_step=30", ANY),
+    ("radar-following-v0", "imm", "noise_jam:start_step=30,power=50", ANY),
+    ("radar-braking-v0", "imm:factors=[1,30,10000],threshold=1", "echo_delay:trigger=near,threshold=60,delay=60", ANY),
+    ("radar-following-v0", "algorithm2:times=[20,40,60,80,100]", "noise_jam:start_step=30,power=50", ANY),
+    ("thesis-ch3-v0", "algorithm2:delta=100", "radar_jam:start_step=51", {}),
+    ("radar-braking-v0", "algorithm2:challenge=random,probability=0.3,quiet=3,mode=widen,suspicion=15", "dropout:probability=0.6", ANY),
 ]
 
 
@@ -136,8 +141,8 @@ def test_threads_and_blocks_change_no_bit():
 
 
 @pytest.mark.parametrize(("scenario", "defence", "threat", "why"), [
-    ("radar-following-v0", "imm", {}, "InteractingModels"), ("radar-following-v0", "kf", {"kinds": ["noise_jam", "replay"]}, "delay and replay"),
-    ("radar-following-v0", "kf", {"knowledge": "white"}, "white-box"), ("radar-following-v0", "algorithm2", {}, "no lane"),
+    ("radar-following-v0", "imm:factors=[1,2,3,4,5]", {}, "more than 4 models"), ("radar-following-v0", "kf", {"kinds": ["noise_jam", "replay"]}, "delay and replay"),
+    ("radar-following-v0", "kf", {"knowledge": "white"}, "white-box"), ("radar-following-v0", "composed:mitigation=hold", {}, "mitigation Hold"),
     ("radar-following-v0", "cra:filter=hold_last", {}, "filter HoldLast"),
     ("highway-v0", "kf", {}, "no lane"),
 ])  # fmt: skip

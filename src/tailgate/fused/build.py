@@ -21,6 +21,7 @@ from tailgate.envs.radar import FmcwRadar
 from tailgate.envs.radar_car import RadarCruise
 from tailgate.envs.radar_following import RadarFollowing
 from tailgate.envs.sensors import Odometry
+from tailgate.estimators.algorithm2 import AsPrinted
 from tailgate.estimators.challenge import ChallengeResponse, PyCra
 from tailgate.estimators.chi_square import ChiSquare
 from tailgate.estimators.compose import AcceptAll, Composed, GateOut, Score
@@ -36,8 +37,8 @@ from tailgate.estimators.sentinels import AcceptFirst, AlwaysAlarm, AlwaysMode
 from tailgate.estimators.sparse import SparseChiSquare
 from tailgate.loop import Loop
 
-from . import challenge, imm, monitor, radar_build, script
 from . import constants as of
+from . import imm, monitor, printed, radar_build, regression, script
 from .constants import put as _put
 from .rows import wires_of
 
@@ -90,8 +91,10 @@ def fuse(loop: Loop, attack: Attack | None = None) -> Constants | Refused:
 
 def _remembered(f: Array) -> int:
     """Rows that the defence keeps beside those of every defence."""
+    if f[of.PRINTED]:
+        return printed.ROWS
     if f[of.CHALLENGED]:
-        return challenge.rows(int(f[of.SAMPLED]))
+        return regression.rows(int(f[of.SAMPLED]))
     if f[of.MODELED]:
         return imm.rows(int(f[of.MODELED]))
     return monitor.ROWS if f[of.BOXED] else max(int(f[of.WINDOW]) - 1, 0)
@@ -159,9 +162,9 @@ def _defence(loop: Loop, c: Array, f: Array) -> str:
     if type(defence) is Raw:
         f[of.RAW] = 1
         return ""
-    if type(defence) is InteractingModels and not f[of.AIRED]:
+    if type(defence) is InteractingModels:
         return _models(defence, loop.plan.defence, c, f)
-    if type(defence) in (ChallengeResponse, PyCra) and f[of.AIRED]:
+    if type(defence) in (ChallengeResponse, PyCra, AsPrinted) and f[of.AIRED]:
         return radar_build.challenged(loop, c, f)
     if isinstance(defence, SafeState) and not f[of.AIRED] and type(defence) in (SafeState, SafeStateBrake):
         return _safe_set(defence, loop, c, f)

@@ -29,7 +29,9 @@ written_in = numba.njit(**_OPTIONS, inline="always")  # as if its text stood whe
 _SOURCES = {  # by package, which may lie in folders of their own
     "tailgate.fused": ("",), "tailgate": ("elementwise.py", "kernels.py", "kinds.py", "draws.py"),
     "tailgate.agents": ("reward.py", "scripted.py", "triggers.py", "values.py"),
-    "tailgate.estimators": ("detectors.py", "imm.py", "kinematic.py", "reactive_brake.py", "safe_state.py"),
+    "tailgate.estimators": (
+        "algorithm2.py", "detectors.py", "imm.py", "kinematic.py", "predictors.py", "reactive_brake.py", "safe_state.py",
+    ),
     "tailgate.envs": ("vehicle.py", "idm.py", "controllers.py", "manoeuvres.py", "fmcw.py", "radar_car.py", "radar_following.py"),
 }  # fmt: skip
 

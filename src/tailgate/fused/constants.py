@@ -88,7 +88,8 @@ RESPONSE, CLEARANCE, DISTANCE, WATCH = _number("response"), _number("clearance")
 NUMBERS = len(_numbers)
 
 AIRED = _choice("aired")  # a car with a radar
-CHALLENGED, FIXED, SAMPLED = _choice("challenged"), _choice("fixed"), _choice("sampled")  # its times; steps whose samples are kept
+CHALLENGED, PRINTED = _choice("challenged"), _choice("printed")  # with the regression of which algorithm
+FIXED, SAMPLED = _choice("fixed"), _choice("sampled")  # how many times; steps whose samples are kept
 PASSES, STOPS, FREEZES, ROLLS_BACK = _choice("passes"), _choice("stops"), _choice("freezes"), _choice("rolls_back")
 WAY, REACTION, REAR = _choice("way"), _choice("reaction"), _choice("rear")
 UNIFORM_NOISE = _choice("uniform_noise")

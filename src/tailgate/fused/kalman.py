@@ -24,6 +24,7 @@ from .rows import (
     LEFT,
     MODE,
     OWN,
+    OWN_COV,
     OWN_VAR,
     REJECTED,
     SCORE,
@@ -43,8 +44,11 @@ from .rows import (
 _1, _2, _3, _4, _5, _6, _7, _8 = (np.uint64(LANES * i) for i in range(1, 9))  # rows further down
 
 
-def predicting(rides):
-    """The phase `predict`: of three states, or also of a fourth that is the known input itself and `rides` in rows of its own."""
+def predicting(rides, tied=False):
+    """The phase `predict`: of three states, or also of a fourth that is the known input itself and `rides` in rows of its own.
+
+    Before the step the fourth may be `tied` to the others by a covariance, as in a mixture; after it, it is not.
+    """
 
     @phase
     def predict(s, c, f, n):
@@ -77,16 +81,22 @@ def predicting(rides):
             )  # A P  # fmt: skip
             h10, h11, h12 = 0.0 + p10 + a12 * p20, 0.0 + p11 + a12 * p21, 0.0 + p12 + a12 * p22
             h20, h21, h22 = 0.0 + a22 * p20, 0.0 + a22 * p21, 0.0 + a22 * p22
+            if tied:
+                t0, t1, t2 = s[OWN_COV + i], s[OWN_COV + _1 + i], s[OWN_COV + _2 + i]
+                h00, h01, h02 = h00 + into0 * t0, h01 + into0 * t1, h02 + into0 * t2
+                h10, h11, h12 = h10 + into1 * t0, h11 + into1 * t1, h12 + into1 * t2
             p00, p01 = 0.0 + h00 + a01 * h01 + a02 * h02, 0.0 + h10 + a01 * h11 + a02 * h12  # A (A P)'
+            p02, p12 = 0.0 + h20 + a01 * h21 + a02 * h22, 0.0 + h21 + a12 * h22
             p10, p11 = 0.0 + h01 + a12 * h02, 0.0 + h11 + a12 * h12
             if rides:
                 h03, h13 = into0 * s[OWN_VAR + i], into1 * s[OWN_VAR + i]
+                if tied:
+                    h03, h13, h23 = t0 + a01 * t1 + a02 * t2 + h03, t1 + a12 * t2 + h13, a22 * t2
+                    p02, p12 = p02 + into0 * h23, p12 + into1 * h23
                 p00, p01, p10, p11 = p00 + into0 * h03, p01 + into0 * h13, p10 + into1 * h03, p11 + into1 * h13
                 s[OWN_VAR + i] = own_q
-            s[P + i], s[P + _1 + i] = p00 + q0, p01 + q1
-            s[P + _2 + i] = (0.0 + h20 + a01 * h21 + a02 * h22) + q2
-            s[P + _3 + i], s[P + _4 + i] = p10 + q3, p11 + q4
-            s[P + _5 + i] = (0.0 + h21 + a12 * h22) + q5
+            s[P + i], s[P + _1 + i], s[P + _2 + i] = p00 + q0, p01 + q1, p02 + q2
+            s[P + _3 + i], s[P + _4 + i], s[P + _5 + i] = p10 + q3, p11 + q4, p12 + q5
             s[P + _6 + i] = (0.0 + a22 * h02) + q6
             s[P + _7 + i] = (0.0 + a22 * h12) + q7
             s[P + _8 + i] = (0.0 + a22 * h22) + q8
@@ -94,7 +104,7 @@ def predicting(rides):
     return predict
 
 
-predict, predict_known = predicting(rides=False), predicting(rides=True)
+predict, predict_known, predict_tied = predicting(rides=False), predicting(rides=True), predicting(rides=True, tied=True)
 
 
 @phase

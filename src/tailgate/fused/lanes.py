@@ -56,7 +56,7 @@ class Lanes:
         self.threads = max(1, min(threads, len(keys.key) // WORTH))
         self.loop, self.constants, self.batch = loop, constants, len(keys.key)
         self.memory = Memory(self.batch, constants.c, constants.f, constants.table, constants.window, constants.intents)
-        self.rows, self.columns, self.record = self.memory.rows, columns.astype(np.int64), np.empty((steps, len(columns), self.batch))
+        self.rows, self.columns, self.record = self.memory.rows, columns.astype(np.int64), np.zeros((steps, len(columns), self.batch))
         self.aired = bool(constants.f[of.AIRED])
         self.play = (radar_kernel if self.aired else kernel).run
         self.wires = np.array(wires_of(len(loop.model.wires)))

@@ -25,7 +25,7 @@ _GROUPS: dict[str, tuple[np.uint64, int]] = {  # what a step leaves, and in how 
     "target": (at.TARGET, WIRES), "alarm": (at.ALARM, 1), "mode": (at.MODE, 1), "refused": (at.REFUSED, 1), "hit": (at.HIT, 1),
     "rear_hit": (at.REAR_HIT, 1),
 }  # fmt: skip
-_RADAR_GROUPS = _GROUPS | {"own": (at.OWN, 1), "energy": (at.HEARD, 1), "probe": (at.PROBE, 1)}
+_RADAR_GROUPS = _GROUPS | {"own": (at.OWN, 1), "told": (at.TOLD, 1), "energy": (at.HEARD, 1), "probe": (at.PROBE, 1)}
 
 
 def _groups(f: Array) -> dict[str, tuple[np.uint64, int]]:
@@ -75,7 +75,8 @@ def signals(record: Array, f: Array) -> dict[str, Array]:
         mine = wires_of(3)
         out |= {name: out[name][..., mine] for name in ("value", "target")}
         out |= {name: out[name][..., mine[:-1]] for name in ("clean", "wires")}
-        out |= {name: np.concatenate([out[name], wide("own")], axis=-1) for name in ("truth", "estimate")}
+        fourth = {"truth": wide("own"), "estimate": wide("told" if f[of.MODELED] else "own")}
+        out |= {name: np.concatenate([out[name], last], axis=-1) for name, last in fourth.items()}
         out |= {"energy": one("energy"), "probe": one("probe") != 0.0}
     return out
 

@@ -10,7 +10,7 @@ from tailgate.draws import Role
 from tailgate.envs import radar_car, radar_following
 from tailgate.kinds import Kind
 
-from . import air, challenge, channel, kalman, road, script, seat, step
+from . import air, channel, imm, kalman, printed, regression, road, script, seat, step
 from . import constants as of
 from .compiled import formula, phase
 from .rows import (
@@ -101,8 +101,12 @@ def start(s, g, window, intent, c, f, table, tick, n):
     _remember(s, n)
     for i in range(n):
         s[X + i], s[X + _1 + i], s[X + _2 + i] = s[TRUTH + i], s[TRUTH + _1 + i], s[TRUTH + _2 + i]
-    if f[of.CHALLENGED] != 0:
-        challenge.begin(s, window, f, n)
+    if f[of.MODELED] != 0:
+        imm.begin(s, window, c, f[of.MODELED], n)
+    elif f[of.PRINTED] != 0:
+        printed.begin(s, window, c, n)
+    elif f[of.CHALLENGED] != 0:
+        regression.begin(s, window, f, n)
     step.begin_way(s, g, c, f, n)
     for i in range(n):
         s[K + i] = 0.0
@@ -133,8 +137,12 @@ def advance(s, g, window, intent, c, f, table, tick, asked, n):
         kalman.read(s, n)
         for i in range(n):
             s[OWN + i] = 0.0 + s[EGO + _1 + i]
+    elif f[of.MODELED] != 0:
+        imm.step_known(s, window, c, f, n)
+    elif f[of.PRINTED] != 0:
+        printed.step(s, g, window, c, f, n)
     elif f[of.CHALLENGED] != 0:
-        challenge.step(s, g, window, c, f, n)
+        regression.step(s, g, window, c, f, n)
     else:
         kalman.predict_known(s, c, f, n)
         kalman.innovation(s, c, of.RNOISE, n)

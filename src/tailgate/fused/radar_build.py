@@ -10,6 +10,7 @@ from tailgate.envs.idm import IDM_GAP, IDM_HEADWAY
 from tailgate.envs.radar import FmcwRadar
 from tailgate.envs.radar_car import STATES, RadarCruise, kinematic
 from tailgate.envs.radar_following import RadarFollowing
+from tailgate.estimators.algorithm2 import PrintedRegression
 from tailgate.estimators.challenge import CHANCE, Challenger
 from tailgate.estimators.kinematic import JointRegression
 from tailgate.loop import Loop
@@ -65,16 +66,12 @@ def challenged(loop: Loop, c: Array, f: Array) -> str:
     defence, plan, R = loop.defence, loop.plan.defence, loop.model.R[0]
     assert isinstance(defence, Challenger)
     part, answer, fixed = plan.filter, plan.response, defence.challenge == "fixed"
-    if type(part) is not JointRegression:
+    if type(part) not in (JointRegression, PrintedRegression):
         return f"filter {type(part).__name__} has no lane"
     if "probe" not in loop.uses:
         return "a challenge without a probe has no lane"
     if R[0, 1] or R[1, 0] or (fixed and len(plan.times) > of.MOMENTS):
         return f"readings that depend on each other, or more than {of.MOMENTS} times, have no lane"
-    f[of.CHALLENGED], f[of.SAMPLED] = 1, part.window
-    put(c, of.PRIOR, np.diag(plan.filter_plan.line.broad[:3]))
-    put(c, of.Q, np.zeros(9))
-    c[of.OWN_PRIOR] = c[of.OWN_Q] = 0.0
     usual = 0.0 if fixed else CHANCE if defence.probability is None else defence.probability
     put(c, of.USUAL, (usual, usual if defence.watch is None else defence.watch))
     put(c, of.SUSPICION, (np.inf if defence.suspicion is None else defence.suspicion, defence.quiet))
@@ -82,8 +79,16 @@ def challenged(loop: Loop, c: Array, f: Array) -> str:
         f[of.FIXED] = len(plan.times)
         put(c, of.TIMES, plan.times)
     c[of.THRESHOLD] = plan.threshold
-    put(c, of.RIDGE, (1.0 / part.delta, part.forgetting, np.inf if part.threshold is None else part.threshold, part.drift))
-    put(c, of.SAMPLE_WEIGHT, plan.filter_plan.weight)
+    if isinstance(part, JointRegression):
+        f[of.CHALLENGED], f[of.SAMPLED] = 1, part.window
+        put(c, of.PRIOR, np.diag(plan.filter_plan.line.broad[:3]))
+        put(c, of.Q, np.zeros(9))
+        c[of.OWN_PRIOR] = c[of.OWN_Q] = 0.0
+        put(c, of.RIDGE, (1.0 / part.delta, part.forgetting, np.inf if part.threshold is None else part.threshold, part.drift))
+        put(c, of.SAMPLE_WEIGHT, plan.filter_plan.weight)
+    else:
+        f[of.PRINTED] = 1
+        put(c, of.RIDGE, (part.delta, part.forgetting))
     f[of.PASSES], f[of.STOPS], f[of.FREEZES], f[of.ROLLS_BACK] = answer
     f[of.MODED], c[of.LINGER], c[of.ASKED] = defence.mode != "normal", plan.reaction_plan.linger, Mode[defence.mode.upper()]
     return ""

@@ -99,6 +99,7 @@ HEARD = _row("heard_now")  # what it heard in this step
 MUTED, BACK, CALM = _row("muted"), _row("back"), _row("calm")  # of a challenge: whether there is one; whether it fails, and passes
 FORMER, MOVED, AGE, CUSUM = _row("former"), _row("moved"), _row("age"), _row("cusum", 4)  # of its regression; the speed before, and the way
 AT_STOP, HALTED, FORESEEN, CHANGED = _row("at_stop"), _row("halted"), _row("foreseen", SENSORS), _row("changed")
+FORMER_VAR, OWN_COV, TOLD = _row("former_var"), _row("own_cov", 3), _row("told")  # of a mixture: of the own speed; what is made of it
 ASIDE = _row("aside", 2)  # two numbers that change places
 ROWS = len(_names)
 
