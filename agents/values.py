@@ -16,6 +16,7 @@ from tailgate.threat import Brief
 
 from .triggers import part
 
+FAINTEST = 1e-12  # power [W] or delay [m] that a command over the air has at least
 TAGS = 4  # tags that one law may draw under
 HalfInteger = Annotated[float, Field(gt=0, le=50, multiple_of=0.5)]
 
@@ -170,5 +171,5 @@ def fit(brief: Brief, kind: Kind, value: Array) -> Array:
     if kind in (Kind.DELAY, Kind.REPLAY):
         return np.clip(np.floor(value + 0.5), 1.0, float(threat.memory))
     if kind in AIRED:
-        return np.clip(value, 1e-12, threat.jam_power if kind == Kind.NOISE_JAM else threat.delay_bound)
+        return np.clip(value, FAINTEST, threat.jam_power if kind == Kind.NOISE_JAM else threat.delay_bound)
     return np.zeros_like(value)

@@ -16,7 +16,7 @@ the swept band (`in_band`), and the integration of the M samples of a sweep. Wha
 
 import math
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -40,6 +40,26 @@ def from_db(value: float) -> float:
 def to_db(ratio: Array | float) -> Array:
     """10 log10(ratio)."""
     return np.asarray(num.log(np.asarray(ratio, np.float64)) * (10.0 / _LN10))
+
+
+# The closed forms, elementwise: the sensor uses them on arrays, the fused engine on single numbers.
+
+
+def beats(d: Array, dv: Array, per_metre: float, per_speed: float) -> tuple[Array, Array]:
+    """fb+ and fb- [Hz] of a target at d [m] with relative speed dv [m/s]: (3.5), (3.6)."""
+    by_range, by_speed = per_metre * d, per_speed * dv
+    return by_range + by_speed, by_range - by_speed
+
+
+def range_speed(up: Array, down: Array, per_metre: float, per_speed: float) -> tuple[Array, Array]:
+    """d [m] and dv [m/s] of the beats fb+ and fb- [Hz]: (3.7), (3.8)."""
+    return 0.5 * (up + down) / per_metre, 0.5 * (up - down) / per_speed
+
+
+def passes(up: Array, down: Array, low: float, high: float) -> Array:
+    """bool: the IF filter passes both beats [Hz]."""
+    out: Array = (np.minimum(up, down) >= low) & (np.maximum(up, down) < high)
+    return out
 
 
 @dataclass(frozen=True)
@@ -101,19 +121,21 @@ class Link:
         """Share of the received jammer's power that reaches the IF samples."""
         return min(1.0, self.bandwidth / self.operating_band) if self.in_band is None else self.in_band
 
+    @property
+    def highest(self) -> float:
+        return self.lowest + self.bandwidth
+
     def beats(self, d: Array, dv: Array) -> tuple[Array, Array]:
         """fb+ and fb- [Hz] of a target at d [m] with relative speed dv [m/s]: (3.5), (3.6)."""
-        by_range, by_speed = self.hz_per_metre * d, self.hz_per_speed * dv
-        return by_range + by_speed, by_range - by_speed
+        return beats(d, dv, self.hz_per_metre, self.hz_per_speed)
 
     def range_speed(self, up: Array, down: Array) -> tuple[Array, Array]:
         """d [m] and dv [m/s] of the beats fb+ and fb- [Hz]: (3.7), (3.8)."""
-        return 0.5 * (up + down) / self.hz_per_metre, 0.5 * (up - down) / self.hz_per_speed
+        return range_speed(up, down, self.hz_per_metre, self.hz_per_speed)
 
     def within_band(self, up: Array, down: Array) -> Array:
         """bool: the IF filter passes both beats [Hz]."""
-        high = self.lowest + self.bandwidth
-        return np.asarray((np.minimum(up, down) >= self.lowest) & (np.maximum(up, down) < high))
+        return np.asarray(passes(up, down, self.lowest, self.highest))
 
     def echo_power(self, d: Array | float) -> Array:
         """Pr [W] of the echo from d [m]: (3.9)."""
@@ -147,23 +169,42 @@ _OUTLIER = (3.96, 1.08, 0.207)  # odds of an outlier: exp(o0 - o1 ln x - o2 x)
 _CELL = 4.0  # an outlier misses by more than _CELL/M cycles per sample, the resolution of a window of M/4 samples
 
 
-def tone_sd(link: Link, x: Array) -> Array:
-    """Standard deviation [Hz] of a beat that is no outlier, at the SNR x after integration.
+class Tone(NamedTuple):
+    """What the error of a beat is reckoned from."""
 
-    Root-MUSIC's variance as a multiple of the Cramer-Rao bound of one tone in M samples, 6 B_if^2/((2 pi)^2 x (M^2 - 1)) (Rife and
-    Boorstyn 1974).
-    """
-    inverse, cell = 1.0 / x, _CELL / link.samples
-    bound = 6.0 / (4.0 * math.pi * math.pi * (link.samples * link.samples - 1)) * inverse
-    e0, e1, e2 = _EFFICIENCY
-    variance = bound * e0 * (1.0 + inverse * (e1 + inverse * e2))
-    return np.asarray(link.bandwidth * np.sqrt(np.minimum(variance, cell * cell / 3.0)))
+    bound: float  # the Cramer-Rao bound at x = 1, of a beat in units of B_if
+    widest: float  # variance of a beat that lies anywhere within a cell, in these units
+
+
+def tone_of(link: Link) -> Tone:
+    """6/((2 pi)^2 (M^2 - 1)), of one tone in M samples (Rife and Boorstyn 1974)."""
+    cell = _CELL / link.samples
+    return Tone(6.0 / (4.0 * math.pi * math.pi * (link.samples * link.samples - 1)), cell * cell / 3.0)
+
+
+def tone_variance(x: Array, bound: float, widest: float) -> Array:
+    """Variance over B_if^2 of a beat that is no outlier, at the SNR x after integration, elementwise: a multiple of the bound."""
+    inverse, (e0, e1, e2) = 1.0 / x, _EFFICIENCY
+    variance = bound * inverse * e0 * (1.0 + inverse * (e1 + inverse * e2))
+    out: Array = np.minimum(variance, widest)
+    return out
+
+
+def outlier_odds(x: Array, log_x: Array) -> Array:
+    """Logarithm of the odds that a beat is no outlier, cut where nothing would change, elementwise."""
+    o0, o1, o2 = _OUTLIER
+    out: Array = np.minimum(o1 * log_x + o2 * x - o0, 700.0)
+    return out
+
+
+def tone_sd(link: Link, x: Array) -> Array:
+    """Standard deviation [Hz] of a beat that is no outlier, at the SNR x after integration."""
+    return np.asarray(link.bandwidth * np.sqrt(tone_variance(x, *tone_of(link))))
 
 
 def outlier_probability(x: Array) -> Array:
     """Probability that the largest root is the noise's, at the SNR x after integration: the beat is then uniform over the band."""
-    o0, o1, o2 = _OUTLIER
-    return np.asarray(1.0 / (1.0 + num.exp(np.minimum(o1 * num.log(x) + o2 * x - o0, 700.0))))
+    return np.asarray(1.0 / (1.0 + num.exp(outlier_odds(x, num.log(x)))))
 
 
 def challenge_samples(window: float, bandwidth: float) -> int:
@@ -195,16 +236,27 @@ def miss_probability(threshold: float, samples: int, jam: float = 0.0, tone: flo
 def heard_energy(samples: int, heard: Array, jam: Array, tone: Array, z: Array) -> Array:
     """Mean power E (B, N) over the receiver's noise, of N_c complex samples of which `heard` (B, N), at least 1, carry what is radiated.
 
-    jam and tone (B, N): powers over the noise in those samples. z (B, N, 3): standard normals. The tone adds to that part of the noise that
-    is in phase with it, one normal; the other 2 N_c - 1 are two gamma variables by Wilson and Hilferty's cube (1931).
+    jam and tone (B, N): powers over the noise in those samples. z (B, N, 3): standard normals.
+    """
+    return np.asarray(mean_power(samples, heard, jam, tone, z[..., 0], z[..., 1], z[..., 2]))
+
+
+def mean_power(samples: int, heard: Array, jam: Array, tone: Array, z0: Array, z1: Array, z2: Array) -> Array:
+    """`heard_energy`, elementwise.
+
+    The tone adds to that part of the noise that is in phase with it, one normal; the other 2 N_c - 1 are two gamma variables by Wilson and
+    Hilferty's cube (1931).
     """
     noise, rest = 1.0 + jam, samples - heard
-    in_phase = np.sqrt(0.5) * z[..., 0] + np.sqrt(heard * tone / noise)
-    loud = noise * (_gamma(heard - 0.5, z[..., 1]) + in_phase * in_phase)
-    quiet = np.where(rest > 0.0, _gamma(np.maximum(rest, 1.0), z[..., 2]), 0.0)
-    return np.asarray((loud + quiet) / samples)
+    in_phase = np.sqrt(0.5) * z0 + np.sqrt(heard * tone / noise)
+    loud = noise * (gamma(heard - 0.5, z1) + in_phase * in_phase)
+    quiet = num.select(rest > 0.0, gamma(np.maximum(rest, 1.0), z2), 0.0)
+    out: Array = (loud + quiet) / samples
+    return out
 
 
-def _gamma(shape: Array, z: Array) -> Array:
+def gamma(shape: Array, z: Array) -> Array:
+    """A gamma variable of scale 1 from a standard normal, elementwise: Wilson and Hilferty's cube."""
     root = np.maximum(1.0 - 1.0 / (9.0 * shape) + z / (3.0 * np.sqrt(shape)), 0.0)
-    return np.asarray(shape * (root * root * root))
+    out: Array = shape * (root * root * root)
+    return out

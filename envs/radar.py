@@ -18,7 +18,7 @@ from .radar_car import STATES
 
 Span = Annotated[tuple[Positive, Positive], Field(min_length=2, max_length=2)]
 NEAREST = 0.1  # closer than this [m] the radar equation means nothing: powers are those at this distance
-_UNIFORM, _SAMPLES = 1, 2  # tags of the draws
+UNIFORM, SAMPLED = 1, 2  # tags of the draws
 
 
 class RadarSensorPlan(NamedTuple):
@@ -84,11 +84,11 @@ class FmcwRadar(Link):
         up, down = self.beats(d + air.delay, dv)
         seen = probe & self.within_band(up, down)  # else the IF filter leaves nothing of the echo
         if self.path == "signal":
-            noise = draws.normal((1, 2, self.samples, 2), tag=_SAMPLES)
+            noise = draws.normal((1, 2, self.samples, 2), tag=SAMPLED)
             y = num.stack(fmcw_signal.read(self, d, dv, air.delay, tone, 1.0 + jam, noise))
         else:
             x = self.samples * tone / (1.0 + jam)
-            y = num.stack(self.range_speed(*self._estimated(up, down, x, z[..., 2:4], draws.uniform((1, 4), tag=_UNIFORM))))
+            y = num.stack(self.range_speed(*self._estimated(up, down, x, z[..., 2:4], draws.uniform((1, 4), tag=UNIFORM))))
         valid = num.full(y.shape, True, bool)
         valid &= (seen & (y[..., 0] >= self.reach[0]) & (y[..., 0] <= self.reach[1]))[..., None]
         return Received(np.where(valid, y, 0.0), valid, self._energy(plan, probe, jam, tone, air, z[..., 4:7]))
@@ -100,14 +100,19 @@ class FmcwRadar(Link):
         down = np.where(u[..., 2] < lost, self.lowest + self.bandwidth * u[..., 3], down + sd * z[..., 1])
         return up, down
 
+    def heard(self, reaction: float) -> tuple[float, float]:
+        """Samples of a challenge in which an attacker with this reaction time [s] is heard, and the share of its power in them."""
+        part = min(reaction, self.window) / self.window * self.challenge  # samples, not always a whole number
+        whole = max(1.0, float(np.ceil(part)))
+        return whole, part / whole
+
     def _energy(self, plan: RadarSensorPlan, probe: Array, jam: Array, tone: Array, air: Air, z: Array) -> Array:
         """(B, N) mean power over the receiver's noise, of a challenge; 0 where the probe is sent.
 
         There it would be the echo's, of a target that does not fluctuate: a distance by the radar equation that no late echo changes.
         """
         attacked = (air.power > 0.0) | (air.delay > 0.0)
-        part = min(air.reaction, self.window) / self.window * plan.challenge  # samples, not always a whole number
-        whole = max(1.0, float(np.ceil(part)))
-        heard, scale = np.where(attacked, whole, float(plan.challenge)), np.where(attacked, part / whole, 1.0)
+        whole, share = self.heard(air.reaction)
+        heard, scale = np.where(attacked, whole, float(plan.challenge)), np.where(attacked, share, 1.0)
         tone = np.where(air.delay > 0.0, tone, 0.0)
         return np.where(probe, 0.0, heard_energy(plan.challenge, heard, jam * scale, tone * scale, z))

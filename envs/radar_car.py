@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from tailgate import num
 from tailgate.core import Array, Estimate, Finite, Model, NonNegative, Plant, Positive, Receiver, Sensor, param
 from tailgate.errors import InputError
 from tailgate.registry import register
@@ -35,6 +36,17 @@ def check_radar_car(model: Model, where: str) -> None:
     """Raise InputError where the state is not [gap, relative speed, leader's acceleration, own speed]."""
     if model.agents != 1 or model.states != STATES or model.gap is None or not np.array_equal(model.gap, np.eye(STATES)[[GAP]]):
         raise InputError(where, f"{model.agents} agents, {model.states} states", "the plant radar_following")
+
+
+def wanted(
+    d: Array, dv: Array, v: Array, headway: Array, standstill: float, g: float, tau: float, gain: float, set_speed: float
+) -> Array:  # fmt: skip
+    """v_des [m/s] of a gap d [m], a relative speed dv and the own speed v [m/s], elementwise: (3.12), (3.13)."""
+    off = d - (standstill + headway * v)
+    spacing = v / gain + tau / (headway * gain) * (dv + g * off)
+    free = d > standstill + headway * set_speed
+    out: Array = num.select(free, set_speed, np.minimum(spacing, set_speed))
+    return out
 
 
 @register("controller", "acc_radar", reference="Dutta 2018, (3.12), (3.13), (3.16), corrected")
@@ -70,11 +82,7 @@ class RadarCruise:
         """estimate.x (B, N, 4) = [d, dv, ...] and odometry (B, N, 2) = [x_F, v_F] to the command a_des (B, N, 1) [m/s^2]."""
         d, dv, v = estimate.x[..., GAP], estimate.x[..., RELATIVE_SPEED], odometry[..., 1]
         headway = widened(self.headway, estimate.mode)
-        off = d - (self.standstill + headway * v)
-        spacing = v / self.gain + self.tau / (headway * self.gain) * (dv + self.g * off)
-        free = d > self.standstill + headway * self.set_speed
-        wanted = np.where(free, self.set_speed, np.minimum(spacing, self.set_speed))
-        a = (wanted - v) / self.sample
+        a = (wanted(d, dv, v, headway, self.standstill, self.g, self.tau, self.gain, self.set_speed) - v) / self.sample
         return None, limited(obeyed(a, estimate.mode), self.accel_min, self.accel_max)[..., None]
 
     def held(self, plan: Any, state: Any, batch: int) -> Array:

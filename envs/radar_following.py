@@ -23,6 +23,7 @@ from tailgate.registry import register
 
 from .idm import Behind, BehindState
 from .radar_car import STATES, radar_model
+from .vehicle import roll
 
 Quadruple = Annotated[tuple[NonNegative, NonNegative, NonNegative, NonNegative], Field(min_length=4, max_length=4)]
 
@@ -40,6 +41,12 @@ class RadarState(NamedTuple):
     lead_a: Array  # over the last step
     own: Array
     behind: BehindState | None
+
+
+def lagged(a: Array, u: Array, keep: float, gain: float) -> Array:
+    """The acceleration [m/s^2] one step later, under the command u, elementwise."""
+    out: Array = keep * a + gain * u
+    return out
 
 
 @register("plant", "radar_following", reference="Dutta 2018, section 3.5.1; (3.12)-(3.17)")
@@ -81,15 +88,12 @@ class RadarFollowing:
         return Prior(self.truth(plan, state, held), num.full((len(state.lead_x), 1, STATES, STATES), np.diag(self.prior_var)))
 
     def step(self, plan: RadarPlan, state: RadarState, u: Array, exo: Array, draws: Draws) -> RadarState:
-        T, half = self.dt, 0.5 * self.dt
         x, v, a = (state.own[:, 0, i] for i in range(3))
-        a = plan.alpha * a + (1.0 - plan.alpha) * self.gain * u[:, 0, 0]
-        v_next = np.maximum(0.0, v + a * T)
-        lead_v = np.maximum(0.0, state.lead_v + exo * T)
-        lead_x = state.lead_x + half * (state.lead_v + lead_v)
-        own = num.stack([(x + half * (v + v_next))[:, None], v_next[:, None], a[:, None]])
+        a = lagged(a, u[:, 0, 0], plan.alpha, (1.0 - plan.alpha) * self.gain)
+        own = num.stack([part[:, None] for part in (*roll(x, v, a, self.dt), a)])
+        lead_x, lead_v = roll(state.lead_x, state.lead_v, exo, self.dt)
         behind = plan.behind.step(state.behind, x, v) if plan.behind and state.behind else None
-        return RadarState(lead_x, lead_v, (lead_v - state.lead_v) / T, own, behind)
+        return RadarState(lead_x, lead_v, (lead_v - state.lead_v) / self.dt, own, behind)
 
     def known(self, plan: RadarPlan, u: Array, exo: Array, state: RadarState) -> Array:
         """The own speed, by odometry."""

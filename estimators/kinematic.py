@@ -161,16 +161,21 @@ class JointRegression:
         )  # fmt: skip
 
 
+def stop_time(speed: Array, a: Array, age: Array) -> Array:
+    """Time [s] to the instant at which a leader's fitted speed [m/s] passed zero, elementwise; `_stop` says of which ones."""
+    slowing = (speed < 0.0) & (a < 0.0)
+    out: Array = num.select(slowing, np.maximum(-speed / num.select(slowing, a, -1.0), -age), 0.0)
+    return out
+
+
 def _stop(state: RegressionState) -> tuple[Array, Array]:
     """Time (B, N) from now to the instant at which the fitted leader's speed passed zero [s], 0 while it moves; and whether it did.
 
     Not before the first instant of the fit; nor where it is not slowing down, as one that stands may seem to do by noise.
     """
     x = state.fit.x
-    speed, a = x[..., RELATIVE_SPEED] + x[..., OWN_SPEED], x[..., LEAD_ACCEL]
-    stopped = speed < 0.0
-    slowing = stopped & (a < 0.0)
-    return np.where(slowing, np.maximum(-speed / np.where(slowing, a, -1.0), -state.age), 0.0), stopped
+    speed = x[..., RELATIVE_SPEED] + x[..., OWN_SPEED]
+    return stop_time(speed, x[..., LEAD_ACCEL], state.age), speed < 0.0
 
 
 def _rows(s: Array, stopped: Array) -> Array:

@@ -12,12 +12,17 @@ import numpy as np
 
 from tailgate import num
 from tailgate.agents.model_based import Stealth
-from tailgate.core import Array, Attack, Kind, Mode
+from tailgate.core import AIRED, Array, Attack, Kind, Mode
 from tailgate.envs import manoeuvres as drives
 from tailgate.envs.controllers import AdaptiveCruise
 from tailgate.envs.following import CarFollowing
 from tailgate.envs.idm import IDM_GAP, IDM_HEADWAY
+from tailgate.envs.radar import FmcwRadar
+from tailgate.envs.radar_car import RadarCruise
+from tailgate.envs.radar_following import RadarFollowing
 from tailgate.envs.sensors import Odometry
+from tailgate.estimators.algorithm2 import AsPrinted
+from tailgate.estimators.challenge import ChallengeResponse, PyCra
 from tailgate.estimators.chi_square import ChiSquare
 from tailgate.estimators.compose import AcceptAll, Composed, GateOut, Score
 from tailgate.estimators.detectors import Cusum, Mewma, WindowedChiSquare
@@ -33,9 +38,12 @@ from tailgate.estimators.sparse import SparseChiSquare
 from tailgate.loop import Loop
 
 from . import constants as of
-from . import imm, monitor, script
+from . import imm, monitor, printed, radar_build, regression, script
+from .constants import put as _put
+from .rows import wires_of
 
-_FUSED_KINDS = {Kind.DOS_JAM, Kind.DOS_HOLD, Kind.DOS_HOLD_FRESH, Kind.DROPOUT, Kind.FDI}
+_ON_WIRES = {Kind.DOS_JAM, Kind.DOS_HOLD, Kind.DOS_HOLD_FRESH, Kind.DROPOUT, Kind.FDI}
+_CAR, _RADAR = (CarFollowing, Odometry, AdaptiveCruise), (RadarFollowing, FmcwRadar, RadarCruise)
 _STRUCTURE = np.array([[True, True, True], [False, True, True], [False, False, True]])  # of A: where it is not zero
 
 
@@ -58,29 +66,35 @@ class Refused:
 
 def fuse(loop: Loop, attack: Attack | None = None) -> Constants | Refused:
     """The constants of a loop, or why the plain loop plays it: under the given attack, or under any that does not hold the defence."""
-    plan, parts = loop.plan, (loop.plant, loop.sensor, loop.controller)
-    for part, known in zip(parts, (CarFollowing, Odometry, AdaptiveCruise), strict=True):
+    parts = (loop.plant, loop.sensor, loop.controller)
+    aired = type(loop.plant) is RadarFollowing
+    for part, known in zip(parts, _RADAR if aired else _CAR, strict=True):
         if type(part) is not known:
             return Refused(f"{type(part).__name__} has no lane")
     if not loop.link.perfect:
         return Refused("readings are lost or late")
     if why := _white(loop, attack):
         return Refused(why)
-    if not {Kind[name.upper()] for name in loop.threat.kinds} <= _FUSED_KINDS:
-        return Refused("delay, replay and what is radiated have no lane")
+    if not {Kind[name.upper()] for name in loop.threat.kinds} <= (_ON_WIRES | set(AIRED) if aired else _ON_WIRES):
+        return Refused("delay and replay have no lane" if aired else "delay, replay and what is radiated have no lane")
     c, f = of.blank()
-    for fill in (_vehicle, _told, _cruise, _defence, _threat):
+    f[of.AIRED] = aired
+    vehicle = (radar_build.vehicle, radar_build.told, radar_build.cruise, radar_build.sensor) if aired else (_vehicle, _told, _cruise)
+    for fill in (*vehicle, _defence, _threat):
         if why := fill(loop, c, f):
             return Refused(why)
     table = _way(loop, c, f)
     if table is None:
         return Refused(f"manoeuvre {type(loop.manoeuvre).__name__} has no lane")
-    intents = plan.plant.behind.reaction if plan.plant.behind else 0
-    return Constants(c, f, table, _remembered(f), intents)
+    return Constants(c, f, table, _remembered(f), int(f[of.REACTION]))
 
 
 def _remembered(f: Array) -> int:
     """Rows that the defence keeps beside those of every defence."""
+    if f[of.PRINTED]:
+        return printed.ROWS
+    if f[of.CHALLENGED]:
+        return regression.rows(int(f[of.SAMPLED]))
     if f[of.MODELED]:
         return imm.rows(int(f[of.MODELED]))
     return monitor.ROWS if f[of.BOXED] else max(int(f[of.WINDOW]) - 1, 0)
@@ -92,14 +106,11 @@ def _white(loop: Loop, attack: Attack | None) -> str:
     if type(attack) is Stealth:
         if not granted:
             return "attack stealth needs a white box"  # which the plain loop says
+        if type(loop.plant) is RadarFollowing:
+            return "attack stealth has no lane against a radar"
         shows = getattr(type(loop.defence), "look", None) is Composed.look
         return "" if shows else f"{type(loop.defence).__name__} shows no innovation to a lane"
     return "" if not granted or script.known(attack) else "a white-box attacker holds the defence itself"
-
-
-def _put(c: Array, at: int, values: Any) -> None:
-    flat = np.asarray(values, np.float64).ravel()
-    c[at : at + len(flat)] = flat
 
 
 def _vehicle(loop: Loop, c: Array, f: Array) -> str:
@@ -153,7 +164,9 @@ def _defence(loop: Loop, c: Array, f: Array) -> str:
         return ""
     if type(defence) is InteractingModels:
         return _models(defence, loop.plan.defence, c, f)
-    if isinstance(defence, SafeState) and type(defence) in (SafeState, SafeStateBrake):
+    if type(defence) in (ChallengeResponse, PyCra, AsPrinted) and f[of.AIRED]:
+        return radar_build.challenged(loop, c, f)
+    if isinstance(defence, SafeState) and not f[of.AIRED] and type(defence) in (SafeState, SafeStateBrake):
         return _safe_set(defence, loop, c, f)
     if not isinstance(defence, Composed):
         return f"defence {type(defence).__name__} has no lane"
@@ -211,8 +224,9 @@ def _filter(part: Any, plan: Any, loop: Loop, c: Array, f: Array) -> str:
         return f"filter {type(part).__name__} has no lane"
     f[of.STEADY] = part.steady
     if part.steady:
-        _put(c, of.PRIOR, plan.filter_plan.held[0])
-    _put(c, of.BROAD, plan.filter_plan.broad)
+        _put(c, of.PRIOR, plan.filter_plan.held[0, :3, :3])
+    _put(c, of.BROAD, plan.filter_plan.broad[:3])
+    c[of.OWN_BROAD] = plan.filter_plan.broad[3] if f[of.AIRED] else 0.0
     return ""
 
 
@@ -267,10 +281,11 @@ def _threat(loop: Loop, c: Array, f: Array) -> str:
     most = [np.inf if value is None else float(value) for value in (threat.budget, threat.duration)]
     _put(c, of.ONSET, (threat.onset, plan.last_step, *most, threat.cooldown))
     _put(c, of.GRANTED, plan.kinds)
-    _put(c, of.WIRE, plan.granted)
-    for at, values in ((of.BOUND, plan.bounds), (of.LOW, plan.low), (of.HIGH, plan.high)):
-        _put(c, at, np.broadcast_to(values, 5))
-    f[of.ACTUATED] = plan.granted[0, 4]
+    mine = np.array(wires_of(plan.granted.shape[1]))
+    for at, values in ((of.WIRE, plan.granted[0]), (of.BOUND, plan.bounds), (of.LOW, plan.low), (of.HIGH, plan.high)):
+        c[at + mine] = values
+    c[of.STRONGEST], c[of.LATEST] = threat.jam_power, threat.delay_bound
+    f[of.ACTUATED] = plan.granted[0, -1]
     return ""
 
 

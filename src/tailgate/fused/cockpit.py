@@ -10,15 +10,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tailgate.agents.observation import LAST_SCALE, LIMIT, SCALES
-from tailgate.core import Array
+from tailgate.core import Array, Kind
 from tailgate.draws import Keys
 
 from . import constants as of
-from . import kernel
+from . import radar
 from . import rows as at
 from . import seat as lane
 from .build import Constants, Refused, fuse
-from .lanes import NOTHING, Lanes, not_finite
+from .lanes import NOTHING, Lanes, not_finite, words_of
 from .memory import AT_COUNT, AT_FLAGS, AT_MASK, AT_PAID, AT_SEEN, FLAGS, MASKED, PAID, SEATED, TICK
 
 if TYPE_CHECKING:
@@ -41,20 +41,27 @@ def fuse_seat(seat: Seat) -> Constants | Refused:
     f[of.REWARD], f[of.FEATURES] = _REWARDS[paid.reward], len(columns)
     c[of.RATE], c[of.HORIZON], c[of.SEEN_MOST] = action.spec.rate, seat.loop.horizon, LIMIT
     if action.discrete:
+        mine = np.array(at.wires_of(len(seat.loop.model.wires)))
         for i, mode in enumerate(action.modes):
-            row = np.concatenate([[mode.kind, mode.sign], mode.target[0], mode.value])
-            c[of.TABLE + of.MODE_WIDTH * i : of.TABLE + of.MODE_WIDTH * (i + 1)] = row
+            row = of.TABLE + of.MODE_WIDTH * i
+            c[[row, row + 1]], c[row + 2 + mine], c[row + 2 + at.WIRES + mine] = (mode.kind, mode.sign), mode.target[0], mode.value
+    elif set(action.carried) - {Kind.FDI}:
+        return Refused("vectors of values over the air have no lane")
     c[of.REWARD_SCALE], c[of.GAP_SHAPING], c[of.ERROR_SHAPING] = paid.error_scale, paid.gap_shaping, paid.error_shaping
     c[of.GAMMA_PAID], c[of.ILLEGAL], c[of.COST] = paid.gamma, paid.illegal_penalty, paid.attack_cost
     c[of.BUDGET_SHARE] = threat.budget or 1.0
+    assert seat.loop.model.gap is not None
+    c[of.BELIEF] = seat.loop.model.gap[0, 0]
     scales = SCALES | {"progress": float(seat.loop.horizon)}
-    bounds = dict(zip(seat.loop.model.wires, seat.action.brief.bounds.tolist(), strict=True))
+    most = {wire: min(bound, LAST_SCALE) for wire, bound in zip(seat.loop.model.wires, seat.action.brief.bounds.tolist(), strict=True)}
+    most |= {"power": threat.jam_power, "delay": threat.delay_bound}
+    quantities = lane.QUANTITIES | (radar.QUANTITIES if f[of.AIRED] else {}) | ({} if f[of.REAR] else lane.ALONE)
     for j, name in enumerate(columns):
-        rows = (lane.QUANTITIES if f[of.REAR] else lane.QUANTITIES | lane.ALONE).get(name)
+        rows = quantities.get(name)
         if rows is None:
             return Refused(f"the observation's {name} has no lane")
         f[of.SEEN + j], f[of.FROM + j] = rows
-        c[of.SEEN_SCALE + j] = min(bounds[name[5:]], LAST_SCALE) if name.startswith("last_") else scales.get(name.removesuffix("0"), 1.0)
+        c[of.SEEN_SCALE + j] = most[name[5:]] if name.startswith("last_") else scales.get(name.removesuffix("0"), 1.0)
     return k
 
 
@@ -81,7 +88,7 @@ class Cockpit(Lanes):
         self._parts = list(zip(parts, self._starts, strict=True))
         self._sheet: Any = NOTHING
         # of a single row
-        self._enter, self._alone, self._anew = kernel.run.entry, (0, self.interval, SEATED, 0, 0, 0), (0, 0, SEATED, 0, 0, 1)
+        self._enter, self._alone, self._anew = self.play.entry, (0, self.interval, SEATED, 0, 0, 0), (0, 0, SEATED, 0, 0, 1)
         self._action, self._single = self.memory.action[0], seat.action.discrete
         self._told = struct.Struct(f"=ddq{4 * features}x6?").unpack_from
 
@@ -141,12 +148,14 @@ class Cockpit(Lanes):
     def reseed(self, where: Array, keys: Keys | None = None) -> None:
         """New episodes in the rows `where` (B,) bool: the next of their own, or those of the given keys of as many rows."""
         if keys is not None:
-            for name, value in ((at.WORLD_KEY, keys.key[:, 0]), (at.ATTACK_KEY, keys.key[:, 1]), (at.EPISODE, keys.episode)):
+            for name, value in words_of(keys):
                 held = self.word(name).copy()
                 held[where] = value.astype(np.uint64) - np.uint64(name == at.EPISODE)  # `again` counts one further
                 self.set_word(name, held)
+        over = self.row(at.OVER).copy()  # of the others, which begin when they are asked to
         self.set_row(at.OVER, where)
         self.again()
+        self.set_row(at.OVER, np.where(where, 0.0, over))
 
     def held(self) -> dict[str, Array]:
         """Everything that changes, by name: copies."""

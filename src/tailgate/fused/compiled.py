@@ -83,11 +83,18 @@ def _tell_array_at(numba: Any) -> None:  # numba's own `carray` wants references
     numba.extending.lower_builtin(array_at, types.voidptr, types.Any, types.Any)(lower)
 
 
+def written_in(function: Callable[..., Any]) -> Jitted:
+    """As if its text stood where it is called."""
+    return Jitted(function, lambda: _OPTIONS | {"inline": "always"})
+
+
 _SOURCES = {  # by package, which may lie in folders of their own
     "tailgate.fused": ("",), "tailgate": ("elementwise.py", "jit.py", "kernels.py", "kinds.py", "draws.py"),
-    "tailgate.agents": ("reward.py", "scripted.py", "triggers.py"),
-    "tailgate.estimators": ("detectors.py", "imm.py", "reactive_brake.py", "safe_state.py"),
-    "tailgate.envs": ("vehicle.py", "idm.py", "controllers.py", "manoeuvres.py"),
+    "tailgate.agents": ("reward.py", "scripted.py", "triggers.py", "values.py"),
+    "tailgate.estimators": (
+        "algorithm2.py", "detectors.py", "imm.py", "kinematic.py", "predictors.py", "reactive_brake.py", "safe_state.py",
+    ),
+    "tailgate.envs": ("vehicle.py", "idm.py", "controllers.py", "manoeuvres.py", "fmcw.py", "radar_car.py", "radar_following.py"),
 }  # fmt: skip
 
 
@@ -163,7 +170,7 @@ class Kernel:
 
         settings = sorted((name, value) for name, value in os.environ.items() if name.startswith("NUMBA_") and name != "NUMBA_CACHE_DIR")
         machine = llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()
-        parts = (digest(), version("numba"), version("llvmlite"), machine, settings)
+        parts = (self.py_func.__module__, digest(), version("numba"), version("llvmlite"), machine, settings)
         return f"kernel-{hashlib.blake2b(repr(parts).encode(), digest_size=16).hexdigest()}.o"
 
 

@@ -3,9 +3,12 @@
 They are arguments of the compiled functions. Were they constants of them, every scenario would be compiled anew.
 """
 
+from typing import Any
+
 import numpy as np
 
 MODELS = 4  # of several, at most
+MOMENTS = 64  # challenges at fixed steps, at most
 MODES, COMPONENTS = 64, 32  # discrete actions, and components of an observation, at most
 MODE_WIDTH = 12  # of an action in the table: kind, sign, five targets, five values
 
@@ -31,6 +34,22 @@ START_SD = _number("start_sd", 3)
 START = _number("start", 3)  # x, v, a
 LEAD_START, REAR_START = _number("lead_start", 2), _number("rear_start", 2)
 WAY_PARAM = _number("way_param", 8)  # of the manoeuvre, see `road.way`
+# a car with a radar: its lag, its filter's fourth state, which is the own speed, and what drives it
+KEEP, GAIN = _number("keep"), _number("gain")
+OWN_INTO, OWN_Q, OWN_PRIOR, OWN_BROAD = _number("own_into", 2), _number("own_Q"), _number("own_prior"), _number("own_broad")
+LOWER_TAU, LOWER_GAIN, SAMPLE = _number("lower_tau"), _number("lower_gain"), _number("sample")
+# the radar: powers at 1 m over the noise, its samples, its beats, their errors, and what it reports
+ECHO, JAMMED, SAMPLES = _number("echo"), _number("jammed"), _number("samples")
+PER_METRE, PER_SPEED, LOWEST, HIGHEST = _number("per_metre"), _number("per_speed"), _number("lowest"), _number("highest")
+IF_BAND, LEAST_BOUND, WIDEST, REACH = _number("if_band"), _number("least_bound"), _number("widest"), _number("reach", 2)
+LISTENED, LOUD, LOUD_SHARE = _number("listened"), _number("loud"), _number("loud_share")  # samples of a challenge; with an attacker
+# a challenge: when, what is too loud, and how long it is remembered
+USUAL, WATCHED, SUSPICION, QUIET = _number("usual"), _number("watched"), _number("suspicion"), _number("quiet")
+TIMES = _number("times", MOMENTS)
+# its regression
+RIDGE, FADING, SURPRISE, ALLOWANCE = _number("ridge"), _number("fading"), _number("surprise"), _number("allowance")
+SAMPLE_WEIGHT = _number("sample_weight", 2)
+STRONGEST, LATEST = _number("strongest"), _number("latest")  # what may be radiated: power, delay
 # what everyone is told
 A, B, C0 = _number("A", 9), _number("B", 3), _number("c", 3)
 Q, RNOISE = _number("Q", 9), _number("R", 4)
@@ -51,6 +70,7 @@ WIRE = _number("wire", 5)  # whether it may be attacked
 BOUND, LOW, HIGH = _number("bound", 5), _number("low", 5), _number("high", 5)
 # seat: what is decided, what is paid
 RATE, TABLE = _number("rate"), _number("mode", MODE_WIDTH * MODES)  # of a ramp; the discrete actions
+BELIEF = _number("belief")  # how the believed gap depends on the first state
 REWARD_SCALE, GAP_SHAPING, ERROR_SHAPING = _number("reward_scale"), _number("gap_shaping"), _number("error_shaping")
 GAMMA_PAID, ILLEGAL, COST = _number("gamma_paid"), _number("illegal"), _number("cost")
 SEEN_SCALE, SEEN_MOST = _number("seen_scale", COMPONENTS), _number("seen_most")  # of each component of the observation; where it is cut
@@ -67,6 +87,10 @@ HARD, HARDER, LAG, RHO, EASED = _number("hard"), _number("harder"), _number("lag
 RESPONSE, CLEARANCE, DISTANCE, WATCH = _number("response"), _number("clearance"), _number("distance"), _number("watch")
 NUMBERS = len(_numbers)
 
+AIRED = _choice("aired")  # a car with a radar
+CHALLENGED, PRINTED = _choice("challenged"), _choice("printed")  # with the regression of which algorithm
+FIXED, SAMPLED = _choice("fixed"), _choice("sampled")  # how many times; steps whose samples are kept
+PASSES, STOPS, FREEZES, ROLLS_BACK = _choice("passes"), _choice("stops"), _choice("freezes"), _choice("rolls_back")
 WAY, REACTION, REAR = _choice("way"), _choice("reaction"), _choice("rear")
 UNIFORM_NOISE = _choice("uniform_noise")
 RAW, STEADY, ROBUST, PER_SIGMA = _choice("raw"), _choice("steady"), _choice("robust"), _choice("per_sigma")
@@ -89,3 +113,9 @@ CRASH, MIN_GAP, ERROR, STEALTH, FINAL = range(5)  # rewards
 def blank() -> tuple[np.ndarray, np.ndarray]:
     """Arrays for `c` and `f`, all zero."""
     return np.zeros(NUMBERS), np.zeros(CHOICES, np.int64)
+
+
+def put(c: np.ndarray, at: int, values: Any) -> None:
+    """Values of any shape, row by row, into `c` from `at` on."""
+    flat = np.asarray(values, np.float64).ravel()
+    c[at : at + len(flat)] = flat

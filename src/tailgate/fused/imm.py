@@ -13,7 +13,29 @@ from tailgate.kernels import _exp, _log
 from . import constants as of
 from . import kalman
 from .compiled import formula, phase
-from .rows import ACCEPT, ALARM, LANES, PIVOT, RIVAL, SCORE, SENSORS, TOP, TOTAL, VALID, WEIGHT, P, R, S, X
+from .rows import (
+    ACCEPT,
+    ALARM,
+    FORMER,
+    FORMER_VAR,
+    LANES,
+    OWN,
+    OWN_COV,
+    OWN_VAR,
+    PIVOT,
+    RIVAL,
+    SCORE,
+    SENSORS,
+    TOLD,
+    TOP,
+    TOTAL,
+    VALID,
+    WEIGHT,
+    P,
+    R,
+    S,
+    X,
+)
 
 WIDE = 12  # rows of a model: mean, covariance
 EACH = 2 * WIDE + 2  # rows that are kept for each model
@@ -181,18 +203,65 @@ def _odds(s, m, c, models, n):
 
 
 @phase
-def step(s, m, c, f, n):
-    """Every model's own step, and what they say together."""
-    models = f[of.MODELED]
-    for j in range(SENSORS):
-        row = np.uint64(j * LANES)
+def _mix_known(s, m, c, models, j, n):
+    """The fourth state likewise, the known input: each model has the same one, and with rounding their mixture is another."""
+    for i in range(n):
+        s[OWN + i] = s[OWN_VAR + i] = s[OWN_COV + i] = s[OWN_COV + _1 + i] = s[OWN_COV + _2 + i] = 0.0
+    for k in range(models):
+        mu, move = probability(models, k), c[of.MOVES + of.MODELS * k + j]
         for i in range(n):
-            s[ACCEPT + row + i] = s[VALID + row + i]
-    for j in range(models):
-        mix(s, m, c, models, j, n)
-        kalman.predict(s, c, f, n)
-        kalman.innovation(s, c, of.NOISES + 4 * j, n)
-        likelihood(s, m, models, j, n)
-        kalman.update(s, f, n)
-        keep(s, m, models + j, n)
-    weigh(s, m, c, models, n)
+            s[OWN + i] += move * m[mu + i] / s[TOTAL + i] * s[FORMER + i]
+    for k in range(models):
+        mu, place, move = probability(models, k), belief(k), c[of.MOVES + of.MODELS * k + j]
+        for i in range(n):
+            w, off = move * m[mu + i] / s[TOTAL + i], s[FORMER + i] - s[OWN + i]
+            x, v, a = m[place + i] - s[X + i], m[place + _1 + i] - s[X + _1 + i], m[place + _2 + i] - s[X + _2 + i]
+            s[OWN_COV + i] += w * (0.0 + x * off)
+            s[OWN_COV + _1 + i] += w * (0.0 + v * off)
+            s[OWN_COV + _2 + i] += w * (0.0 + a * off)
+            s[OWN_VAR + i] += w * (s[FORMER_VAR + i] + off * off)
+
+
+@phase
+def _tell(s, m, models, n):
+    """The fourth state of the estimate."""
+    for i in range(n):
+        s[TOLD + i] = 0.0
+    for k in range(models):
+        mu = probability(models, k)
+        for i in range(n):
+            s[TOLD + i] += m[mu + i] * s[OWN + i]
+
+
+def stepping(rides):
+    """The phase `step`, of models of three states or also of a fourth that is the known input."""
+    predict = kalman.predict_tied if rides else kalman.predict
+
+    @phase
+    def step(s, m, c, f, n):
+        """Every model's own step, and what they say together."""
+        models = f[of.MODELED]
+        for j in range(SENSORS):
+            row = np.uint64(j * LANES)
+            for i in range(n):
+                s[ACCEPT + row + i] = s[VALID + row + i]
+        if rides:
+            for i in range(n):
+                s[FORMER + i], s[FORMER_VAR + i] = s[OWN + i], s[OWN_VAR + i]
+        for j in range(models):
+            mix(s, m, c, models, j, n)
+            if rides:
+                _mix_known(s, m, c, models, j, n)
+            predict(s, c, f, n)
+            kalman.innovation(s, c, of.NOISES + 4 * j, n)
+            likelihood(s, m, models, j, n)
+            kalman.update(s, f, n)
+            keep(s, m, models + j, n)
+        weigh(s, m, c, models, n)
+        if rides:
+            _tell(s, m, models, n)
+
+    return step
+
+
+step, step_known = stepping(rides=False), stepping(rides=True)

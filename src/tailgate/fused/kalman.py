@@ -18,10 +18,14 @@ from .rows import (
     ALARM,
     ARRIVED,
     CROSS,
+    EGO,
     FORGET,
     LANES,
     LEFT,
     MODE,
+    OWN,
+    OWN_COV,
+    OWN_VAR,
     REJECTED,
     SCORE,
     SENSORS,
@@ -40,39 +44,67 @@ from .rows import (
 _1, _2, _3, _4, _5, _6, _7, _8 = (np.uint64(LANES * i) for i in range(1, 9))  # rows further down
 
 
-@phase
-def predict(s, c, f, n):
-    """x- and P-. Entries of A: 1, a01, a02, 1, a12, a22."""
-    a01, a02, a12, a22 = c[of.A + 1], c[of.A + 2], c[of.A + 5], c[of.A + 8]
-    b0, b1, b2, c0, c1, c2 = c[of.B], c[of.B + 1], c[of.B + 2], c[of.C0], c[of.C0 + 1], c[of.C0 + 2]
-    for i in range(n):
-        x, v, a, u = s[X + i], s[X + _1 + i], s[X + _2 + i], s[U + i]
-        s[X + i] = (0.0 + x + a01 * v + a02 * a) + (0.0 + b0 * u) + c0
-        s[X + _1 + i] = (0.0 + v + a12 * a) + (0.0 + b1 * u) + c1
-        s[X + _2 + i] = (0.0 + a22 * a) + (0.0 + b2 * u) + c2
-    if f[of.STEADY] != 0:
-        return
-    q0, q1, q2, q3, q4, q5, q6, q7, q8 = (
-        c[of.Q], c[of.Q + 1], c[of.Q + 2], c[of.Q + 3], c[of.Q + 4], c[of.Q + 5], c[of.Q + 6], c[of.Q + 7], c[of.Q + 8],
-    )  # fmt: skip
-    for i in range(n):
-        p20, p21, p22 = s[P + _6 + i], s[P + _7 + i], s[P + _8 + i]
-        p10, p11, p12 = s[P + _3 + i], s[P + _4 + i], s[P + _5 + i]
-        h00, h01, h02 = (
-            0.0 + s[P + i] + a01 * p10 + a02 * p20, 0.0 + s[P + _1 + i] + a01 * p11 + a02 * p21,
-            0.0 + s[P + _2 + i] + a01 * p12 + a02 * p22,
-        )  # A P  # fmt: skip
-        h10, h11, h12 = 0.0 + p10 + a12 * p20, 0.0 + p11 + a12 * p21, 0.0 + p12 + a12 * p22
-        h20, h21, h22 = 0.0 + a22 * p20, 0.0 + a22 * p21, 0.0 + a22 * p22
-        s[P + i] = (0.0 + h00 + a01 * h01 + a02 * h02) + q0  # A (A P)'
-        s[P + _1 + i] = (0.0 + h10 + a01 * h11 + a02 * h12) + q1
-        s[P + _2 + i] = (0.0 + h20 + a01 * h21 + a02 * h22) + q2
-        s[P + _3 + i] = (0.0 + h01 + a12 * h02) + q3
-        s[P + _4 + i] = (0.0 + h11 + a12 * h12) + q4
-        s[P + _5 + i] = (0.0 + h21 + a12 * h22) + q5
-        s[P + _6 + i] = (0.0 + a22 * h02) + q6
-        s[P + _7 + i] = (0.0 + a22 * h12) + q7
-        s[P + _8 + i] = (0.0 + a22 * h22) + q8
+def predicting(rides, tied=False):
+    """The phase `predict`: of three states, or also of a fourth that is the known input itself and `rides` in rows of its own.
+
+    Before the step the fourth may be `tied` to the others by a covariance, as in a mixture; after it, it is not.
+    """
+
+    @phase
+    def predict(s, c, f, n):
+        """x- and P-. Entries of A: 1, a01, a02, 1, a12, a22; of the fourth state into0, into1."""
+        a01, a02, a12, a22 = c[of.A + 1], c[of.A + 2], c[of.A + 5], c[of.A + 8]
+        b0, b1, b2, c0, c1, c2 = c[of.B], c[of.B + 1], c[of.B + 2], c[of.C0], c[of.C0 + 1], c[of.C0 + 2]
+        into0, into1 = c[of.OWN_INTO], c[of.OWN_INTO + 1]
+        for i in range(n):
+            x, v, a = s[X + i], s[X + _1 + i], s[X + _2 + i]
+            u = s[EGO + _1 + i] if rides else s[U + i]
+            moved, faster = 0.0 + x + a01 * v + a02 * a, 0.0 + v + a12 * a
+            if rides:
+                moved, faster = moved + into0 * s[OWN + i], faster + into1 * s[OWN + i]
+                s[OWN + i] = 0.0 + u
+            s[X + i] = moved + (0.0 + b0 * u) + c0
+            s[X + _1 + i] = faster + (0.0 + b1 * u) + c1
+            s[X + _2 + i] = (0.0 + a22 * a) + (0.0 + b2 * u) + c2
+        if f[of.STEADY] != 0:
+            return
+        q0, q1, q2, q3, q4, q5, q6, q7, q8 = (
+            c[of.Q], c[of.Q + 1], c[of.Q + 2], c[of.Q + 3], c[of.Q + 4], c[of.Q + 5], c[of.Q + 6], c[of.Q + 7], c[of.Q + 8],
+        )  # fmt: skip
+        own_q = c[of.OWN_Q]
+        for i in range(n):
+            p20, p21, p22 = s[P + _6 + i], s[P + _7 + i], s[P + _8 + i]
+            p10, p11, p12 = s[P + _3 + i], s[P + _4 + i], s[P + _5 + i]
+            h00, h01, h02 = (
+                0.0 + s[P + i] + a01 * p10 + a02 * p20, 0.0 + s[P + _1 + i] + a01 * p11 + a02 * p21,
+                0.0 + s[P + _2 + i] + a01 * p12 + a02 * p22,
+            )  # A P  # fmt: skip
+            h10, h11, h12 = 0.0 + p10 + a12 * p20, 0.0 + p11 + a12 * p21, 0.0 + p12 + a12 * p22
+            h20, h21, h22 = 0.0 + a22 * p20, 0.0 + a22 * p21, 0.0 + a22 * p22
+            if tied:
+                t0, t1, t2 = s[OWN_COV + i], s[OWN_COV + _1 + i], s[OWN_COV + _2 + i]
+                h00, h01, h02 = h00 + into0 * t0, h01 + into0 * t1, h02 + into0 * t2
+                h10, h11, h12 = h10 + into1 * t0, h11 + into1 * t1, h12 + into1 * t2
+            p00, p01 = 0.0 + h00 + a01 * h01 + a02 * h02, 0.0 + h10 + a01 * h11 + a02 * h12  # A (A P)'
+            p02, p12 = 0.0 + h20 + a01 * h21 + a02 * h22, 0.0 + h21 + a12 * h22
+            p10, p11 = 0.0 + h01 + a12 * h02, 0.0 + h11 + a12 * h12
+            if rides:
+                h03, h13 = into0 * s[OWN_VAR + i], into1 * s[OWN_VAR + i]
+                if tied:
+                    h03, h13, h23 = t0 + a01 * t1 + a02 * t2 + h03, t1 + a12 * t2 + h13, a22 * t2
+                    p02, p12 = p02 + into0 * h23, p12 + into1 * h23
+                p00, p01, p10, p11 = p00 + into0 * h03, p01 + into0 * h13, p10 + into1 * h03, p11 + into1 * h13
+                s[OWN_VAR + i] = own_q
+            s[P + i], s[P + _1 + i], s[P + _2 + i] = p00 + q0, p01 + q1, p02 + q2
+            s[P + _3 + i], s[P + _4 + i], s[P + _5 + i] = p10 + q3, p11 + q4, p12 + q5
+            s[P + _6 + i] = (0.0 + a22 * h02) + q6
+            s[P + _7 + i] = (0.0 + a22 * h12) + q7
+            s[P + _8 + i] = (0.0 + a22 * h22) + q8
+
+    return predict
+
+
+predict, predict_known, predict_tied = predicting(rides=False), predicting(rides=True), predicting(rides=True, tied=True)
 
 
 @phase
@@ -246,6 +278,16 @@ def forget(s, c, n):
         s[P + _6 + i] = 0.0 if clear else s[P + _6 + i]
         s[P + _7 + i] = 0.0 if clear else s[P + _7 + i]
     return True
+
+
+@phase
+def weigh(s, ring, c, f, n):
+    """What is made of the innovation: score, alarm, mode, and which readings the update may use."""
+    detect(s, ring, c, f, n)
+    suspect(s, c, f, n)
+    mitigate(s, c, f, n)
+    if f[of.MITIGATION] == of.REACQUIRE and forget(s, c, n):
+        innovation(s, c, of.RNOISE, n)
 
 
 @formula

@@ -1,12 +1,15 @@
-"""What is compiled: one function that plays a batch block by block, so that a block's rows stay in the processor's cache."""
+"""What is compiled: a function that plays a batch block by block, so that a block's rows stay in the processor's cache.
+
+Each kind of plant has its own, of which here is that of car following.
+"""
 
 import numpy as np
 
 from . import constants as of
 from . import memory as at
 from . import script, seat, step
-from .compiled import Kernel, array_at, phase
-from .rows import EGO, ENDED, EPISODE, LANES, LEAD_X, LENGTH, OVER, REAR_X, ROWS, SCORE, STATE, WANT_KIND, WIRES, WORDS, K, X
+from .compiled import Kernel, array_at, phase, written_in
+from .rows import EGO, ENDED, EPISODE, LANES, LEAD_X, LENGTH, OVER, RADAR_STATE, REAR_X, ROWS, SCORE, WANT_KIND, WIRES, WORDS, K, X
 
 _1, _2 = np.uint64(LANES), np.uint64(2 * LANES)
 
@@ -64,7 +67,7 @@ def living(s, n):
 @phase
 def carry(source, goal):
     """The state of a block from one place to another."""
-    for i in range(np.uint64(STATE * LANES)):
+    for i in range(np.uint64(min(len(source), len(goal)))):
         goal[i] = source[i]
 
 
@@ -77,7 +80,7 @@ def everyone(s, g, n):
 
 
 @phase
-def begin_again(s, g, window, intent, c, f, table, tick, fresh, words, new_window, new_intent, n):
+def begin_again(start, s, g, window, intent, c, f, table, tick, fresh, words, new_window, new_intent, n):
     """The next episode in every row that is over: played apart in a block of its own, then put in its place."""
     count = np.uint64(0)
     for i in range(n):
@@ -88,12 +91,12 @@ def begin_again(s, g, window, intent, c, f, table, tick, fresh, words, new_windo
             count += np.uint64(1)
     if count == np.uint64(0):
         return
-    step.start(fresh, words, new_window, new_intent, c, f, table, tick, count)
+    start(fresh, words, new_window, new_intent, c, f, table, tick, count)
     seat.begin(fresh, c, count)
     k = np.uint64(0)
     for i in range(n):
         if s[OVER + i] != 0.0:
-            for j in range(STATE):
+            for j in range(RADAR_STATE):
                 s[np.uint64(j * LANES) + i] = fresh[np.uint64(j * LANES) + k]
             for j in range(WORDS):
                 g[np.uint64(j * LANES) + i] = words[np.uint64(j * LANES) + k]
@@ -104,9 +107,11 @@ def begin_again(s, g, window, intent, c, f, table, tick, fresh, words, new_windo
             k += np.uint64(1)
 
 
-@Kernel
-def run(places, first_block, last_block, part):
+@written_in
+def play(start, advance, decide, look, places, first_block, last_block, part):
     """What the orders ask for (`memory`), in blocks from the first to before the last, at the desk of a `part` of the threads.
+
+    How a step begins and goes on, how a script decides, and what is seen after a step are phases of the plant.
 
     Recorded in record (K, columns, B), or in (1, 2, B) the smallest gaps. What a seat is shown in the end goes into its sheet
     (`cockpit.SHEET`).
@@ -159,10 +164,10 @@ def run(places, first_block, last_block, part):
                 if t == 0 or f[of.ACTION] == of.RAMPING or f[of.ACTION] == of.INCREMENT:  # which depend on the last command
                     wanted = seat.decode(s, c, f, action, first, n)
             elif how == at.SCRIPTED:
-                wanted = script.decide(s, g, window, c, f, p, n)
+                wanted = decide(s, g, window, c, f, p, n)
             else:
                 wanted = obey(s, asked, first, n)
-            step.advance(s, g, window, intent, c, f, table, now, wanted, n)
+            advance(s, g, window, intent, c, f, table, now, wanted, n)
             now += 1
             if not sound(s, n):
                 return -1
@@ -176,14 +181,20 @@ def run(places, first_block, last_block, part):
         if seated and steps > 0:
             seat.settle(s, c, paid, flags, first, n)
         if restart:
-            begin_again(s, g, window, intent, c, f, table, now - 1, spare, spare_words, spare_window, spare_intent, n)
+            begin_again(start, s, g, window, intent, c, f, table, now - 1, spare, spare_words, spare_window, spare_intent, n)
         if seated:
             if steps > 0:
                 seat.close(s, flags, first, n)
-            seat.look(s, c, paid, flags, count, mask, first, n)
+            look(s, c, paid, flags, count, mask, first, n)
             seat.observe(s, c, f, seen, first, n)
         if not alone:
             carry(desk, held)
     if last_block - first_block == blocks:  # nobody else reads it
         o[at.TICK] += o[at.FRESH] + steps
     return longest
+
+
+@Kernel
+def run(places, first_block, last_block, part):
+    """`play`, of car following."""
+    return play(step.start, step.advance, script.decide, seat.look, places, first_block, last_block, part)

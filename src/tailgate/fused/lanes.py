@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
+from importlib import import_module
 from itertools import repeat
 from typing import Any, NamedTuple
 
@@ -13,19 +14,26 @@ from tailgate.core import Array, Command, Received, Scene, View
 from tailgate.draws import Draws, Keys, Role
 from tailgate.envs.following import FollowingState
 from tailgate.envs.idm import BehindState
+from tailgate.envs.radar_following import RadarState
 from tailgate.errors import InputError
 from tailgate.loop import Loop
 from tailgate.threat import Channel
 
 from . import constants as of
-from . import kernel
 from . import rows as at
 from .build import Constants
+from .compiled import Kernel
 from .memory import AT_COLUMNS, AT_RECORD, COLUMNS, FRESH, KEPT, OBEY, RESTART, TICK, Memory
-from .rows import LANES, LINKS, SENSORS, WIRES
+from .rows import LANES, SENSORS, WIRES, wires_of
 
 NOTHING = np.zeros(0, np.uint64)
 WORTH = 2048  # episodes that are worth a thread
+
+
+def words_of(keys: Keys) -> tuple[tuple[np.uint64, Array], ...]:
+    """What the episodes of these keys draw by, and the row of each."""
+    world, attack, defence = (keys.key[:, i] for i in range(3))
+    return (at.WORLD_KEY, world), (at.ATTACK_KEY, attack), (at.DEFENCE_KEY, defence), (at.EPISODE, keys.episode)
 
 
 class _Spent(NamedTuple):
@@ -34,6 +42,13 @@ class _Spent(NamedTuple):
     used: Array
     burst: Array
     cooldown: Array
+
+
+def _kernel(aired: bool) -> Kernel:
+    """What plays the plant: of the others nothing is imported."""
+    name = "radar_kernel" if aired else "kernel"
+    run: Kernel = import_module(f"tailgate.fused.{name}").run
+    return run
 
 
 @cache
@@ -49,7 +64,10 @@ class Lanes:
         self.threads = max(1, min(threads, len(keys.key) // WORTH))
         self.loop, self.constants, self.batch = loop, constants, len(keys.key)
         self.memory = Memory(self.batch, constants.c, constants.f, constants.table, constants.window, constants.intents, self.threads)
-        self.rows, self.record = self.memory.rows, np.empty((steps, len(columns), self.batch))
+        self.rows, self.record = self.memory.rows, np.zeros((steps, len(columns), self.batch))
+        self.aired = bool(constants.f[of.AIRED])
+        self.play = _kernel(self.aired)
+        self.wires = np.array(wires_of(len(loop.model.wires)))
         self._asked: tuple[int, ...] = ()
         self.memory.put(AT_COLUMNS, columns.astype(np.int64))
         self.memory.put(AT_RECORD, self.record)
@@ -60,7 +78,7 @@ class Lanes:
     def take(self, keys: Keys) -> None:
         """The keys of the episodes that begin next."""
         self.keys = keys
-        for word, value in ((at.WORLD_KEY, keys.key[:, 0]), (at.ATTACK_KEY, keys.key[:, 1]), (at.EPISODE, keys.episode)):
+        for word, value in words_of(keys):
             self.set_word(word, value)
 
     # -- rows by name
@@ -72,7 +90,15 @@ class Lanes:
 
     def stack(self, name: np.uint64, width: int) -> Array:
         """(B, 1, width): rows that follow each other."""
-        return np.moveaxis(np.stack([self.row(name, j) for j in range(width)]), 0, -1)[:, None, :]
+        return self._side_by_side([self.row(name, j) for j in range(width)])
+
+    def of_wires(self, name: np.uint64) -> Array:
+        """(B, 1, w): of each wire of the model."""
+        return self._side_by_side([self.row(name, j) for j in self.wires])
+
+    @staticmethod
+    def _side_by_side(rows: list[Array]) -> Array:
+        return np.moveaxis(np.stack(rows), 0, -1)[:, None, :]
 
     def set_row(self, name: np.uint64, values: Array) -> None:
         """One number for each episode."""
@@ -98,10 +124,10 @@ class Lanes:
         if asked != self._asked:  # mostly the same again
             self.order(asked)
         if self.threads == 1:
-            played = [kernel.run(places, 0, len(self.rows), 0)]
+            played = [self.play(places, 0, len(self.rows), 0)]
         else:  # blocks share nothing, so that the order in which they are played does not matter
             edges = [len(self.rows) * part // self.threads for part in range(self.threads + 1)]
-            played = list(_pool(self.threads).map(kernel.run, repeat(places), edges[:-1], edges[1:], range(self.threads)))
+            played = list(_pool(self.threads).map(self.play, repeat(places), edges[:-1], edges[1:], range(self.threads)))
             self.memory.order[TICK] += fresh + steps
         if min(played) < 0:
             raise not_finite()
@@ -119,8 +145,8 @@ class Lanes:
         """One step under a command, kept at t of the record."""
         asked = self.memory.asked
         asked[0] = command.kind
-        asked[1 : 1 + WIRES] = np.moveaxis(command.target[:, 0], 0, -1)
-        asked[1 + WIRES :] = np.moveaxis(command.value[:, 0], 0, -1)
+        asked[1 + self.wires] = np.moveaxis(command.target[:, 0], 0, -1)
+        asked[1 + WIRES + self.wires] = np.moveaxis(command.value[:, 0], 0, -1)
         self.run(OBEY, 1, first_step=t)
 
     @property
@@ -141,8 +167,10 @@ class Lanes:
         spent: Any = _Spent(*(self.row(name).astype(np.int64) for name in (at.USED, at.BURST, at.COOLDOWN)))
         left, allowed = Channel().budget_left(plan, spent), Channel().allowed(plan, spent, k)
         budget = np.full(self.batch, np.inf if threat.budget is None else float(threat.budget))
-        last = Command(self.row(at.KIND).astype(np.int8), self.stack(at.TARGET, WIRES) != 0.0, self.stack(at.VALUE, WIRES))
+        last = Command(self.row(at.KIND).astype(np.int8), self.of_wires(at.TARGET) != 0.0, self.of_wires(at.VALUE))
         view = View(k, k / self.loop.horizon, self.scene(), left, budget, spent.burst, spent.cooldown, allowed, last)
+        if self.aired:
+            view = view._replace(probed=self.row(at.PROBED)[:, None] != 0.0)
         if threat.knowledge == "grey":
             view = view._replace(control=self.row(at.U)[:, None, None].copy())
         if threat.sees_measurement:
@@ -155,13 +183,17 @@ class Lanes:
         behind = (
             BehindState(self.row(at.REAR_X).copy(), self.row(at.REAR_V).copy(), nothing, nothing) if self.constants.f[of.REAR] else None
         )
-        state = FollowingState(self.row(at.LEAD_X).copy(), self.row(at.LEAD_V).copy(), self.stack(at.EGO, 3), behind)
+        x, v, own = self.row(at.LEAD_X).copy(), self.row(at.LEAD_V).copy(), self.stack(at.EGO, 3)
+        state = RadarState(x, v, self.row(at.LEAD_A).copy(), own, behind) if self.aired else FollowingState(x, v, own, behind)
         return self.loop.plant.scene(self.loop.plan.plant, state)
 
     def _received(self) -> Received:
-        sent = self.stack(at.SENT, LINKS)
+        sent = self.stack(at.SENT, len(self.wires) - 1)  # all but the actuator
         y = sent[..., :SENSORS]
-        return Received(y, np.ones(y.shape, bool), np.zeros(y.shape[:2]), sent[..., SENSORS:])
+        if not self.aired:
+            return Received(y, np.ones(y.shape, bool), np.zeros(y.shape[:2]), sent[..., SENSORS:])
+        valid = np.repeat(self.row(at.HEARS)[:, None, None] != 0.0, SENSORS, axis=2)
+        return Received(y, valid, self.row(at.ENERGY)[:, None].copy(), sent[..., SENSORS:])
 
 
 def not_finite() -> InputError:

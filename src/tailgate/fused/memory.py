@@ -7,7 +7,7 @@ import numpy as np
 from tailgate.core import Array
 
 from . import constants as of
-from .rows import LANES, ROWS, STATE, WIRES, WORDS
+from .rows import LANES, RADAR_STATE, ROWS, STATE, WIRES, WORDS
 from .script import PLACES
 
 _orders: list[str] = []
@@ -64,7 +64,8 @@ class Memory:
 
     def __init__(self, batch: int, c: Array, f: Array, table: Array, window: int, intents: int, threads: int) -> None:
         blocks, actions = -(-batch // LANES), int(f[of.ACTIONS])
-        deep = ROWS if blocks <= FEW else STATE  # many blocks share one place to work at, which stays in the cache
+        kept = RADAR_STATE if f[of.AIRED] else STATE
+        deep = ROWS if blocks <= FEW else kept  # many blocks share one place to work at, which stays in the cache
         sizes = {
             AT_ROWS: blocks * deep * LANES, AT_WINDOW: blocks * window * LANES, AT_INTENT: blocks * intents * LANES, AT_C: len(c),
             AT_TABLE: len(table), AT_SCRIPT: PLACES, AT_ASKED: 0 if actions else ASKED * batch, AT_ACTION: actions * batch,

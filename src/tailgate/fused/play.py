@@ -16,7 +16,7 @@ from . import script
 from .build import Constants
 from .lanes import Lanes
 from .memory import LEAST, SCRIPTED
-from .rows import LANES, LINKS, SENSORS, WIRES
+from .rows import LANES, LINKS, SENSORS, WIRES, wires_of
 
 _GROUPS: dict[str, tuple[np.uint64, int]] = {  # what a step leaves, and in how many rows
     "lead_x": (at.LEAD_X, 1), "lead_speed": (at.LEAD_V, 1), "ego": (at.EGO, 3), "rear_x": (at.REAR_X, 1), "rear_v": (at.REAR_V, 1),
@@ -25,16 +25,25 @@ _GROUPS: dict[str, tuple[np.uint64, int]] = {  # what a step leaves, and in how 
     "target": (at.TARGET, WIRES), "alarm": (at.ALARM, 1), "mode": (at.MODE, 1), "refused": (at.REFUSED, 1), "hit": (at.HIT, 1),
     "rear_hit": (at.REAR_HIT, 1),
 }  # fmt: skip
-COLUMNS = np.concatenate([[int(row) + LANES * j for j in range(width)] for row, width in _GROUPS.values()]).astype(np.uint64)
+_RADAR_GROUPS = _GROUPS | {"own": (at.OWN, 1), "told": (at.TOLD, 1), "energy": (at.HEARD, 1), "probe": (at.PROBE, 1)}
+
+
+def _groups(f: Array) -> dict[str, tuple[np.uint64, int]]:
+    return _RADAR_GROUPS if f[of.AIRED] else _GROUPS
+
+
+def columns(f: Array) -> Array:
+    """The rows that are recorded of every step."""
+    return np.concatenate([[int(row) + LANES * j for j in range(width)] for row, width in _groups(f).values()]).astype(np.uint64)
 
 
 class Recorded:
     """A record (K, columns, B) by name."""
 
-    def __init__(self, record: Array) -> None:
+    def __init__(self, record: Array, f: Array) -> None:
         first = 0
         self.held: dict[str, Array] = {}
-        for name, (_, width) in _GROUPS.items():
+        for name, (_, width) in _groups(f).items():
             self.held[name] = np.moveaxis(record[:, first : first + width], 1, 2)[:, :, None, :]
             first += width
 
@@ -49,11 +58,11 @@ class Recorded:
 
 def signals(record: Array, f: Array) -> dict[str, Array]:
     """The signals of a Trace from a record (K, columns, B)."""
-    kept = Recorded(record)
+    kept = Recorded(record, f)
     one, wide, ego = kept.one, kept.wide, kept.wide("ego")
     x, v = ego[..., 0], ego[..., 1]
     rear_gap, rear_v = (x - one("rear_x"), one("rear_v")) if f[of.REAR] else (np.full_like(x, np.inf), v)
-    return {
+    out = {
         "gap": one("lead_x") - x, "speed": v, "accel": ego[..., 2], "lead_speed": one("lead_speed"), "rear_gap": rear_gap,
         "rear_speed": rear_v, "position": x, "truth": wide("truth"), "estimate": wide("estimate"), "score": one("score"),
         "clean": wide("clean"), "wires": wide("arrived"), "valid": wide("valid") != 0.0, "energy": np.zeros_like(x),
@@ -62,12 +71,20 @@ def signals(record: Array, f: Array) -> dict[str, Array]:
         "mode": one("mode").astype(np.int8), "refused": one("refused")[..., 0] != 0.0, "collided": one("hit")[..., 0] != 0.0,
         "rear_collided": one("rear_hit")[..., 0] != 0.0,
     }  # fmt: skip
+    if f[of.AIRED]:
+        mine = wires_of(3)
+        out |= {name: out[name][..., mine] for name in ("value", "target")}
+        out |= {name: out[name][..., mine[:-1]] for name in ("clean", "wires")}
+        fourth = {"truth": wide("own"), "estimate": wide("told" if f[of.MODELED] else "own")}
+        out |= {name: np.concatenate([out[name], last], axis=-1) for name, last in fourth.items()}
+        out |= {"energy": one("energy"), "probe": one("probe") != 0.0}
+    return out
 
 
 def play(loop: Loop, k: Constants, attack: Attack, keys: Keys, terminate: bool) -> tuple[Array, dict[str, Array], dict[str, Array]]:
     """-> lengths (B,), signals (K, B, ...) and the road before the first step, as `tailgate.trace.Trace` holds them."""
     plan: Any = attack.prepare(loop.brief)
-    lanes = Lanes(loop, k, keys, COLUMNS, loop.horizon)
+    lanes = Lanes(loop, k, keys, columns(k.f), loop.horizon)
     written = script.numbers(attack, plan)
     lanes.start()
     first = lanes.scene()._asdict()

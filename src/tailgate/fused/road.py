@@ -115,15 +115,9 @@ def way(s, g, c, f, table, stream, n):
 
 
 @phase
-def move(s, g, intent, c, f, stream, tick, n):
-    """Leader, follower and the driver behind, one step later; `tick` counts the steps of the block, by which the ring of intents turns."""
-    dt, load = c[of.DT], c[of.LOAD]
-    A = (
-        (c[of.OWN_A], c[of.OWN_A + 1], c[of.OWN_A + 2]), (c[of.OWN_A + 3], c[of.OWN_A + 4], c[of.OWN_A + 5]),
-        (c[of.OWN_A + 6], c[of.OWN_A + 7], c[of.OWN_A + 8]),
-    )  # fmt: skip
-    B = ((c[of.OWN_B],), (c[of.OWN_B + 1],), (c[of.OWN_B + 2],))
-    sd0, sd1, sd2 = c[of.PROCESS_SD], c[of.PROCESS_SD + 1], c[of.PROCESS_SD + 2]
+def follow(s, intent, c, f, tick, n):
+    """The driver behind, if there is one, one step later; `tick` counts the steps of the block, by which the ring of intents turns."""
+    dt = c[of.DT]
     if f[of.REAR] != 0:
         reaction = f[of.REACTION]
         if reaction > 0:
@@ -137,6 +131,19 @@ def move(s, g, intent, c, f, stream, tick, n):
             for i in range(n):
                 decided = idm_accel(s[EGO + i] - s[REAR_X + i], s[REAR_V + i], s[EGO + _1 + i])
                 s[REAR_X + i], s[REAR_V + i] = roll(s[REAR_X + i], s[REAR_V + i], decided, dt)
+
+
+@phase
+def move(s, g, intent, c, f, stream, tick, n):
+    """Leader, follower and the driver behind, one step later."""
+    dt, load = c[of.DT], c[of.LOAD]
+    A = (
+        (c[of.OWN_A], c[of.OWN_A + 1], c[of.OWN_A + 2]), (c[of.OWN_A + 3], c[of.OWN_A + 4], c[of.OWN_A + 5]),
+        (c[of.OWN_A + 6], c[of.OWN_A + 7], c[of.OWN_A + 8]),
+    )  # fmt: skip
+    B = ((c[of.OWN_B],), (c[of.OWN_B + 1],), (c[of.OWN_B + 2],))
+    sd0, sd1, sd2 = c[of.PROCESS_SD], c[of.PROCESS_SD + 1], c[of.PROCESS_SD + 2]
+    follow(s, intent, c, f, tick, n)
     normals(s, g, WORLD_KEY, stream, np.uint64(0), DRAW, n)
     normals(s, g, WORLD_KEY, stream, np.uint64(1), DRAW + _2, n)
     for i in range(n):

@@ -13,6 +13,11 @@ SENSORS, LINKS, WIRES = 2, 4, 5  # position, velocity; + the leader's, by V2V; +
 _names: list[str] = []
 
 
+def wires_of(count: int) -> list[int]:
+    """Which of the WIRES are those of a model with so many: without a leader's message the sensors are the first, the actuator the last."""
+    return [*range(count - 1), WIRES - 1]
+
+
 def _row(name: str, width: int = 1) -> np.uint64:
     first = np.uint64(LANES * len(_names))
     _names.extend([name] + [f"{name}{i}" for i in range(1, width)])
@@ -44,6 +49,12 @@ OPENED, ELAPSED, SEEN = _row("opened"), _row("elapsed"), _row("seen")  # a scrip
 OVER = _row("over")  # of a seat: the row was over before this decision
 POTENTIAL, LEAST = _row("potential"), _row("least")  # and what its reward remembers
 STATE = len(_names)  # rows of a state: what is kept of an episode between two calls
+# What a car with a radar keeps on top.
+LEAD_A = _row("lead_a")
+OWN, OWN_VAR = _row("own"), _row("own_var")  # the own speed as the filter was told it last, and its variance there
+HEARS, ENERGY = _row("hears"), _row("energy")  # of the readings SENT: whether there are any; what a silent radar heard
+PROBE, PROBED = _row("probe"), _row("probed")  # whether these readings were taken with a probe, and those before them
+RADAR_STATE = len(_names)
 
 # What a step computes on its way.
 SCORE, ALARM = _row("score"), _row("alarm")
@@ -79,8 +90,19 @@ LIVE, RAW, BEFORE = _row("live"), _row("raw"), _row("before")  # of a seat: this
 EARNED, PART = _row("earned"), _row("part")  # this step's pay, and a part of it
 ANY_REFUSED, ANY_HIT, ANY_REAR = _row("any_refused"), _row("any_hit"), _row("any_rear")
 LEFT_OVER, ATTACKING, ZERO, INFINITE = _row("left_over"), _row("attacking"), _row("zero"), _row("infinite")  # of an observation
+POWER, DELAY = _row("power"), _row("delay")  # radiated at a radar
+BEAT, SNR, DEALT = _row("beat", 2), _row("snr"), _row("dealt", 4)  # how it measures: beats, signal over noise, uniforms
+UNDER, UNDER_HEARS, UNDER_ENERGY = _row("under", SENSORS), _row("under_hears"), _row("under_energy")  # what it reads under that
+LAST_POWER, LAST_DELAY, LAST = _row("last_power"), _row("last_delay"), _row("last", SENSORS)  # of an observation: what was sent last
+NOISE, SILENT = _row("noise", SENSORS), _row("silent")  # by how much readings are off, and whether there are none
+HEARD = _row("heard_now")  # what it heard in this step
+MUTED, BACK, CALM = _row("muted"), _row("back"), _row("calm")  # of a challenge: whether there is one; whether it fails, and passes
+FORMER, MOVED, AGE, CUSUM = _row("former"), _row("moved"), _row("age"), _row("cusum", 4)  # of its regression; the speed before, and the way
+AT_STOP, HALTED, FORESEEN, CHANGED = _row("at_stop"), _row("halted"), _row("foreseen", SENSORS), _row("changed")
+FORMER_VAR, OWN_COV, TOLD = _row("former_var"), _row("own_cov", 3), _row("told")  # of a mixture: of the own speed; what is made of it
+ASIDE = _row("aside", 2)  # two numbers that change places
 ROWS = len(_names)
 
 # Whole numbers, in an array of their own: what the random numbers are drawn by.
-WORLD_KEY, ATTACK_KEY, EPISODE, STEP = (np.uint64(LANES * i) for i in range(4))
-WORDS = 4
+WORLD_KEY, ATTACK_KEY, EPISODE, STEP, DEFENCE_KEY = (np.uint64(LANES * i) for i in range(5))
+WORDS = 5

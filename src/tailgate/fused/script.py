@@ -6,10 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from tailgate.agents import scripted
+from tailgate.agents import radio, scripted
 from tailgate.agents.model_based import Stealth
 from tailgate.agents.triggers import Closing, Fast, LeaderBraking, Near, Slow, Trigger
-from tailgate.core import Array, Kind
+from tailgate.agents.values import FAINTEST
+from tailgate.core import AIRED, Array, Kind
 from tailgate.draws import Role
 from tailgate.elementwise import clip
 
@@ -33,6 +34,7 @@ from .rows import (
     WANT_VALUE,
     WIRES,
     K,
+    wires_of,
 )
 
 # A script as numbers: what each place of the array holds.
@@ -40,7 +42,8 @@ WHEN, THRESHOLD, BEGIN, WINDOW, ON_FOR, OFF_FOR, CHANCE = range(7)
 WHAT, LAW, FIRST, SECOND, LIMIT, HIT, TURN = range(7, 14)
 AIM, SIGN = 14, 19  # five places each: the wires, and a factor for each
 PUSHED, TOWARDS, GATE = 24, 25, 26  # of the white-box attack: a state, a sign, and a gate; NaN: the defence's own
-PLACES = 27
+MOST, HOPS = 27, 28  # over the air: the most that may be sent; whether only after a probe that was heard
+PLACES = 29
 TIME, NEAR, CLOSING, FAST, SLOW, LEADER_BRAKING = range(6)
 NOTHING, CONSTANT, UNIFORM, GAUSSIAN, RAMP, STEALTH = range(6)
 
@@ -48,10 +51,10 @@ _WHEN = {Trigger: TIME, Near: NEAR, Closing: CLOSING, Fast: FAST, Slow: SLOW, Le
 _ATTACK = np.uint64(int(Role.ATTACK) << 16)
 _CHANCE = np.uint64(int(Role.ATTACK) << 16 | scripted.CHANCE)
 _1 = np.uint64(LANES)
-_JAM, _FDI = float(Kind.DOS_JAM), float(Kind.FDI)
+_JAM, _FDI, _AIRED = float(Kind.DOS_JAM), float(Kind.FDI), float(min(AIRED))
 _LANES = {
     scripted.NoAttack, scripted.Jam, scripted.Hold, scripted.Dropout, scripted.Inject, scripted.InjectGaussian, scripted.InjectBernoulli,
-    scripted.InjectRamp, scripted.InjectThenJam, scripted.InjectUniform, Stealth,
+    scripted.InjectRamp, scripted.InjectThenJam, scripted.InjectUniform, Stealth, radio.NoiseJam, radio.EchoDelay, radio.EchoPullOff,
 }  # fmt: skip
 
 
@@ -70,7 +73,7 @@ def numbers(attack: Any, plan: Any) -> Array | None:
     if type(attack) is scripted.NoAttack:
         p[BEGIN] = np.inf
         return p
-    kind = type(attack)
+    kind, threat, mine = type(attack), plan.brief.threat, np.array(wires_of(plan.target.shape[1]))
     if kind is scripted.Jam:
         p[WHAT], p[LAW], p[FIRST], p[SECOND] = Kind.DOS_JAM, UNIFORM, attack.low, attack.high
     elif kind is scripted.Hold:
@@ -79,7 +82,7 @@ def numbers(attack: Any, plan: Any) -> Array | None:
         p[WHAT], p[HIT] = Kind.DROPOUT, attack.probability
     elif kind is scripted.Inject:
         p[WHAT], p[LAW], p[FIRST] = Kind.FDI, CONSTANT, attack.value
-        p[SIGN : SIGN + WIRES] = 1.0 if plan.extra is None else plan.extra[0]
+        p[SIGN + mine] = 1.0 if plan.extra is None else plan.extra[0]
     elif kind is scripted.InjectGaussian:
         p[WHAT], p[LAW], p[FIRST], p[SECOND] = Kind.FDI, GAUSSIAN, attack.mean, attack.sd
     elif kind is scripted.InjectBernoulli:
@@ -90,15 +93,22 @@ def numbers(attack: Any, plan: Any) -> Array | None:
         p[WHAT], p[LAW], p[FIRST], p[TURN] = Kind.FDI, CONSTANT, attack.value, attack.inject
     elif kind is scripted.InjectUniform:
         p[WHAT], p[LAW], p[FIRST], p[SECOND] = Kind.FDI, UNIFORM, attack.low, attack.high
+    elif kind is radio.NoiseJam:
+        p[WHAT], p[LAW], p[FIRST], p[MOST] = Kind.NOISE_JAM, CONSTANT, attack.power, threat.jam_power
+    elif kind is radio.EchoDelay:
+        p[WHAT], p[LAW], p[FIRST], p[MOST] = Kind.ECHO_DELAY, CONSTANT, attack.delay, threat.delay_bound
+    elif kind is radio.EchoPullOff:
+        p[WHAT], p[LAW], p[FIRST], p[SECOND], p[LIMIT] = Kind.ECHO_DELAY, RAMP, attack.base, attack.rate, threat.delay_bound
+        p[MOST] = threat.delay_bound
     else:
         p[WHAT], p[LAW], p[PUSHED], p[TOWARDS] = Kind.FDI, STEALTH, attack.state_index, attack.sign
         p[GATE] = np.nan if attack.gate is None else attack.gate
     when = attack.when
-    p[WHEN], p[THRESHOLD], p[BEGIN] = _WHEN[type(when)], getattr(when, "threshold", 0.0), max(when.start, plan.brief.threat.onset)
+    p[WHEN], p[THRESHOLD], p[BEGIN] = _WHEN[type(when)], getattr(when, "threshold", 0.0), max(when.start, threat.onset)
     p[WINDOW] = np.inf if when.window is None else when.window
     p[ON_FOR], p[OFF_FOR] = (np.inf, 0.0) if attack.burst is None else (attack.burst, attack.pause)
     p[CHANCE] = attack.chance
-    p[AIM : AIM + WIRES] = plan.target[0]
+    p[AIM + mine], p[HOPS] = plan.target[0], getattr(attack, "hop", False)
     return p
 
 
@@ -129,8 +139,8 @@ def _when(s, c, p, n):
 
 
 @phase
-def decide(s, g, window, c, f, p, n):
-    """The command of the script into the rows WANT_*. -> whether there is any."""
+def ready(s, c, p, n):
+    """Row ON: who is attacked now, with no command so far in the rows WANT_*. -> whether anybody is."""
     _when(s, c, p, n)
     channel.allowed(s, c, WANT_KIND, n)
     some = False
@@ -145,12 +155,21 @@ def decide(s, g, window, c, f, p, n):
         row = np.uint64(w * LANES)
         for i in range(n):
             s[WANT_TARGET + row + i] = s[WANT_VALUE + row + i] = 0.0
+    return True
+
+
+@phase
+def decide(s, g, window, c, f, p, n):
+    """The command of the script into the rows WANT_*. -> whether there is any."""
+    if not ready(s, c, p, n):
+        return False
     if p[LAW] == STEALTH:
         _push(s, window, c, f, p, n)
     else:
-        _sample(s, g, c, p, n)
+        deal(s, g, p, n)
+        sample(s, c, p, n)
     if p[CHANCE] < 1.0:
-        _spare(s, g, p[CHANCE], n)
+        spare(s, g, p[CHANCE], n)
     return True
 
 
@@ -171,27 +190,33 @@ def _push(s, window, c, f, p, n):
 
 
 @phase
-def _sample(s, g, c, p, n):
-    """What the law of the values says."""
-    kind, law, first, second, limit, turn = p[WHAT], p[LAW], p[FIRST], p[SECOND], p[LIMIT], p[TURN]
-    hit = p[HIT]
-    if law == UNIFORM or hit < 2.0:
+def deal(s, g, p, n):
+    """The random numbers of the values and of who is hit."""
+    law = p[LAW]
+    if law == UNIFORM or p[HIT] < 2.0:
         for b in range(3):
             road.uniforms(s, g, ATTACK_KEY, _ATTACK, np.uint64(b), DRAWN + np.uint64(2 * b * LANES), n)
     elif law == GAUSSIAN:
         for b in range(3):
             road.normals(s, g, ATTACK_KEY, _ATTACK, np.uint64(b), DRAWN + np.uint64(2 * b * LANES), n)
+
+
+@phase
+def sample(s, c, p, n):
+    """What the law of the values says."""
+    kind, law, first, second, limit, turn = p[WHAT], p[LAW], p[FIRST], p[SECOND], p[LIMIT], p[TURN]
+    hit, airs = p[HIT], p[WHAT] >= _AIRED
+    spans = kind == _JAM or airs
     for w in range(WIRES):
         row, aim, sign = np.uint64(w * LANES), p[AIM + w], p[SIGN + w]
-        bound, low, high = c[of.BOUND + w], c[of.LOW + w], c[of.HIGH + w]
+        bound, low, high = c[of.BOUND + w], FAINTEST if airs else c[of.LOW + w], p[MOST] if airs else c[of.HIGH + w]
         for i in range(n):
             count, u = s[ELAPSED + i] - 1.0, s[DRAWN + row + i]
             value = first
             value = first + (second - first) * u if law == UNIFORM else value
             value = first + second * u if law == GAUSSIAN else value
             value = clip(first + second * (count + 1.0), -limit, limit) if law == RAMP else value
-            jams = (kind == _JAM) | (count >= turn)
-            value = clip(value, low, high) if jams else clip(value, -bound, bound)
+            value = clip(value, low, high) if spans | (count >= turn) else clip(value, -bound, bound)
             on = (s[ON + i] != 0.0) & (aim != 0.0) & ((hit >= 2.0) | (u < hit))
             s[WANT_TARGET + row + i] = on
             s[WANT_VALUE + row + i] = value * sign if on & (law != NOTHING) else 0.0
@@ -199,7 +224,7 @@ def _sample(s, g, c, p, n):
 
 
 @phase
-def _spare(s, g, chance, n):
+def spare(s, g, chance, n):
     """Without luck nothing is sent."""
     road.uniforms(s, g, ATTACK_KEY, _CHANCE, np.uint64(0), DRAWN, n)
     for i in range(n):

@@ -6,6 +6,7 @@ import numpy as np
 
 from tailgate.agents import reward
 from tailgate.agents.reward import NEAR
+from tailgate.agents.values import FAINTEST
 from tailgate.elementwise import clip
 from tailgate.kinds import Kind
 
@@ -86,13 +87,15 @@ def decode(s, c, f, action, first, n):
         for i in range(n):
             row = of.TABLE + of.MODE_WIDTH * np.int64(action[first + i, 0])
             wanted, sign = c[row], c[row + 1]
-            ramps = (kind == of.RAMPING) & (wanted == _FDI) & (s[KIND + i] == _FDI)
+            delays = wanted == channel.ECHO_DELAY
+            ramps = (kind == of.RAMPING) & ((wanted == _FDI) | delays) & (s[KIND + i] == wanted)
             s[WANT_KIND + i] = wanted
             for w in range(WIRES):
                 at = np.uint64(w * LANES) + i
                 aimed, value = c[row + 2 + w], c[row + 7 + w]
                 if ramps:
-                    value = clip(s[VALUE + at] + rate * sign, -c[of.BOUND + w], c[of.BOUND + w])
+                    low, high = FAINTEST if delays else -c[of.BOUND + w], c[of.LATEST] if delays else c[of.BOUND + w]
+                    value = clip(s[VALUE + at] + rate * sign, low, high)
                 s[WANT_TARGET + at] = aimed
                 s[WANT_VALUE + at] = value if aimed != 0.0 else 0.0
         return True
@@ -116,11 +119,11 @@ def decode(s, c, f, action, first, n):
 @phase
 def potential(s, c, believed, out, n):
     """The reward's potential of the gap, and with `believed` of what the car believes that it has on top, into row `out`."""
-    gap_shaping, error_shaping = c[of.GAP_SHAPING], c[of.ERROR_SHAPING]
+    gap_shaping, error_shaping, sign = c[of.GAP_SHAPING], c[of.ERROR_SHAPING], c[of.BELIEF]
     for i in range(n):
         gap = s[LEAD_X + i] - s[EGO + i]
         near = closeness(gap)
-        belief = 0.0 + -1.0 * (s[X + i] - s[TRUTH + i]) if believed else 0.0
+        belief = 0.0 + sign * (s[X + i] - s[TRUTH + i]) if believed else 0.0
         s[out + i] = gap_shaping * near + error_shaping * (fooled(belief) + 0.0)
 
 
@@ -153,6 +156,7 @@ def alive(s, c, n):
 def pay(s, c, f, n):
     """After a step of it: its reward, and what happened."""
     kind, illegal, cost, scale, dt, horizon = f[of.REWARD], c[of.ILLEGAL], c[of.COST], c[of.REWARD_SCALE], c[of.DT], c[of.HORIZON]
+    sign = c[of.BELIEF]
     for i in range(n):
         s[EARNED + i] = -illegal * s[REFUSED + i] - cost * (1.0 if s[KIND + i] != 0.0 else 0.0)
     if kind == of.CRASH or kind == of.MIN_GAP:
@@ -165,7 +169,7 @@ def pay(s, c, f, n):
             s[EARNED + i] += s[PART + i] / NEAR
     else:
         for i in range(n):
-            s[PART + i] = abs(0.0 + -1.0 * (s[X + i] - s[TRUTH + i])) / scale
+            s[PART + i] = abs(0.0 + sign * (s[X + i] - s[TRUTH + i])) / scale
         if kind == of.FINAL:
             for i in range(n):
                 s[EARNED + i] += s[PART + i] * s[PART + i] if s[K + i] - 1.0 == horizon else 0.0

@@ -69,8 +69,8 @@ def move_and_measure(s, g, intent, c, f, table, tick, n):
 
 
 @phase
-def start(s, g, window, intent, c, f, table, tick, n):
-    """Fresh episodes at k = 1, measured: keys and episode numbers stand in g."""
+def clear(s, g, window, intent, c, n):
+    """What is zero before the first step, and the leader."""
     for i in range(n):
         g[STEP + i] = _PRIOR_STEP
         s[K + i] = s[ENDED + i] = s[LEFT + i] = s[SCORE + i] = s[ALARM + i] = s[MODE + i] = 0.0
@@ -91,6 +91,12 @@ def start(s, g, window, intent, c, f, table, tick, n):
         row = np.uint64(j * LANES)
         for i in range(n):
             intent[row + i] = 0.0
+
+
+@phase
+def start(s, g, window, intent, c, f, table, tick, n):
+    """Fresh episodes at k = 1, measured: keys and episode numbers stand in g."""
+    clear(s, g, window, intent, c, n)
     road.normals(s, g, WORLD_KEY, _PRIOR, np.uint64(0), DRAW, n)
     road.normals(s, g, WORLD_KEY, _PRIOR, np.uint64(1), DRAW + _2, n)
     for j in range(3):
@@ -108,24 +114,30 @@ def start(s, g, window, intent, c, f, table, tick, n):
         monitor.begin(window, c, n)
     for i in range(n):
         s[REAR_X + i], s[REAR_V + i] = s[EGO + i] - c[of.REAR_START], c[of.REAR_START + 1]
-    _begin(s, g, c, f, n)
+    begin_way(s, g, c, f, n)
     for i in range(n):
         s[K + i] = 0.0
         g[STEP + i] = np.uint64(0)
         s[SENT + i], s[SENT + _1 + i], s[SENT + _2 + i] = 0.0 + s[X + i], 0.0 + s[X + _1 + i], s[LEAD_X + i]
         s[SENT + _2 + _1 + i] = s[LEAD_V + i]
     road.control(s, SENT + _2, c, n)
-    for j in range(WIRES):
-        row = np.uint64(j * LANES)
-        for i in range(n):
-            s[TARGET + row + i] = s[VALUE + row + i] = 0.0
-            s[HELD + row + i] = s[FRESH + row + i] = s[SENT + row + i] if j < LINKS else s[U + i]
+    take_hold(s, n)
     channel.pass_on(s, n)
     move_and_measure(s, g, intent, c, f, table, tick, n)
 
 
 @phase
-def _begin(s, g, c, f, n):
+def take_hold(s, n):
+    """What the channel keeps of the readings that are expected and of the first command, and that nothing is attacked."""
+    for j in range(WIRES):
+        row = np.uint64(j * LANES)
+        for i in range(n):
+            s[TARGET + row + i] = s[VALUE + row + i] = 0.0
+            s[HELD + row + i] = s[FRESH + row + i] = s[SENT + row + i] if j < LINKS else s[U + i]
+
+
+@phase
+def begin_way(s, g, c, f, n):
     """What the manoeuvre remembers at first."""
     kind, p = f[of.WAY], of.WAY_PARAM
     if kind == of.SINE:
@@ -160,11 +172,7 @@ def advance(s, g, window, intent, c, f, table, tick, asked, n):
         if f[of.BOXED] != 0:
             monitor.enclose(s, window, c, n)
         else:
-            kalman.detect(s, window, c, f, n)
-            kalman.suspect(s, c, f, n)
-            kalman.mitigate(s, c, f, n)
-            if f[of.MITIGATION] == of.REACQUIRE and kalman.forget(s, c, n):
-                kalman.innovation(s, c, of.RNOISE, n)
+            kalman.weigh(s, window, c, f, n)
         if f[of.ROBUST] != 0:
             kalman.take_out(s, c, f, n)
         kalman.update(s, f, n)
