@@ -1,6 +1,7 @@
 """The fused engine against the plain loop: the same bits, lane by lane and over a covering set of pairs, over whole episodes."""
 
 import dataclasses
+import hashlib
 import os
 import subprocess
 import sys
@@ -339,3 +340,64 @@ def test_a_calm_road_does_not_slow_down():
         lanes.run(SCRIPTED, 1000)
         took.append(time.process_time() - started)
     assert min(took[5:]) < 3.0 * min(took[:5])
+
+
+def _kernel_is_kept():
+    from tailgate.fused import kernel
+
+    assert kernel.run.entry
+    return any((folder / kernel.run._file).is_file() for folder in compiled._folders())
+
+
+def test_an_environment_starts_without_numba_and_scipy_where_the_code_is_kept():
+    """Their import takes longer than all the rest; nor are modules of estimators imported that nobody asked for."""
+    if not _kernel_is_kept():
+        pytest.skip("no folder to keep machine code in")
+    code = """
+import sys
+import gymnasium
+env = gymnasium.make("tailgate:tailgate/CarFollowing-v0")
+env.reset(seed=0)
+env.step(0)
+print([name for name in ("numba", "scipy", "torch", "tailgate.estimators.lasso", "tailgate.envs.radar") if name in sys.modules])
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.stdout.strip() == "[]", done.stdout + done.stderr
+
+
+def test_broken_machine_code_counts_as_none(monkeypatch, tmp_path):
+    """Half a file, somebody else's, and code that calls what this process does not have: compiled anew, and no crash."""
+    from tailgate.fused import kernel
+
+    held = compiled.Kernel(kernel.run.py_func)
+    monkeypatch.setattr(compiled, "_folders", lambda: iter([tmp_path]))
+    assert held._loaded is None
+    for content in (b"", b"junk", b"symbol\njunk", b"symbol digest\njunk", f"symbol {hashlib.blake2b(b'junk').hexdigest()}\njunk".encode()):
+        (tmp_path / held._file).write_bytes(content)
+        assert held._loaded is None
+    if _kernel_is_kept():
+        monkeypatch.undo()
+        (path, *_) = [path for folder in compiled._folders() if (path := folder / held._file).is_file()]
+        head, _, code = path.read_bytes().partition(b"\n")
+        monkeypatch.setattr(compiled, "_folders", lambda: iter([tmp_path]))
+        for content in (head + b"\n" + code[:-1], b"another_" + head + b"\n" + code):
+            (tmp_path / held._file).write_bytes(content)
+            assert held._loaded is None
+
+
+def test_what_an_environment_returned_stays_as_it_is():
+    """Arrays of a step belong to who asked for it: no later step or reset writes into them."""
+    for env in (AdversaryEnv(), AdversaryVectorEnv(3), AdversaryVectorEnv(3, autoreset="same_step")):
+        single, held = isinstance(env, AdversaryEnv), []
+        for t in range(30):
+            if t in (0, 7, 8, 19):
+                seen, info = env.reset(seed=t if t != 8 else None)
+                arrays = [seen, *info.values()]
+            else:
+                seen, reward, *ends, info = env.step(1 if single else np.ones(3, np.int64))
+                arrays = [seen, reward, *ends, *info.values()]
+            arrays = [x for x in arrays if isinstance(x, np.ndarray)]
+            held.append((arrays, [x.copy() for x in arrays]))
+        for arrays, copies in held:
+            for x, y in zip(arrays, copies, strict=True):
+                np.testing.assert_array_equal(x, y)

@@ -1,8 +1,10 @@
 """Names to components: specs as text, nearest names, plug-ins, and data that is the same for the same parameters."""
 
 import dataclasses
+import importlib
 import json
 import pickle
+import re
 import sys
 import textwrap
 from dataclasses import dataclass
@@ -259,3 +261,17 @@ def test_a_parameter_without_a_value_is_no_module(text):
     """The name is registered, so what follows it should have been key=value."""
     with pytest.raises(InputError, match="chi2_kf:key=value"):
         Spec("defence", text).make()
+
+
+def test_every_built_in_component_is_found_in_its_own_module():
+    """By the text of the module, so that no other has to be imported; and a package gives what it says."""
+    for family in registry._MODULES:
+        for name, entry in entries(family).items():
+            package, _, module = entry.cls.__module__.rpartition(".")
+            if package == registry._MODULES[family]:
+                said = [m for m, text in registry._sources(package).items() if re.search(rf'register\(\s*"{family}",\s*"{name}"', text)]
+                assert said == [module], (family, name)
+    for package in map(importlib.import_module, set(registry._MODULES.values())):
+        assert all(hasattr(package, name) for name in package.__all__)
+        with pytest.raises(AttributeError, match="has no attribute 'nothing'"):
+            _ = package.nothing

@@ -33,7 +33,7 @@ LINES: tuple[Line, ...] = (
     Line("filterpy", "filterpy's Kalman filter, predict and update", peers.filterpy_kalman, of="updates", ours=False),
     Line("cores-1", "whole step, car following, 4096 episodes in 1 thread, wall time", partial(ours.on_cores, MANY, 1)),
     Line("cores-2", "whole step, car following, 4096 episodes in 2 threads, wall time", partial(ours.on_cores, MANY, 2), cores=2),
-    Line("cores-2-unequal", "numbers that differ between one thread and two", ours.unequal, NUMBER, "numbers", most=1),
+    Line("cores-2-unequal", "bytes that differ between one thread and two", ours.unequal, NUMBER, "bytes", most=1),
     Line("rkf", "robust KF update, 2 sensors, 4096 at once", partial(problems.robust_updates, MANY), of="updates"),
     Line("cvxpy-rkf", "robust KF update by cvxpy, 2 sensors", problems.robust_by_cvxpy, of="updates", ours=False),
     Line("norm", "(5.8), 14 sensors, 20 states, 4096 at once", partial(problems.ours, "norm", MANY), of="problems"),

@@ -100,10 +100,12 @@ class Cockpit(Lanes):
         self.memory.places[AT_PAID : AT_MASK + 1] = [first + start for start in self._starts]
         self.paid, self.count, self.seen, self.flags, self.mask = (np.ndarray(*part, buffer, at) for part, at in self._parts)
 
-    def run(self, *arguments: Any, **orders: Any) -> int:
+    def run(self, how: int, steps: int, *arguments: Any, **orders: Any) -> int:
         self._turn()
+        if not steps:  # no decision: it brought nothing
+            self._sheet[:] = 0
         self._shared, self._asked = True, ()
-        return super().run(*arguments, **orders)
+        return super().run(how, steps, *arguments, **orders)
 
     def begin(self) -> None:
         """All episodes begin."""

@@ -140,11 +140,13 @@ class Kernel:
 
     @property
     def _loaded(self) -> Any:
-        """From machine code that is kept; None where none is, or none that can be linked."""
+        """From machine code that is kept; None where none is, or none that is whole and can be linked."""
         for folder in _folders():
             with contextlib.suppress(OSError, ValueError, RuntimeError):
-                symbol, _, code = (folder / self._file).read_bytes().partition(b"\n")
-                return _linked(symbol.decode(), code)
+                head, _, code = (folder / self._file).read_bytes().partition(b"\n")
+                symbol, whole = head.decode().split()
+                if whole == hashlib.blake2b(code).hexdigest():
+                    return _linked(symbol, code)
         return None
 
     def _made(self) -> Any:
@@ -156,7 +158,7 @@ class Kernel:
         code = made._library.serialize_using_object_code()[2][0]
         for folder in _folders():
             with contextlib.suppress(InputError):
-                write_atomic(folder / self._file, made.native_name.encode() + b"\n" + code)
+                write_atomic(folder / self._file, f"{made.native_name} {hashlib.blake2b(code).hexdigest()}\n".encode() + code)
                 for old in sorted(folder.glob("kernel-*.o"), key=lambda path: path.stat().st_mtime)[:-KEPT]:
                     remove(old)
                 break
@@ -201,6 +203,6 @@ def _linked(symbol: str, code: bytes) -> Any:
     linker, builder = llvm.create_lljit_compiler(suppress_errors=True), llvm.JITLibraryBuilder()
     for name in _RAISING:
         builder.import_symbol(name, ctypes.cast(ctypes.CDLL(None).abort, ctypes.c_void_p).value)
-    library = builder.add_object_img(code).add_current_process().export_symbol(symbol).link(linker, symbol)
+    library = builder.add_object_img(code).add_current_process().export_symbol(symbol).link(linker, "kernel")
     _linked_so_far.append((linker, library))
     return _callable(library[symbol])
