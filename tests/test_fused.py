@@ -157,6 +157,24 @@ def test_an_environment_is_the_plain_one_to_the_last_bit(arguments, tmp_path):
     assert ended >= 5 and np.array_equal(one.episode, two.episode)
 
 
+def test_a_masked_reset_leaves_rows_that_wait_for_their_next_episode_alone(tmp_path):
+    """All rows are over at the horizon; the one that is reset begins, the others do so at their next step."""
+    text = tmp_path / "short.yaml"
+    text.write_text(_short("stop-and-go-v0"))
+    seen = []
+    for engine in ("fused", "plain"):
+        env = AdversaryVectorEnv(6, engine=engine, scenario=str(text), defence="kf", autoreset="next_step")
+        env.reset(seed=3)
+        for _ in range(60):
+            *_, over, _ = env.step(np.zeros(6, np.int64))
+        assert over.all()
+        env.reset(seed=[8, *[None] * 5], options={"reset_mask": np.arange(6) == 0})
+        observed, *_, info = env.step(np.zeros(6, np.int64))
+        assert info["step"].tolist() == [2, 1, 1, 1, 1, 1]
+        seen.append(observed)
+    _same(*seen)
+
+
 @pytest.mark.parametrize("action", ["mode", "continuous"])
 def test_a_single_environment_is_a_batch_of_one(action):
     """The short way through a single environment gives the results, types and errors of the long one."""

@@ -9,7 +9,7 @@ from tailgate.fused import Constants, Refused, fuse
 from tailgate.fused.lanes import Lanes
 from tailgate.registry import Spec
 from tailgate.scenario import load_scenario
-from tailgate.trace import rollout
+from tailgate.trace import nearest, rollout
 
 from .test_fused import _loop, _same, _short
 
@@ -123,6 +123,18 @@ def test_an_environment_is_the_plain_one_to_the_last_bit(arguments, tmp_path):
             one.episodes.put(kept)
             one.observed = two.observed.copy()
     assert ended >= rows and np.array_equal(one.episode, two.episode)
+
+
+def test_the_smallest_gaps_are_those_of_the_trace():
+    """Without a trace, in front and behind."""
+    loop, rival = _loop("radar-following-v0", "cra", "echo_delay:trigger=near,threshold=60,delay=60", horizon=240)
+    keys = draws.keys("report", range(67))
+    length, gaps = nearest(loop, rival, keys)
+    trace = rollout(loop, rival, keys, plain=True)
+    assert np.array_equal(length, trace.length) and (length < 240).any()
+    for name in ("gap", "rear_gap"):
+        least = np.where(trace.live, trace.signals[name][..., 0], np.inf).min(axis=0)
+        assert np.array_equal(gaps[name], least)
 
 
 def test_threads_and_blocks_change_no_bit():
