@@ -176,7 +176,10 @@ class DistributedFilter(LinearFilter):
         if plan.held is not None:
             assert plan.L is not None and plan.merge is not None
             return KalmanState(num.predicted(plan.A, plan.B, plan.c, plan.L, plan.merge, plan.hears, state.x, known_u), None)
-        return self.fuse(plan, self.forecast(plan, state, known_u), self.spread(plan, state))
+        x, P = self.forecast(plan, state, known_u), one_row(state.P)
+        if len(P) < len(x):
+            return self.fuse(plan, x, self.spread(plan, state))
+        return KalmanState(*num.fused(plan.hears, x, P, step=(plan.A, plan.Q)))
 
     def forecast(self, plan: FusionPlan, state: Any, known_u: Array) -> Array:
         """A xh_j + B u_j + c (B, N, n): what each agent sends."""
@@ -200,22 +203,21 @@ class DistributedFilter(LinearFilter):
             z = num.apply(plan.L, x)
             out = KalmanState(num.apply(plan.merge, gather(plan.heard, z)), None)
             return out if weight is None else self._reweigh(plan, out, z, weight)
-        degree = np.array([[float(len(near)) for near in plan.heard]])
-        alike = np.ones(degree.shape, bool) if weight is None else even(plan.heard, weight)
-        if len(M) < len(x) and alike.all():  # one covariance for all rows
+        alike = None if weight is None else even(plan.heard, weight)
+        if len(M) < len(x) and (alike is None or alike.all()):  # one covariance for all rows
             L = num.inverse(M)
             Qinv, z = num.zeros(L.shape), gather(plan.heard, num.matvec(L, x))
             for i, near in enumerate(plan.heard):
                 Qinv[:, i] = num.inverse(_sum(L, near) / len(near))
                 z[:, i] = z[:, i] / len(near)
             return KalmanState(num.matvec(Qinv, z), np.broadcast_to(Qinv, (len(x), *Qinv.shape[1:])))
-        share, total = np.ones((1, *plan.hears.shape)), degree
-        if weight is not None:
-            share, total = np.where(alike[..., None], 1.0, weight), num.zeros(alike.shape)
-            for i, near in enumerate(plan.heard):
-                for j in near:
-                    total[:, i] += share[:, i, j]
-        return KalmanState(*num.fused(plan.hears, x, M, share, total, np.where(alike, -0.0, 0.0)))
+        if weight is None or alike is None:
+            return KalmanState(*num.fused(plan.hears, x, M))
+        share, total = np.where(alike[..., None], 1.0, weight), num.zeros(alike.shape)
+        for i, near in enumerate(plan.heard):
+            for j in near:
+                total[:, i] += share[:, i, j]
+        return KalmanState(*num.fused(plan.hears, x, M, (share, total, np.where(alike, -0.0, 0.0))))
 
     def _reweigh(self, plan: FusionPlan, out: KalmanState, z: Array, weight: Array) -> KalmanState:
         """The steady fusion of z_j = L_j x_j (B, N, n) again where an agent's weights differ from each other."""
@@ -249,7 +251,7 @@ class DistributedFilter(LinearFilter):
         r, S = innovation
         if plan.held is not None and state.P is None:
             assert plan.K is not None and plan.cross is not None
-            x = state.x + num.apply(plan.K, r)
+            x = num.apply(plan.K, r, state.x)
             b, i = np.nonzero(~accept.all(axis=-1))
             if len(b):
                 keep = accept[b, i]

@@ -46,6 +46,10 @@ def test_products_and_inverses_are_plain_loops(batch, same_bits):
     matrices, x = RNG.normal(size=(3, 5, 4)) * (RNG.uniform(size=(3, 5, 4)) < 0.6), RNG.normal(size=(batch, 3, 4))
     want = np.stack([[_ordered(matrices[n], x[b, n][:, None])[:, 0] for n in range(3)] for b in range(batch)])
     assert same_bits(num.apply(matrices, x), want)
+    base = RNG.normal(size=want.shape)
+    assert same_bits(num.apply(matrices, x, base), base + want)
+    flat = matrices[:, :2]  # fewer rows than columns
+    assert same_bits(num.apply(flat, x), want[..., :2])
     want = np.stack([[_ordered(matrices[0], x[b, n][:, None])[:, 0] for n in range(3)] for b in range(batch)])
     assert same_bits(num.apply(matrices[:1], x), want)
     wide = RNG.normal(size=(batch, 3, 4, 2))
@@ -94,11 +98,36 @@ def test_predictions_are_fused_as_by_matrices(n, batch, same_bits):
                 Q, total = Q + w[:, i, j, None, None] * L[:, j], total + w[:, i, j, None] * y[:, j]
             Qinv[:, i] = num.inverse(Q / t[:, i, None, None])
             mean[:, i] = num.matvec(Qinv[:, i], total / t[:, i, None])
-        got = num.fused(heard, x, M, w, t, np.zeros(t.shape))
+        got = num.fused(heard, x, M, (w, t, np.zeros(t.shape)))
         assert same_bits(got[0], mean) and same_bits(got[1], Qinv)
+    grown = num.fused(heard, x, num.congruent(A, spread, np.eye(n)))
+    assert all(same_bits(a, b) for a, b in zip(num.fused(heard, x, spread, step=(A, np.eye(n))), grown, strict=True))
+    assert same_bits(grown[0], num.fused(heard, x, num.congruent(A, spread, np.eye(n)), (np.ones((1, 3, 3)), heard.sum(axis=1)[None], np.zeros((1, 3))))[0])
 
 
-@pytest.mark.parametrize("q", [1, 2, 3])
+@pytest.mark.parametrize("moved", range(4))
+def test_what_is_the_same_in_all_rows_is_computed_once_and_changes_no_bit(moved, same_bits):
+    """A batch in which all rows have equal covariances but those of one agent, or of none: each row as by itself."""
+    heard, A, C, Q = np.tril(np.ones((3, 3), bool)), RNG.normal(size=(5, 5)), RNG.normal(size=(3, 2, 5)), np.eye(5)
+    heard[2, 1] = False
+    x, r, P, W = RNG.normal(size=(20, 3, 5)), RNG.normal(size=(20, 3, 2)), np.repeat(_spd(1, 3, 5), 20, axis=0), np.repeat(_spd(1, 3, 2), 20, axis=0)
+    keep, weight = np.ones((20, 3, 2)), np.ones((20, 3, 3))
+    if moved < 3:
+        P[17, moved, 0, 0] = np.nextafter(P[17, moved, 0, 0], 9e9)
+        keep[18, moved, 1], weight[19, moved, 0] = 0.0, 0.5
+    total = np.sum(weight * heard, axis=2)
+    for rows in (slice(0, 20), slice(16, 20)):
+        parts = x[rows], P[rows], (weight[rows], total[rows], np.zeros((20, 3))[rows]), (A, Q)
+        grown, fused, corrected = num.congruent(A, P[rows], Q), num.fused(heard, *parts), num.corrected(C, W[rows], *parts[:2], r[rows], keep[rows])
+        for b in range(len(x[rows])):
+            one = slice(rows.start + b, rows.start + b + 1)
+            alone = x[one], P[one], (weight[one], total[one], np.zeros((1, 3))), (A, Q)
+            assert same_bits(grown[b : b + 1], num.congruent(A, P[one], Q))
+            for many, single in ((fused, num.fused(heard, *alone)), (corrected, num.corrected(C, W[one], *alone[:2], r[one], keep[one]))):
+                assert all(same_bits(got[b : b + 1], want) for got, want in zip(many, single, strict=True))
+
+
+@pytest.mark.parametrize("q", [1, 2, 3, 7])
 @pytest.mark.parametrize("batch", BATCHES)
 def test_a_correction_is_that_of_matrices(q, batch, same_bits):
     C, inverse, x, before = RNG.normal(size=(3, q, 5)), _spd(batch, 3, q), RNG.normal(size=(batch, 3, 5)), _spd(batch, 3, 5)

@@ -1,91 +1,17 @@
-"""Compiled kernels of matrices that take eight episodes at a time, each in a lane of a vector of the processor.
+"""Compiled kernels of matrices that take eight episodes at a time, each in a lane of a vector of the processor (`tailgate.vector`).
 
-Eight numbers are one for numba: + - * / of them are one instruction where the processor has one that wide, else two or four. To
-vectorise a loop over a batch is left to the compiler, which does it along the wrong index, or not at all, where matrices are small; here it
-has no choice. Lanes do not mix, so that what a row of a batch gets does not depend on the others. Where eight does not divide a batch, the
-last lanes repeat its last row.
-
-As in `tailgate.kernels`, every sum has a fixed order and nothing is contracted.
+To vectorise a loop over a batch is otherwise left to the compiler, which does it along the wrong index, or not at all, where matrices are
+small. What a row of a batch gets does not depend on the others; where eight does not divide a batch, the last lanes repeat its last row. As
+in `tailgate.kernels`, every sum has a fixed order and nothing is contracted.
 """
-
-import operator
-from typing import Any
 
 import numba
 import numpy as np
-from llvmlite import ir
-from numba.core import types
-from numba.extending import intrinsic, lower_builtin, models, register_model, type_callable
 
-WIDTH = 8
-_VECTOR = ir.VectorType(ir.DoubleType(), WIDTH)
+from tailgate.vector import WIDTH, alike, get, put
+
 _jit = numba.njit(cache=True, fastmath=False, error_model="numpy", nogil=True)
 _part = numba.njit(cache=True, fastmath=False, error_model="numpy", forceinline=True)
-
-
-class _Lanes(types.Type):
-    """Eight float64."""
-
-
-@register_model(_Lanes)
-class _LanesModel(models.PrimitiveModel):
-    def __init__(self, dmm: Any, fe_type: Any) -> None:
-        super().__init__(dmm, fe_type, _VECTOR)
-
-
-def _operation(symbol: Any, name: str) -> None:
-    @type_callable(symbol)
-    def typed(context: Any) -> Any:
-        return lambda x, y: _lanes if x is y is _lanes else None
-
-    @lower_builtin(symbol, _Lanes, _Lanes)
-    def lowered(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return getattr(builder, name)(*args)
-
-
-_lanes = _Lanes("Lanes")
-for _symbol, _name in ((operator.add, "fadd"), (operator.sub, "fsub"), (operator.mul, "fmul"), (operator.truediv, "fdiv")):
-    _operation(_symbol, _name)
-
-
-def _place(context: Any, builder: Any, kind: Any, array: Any, at: Any) -> Any:
-    return builder.bitcast(builder.gep(context.make_array(kind)(context, builder, array).data, [at]), _VECTOR.as_pointer())
-
-
-def _get(typing: Any, array: Any, at: Any) -> Any:
-    """The eight numbers of a flat array from `at` on."""
-
-    def make(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return builder.load(_place(context, builder, signature.args[0], *args), align=8)
-
-    return _lanes(array, types.uintp), make
-
-
-def _put(typing: Any, array: Any, at: Any, value: Any) -> Any:
-    """Writes eight numbers to a flat array from `at` on."""
-
-    def make(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        builder.store(args[2], _place(context, builder, signature.args[0], *args[:2]), align=8)
-        return context.get_dummy_value()
-
-    return types.void(array, types.uintp, _lanes), make
-
-
-def _alike(typing: Any, number: Any) -> Any:
-    """One number in all eight lanes."""
-
-    def make(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        nothing, index = ir.Constant(_VECTOR, ir.Undefined), ir.IntType(32)
-        first = builder.insert_element(nothing, args[0], ir.Constant(index, 0))
-        return builder.shuffle_vector(first, nothing, ir.Constant(ir.VectorType(index, WIDTH), [0] * WIDTH))
-
-    return _lanes(types.float64), make
-
-
-get: Any = intrinsic(_get)
-put: Any = intrinsic(_put)
-alike: Any = intrinsic(_alike)
-
 
 # -- parts
 
@@ -128,32 +54,66 @@ def _unpack(room, u, rows, flat, at, batch, first, columns):
 
 
 @_part
-def _constant(matrix, m, rows, inner, x, u, row, column, columns, y, v):
-    """y (rows, columns) at v = matrix (rows, inner) at m times x (inner, columns) at u; all columns are lanes.
+def _same(flat, at, rows, batch):
+    """Whether what stands at `at`, (rows, batch), is the same in the whole batch to the last bit: what is computed of it is so too."""
+    bits = flat.view(np.int64)
+    for e in range(at, at + rows * batch, batch):
+        for b in range(1, batch):
+            if bits[e + b] != bits[e]:
+                return False
+    return True
 
-    In x a row is `row` numbers behind the one before, and lanes `column` behind those before. Sums run from 0, and zeros of the matrix
-    count for nothing.
+
+@_part
+def _entries(matrices):
+    """What is not zero of matrices (M, i, k), row after row: values, their k, and where each row of each matrix begins."""
+    values, places = np.empty(matrices.size), np.empty(matrices.size, np.intp)
+    starts = np.empty(matrices.shape[0] * matrices.shape[1] + 1, np.intp)
+    count = row = 0
+    for m in range(matrices.shape[0]):
+        for i in range(matrices.shape[1]):
+            starts[row], row = count, row + 1
+            for k in range(matrices.shape[2]):
+                if matrices[m, i, k] != 0.0:
+                    values[count], places[count], count = matrices[m, i, k], k, count + 1
+    starts[row] = count
+    return values, places, starts
+
+
+@_part
+def _constant(entries, line, rows, x, u, row, column, columns, y, v):
+    """y (rows, columns) at v = the matrix whose entries begin at `line` times x (inner, columns) at u; all columns are lanes.
+
+    In x a row is `row` numbers behind the one before, and lanes `column` behind those before. Sums run from 0.
     """
+    values, places, starts = entries
     for i in range(rows):
-        at, to = m + i * inner, v + i * columns * WIDTH
+        begin, end, to = starts[line + i], starts[line + i + 1], v + i * columns * WIDTH
         for step in range(0, columns if columns >= 4 else 0, 4):  # sums that wait for themselves, four at a time
             first = min(step, columns - 4)
             a = b = c = d = alike(0.0)
-            for k in range(inner):
-                if matrix[at + k] != 0.0:
-                    w, o = alike(matrix[at + k]), u + k * row + first * column
-                    a, b = a + w * get(x, o), b + w * get(x, o + column)
-                    c, d = c + w * get(x, o + 2 * column), d + w * get(x, o + 3 * column)
+            for e in range(begin, end):
+                w, o = alike(values[e]), u + places[e] * row + first * column
+                a, b = a + w * get(x, o), b + w * get(x, o + column)
+                c, d = c + w * get(x, o + 2 * column), d + w * get(x, o + 3 * column)
             put(y, to + first * WIDTH, a)
             put(y, to + first * WIDTH + WIDTH, b)
             put(y, to + first * WIDTH + 2 * WIDTH, c)
             put(y, to + first * WIDTH + 3 * WIDTH, d)
         for first in range(columns if columns < 4 else 0):
             a = alike(0.0)
-            for k in range(inner):
-                if matrix[at + k] != 0.0:
-                    a = a + alike(matrix[at + k]) * get(x, u + k * row + first * column)
+            for e in range(begin, end):
+                a = a + alike(values[e]) * get(x, u + places[e] * row + first * column)
             put(y, to + first * WIDTH, a)
+
+
+@_part
+def _grow(entries, noise, n, P, u, half):
+    """A P A' + Q in the place of P (n, n), of lanes from u on, by the entries of A and Q (n n)."""
+    _constant(entries, 0, n, P, u, n * WIDTH, WIDTH, n, half, 0)
+    _constant(entries, 0, n, half, 0, WIDTH, n * WIDTH, n, P, u)  # of its transpose
+    for e in range(n * n):
+        put(P, u + e * WIDTH, get(P, u + e * WIDTH) + alike(noise[e]))
 
 
 @_part
@@ -228,21 +188,29 @@ def _invert(a, u, q):
 
 
 @_jit
-def apply_each(matrix, x, out):
-    """out (N, i, B) = matrix[n] x[n], for matrix (N, i, k) or (1, i, k) and x (N, k, B).
+def apply_each(matrix, x, base, out):
+    """out (N, i, B) = base + matrix[n] x[n], for matrix (N, i, k) or (1, i, k), x (N, k, B) and base (N, i, B), or of no size for none.
 
     Sums run from 0 over k in ascending order, and zeros of the matrix count for nothing.
     """
     (alone, rows, inner), (agents, _, batch) = matrix.shape, x.shape
     columns = 4 if batch > 2 * WIDTH else 1
     wide = columns * WIDTH
-    room, result = _room(inner * wide), _room(rows * wide)
-    flat, source, target = matrix.reshape(-1), x.reshape(-1), out.reshape(-1)
+    room, result, more = _room(inner * wide), _room(rows * wide), _room(rows * wide)
+    entries, source, target, under = _entries(matrix), x.reshape(-1), out.reshape(-1), base.reshape(-1)
     for first in range(0, batch, wide):
         for n in range(agents):
-            _pack(source, n * inner * batch, inner, batch, first, wide, room, 0)
-            _constant(flat, n * inner * rows if alone > 1 else 0, rows, inner, room, 0, wide, WIDTH, columns, result, 0)
-            _unpack(result, 0, rows, target, n * rows * batch, batch, first, wide)
+            line, at, to = n * rows if alone > 1 else 0, n * inner * batch, n * rows * batch
+            if rows < inner and first + wide <= batch:  # little of x is read, and that not often
+                _constant(entries, line, rows, source, at + first, batch, WIDTH, columns, result, 0)
+            else:
+                _pack(source, at, inner, batch, first, wide, room, 0)
+                _constant(entries, line, rows, room, 0, wide, WIDTH, columns, result, 0)
+            if base.size:
+                _pack(under, to, rows, batch, first, wide, more, 0)
+                for e in range(0, rows * wide, WIDTH):
+                    put(result, e, get(more, e) + get(result, e))
+            _unpack(result, 0, rows, target, to, batch, first, wide)
 
 
 @_jit
@@ -267,19 +235,19 @@ def predict_each(A, B, c, L, merge, heard, x, u, out):
     columns = 4 if batch > 2 * WIDTH else 1
     wide = columns * WIDTH
     line = n * wide
-    a, b, d, z = _room(line), _room(max(m, 1) * wide), _room(line), _room(agents * line)
-    drift, drive, send, gather = A.reshape(-1), B.reshape(-1), L.reshape(-1), merge.reshape(-1)
+    a, b, d, z = _room(line), _room(m * wide), _room(line), _room(agents * line)
+    drift, drive, send, gather = _entries(A[None]), _entries(B[None]), _entries(L), _entries(merge)
     source, known, target = x.reshape(-1), u.reshape(-1), out.reshape(-1)
     for first in range(0, batch, wide):
         for j in range(agents):
             _pack(source, j * n * batch, n, batch, first, wide, a, 0)
             _pack(known, j * m * batch, m, batch, first, wide, b, 0)
-            _constant(drift, 0, n, n, a, 0, wide, WIDTH, columns, d, 0)
-            _constant(drive, 0, n, m, b, 0, wide, WIDTH, columns, a, 0)
+            _constant(drift, 0, n, a, 0, wide, WIDTH, columns, d, 0)
+            _constant(drive, 0, n, b, 0, wide, WIDTH, columns, a, 0)
             for i in range(n):
                 for e in range(i * wide, i * wide + wide, WIDTH):
                     put(a, e, get(d, e) + get(a, e) + alike(c[i]))
-            _constant(send, j * n * n, n, n, a, 0, wide, WIDTH, columns, z, j * line)
+            _constant(send, j * n, n, a, 0, wide, WIDTH, columns, z, j * line)
         for i in range(agents):
             for e in range(0, line, WIDTH):
                 total = alike(0.0)
@@ -287,7 +255,7 @@ def predict_each(A, B, c, L, merge, heard, x, u, out):
                     if heard[i, j]:
                         total = total + get(z, j * line + e)
                 put(a, e, total)
-            _constant(gather, i * n * n, n, n, a, 0, wide, WIDTH, columns, d, 0)
+            _constant(gather, i * n, n, a, 0, wide, WIDTH, columns, d, 0)
             _unpack(d, 0, n, target, i * n * batch, batch, first, wide)
 
 
@@ -295,62 +263,76 @@ def predict_each(A, B, c, L, merge, heard, x, u, out):
 def spread_each(A, P, Q, out):
     """out (N, n, n, B) = A P A' + Q for P (N, n, n, B)."""
     n, size, batch = A.shape[0], A.size, P.shape[3]
-    a, half = _room(size * WIDTH), _room(size * WIDTH)
-    flat, noise, source, target = A.reshape(-1), Q.reshape(-1), P.reshape(-1), out.reshape(-1)
-    for first in range(0, batch, WIDTH):
-        for at in range(0, P.shape[0] * size * batch, size * batch):
-            _pack(source, at, size, batch, first, WIDTH, a, 0)
-            _constant(flat, 0, n, n, a, 0, n * WIDTH, WIDTH, n, half, 0)
-            _constant(flat, 0, n, n, half, 0, WIDTH, n * WIDTH, n, a, 0)  # of its transpose
-            for e in range(size):
-                put(a, e * WIDTH, get(a, e * WIDTH) + alike(noise[e]))
+    a, half, entries = _room(size * WIDTH), _room(size * WIDTH), _entries(A[None])
+    noise, source, target = Q.reshape(-1), P.reshape(-1), out.reshape(-1)
+    for at in range(0, P.shape[0] * size * batch, size * batch):
+        same = _same(source, at, size, batch)
+        for first in range(0, batch, WIDTH):
+            if first == 0 or not same:
+                _pack(source, at, size, batch, first, WIDTH, a, 0)
+                _grow(entries, noise, n, a, 0, half)
             _unpack(a, 0, size, target, at, batch, first, WIDTH)
 
 
 @_jit
-def fuse_each(heard, M, x, weight, total, begin, P, out):
+def fuse_each(A, Q, heard, M, x, weight, total, begin, P, out):
     """Q_i^-1 into P (N, n, n, B) and xb_i into out (N, n, B) of what is sent, x (N, n, B) with its covariances M (N, n, n, B or 1).
 
-    Q_i = sum_j w_ij L_j / t_i over the j in heard (N, N) bool, and xb_i with it; weight (N, N, B or 1) and total (N, B or 1). The sum of
-    the matrices begins with the zero `begin` (N, B or 1), of either sign: adding -0 changes no bit.
+    M is what they are one step before where A and Q (n, n) are given, and of size.
+
+    Q_i = sum_j w_ij L_j / t_i over the j in heard (N, N) bool, and xb_i with it; weight (N, N, B or 1) and total (N, as weight). The sum
+    of the matrices begins with the zero `begin` (as total), of either sign: adding -0 changes no bit.
     """
     agents, n, batch = x.shape
     size = n * n
-    L, inverse, y = _room(agents * size * WIDTH), _room(size * WIDTH), _room(agents * n * WIDTH)
-    z, mean = _room(n * WIDTH), _room(n * WIDTH)
+    L, inverses, y = _room(agents * size * WIDTH), _room(agents * size * WIDTH), _room(agents * n * WIDTH)
+    z, mean, half = _room(n * WIDTH), _room(n * WIDTH), _room(size * WIDTH)
     w, t, start = _room(agents * agents * WIDTH), _room(agents * WIDTH), _room(agents * WIDTH)
     sent, spread, fused, covariance = x.reshape(-1), M.reshape(-1), out.reshape(-1), P.reshape(-1)
+    entries, noise = _entries(A[None]), Q.reshape(-1)
     weights, totals, begins = weight.reshape(-1), total.reshape(-1), begin.reshape(-1)
+    alone, shared = np.empty(agents, np.bool_), np.empty(agents, np.bool_)
+    for j in range(agents):
+        alone[j] = _same(spread, j * size * M.shape[3], size, M.shape[3])
+    for i in range(agents):
+        b = weight.shape[2]
+        shared[i] = _same(weights, i * agents * b, agents, b) and _same(totals, i * b, 1, b) and _same(begins, i * b, 1, b)
+        for j in range(agents):
+            shared[i] &= alone[j] or not heard[i, j]
     for first in range(0, batch, WIDTH):
         _pack(weights, 0, agents * agents, weight.shape[2], first, WIDTH, w, 0)
-        _pack(totals, 0, agents, total.shape[1], first, WIDTH, t, 0)
-        _pack(begins, 0, agents, total.shape[1], first, WIDTH, start, 0)
+        _pack(totals, 0, agents, weight.shape[2], first, WIDTH, t, 0)
+        _pack(begins, 0, agents, weight.shape[2], first, WIDTH, start, 0)
         for j in range(agents):
             at = j * size * WIDTH
-            _pack(spread, j * size * M.shape[3], size, M.shape[3], first, WIDTH, L, at)
-            _invert(L, at, n)
+            if first == 0 or not alone[j]:
+                _pack(spread, j * size * M.shape[3], size, M.shape[3], first, WIDTH, L, at)
+                if A.size:
+                    _grow(entries, noise, n, L, at, half)
+                _invert(L, at, n)
             _pack(sent, j * n * batch, n, batch, first, WIDTH, z, 0)
             _times(L, at, z, 0, n, n, 1, y, j * n * WIDTH)
         for i in range(agents):
-            for e in range(0, size * WIDTH, WIDTH):
-                put(inverse, e, get(start, i * WIDTH))
+            at, fresh, whole = i * size * WIDTH, first == 0 or not shared[i], get(t, i * WIDTH)
+            for e in range(at, at + size * WIDTH if fresh else at, WIDTH):
+                put(inverses, e, get(start, i * WIDTH))
             for e in range(0, n * WIDTH, WIDTH):
                 put(z, e, alike(0.0))
             for j in range(agents):
                 if heard[i, j]:
                     share = get(w, (i * agents + j) * WIDTH)
-                    for e in range(0, size * WIDTH, WIDTH):
-                        put(inverse, e, get(inverse, e) + share * get(L, j * size * WIDTH + e))
+                    for e in range(0, size * WIDTH if fresh else 0, WIDTH):
+                        put(inverses, at + e, get(inverses, at + e) + share * get(L, j * size * WIDTH + e))
                     for e in range(0, n * WIDTH, WIDTH):
                         put(z, e, get(z, e) + share * get(y, j * n * WIDTH + e))
-            whole = get(t, i * WIDTH)
-            for e in range(0, size * WIDTH, WIDTH):
-                put(inverse, e, get(inverse, e) / whole)
-            _invert(inverse, 0, n)
             for e in range(0, n * WIDTH, WIDTH):
                 put(z, e, get(z, e) / whole)
-            _times(inverse, 0, z, 0, n, n, 1, mean, 0)
-            _unpack(inverse, 0, size, covariance, i * size * batch, batch, first, WIDTH)
+            if fresh:
+                for e in range(at, at + size * WIDTH, WIDTH):
+                    put(inverses, e, get(inverses, e) / whole)
+                _invert(inverses, at, n)
+            _times(inverses, at, z, 0, n, n, 1, mean, 0)
+            _unpack(inverses, at, size, covariance, i * size * batch, batch, first, WIDTH)
             _unpack(mean, 0, n, fused, i * n * batch, batch, first, WIDTH)
 
 
@@ -362,38 +344,42 @@ def correct_each(C, W, x, P, r, keep, out, new):
     """
     (agents, q, n), batch = C.shape, x.shape[2]
     size, line = n * n, n * WIDTH
-    p, w, off, mean, step = _room(size * WIDTH), _room(q * q * WIDTH), _room(q * WIDTH), _room(line), _room(line)
+    p, w, off, mask, mean, step = _room(size * WIDTH), _room(q * q * WIDTH), _room(q * WIDTH), _room(q * WIDTH), _room(line), _room(line)
     cross, gain, turned, product = _room(q * line), _room(q * line), _room(q * line), _room(size * WIDTH)
-    flat, was, known, residue, kept = C.reshape(-1), x.reshape(-1), P.reshape(-1), r.reshape(-1), keep.reshape(-1)
+    entries, was, known, residue, kept = _entries(C), x.reshape(-1), P.reshape(-1), r.reshape(-1), keep.reshape(-1)
     told, fused, target = W.reshape(-1), out.reshape(-1), new.reshape(-1)
-    for first in range(0, batch, WIDTH):
-        for i in range(agents):
-            _pack(known, i * size * P.shape[3], size, P.shape[3], first, WIDTH, p, 0)
-            _pack(told, i * q * q * W.shape[3], q * q, W.shape[3], first, WIDTH, w, 0)
-            _constant(flat, i * q * n, q, n, p, 0, line, WIDTH, n, cross, 0)
-            _pack(kept, i * q * batch, q, batch, first, WIDTH, mean, 0)
-            _pack(residue, i * q * batch, q, batch, first, WIDTH, off, 0)
-            for m in range(q):
-                here = get(mean, m * WIDTH)
-                put(off, m * WIDTH, get(off, m * WIDTH) * here)
-                for e in range(m * line, m * line + line, WIDTH):
-                    put(cross, e, get(cross, e) * here)
-            _times(w, 0, cross, 0, q, q, n, gain, 0)
-            for m in range(q):
+    for i in range(agents):
+        at, to, near = i * size * P.shape[3], i * q * q * W.shape[3], i * q * batch
+        same = _same(known, at, size, P.shape[3]) and _same(told, to, q * q, W.shape[3]) and _same(kept, near, q, batch)
+        for first in range(0, batch, WIDTH):
+            fresh = first == 0 or not same
+            if fresh:
+                _pack(known, at, size, P.shape[3], first, WIDTH, p, 0)
+                _pack(told, to, q * q, W.shape[3], first, WIDTH, w, 0)
+                _pack(kept, near, q, batch, first, WIDTH, mask, 0)
+                _constant(entries, i * q, q, p, 0, line, WIDTH, n, cross, 0)
+                for m in range(q):
+                    for e in range(m * line, m * line + line, WIDTH):
+                        put(cross, e, get(cross, e) * get(mask, m * WIDTH))
+                _times(w, 0, cross, 0, q, q, n, gain, 0)
+                for m in range(q):
+                    for e in range(n):
+                        put(turned, (e * q + m) * WIDTH, get(gain, m * line + e * WIDTH))
+                _times(turned, 0, cross, 0, n, q, n, product, 0)
+                for e in range(0, size * WIDTH, WIDTH):
+                    put(p, e, get(p, e) - get(product, e))
                 for e in range(n):
-                    put(turned, (e * q + m) * WIDTH, get(gain, m * line + e * WIDTH))
+                    for f in range(e, n):
+                        one, other = e * line + f * WIDTH, f * line + e * WIDTH
+                        both = alike(0.5) * (get(p, one) + get(p, other))
+                        put(p, one, both)
+                        put(p, other, both)
+            _unpack(p, 0, size, target, i * size * batch, batch, first, WIDTH)
+            _pack(residue, near, q, batch, first, WIDTH, off, 0)
+            for m in range(0, q * WIDTH, WIDTH):
+                put(off, m, get(off, m) * get(mask, m))
             _times(turned, 0, off, 0, n, q, 1, step, 0)
             _pack(was, i * n * batch, n, batch, first, WIDTH, mean, 0)
             for e in range(0, line, WIDTH):
                 put(mean, e, get(mean, e) + get(step, e))
             _unpack(mean, 0, n, fused, i * n * batch, batch, first, WIDTH)
-            _times(turned, 0, cross, 0, n, q, n, product, 0)
-            for e in range(0, size * WIDTH, WIDTH):
-                put(p, e, get(p, e) - get(product, e))
-            for e in range(n):
-                for f in range(e, n):
-                    one, other = e * line + f * WIDTH, f * line + e * WIDTH
-                    both = alike(0.5) * (get(p, one) + get(p, other))
-                    put(p, one, both)
-                    put(p, other, both)
-            _unpack(p, 0, size, target, i * size * batch, batch, first, WIDTH)

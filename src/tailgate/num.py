@@ -137,18 +137,22 @@ def inverse(s: Array) -> Array:
     return full_out if s.ndim > 2 else full_out[0]
 
 
-def apply(matrices: Array, x: Array) -> Array:
-    """Each agent's own matrix (N, i, k), or one (1, i, k) for all, times its vector in x (B, N, k): (B, N, i).
+def apply(matrices: Array, x: Array, base: Array | None = None) -> Array:
+    """Each agent's own matrix (N, i, k), or one (1, i, k) for all, times its vector in x (B, N, k), and base (B, N, i) with it: (B, N, i).
 
     Sums run over k in ascending order, and structural zeros of the matrices count for nothing.
     """
-    return last_to_first(_applied(matrices, np.ascontiguousarray(first_to_last(x), np.float64)))
+    under = _NOTHING if base is None else np.ascontiguousarray(first_to_last(base), np.float64)
+    return last_to_first(_applied(matrices, np.ascontiguousarray(first_to_last(x), np.float64), under))
 
 
-def _applied(matrices: Array, x: Array) -> Array:
+_NOTHING = np.empty((0, 0, 0))
+
+
+def _applied(matrices: Array, x: Array, base: Array = _NOTHING) -> Array:
     out = np.empty((len(x), matrices.shape[-2], x.shape[2]))
     held = np.ascontiguousarray(matrices, np.float64)
-    lanes.apply_each(held if held.ndim == 3 else held[None], x, out)
+    lanes.apply_each(held if held.ndim == 3 else held[None], x, base, out)
     return out
 
 
@@ -168,11 +172,19 @@ def congruent(A: Array, P: Array, Q: Array) -> Array:
     return last_to_first(out)
 
 
-def fused(heard: Array, x: Array, M: Array, weight: Array, total: Array, begin: Array) -> tuple[Array, Array]:
-    """xb (B, N, n) and Q^-1 (B, N, n, n) of x (B, N, n), M, weight, total and begin (B or 1, ...): `lanes.fuse_each`."""
-    flat, spread, w, t, start = (np.ascontiguousarray(first_to_last(part), np.float64) for part in (x, M, weight, total, begin))
+Shares = tuple[Array, Array, Array]
+
+
+def fused(heard: Array, x: Array, M: Array, shares: Shares | None = None, step: tuple[Array, Array] | None = None) -> tuple[Array, Array]:
+    """xb (B, N, n) and Q^-1 (B, N, n, n) of x (B, N, n) and M (B or 1, N, n, n) by `lanes.fuse_each`.
+
+    shares: its weight, total and begin, (B or 1, ...); none: all weigh the same. step: its A and Q.
+    """
+    shares = shares or (np.ones((1, *heard.shape)), heard.sum(axis=1, dtype=np.float64)[None], np.full((1, len(heard)), -0.0))
+    flat, spread, weight, total, begin = (np.ascontiguousarray(first_to_last(part), np.float64) for part in (x, M, *shares))
     mean, P = np.empty_like(flat), np.empty((*spread.shape[:-1], flat.shape[-1]))
-    lanes.fuse_each(heard, spread, flat, w, t, start, P, mean)
+    A, Q = step or (np.empty((0, 0)), np.empty((0, 0)))
+    lanes.fuse_each(A, Q, heard, spread, flat, weight, total, begin, P, mean)
     return last_to_first(mean), last_to_first(P)
 
 
