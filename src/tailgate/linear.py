@@ -132,13 +132,14 @@ def ball_each(w: np.ndarray, c: np.ndarray, u: np.ndarray) -> None:
 def pivot_each(r, W, which, half, size, tolerance, rounding, patience, rounds, y):
     """Block principal pivoting (robust.py) of r (M, q) with W (K, q, q) at which (M,) into y (M, q); returns how many are left unsolved."""
     q, unsolved = r.shape[1], 0
-    z, g, wrong, L = np.empty(q), np.empty(q), np.empty(q, np.bool_), np.empty((q, q))
+    z, g, wrong, sign, L = np.empty(q), np.empty(q), np.empty(q, np.bool_), np.empty(q), np.empty((q, q))
     for m in range(r.shape[0]):
         w, fewest, left, count = W[which[m]], q + 1, patience, 1
-        sign = np.where(np.abs(r[m]) > half[m] * size[m], np.sign(r[m]), 0.0)  # what each sensor alone would say
+        for i in range(q):  # what each sensor alone would say
+            sign[i] = math.copysign(1.0, r[m, i]) if abs(r[m, i]) > half[m, i] * size[m, i] else 0.0
         for _ in range(rounds):
-            y[m] = np.where(sign == 0.0, r[m], 0.0)
             for i in range(q):  # L L' = W of the outliers, 1 for the others
+                y[m, i] = r[m, i] if sign[i] == 0.0 else 0.0
                 for j in range(i + 1):
                     both = sign[i] != 0.0 and sign[j] != 0.0
                     L[i, j] = w[i, j] if both else (1.0 if i == j else 0.0)
@@ -155,7 +156,8 @@ def pivot_each(r, W, which, half, size, tolerance, rounding, patience, rounds, y
                     for k in range(i + 1, q):
                         z[i] -= L[k, i] * z[k]
                     z[i] /= L[i, i]
-                y[m] += z
+                for i in range(q):
+                    y[m, i] += z[i]
             last, count = -1, 0
             for i in range(q):
                 g[i] = largest = 0.0
@@ -168,6 +170,8 @@ def pivot_each(r, W, which, half, size, tolerance, rounding, patience, rounds, y
             if count == 0:
                 break
             left, fewest = patience if count < fewest else left - 1, min(count, fewest)
-            sign = np.where(wrong & (np.arange(q) >= (0 if left >= 0 else last)), np.where(sign == 0.0, np.sign(g), 0.0), sign)
+            for i in range(0 if left >= 0 else last, q):
+                if wrong[i]:
+                    sign[i] = math.copysign(1.0, g[i]) if sign[i] == 0.0 else 0.0
         unsolved += count > 0
     return unsolved
