@@ -239,7 +239,7 @@ class ObservationCodec:
             if road:
                 sight = sight._replace(gap_error=model.gap_error(x, truth), speed_error=model.speed_error(x, truth))
             else:
-                off = _given(view.received).y - num.apply(num.transposed(model.C), truth)
+                off = _given(view.received).y - num.apply(model.C, truth)
                 sight = sight._replace(error=model.error(x, truth), noise=np.sqrt(num.dot(off, off)))
         elif threat.sees_measurement and not road:
             y = _given(view.received).y

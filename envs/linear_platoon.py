@@ -15,7 +15,7 @@ from .platoon import String
 
 
 class LinearPlan(NamedTuple):
-    A: Array  # (1, n, n) as num.apply wants it
+    A: Array  # (1, n, n)
     B: Array  # (n,)
     c: Array  # (n,)
     leader_heard: Array  # (N,) 1 where the leader's messages arrive, else 0
@@ -33,7 +33,7 @@ class LinearPlatoon(String):
     """The string as its own linear model has it: controllers on the true state and in continuous time, no limits. Estimates only watch."""
 
     def prepare(self, model: Model) -> LinearPlan:
-        return LinearPlan(num.transposed(model.A[None]), model.B[:, 0], model.c, model.graph[:, 0].astype(np.float64))
+        return LinearPlan(model.A[None], model.B[:, 0], model.c, model.graph[:, 0].astype(np.float64))
 
     def start(self, plan: LinearPlan, draws: Draws) -> LinearState:
         gaps = self.initial_gaps(draws)

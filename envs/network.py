@@ -45,7 +45,7 @@ ANGLE = 0.9  # the widest angle by which a mode turns in a step, in units of pi
 
 
 class NetworkPlan(NamedTuple):
-    A: Array  # (1, n, n) as num.apply wants it
+    A: Array  # (1, n, n)
     noise_sd: float
 
 
@@ -144,7 +144,7 @@ class SensorNetwork:
         return tuple(sorted(tree | more))
 
     def prepare(self, model: Model) -> NetworkPlan:
-        return NetworkPlan(num.transposed(model.A[None]), float(np.sqrt(self.noise_var)))
+        return NetworkPlan(model.A[None], float(np.sqrt(self.noise_var)))
 
     def model(self, sensor: Sensor, controller: Controller) -> Model:
         """The public model. Raises InputError, naming the agents, where it is not detectable."""
@@ -190,7 +190,7 @@ class SensorNetwork:
 
 
 class LinearPlan(NamedTuple):
-    C: Array  # (N, n, q) as num.apply wants it
+    C: Array  # (N, q, n)
     sd: float
 
 
@@ -235,7 +235,7 @@ class LinearSensors:
         return out
 
     def prepare(self, model: Model) -> LinearPlan:
-        return LinearPlan(num.transposed(model.C), float(np.sqrt(self.noise_var)))
+        return LinearPlan(model.C, float(np.sqrt(self.noise_var)))
 
     def measure(self, plan: LinearPlan, truth: Array, probe: Array, draws: Draws) -> Received:
         y = num.apply(plan.C, truth)

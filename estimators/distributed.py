@@ -54,15 +54,12 @@ class FusionPlan(NamedTuple):
     Q: Array
     R: Array
     broad: Array
-    graph: Array  # (N, N) bool
+    hears: Array  # (N, N) bool: the graph, with each agent hearing itself
     heard: tuple[tuple[int, ...], ...]  # N(i)
-    A_each: Array  # as num.apply wants them: (N, n, n) A
-    C_each: Array  # (N, n, q)
     held: Array | None = None  # (N, n, n) Q_i^-1 of the steady filter
     K: Array | None = None  # (N, q, n) its gain for all sensors
-    send: Array | None = None  # (N, n, n) L_j
     merge: Array | None = None  # (N, n, n) Q_i^-1 / d_i
-    L: Array | None = None  # (N, n, n) L_j as it stands
+    L: Array | None = None  # (N, n, n) L_j
     M: Array | None = None  # (N, n, n) its inverse
     cross: Array | None = None  # (N, q, n) C_i Q_i^-1
     S: Array | None = None  # (N, q, q)
@@ -156,8 +153,8 @@ class DistributedFilter(LinearFilter):
 
     def prepare(self, model: Model) -> FusionPlan:
         plan = FusionPlan(
-            model.A, model.B, model.c, model.C, model.Q, model.R, broad(model), model.graph, neighbours(model.graph),
-            num.transposed(np.repeat(model.A[None], model.agents, axis=0)), num.transposed(model.C),
+            model.A, model.B, model.c, model.C, model.Q, model.R, broad(model), model.graph | np.eye(model.agents, dtype=bool),
+            neighbours(model.graph),
         )  # fmt: skip
         if not self.steady:
             require_detectable(model, "model")
@@ -167,7 +164,7 @@ class DistributedFilter(LinearFilter):
         cross = num.matmul(model.C, Qinv)
         S = num.matmul(model.C, num.transpose(cross)) + model.R
         return plan._replace(
-            held=Qinv, K=num.transposed(_gain(S, cross)), send=num.transposed(L), merge=num.transposed(Qinv / degree[:, None, None]),
+            held=Qinv, K=np.ascontiguousarray(_gain(S, cross)), merge=Qinv / degree[:, None, None],
             L=L, M=np.stack([_inverse(L_j) for L_j in L]), cross=cross, S=S,
         )  # fmt: skip
 
@@ -176,18 +173,24 @@ class DistributedFilter(LinearFilter):
 
     def predict(self, plan: FusionPlan, state: Any, known_u: Array) -> Any:
         """xb_i, and Q_i^-1 as the predicted covariance."""
-        return self.fuse(plan, self.forecast(plan, state, known_u), self.spread(plan, state))
+        if plan.held is not None:
+            assert plan.L is not None and plan.merge is not None
+            return KalmanState(num.predicted(plan.A, plan.B, plan.c, plan.L, plan.merge, plan.hears, state.x, known_u), None)
+        x, P = self.forecast(plan, state, known_u), one_row(state.P)
+        if len(P) < len(x):
+            return self.fuse(plan, x, self.spread(plan, state))
+        return KalmanState(*num.fused(plan.hears, x, P, step=(plan.A, plan.Q)))
 
     def forecast(self, plan: FusionPlan, state: Any, known_u: Array) -> Array:
         """A xh_j + B u_j + c (B, N, n): what each agent sends."""
-        return num.apply(plan.A_each, state.x) + num.matvec(plan.B, known_u) + plan.c
+        return num.apply(plan.A[None], state.x) + num.matvec(plan.B, known_u) + plan.c
 
     def spread(self, plan: FusionPlan, state: Any) -> Array:
         """L_j^-1 = A P_j A' + Sw (B or 1, N, n, n): the covariance that each agent gives what it sends."""
         if plan.held is not None:
             assert plan.M is not None
             return plan.M[None]
-        return num.matmul(plan.A, num.transpose(num.matmul(plan.A, one_row(state.P)))) + plan.Q
+        return num.congruent(plan.A, one_row(state.P), plan.Q)
 
     def fuse(self, plan: FusionPlan, x: Array, M: Array, weight: Array | None = None) -> KalmanState:
         """xb_i and Q_i^-1 of what is sent, x (B, N, n) with its `spread` M.
@@ -196,40 +199,48 @@ class DistributedFilter(LinearFilter):
         weights are all equal, every bit is that of the fusion without weights.
         """
         if plan.held is not None:
-            assert plan.send is not None and plan.merge is not None and plan.L is not None
-            z = num.apply(plan.send, x)
+            assert plan.merge is not None and plan.L is not None
+            z = num.apply(plan.L, x)
             out = KalmanState(num.apply(plan.merge, gather(plan.heard, z)), None)
-            return out if weight is None else self._reweigh(plan, out, z, plan.L[None], weight)
-        L = num.inverse(M)
-        Qinv, y = num.zeros(L.shape), num.matvec(L, x)
-        z = gather(plan.heard, y)
+            return out if weight is None else self._reweigh(plan, out, z, weight)
+        alike = None if weight is None else even(plan.heard, weight)
+        if len(M) < len(x) and (alike is None or alike.all()):  # one covariance for all rows
+            L = num.inverse(M)
+            Qinv, z = num.zeros(L.shape), gather(plan.heard, num.matvec(L, x))
+            for i, near in enumerate(plan.heard):
+                Qinv[:, i] = num.inverse(_sum(L, near) / len(near))
+                z[:, i] = z[:, i] / len(near)
+            return KalmanState(num.matvec(Qinv, z), np.broadcast_to(Qinv, (len(x), *Qinv.shape[1:])))
+        if weight is None or alike is None:
+            return KalmanState(*num.fused(plan.hears, x, M))
+        share, total = np.where(alike[..., None], 1.0, weight), num.zeros(alike.shape)
         for i, near in enumerate(plan.heard):
-            Qinv[:, i] = num.inverse(_sum(L, near) / len(near))
-            z[:, i] = z[:, i] / len(near)
-        out = KalmanState(num.matvec(Qinv, z), np.broadcast_to(Qinv, (len(x), *Qinv.shape[1:])))
-        return out if weight is None else self._reweigh(plan, out, y, L, weight)
+            for j in near:
+                total[:, i] += share[:, i, j]
+        return KalmanState(*num.fused(plan.hears, x, M, (share, total, np.where(alike, -0.0, 0.0))))
 
-    def _reweigh(self, plan: FusionPlan, out: KalmanState, z: Array, L: Array, weight: Array) -> KalmanState:
-        """The fusion of z_j = L_j x_j (B, N, n) again where an agent's weights differ from each other."""
-        x, P = out.x, None
+    def _reweigh(self, plan: FusionPlan, out: KalmanState, z: Array, weight: Array) -> KalmanState:
+        """The steady fusion of z_j = L_j x_j (B, N, n) again where an agent's weights differ from each other."""
+        assert plan.L is not None
+        x, P, alike = out.x, None, even(plan.heard, weight)
         for i, near in enumerate(plan.heard):
-            rows = np.flatnonzero((weight[:, i, near] != weight[:, i, near[:1]]).any(axis=1))
+            rows = np.flatnonzero(~alike[:, i])
             if not len(rows):
                 continue
-            w, own = weight[rows, i], np.zeros(len(rows), np.int64) if len(L) == 1 else rows
-            total, Q, y = np.zeros(len(rows)), np.zeros((len(rows), *L.shape[2:])), np.zeros((len(rows), z.shape[2]))
+            w = weight[rows, i]
+            total, Q, y = np.zeros(len(rows)), np.zeros((len(rows), *plan.Q.shape)), np.zeros((len(rows), z.shape[2]))
             for j in near:
                 total += w[:, j]
-                Q += w[:, j, None, None] * L[own, j]
+                Q += w[:, j, None, None] * plan.L[j]
                 y += w[:, j, None] * z[rows, j]
             Qinv = num.inverse(Q / total[:, None, None])
             if P is None:
-                P = num.full((*x.shape, x.shape[2]), plan.held if out.P is None else out.P)
+                P = num.full((*x.shape, x.shape[2]), plan.held)
             P[rows, i], x[rows, i] = Qinv, num.matvec(Qinv, y / total[:, None])
         return out if P is None else KalmanState(x, P)
 
     def innovation(self, plan: FusionPlan, state: Any, received: Received) -> Innovation:
-        r = np.where(received.valid, received.y - num.apply(plan.C_each, state.x), 0.0)
+        r = np.where(received.valid, received.y - num.apply(plan.C, state.x), 0.0)
         S = plan.S
         if S is None or state.P is not None:
             S = num.matmul(plan.C, num.transpose(self._cross(plan, state))) + plan.R
@@ -240,7 +251,7 @@ class DistributedFilter(LinearFilter):
         r, S = innovation
         if plan.held is not None and state.P is None:
             assert plan.K is not None and plan.cross is not None
-            x = state.x + num.apply(plan.K, r)
+            x = num.apply(plan.K, r, state.x)
             b, i = np.nonzero(~accept.all(axis=-1))
             if len(b):
                 keep = accept[b, i]
@@ -253,7 +264,8 @@ class DistributedFilter(LinearFilter):
             P = state.P[:1] - num.matmul(K, cross)
             P = np.broadcast_to(0.5 * (P + num.transpose(P)), state.P.shape)
             return KalmanState(state.x + num.matvec(K, r), P if plan.held is None else None)
-        return super().update(plan, state, innovation, accept)
+        x, P = num.corrected(plan.C, num.inverse(alone(S, accept)), state.x, one_row(state.P), r, accept)
+        return KalmanState(x, P if plan.held is None else None)
 
     def _predicted(self, plan: FusionPlan, state: Any) -> Array:
         return one_row(super()._predicted(plan, state))
@@ -272,6 +284,11 @@ def shared(P: Array) -> Array:
 def _gain(S: Array, cross: Array) -> Array:
     """P- C' S^-1 (..., n, q) from C P- (..., q, n), in the order of the Kalman filter's update, to the last bit."""
     return num.transpose(num.matmul(num.inverse(S), cross))
+
+
+def even(heard: tuple[tuple[int, ...], ...], weight: Array) -> Array:
+    """(B, N) bool: whether agent i weighs all j in N(i) alike, by weight (B, N, N)."""
+    return np.stack([(weight[:, i, near] == weight[:, i, near[:1]]).all(axis=1) for i, near in enumerate(heard)], axis=1)
 
 
 def _sum(L: Array, near: tuple[int, ...]) -> Array:

@@ -32,7 +32,7 @@ from .robust import ACCURACY, load_cvxpy
 
 
 class Axes(NamedTuple):
-    """Constants of P problems: turn = V' Sv^-1/2 (P, q, q), half = g / 2 (P, q) and push = Q^-1 M' V / 2 (P, q, n); matrices transposed."""
+    """Constants of P problems: turn = V' Sv^-1/2 (P, q, q), half = g / 2 (P, q) and push = Q^-1 M' V / 2 (P, n, q)."""
 
     turn: Array
     half: Array
@@ -46,7 +46,7 @@ def axes(C: Array, R: Array, spread: Array) -> Axes:
     """
     _, white = num.root(R)
     rows, turn = num.orthogonal(num.matmul(num.matmul(white, C), num.transpose(spread)), white)
-    return Axes(num.transposed(turn), 0.5 * num.dot(rows, rows), 0.5 * np.ascontiguousarray(num.matmul(rows, spread)))
+    return Axes(np.ascontiguousarray(turn), 0.5 * num.dot(rows, rows), 0.5 * np.ascontiguousarray(num.transpose(num.matmul(rows, spread))))
 
 
 def moved(problem: Axes, r: Array, lam: float) -> tuple[Array, Array]:

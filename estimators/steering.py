@@ -230,7 +230,7 @@ class Sight:
     def _residuals(self, estimate: Estimate, received: Received) -> list[Array]:
         """By how much the readings differ from the estimate, in standard deviations of the noise; 0 where nothing was received."""
         model = self.model
-        off = received.y - num.apply(num.transposed(model.C), estimate.x)
+        off = received.y - num.apply(model.C, estimate.x)
         sd = np.sqrt(np.maximum(model.R.diagonal(axis1=1, axis2=2), 1e-12))
         off = np.where(received.valid, off / sd, 0.0)
         if model.agents == 1:

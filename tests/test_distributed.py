@@ -162,7 +162,7 @@ def test_the_varying_gain_settles_at_the_steady_one(model):
     plan = f.prepare(model)
     predicted = f.predict(plan, state.filter, np.zeros((1, model.agents, model.inputs)))
     innovation = f.innovation(plan, predicted, Received(np.zeros((1, *model.C.shape[:2])), np.ones((1, *model.C.shape[:2]), bool), None))
-    K = np.swapaxes(DistributedKalmanFilter(True).prepare(model).K, 1, 2)
+    K = DistributedKalmanFilter(True).prepare(model).K
     np.testing.assert_allclose(f.gain(plan, predicted, innovation)[0], K, rtol=1e-5, atol=1e-6 * np.abs(K).max())
 
 

@@ -182,7 +182,7 @@ def test_a_saturated_step_is_bounded_and_keeps_its_direction():
     plan = f.prepare(model)
     prior, received = random_state(model, 1)
     state = f.predict(plan, f.start(plan, prior), np.zeros((1, 10, 0)))
-    S, K = f.innovation(plan, state, received).S[0], np.swapaxes(plan.K, 1, 2)
+    S, K = f.innovation(plan, state, received).S[0], plan.K
     q, everything = model.C.shape[1], np.ones((1, 10, model.C.shape[1]), bool)
     values, vectors = np.linalg.eigh(np.linalg.cholesky(S).transpose(0, 2, 1) @ np.swapaxes(K, 1, 2) @ K @ np.linalg.cholesky(S))
     bound, worst = gamma * np.sqrt(q * values[:, -1]), (np.linalg.cholesky(S) @ vectors[:, :, -1:])[..., 0]

@@ -85,7 +85,7 @@ def test_the_estimate_is_optimal(family, lam):
     C, R, Q, Qinv, r = _problems(family, lam)
     problem = _axes(C, R, Qinv)
     d, u = moved(problem, r, lam)
-    root = np.swapaxes(problem.turn, 1, 2)  # V' Sv^-1/2: a root of Sv^-1
+    root = problem.turn  # V' Sv^-1/2: a root of Sv^-1
     np.testing.assert_allclose(np.swapaxes(root, 1, 2) @ root @ R, np.broadcast_to(np.eye(R.shape[-1]), R.shape), atol=1e-11)
     M, w = root @ C, np.einsum("pkl,bpl->bpk", root, r)
     e = w - np.einsum("pqn,bpn->bpq", M, d)

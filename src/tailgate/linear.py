@@ -1,4 +1,4 @@
-"""Compiled kernels of matrices: products, inverses and solutions for each row of a batch by itself.
+"""Compiled kernels of matrices: products and small problems, each row of a batch by itself. `tailgate.lanes` has those of large matrices.
 
 As in `tailgate.kernels`, every sum has a fixed order and nothing is contracted, so that a row has the same bits in every batch.
 """
@@ -10,49 +10,6 @@ import numpy as np
 from tailgate.jit import jit
 
 _jit = jit(cache=True)
-
-
-@_jit
-def apply_each(matrix: np.ndarray, x: np.ndarray, out: np.ndarray) -> None:
-    """out (N, i, B) = matrix[n] x[n], with the matrices transposed, (N, k, i), and x (N, k, B); sums run over k in ascending order."""
-    batch = x.shape[2]
-    for n in range(matrix.shape[0]):
-        if batch < 8:  # the order of the loops changes no sum's order
-            for b in range(batch):
-                for i in range(matrix.shape[2]):
-                    out[n, i, b] = 0.0
-                for k in range(matrix.shape[1]):
-                    v = x[n, k, b]
-                    for i in range(matrix.shape[2]):
-                        out[n, i, b] += matrix[n, k, i] * v
-        else:
-            for i in range(matrix.shape[2]):
-                for b in range(batch):
-                    out[n, i, b] = 0.0
-                for k in range(matrix.shape[1]):
-                    m = matrix[n, k, i]
-                    for b in range(batch):
-                        out[n, i, b] += m * x[n, k, b]
-
-
-@_jit
-def constant_times(x: np.ndarray, y: np.ndarray, out: np.ndarray) -> None:
-    """out (M, i, c) = x y[m] for one x (i, k) and y (M, k, c).
-
-    Sums run from 0 over k in ascending order, and zeros of x count for nothing.
-    """
-    for m in range(y.shape[0]):
-        for first in range(0, y.shape[2], 256):  # so many columns of y[m] stay in the cache
-            last = min(first + 256, y.shape[2])
-            for i in range(x.shape[0]):
-                total = out[m, i, first:last]  # a slice is indexed from 0, which the compiler sees: it takes several at a time
-                total[:] = 0.0
-                for k in range(x.shape[1]):
-                    v = x[i, k]
-                    if v != 0.0:
-                        row = y[m, k, first:last]
-                        for c in range(len(total)):
-                            total[c] += v * row[c]
 
 
 @_jit
@@ -80,28 +37,6 @@ def times_each(x: np.ndarray, y: np.ndarray, out: np.ndarray) -> None:
                     else:
                         for b in range(len(total)):
                             total[b] = first[b] * last[b] if k == 0 else total[b] + first[b] * last[b]
-
-
-@_jit
-def invert_each(s: np.ndarray, out: np.ndarray) -> None:
-    """Inverses out (M, q, q) of symmetric positive definite s (M, q, q) by Gauss-Jordan without pivots; s is used up."""
-    q = s.shape[1]
-    for m in range(s.shape[0]):
-        left, right = s[m], out[m]
-        right[:] = np.eye(q)
-        for p in range(q):
-            scale = 1.0 / left[p, p]
-            for j in range(p, q):  # left of column p the left half is done, right of it the right half is still zero
-                left[p, j] *= scale
-            for j in range(p + 1):
-                right[p, j] *= scale
-            for i in range(q):
-                if i != p:
-                    factor = left[i, p]
-                    for j in range(p, q):
-                        left[i, j] -= factor * left[p, j]
-                    for j in range(p + 1):
-                        right[i, j] -= factor * right[p, j]
 
 
 @_jit
@@ -237,13 +172,14 @@ def _within(x, low, high):
 def pivot_each(r, W, which, half, size, tolerance, rounding, patience, rounds, y):
     """Block principal pivoting (robust.py) of r (M, q) with W (K, q, q) at which (M,) into y (M, q); returns how many are left unsolved."""
     q, unsolved = r.shape[1], 0
-    z, g, wrong, L = np.empty(q), np.empty(q), np.empty(q, np.bool_), np.empty((q, q))
+    z, g, wrong, sign, L = np.empty(q), np.empty(q), np.empty(q, np.bool_), np.empty(q), np.empty((q, q))
     for m in range(r.shape[0]):
         w, fewest, left, count = W[which[m]], q + 1, patience, 1
-        sign = np.where(np.abs(r[m]) > half[m] * size[m], np.sign(r[m]), 0.0)  # what each sensor alone would say
+        for i in range(q):  # what each sensor alone would say
+            sign[i] = math.copysign(1.0, r[m, i]) if abs(r[m, i]) > half[m, i] * size[m, i] else 0.0
         for _ in range(rounds):
-            y[m] = np.where(sign == 0.0, r[m], 0.0)
             for i in range(q):  # L L' = W of the outliers, 1 for the others
+                y[m, i] = r[m, i] if sign[i] == 0.0 else 0.0
                 for j in range(i + 1):
                     both = sign[i] != 0.0 and sign[j] != 0.0
                     L[i, j] = w[i, j] if both else (1.0 if i == j else 0.0)
@@ -260,7 +196,8 @@ def pivot_each(r, W, which, half, size, tolerance, rounding, patience, rounds, y
                     for k in range(i + 1, q):
                         z[i] -= L[k, i] * z[k]
                     z[i] /= L[i, i]
-                y[m] += z
+                for i in range(q):
+                    y[m, i] += z[i]
             last, count = -1, 0
             for i in range(q):
                 g[i] = largest = 0.0
@@ -273,6 +210,8 @@ def pivot_each(r, W, which, half, size, tolerance, rounding, patience, rounds, y
             if count == 0:
                 break
             left, fewest = patience if count < fewest else left - 1, min(count, fewest)
-            sign = np.where(wrong & (np.arange(q) >= (0 if left >= 0 else last)), np.where(sign == 0.0, np.sign(g), 0.0), sign)
+            for i in range(0 if left >= 0 else last, q):
+                if wrong[i]:
+                    sign[i] = math.copysign(1.0, g[i]) if sign[i] == 0.0 else 0.0
         unsolved += count > 0
     return unsolved

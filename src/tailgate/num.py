@@ -10,6 +10,8 @@ runs along the batch.
 
 import math
 from collections.abc import Sequence
+from functools import cache
+from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -24,6 +26,12 @@ Array = NDArray[Any]
 exp = kernels.exp
 log = kernels.log
 tanh = kernels.tanh
+
+
+@cache
+def _lanes() -> Any:
+    """The kernels of large matrices, which import numba: a single car does without."""
+    return import_module("tailgate.lanes")
 
 
 _TO_LAST = [(*range(1, n), 0) if n else () for n in range(12)]  # for each number of axes; np.moveaxis takes longer than a small product
@@ -62,11 +70,6 @@ def stack(columns: Sequence[Array]) -> Array:
     return last_to_first(np.stack([first_to_last(c) for c in columns], axis=-2))
 
 
-def _constant(x: Array) -> Array | None:
-    """x without its agent axis when it is one matrix for the whole batch."""
-    return x if x.ndim == 2 else x[0] if x.ndim == 3 and x.shape[0] == 1 else None
-
-
 def _last(x: Array) -> Array:
     """(B, ..., p, q) as (M, p, q, B) in memory: all axes but the first and the last two are one."""
     moved = np.ascontiguousarray(first_to_last(x), np.float64)
@@ -76,15 +79,12 @@ def _last(x: Array) -> Array:
 def matmul(x: Array, y: Array) -> Array:
     """(..., i, k) times (..., k, j), summed over k in ascending order; (B, ..., i, j) has B contiguous in memory.
 
-    One matrix x for a whole batch: its structural zeros count for nothing, whatever y holds there.
+    One matrix x for a whole batch, or one (N, i, k) for each agent of it: its structural zeros count for nothing, whatever y holds there.
     """
-    fixed = _constant(x)
-    if fixed is not None and y.ndim > 3:
+    if y.ndim > 3 and (x.ndim == 2 or (x.ndim == 3 and (x.shape[0] == 1 or y.shape[1:-2] == x.shape[:1]))):
         flat = _last(y)
         m, k, j, b = flat.shape
-        held = np.empty((m, len(fixed), j * b))
-        linear.constant_times(np.ascontiguousarray(fixed, np.float64), flat.reshape(m, k, j * b), held)
-        return last_to_first(held.reshape(*y.shape[1:-2], len(fixed), j, b))
+        return last_to_first(_applied(x, flat.reshape(m, k, j * b)).reshape(*y.shape[1:-2], x.shape[-2], j, b))
     if x.ndim == y.ndim == 2:  # of what is computed once: numba is not worth its import
         out = x[:, :1] * y[:1]
         for k in range(1, len(y)):
@@ -142,24 +142,72 @@ def inverse(s: Array) -> Array:
         out[..., 1, 1] = a * scale
         out[..., 0, 1] = out[..., 1, 0] = -b * scale
         return out
-    flat = np.array(s, np.float64, order="C").reshape(-1, q, q)
-    flat_out = np.empty_like(flat)
-    linear.invert_each(flat, flat_out)
-    full_out = flat_out.reshape(s.shape)
-    return batch_last(full_out) if s.ndim > 2 else full_out
+    if s.ndim > 2 and len(s) > 1 and s.strides[0] == 0:  # the same for the whole batch
+        return np.broadcast_to(inverse(s[:1]), s.shape)
+    flat = _last(s if s.ndim > 2 else s[None])
+    out = np.empty_like(flat)
+    _lanes().invert_each(flat, out)
+    full_out = last_to_first(out.reshape(*s.shape[1:-2], q, q, flat.shape[3]))
+    return full_out if s.ndim > 2 else full_out[0]
 
 
-def apply(matrices: Array, x: Array) -> Array:
-    """Each agent's own matrix, `transposed` (N, k, i), times its vector in x (B, N, k): (B, N, i), summed over k in ascending order."""
-    flat = np.ascontiguousarray(first_to_last(x))
-    out = np.empty((flat.shape[0], matrices.shape[2], flat.shape[2]))
-    linear.apply_each(matrices, flat, out)
+def apply(matrices: Array, x: Array, base: Array | None = None) -> Array:
+    """Each agent's own matrix (N, i, k), or one (1, i, k) for all, times its vector in x (B, N, k), and base (B, N, i) with it: (B, N, i).
+
+    Sums run over k in ascending order, and structural zeros of the matrices count for nothing.
+    """
+    under = _NOTHING if base is None else np.ascontiguousarray(first_to_last(base), np.float64)
+    return last_to_first(_applied(matrices, np.ascontiguousarray(first_to_last(x), np.float64), under))
+
+
+_NOTHING = np.empty((0, 0, 0))
+
+
+def _applied(matrices: Array, x: Array, base: Array = _NOTHING) -> Array:
+    out = np.empty((len(x), matrices.shape[-2], x.shape[2]))
+    held = np.ascontiguousarray(matrices, np.float64)
+    _lanes().apply_each(held if held.ndim == 3 else held[None], x, base, out)
+    return out
+
+
+def predicted(A: Array, B: Array, c: Array, L: Array, merge: Array, heard: Array, x: Array, u: Array) -> Array:
+    """merge_i sum_j L_j (A x_j + B u_j + c) (B, N, n) over the j in heard (N, N) bool, for x (B, N, n) and u (B, N, m)."""
+    flat = np.ascontiguousarray(first_to_last(x), np.float64)
+    out = np.empty_like(flat)
+    _lanes().predict_each(A, B, c, L, merge, heard, flat, np.ascontiguousarray(first_to_last(u), np.float64), out)
     return last_to_first(out)
 
 
-def transposed(matrices: Array) -> Array:
-    """(N, i, k) as `apply` wants it: (N, k, i), contiguous."""
-    return np.ascontiguousarray(np.swapaxes(matrices, 1, 2), np.float64)
+def congruent(A: Array, P: Array, Q: Array) -> Array:
+    """A P A' + Q for one A and Q (n, n) and P (B, N, n, n), in the order of `matmul`."""
+    flat = _last(P)
+    out = np.empty_like(flat)
+    _lanes().spread_each(A, flat, Q, out)
+    return last_to_first(out)
+
+
+Shares = tuple[Array, Array, Array]
+
+
+def fused(heard: Array, x: Array, M: Array, shares: Shares | None = None, step: tuple[Array, Array] | None = None) -> tuple[Array, Array]:
+    """xb (B, N, n) and Q^-1 (B, N, n, n) of x (B, N, n) and M (B or 1, N, n, n) by `lanes.fuse_each`.
+
+    shares: its weight, total and begin, (B or 1, ...); none: all weigh the same. step: its A and Q.
+    """
+    shares = shares or (np.ones((1, *heard.shape)), heard.sum(axis=1, dtype=np.float64)[None], np.full((1, len(heard)), -0.0))
+    flat, spread, weight, total, begin = (np.ascontiguousarray(first_to_last(part), np.float64) for part in (x, M, *shares))
+    mean, P = np.empty_like(flat), np.empty((*spread.shape[:-1], flat.shape[-1]))
+    A, Q = step or (np.empty((0, 0)), np.empty((0, 0)))
+    _lanes().fuse_each(A, Q, heard, spread, flat, weight, total, begin, P, mean)
+    return last_to_first(mean), last_to_first(P)
+
+
+def corrected(C: Array, W: Array, x: Array, P: Array, r: Array, keep: Array) -> tuple[Array, Array]:
+    """x (B, N, n) and P (B, N, n, n) after an update by r (B, N, q), whose covariance has the inverse W: `lanes.correct_each`."""
+    inverse, flat, known, off, mask = (np.ascontiguousarray(first_to_last(part), np.float64) for part in (W, x, P, r, keep))
+    mean, covariance = np.empty_like(flat), np.empty((*known.shape[:-1], len(x)))
+    _lanes().correct_each(C, inverse, flat, known, off, mask, mean, covariance)
+    return last_to_first(mean), last_to_first(covariance)
 
 
 def product(x: Array, y: Array) -> Array:

@@ -63,7 +63,7 @@ def exactly(c: Case, form: Form) -> Callable[[], Array]:
         constants = axes(c.C[None], c.R[None], num.root(c.Qinv[None])[0])
         return lambda: moved(constants, r, c.lam)[0][:, 0]
     S = c.R + c.C @ c.Qinv @ c.C.T
-    K = num.transposed((c.Qinv @ c.C.T @ np.linalg.inv(S))[None])
+    K = (c.Qinv @ c.C.T @ np.linalg.inv(S))[None]
     wide, price = np.broadcast_to(S, (len(c.r), 1, *S.shape)), np.full(r.shape, c.lam)
     return lambda: num.apply(K, believed(r, wide, price))[:, 0]
 
