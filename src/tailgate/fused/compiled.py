@@ -94,7 +94,9 @@ _SOURCES = {  # by package, which may lie in folders of their own
     "tailgate.estimators": (
         "algorithm2.py", "detectors.py", "imm.py", "kinematic.py", "predictors.py", "reactive_brake.py", "safe_state.py",
     ),
-    "tailgate.envs": ("vehicle.py", "idm.py", "controllers.py", "manoeuvres.py", "fmcw.py", "radar_car.py", "radar_following.py"),
+    "tailgate.envs": (
+        "vehicle.py", "idm.py", "controllers.py", "manoeuvres.py", "fmcw.py", "radar.py", "radar_car.py", "radar_following.py",
+    ),
 }  # fmt: skip
 
 
