@@ -62,6 +62,11 @@ def stack(columns: Sequence[Array]) -> Array:
     return last_to_first(np.stack([first_to_last(c) for c in columns], axis=-2))
 
 
+def _constant(x: Array) -> Array | None:
+    """x without its agent axis when it is one matrix for the whole batch."""
+    return x if x.ndim == 2 else x[0] if x.ndim == 3 and x.shape[0] == 1 else None
+
+
 def _last(x: Array) -> Array:
     """(B, ..., p, q) as (M, p, q, B) in memory: all axes but the first and the last two are one."""
     moved = np.ascontiguousarray(first_to_last(x), np.float64)
@@ -73,10 +78,16 @@ def matmul(x: Array, y: Array) -> Array:
 
     One matrix x for a whole batch, or one (N, i, k) for each agent of it: its structural zeros count for nothing, whatever y holds there.
     """
-    if y.ndim > 3 and (x.ndim == 2 or (x.ndim == 3 and (x.shape[0] == 1 or y.shape[1:-2] == x.shape[:1]))):
+    fixed = _constant(x)
+    if y.ndim > 3 and (fixed is not None or (x.ndim == 3 and x.shape[:1] == y.shape[1:-2])):
         flat = _last(y)
         m, k, j, b = flat.shape
-        return last_to_first(_applied(x, flat.reshape(m, k, j * b)).reshape(*y.shape[1:-2], x.shape[-2], j, b))
+        if fixed is None:
+            held = _applied(x, flat.reshape(m, k, j * b))
+        else:
+            held = np.empty((m, len(fixed), j * b))
+            linear.constant_times(np.ascontiguousarray(fixed, np.float64), flat.reshape(m, k, j * b), held)
+        return last_to_first(held.reshape(*y.shape[1:-2], x.shape[-2], j, b))
     batch = np.broadcast_shapes(x.shape[:-2], y.shape[:-2])
     first, *middle = batch or (1,)
     out = np.zeros((math.prod(middle), x.shape[-2], y.shape[-1], first))
@@ -151,8 +162,7 @@ _NOTHING = np.empty((0, 0, 0))
 
 def _applied(matrices: Array, x: Array, base: Array = _NOTHING) -> Array:
     out = np.empty((len(x), matrices.shape[-2], x.shape[2]))
-    held = np.ascontiguousarray(matrices, np.float64)
-    lanes.apply_each(held if held.ndim == 3 else held[None], x, base, out)
+    lanes.apply_each(np.ascontiguousarray(matrices, np.float64), x, base, out)
     return out
 
 
