@@ -190,7 +190,7 @@ def fused(heard: Array, x: Array, M: Array, shares: Shares | None = None, step: 
 
     shares: its weight, total and begin, (B or 1, ...); none: all weigh the same. step: its A and Q.
     """
-    shares = shares or (np.ones((1, *heard.shape)), heard.sum(axis=1, dtype=np.float64)[None], np.full((1, len(heard)), -0.0))
+    shares = shares or (np.ones((1, *heard.shape)), np.count_nonzero(heard, axis=1)[None], np.full((1, len(heard)), -0.0))
     flat, spread, weight, total, begin = (np.ascontiguousarray(first_to_last(part), np.float64) for part in (x, M, *shares))
     mean, P = np.empty_like(flat), np.empty((*spread.shape[:-1], flat.shape[-1]))
     A, Q = step or (np.empty((0, 0)), np.empty((0, 0)))
