@@ -13,6 +13,26 @@ _jit = jit(cache=True)
 
 
 @_jit
+def constant_times(x: np.ndarray, y: np.ndarray, out: np.ndarray) -> None:
+    """out (M, i, c) = x y[m] for one x (i, k) and y (M, k, c).
+
+    Sums run from 0 over k in ascending order, and zeros of x count for nothing.
+    """
+    for m in range(y.shape[0]):
+        for first in range(0, y.shape[2], 256):  # so many columns of y[m] stay in the cache
+            last = min(first + 256, y.shape[2])
+            for i in range(x.shape[0]):
+                total = out[m, i, first:last]  # a slice is indexed from 0, which the compiler sees: it takes several at a time
+                total[:] = 0.0
+                for k in range(x.shape[1]):
+                    v = x[i, k]
+                    if v != 0.0:
+                        row = y[m, k, first:last]
+                        for c in range(len(total)):
+                            total[c] += v * row[c]
+
+
+@_jit
 def times_each(x: np.ndarray, y: np.ndarray, out: np.ndarray) -> None:
     """out (M, i, j, B) = x (M, i, k, B) times y (M, k, j, B), summed over k in ascending order. M, B of x or y may be 1: alike for all."""
     for m in range(out.shape[0]):

@@ -70,6 +70,11 @@ def stack(columns: Sequence[Array]) -> Array:
     return last_to_first(np.stack([first_to_last(c) for c in columns], axis=-2))
 
 
+def _constant(x: Array) -> Array | None:
+    """x without its agent axis when it is one matrix for the whole batch."""
+    return x if x.ndim == 2 else x[0] if x.ndim == 3 and x.shape[0] == 1 else None
+
+
 def _last(x: Array) -> Array:
     """(B, ..., p, q) as (M, p, q, B) in memory: all axes but the first and the last two are one."""
     moved = np.ascontiguousarray(first_to_last(x), np.float64)
@@ -81,10 +86,16 @@ def matmul(x: Array, y: Array) -> Array:
 
     One matrix x for a whole batch, or one (N, i, k) for each agent of it: its structural zeros count for nothing, whatever y holds there.
     """
-    if y.ndim > 3 and (x.ndim == 2 or (x.ndim == 3 and (x.shape[0] == 1 or y.shape[1:-2] == x.shape[:1]))):
+    fixed = _constant(x)
+    if y.ndim > 3 and (fixed is not None or (x.ndim == 3 and x.shape[:1] == y.shape[1:-2])):
         flat = _last(y)
         m, k, j, b = flat.shape
-        return last_to_first(_applied(x, flat.reshape(m, k, j * b)).reshape(*y.shape[1:-2], x.shape[-2], j, b))
+        if fixed is None:
+            held = _applied(x, flat.reshape(m, k, j * b))
+        else:
+            held = np.empty((m, len(fixed), j * b))
+            linear.constant_times(np.ascontiguousarray(fixed, np.float64), flat.reshape(m, k, j * b), held)
+        return last_to_first(held.reshape(*y.shape[1:-2], x.shape[-2], j, b))
     if x.ndim == y.ndim == 2:  # of what is computed once: numba is not worth its import
         out = x[:, :1] * y[:1]
         for k in range(1, len(y)):
@@ -165,8 +176,7 @@ _NOTHING = np.empty((0, 0, 0))
 
 def _applied(matrices: Array, x: Array, base: Array = _NOTHING) -> Array:
     out = np.empty((len(x), matrices.shape[-2], x.shape[2]))
-    held = np.ascontiguousarray(matrices, np.float64)
-    _lanes().apply_each(held if held.ndim == 3 else held[None], x, base, out)
+    _lanes().apply_each(np.ascontiguousarray(matrices, np.float64), x, base, out)
     return out
 
 
@@ -194,7 +204,7 @@ def fused(heard: Array, x: Array, M: Array, shares: Shares | None = None, step: 
 
     shares: its weight, total and begin, (B or 1, ...); none: all weigh the same. step: its A and Q.
     """
-    shares = shares or (np.ones((1, *heard.shape)), heard.sum(axis=1, dtype=np.float64)[None], np.full((1, len(heard)), -0.0))
+    shares = shares or (np.ones((1, *heard.shape)), np.count_nonzero(heard, axis=1)[None], np.full((1, len(heard)), -0.0))
     flat, spread, weight, total, begin = (np.ascontiguousarray(first_to_last(part), np.float64) for part in (x, M, *shares))
     mean, P = np.empty_like(flat), np.empty((*spread.shape[:-1], flat.shape[-1]))
     A, Q = step or (np.empty((0, 0)), np.empty((0, 0)))
