@@ -3,8 +3,8 @@
     python benchmarks/adversaries.py [CELL ...] [--seeds 5] [--episodes 1000] [--out results/adversaries-v0] [--zoo]
 
 Trains each learner of every cell (one process per training seed; finished policies are not trained again), plays them on report seeds,
-and writes report.json, report.md and a picture. The learner that speaks for a cell is chosen on select seeds. `--zoo` puts its policies
-into the package. Best on an otherwise idle machine: training times are recorded.
+and writes report.json, report.md and a picture, in which cells that are not named stay as they are. The learner that speaks for a cell is
+chosen on select seeds. `--zoo` puts its policies into the package. Best on an otherwise idle machine: training times are recorded.
 """
 
 from __future__ import annotations
@@ -293,6 +293,9 @@ def main() -> None:
     out.mkdir(parents=True, exist_ok=True)
     for _, _, report in learners_of(record):
         report.pop("policies", None)
+    if (kept := out / "report.json").is_file():  # cells that were not asked for stay as they are
+        record = json.loads(kept.read_text()) | record
+        record = {name: record[name] for name in cells if name in record}
     write_atomic(out / "report.json", lines(record).encode())
     write_atomic(out / "report.md", markdown(record).encode())
     write_atomic(out / "adversaries.png", picture(record))

@@ -312,7 +312,7 @@ from tailgate.trace import rollout
 loop = load_scenario("stop-and-go-v0").loop(make_defence("chi2_kf"))
 one, two = (rollout(loop, make_attack("none"), draws.keys("train", [3]), plain=plain).trace_hash(0) for plain in (False, True))
 from tailgate.fused import compiled
-assert one == two and not compiled._INSIDE
+assert one == two and not compiled._inside()
 """
     done = subprocess.run([sys.executable, "-c", code], env=os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
