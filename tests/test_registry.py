@@ -275,3 +275,11 @@ def test_every_built_in_component_is_found_in_its_own_module():
         assert all(hasattr(package, name) for name in package.__all__)
         with pytest.raises(AttributeError, match="has no attribute 'nothing'"):
             _ = package.nothing
+
+
+@pytest.mark.parametrize("package", ["agents", "envs", "estimators"])
+def test_every_module_that_registers_something_is_named_by_its_package(package):
+    """What HOMES does not name is never imported, and so not there."""
+    held = importlib.import_module(f"tailgate.{package}")
+    modules = {path.stem for path in Path(held.__file__).parent.glob("*.py") if "@register(" in path.read_text("utf-8")}
+    assert modules and modules <= set(held.HOMES)
