@@ -17,12 +17,7 @@ from tailgate.envs import manoeuvres as drives
 from tailgate.envs.controllers import AdaptiveCruise
 from tailgate.envs.following import CarFollowing
 from tailgate.envs.idm import IDM_GAP, IDM_HEADWAY
-from tailgate.envs.radar import FmcwRadar
-from tailgate.envs.radar_car import RadarCruise
-from tailgate.envs.radar_following import RadarFollowing
 from tailgate.envs.sensors import Odometry
-from tailgate.estimators.algorithm2 import AsPrinted
-from tailgate.estimators.challenge import ChallengeResponse, PyCra
 from tailgate.estimators.chi_square import ChiSquare
 from tailgate.estimators.compose import AcceptAll, Composed, GateOut, Score
 from tailgate.estimators.detectors import Cusum, Mewma, WindowedChiSquare
@@ -38,12 +33,12 @@ from tailgate.estimators.sparse import SparseChiSquare
 from tailgate.loop import Loop
 
 from . import constants as of
-from . import imm, monitor, printed, radar_build, regression, script
+from . import imm, monitor, script
 from .constants import put as _put
 from .rows import wires_of
 
 _ON_WIRES = {Kind.DOS_JAM, Kind.DOS_HOLD, Kind.DOS_HOLD_FRESH, Kind.DROPOUT, Kind.FDI}
-_CAR, _RADAR = (CarFollowing, Odometry, AdaptiveCruise), (RadarFollowing, FmcwRadar, RadarCruise)
+_CAR = (CarFollowing, Odometry, AdaptiveCruise)
 _STRUCTURE = np.array([[True, True, True], [False, True, True], [False, False, True]])  # of A: where it is not zero
 
 
@@ -64,11 +59,18 @@ class Refused:
     why: str
 
 
+def _radar() -> Any:
+    """What is known of a car with a radar; car following does without, and without the modules of radars."""
+    from . import radar_build
+
+    return radar_build
+
+
 def fuse(loop: Loop, attack: Attack | None = None) -> Constants | Refused:
     """The constants of a loop, or why the plain loop plays it: under the given attack, or under any that does not hold the defence."""
     parts = (loop.plant, loop.sensor, loop.controller)
-    aired = type(loop.plant) is RadarFollowing
-    for part, known in zip(parts, _RADAR if aired else _CAR, strict=True):
+    aired = loop.model.air and type(loop.plant) is _radar().PARTS[0]
+    for part, known in zip(parts, _radar().PARTS if aired else _CAR, strict=True):
         if type(part) is not known:
             return Refused(f"{type(part).__name__} has no lane")
     if not loop.link.perfect:
@@ -79,7 +81,7 @@ def fuse(loop: Loop, attack: Attack | None = None) -> Constants | Refused:
         return Refused("delay and replay have no lane" if aired else "delay, replay and what is radiated have no lane")
     c, f = of.blank()
     f[of.AIRED] = aired
-    vehicle = (radar_build.vehicle, radar_build.told, radar_build.cruise, radar_build.sensor) if aired else (_vehicle, _told, _cruise)
+    vehicle = _radar().FILLS if aired else (_vehicle, _told, _cruise)
     for fill in (*vehicle, _defence, _threat):
         if why := fill(loop, c, f):
             return Refused(why)
@@ -91,10 +93,8 @@ def fuse(loop: Loop, attack: Attack | None = None) -> Constants | Refused:
 
 def _remembered(f: Array) -> int:
     """Rows that the defence keeps beside those of every defence."""
-    if f[of.PRINTED]:
-        return printed.ROWS
-    if f[of.CHALLENGED]:
-        return regression.rows(int(f[of.SAMPLED]))
+    if f[of.PRINTED] or f[of.CHALLENGED]:
+        return int(_radar().remembered(f))
     if f[of.MODELED]:
         return imm.rows(int(f[of.MODELED]))
     return monitor.ROWS if f[of.BOXED] else max(int(f[of.WINDOW]) - 1, 0)
@@ -106,7 +106,7 @@ def _white(loop: Loop, attack: Attack | None) -> str:
     if type(attack) is Stealth:
         if not granted:
             return "attack stealth needs a white box"  # which the plain loop says
-        if type(loop.plant) is RadarFollowing:
+        if loop.model.air:
             return "attack stealth has no lane against a radar"
         shows = getattr(type(loop.defence), "look", None) is Composed.look
         return "" if shows else f"{type(loop.defence).__name__} shows no innovation to a lane"
@@ -164,8 +164,8 @@ def _defence(loop: Loop, c: Array, f: Array) -> str:
         return ""
     if type(defence) is InteractingModels:
         return _models(defence, loop.plan.defence, c, f)
-    if type(defence) in (ChallengeResponse, PyCra, AsPrinted) and f[of.AIRED]:
-        return radar_build.challenged(loop, c, f)
+    if f[of.AIRED] and type(defence) in _radar().CHALLENGERS:
+        return str(_radar().challenged(loop, c, f))
     if isinstance(defence, SafeState) and not f[of.AIRED] and type(defence) in (SafeState, SafeStateBrake):
         return _safe_set(defence, loop, c, f)
     if not isinstance(defence, Composed):

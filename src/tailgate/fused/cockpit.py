@@ -14,7 +14,6 @@ from tailgate.core import Array, Kind
 from tailgate.draws import Keys
 
 from . import constants as of
-from . import radar
 from . import rows as at
 from . import seat as lane
 from .build import Constants, Refused, fuse
@@ -55,7 +54,11 @@ def fuse_seat(seat: Seat) -> Constants | Refused:
     scales = SCALES | {"progress": float(seat.loop.horizon)}
     most = {wire: min(bound, LAST_SCALE) for wire, bound in zip(seat.loop.model.wires, seat.action.brief.bounds.tolist(), strict=True)}
     most |= {"power": threat.jam_power, "delay": threat.delay_bound}
-    quantities = lane.QUANTITIES | (radar.QUANTITIES if f[of.AIRED] else {}) | ({} if f[of.REAR] else lane.ALONE)
+    quantities = lane.QUANTITIES | ({} if f[of.REAR] else lane.ALONE)
+    if f[of.AIRED]:
+        from . import radar
+
+        quantities = lane.QUANTITIES | radar.QUANTITIES | ({} if f[of.REAR] else lane.ALONE)
     for j, name in enumerate(columns):
         rows = quantities.get(name)
         if rows is None:

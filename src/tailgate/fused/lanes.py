@@ -14,7 +14,6 @@ from tailgate.core import Array, Command, Received, Scene, View
 from tailgate.draws import Draws, Keys, Role
 from tailgate.envs.following import FollowingState
 from tailgate.envs.idm import BehindState
-from tailgate.envs.radar_following import RadarState
 from tailgate.errors import InputError
 from tailgate.loop import Loop
 from tailgate.threat import Channel
@@ -184,7 +183,11 @@ class Lanes:
             BehindState(self.row(at.REAR_X).copy(), self.row(at.REAR_V).copy(), nothing, nothing) if self.constants.f[of.REAR] else None
         )
         x, v, own = self.row(at.LEAD_X).copy(), self.row(at.LEAD_V).copy(), self.stack(at.EGO, 3)
-        state = RadarState(x, v, self.row(at.LEAD_A).copy(), own, behind) if self.aired else FollowingState(x, v, own, behind)
+        state: Any = FollowingState(x, v, own, behind)
+        if self.aired:
+            from tailgate.envs.radar_following import RadarState
+
+            state = RadarState(x, v, self.row(at.LEAD_A).copy(), own, behind)
         return self.loop.plant.scene(self.loop.plan.plant, state)
 
     def _received(self) -> Received:

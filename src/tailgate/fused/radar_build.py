@@ -10,12 +10,13 @@ from tailgate.envs.idm import IDM_GAP, IDM_HEADWAY
 from tailgate.envs.radar import FmcwRadar
 from tailgate.envs.radar_car import STATES, RadarCruise, kinematic
 from tailgate.envs.radar_following import RadarFollowing
-from tailgate.estimators.algorithm2 import PrintedRegression
-from tailgate.estimators.challenge import CHANCE, Challenger
+from tailgate.estimators.algorithm2 import AsPrinted, PrintedRegression
+from tailgate.estimators.challenge import CHANCE, Challenger, ChallengeResponse, PyCra
 from tailgate.estimators.kinematic import JointRegression
 from tailgate.loop import Loop
 
 from . import constants as of
+from . import printed, regression
 from .constants import put
 
 
@@ -106,3 +107,12 @@ def sensor(loop: Loop, c: Array, f: Array) -> str:
     put(c, of.IF_BAND, (radar.bandwidth, *tone_of(radar), *radar.reach))
     put(c, of.LISTENED, (plan.challenge, *radar.heard(np.inf if loop.threat.reaction is None else loop.threat.reaction)))
     return ""
+
+
+def remembered(f: Array) -> int:
+    """Rows that a challenger keeps, or an algorithm as printed."""
+    return printed.ROWS if f[of.PRINTED] else regression.rows(int(f[of.SAMPLED]))
+
+
+PARTS, CHALLENGERS = (RadarFollowing, FmcwRadar, RadarCruise), (ChallengeResponse, PyCra, AsPrinted)
+FILLS = (vehicle, told, cruise, sensor)
