@@ -153,8 +153,6 @@ def inverse(s: Array) -> Array:
         out[..., 1, 1] = a * scale
         out[..., 0, 1] = out[..., 1, 0] = -b * scale
         return out
-    if s.ndim > 2 and len(s) > 1 and s.strides[0] == 0:  # the same for the whole batch
-        return np.broadcast_to(inverse(s[:1]), s.shape)
     flat = _last(s if s.ndim > 2 else s[None])
     out = np.empty_like(flat)
     _lanes().invert_each(flat, out)

@@ -58,7 +58,7 @@ def fuse_seat(seat: Seat) -> Constants | Refused:
     if f[of.AIRED]:
         from . import radar
 
-        quantities = lane.QUANTITIES | radar.QUANTITIES | ({} if f[of.REAR] else lane.ALONE)
+        quantities = quantities | radar.QUANTITIES
     for j, name in enumerate(columns):
         rows = quantities.get(name)
         if rows is None:
