@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import tailgate
-from tailgate.metrics import METRICS, UNITS, measure, metric
+from tailgate.metrics import METRICS, UNITS, measure, metric, unit_in
 from tailgate.scenario import load_scenario
 from tailgate.trace import Trace
 
@@ -115,6 +115,13 @@ def test_every_metric_has_a_known_answer_and_a_unit():
     """No metric without a case above, a unit and a sentence."""
     assert set(METRICS) == set(CASES) == set(UNITS)
     assert all(METRICS[name].__doc__ and UNITS[name] for name in METRICS)
+
+
+def test_an_error_has_no_unit_where_nothing_drives():
+    """A car errs in metres; a network's error is a norm over states of any unit. Other metrics keep theirs."""
+    network = load_scenario("thesis-ch5-v0").brief().model
+    assert [unit_in(name, MODEL) for name in ("max_error", "crashed")] == ["m", "0/1"]
+    assert [unit_in(name, network) for name in ("max_error", "rmse_position", "crashed")] == ["-", "-", "0/1"]
 
 
 @pytest.mark.parametrize("attack", ["fdi_ramp", "dos_jam"])

@@ -15,7 +15,7 @@ from tailgate.agents.policy import load_policy
 from tailgate.core import Array
 from tailgate.evaluation import cells_of, run
 from tailgate.files import write_atomic
-from tailgate.metrics import UNITS
+from tailgate.metrics import UNITS, unit_in
 from tailgate.registry import Spec
 from tailgate.rivals import BATCH, best_of
 from tailgate.rivals import outcomes as outcomes_of
@@ -108,11 +108,12 @@ def _report(
     versus = {"no attack": difference(none), "own yoked schedule": difference(yoked)}
     if best is not None:
         versus["best scripted attack"] = over(best)
+    place = load_scenario(config.scenario).with_threat(**config.threat)
     report = {
         "name": config.name, "scenario": config.scenario, "defence": config.defence, "episodes": config.episodes, "steps": config.steps,
-        "outcome": outcome, "unit": UNITS[outcome], "learner": config.learner,
+        "outcome": outcome, "unit": unit_in(outcome, place.brief().model), "learner": config.learner,
         "teacher": load_policy(verdicts[0].policy)[0].training.get("teacher"),
-        "threat": as_data(load_scenario(config.scenario).with_threat(**config.threat).threat_model),
+        "threat": as_data(place.threat_model),
         "config": json.loads(canonical(config)), "policies": [str(v.policy) for v in verdicts], "best_scripted": best,
         "attacks": [{"label": label, **interval._asdict(), "note": note} for label, interval, note in items],
         "advantage": {name: interval._asdict() for name, interval in versus.items()},

@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from tailgate.core import Array
+from tailgate.core import Array, Model
 from tailgate.trace import Trace
 
 TTC_CAP = 100.0  # [s]
@@ -16,7 +16,13 @@ RECOVERY_TOLERANCE = 2.0  # [m]
 DETECTION_DEADLINE = 10  # [steps]
 
 METRICS: dict[str, Callable[[Trace], Array]] = {}
-UNITS: dict[str, str] = {}
+UNITS: dict[str, str] = {}  # on a road
+ERRORS = ("rmse_position", "max_error", "final_error")  # norms over states of any unit where there is no road
+
+
+def unit_in(name: str, model: Model) -> str:
+    """The unit of a metric in episodes of this model; "-" where it has none, or no one unit."""
+    return "-" if name in ERRORS and not model.followers.any() else UNITS[name]
 
 
 def metric(unit: str) -> Callable[[Callable[[Trace], Array]], Callable[[Trace], Array]]:

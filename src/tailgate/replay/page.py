@@ -19,7 +19,7 @@ from markupsafe import Markup
 
 from tailgate.files import writable_directory, write_atomic
 from tailgate.leaderboard.build import names_of
-from tailgate.metrics import METRICS, UNITS
+from tailgate.metrics import METRICS, unit_in
 
 from .episode import Data, episode_of, first_step, noun
 from .replay import Replay
@@ -31,7 +31,6 @@ VERDICTS = {
     "unknown": ("warn", "Cannot be checked", "the row records no hash"),
 }  # fmt: skip
 NO_ENTRY = "not recorded"
-NORMS = ("rmse_position", "max_error", "final_error")
 LABELS = {"version": "version of Tailgate", "config_hash": "configuration (config_hash)", "versions": "versions of the components"}
 
 
@@ -112,7 +111,7 @@ def context_of(replay: Replay, source: str) -> Data:
     tone, title, why = VERDICTS[replay.verdict]
     tone_of = "plain" if picture == "graph" else "bad" if replay.metrics["crashed"] else "good"
     metrics = [
-        (name.replace("_", " "), _measured(value), _unit(replay, name), " ".join((METRICS[name].__doc__ or "").split()),
+        (name.replace("_", " "), _measured(value), unit_in(name, replay.loop.model), " ".join((METRICS[name].__doc__ or "").split()),
          _measured(row[name]) if row[name] != value else "")
         for name, value in replay.metrics.items()
     ]  # fmt: skip
@@ -132,11 +131,6 @@ def context_of(replay: Replay, source: str) -> Data:
         "threat": _card("threat model", place.threat_model),
         "players": [_card("defence", replay.loop.defence, _named(row["defence"])), _card("attack", replay.attack, _named(row["attack"]))],
     }  # fmt: skip
-
-
-def _unit(replay: Replay, name: str) -> str:
-    """A metric's unit; without a road an estimate's error is a norm over states of any unit."""
-    return "-" if name in NORMS and not replay.loop.model.followers.any() else UNITS[name]
 
 
 def failed(row: Data) -> Data | None:

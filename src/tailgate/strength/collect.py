@@ -17,7 +17,7 @@ from tailgate.agents.zoo import FOLDER, zoo_names
 from tailgate.core import Array
 from tailgate.errors import InputError
 from tailgate.files import writable_directory, write_atomic
-from tailgate.metrics import METRICS, UNITS
+from tailgate.metrics import METRICS, unit_in
 from tailgate.registry import Spec
 from tailgate.schema import as_data
 
@@ -76,7 +76,7 @@ def add_policy(policy: Path, name: str, summary: str, *, episodes: int = EPISODE
         "summary": summary, "curve": thinned(curve), "threat_model": as_data(loop.threat),
         "source_sha256": header.sha256,
         "measured": {
-            "outcome": outcome, "unit": UNITS[outcome], "purpose": "report", "episodes": episodes, **measured(who.policy),
+            "outcome": outcome, "unit": unit_in(outcome, loop.model), "purpose": "report", "episodes": episodes, **measured(who.policy),
             "no_attack": measured(Spec("attack", "none").make()),
         },
     }  # fmt: skip

@@ -18,7 +18,7 @@ from scipy.optimize import isotonic_regression
 from tailgate.core import Array
 from tailgate.errors import InputError
 from tailgate.evaluation import Cell, cells_of, run
-from tailgate.metrics import UNITS
+from tailgate.metrics import unit_in
 from tailgate.registry import Spec
 from tailgate.scenario import Suite, load_scenario
 from tailgate.schema import as_data
@@ -97,10 +97,11 @@ def dose_response(
             played = [held[guard, "none", 0], *(held[guard, rival, dose] for dose in steps)]
             curves.append(_curve(rival, guard, played, [0, *steps], counted, exceeds, limit))
     curves += [{"attack": attack, "defence": guard, "skipped": why} for guard in guards for attack, why in reasons.items() if why]
+    place = load_scenario(scenario).with_threat(**threat)
     return {
         "measure": "dose-response", "scenario": scenario, "purpose": purpose, "episodes": episodes, "outcome": counted,
-        "unit": "0/1" if share else UNITS[counted], "exceeds": exceeds, "limit": limit, "doses": [0, *steps], "threat": as_data(threat),
-        "threat_model": as_data(load_scenario(scenario).with_threat(**threat).threat_model), "curves": curves,
+        "unit": "0/1" if share else unit_in(counted, place.brief().model), "exceeds": exceeds, "limit": limit, "doses": [0, *steps],
+        "threat": as_data(threat), "threat_model": as_data(place.threat_model), "curves": curves,
     }  # fmt: skip
 
 

@@ -20,7 +20,7 @@ from tailgate.core import Array
 from tailgate.draws import Draws, Keys, Role
 from tailgate.errors import InputError
 from tailgate.loop import Loop
-from tailgate.metrics import METRICS, UNITS, attack_steps
+from tailgate.metrics import METRICS, attack_steps, unit_in
 from tailgate.schema import as_data, canonical
 from tailgate.stats import Interval, paired_difference
 from tailgate.trace import Trace, episodes_at_once, rollout
@@ -127,7 +127,7 @@ def timing(
         loop = loop_for(who, where, guard, changed, dose)
         facts = {
             "scenario": where, "defence": guard, "learner": who.learner, "trained_on": who.defence, "outcome": counted,
-            "unit": UNITS[counted], "threat_model": as_data(loop.threat),
+            "unit": unit_in(counted, loop.model), "threat_model": as_data(loop.threat),
         }  # fmt: skip
         key = canonical(facts | {"action": who.header.action, "trained": [who.scenario, who.threat]})
         groups.setdefault(key, []).append((who, loop, facts))

@@ -17,7 +17,7 @@ from scipy import stats
 from tailgate.core import Array
 from tailgate.errors import InputError
 from tailgate.evaluation import Cell, cells_of, run
-from tailgate.metrics import UNITS
+from tailgate.metrics import unit_in
 from tailgate.scenario import Suite, load_scenario
 from tailgate.schema import as_data, canonical
 from tailgate.stats import Interval, paired_difference
@@ -101,9 +101,10 @@ def transfer(
                 gain = difference(values, own, is_share(counted))
                 entry |= {"over_own": gain._asdict(), "flags": ["transferred beats own"] if gain.low > 0.0 else []}
             entries.append(entry)
+    place = load_scenario(where).with_threat(**(changed | ({} if dose is None else {"budget": dose})))
     return {
-        "measure": "transfer", "scenario": where, "purpose": purpose, "episodes": episodes, "outcome": counted, "unit": UNITS[counted],
-        "threat_model": as_data(load_scenario(where).with_threat(**(changed | ({} if dose is None else {"budget": dose}))).threat_model),
+        "measure": "transfer", "scenario": where, "purpose": purpose, "episodes": episodes, "outcome": counted,
+        "unit": unit_in(counted, place.brief().model), "threat_model": as_data(place.threat_model),
         "trained_on": list(origin_rows), "played_on": list(columns),
         "no_attack": {column: float(held["none", column].mean()) for column in columns if ("none", column) in held},
         "entries": entries, "skipped": skipped,
