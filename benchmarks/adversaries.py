@@ -30,7 +30,6 @@ from tailgate.schema import as_data, read_yaml
 
 HERE = Path(__file__).parent
 RISING = 0.05  # of the whole rise of the learning curve, that its last tenth may bring
-CHOICE = 256  # select episodes that the learner of a cell is chosen on
 QUESTIONS = ("no attack", "own yoked schedule", "best scripted attack")
 
 
@@ -90,11 +89,12 @@ def champion(name: str, cell: dict[str, Any], record: dict[str, Any], options: a
 
 
 def chosen_by(config: train.TrainConfig, policies: list[Path]) -> list[float]:
-    """The mean outcome of each policy on select seeds."""
-    suite = train.Suite("choice", "", (config.scenario,), (None,), (config.defence,), tuple(map(str, policies)), CHOICE)
+    """The mean outcome of each policy on the episodes that the best script is chosen on."""
+    n = config.select_episodes
+    suite = train.Suite("choice", "", (config.scenario,), (None,), (config.defence,), tuple(map(str, policies)), n)
     rows = run(cells_of(suite, batch=BATCH, purpose="select", threat=dict(config.threat)), workers=config.workers)
     counted = train.outcome_of(config)
-    return [float(outcomes(rows[i * CHOICE : (i + 1) * CHOICE], counted).mean()) for i in range(len(policies))]
+    return [float(outcomes(rows[i * n : (i + 1) * n], counted).mean()) for i in range(len(policies))]
 
 
 def flags(config: train.TrainConfig, report: dict[str, Any], rows: list[dict[str, Any]]) -> list[str]:
