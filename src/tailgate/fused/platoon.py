@@ -1,0 +1,91 @@
+"""A step of a platoon from its lanes: the same order as `tailgate.loop.Loop`, for blocks of LANES episodes.
+
+start     the string, what each car is told, the first commands, the first move, the first measurement
+advance   channel -> distributed filter -> law -> channel -> cars -> measurement
+
+The records of cars and victims stand in the `window` (`platoon_rows`); the constants of filter and law in the `table` (`platoon_build`).
+"""
+
+import numpy as np
+
+from . import constants as of
+from . import platoon_channel as channel
+from . import platoon_filter as filter
+from . import platoon_road as road
+from . import road as single
+from . import step
+from .compiled import formula, phase
+from .platoon_rows import BELIEF, SEEN, SENSORS, SENT
+from .rows import ALARM, LANES, STEP, K
+
+
+@formula
+def _groups(n):
+    """How many lanes the products take."""
+    return (int(n) + filter.GROUP - 1) // filter.GROUP * filter.GROUP
+
+
+@phase
+def _move_and_measure(s, g, window, c, f, table, n):
+    """The rest of a step after the commands are applied; leaves k one higher."""
+    road.move(s, g, window, c, f, table, n)
+    single.next_step(s, g, n)
+    road.measure(s, g, window, c, f, table, n)
+
+
+@phase
+def _expect(window, table, f, n):
+    """What the channel would hold of an attack in the first step: the readings that each car expects, and the messages."""
+    whole = table.view(np.int64)
+    for j in range(f[of.CARS]):
+        car = window[j * f[of.CAR] : (j + 1) * f[of.CAR]]
+        for q in range(SENSORS):
+            row, column = SENT + np.uint64(q * LANES), BELIEF + np.uint64(whole[f[of.IN_READS] + j * SENSORS + q] * LANES)
+            for i in range(n):
+                car[row + i] = 0.0 + car[column + i]
+        for i in range(n):
+            car[SEEN + i] = -np.inf
+    road.message(window, table, f, n)
+
+
+@phase
+def start(s, g, window, intent, c, f, table, tick, n):
+    """Fresh episodes at k = 1, measured: keys and episode numbers stand in g."""
+    lanes = _groups(n)
+    step.clear(s, g, window, intent, c, n)
+    road.line_up(s, g, window, c, f, n)
+    road.remember(s, window, f, n)
+    road.told(s, g, window, c, f, n)
+    step.begin_way(s, g, c, f, n)
+    for i in range(n):
+        s[K + i] = 0.0
+        g[STEP + i] = np.uint64(0)
+    _expect(window, table, f, n)
+    channel.arrive(s, window, table, f, n)
+    road.control(s, window, table, c, f, n, lanes)
+    channel.take_hold(s, window, table, f, n)
+    road.pass_on(s, window, f, n)
+    _move_and_measure(s, g, window, c, f, table, n)
+
+
+@phase
+def advance(s, g, window, intent, c, f, table, tick, asked, n):
+    """A step under the command in the rows WANT_*, if any is `asked` for. What a Frame shows stands in the rows afterwards."""
+    lanes = _groups(n)
+    channel.decide(s, window, c, f, table, asked, n)
+    channel.arrive(s, window, table, f, n)
+    filter.calm(window, f, n, lanes)
+    filter.predict(s, window, table, f, lanes)
+    filter.innovation(s, table, f, n, lanes)
+    filter.score(s, table, f, lanes)
+    filter.update(s, window, table, f, lanes)
+    filter.lost(s, window, table, f, n)
+    filter.sound(s, window, f, lanes)
+    road.remember(s, window, f, n)
+    road.fooled(s, window, f, n)
+    road.control(s, window, table, c, f, n, lanes)
+    channel.actuate(s, window, table, f, n)
+    _move_and_measure(s, g, window, c, f, table, n)
+    road.collide(s, f, n)
+    for i in range(n):
+        s[ALARM + i] = 0.0

@@ -1,0 +1,176 @@
+"""The constants of a platoon, or why it has no lane."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from tailgate import num
+from tailgate.agents.codec import Mode
+from tailgate.core import Array
+from tailgate.envs.cacc import FeedForward
+from tailgate.envs.consensus_cacc import Consensus
+from tailgate.envs.platoon import Platoon, PlatoonSensors
+from tailgate.envs.ploeg import Ploeg
+from tailgate.estimators.compose import AcceptAll, Composed, Score
+from tailgate.estimators.distributed import DistributedKalmanFilter, FusionPlan, gain_of
+from tailgate.estimators.kalman import alone
+from tailgate.loop import Loop
+
+from . import constants as of
+from .constants import put
+from .platoon_rows import AIM_ROWS, BELIEF, CAR_ROWS, LAW, SENSORS, VICTIM_ROWS, WORK_ROWS
+from .rows import LANES, ROWS
+
+PARTS, LAWS = (Platoon, PlatoonSensors), (FeedForward, Consensus, Ploeg)
+
+
+class Table:
+    """Numbers one after the other; whole ones by their bits."""
+
+    def __init__(self, first: Array) -> None:
+        self.parts, self.size = [first], len(first)
+
+    def add(self, values: Any) -> int:
+        """-> where they begin."""
+        flat = np.array(values).ravel()
+        flat = flat.astype(np.float64) if flat.dtype.kind == "f" else flat.astype(np.int64).view(np.float64)
+        self.parts.append(flat)
+        self.size += len(flat)
+        return self.size - len(flat)
+
+    def listed(self, matrix: Array, place: Array) -> int:
+        """What is not zero of a matrix, row after row: how many, where the values of each row begin, the values, and the place of each."""
+        rows, columns = np.nonzero(matrix)
+        first = self.size + 1 + len(matrix) + 1
+        starts = first + np.searchsorted(rows, np.arange(len(matrix) + 1))
+        at = self.add([len(rows)])
+        self.add(starts)
+        self.add(matrix[rows, columns].astype(np.float64))
+        places = np.broadcast_to(place, matrix.shape)[rows, columns]
+        self.add(places.astype(np.int64))
+        return at
+
+
+def unknown(loop: Loop) -> str:
+    """Why this loop is no platoon with a lane; empty where it is one."""
+    return _parts(loop) or _defence(loop)
+
+
+def fill(loop: Loop, c: Array, f: Array, profile: Array) -> tuple[Array, int]:
+    """Fills in c and f. -> the table, which begins with the speeds of a profile, and the rows of the window."""
+    table = Table(profile if f[of.WAY] == of.PROFILE else np.zeros(0))
+    f[of.PROFILED] = table.size
+    _vehicles(loop, c, f)
+    _filter(loop.plan.defence.filter_plan, _threat(loop, f, table), f, table)
+    _law(loop, c, f, table)
+    return np.concatenate(table.parts), _places(f)
+
+
+def _parts(loop: Loop) -> str:
+    for part, known in zip((loop.plant, loop.sensor), PARTS, strict=True):
+        if type(part) is not known:
+            return f"{type(part).__name__} has no lane"
+    if type(loop.controller) not in LAWS:
+        return f"{type(loop.controller).__name__} has no lane"
+    C = loop.model.C
+    if C.shape[1] != SENSORS or not np.isin(C, (0.0, 1.0)).all() or (np.count_nonzero(C, axis=2) != 1).any():
+        return "sensors that do not read one state each have no lane"
+    return "" if loop.model.inputs == 1 and loop.model.states > 1 else "a model with several inputs has no lane"
+
+
+def _defence(loop: Loop) -> str:
+    defence = loop.defence
+    if not isinstance(defence, Composed) or type(defence).step is not Composed.step or type(defence).start is not Composed.start:
+        return f"defence {type(defence).__name__} has no lane"
+    estimator, detector, mitigation = defence.parts()
+    if type(estimator) is not DistributedKalmanFilter:
+        return f"filter {type(estimator).__name__} has no lane"
+    if not estimator.steady:
+        return "covariances of a platoon's rows have no lane"
+    if type(detector) is not Score:
+        return f"detector {type(detector).__name__} has no lane"
+    return "" if type(mitigation) is AcceptAll and mitigation.mode == "normal" else f"mitigation {type(mitigation).__name__} has no lane"
+
+
+def _vehicles(loop: Loop, c: Array, f: Array) -> None:
+    plant, plan = loop.plant, loop.plan.plant
+    assert isinstance(plant, Platoon)
+    f[of.CARS], f[of.STATES] = plant.size
+    f[of.INPUT_KNOWN], f[of.ENDS] = plant.leader_input_known, loop.ends_on_collision
+    c[of.DT], c[of.LOAD], c[of.LEAD_START + 1] = plant.dt, loop.load, plant.speed
+    put(c, of.OWN_A, plan.A)
+    put(c, of.OWN_B, plan.B)
+    put(c, of.PROCESS_SD, plan.noise_sd)
+    put(c, of.NOISE_SD, loop.plan.sensor[1])
+    put(c, of.GAPS, (plant.gap, plant.gap_sd, plant.gap_range))
+    c[of.PRIOR_SD] = plant.initial_sd
+
+
+def _threat(loop: Loop, f: Array, table: Table) -> Array:
+    """The victims, and what may be done to each of their wires. -> who they are."""
+    plan = loop.plan.channel
+    victims = np.flatnonzero(plan.granted.any(axis=1))
+    f[of.VICTIMS], f[of.IN_VICTIMS] = len(victims), table.add(victims.astype(np.int64))
+    mine = plan.granted.any(axis=0)
+    place, wires = np.where(mine, np.cumsum(mine), 0), []  # of each wire in a vector of values, of the first victim
+    for h, i in enumerate(victims):
+        wires.append([plan.granted[i].astype(np.float64), plan.bounds, plan.low, plan.high, place + h * np.count_nonzero(mine)])
+    f[of.IN_WIRES] = table.add(np.array(wires, np.float64))
+    return victims
+
+
+def _filter(plan: FusionPlan, victims: Array, f: Array, table: Table) -> None:
+    """A, B, c, L, merge and the gain, and for each victim S^-1 and gain with each set of sensors."""
+    S, cross, K = plan.S, plan.cross, plan.K
+    assert S is not None and cross is not None and K is not None
+    f[of.IN_A] = table.listed(plan.A, np.arange(len(plan.A)) * LANES)
+    f[of.IN_B], f[of.IN_C], f[of.IN_L], f[of.IN_MERGE] = (table.add(part) for part in (plan.B[:, 0], plan.c, plan.L, plan.merge))
+    f[of.IN_HEARD], f[of.IN_READS] = table.add(plan.hears.astype(np.int64)), table.add(np.argmax(plan.C, axis=2))
+    f[of.IN_W], f[of.IN_K] = table.add(num.inverse(S[None])[0]), table.add(K)
+    some = []
+    for i in victims:
+        for held in range(1 << SENSORS):
+            keep = np.array([held >> q & 1 for q in range(SENSORS)], bool)
+            part = alone(S[i][None], keep[None])
+            some.append(np.concatenate([num.inverse(part)[0], gain_of(part, cross[i][None] * keep[:, None])[0]]))
+    f[of.IN_SOME] = table.add(np.array(some, np.float64))
+
+
+def _law(loop: Loop, c: Array, f: Array, table: Table) -> None:
+    """The law for each car, on its own belief but for its own f."""
+    law: Any = loop.controller
+    gains, keep = loop.plan.controller.normal
+    cars, states = gains.K.shape
+    place = int(BELIEF) + np.tile(np.arange(states) * LANES, (cars, 1))
+    place[np.arange(1, cars), 6 + 4 * np.arange(cars - 1)] = int(LAW)
+    f[of.IN_LAW], f[of.IN_FEED] = table.listed(gains.K, place), table.listed(gains.G, place)
+    f[of.IN_BIAS], f[of.IN_V] = table.add(np.stack([gains.k0, gains.g0], axis=1)), table.add(gains.V)
+    f[of.IN_LED] = table.add(loop.plan.plant.leader_heard)
+    c[of.FADES] = keep
+    low, high = (limit if given is None else given for given, limit in ((law.accel_min, -np.inf), (law.accel_max, np.inf)))
+    put(c, of.ACCEL_MIN, (low, high))
+
+
+def _places(f: Array) -> int:
+    """Where records begin. -> rows of the window."""
+    cars, states, victims = int(f[of.CARS]), int(f[of.STATES]), int(f[of.VICTIMS])
+    f[of.CAR], f[of.HUNTED] = (CAR_ROWS + states) * LANES, cars * (CAR_ROWS + states) * LANES
+    last = ROWS
+    for name, rows in (
+        (of.WORKS, cars * WORK_ROWS), (of.AIMS, victims * AIM_ROWS), (of.TRUTHS, states), (of.FUSED, cars * states),
+        (of.SENDS, cars * states), (of.FORE, states), (of.DEALT, max(3 * cars, states) + 2),
+    ):  # fmt: skip
+        f[name], last = last * LANES, last + rows
+    f[of.ROOM] = last - ROWS
+    return cars * (CAR_ROWS + states) + victims * VICTIM_ROWS
+
+
+def modes(table: Array, f: Array, known: Sequence[Mode]) -> Array:
+    """The table with the discrete actions behind it: kind, sign, and each victim's targets and values."""
+    victims = table[f[of.IN_VICTIMS] : f[of.IN_VICTIMS] + f[of.VICTIMS]].view(np.int64)
+    f[of.IN_MODES] = len(table)
+    parts = [[(mode.kind, mode.sign), *(part for i in victims for part in (mode.target[i], mode.value))] for mode in known]
+    return np.concatenate([table, *(np.asarray(part, np.float64) for mode in parts for part in mode)])
