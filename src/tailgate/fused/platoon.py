@@ -14,15 +14,9 @@ from . import platoon_filter as filter
 from . import platoon_road as road
 from . import road as single
 from . import step
-from .compiled import formula, phase
+from .compiled import phase
 from .platoon_rows import BELIEF, SEEN, SENSORS, SENT
 from .rows import ALARM, LANES, STEP, K
-
-
-@formula
-def _groups(n):
-    """How many lanes the products take."""
-    return (int(n) + filter.GROUP - 1) // filter.GROUP * filter.GROUP
 
 
 @phase
@@ -51,7 +45,6 @@ def _expect(window, table, f, n):
 @phase
 def start(s, g, window, intent, c, f, table, tick, n):
     """Fresh episodes at k = 1, measured: keys and episode numbers stand in g."""
-    lanes = _groups(n)
     step.clear(s, g, window, intent, c, n)
     road.line_up(s, g, window, c, f, n)
     road.remember(s, window, f, n)
@@ -62,7 +55,7 @@ def start(s, g, window, intent, c, f, table, tick, n):
         g[STEP + i] = np.uint64(0)
     _expect(window, table, f, n)
     channel.arrive(s, window, table, f, n)
-    road.control(s, window, table, c, f, n, lanes)
+    road.control(s, window, table, c, f, n)
     channel.take_hold(s, window, table, f, n)
     road.pass_on(s, window, f, n)
     _move_and_measure(s, g, window, c, f, table, n)
@@ -71,19 +64,18 @@ def start(s, g, window, intent, c, f, table, tick, n):
 @phase
 def advance(s, g, window, intent, c, f, table, tick, asked, n):
     """A step under the command in the rows WANT_*, if any is `asked` for. What a Frame shows stands in the rows afterwards."""
-    lanes = _groups(n)
     channel.decide(s, window, c, f, table, asked, n)
     channel.arrive(s, window, table, f, n)
-    filter.calm(window, f, n, lanes)
-    filter.predict(s, window, table, f, lanes)
-    filter.innovation(s, table, f, n, lanes)
-    filter.score(s, table, f, lanes)
-    filter.update(s, window, table, f, lanes)
+    filter.calm(window, f, n)
+    filter.predict(s, window, table, f)
+    filter.innovation(s, table, f, n)
+    filter.score(s, table, f)
+    filter.update(s, window, table, f)
     filter.lost(s, window, table, f, n)
-    filter.sound(s, window, f, lanes)
+    filter.sound(s, window, f)
     road.remember(s, window, f, n)
     road.fooled(s, window, f, n)
-    road.control(s, window, table, c, f, n, lanes)
+    road.control(s, window, table, c, f, n)
     channel.actuate(s, window, table, f, n)
     _move_and_measure(s, g, window, c, f, table, n)
     road.collide(s, f, n)

@@ -128,7 +128,7 @@ def _filter(plan: FusionPlan, victims: Array, f: Array, table: Table) -> None:
     assert S is not None and cross is not None and K is not None
     f[of.IN_A] = table.listed(plan.A, np.arange(len(plan.A)) * LANES)
     f[of.IN_B], f[of.IN_C], f[of.IN_L], f[of.IN_MERGE] = (table.add(part) for part in (plan.B[:, 0], plan.c, plan.L, plan.merge))
-    f[of.IN_HEARD], f[of.IN_READS] = table.add(plan.hears.astype(np.int64)), table.add(np.argmax(plan.C, axis=2))
+    f[of.IN_HEARD], f[of.IN_READS] = _lists(plan.heard, table), table.add(np.argmax(plan.C, axis=2))
     f[of.IN_W], f[of.IN_K] = table.add(num.inverse(S[None])[0]), table.add(K)
     some = []
     for i in victims:
@@ -137,6 +137,14 @@ def _filter(plan: FusionPlan, victims: Array, f: Array, table: Table) -> None:
             part = alone(S[i][None], keep[None])
             some.append(np.concatenate([num.inverse(part)[0], gain_of(part, cross[i][None] * keep[:, None])[0]]))
     f[of.IN_SOME] = table.add(np.array(some, np.float64))
+
+
+def _lists(heard: tuple[tuple[int, ...], ...], table: Table) -> int:
+    """N(i) of all cars, behind where each begins. -> where that is."""
+    begin = table.size + len(heard) + 1
+    at = table.add(begin + np.cumsum([0, *map(len, heard)]))
+    table.add([j for near in heard for j in near])
+    return at
 
 
 def _law(loop: Loop, c: Array, f: Array, table: Table) -> None:

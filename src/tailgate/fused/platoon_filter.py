@@ -15,100 +15,117 @@ from .platoon_rows import AIM_ROWS, ARRIVED, BELIEF, SCORE, SENSORS, TOLD, VALID
 from .rows import LANES
 from .rows import SCORE as SOUND
 
-GROUP = 4 * WIDTH  # episodes that a product takes at a time
 WORK, AIM = WORK_ROWS * LANES, AIM_ROWS * LANES
 _SCORE, _VALID, _R, _BELIEF, _TOLD, _ARRIVED = (int(row) for row in (SCORE, VALID, R, BELIEF, TOLD, ARRIVED))
 _READINGS = 1 << SENSORS  # sets of sensors
+_1, _2, _3, _4, _5, _6, _7 = (WIDTH * i for i in range(1, 8))  # a row is eight vectors
 
 
 @formula
-def total(table, entries, line, x, u, begin, y, v, lanes):
-    """Row v of y = begin + the sum over the entries of a line of a list (`platoon_build.listed`) times rows of x, which begin at u."""
+def write(y, v, a, b, c, d, e, f, g, h):
+    """A row at v."""
+    put(y, v, a)
+    put(y, v + _1, b)
+    put(y, v + _2, c)
+    put(y, v + _3, d)
+    put(y, v + _4, e)
+    put(y, v + _5, f)
+    put(y, v + _6, g)
+    put(y, v + _7, h)
+
+
+@formula
+def total(table, entries, line, x, u, begin, y, v):
+    """The row of y at v = begin + the sum over a line of entries (`platoon_build.Table.listed`) times rows of x, counted from u."""
     whole = table.view(np.int64)
-    first, last = whole[entries + 1 + line], whole[entries + 2 + line]
-    more = whole[entries]
-    for lane in range(0, lanes, GROUP):
-        a = b = c = d = alike(begin)
-        for e in range(first, last):
-            w, o = alike(table[e]), u + lane + whole[e + more]
-            a, b = a + w * get(x, o), b + w * get(x, o + WIDTH)
-            c, d = c + w * get(x, o + 2 * WIDTH), d + w * get(x, o + 3 * WIDTH)
-        put(y, v + lane, a)
-        put(y, v + lane + WIDTH, b)
-        put(y, v + lane + 2 * WIDTH, c)
-        put(y, v + lane + 3 * WIDTH, d)
+    first, last, more = whole[entries + 1 + line], whole[entries + 2 + line], whole[entries]
+    a = b = c = d = e = f = g = h = alike(begin)
+    for k in range(first, last):
+        w, o = alike(table[k]), u + whole[k + more]
+        a, b, c, d = a + w * get(x, o), b + w * get(x, o + _1), c + w * get(x, o + _2), d + w * get(x, o + _3)
+        e, f, g, h = e + w * get(x, o + _4), f + w * get(x, o + _5), g + w * get(x, o + _6), h + w * get(x, o + _7)
+    write(y, v, a, b, c, d, e, f, g, h)
 
 
 @phase
-def product(table, at, rows, inner, x, u, y, v, lanes):
-    """y (rows) at v = the matrix (rows, inner) at `at` of the table times x (inner) at u. Two rows at a time: sums wait for themselves."""
+def product(table, at, rows, inner, x, u, y, v):
+    """y (rows) at v = the matrix (rows, inner) at a place of the table times x (inner) at u: two rows at a time, for half the way to x."""
     for pair in range(0, rows, 2):
         i = min(pair, rows - 2)
-        one, two, to = at + i * inner, at + i * inner + inner, v + i * LANES
-        for lane in range(0, lanes, GROUP):
-            a = b = c = d = e = f = g = h = alike(0.0)
-            o = u + lane
-            for k in range(inner):
-                w, z = alike(table[one + k]), alike(table[two + k])
-                p, q, r, t = get(x, o), get(x, o + WIDTH), get(x, o + 2 * WIDTH), get(x, o + 3 * WIDTH)
-                a, b, c, d = a + w * p, b + w * q, c + w * r, d + w * t
-                e, f, g, h = e + z * p, f + z * q, g + z * r, h + z * t
-                o += LANES
-            put(y, to + lane, a)
-            put(y, to + lane + WIDTH, b)
-            put(y, to + lane + 2 * WIDTH, c)
-            put(y, to + lane + 3 * WIDTH, d)
-            put(y, to + lane + LANES, e)
-            put(y, to + lane + LANES + WIDTH, f)
-            put(y, to + lane + LANES + 2 * WIDTH, g)
-            put(y, to + lane + LANES + 3 * WIDTH, h)
+        one, two, o = at + i * inner, at + i * inner + inner, u
+        a = b = c = d = e = f = g = h = alike(0.0)
+        A = B = C = D = E = F = G = H = alike(0.0)
+        for k in range(inner):
+            w, z = alike(table[one + k]), alike(table[two + k])
+            p, q, r, t = get(x, o), get(x, o + _1), get(x, o + _2), get(x, o + _3)
+            a, b, c, d = a + w * p, b + w * q, c + w * r, d + w * t
+            A, B, C, D = A + z * p, B + z * q, C + z * r, D + z * t
+            p, q, r, t = get(x, o + _4), get(x, o + _5), get(x, o + _6), get(x, o + _7)
+            e, f, g, h = e + w * p, f + w * q, g + w * r, h + w * t
+            E, F, G, H = E + z * p, F + z * q, G + z * r, H + z * t
+            o += LANES
+        write(y, v + i * LANES, a, b, c, d, e, f, g, h)
+        write(y, v + i * LANES + LANES, A, B, C, D, E, F, G, H)
 
 
 @phase
-def calm(window, f, n, lanes):
+def calm(window, f, n):
     """What lanes without an episode believe is zero: else it would die out until no number were normal, which is slow."""
     for j in range(f[of.CARS]):
-        for e in range(f[of.STATES]):
+        for e in range(f[of.STATES] if n < LANES else 0):
             at = j * f[of.CAR] + _BELIEF + e * LANES
-            for i in range(int(n), lanes):
+            for i in range(int(n), LANES):
                 window[at + i] = 0.0
 
 
 @phase
-def predict(s, window, table, f, lanes):
+def predict(s, window, table, f):
     """xb_i: what the cars send, L_j (A xh_j + B u_j + c), summed over those that are heard."""
-    whole, cars, states = table.view(np.int64), f[of.CARS], f[of.STATES]
-    fore, size = f[of.FORE], states * states
+    cars, states, size = f[of.CARS], f[of.STATES], f[of.STATES] * f[of.STATES]
     for j in range(cars):
-        car = j * f[of.CAR]
-        for e in range(states):
-            total(table, f[of.IN_A], e, window, car + _BELIEF, 0.0, s, fore + e * LANES, lanes)
-            b, c = alike(table[f[of.IN_B] + e]), alike(table[f[of.IN_C] + e])
-            for lane in range(0, lanes, WIDTH):
-                at = fore + e * LANES + lane
-                put(s, at, get(s, at) + (alike(0.0) + b * get(window, car + _TOLD + lane)) + c)
-        product(table, f[of.IN_L] + j * size, states, states, s, fore, s, f[of.SENDS] + j * states * LANES, lanes)
+        forecast(s, window, table, f, j * f[of.CAR])
+        product(table, f[of.IN_L] + j * size, states, states, s, f[of.FORE], s, f[of.SENDS] + j * states * LANES)
     for i in range(cars):
-        for e in range(states):
-            for lane in range(0, lanes, WIDTH):
-                at = e * LANES + lane
-                sent = alike(0.0)
-                for j in range(cars):
-                    if whole[f[of.IN_HEARD] + i * cars + j] != 0:
-                        sent = sent + get(s, f[of.SENDS] + j * states * LANES + at)
-                put(s, fore + at, sent)
-        product(table, f[of.IN_MERGE] + i * size, states, states, s, fore, s, f[of.FUSED] + i * states * LANES, lanes)
+        gather(s, table, f, i)
+        product(table, f[of.IN_MERGE] + i * size, states, states, s, f[of.FORE], s, f[of.FUSED] + i * states * LANES)
 
 
 @phase
-def innovation(s, table, f, n, lanes):
+def forecast(s, window, table, f, car):
+    """A xh_j + B u_j + c into the rows FORE. To add a zero changes no bit of a sum that begins with +0."""
+    for e in range(f[of.STATES]):
+        total(table, f[of.IN_A], e, window, car + _BELIEF, 0.0, s, f[of.FORE] + e * LANES)
+        b, c = table[f[of.IN_B] + e], table[f[of.IN_C] + e]
+        if b != 0.0 or c != 0.0:
+            for lane in range(0, LANES, WIDTH):
+                at = f[of.FORE] + e * LANES + lane
+                put(s, at, get(s, at) + (alike(0.0) + alike(b) * get(window, car + _TOLD + lane)) + alike(c))
+
+
+@phase
+def gather(s, table, f, i):
+    """The sum of what car i hears into the rows FORE."""
+    whole, states = table.view(np.int64), f[of.STATES]
+    first, last = whole[f[of.IN_HEARD] + i], whole[f[of.IN_HEARD] + i + 1]
+    for e in range(0, states * LANES, LANES):
+        o = f[of.SENDS] + e
+        a = b = c = d = p = q = g = h = alike(0.0)
+        for k in range(first, last):
+            z = o + whole[k] * states * LANES
+            a, b, c, d = a + get(s, z), b + get(s, z + _1), c + get(s, z + _2), d + get(s, z + _3)
+            p, q, g, h = p + get(s, z + _4), q + get(s, z + _5), g + get(s, z + _6), h + get(s, z + _7)
+        write(s, f[of.FORE] + e, a, b, c, d, p, q, g, h)
+
+
+@phase
+def innovation(s, table, f, n):
     """r_i, 0 where nothing is read."""
     whole, states = table.view(np.int64), f[of.STATES]
     for i in range(f[of.CARS]):
         work, fused = f[of.WORKS] + i * WORK, f[of.FUSED] + i * states * LANES
         for q in range(SENSORS):
             column = fused + whole[f[of.IN_READS] + i * SENSORS + q] * LANES
-            for lane in range(0, lanes, WIDTH):
+            for lane in range(0, LANES, WIDTH):
                 y = get(s, work + _ARRIVED + q * LANES + lane)
                 put(s, work + _R + q * LANES + lane, y - (alike(0.0) + get(s, column + lane)))
     for h in range(f[of.VICTIMS]):
@@ -120,11 +137,11 @@ def innovation(s, table, f, n, lanes):
 
 
 @phase
-def score(s, table, f, lanes):
+def score(s, table, f):
     """g_i = r' S^-1 r."""
     for i in range(f[of.CARS]):
         work, w = f[of.WORKS] + i * WORK, f[of.IN_W] + i * SENSORS * SENSORS
-        for lane in range(0, lanes, WIDTH):
+        for lane in range(0, LANES, WIDTH):
             at = work + _R + lane
             r0, r1, r2 = get(s, at), get(s, at + LANES), get(s, at + 2 * LANES)
             t0 = alike(table[w]) * r0 + alike(table[w + 1]) * r1 + alike(table[w + 2]) * r2
@@ -134,17 +151,18 @@ def score(s, table, f, lanes):
 
 
 @phase
-def update(s, window, table, f, lanes):
+def update(s, window, table, f):
     """xh_i."""
     states = f[of.STATES]
     for i in range(f[of.CARS]):
         r, fused, belief = f[of.WORKS] + i * WORK + _R, f[of.FUSED] + i * states * LANES, i * f[of.CAR] + _BELIEF
-        for e in range(states):
-            k = f[of.IN_K] + (i * states + e) * SENSORS
-            k0, k1, k2 = alike(table[k]), alike(table[k + 1]), alike(table[k + 2])
-            for lane in range(0, lanes, WIDTH):
-                r0, r1, r2 = get(s, r + lane), get(s, r + lane + LANES), get(s, r + lane + 2 * LANES)
-                put(window, belief + e * LANES + lane, get(s, fused + e * LANES + lane) + (alike(0.0) + k0 * r0 + k1 * r1 + k2 * r2))
+        for lane in range(0, LANES, WIDTH):
+            r0, r1, r2 = get(s, r + lane), get(s, r + lane + LANES), get(s, r + lane + 2 * LANES)
+            k, at = f[of.IN_K] + i * states * SENSORS, lane
+            for _ in range(states):
+                correction = alike(0.0) + alike(table[k]) * r0 + alike(table[k + 1]) * r1 + alike(table[k + 2]) * r2
+                put(window, belief + at, get(s, fused + at) + correction)
+                k, at = k + SENSORS, at + LANES
 
 
 @phase
@@ -172,12 +190,16 @@ def lost(s, window, table, f, n):
 
 
 @phase
-def sound(s, window, f, lanes):
+def sound(s, window, f):
     """Row SCORE of the episode: 0, or NaN where an estimate or a score is not finite."""
-    for lane in range(0, lanes, WIDTH):
-        bad = alike(0.0)
+    for lane in range(0, LANES, WIDTH):
+        bad = worse = alike(0.0)
         for i in range(f[of.CARS]):
+            at = i * f[of.CAR] + _BELIEF + lane
             bad = bad + alike(0.0) * get(s, f[of.WORKS] + i * WORK + _SCORE + lane)
-            for e in range(f[of.STATES]):
-                bad = bad + alike(0.0) * get(window, i * f[of.CAR] + _BELIEF + e * LANES + lane)
-        put(s, int(SOUND) + lane, bad)
+            for _ in range(0, f[of.STATES] - 1, 2):
+                bad, worse = bad + alike(0.0) * get(window, at), worse + alike(0.0) * get(window, at + LANES)
+                at += 2 * LANES
+            if f[of.STATES] % 2:
+                bad = bad + alike(0.0) * get(window, at)
+        put(s, int(SOUND) + lane, bad + worse)

@@ -106,13 +106,13 @@ def remember(s, window, f, n):
 
 
 @phase
-def control(s, window, table, c, f, n, lanes):
+def control(s, window, table, c, f, n):
     """u = K X + k0 within its limits, and f one step later: keep f + (1 - keep) (G X + g0 + V v2v). A car knows its own f."""
     low, high, keep = c[of.ACCEL_MIN], c[of.ACCEL_MAX], c[of.FADES]
     for j in range(1, f[of.CARS]):
         first, to, bias, gain = j * f[of.CAR], f[of.WORKS] + j * WORK, f[of.IN_BIAS] + 2 * j, f[of.IN_V] + 3 * j
-        total(table, f[of.IN_LAW], j, window, first, table[bias], window, first + _COMMAND, lanes)
-        total(table, f[of.IN_FEED], j, window, first, table[bias + 1], s, to + _NEXT, lanes)
+        total(table, f[of.IN_LAW], j, window, first, table[bias], window, first + _COMMAND)
+        total(table, f[of.IN_FEED], j, window, first, table[bias + 1], s, to + _NEXT)
         car, work = window[first : first + f[of.CAR]], s[to : to + WORK]
         v0, v1, v2 = table[gain], table[gain + 1], table[gain + 2]
         if v0 != 0.0:
