@@ -38,6 +38,15 @@ CELLS = [
     ("platoon-two-predecessor-v0", "dkf", "actuator_fdi:start_step=20,value=1.5", ANY),
     ("platoon-20-v0", "dkf", "fdi:start_step=20,value=-20", {}),
     ("platoon-braking-v0", "composed:filter=dkf,detector=score,mitigation=accept_all", "dropout:start_step=30", LEADER),
+    ("platoon-gusty-v0", "lasso_dkf", "fdi:start_step=20,value=30", ANY),
+    ("platoon-heavy-v0", "lasso_dkf:unit=sigma,lam=1.3", "dropout:start_step=30,probability=0.5", ANY),
+    ("platoon-20-v0", "lasso_dkf", "dos_hold:start_step=20", {}),
+    ("platoon-bidirectional-v0", "norm_resilient", "fdi_gaussian:start_step=20,sd=8", ANY),
+    ("platoon-noisy-v0", "norm_resilient:lam=5", "dropout:start_step=30,probability=0.5", ANY),
+    ("platoon-gusty-v0", "norm_resilient", "fdi_bernoulli:start_step=20,value=50", LEADER),
+    ("platoon-stop-and-go-v0", "saturated_dkf", "fdi:start_step=20,value=-50", {"onset": 10}),
+    ("platoon-two-predecessor-v0", "saturated_dkf:eta=3,gamma=0.5", "dropout:start_step=30,probability=0.5", ANY),
+    ("platoon-braking-v0", "composed:filter=lasso,detector=chi2_tail,mitigation=accept_all", "dos_jam:start_step=20", ANY),
 ]
 
 
@@ -96,6 +105,10 @@ ENVIRONMENTS = [
      "attack_cost": 0.1, "illegal_penalty": 0.2, "threat": {"agents": [2, 4]}},
     {"scenario": "platoon-braking-known-v0", "defence": "dkf", "action": "timing", "kind": "dos_jam", "reward": "collision"},
     {"scenario": "platoon-20-v0", "defence": "dkf", "per_sensor": True, "per_agent": True, "autoreset": "same_step"},
+    {"scenario": "platoon-braking-v0", "defence": "lasso_dkf", "autoreset": "same_step", "reward": "error"},
+    {"scenario": "platoon-gusty-v0", "defence": "saturated_dkf:eta=2", "autoreset": "next_step", "action": "continuous", "reward": "stealth",
+     "threat": {"kinds": ["fdi"], "targets": ["distance", "velocity"]}},
+    {"scenario": "platoon-noisy-v0", "defence": "norm_resilient", "interval": 2},
     {"scenario": "platoon-bidirectional-v0", "defence": "dkf", "interval": 3, "per_agent": True, "value": -20.0,
      "threat": {"agents": [0, 1, 4], "sees_measurement": True}},
 ]  # fmt: skip
@@ -184,12 +197,14 @@ def test_a_command_beyond_what_is_granted_is_refused():
 
 @pytest.mark.parametrize(("scenario", "defence", "threat", "why"), [
     ("platoon-lossy-v0", "dkf", {}, "lost or late"), ("platoon-braking-v0", "dkf:gain=varying", {}, "covariances"),
+    ("platoon-braking-v0", "lasso_dkf:solver=cvxpy", {}, "not the exact one"), ("platoon-braking-v0", "centralised_kf", {}, "no lane"),
     ("platoon-braking-v0", "chi2_dkf", {}, "no lane"), ("platoon-braking-v0", "dkf", {"knowledge": "white"}, "white-box"),
     ("platoon-v2v-v0", "dkf", {}, "delay, replay"), ("thesis-ch6-v0", "dkf", {}, "no lane"), ("thesis-ch5-v0", "dkf", {}, "no lane"),
     ("platoon-braking-v0", "composed:filter=dkf,detector=score,mitigation=accept_all,mitigation.mode=brake", {}, "mitigation AcceptAll"),
 ])  # fmt: skip
 def test_what_has_no_lane_is_played_by_the_plain_loop(scenario, defence, threat, why):
     """And says why."""
+    pytest.importorskip("cvxpy") if "cvxpy" in defence else None
     guard = Spec("defence", defence)
     found = fuse(load_scenario(scenario).with_threat(**threat).loop(guard.make(), guard.entry.uses))
     assert isinstance(found, Refused) and why in found.why, found

@@ -10,13 +10,14 @@ import numpy as np
 
 from . import constants as of
 from . import platoon_channel as channel
+from . import platoon_defence as defence
 from . import platoon_filter as filter
 from . import platoon_road as road
 from . import road as single
 from . import step
 from .compiled import phase
 from .platoon_rows import BELIEF, SEEN, SENSORS, SENT
-from .rows import ALARM, LANES, STEP, K
+from .rows import LANES, STEP, K
 
 
 @phase
@@ -70,8 +71,11 @@ def advance(s, g, window, intent, c, f, table, tick, asked, n):
     filter.predict(s, window, table, f)
     filter.innovation(s, table, f, n)
     filter.score(s, table, f)
-    filter.update(s, window, table, f)
-    filter.lost(s, window, table, f, n)
+    filter.score_again(s, table, f, n)
+    defence.alarm(s, c, f, n)
+    defence.believe(s, table, c, f, n)
+    filter.update(s, window, table, c, f)
+    filter.update_again(s, window, table, c, f, n)
     filter.sound(s, window, f)
     road.remember(s, window, f, n)
     road.fooled(s, window, f, n)
@@ -79,5 +83,3 @@ def advance(s, g, window, intent, c, f, table, tick, asked, n):
     channel.actuate(s, window, table, f, n)
     _move_and_measure(s, g, window, c, f, table, n)
     road.collide(s, f, n)
-    for i in range(n):
-        s[ALARM + i] = 0.0

@@ -14,9 +14,14 @@ from tailgate.envs.cacc import FeedForward
 from tailgate.envs.consensus_cacc import Consensus
 from tailgate.envs.platoon import Platoon, PlatoonSensors
 from tailgate.envs.ploeg import Ploeg
-from tailgate.estimators.compose import AcceptAll, Composed, Score
-from tailgate.estimators.distributed import DistributedKalmanFilter, FusionPlan, gain_of
+from tailgate.estimators.chi_square import ChiSquare
+from tailgate.estimators.compose import AcceptAll, Composed, ComposedPlan, Score
+from tailgate.estimators.distributed import DistributedKalmanFilter, FusionPlan, TailChiSquare, gain_of
 from tailgate.estimators.kalman import alone
+from tailgate.estimators.lasso import LassoFilter
+from tailgate.estimators.norm_resilient import NormResilientFilter, axes
+from tailgate.estimators.saturated import SaturatedFilter
+from tailgate.estimators.sentinels import AlwaysAlarm
 from tailgate.loop import Loop
 
 from . import constants as of
@@ -25,6 +30,10 @@ from .platoon_rows import AIM_ROWS, BELIEF, CAR_ROWS, LAW, SENSORS, VICTIM_ROWS,
 from .rows import LANES, ROWS
 
 PARTS, LAWS = (Platoon, PlatoonSensors), (FeedForward, Consensus, Ploeg)
+ESTIMATORS = {
+    DistributedKalmanFilter: of.LINEAR, LassoFilter: of.LASSO, SaturatedFilter: of.SATURATED, NormResilientFilter: of.NORM,
+}  # fmt: skip
+DETECTORS = (Score, ChiSquare, TailChiSquare, AlwaysAlarm)
 
 
 class Table:
@@ -64,7 +73,8 @@ def fill(loop: Loop, c: Array, f: Array, profile: Array) -> tuple[Array, int]:
     table = Table(profile if f[of.WAY] == of.PROFILE else np.zeros(0))
     f[of.PROFILED] = table.size
     _vehicles(loop, c, f)
-    _filter(loop.plan.defence.filter_plan, _threat(loop, f, table), f, table)
+    _filter(loop.plan.defence, _threat(loop, f, table), c, f, table)
+    _detector(loop.plan.defence, c, f)
     _law(loop, c, f, table)
     return np.concatenate(table.parts), _places(f)
 
@@ -85,12 +95,15 @@ def _defence(loop: Loop) -> str:
     defence = loop.defence
     if not isinstance(defence, Composed) or type(defence).step is not Composed.step or type(defence).start is not Composed.start:
         return f"defence {type(defence).__name__} has no lane"
+    estimator: Any
     estimator, detector, mitigation = defence.parts()
-    if type(estimator) is not DistributedKalmanFilter:
+    if type(estimator) not in ESTIMATORS:
         return f"filter {type(estimator).__name__} has no lane"
     if not estimator.steady:
         return "covariances of a platoon's rows have no lane"
-    if type(detector) is not Score:
+    if getattr(estimator, "solver", "exact") != "exact":
+        return "the solver is not the exact one"
+    if type(detector) not in DETECTORS:
         return f"detector {type(detector).__name__} has no lane"
     return "" if type(mitigation) is AcceptAll and mitigation.mode == "normal" else f"mitigation {type(mitigation).__name__} has no lane"
 
@@ -122,21 +135,42 @@ def _threat(loop: Loop, f: Array, table: Table) -> Array:
     return victims
 
 
-def _filter(plan: FusionPlan, victims: Array, f: Array, table: Table) -> None:
+def _filter(held: ComposedPlan, victims: Array, c: Array, f: Array, table: Table) -> None:
     """A, B, c, L, merge and the gain, and for each victim S^-1 and gain with each set of sensors."""
+    part: Any = held.filter
+    plan: FusionPlan = getattr(held.filter_plan, "linear", held.filter_plan)
     S, cross, K = plan.S, plan.cross, plan.K
     assert S is not None and cross is not None and K is not None
     f[of.IN_A] = table.listed(plan.A, np.arange(len(plan.A)) * LANES)
-    f[of.IN_B], f[of.IN_C], f[of.IN_L], f[of.IN_MERGE] = (table.add(part) for part in (plan.B[:, 0], plan.c, plan.L, plan.merge))
+    f[of.IN_B], f[of.IN_C], f[of.IN_L], f[of.IN_MERGE] = (table.add(each) for each in (plan.B[:, 0], plan.c, plan.L, plan.merge))
     f[of.IN_HEARD], f[of.IN_READS] = _lists(plan.heard, table), table.add(np.argmax(plan.C, axis=2))
+    f[of.ESTIMATOR], c[of.PRICE], c[of.FACTOR] = ESTIMATORS[type(part)], getattr(part, "gamma", 0.0), 1.0
+    keeps = np.array([[some >> q & 1 for q in range(SENSORS)] for some in range(1 << SENSORS)], bool)
+    weights, gains, shapes = [], [], []
+    for i in range(len(S)):
+        for keep in keeps:
+            mine = alone(S[i][None], keep[None])
+            weights.append(num.inverse(mine)[0])
+            gains.append(gain_of(mine, cross[i][None] * keep[:, None])[0])
+            if f[of.ESTIMATOR] == of.LASSO:
+                shapes.append(np.concatenate([weights[-1].ravel(), 0.5 * part.price(mine)[0], mine[0].diagonal()]))
+            elif f[of.ESTIMATOR] == of.NORM:
+                spread = held.filter_plan.spread[i][None]
+                own = axes(plan.C[i][None] * keep[:, None], alone(plan.R[i][None], keep[None]), spread)
+                gains[-1] = own.push[0]
+                shapes.append(np.concatenate([own.turn[0].ravel(), part.lam * own.half[0]]))
+    if f[of.ESTIMATOR] == of.NORM:
+        K, c[of.FACTOR] = held.filter_plan.whole.push, part.lam
     f[of.IN_W], f[of.IN_K] = table.add(num.inverse(S[None])[0]), table.add(K)
-    some = []
-    for i in victims:
-        for held in range(1 << SENSORS):
-            keep = np.array([held >> q & 1 for q in range(SENSORS)], bool)
-            part = alone(S[i][None], keep[None])
-            some.append(np.concatenate([num.inverse(part)[0], gain_of(part, cross[i][None] * keep[:, None])[0]]))
+    f[of.SHAPE], f[of.IN_SHAPE] = (len(shapes[0]) if shapes else 0), table.add(np.array(shapes, np.float64))
+    some = [np.concatenate([weights[i * len(keeps) + k], gains[i * len(keeps) + k]]) for i in victims for k in range(len(keeps))]
     f[of.IN_SOME] = table.add(np.array(some, np.float64))
+
+
+def _detector(held: ComposedPlan, c: Array, f: Array) -> None:
+    part: Any = held.detector
+    f[of.DETECTOR] = of.ALWAYS if type(part) is AlwaysAlarm else of.CHI2
+    c[of.THRESHOLD] = held.detector_plan if type(part) is TailChiSquare else getattr(part, "eta", np.inf)
 
 
 def _lists(heard: tuple[tuple[int, ...], ...], table: Table) -> int:
@@ -169,7 +203,7 @@ def _places(f: Array) -> int:
     last = ROWS
     for name, rows in (
         (of.WORKS, cars * WORK_ROWS), (of.AIMS, victims * AIM_ROWS), (of.TRUTHS, states), (of.FUSED, cars * states),
-        (of.SENDS, cars * states), (of.FORE, states), (of.DEALT, max(3 * cars, states) + 2),
+        (of.SENDS, cars * states), (of.FORE, states), (of.DEALT, max(3 * cars, states) + 3),
     ):  # fmt: skip
         f[name], last = last * LANES, last + rows
     f[of.ROOM] = last - ROWS

@@ -17,7 +17,7 @@ from .rows import SCORE as SOUND
 
 WORK, AIM = WORK_ROWS * LANES, AIM_ROWS * LANES
 _SCORE, _VALID, _R, _BELIEF, _TOLD, _ARRIVED = (int(row) for row in (SCORE, VALID, R, BELIEF, TOLD, ARRIVED))
-_READINGS = 1 << SENSORS  # sets of sensors
+SETS = 1 << SENSORS  # of sensors that are read
 _1, _2, _3, _4, _5, _6, _7 = (WIDTH * i for i in range(1, 8))  # a row is eight vectors
 
 
@@ -151,9 +151,9 @@ def score(s, table, f):
 
 
 @phase
-def update(s, window, table, f):
+def update(s, window, table, c, f):
     """xh_i."""
-    states = f[of.STATES]
+    states, factor = f[of.STATES], alike(c[of.FACTOR])
     for i in range(f[of.CARS]):
         r, fused, belief = f[of.WORKS] + i * WORK + _R, f[of.FUSED] + i * states * LANES, i * f[of.CAR] + _BELIEF
         for lane in range(0, LANES, WIDTH):
@@ -161,32 +161,49 @@ def update(s, window, table, f):
             k, at = f[of.IN_K] + i * states * SENSORS, lane
             for _ in range(states):
                 correction = alike(0.0) + alike(table[k]) * r0 + alike(table[k + 1]) * r1 + alike(table[k + 2]) * r2
-                put(window, belief + at, get(s, fused + at) + correction)
+                put(window, belief + at, get(s, fused + at) + factor * correction)
                 k, at = k + SENSORS, at + LANES
 
 
+@formula
+def _missing(s, table, f, h, i):
+    """Where S^-1 and the gain stand with which a victim's sensors that are read weigh alone; 0 where all are read."""
+    valid = f[of.AIMS] + h * AIM + _VALID + i
+    some = int(s[valid]) + 2 * int(s[valid + LANES]) + 4 * int(s[valid + 2 * LANES])
+    return 0 if some == SETS - 1 else f[of.IN_SOME] + (h * SETS + some) * (SENSORS + f[of.STATES]) * SENSORS
+
+
 @phase
-def lost(s, window, table, f, n):
-    """Score and estimate again in the episodes in which a victim misses a reading: the others weigh as they do alone."""
-    whole, states = table.view(np.int64), f[of.STATES]
-    wide = (SENSORS + states) * SENSORS  # of S^-1 and of the gain for one set of sensors
+def score_again(s, table, f, n):
+    """g_i of the victims in the episodes in which they miss a reading."""
+    whole = table.view(np.int64)
     for h in range(f[of.VICTIMS]):
-        victim, valid = whole[f[of.IN_VICTIMS] + h], f[of.AIMS] + h * AIM + _VALID
+        work = f[of.WORKS] + whole[f[of.IN_VICTIMS] + h] * WORK
+        for i in range(int(n)):
+            w = _missing(s, table, f, h, i)
+            if w > 0:
+                r0, r1, r2 = s[work + _R + i], s[work + _R + LANES + i], s[work + _R + 2 * LANES + i]
+                t0 = table[w] * r0 + table[w + 1] * r1 + table[w + 2] * r2
+                t1 = table[w + 3] * r0 + table[w + 4] * r1 + table[w + 5] * r2
+                t2 = table[w + 6] * r0 + table[w + 7] * r1 + table[w + 8] * r2
+                s[work + _SCORE + i] = r0 * t0 + r1 * t1 + r2 * t2
+
+
+@phase
+def update_again(s, window, table, c, f, n):
+    """xh_i likewise."""
+    whole, states = table.view(np.int64), f[of.STATES]
+    for h in range(f[of.VICTIMS]):
+        victim = whole[f[of.IN_VICTIMS] + h]
         work, fused, belief = f[of.WORKS] + victim * WORK, f[of.FUSED] + victim * states * LANES, victim * f[of.CAR] + _BELIEF
         for i in range(int(n)):
-            some = int(s[valid + i]) + 2 * int(s[valid + LANES + i]) + 4 * int(s[valid + 2 * LANES + i])
-            if some == _READINGS - 1:
-                continue
-            w = f[of.IN_SOME] + (h * _READINGS + some) * wide
-            r0, r1, r2 = s[work + _R + i], s[work + _R + LANES + i], s[work + _R + 2 * LANES + i]
-            t0 = table[w] * r0 + table[w + 1] * r1 + table[w + 2] * r2
-            t1 = table[w + 3] * r0 + table[w + 4] * r1 + table[w + 5] * r2
-            t2 = table[w + 6] * r0 + table[w + 7] * r1 + table[w + 8] * r2
-            s[work + _SCORE + i] = r0 * t0 + r1 * t1 + r2 * t2
-            for e in range(states):
-                k = w + (SENSORS + e) * SENSORS
-                corrected = table[k] * r0 + table[k + 1] * r1 + table[k + 2] * r2
-                window[belief + e * LANES + i] = s[fused + e * LANES + i] + corrected
+            k = _missing(s, table, f, h, i)
+            if k > 0:
+                r0, r1, r2 = s[work + _R + i], s[work + _R + LANES + i], s[work + _R + 2 * LANES + i]
+                for e in range(states):
+                    k += SENSORS if e > 0 else SENSORS * SENSORS
+                    correction = table[k] * r0 + table[k + 1] * r1 + table[k + 2] * r2
+                    window[belief + e * LANES + i] = s[fused + e * LANES + i] + c[of.FACTOR] * correction
 
 
 @phase

@@ -48,6 +48,7 @@ def _parts(f: Array) -> dict[str, _Part]:
     return {
         "position": record(of_car.X), "speed": record(of_car.V), "accel": record(of_car.A), "control": record(of_car.COMMAND),
         "estimate": record(of_car.BELIEF, states), "gap": worked(of_car.GAP), "ahead": worked(of_car.AHEAD), "score": worked(of_car.SCORE),
+        "alarm": worked(of_car.ALARM),
         "wires": worked(of_car.ARRIVED, LINKS), "applied": worked(of_car.APPLIED),
     }  # fmt: skip
 
@@ -106,7 +107,7 @@ def signals(loop: Any, record: Array, f: Array) -> dict[str, Array]:
         "clean": spread("clean", held["wires"]), "wires": held["wires"], "valid": spread("valid", np.ones((*shape, SENSORS))) != 0.0,
         "energy": np.zeros(shape), "probe": np.ones(shape, bool), "control": held["control"], "applied": held["applied"],
         "value": spread("value", nothing), "kind": one["kind"][..., 0].astype(np.int8), "target": spread("target", nothing) != 0.0,
-        "alarm": np.zeros(shape, bool), "mode": np.zeros(shape, np.int8), "refused": one["refused"][..., 0] != 0.0,
+        "alarm": one["alarm"] != 0.0, "mode": np.zeros(shape, np.int8), "refused": one["refused"][..., 0] != 0.0,
         "collided": one["hit"][..., 0] != 0.0, "rear_collided": np.zeros(shape[:2], bool),
     }  # fmt: skip
 
