@@ -21,6 +21,7 @@ from .test_fused import _loop, _same, _short
 WIRES = ("distance", "velocity", "acceleration", "predecessor_acceleration", "leader_acceleration", "predecessor_command", "command")
 ANY = {"onset": 10, "end": 110, "agents": (1, 2, 4), "targets": WIRES}
 LEADER = {"onset": 10, "agents": (0, 3)}
+READ = ANY | {"kinds": ("dos_jam", "dos_hold", "dos_hold_fresh", "fdi")}  # nothing is missed: covariances are the same in all rows
 CELLS = [
     ("platoon-braking-v0", "dkf", "none", {}),
     ("platoon-braking-v0", "dkf", "fdi:value=60,targets=[distance]", {"onset": 20}),
@@ -46,6 +47,17 @@ CELLS = [
     ("platoon-gusty-v0", "norm_resilient", "fdi_bernoulli:start_step=20,value=50", LEADER),
     ("platoon-stop-and-go-v0", "saturated_dkf", "fdi:start_step=20,value=-50", {"onset": 10}),
     ("platoon-two-predecessor-v0", "saturated_dkf:eta=3,gamma=0.5", "dropout:start_step=30,probability=0.5", ANY),
+    ("platoon-heavy-v0", "none", "dropout:start_step=30,probability=0.5", ANY),
+    ("platoon-20-v0", "none", "fdi:start_step=20,value=30", {}),
+    ("platoon-gusty-v0", "kf", "fdi:start_step=20,value=30", READ),
+    ("platoon-two-predecessor-v0", "composed:filter=kf,detector=chi2,mitigation=accept_all", "dos_jam:start_step=20", READ),
+    ("platoon-bidirectional-v0", "consensus_kf", "fdi_gaussian:start_step=20,sd=8", READ),
+    ("platoon-noisy-v0", "consensus_kf:eta=4,consensus=0.3", "dos_hold:start_step=20", READ),
+    ("platoon-stop-and-go-v0", "consensus_kf:consensus=0", "none", READ),
+    ("platoon-gusty-v0", "always_alarm", "none", READ),
+    ("platoon-gusty-v0", "always_brake", "fdi:start_step=20,value=30", READ),
+    ("platoon-bidirectional-v0", "stand_still", "none", READ),
+    ("platoon-gusty-v0", "coast", "fdi:start_step=20,value=-9", READ),
     ("platoon-braking-v0", "composed:filter=lasso,detector=chi2_tail,mitigation=accept_all", "dos_jam:start_step=20", ANY),
 ]
 
@@ -109,6 +121,9 @@ ENVIRONMENTS = [
     {"scenario": "platoon-gusty-v0", "defence": "saturated_dkf:eta=2", "autoreset": "next_step", "action": "continuous", "reward": "stealth",
      "threat": {"kinds": ["fdi"], "targets": ["distance", "velocity"]}},
     {"scenario": "platoon-noisy-v0", "defence": "norm_resilient", "interval": 2},
+    {"scenario": "platoon-gusty-v0", "defence": "none", "autoreset": "same_step", "interval": 4, "action": "increment"},
+    {"scenario": "platoon-gusty-v0", "defence": "kf", "autoreset": "same_step", "threat": {"kinds": ["fdi", "dos_hold"]}, "value": -40.0},
+    {"scenario": "platoon-bidirectional-v0", "defence": "consensus_kf", "interval": 7, "threat": {"kinds": ["fdi", "dos_hold"]}, "value": -40.0},
     {"scenario": "platoon-bidirectional-v0", "defence": "dkf", "interval": 3, "per_agent": True, "value": -20.0,
      "threat": {"agents": [0, 1, 4], "sees_measurement": True}},
 ]  # fmt: skip
@@ -197,6 +212,8 @@ def test_a_command_beyond_what_is_granted_is_refused():
 
 @pytest.mark.parametrize(("scenario", "defence", "threat", "why"), [
     ("platoon-lossy-v0", "dkf", {}, "lost or late"), ("platoon-braking-v0", "dkf:gain=varying", {}, "covariances"),
+    ("platoon-gusty-v0", "kf", {}, "what is missed"), ("platoon-20-v0", "consensus_kf", {"kinds": ["fdi"]}, "so many gains"),
+    ("platoon-gusty-v0", "consensus_kf:share=true", {"kinds": ["fdi"]}, "shared"),
     ("platoon-braking-v0", "lasso_dkf:solver=cvxpy", {}, "not the exact one"), ("platoon-braking-v0", "centralised_kf", {}, "no lane"),
     ("platoon-braking-v0", "chi2_dkf", {}, "no lane"), ("platoon-braking-v0", "dkf", {"knowledge": "white"}, "white-box"),
     ("platoon-v2v-v0", "dkf", {}, "delay, replay"), ("thesis-ch6-v0", "dkf", {}, "no lane"), ("thesis-ch5-v0", "dkf", {}, "no lane"),

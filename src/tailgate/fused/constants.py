@@ -112,6 +112,8 @@ SENDS, FORE, DEALT = _choice("sends"), _choice("fore"), _choice("dealt")
 IN_A, IN_B, IN_C, IN_L, IN_MERGE, IN_HEARD = (_choice(name) for name in ("A", "B", "c", "L", "merge", "heard"))  # prediction and fusion
 IN_READS, IN_W, IN_K, IN_SOME = (_choice(name) for name in ("reads", "W", "K", "some"))  # C, S^-1, gain; both where readings are missing
 IN_LAW, IN_FEED, IN_BIAS, IN_V, IN_LED = (_choice(name) for name in ("law", "feed", "bias", "V", "led"))  # K, G, k0 and g0, V of the law
+ALONE, STEPPED, PULLED = _choice("alone"), _choice("stepped"), _choice("pulled")  # no fusion; gains of so many steps; consensus
+STEP_WIDE, IN_HEARS = _choice("step wide"), _choice("hears")  # how far apart the gains of two steps are; who reads whose sensors
 ESTIMATOR, SHAPE, IN_SHAPE = _choice("estimator"), _choice("shape"), _choice("in shape")  # and what is made of an innovation before
 IN_VICTIMS, IN_WIRES, IN_MODES, PROFILED = (_choice(name) for name in ("victims", "wires", "modes", "profiled"))
 CHOICES = len(_choices)
@@ -120,7 +122,7 @@ CHOICES = len(_choices)
 CONSTANT, PULSE, SWITCHED, SINE, BRAKING, STOP_AND_GO, RANDOM, PROFILE = range(8)
 SCORE_ONLY, CHI2, WINDOWED, CUSUM, MEWMA, ALWAYS, SPARSE = range(7)
 ACCEPT_ALL, GATE_OUT, REACQUIRE, ACCEPT_FIRST, ALWAYS_MODE, ACCEPT_HONEST = range(6)
-LINEAR, LASSO, SATURATED, NORM = range(4)  # updates of a platoon's filter
+LINEAR, LASSO, SATURATED, NORM, READ = range(5)  # how a platoon's cars estimate
 DISCRETE, RAMPING, CONTINUOUS, INCREMENT = range(4)  # actions
 CRASH, MIN_GAP, ERROR, STEALTH, FINAL = range(5)  # rewards
 

@@ -13,6 +13,7 @@ from . import platoon_channel as channel
 from . import platoon_defence as defence
 from . import platoon_filter as filter
 from . import platoon_road as road
+from . import platoon_steps as steps
 from . import road as single
 from . import step
 from .compiled import phase
@@ -56,7 +57,7 @@ def start(s, g, window, intent, c, f, table, tick, n):
         g[STEP + i] = np.uint64(0)
     _expect(window, table, f, n)
     channel.arrive(s, window, table, f, n)
-    road.control(s, window, table, c, f, n)
+    road.control(s, window, table, c, f, 0.0, n)
     channel.take_hold(s, window, table, f, n)
     road.pass_on(s, window, f, n)
     _move_and_measure(s, g, window, c, f, table, n)
@@ -67,19 +68,26 @@ def advance(s, g, window, intent, c, f, table, tick, asked, n):
     """A step under the command in the rows WANT_*, if any is `asked` for. What a Frame shows stands in the rows afterwards."""
     channel.decide(s, window, c, f, table, asked, n)
     channel.arrive(s, window, table, f, n)
-    filter.calm(window, f, n)
-    filter.predict(s, window, table, f)
-    filter.innovation(s, table, f, n)
-    filter.score(s, table, f)
-    filter.score_again(s, table, f, n)
+    if f[of.ESTIMATOR] == of.READ:
+        steps.read(s, window, table, f, n)
+    else:
+        filter.calm(window, f, n)
+        filter.predict(s, window, table, f)
+        filter.innovation(s, table, f, n)
+        if f[of.STEPPED] != 0:
+            steps.weigh(s, table, f, n)
+            steps.correct(s, window, table, c, f, n)
+        else:
+            filter.score(s, table, f, f[of.IN_W], SENSORS * SENSORS)
+            filter.score_again(s, table, f, n)
+            defence.believe(s, table, c, f, n)
+            filter.update(s, window, table, c, f, f[of.IN_K], f[of.STATES] * SENSORS)
+            filter.update_again(s, window, table, c, f, n)
     defence.alarm(s, c, f, n)
-    defence.believe(s, table, c, f, n)
-    filter.update(s, window, table, c, f)
-    filter.update_again(s, window, table, c, f, n)
     filter.sound(s, window, f)
     road.remember(s, window, f, n)
     road.fooled(s, window, f, n)
-    road.control(s, window, table, c, f, n)
+    road.control(s, window, table, c, f, c[of.ASKED], n)
     channel.actuate(s, window, table, f, n)
     _move_and_measure(s, g, window, c, f, table, n)
     road.collide(s, f, n)

@@ -10,21 +10,25 @@ import numpy as np
 from tailgate import num
 from tailgate.agents.codec import Mode
 from tailgate.core import Array
+from tailgate.core import Mode as Asked
 from tailgate.envs.cacc import FeedForward
 from tailgate.envs.consensus_cacc import Consensus
 from tailgate.envs.platoon import Platoon, PlatoonSensors
 from tailgate.envs.ploeg import Ploeg
 from tailgate.estimators.chi_square import ChiSquare
 from tailgate.estimators.compose import AcceptAll, Composed, ComposedPlan, Score
-from tailgate.estimators.distributed import DistributedKalmanFilter, FusionPlan, TailChiSquare, gain_of
-from tailgate.estimators.kalman import alone
+from tailgate.estimators.consensus import ConsensusFilter
+from tailgate.estimators.distributed import DistributedKalmanFilter, TailChiSquare, gain_of, neighbours
+from tailgate.estimators.kalman import KalmanFilter, alone
 from tailgate.estimators.lasso import LassoFilter
 from tailgate.estimators.norm_resilient import NormResilientFilter, axes
+from tailgate.estimators.raw import Raw
 from tailgate.estimators.saturated import SaturatedFilter
-from tailgate.estimators.sentinels import AlwaysAlarm
+from tailgate.estimators.sentinels import AcceptFirst, AlwaysAlarm, AlwaysMode
 from tailgate.loop import Loop
 
 from . import constants as of
+from . import platoon_gains as gains
 from .constants import put
 from .platoon_rows import AIM_ROWS, BELIEF, CAR_ROWS, LAW, SENSORS, VICTIM_ROWS, WORK_ROWS
 from .rows import LANES, ROWS
@@ -32,6 +36,7 @@ from .rows import LANES, ROWS
 PARTS, LAWS = (Platoon, PlatoonSensors), (FeedForward, Consensus, Ploeg)
 ESTIMATORS = {
     DistributedKalmanFilter: of.LINEAR, LassoFilter: of.LASSO, SaturatedFilter: of.SATURATED, NormResilientFilter: of.NORM,
+    KalmanFilter: of.LINEAR, ConsensusFilter: of.LINEAR,
 }  # fmt: skip
 DETECTORS = (Score, ChiSquare, TailChiSquare, AlwaysAlarm)
 
@@ -73,7 +78,7 @@ def fill(loop: Loop, c: Array, f: Array, profile: Array) -> tuple[Array, int]:
     table = Table(profile if f[of.WAY] == of.PROFILE else np.zeros(0))
     f[of.PROFILED] = table.size
     _vehicles(loop, c, f)
-    _filter(loop.plan.defence, _threat(loop, f, table), c, f, table)
+    _filter(loop, _threat(loop, f, table), c, f, table)
     _detector(loop.plan.defence, c, f)
     _law(loop, c, f, table)
     return np.concatenate(table.parts), _places(f)
@@ -93,19 +98,44 @@ def _parts(loop: Loop) -> str:
 
 def _defence(loop: Loop) -> str:
     defence = loop.defence
+    if type(defence) is Raw:
+        return "a state that the known input decides has no lane" if loop.plan.defence.by_input.any() else ""
     if not isinstance(defence, Composed) or type(defence).step is not Composed.step or type(defence).start is not Composed.start:
         return f"defence {type(defence).__name__} has no lane"
     estimator: Any
     estimator, detector, mitigation = defence.parts()
     if type(estimator) not in ESTIMATORS:
         return f"filter {type(estimator).__name__} has no lane"
-    if not estimator.steady:
-        return "covariances of a platoon's rows have no lane"
+    if why := "" if estimator.steady else _stepped(estimator, loop):
+        return why
+    if estimator.steady and type(estimator) is KalmanFilter:
+        return "a steady filter on the own sensors has no lane"  # nor a steady state, where cars are behind
     if getattr(estimator, "solver", "exact") != "exact":
         return "the solver is not the exact one"
     if type(detector) not in DETECTORS:
         return f"detector {type(detector).__name__} has no lane"
-    return "" if type(mitigation) is AcceptAll and mitigation.mode == "normal" else f"mitigation {type(mitigation).__name__} has no lane"
+    known = (
+        type(mitigation) is AcceptAll and mitigation.mode == "normal", type(mitigation) is AcceptFirst and not estimator.steady,
+        type(mitigation) is AlwaysMode and mitigation.mode in (Asked.NORMAL, Asked.BRAKE, Asked.STOP),
+    )  # fmt: skip
+    return "" if any(known) else f"mitigation {type(mitigation).__name__} has no lane"
+
+
+def _stepped(estimator: Any, loop: Loop) -> str:
+    """Why a gain that follows the covariance has no lane."""
+    if type(estimator) not in (KalmanFilter, ConsensusFilter):
+        return "fusion by covariances of each row has no lane"
+    if "dropout" in loop.threat.kinds:
+        return "covariances that depend on what is missed have no lane"
+    pulled = type(estimator) is ConsensusFilter
+    if pulled and estimator.share:
+        return "readings that are shared have no lane"
+    return "" if gains.numbers(loop.model, pulled) * _steps(loop) <= gains.MOST else "so many gains have no lane"
+
+
+def _steps(loop: Loop) -> int:
+    """How many steps have gains of their own: those of an episode, and of one that is over and waits for the next."""
+    return loop.horizon + 200
 
 
 def _vehicles(loop: Loop, c: Array, f: Array) -> None:
@@ -135,40 +165,60 @@ def _threat(loop: Loop, f: Array, table: Table) -> Array:
     return victims
 
 
-def _filter(held: ComposedPlan, victims: Array, c: Array, f: Array, table: Table) -> None:
-    """A, B, c, L, merge and the gain, and for each victim S^-1 and gain with each set of sensors."""
+def _filter(loop: Loop, victims: Array, c: Array, f: Array, table: Table) -> None:
+    """A, B, c, what fuses, and the gain: for each victim also with each set of sensors, or for each step."""
+    held, model = loop.plan.defence, loop.model
+    f[of.IN_A] = table.listed(model.A, np.arange(model.states) * LANES)
+    f[of.IN_B], f[of.IN_C], c[of.FACTOR] = table.add(model.B[:, 0]), table.add(model.c), 1.0
+    f[of.IN_HEARD], f[of.IN_READS] = _lists(neighbours(model.graph), table), table.add(np.argmax(model.C, axis=2))
+    if type(loop.defence) is Raw:
+        f[of.ESTIMATOR] = of.READ
+        agents = victims.tolist()
+        told = [(i, e, j, q, agents.index(j) if j in agents else -1) for each in held.rounds for i, e, j, q in zip(*each, strict=True)]
+        f[of.IN_HEARS] = table.add([len(told), *np.array(told).ravel()])
+        return
+    part, plan = held.filter, getattr(held.filter_plan, "linear", held.filter_plan)
+    f[of.ESTIMATOR], c[of.PRICE] = ESTIMATORS[type(part)], getattr(part, "gamma", 0.0)
+    f[of.ALONE] = type(part) in (KalmanFilter, ConsensusFilter)
+    if not part.steady:
+        each = gains.by_step(part, held.mitigation, model, loop.plant.prior_var, _steps(loop))  # type: ignore[attr-defined]
+        f[of.STEPPED], f[of.STEP_WIDE], f[of.IN_W] = len(each), each[0].size, table.add(each)
+        f[of.PULLED] = type(part) is ConsensusFilter and part.consensus > 0.0
+        return
+    f[of.IN_L], f[of.IN_MERGE] = table.add(plan.L), table.add(plan.merge)
+    _sets(held, plan, victims, c, f, table)
+
+
+def _sets(held: ComposedPlan, fusion: Any, victims: Array, c: Array, f: Array, table: Table) -> None:
+    """S^-1 and gain of each car, and of each victim with each set of sensors; and what an estimator makes of an innovation with each."""
     part: Any = held.filter
-    plan: FusionPlan = getattr(held.filter_plan, "linear", held.filter_plan)
-    S, cross, K = plan.S, plan.cross, plan.K
-    assert S is not None and cross is not None and K is not None
-    f[of.IN_A] = table.listed(plan.A, np.arange(len(plan.A)) * LANES)
-    f[of.IN_B], f[of.IN_C], f[of.IN_L], f[of.IN_MERGE] = (table.add(each) for each in (plan.B[:, 0], plan.c, plan.L, plan.merge))
-    f[of.IN_HEARD], f[of.IN_READS] = _lists(plan.heard, table), table.add(np.argmax(plan.C, axis=2))
-    f[of.ESTIMATOR], c[of.PRICE], c[of.FACTOR] = ESTIMATORS[type(part)], getattr(part, "gamma", 0.0), 1.0
+    plan, kind, S, cross, K = held.filter_plan, f[of.ESTIMATOR], fusion.S, fusion.cross, fusion.K
     keeps = np.array([[some >> q & 1 for q in range(SENSORS)] for some in range(1 << SENSORS)], bool)
-    weights, gains, shapes = [], [], []
+    some, shapes = [], []
     for i in range(len(S)):
         for keep in keeps:
             mine = alone(S[i][None], keep[None])
-            weights.append(num.inverse(mine)[0])
-            gains.append(gain_of(mine, cross[i][None] * keep[:, None])[0])
-            if f[of.ESTIMATOR] == of.LASSO:
-                shapes.append(np.concatenate([weights[-1].ravel(), 0.5 * part.price(mine)[0], mine[0].diagonal()]))
-            elif f[of.ESTIMATOR] == of.NORM:
-                spread = held.filter_plan.spread[i][None]
-                own = axes(plan.C[i][None] * keep[:, None], alone(plan.R[i][None], keep[None]), spread)
-                gains[-1] = own.push[0]
+            weight, gain = num.inverse(mine)[0], gain_of(mine, cross[i][None] * keep[:, None])[0]
+            if kind == of.LASSO:
+                shapes.append(np.concatenate([weight.ravel(), 0.5 * part.price(mine)[0], mine[0].diagonal()]))
+            elif kind == of.NORM:
+                own = axes(plan.linear.C[i][None] * keep[:, None], alone(plan.linear.R[i][None], keep[None]), plan.spread[i][None])
+                gain = own.push[0]
                 shapes.append(np.concatenate([own.turn[0].ravel(), part.lam * own.half[0]]))
-    if f[of.ESTIMATOR] == of.NORM:
-        K, c[of.FACTOR] = held.filter_plan.whole.push, part.lam
-    f[of.IN_W], f[of.IN_K] = table.add(num.inverse(S[None])[0]), table.add(K)
+            if i in victims:
+                some.append(np.concatenate([weight, gain]))
+    if kind == of.NORM:
+        K, c[of.FACTOR] = plan.whole.push, part.lam
+    f[of.IN_W], f[of.IN_K], f[of.IN_SOME] = table.add(num.inverse(S[None])[0]), table.add(K), table.add(np.array(some, np.float64))
     f[of.SHAPE], f[of.IN_SHAPE] = (len(shapes[0]) if shapes else 0), table.add(np.array(shapes, np.float64))
-    some = [np.concatenate([weights[i * len(keeps) + k], gains[i * len(keeps) + k]]) for i in victims for k in range(len(keeps))]
-    f[of.IN_SOME] = table.add(np.array(some, np.float64))
 
 
-def _detector(held: ComposedPlan, c: Array, f: Array) -> None:
+def _detector(held: Any, c: Array, f: Array) -> None:
+    if not isinstance(held, ComposedPlan):  # none, which never alarms
+        c[of.THRESHOLD] = np.inf
+        return
     part: Any = held.detector
+    c[of.ASKED] = getattr(held.mitigation, "mode", 0) if type(held.mitigation) is AlwaysMode else 0.0
     f[of.DETECTOR] = of.ALWAYS if type(part) is AlwaysAlarm else of.CHI2
     c[of.THRESHOLD] = held.detector_plan if type(part) is TailChiSquare else getattr(part, "eta", np.inf)
 
@@ -184,12 +234,12 @@ def _lists(heard: tuple[tuple[int, ...], ...], table: Table) -> int:
 def _law(loop: Loop, c: Array, f: Array, table: Table) -> None:
     """The law for each car, on its own belief but for its own f."""
     law: Any = loop.controller
-    gains, keep = loop.plan.controller.normal
-    cars, states = gains.K.shape
+    matrices, keep = loop.plan.controller.normal
+    cars, states = matrices.K.shape
     place = int(BELIEF) + np.tile(np.arange(states) * LANES, (cars, 1))
     place[np.arange(1, cars), 6 + 4 * np.arange(cars - 1)] = int(LAW)
-    f[of.IN_LAW], f[of.IN_FEED] = table.listed(gains.K, place), table.listed(gains.G, place)
-    f[of.IN_BIAS], f[of.IN_V] = table.add(np.stack([gains.k0, gains.g0], axis=1)), table.add(gains.V)
+    f[of.IN_LAW], f[of.IN_FEED] = table.listed(matrices.K, place), table.listed(matrices.G, place)
+    f[of.IN_BIAS], f[of.IN_V] = table.add(np.stack([matrices.k0, matrices.g0], axis=1)), table.add(matrices.V)
     f[of.IN_LED] = table.add(loop.plan.plant.leader_heard)
     c[of.FADES] = keep
     low, high = (limit if given is None else given for given, limit in ((law.accel_min, -np.inf), (law.accel_max, np.inf)))

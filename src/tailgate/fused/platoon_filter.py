@@ -80,10 +80,14 @@ def calm(window, f, n):
 
 @phase
 def predict(s, window, table, f):
-    """xb_i: what the cars send, L_j (A xh_j + B u_j + c), summed over those that are heard."""
+    """xb_i: what the cars send, L_j (A xh_j + B u_j + c), summed over those that are heard; or without fusion what each predicts."""
     cars, states, size = f[of.CARS], f[of.STATES], f[of.STATES] * f[of.STATES]
+    if f[of.ALONE] != 0:
+        for j in range(cars):
+            forecast(s, window, table, f, j * f[of.CAR], f[of.FUSED] + j * states * LANES)
+        return
     for j in range(cars):
-        forecast(s, window, table, f, j * f[of.CAR])
+        forecast(s, window, table, f, j * f[of.CAR], f[of.FORE])
         product(table, f[of.IN_L] + j * size, states, states, s, f[of.FORE], s, f[of.SENDS] + j * states * LANES)
     for i in range(cars):
         gather(s, table, f, i)
@@ -91,14 +95,14 @@ def predict(s, window, table, f):
 
 
 @phase
-def forecast(s, window, table, f, car):
-    """A xh_j + B u_j + c into the rows FORE. To add a zero changes no bit of a sum that begins with +0."""
+def forecast(s, window, table, f, car, out):
+    """A xh_j + B u_j + c into the rows from `out` on. To add a zero changes no bit of a sum that begins with +0."""
     for e in range(f[of.STATES]):
-        total(table, f[of.IN_A], e, window, car + _BELIEF, 0.0, s, f[of.FORE] + e * LANES)
+        total(table, f[of.IN_A], e, window, car + _BELIEF, 0.0, s, out + e * LANES)
         b, c = table[f[of.IN_B] + e], table[f[of.IN_C] + e]
         if b != 0.0 or c != 0.0:
             for lane in range(0, LANES, WIDTH):
-                at = f[of.FORE] + e * LANES + lane
+                at = out + e * LANES + lane
                 put(s, at, get(s, at) + (alike(0.0) + alike(b) * get(window, car + _TOLD + lane)) + alike(c))
 
 
@@ -137,10 +141,10 @@ def innovation(s, table, f, n):
 
 
 @phase
-def score(s, table, f):
-    """g_i = r' S^-1 r."""
+def score(s, table, f, weight, apart):
+    """g_i = r' S^-1 r; S^-1 of the first car stands at `weight` of the table, of the others so far apart."""
     for i in range(f[of.CARS]):
-        work, w = f[of.WORKS] + i * WORK, f[of.IN_W] + i * SENSORS * SENSORS
+        work, w = f[of.WORKS] + i * WORK, weight + i * apart
         for lane in range(0, LANES, WIDTH):
             at = work + _R + lane
             r0, r1, r2 = get(s, at), get(s, at + LANES), get(s, at + 2 * LANES)
@@ -151,18 +155,42 @@ def score(s, table, f):
 
 
 @phase
-def update(s, window, table, c, f):
-    """xh_i."""
+def update(s, window, table, c, f, gain, apart):
+    """xh_i; the gain of the first car stands at `gain` of the table, of the others so far apart."""
     states, factor = f[of.STATES], alike(c[of.FACTOR])
     for i in range(f[of.CARS]):
         r, fused, belief = f[of.WORKS] + i * WORK + _R, f[of.FUSED] + i * states * LANES, i * f[of.CAR] + _BELIEF
         for lane in range(0, LANES, WIDTH):
             r0, r1, r2 = get(s, r + lane), get(s, r + lane + LANES), get(s, r + lane + 2 * LANES)
-            k, at = f[of.IN_K] + i * states * SENSORS, lane
+            k, at = gain + i * apart, lane
             for _ in range(states):
                 correction = alike(0.0) + alike(table[k]) * r0 + alike(table[k + 1]) * r1 + alike(table[k + 2]) * r2
                 put(window, belief + at, get(s, fused + at) + factor * correction)
                 k, at = k + SENSORS, at + LANES
+
+
+# -- a car and an episode at a time, where not all have the same gain
+
+
+@formula
+def score_one(s, table, w, work, i):
+    """g of one car, whose record begins at `work`, in episode i, with the S^-1 at w."""
+    r0, r1, r2 = s[work + _R + i], s[work + _R + LANES + i], s[work + _R + 2 * LANES + i]
+    t0 = table[w] * r0 + table[w + 1] * r1 + table[w + 2] * r2
+    t1 = table[w + 3] * r0 + table[w + 4] * r1 + table[w + 5] * r2
+    t2 = table[w + 6] * r0 + table[w + 7] * r1 + table[w + 8] * r2
+    s[work + _SCORE + i] = r0 * t0 + r1 * t1 + r2 * t2
+
+
+@formula
+def update_one(s, window, table, factor, f, k, car, i):
+    """xh of a car likewise, with the gain at k."""
+    work, fused, belief = f[of.WORKS] + car * WORK, f[of.FUSED] + car * f[of.STATES] * LANES + i, car * f[of.CAR] + _BELIEF + i
+    r0, r1, r2 = s[work + _R + i], s[work + _R + LANES + i], s[work + _R + 2 * LANES + i]
+    for e in range(f[of.STATES]):
+        correction = table[k] * r0 + table[k + 1] * r1 + table[k + 2] * r2
+        window[belief + e * LANES] = s[fused + e * LANES] + factor * correction
+        k += SENSORS
 
 
 @formula
@@ -178,32 +206,21 @@ def score_again(s, table, f, n):
     """g_i of the victims in the episodes in which they miss a reading."""
     whole = table.view(np.int64)
     for h in range(f[of.VICTIMS]):
-        work = f[of.WORKS] + whole[f[of.IN_VICTIMS] + h] * WORK
         for i in range(int(n)):
             w = _missing(s, table, f, h, i)
             if w > 0:
-                r0, r1, r2 = s[work + _R + i], s[work + _R + LANES + i], s[work + _R + 2 * LANES + i]
-                t0 = table[w] * r0 + table[w + 1] * r1 + table[w + 2] * r2
-                t1 = table[w + 3] * r0 + table[w + 4] * r1 + table[w + 5] * r2
-                t2 = table[w + 6] * r0 + table[w + 7] * r1 + table[w + 8] * r2
-                s[work + _SCORE + i] = r0 * t0 + r1 * t1 + r2 * t2
+                score_one(s, table, w, f[of.WORKS] + whole[f[of.IN_VICTIMS] + h] * WORK, i)
 
 
 @phase
 def update_again(s, window, table, c, f, n):
     """xh_i likewise."""
-    whole, states = table.view(np.int64), f[of.STATES]
+    whole = table.view(np.int64)
     for h in range(f[of.VICTIMS]):
-        victim = whole[f[of.IN_VICTIMS] + h]
-        work, fused, belief = f[of.WORKS] + victim * WORK, f[of.FUSED] + victim * states * LANES, victim * f[of.CAR] + _BELIEF
         for i in range(int(n)):
-            k = _missing(s, table, f, h, i)
-            if k > 0:
-                r0, r1, r2 = s[work + _R + i], s[work + _R + LANES + i], s[work + _R + 2 * LANES + i]
-                for e in range(states):
-                    k += SENSORS if e > 0 else SENSORS * SENSORS
-                    correction = table[k] * r0 + table[k + 1] * r1 + table[k + 2] * r2
-                    window[belief + e * LANES + i] = s[fused + e * LANES + i] + c[of.FACTOR] * correction
+            w = _missing(s, table, f, h, i)
+            if w > 0:
+                update_one(s, window, table, c[of.FACTOR], f, w + SENSORS * SENSORS, whole[f[of.IN_VICTIMS] + h], i)
 
 
 @phase

@@ -83,8 +83,8 @@ def columns(f: Array) -> Array:
     ])  # fmt: skip
 
 
-def signals(loop: Any, record: Array, f: Array) -> dict[str, Array]:
-    """The signals of a Trace from a record (K, columns, B)."""
+def signals(loop: Any, record: Array, f: Array, asked: float) -> dict[str, Array]:
+    """The signals of a Trace from a record (K, columns, B); asked: the mode of the controller."""
     held, first = {}, 0
     for name, part, count in _groups(f):
         block = record[:, first : first + count * part.width]
@@ -107,7 +107,7 @@ def signals(loop: Any, record: Array, f: Array) -> dict[str, Array]:
         "clean": spread("clean", held["wires"]), "wires": held["wires"], "valid": spread("valid", np.ones((*shape, SENSORS))) != 0.0,
         "energy": np.zeros(shape), "probe": np.ones(shape, bool), "control": held["control"], "applied": held["applied"],
         "value": spread("value", nothing), "kind": one["kind"][..., 0].astype(np.int8), "target": spread("target", nothing) != 0.0,
-        "alarm": one["alarm"] != 0.0, "mode": np.zeros(shape, np.int8), "refused": one["refused"][..., 0] != 0.0,
+        "alarm": one["alarm"] != 0.0, "mode": np.full(shape, asked, np.int8), "refused": one["refused"][..., 0] != 0.0,
         "collided": one["hit"][..., 0] != 0.0, "rear_collided": np.zeros(shape[:2], bool),
     }  # fmt: skip
 
@@ -132,7 +132,7 @@ class Platoon(Lanes):
 
     def signals(self, steps: int) -> dict[str, Array]:
         """Those of a Trace, of so many steps."""
-        return signals(self.loop, self.record[:steps], self.constants.f)
+        return signals(self.loop, self.record[:steps], self.constants.f, self.constants.c[of.ASKED])
 
     @property
     def _victims(self) -> Array:

@@ -106,8 +106,8 @@ def remember(s, window, f, n):
 
 
 @phase
-def control(s, window, table, c, f, n):
-    """u = K X + k0 within its limits, and f one step later: keep f + (1 - keep) (G X + g0 + V v2v). A car knows its own f."""
+def control(s, window, table, c, f, mode, n):
+    """u = K X + k0 as the mode wants it, within its limits, and f later: keep f + (1 - keep) (G X + g0 + V v2v). A car knows its own f."""
     low, high, keep = c[of.ACCEL_MIN], c[of.ACCEL_MAX], c[of.FADES]
     for j in range(1, f[of.CARS]):
         first, to, bias, gain = j * f[of.CAR], f[of.WORKS] + j * WORK, f[of.IN_BIAS] + 2 * j, f[of.IN_V] + 3 * j
@@ -125,7 +125,7 @@ def control(s, window, table, c, f, n):
             for i in range(n):
                 work[NEXT + i] += v2 * work[ARRIVED + _5 + i]
         for i in range(n):
-            car[COMMAND + i] = np.minimum(np.maximum(car[COMMAND + i], low), high)
+            car[COMMAND + i] = np.minimum(np.maximum(road.obeyed(car[COMMAND + i], mode), low), high)
             car[LAW + i] = keep * car[LAW + i] + (1.0 - keep) * work[NEXT + i]
 
 
