@@ -164,7 +164,7 @@ class DistributedFilter(LinearFilter):
         cross = num.matmul(model.C, Qinv)
         S = num.matmul(model.C, num.transpose(cross)) + model.R
         return plan._replace(
-            held=Qinv, K=np.ascontiguousarray(_gain(S, cross)), merge=Qinv / degree[:, None, None],
+            held=Qinv, K=np.ascontiguousarray(gain_of(S, cross)), merge=Qinv / degree[:, None, None],
             L=L, M=np.stack([_inverse(L_j) for L_j in L]), cross=cross, S=S,
         )  # fmt: skip
 
@@ -255,12 +255,12 @@ class DistributedFilter(LinearFilter):
             b, i = np.nonzero(~accept.all(axis=-1))
             if len(b):
                 keep = accept[b, i]
-                K = _gain(alone(S[b, i], keep), plan.cross[i] * keep[..., None])
+                K = gain_of(alone(S[b, i], keep), plan.cross[i] * keep[..., None])
                 x[b, i] = state.x[b, i] + num.matvec(K, r[b, i] * keep)
             return KalmanState(x, None)
         if len(one_row(state.P)) < len(r) and accept.all() and len(one_row(S)) == 1:
             cross = num.matmul(plan.C, state.P[:1])
-            K = _gain(S[:1], cross)
+            K = gain_of(S[:1], cross)
             P = state.P[:1] - num.matmul(K, cross)
             P = np.broadcast_to(0.5 * (P + num.transpose(P)), state.P.shape)
             return KalmanState(state.x + num.matvec(K, r), P if plan.held is None else None)
@@ -281,7 +281,7 @@ def shared(P: Array) -> Array:
     return np.broadcast_to(P[:1], P.shape) if (P[:1] == P).all() else P
 
 
-def _gain(S: Array, cross: Array) -> Array:
+def gain_of(S: Array, cross: Array) -> Array:
     """P- C' S^-1 (..., n, q) from C P- (..., q, n), in the order of the Kalman filter's update, to the last bit."""
     return num.transpose(num.matmul(num.inverse(S), cross))
 

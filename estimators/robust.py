@@ -30,7 +30,8 @@ ROUNDS = 1000  # far above what was ever seen: a guard against rounding
 ACCURACY = 1e-9  # asked of the interior-point solver
 PATIENCE = 3  # rounds of block changes without progress
 TOLERANCE = 1e-12  # of the optimality conditions, relative to lam
-ROUNDING = 8 * np.finfo(np.float64).eps  # of a sum, relative to its largest term
+ROUNDING = 8 * float(np.finfo(np.float64).eps)  # of a sum, relative to its largest term
+LIMITS = (TOLERANCE, ROUNDING, PATIENCE, ROUNDS)
 
 
 def believed(r: Array, S: Array, lam: Array) -> Array:
@@ -73,7 +74,8 @@ def _pivot(r: Array, S: Array, W: Array, half: Array, rows: tuple[Array, ...]) -
     shared = W.ndim == 4 and W.strides[0] == 0  # the same for the whole batch
     blocks, which = (W[0], rows[1]) if shared else (W[rows], np.arange(len(r)))
     y = np.empty_like(r)
-    left = linear.pivot_each(r, np.ascontiguousarray(blocks), which, half, size, TOLERANCE, ROUNDING, PATIENCE, ROUNDS, y)
+    flat = np.ascontiguousarray(blocks).reshape(len(blocks), -1)
+    left = linear.pivot_each(r, flat, which, half, size, LIMITS, y)
     if left:
         raise ArithmeticError(f"believed: {left} problems of {r.shape[1]} sensors are not solved after {ROUNDS} rounds of pivoting")
     return y

@@ -235,7 +235,7 @@ def test_threads_and_blocks_change_no_bit():
 
 
 @pytest.mark.parametrize(("scenario", "defence", "threat", "why"), [
-    ("platoon-braking-v0", "dkf", {}, "no lane"), ("car-following-lossy-v0", "kf", {}, "lost or late"),
+    ("platoon-braking-v0", "trust_dkf", {}, "no lane"), ("car-following-lossy-v0", "kf", {}, "lost or late"),
     ("stop-and-go-v0", "kf", {"knowledge": "white"}, "white-box"), ("stop-and-go-v0", "kf", {"kinds": ["delay"]}, "delay"),
     ("stop-and-go-v0", "steered", {}, "no lane"), ("stop-and-go-v0", "imm:factors=[1,2,3,4,5]", {}, "more than 4 models"),
 ])  # fmt: skip

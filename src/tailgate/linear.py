@@ -124,29 +124,36 @@ def turn_rows(x: np.ndarray, n: int) -> None:
 
 
 @_jit
+def ball(q, x, c, u):
+    """u (q,): x_k / (c_k + mu) with the least mu >= 0 at which |u| <= 1, for x (q,) and c (q,) >= 0; 0/0 counts as 0."""
+    mu = length = s = largest = 0.0
+    for k in range(q):
+        mu, length, largest = max(mu, abs(x[k]) - c[k]), length + x[k] * x[k], max(largest, c[k])
+        s += (x[k] / c[k]) ** 2 if x[k] != 0.0 else 0.0
+    mu, size = max(mu, math.sqrt(length) - largest) if s > 1.0 else 0.0, 1.0
+    for _ in range(100 if s > 1.0 else 0):  # Newton on 1 / |u|, monotone from below
+        s = t = 0.0
+        for k in range(q):
+            z = x[k] / (c[k] + mu) if x[k] != 0.0 else 0.0
+            s, t = s + z * z, t + (z * z / (c[k] + mu) if z != 0.0 else 0.0)
+        size = math.sqrt(s)
+        step = s * (size - 1.0) / t
+        if not step > 1e-15 * mu:
+            break
+        mu += step
+    for k in range(q):
+        u[k] = x[k] / (c[k] + mu) / size if x[k] != 0.0 else 0.0
+
+
+@_jit
 def ball_each(w: np.ndarray, c: np.ndarray, u: np.ndarray) -> None:
-    """u (P, q, B): w_k / (c_k + mu) with the least mu >= 0 at which |u| <= 1, for w (P, q, B) and c (P, q) >= 0; 0/0 counts as 0."""
-    x = np.empty(w.shape[1])
+    """`ball` of w (P, q, B) and c (P, q) into u (P, q, B), each by itself."""
+    x, y = np.empty(w.shape[1]), np.empty(w.shape[1])
     for p in range(w.shape[0]):
         for b in range(w.shape[2]):
-            mu = length = s = 0.0
-            for k in range(len(x)):
-                x[k] = w[p, k, b]
-                mu, length = max(mu, abs(x[k]) - c[p, k]), length + x[k] * x[k]
-                s += (x[k] / c[p, k]) ** 2 if x[k] != 0.0 else 0.0
-            mu, size = max(mu, math.sqrt(length) - np.max(c[p])) if s > 1.0 else 0.0, 1.0
-            for _ in range(100 if s > 1.0 else 0):  # Newton on 1 / |u|, monotone from below; each row ends by itself
-                s = t = 0.0
-                for k in range(len(x)):
-                    z = x[k] / (c[p, k] + mu) if x[k] != 0.0 else 0.0
-                    s, t = s + z * z, t + (z * z / (c[p, k] + mu) if z != 0.0 else 0.0)
-                size = math.sqrt(s)
-                step = s * (size - 1.0) / t
-                if not step > 1e-15 * mu:
-                    break
-                mu += step
-            for k in range(len(x)):
-                u[p, k, b] = x[k] / (c[p, k] + mu) / size if x[k] != 0.0 else 0.0
+            x[:] = w[p, :, b]
+            ball(len(x), x, c[p], y)
+            u[p, :, b] = y
 
 
 @_jit
@@ -189,49 +196,59 @@ def _within(x, low, high):
 
 
 @_jit
-def pivot_each(r, W, which, half, size, tolerance, rounding, patience, rounds, y):
-    """Block principal pivoting (robust.py) of r (M, q) with W (K, q, q) at which (M,) into y (M, q); returns how many are left unsolved."""
-    q, unsolved = r.shape[1], 0
-    z, g, wrong, sign, L = np.empty(q), np.empty(q), np.empty(q, np.bool_), np.empty(q), np.empty((q, q))
-    for m in range(r.shape[0]):
-        w, fewest, left, count = W[which[m]], q + 1, patience, 1
-        for i in range(q):  # what each sensor alone would say
-            sign[i] = math.copysign(1.0, r[m, i]) if abs(r[m, i]) > half[m, i] * size[m, i] else 0.0
-        for _ in range(rounds):
-            for i in range(q):  # L L' = W of the outliers, 1 for the others
-                y[m, i] = r[m, i] if sign[i] == 0.0 else 0.0
-                for j in range(i + 1):
-                    both = sign[i] != 0.0 and sign[j] != 0.0
-                    L[i, j] = w[i, j] if both else (1.0 if i == j else 0.0)
-                    for k in range(j if both else 0):
-                        L[i, j] -= L[i, k] * L[j, k]
-                    L[i, j] = L[i, j] / L[j, j] if i != j else math.sqrt(L[i, i])
-            for _again in range(2):  # the second time mends the rounding of the first
-                for i in range(q):
-                    z[i] = sign[i] * half[m, i]
-                    for j in range(q if sign[i] != 0.0 else 0):
-                        z[i] -= w[i, j] * y[m, j] + (L[i, j] * z[j] if j < i else 0.0)
-                    z[i] /= L[i, i]
-                for i in range(q - 1, -1, -1):
-                    for k in range(i + 1, q):
-                        z[i] -= L[k, i] * z[k]
-                    z[i] /= L[i, i]
-                for i in range(q):
-                    y[m, i] += z[i]
-            last, count = -1, 0
+def pivot(q, r, w, half, size, limits, y, z, g, wrong, sign, L):
+    """Block principal pivoting (robust.py) of r (q,) with w (q q,) into y (q,); -> how many presumptions are left wrong.
+
+    limits: tolerance, rounding, patience, rounds. z, g, wrong, sign (q,) and L (q q,) are rooms to work in.
+    """
+    tolerance, rounding, patience, rounds = limits
+    fewest, left, count = q + 1, patience, 1
+    for i in range(q):  # what each sensor alone would say
+        sign[i] = math.copysign(1.0, r[i]) if abs(r[i]) > half[i] * size[i] else 0.0
+    for _ in range(rounds):
+        for i in range(q):  # L L' = W of the outliers, 1 for the others
+            y[i] = r[i] if sign[i] == 0.0 else 0.0
+            for j in range(i + 1):
+                both = sign[i] != 0.0 and sign[j] != 0.0
+                L[i * q + j] = w[i * q + j] if both else (1.0 if i == j else 0.0)
+                for k in range(j if both else 0):
+                    L[i * q + j] -= L[i * q + k] * L[j * q + k]
+                L[i * q + j] = L[i * q + j] / L[j * q + j] if i != j else math.sqrt(L[i * q + i])
+        for _again in range(2):  # the second time mends the rounding of the first
             for i in range(q):
-                g[i] = largest = 0.0
-                for j in range(q):
-                    g[i], largest = g[i] + w[i, j] * y[m, j], max(largest, abs(w[i, j] * y[m, j]))
-                beyond = abs(g[i]) > half[m, i] + (tolerance * half[m, i] + rounding * largest)
-                slack = tolerance * half[m, i] * size[m, i] + rounding * (abs(r[m, i]) + abs(y[m, i]))
-                wrong[i] = beyond if sign[i] == 0.0 else sign[i] * (r[m, i] - y[m, i]) < -slack
-                last, count = (i, count + 1) if wrong[i] else (last, count)
-            if count == 0:
-                break
-            left, fewest = patience if count < fewest else left - 1, min(count, fewest)
-            for i in range(0 if left >= 0 else last, q):
-                if wrong[i]:
-                    sign[i] = math.copysign(1.0, g[i]) if sign[i] == 0.0 else 0.0
-        unsolved += count > 0
+                z[i] = sign[i] * half[i]
+                for j in range(q if sign[i] != 0.0 else 0):
+                    z[i] -= w[i * q + j] * y[j] + (L[i * q + j] * z[j] if j < i else 0.0)
+                z[i] /= L[i * q + i]
+            for i in range(q - 1, -1, -1):
+                for k in range(i + 1, q):
+                    z[i] -= L[k * q + i] * z[k]
+                z[i] /= L[i * q + i]
+            for i in range(q):
+                y[i] += z[i]
+        last, count = -1, 0
+        for i in range(q):
+            g[i] = largest = 0.0
+            for j in range(q):
+                g[i], largest = g[i] + w[i * q + j] * y[j], max(largest, abs(w[i * q + j] * y[j]))
+            beyond = abs(g[i]) > half[i] + (tolerance * half[i] + rounding * largest)
+            slack = tolerance * half[i] * size[i] + rounding * (abs(r[i]) + abs(y[i]))
+            wrong[i] = 1.0 if (beyond if sign[i] == 0.0 else sign[i] * (r[i] - y[i]) < -slack) else 0.0
+            last, count = (i, count + 1) if wrong[i] != 0.0 else (last, count)
+        if count == 0:
+            break
+        left, fewest = patience if count < fewest else left - 1, min(count, fewest)
+        for i in range(0 if left >= 0 else last, q):
+            if wrong[i] != 0.0:
+                sign[i] = math.copysign(1.0, g[i]) if sign[i] == 0.0 else 0.0
+    return count
+
+
+@_jit
+def pivot_each(r, W, which, half, size, limits, y):
+    """`pivot` of r (M, q) with W (K, q q) at which (M,) into y (M, q); returns how many are left unsolved."""
+    q, unsolved = r.shape[1], 0
+    z, g, wrong, sign, L = np.empty(q), np.empty(q), np.empty(q), np.empty(q), np.empty(q * q)
+    for m in range(r.shape[0]):
+        unsolved += pivot(q, r[m], W[which[m]], half[m], size[m], limits, y[m], z, g, wrong, sign, L) > 0
     return unsolved

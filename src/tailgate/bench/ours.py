@@ -16,8 +16,12 @@ import gymnasium
 import numpy as np
 
 from tailgate import draws, num
+from tailgate.agents.codec import ActionCodec, ActionSpec
+from tailgate.agents.observation import ObservationCodec
+from tailgate.agents.reward import Reward
 from tailgate.core import Array, Command, Estimate, Mode, View
 from tailgate.draws import Role
+from tailgate.envs.batches import side_by_side
 from tailgate.envs.seat import Seat
 from tailgate.fused import Constants
 from tailgate.fused.cockpit import Cockpit, fuse_seat
@@ -123,10 +127,22 @@ def batch(episodes: int, threads: int = 1) -> Go:
 
 
 def platoon(episodes: int, followers: int = 4, defence: str = "dkf") -> Go:
-    """Whole steps of a platoon; each car has an estimator of the whole state."""
-    place = load_scenario("platoon-braking-v0").with_threat(agents=(min(2, followers),))
+    """Whole steps of a platoon, each car with an estimator of the whole state, under a learner's action as in `batch`."""
+    place = load_scenario("platoon-braking-v0").with_threat(agents=(min(2, followers),), targets=("distance",))
     place = dataclasses.replace(place, plant=dataclasses.replace(place.plant, followers=followers))
-    return played(playing(defence, place, "fdi:value=60,targets=[distance]"), episodes)
+    guard, spec = Spec("defence", defence), ActionSpec("timing", "fdi", 60.0, interval=HELD)
+    loop = place.loop(guard.make(), guard.entry.uses)
+    seat = Seat(loop, ActionCodec(spec, loop.brief), ObservationCodec(loop.brief), Reward(), {})
+    rows, attack, over = side_by_side(seat), np.ones(episodes, np.int64), np.zeros(episodes, bool)
+    rows.begin(draws.keys("tune", range(episodes)))
+
+    def chunk() -> int:
+        nonlocal over
+        outcome = rows.decide(attack, over, restart=True)
+        over = outcome.terminated | outcome.truncated
+        return HELD * episodes
+
+    return repeated(chunk)
 
 
 def network(episodes: int, sensors: int) -> Go:

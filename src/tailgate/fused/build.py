@@ -68,6 +68,8 @@ def _radar() -> Any:
 
 def fuse(loop: Loop, attack: Attack | None = None) -> Constants | Refused:
     """The constants of a loop, or why the plain loop plays it: under the given attack, or under any that does not hold the defence."""
+    if loop.model.agents > 1:
+        return _several(loop, attack)
     parts = (loop.plant, loop.sensor, loop.controller)
     aired = loop.model.air and type(loop.plant) is _radar().PARTS[0]
     for part, known in zip(parts, _radar().PARTS if aired else _CAR, strict=True):
@@ -91,6 +93,26 @@ def fuse(loop: Loop, attack: Attack | None = None) -> Constants | Refused:
     return Constants(c, f, table, _remembered(f), int(f[of.REACTION]))
 
 
+def _several(loop: Loop, attack: Attack | None) -> Constants | Refused:
+    """As `fuse`, of several agents: a platoon."""
+    from . import platoon_build  # which a single car does without, and without the modules of platoons
+
+    if not loop.link.perfect:
+        return Refused("readings are lost or late")
+    if why := _white(loop, attack):
+        return Refused(why)
+    if not {Kind[name.upper()] for name in loop.threat.kinds} <= _ON_WIRES:
+        return Refused("delay, replay and what is radiated have no lane")
+    if why := platoon_build.unknown(loop):
+        return Refused(why)
+    c, f = of.blank()
+    _granted(loop, c)
+    table = _way(loop, c, f)
+    if table is None:
+        return Refused(f"manoeuvre {type(loop.manoeuvre).__name__} has no lane")
+    return Constants(c, f, *platoon_build.fill(loop, c, f, table), 0)
+
+
 def _remembered(f: Array) -> int:
     """Rows that the defence keeps beside those of every defence."""
     if f[of.PRINTED] or f[of.CHALLENGED]:
@@ -106,8 +128,8 @@ def _white(loop: Loop, attack: Attack | None) -> str:
     if type(attack) is Stealth:
         if not granted:
             return "attack stealth needs a white box"  # which the plain loop says
-        if loop.model.air:
-            return "attack stealth has no lane against a radar"
+        if loop.model.air or loop.model.agents > 1:
+            return "attack stealth has no lane against a radar or several agents"
         shows = getattr(type(loop.defence), "look", None) is Composed.look
         return "" if shows else f"{type(loop.defence).__name__} shows no innovation to a lane"
     return "" if not granted or script.known(attack) else "a white-box attacker holds the defence itself"
@@ -276,11 +298,17 @@ def _mitigation(part: Any, plan: Any, loop: Loop, c: Array, f: Array) -> str:
     return ""
 
 
-def _threat(loop: Loop, c: Array, f: Array) -> str:
+def _granted(loop: Loop, c: Array) -> None:
+    """When and how an attack may be, whoever is attacked."""
     plan, threat = loop.plan.channel, loop.threat
     most = [np.inf if value is None else float(value) for value in (threat.budget, threat.duration)]
     _put(c, of.ONSET, (threat.onset, plan.last_step, *most, threat.cooldown))
     _put(c, of.GRANTED, plan.kinds)
+
+
+def _threat(loop: Loop, c: Array, f: Array) -> str:
+    plan, threat = loop.plan.channel, loop.threat
+    _granted(loop, c)
     mine = np.array(wires_of(plan.granted.shape[1]))
     for at, values in ((of.WIRE, plan.granted[0]), (of.BOUND, plan.bounds), (of.LOW, plan.low), (of.HIGH, plan.high)):
         c[at + mine] = values

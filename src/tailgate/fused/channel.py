@@ -84,14 +84,25 @@ def count(s, c, n):
 
 
 @formula
+def fits(kind, value, bound, low, high):
+    """Whether a value is granted with that kind."""
+    return ((kind != JAM) | ((value >= low) & (value <= high))) & ((kind != FDI) | (abs(value) <= bound))
+
+
+@formula
+def carried(kind, value):
+    """The value of a command in force, where its kind has one."""
+    return value if (kind == JAM) | (kind == FDI) else 0.0
+
+
+@formula
 def judge(s, c, row, n):
     """Counts in REFUSED a wire that is aimed at with a value that is not granted."""
     wire = np.int64(row) // LANES
     bound, low, high = c[of.BOUND + wire], c[of.LOW + wire], c[of.HIGH + wire]
     for i in range(n if c[of.WIRE + wire] != 0.0 else np.uint64(0)):
         kind, value, aimed = s[WANT_KIND + i], s[WANT_VALUE + row + i], s[WANT_TARGET + row + i] != 0.0
-        fits = ((kind != JAM) | ((value >= low) & (value <= high))) & ((kind != FDI) | (abs(value) <= bound))
-        s[REFUSED + i] += 1.0 if aimed & (not fits) else 0.0
+        s[REFUSED + i] += 1.0 if aimed & (not fits(kind, value, bound, low, high)) else 0.0
 
 
 def charging(aired):
@@ -130,7 +141,7 @@ def charging(aired):
     return charge
 
 
-_charge = charging(aired=False)
+charge = charging(aired=False)
 
 
 @phase
@@ -142,7 +153,7 @@ def decide(s, c, n):
     judge(s, c, _2, n)
     judge(s, c, _3, n)
     judge(s, c, _4, n)
-    firsts = _charge(s, c, n)
+    firsts = charge(s, c, n)
     enforce(s, c, _0, n)
     enforce(s, c, _1, n)
     enforce(s, c, _2, n)
@@ -168,7 +179,7 @@ def enforce(s, c, row, n):
         kind, value = s[KIND + i], s[WANT_VALUE + row + i]
         hit = (s[WANT_TARGET + row + i] != 0.0) & (kind != 0.0)
         s[TARGET + row + i] = 1.0 if hit else 0.0
-        s[VALUE + row + i] = value if hit & ((kind == JAM) | (kind == FDI)) else 0.0
+        s[VALUE + row + i] = carried(kind, value) if hit else 0.0
 
 
 @formula

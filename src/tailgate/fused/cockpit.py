@@ -33,38 +33,47 @@ def fuse_seat(seat: Seat) -> Constants | Refused:
     if isinstance(k, Refused):
         return k
     c, f, action, paid, threat = k.c, k.f, seat.action, seat.reward, seat.loop.threat
-    columns = [name for name, _ in seat.observation.columns]
-    if len(columns) > of.COMPONENTS or (action.discrete and action.size > of.MODES):
+    columns, several = [name for name, _ in seat.observation.columns], f[of.CARS] > 0
+    if len(columns) > of.COMPONENTS or (action.discrete and not several and action.size > of.MODES):
         return Refused("too many components or actions")
     f[of.ACTION], f[of.ACTIONS] = _ACTIONS[action.spec.action], 1 if action.discrete else action.size
     f[of.REWARD], f[of.FEATURES] = _REWARDS[paid.reward], len(columns)
     c[of.RATE], c[of.HORIZON], c[of.SEEN_MOST] = action.spec.rate, seat.loop.horizon, LIMIT
-    if action.discrete:
+    if several:
+        from . import platoon_build
+
+        k = k._replace(table=platoon_build.modes(k.table, f, action.modes if action.discrete else []))
+    elif action.discrete:
         mine = np.array(at.wires_of(len(seat.loop.model.wires)))
         for i, mode in enumerate(action.modes):
             row = of.TABLE + of.MODE_WIDTH * i
             c[[row, row + 1]], c[row + 2 + mine], c[row + 2 + at.WIRES + mine] = (mode.kind, mode.sign), mode.target[0], mode.value
-    elif set(action.carried) - {Kind.FDI}:
+    if not action.discrete and set(action.carried) - {Kind.FDI}:
         return Refused("vectors of values over the air have no lane")
     c[of.REWARD_SCALE], c[of.GAP_SHAPING], c[of.ERROR_SHAPING] = paid.error_scale, paid.gap_shaping, paid.error_shaping
     c[of.GAMMA_PAID], c[of.ILLEGAL], c[of.COST] = paid.gamma, paid.illegal_penalty, paid.attack_cost
     c[of.BUDGET_SHARE] = threat.budget or 1.0
     assert seat.loop.model.gap is not None
-    c[of.BELIEF] = seat.loop.model.gap[0, 0]
+    c[of.BELIEF] = 1.0 if several else seat.loop.model.gap[0, 0]
     scales = SCALES | {"progress": float(seat.loop.horizon)}
     most = {wire: min(bound, LAST_SCALE) for wire, bound in zip(seat.loop.model.wires, seat.action.brief.bounds.tolist(), strict=True)}
     most |= {"power": threat.jam_power, "delay": threat.delay_bound}
-    quantities = lane.QUANTITIES | ({} if f[of.REAR] else lane.ALONE)
+    quantities: dict[str, tuple[Any, Any]] = lane.QUANTITIES | ({} if f[of.REAR] else lane.ALONE)
     if f[of.AIRED]:
         from . import radar
 
         quantities = quantities | radar.QUANTITIES
+    if several:
+        from . import platoon_seat
+
+        quantities = platoon_seat.quantities(columns, f, seat.loop)
+        scales |= platoon_seat.scales(seat.loop)
     for j, name in enumerate(columns):
-        rows = quantities.get(name)
+        rows, what = quantities.get(name), name.partition("[")[0]
         if rows is None:
             return Refused(f"the observation's {name} has no lane")
         f[of.SEEN + j], f[of.FROM + j] = rows
-        c[of.SEEN_SCALE + j] = most[name[5:]] if name.startswith("last_") else scales.get(name.removesuffix("0"), 1.0)
+        c[of.SEEN_SCALE + j] = most[what[5:]] if what.startswith("last_") else scales.get(name, scales.get(what.removesuffix("0"), 1.0))
     return k
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 MODELS = 4  # of several, at most
 MOMENTS = 64  # challenges at fixed steps, at most
-MODES, COMPONENTS = 64, 32  # discrete actions, and components of an observation, at most
+MODES, COMPONENTS = 64, 128  # discrete actions, and components of an observation, at most
 MODE_WIDTH = 12  # of an action in the table: kind, sign, five targets, five values
 
 _numbers: list[str] = []
@@ -60,6 +60,7 @@ HEADWAY, STANDSTILL, GAMMA = _number("headway"), _number("standstill"), _number(
 SET_SPEED, ACCEL_MIN, ACCEL_MAX = _number("set_speed"), _number("accel_min"), _number("accel_max")
 # defence
 PRICE = _number("price")  # lam of the robust filter
+FACTOR = _number("factor")  # of a platoon's correction
 THRESHOLD, FEWER = _number("threshold"), _number("fewer")  # of all sensors, and of one that is left
 DRIFT, WEIGHT, LIMIT = _number("drift"), _number("weight"), _number("limit")
 LATCH, AFTER, LINGER, ASKED = _number("latch"), _number("after"), _number("linger"), _number("asked")  # ASKED: the mode
@@ -85,6 +86,8 @@ AHEAD_LO, AHEAD_HI, RECOVER = _number("ahead_lo"), _number("ahead_hi"), _number(
 # the brake that acts on it
 HARD, HARDER, LAG, RHO, EASED = _number("hard"), _number("harder"), _number("lag"), _number("rho"), _number("eased")
 RESPONSE, CLEARANCE, DISTANCE, WATCH = _number("response"), _number("clearance"), _number("distance"), _number("watch")
+# a platoon: gaps at the start (mean, sd, to either side), what cars are told of the start, sensors, what f keeps of itself in a step
+GAPS, PRIOR_SD, NOISE_SD, FADES = _number("gaps", 3), _number("prior_sd"), _number("noise_sd", 3), _number("fades")
 NUMBERS = len(_numbers)
 
 AIRED = _choice("aired")  # a car with a radar
@@ -100,12 +103,26 @@ MITIGATION, MODED = _choice("mitigation"), _choice("moded")
 ENDS, ACTUATED = _choice("ends"), _choice("actuated")
 ACTION, ACTIONS, REWARD, FEATURES = _choice("action"), _choice("actions"), _choice("reward"), _choice("features")
 SEEN, FROM = _choice("seen", COMPONENTS), _choice("from", COMPONENTS)  # the two rows of each component of the observation
+# a platoon: how many; rows that a desk has on top; the length of a car's record; where things begin in `window`, in `s` and in `table`
+CARS, STATES, VICTIMS, INPUT_KNOWN = _choice("cars"), _choice("states"), _choice("victims"), _choice("input_known")
+ROOM, CAR = _choice("room"), _choice("car")
+HUNTED = _choice("hunted")
+WORKS, AIMS, TRUTHS, FUSED = _choice("works"), _choice("aims"), _choice("truths"), _choice("fused")
+SENDS, FORE, DEALT = _choice("sends"), _choice("fore"), _choice("dealt")
+IN_A, IN_B, IN_C, IN_L, IN_MERGE, IN_HEARD = (_choice(name) for name in ("A", "B", "c", "L", "merge", "heard"))  # prediction and fusion
+IN_READS, IN_W, IN_K, IN_SOME = (_choice(name) for name in ("reads", "W", "K", "some"))  # C, S^-1, gain; both where readings are missing
+IN_LAW, IN_FEED, IN_BIAS, IN_V, IN_LED = (_choice(name) for name in ("law", "feed", "bias", "V", "led"))  # K, G, k0 and g0, V of the law
+ALONE, STEPPED, PULLED = _choice("alone"), _choice("stepped"), _choice("pulled")  # no fusion; gains of so many steps; consensus
+STEP_WIDE, IN_HEARS = _choice("step wide"), _choice("hears")  # how far apart the gains of two steps are; who reads whose sensors
+ESTIMATOR, SHAPE, IN_SHAPE = _choice("estimator"), _choice("shape"), _choice("in shape")  # and what is made of an innovation before
+IN_VICTIMS, IN_WIRES, IN_MODES, PROFILED = (_choice(name) for name in ("victims", "wires", "modes", "profiled"))
 CHOICES = len(_choices)
 
 # manoeuvres, detectors, mitigations
 CONSTANT, PULSE, SWITCHED, SINE, BRAKING, STOP_AND_GO, RANDOM, PROFILE = range(8)
 SCORE_ONLY, CHI2, WINDOWED, CUSUM, MEWMA, ALWAYS, SPARSE = range(7)
 ACCEPT_ALL, GATE_OUT, REACQUIRE, ACCEPT_FIRST, ALWAYS_MODE, ACCEPT_HONEST = range(6)
+LINEAR, LASSO, SATURATED, NORM, READ = range(5)  # how a platoon's cars estimate
 DISCRETE, RAMPING, CONTINUOUS, INCREMENT = range(4)  # actions
 CRASH, MIN_GAP, ERROR, STEALTH, FINAL = range(5)  # rewards
 

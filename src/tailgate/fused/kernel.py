@@ -9,13 +9,13 @@ from . import constants as of
 from . import memory as at
 from . import script, seat, step
 from .compiled import Kernel, array_at, phase, written_in
-from .rows import EGO, ENDED, EPISODE, LANES, LEAD_X, LENGTH, OVER, RADAR_STATE, REAR_X, ROWS, SCORE, WANT_KIND, WIRES, WORDS, K, X
+from .rows import EGO, ENDED, EPISODE, LANES, LEAD_X, LENGTH, OVER, RADAR_STATE, REAR_X, SCORE, WANT_KIND, WIRES, WORDS, K, X
 
 _1, _2 = np.uint64(LANES), np.uint64(2 * LANES)
 
 
 @phase
-def obey(s, asked, first, n):
+def obey(s, asked, f, first, n):
     """The command of asked (ASKED, B) into the rows WANT_*. -> whether there is any."""
     some = 0.0
     for j in range(at.ASKED):
@@ -36,12 +36,17 @@ def sound(s, n):
 
 
 @phase
-def keep(s, columns, record, t, first, n):
-    """The rows `columns` of a block into record (K, columns, B) at step t."""
+def keep(s, window, columns, record, t, first, n):
+    """The rows `columns` of a block into record (K, columns, B) at step t; -1 - row of one that stands in the window."""
     for j in range(len(columns)):
-        row = np.uint64(columns[j])
-        for i in range(n):
-            record[t, j, first + i] = s[row + i]
+        if columns[j] >= 0:
+            row = np.uint64(columns[j])
+            for i in range(n):
+                record[t, j, first + i] = s[row + i]
+        else:
+            row = np.uint64(-1 - columns[j])
+            for i in range(n):
+                record[t, j, first + i] = window[row + i]
 
 
 @phase
@@ -108,39 +113,40 @@ def begin_again(start, s, g, window, intent, c, f, table, tick, fresh, words, ne
 
 
 @written_in
-def play(start, advance, decide, look, places, first_block, last_block, part):
+def play(start, advance, obey, decide, decode, pay, look, places, first_block, last_block, part):
     """What the orders ask for (`memory`), in blocks from the first to before the last, at the desk of a `part` of the threads.
 
-    How a step begins and goes on, how a script decides, and what is seen after a step are phases of the plant.
+    How a step begins and goes on, what a command, a script and an action decide, what is paid for and seen, are phases of the plant.
 
     Recorded in record (K, columns, B), or in (1, 2, B) the smallest gaps. What a seat is shown in the end goes into its sheet
     (`cockpit.SHEET`).
 
     -> steps played, or -1 where an estimate is not finite.
     """
-    whole = array_at(places[at.AT_ORDERS], at.ORDERS + of.CHOICES, np.int64)
-    o, f = whole[: at.ORDERS], whole[at.ORDERS :]
+    asks = array_at(places[at.AT_ORDERS], at.ORDERS + of.CHOICES, np.int64)
+    o, f = asks[: at.ORDERS], asks[at.ORDERS :]
     batch, how, steps, tick = o[at.BATCH], o[at.HOW], o[at.STEPS], o[at.TICK]
     blocks, wide, long, deep = (batch + LANES - 1) // LANES, o[at.WINDOW] * LANES, o[at.INTENT] * LANES, o[at.DEEP] * LANES
+    whole = o[at.WHOLE] * LANES
     c = array_at(places[at.AT_C], of.NUMBERS, np.float64)
     table = array_at(places[at.AT_TABLE], o[at.TABLE], np.float64)
-    p = array_at(places[at.AT_SCRIPT], script.PLACES, np.float64)
+    p = array_at(places[at.AT_SCRIPT], o[at.SCRIPT], np.float64)
     rows = array_at(places[at.AT_ROWS], blocks * deep, np.float64)
     windows, intents = array_at(places[at.AT_WINDOW], blocks * wide, np.float64), array_at(places[at.AT_INTENT], blocks * long, np.float64)
     words = array_at(places[at.AT_WORDS], blocks * WORDS * LANES, np.uint64)
-    asked = array_at(places[at.AT_ASKED], (at.ASKED, batch), np.float64)
+    asked = array_at(places[at.AT_ASKED], (o[at.ASKING], batch), np.float64)
     action = array_at(places[at.AT_ACTION], (batch, f[of.ACTIONS]), np.float64)
     paid, flags = array_at(places[at.AT_PAID], (at.PAID, batch), np.float64), array_at(places[at.AT_FLAGS], (at.FLAGS, batch), np.bool_)
     count, mask = array_at(places[at.AT_COUNT], batch, np.int64), array_at(places[at.AT_MASK], (batch, o[at.MASKED]), np.int8)
     seen = array_at(places[at.AT_SEEN], (batch, f[of.FEATURES]), np.float32)
     columns = array_at(places[at.AT_COLUMNS], o[at.COLUMNS], np.int64)
     record = array_at(places[at.AT_RECORD], (o[at.KEPT], o[at.COLUMNS], batch), np.float64)
-    room = at.DESKS * ROWS * LANES + wide + long
+    room = at.DESKS * whole + wide + long
     desk = array_at(places[at.AT_DESK], (part + 1) * room, np.float64)[part * room :]
-    spare, spare_window, spare_intent = desk[ROWS * LANES : 2 * ROWS * LANES], desk[2 * ROWS * LANES : room - long], desk[room - long :]
+    spare, spare_window, spare_intent = desk[whole : 2 * whole], desk[2 * whole : room - long], desk[room - long :]
     spare_words = array_at(places[at.AT_DESK_WORDS], (part + 1) * WORDS * LANES, np.uint64)[part * WORDS * LANES :]
     seated, fresh, longest = how == at.SEATED, o[at.FRESH] != 0, 0
-    restart, alone = fresh or o[at.RESTART] != 0, deep == ROWS * LANES
+    restart, alone = fresh or o[at.RESTART] != 0, deep == whole
     for b in range(first_block, last_block):
         n, first = np.uint64(min(LANES, batch - b * LANES)), np.uint64(b * LANES)
         held = rows[b * deep : (b + 1) * deep]
@@ -162,21 +168,21 @@ def play(start, advance, decide, look, places, first_block, last_block, part):
             if seated:
                 seat.alive(s, c, n)
                 if t == 0 or f[of.ACTION] == of.RAMPING or f[of.ACTION] == of.INCREMENT:  # which depend on the last command
-                    wanted = seat.decode(s, c, f, action, first, n)
+                    wanted = decode(s, window, c, f, table, action, first, n)
             elif how == at.SCRIPTED:
-                wanted = decide(s, g, window, c, f, p, n)
+                wanted = decide(s, g, window, c, f, table, p, n)
             else:
-                wanted = obey(s, asked, first, n)
+                wanted = obey(s, asked, f, first, n)
             advance(s, g, window, intent, c, f, table, now, wanted, n)
             now += 1
             if not sound(s, n):
                 return -1
             if seated:
-                seat.pay(s, c, f, n)
+                pay(s, c, f, n)
             if o[at.LEAST] != 0:
                 nearest(s, f, record, first, n)
             else:
-                keep(s, columns, record, o[at.FIRST_STEP] + t, first, n)
+                keep(s, window, columns, record, o[at.FIRST_STEP] + t, first, n)
             longest = max(longest, t + 1)
         if seated and steps > 0:
             seat.settle(s, c, paid, flags, first, n)
@@ -185,7 +191,7 @@ def play(start, advance, decide, look, places, first_block, last_block, part):
         if seated:
             if steps > 0:
                 seat.close(s, flags, first, n)
-            look(s, c, paid, flags, count, mask, first, n)
+            look(s, window, c, f, paid, flags, count, mask, first, n)
             seat.observe(s, c, f, seen, first, n)
         if not alone:
             carry(desk, held)
@@ -197,4 +203,6 @@ def play(start, advance, decide, look, places, first_block, last_block, part):
 @Kernel
 def run(places, first_block, last_block, part):
     """`play`, of car following."""
-    return play(step.start, step.advance, script.decide, seat.look, places, first_block, last_block, part)
+    return play(
+        step.start, step.advance, obey, script.decide, seat.decode, seat.pay, seat.look, places, first_block, last_block, part
+    )  # fmt: skip

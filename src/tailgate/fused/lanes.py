@@ -43,9 +43,9 @@ class _Spent(NamedTuple):
     cooldown: Array
 
 
-def _kernel(aired: bool) -> Kernel:
+def _kernel(f: Array) -> Kernel:
     """What plays the plant: of the others nothing is imported."""
-    name = "radar_kernel" if aired else "kernel"
+    name = "platoon_kernel" if f[of.CARS] else "radar_kernel" if f[of.AIRED] else "kernel"
     run: Kernel = import_module(f"tailgate.fused.{name}").run
     return run
 
@@ -65,7 +65,7 @@ class Lanes:
         self.memory = Memory(self.batch, constants.c, constants.f, constants.table, constants.window, constants.intents, self.threads)
         self.rows, self.record = self.memory.rows, np.zeros((steps, len(columns), self.batch))
         self.aired = bool(constants.f[of.AIRED])
-        self.play = _kernel(self.aired)
+        self.play = _kernel(constants.f)
         self.wires = np.array(wires_of(len(loop.model.wires)))
         self._asked: tuple[int, ...] = ()
         self.memory.put(AT_COLUMNS, columns.astype(np.int64))
@@ -166,15 +166,22 @@ class Lanes:
         spent: Any = _Spent(*(self.row(name).astype(np.int64) for name in (at.USED, at.BURST, at.COOLDOWN)))
         left, allowed = Channel().budget_left(plan, spent), Channel().allowed(plan, spent, k)
         budget = np.full(self.batch, np.inf if threat.budget is None else float(threat.budget))
-        last = Command(self.row(at.KIND).astype(np.int8), self.of_wires(at.TARGET) != 0.0, self.of_wires(at.VALUE))
-        view = View(k, k / self.loop.horizon, self.scene(), left, budget, spent.burst, spent.cooldown, allowed, last)
+        view = View(k, k / self.loop.horizon, self.scene(), left, budget, spent.burst, spent.cooldown, allowed, self.last())
         if self.aired:
             view = view._replace(probed=self.row(at.PROBED)[:, None] != 0.0)
         if threat.knowledge == "grey":
-            view = view._replace(control=self.row(at.U)[:, None, None].copy())
+            view = view._replace(control=self.control())
         if threat.sees_measurement:
-            view = view._replace(received=self._received())
+            view = view._replace(received=self.received())
         return view
+
+    def last(self) -> Command:
+        """The command that was in force in the last step."""
+        return Command(self.row(at.KIND).astype(np.int8), self.of_wires(at.TARGET) != 0.0, self.of_wires(at.VALUE))
+
+    def control(self) -> Array:
+        """(B, N, 1) what was commanded last."""
+        return self.row(at.U)[:, None, None].copy()
 
     def scene(self) -> Scene:
         """The road now."""
@@ -190,7 +197,8 @@ class Lanes:
             state = RadarState(x, v, self.row(at.LEAD_A).copy(), own, behind)
         return self.loop.plant.scene(self.loop.plan.plant, state)
 
-    def _received(self) -> Received:
+    def received(self) -> Received:
+        """The readings as they were sent."""
         sent = self.stack(at.SENT, len(self.wires) - 1)  # all but the actuator
         y = sent[..., :SENSORS]
         if not self.aired:

@@ -7,6 +7,7 @@ import numpy as np
 from tailgate.core import Array
 
 from . import constants as of
+from .platoon_rows import WIRES as MANY_WIRES
 from .rows import LANES, RADAR_STATE, ROWS, STATE, WIRES, WORDS
 from .script import PLACES
 
@@ -33,6 +34,7 @@ FRESH, STEPS, HOW, TERMINATE, FIRST_STEP, RESTART = (
 # How long things are that differ.
 DEEP, WINDOW, INTENT, TABLE = _order("rows of a block"), _order("window rows"), _order("intent rows"), _order("table length")
 COLUMNS, KEPT = _order("recorded columns"), _order("recorded steps")
+WHOLE, ASKING, SCRIPT = _order("rows of a desk"), _order("rows of a command"), _order("script length")
 MASKED = _order("actions of a mask")
 ORDERS = len(_orders)
 
@@ -46,6 +48,7 @@ AT_DESK, AT_DESK_WORDS = _place("desk"), _place("desk words")  # of each thread 
 
 FEW = 4  # blocks that stay in the cache with all that a step computes on its way
 ASKED = 1 + 2 * WIRES  # rows of a command: kind, targets, values
+OF_VICTIM = 2 * MANY_WIRES  # numbers of a command or of a script for each of several cars that may be attacked
 OBEY, SCRIPTED, SEATED = range(3)  # who decides
 DESKS = 2  # rooms of ROWS at a desk: for a block that is played, and for episodes that begin
 PAID = 2  # rows of numbers of what a decision brought: reward, gap
@@ -65,15 +68,18 @@ class Memory:
     def __init__(self, batch: int, c: Array, f: Array, table: Array, window: int, intents: int, threads: int) -> None:
         blocks, actions = -(-batch // LANES), int(f[of.ACTIONS])
         kept = RADAR_STATE if f[of.AIRED] else STATE
-        deep = ROWS if blocks <= FEW else kept  # many blocks share one place to work at, which stays in the cache
+        whole, victims = ROWS + int(f[of.ROOM]), int(f[of.VICTIMS])
+        asking, written = 2 + OF_VICTIM * victims if victims else ASKED, PLACES + OF_VICTIM * victims
+        deep = whole if blocks <= FEW else kept  # many blocks share one place to work at, which stays in the cache
         sizes = {
             AT_ROWS: blocks * deep * LANES, AT_WINDOW: blocks * window * LANES, AT_INTENT: blocks * intents * LANES, AT_C: len(c),
-            AT_TABLE: len(table), AT_SCRIPT: PLACES, AT_ASKED: 0 if actions else ASKED * batch, AT_ACTION: actions * batch,
+            AT_TABLE: len(table), AT_SCRIPT: written, AT_ASKED: 0 if actions else asking * batch, AT_ACTION: actions * batch,
         }  # fmt: skip
         self.places, self._placed = np.zeros(len(_places), np.uintp), [np.zeros(0)] * len(_places)
         self.whole = np.zeros(ORDERS + len(f), np.int64)
         self.order, self.whole[ORDERS:] = self.whole[:ORDERS], f
         self.order[[BATCH, DEEP, WINDOW, INTENT, TABLE]] = batch, deep, window, intents, len(table)
+        self.order[[WHOLE, ASKING, SCRIPT]] = whole, asking, written
         self.floats = _lined_up(sum(sizes.values()), np.float64)
         held, at = {}, 0
         for name, size in sizes.items():
@@ -82,12 +88,13 @@ class Memory:
             at += size
         held[AT_C][:], held[AT_TABLE][:] = c, table
         self.rows, self.script = held[AT_ROWS].reshape(blocks, deep * LANES), held[AT_SCRIPT]
-        self.asked, self.action = held[AT_ASKED].reshape(ASKED, -1), held[AT_ACTION].reshape(-1, max(actions, 1))
+        self.window = held[AT_WINDOW].reshape(blocks, window * LANES)
+        self.asked, self.action = held[AT_ASKED].reshape(asking, -1), held[AT_ACTION].reshape(-1, max(actions, 1))
         self.flat_words = _lined_up(blocks * WORDS * LANES, np.uint64)
         self.words = self.flat_words.reshape(blocks, WORDS * LANES)
         self.put(AT_ORDERS, self.whole)
         self.put(AT_WORDS, self.flat_words)
-        self.put(AT_DESK, _lined_up(threads * (DESKS * ROWS + window + intents) * LANES, np.float64))
+        self.put(AT_DESK, _lined_up(threads * (DESKS * whole + window + intents) * LANES, np.float64))
         self.put(AT_DESK_WORDS, _lined_up(threads * WORDS * LANES, np.uint64))
 
     def put(self, place: int, array: Array) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -81,11 +82,32 @@ def signals(record: Array, f: Array) -> dict[str, Array]:
     return out
 
 
+class Car(Lanes):
+    """B episodes of one car that follows another."""
+
+    columns = staticmethod(columns)
+
+    @staticmethod
+    def numbers(loop: Loop, attack: Attack, plan: Any) -> Array | None:
+        """A script as the kernel takes it, None where it has no lane."""
+        return script.numbers(attack, plan)
+
+    def signals(self, steps: int) -> dict[str, Array]:
+        """Those of a Trace, of so many steps."""
+        return signals(self.record[:steps], self.constants.f)
+
+
+def _kind(f: Array) -> Any:
+    """One car, or a platoon, whose module a single car does without."""
+    return import_module("tailgate.fused.platoon_play").Platoon if f[of.CARS] else Car
+
+
 def play(loop: Loop, k: Constants, attack: Attack, keys: Keys, terminate: bool) -> tuple[Array, dict[str, Array], dict[str, Array]]:
     """-> lengths (B,), signals (K, B, ...) and the road before the first step, as `tailgate.trace.Trace` holds them."""
     plan: Any = attack.prepare(loop.brief)
-    lanes = Lanes(loop, k, keys, columns(k.f), loop.horizon)
-    written = script.numbers(attack, plan)
+    kind = _kind(k.f)
+    lanes = kind(loop, k, keys, kind.columns(k.f), loop.horizon)
+    written = kind.numbers(loop, attack, plan)
     lanes.start()
     first = lanes.scene()._asdict()
     if written is None:
@@ -94,7 +116,7 @@ def play(loop: Loop, k: Constants, attack: Attack, keys: Keys, terminate: bool) 
         lanes.memory.script[:] = written
         steps = lanes.run(SCRIPTED, loop.horizon, terminate=terminate)
     length = lanes.row(at.LENGTH).astype(np.int64) if terminate else np.full(lanes.batch, steps)
-    return length, signals(lanes.record[:steps], k.f), first
+    return length, lanes.signals(steps), first
 
 
 def nearest(loop: Loop, k: Constants, attack: Attack, keys: Keys) -> tuple[Array, Array] | None:
@@ -102,10 +124,11 @@ def nearest(loop: Loop, k: Constants, attack: Attack, keys: Keys) -> tuple[Array
 
     Nothing else is kept of them: many at a time take little memory. None where the attack has no lane.
     """
-    written = script.numbers(attack, attack.prepare(loop.brief))
+    kind = _kind(k.f)
+    written = kind.numbers(loop, attack, attack.prepare(loop.brief))
     if written is None:
         return None
-    lanes = Lanes(loop, k, keys, np.zeros(2, np.uint64), 1)
+    lanes = kind(loop, k, keys, np.zeros(2, np.uint64), 1)
     lanes.record[:] = np.inf
     lanes.memory.script[:], lanes.memory.order[LEAST] = written, 1
     lanes.start()

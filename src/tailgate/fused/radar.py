@@ -162,7 +162,7 @@ def advance(s, g, window, intent, c, f, table, tick, asked, n):
 
 
 @phase
-def decide(s, g, window, c, f, p, n):
+def decide(s, g, window, c, f, table, p, n):
     """The command of a script into the rows WANT_*. -> whether there is any."""
     if not script.ready(s, c, p, n):
         return False
@@ -187,9 +187,9 @@ QUANTITIES = {
 
 
 @phase
-def look(s, c, paid, flags, count, mask, first, n):
+def look(s, window, c, f, paid, flags, count, mask, first, n):
     """What the information of a step shows of the state that it led to, and what the observation needs of it."""
-    seat.look(s, c, paid, flags, count, mask, first, n)
+    seat.look(s, window, c, f, paid, flags, count, mask, first, n)
     for i in range(n):
         kind, value = s[KIND + i], s[VALUE + i]
         s[LAST_POWER + i], s[LAST_DELAY + i] = value if kind == _NOISE_JAM else 0.0, value if kind == _ECHO_DELAY else 0.0

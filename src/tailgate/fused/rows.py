@@ -88,6 +88,7 @@ TOTAL, TOP, RIVAL, WEIGHT = _row("total"), _row("top"), _row("rival"), _row("wei
 STOP = _row("stop", 4)  # of a stop: speed, acceleration above braking, time, exp(-time / lag)
 LIVE, RAW, BEFORE = _row("live"), _row("raw"), _row("before")  # of a seat: this step counts; what it pays; the potential before
 EARNED, PART = _row("earned"), _row("part")  # this step's pay, and a part of it
+OFF = _row("off")  # of several cars: the largest error of a gap
 ANY_REFUSED, ANY_HIT, ANY_REAR = _row("any_refused"), _row("any_hit"), _row("any_rear")
 LEFT_OVER, ATTACKING, ZERO, INFINITE = _row("left_over"), _row("attacking"), _row("zero"), _row("infinite")  # of an observation
 POWER, DELAY = _row("power"), _row("delay")  # radiated at a radar

@@ -16,7 +16,7 @@ from tailgate.elementwise import clip
 
 from . import channel, road, stealth
 from . import constants as of
-from .compiled import phase
+from .compiled import formula, phase
 from .rows import (
     ATTACK_KEY,
     DRAWN,
@@ -48,8 +48,8 @@ TIME, NEAR, CLOSING, FAST, SLOW, LEADER_BRAKING = range(6)
 NOTHING, CONSTANT, UNIFORM, GAUSSIAN, RAMP, STEALTH = range(6)
 
 _WHEN = {Trigger: TIME, Near: NEAR, Closing: CLOSING, Fast: FAST, Slow: SLOW, LeaderBraking: LEADER_BRAKING}
-_ATTACK = np.uint64(int(Role.ATTACK) << 16)
-_CHANCE = np.uint64(int(Role.ATTACK) << 16 | scripted.CHANCE)
+ATTACK = np.uint64(int(Role.ATTACK) << 16)
+CHANCES = np.uint64(int(Role.ATTACK) << 16 | scripted.CHANCE)
 _1 = np.uint64(LANES)
 _JAM, _FDI, _AIRED = float(Kind.DOS_JAM), float(Kind.FDI), float(min(AIRED))
 _LANES = {
@@ -67,13 +67,28 @@ def numbers(attack: Any, plan: Any) -> Array | None:
     """A script as (PLACES,) numbers, None where it has no lane."""
     if not known(attack):
         return None
+    p = law(attack, plan)
+    p[SIGN : SIGN + WIRES] = 1.0
+    if type(attack) is not scripted.NoAttack:
+        mine = np.array(wires_of(plan.target.shape[1]))
+        p[AIM + mine], p[SIGN + mine] = plan.target[0], signs(attack, plan)[0]
+    return p
+
+
+def signs(attack: Any, plan: Any) -> Array:
+    """(N, w) the factor of what is injected at each wire."""
+    out = np.ones(plan.target.shape)
+    return np.asarray(plan.extra) if type(attack) is scripted.Inject and plan.extra is not None else out
+
+
+def law(attack: Any, plan: Any) -> Array:
+    """All of it but the wires that it reaches."""
     p = np.zeros(PLACES)
     p[[WINDOW, ON_FOR, CHANCE, HIT, TURN, LIMIT]] = np.inf, np.inf, 1.0, 2.0, np.inf, np.inf
-    p[SIGN : SIGN + WIRES] = 1.0
     if type(attack) is scripted.NoAttack:
         p[BEGIN] = np.inf
         return p
-    kind, threat, mine = type(attack), plan.brief.threat, np.array(wires_of(plan.target.shape[1]))
+    kind, threat = type(attack), plan.brief.threat
     if kind is scripted.Jam:
         p[WHAT], p[LAW], p[FIRST], p[SECOND] = Kind.DOS_JAM, UNIFORM, attack.low, attack.high
     elif kind is scripted.Hold:
@@ -82,7 +97,6 @@ def numbers(attack: Any, plan: Any) -> Array | None:
         p[WHAT], p[HIT] = Kind.DROPOUT, attack.probability
     elif kind is scripted.Inject:
         p[WHAT], p[LAW], p[FIRST] = Kind.FDI, CONSTANT, attack.value
-        p[SIGN + mine] = 1.0 if plan.extra is None else plan.extra[0]
     elif kind is scripted.InjectGaussian:
         p[WHAT], p[LAW], p[FIRST], p[SECOND] = Kind.FDI, GAUSSIAN, attack.mean, attack.sd
     elif kind is scripted.InjectBernoulli:
@@ -108,15 +122,14 @@ def numbers(attack: Any, plan: Any) -> Array | None:
     p[WINDOW] = np.inf if when.window is None else when.window
     p[ON_FOR], p[OFF_FOR] = (np.inf, 0.0) if attack.burst is None else (attack.burst, attack.pause)
     p[CHANCE] = attack.chance
-    p[AIM + mine], p[HOPS] = plan.target[0], getattr(attack, "hop", False)
+    p[HOPS] = getattr(attack, "hop", False)
     return p
 
 
 @phase
-def _when(s, c, p, n):
-    """Row ON: whether the window is open; the trigger's memory one step later."""
-    kind, threshold, begin, window = p[WHEN], p[THRESHOLD], p[BEGIN], p[WINDOW]
-    dt, on_for, off_for = c[of.DT], p[ON_FOR], p[OFF_FOR]
+def _holds(s, c, p, n):
+    """Row ON: whether the trigger's condition holds."""
+    kind, threshold, dt = p[WHEN], p[THRESHOLD], c[of.DT]
     for i in range(n):
         gap, speed, lead = s[LEAD_X + i] - s[EGO + i], s[EGO + _1 + i], s[LEAD_V + i]
         holds = kind == TIME
@@ -125,23 +138,25 @@ def _when(s, c, p, n):
         holds |= (kind == FAST) & (speed > threshold)
         holds |= (kind == SLOW) & (speed < threshold)
         holds |= (kind == LEADER_BRAKING) & ((s[SEEN + i] - lead) / dt > threshold)
-        opened = (s[OPENED + i] != 0.0) | (holds & (s[K + i] >= begin))
+        s[ON + i] = holds
+        s[SEEN + i] = lead
+
+
+@phase
+def open_now(s, c, p, n):
+    """From the condition in row ON to who is attacked now, with no kind so far in row WANT_KIND. -> whether anybody is."""
+    begin, window, on_for, off_for = p[BEGIN], p[WINDOW], p[ON_FOR], p[OFF_FOR]
+    for i in range(n):
+        opened = (s[OPENED + i] != 0.0) | ((s[ON + i] != 0.0) & (s[K + i] >= begin))
         count = s[ELAPSED + i]
         s[ON + i] = opened & (count < window)
         s[OPENED + i] = opened
         s[ELAPSED + i] = count + s[OPENED + i]
-        s[SEEN + i] = lead
     if on_for < np.inf:
         whole = on_for + off_for
         for i in range(n):
             count = s[ELAPSED + i] - s[OPENED + i]
             s[ON + i] = s[ON + i] if count - whole * np.floor(count / whole) < on_for else 0.0
-
-
-@phase
-def ready(s, c, p, n):
-    """Row ON: who is attacked now, with no command so far in the rows WANT_*. -> whether anybody is."""
-    _when(s, c, p, n)
     channel.allowed(s, c, WANT_KIND, n)
     some = False
     for i in range(n):
@@ -149,7 +164,14 @@ def ready(s, c, p, n):
         s[ON + i] = on
         s[WANT_KIND + i] = 0.0
         some |= on
-    if not some:
+    return some
+
+
+@phase
+def ready(s, c, p, n):
+    """Row ON: who is attacked now, with no command so far in the rows WANT_*. -> whether anybody is."""
+    _holds(s, c, p, n)
+    if not open_now(s, c, p, n):
         return False
     for w in range(WIRES):
         row = np.uint64(w * LANES)
@@ -159,7 +181,7 @@ def ready(s, c, p, n):
 
 
 @phase
-def decide(s, g, window, c, f, p, n):
+def decide(s, g, window, c, f, table, p, n):
     """The command of the script into the rows WANT_*. -> whether there is any."""
     if not ready(s, c, p, n):
         return False
@@ -195,15 +217,24 @@ def deal(s, g, p, n):
     law = p[LAW]
     if law == UNIFORM or p[HIT] < 2.0:
         for b in range(3):
-            road.uniforms(s, g, ATTACK_KEY, _ATTACK, np.uint64(b), DRAWN + np.uint64(2 * b * LANES), n)
+            road.uniforms(s, g, ATTACK_KEY, ATTACK, np.uint64(b), DRAWN + np.uint64(2 * b * LANES), n)
     elif law == GAUSSIAN:
         for b in range(3):
-            road.normals(s, g, ATTACK_KEY, _ATTACK, np.uint64(b), DRAWN + np.uint64(2 * b * LANES), n)
+            road.normals(s, g, ATTACK_KEY, ATTACK, np.uint64(b), DRAWN + np.uint64(2 * b * LANES), n)
+
+
+@formula
+def worth(law, first, second, limit, count, u):
+    """What the law of the values says, so many steps after the window opened."""
+    value = first
+    value = first + (second - first) * u if law == UNIFORM else value
+    value = first + second * u if law == GAUSSIAN else value
+    return clip(first + second * (count + 1.0), -limit, limit) if law == RAMP else value
 
 
 @phase
 def sample(s, c, p, n):
-    """What the law of the values says."""
+    """What is sent."""
     kind, law, first, second, limit, turn = p[WHAT], p[LAW], p[FIRST], p[SECOND], p[LIMIT], p[TURN]
     hit, airs = p[HIT], p[WHAT] >= _AIRED
     spans = kind == _JAM or airs
@@ -212,10 +243,7 @@ def sample(s, c, p, n):
         bound, low, high = c[of.BOUND + w], FAINTEST if airs else c[of.LOW + w], p[MOST] if airs else c[of.HIGH + w]
         for i in range(n):
             count, u = s[ELAPSED + i] - 1.0, s[DRAWN + row + i]
-            value = first
-            value = first + (second - first) * u if law == UNIFORM else value
-            value = first + second * u if law == GAUSSIAN else value
-            value = clip(first + second * (count + 1.0), -limit, limit) if law == RAMP else value
+            value = worth(law, first, second, limit, count, u)
             value = clip(value, low, high) if spans | (count >= turn) else clip(value, -bound, bound)
             on = (s[ON + i] != 0.0) & (aim != 0.0) & ((hit >= 2.0) | (u < hit))
             s[WANT_TARGET + row + i] = on
@@ -226,7 +254,7 @@ def sample(s, c, p, n):
 @phase
 def spare(s, g, chance, n):
     """Without luck nothing is sent."""
-    road.uniforms(s, g, ATTACK_KEY, _CHANCE, np.uint64(0), DRAWN, n)
+    road.uniforms(s, g, ATTACK_KEY, CHANCES, np.uint64(0), DRAWN, n)
     for i in range(n):
         s[WANT_KIND + i] = s[WANT_KIND + i] if s[DRAWN + i] < chance else 0.0
     for w in range(WIRES):

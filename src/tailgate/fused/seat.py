@@ -34,6 +34,7 @@ from .rows import (
     LEAST,
     LEFT_OVER,
     LIVE,
+    OFF,
     ON,
     OVER,
     PART,
@@ -59,7 +60,7 @@ from .rows import (
 
 closeness, fooled, small = formula(reward.closeness), formula(reward.fooled), formula(reward.small)
 _1, _2, _3, _4 = (np.uint64(LANES * i) for i in range(1, 5))
-_FDI = float(Kind.FDI)
+FDI = float(Kind.FDI)
 
 # What an observation shows: the difference of two rows, the second of which is mostly 0.
 QUANTITIES = {
@@ -74,7 +75,7 @@ ALONE = {"rear_gap": (INFINITE, ZERO), "rear_closing": (ZERO, ZERO)}  # without 
 
 
 @phase
-def decode(s, c, f, action, first, n):
+def decode(s, window, c, f, table, action, first, n):
     """Actions (B, ACTIONS), of this block from `first` on, into the rows WANT_*. -> whether there is any command."""
     kind, rate = f[of.ACTION], c[of.RATE]
     some = 0
@@ -88,7 +89,7 @@ def decode(s, c, f, action, first, n):
             row = of.TABLE + of.MODE_WIDTH * np.int64(action[first + i, 0])
             wanted, sign = c[row], c[row + 1]
             delays = wanted == channel.ECHO_DELAY
-            ramps = (kind == of.RAMPING) & ((wanted == _FDI) | delays) & (s[KIND + i] == wanted)
+            ramps = (kind == of.RAMPING) & ((wanted == FDI) | delays) & (s[KIND + i] == wanted)
             s[WANT_KIND + i] = wanted
             for w in range(WIRES):
                 at = np.uint64(w * LANES) + i
@@ -101,13 +102,13 @@ def decode(s, c, f, action, first, n):
         return True
     for i in range(n):
         s[ON + i] = clip(action[first + i, 0], -1.0, 1.0) > 0.0
-        s[WANT_KIND + i] = _FDI if s[ON + i] != 0.0 else 0.0
+        s[WANT_KIND + i] = FDI if s[ON + i] != 0.0 else 0.0
     place: int = 1
     for w in range(WIRES):
         down, bound, mine = np.uint64(w * LANES), c[of.BOUND + w], c[of.WIRE + w] != 0.0
         for i in range(n):
             share = clip(action[first + i, place if mine else 0], -1.0, 1.0)
-            before = s[VALUE + down + i] if s[KIND + i] == _FDI else 0.0
+            before = s[VALUE + down + i] if s[KIND + i] == FDI else 0.0
             value = clip(before + rate * share, -bound, bound) if kind == of.INCREMENT else bound * share
             on = mine & (s[ON + i] != 0.0)
             s[WANT_TARGET + down + i] = on
@@ -152,41 +153,52 @@ def alive(s, c, n):
         s[LIVE + i] = (s[OVER + i] == 0.0) & (s[ENDED + i] == 0.0) & (s[K + i] <= horizon)
 
 
-@phase
-def pay(s, c, f, n):
-    """After a step of it: its reward, and what happened."""
-    kind, illegal, cost, scale, dt, horizon = f[of.REWARD], c[of.ILLEGAL], c[of.COST], c[of.REWARD_SCALE], c[of.DT], c[of.HORIZON]
-    sign = c[of.BELIEF]
-    for i in range(n):
-        s[EARNED + i] = -illegal * s[REFUSED + i] - cost * (1.0 if s[KIND + i] != 0.0 else 0.0)
-    if kind == of.CRASH or kind == of.MIN_GAP:
+def paying(many):
+    """The phase `pay`: of one car, or of `many`.
+
+    Of many the smallest gap and the largest belief stand in the place of a single car's, and the largest error in row OFF.
+    """
+
+    @phase
+    def pay(s, c, f, n):
+        """After a step of it: its reward, and what happened."""
+        kind, illegal, cost, scale, dt, horizon = f[of.REWARD], c[of.ILLEGAL], c[of.COST], c[of.REWARD_SCALE], c[of.DT], c[of.HORIZON]
+        sign = c[of.BELIEF]
         for i in range(n):
-            before, gap = s[LEAST + i], s[LEAD_X + i] - s[EGO + i]
-            s[LEAST + i] = np.minimum(small(gap), before)
-            s[PART + i] = before - s[LEAST + i]
-            s[EARNED + i] += 1.0 if (s[HIT + i] != 0.0) | (s[REAR_HIT + i] != 0.0) else 0.0
-        for i in range(n if kind == of.MIN_GAP else np.uint64(0)):
-            s[EARNED + i] += s[PART + i] / NEAR
-    else:
-        for i in range(n):
-            s[PART + i] = abs(0.0 + sign * (s[X + i] - s[TRUTH + i])) / scale
-        if kind == of.FINAL:
+            s[EARNED + i] = -illegal * s[REFUSED + i] - cost * (1.0 if s[KIND + i] != 0.0 else 0.0)
+        if kind == of.CRASH or kind == of.MIN_GAP:
             for i in range(n):
-                s[EARNED + i] += s[PART + i] * s[PART + i] if s[K + i] - 1.0 == horizon else 0.0
+                before, gap = s[LEAST + i], s[LEAD_X + i] - s[EGO + i]
+                s[LEAST + i] = np.minimum(small(gap), before)
+                s[PART + i] = before - s[LEAST + i]
+                s[EARNED + i] += 1.0 if (s[HIT + i] != 0.0) | (s[REAR_HIT + i] != 0.0) else 0.0
+            for i in range(n if kind == of.MIN_GAP else np.uint64(0)):
+                s[EARNED + i] += s[PART + i] / NEAR
         else:
             for i in range(n):
-                s[EARNED + i] += dt * np.minimum(s[PART + i], 1.0)
-            for i in range(n if kind == of.STEALTH else np.uint64(0)):
-                s[EARNED + i] -= dt * s[ALARM + i]
-    potential(s, c, True, PART, n)
-    for i in range(n):
-        live, refused, hit, rear = s[LIVE + i] != 0.0, s[REFUSED + i] != 0.0, s[HIT + i] != 0.0, s[REAR_HIT + i] != 0.0
-        now, before, earned = s[PART + i], s[POTENTIAL + i], s[EARNED + i]
-        s[RAW + i] += earned if live else 0.0
-        s[POTENTIAL + i] = now if live else before
-        s[ANY_REFUSED + i] = 1.0 if (live & refused) | (s[ANY_REFUSED + i] != 0.0) else 0.0
-        s[ANY_HIT + i] = 1.0 if (live & hit) | (s[ANY_HIT + i] != 0.0) else 0.0
-        s[ANY_REAR + i] = 1.0 if (live & rear) | (s[ANY_REAR + i] != 0.0) else 0.0
+                s[PART + i] = (s[OFF + i] if many else abs(0.0 + sign * (s[X + i] - s[TRUTH + i]))) / scale
+            if kind == of.FINAL:
+                for i in range(n):
+                    s[EARNED + i] += s[PART + i] * s[PART + i] if s[K + i] - 1.0 == horizon else 0.0
+            else:
+                for i in range(n):
+                    s[EARNED + i] += dt * np.minimum(s[PART + i], 1.0)
+                for i in range(n if kind == of.STEALTH else np.uint64(0)):
+                    s[EARNED + i] -= dt * s[ALARM + i]
+        potential(s, c, True, PART, n)
+        for i in range(n):
+            live, refused, hit, rear = s[LIVE + i] != 0.0, s[REFUSED + i] != 0.0, s[HIT + i] != 0.0, s[REAR_HIT + i] != 0.0
+            now, before, earned = s[PART + i], s[POTENTIAL + i], s[EARNED + i]
+            s[RAW + i] += earned if live else 0.0
+            s[POTENTIAL + i] = now if live else before
+            s[ANY_REFUSED + i] = 1.0 if (live & refused) | (s[ANY_REFUSED + i] != 0.0) else 0.0
+            s[ANY_HIT + i] = 1.0 if (live & hit) | (s[ANY_HIT + i] != 0.0) else 0.0
+            s[ANY_REAR + i] = 1.0 if (live & rear) | (s[ANY_REAR + i] != 0.0) else 0.0
+
+    return pay
+
+
+pay = paying(many=False)
 
 
 @phase
@@ -213,7 +225,7 @@ def close(s, flags, first, n):
 
 
 @phase
-def look(s, c, paid, flags, count, mask, first, n):
+def look(s, window, c, f, paid, flags, count, mask, first, n):
     """What the information of a step shows of the state that it led to, and what the observation needs of it."""
     channel.allowed(s, c, ON, n)
     budget, share = c[of.BUDGET], c[of.BUDGET_SHARE]

@@ -1,0 +1,268 @@
+"""The constants of a platoon, or why it has no lane."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from tailgate import num
+from tailgate.agents.codec import Mode
+from tailgate.core import Array
+from tailgate.core import Mode as Asked
+from tailgate.envs.cacc import FeedForward
+from tailgate.envs.consensus_cacc import Consensus
+from tailgate.envs.platoon import Platoon, PlatoonSensors
+from tailgate.envs.ploeg import Ploeg
+from tailgate.estimators.chi_square import ChiSquare
+from tailgate.estimators.compose import AcceptAll, Composed, ComposedPlan, Score
+from tailgate.estimators.consensus import ConsensusFilter
+from tailgate.estimators.distributed import DistributedKalmanFilter, TailChiSquare, gain_of, neighbours
+from tailgate.estimators.kalman import KalmanFilter, alone
+from tailgate.estimators.lasso import LassoFilter
+from tailgate.estimators.norm_resilient import NormResilientFilter, axes
+from tailgate.estimators.raw import Raw
+from tailgate.estimators.saturated import SaturatedFilter
+from tailgate.estimators.sentinels import AcceptFirst, AlwaysAlarm, AlwaysMode
+from tailgate.loop import Loop
+
+from . import constants as of
+from . import platoon_gains as gains
+from .constants import put
+from .platoon_rows import AIM_ROWS, BELIEF, CAR_ROWS, LAW, SENSORS, VICTIM_ROWS, WORK_ROWS
+from .rows import LANES, ROWS
+
+PARTS, LAWS = (Platoon, PlatoonSensors), (FeedForward, Consensus, Ploeg)
+ESTIMATORS = {
+    DistributedKalmanFilter: of.LINEAR, LassoFilter: of.LASSO, SaturatedFilter: of.SATURATED, NormResilientFilter: of.NORM,
+    KalmanFilter: of.LINEAR, ConsensusFilter: of.LINEAR,
+}  # fmt: skip
+DETECTORS = (Score, ChiSquare, TailChiSquare, AlwaysAlarm)
+
+
+class Table:
+    """Numbers one after the other; whole ones by their bits."""
+
+    def __init__(self, first: Array) -> None:
+        self.parts, self.size = [first], len(first)
+
+    def add(self, values: Any) -> int:
+        """-> where they begin."""
+        flat = np.array(values).ravel()
+        flat = flat.astype(np.float64) if flat.dtype.kind == "f" else flat.astype(np.int64).view(np.float64)
+        self.parts.append(flat)
+        self.size += len(flat)
+        return self.size - len(flat)
+
+    def listed(self, matrix: Array, place: Array) -> int:
+        """What is not zero of a matrix, row after row: how many, where the values of each row begin, the values, and the place of each."""
+        rows, columns = np.nonzero(matrix)
+        first = self.size + 1 + len(matrix) + 1
+        starts = first + np.searchsorted(rows, np.arange(len(matrix) + 1))
+        at = self.add([len(rows)])
+        self.add(starts)
+        self.add(matrix[rows, columns].astype(np.float64))
+        places = np.broadcast_to(place, matrix.shape)[rows, columns]
+        self.add(places.astype(np.int64))
+        return at
+
+
+def unknown(loop: Loop) -> str:
+    """Why this loop is no platoon with a lane; empty where it is one."""
+    return _parts(loop) or _defence(loop)
+
+
+def fill(loop: Loop, c: Array, f: Array, profile: Array) -> tuple[Array, int]:
+    """Fills in c and f. -> the table, which begins with the speeds of a profile, and the rows of the window."""
+    table = Table(profile if f[of.WAY] == of.PROFILE else np.zeros(0))
+    f[of.PROFILED] = table.size
+    _vehicles(loop, c, f)
+    _filter(loop, _threat(loop, f, table), c, f, table)
+    _detector(loop.plan.defence, c, f)
+    _law(loop, c, f, table)
+    return np.concatenate(table.parts), _places(f)
+
+
+def _parts(loop: Loop) -> str:
+    for part, known in zip((loop.plant, loop.sensor), PARTS, strict=True):
+        if type(part) is not known:
+            return f"{type(part).__name__} has no lane"
+    if type(loop.controller) not in LAWS:
+        return f"{type(loop.controller).__name__} has no lane"
+    C = loop.model.C
+    if C.shape[1] != SENSORS or not np.isin(C, (0.0, 1.0)).all() or (np.count_nonzero(C, axis=2) != 1).any():
+        return "sensors that do not read one state each have no lane"
+    return "" if loop.model.inputs == 1 and loop.model.states > 1 else "a model with several inputs has no lane"
+
+
+def _defence(loop: Loop) -> str:
+    defence = loop.defence
+    if type(defence) is Raw:
+        return "a state that the known input decides has no lane" if loop.plan.defence.by_input.any() else ""
+    if not isinstance(defence, Composed) or type(defence).step is not Composed.step or type(defence).start is not Composed.start:
+        return f"defence {type(defence).__name__} has no lane"
+    estimator: Any
+    estimator, detector, mitigation = defence.parts()
+    if type(estimator) not in ESTIMATORS:
+        return f"filter {type(estimator).__name__} has no lane"
+    if why := "" if estimator.steady else _stepped(estimator, loop):
+        return why
+    if estimator.steady and type(estimator) is KalmanFilter:
+        return "a steady filter on the own sensors has no lane"  # nor a steady state, where cars are behind
+    if getattr(estimator, "solver", "exact") != "exact":
+        return "the solver is not the exact one"
+    if type(detector) not in DETECTORS:
+        return f"detector {type(detector).__name__} has no lane"
+    known = (
+        type(mitigation) is AcceptAll and mitigation.mode == "normal", type(mitigation) is AcceptFirst and not estimator.steady,
+        type(mitigation) is AlwaysMode and mitigation.mode in (Asked.NORMAL, Asked.BRAKE, Asked.STOP),
+    )  # fmt: skip
+    return "" if any(known) else f"mitigation {type(mitigation).__name__} has no lane"
+
+
+def _stepped(estimator: Any, loop: Loop) -> str:
+    """Why a gain that follows the covariance has no lane."""
+    if type(estimator) not in (KalmanFilter, ConsensusFilter):
+        return "fusion by covariances of each row has no lane"
+    if "dropout" in loop.threat.kinds:
+        return "covariances that depend on what is missed have no lane"
+    pulled = type(estimator) is ConsensusFilter
+    if pulled and estimator.share:
+        return "readings that are shared have no lane"
+    return "" if gains.numbers(loop.model, pulled) * _steps(loop) <= gains.MOST else "so many gains have no lane"
+
+
+def _steps(loop: Loop) -> int:
+    """How many steps have gains of their own: those of an episode, and of one that is over and waits for the next."""
+    return loop.horizon + 200
+
+
+def _vehicles(loop: Loop, c: Array, f: Array) -> None:
+    plant, plan = loop.plant, loop.plan.plant
+    assert isinstance(plant, Platoon)
+    f[of.CARS], f[of.STATES] = plant.size
+    f[of.INPUT_KNOWN], f[of.ENDS] = plant.leader_input_known, loop.ends_on_collision
+    c[of.DT], c[of.LOAD], c[of.LEAD_START + 1] = plant.dt, loop.load, plant.speed
+    put(c, of.OWN_A, plan.A)
+    put(c, of.OWN_B, plan.B)
+    put(c, of.PROCESS_SD, plan.noise_sd)
+    put(c, of.NOISE_SD, loop.plan.sensor[1])
+    put(c, of.GAPS, (plant.gap, plant.gap_sd, plant.gap_range))
+    c[of.PRIOR_SD] = plant.initial_sd
+
+
+def _threat(loop: Loop, f: Array, table: Table) -> Array:
+    """The victims, and what may be done to each of their wires. -> who they are."""
+    plan = loop.plan.channel
+    victims = np.flatnonzero(plan.granted.any(axis=1))
+    f[of.VICTIMS], f[of.IN_VICTIMS] = len(victims), table.add(victims.astype(np.int64))
+    mine = plan.granted.any(axis=0)
+    place, wires = np.where(mine, np.cumsum(mine), 0), []  # of each wire in a vector of values, of the first victim
+    for h, i in enumerate(victims):
+        wires.append([plan.granted[i].astype(np.float64), plan.bounds, plan.low, plan.high, place + h * np.count_nonzero(mine)])
+    f[of.IN_WIRES] = table.add(np.array(wires, np.float64))
+    return victims
+
+
+def _filter(loop: Loop, victims: Array, c: Array, f: Array, table: Table) -> None:
+    """A, B, c, what fuses, and the gain: for each victim also with each set of sensors, or for each step."""
+    held, model = loop.plan.defence, loop.model
+    f[of.IN_A] = table.listed(model.A, np.arange(model.states) * LANES)
+    f[of.IN_B], f[of.IN_C], c[of.FACTOR] = table.add(model.B[:, 0]), table.add(model.c), 1.0
+    f[of.IN_HEARD], f[of.IN_READS] = _lists(neighbours(model.graph), table), table.add(np.argmax(model.C, axis=2))
+    if type(loop.defence) is Raw:
+        f[of.ESTIMATOR] = of.READ
+        agents = victims.tolist()
+        told = [(i, e, j, q, agents.index(j) if j in agents else -1) for each in held.rounds for i, e, j, q in zip(*each, strict=True)]
+        f[of.IN_HEARS] = table.add([len(told), *np.array(told).ravel()])
+        return
+    part, plan = held.filter, getattr(held.filter_plan, "linear", held.filter_plan)
+    f[of.ESTIMATOR], c[of.PRICE] = ESTIMATORS[type(part)], getattr(part, "gamma", 0.0)
+    f[of.ALONE] = type(part) in (KalmanFilter, ConsensusFilter)
+    if not part.steady:
+        each = gains.by_step(part, held.mitigation, model, loop.plant.prior_var, _steps(loop))  # type: ignore[attr-defined]
+        f[of.STEPPED], f[of.STEP_WIDE], f[of.IN_W] = len(each), each[0].size, table.add(each)
+        f[of.PULLED] = type(part) is ConsensusFilter and part.consensus > 0.0
+        return
+    f[of.IN_L], f[of.IN_MERGE] = table.add(plan.L), table.add(plan.merge)
+    _sets(held, plan, victims, c, f, table)
+
+
+def _sets(held: ComposedPlan, fusion: Any, victims: Array, c: Array, f: Array, table: Table) -> None:
+    """S^-1 and gain of each car, and of each victim with each set of sensors; and what an estimator makes of an innovation with each."""
+    part: Any = held.filter
+    plan, kind, S, cross, K = held.filter_plan, f[of.ESTIMATOR], fusion.S, fusion.cross, fusion.K
+    keeps = np.array([[some >> q & 1 for q in range(SENSORS)] for some in range(1 << SENSORS)], bool)
+    some, shapes = [], []
+    for i in range(len(S)):
+        for keep in keeps:
+            mine = alone(S[i][None], keep[None])
+            weight, gain = num.inverse(mine)[0], gain_of(mine, cross[i][None] * keep[:, None])[0]
+            if kind == of.LASSO:
+                shapes.append(np.concatenate([weight.ravel(), 0.5 * part.price(mine)[0], mine[0].diagonal()]))
+            elif kind == of.NORM:
+                own = axes(plan.linear.C[i][None] * keep[:, None], alone(plan.linear.R[i][None], keep[None]), plan.spread[i][None])
+                gain = own.push[0]
+                shapes.append(np.concatenate([own.turn[0].ravel(), part.lam * own.half[0]]))
+            if i in victims:
+                some.append(np.concatenate([weight, gain]))
+    if kind == of.NORM:
+        K, c[of.FACTOR] = plan.whole.push, part.lam
+    f[of.IN_W], f[of.IN_K], f[of.IN_SOME] = table.add(num.inverse(S[None])[0]), table.add(K), table.add(np.array(some, np.float64))
+    f[of.SHAPE], f[of.IN_SHAPE] = (len(shapes[0]) if shapes else 0), table.add(np.array(shapes, np.float64))
+
+
+def _detector(held: Any, c: Array, f: Array) -> None:
+    if not isinstance(held, ComposedPlan):  # none, which never alarms
+        c[of.THRESHOLD] = np.inf
+        return
+    part: Any = held.detector
+    c[of.ASKED] = getattr(held.mitigation, "mode", 0) if type(held.mitigation) is AlwaysMode else 0.0
+    f[of.DETECTOR] = of.ALWAYS if type(part) is AlwaysAlarm else of.CHI2
+    c[of.THRESHOLD] = held.detector_plan if type(part) is TailChiSquare else getattr(part, "eta", np.inf)
+
+
+def _lists(heard: tuple[tuple[int, ...], ...], table: Table) -> int:
+    """N(i) of all cars, behind where each begins. -> where that is."""
+    begin = table.size + len(heard) + 1
+    at = table.add(begin + np.cumsum([0, *map(len, heard)]))
+    table.add([j for near in heard for j in near])
+    return at
+
+
+def _law(loop: Loop, c: Array, f: Array, table: Table) -> None:
+    """The law for each car, on its own belief but for its own f."""
+    law: Any = loop.controller
+    matrices, keep = loop.plan.controller.normal
+    cars, states = matrices.K.shape
+    place = int(BELIEF) + np.tile(np.arange(states) * LANES, (cars, 1))
+    place[np.arange(1, cars), 6 + 4 * np.arange(cars - 1)] = int(LAW)
+    f[of.IN_LAW], f[of.IN_FEED] = table.listed(matrices.K, place), table.listed(matrices.G, place)
+    f[of.IN_BIAS], f[of.IN_V] = table.add(np.stack([matrices.k0, matrices.g0], axis=1)), table.add(matrices.V)
+    f[of.IN_LED] = table.add(loop.plan.plant.leader_heard)
+    c[of.FADES] = keep
+    low, high = (limit if given is None else given for given, limit in ((law.accel_min, -np.inf), (law.accel_max, np.inf)))
+    put(c, of.ACCEL_MIN, (low, high))
+
+
+def _places(f: Array) -> int:
+    """Where records begin. -> rows of the window."""
+    cars, states, victims = int(f[of.CARS]), int(f[of.STATES]), int(f[of.VICTIMS])
+    f[of.CAR], f[of.HUNTED] = (CAR_ROWS + states) * LANES, cars * (CAR_ROWS + states) * LANES
+    last = ROWS
+    for name, rows in (
+        (of.WORKS, cars * WORK_ROWS), (of.AIMS, victims * AIM_ROWS), (of.TRUTHS, states), (of.FUSED, cars * states),
+        (of.SENDS, cars * states), (of.FORE, states), (of.DEALT, max(3 * cars, states) + 3),
+    ):  # fmt: skip
+        f[name], last = last * LANES, last + rows
+    f[of.ROOM] = last - ROWS
+    return cars * (CAR_ROWS + states) + victims * VICTIM_ROWS
+
+
+def modes(table: Array, f: Array, known: Sequence[Mode]) -> Array:
+    """The table with the discrete actions behind it: kind, sign, and each victim's targets and values."""
+    victims = table[f[of.IN_VICTIMS] : f[of.IN_VICTIMS] + f[of.VICTIMS]].view(np.int64)
+    f[of.IN_MODES] = len(table)
+    parts = [[(mode.kind, mode.sign), *(part for i in victims for part in (mode.target[i], mode.value))] for mode in known]
+    return np.concatenate([table, *(np.asarray(part, np.float64) for mode in parts for part in mode)])
