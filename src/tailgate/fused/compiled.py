@@ -83,6 +83,30 @@ def _tell_array_at(numba: Any) -> None:  # numba's own `carray` wants references
     numba.extending.lower_builtin(array_at, types.voidptr, types.Any, types.Any)(lower)
 
 
+def fetch(array: Any, at: Any) -> None:
+    """In compiled code: the line of the cache with this element will be read soon."""
+    raise TypeError("fetch is for compiled code")
+
+
+@when_there
+def _tell_fetch(numba: Any) -> None:
+    from llvmlite import ir
+
+    types, cgutils = numba.types, numba.core.cgutils
+    whole = ir.IntType(32)
+
+    def lower(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        array = context.make_array(signature.args[0])(context, builder, arguments[0])
+        place = builder.bitcast(builder.gep(array.data, [arguments[1]]), cgutils.voidptr_t)
+        signature = ir.FunctionType(ir.VoidType(), [cgutils.voidptr_t, whole, whole, whole])
+        prefetch = builder.module.declare_intrinsic("llvm.prefetch", [cgutils.voidptr_t], signature)
+        builder.call(prefetch, [place, whole(0), whole(2), whole(1)])  # to read, into the second cache, data
+        return context.get_dummy_value()
+
+    numba.extending.type_callable(fetch)(lambda context: lambda array, at: types.none)
+    numba.extending.lower_builtin(fetch, types.Array, types.Integer)(lower)
+
+
 def written_in(function: Callable[..., Any]) -> Jitted:
     """As if its text stood where it is called."""
     return Jitted(function, lambda: _OPTIONS | {"inline": "always"})
