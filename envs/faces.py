@@ -206,7 +206,8 @@ class AdversaryVectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
         info: dict[str, Any] = dict(zip(self._facts, (illegal, collided, rear, *self.episodes.facts()), strict=True))
         if self._modes:
             info["action_mask"] = self.episodes.mask().view(np.int8)  # as Space.sample(mask) wants it
-        return info | self._present
+        info |= self._present
+        return info
 
 
 class AdversaryEnv(gymnasium.Env[Array, Any]):
@@ -263,7 +264,9 @@ class AdversaryEnv(gymnasium.Env[Array, Any]):
 
     def _told(self, illegal: bool, collided: bool, rear: bool, allowed: bool, step: int, gap: float, mask: Array) -> dict[str, Any]:
         info = {"illegal": illegal, "collided": collided, "rear_collided": rear, "allowed": allowed, "step": step, "gap": gap}
-        return info | {"action_mask": mask} if self._actions else info
+        if self._actions:
+            info["action_mask"] = mask
+        return info
 
     def _step_as_batch(self, action: Any) -> tuple[Array, float, bool, bool, dict[str, Any]]:
         observation, reward, terminated, truncated, info = self.batch.step(np.asarray(action)[None])

@@ -75,8 +75,7 @@ def measure(s, g, c, f, n):
     per_metre, per_speed, lowest, band = c[of.PER_METRE], c[of.PER_SPEED], c[of.LOWEST], c[of.IF_BAND]
     sd0, sd1, least, most = c[of.SENSOR_SD], c[of.SENSOR_SD + 1], c[of.REACH], c[of.REACH + 1]
     bound, widest = c[of.LEAST_BOUND], c[of.WIDEST]
-    road.normals(s, g, WORLD_KEY, _SENSOR, np.uint64(0), DRAW, n)
-    road.normals(s, g, WORLD_KEY, _SENSOR, np.uint64(1), DRAW + _2, n)
+    road.four_normals(s, g, WORLD_KEY, _SENSOR, np.uint64(0), DRAW, n)
     road.uniforms(s, g, WORLD_KEY, _UNIFORM, np.uint64(0), DEALT, n)
     road.uniforms(s, g, WORLD_KEY, _UNIFORM, np.uint64(1), DEALT + _2, n)
     for i in range(n):
@@ -112,8 +111,7 @@ def measure(s, g, c, f, n):
 def _hear(s, g, c, n):
     """What a silent radar hears, into UNDER_ENERGY."""
     echo, jammed, samples, loud, share = c[of.ECHO], c[of.JAMMED], c[of.LISTENED], c[of.LOUD], c[of.LOUD_SHARE]
-    road.normals(s, g, WORLD_KEY, _SENSOR, np.uint64(2), DRAW, n)
-    road.normals(s, g, WORLD_KEY, _SENSOR, np.uint64(3), DRAW + _2, n)
+    road.four_normals(s, g, WORLD_KEY, _SENSOR, np.uint64(2), DRAW, n)
     for i in range(n):
         power, delay = s[POWER + i], s[DELAY + i]
         jam, tone = _received(0.0 + (s[LEAD_X + i] - s[EGO + i]), power, echo, jammed)

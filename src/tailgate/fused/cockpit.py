@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import math
 import struct
 from itertools import accumulate
@@ -108,7 +109,7 @@ class Cockpit(Lanes):
         """A new sheet for what the compiled function tells."""
         self._sheet = self.paid = self.count = self.seen = self.flags = self.mask = NOTHING  # the last goes, where nobody else holds it
         self._sheet = np.empty(self._size, np.uint8)
-        first, buffer = self._sheet.ctypes.data, memoryview(self._sheet)
+        first, buffer = ctypes.addressof(ctypes.c_char.from_buffer(self._sheet)), memoryview(self._sheet)
         self.memory.places[AT_PAID : AT_MASK + 1] = [first + start for start in self._starts]
         self.paid, self.count, self.seen, self.flags, self.mask = (np.ndarray(*part, buffer, at) for part, at in self._parts)
 

@@ -83,6 +83,30 @@ def _tell_array_at(numba: Any) -> None:  # numba's own `carray` wants references
     numba.extending.lower_builtin(array_at, types.voidptr, types.Any, types.Any)(lower)
 
 
+def fetch(array: Any, at: Any) -> None:
+    """In compiled code: the line of the cache with this element will be read soon."""
+    raise TypeError("fetch is for compiled code")
+
+
+@when_there
+def _tell_fetch(numba: Any) -> None:
+    from llvmlite import ir
+
+    types, cgutils = numba.types, numba.core.cgutils
+    whole = ir.IntType(32)
+
+    def lower(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        array = context.make_array(signature.args[0])(context, builder, arguments[0])
+        place = builder.bitcast(builder.gep(array.data, [arguments[1]]), cgutils.voidptr_t)
+        signature = ir.FunctionType(ir.VoidType(), [cgutils.voidptr_t, whole, whole, whole])
+        prefetch = builder.module.declare_intrinsic("llvm.prefetch", [cgutils.voidptr_t], signature)
+        builder.call(prefetch, [place, whole(0), whole(2), whole(1)])  # to read, into the second cache, data
+        return context.get_dummy_value()
+
+    numba.extending.type_callable(fetch)(lambda context: lambda array, at: types.none)
+    numba.extending.lower_builtin(fetch, types.Array, types.Integer)(lower)
+
+
 def written_in(function: Callable[..., Any]) -> Jitted:
     """As if its text stood where it is called."""
     return Jitted(function, lambda: _OPTIONS | {"inline": "always"})
@@ -153,19 +177,23 @@ class Kernel:
 
     def _made(self) -> Any:
         """Compiled, and kept where there is a place to keep it: without one, by every process anew."""
-        held, options = numba(), _OPTIONS | (_BARE if _inside() else {})
-        types = held.types
-        with _remembering():
-            made = held.cfunc(types.int64(types.CPointer(types.voidptr), *[types.int64] * 3), **options)(self.py_func)
-        code = made._library.serialize_using_object_code()[2][0]
+        types = numba().types
+        signature = types.int64(types.CPointer(types.voidptr), *[types.int64] * 3)
+        if _inside():
+            from .parts import remembering, whole
+
+            with remembering():
+                symbol, code = whole(self.py_func, signature, _OPTIONS | _BARE)
+        else:
+            made = numba().cfunc(signature, **_OPTIONS)(self.py_func)
+            symbol, code = made.native_name, made._library.serialize_using_object_code()[2][0]
         for folder in _folders():
             with contextlib.suppress(InputError):
-                write_atomic(folder / self._file, f"{made.native_name} {hashlib.blake2b(code).hexdigest()}\n".encode() + code)
+                write_atomic(folder / self._file, f"{symbol} {hashlib.blake2b(code).hexdigest()}\n".encode() + code)
                 for old in sorted(folder.glob("kernel-*.o"), key=lambda path: path.stat().st_mtime)[:-KEPT]:
                     remove(old)
                 break
-        self._owner = made
-        return _callable(made.address)
+        return _linked(symbol, code)
 
     @cached_property
     def _file(self) -> str:
@@ -176,14 +204,6 @@ class Kernel:
         machine = llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()
         parts = (self.py_func.__module__, digest(), version("numba"), version("llvmlite"), machine, settings)
         return f"kernel-{hashlib.blake2b(repr(parts).encode(), digest_size=16).hexdigest()}.o"
-
-
-def _remembering() -> contextlib.AbstractContextManager[None]:
-    if not _inside():
-        return contextlib.nullcontext()
-    from .parts import remembering
-
-    return remembering()
 
 
 def _callable(address: int) -> Any:

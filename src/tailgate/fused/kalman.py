@@ -17,7 +17,6 @@ from .rows import (
     ACCEPT,
     ALARM,
     ARRIVED,
-    CROSS,
     EGO,
     FORGET,
     LANES,
@@ -109,7 +108,7 @@ predict, predict_known, predict_tied = predicting(rides=False), predicting(rides
 
 @phase
 def innovation(s, c, noise, n):
-    """r, S, and C P-, the first two rows of P-. A reading that is missing has r = 0 and no covariance with the other.
+    """r and S. A reading that is missing has r = 0 and no covariance with the other.
 
     `noise`: where in c the covariance of the readings begins.
     """
@@ -123,8 +122,6 @@ def innovation(s, c, noise, n):
         s[S + i] = (0.0 + s[P + i]) + r00
         s[S + _1 + i], s[S + _2 + i] = S01 if both else 0.0, S10 if both else 0.0
         s[S + _3 + i] = (0.0 + s[P + _4 + i]) + r11
-        s[CROSS + i], s[CROSS + _1 + i], s[CROSS + _2 + i] = 0.0 + s[P + i], 0.0 + s[P + _1 + i], 0.0 + s[P + _2 + i]
-        s[CROSS + _3 + i], s[CROSS + _4 + i], s[CROSS + _5 + i] = 0.0 + s[P + _3 + i], 0.0 + s[P + _4 + i], 0.0 + s[P + _5 + i]
 
 
 @formula
@@ -339,8 +336,8 @@ def take_out(s, c, f, n):
 def _correct(s, i):
     """x, with the accepted readings: the others have no row in C and no covariance in S. -> rows of C P-, columns of K."""
     a0, a1 = s[ACCEPT + i], s[ACCEPT + _1 + i]
-    c00, c01, c02 = s[CROSS + i] * a0, s[CROSS + _1 + i] * a0, s[CROSS + _2 + i] * a0
-    c10, c11, c12 = s[CROSS + _3 + i] * a1, s[CROSS + _4 + i] * a1, s[CROSS + _5 + i] * a1
+    c00, c01, c02 = (0.0 + s[P + i]) * a0, (0.0 + s[P + _1 + i]) * a0, (0.0 + s[P + _2 + i]) * a0
+    c10, c11, c12 = (0.0 + s[P + _3 + i]) * a1, (0.0 + s[P + _4 + i]) * a1, (0.0 + s[P + _5 + i]) * a1
     r0, r1 = s[R + i] * a0, s[R + _1 + i] * a1
     w00, w01, w11 = inverse(s[S + i], s[S + _1 + i] * (a0 * a1), s[S + _3 + i])
     k00, k01 = w00 * c00 + w01 * c10, w01 * c00 + w11 * c10

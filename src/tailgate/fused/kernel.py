@@ -8,10 +8,11 @@ import numpy as np
 from . import constants as of
 from . import memory as at
 from . import script, seat, step
-from .compiled import Kernel, array_at, phase, written_in
+from .compiled import Kernel, array_at, fetch, phase, written_in
 from .rows import EGO, ENDED, EPISODE, LANES, LEAD_X, LENGTH, OVER, RADAR_STATE, REAR_X, SCORE, WANT_KIND, WIRES, WORDS, K, X
 
 _1, _2 = np.uint64(LANES), np.uint64(2 * LANES)
+LINE = 8  # numbers of a line of the cache
 
 
 @phase
@@ -74,6 +75,14 @@ def carry(source, goal):
     """The state of a block from one place to another."""
     for i in range(np.uint64(min(len(source), len(goal)))):
         goal[i] = source[i]
+
+
+@phase
+def foresee(source, t, steps):
+    """Asks for a part of a block that is played next: in each of so many steps one, until the cache has it all."""
+    lines = len(source) // LINE
+    for i in range(lines * t // steps, lines * (t + 1) // steps):
+        fetch(source, i * LINE)
 
 
 @phase
@@ -149,7 +158,7 @@ def play(start, advance, obey, decide, decode, pay, look, places, first_block, l
     restart, alone = fresh or o[at.RESTART] != 0, deep == whole
     for b in range(first_block, last_block):
         n, first = np.uint64(min(LANES, batch - b * LANES)), np.uint64(b * LANES)
-        held = rows[b * deep : (b + 1) * deep]
+        held, coming = rows[b * deep : (b + 1) * deep], rows[(b + 1) * deep : (b + 2) * deep]
         s = held if alone else desk
         if not alone:
             carry(held, desk)
@@ -165,6 +174,8 @@ def play(start, advance, obey, decide, decode, pay, look, places, first_block, l
         for t in range(steps):
             if o[at.TERMINATE] != 0 and not living(s, n):
                 break
+            if not alone and steps > 1:  # within one there is no time for it
+                foresee(coming, t, steps)
             if seated:
                 seat.alive(s, c, n)
                 if t == 0 or f[of.ACTION] == of.RAMPING or f[of.ACTION] == of.INCREMENT:  # which depend on the last command

@@ -5,7 +5,6 @@ from __future__ import annotations
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from importlib import import_module
-from itertools import repeat
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -126,7 +125,9 @@ class Lanes:
             played = [self.play(places, 0, len(self.rows), 0)]
         else:  # blocks share nothing, so that the order in which they are played does not matter
             edges = [len(self.rows) * part // self.threads for part in range(self.threads + 1)]
-            played = list(_pool(self.threads).map(self.play, repeat(places), edges[:-1], edges[1:], range(self.threads)))
+            pool = _pool(self.threads - 1)
+            others = [pool.submit(self.play, places, *edges[part : part + 2], part) for part in range(1, self.threads)]
+            played = [self.play(places, 0, edges[1], 0), *(other.result() for other in others)]
             self.memory.order[TICK] += fresh + steps
         if min(played) < 0:
             raise not_finite()

@@ -51,16 +51,43 @@ def uniforms(s, g, key, stream, block, out, n):
         s[out + i], s[out + _1 + i] = _uniform_pair(g[key + i], g[EPISODE + i], g[STEP + i], stream, block)
 
 
+@formula
+def _radius(u):
+    """How far two standard normals lie from 0: Box and Muller's."""
+    return np.sqrt(-2.0 * _log_normal(u, 0.0))
+
+
+@formula
+def _turn(s, out, i):
+    """Two standard normals from their radius in row `out` and the direction in the next, in turns."""
+    radius = s[out + i]
+    sine, cosine = _sincos_turn(s[out + _1 + i])
+    s[out + i], s[out + _1 + i] = radius * cosine, radius * sine
+
+
 @phase
 def normals(s, g, key, stream, block, out, n):
     """Two standard normals likewise. Three short loops: the steps of a long sum wait for each other, those of several episodes do not."""
     uniforms(s, g, key, stream, block, out, n)
     for i in range(n):
-        s[out + i] = np.sqrt(-2.0 * _log_normal(s[out + i], 0.0))
+        s[out + i] = _radius(s[out + i])
     for i in range(n):
-        radius = s[out + i]
-        sine, cosine = _sincos_turn(s[out + _1 + i])
-        s[out + i], s[out + _1 + i] = radius * cosine, radius * sine
+        _turn(s, out, i)
+
+
+@phase
+def four_normals(s, g, key, stream, block, out, n):
+    """Four: those of this block and of the next one, which share what depends on the key alone."""
+    for i in range(n):
+        world, episode, step = g[key + i], g[EPISODE + i], g[STEP + i]
+        first, second = _uniform_pair(world, episode, step, stream, block)
+        third, fourth = _uniform_pair(world, episode, step, stream, block + np.uint64(1))
+        s[out + i], s[out + _1 + i], s[out + _2 + i], s[out + _3 + i] = first, second, third, fourth
+    for i in range(n):
+        s[out + i], s[out + _2 + i] = _radius(s[out + i]), _radius(s[out + _2 + i])
+    for i in range(n):
+        _turn(s, out, i)
+        _turn(s, out + _2, i)
 
 
 @phase
@@ -95,11 +122,12 @@ def way(s, g, c, f, table, stream, n):
             some += 1 if over else 0
         if some > 0:
             uniforms(s, g, WORLD_KEY, stream, np.uint64(0), DRAW, n)
+            cruise, cruises_most, dwell, dwells_most = c[p + 4], c[p + 5], c[p + 6], c[p + 7]  # a choice between places would be slow
             for i in range(n):
                 over, u, after = s[EXO + i] > 0.0, s[DRAW + i], s[WAY + i] + 1.0
                 after = after if after < 4.0 else 0.0
                 cruises = after == manoeuvres.CRUISE
-                fresh = c[p + 4] + (c[p + 5] - c[p + 4]) * u if cruises else c[p + 6] + (c[p + 7] - c[p + 6]) * u
+                fresh = cruise + (cruises_most - cruise) * u if cruises else dwell + (dwells_most - dwell) * u
                 s[WAY + i] = after if over else s[WAY + i]
                 s[WAY + _1 + i] = fresh if over else s[WAY + _1 + i]
         for i in range(n):
@@ -144,8 +172,7 @@ def move(s, g, intent, c, f, stream, tick, n):
     B = ((c[of.OWN_B],), (c[of.OWN_B + 1],), (c[of.OWN_B + 2],))
     sd0, sd1, sd2 = c[of.PROCESS_SD], c[of.PROCESS_SD + 1], c[of.PROCESS_SD + 2]
     follow(s, intent, c, f, tick, n)
-    normals(s, g, WORLD_KEY, stream, np.uint64(0), DRAW, n)
-    normals(s, g, WORLD_KEY, stream, np.uint64(1), DRAW + _2, n)
+    four_normals(s, g, WORLD_KEY, stream, np.uint64(0), DRAW, n)
     for i in range(n):
         noise = (sd0 * s[DRAW + i], sd1 * s[DRAW + _1 + i], sd2 * s[DRAW + _2 + i])
         x, v, a = drive(A, B, s[EGO + i], s[EGO + _1 + i], s[EGO + _2 + i], s[APPLIED + i] / load, noise)

@@ -117,22 +117,19 @@ def decode(s, window, c, f, table, action, first, n):
     return True
 
 
-@phase
-def potential(s, c, believed, out, n):
-    """The reward's potential of the gap, and with `believed` of what the car believes that it has on top, into row `out`."""
-    gap_shaping, error_shaping, sign = c[of.GAP_SHAPING], c[of.ERROR_SHAPING], c[of.BELIEF]
-    for i in range(n):
-        gap = s[LEAD_X + i] - s[EGO + i]
-        near = closeness(gap)
-        belief = 0.0 + sign * (s[X + i] - s[TRUTH + i]) if believed else 0.0
-        s[out + i] = gap_shaping * near + error_shaping * (fooled(belief) + 0.0)
+@formula
+def _potential(s, gap_shaping, error_shaping, belief, i):
+    """The reward's potential of the gap, and of what the car believes that it has on top."""
+    near = closeness(s[LEAD_X + i] - s[EGO + i])
+    return gap_shaping * near + error_shaping * (fooled(belief) + 0.0)
 
 
 @phase
 def begin(s, c, n):
     """The reward's memory of episodes that have just begun."""
-    potential(s, c, False, POTENTIAL, n)
+    gap_shaping, error_shaping = c[of.GAP_SHAPING], c[of.ERROR_SHAPING]
     for i in range(n):
+        s[POTENTIAL + i] = _potential(s, gap_shaping, error_shaping, 0.0, i)
         s[LEAST + i] = np.minimum(small(s[LEAD_X + i] - s[EGO + i]), NEAR)
         s[OVER + i] = 0.0
 
@@ -153,6 +150,12 @@ def alive(s, c, n):
         s[LIVE + i] = (s[OVER + i] == 0.0) & (s[ENDED + i] == 0.0) & (s[K + i] <= horizon)
 
 
+@formula
+def _costs(s, illegal, cost, i):
+    """What a step's attack costs, below zero."""
+    return -illegal * s[REFUSED + i] - cost * (1.0 if s[KIND + i] != 0.0 else 0.0)
+
+
 def paying(many):
     """The phase `pay`: of one car, or of `many`.
 
@@ -163,19 +166,18 @@ def paying(many):
     def pay(s, c, f, n):
         """After a step of it: its reward, and what happened."""
         kind, illegal, cost, scale, dt, horizon = f[of.REWARD], c[of.ILLEGAL], c[of.COST], c[of.REWARD_SCALE], c[of.DT], c[of.HORIZON]
-        sign = c[of.BELIEF]
-        for i in range(n):
-            s[EARNED + i] = -illegal * s[REFUSED + i] - cost * (1.0 if s[KIND + i] != 0.0 else 0.0)
+        gap_shaping, error_shaping, sign = c[of.GAP_SHAPING], c[of.ERROR_SHAPING], c[of.BELIEF]
         if kind == of.CRASH or kind == of.MIN_GAP:
+            nearer = kind == of.MIN_GAP
             for i in range(n):
-                before, gap = s[LEAST + i], s[LEAD_X + i] - s[EGO + i]
-                s[LEAST + i] = np.minimum(small(gap), before)
-                s[PART + i] = before - s[LEAST + i]
-                s[EARNED + i] += 1.0 if (s[HIT + i] != 0.0) | (s[REAR_HIT + i] != 0.0) else 0.0
-            for i in range(n if kind == of.MIN_GAP else np.uint64(0)):
-                s[EARNED + i] += s[PART + i] / NEAR
+                before = s[LEAST + i]
+                least = np.minimum(small(s[LEAD_X + i] - s[EGO + i]), before)
+                earned = _costs(s, illegal, cost, i) + (1.0 if (s[HIT + i] != 0.0) | (s[REAR_HIT + i] != 0.0) else 0.0)
+                s[EARNED + i] = earned + (before - least) / NEAR if nearer else earned
+                s[LEAST + i] = least
         else:
             for i in range(n):
+                s[EARNED + i] = _costs(s, illegal, cost, i)
                 s[PART + i] = (s[OFF + i] if many else abs(0.0 + sign * (s[X + i] - s[TRUTH + i]))) / scale
             if kind == of.FINAL:
                 for i in range(n):
@@ -185,10 +187,10 @@ def paying(many):
                     s[EARNED + i] += dt * np.minimum(s[PART + i], 1.0)
                 for i in range(n if kind == of.STEALTH else np.uint64(0)):
                     s[EARNED + i] -= dt * s[ALARM + i]
-        potential(s, c, True, PART, n)
         for i in range(n):
             live, refused, hit, rear = s[LIVE + i] != 0.0, s[REFUSED + i] != 0.0, s[HIT + i] != 0.0, s[REAR_HIT + i] != 0.0
-            now, before, earned = s[PART + i], s[POTENTIAL + i], s[EARNED + i]
+            now = _potential(s, gap_shaping, error_shaping, 0.0 + sign * (s[X + i] - s[TRUTH + i]), i)
+            before, earned = s[POTENTIAL + i], s[EARNED + i]
             s[RAW + i] += earned if live else 0.0
             s[POTENTIAL + i] = now if live else before
             s[ANY_REFUSED + i] = 1.0 if (live & refused) | (s[ANY_REFUSED + i] != 0.0) else 0.0

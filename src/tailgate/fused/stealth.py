@@ -12,7 +12,6 @@ from .compiled import phase
 from .rows import (
     ARRIVED,
     COVARIANCE,
-    CROSS,
     GATE,
     INTO,
     LANES,
@@ -54,7 +53,7 @@ def look(s, c, f, state, n):
     down = np.uint64(state * LANES)
     for i in range(n):
         w00, w01, w11 = kalman.inverse(s[S + i], s[S + _1 + i], s[S + _3 + i])
-        c0, c1 = s[CROSS + down + i], s[CROSS + _3 + down + i]
+        c0, c1 = 0.0 + s[P + down + i], 0.0 + s[P + _3 + down + i]  # C P-
         s[INTO + i], s[INTO + _1 + i] = c0 * w00 + c1 * w01, c0 * w01 + c1 * w11
     for j in range(3):
         row = np.uint64(j * LANES)

@@ -97,8 +97,7 @@ def clear(s, g, window, intent, c, n):
 def start(s, g, window, intent, c, f, table, tick, n):
     """Fresh episodes at k = 1, measured: keys and episode numbers stand in g."""
     clear(s, g, window, intent, c, n)
-    road.normals(s, g, WORLD_KEY, _PRIOR, np.uint64(0), DRAW, n)
-    road.normals(s, g, WORLD_KEY, _PRIOR, np.uint64(1), DRAW + _2, n)
+    road.four_normals(s, g, WORLD_KEY, _PRIOR, np.uint64(0), DRAW, n)
     for j in range(3):
         row, at, sd, mean = np.uint64(j * LANES), c[of.START + j], c[of.START_SD + j], c[of.MEAN + j]
         for i in range(n):
