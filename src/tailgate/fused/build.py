@@ -95,6 +95,8 @@ def fuse(loop: Loop, attack: Attack | None = None) -> Constants | Refused:
 
 def _several(loop: Loop, attack: Attack | None) -> Constants | Refused:
     """As `fuse`, of several agents: a platoon."""
+    if not loop.model.v2v:
+        return Refused(f"{type(loop.plant).__name__} has no lane")
     from . import platoon_build  # which a single car does without, and without the modules of platoons
 
     if not loop.link.perfect:

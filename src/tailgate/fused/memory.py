@@ -8,7 +8,7 @@ from tailgate.core import Array
 
 from . import constants as of
 from .platoon_rows import WIRES as MANY_WIRES
-from .rows import LANES, RADAR_STATE, ROWS, STATE, WIRES, WORDS
+from .rows import COMMON, LANES, RADAR_STATE, ROWS, STATE, WIRES, WORDS
 from .script import PLACES
 
 _orders: list[str] = []
@@ -67,10 +67,10 @@ class Memory:
 
     def __init__(self, batch: int, c: Array, f: Array, table: Array, window: int, intents: int, threads: int) -> None:
         blocks, actions = -(-batch // LANES), int(f[of.ACTIONS])
-        kept = RADAR_STATE if f[of.AIRED] else STATE
+        kept = COMMON if f[of.CARS] else RADAR_STATE if f[of.AIRED] else STATE
         whole, victims = ROWS + int(f[of.ROOM]), int(f[of.VICTIMS])
         asking, written = 2 + OF_VICTIM * victims if victims else ASKED, PLACES + OF_VICTIM * victims
-        deep = whole if blocks <= FEW else kept  # many blocks share one place to work at, which stays in the cache
+        deep = whole if blocks <= (1 if f[of.CARS] else FEW) else kept  # many blocks share one place to work at, which stays in the cache
         sizes = {
             AT_ROWS: blocks * deep * LANES, AT_WINDOW: blocks * window * LANES, AT_INTENT: blocks * intents * LANES, AT_C: len(c),
             AT_TABLE: len(table), AT_SCRIPT: written, AT_ASKED: 0 if actions else asking * batch, AT_ACTION: actions * batch,

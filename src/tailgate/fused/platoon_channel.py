@@ -7,6 +7,7 @@ Victims are the cars with a wire that may be attacked; all other wires carry wha
 import numpy as np
 
 from tailgate.elementwise import clip
+from tailgate.vector import WIDTH, get, put
 
 from . import channel, road, script
 from . import constants as of
@@ -76,29 +77,30 @@ def decide(s, window, c, f, table, asked, n):
     for h in range(f[of.VICTIMS]):
         victim = window[f[of.HUNTED] + h * VICTIM : f[of.HUNTED] + (h + 1) * VICTIM]
         aim = s[f[of.AIMS] + h * AIM : f[of.AIMS] + (h + 1) * AIM]
-        enforce(s, victim, aim, asked, n)
+        enforce(s, victim, aim, table[f[of.IN_WIRES] + h * PER_VICTIM :], asked, n)
         if firsts > 0:
             hold(s, victim, n)
 
 
 @phase
 def judge(s, aim, granted, n):
-    """Counts the wires of a victim that are aimed at, and in REFUSED those that are not granted, or not with that value."""
+    """Counts the wires of a victim that are aimed at, and in REFUSED those that are not granted with that value. Others are STRAY."""
     for w in range(WIRES):
-        row, mine = np.uint64(w * LANES), granted[GRANTED + w] != 0.0
-        bound, low, high = granted[BOUND + w], granted[LOW + w], granted[HIGH + w]
-        for i in range(n):
+        row, bound, low, high = np.uint64(w * LANES), granted[BOUND + w], granted[LOW + w], granted[HIGH + w]
+        for i in range(n if granted[GRANTED + w] != 0.0 else np.uint64(0)):
             aimed = aim[WANT_TARGET + row + i] != 0.0
-            fits = mine & channel.fits(s[WANT_KIND + i], aim[WANT_VALUE + row + i], bound, low, high)
+            fits = channel.fits(s[WANT_KIND + i], aim[WANT_VALUE + row + i], bound, low, high)
             s[AIMED + i] += 1.0 if aimed else 0.0
             s[REFUSED + i] += 1.0 if aimed & (not fits) else 0.0
 
 
 @phase
-def enforce(s, victim, aim, asked, n):
-    """What is in force at the wires of a victim."""
+def enforce(s, victim, aim, granted, asked, n):
+    """What is in force at the wires of a victim; at those that are not granted there never is anything."""
     for w in range(WIRES):
         row = np.uint64(w * LANES)
+        if granted[GRANTED + w] == 0.0:
+            continue
         if asked:
             for i in range(n):
                 kind, value = s[KIND + i], aim[WANT_VALUE + row + i]
@@ -124,22 +126,25 @@ def arrive(s, window, table, f, n):
     """What arrives of readings and messages under the command in force."""
     whole = table.view(np.int64)
     for j in range(f[of.CARS]):
-        car, work = window[j * f[of.CAR] : (j + 1) * f[of.CAR]], s[f[of.WORKS] + j * WORK : f[of.WORKS] + (j + 1) * WORK]
-        for w in range(LINKS):
-            row = np.uint64(w * LANES)
-            for i in range(n):
-                work[ARRIVED + row + i] = car[SENT + row + i]
+        sent, arrived = j * f[of.CAR] + int(SENT), f[of.WORKS] + j * WORK + int(ARRIVED)
+        for at in range(0, LINKS * LANES, WIDTH):
+            put(s, arrived + at, get(window, sent + at))
     for h in range(f[of.VICTIMS]):
         at = f[of.WORKS] + whole[f[of.IN_VICTIMS] + h] * WORK
         victim = window[f[of.HUNTED] + h * VICTIM : f[of.HUNTED] + (h + 1) * VICTIM]
-        reach(s, victim, s[at : at + WORK], s[f[of.AIMS] + h * AIM : f[of.AIMS] + (h + 1) * AIM], n)
+        aim, granted = s[f[of.AIMS] + h * AIM : f[of.AIMS] + (h + 1) * AIM], table[f[of.IN_WIRES] + h * PER_VICTIM :]
+        reach(s, victim, s[at : at + WORK], aim, granted, n)
 
 
 @phase
-def reach(s, victim, work, aim, n):
+def reach(s, victim, work, aim, granted, n):
     """What arrives at a victim in place of what was sent."""
     for w in range(LINKS):
         row = np.uint64(w * LANES)
+        if granted[GRANTED + w] == 0.0:
+            for i in range(n):
+                aim[CLEAN + row + i] = work[ARRIVED + row + i]
+            continue
         for i in range(n):
             sent, fresh, hit = work[ARRIVED + row + i], victim[FRESH + row + i], victim[TARGET + row + i] != 0.0
             changed = channel.altered(sent, s[KIND + i], victim[VALUE + row + i], victim[HELD + row + i], fresh)

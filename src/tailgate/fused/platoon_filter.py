@@ -154,19 +154,30 @@ def score(s, table, f, weight, apart):
             put(s, work + _SCORE + lane, r0 * t0 + r1 * t1 + r2 * t2)
 
 
+@formula
+def _correction(table, k, r0, r1, r2):
+    """A row of the gain, at k, times r."""
+    return alike(0.0) + alike(table[k]) * r0 + alike(table[k + 1]) * r1 + alike(table[k + 2]) * r2
+
+
 @phase
 def update(s, window, table, c, f, gain, apart):
     """xh_i; the gain of the first car stands at `gain` of the table, of the others so far apart."""
     states, factor = f[of.STATES], alike(c[of.FACTOR])
+    plain = c[of.FACTOR] == 1.0
     for i in range(f[of.CARS]):
         r, fused, belief = f[of.WORKS] + i * WORK + _R, f[of.FUSED] + i * states * LANES, i * f[of.CAR] + _BELIEF
         for lane in range(0, LANES, WIDTH):
             r0, r1, r2 = get(s, r + lane), get(s, r + lane + LANES), get(s, r + lane + 2 * LANES)
             k, at = gain + i * apart, lane
-            for _ in range(states):
-                correction = alike(0.0) + alike(table[k]) * r0 + alike(table[k + 1]) * r1 + alike(table[k + 2]) * r2
-                put(window, belief + at, get(s, fused + at) + factor * correction)
-                k, at = k + SENSORS, at + LANES
+            if plain:
+                for _ in range(states):
+                    put(window, belief + at, get(s, fused + at) + _correction(table, k, r0, r1, r2))
+                    k, at = k + SENSORS, at + LANES
+            else:
+                for _ in range(states):
+                    put(window, belief + at, get(s, fused + at) + factor * _correction(table, k, r0, r1, r2))
+                    k, at = k + SENSORS, at + LANES
 
 
 # -- a car and an episode at a time, where not all have the same gain
@@ -225,15 +236,16 @@ def update_again(s, window, table, c, f, n):
 
 @phase
 def sound(s, window, f):
-    """Row SCORE of the episode: 0, or NaN where an estimate or a score is not finite."""
+    """Row SCORE of the episode: a number that is not finite where an estimate or a score is not."""
     for lane in range(0, LANES, WIDTH):
-        bad = worse = alike(0.0)
+        one = other = third = fourth = alike(0.0)  # sums that wait for themselves
         for i in range(f[of.CARS]):
             at = i * f[of.CAR] + _BELIEF + lane
-            bad = bad + alike(0.0) * get(s, f[of.WORKS] + i * WORK + _SCORE + lane)
-            for _ in range(0, f[of.STATES] - 1, 2):
-                bad, worse = bad + alike(0.0) * get(window, at), worse + alike(0.0) * get(window, at + LANES)
-                at += 2 * LANES
-            if f[of.STATES] % 2:
-                bad = bad + alike(0.0) * get(window, at)
-        put(s, int(SOUND) + lane, bad + worse)
+            one = one + get(s, f[of.WORKS] + i * WORK + _SCORE + lane)
+            for _ in range(f[of.STATES] // 4):
+                one, other = one + get(window, at), other + get(window, at + LANES)
+                third, fourth = third + get(window, at + 2 * LANES), fourth + get(window, at + 3 * LANES)
+                at += 4 * LANES
+            for _ in range(f[of.STATES] % 4):
+                other, at = other + get(window, at), at + LANES
+        put(s, int(SOUND) + lane, (one + other) + (third + fourth))

@@ -94,20 +94,20 @@ def signals(loop: Any, record: Array, f: Array, asked: float) -> dict[str, Array
     shape, victims = held["wires"].shape[:3], np.flatnonzero(loop.plan.channel.granted.any(axis=1))
 
     def spread(name: str, rest: Array) -> Array:
-        """What belongs to the victims among what the others have."""
+        """What belongs to the victims among what the others have, of the same type."""
         out = np.array(rest)
         out[:, :, victims] = held[name]
         return out
 
-    nothing = np.zeros((*shape, WIRES))
     return {
         "gap": one["gap"], "speed": one["speed"], "accel": one["accel"], "lead_speed": one["ahead"], "rear_gap": np.full(shape, np.inf),
         "rear_speed": np.zeros(shape), "position": one["position"],
         "truth": np.broadcast_to(held["truth"], held["estimate"].shape), "estimate": held["estimate"], "score": one["score"],
-        "clean": spread("clean", held["wires"]), "wires": held["wires"], "valid": spread("valid", np.ones((*shape, SENSORS))) != 0.0,
+        "clean": spread("clean", held["wires"]), "wires": held["wires"], "valid": spread("valid", np.ones((*shape, SENSORS), bool)),
         "energy": np.zeros(shape), "probe": np.ones(shape, bool), "control": held["control"], "applied": held["applied"],
-        "value": spread("value", nothing), "kind": one["kind"][..., 0].astype(np.int8), "target": spread("target", nothing) != 0.0,
-        "alarm": one["alarm"] != 0.0, "mode": np.full(shape, asked, np.int8), "refused": one["refused"][..., 0] != 0.0,
+        "value": spread("value", np.zeros((*shape, WIRES))), "target": spread("target", np.zeros((*shape, WIRES), bool)),
+        "kind": one["kind"][..., 0].astype(np.int8), "alarm": one["alarm"] != 0.0, "mode": np.full(shape, asked, np.int8),
+        "refused": one["refused"][..., 0] != 0.0,
         "collided": one["hit"][..., 0] != 0.0, "rear_collided": np.zeros(shape[:2], bool),
     }  # fmt: skip
 

@@ -24,13 +24,21 @@ def _row(name: str, width: int = 1) -> np.uint64:
     return first
 
 
-# The state between two steps.
+# The state between two steps, of whatever drives.
 K = _row("k")
 ENDED = _row("ended")
 LEAD_X, LEAD_V = _row("lead_x"), _row("lead_v")
+WAY = _row("way", 2)  # the manoeuvre's own
+USED, BURST, COOLDOWN = _row("used"), _row("burst"), _row("cooldown")
+KIND = _row("kind")  # of the command in force
+LENGTH = _row("length")  # steps that the episode has lasted
+OPENED, ELAPSED, SEEN = _row("opened"), _row("elapsed"), _row("seen")  # a script's trigger: `tailgate.agents.triggers`
+OVER = _row("over")  # of a seat: the row was over before this decision
+POTENTIAL, LEAST = _row("potential"), _row("least")  # and what its reward remembers
+COMMON = len(_names)
+# And of a car that follows another.
 EGO = _row("ego", 3)  # x, v, a
 REAR_X, REAR_V = _row("rear_x"), _row("rear_v")
-WAY = _row("way", 2)  # the manoeuvre's own
 X = _row("x", 3)  # the filter's mean, which is the estimate
 P = _row("P", 9)  # and its covariance, row by row
 SUM = _row("sum", 3)  # what a detector sums up
@@ -39,15 +47,9 @@ SHUT = _row("shut", SENSORS)  # steps that a gate stays shut
 REJECTED = _row("rejected", SENSORS)
 U = _row("u")  # commanded last
 SENT = _row("sent", LINKS)
-USED, BURST, COOLDOWN = _row("used"), _row("burst"), _row("cooldown")
 HELD, FRESH = _row("held", WIRES), _row("fresh", WIRES)
-KIND = _row("kind")  # of the command in force
-TARGET, VALUE = _row("target", WIRES), _row("value", WIRES)
+TARGET, VALUE = _row("target", WIRES), _row("value", WIRES)  # of the command in force
 MODE = _row("mode")  # asked of the controller
-LENGTH = _row("length")  # steps that the episode has lasted
-OPENED, ELAPSED, SEEN = _row("opened"), _row("elapsed"), _row("seen")  # a script's trigger: `tailgate.agents.triggers`
-OVER = _row("over")  # of a seat: the row was over before this decision
-POTENTIAL, LEAST = _row("potential"), _row("least")  # and what its reward remembers
 STATE = len(_names)  # rows of a state: what is kept of an episode between two calls
 # What a car with a radar keeps on top.
 LEAD_A = _row("lead_a")
