@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tailgate import draws
-from tailgate.envs.faces import AdversaryVectorEnv
+from tailgate.envs.faces import AdversaryEnv, AdversaryVectorEnv
 from tailgate.envs.manoeuvres import Profile
 from tailgate.errors import InputError
 from tailgate.fused import Constants, Refused, fuse
@@ -14,6 +14,7 @@ from tailgate.fused.platoon_play import Platoon
 from tailgate.registry import Spec
 from tailgate.scenario import load_scenario
 from tailgate.trace import nearest, rollout
+from tailgate.tree import leaves
 
 from .test_fused import _loop, _same, _short
 
@@ -208,6 +209,43 @@ def test_a_command_beyond_what_is_granted_is_refused():
         assert frame.refused.tolist() == [False, True, True, True]
         assert np.array_equal(view.last.kind, seen.last.kind) and np.array_equal(view.last.target, seen.last.target)
         assert np.array_equal(view.scene.gap, seen.scene.gap)
+
+
+@pytest.mark.parametrize("defence", ["dkf", "none"])
+def test_what_an_attacker_sees_is_what_the_plain_loop_shows(defence):
+    """Every part of a view, under random commands at several cars, with a grey box and the measurement."""
+    granted = {"knowledge": "grey", "sees_measurement": True, "budget": 20, "cooldown": 2, "duration": 3, "onset": 2}
+    loop, _ = _loop("platoon-gusty-v0", defence, "none", **(ANY | granted))
+    keys, rng, shape = draws.keys("report", range(70)), np.random.default_rng(1), loop.brief.granted.shape
+    lanes, state = Platoon(loop, fuse(loop), keys), loop.start(keys)
+    lanes.start()
+    for _ in range(40):
+        for one, two in zip(leaves(lanes.view()).items(), leaves(loop.sense(state)).items(), strict=True):
+            assert one[0] == two[0] and one[1].dtype == two[1].dtype, one[0]
+            assert np.array_equal(one[1], two[1]), one[0]
+        kind = rng.integers(1, 6, 70)
+        target = loop.brief.granted & (rng.random((70, *shape)) < 0.4)
+        command = loop.brief.command(rng.random(70) < 0.7, kind, target, rng.uniform(-70.0, 70.0, (70, *shape)))
+        lanes.advance(command)
+        state, _ = loop.advance(state, command)
+
+
+@pytest.mark.parametrize("action", ["mode", "continuous"])
+def test_a_single_environment_is_a_batch_of_one(action):
+    """The short way through a single environment gives the results and types of the long one."""
+    one, two = (
+        AdversaryEnv(engine=engine, scenario="platoon-gusty-v0", defence="lasso_dkf", action=action, value=-30.0) for engine in ("fused", "plain")
+    )  # fmt: skip
+    assert [env.batch.engine for env in (one, two)] == ["fused", "plain"]
+    rng, over = np.random.default_rng(3), False
+    _same(*(env.reset(seed=5)[0] for env in (one, two)))
+    while not over:
+        chosen = int(rng.integers(0, one.batch.seat.action.size)) if action == "mode" else rng.uniform(-1, 1, one.batch.seat.action.size)
+        first, second = one.step(chosen), two.step(chosen)
+        _same(first[0], second[0])
+        assert [type(value) for value in first] == [type(value) for value in second] and first[1:4] == second[1:4]
+        assert all(np.array_equal(value, second[4][key]) for key, value in first[4].items())
+        over = first[2] or first[3]
 
 
 @pytest.mark.parametrize(("scenario", "defence", "threat", "why"), [

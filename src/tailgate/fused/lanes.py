@@ -200,12 +200,11 @@ class Lanes:
 
     def received(self) -> Received:
         """The readings as they were sent."""
-        sent = self.stack(at.SENT, len(self.wires) - 1)  # all but the actuator
-        y = sent[..., :SENSORS]
+        y = self.stack(at.SENT, SENSORS)
         if not self.aired:
-            return Received(y, np.ones(y.shape, bool), np.zeros(y.shape[:2]), sent[..., SENSORS:])
+            return Received(y, np.ones(y.shape, bool), np.zeros(y.shape[:2]))
         valid = np.repeat(self.row(at.HEARS)[:, None, None] != 0.0, SENSORS, axis=2)
-        return Received(y, valid, self.row(at.ENERGY)[:, None].copy(), sent[..., SENSORS:])
+        return Received(y, valid, self.row(at.ENERGY)[:, None].copy())
 
 
 def not_finite() -> InputError:

@@ -173,6 +173,5 @@ class Platoon(Lanes):
         return self.loop.plant.scene(self.loop.plan.plant, PlatoonState(x, v, a, np.zeros_like(x)))
 
     def received(self) -> Received:
-        sent = np.stack([self._of_cars(of_car.SENT + np.uint64(j * LANES)) for j in range(LINKS)], axis=2)
-        y = sent[..., :SENSORS]
-        return Received(y, np.ones(y.shape, bool), np.zeros(y.shape[:2]), sent[..., SENSORS:])
+        y = np.stack([self._of_cars(of_car.SENT + np.uint64(j * LANES)) for j in range(SENSORS)], axis=2)
+        return Received(y, np.ones(y.shape, bool), np.zeros(y.shape[:2]))
