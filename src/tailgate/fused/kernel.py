@@ -158,7 +158,7 @@ def play(start, advance, decide, look, places, first_block, last_block, part):
             carry(held, desk)
         g = words[b * WORDS * LANES : (b + 1) * WORDS * LANES]
         window = windows[b * wide : (b + 1) * wide]
-        intent = intents[b * long : (b + 1) * long]
+        intent, coming_intent = intents[b * long : (b + 1) * long], intents[(b + 1) * long : (b + 2) * long]
         now, wanted = tick, False
         if fresh:
             everyone(s, g, n)
@@ -170,6 +170,7 @@ def play(start, advance, decide, look, places, first_block, last_block, part):
                 break
             if not alone and steps > 1:  # within one there is no time for it
                 foresee(coming, t, steps)
+                foresee(coming_intent, t, steps)
             if seated:
                 seat.alive(s, c, n)
                 if t == 0 or f[of.ACTION] == of.RAMPING or f[of.ACTION] == of.INCREMENT:  # which depend on the last command
