@@ -106,9 +106,11 @@ class Cockpit(Lanes):
         self.paid, self.count, self.seen, self.flags, self.mask = (np.ndarray(*part, buffer, at) for part, at in self._parts)
 
     def run(self, how: int, steps: int, *arguments: Any, **orders: Any) -> int:
+        before = None if steps else self._sheet
         self._turn()
-        if not steps:  # no decision: it brought nothing
-            self._sheet[:] = 0
+        if before is not None:  # no decision: it brought nothing, and rows in blocks where nothing begins are seen as they were
+            self._sheet[:] = before if len(before) else 0
+            self.paid[0], self.flags[:-1] = 0.0, False
         self._shared, self._asked = True, ()
         return super().run(how, steps, *arguments, **orders)
 

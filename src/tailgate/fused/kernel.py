@@ -66,6 +66,15 @@ def living(s, n):
 
 
 @phase
+def ending(s, n):
+    """Whether any episode of a block is over."""
+    over = 0
+    for i in range(n):
+        over += 1 if s[OVER + i] != 0.0 else 0
+    return over > 0
+
+
+@phase
 def carry(source, goal):
     """The state of a block from one place to another."""
     for i in range(np.uint64(min(len(source), len(goal)))):
@@ -153,6 +162,8 @@ def play(start, advance, decide, look, places, first_block, last_block, part):
     for b in range(first_block, last_block):
         n, first = np.uint64(min(LANES, batch - b * LANES)), np.uint64(b * LANES)
         held, coming = rows[b * deep : (b + 1) * deep], rows[(b + 1) * deep : (b + 2) * deep]
+        if steps == 0 and not fresh and not ending(held, n):
+            continue  # nothing is decided and nothing begins
         s = held if alone else desk
         if not alone:
             carry(held, desk)
