@@ -263,7 +263,9 @@ class AdversaryEnv(gymnasium.Env[Array, Any]):
         return seen, reward, terminated, truncated, self._told(illegal, collided, rear, allowed, step, gap, mask)
 
     def _told(self, illegal: bool, collided: bool, rear: bool, allowed: bool, step: int, gap: float, mask: Array) -> dict[str, Any]:
-        info = {"illegal": illegal, "collided": collided, "rear_collided": rear, "allowed": allowed, "step": step, "gap": gap}
+        info: dict[str, Any] = {
+            "illegal": illegal, "collided": collided, "rear_collided": rear, "allowed": allowed, "step": step, "gap": gap,
+        }  # fmt: skip
         if self._actions:
             info["action_mask"] = mask
         return info

@@ -102,7 +102,8 @@ class Cockpit(Lanes):
         self._sheet: Any = NOTHING
         # of a single row
         self._enter, self._alone, self._anew = self.play.entry, (0, self.interval, SEATED, 0, 0, 0), (0, 0, SEATED, 0, 0, 1)
-        self._action, self._single = self.memory.action[0], seat.action.discrete
+        self._action, self._single = memoryview(self.memory.action[0]), seat.action.discrete
+        self._whole = ctypes.c_void_p(self._places), ctypes.c_int64(0), ctypes.c_int64(1), ctypes.c_int64(0)  # arguments, made once
         self._told = struct.Struct(f"=ddq{4 * features}x6?").unpack_from
 
     def _turn(self) -> None:
@@ -114,9 +115,11 @@ class Cockpit(Lanes):
         self.paid, self.count, self.seen, self.flags, self.mask = (np.ndarray(*part, buffer, at) for part, at in self._parts)
 
     def run(self, how: int, steps: int, *arguments: Any, **orders: Any) -> int:
+        before = None if steps else self._sheet
         self._turn()
-        if not steps:  # no decision: it brought nothing
-            self._sheet[:] = 0
+        if before is not None:  # no decision: it brought nothing, and rows in blocks where nothing begins are seen as they were
+            self._sheet[:] = before if len(before) else 0
+            self.paid[0], self.flags[:-1] = 0.0, False
         self._shared, self._asked = True, ()
         return super().run(how, steps, *arguments, **orders)
 
@@ -137,7 +140,7 @@ class Cockpit(Lanes):
         if self._single:
             self._action[0] = action
         else:
-            self._action[:] = action
+            self.memory.action[0] = action
         return self._play_alone(self._alone)
 
     def again_alone(self) -> tuple[Any, ...]:
@@ -152,7 +155,7 @@ class Cockpit(Lanes):
             self._row, self._allowed, self._shared = self.seen[0], self.mask[0], False
         if self._asked is not orders:
             self.order(orders)
-        if self._enter(self._places, 0, 1, 0) < 0:
+        if self._enter(*self._whole) < 0:
             raise not_finite()
         return *self._told(self._sheet), self._row.copy(), self._allowed.copy()
 

@@ -71,6 +71,15 @@ def living(s, n):
 
 
 @phase
+def ending(s, n):
+    """Whether any episode of a block is over."""
+    over = 0
+    for i in range(n):
+        over += 1 if s[OVER + i] != 0.0 else 0
+    return over > 0
+
+
+@phase
 def carry(source, goal):
     """The state of a block from one place to another."""
     for i in range(np.uint64(min(len(source), len(goal)))):
@@ -159,12 +168,14 @@ def play(start, advance, obey, decide, decode, pay, look, places, first_block, l
     for b in range(first_block, last_block):
         n, first = np.uint64(min(LANES, batch - b * LANES)), np.uint64(b * LANES)
         held, coming = rows[b * deep : (b + 1) * deep], rows[(b + 1) * deep : (b + 2) * deep]
+        if steps == 0 and not fresh and not ending(held, n):
+            continue  # nothing is decided and nothing begins
         s = held if alone else desk
         if not alone:
             carry(held, desk)
         g = words[b * WORDS * LANES : (b + 1) * WORDS * LANES]
         window = windows[b * wide : (b + 1) * wide]
-        intent = intents[b * long : (b + 1) * long]
+        intent, coming_intent = intents[b * long : (b + 1) * long], intents[(b + 1) * long : (b + 2) * long]
         now, wanted = tick, False
         if fresh:
             everyone(s, g, n)
@@ -176,6 +187,7 @@ def play(start, advance, obey, decide, decode, pay, look, places, first_block, l
                 break
             if not alone and steps > 1:  # within one there is no time for it
                 foresee(coming, t, steps)
+                foresee(coming_intent, t, steps)
             if seated:
                 seat.alive(s, c, n)
                 if t == 0 or f[of.ACTION] == of.RAMPING or f[of.ACTION] == of.INCREMENT:  # which depend on the last command

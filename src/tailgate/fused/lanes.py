@@ -126,7 +126,7 @@ class Lanes:
         else:  # blocks share nothing, so that the order in which they are played does not matter
             edges = [len(self.rows) * part // self.threads for part in range(self.threads + 1)]
             pool = _pool(self.threads - 1)
-            others = [pool.submit(self.play, places, *edges[part : part + 2], part) for part in range(1, self.threads)]
+            others = [pool.submit(self.play, places, edges[part], edges[part + 1], part) for part in range(1, self.threads)]
             played = [self.play(places, 0, edges[1], 0), *(other.result() for other in others)]
             self.memory.order[TICK] += fresh + steps
         if min(played) < 0:

@@ -120,16 +120,18 @@ def way(s, g, c, f, table, stream, n):
             over = phase_over(s[WAY + i], s[WAY + _1 + i], s[LEAD_V + i], a, b)
             s[EXO + i] = 1.0 if over else 0.0
             some += 1 if over else 0
-        if some > 0:
-            uniforms(s, g, WORLD_KEY, stream, np.uint64(0), DRAW, n)
-            cruise, cruises_most, dwell, dwells_most = c[p + 4], c[p + 5], c[p + 6], c[p + 7]  # a choice between places would be slow
+        if some > 0:  # few: a list of them, so that not everybody draws
+            listed = np.uint64(0)
             for i in range(n):
-                over, u, after = s[EXO + i] > 0.0, s[DRAW + i], s[WAY + i] + 1.0
+                s[DRAW + listed] = i
+                listed += np.uint64(s[EXO + i] > 0.0)
+            for j in range(listed):
+                lane = np.uint64(np.int64(s[DRAW + j]))
+                u, _ = _uniform_pair(g[WORLD_KEY + lane], g[EPISODE + lane], g[STEP + lane], stream, np.uint64(0))
+                after = s[WAY + lane] + 1.0
                 after = after if after < 4.0 else 0.0
-                cruises = after == manoeuvres.CRUISE
-                fresh = cruise + (cruises_most - cruise) * u if cruises else dwell + (dwells_most - dwell) * u
-                s[WAY + i] = after if over else s[WAY + i]
-                s[WAY + _1 + i] = fresh if over else s[WAY + _1 + i]
+                low = p + 4 if after == manoeuvres.CRUISE else p + 6
+                s[WAY + lane], s[WAY + _1 + lane] = after, c[low] + (c[low + 1] - c[low]) * u
         for i in range(n):
             s[EXO + i] = stop_and_go(s[WAY + i], s[LEAD_V + i], a, b, d, e, dt)
     elif kind == of.RANDOM:
