@@ -11,6 +11,7 @@ from tailgate.envs.manoeuvres import Profile
 from tailgate.errors import InputError
 from tailgate.fused import Constants, Refused, fuse
 from tailgate.fused.platoon_play import Platoon
+from tailgate.link import Link
 from tailgate.registry import Spec
 from tailgate.scenario import load_scenario
 from tailgate.trace import nearest, rollout
@@ -48,6 +49,11 @@ CELLS = [
     ("platoon-gusty-v0", "norm_resilient", "fdi_bernoulli:start_step=20,value=50", LEADER),
     ("platoon-stop-and-go-v0", "saturated_dkf", "fdi:start_step=20,value=-50", {"onset": 10}),
     ("platoon-two-predecessor-v0", "saturated_dkf:eta=3,gamma=0.5", "dropout:start_step=30,probability=0.5", ANY),
+    ("platoon-lossy-v0", "dkf", "fdi:start_step=20,value=30", ANY),
+    ("platoon-lossy-v0", "lasso_dkf", "dropout:start_step=30,probability=0.5", ANY),
+    ("platoon-lossy-v0", "norm_resilient", "dos_hold:start_step=30,fresh=true,burst=3,pause=2", ANY),
+    ("platoon-lossy-v0", "saturated_dkf", "dos_hold:start_step=30", {"onset": 10}),
+    ("platoon-lossy-v0", "none", "dos_jam:start_step=20", ANY),
     ("platoon-heavy-v0", "none", "dropout:start_step=30,probability=0.5", ANY),
     ("platoon-20-v0", "none", "fdi:start_step=20,value=30", {}),
     ("platoon-gusty-v0", "kf", "fdi:start_step=20,value=30", READ),
@@ -125,6 +131,7 @@ ENVIRONMENTS = [
     {"scenario": "platoon-gusty-v0", "defence": "none", "autoreset": "same_step", "interval": 4, "action": "increment"},
     {"scenario": "platoon-gusty-v0", "defence": "kf", "autoreset": "same_step", "threat": {"kinds": ["fdi", "dos_hold"]}, "value": -40.0},
     {"scenario": "platoon-bidirectional-v0", "defence": "consensus_kf", "interval": 7, "threat": {"kinds": ["fdi", "dos_hold"]}, "value": -40.0},
+    {"scenario": "platoon-lossy-v0", "defence": "lasso_dkf", "autoreset": "same_step", "threat": {"sees_measurement": True}},
     {"scenario": "platoon-bidirectional-v0", "defence": "dkf", "interval": 3, "per_agent": True, "value": -20.0,
      "threat": {"agents": [0, 1, 4], "sees_measurement": True}},
 ]  # fmt: skip
@@ -211,11 +218,11 @@ def test_a_command_beyond_what_is_granted_is_refused():
         assert np.array_equal(view.scene.gap, seen.scene.gap)
 
 
-@pytest.mark.parametrize("defence", ["dkf", "none"])
-def test_what_an_attacker_sees_is_what_the_plain_loop_shows(defence):
+@pytest.mark.parametrize(("scenario", "defence"), [("platoon-gusty-v0", "dkf"), ("platoon-lossy-v0", "none")])
+def test_what_an_attacker_sees_is_what_the_plain_loop_shows(scenario, defence):
     """Every part of a view, under random commands at several cars, with a grey box and the measurement."""
     granted = {"knowledge": "grey", "sees_measurement": True, "budget": 20, "cooldown": 2, "duration": 3, "onset": 2}
-    loop, _ = _loop("platoon-gusty-v0", defence, "none", **(ANY | granted))
+    loop, _ = _loop(scenario, defence, "none", **(ANY | granted))
     keys, rng, shape = draws.keys("report", range(70)), np.random.default_rng(1), loop.brief.granted.shape
     lanes, state = Platoon(loop, fuse(loop), keys), loop.start(keys)
     lanes.start()
@@ -249,7 +256,7 @@ def test_a_single_environment_is_a_batch_of_one(action):
 
 
 @pytest.mark.parametrize(("scenario", "defence", "threat", "why"), [
-    ("platoon-lossy-v0", "dkf", {}, "lost or late"), ("platoon-braking-v0", "dkf:gain=varying", {}, "covariances"),
+    ("platoon-lossy-v0", "kf", {"kinds": ["fdi"]}, "what is missed"), ("platoon-braking-v0", "dkf:gain=varying", {}, "covariances"),
     ("platoon-gusty-v0", "kf", {}, "what is missed"), ("platoon-20-v0", "consensus_kf", {"kinds": ["fdi"]}, "so many gains"),
     ("platoon-gusty-v0", "consensus_kf:share=true", {"kinds": ["fdi"]}, "shared"),
     ("platoon-braking-v0", "lasso_dkf:solver=cvxpy", {}, "not the exact one"), ("platoon-braking-v0", "centralised_kf", {}, "no lane"),
@@ -265,8 +272,11 @@ def test_what_has_no_lane_is_played_by_the_plain_loop(scenario, defence, threat,
     assert isinstance(found, Refused) and why in found.why, found
 
 
-def test_a_look_ahead_has_no_lane():
-    """The white-box script against many."""
+def test_late_readings_and_a_look_ahead_have_no_lane():
+    """And the white-box script against many."""
+    guard = Spec("defence", "dkf")
+    late = dataclasses.replace(load_scenario("platoon-gusty-v0").loop(guard.make(), guard.entry.uses), link=Link(latency=2))
+    assert isinstance(found := fuse(late), Refused) and "late" in found.why
     place, guard = load_scenario("platoon-gusty-v0").with_threat(knowledge="white", kinds=("fdi",)), Spec("defence", "dkf")
     found = fuse(place.loop(guard.make()), Spec("attack", "stealth").make())
     assert isinstance(found, Refused) and "stealth" in found.why

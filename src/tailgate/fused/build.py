@@ -99,8 +99,8 @@ def _several(loop: Loop, attack: Attack | None) -> Constants | Refused:
         return Refused(f"{type(loop.plant).__name__} has no lane")
     from . import platoon_build  # which a single car does without, and without the modules of platoons
 
-    if not loop.link.perfect:
-        return Refused("readings are lost or late")
+    if loop.link.latency:
+        return Refused("readings are late")
     if why := _white(loop, attack):
         return Refused(why)
     if not {Kind[name.upper()] for name in loop.threat.kinds} <= _ON_WIRES:

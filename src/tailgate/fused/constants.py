@@ -88,6 +88,7 @@ HARD, HARDER, LAG, RHO, EASED = _number("hard"), _number("harder"), _number("lag
 RESPONSE, CLEARANCE, DISTANCE, WATCH = _number("response"), _number("clearance"), _number("distance"), _number("watch")
 # a platoon: gaps at the start (mean, sd, to either side), what cars are told of the start, sensors, what f keeps of itself in a step
 GAPS, PRIOR_SD, NOISE_SD, FADES = _number("gaps", 3), _number("prior_sd"), _number("noise_sd", 3), _number("fades")
+LOSS = _number("loss")  # probability that a reading or a message is lost
 NUMBERS = len(_numbers)
 
 AIRED = _choice("aired")  # a car with a radar
@@ -105,6 +106,7 @@ ACTION, ACTIONS, REWARD, FEATURES = _choice("action"), _choice("actions"), _choi
 SEEN, FROM = _choice("seen", COMPONENTS), _choice("from", COMPONENTS)  # the two rows of each component of the observation
 # a platoon: how many; rows that a desk has on top; the length of a car's record; where things begin in `window`, in `s` and in `table`
 CARS, STATES, VICTIMS, INPUT_KNOWN = _choice("cars"), _choice("states"), _choice("victims"), _choice("input_known")
+MISSES, IN_MISSES, THERE = _choice("misses"), _choice("who misses"), _choice("there")  # cars that may miss a reading; what was not lost
 ROOM, CAR = _choice("room"), _choice("car")
 HUNTED = _choice("hunted")
 WORKS, AIMS, TRUTHS, FUSED = _choice("works"), _choice("aims"), _choice("truths"), _choice("fused")

@@ -56,6 +56,8 @@ def start(s, g, window, intent, c, f, table, tick, n):
         s[K + i] = 0.0
         g[STEP + i] = np.uint64(0)
     _expect(window, table, f, n)
+    if f[of.THERE] != 0:
+        road.all_there(window, f, n)
     channel.arrive(s, window, table, f, n)
     road.control(s, window, table, c, f, 0.0, n)
     channel.take_hold(s, window, table, f, n)
@@ -89,5 +91,9 @@ def advance(s, g, window, intent, c, f, table, tick, asked, n):
     road.fooled(s, window, f, n)
     road.control(s, window, table, c, f, c[of.ASKED], n)
     channel.actuate(s, window, table, f, n)
+    if f[of.THERE] != 0:
+        road.keep(s, window, f, n)
     _move_and_measure(s, g, window, c, f, table, n)
+    if f[of.THERE] != 0:
+        road.lose(s, g, window, c, f, f[of.SENDS], n)
     road.collide(s, f, n)

@@ -30,7 +30,7 @@ from tailgate.loop import Loop
 from . import constants as of
 from . import platoon_gains as gains
 from .constants import put
-from .platoon_rows import AIM_ROWS, BELIEF, CAR_ROWS, LAW, SENSORS, VICTIM_ROWS, WORK_ROWS
+from .platoon_rows import AIM_ROWS, BELIEF, CAR_ROWS, LAW, LINKS, SENSORS, VICTIM_ROWS, WORK_ROWS
 from .rows import LANES, ROWS
 
 PARTS, LAWS = (Platoon, PlatoonSensors), (FeedForward, Consensus, Ploeg)
@@ -81,7 +81,7 @@ def fill(loop: Loop, c: Array, f: Array, profile: Array) -> tuple[Array, int]:
     _filter(loop, _threat(loop, f, table), c, f, table)
     _detector(loop.plan.defence, c, f)
     _law(loop, c, f, table)
-    return np.concatenate(table.parts), _places(f)
+    return np.concatenate(table.parts), _places(f, c[of.LOSS] > 0.0)
 
 
 def _parts(loop: Loop) -> str:
@@ -125,7 +125,7 @@ def _stepped(estimator: Any, loop: Loop) -> str:
     """Why a gain that follows the covariance has no lane."""
     if type(estimator) not in (KalmanFilter, ConsensusFilter):
         return "fusion by covariances of each row has no lane"
-    if "dropout" in loop.threat.kinds:
+    if "dropout" in loop.threat.kinds or loop.link.loss:
         return "covariances that depend on what is missed have no lane"
     pulled = type(estimator) is ConsensusFilter
     if pulled and estimator.share:
@@ -149,7 +149,7 @@ def _vehicles(loop: Loop, c: Array, f: Array) -> None:
     put(c, of.PROCESS_SD, plan.noise_sd)
     put(c, of.NOISE_SD, loop.plan.sensor[1])
     put(c, of.GAPS, (plant.gap, plant.gap_sd, plant.gap_range))
-    c[of.PRIOR_SD] = plant.initial_sd
+    c[of.PRIOR_SD], c[of.LOSS] = plant.initial_sd, loop.link.loss
 
 
 def _threat(loop: Loop, f: Array, table: Table) -> Array:
@@ -173,8 +173,7 @@ def _filter(loop: Loop, victims: Array, c: Array, f: Array, table: Table) -> Non
     f[of.IN_HEARD], f[of.IN_READS] = _lists(neighbours(model.graph), table), table.add(np.argmax(model.C, axis=2))
     if type(loop.defence) is Raw:
         f[of.ESTIMATOR] = of.READ
-        agents = victims.tolist()
-        told = [(i, e, j, q, agents.index(j) if j in agents else -1) for each in held.rounds for i, e, j, q in zip(*each, strict=True)]
+        told = [one for each in held.rounds for one in zip(*each, strict=True)]
         f[of.IN_HEARS] = table.add([len(told), *np.array(told).ravel()])
         return
     part, plan = held.filter, getattr(held.filter_plan, "linear", held.filter_plan)
@@ -186,11 +185,13 @@ def _filter(loop: Loop, victims: Array, c: Array, f: Array, table: Table) -> Non
         f[of.PULLED] = type(part) is ConsensusFilter and part.consensus > 0.0
         return
     f[of.IN_L], f[of.IN_MERGE] = table.add(plan.L), table.add(plan.merge)
-    _sets(held, plan, victims, c, f, table)
+    misses = np.arange(len(model.C)) if c[of.LOSS] else victims if "dropout" in loop.threat.kinds else victims[:0]
+    f[of.MISSES], f[of.IN_MISSES] = len(misses), table.add(misses.astype(np.int64))
+    _sets(held, plan, misses, c, f, table)
 
 
-def _sets(held: ComposedPlan, fusion: Any, victims: Array, c: Array, f: Array, table: Table) -> None:
-    """S^-1 and gain of each car, and of each victim with each set of sensors; and what an estimator makes of an innovation with each."""
+def _sets(held: ComposedPlan, fusion: Any, misses: Array, c: Array, f: Array, table: Table) -> None:
+    """S^-1 and gain of each car, and of those that may miss readings with each set of sensors; what is made of an innovation with each."""
     part: Any = held.filter
     plan, kind, S, cross, K = held.filter_plan, f[of.ESTIMATOR], fusion.S, fusion.cross, fusion.K
     keeps = np.array([[some >> q & 1 for q in range(SENSORS)] for some in range(1 << SENSORS)], bool)
@@ -205,7 +206,7 @@ def _sets(held: ComposedPlan, fusion: Any, victims: Array, c: Array, f: Array, t
                 own = axes(plan.linear.C[i][None] * keep[:, None], alone(plan.linear.R[i][None], keep[None]), plan.spread[i][None])
                 gain = own.push[0]
                 shapes.append(np.concatenate([own.turn[0].ravel(), part.lam * own.half[0]]))
-            if i in victims:
+            if i in misses:
                 some.append(np.concatenate([weight, gain]))
     if kind == of.NORM:
         K, c[of.FACTOR] = plan.whole.push, part.lam
@@ -246,18 +247,18 @@ def _law(loop: Loop, c: Array, f: Array, table: Table) -> None:
     put(c, of.ACCEL_MIN, (low, high))
 
 
-def _places(f: Array) -> int:
+def _places(f: Array, lossy: bool) -> int:
     """Where records begin. -> rows of the window."""
     cars, states, victims = int(f[of.CARS]), int(f[of.STATES]), int(f[of.VICTIMS])
-    f[of.CAR], f[of.HUNTED] = (CAR_ROWS + states) * LANES, cars * (CAR_ROWS + states) * LANES
-    last = ROWS
+    record, last = CAR_ROWS + states + (SENSORS if lossy else 0), ROWS
+    f[of.CAR], f[of.HUNTED], f[of.THERE] = record * LANES, cars * record * LANES, (CAR_ROWS + states) * LANES if lossy else 0
     for name, rows in (
         (of.WORKS, cars * WORK_ROWS), (of.AIMS, victims * AIM_ROWS), (of.TRUTHS, states), (of.FUSED, cars * states),
-        (of.SENDS, cars * states), (of.FORE, states), (of.DEALT, max(3 * cars, states) + 3),
+        (of.SENDS, cars * max(states, LINKS)), (of.FORE, states), (of.DEALT, max(LINKS * cars, states) + 3),
     ):  # fmt: skip
         f[name], last = last * LANES, last + rows
     f[of.ROOM] = last - ROWS
-    return cars * (CAR_ROWS + states) + victims * VICTIM_ROWS
+    return cars * record + victims * VICTIM_ROWS
 
 
 def modes(table: Array, f: Array, known: Sequence[Mode]) -> Array:

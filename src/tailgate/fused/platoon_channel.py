@@ -7,7 +7,7 @@ Victims are the cars with a wire that may be attacked; all other wires carry wha
 import numpy as np
 
 from tailgate.elementwise import clip
-from tailgate.vector import WIDTH, get, put
+from tailgate.vector import WIDTH, alike, get, put
 
 from . import channel, road, script
 from . import constants as of
@@ -129,6 +129,9 @@ def arrive(s, window, table, f, n):
         sent, arrived = j * f[of.CAR] + int(SENT), f[of.WORKS] + j * WORK + int(ARRIVED)
         for at in range(0, LINKS * LANES, WIDTH):
             put(s, arrived + at, get(window, sent + at))
+        for at in range(0, SENSORS * LANES, WIDTH):
+            there = get(window, j * f[of.CAR] + f[of.THERE] + at) if f[of.THERE] != 0 else alike(1.0)
+            put(s, f[of.WORKS] + j * WORK + int(VALID) + at, there)
     for h in range(f[of.VICTIMS]):
         at = f[of.WORKS] + whole[f[of.IN_VICTIMS] + h] * WORK
         victim = window[f[of.HUNTED] + h * VICTIM : f[of.HUNTED] + (h + 1) * VICTIM]
@@ -141,6 +144,7 @@ def reach(s, victim, work, aim, granted, n):
     """What arrives at a victim in place of what was sent."""
     for w in range(LINKS):
         row = np.uint64(w * LANES)
+        there = np.uint64(min(w, SENSORS - 1) * LANES)
         if granted[GRANTED + w] == 0.0:
             for i in range(n):
                 aim[CLEAN + row + i] = work[ARRIVED + row + i]
@@ -149,11 +153,12 @@ def reach(s, victim, work, aim, granted, n):
             sent, fresh, hit = work[ARRIVED + row + i], victim[FRESH + row + i], victim[TARGET + row + i] != 0.0
             changed = channel.altered(sent, s[KIND + i], victim[VALUE + row + i], victim[HELD + row + i], fresh)
             aim[CLEAN + row + i], work[ARRIVED + row + i] = sent, changed if hit else sent
-            victim[FRESH + row + i] = fresh if hit else sent
+            victim[FRESH + row + i] = fresh if hit | ((w < SENSORS) & (work[VALID + there + i] == 0.0)) else sent  # a lost one is no sample
     for q in range(SENSORS):
         row = np.uint64(q * LANES)
         for i in range(n):
-            aim[VALID + row + i] = 0.0 if (victim[TARGET + row + i] != 0.0) & (s[KIND + i] == channel.DROPOUT) else 1.0
+            drops = (victim[TARGET + row + i] != 0.0) & (s[KIND + i] == channel.DROPOUT)
+            work[VALID + row + i] = 0.0 if drops else work[VALID + row + i]
 
 
 @phase

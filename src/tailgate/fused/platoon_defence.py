@@ -12,13 +12,13 @@ from tailgate.estimators.robust import LIMITS
 
 from . import constants as of
 from .compiled import formula, phase
-from .platoon_filter import AIM, SETS, WORK
-from .platoon_rows import ALARM, SCORE, SENSORS, VALID, R
+from .platoon_filter import SETS, WORK, read_set
+from .platoon_rows import ALARM, SCORE, SENSORS, R
 from .rows import ALARM as ANY_ALARM
 from .rows import LANES
 
 pivot, ball = formula(linear.pivot.py_func), formula(linear.ball.py_func)
-_R, _SCORE, _VALID, _ALARM, _Q = int(R), int(SCORE), int(VALID), int(ALARM), SENSORS
+_R, _SCORE, _Q = int(R), int(SCORE), SENSORS
 _tolerance, _rounding, _patience, _rounds = LIMITS
 ROOM = 2 * LANES  # numbers to work with
 
@@ -39,19 +39,12 @@ def alarm(s, c, f, n):
 
 
 @formula
-def _victim(table, f, j):
-    """Which of the victims a car is; -1: none."""
-    whole, found = table.view(np.int64), -1
-    for h in range(f[of.VICTIMS]):
-        found = h if whole[f[of.IN_VICTIMS] + h] == j else found
+def _misses(table, f, j):
+    """Whether a car may miss a reading."""
+    whole, found = table.view(np.int64), False
+    for h in range(f[of.MISSES]):
+        found |= whole[f[of.IN_MISSES] + h] == j
     return found
-
-
-@formula
-def _read(s, f, h, i):
-    """Which sensors of a victim are read, as the number of the set; all of a car that is none."""
-    valid = f[of.AIMS] + h * AIM + _VALID + i
-    return SETS - 1 if h < 0 else int(s[valid]) + 2 * int(s[valid + LANES]) + 4 * int(s[valid + 2 * LANES])
 
 
 @phase
@@ -62,9 +55,9 @@ def believe(s, table, c, f, n):
         return
     room = s[f[of.DEALT] : f[of.DEALT] + ROOM]
     for j in range(f[of.CARS]):
-        work, h = f[of.WORKS] + j * WORK, _victim(table, f, j)
+        work, misses = f[of.WORKS] + j * WORK, _misses(table, f, j)
         for i in range(int(n)):
-            some = _read(s, f, h, i)
+            some = read_set(s, work, i) if misses else SETS - 1
             at = work + _R + i
             if kind == of.SATURATED:
                 count = max((some & 1) + (some >> 1 & 1) + (some >> 2), 1)

@@ -132,12 +132,12 @@ def innovation(s, table, f, n):
             for lane in range(0, LANES, WIDTH):
                 y = get(s, work + _ARRIVED + q * LANES + lane)
                 put(s, work + _R + q * LANES + lane, y - (alike(0.0) + get(s, column + lane)))
-    for h in range(f[of.VICTIMS]):
-        work, aim = f[of.WORKS] + whole[f[of.IN_VICTIMS] + h] * WORK, f[of.AIMS] + h * AIM
+    for h in range(f[of.MISSES]):
+        work = f[of.WORKS] + whole[f[of.IN_MISSES] + h] * WORK
         for q in range(SENSORS):
             for i in range(int(n)):
                 at = work + _R + q * LANES + i
-                s[at] = s[at] if s[aim + _VALID + q * LANES + i] != 0.0 else 0.0
+                s[at] = s[at] if s[work + _VALID + q * LANES + i] != 0.0 else 0.0
 
 
 @phase
@@ -205,33 +205,41 @@ def update_one(s, window, table, factor, f, k, car, i):
 
 
 @formula
-def _missing(s, table, f, h, i):
-    """Where S^-1 and the gain stand with which a victim's sensors that are read weigh alone; 0 where all are read."""
-    valid = f[of.AIMS] + h * AIM + _VALID + i
-    some = int(s[valid]) + 2 * int(s[valid + LANES]) + 4 * int(s[valid + 2 * LANES])
+def read_set(s, work, i):
+    """Which sensors of a car are read, as the number of the set."""
+    valid = work + _VALID + i
+    return int(s[valid]) + 2 * int(s[valid + LANES]) + 4 * int(s[valid + 2 * LANES])
+
+
+@formula
+def _missing(s, f, h, work, i):
+    """Where S^-1 and the gain stand with which the sensors that are read weigh alone; 0 where all are read."""
+    some = read_set(s, work, i)
     return 0 if some == SETS - 1 else f[of.IN_SOME] + (h * SETS + some) * (SENSORS + f[of.STATES]) * SENSORS
 
 
 @phase
 def score_again(s, table, f, n):
-    """g_i of the victims in the episodes in which they miss a reading."""
+    """g_i again in the episodes in which a car misses a reading."""
     whole = table.view(np.int64)
-    for h in range(f[of.VICTIMS]):
+    for h in range(f[of.MISSES]):
+        work = f[of.WORKS] + whole[f[of.IN_MISSES] + h] * WORK
         for i in range(int(n)):
-            w = _missing(s, table, f, h, i)
+            w = _missing(s, f, h, work, i)
             if w > 0:
-                score_one(s, table, w, f[of.WORKS] + whole[f[of.IN_VICTIMS] + h] * WORK, i)
+                score_one(s, table, w, work, i)
 
 
 @phase
 def update_again(s, window, table, c, f, n):
     """xh_i likewise."""
     whole = table.view(np.int64)
-    for h in range(f[of.VICTIMS]):
+    for h in range(f[of.MISSES]):
+        car = whole[f[of.IN_MISSES] + h]
         for i in range(int(n)):
-            w = _missing(s, table, f, h, i)
+            w = _missing(s, f, h, f[of.WORKS] + car * WORK, i)
             if w > 0:
-                update_one(s, window, table, c[of.FACTOR], f, w + SENSORS * SENSORS, whole[f[of.IN_VICTIMS] + h], i)
+                update_one(s, window, table, c[of.FACTOR], f, w + SENSORS * SENSORS, car, i)
 
 
 @phase

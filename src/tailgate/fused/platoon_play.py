@@ -48,7 +48,7 @@ def _parts(f: Array) -> dict[str, _Part]:
     return {
         "position": record(of_car.X), "speed": record(of_car.V), "accel": record(of_car.A), "control": record(of_car.COMMAND),
         "estimate": record(of_car.BELIEF, states), "gap": worked(of_car.GAP), "ahead": worked(of_car.AHEAD), "score": worked(of_car.SCORE),
-        "alarm": worked(of_car.ALARM),
+        "alarm": worked(of_car.ALARM), "valid": worked(of_car.VALID, SENSORS),
         "wires": worked(of_car.ARRIVED, LINKS), "applied": worked(of_car.APPLIED),
     }  # fmt: skip
 
@@ -59,7 +59,7 @@ def _of_victims(f: Array) -> dict[str, _Part]:
     return {
         "target": _Part(_held(hunted + int(of_car.TARGET)), WIRES, -VICTIM),
         "value": _Part(_held(hunted + int(of_car.VALUE)), WIRES, -VICTIM),
-        "clean": _Part(aims + int(of_car.CLEAN), LINKS, AIM), "valid": _Part(aims + int(of_car.VALID), SENSORS, AIM),
+        "clean": _Part(aims + int(of_car.CLEAN), LINKS, AIM),
     }  # fmt: skip
 
 
@@ -103,7 +103,7 @@ def signals(loop: Any, record: Array, f: Array, asked: float) -> dict[str, Array
         "gap": one["gap"], "speed": one["speed"], "accel": one["accel"], "lead_speed": one["ahead"], "rear_gap": np.full(shape, np.inf),
         "rear_speed": np.zeros(shape), "position": one["position"],
         "truth": np.broadcast_to(held["truth"], held["estimate"].shape), "estimate": held["estimate"], "score": one["score"],
-        "clean": spread("clean", held["wires"]), "wires": held["wires"], "valid": spread("valid", np.ones((*shape, SENSORS), bool)),
+        "clean": spread("clean", held["wires"]), "wires": held["wires"], "valid": held["valid"] != 0.0,
         "energy": np.zeros(shape), "probe": np.ones(shape, bool), "control": held["control"], "applied": held["applied"],
         "value": spread("value", np.zeros((*shape, WIRES))), "target": spread("target", np.zeros((*shape, WIRES), bool)),
         "kind": one["kind"][..., 0].astype(np.int8), "alarm": one["alarm"] != 0.0, "mode": np.full(shape, asked, np.int8),
@@ -174,4 +174,7 @@ class Platoon(Lanes):
 
     def received(self) -> Received:
         y = np.stack([self._of_cars(of_car.SENT + np.uint64(j * LANES)) for j in range(SENSORS)], axis=2)
-        return Received(y, np.ones(y.shape, bool), np.zeros(y.shape[:2]))
+        valid, there = np.ones(y.shape, bool), self.constants.f[of.THERE]
+        if there:
+            valid = np.stack([self._of_cars(np.uint64(there + j * LANES)) != 0.0 for j in range(SENSORS)], axis=2)
+        return Received(y, valid, np.zeros(y.shape[:2]))

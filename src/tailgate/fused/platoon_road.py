@@ -6,6 +6,7 @@ The state of the string is X = [c_0 v_0 a_0 | d_1 v_1 a_1 f_1 | ...]; a car's re
 import numpy as np
 
 from tailgate.draws import Role
+from tailgate.vector import WIDTH, get, put
 
 from . import constants as of
 from . import road
@@ -20,7 +21,9 @@ from .platoon_rows import (
     DRIVEN,
     GAP,
     LAW,
+    LINKS,
     NEXT,
+    SENSORS,
     SENT,
     TOLD,
     A,
@@ -31,6 +34,7 @@ from .rows import EGO, ENDED, EXO, HIT, LANES, LEAD_V, LEAD_X, LENGTH, OFF, REAR
 from .rows import X as FOOLED
 
 _1, _2, _3, _4, _5 = (np.uint64(LANES * i) for i in range(1, 6))
+_LINK = np.uint64(int(Role.LINK) << 16)
 _PRIOR, _PROCESS, _SENSOR, _WAY = (np.uint64(int(role) << 16) for role in (Role.PRIOR, Role.PROCESS, Role.SENSOR, Role.MANOEUVRE))
 _RANGE, _SPREAD = _PRIOR | np.uint64(1), _PRIOR | np.uint64(16)  # tags of what is drawn at the start
 _BELIEF, _NEXT, _COMMAND = int(BELIEF), int(NEXT), int(COMMAND)
@@ -215,6 +219,37 @@ def measure(s, g, window, c, f, table, n):
                 car[SENT + _1 + i] += sd1 * deal[_1 + i]
                 car[SENT + _2 + i] += sd2 * deal[_2 + i]
     message(window, table, f, n)
+
+
+@phase
+def lose(s, g, window, c, f, before, n):
+    """Of what is sent at the step that g holds some is lost: its wire keeps the last that arrived, which is in the rows `before` of s."""
+    dealt(s, g, _LINK, LINKS * f[of.CARS], False, f, n)
+    for j in range(f[of.CARS]):
+        car, there = window[j * f[of.CAR] : (j + 1) * f[of.CAR]], window[j * f[of.CAR] + f[of.THERE] :]
+        for w in range(LINKS):
+            row, last, u = np.uint64(w * LANES), s[before + (j * LINKS + w) * LANES :], s[f[of.DEALT] + (j * LINKS + w) * LANES :]
+            for i in range(n):
+                car[SENT + row + i] = last[i] if u[i] < c[of.LOSS] else car[SENT + row + i]
+            if w < SENSORS:
+                for i in range(n):
+                    there[row + i] = 0.0 if u[i] < c[of.LOSS] else 1.0
+
+
+@phase
+def keep(s, window, f, n):
+    """What arrived last, into the rows SENDS."""
+    for j in range(f[of.CARS]):
+        for at in range(0, LINKS * LANES, WIDTH):
+            put(s, f[of.SENDS] + j * LINKS * LANES + at, get(window, j * f[of.CAR] + int(SENT) + at))
+
+
+@phase
+def all_there(window, f, n):
+    """The first readings arrive."""
+    for j in range(f[of.CARS]):
+        for at in range(SENSORS * LANES):
+            window[j * f[of.CAR] + f[of.THERE] + at] = 1.0
 
 
 @phase

@@ -145,6 +145,11 @@ def look(s, window, c, f, paid, flags, count, mask, first, n):
         for i in range(n):
             work[SHOWN_V + i], work[SHOWN_A + i], work[SHOWN_U + i] = car[V + i], car[A + i], car[COMMAND + i]
             work[SHOWN_Y + i], work[SHOWN_Y + _1 + i] = car[SENT + i], car[SENT + _1 + i]
+        if f[of.THERE] != 0:  # a reading that is lost is off by nothing
+            there = window[j * f[of.CAR] + f[of.THERE] :]
+            for i in range(n):
+                work[SHOWN_Y + i] = work[SHOWN_Y + i] if there[i] != 0.0 else work[GAP + i]
+                work[SHOWN_Y + _1 + i] = work[SHOWN_Y + _1 + i] if there[_1 + i] != 0.0 else car[V + i]
     for h in range(f[of.VICTIMS]):
         victim = window[f[of.HUNTED] + h * channel.VICTIM : f[of.HUNTED] + (h + 1) * channel.VICTIM]
         aim = s[f[of.AIMS] + h * AIM : f[of.AIMS] + (h + 1) * AIM]

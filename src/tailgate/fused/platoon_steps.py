@@ -13,10 +13,10 @@ from tailgate.vector import WIDTH, alike, get, put
 from . import constants as of
 from .compiled import formula, phase
 from .platoon_filter import WORK, product, score, score_one, update, update_one
-from .platoon_rows import AIM_ROWS, ARRIVED, BELIEF, SCORE, SENSORS, VALID
+from .platoon_rows import ARRIVED, BELIEF, SCORE, SENSORS, VALID
 from .rows import LANES, K
 
-_BELIEF, _AIM, _W = int(BELIEF), AIM_ROWS * LANES, SENSORS * SENSORS
+_BELIEF, _W = int(BELIEF), SENSORS * SENSORS
 
 
 @formula
@@ -108,14 +108,9 @@ def read(s, window, table, f, n):
         work = s[f[of.WORKS] + j * WORK : f[of.WORKS] + (j + 1) * WORK]
         for i in range(n):
             work[SCORE + i] = 0.0
-    for at in range(f[of.IN_HEARS] + 1, f[of.IN_HEARS] + 1 + 5 * whole[f[of.IN_HEARS]], 5):
-        to, column, teller, sensor, h = whole[at], whole[at + 1], whole[at + 2], whole[at + 3], whole[at + 4]
+    for at in range(f[of.IN_HEARS] + 1, f[of.IN_HEARS] + 1 + 4 * whole[f[of.IN_HEARS]], 4):
+        to, column, teller, sensor = whole[at], whole[at + 1], whole[at + 2], whole[at + 3]
         belief = window[to * f[of.CAR] + _BELIEF + column * LANES :]
-        told = s[f[of.WORKS] + teller * WORK + int(ARRIVED) + sensor * LANES :]
-        if h < 0:
-            for i in range(n):
-                belief[i] = told[i]
-        else:
-            valid = s[f[of.AIMS] + h * _AIM + int(VALID) + sensor * LANES :]
-            for i in range(n):
-                belief[i] = told[i] if valid[i] != 0.0 else belief[i]
+        told = s[f[of.WORKS] + teller * WORK + sensor * LANES :]
+        for i in range(n):
+            belief[i] = told[ARRIVED + i] if told[VALID + i] != 0.0 else belief[i]
