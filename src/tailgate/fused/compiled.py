@@ -184,16 +184,17 @@ class Kernel:
 
             with remembering():
                 symbol, code = whole(self.py_func, signature, _OPTIONS | _BARE)
+            entry = _linked(symbol, code)
         else:
-            made = numba().cfunc(signature, **_OPTIONS)(self.py_func)
-            symbol, code = made.native_name, made._library.serialize_using_object_code()[2][0]
+            self._owner = made = numba().cfunc(signature, **_OPTIONS)(self.py_func)
+            symbol, code, entry = made.native_name, made._library.serialize_using_object_code()[2][0], _callable(made.address)
         for folder in _folders():
             with contextlib.suppress(InputError):
                 write_atomic(folder / self._file, f"{symbol} {hashlib.blake2b(code).hexdigest()}\n".encode() + code)
                 for old in sorted(folder.glob("kernel-*.o"), key=lambda path: path.stat().st_mtime)[:-KEPT]:
                     remove(old)
                 break
-        return _linked(symbol, code)
+        return entry
 
     @cached_property
     def _file(self) -> str:
