@@ -260,7 +260,7 @@ def test_modes_per_agent_and_sensor():
 
 def test_a_mode_hits_its_agent_in_the_loop():
     """The wires of the chosen agent arrive changed, all others as they were sent."""
-    env = AdversaryVectorEnv(2, scenario="platoon-braking-v0", defence="dkf", value=5.0, per_agent=True,
+    env = AdversaryVectorEnv(2, scenario="platoon-braking-v0", defence="dkf", value=5.0, per_agent=True, engine="plain",
                              threat={"agents": [1, 3], "targets": ["distance"], "kinds": ["fdi"], "onset": 1})  # fmt: skip
     env.reset(seed=0)
     names = [mode.name for mode in env.seat.action.modes]
