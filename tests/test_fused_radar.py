@@ -4,14 +4,13 @@ import numpy as np
 import pytest
 
 from tailgate import draws
-from tailgate.envs.faces import AdversaryVectorEnv
 from tailgate.fused import Constants, Refused, fuse
 from tailgate.fused.lanes import Lanes
 from tailgate.registry import Spec
 from tailgate.scenario import load_scenario
 from tailgate.trace import nearest, rollout
 
-from .test_fused import _loop, _same, _short
+from .test_fused import _as_plain, _loop
 
 # Every filter, detector, mitigation and kind at least once, over the air and on the wires, and a jammer that leaves nothing to read.
 ANY = {
@@ -96,33 +95,7 @@ ENVIRONMENTS = [
 @pytest.mark.parametrize("arguments", ENVIRONMENTS, ids=lambda a: f"{a['scenario']}-{a['defence']}")
 def test_an_environment_is_the_plain_one_to_the_last_bit(arguments, tmp_path):
     """Observations, rewards, flags and information, over restarts and a masked reset, in several blocks."""
-    text, rows = tmp_path / "short.yaml", 70
-    text.write_text(_short(arguments["scenario"]))
-    one, two = (AdversaryVectorEnv(rows, engine=engine, **(arguments | {"scenario": str(text)})) for engine in ("fused", "plain"))
-    assert (one.engine, two.engine) == ("fused", "plain")
-    for first, second in zip(one.reset(seed=3), two.reset(seed=3), strict=True):
-        _same(first, second)
-    rng, ended = np.random.default_rng(0), 0
-    for t in range(130):
-        if one.seat.action.discrete:
-            actions = np.where(rng.random(rows) < 0.6, 0, rng.integers(0, one.seat.action.size, rows))
-        else:
-            actions = rng.uniform(-1.2, 1.2, (rows, one.seat.action.size)).astype(np.float32)
-        results = one.step(actions), two.step(actions)
-        for first, second in zip(*results, strict=True):
-            _same(*(value if isinstance(value, dict) else np.asarray(value) for value in (first, second)))
-        ended += int((results[0][2] | results[0][3]).sum())
-        if t == 60:
-            mask = np.arange(rows) % 3 == 0
-            seeds = [int(i) if here else None for i, here in enumerate(mask)]
-            for first, second in zip(*(env.reset(seed=seeds, options={"reset_mask": mask}) for env in (one, two)), strict=True):
-                _same(first, second)
-        if t == 90:
-            kept = one.episodes.held()
-            one.step(actions)
-            one.episodes.put(kept)
-            one.observed = two.observed.copy()
-    assert ended >= rows and np.array_equal(one.episode, two.episode)
+    _as_plain(arguments, 70, tmp_path)
 
 
 def test_the_smallest_gaps_are_those_of_the_trace():
