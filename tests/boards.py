@@ -158,7 +158,7 @@ def make_board(name="synthetic-v0", *, bound=None, beacon="", trusted=True, defe
             ],
             "critical_dose": {level: critical(line, 0.1) for level, line in mine.items()}, "rates": rates,
             "rank": {"best": max(1, ranks[kind] - 1), "worst": ranks[kind]} if status == "ranked" else None,
-            "clean": {"min_gap": {"median": 12.0, "q25": 11.5, "q75": 12.25}, "rms_jerk": None},
+            "clean": {"min_gap": {"median": 12.0, "q25": 11.5, "q75": 12.25}, "rms_jerk": None, "max_error": {"median": 0.5, "q25": 0.4, "q75": 0.75}},
             "flags": ["the budget was not spent", "seed spread 12 %"] if text.startswith("chi2") else [],
             "worst_episode": {"scenario": "nowhere-v0"} if text == "imm" else None,
             "robustness": [{"scenario": scenarios[-1], "undamaged": {"value": 0.8, "low": 0.74}, "change": -0.07}],

@@ -126,6 +126,9 @@ def test_a_board_without_a_road_names_its_bound(site):
     text = site.read_text(encoding="utf-8")
     assert "an error above 25" in text and text.count("a collision, in front or behind") == 1
     assert "an error above 25" in entry(site, "kf", "network-v0").read_text(encoding="utf-8")
+    road, network = (Outline(entry(site, "kf", *suite).read_text(encoding="utf-8")).lines for suite in ((), ("network-v0",)))
+    units = [next(line for _, line in lines if line.split()[:2] == ["max", "error"]).split()[5] for lines in (road, network)]
+    assert units == ["m", "-"]
 
 
 def test_an_entry_s_page_has_all_parts(site):

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from tailgate.errors import InputError
-from tailgate.metrics import METRICS, UNITS
+from tailgate.metrics import ERRORS, METRICS, UNITS
 from tailgate.replay.page import VERDICTS, outcome, write_page
 from tailgate.replay.replay import play
 
@@ -150,12 +150,13 @@ def _robust(suite: Suite, item: Robust) -> Data:
     return {"scenario": item.scenario, "undamaged": share, "change": change, "worst": worst}
 
 
-def _clean(entry: EntryPart) -> list[Data]:
-    out = []
+def _clean(suite: Suite, entry: EntryPart) -> list[Data]:
+    road, out = suite.board.suite.bound is None, []
     for name, spread in entry.clean.items():
         about = " ".join((METRICS[name].__doc__ or "").split()) if name in METRICS else ""
+        unit = UNITS.get(name, "") if road or name not in ERRORS else "-"
         numbers = [figure(x) for x in (spread.median, spread.q25, spread.q75)] if spread else ["\N{EN DASH}"] * 3
-        out.append({"name": name.replace("_", " "), "about": about, "unit": UNITS.get(name, ""), "numbers": numbers})
+        out.append({"name": name.replace("_", " "), "about": about, "unit": unit, "numbers": numbers})
     return out
 
 
@@ -186,7 +187,7 @@ def entry_page(suite: Suite, entry: EntryPart, replayed: Replayed | None, also: 
         "doses": [dose_text(d) for d in suite.board.suite.doses],
         "gates": [{"gate": g.gate.replace("_", " "), "scenario": g.scenario, "value": figure(g.value), "limit": figure(g.limit),
                    "passed": g.passed} for g in entry.gates],
-        "charts": curves[0]["charts"] if curves else [], "clean": _clean(entry),
+        "charts": curves[0]["charts"] if curves else [], "clean": _clean(suite, entry),
         "robustness": [_robust(suite, r) for r in entry.robustness],
         "stealth": [{"hours": figure(s.hours), "threshold": figure(s.threshold), "deviation": figure(s.deviation, 3)}
                     for s in entry.stealth or ()],
