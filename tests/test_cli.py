@@ -112,6 +112,29 @@ def test_a_file_of_other_rows_is_kept(run: Run, tmp_path: Path) -> None:
     assert "rows.jsonl.2" in said and '"kf"' in (tmp_path / "rows.jsonl.1").read_text()
 
 
+def test_nothing_played_is_exit_code_1(run: Run, tmp_path: Path) -> None:
+    """Where no row and no property comes to a figure the reason is the last line; beside others it has a column of its own."""
+    place = ["--scenario", "thesis-ch4-v0", "--dose", "none"]
+    code, table, said = run("evaluate", *place, "--defence", "none", "--attack", "stealth", "--seeds", "2")
+    assert code == 1 and "nothing was played" in said.splitlines()[-1] and "why not" in table
+    code, table, _ = run("evaluate", *place, "--defence", "none", "--attack", "stealth", "--attack", "none", "--seeds", "2")
+    assert code == 0 and "why not" in table
+    code, table, said = run("trust", "--scenario", "thesis-ch5-v0", "--defence", "dkf", "--attack", "none", "--runs", "2", "--property", "gap > 2")
+    assert code == 1 and "nothing was decided" in said.splitlines()[-1] and "why not" in table
+    (tmp_path / "empty.jsonl").touch()
+    code, _, said = run("leaderboard", "build", "--rows", "empty.jsonl", "--out", "page")
+    assert code == 2 and "empty.jsonl" in said
+
+
+@pytest.mark.parametrize(
+    ("rule", "field"),
+    [(["--width", "2"], "--width"), (["--test", "0"], "--test"), (["--test", "0.04"], "--indifference"), (["--test", "0.9", "--indifference", "0"], "--indifference")],
+)
+def test_a_rule_that_cannot_be_names_its_option(run: Run, rule: list[str], field: str) -> None:
+    code, _, said = run("trust", "--scenario", "ch7-v0", "--defence", "kf", "--attack", "none", *rule)
+    assert code == 2 and f"error: {field}: got" in said
+
+
 def test_a_detector_is_no_defence(run: Run) -> None:
     """Named as a defence, it is refused with the way to use it; an attack that is granted nothing is marked in the table."""
     part = ["evaluate", "--scenario", "thesis-ch4-v0", "--dose", "none", "--attack", "dos_jam", "--seeds", "2", "--threat", "kinds=[fdi]"]

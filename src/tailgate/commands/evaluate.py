@@ -82,7 +82,10 @@ def _evaluate(options: argparse.Namespace) -> int:
     failed = sum(entry["failed"] for entry in table)
     if failed:
         print(f"tailgate: {failed} of {len(rows)} rows failed; their reasons are in the rows", file=sys.stderr)
-    return 1 if failed else 0
+    idle = bool(rows) and all(entry["crash"] is None for entry in table)
+    if idle and not failed:
+        print(f"tailgate: nothing was played: {table[0]['reason']}", file=sys.stderr)
+    return 1 if failed or idle else 0
 
 
 def _print_summary(table: list[dict[str, Any]]) -> None:
@@ -94,13 +97,14 @@ def _print_summary(table: list[dict[str, Any]]) -> None:
         shown = Table(title=f"{scenario}, budget {'unlimited' if dose is None else f'{dose} steps'}")
         errors = ("min gap [m]", "max error [m]") if road else ("RMS error", "max error")
         measures = ("n", *(("collisions", "95 % interval") if road else ()), *errors, "alarm onsets")
-        for heading in ("defence", "attack", "knowledge", *measures):
+        why = any(entry["crash"] is None for entry in here)
+        for heading in ("defence", "attack", "knowledge", *measures, *(("why not",) if why else ())):
             shown.add_column(heading, overflow="fold")
         for entry in here:
             head = [escape(entry["defence"]), escape(entry["attack"]), entry["knowledge"], str(entry["n"])]
             crash = entry["crash"]
             if crash is None:
-                shown.add_row(*head, "-", escape(entry["reason"]))
+                shown.add_row(*head, *["-"] * (len(measures) - 1), escape(entry["reason"]))
                 continue
             if entry["refused_all"]:
                 head[1] += " (refused: not granted)"

@@ -24,9 +24,12 @@ def add(commands: Any) -> None:
 
 
 def _build(options: argparse.Namespace) -> int:
+    from tailgate.errors import InputError
     from tailgate.leaderboard.build import build
     from tailgate.rows import read_rows
 
     rows = [row for name in options.rows for row in read_rows(Path(name))]
+    if not rows:
+        raise InputError("--rows", options.rows, "at least one row of an evaluation in them")
     print(build(rows, Path(options.out), title=options.title))
     return 0

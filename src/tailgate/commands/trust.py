@@ -88,9 +88,15 @@ def _suite(options: argparse.Namespace) -> Any:
 def _rule(options: argparse.Namespace) -> Any:
     from tailgate.trust.statistics import Sequential, Sprt
 
+    for name in ("width", "test"):
+        value = getattr(options, name)
+        if value is not None and not 0.0 < value < 1.0:
+            raise InputError(f"--{name}", value, "a number above 0 and below 1")
     if options.width is not None:
         return Sequential(options.width, 1.0 - options.alpha)
     if options.test is not None:
+        if not 0.0 < options.indifference < options.test:
+            raise InputError("--indifference", options.indifference, f"a number above 0 and below --test, {options.test:g}")
         return Sprt(options.test - options.indifference, options.test, options.alpha, options.alpha)
     return None
 
@@ -131,7 +137,15 @@ def _trust(options: argparse.Namespace) -> int:
     lost = [cell for cell in found["cells"] if cell["status"] == "error"]
     for cell in lost:
         print(f"tailgate: {cell['defence']} against {cell['attack']} on {cell['scenario']} failed: {cell['reason']}", file=sys.stderr)
-    return 1 if lost else 0
+    idle = not any(cell["trust"] for cell in found["cells"])
+    if idle and not lost:
+        print(f"tailgate: nothing was decided: {_why_nothing(found)}", file=sys.stderr)
+    return 1 if lost or idle else 0
+
+
+def _why_nothing(found: dict[str, Any]) -> str:
+    reasons = [cell["reason"] for cell in found["cells"]] + [p["reason"] for entry in found["defences"] for p in entry["properties"]]
+    return next(filter(None, reasons), "no property has a meaning here")
 
 
 def at_least(share: float) -> str:
@@ -180,13 +194,14 @@ def _print_bounds(found: dict[str, Any]) -> None:
 
 def _print_properties(found: dict[str, Any]) -> None:
     table = Table(title="each property in its worst cell", caption="intervals hold for all cells of a property together")
-    for heading in ("defence", "property", "share", "runs", "interval", "worst", "antecedent"):
+    why = any(p["share"] is None for entry in found["defences"] for p in entry["properties"])
+    for heading in ("defence", "property", "share", "runs", "interval", "worst", "antecedent", *(("why not",) if why else ())):
         table.add_column(heading, overflow="fold")
     for entry in found["defences"]:
         for p in entry["properties"]:
             share, when = p["share"], p["antecedent"]
             if share is None:
-                table.add_row(escape(entry["defence"]), escape(p["name"]), "-", "-", "-", escape(p["reason"]), "-")
+                table.add_row(escape(entry["defence"]), escape(p["name"]), *["-"] * 5, escape(p["reason"]))
                 continue
             often = "-" if when is None else f"in {when['runs']} of {when['of']} runs, {_percent(when['instants'])} of the steps"
             span = f"{_percent(share['low'])} to {_percent(share['high'])}"
@@ -210,13 +225,14 @@ def _print_cells(found: dict[str, Any]) -> None:
     """What a rule that stops early found out."""
     rule = found["rule"]
     table = Table(title=f"{found['suite']['name']}: rule {rule['name']}, for exploring: these intervals miss more often than they say")
-    for heading in ("defence", "attack", "scenario", "runs", "hold", "interval", "verdict"):
+    why = any(cell["trust"] is None for cell in found["cells"])
+    for heading in ("defence", "attack", "scenario", "runs", "hold", "interval", "verdict", *(("why not",) if why else ())):
         table.add_column(heading, overflow="fold")
     for cell in found["cells"]:
         head = [escape(cell["defence"]), escape(cell["attack"]), escape(cell["scenario"])]
         held = cell["trust"]
         if held is None:
-            table.add_row(*head, "-", "-", escape(cell["reason"]), "-")
+            table.add_row(*head, *["-"] * 4, escape(cell["reason"]))
             continue
         verdict = {None: "-", True: f"P >= {rule.get('high', 0):g}", False: f"P <= {rule.get('low', 0):g}"}[cell["verdict"]]
         table.add_row(*head, str(cell["n"]), str(held["k"]), f"{_percent(held['low'])} to {_percent(held['high'])}", verdict)

@@ -69,6 +69,8 @@ def play(jobs: Sequence[Job], folder: Path | None = None, workers: int = 1, prog
         kept = [row for path in (out, *sorted(parts.glob("*.json"))) for row in _read(path)]
         done = {row["cell"]: row for row in kept if row.get("cell") in ids and row.get("status") != "error"}
     missing = [job for job, i in zip(jobs, ids, strict=True) if i not in done]
+    if progress is not None and done:  # of an earlier run
+        progress(len(done), len(set(ids)))
     for row in _played(missing, workers):
         done[row["cell"]] = row
         if parts is not None:
