@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import dataclasses
 import json
+import re
 from collections.abc import Callable, Iterable, Sequence
 from importlib import import_module
 from importlib.resources import files
@@ -12,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from jinja2 import Environment, FunctionLoader, StrictUndefined
+from markupsafe import Markup, escape
 
 import tailgate
 from tailgate.errors import InputError, unknown
@@ -119,7 +121,12 @@ def page(name: str, **values: Any) -> str:
     """A page from one of the templates."""
     loader = FunctionLoader(lambda file: files("tailgate.reproduce").joinpath(file).read_text(encoding="utf-8"))
     made = Environment(autoescape=True, undefined=StrictUndefined, loader=loader)
-    return made.get_template(name).render(flat=flat, base64=lambda figure: base64.b64encode(figure.png).decode(), **values)
+    return made.get_template(name).render(flat=flat, prose=prose, base64=lambda figure: base64.b64encode(figure.png).decode(), **values)
+
+
+def prose(text: str) -> Markup:
+    """Text of a report as HTML: what stands between backticks is code."""
+    return Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", str(escape(text))))
 
 
 def write(report: Report, directory: Path, **stamp: Any) -> Path:
