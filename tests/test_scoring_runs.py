@@ -4,15 +4,20 @@ import dataclasses
 import json
 import math
 
+import numpy as np
 import pytest
 
+from tailgate import make_attack, make_defence
+from tailgate.draws import keys
 from tailgate.errors import InputError
 from tailgate.evaluation import evaluate
 from tailgate.leaderboard.board_format import read_board
+from tailgate.metrics import max_error
 from tailgate.registry import entries
-from tailgate.scenario import Suite, load_suite
+from tailgate.scenario import Suite, load_scenario, load_suite
 from tailgate.scoring import score
-from tailgate.scoring.detection import detection, plants, stealth_impact, threshold, with_detection
+from tailgate.scoring.detection import detection, deviation, plants, stealth_impact, threshold, with_detection
+from tailgate.trace import rollout
 
 SENTINELS = {name: e.sentinel for name, e in entries("defence").items() if e.sentinel}
 
@@ -92,6 +97,19 @@ def test_the_looser_threshold_lets_a_stealthy_attacker_further() -> None:
     assert stealth_impact(ROAD, "none", (0.02,), **FEW) is None
     made = with_detection({"entries": [{"defence": "chi2_kf"}, {"defence": "none"}]}, {"hours": []}, {"chi2_kf": curve})
     assert made["entries"][0]["stealth"] == curve and made["entries"][1]["stealth"] is None
+
+
+def test_what_comes_after_an_attack_is_no_deviation() -> None:
+    """A gate stays shut on honest readings after a jump, and the error grows; what counts is the largest while the attack lasts."""
+    loop = load_scenario("stop-and-go-v0").with_threat(kinds=("fdi",), fdi_bound=500.0, budget=10).loop(make_defence("chi2_kf"), ("measurements",))
+    trace = rollout(loop, make_attack("fdi_ramp", start_step=100, rate=-1.0, limit=100), keys("report", range(6)))
+    attacked = (trace.kind != 0) & trace.live
+    error = trace.model.error(trace.estimate, trace.truth)[..., 0]
+    for b, value in enumerate(deviation(trace)):
+        during = error[attacked[:, b], b]
+        assert len(during) == 10 and value == pytest.approx(during.max() / 1.0)
+    assert (max_error(trace) > 1.2 * deviation(trace)).any()
+    assert np.isnan(deviation(rollout(loop, make_attack("none"), keys("report", [0])))).all()
 
 
 def test_scenarios_of_one_plant_share_a_threshold() -> None:

@@ -121,6 +121,19 @@ def test_the_map_shows_the_worst_scenario_at_the_middle_dose(index):
     assert shown[1:] == pytest.approx([by_attack[a] for a, *_ in boards.ATTACKS], abs=0.0051)
 
 
+def test_detection_is_shown_attack_by_attack(index):
+    """At the middle time between false alarms: per attack a row, per defence the share in the scenario where it sees least of it."""
+    cases = [c for c in make_board("x")["detection"]["entries"] if c["hours"] == 1]
+    lines = [re.sub(r"\s+", " ", text).strip() for _, text in index.lines]
+    for attack in dict.fromkeys(c["attack"] for c in cases):
+        least = {}
+        for c in cases:
+            if c["attack"] == attack and c["detected"]:
+                least[c["defence"]] = min(least.get(c["defence"], 1.0), c["detected"]["value"])
+        shown = [percent(least[g]) if g in least else "\N{EN DASH}" for g in dict.fromkeys(c["defence"] for c in cases)]
+        assert any(line.startswith(attack.split(":")[0]) and " ".join(["", *shown]) in line for line in lines)
+
+
 def test_a_board_without_a_road_names_its_bound(site):
     """Where nobody can collide, damage is an error above the suite's bound."""
     text = site.read_text(encoding="utf-8")

@@ -106,7 +106,25 @@ def detection_of(suite: Suite) -> Data | None:
                 "about": suite.where(least.scenario, least.attack), "delay": figure(least.delay, 3) if least.delay is not None else "",
             })  # fmt: skip
         rows.append({"name": suite.defences[defence], "page": suite.pages.get(defence, ""), "cells": cells})
-    return {"hours": [figure(h) for h in hours], "rows": rows}
+    return {"hours": [figure(h) for h in hours], "rows": rows, "each": _each_attack(suite, sorted(hours)[len(hours) // 2])}
+
+
+def _each_attack(suite: Suite, hour: float) -> Data:
+    """At one time between false alarms the share of each attack that each defence detects, in the scenario where it detects least."""
+    assert suite.board.detection is not None
+    cases = [c for c in suite.board.detection.entries if c.hours == hour]
+    names = list(dict.fromkeys(c.attack for c in cases))
+    least: dict[tuple[str, str], float] = {}
+    for case in cases:
+        if case.detected is not None:
+            key = case.defence, case.attack
+            least[key] = min(least.get(key, 1.0), case.detected.value)
+    guards = list(dict.fromkeys(c.defence for c in cases))
+    rows = [
+        {"name": suite.attacks[a], "cells": [percent(least[g, a]) if (g, a) in least else "\N{EN DASH}" for g in guards]} for a in names
+    ]
+    heads = [{"name": suite.defences[g], "page": suite.pages.get(g, "")} for g in guards]
+    return {"hour": figure(hour), "heads": heads, "rows": rows}
 
 
 def comparisons_of(suite: Suite, defence: str | None = None) -> list[Data]:

@@ -13,11 +13,15 @@ from typing import Any
 
 import numpy as np
 
+from tailgate import draws
 from tailgate.calibrate import Bench, calibrate
+from tailgate.core import Array
 from tailgate.errors import InputError, NotApplicable
 from tailgate.evaluation import Cell, run_cell
+from tailgate.registry import Spec
 from tailgate.scenario import Suite, load_scenario
 from tailgate.stats import proportion
+from tailgate.trace import Trace, episodes_at_once, rollout
 
 HOURS = (0.1, 1.0, 10.0)
 ONSETS = 100  # false alarms that a threshold is found on: its mean time is known to 20 %
@@ -107,7 +111,7 @@ def stealth_impact(
 ) -> list[Data] | None:  # fmt: skip
     """The field `stealth` of an entry: by the mean time between false alarms, the error that the stealth attack reaches per time.
 
-    deviation [m/s]: the largest error of an episode over the time that it was attacked, the median of episodes, the most of scenarios.
+    The median `deviation` [m/s] of episodes, the most of scenarios.
     None for a defence without a threshold. In the scenarios, under the threat model and at the dose of `detection`.
     """
     update = progress or (lambda *_: None)
@@ -124,11 +128,29 @@ def stealth_impact(
 
 
 def _reached(level: float, cell: Cell) -> float | None:
-    made = Bench.of(cell.defence, [cell.scenario], cell.seeds, None).at(level)
-    rows = run_cell(cell, made)
-    dt = load_scenario(cell.scenario).brief().model.dt
-    values = [row["max_error"] / (row["attack_steps"] * dt) for row in rows if row["status"] == "ok" and row["attack_steps"]]
-    return float(np.median(values)) if values else None
+    made, rival = Bench.of(cell.defence, [cell.scenario], cell.seeds, None).at(level), Spec("attack", cell.attack)
+    attack, guard = rival.make(), Spec("defence", cell.defence)
+    values: list[Array] = []
+    try:
+        loop = cell.place(attack, rival.entry.knowledge).loop(made, guard.entry.uses)
+        size = episodes_at_once(loop.model, loop.horizon, cell.batch)
+        for first in range(0, cell.seeds, size):
+            values.append(deviation(rollout(loop, attack, draws.keys(cell.purpose, cell.episodes[first : first + size]))))
+    except NotApplicable:
+        return None
+    reached = np.concatenate(values)
+    return float(np.nanmedian(reached)) if np.isfinite(reached).any() else None
+
+
+def deviation(trace: Trace) -> Array:
+    """(B,) the largest error of an estimated gap while an episode is attacked, over the time of the attack [m/s]; NaN without one.
+
+    What comes after the attack does not count: a gate that stays shut on honest readings loses a car for good, however little was injected.
+    """
+    attacked = (trace.kind != 0) & trace.live
+    error = np.max(trace.model.error(trace.estimate, trace.truth), axis=2)
+    steps = np.count_nonzero(attacked, axis=0)
+    return np.max(np.where(attacked, error, 0.0), axis=0) / np.where(steps, steps * trace.model.dt, np.nan)
 
 
 def with_detection(board: Data, found: Data, stealth: dict[str, list[Data] | None]) -> Data:
