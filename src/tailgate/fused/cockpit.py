@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import math
 import struct
+from importlib import import_module
 from itertools import accumulate
 from typing import TYPE_CHECKING, Any
 
@@ -40,10 +41,10 @@ def fuse_seat(seat: Seat) -> Constants | Refused:
     f[of.ACTION], f[of.ACTIONS] = _ACTIONS[action.spec.action], 1 if action.discrete else action.size
     f[of.REWARD], f[of.FEATURES] = _REWARDS[paid.reward], len(columns)
     c[of.RATE], c[of.HORIZON], c[of.SEEN_MOST] = action.spec.rate, seat.loop.horizon, LIMIT
+    road = not f[of.SENSED]
     if several:
-        from . import platoon_build
-
-        k = k._replace(table=platoon_build.modes(k.table, f, action.modes if action.discrete else []))
+        built = import_module(f"tailgate.fused.{'platoon' if road else 'network'}_build")
+        k = k._replace(table=built.modes(seat.loop, k.table, f, action.modes if action.discrete else []))
     elif action.discrete:
         mine = np.array(at.wires_of(len(seat.loop.model.wires)))
         for i, mode in enumerate(action.modes):
@@ -54,17 +55,27 @@ def fuse_seat(seat: Seat) -> Constants | Refused:
     c[of.REWARD_SCALE], c[of.GAP_SHAPING], c[of.ERROR_SHAPING] = paid.error_scale, paid.gap_shaping, paid.error_shaping
     c[of.GAMMA_PAID], c[of.ILLEGAL], c[of.COST] = paid.gamma, paid.illegal_penalty, paid.attack_cost
     c[of.BUDGET_SHARE] = threat.budget or 1.0
-    assert seat.loop.model.gap is not None
-    c[of.BELIEF] = 1.0 if several else seat.loop.model.gap[0, 0]
+    if several:
+        c[of.BELIEF] = 1.0
+    else:
+        assert seat.loop.model.gap is not None
+        c[of.BELIEF] = seat.loop.model.gap[0, 0]
+    if not road:
+        c[of.GAP_SHAPING] = 0.0  # nobody is ahead
     scales = SCALES | {"progress": float(seat.loop.horizon)}
-    most = {wire: min(bound, LAST_SCALE) for wire, bound in zip(seat.loop.model.wires, seat.action.brief.bounds.tolist(), strict=True)}
+    limit = LAST_SCALE if road else np.inf
+    most = {wire: min(bound, limit) for wire, bound in zip(seat.loop.model.wires, seat.action.brief.bounds.tolist(), strict=True)}
     most |= {"power": threat.jam_power, "delay": threat.delay_bound}
     quantities: dict[str, tuple[Any, Any]] = lane.QUANTITIES | ({} if f[of.REAR] else lane.ALONE)
     if f[of.AIRED]:
         from . import radar
 
         quantities = quantities | radar.QUANTITIES
-    if several:
+    if not road:
+        from . import network_seat
+
+        quantities = network_seat.quantities(f, seat.loop)
+    elif several:
         from . import platoon_seat
 
         quantities = platoon_seat.quantities(columns, f, seat.loop)

@@ -89,6 +89,7 @@ RESPONSE, CLEARANCE, DISTANCE, WATCH = _number("response"), _number("clearance")
 # a platoon: gaps at the start (mean, sd, to either side), what cars are told of the start, sensors, what f keeps of itself in a step
 GAPS, PRIOR_SD, NOISE_SD, FADES = _number("gaps", 3), _number("prior_sd"), _number("noise_sd", 3), _number("fades")
 LOSS = _number("loss")  # probability that a reading or a message is lost
+STATE_SD, WALK_SD, READ_SD = _number("state_sd"), _number("walk_sd"), _number("read_sd")  # a network: of its start, of a step, of readings
 NUMBERS = len(_numbers)
 
 AIRED = _choice("aired")  # a car with a radar
@@ -118,6 +119,12 @@ ALONE, STEPPED, PULLED = _choice("alone"), _choice("stepped"), _choice("pulled")
 STEP_WIDE, IN_HEARS = _choice("step wide"), _choice("hears")  # how far apart the gains of two steps are; who reads whose sensors
 ESTIMATOR, SHAPE, IN_SHAPE = _choice("estimator"), _choice("shape"), _choice("in shape")  # and what is made of an innovation before
 IN_VICTIMS, IN_WIRES, IN_MODES, PROFILED = (_choice(name) for name in ("victims", "wires", "modes", "profiled"))
+# a network, which is no road: readings of an agent; wires that may be attacked; where things begin, and the matrices of plant and sensors
+SENSED, WIRED = _choice("sensed"), _choice("wired")
+SENTS, BELIEFS = _choice("sents"), _choice("beliefs")
+ARRIVALS, VALIDS, RESIDUES, TAKEN = (_choice(name) for name in ("arrivals", "valids", "residues", "taken"))
+SCORES, ALARMS, ABSENT, ASIDE = (_choice(name) for name in ("scores", "alarms", "absent", "aside"))
+IN_OWN, IN_MEASURE, IN_SOME_WIDE = (_choice(name) for name in ("own", "measure", "some wide"))
 CHOICES = len(_choices)
 
 # manoeuvres, detectors, mitigations

@@ -69,7 +69,8 @@ class Memory:
         blocks, actions = -(-batch // LANES), int(f[of.ACTIONS])
         kept = COMMON if f[of.CARS] else RADAR_STATE if f[of.AIRED] else STATE
         whole, victims = ROWS + int(f[of.ROOM]), int(f[of.VICTIMS])
-        asking, written = 2 + OF_VICTIM * victims if victims else ASKED, PLACES + OF_VICTIM * victims
+        aimed = 2 * int(f[of.WIRED]) if f[of.SENSED] else OF_VICTIM * victims
+        asking, written = 2 + aimed if f[of.CARS] else ASKED, PLACES + aimed
         deep = whole if blocks <= (1 if f[of.CARS] else FEW) else kept  # many blocks share one place to work at, which stays in the cache
         sizes = {
             AT_ROWS: blocks * deep * LANES, AT_WINDOW: blocks * window * LANES, AT_INTENT: blocks * intents * LANES, AT_C: len(c),

@@ -9,7 +9,8 @@ import numpy as np
 
 from tailgate import num
 from tailgate.agents.codec import Mode
-from tailgate.core import Array
+from tailgate.agents.scripted import Dropout
+from tailgate.core import Array, Attack
 from tailgate.core import Mode as Asked
 from tailgate.envs.cacc import FeedForward
 from tailgate.envs.consensus_cacc import Consensus
@@ -29,6 +30,7 @@ from tailgate.loop import Loop
 
 from . import constants as of
 from . import platoon_gains as gains
+from . import script
 from .constants import put
 from .platoon_rows import AIM_ROWS, BELIEF, CAR_ROWS, LAW, LINKS, SENSORS, VICTIM_ROWS, WORK_ROWS
 from .rows import LANES, ROWS
@@ -68,18 +70,18 @@ class Table:
         return at
 
 
-def unknown(loop: Loop) -> str:
+def unknown(loop: Loop, attack: Attack | None) -> str:
     """Why this loop is no platoon with a lane; empty where it is one."""
-    return _parts(loop) or _defence(loop)
+    return _parts(loop) or defence(loop, attack)
 
 
-def fill(loop: Loop, c: Array, f: Array, profile: Array) -> tuple[Array, int]:
+def fill(loop: Loop, attack: Attack | None, c: Array, f: Array, profile: Array) -> tuple[Array, int]:
     """Fills in c and f. -> the table, which begins with the speeds of a profile, and the rows of the window."""
     table = Table(profile if f[of.WAY] == of.PROFILE else np.zeros(0))
     f[of.PROFILED] = table.size
     _vehicles(loop, c, f)
-    _filter(loop, _threat(loop, f, table), c, f, table)
-    _detector(loop.plan.defence, c, f)
+    _filter(loop, _threat(loop, f, table), drops(loop, attack), c, f, table)
+    detector(loop.plan.defence, c, f)
     _law(loop, c, f, table)
     return np.concatenate(table.parts), _places(f, c[of.LOSS] > 0.0)
 
@@ -96,7 +98,13 @@ def _parts(loop: Loop) -> str:
     return "" if loop.model.inputs == 1 and loop.model.states > 1 else "a model with several inputs has no lane"
 
 
-def _defence(loop: Loop) -> str:
+def drops(loop: Loop, attack: Attack | None) -> bool:
+    """Whether readings may be made to go missing: where that is granted, by anybody but a script that does something else."""
+    return "dropout" in loop.threat.kinds and (type(attack) is Dropout or not script.known(attack))
+
+
+def defence(loop: Loop, attack: Attack | None) -> str:
+    """Why a defence of several agents has no lane."""
     defence = loop.defence
     if type(defence) is Raw:
         return "a state that the known input decides has no lane" if loop.plan.defence.by_input.any() else ""
@@ -106,7 +114,7 @@ def _defence(loop: Loop) -> str:
     estimator, detector, mitigation = defence.parts()
     if type(estimator) not in ESTIMATORS:
         return f"filter {type(estimator).__name__} has no lane"
-    if why := "" if estimator.steady else _stepped(estimator, loop):
+    if why := "" if estimator.steady else _stepped(estimator, loop, attack):
         return why
     if estimator.steady and type(estimator) is KalmanFilter:
         return "a steady filter on the own sensors has no lane"  # nor a steady state, where cars are behind
@@ -121,19 +129,19 @@ def _defence(loop: Loop) -> str:
     return "" if any(known) else f"mitigation {type(mitigation).__name__} has no lane"
 
 
-def _stepped(estimator: Any, loop: Loop) -> str:
+def _stepped(estimator: Any, loop: Loop, attack: Attack | None) -> str:
     """Why a gain that follows the covariance has no lane."""
     if type(estimator) not in (KalmanFilter, ConsensusFilter):
         return "fusion by covariances of each row has no lane"
-    if "dropout" in loop.threat.kinds or loop.link.loss:
+    if drops(loop, attack) or loop.link.loss:
         return "covariances that depend on what is missed have no lane"
     pulled = type(estimator) is ConsensusFilter
     if pulled and estimator.share:
         return "readings that are shared have no lane"
-    return "" if gains.numbers(loop.model, pulled) * _steps(loop) <= gains.MOST else "so many gains have no lane"
+    return "" if gains.numbers(loop.model, pulled) * steps(loop) <= gains.MOST else "so many gains have no lane"
 
 
-def _steps(loop: Loop) -> int:
+def steps(loop: Loop) -> int:
     """How many steps have gains of their own: those of an episode, and of one that is over and waits for the next."""
     return loop.horizon + 200
 
@@ -165,12 +173,12 @@ def _threat(loop: Loop, f: Array, table: Table) -> Array:
     return victims
 
 
-def _filter(loop: Loop, victims: Array, c: Array, f: Array, table: Table) -> None:
+def _filter(loop: Loop, victims: Array, dropped: bool, c: Array, f: Array, table: Table) -> None:
     """A, B, c, what fuses, and the gain: for each victim also with each set of sensors, or for each step."""
     held, model = loop.plan.defence, loop.model
     f[of.IN_A] = table.listed(model.A, np.arange(model.states) * LANES)
     f[of.IN_B], f[of.IN_C], c[of.FACTOR] = table.add(model.B[:, 0]), table.add(model.c), 1.0
-    f[of.IN_HEARD], f[of.IN_READS] = _lists(neighbours(model.graph), table), table.add(np.argmax(model.C, axis=2))
+    f[of.IN_HEARD], f[of.IN_READS] = lists(neighbours(model.graph), table), table.add(np.argmax(model.C, axis=2))
     if type(loop.defence) is Raw:
         f[of.ESTIMATOR] = of.READ
         told = [one for each in held.rounds for one in zip(*each, strict=True)]
@@ -180,12 +188,12 @@ def _filter(loop: Loop, victims: Array, c: Array, f: Array, table: Table) -> Non
     f[of.ESTIMATOR], c[of.PRICE] = ESTIMATORS[type(part)], getattr(part, "gamma", 0.0)
     f[of.ALONE] = type(part) in (KalmanFilter, ConsensusFilter)
     if not part.steady:
-        each = gains.by_step(part, held.mitigation, model, loop.plant.prior_var, _steps(loop))  # type: ignore[attr-defined]
+        each = gains.by_step(part, held.mitigation, model, loop.plant.prior_var, steps(loop))  # type: ignore[attr-defined]
         f[of.STEPPED], f[of.STEP_WIDE], f[of.IN_W] = len(each), each[0].size, table.add(each)
         f[of.PULLED] = type(part) is ConsensusFilter and part.consensus > 0.0
         return
     f[of.IN_L], f[of.IN_MERGE] = table.add(plan.L), table.add(plan.merge)
-    misses = np.arange(len(model.C)) if c[of.LOSS] else victims if "dropout" in loop.threat.kinds else victims[:0]
+    misses = np.arange(len(model.C)) if c[of.LOSS] else victims if dropped else victims[:0]
     f[of.MISSES], f[of.IN_MISSES] = len(misses), table.add(misses.astype(np.int64))
     _sets(held, plan, misses, c, f, table)
 
@@ -214,7 +222,7 @@ def _sets(held: ComposedPlan, fusion: Any, misses: Array, c: Array, f: Array, ta
     f[of.SHAPE], f[of.IN_SHAPE] = (len(shapes[0]) if shapes else 0), table.add(np.array(shapes, np.float64))
 
 
-def _detector(held: Any, c: Array, f: Array) -> None:
+def detector(held: Any, c: Array, f: Array) -> None:
     if not isinstance(held, ComposedPlan):  # none, which never alarms
         c[of.THRESHOLD] = np.inf
         return
@@ -224,7 +232,7 @@ def _detector(held: Any, c: Array, f: Array) -> None:
     c[of.THRESHOLD] = held.detector_plan if type(part) is TailChiSquare else getattr(part, "eta", np.inf)
 
 
-def _lists(heard: tuple[tuple[int, ...], ...], table: Table) -> int:
+def lists(heard: tuple[tuple[int, ...], ...], table: Table) -> int:
     """N(i) of all cars, behind where each begins. -> where that is."""
     begin = table.size + len(heard) + 1
     at = table.add(begin + np.cumsum([0, *map(len, heard)]))
@@ -261,7 +269,7 @@ def _places(f: Array, lossy: bool) -> int:
     return cars * record + victims * VICTIM_ROWS
 
 
-def modes(table: Array, f: Array, known: Sequence[Mode]) -> Array:
+def modes(loop: Loop, table: Array, f: Array, known: Sequence[Mode]) -> Array:
     """The table with the discrete actions behind it: kind, sign, and each victim's targets and values."""
     victims = table[f[of.IN_VICTIMS] : f[of.IN_VICTIMS] + f[of.VICTIMS]].view(np.int64)
     f[of.IN_MODES] = len(table)

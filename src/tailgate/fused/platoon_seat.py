@@ -136,10 +136,10 @@ def _fill(s, victim, aim, granted, c, f, action, first, n):
 
 
 @phase
-def look(s, window, c, f, paid, flags, count, mask, first, n):
+def look(s, window, c, f, table, paid, flags, count, mask, first, n):
     """What the information of a step shows of the state that it led to, and what the observation needs of it."""
     road.look_ahead(s, window, f, n)
-    seat.look(s, window, c, f, paid, flags, count, mask, first, n)
+    seat.look(s, window, c, f, table, paid, flags, count, mask, first, n)
     for j in range(f[of.CARS]):
         car, work = window[j * f[of.CAR] : (j + 1) * f[of.CAR]], s[f[of.WORKS] + j * WORK : f[of.WORKS] + (j + 1) * WORK]
         for i in range(n):
