@@ -28,7 +28,7 @@ _NOTHING = -0.0  # a sum that begins so begins with its first number
 
 def room(q: int, n: int) -> int:
     """Rows that are worked in: S^-1 times r, and behind it matrices of eight episodes, or what a single one is solved in."""
-    return q + -(-(q * q + 2 * q * n) // (LANES // WIDTH)) + -(-(2 * q * (n + q) + 8 * q) // LANES) + 1
+    return q + max(5, -(-(q * q + 2 * q * n) // (LANES // WIDTH)) + -(-(2 * q * (n + q) + 8 * q) // LANES) + 1)
 
 
 @phase
@@ -130,14 +130,46 @@ def _bound(s, table, f, j, n):
     """Of an agent, the dual u; of its shape there are the axes' turn and lam times half their lengths."""
     q, first, shape = f[of.SENSED], j * f[of.SENSED] * LANES, f[of.IN_SHAPE] + j * (f[of.SENSED] + 1) * f[of.SENSED]
     product(table, shape, q, q, s, f[of.RESIDUES] + first, 0.0, s, f[of.ASIDE])
-    some, half = s[f[of.ASIDE] + q * LANES :], table[shape + q * q : shape + q * q + q]
-    for i in range(int(n)):
-        w, u = some[:q], some[q : 2 * q]
-        for m in range(q):
-            w[m] = s[f[of.ASIDE] + m * LANES + i]
-        ball(q, w, half, u)
-        for m in range(q):
-            s[f[of.TAKEN] + first + m * LANES + i] = u[m]
+    w, half, at = s[f[of.ASIDE] : f[of.ASIDE] + q * LANES], table[shape + q * q : shape + q * q + q], f[of.ASIDE] + q * LANES
+    mu, size, on = s[at : at + LANES], s[at + LANES : at + 2 * LANES], s[at + 2 * LANES : at + 3 * LANES]
+    _into_ball(w, half, mu, size, on, s[at + 3 * LANES : at + 4 * LANES], s[at + 4 * LANES : at + 5 * LANES], n)
+    for m in range(q):
+        x, c, u = w[m * LANES : (m + 1) * LANES], half[m], s[f[of.TAKEN] + first + m * LANES : f[of.TAKEN] + first + (m + 1) * LANES]
+        for i in range(n):
+            u[i] = x[i] / (c + mu[i]) / size[i] if x[i] != 0.0 else 0.0
+
+
+@phase
+def _into_ball(w, half, mu, size, on, one, other, n):
+    """`linear.ball` of rows w, of all episodes at once: mu and the length; each takes as many rounds as it does alone."""
+    beyond, rounds, largest = 0, 0, 0.0
+    for i in range(n):
+        mu[i] = one[i] = other[i] = 0.0
+    for m in range(len(half)):
+        x, c = w[m * LANES : (m + 1) * LANES], half[m]
+        largest = max(largest, c)
+        for i in range(n):
+            share = x[i] / c if x[i] != 0.0 else 0.0
+            mu[i], one[i], other[i] = max(mu[i], abs(x[i]) - c), one[i] + x[i] * x[i], other[i] + share * share
+    for i in range(n):
+        outside, least = other[i] > 1.0, max(mu[i], np.sqrt(one[i]) - largest)
+        mu[i], size[i], on[i] = least if outside else 0.0, 1.0, 1.0 if outside else 0.0
+        beyond += 1 if outside else 0
+    while beyond > 0 and rounds < 100:
+        for i in range(n):
+            one[i] = other[i] = 0.0
+        for m in range(len(half)):
+            x, c = w[m * LANES : (m + 1) * LANES], half[m]
+            for i in range(n):
+                z = x[i] / (c + mu[i]) if x[i] != 0.0 else 0.0
+                one[i], other[i] = one[i] + z * z, other[i] + (z * z / (c + mu[i]) if z != 0.0 else 0.0)
+        beyond, rounds = 0, rounds + 1
+        for i in range(n):
+            length, searches = np.sqrt(one[i]), on[i] != 0.0
+            step = one[i] * (length - 1.0) / other[i]
+            goes = searches & (step > 1e-15 * mu[i])
+            size[i], mu[i], on[i] = length if searches else size[i], mu[i] + step if goes else mu[i], 1.0 if goes else 0.0
+            beyond += 1 if goes else 0
 
 
 # -- who lacks readings
