@@ -5,7 +5,6 @@ from __future__ import annotations
 import ctypes
 import math
 import struct
-from importlib import import_module
 from itertools import accumulate
 from typing import TYPE_CHECKING, Any
 
@@ -35,16 +34,17 @@ def fuse_seat(seat: Seat) -> Constants | Refused:
     if isinstance(k, Refused):
         return k
     c, f, action, paid, threat = k.c, k.f, seat.action, seat.reward, seat.loop.threat
-    columns, several = [name for name, _ in seat.observation.columns], f[of.CARS] > 0
-    if len(columns) > of.COMPONENTS or (action.discrete and not several and action.size > of.MODES):
+    columns, many = [name for name, _ in seat.observation.columns], f[of.CARS] > 0
+    if len(columns) > of.COMPONENTS or (action.discrete and not many and action.size > of.MODES):
         return Refused("too many components or actions")
     f[of.ACTION], f[of.ACTIONS] = _ACTIONS[action.spec.action], 1 if action.discrete else action.size
     f[of.REWARD], f[of.FEATURES] = _REWARDS[paid.reward], len(columns)
     c[of.RATE], c[of.HORIZON], c[of.SEEN_MOST] = action.spec.rate, seat.loop.horizon, LIMIT
     road = not f[of.SENSED]
-    if several:
-        built = import_module(f"tailgate.fused.{'platoon' if road else 'network'}_build")
-        k = k._replace(table=built.modes(seat.loop, k.table, f, action.modes if action.discrete else []))
+    if many:
+        from . import several  # which a single car does without
+
+        k = k._replace(table=several.modes(seat.loop, k.table, f, action.modes if action.discrete else []))
     elif action.discrete:
         mine = np.array(at.wires_of(len(seat.loop.model.wires)))
         for i, mode in enumerate(action.modes):
@@ -55,7 +55,7 @@ def fuse_seat(seat: Seat) -> Constants | Refused:
     c[of.REWARD_SCALE], c[of.GAP_SHAPING], c[of.ERROR_SHAPING] = paid.error_scale, paid.gap_shaping, paid.error_shaping
     c[of.GAMMA_PAID], c[of.ILLEGAL], c[of.COST] = paid.gamma, paid.illegal_penalty, paid.attack_cost
     c[of.BUDGET_SHARE] = threat.budget or 1.0
-    if several:
+    if many:
         c[of.BELIEF] = 1.0
     else:
         assert seat.loop.model.gap is not None
@@ -72,10 +72,8 @@ def fuse_seat(seat: Seat) -> Constants | Refused:
 
         quantities = quantities | radar.QUANTITIES
     if not road:
-        from . import network_seat
-
-        quantities = network_seat.quantities(f, seat.loop)
-    elif several:
+        quantities = several.shown(seat.loop, f)
+    elif many:
         from . import platoon_seat
 
         quantities = platoon_seat.quantities(columns, f, seat.loop)

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from tailgate import num
-from tailgate.agents.codec import Mode
 from tailgate.core import Array, Attack
 from tailgate.envs.network import LinearSensors, NoControl, SensorNetwork
 from tailgate.estimators.consensus import ConsensusFilter
@@ -17,11 +15,11 @@ from tailgate.estimators.kalman import KalmanFilter
 from tailgate.loop import Loop
 
 from . import constants as of
-from . import platoon_build as several
+from . import platoon_build as platoon
 from . import platoon_gains as gains
+from . import several
+from .constants import Table
 from .rows import LANES, ROWS
-
-_WIRE = 4  # rows of a wire's record, in the window and in s
 
 
 def unknown(loop: Loop, attack: Attack | None) -> str:
@@ -32,23 +30,23 @@ def unknown(loop: Loop, attack: Attack | None) -> str:
     if min(len(loop.model.sensors), loop.model.states) < 2:
         return "a single sensor or state has no lane"
     R = loop.model.R
-    if several.drops(loop, attack) and (R * (1.0 - np.eye(R.shape[1]))).any():
+    if platoon.drops(loop, attack) and (R * (1.0 - np.eye(R.shape[1]))).any():
         return "noises that depend on each other have no lane"
-    return several.defence(loop, attack)
+    return platoon.defence(loop, attack)
 
 
 def fill(loop: Loop, attack: Attack | None, c: Array, f: Array, profile: Array) -> tuple[Array, int]:
     """Fills in c and f. -> the table, and the rows of the window. No manoeuvre moves anything."""
-    plant, sensor, table = loop.plan.plant, loop.plan.sensor, several.Table(profile)
+    plant, sensor, table = loop.plan.plant, loop.plan.sensor, Table(profile)
     assert isinstance(loop.plant, SensorNetwork)
     f[of.CARS], f[of.STATES] = loop.plant.size
     f[of.SENSED], f[of.WIRED] = len(loop.model.sensors), np.count_nonzero(loop.plan.channel.granted)
     f[of.IN_OWN], f[of.IN_MEASURE] = table.add(plant.A[0]), table.add(sensor.C)
     c[of.DT], c[of.STATE_SD], c[of.WALK_SD], c[of.READ_SD] = loop.plant.dt, loop.plant.initial_sd, plant.noise_sd, sensor.sd
     window = _places(f)
-    _wires(loop, f, table)
-    _filter(loop, several.drops(loop, attack), c, f, table)
-    several.detector(loop.plan.defence, c, f)
+    several.listed(loop, f, table, lambda i, w: _wires(f, i, w))
+    _filter(loop, platoon.drops(loop, attack), c, f, table)
+    platoon.detector(loop.plan.defence, c, f)
     return np.concatenate(table.parts), window
 
 
@@ -58,46 +56,39 @@ def _places(f: Array) -> int:
     from .network_defence import room
 
     last = states
-    for name, rows in ((of.SENTS, agents * q), (of.BELIEFS, agents * states), (of.HUNTED, count * _WIRE)):
+    for name, rows in ((of.SENTS, agents * q), (of.BELIEFS, agents * states), (of.HUNTED, count * several.WIRE_ROWS)):
         f[name], last = last * LANES, last + rows
     window, last = last, ROWS
     for name, rows in (
-        (of.AIMS, count * _WIRE + agents), (of.TRUTHS, states), (of.FUSED, agents * states), (of.SENDS, agents * states), (of.FORE, states),
-        (of.ARRIVALS, agents * q), (of.VALIDS, agents * q), (of.RESIDUES, agents * q), (of.TAKEN, agents * q), (of.SCORES, agents),
-        (of.ALARMS, agents), (of.ABSENT, agents), (of.ASIDE, room(q, states)), (of.DEALT, max(states, agents * q) + 1),
+        (of.AIMS, count * several.WIRE_ROWS + agents), (of.TRUTHS, states), (of.FUSED, agents * states), (of.SENDS, agents * states),
+        (of.FORE, states), (of.ARRIVALS, agents * q), (of.VALIDS, agents * q), (of.RESIDUES, agents * q), (of.TAKEN, agents * q),
+        (of.SCORES, agents), (of.ALARMS, agents), (of.ABSENT, agents), (of.ASIDE, room(q, states)), (of.DEALT, max(states, agents * q) + 1),
     ):  # fmt: skip
         f[name], last = last * LANES, last + rows
     f[of.ROOM] = last - ROWS
     return window
 
 
-def _wires(loop: Loop, f: Array, table: several.Table) -> None:
-    """The wires that may be attacked, as `tailgate.fused.wires` reads them, and whose they are."""
-    plan, q = loop.plan.channel, int(f[of.SENSED])
-    each = np.argwhere(plan.granted)
-    i, w = each[:, 0], each[:, 1]
-    victims, mine = np.flatnonzero(plan.granted.any(axis=1)), np.flatnonzero(plan.granted.any(axis=0))
-    place = 1 + np.searchsorted(victims, i) * len(mine) + np.searchsorted(mine, w)
-    at, first = (i * q + w) * LANES, np.diff(i, prepend=-1) != 0
-    f[of.VICTIMS], f[of.IN_VICTIMS] = len(victims), table.add(victims.astype(np.int64))
-    f[of.IN_WIRES] = table.add(np.stack([
-        plan.bounds[w], plan.low[w], plan.high[w], place, i * q + w, i, f[of.SENTS] + at, f[of.ARRIVALS] + at, f[of.VALIDS] + at,
-        np.zeros(len(i)), first,
-    ], axis=1).astype(np.float64))  # fmt: skip
+def _wires(f: Array, i: Array, w: Array) -> tuple[Array, Array, Array, Array]:
+    """Where what is sent to agents i on wires w stands, what arrives, and whether it does: all of them are readings."""
+    at = (i * f[of.SENSED] + w) * LANES
+    return f[of.SENTS] + at, f[of.ARRIVALS] + at, f[of.VALIDS] + at, np.zeros(len(i))
 
 
-def _filter(loop: Loop, drops: bool, c: Array, f: Array, table: several.Table) -> None:
+def _filter(loop: Loop, drops: bool, c: Array, f: Array, table: Table) -> None:
     """A, what fuses, C, S^-1 and the gain; where readings may be missing, what the gain is made of."""
     held, model = loop.plan.defence, loop.model
     part: Any = held.filter
     plan: Any = getattr(held.filter_plan, "linear", held.filter_plan)
-    f[of.IN_A], f[of.IN_READS], f[of.IN_HEARD] = table.add(model.A), table.add(model.C), several.lists(neighbours(model.graph), table)
-    f[of.ESTIMATOR], c[of.PRICE], c[of.FACTOR] = several.ESTIMATORS[type(part)], getattr(part, "gamma", 0.0), 1.0
-    f[of.ALONE], f[of.MISSES] = type(part) in (KalmanFilter, ConsensusFilter), drops
+    f[of.IN_A], f[of.IN_READS], f[of.IN_HEARD] = table.add(model.A), table.add(model.C), platoon.lists(neighbours(model.graph), table)
+    f[of.ESTIMATOR], c[of.PRICE], c[of.FACTOR] = platoon.ESTIMATORS[type(part)], getattr(part, "gamma", 0.0), 1.0
+    f[of.ALONE] = type(part) in (KalmanFilter, ConsensusFilter)
+    misses = np.flatnonzero(loop.plan.channel.granted.any(axis=1) & drops)
+    f[of.MISSES], f[of.IN_MISSES] = len(misses), table.add(misses.astype(np.int64))
     if f[of.ESTIMATOR] == of.LINEAR:
         f[of.TAKEN] = f[of.RESIDUES]
     if not part.steady:
-        each = gains.by_step(part, held.mitigation, model, loop.plant.prior_var, several.steps(loop))  # type: ignore[attr-defined]
+        each = gains.by_step(part, held.mitigation, model, loop.plant.prior_var, platoon.steps(loop))  # type: ignore[attr-defined]
         f[of.STEPPED], f[of.STEP_WIDE], f[of.IN_W] = len(each), each[0].size, table.add(each)
         f[of.PULLED] = type(part) is ConsensusFilter and part.consensus > 0.0
         return
@@ -118,11 +109,3 @@ def _filter(loop: Loop, drops: bool, c: Array, f: Array, table: several.Table) -
 def _each(parts: list[Array]) -> Array:
     """(N, .) of each agent all parts (N, ...), one after the other."""
     return np.concatenate([np.ascontiguousarray(part).reshape(len(part), -1) for part in parts], axis=1)
-
-
-def modes(loop: Loop, table: Array, f: Array, known: Sequence[Mode]) -> Array:
-    """The table with the discrete actions behind it: kind, sign, and each wire's target and value."""
-    i, w = np.argwhere(loop.plan.channel.granted).T
-    f[of.IN_MODES] = len(table)
-    parts = [((mode.kind, mode.sign), mode.target[i, w], mode.value[w]) for mode in known]
-    return np.concatenate([table, *(np.asarray(part, np.float64) for mode in parts for part in mode)])

@@ -179,8 +179,8 @@ def _into_ball(w, half, mu, size, on, one, other, n):
 def again(s, window, table, c, f, n):
     """Score and estimate again of eight episodes at a time in which an agent lacks a reading."""
     whole = table.view(np.int64)
-    for h in range(f[of.VICTIMS]):
-        j = whole[f[of.IN_VICTIMS] + h]
+    for h in range(f[of.MISSES]):
+        j = whole[f[of.IN_MISSES] + h]
         for lane in range(0, LANES, WIDTH):
             absent = 0.0
             for i in range(lane, lane + WIDTH):

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from tailgate import num
-from tailgate.agents.codec import Mode
 from tailgate.agents.scripted import Dropout
 from tailgate.core import Array, Attack
 from tailgate.core import Mode as Asked
@@ -30,10 +28,11 @@ from tailgate.loop import Loop
 
 from . import constants as of
 from . import platoon_gains as gains
-from . import script
-from .constants import put
-from .platoon_rows import AIM_ROWS, BELIEF, CAR_ROWS, LAW, LINKS, SENSORS, VICTIM_ROWS, WORK_ROWS
+from . import script, several
+from .constants import Table, put
+from .platoon_rows import APPLIED, ARRIVED, BELIEF, CAR_ROWS, COMMAND, LAW, LINKS, SENSORS, SENT, VALID, WORK_ROWS
 from .rows import LANES, ROWS
+from .several import WIRE_ROWS
 
 PARTS, LAWS = (Platoon, PlatoonSensors), (FeedForward, Consensus, Ploeg)
 ESTIMATORS = {
@@ -41,33 +40,6 @@ ESTIMATORS = {
     KalmanFilter: of.LINEAR, ConsensusFilter: of.LINEAR,
 }  # fmt: skip
 DETECTORS = (Score, ChiSquare, TailChiSquare, AlwaysAlarm)
-
-
-class Table:
-    """Numbers one after the other; whole ones by their bits."""
-
-    def __init__(self, first: Array) -> None:
-        self.parts, self.size = [first], len(first)
-
-    def add(self, values: Any) -> int:
-        """-> where they begin."""
-        flat = np.array(values).ravel()
-        flat = flat.astype(np.float64) if flat.dtype.kind == "f" else flat.astype(np.int64).view(np.float64)
-        self.parts.append(flat)
-        self.size += len(flat)
-        return self.size - len(flat)
-
-    def listed(self, matrix: Array, place: Array) -> int:
-        """What is not zero of a matrix, row after row: how many, where the values of each row begin, the values, and the place of each."""
-        rows, columns = np.nonzero(matrix)
-        first = self.size + 1 + len(matrix) + 1
-        starts = first + np.searchsorted(rows, np.arange(len(matrix) + 1))
-        at = self.add([len(rows)])
-        self.add(starts)
-        self.add(matrix[rows, columns].astype(np.float64))
-        places = np.broadcast_to(place, matrix.shape)[rows, columns]
-        self.add(places.astype(np.int64))
-        return at
 
 
 def unknown(loop: Loop, attack: Attack | None) -> str:
@@ -80,10 +52,12 @@ def fill(loop: Loop, attack: Attack | None, c: Array, f: Array, profile: Array) 
     table = Table(profile if f[of.WAY] == of.PROFILE else np.zeros(0))
     f[of.PROFILED] = table.size
     _vehicles(loop, c, f)
-    _filter(loop, _threat(loop, f, table), drops(loop, attack), c, f, table)
+    window = _places(f, c[of.LOSS] > 0.0)
+    several.listed(loop, f, table, lambda i, w: _wires(f, i, w))
+    _filter(loop, drops(loop, attack), c, f, table)
     detector(loop.plan.defence, c, f)
     _law(loop, c, f, table)
-    return np.concatenate(table.parts), _places(f, c[of.LOSS] > 0.0)
+    return np.concatenate(table.parts), window
 
 
 def _parts(loop: Loop) -> str:
@@ -150,6 +124,7 @@ def _vehicles(loop: Loop, c: Array, f: Array) -> None:
     plant, plan = loop.plant, loop.plan.plant
     assert isinstance(plant, Platoon)
     f[of.CARS], f[of.STATES] = plant.size
+    f[of.WIRED] = np.count_nonzero(loop.plan.channel.granted)
     f[of.INPUT_KNOWN], f[of.ENDS] = plant.leader_input_known, loop.ends_on_collision
     c[of.DT], c[of.LOAD], c[of.LEAD_START + 1] = plant.dt, loop.load, plant.speed
     put(c, of.OWN_A, plan.A)
@@ -160,20 +135,16 @@ def _vehicles(loop: Loop, c: Array, f: Array) -> None:
     c[of.PRIOR_SD], c[of.LOSS] = plant.initial_sd, loop.link.loss
 
 
-def _threat(loop: Loop, f: Array, table: Table) -> Array:
-    """The victims, and what may be done to each of their wires. -> who they are."""
-    plan = loop.plan.channel
-    victims = np.flatnonzero(plan.granted.any(axis=1))
-    f[of.VICTIMS], f[of.IN_VICTIMS] = len(victims), table.add(victims.astype(np.int64))
-    mine = plan.granted.any(axis=0)
-    place, wires = np.where(mine, np.cumsum(mine), 0), []  # of each wire in a vector of values, of the first victim
-    for h, i in enumerate(victims):
-        wires.append([plan.granted[i].astype(np.float64), plan.bounds, plan.low, plan.high, place + h * np.count_nonzero(mine)])
-    f[of.IN_WIRES] = table.add(np.array(wires, np.float64))
-    return victims
+def _wires(f: Array, i: Array, w: Array) -> tuple[Array, Array, Array, Array]:
+    """Where what is sent to cars i on wires w stands, what arrives, and whether it does; whether it is a command."""
+    car, work, row, acts = i * f[of.CAR], f[of.WORKS] + i * WORK_ROWS * LANES, w * LANES, w == LINKS
+    return (
+        np.where(acts, car + int(COMMAND), car + int(SENT) + row), np.where(acts, work + int(APPLIED), work + int(ARRIVED) + row),
+        np.where(w < SENSORS, work + int(VALID) + row, -1), acts,
+    )  # fmt: skip
 
 
-def _filter(loop: Loop, victims: Array, dropped: bool, c: Array, f: Array, table: Table) -> None:
+def _filter(loop: Loop, dropped: bool, c: Array, f: Array, table: Table) -> None:
     """A, B, c, what fuses, and the gain: for each victim also with each set of sensors, or for each step."""
     held, model = loop.plan.defence, loop.model
     f[of.IN_A] = table.listed(model.A, np.arange(model.states) * LANES)
@@ -193,7 +164,7 @@ def _filter(loop: Loop, victims: Array, dropped: bool, c: Array, f: Array, table
         f[of.PULLED] = type(part) is ConsensusFilter and part.consensus > 0.0
         return
     f[of.IN_L], f[of.IN_MERGE] = table.add(plan.L), table.add(plan.merge)
-    misses = np.arange(len(model.C)) if c[of.LOSS] else victims if dropped else victims[:0]
+    misses = np.flatnonzero(np.full(len(model.C), c[of.LOSS] > 0.0) | (loop.plan.channel.granted.any(axis=1) & dropped))
     f[of.MISSES], f[of.IN_MISSES] = len(misses), table.add(misses.astype(np.int64))
     _sets(held, plan, misses, c, f, table)
 
@@ -257,21 +228,13 @@ def _law(loop: Loop, c: Array, f: Array, table: Table) -> None:
 
 def _places(f: Array, lossy: bool) -> int:
     """Where records begin. -> rows of the window."""
-    cars, states, victims = int(f[of.CARS]), int(f[of.STATES]), int(f[of.VICTIMS])
+    cars, states, count = int(f[of.CARS]), int(f[of.STATES]), int(f[of.WIRED])
     record, last = CAR_ROWS + states + (SENSORS if lossy else 0), ROWS
     f[of.CAR], f[of.HUNTED], f[of.THERE] = record * LANES, cars * record * LANES, (CAR_ROWS + states) * LANES if lossy else 0
     for name, rows in (
-        (of.WORKS, cars * WORK_ROWS), (of.AIMS, victims * AIM_ROWS), (of.TRUTHS, states), (of.FUSED, cars * states),
+        (of.WORKS, cars * WORK_ROWS), (of.AIMS, count * WIRE_ROWS + cars), (of.TRUTHS, states), (of.FUSED, cars * states),
         (of.SENDS, cars * max(states, LINKS)), (of.FORE, states), (of.DEALT, max(LINKS * cars, states) + 3),
     ):  # fmt: skip
         f[name], last = last * LANES, last + rows
     f[of.ROOM] = last - ROWS
-    return cars * record + victims * VICTIM_ROWS
-
-
-def modes(loop: Loop, table: Array, f: Array, known: Sequence[Mode]) -> Array:
-    """The table with the discrete actions behind it: kind, sign, and each victim's targets and values."""
-    victims = table[f[of.IN_VICTIMS] : f[of.IN_VICTIMS] + f[of.VICTIMS]].view(np.int64)
-    f[of.IN_MODES] = len(table)
-    parts = [[(mode.kind, mode.sign), *(part for i in victims for part in (mode.target[i], mode.value))] for mode in known]
-    return np.concatenate([table, *(np.asarray(part, np.float64) for mode in parts for part in mode)])
+    return cars * record + count * WIRE_ROWS

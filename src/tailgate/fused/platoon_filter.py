@@ -11,11 +11,11 @@ from tailgate.vector import WIDTH, alike, get, put
 
 from . import constants as of
 from .compiled import formula, phase
-from .platoon_rows import AIM_ROWS, ARRIVED, BELIEF, SCORE, SENSORS, TOLD, VALID, WORK_ROWS, R
+from .platoon_rows import ARRIVED, BELIEF, SCORE, SENSORS, TOLD, VALID, WORK_ROWS, R
 from .rows import LANES
 from .rows import SCORE as SOUND
 
-WORK, AIM = WORK_ROWS * LANES, AIM_ROWS * LANES
+WORK = WORK_ROWS * LANES
 _SCORE, _VALID, _R, _BELIEF, _TOLD, _ARRIVED = (int(row) for row in (SCORE, VALID, R, BELIEF, TOLD, ARRIVED))
 SETS = 1 << SENSORS  # of sensors that are read
 _1, _2, _3, _4, _5, _6, _7 = (WIDTH * i for i in range(1, 8))  # a row is eight vectors
