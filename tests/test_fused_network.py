@@ -1,6 +1,7 @@
 """Networks in the fused engine, against the plain loop: the same bits over whole episodes."""
 
 import dataclasses
+from importlib.resources import files
 
 import numpy as np
 import pytest
@@ -53,7 +54,8 @@ CELLS = [
     (RESTLESS, "saturated_dkf", "fdi:value=5", {}),
     (WEAK, "saturated_dkf:eta=3,gamma=0.5", HALF, {}),
     (RESTLESS, "kf", "fdi:value=100", {}),
-    (NOISY, "kf", "program:path=sudden_bias", {"kinds": ("fdi",)}),
+    (NOISY, "kf", "program:path=sudden_bias", {}),
+    (WEAK, "consensus_kf", "ghost:size=20", {}),
     (WEAK, "composed:filter=kf,detector=chi2_tail,mitigation=accept_all", "dos_hold", {}),
     (RESTLESS, "consensus_kf", "fdi_ramp:rate=1.0,limit=100", {}),
     (WEAK, "consensus_kf:eta=4,consensus=0.3", "dos_jam", {}),
@@ -221,9 +223,12 @@ def test_lost_readings_a_look_ahead_and_seen_readings_have_no_lane():
     assert env.batch.engine == "plain"
 
 
-def test_a_script_that_drops_nothing_leaves_gains_that_are_the_same_in_all_rows():
+def test_an_attack_that_drops_nothing_leaves_gains_that_are_the_same_in_all_rows(tmp_path):
     """What is granted beyond that does not matter; what drops readings, or may, does."""
-    for attack, wanted in (("fdi", Constants), ("dos_hold", Constants), ("dropout", Refused), ("program:path=sudden_bias", Refused)):
+    program = tmp_path / "program.yaml"
+    program.write_text(files("tailgate.configs").joinpath("attacks/sudden_hold.yaml").read_text().replace("dos_hold", "dropout"))
+    known = "fdi", "dos_hold", "ghost:size=20", "fdi_sparse", "program:path=sudden_hold"
+    for attack, wanted in [(name, Constants) for name in known] + [(name, Refused) for name in ("dropout", f"program:path={program}")]:
         loop, rival = _loop(WEAK, "kf", attack)
         assert isinstance(fuse(loop, rival), wanted), attack
 

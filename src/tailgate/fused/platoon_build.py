@@ -7,7 +7,9 @@ from typing import Any
 import numpy as np
 
 from tailgate import num
-from tailgate.agents.scripted import Dropout
+from tailgate.agents.ghost import GhostState
+from tailgate.agents.program import Program
+from tailgate.agents.scripted import Dropout, InjectSparse
 from tailgate.core import Array, Attack
 from tailgate.core import Mode as Asked
 from tailgate.envs.cacc import FeedForward
@@ -73,8 +75,11 @@ def _parts(loop: Loop) -> str:
 
 
 def drops(loop: Loop, attack: Attack | None) -> bool:
-    """Whether readings may be made to go missing: where that is granted, by anybody but a script that does something else."""
-    return "dropout" in loop.threat.kinds and (type(attack) is Dropout or not script.known(attack))
+    """Whether readings may be made to go missing: where that is granted, by anybody who is not known to do something else."""
+    if isinstance(attack, Program) and type(attack) is Program:
+        return any(phase.kind == "dropout" for phase in attack.sheet.phases)
+    spares = script.known(attack) or type(attack) in (GhostState, InjectSparse)
+    return "dropout" in loop.threat.kinds and (type(attack) is Dropout or not spares)
 
 
 def defence(loop: Loop, attack: Attack | None) -> str:
