@@ -265,24 +265,27 @@ def _bound_again(s, window, table, c, f, j, lane, n):
     for i in range(lane, min(lane + WIDTH, int(n))):
         if s[f[of.ABSENT] + j * LANES + i] == 0.0:
             continue
+        left = 0  # those that are missing neither turn nor push
         for m in range(q):
-            r[m], keep = s[f[of.RESIDUES] + (j * q + m) * LANES + i], s[f[of.VALIDS] + (j * q + m) * LANES + i]
-            for e in range(states):
-                both[m * wide + e] = keep * table[known + m * states + e]
-            for k in range(q):
-                both[m * wide + states + k] = table[white + m] if k == m else 0.0
-        turn(both, q, wide, states)
-        for m in range(q):
+            r[m] = s[f[of.RESIDUES] + (j * q + m) * LANES + i]
+            if s[f[of.VALIDS] + (j * q + m) * LANES + i] != 0.0:
+                for e in range(states):
+                    both[left * wide + e] = table[known + m * states + e]
+                for k in range(q):
+                    both[left * wide + states + k] = table[white + m] if k == m else 0.0
+                left += 1
+        turn(both, left, wide, states)
+        for m in range(left):
             w[m] = half[m] = 0.0
             for k in range(q):
                 w[m] += both[m * wide + states + k] * r[k]
             for e in range(states):
                 half[m] += both[m * wide + e] * both[m * wide + e]
             half[m] = c[of.FACTOR] * (0.5 * half[m])
-        ball(q, w, half, u)
+        ball(left, w, half, u)
         for e in range(states):
             moved = 0.0
-            for m in range(q):
+            for m in range(left):
                 push = _NOTHING
                 for k in range(states):
                     push += both[m * wide + k] * table[spread + k * states + e]
