@@ -226,6 +226,7 @@ class AdversaryEnv(gymnasium.Env[Array, Any]):
         self.metadata = self.metadata | {"render_fps": self.batch.metadata["render_fps"]}
         self._cockpit: Cockpit | None = None  # where nothing stands between
         self._actions, self._over = self.batch._modes, False  # the second: the episode is over
+        self._damage = self.batch._facts[-1]
         self._usual = frozenset(range(self._actions))
         self._window: Any = None
         self._shown: LoopState | None = None  # in the window
@@ -242,8 +243,8 @@ class AdversaryEnv(gymnasium.Env[Array, Any]):
             seed = int(self.np_random.integers(2**31))
         played, self._over = self.batch.episodes, False
         if seed is None and self._cockpit is not None:
-            _, gap, step, _, _, illegal, collided, rear, allowed, seen, mask = self._cockpit.again_alone()
-            return seen, self._told(illegal, collided, rear, allowed, step, gap, mask)
+            _, damage, step, _, _, illegal, collided, rear, allowed, seen, mask = self._cockpit.again_alone()
+            return seen, self._told(illegal, collided, rear, allowed, step, damage, mask)
         observation, info = self.batch.reset(seed=seed)
         if isinstance(played, FusedEpisodes) and self.batch.seat.observation.frames == 1:
             self._cockpit = played.cockpit
@@ -258,13 +259,13 @@ class AdversaryEnv(gymnasium.Env[Array, Any]):
             raise InputError("step", [0], "an episode that is not over: reset() first")
         if not (type(action) in _WHOLE and action in self._usual):
             action = self.batch.checked(np.asarray(action)[None])[0]
-        reward, gap, step, terminated, truncated, illegal, collided, rear, allowed, seen, mask = self._cockpit.decide_alone(action)
+        reward, damage, step, terminated, truncated, illegal, collided, rear, allowed, seen, mask = self._cockpit.decide_alone(action)
         self._over = terminated or truncated
-        return seen, reward, terminated, truncated, self._told(illegal, collided, rear, allowed, step, gap, mask)
+        return seen, reward, terminated, truncated, self._told(illegal, collided, rear, allowed, step, damage, mask)
 
-    def _told(self, illegal: bool, collided: bool, rear: bool, allowed: bool, step: int, gap: float, mask: Array) -> dict[str, Any]:
+    def _told(self, illegal: bool, collided: bool, rear: bool, allowed: bool, step: int, damage: float, mask: Array) -> dict[str, Any]:
         info: dict[str, Any] = {
-            "illegal": illegal, "collided": collided, "rear_collided": rear, "allowed": allowed, "step": step, "gap": gap,
+            "illegal": illegal, "collided": collided, "rear_collided": rear, "allowed": allowed, "step": step, self._damage: damage,
         }  # fmt: skip
         if self._actions:
             info["action_mask"] = mask

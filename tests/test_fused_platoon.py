@@ -235,7 +235,7 @@ def test_a_single_environment_is_a_batch_of_one(action):
     ("platoon-gusty-v0", "consensus_kf:share=true", {"kinds": ["fdi"]}, "shared"),
     ("platoon-braking-v0", "lasso_dkf:solver=cvxpy", {}, "not the exact one"), ("platoon-braking-v0", "centralised_kf", {}, "no lane"),
     ("platoon-braking-v0", "chi2_dkf", {}, "no lane"), ("platoon-braking-v0", "dkf", {"knowledge": "white"}, "white-box"),
-    ("platoon-v2v-v0", "dkf", {}, "delay, replay"), ("thesis-ch6-v0", "dkf", {}, "no lane"), ("thesis-ch5-v0", "dkf", {}, "no lane"),
+    ("platoon-v2v-v0", "dkf", {}, "delay, replay"), ("thesis-ch6-v0", "dkf", {}, "no lane"),
     ("platoon-braking-v0", "composed:filter=dkf,detector=score,mitigation=accept_all,mitigation.mode=brake", {}, "mitigation AcceptAll"),
 ])  # fmt: skip
 def test_what_has_no_lane_is_played_by_the_plain_loop(scenario, defence, threat, why):

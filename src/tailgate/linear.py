@@ -101,26 +101,35 @@ def solve(m: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 @_jit
+def turn(x, q, p, n):
+    """Rotates q rows of p numbers each, one after the other in x, until their first n entries are orthogonal.
+
+    Jacobi's rotations from one side, pair by pair.
+    """
+    turned, sweep = True, 0
+    while turned and sweep < 60:
+        turned, sweep = False, sweep + 1
+        for i in range(0, (q - 1) * p, p):
+            for j in range(i + p, q * p, p):
+                a = b = g = 0.0
+                for k in range(n):
+                    v, w = x[i + k], x[j + k]
+                    a, b, g = a + v * v, b + w * w, g + v * w
+                if abs(g) <= 1e-15 * math.sqrt(a * b):
+                    continue
+                turned, half = True, (b - a) / (2.0 * g)
+                t = (1.0 if half >= 0.0 else -1.0) / (abs(half) + math.sqrt(half * half + 1.0))
+                c = 1.0 / math.sqrt(t * t + 1.0)
+                for k in range(p):
+                    v, w = x[i + k], x[j + k]
+                    x[i + k], x[j + k] = c * (v - t * w), c * (w + t * v)
+
+
+@_jit
 def turn_rows(x: np.ndarray, n: int) -> None:
-    """Rotates the rows of each x (M, q, p) until their first n entries are orthogonal: Jacobi's rotations from one side, pair by pair."""
+    """`turn` of each x (M, q, p)."""
     for m in range(x.shape[0]):
-        turned, sweep = True, 0
-        while turned and sweep < 60:
-            turned, sweep = False, sweep + 1
-            for i in range(x.shape[1] - 1):
-                for j in range(i + 1, x.shape[1]):
-                    a = b = g = 0.0
-                    for k in range(n):
-                        v, w = x[m, i, k], x[m, j, k]
-                        a, b, g = a + v * v, b + w * w, g + v * w
-                    if abs(g) <= 1e-15 * math.sqrt(a * b):
-                        continue
-                    turned, half = True, (b - a) / (2.0 * g)
-                    t = (1.0 if half >= 0.0 else -1.0) / (abs(half) + math.sqrt(half * half + 1.0))
-                    c = 1.0 / math.sqrt(t * t + 1.0)
-                    for k in range(x.shape[2]):
-                        v, w = x[m, i, k], x[m, j, k]
-                        x[m, i, k], x[m, j, k] = c * (v - t * w), c * (w + t * v)
+        turn(x[m].reshape(-1), x.shape[1], x.shape[2], n)
 
 
 @_jit
@@ -158,35 +167,42 @@ def ball_each(w: np.ndarray, c: np.ndarray, u: np.ndarray) -> None:
 
 @_jit
 def pair_each(r, S, W, half, y):
-    """The part of r (N, 2, B) that is believed (robust.py) into y, in closed form; S and W = S^-1 (N, 2, 2, B or 1), lam/2 (N, 2, B).
-
-    Nothing is an outlier, or both are, with one of four pairs of signs s and y = S (s lam) / 2, or one is.
-    """
+    """`pair` of r (N, 2, B) into y, with S and W = S^-1 (N, 2, 2, B or 1) and half (N, 2, B)."""
     for n in range(r.shape[0]):
         for b in range(r.shape[2]):
             at = b if S.shape[3] > 1 else 0
-            r0, r1, half0, half1 = r[n, 0, b], r[n, 1, b], half[n, 0, b], half[n, 1, b]
-            S00, S01, S10, S11 = S[n, 0, 0, at], S[n, 0, 1, at], S[n, 1, 0, at], S[n, 1, 1, at]
-            W00, W01, W10, W11 = W[n, 0, 0, at], W[n, 0, 1, at], W[n, 1, 0, at], W[n, 1, 1, at]
-            y[n, 0, b], y[n, 1, b], best = r0, r1, -np.inf
-            if not (abs(W00 * r0 + W01 * r1) > half0 or abs(W10 * r0 + W11 * r1) > half1):
-                continue
-            for pair in range(4):
-                s0, s1 = 1.0 if pair < 2 else -1.0, 1.0 if pair % 2 == 0 else -1.0
-                price0, price1 = s0 * half0, s1 * half1
-                y0, y1 = S00 * price0 + S01 * price1, S10 * price0 + S11 * price1
-                left0, left1 = price0 - (W00 * y0 + W01 * y1), price1 - (W10 * y0 + W11 * y1)
-                y0, y1 = y0 + (S00 * left0 + S01 * left1), y1 + (S10 * left0 + S11 * left1)  # mends the rounding
-                least = np.minimum(s0 * (r0 - y0), s1 * (r1 - y1))  # negative where a sign is wrong
-                if least > best:
-                    y[n, 0, b], y[n, 1, b] = y0, y1
-                best = np.maximum(least, best)
-            one = _within(r0, (-half0 - W01 * r1) / W00, (half0 - W01 * r1) / W00)
-            if abs(W10 * one + W11 * r1) <= half1:
-                y[n, 0, b], y[n, 1, b] = one, r1
-            one = _within(r1, (-half1 - W10 * r0) / W11, (half1 - W10 * r0) / W11)
-            if abs(W00 * r0 + W01 * one) <= half0:
-                y[n, 0, b], y[n, 1, b] = r0, one
+            y[n, 0, b], y[n, 1, b] = pair(
+                r[n, 0, b], r[n, 1, b], half[n, 0, b], half[n, 1, b], S[n, 0, 0, at], S[n, 0, 1, at], S[n, 1, 0, at], S[n, 1, 1, at],
+                W[n, 0, 0, at], W[n, 0, 1, at], W[n, 1, 0, at], W[n, 1, 1, at],
+            )  # fmt: skip
+
+
+@_jit
+def pair(r0, r1, half0, half1, S00, S01, S10, S11, W00, W01, W10, W11):
+    """The part of two readings that is believed (robust.py), in closed form; S and W = S^-1, and half of lam.
+
+    Nothing is an outlier, or both are, with one of four pairs of signs s and y = S (s lam) / 2, or one is.
+    """
+    out0, out1, best = r0, r1, -np.inf
+    if not (abs(W00 * r0 + W01 * r1) > half0 or abs(W10 * r0 + W11 * r1) > half1):
+        return out0, out1
+    for signs in range(4):
+        s0, s1 = 1.0 if signs < 2 else -1.0, 1.0 if signs % 2 == 0 else -1.0
+        price0, price1 = s0 * half0, s1 * half1
+        y0, y1 = S00 * price0 + S01 * price1, S10 * price0 + S11 * price1
+        left0, left1 = price0 - (W00 * y0 + W01 * y1), price1 - (W10 * y0 + W11 * y1)
+        y0, y1 = y0 + (S00 * left0 + S01 * left1), y1 + (S10 * left0 + S11 * left1)  # mends the rounding
+        least = np.minimum(s0 * (r0 - y0), s1 * (r1 - y1))  # negative where a sign is wrong
+        if least > best:
+            out0, out1 = y0, y1
+        best = np.maximum(least, best)
+    one = _within(r0, (-half0 - W01 * r1) / W00, (half0 - W01 * r1) / W00)
+    if abs(W10 * one + W11 * r1) <= half1:
+        out0, out1 = one, r1
+    one = _within(r1, (-half1 - W10 * r0) / W11, (half1 - W10 * r0) / W11)
+    if abs(W00 * r0 + W01 * one) <= half0:
+        out0, out1 = r0, one
+    return out0, out1
 
 
 @_jit

@@ -6,6 +6,7 @@ What is not known here, to the exact type, is played by the plain loop: a subcla
 from __future__ import annotations
 
 from dataclasses import dataclass
+from importlib import import_module
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -94,25 +95,26 @@ def fuse(loop: Loop, attack: Attack | None = None) -> Constants | Refused:
 
 
 def _several(loop: Loop, attack: Attack | None) -> Constants | Refused:
-    """As `fuse`, of several agents: a platoon."""
-    if not loop.model.v2v:
+    """As `fuse`, of several agents: a platoon, or a network that watches what nobody drives."""
+    road = bool(loop.model.followers.any())
+    if road and not loop.model.v2v:
         return Refused(f"{type(loop.plant).__name__} has no lane")
-    from . import platoon_build  # which a single car does without, and without the modules of platoons
-
-    if loop.link.latency:
-        return Refused("readings are late")
+    if loop.link.latency or not (road or loop.link.perfect):
+        return Refused("readings are late" if loop.link.latency else "readings are lost")
     if why := _white(loop, attack):
         return Refused(why)
     if not {Kind[name.upper()] for name in loop.threat.kinds} <= _ON_WIRES:
         return Refused("delay, replay and what is radiated have no lane")
-    if why := platoon_build.unknown(loop):
+    kind = import_module(f"tailgate.fused.{'platoon' if road else 'network'}_build")  # which a single car does without
+    if why := kind.unknown(loop, attack):
         return Refused(why)
     c, f = of.blank()
     _granted(loop, c)
     table = _way(loop, c, f)
     if table is None:
         return Refused(f"manoeuvre {type(loop.manoeuvre).__name__} has no lane")
-    return Constants(c, f, *platoon_build.fill(loop, c, f, table), 0)
+    table, window = kind.fill(loop, attack, c, f, table)
+    return Constants(c, f, table, window, 0)
 
 
 def _remembered(f: Array) -> int:

@@ -34,16 +34,17 @@ def fuse_seat(seat: Seat) -> Constants | Refused:
     if isinstance(k, Refused):
         return k
     c, f, action, paid, threat = k.c, k.f, seat.action, seat.reward, seat.loop.threat
-    columns, several = [name for name, _ in seat.observation.columns], f[of.CARS] > 0
-    if len(columns) > of.COMPONENTS or (action.discrete and not several and action.size > of.MODES):
+    columns, many = [name for name, _ in seat.observation.columns], f[of.CARS] > 0
+    if len(columns) > of.COMPONENTS or (action.discrete and not many and action.size > of.MODES):
         return Refused("too many components or actions")
     f[of.ACTION], f[of.ACTIONS] = _ACTIONS[action.spec.action], 1 if action.discrete else action.size
     f[of.REWARD], f[of.FEATURES] = _REWARDS[paid.reward], len(columns)
     c[of.RATE], c[of.HORIZON], c[of.SEEN_MOST] = action.spec.rate, seat.loop.horizon, LIMIT
-    if several:
-        from . import platoon_build
+    road = not f[of.SENSED]
+    if many:
+        from . import several  # which a single car does without
 
-        k = k._replace(table=platoon_build.modes(k.table, f, action.modes if action.discrete else []))
+        k = k._replace(table=several.modes(seat.loop, k.table, f, action.modes if action.discrete else []))
     elif action.discrete:
         mine = np.array(at.wires_of(len(seat.loop.model.wires)))
         for i, mode in enumerate(action.modes):
@@ -54,17 +55,25 @@ def fuse_seat(seat: Seat) -> Constants | Refused:
     c[of.REWARD_SCALE], c[of.GAP_SHAPING], c[of.ERROR_SHAPING] = paid.error_scale, paid.gap_shaping, paid.error_shaping
     c[of.GAMMA_PAID], c[of.ILLEGAL], c[of.COST] = paid.gamma, paid.illegal_penalty, paid.attack_cost
     c[of.BUDGET_SHARE] = threat.budget or 1.0
-    assert seat.loop.model.gap is not None
-    c[of.BELIEF] = 1.0 if several else seat.loop.model.gap[0, 0]
+    if many:
+        c[of.BELIEF] = 1.0
+    else:
+        assert seat.loop.model.gap is not None
+        c[of.BELIEF] = seat.loop.model.gap[0, 0]
+    if not road:
+        c[of.GAP_SHAPING] = 0.0  # nobody is ahead
     scales = SCALES | {"progress": float(seat.loop.horizon)}
-    most = {wire: min(bound, LAST_SCALE) for wire, bound in zip(seat.loop.model.wires, seat.action.brief.bounds.tolist(), strict=True)}
+    limit = LAST_SCALE if road else np.inf
+    most = {wire: min(bound, limit) for wire, bound in zip(seat.loop.model.wires, seat.action.brief.bounds.tolist(), strict=True)}
     most |= {"power": threat.jam_power, "delay": threat.delay_bound}
     quantities: dict[str, tuple[Any, Any]] = lane.QUANTITIES | ({} if f[of.REAR] else lane.ALONE)
     if f[of.AIRED]:
         from . import radar
 
         quantities = quantities | radar.QUANTITIES
-    if several:
+    if not road:
+        quantities = several.shown(seat.loop, f)
+    elif many:
         from . import platoon_seat
 
         quantities = platoon_seat.quantities(columns, f, seat.loop)

@@ -89,6 +89,7 @@ RESPONSE, CLEARANCE, DISTANCE, WATCH = _number("response"), _number("clearance")
 # a platoon: gaps at the start (mean, sd, to either side), what cars are told of the start, sensors, what f keeps of itself in a step
 GAPS, PRIOR_SD, NOISE_SD, FADES = _number("gaps", 3), _number("prior_sd"), _number("noise_sd", 3), _number("fades")
 LOSS = _number("loss")  # probability that a reading or a message is lost
+STATE_SD, WALK_SD, READ_SD = _number("state_sd"), _number("walk_sd"), _number("read_sd")  # a network: of its start, of a step, of readings
 NUMBERS = len(_numbers)
 
 AIRED = _choice("aired")  # a car with a radar
@@ -105,7 +106,7 @@ ENDS, ACTUATED = _choice("ends"), _choice("actuated")
 ACTION, ACTIONS, REWARD, FEATURES = _choice("action"), _choice("actions"), _choice("reward"), _choice("features")
 SEEN, FROM = _choice("seen", COMPONENTS), _choice("from", COMPONENTS)  # the two rows of each component of the observation
 # a platoon: how many; rows that a desk has on top; the length of a car's record; where things begin in `window`, in `s` and in `table`
-CARS, STATES, VICTIMS, INPUT_KNOWN = _choice("cars"), _choice("states"), _choice("victims"), _choice("input_known")
+CARS, STATES, INPUT_KNOWN = _choice("cars"), _choice("states"), _choice("input_known")
 MISSES, IN_MISSES, THERE = _choice("misses"), _choice("who misses"), _choice("there")  # cars that may miss a reading; what was not lost
 ROOM, CAR = _choice("room"), _choice("car")
 HUNTED = _choice("hunted")
@@ -117,7 +118,12 @@ IN_LAW, IN_FEED, IN_BIAS, IN_V, IN_LED = (_choice(name) for name in ("law", "fee
 ALONE, STEPPED, PULLED = _choice("alone"), _choice("stepped"), _choice("pulled")  # no fusion; gains of so many steps; consensus
 STEP_WIDE, IN_HEARS = _choice("step wide"), _choice("hears")  # how far apart the gains of two steps are; who reads whose sensors
 ESTIMATOR, SHAPE, IN_SHAPE = _choice("estimator"), _choice("shape"), _choice("in shape")  # and what is made of an innovation before
-IN_VICTIMS, IN_WIRES, IN_MODES, PROFILED = (_choice(name) for name in ("victims", "wires", "modes", "profiled"))
+WIRED, IN_WIRES, IN_MODES, PROFILED = (_choice(name) for name in ("wired", "wires", "modes", "profiled"))  # wires that may be attacked
+# a network, which is no road: readings of an agent; where things begin, and the matrices of plant and sensors
+SENSED, SENTS, BELIEFS = _choice("sensed"), _choice("sents"), _choice("beliefs")
+ARRIVALS, VALIDS, RESIDUES, TAKEN = (_choice(name) for name in ("arrivals", "valids", "residues", "taken"))
+SCORES, ALARMS, ABSENT, ASIDE = (_choice(name) for name in ("scores", "alarms", "absent", "aside"))
+IN_OWN, IN_MEASURE, IN_SOME_WIDE = (_choice(name) for name in ("own", "measure", "some wide"))
 CHOICES = len(_choices)
 
 # manoeuvres, detectors, mitigations
@@ -138,3 +144,30 @@ def put(c: np.ndarray, at: int, values: Any) -> None:
     """Values of any shape, row by row, into `c` from `at` on."""
     flat = np.asarray(values, np.float64).ravel()
     c[at : at + len(flat)] = flat
+
+
+class Table:
+    """Numbers one after the other; whole ones by their bits."""
+
+    def __init__(self, first: np.ndarray) -> None:
+        self.parts, self.size = [first], len(first)
+
+    def add(self, values: Any) -> int:
+        """-> where they begin."""
+        flat = np.array(values).ravel()
+        flat = flat.astype(np.float64) if flat.dtype.kind == "f" else flat.astype(np.int64).view(np.float64)
+        self.parts.append(flat)
+        self.size += len(flat)
+        return self.size - len(flat)
+
+    def listed(self, matrix: np.ndarray, place: np.ndarray) -> int:
+        """What is not zero of a matrix, row after row: how many, where the values of each row begin, the values, and the place of each."""
+        rows, columns = np.nonzero(matrix)
+        first = self.size + 1 + len(matrix) + 1
+        starts = first + np.searchsorted(rows, np.arange(len(matrix) + 1))
+        at = self.add([len(rows)])
+        self.add(starts)
+        self.add(matrix[rows, columns].astype(np.float64))
+        places = np.broadcast_to(place, matrix.shape)[rows, columns]
+        self.add(places.astype(np.int64))
+        return at

@@ -214,7 +214,7 @@ def play(start, advance, obey, decide, decode, pay, look, places, first_block, l
         if seated:
             if steps > 0:
                 seat.close(s, flags, first, n)
-            look(s, window, c, f, paid, flags, count, mask, first, n)
+            look(s, window, c, f, table, paid, flags, count, mask, first, n)
             seat.observe(s, c, f, seen, first, n)
         if not alone:
             carry(desk, held)

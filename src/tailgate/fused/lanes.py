@@ -44,7 +44,7 @@ class _Spent(NamedTuple):
 
 def _kernel(f: Array) -> Kernel:
     """What plays the plant: of the others nothing is imported."""
-    name = "platoon_kernel" if f[of.CARS] else "radar_kernel" if f[of.AIRED] else "kernel"
+    name = "network_kernel" if f[of.SENSED] else "platoon_kernel" if f[of.CARS] else "radar_kernel" if f[of.AIRED] else "kernel"
     run: Kernel = import_module(f"tailgate.fused.{name}").run
     return run
 

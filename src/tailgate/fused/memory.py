@@ -7,7 +7,6 @@ import numpy as np
 from tailgate.core import Array
 
 from . import constants as of
-from .platoon_rows import WIRES as MANY_WIRES
 from .rows import COMMON, LANES, RADAR_STATE, ROWS, STATE, WIRES, WORDS
 from .script import PLACES
 
@@ -48,7 +47,6 @@ AT_DESK, AT_DESK_WORDS = _place("desk"), _place("desk words")  # of each thread 
 
 FEW = 4  # blocks that stay in the cache with all that a step computes on its way
 ASKED = 1 + 2 * WIRES  # rows of a command: kind, targets, values
-OF_VICTIM = 2 * MANY_WIRES  # numbers of a command or of a script for each of several cars that may be attacked
 OBEY, SCRIPTED, SEATED = range(3)  # who decides
 DESKS = 2  # rooms of ROWS at a desk: for a block that is played, and for episodes that begin
 PAID = 2  # rows of numbers of what a decision brought: reward, gap
@@ -68,8 +66,8 @@ class Memory:
     def __init__(self, batch: int, c: Array, f: Array, table: Array, window: int, intents: int, threads: int) -> None:
         blocks, actions = -(-batch // LANES), int(f[of.ACTIONS])
         kept = COMMON if f[of.CARS] else RADAR_STATE if f[of.AIRED] else STATE
-        whole, victims = ROWS + int(f[of.ROOM]), int(f[of.VICTIMS])
-        asking, written = 2 + OF_VICTIM * victims if victims else ASKED, PLACES + OF_VICTIM * victims
+        whole, aimed = ROWS + int(f[of.ROOM]), 2 * int(f[of.WIRED])  # of several agents a command and a script have two numbers a wire
+        asking, written = 2 + aimed if f[of.CARS] else ASKED, PLACES + aimed
         deep = whole if blocks <= (1 if f[of.CARS] else FEW) else kept  # many blocks share one place to work at, which stays in the cache
         sizes = {
             AT_ROWS: blocks * deep * LANES, AT_WINDOW: blocks * window * LANES, AT_INTENT: blocks * intents * LANES, AT_C: len(c),

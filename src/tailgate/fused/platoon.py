@@ -3,22 +3,23 @@
 start     the string, what each car is told, the first commands, the first move, the first measurement
 advance   channel -> distributed filter -> law -> channel -> cars -> measurement
 
-The records of cars and victims stand in the `window` (`platoon_rows`); the constants of filter and law in the `table` (`platoon_build`).
+The records of cars (`platoon_rows`) and of wires that may be attacked (`wires`) stand in the `window`; the constants of filter and law in
+the `table` (`platoon_build`).
 """
 
 import numpy as np
 
 from . import constants as of
-from . import platoon_channel as channel
 from . import platoon_defence as defence
 from . import platoon_filter as filter
 from . import platoon_road as road
 from . import platoon_steps as steps
 from . import road as single
-from . import step
+from . import script, step, wires
 from .compiled import phase
-from .platoon_rows import BELIEF, SEEN, SENSORS, SENT
-from .rows import LANES, STEP, K
+from .platoon_filter import WORK
+from .platoon_rows import AHEAD, BELIEF, GAP, SEEN, SENSORS, SENT, V
+from .rows import LANES, ON, STEP, K
 
 
 @phase
@@ -58,9 +59,9 @@ def start(s, g, window, intent, c, f, table, tick, n):
     _expect(window, table, f, n)
     if f[of.THERE] != 0:
         road.all_there(window, f, n)
-    channel.arrive(s, window, table, f, n)
+    road.hear(s, window, f)
     road.control(s, window, table, c, f, 0.0, n)
-    channel.take_hold(s, window, table, f, n)
+    wires.take_hold(window, f, table, n)
     road.pass_on(s, window, f, n)
     _move_and_measure(s, g, window, c, f, table, n)
 
@@ -68,8 +69,9 @@ def start(s, g, window, intent, c, f, table, tick, n):
 @phase
 def advance(s, g, window, intent, c, f, table, tick, asked, n):
     """A step under the command in the rows WANT_*, if any is `asked` for. What a Frame shows stands in the rows afterwards."""
-    channel.decide(s, window, c, f, table, asked, n)
-    channel.arrive(s, window, table, f, n)
+    attacked = wires.decide(s, window, c, f, table, asked, n)
+    road.hear(s, window, f)
+    wires.arrive(s, window, f, table, False, attacked, n)
     if f[of.ESTIMATOR] == of.READ:
         steps.read(s, window, table, f, n)
     else:
@@ -90,10 +92,37 @@ def advance(s, g, window, intent, c, f, table, tick, asked, n):
     road.remember(s, window, f, n)
     road.fooled(s, window, f, n)
     road.control(s, window, table, c, f, c[of.ASKED], n)
-    channel.actuate(s, window, table, f, n)
+    road.pass_on(s, window, f, n)
+    wires.arrive(s, window, f, table, True, attacked, n)
     if f[of.THERE] != 0:
         road.keep(s, window, f, n)
     _move_and_measure(s, g, window, c, f, table, n)
     if f[of.THERE] != 0:
         road.lose(s, g, window, c, f, f[of.SENDS], n)
     road.collide(s, f, n)
+
+
+@phase
+def scripted(s, g, window, c, f, table, p, n):
+    """The command of the script into the rows WANT_*. -> whether there is any."""
+    _holds(s, window, c, f, p, n)
+    return wires.scripted(s, g, c, f, table, p, n)
+
+
+@phase
+def _holds(s, window, c, f, p, n):
+    """Row ON: whether the trigger's condition holds for any car."""
+    kind, threshold, dt = p[script.WHEN], p[script.THRESHOLD], c[of.DT]
+    for i in range(n):
+        s[ON + i] = kind == script.TIME
+    for j in range(f[of.CARS] if kind != script.TIME else 0):
+        car, work = window[j * f[of.CAR] : (j + 1) * f[of.CAR]], s[f[of.WORKS] + j * WORK : f[of.WORKS] + (j + 1) * WORK]
+        for i in range(n):
+            speed, ahead = car[V + i], work[AHEAD + i]
+            holds = (kind == script.NEAR) & (work[GAP + i] < threshold)
+            holds |= (kind == script.CLOSING) & (speed - ahead > threshold)
+            holds |= (kind == script.FAST) & (speed > threshold)
+            holds |= (kind == script.SLOW) & (speed < threshold)
+            holds |= (kind == script.LEADER_BRAKING) & ((car[SEEN + i] - ahead) / dt > threshold)
+            s[ON + i] = 1.0 if holds | (s[ON + i] != 0.0) else 0.0
+            car[SEEN + i] = ahead

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from tailgate import num
-from tailgate.agents.codec import Mode
-from tailgate.core import Array
+from tailgate.agents.ghost import GhostState
+from tailgate.agents.program import Program
+from tailgate.agents.scripted import Dropout, InjectSparse
+from tailgate.core import Array, Attack
 from tailgate.core import Mode as Asked
 from tailgate.envs.cacc import FeedForward
 from tailgate.envs.consensus_cacc import Consensus
@@ -29,9 +30,11 @@ from tailgate.loop import Loop
 
 from . import constants as of
 from . import platoon_gains as gains
-from .constants import put
-from .platoon_rows import AIM_ROWS, BELIEF, CAR_ROWS, LAW, LINKS, SENSORS, VICTIM_ROWS, WORK_ROWS
+from . import script, several
+from .constants import Table, put
+from .platoon_rows import APPLIED, ARRIVED, BELIEF, CAR_ROWS, COMMAND, LAW, LINKS, SENSORS, SENT, VALID, WORK_ROWS
 from .rows import LANES, ROWS
+from .several import WIRE_ROWS
 
 PARTS, LAWS = (Platoon, PlatoonSensors), (FeedForward, Consensus, Ploeg)
 ESTIMATORS = {
@@ -41,47 +44,22 @@ ESTIMATORS = {
 DETECTORS = (Score, ChiSquare, TailChiSquare, AlwaysAlarm)
 
 
-class Table:
-    """Numbers one after the other; whole ones by their bits."""
-
-    def __init__(self, first: Array) -> None:
-        self.parts, self.size = [first], len(first)
-
-    def add(self, values: Any) -> int:
-        """-> where they begin."""
-        flat = np.array(values).ravel()
-        flat = flat.astype(np.float64) if flat.dtype.kind == "f" else flat.astype(np.int64).view(np.float64)
-        self.parts.append(flat)
-        self.size += len(flat)
-        return self.size - len(flat)
-
-    def listed(self, matrix: Array, place: Array) -> int:
-        """What is not zero of a matrix, row after row: how many, where the values of each row begin, the values, and the place of each."""
-        rows, columns = np.nonzero(matrix)
-        first = self.size + 1 + len(matrix) + 1
-        starts = first + np.searchsorted(rows, np.arange(len(matrix) + 1))
-        at = self.add([len(rows)])
-        self.add(starts)
-        self.add(matrix[rows, columns].astype(np.float64))
-        places = np.broadcast_to(place, matrix.shape)[rows, columns]
-        self.add(places.astype(np.int64))
-        return at
-
-
-def unknown(loop: Loop) -> str:
+def unknown(loop: Loop, attack: Attack | None) -> str:
     """Why this loop is no platoon with a lane; empty where it is one."""
-    return _parts(loop) or _defence(loop)
+    return _parts(loop) or defence(loop, attack)
 
 
-def fill(loop: Loop, c: Array, f: Array, profile: Array) -> tuple[Array, int]:
+def fill(loop: Loop, attack: Attack | None, c: Array, f: Array, profile: Array) -> tuple[Array, int]:
     """Fills in c and f. -> the table, which begins with the speeds of a profile, and the rows of the window."""
     table = Table(profile if f[of.WAY] == of.PROFILE else np.zeros(0))
     f[of.PROFILED] = table.size
     _vehicles(loop, c, f)
-    _filter(loop, _threat(loop, f, table), c, f, table)
-    _detector(loop.plan.defence, c, f)
+    window = _places(f, c[of.LOSS] > 0.0)
+    several.listed(loop, f, table, lambda i, w: _wires(f, i, w))
+    _filter(loop, drops(loop, attack), c, f, table)
+    detector(loop.plan.defence, c, f)
     _law(loop, c, f, table)
-    return np.concatenate(table.parts), _places(f, c[of.LOSS] > 0.0)
+    return np.concatenate(table.parts), window
 
 
 def _parts(loop: Loop) -> str:
@@ -96,7 +74,16 @@ def _parts(loop: Loop) -> str:
     return "" if loop.model.inputs == 1 and loop.model.states > 1 else "a model with several inputs has no lane"
 
 
-def _defence(loop: Loop) -> str:
+def drops(loop: Loop, attack: Attack | None) -> bool:
+    """Whether readings may be made to go missing: where that is granted, by anybody who is not known to do something else."""
+    if isinstance(attack, Program) and type(attack) is Program:
+        return any(phase.kind == "dropout" for phase in attack.sheet.phases)
+    spares = script.known(attack) or type(attack) in (GhostState, InjectSparse)
+    return "dropout" in loop.threat.kinds and (type(attack) is Dropout or not spares)
+
+
+def defence(loop: Loop, attack: Attack | None) -> str:
+    """Why a defence of several agents has no lane."""
     defence = loop.defence
     if type(defence) is Raw:
         return "a state that the known input decides has no lane" if loop.plan.defence.by_input.any() else ""
@@ -106,7 +93,7 @@ def _defence(loop: Loop) -> str:
     estimator, detector, mitigation = defence.parts()
     if type(estimator) not in ESTIMATORS:
         return f"filter {type(estimator).__name__} has no lane"
-    if why := "" if estimator.steady else _stepped(estimator, loop):
+    if why := "" if estimator.steady else _stepped(estimator, loop, attack):
         return why
     if estimator.steady and type(estimator) is KalmanFilter:
         return "a steady filter on the own sensors has no lane"  # nor a steady state, where cars are behind
@@ -121,19 +108,19 @@ def _defence(loop: Loop) -> str:
     return "" if any(known) else f"mitigation {type(mitigation).__name__} has no lane"
 
 
-def _stepped(estimator: Any, loop: Loop) -> str:
+def _stepped(estimator: Any, loop: Loop, attack: Attack | None) -> str:
     """Why a gain that follows the covariance has no lane."""
     if type(estimator) not in (KalmanFilter, ConsensusFilter):
         return "fusion by covariances of each row has no lane"
-    if "dropout" in loop.threat.kinds or loop.link.loss:
+    if drops(loop, attack) or loop.link.loss:
         return "covariances that depend on what is missed have no lane"
     pulled = type(estimator) is ConsensusFilter
     if pulled and estimator.share:
         return "readings that are shared have no lane"
-    return "" if gains.numbers(loop.model, pulled) * _steps(loop) <= gains.MOST else "so many gains have no lane"
+    return "" if gains.numbers(loop.model, pulled) * steps(loop) <= gains.MOST else "so many gains have no lane"
 
 
-def _steps(loop: Loop) -> int:
+def steps(loop: Loop) -> int:
     """How many steps have gains of their own: those of an episode, and of one that is over and waits for the next."""
     return loop.horizon + 200
 
@@ -142,6 +129,7 @@ def _vehicles(loop: Loop, c: Array, f: Array) -> None:
     plant, plan = loop.plant, loop.plan.plant
     assert isinstance(plant, Platoon)
     f[of.CARS], f[of.STATES] = plant.size
+    f[of.WIRED] = np.count_nonzero(loop.plan.channel.granted)
     f[of.INPUT_KNOWN], f[of.ENDS] = plant.leader_input_known, loop.ends_on_collision
     c[of.DT], c[of.LOAD], c[of.LEAD_START + 1] = plant.dt, loop.load, plant.speed
     put(c, of.OWN_A, plan.A)
@@ -152,25 +140,21 @@ def _vehicles(loop: Loop, c: Array, f: Array) -> None:
     c[of.PRIOR_SD], c[of.LOSS] = plant.initial_sd, loop.link.loss
 
 
-def _threat(loop: Loop, f: Array, table: Table) -> Array:
-    """The victims, and what may be done to each of their wires. -> who they are."""
-    plan = loop.plan.channel
-    victims = np.flatnonzero(plan.granted.any(axis=1))
-    f[of.VICTIMS], f[of.IN_VICTIMS] = len(victims), table.add(victims.astype(np.int64))
-    mine = plan.granted.any(axis=0)
-    place, wires = np.where(mine, np.cumsum(mine), 0), []  # of each wire in a vector of values, of the first victim
-    for h, i in enumerate(victims):
-        wires.append([plan.granted[i].astype(np.float64), plan.bounds, plan.low, plan.high, place + h * np.count_nonzero(mine)])
-    f[of.IN_WIRES] = table.add(np.array(wires, np.float64))
-    return victims
+def _wires(f: Array, i: Array, w: Array) -> tuple[Array, Array, Array, Array]:
+    """Where what is sent to cars i on wires w stands, what arrives, and whether it does; whether it is a command."""
+    car, work, row, acts = i * f[of.CAR], f[of.WORKS] + i * WORK_ROWS * LANES, w * LANES, w == LINKS
+    return (
+        np.where(acts, car + int(COMMAND), car + int(SENT) + row), np.where(acts, work + int(APPLIED), work + int(ARRIVED) + row),
+        np.where(w < SENSORS, work + int(VALID) + row, -1), acts,
+    )  # fmt: skip
 
 
-def _filter(loop: Loop, victims: Array, c: Array, f: Array, table: Table) -> None:
+def _filter(loop: Loop, dropped: bool, c: Array, f: Array, table: Table) -> None:
     """A, B, c, what fuses, and the gain: for each victim also with each set of sensors, or for each step."""
     held, model = loop.plan.defence, loop.model
     f[of.IN_A] = table.listed(model.A, np.arange(model.states) * LANES)
     f[of.IN_B], f[of.IN_C], c[of.FACTOR] = table.add(model.B[:, 0]), table.add(model.c), 1.0
-    f[of.IN_HEARD], f[of.IN_READS] = _lists(neighbours(model.graph), table), table.add(np.argmax(model.C, axis=2))
+    f[of.IN_HEARD], f[of.IN_READS] = lists(neighbours(model.graph), table), table.add(np.argmax(model.C, axis=2))
     if type(loop.defence) is Raw:
         f[of.ESTIMATOR] = of.READ
         told = [one for each in held.rounds for one in zip(*each, strict=True)]
@@ -180,12 +164,12 @@ def _filter(loop: Loop, victims: Array, c: Array, f: Array, table: Table) -> Non
     f[of.ESTIMATOR], c[of.PRICE] = ESTIMATORS[type(part)], getattr(part, "gamma", 0.0)
     f[of.ALONE] = type(part) in (KalmanFilter, ConsensusFilter)
     if not part.steady:
-        each = gains.by_step(part, held.mitigation, model, loop.plant.prior_var, _steps(loop))  # type: ignore[attr-defined]
+        each = gains.by_step(part, held.mitigation, model, loop.plant.prior_var, steps(loop))  # type: ignore[attr-defined]
         f[of.STEPPED], f[of.STEP_WIDE], f[of.IN_W] = len(each), each[0].size, table.add(each)
         f[of.PULLED] = type(part) is ConsensusFilter and part.consensus > 0.0
         return
     f[of.IN_L], f[of.IN_MERGE] = table.add(plan.L), table.add(plan.merge)
-    misses = np.arange(len(model.C)) if c[of.LOSS] else victims if "dropout" in loop.threat.kinds else victims[:0]
+    misses = np.flatnonzero(np.full(len(model.C), c[of.LOSS] > 0.0) | (loop.plan.channel.granted.any(axis=1) & dropped))
     f[of.MISSES], f[of.IN_MISSES] = len(misses), table.add(misses.astype(np.int64))
     _sets(held, plan, misses, c, f, table)
 
@@ -214,7 +198,7 @@ def _sets(held: ComposedPlan, fusion: Any, misses: Array, c: Array, f: Array, ta
     f[of.SHAPE], f[of.IN_SHAPE] = (len(shapes[0]) if shapes else 0), table.add(np.array(shapes, np.float64))
 
 
-def _detector(held: Any, c: Array, f: Array) -> None:
+def detector(held: Any, c: Array, f: Array) -> None:
     if not isinstance(held, ComposedPlan):  # none, which never alarms
         c[of.THRESHOLD] = np.inf
         return
@@ -224,7 +208,7 @@ def _detector(held: Any, c: Array, f: Array) -> None:
     c[of.THRESHOLD] = held.detector_plan if type(part) is TailChiSquare else getattr(part, "eta", np.inf)
 
 
-def _lists(heard: tuple[tuple[int, ...], ...], table: Table) -> int:
+def lists(heard: tuple[tuple[int, ...], ...], table: Table) -> int:
     """N(i) of all cars, behind where each begins. -> where that is."""
     begin = table.size + len(heard) + 1
     at = table.add(begin + np.cumsum([0, *map(len, heard)]))
@@ -249,21 +233,13 @@ def _law(loop: Loop, c: Array, f: Array, table: Table) -> None:
 
 def _places(f: Array, lossy: bool) -> int:
     """Where records begin. -> rows of the window."""
-    cars, states, victims = int(f[of.CARS]), int(f[of.STATES]), int(f[of.VICTIMS])
+    cars, states, count = int(f[of.CARS]), int(f[of.STATES]), int(f[of.WIRED])
     record, last = CAR_ROWS + states + (SENSORS if lossy else 0), ROWS
     f[of.CAR], f[of.HUNTED], f[of.THERE] = record * LANES, cars * record * LANES, (CAR_ROWS + states) * LANES if lossy else 0
     for name, rows in (
-        (of.WORKS, cars * WORK_ROWS), (of.AIMS, victims * AIM_ROWS), (of.TRUTHS, states), (of.FUSED, cars * states),
+        (of.WORKS, cars * WORK_ROWS), (of.AIMS, count * WIRE_ROWS + cars), (of.TRUTHS, states), (of.FUSED, cars * states),
         (of.SENDS, cars * max(states, LINKS)), (of.FORE, states), (of.DEALT, max(LINKS * cars, states) + 3),
     ):  # fmt: skip
         f[name], last = last * LANES, last + rows
     f[of.ROOM] = last - ROWS
-    return cars * record + victims * VICTIM_ROWS
-
-
-def modes(table: Array, f: Array, known: Sequence[Mode]) -> Array:
-    """The table with the discrete actions behind it: kind, sign, and each victim's targets and values."""
-    victims = table[f[of.IN_VICTIMS] : f[of.IN_VICTIMS] + f[of.VICTIMS]].view(np.int64)
-    f[of.IN_MODES] = len(table)
-    parts = [[(mode.kind, mode.sign), *(part for i in victims for part in (mode.target[i], mode.value))] for mode in known]
-    return np.concatenate([table, *(np.asarray(part, np.float64) for mode in parts for part in mode)])
+    return cars * record + count * WIRE_ROWS

@@ -11,11 +11,11 @@ from tailgate.vector import WIDTH, alike, get, put
 
 from . import constants as of
 from .compiled import formula, phase
-from .platoon_rows import AIM_ROWS, ARRIVED, BELIEF, SCORE, SENSORS, TOLD, VALID, WORK_ROWS, R
+from .platoon_rows import ARRIVED, BELIEF, SCORE, SENSORS, TOLD, VALID, WORK_ROWS, R
 from .rows import LANES
 from .rows import SCORE as SOUND
 
-WORK, AIM = WORK_ROWS * LANES, AIM_ROWS * LANES
+WORK = WORK_ROWS * LANES
 _SCORE, _VALID, _R, _BELIEF, _TOLD, _ARRIVED = (int(row) for row in (SCORE, VALID, R, BELIEF, TOLD, ARRIVED))
 SETS = 1 << SENSORS  # of sensors that are read
 _1, _2, _3, _4, _5, _6, _7 = (WIDTH * i for i in range(1, 8))  # a row is eight vectors
@@ -48,13 +48,16 @@ def total(table, entries, line, x, u, begin, y, v):
 
 
 @phase
-def product(table, at, rows, inner, x, u, y, v):
-    """y (rows) at v = the matrix (rows, inner) at a place of the table times x (inner) at u: two rows at a time, for half the way to x."""
+def product(table, at, rows, inner, x, u, begin, y, v):
+    """y (rows) at v = the matrix (rows, inner) at a place of the table times x (inner) at u: two rows at a time, for half the way to x.
+
+    Sums begin with `begin`, which is +0, or -0 where the plain loop's begin with their first product.
+    """
     for pair in range(0, rows, 2):
         i = min(pair, rows - 2)
         one, two, o = at + i * inner, at + i * inner + inner, u
-        a = b = c = d = e = f = g = h = alike(0.0)
-        A = B = C = D = E = F = G = H = alike(0.0)
+        a = b = c = d = e = f = g = h = alike(begin)
+        A = B = C = D = E = F = G = H = alike(begin)
         for k in range(inner):
             w, z = alike(table[one + k]), alike(table[two + k])
             p, q, r, t = get(x, o), get(x, o + _1), get(x, o + _2), get(x, o + _3)
@@ -88,10 +91,10 @@ def predict(s, window, table, f):
         return
     for j in range(cars):
         forecast(s, window, table, f, j * f[of.CAR], f[of.FORE])
-        product(table, f[of.IN_L] + j * size, states, states, s, f[of.FORE], s, f[of.SENDS] + j * states * LANES)
+        product(table, f[of.IN_L] + j * size, states, states, s, f[of.FORE], 0.0, s, f[of.SENDS] + j * states * LANES)
     for i in range(cars):
         gather(s, table, f, i)
-        product(table, f[of.IN_MERGE] + i * size, states, states, s, f[of.FORE], s, f[of.FUSED] + i * states * LANES)
+        product(table, f[of.IN_MERGE] + i * size, states, states, s, f[of.FORE], 0.0, s, f[of.FUSED] + i * states * LANES)
 
 
 @phase

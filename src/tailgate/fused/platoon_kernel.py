@@ -1,6 +1,6 @@
 """What is compiled of a platoon; a single car does without."""
 
-from . import kernel, platoon, platoon_channel, platoon_seat
+from . import kernel, platoon, platoon_seat, wires
 from .compiled import Kernel
 
 
@@ -8,6 +8,6 @@ from .compiled import Kernel
 def run(places, first_block, last_block, part):
     """`kernel.play`, of a platoon."""
     return kernel.play(
-        platoon.start, platoon.advance, platoon_channel.obey, platoon_channel.scripted, platoon_seat.decode, platoon_seat.pay,
-        platoon_seat.look, places, first_block, last_block, part,
+        platoon.start, platoon.advance, wires.obey, platoon.scripted, wires.decode, platoon_seat.pay, platoon_seat.look, places,
+        first_block, last_block, part,
     )  # fmt: skip

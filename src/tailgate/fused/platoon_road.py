@@ -6,7 +6,7 @@ The state of the string is X = [c_0 v_0 a_0 | d_1 v_1 a_1 f_1 | ...]; a car's re
 import numpy as np
 
 from tailgate.draws import Role
-from tailgate.vector import WIDTH, get, put
+from tailgate.vector import WIDTH, alike, get, put
 
 from . import constants as of
 from . import road
@@ -26,6 +26,7 @@ from .platoon_rows import (
     SENSORS,
     SENT,
     TOLD,
+    VALID,
     A,
     V,
     X,
@@ -131,6 +132,18 @@ def control(s, window, table, c, f, mode, n):
         for i in range(n):
             car[COMMAND + i] = np.minimum(np.maximum(road.obeyed(car[COMMAND + i], mode), low), high)
             car[LAW + i] = keep * car[LAW + i] + (1.0 - keep) * work[NEXT + i]
+
+
+@phase
+def hear(s, window, f):
+    """What arrives of readings and messages where nothing is attacked."""
+    for j in range(f[of.CARS]):
+        sent, arrived = j * f[of.CAR] + int(SENT), f[of.WORKS] + j * WORK + int(ARRIVED)
+        for at in range(0, LINKS * LANES, WIDTH):
+            put(s, arrived + at, get(window, sent + at))
+        for at in range(0, SENSORS * LANES, WIDTH):
+            there = get(window, j * f[of.CAR] + f[of.THERE] + at) if f[of.THERE] != 0 else alike(1.0)
+            put(s, f[of.WORKS] + j * WORK + int(VALID) + at, there)
 
 
 @phase

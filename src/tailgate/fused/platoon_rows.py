@@ -1,15 +1,15 @@
 """Where the lane of a platoon keeps what. What is one for the whole episode (step, command, leader's way) stands in `tailgate.fused.rows`.
 
 Each car has a *record* of rows in the `window`, which is kept between two calls, and another in `s`, behind the rows of the block, for
-what a step computes on its way; so has each victim, which is a car that may be attacked. Within a record a row's name is its offset:
-`car[V + i]`. Where records begin depends on how many cars there are, and is in `f` (`tailgate.fused.constants`).
+what a step computes on its way. Within a record a row's name is its offset: `car[V + i]`. Where records begin depends on how many cars
+there are, and is in `f` (`tailgate.fused.constants`).
 """
 
 import numpy as np
 
 from .rows import LANES
 
-SENSORS, LINKS, WIRES = 3, 6, 7  # distance, velocity, acceleration; + the message; + the command
+SENSORS, LINKS = 3, 6  # distance, velocity, acceleration; + the message
 
 
 class _Record:
@@ -46,14 +46,3 @@ GAP, AHEAD = _work.row(), _work.row()  # to the car ahead, and its speed
 SHOWN_V, SHOWN_A, SHOWN_U = _work.row(), _work.row(), _work.row()  # what an observation shows of the record: speed, acceleration, command
 SHOWN_Y = _work.row(2)  # and readings
 WORK_ROWS = _work.rows
-
-_victim = _Record()
-HELD, FRESH, TARGET, VALUE = (_victim.row(WIRES) for _ in range(4))
-VICTIM_ROWS = _victim.rows
-
-_aim = _Record()
-WANT_TARGET, WANT_VALUE = _aim.row(WIRES), _aim.row(WIRES)
-CLEAN = _aim.row(LINKS)
-SHOWN = _aim.row(WIRES)  # what an observation shows: the values sent last
-ATTACKED = _aim.row()
-AIM_ROWS = _aim.rows

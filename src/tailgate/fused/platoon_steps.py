@@ -20,13 +20,13 @@ _BELIEF, _W = int(BELIEF), SENSORS * SENSORS
 
 
 @formula
-def _at(s, f, i):
+def at_step(s, f, i):
     """Where the constants of an episode's step stand."""
     return f[of.IN_W] + min(int(s[K + np.uint64(i)]) - 1, f[of.STEPPED] - 1) * f[of.STEP_WIDE]
 
 
 @formula
-def _together(s, n):
+def together(s, n):
     """Whether all episodes of a block are at the same step."""
     apart = 0
     for i in range(n):
@@ -38,33 +38,33 @@ def _together(s, n):
 def weigh(s, table, f, n):
     """g_i."""
     each = f[of.STEP_WIDE] // f[of.CARS]
-    if _together(s, n):
-        score(s, table, f, _at(s, f, 0), each)
+    if together(s, n):
+        score(s, table, f, at_step(s, f, 0), each)
         return
     for j in range(f[of.CARS]):
         for i in range(int(n)):
-            score_one(s, table, _at(s, f, i) + j * each, f[of.WORKS] + j * WORK, i)
+            score_one(s, table, at_step(s, f, i) + j * each, f[of.WORKS] + j * WORK, i)
 
 
 @phase
 def correct(s, window, table, c, f, n):
     """xh_i."""
-    each, together = f[of.STEP_WIDE] // f[of.CARS], _together(s, n)
-    if together:
-        update(s, window, table, c, f, _at(s, f, 0) + _W, each)
+    each, as_one = f[of.STEP_WIDE] // f[of.CARS], together(s, n)
+    if as_one:
+        update(s, window, table, c, f, at_step(s, f, 0) + _W, each)
     for j in range(f[of.CARS]):
-        for i in range(0 if together else int(n)):
-            update_one(s, window, table, 1.0, f, _at(s, f, i) + j * each + _W, j, i)
+        for i in range(0 if as_one else int(n)):
+            update_one(s, window, table, 1.0, f, at_step(s, f, i) + j * each + _W, j, i)
         if f[of.PULLED] != 0:
-            _pull(s, table, f, j)
-            if together:
-                _pull_all(s, window, table, f, j, _at(s, f, 0) + j * each + _W + f[of.STATES] * SENSORS)
+            pull(s, table, f, j)
+            if as_one:
+                _pull_all(s, window, table, f, j, at_step(s, f, 0) + j * each + _W + f[of.STATES] * SENSORS)
             else:
                 _pull_each(s, window, table, f, j, n)
 
 
 @phase
-def _pull(s, table, f, i):
+def pull(s, table, f, i):
     """The mean of (xb_j - xb_i) over the others that car i hears, into the rows FORE."""
     whole, line = table.view(np.int64), f[of.STATES] * LANES
     first, last, mine = whole[f[of.IN_HEARD] + i], whole[f[of.IN_HEARD] + i + 1], f[of.FUSED] + i * line
@@ -81,7 +81,7 @@ def _pull(s, table, f, i):
 def _pull_all(s, window, table, f, j, at):
     """xh_j moved by Cons_j times the rows FORE; Cons is the first number times the matrix behind it."""
     states, gain = f[of.STATES], alike(table[at])
-    product(table, at + 1, states, states, s, f[of.FORE], s, f[of.SENDS])
+    product(table, at + 1, states, states, s, f[of.FORE], 0.0, s, f[of.SENDS])
     for e in range(0, states * LANES, WIDTH):
         belief = j * f[of.CAR] + _BELIEF + e
         put(window, belief, get(window, belief) + gain * get(s, f[of.SENDS] + e))
@@ -92,7 +92,7 @@ def _pull_each(s, window, table, f, j, n):
     """The same where the episodes are at steps of their own."""
     states, each = f[of.STATES], f[of.STEP_WIDE] // f[of.CARS]
     for i in range(int(n)):
-        at = _at(s, f, i) + j * each + _W + states * SENSORS
+        at = at_step(s, f, i) + j * each + _W + states * SENSORS
         for e in range(states):
             moved, row = 0.0, at + 1 + e * states
             for k in range(states):

@@ -98,7 +98,9 @@ class Car(Lanes):
 
 
 def _kind(f: Array) -> Any:
-    """One car, or a platoon, whose module a single car does without."""
+    """One car, or several agents, whose modules a single car does without."""
+    if f[of.SENSED]:
+        return import_module("tailgate.fused.network_play").Network
     return import_module("tailgate.fused.platoon_play").Platoon if f[of.CARS] else Car
 
 
@@ -122,9 +124,11 @@ def play(loop: Loop, k: Constants, attack: Attack, keys: Keys, terminate: bool) 
 def nearest(loop: Loop, k: Constants, attack: Attack, keys: Keys) -> tuple[Array, Array] | None:
     """-> lengths (B,) and the smallest gaps (2, B) [m], in front and behind, of episodes that end with a collision.
 
-    Nothing else is kept of them: many at a time take little memory. None where the attack has no lane.
+    Nothing else is kept of them: many at a time take little memory. None where the attack has no lane, or nobody drives.
     """
     kind = _kind(k.f)
+    if k.f[of.SENSED]:
+        return None
     written = kind.numbers(loop, attack, attack.prepare(loop.brief))
     if written is None:
         return None

@@ -187,9 +187,9 @@ QUANTITIES = {
 
 
 @phase
-def look(s, window, c, f, paid, flags, count, mask, first, n):
+def look(s, window, c, f, table, paid, flags, count, mask, first, n):
     """What the information of a step shows of the state that it led to, and what the observation needs of it."""
-    seat.look(s, window, c, f, paid, flags, count, mask, first, n)
+    seat.look(s, window, c, f, table, paid, flags, count, mask, first, n)
     for i in range(n):
         kind, value = s[KIND + i], s[VALUE + i]
         s[LAST_POWER + i], s[LAST_DELAY + i] = value if kind == _NOISE_JAM else 0.0, value if kind == _ECHO_DELAY else 0.0

@@ -227,7 +227,7 @@ def close(s, flags, first, n):
 
 
 @phase
-def look(s, window, c, f, paid, flags, count, mask, first, n):
+def look(s, window, c, f, table, paid, flags, count, mask, first, n):
     """What the information of a step shows of the state that it led to, and what the observation needs of it."""
     channel.allowed(s, c, ON, n)
     budget, share = c[of.BUDGET], c[of.BUDGET_SHARE]
