@@ -18,7 +18,7 @@ import numpy as np
 from tailgate import draws, num
 from tailgate.agents.codec import ActionCodec, ActionSpec
 from tailgate.agents.observation import ObservationCodec
-from tailgate.agents.reward import Reward
+from tailgate.agents.reward import Reward, RewardName
 from tailgate.core import Array, Command, Estimate, Mode, View
 from tailgate.draws import Role
 from tailgate.envs.batches import side_by_side
@@ -62,12 +62,10 @@ class Playing(NamedTuple):
     plan: Any
 
 
-def playing(defence: Any, place: str | Scenario = SCENARIO, attack: str = INJECTION, reward: str = "min_gap") -> Playing:
-    """A scenario by name, or one that was changed."""
-    seat = Seat.make(scenario=place if isinstance(place, str) else place.name, defence=defence, reward=reward)
-    if not isinstance(place, str):
-        seat = dataclasses.replace(seat, loop=place.loop(seat.loop.defence, seat.loop.uses))
-    script = Spec("attack", attack).make()
+def playing(defence: Any) -> Playing:
+    """Car following under injection by a script."""
+    seat = Seat.make(scenario=SCENARIO, defence=defence, reward="min_gap")
+    script = Spec("attack", INJECTION).make()
     return Playing(seat, script, script.prepare(seat.loop.brief))
 
 
@@ -126,13 +124,11 @@ def batch(episodes: int, threads: int = 1) -> Go:
     return repeated(chunk)
 
 
-def platoon(episodes: int, followers: int = 4, defence: str = "dkf") -> Go:
-    """Whole steps of a platoon, each car with an estimator of the whole state, under a learner's action as in `batch`."""
-    place = load_scenario("platoon-braking-v0").with_threat(agents=(min(2, followers),), targets=("distance",))
-    place = dataclasses.replace(place, plant=dataclasses.replace(place.plant, followers=followers))
-    guard, spec = Spec("defence", defence), ActionSpec("timing", "fdi", 60.0, interval=HELD)
+def several(place: Scenario, defence: str, value: float, reward: RewardName, episodes: int) -> Go:
+    """Whole steps of several agents under a learner's action, as in `batch`."""
+    guard, spec = Spec("defence", defence), ActionSpec("timing", "fdi", value, interval=HELD)
     loop = place.loop(guard.make(), guard.entry.uses)
-    seat = Seat(loop, ActionCodec(spec, loop.brief), ObservationCodec(loop.brief), Reward(), {})
+    seat = Seat(loop, ActionCodec(spec, loop.brief), ObservationCodec(loop.brief), Reward(reward), {})
     rows, attack, over = side_by_side(seat), np.ones(episodes, np.int64), np.zeros(episodes, bool)
     rows.begin(draws.keys("tune", range(episodes)))
 
@@ -145,11 +141,18 @@ def platoon(episodes: int, followers: int = 4, defence: str = "dkf") -> Go:
     return repeated(chunk)
 
 
+def platoon(episodes: int, followers: int = 4, defence: str = "dkf") -> Go:
+    """Whole steps of a platoon, each car with an estimator of the whole state; one gap is attacked."""
+    place = load_scenario("platoon-braking-v0").with_threat(agents=(min(2, followers),), targets=("distance",))
+    place = dataclasses.replace(place, plant=dataclasses.replace(place.plant, followers=followers))
+    return several(place, defence, 60.0, "min_gap", episodes)
+
+
 def network(episodes: int, sensors: int) -> Go:
-    """Whole steps of the network of chapter 5, ten agents with so many sensors each, under the norm-penalised estimator."""
-    place = load_scenario("thesis-ch5-v0")
+    """Whole steps of the network of chapter 5, ten agents with so many sensors each, under the norm-penalised estimator; one attacked."""
+    place = load_scenario("thesis-ch5-v0").with_threat(agents=(0,))
     place = dataclasses.replace(place, sensor=dataclasses.replace(place.sensor, sensors=sensors))
-    return played(playing("norm_resilient", place, "none", "error"), episodes)
+    return several(place, "norm_resilient", 60.0, "error", episodes)
 
 
 # -- a defence by somebody else

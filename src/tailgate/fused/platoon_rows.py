@@ -9,7 +9,7 @@ import numpy as np
 
 from .rows import LANES
 
-SENSORS, LINKS, WIRES = 3, 6, 7  # distance, velocity, acceleration; + the message; + the command
+SENSORS, LINKS = 3, 6  # distance, velocity, acceleration; + the message
 
 
 class _Record:
