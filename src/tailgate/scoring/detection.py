@@ -150,7 +150,7 @@ def deviation(trace: Trace) -> Array:
     attacked = (trace.kind != 0) & trace.live
     error = np.max(trace.model.error(trace.estimate, trace.truth), axis=2)
     steps = np.count_nonzero(attacked, axis=0)
-    return np.max(np.where(attacked, error, 0.0), axis=0) / np.where(steps, steps * trace.model.dt, np.nan)
+    return np.asarray(np.max(np.where(attacked, error, 0.0), axis=0) / np.where(steps, steps * trace.model.dt, np.nan))
 
 
 def with_detection(board: Data, found: Data, stealth: dict[str, list[Data] | None]) -> Data:
