@@ -20,6 +20,8 @@ from tailgate.registry import Spec
 from tailgate.scenario import load_scenario
 from tailgate.trace import rollout
 
+from .fused import as_plain, loop_of, same, short
+
 # Every filter, detector, mitigation, manoeuvre, kind, law and trigger at least once.
 CELLS = [
     ("stop-and-go-v0", "chi2_kf", "none"),
@@ -68,20 +70,10 @@ STEALTH = [
 ]
 
 
-def _loop(scenario, defence, attack, horizon=200, **threat):
-    made = Spec("attack", attack)
-    changes = {"knowledge": getattr(made.make(), "knowledge", made.entry.knowledge)} | threat
-    guard = Spec("defence", defence)
-    place = load_scenario(scenario).with_threat(**changes)
-    loop = place.loop(guard.make(), guard.entry.uses)
-    object.__setattr__(loop, "horizon", min(horizon, place.horizon))
-    return loop, made.make()
-
-
 @pytest.mark.parametrize(("scenario", "defence", "attack"), CELLS + STEALTH)
 def test_a_trace_is_the_plain_loops_to_the_last_bit(scenario, defence, attack):
     """Episodes in two blocks, one of them not full: every signal's hash, and the lengths."""
-    loop, rival = _loop(scenario, defence, attack)
+    loop, rival = loop_of(scenario, defence, attack)
     assert isinstance(fuse(loop, rival), Constants)
     keys = draws.keys("report", range(67))
     fused, plain = rollout(loop, rival, keys), rollout(loop, rival, keys, plain=True)
@@ -92,7 +84,7 @@ def test_a_trace_is_the_plain_loops_to_the_last_bit(scenario, defence, attack):
 
 def test_a_run_to_the_horizon_goes_on_after_a_collision():
     """Without an end at a collision the attack goes on as well, to the last bit."""
-    loop, rival = _loop("gusty-stop-and-go-v0", "chi2_kf", "fdi:trigger=near,threshold=30,value=-4", horizon=600)
+    loop, rival = loop_of("gusty-stop-and-go-v0", "chi2_kf", "fdi:trigger=near,threshold=30,value=-4", horizon=600)
     keys = draws.keys("report", range(20))
     fused, plain = (rollout(loop, rival, keys, terminate=False, plain=engine) for engine in (False, True))
     crashed = (plain.collided | plain.rear_collided)[:450].any(axis=0)
@@ -115,56 +107,16 @@ ENVIRONMENTS = [
 ]  # fmt: skip
 
 
-def _same(one, two):
-    if isinstance(one, dict):
-        assert one.keys() == two.keys()
-        for key in one:
-            _same(one[key], two[key])
-    else:
-        assert one.dtype == two.dtype and np.array_equal(one, two, equal_nan=True)
-
-
 @pytest.mark.parametrize("arguments", ENVIRONMENTS, ids=lambda a: f"{a['scenario']}-{a['defence']}")
 def test_an_environment_is_the_plain_one_to_the_last_bit(arguments, tmp_path):
     """Observations, rewards, flags and information, over restarts, a masked reset and what was held."""
-    _as_plain(arguments, 5, tmp_path)
-
-
-def _as_plain(arguments, rows, folder):
-    """So many rows of both engines, in a scenario so short that all begin again; some are reset by a mask, one in two of them with a seed."""
-    text = folder / "short.yaml"
-    text.write_text(_short(arguments["scenario"]))
-    one, two = (AdversaryVectorEnv(rows, engine=engine, **(arguments | {"scenario": str(text)})) for engine in ("fused", "plain"))
-    assert (one.engine, two.engine) == ("fused", "plain")
-    for first, second in zip(one.reset(seed=3), two.reset(seed=3), strict=True):
-        _same(first, second)
-    rng, ended = np.random.default_rng(0), 0
-    for t in range(130):
-        if one.seat.action.discrete:
-            actions = np.where(rng.random(rows) < 0.6, 0, rng.integers(0, one.seat.action.size, rows))
-        else:
-            actions = rng.uniform(-1.2, 1.2, (rows, one.seat.action.size)).astype(np.float32)
-        results = one.step(actions), two.step(actions)
-        for first, second in zip(*results, strict=True):
-            _same(*(value if isinstance(value, dict) else np.asarray(value) for value in (first, second)))
-        ended += int((results[0][2] | results[0][3]).sum())
-        if t == 60:
-            mask = np.arange(rows) % 3 == 0
-            seeds = [int(i) if here and i % 2 == 0 else None for i, here in enumerate(mask)]
-            for first, second in zip(*(env.reset(seed=seeds, options={"reset_mask": mask}) for env in (one, two)), strict=True):
-                _same(first, second)
-        if t == 90:
-            kept = one.episodes.held()
-            one.step(actions)
-            one.episodes.put(kept)
-            one.observed = two.observed.copy()
-    assert ended >= rows and np.array_equal(one.episode, two.episode)
+    as_plain(arguments, 5, tmp_path)
 
 
 def test_a_masked_reset_leaves_rows_that_wait_for_their_next_episode_alone(tmp_path):
     """All rows are over at the horizon; the one that is reset begins, the others do so at their next step."""
     text = tmp_path / "short.yaml"
-    text.write_text(_short("stop-and-go-v0"))
+    text.write_text(short("stop-and-go-v0"))
     seen = []
     for engine in ("fused", "plain"):
         env = AdversaryVectorEnv(6, engine=engine, scenario=str(text), defence="kf", autoreset="next_step")
@@ -176,7 +128,7 @@ def test_a_masked_reset_leaves_rows_that_wait_for_their_next_episode_alone(tmp_p
         observed, *_, info = env.step(np.zeros(6, np.int64))
         assert info["step"].tolist() == [2, 1, 1, 1, 1, 1]
         seen.append(observed)
-    _same(*seen)
+    same(*seen)
 
 
 @pytest.mark.parametrize("action", ["mode", "continuous"])
@@ -185,17 +137,17 @@ def test_a_single_environment_is_a_batch_of_one(action):
     one, two = (AdversaryEnv(engine=engine, action=action, threat={"budget": 30}) for engine in ("fused", "plain"))
     assert [env.batch.engine for env in (one, two)] == ["fused", "plain"]
     rng, over, chosen = np.random.default_rng(3), False, None
-    _same(*(env.reset(seed=5)[0] for env in (one, two)))
+    same(*(env.reset(seed=5)[0] for env in (one, two)))
     for _ in range(700):
         if over:
             for env in (one, two):
                 with pytest.raises(InputError, match="step: got"):
                     env.step(chosen)
-            _same(*(env.reset()[0] for env in (one, two)))
+            same(*(env.reset()[0] for env in (one, two)))
             break
         chosen = int(rng.integers(0, 4)) if action == "mode" else rng.uniform(-1, 1, one.batch.seat.action.size).astype(np.float32)
         first, second = one.step(chosen), two.step(chosen)
-        _same(first[0], second[0])
+        same(first[0], second[0])
         assert [type(value) for value in first] == [type(value) for value in second] and first[1:4] == second[1:4]
         assert {k: type(v) for k, v in first[4].items()} == {k: type(v) for k, v in second[4].items()}
         assert all(np.array_equal(value, second[4][key]) for key, value in first[4].items())
@@ -205,21 +157,9 @@ def test_a_single_environment_is_a_batch_of_one(action):
         one.step(99 if action == "mode" else np.full(3, np.nan, np.float32))
 
 
-def _short(name):
-    """A scenario of 60 steps, so that rows begin again."""
-    from importlib.resources import files
-
-    import yaml
-
-    data = yaml.safe_load(files("tailgate.configs").joinpath(f"scenarios/{name}.yaml").read_text())
-    data["horizon"] = 60
-    data["threat_model"] = data["threat_model"] | {"onset": 5, "end": 55}
-    return yaml.safe_dump(data)
-
-
 def test_threads_and_blocks_change_no_bit():
     """4200 episodes in one thread, in two, and apart."""
-    loop, _ = _loop("stop-and-go-v0", "chi2_kf", "none", horizon=3)
+    loop, _ = loop_of("stop-and-go-v0", "chi2_kf", "none", horizon=3)
     constants, keys = fuse(loop), draws.keys("report", range(4200))
     held = []
     for threads in (1, 2):
@@ -270,7 +210,7 @@ def test_somebody_elses_filter_of_the_same_base_is_not_taken_for_it():
 
 def test_what_is_not_finite_is_refused_as_in_the_plain_loop():
     """A measurement of 1e308 makes the estimate infinite."""
-    loop, _ = _loop("stop-and-go-v0", "kf", "none", fdi_bound=1.7e308, onset=1)
+    loop, _ = loop_of("stop-and-go-v0", "kf", "none", fdi_bound=1.7e308, onset=1)
     lanes = Lanes(loop, fuse(loop), draws.keys("report", range(3)))
     lanes.start()
     command = loop.brief.command(np.ones(3, bool), 5, np.array([True, True, False, False, False]), 1.7e308)

@@ -17,7 +17,7 @@ from tailgate.scenario import load_scenario
 from tailgate.trace import nearest, rollout
 from tailgate.tree import leaves
 
-from .test_fused import _as_plain, _loop, _same
+from .fused import as_plain, in_any_thread, loop_of, same, trace_as_plain
 
 # Every scenario, filter, kind, law of values and trigger at least once; with two, three and fourteen sensors, and readings that drop out.
 RESTLESS, WEAK, NOISY, LARGE, THESIS = (f"{name}-v0" for name in (
@@ -68,15 +68,9 @@ CELLS = [
 @pytest.mark.parametrize(("scenario", "defence", "attack", "threat"), CELLS)
 def test_a_trace_is_the_plain_loops_to_the_last_bit(scenario, defence, attack, threat):
     """Episodes in two blocks, one of them not full: every signal's hash, and the lengths."""
-    loop, rival = _loop(scenario, defence, attack, horizon=90, **({"onset": 10, "end": 80} | threat))
-    assert isinstance(fuse(loop, rival), Constants)
-    keys = draws.keys("report", range(67))
-    fused, plain = rollout(loop, rival, keys), rollout(loop, rival, keys, plain=True)
+    loop, rival = loop_of(scenario, defence, attack, horizon=90, **({"onset": 10, "end": 80} | threat))
+    plain = trace_as_plain(loop, rival)
     assert attack == "none" or "near" in attack or (plain.kind != 0).any()
-    assert np.array_equal(fused.length, plain.length)
-    assert [fused.trace_hash(b) for b in range(67)] == [plain.trace_hash(b) for b in range(67)]
-    assert {name: column.dtype for name, column in fused.signals.items()} == {name: column.dtype for name, column in plain.signals.items()}
-    assert all(np.array_equal(fused.first[name], plain.first[name]) for name in plain.first)
 
 
 @pytest.mark.parametrize(("agents", "states", "sensors", "graph"), [(2, 2, 2, "path"), (7, 5, 3, "star"), (4, 9, 20, "complete")])
@@ -100,7 +94,7 @@ def test_networks_of_any_size(agents, states, sensors, graph, defence):
 
 def test_without_a_road_there_is_no_gap():
     """Which only the plain loop says."""
-    loop, rival = _loop(WEAK, "dkf", "fdi:value=5", horizon=20)
+    loop, rival = loop_of(WEAK, "dkf", "fdi:value=5", horizon=20)
     assert nearest(loop, rival, draws.keys("report", range(3))) is None
 
 
@@ -125,31 +119,18 @@ ENVIRONMENTS = [
 @pytest.mark.parametrize("arguments", ENVIRONMENTS, ids=lambda a: f"{a['scenario']}-{a['defence']}")
 def test_an_environment_is_the_plain_one_to_the_last_bit(arguments, rows, tmp_path):
     """Observations, rewards, flags and information, over restarts, a masked reset and what was held."""
-    _as_plain(arguments, rows, tmp_path)
+    as_plain(arguments, rows, tmp_path)
 
 
 def test_threads_and_blocks_change_no_bit():
     """4200 episodes in one thread and in two, and one of them apart."""
-    loop, _ = _loop(WEAK, "norm_resilient", "none", horizon=3, onset=1)
-    constants, keys = fuse(loop), draws.keys("report", range(4200))
-    held = []
-    for threads, mine in ((1, keys), (2, keys), (1, draws.keys("report", [4111]))):
-        rows = len(mine.key)
-        command = loop.brief.command(np.ones(rows, bool), 5, loop.brief.granted, 2.0)
-        lanes = Network(loop, constants, mine, threads=threads)
-        assert lanes.threads == threads
-        lanes.start()
-        for _ in range(3):
-            lanes.advance(command)
-        held.append(lanes.memory.window.copy())
-    assert np.array_equal(*held[:2])
-    block, lane = divmod(4111, 64)
-    assert np.array_equal(held[0][block].reshape(-1, 64)[:, lane], held[2][0].reshape(-1, 64)[:, 0])
+    loop, _ = loop_of(WEAK, "norm_resilient", "none", horizon=3, onset=1)
+    in_any_thread(Network, loop)
 
 
 def test_what_is_not_finite_is_refused_as_in_the_plain_loop():
     """A measurement of 1e308 makes the estimate infinite."""
-    loop, _ = _loop(WEAK, "dkf", "none", fdi_bound=1.7e308, onset=1)
+    loop, _ = loop_of(WEAK, "dkf", "none", fdi_bound=1.7e308, onset=1)
     lanes = Network(loop, fuse(loop), draws.keys("report", range(3)))
     lanes.start()
     command = loop.brief.command(np.ones(3, bool), 5, loop.brief.granted, 1.7e308)
@@ -161,7 +142,7 @@ def test_what_is_not_finite_is_refused_as_in_the_plain_loop():
 def test_what_an_attacker_sees_and_may_do_is_as_in_the_plain_loop():
     """Every part of a view, under random commands at any agent, granted or not, with a grey box and the measurement."""
     granted = {"knowledge": "grey", "sees_measurement": True, "budget": 20, "cooldown": 2, "duration": 3, "onset": 2, "fdi_bound": 60.0}
-    loop, _ = _loop(RESTLESS, "dkf", "none", targets=("y1", "y2", "y9"), **granted)
+    loop, _ = loop_of(RESTLESS, "dkf", "none", targets=("y1", "y2", "y9"), **granted)
     keys, rng, shape = draws.keys("report", range(70)), np.random.default_rng(1), loop.brief.granted.shape
     lanes, state, refused = Network(loop, fuse(loop), keys), loop.start(keys), []
     lanes.start()
@@ -188,11 +169,11 @@ def test_a_single_environment_is_a_batch_of_one(action):
     )  # fmt: skip
     assert [env.batch.engine for env in (one, two)] == ["fused", "plain"]
     rng, over = np.random.default_rng(3), False
-    _same(*(env.reset(seed=5)[0] for env in (one, two)))
+    same(*(env.reset(seed=5)[0] for env in (one, two)))
     while not over:
         chosen = int(rng.integers(0, one.batch.seat.action.size)) if action == "mode" else rng.uniform(-1, 1, one.batch.seat.action.size)
         first, second = one.step(chosen), two.step(chosen)
-        _same(first[0], second[0])
+        same(first[0], second[0])
         assert [type(value) for value in first] == [type(value) for value in second] and first[1:4] == second[1:4]
         assert first[4].keys() == second[4].keys() and all(np.array_equal(value, second[4][key]) for key, value in first[4].items())
         over = first[2] or first[3]
@@ -230,7 +211,7 @@ def test_an_attack_that_drops_nothing_leaves_gains_that_are_the_same_in_all_rows
     program.write_text(files("tailgate.configs").joinpath("attacks/sudden_hold.yaml").read_text().replace("dos_hold", "dropout"))
     known = "fdi", "dos_hold", "ghost:size=20", "fdi_sparse", "program:path=sudden_hold"
     for attack, wanted in [(name, Constants) for name in known] + [(name, Refused) for name in ("dropout", f"program:path={program}")]:
-        loop, rival = _loop(WEAK, "kf", attack)
+        loop, rival = loop_of(WEAK, "kf", attack)
         assert isinstance(fuse(loop, rival), wanted), attack
 
 

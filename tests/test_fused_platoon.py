@@ -17,7 +17,7 @@ from tailgate.scenario import load_scenario
 from tailgate.trace import nearest, rollout
 from tailgate.tree import leaves
 
-from .test_fused import _as_plain, _loop, _same
+from .fused import as_plain, in_any_thread, loop_of, same, trace_as_plain
 
 # Every topology and law, manoeuvre of a scenario, kind, law of values and trigger at least once; wires of several cars, and all of a car's.
 WIRES = ("distance", "velocity", "acceleration", "predecessor_acceleration", "leader_acceleration", "predecessor_command", "command")
@@ -72,15 +72,9 @@ CELLS = [
 @pytest.mark.parametrize(("scenario", "defence", "attack", "threat"), CELLS)
 def test_a_trace_is_the_plain_loops_to_the_last_bit(scenario, defence, attack, threat):
     """Episodes in two blocks, one of them not full: every signal's hash, and the lengths."""
-    loop, rival = _loop(scenario, defence, attack, horizon=120, **threat)
-    assert isinstance(fuse(loop, rival), Constants)
-    keys = draws.keys("report", range(67))
-    fused, plain = rollout(loop, rival, keys), rollout(loop, rival, keys, plain=True)
+    loop, rival = loop_of(scenario, defence, attack, horizon=120, **threat)
+    plain = trace_as_plain(loop, rival)
     assert attack == "none" or (plain.kind != 0).any()
-    assert np.array_equal(fused.length, plain.length)
-    assert [fused.trace_hash(b) for b in range(67)] == [plain.trace_hash(b) for b in range(67)]
-    assert {name: column.dtype for name, column in fused.signals.items()} == {name: column.dtype for name, column in plain.signals.items()}
-    assert all(np.array_equal(fused.first[name], plain.first[name]) for name in plain.first)
 
 
 @pytest.mark.parametrize("followers", [1, 2, 7])
@@ -102,7 +96,7 @@ def test_strings_of_any_length(followers, tmp_path):
 
 def test_whole_episodes_with_collisions_and_beyond_them():
     """To the horizon, ended by a collision or not."""
-    loop, rival = _loop("platoon-gusty-v0", "dkf", "fdi:start_step=60,value=30,targets=[distance]", horizon=550)
+    loop, rival = loop_of("platoon-gusty-v0", "dkf", "fdi:start_step=60,value=30,targets=[distance]", horizon=550)
     keys = draws.keys("report", range(20))
     for terminate in (True, False):
         fused, plain = (rollout(loop, rival, keys, terminate=terminate, plain=engine) for engine in (False, True))
@@ -141,31 +135,18 @@ ENVIRONMENTS = [
 @pytest.mark.parametrize("arguments", ENVIRONMENTS, ids=lambda a: f"{a['scenario']}-{a['defence']}")
 def test_an_environment_is_the_plain_one_to_the_last_bit(arguments, rows, tmp_path):
     """Observations, rewards, flags and information, over restarts, a masked reset and what was held."""
-    _as_plain(arguments, rows, tmp_path)
+    as_plain(arguments, rows, tmp_path)
 
 
 def test_threads_and_blocks_change_no_bit():
     """4200 episodes in one thread and in two, and one of them apart."""
-    loop, _ = _loop("platoon-gusty-v0", "dkf", "none", horizon=3, onset=1, agents=(1, 2))
-    constants, keys = fuse(loop), draws.keys("report", range(4200))
-    held = []
-    for threads, mine in ((1, keys), (2, keys), (1, draws.keys("report", [4111]))):
-        rows = len(mine.key)
-        command = loop.brief.command(np.ones(rows, bool), 5, loop.brief.granted, 2.0)
-        lanes = Platoon(loop, constants, mine, threads=threads)
-        assert lanes.threads == threads
-        lanes.start()
-        for _ in range(3):
-            lanes.advance(command)
-        held.append(lanes.memory.window.copy())
-    assert np.array_equal(*held[:2])
-    block, lane = divmod(4111, 64)
-    assert np.array_equal(held[0][block].reshape(-1, 64)[:, lane], held[2][0].reshape(-1, 64)[:, 0])
+    loop, _ = loop_of("platoon-gusty-v0", "dkf", "none", horizon=3, onset=1, agents=(1, 2))
+    in_any_thread(Platoon, loop)
 
 
 def test_what_is_not_finite_is_refused_as_in_the_plain_loop():
     """A measurement of 1e308 makes the estimate infinite."""
-    loop, _ = _loop("platoon-gusty-v0", "dkf", "none", fdi_bound=1.7e308, onset=1)
+    loop, _ = loop_of("platoon-gusty-v0", "dkf", "none", fdi_bound=1.7e308, onset=1)
     lanes = Platoon(loop, fuse(loop), draws.keys("report", range(3)))
     lanes.start()
     command = loop.brief.command(np.ones(3, bool), 5, loop.brief.granted, 1.7e308)
@@ -176,7 +157,7 @@ def test_what_is_not_finite_is_refused_as_in_the_plain_loop():
 
 def test_a_command_beyond_what_is_granted_is_refused():
     """At another car, of another value: as in the plain loop, and alone as beside a legal target."""
-    loop, _ = _loop("platoon-gusty-v0", "dkf", "none", onset=1)
+    loop, _ = loop_of("platoon-gusty-v0", "dkf", "none", onset=1)
     keys, wires = draws.keys("report", range(4)), len(loop.model.wires)
     command = loop.brief.command(np.ones(4, bool), 5, np.zeros((5, wires), bool), 0.0)
     command.target[0, 2, 0] = command.target[1, 2, 0] = command.target[1, 4, 0] = command.target[2, 3, 1] = command.target[3, 2, 0] = True
@@ -196,7 +177,7 @@ def test_a_command_beyond_what_is_granted_is_refused():
 def test_what_an_attacker_sees_is_what_the_plain_loop_shows(scenario, defence):
     """Every part of a view, under random commands at several cars, with a grey box and the measurement."""
     granted = {"knowledge": "grey", "sees_measurement": True, "budget": 20, "cooldown": 2, "duration": 3, "onset": 2}
-    loop, _ = _loop(scenario, defence, "none", **(ANY | granted))
+    loop, _ = loop_of(scenario, defence, "none", **(ANY | granted))
     keys, rng, shape = draws.keys("report", range(70)), np.random.default_rng(1), loop.brief.granted.shape
     lanes, state = Platoon(loop, fuse(loop), keys), loop.start(keys)
     lanes.start()
@@ -219,11 +200,11 @@ def test_a_single_environment_is_a_batch_of_one(action):
     )  # fmt: skip
     assert [env.batch.engine for env in (one, two)] == ["fused", "plain"]
     rng, over = np.random.default_rng(3), False
-    _same(*(env.reset(seed=5)[0] for env in (one, two)))
+    same(*(env.reset(seed=5)[0] for env in (one, two)))
     while not over:
         chosen = int(rng.integers(0, one.batch.seat.action.size)) if action == "mode" else rng.uniform(-1, 1, one.batch.seat.action.size)
         first, second = one.step(chosen), two.step(chosen)
-        _same(first[0], second[0])
+        same(first[0], second[0])
         assert [type(value) for value in first] == [type(value) for value in second] and first[1:4] == second[1:4]
         assert all(np.array_equal(value, second[4][key]) for key, value in first[4].items())
         over = first[2] or first[3]

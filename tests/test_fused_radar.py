@@ -10,7 +10,7 @@ from tailgate.registry import Spec
 from tailgate.scenario import load_scenario
 from tailgate.trace import nearest, rollout
 
-from .test_fused import _as_plain, _loop
+from .fused import as_plain, loop_of
 
 # Every filter, detector, mitigation and kind at least once, over the air and on the wires, and a jammer that leaves nothing to read.
 ANY = {
@@ -65,7 +65,7 @@ CELLS = [
 @pytest.mark.parametrize(("scenario", "defence", "attack", "threat"), CELLS)
 def test_a_trace_is_the_plain_loops_to_the_last_bit(scenario, defence, attack, threat):
     """Episodes in two blocks, one of them not full: every signal's hash, and the lengths."""
-    loop, rival = _loop(scenario, defence, attack, **threat)
+    loop, rival = loop_of(scenario, defence, attack, **threat)
     assert isinstance(fuse(loop, rival), Constants)
     keys = draws.keys("report", range(67))
     fused, plain = rollout(loop, rival, keys), rollout(loop, rival, keys, plain=True)
@@ -95,12 +95,12 @@ ENVIRONMENTS = [
 @pytest.mark.parametrize("arguments", ENVIRONMENTS, ids=lambda a: f"{a['scenario']}-{a['defence']}")
 def test_an_environment_is_the_plain_one_to_the_last_bit(arguments, tmp_path):
     """Observations, rewards, flags and information, over restarts and a masked reset, in several blocks."""
-    _as_plain(arguments, 70, tmp_path)
+    as_plain(arguments, 70, tmp_path)
 
 
 def test_the_smallest_gaps_are_those_of_the_trace():
     """Without a trace, in front and behind."""
-    loop, rival = _loop("radar-following-v0", "cra", "echo_delay:trigger=near,threshold=60,delay=60", horizon=240)
+    loop, rival = loop_of("radar-following-v0", "cra", "echo_delay:trigger=near,threshold=60,delay=60", horizon=240)
     keys = draws.keys("report", range(67))
     length, gaps = nearest(loop, rival, keys)
     trace = rollout(loop, rival, keys, plain=True)
@@ -112,7 +112,7 @@ def test_the_smallest_gaps_are_those_of_the_trace():
 
 def test_threads_and_blocks_change_no_bit():
     """4200 episodes in one thread, in two, and apart."""
-    loop, _ = _loop("radar-following-v0", "chi2_kf", "none", horizon=3)
+    loop, _ = loop_of("radar-following-v0", "chi2_kf", "none", horizon=3)
     constants, keys = fuse(loop), draws.keys("report", range(4200))
     command = loop.brief.command(np.ones(4200, bool), 8, np.array([True, True, False]), 0.1)
     held = []

@@ -1,0 +1,103 @@
+"""The fused engine beside the plain loop, for the tests of each of its plants."""
+
+
+import numpy as np
+
+from tailgate import draws
+from tailgate.envs.faces import AdversaryVectorEnv
+from tailgate.fused import Constants, fuse
+from tailgate.registry import Spec
+from tailgate.scenario import load_scenario
+from tailgate.trace import rollout
+
+
+def loop_of(scenario, defence, attack, horizon=200, **threat):
+    made = Spec("attack", attack)
+    changes = {"knowledge": getattr(made.make(), "knowledge", made.entry.knowledge)} | threat
+    guard = Spec("defence", defence)
+    place = load_scenario(scenario).with_threat(**changes)
+    loop = place.loop(guard.make(), guard.entry.uses)
+    object.__setattr__(loop, "horizon", min(horizon, place.horizon))
+    return loop, made.make()
+
+
+def same(one, two):
+    if isinstance(one, dict):
+        assert one.keys() == two.keys()
+        for key in one:
+            same(one[key], two[key])
+    else:
+        assert one.dtype == two.dtype and np.array_equal(one, two, equal_nan=True)
+
+
+def trace_as_plain(loop, rival):
+    """Episodes in two blocks, one of them not full: every signal's hash, and the lengths. -> the plain loop's trace."""
+    assert isinstance(fuse(loop, rival), Constants)
+    keys = draws.keys("report", range(67))
+    fused, plain = rollout(loop, rival, keys), rollout(loop, rival, keys, plain=True)
+    assert np.array_equal(fused.length, plain.length)
+    assert [fused.trace_hash(b) for b in range(67)] == [plain.trace_hash(b) for b in range(67)]
+    assert {name: column.dtype for name, column in fused.signals.items()} == {name: column.dtype for name, column in plain.signals.items()}
+    assert all(np.array_equal(fused.first[name], plain.first[name]) for name in plain.first)
+    return plain
+
+
+def in_any_thread(kind, loop):
+    """4200 episodes of a kind of lanes in one thread and in two, and one of them apart."""
+    constants, keys = fuse(loop), draws.keys("report", range(4200))
+    held = []
+    for threads, mine in ((1, keys), (2, keys), (1, draws.keys("report", [4111]))):
+        rows = len(mine.key)
+        command = loop.brief.command(np.ones(rows, bool), 5, loop.brief.granted, 2.0)
+        lanes = kind(loop, constants, mine, threads=threads)
+        assert lanes.threads == threads
+        lanes.start()
+        for _ in range(3):
+            lanes.advance(command)
+        held.append(lanes.memory.window.copy())
+    assert np.array_equal(*held[:2])
+    block, lane = divmod(4111, 64)
+    assert np.array_equal(held[0][block].reshape(-1, 64)[:, lane], held[2][0].reshape(-1, 64)[:, 0])
+
+
+def as_plain(arguments, rows, folder):
+    """So many rows of both engines, in a scenario so short that all begin again; some are reset by a mask, one in two of them with a seed."""
+    text = folder / "short.yaml"
+    text.write_text(short(arguments["scenario"]))
+    one, two = (AdversaryVectorEnv(rows, engine=engine, **(arguments | {"scenario": str(text)})) for engine in ("fused", "plain"))
+    assert (one.engine, two.engine) == ("fused", "plain")
+    for first, second in zip(one.reset(seed=3), two.reset(seed=3), strict=True):
+        same(first, second)
+    rng, ended = np.random.default_rng(0), 0
+    for t in range(130):
+        if one.seat.action.discrete:
+            actions = np.where(rng.random(rows) < 0.6, 0, rng.integers(0, one.seat.action.size, rows))
+        else:
+            actions = rng.uniform(-1.2, 1.2, (rows, one.seat.action.size)).astype(np.float32)
+        results = one.step(actions), two.step(actions)
+        for first, second in zip(*results, strict=True):
+            same(*(value if isinstance(value, dict) else np.asarray(value) for value in (first, second)))
+        ended += int((results[0][2] | results[0][3]).sum())
+        if t == 60:
+            mask = np.arange(rows) % 3 == 0
+            seeds = [int(i) if here and i % 2 == 0 else None for i, here in enumerate(mask)]
+            for first, second in zip(*(env.reset(seed=seeds, options={"reset_mask": mask}) for env in (one, two)), strict=True):
+                same(first, second)
+        if t == 90:
+            kept = one.episodes.held()
+            one.step(actions)
+            one.episodes.put(kept)
+            one.observed = two.observed.copy()
+    assert ended >= rows and np.array_equal(one.episode, two.episode)
+
+
+def short(name):
+    """A scenario of 60 steps, so that rows begin again."""
+    from importlib.resources import files
+
+    import yaml
+
+    data = yaml.safe_load(files("tailgate.configs").joinpath(f"scenarios/{name}.yaml").read_text())
+    data["horizon"] = 60
+    data["threat_model"] = data["threat_model"] | {"onset": 5, "end": 55}
+    return yaml.safe_dump(data)
