@@ -11,7 +11,7 @@ from tailgate.core import Array, Frame, Kind, Model, NonNegative, Positive, para
 from tailgate.elementwise import clip
 from tailgate.errors import InputError
 
-RewardName = Literal["collision", "min_gap", "error", "stealth", "final"]
+RewardName = Literal["collision", "min_gap", "error", "peak", "stealth", "final"]
 NEAR = 20.0  # min_gap: a smaller gap than this counts [m]
 
 
@@ -39,14 +39,15 @@ class Reward:
 
     collision: 1 at a collision in front or behind. min_gap: the same, and the metres by which the smallest gap of the episode falls
     below 20 m, over 20 m: a burst at the right moment earns something long before it makes a collision. error: the largest error of an
-    agent (`Model.error`) over `error_scale`, capped at 1, per second. stealth: error, less one per second of alarm. final: that error over
+    agent (`Model.error`) over `error_scale`, capped at 1, per second. peak: by how much the largest error of the episode so far rises, over
+    `error_scale`: in all, the metric `max_error`. stealth: error, less one per second of alarm. final: that error over
     `error_scale`, squared, at the last step of the horizon alone: its mean is the trace of the error's covariance. The shaping terms are
     potential-based (Ng, Harada, Russell 1999): they leave the best policy unchanged when `gamma` is the learner's, and may use the truth,
     which the policy does not see. Without a road nothing collides, and the potentials are 0.
     """
 
-    reward: RewardName = param("min_gap", "collision, min_gap, error, stealth or final")
-    error_scale: Positive = param(10.0, "error, stealth, final: the error that earns 1: of the gap [m], or of the state [its unit]")
+    reward: RewardName = param("min_gap", "collision, min_gap, error, peak, stealth or final")
+    error_scale: Positive = param(10.0, "error, peak, stealth, final: the error that earns 1: of the gap [m], or of the state [its unit]")
     gap_shaping: NonNegative = param(0.5, "weight of the closeness of the car ahead as a potential [-]")
     error_shaping: NonNegative = param(1.0, "weight of the believed extra gap, per 10 m and capped at 20 m, as a potential [-]")
     gamma: Positive = param(0.995, "discount in the potential's difference [-]")
@@ -65,16 +66,21 @@ class Reward:
     def check(self, model: Model) -> None:
         """Raise InputError for a reward that nothing can earn under this model."""
         if self.reward in ("collision", "min_gap") and not model.followers.any():
-            raise InputError("reward", self.reward, "error, stealth or final: nobody drives in this scenario, so nobody collides")
+            raise InputError("reward", self.reward, "error, peak, stealth or final: nobody drives in this scenario, so nobody collides")
 
-    def __call__(self, model: Model, frame: Frame, fall: Array, last: Array) -> Array:
-        """(B,) reward of one step of the loop; fall (B,) of the smallest gap [m]; last (B,) bool: the horizon's last step."""
+    def __call__(self, model: Model, frame: Frame, fall: Array, last: Array, rise: Array | float = 0.0) -> Array:
+        """(B,) reward of one step of the loop; last (B,) bool: the horizon's last step.
+
+        fall (B,) of the smallest gap [m]; rise (B,) of the largest error, which only `peak` asks for.
+        """
         crashed = frame.collided | frame.rear_collided
         out = -self.illegal_penalty * frame.refused - self.attack_cost * (frame.command.kind != Kind.NONE)
         if self.reward in ("collision", "min_gap"):
             out = out + crashed
             if self.reward == "min_gap":
                 out = out + fall / NEAR
+        elif self.reward == "peak":
+            out = out + rise / self.error_scale
         else:
             error = np.max(model.error(frame.estimate.x, frame.truth), axis=1) / self.error_scale
             out = out + (np.where(last, error * error, 0.0) if self.reward == "final" else model.dt * np.minimum(error, 1.0))

@@ -37,6 +37,7 @@ class Tally(NamedTuple):
     potential: Array  # of the shaping
     least: Array  # smallest gap so far, within the reward's reach [m]
     error: Array  # largest error of an agent, where there is no road
+    peak: Array  # the largest of the episode so far, where the reward is for that
 
 
 class Outcome(NamedTuple):
@@ -128,7 +129,7 @@ class Seat:
     def begin(self, state: LoopState) -> Tally:
         """The reward's memory of episodes that have just begun."""
         gap = self.loop.plant.scene(self.loop.plan.plant, state.plant).gap
-        return Tally(self.reward.potential(gap), self.reward.least(gap), np.zeros(len(gap)))
+        return Tally(self.reward.potential(gap), self.reward.least(gap), np.zeros(len(gap)), np.zeros(len(gap)))
 
     def step(
         self, state: LoopState, tally: Tally, action: Array | Callable[[View], Command], over: Array
@@ -138,14 +139,16 @@ class Seat:
         action: as `ActionCodec.decode` takes it, or somebody who decides in every step.
         """
         loop, reward = self.loop, self.reward
-        raw, potential, least, largest = np.zeros(len(over)), tally.potential, tally.least, tally.error
+        raw, (potential, least, largest, peak) = np.zeros(len(over)), tally
         collided, rear, refused = (np.zeros(len(over), bool) for _ in range(3))
         for _ in range(self.action.spec.interval):
             live = ~over & ~state.ended & (state.k <= loop.horizon)
             view = loop.sense(state)
             state, frame = loop.advance(state, action(view) if callable(action) else self.action.decode(action, view))
-            before, least = least, reward.least(frame.scene.gap, least)
-            raw += np.where(live, reward(loop.model, frame, before - least, frame.k == loop.horizon), 0.0)
+            before, least, lower = least, reward.least(frame.scene.gap, least), peak
+            if reward.reward == "peak":
+                peak = np.maximum(np.max(loop.model.error(frame.estimate.x, frame.truth), axis=1), peak)
+            raw += np.where(live, reward(loop.model, frame, before - least, frame.k == loop.horizon, peak - lower), 0.0)
             gap_error = loop.model.gap_error(frame.estimate.x, frame.truth)
             potential = np.where(live, reward.potential(frame.scene.gap, gap_error), potential)
             if not self.road:
@@ -155,4 +158,4 @@ class Seat:
         terminated = state.ended & ~over
         truncated = ~terminated & ~over & (state.k > loop.horizon)
         gained = np.where(over, 0.0, reward.shaped(raw, tally.potential, potential, terminated))
-        return state, Tally(potential, least, largest), Outcome(gained, collided, rear, refused, terminated, truncated), frame
+        return state, Tally(potential, least, largest, peak), Outcome(gained, collided, rear, refused, terminated, truncated), frame

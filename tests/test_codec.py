@@ -12,13 +12,16 @@ from tailgate.agents.observation import LIMIT, ObservationCodec
 from tailgate.agents.policy import load_policy
 from tailgate.agents.reward import NEAR, Reward
 from tailgate.core import Kind
-from tailgate.draws import keys
+from tailgate.draws import Role, keys
 from tailgate.envs.faces import AdversaryVectorEnv
 from tailgate.envs.network import LinearSensors, NoControl, SensorNetwork
 from tailgate.envs.platoon import Platoon, PlatoonSensors
+from tailgate.envs.seat import Seat
 from tailgate.errors import InputError
+from tailgate.metrics import METRICS
 from tailgate.registry import Spec
 from tailgate.scenario import load_scenario
+from tailgate.trace import rollout
 
 ROOT = Path(__file__).parents[1]
 DKF = Spec("defence", "dkf")
@@ -321,6 +324,30 @@ def test_error_pays_the_largest_error_of_an_agent(kind):
     np.testing.assert_allclose(Reward(reward="final", error_scale=4.0)(model, frame, fall, last), final)
 
 
+@pytest.mark.parametrize(("scenario", "defence"), [("network-restless-v0", "dkf"), ("platoon-gusty-v0", "dkf"), ("stop-and-go-v0", "kf")])
+def test_the_rises_of_the_peak_add_up_to_the_largest_error(scenario, defence):
+    """What `peak` pays for in an episode is `max_error` over error_scale, however many steps a decision lasts."""
+    scale = 7.0
+    seat = Seat.make(scenario, defence, {"budget": 5}, reward="peak", error_scale=scale, gap_shaping=0.0, error_shaping=0.0, interval=3)
+    loop, attack, rows = seat.loop, Spec("attack", "fdi:start_step=60,value=-3").make(), keys("report", range(6))
+    plan = attack.prepare(loop.brief)
+    state, memory = loop.start(rows), attack.start(plan, 6, rows.at(Role.ATTACK, np.zeros(6, np.int64)))
+    tally, over, total = seat.begin(state), np.zeros(6, bool), np.zeros(6)
+
+    def chosen(view):
+        nonlocal memory
+        memory, command = attack.decide(plan, memory, view, rows.at(Role.ATTACK, view.k))
+        return command
+
+    for _ in range(seat.decisions):
+        state, tally, outcome, _ = seat.step(state, tally, chosen, over)
+        total += outcome.reward
+        over = over | outcome.terminated | outcome.truncated
+    wanted = METRICS["max_error"](rollout(loop, attack, rows))
+    assert wanted.min() > 1.0
+    np.testing.assert_allclose(total * scale, wanted, rtol=1e-12)
+
+
 def test_the_smallest_gap_of_any_car_counts():
     """min_gap and the potentials look at the worst car; the leader, whom nothing is ahead of, is none."""
     reward = Reward(gap_shaping=1.0, error_shaping=1.0)
@@ -336,7 +363,7 @@ def test_without_a_road_potentials_are_zero_and_nothing_collides():
     nobody = np.full((3, 5), np.inf)
     assert Reward().potential(nobody, model.gap_error(np.ones((3, 5, 4)), np.zeros((3, 5, 4)))).tolist() == [0.0, 0.0, 0.0]
     for name in ("min_gap", "collision"):
-        with pytest.raises(InputError, match=f"reward.*'{name}'.*error, stealth or final"):
+        with pytest.raises(InputError, match=f"reward.*'{name}'.*error, peak, stealth or final"):
             AdversaryVectorEnv(2, scenario="thesis-ch5-v0", defence="dkf", reward=name)
 
 

@@ -101,7 +101,7 @@ ENVIRONMENTS = [
     {"scenario": "ch7-v0", "defence": "windowed_chi2_kf", "autoreset": "same_step", "action": "increment", "reward": "error",
      "attack_cost": 0.1, "illegal_penalty": 0.2},
     {"scenario": "car-following-heavy-v0", "defence": "brake_kf", "action": "timing", "kind": "dos_jam", "reward": "collision"},
-    {"scenario": "stop-and-go-v0", "defence": "imm", "autoreset": "same_step"},
+    {"scenario": "stop-and-go-v0", "defence": "imm", "autoreset": "same_step", "reward": "peak"},
     {"scenario": "gusty-stop-and-go-v0", "defence": "safe_state_brake", "autoreset": "next_step", "action": "continuous",
      "threat": {"targets": ["position", "leader_position", "leader_velocity"]}},
 ]  # fmt: skip

@@ -108,7 +108,7 @@ ENVIRONMENTS = [
      "threat": {"agents": [1, 4], "targets": ["y1", "y3"]}},
     {"scenario": NOISY, "defence": "saturated_dkf:eta=2", "autoreset": "same_step", "reward": "stealth", "per_sensor": True, "per_agent": True,
      "attack_cost": 0.1, "illegal_penalty": 0.2},
-    {"scenario": RESTLESS, "defence": "norm_resilient", "autoreset": "same_step", "reward": "error", "action": "timing", "kind": "dropout"},
+    {"scenario": RESTLESS, "defence": "norm_resilient", "autoreset": "same_step", "reward": "peak", "action": "timing", "kind": "dropout"},
     {"scenario": LARGE, "defence": "lasso_dkf", "interval": 3, "reward": "error", "value": 40.0},
     {"scenario": WEAK, "defence": "kf", "autoreset": "same_step", "reward": "error", "threat": {"kinds": ["fdi", "dos_hold"]}},
     {"scenario": WEAK, "defence": "consensus_kf", "reward": "error", "autoreset": "next_step", "threat": {"kinds": ["fdi"], "agents": [5]}},

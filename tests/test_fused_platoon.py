@@ -118,7 +118,7 @@ ENVIRONMENTS = [
      "attack_cost": 0.1, "illegal_penalty": 0.2, "threat": {"agents": [2, 4]}},
     {"scenario": "platoon-braking-known-v0", "defence": "dkf", "action": "timing", "kind": "dos_jam", "reward": "collision"},
     {"scenario": "platoon-20-v0", "defence": "dkf", "per_sensor": True, "per_agent": True, "autoreset": "same_step"},
-    {"scenario": "platoon-braking-v0", "defence": "lasso_dkf", "autoreset": "same_step", "reward": "error"},
+    {"scenario": "platoon-braking-v0", "defence": "lasso_dkf", "autoreset": "same_step", "reward": "peak"},
     {"scenario": "platoon-gusty-v0", "defence": "saturated_dkf:eta=2", "autoreset": "next_step", "action": "continuous", "reward": "stealth",
      "threat": {"kinds": ["fdi"], "targets": ["distance", "velocity"]}},
     {"scenario": "platoon-noisy-v0", "defence": "norm_resilient", "interval": 2},

@@ -25,7 +25,9 @@ if TYPE_CHECKING:
     from tailgate.envs.seat import Seat
 
 _ACTIONS = {"timing": of.DISCRETE, "mode": of.DISCRETE, "ramp": of.RAMPING, "continuous": of.CONTINUOUS, "increment": of.INCREMENT}
-_REWARDS = {"collision": of.CRASH, "min_gap": of.MIN_GAP, "error": of.ERROR, "stealth": of.STEALTH, "final": of.FINAL}
+_REWARDS = {
+    "collision": of.CRASH, "min_gap": of.MIN_GAP, "error": of.ERROR, "peak": of.PEAK, "stealth": of.STEALTH, "final": of.FINAL,
+}  # fmt: skip
 
 
 def fuse_seat(seat: Seat) -> Constants | Refused:

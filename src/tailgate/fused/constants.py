@@ -132,7 +132,7 @@ SCORE_ONLY, CHI2, WINDOWED, CUSUM, MEWMA, ALWAYS, SPARSE = range(7)
 ACCEPT_ALL, GATE_OUT, REACQUIRE, ACCEPT_FIRST, ALWAYS_MODE, ACCEPT_HONEST = range(6)
 LINEAR, LASSO, SATURATED, NORM, READ = range(5)  # how a platoon's cars estimate
 DISCRETE, RAMPING, CONTINUOUS, INCREMENT = range(4)  # actions
-CRASH, MIN_GAP, ERROR, STEALTH, FINAL = range(5)  # rewards
+CRASH, MIN_GAP, ERROR, PEAK, STEALTH, FINAL = range(6)  # rewards
 
 
 def blank() -> tuple[np.ndarray, np.ndarray]:

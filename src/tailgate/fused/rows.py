@@ -34,7 +34,7 @@ KIND = _row("kind")  # of the command in force
 LENGTH = _row("length")  # steps that the episode has lasted
 OPENED, ELAPSED, SEEN = _row("opened"), _row("elapsed"), _row("seen")  # a script's trigger: `tailgate.agents.triggers`
 OVER = _row("over")  # of a seat: the row was over before this decision
-POTENTIAL, LEAST = _row("potential"), _row("least")  # and what its reward remembers
+POTENTIAL, LEAST, PEAK = _row("potential"), _row("least"), _row("peak")  # and what its reward remembers
 COMMON = len(_names)
 # And of a car that follows another.
 EGO = _row("ego", 3)  # x, v, a

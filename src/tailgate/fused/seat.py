@@ -38,6 +38,7 @@ from .rows import (
     ON,
     OVER,
     PART,
+    PEAK,
     POTENTIAL,
     RAW,
     REAR_HIT,
@@ -131,7 +132,7 @@ def begin(s, c, n):
     for i in range(n):
         s[POTENTIAL + i] = _potential(s, gap_shaping, error_shaping, 0.0, i)
         s[LEAST + i] = np.minimum(small(s[LEAD_X + i] - s[EGO + i]), NEAR)
-        s[OVER + i] = 0.0
+        s[PEAK + i] = s[OVER + i] = 0.0
 
 
 @phase
@@ -178,11 +179,18 @@ def paying(many):
         else:
             for i in range(n):
                 s[EARNED + i] = _costs(s, illegal, cost, i)
-                s[PART + i] = (s[OFF + i] if many else abs(0.0 + sign * (s[X + i] - s[TRUTH + i]))) / scale
+                s[PART + i] = s[OFF + i] if many else abs(0.0 + sign * (s[X + i] - s[TRUTH + i]))
+            if kind == of.PEAK:
+                for i in range(n):
+                    lower = s[PEAK + i]
+                    s[PEAK + i] = np.maximum(s[PART + i], lower)
+                    s[EARNED + i] += (s[PEAK + i] - lower) / scale
+            for i in range(n):
+                s[PART + i] /= scale
             if kind == of.FINAL:
                 for i in range(n):
                     s[EARNED + i] += s[PART + i] * s[PART + i] if s[K + i] - 1.0 == horizon else 0.0
-            else:
+            elif kind != of.PEAK:
                 for i in range(n):
                     s[EARNED + i] += dt * np.minimum(s[PART + i], 1.0)
                 for i in range(n if kind == of.STEALTH else np.uint64(0)):
