@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from tailgate.adaptive import configs_of, plan_of, train_against
+from tailgate.adaptive import asked_of, configs_of, fitting, plan_of, train_against
 from tailgate.errors import InputError
 from tailgate.evaluation import evaluate
 from tailgate.scenario import Suite
@@ -44,11 +44,26 @@ def test_policies_play_as_attacks_and_are_trained_once(tmp_path: Path) -> None:
     assert json.loads(policies[0].read_text())["training"]["config"]["defence"] == "kf"
 
 
+def test_policies_play_where_the_attacker_sees_and_may_do_as_much() -> None:
+    """Networks of another shape are trained on apart, and asked for apart; another car with the same radio is not."""
+    plan = {"config": "network", "dose": 5, "learners": {"cem": ["steps=600"]}, "knowledge": ["black"], "seeds": 1}
+    places = ("network-restless-v0", "network-restless-weak-v0")
+    suite = Suite("own-v0", "", places, (5,), ("dkf",), ("none",), 3, adaptive=plan | {"scenarios": list(places)})
+    first, second = configs_of(suite, "dkf", Path("runs"))
+    assert (first.name, second.name) == (f"dkf-cem-black-{places[0]}", f"dkf-cem-black-{places[1]}")
+    assert (first.scenario, second.scenario) == places
+    assert fitting(suite, first) == places[:1] and fitting(suite, second) == places[1:]
+    assert [(one.name, one.scenarios) for one in asked_of(suite)] == [(f"cem-black-{name}", (name,)) for name in places]
+    assert fitting(SUITE, configs_of(SUITE, "kf", Path("runs"))[0]) == SUITE.scenarios
+    assert asked_of(SUITE)[0].scenarios == SUITE.scenarios
+
+
 @pytest.mark.parametrize(
     ("plan", "words"),
     [
         ({}, ["adaptive", "learners"]), (PLAN | {"learners": {"ppoo": []}}, ["ppoo", "ppo"]), (PLAN | {"learners": {}}, ["learners"]),
         (PLAN | {"knowledge": ["blck"]}, ["blck", "black"]), (PLAN | {"seed": 3}, ["seed", "seeds"]), (PLAN | {"dose": 0}, ["dose", "0"]),
+        (PLAN | {"scenarios": ["nowhere-v0"]}, ["scenarios", "nowhere-v0"]),
     ],
 )  # fmt: skip
 def test_a_plan_that_makes_no_sense_is_one_clear_error(plan: dict[str, object], words: list[str]) -> None:

@@ -6,13 +6,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
 from tailgate.adaptive import configs_of, train_against
+from tailgate.cli import main
 from tailgate.errors import InputError
 from tailgate.evaluation import evaluate
 from tailgate.leaderboard.run import OWN, board_of, play
 from tailgate.rows import packed, read_rows
-from tailgate.scenario import Suite
+from tailgate.scenario import Suite, load_suite
 from tailgate.scoring import Admitted, score
 
 spec = importlib.util.spec_from_file_location("scored", Path(__file__).with_name("scored.py"))
@@ -59,6 +61,27 @@ def test_a_rank_takes_every_training_of_the_plan(tmp_path: Path) -> None:
     assert status(whole) == ("ranked", "")
     assert status(whole[:1]) == ("unattacked", "1 of 2 of the suite's own trainings are missing, first cem-black seed 1")
     assert status(short)[0] == "unattacked" and status(short)[1].startswith("2 of 2")
+
+
+def test_attackers_of_networks_of_two_shapes_play_where_they_fit(tmp_path: Path) -> None:
+    """The command trains on both, plays each policy on its own, and the defence is ranked: nothing of the plan is missing."""
+    learners = {"cem": ["steps=400", "cem={population: 4, episodes: 1, hidden: []}"]}
+    places = ["network-restless-v0", "network-restless-weak-v0"]
+    plan = {"config": "network", "scenarios": places, "dose": 5, "knowledge": ["black"], "learners": learners, "seeds": 1}
+    made = {
+        "about": "Two networks.", "scenarios": places, "doses": [5], "defences": ["dkf"], "attacks": ["none", "fdi:value=5"], "bound": 10.0,
+        "threat": {"fdi_bound": 100.0}, "seeds": 2, "adaptive": plan,
+    }  # fmt: skip
+    (tmp_path / "two-v0.yaml").write_text(yaml.safe_dump(made))
+    own, folder = str(tmp_path / "two-v0.yaml"), tmp_path / "boards" / "two-v0"
+    assert main(["leaderboard", "attack", "dkf", "--suite", own, "--out", str(folder / "attacked"), "--workers", "1"]) == 0
+    assert sorted(path.name for path in (folder / "attacked").glob("*.jsonl")) == [f"dkf-{place}.jsonl" for place in places]
+    play(load_suite(own), folder)
+    found = entry(board_of(load_suite(own), folder), "dkf")
+    assert (found["status"], found["why"]) == ("ranked", "")
+    left = (folder / "attacked" / f"dkf-{places[1]}.jsonl").rename(tmp_path / "away.jsonl")
+    found = entry(board_of(load_suite(own), folder), "dkf")
+    assert found["why"] == f"1 of 2 of the suite's own trainings are missing, first cem-black-{places[1]} seed 0" and left.is_file()
 
 
 def test_an_admitted_name_stands_for_one_file() -> None:

@@ -12,15 +12,17 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from tailgate import train
+from tailgate.agents.codec import ActionCodec, ActionSpec
 from tailgate.agents.learning import LEARNERS
+from tailgate.agents.observation import ObservationCodec
 from tailgate.core import PositiveCount, param
 from tailgate.errors import InputError, unknown
 from tailgate.registry import Spec
-from tailgate.scenario import Suite
-from tailgate.schema import as_data, build
+from tailgate.scenario import Suite, load_scenario
+from tailgate.schema import as_data, build, fields_of
 from tailgate.threat import KNOWLEDGE
 
 Progress = Callable[[str, int, int, str], None]  # label, done, total, figures
@@ -31,6 +33,7 @@ class Adaptive:
     """The field `adaptive` of a suite."""
 
     config: str = param("", "preset of the training")
+    scenarios: tuple[str, ...] = param((), "the suite's scenarios that are trained on; none: the first. One of each kind of system")
     dose: PositiveCount | None = param(None, "attack budget in training [steps]; none: the scenario's own")
     changes: tuple[str, ...] = param((), "key=value changes of the preset, for all learners")
     learners: dict[str, tuple[str, ...]] = field(default_factory=dict, metadata={"doc": "learners, each with its own changes"})
@@ -52,47 +55,82 @@ def plan_of(suite: Suite) -> Adaptive:
             raise unknown(f"{where}.knowledge", name, KNOWLEDGE)
     if not plan.learners:
         raise InputError(f"{where}.learners", {}, "at least one learner")
+    for name in plan.scenarios:
+        if name not in suite.scenarios:
+            raise unknown(f"{where}.scenarios", name, suite.scenarios)
     return plan
 
 
 def configs_of(suite: Suite, defence: str, out: Path, *, seeds: int | None = None, extra: tuple[str, ...] = ()) -> list[train.TrainConfig]:
-    """One training for each learner and knowledge, on the first of the suite's scenarios."""
+    """One training for each scenario that is trained on, learner and knowledge."""
     plan = plan_of(suite)
     Spec("defence", defence).refuse_imports("adaptive attack")
     threat = suite.threat | ({} if plan.dose is None else {"budget": plan.dose})
-    settings = [f"scenario={suite.scenarios[0]}", f"defence={json.dumps(defence)}", f"out={json.dumps(str(out))}", "tensorboard=false"]
+    settings = [f"defence={json.dumps(defence)}", f"out={json.dumps(str(out))}", "tensorboard=false"]
     settings += ["others=[]", "white_box=[]", f"seeds={seeds or plan.seeds}"]
     found = []
-    for learner, changes in plan.learners.items():
-        for knowledge in plan.knowledge:
-            name = re.sub(r"[^A-Za-z0-9_.=-]+", "_", f"{defence}-{learner}-{knowledge}")
-            granted = f"threat={json.dumps(threat | {'knowledge': knowledge})}"
-            own = [f"name={name}", f"learner={learner}", *settings, granted, *plan.changes, *changes, *extra]
-            found.append(train.load_config(plan.config, own))
+    for place in plan.scenarios or suite.scenarios[:1]:
+        tag = f"-{place}" if len(plan.scenarios) > 1 else ""
+        for learner, changes in plan.learners.items():
+            for knowledge in plan.knowledge:
+                name = f"{stem(defence)}-{learner}-{knowledge}{tag}"
+                granted = f"threat={json.dumps(threat | {'knowledge': knowledge})}"
+                own = [f"name={name}", f"learner={learner}", f"scenario={place}", *settings, granted, *plan.changes, *changes, *extra]
+                found.append(train.load_config(plan.config, own))
     return found
 
 
-def asked_of(suite: Suite) -> list[tuple[str, str, int]]:
-    """(name, plan, seed) of every training that the suite asks for against each defence."""
-    configs = configs_of(suite, "none", Path("runs"))
-    return [
-        (config.name.removeprefix("none-"), train.plan_key(as_data(config)), seed)
-        for config in configs for seed in range(config.first_seed, config.first_seed + config.seeds)
-    ]  # fmt: skip
+def stem(defence: str) -> str:
+    """The text of a defence as the beginning of a file's name."""
+    return re.sub(r"[^A-Za-z0-9_.=-]+", "_", defence)
+
+
+def fitting(suite: Suite, config: train.TrainConfig) -> tuple[str, ...]:
+    """The suite's scenarios that show an attacker what the training's does, and let it do as much: where its policies play."""
+    spec = build(ActionSpec, {k: v for k, v in config.environment.items() if k in fields_of(ActionSpec)}, "environment")
+
+    def seat(name: str) -> tuple[tuple[str, ...], int]:
+        brief = load_scenario(name).with_threat(**config.threat).brief()
+        return ObservationCodec(brief, config.environment.get("frames", 1)).names, ActionCodec(spec, brief).size
+
+    own = seat(config.scenario)
+    return tuple(name for name in suite.scenarios if name == config.scenario or seat(name) == own)
+
+
+class Asked(NamedTuple):
+    """A training that a suite asks for against each defence."""
+
+    name: str
+    plan: str  # hash of the training, whoever is attacked
+    seed: int
+    scenarios: tuple[str, ...]  # where the policy has to play
+
+
+def asked_of(suite: Suite) -> list[Asked]:
+    """Every training that the suite asks for against each defence."""
+    out = []
+    for config in configs_of(suite, "none", Path("runs")):
+        name, key, where = config.name.removeprefix("none-"), train.plan_key(as_data(config)), fitting(suite, config)
+        out += [Asked(name, key, seed, where) for seed in range(config.first_seed, config.first_seed + config.seeds)]
+    return out
+
+
+def policies_of(config: train.TrainConfig) -> list[Path]:
+    """Where a training's policies lie once it is done."""
+    return [config.directory / f"policy-{seed}.json" for seed in range(config.first_seed, config.first_seed + config.seeds)]
 
 
 def train_against(configs: list[train.TrainConfig], progress: Progress) -> list[Path]:
-    """The policies of all trainings. A finished one is not trained again, and one that was interrupted goes on."""
+    """The policies of all trainings, in their order. A finished one is not trained again, and one that was interrupted goes on."""
     out = []
     for config in configs:
-        held = config.directory / "config.json"
+        held, policies = config.directory / "config.json", policies_of(config)
         again = held.is_file() and train.training_of(json.loads(held.read_text(encoding="utf-8"))) == train.training_of(as_data(config))
-        policies = [config.directory / f"policy-{seed}.json" for seed in range(config.first_seed, config.first_seed + config.seeds)]
         if not (again and all(path.is_file() for path in policies)):
 
             def learned(seed: int, now: Any, config: train.TrainConfig = config) -> None:
                 progress(f"{config.name}, seed {seed}", min(now.steps, config.steps), config.steps, train.figures(now))
 
-            policies = train.train(config, learned, resume=again)
+            train.train(config, learned, resume=again)
         out += policies
     return out

@@ -21,7 +21,7 @@ def add(actions: Any) -> None:
     )  # fmt: skip
     command.add_argument("defence", metavar="NAME", help="registered defence, or a class in a sandbox: bwrap/module:Class")
     command.add_argument("--suite", required=True, metavar="NAME", help="suite that says what is trained")
-    command.add_argument("--out", required=True, metavar="DIR", help="policies go to DIR/policies, rows to DIR/NAME.jsonl")
+    command.add_argument("--out", required=True, metavar="DIR", help="policies go to DIR/policies, rows to DIR/NAME*.jsonl")
     command.add_argument("--seeds", type=int, metavar="N", help="training seeds instead of the suite's")
     command.add_argument("--episodes", type=int, metavar="N", help="report episodes per cell instead of the suite's")
     command.add_argument("--beacon", default="", metavar="TEXT", help="the round of the board: its seeds are played")
@@ -31,7 +31,7 @@ def add(actions: Any) -> None:
 
 
 def _attack(options: argparse.Namespace) -> int:
-    from tailgate.adaptive import configs_of, train_against
+    from tailgate.adaptive import configs_of, fitting, policies_of, stem, train_against
     from tailgate.evaluation import evaluate
     from tailgate.registry import Spec
     from tailgate.scenario import load_suite
@@ -44,22 +44,28 @@ def _attack(options: argparse.Namespace) -> int:
     configs = configs_of(suite, options.defence, out / "policies", seeds=options.seeds, extra=extra)
     with progress(Console(stderr=True)) as update:
         policies = train_against(configs, update)
-        file = out / f"{configs[0].name.rsplit('-', 2)[0]}.jsonl"
-        attacks = [str(path) for path in policies]
+        groups: dict[tuple[str, ...], list[str]] = {}  # a policy plays where the attacker sees and may do what it learned with
+        for config in configs:
+            groups.setdefault(fitting(suite, config), []).extend(map(str, policies_of(config)))
+        count = 0
+        for scenarios, attacks in groups.items():
+            file = out / f"{stem(options.defence)}{f'-{scenarios[0]}' if len(groups) > 1 else ''}.jsonl"
+            part = dataclasses.replace(suite, scenarios=scenarios, attacks=tuple(attacks))
 
-        def told(done: int, total: int) -> None:
-            update("playing", done, total, cells(done, total))
+            def told(done: int, total: int) -> None:
+                update("playing", done, total, cells(done, total))
 
-        if apart := Spec("defence", options.defence).sandboxed:
-            rows = play_submission(
-                apart[1], dataclasses.replace(suite, attacks=tuple(attacks)), sandbox=apart[0], beacon=options.beacon,
-                episodes=options.episodes, workers=options.workers, out=file, progress=told,
-            )  # fmt: skip
-        else:
-            rows = evaluate(
-                suite, defences=[options.defence], attacks=attacks, seeds=options.episodes, workers=options.workers, out=file,
-                beacon=options.beacon, progress=told,
-            )  # fmt: skip
-    print(file)
-    print(f"{len(policies)} policies, {len(rows)} rows", file=sys.stderr)
+            if apart := Spec("defence", options.defence).sandboxed:
+                rows = play_submission(
+                    apart[1], part, sandbox=apart[0], beacon=options.beacon, episodes=options.episodes, workers=options.workers, out=file,
+                    progress=told,
+                )  # fmt: skip
+            else:
+                rows = evaluate(
+                    part, defences=[options.defence], seeds=options.episodes, workers=options.workers, out=file, beacon=options.beacon,
+                    progress=told,
+                )  # fmt: skip
+            print(file)
+            count += len(rows)
+    print(f"{len(policies)} policies, {count} rows", file=sys.stderr)
     return 0

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 import tailgate
-from tailgate.adaptive import asked_of
+from tailgate.adaptive import Asked, asked_of
 from tailgate.errors import InputError
 from tailgate.registry import Entry, entries, split_text
 from tailgate.scenario import Suite
@@ -54,7 +54,8 @@ def score(
     origins = _origins(table)
     slot = middle(table)
     levels: Levels = {d: {k: Worst(table, d, k, alpha) for k in KNOWLEDGE} for d in table.defences}
-    found = [_entry(table, d, levels[d], slot, origins, require_adaptive) for d in table.defences]
+    asked = asked_of(suite) if require_adaptive and suite.adaptive else [] if require_adaptive else None
+    found = [_entry(table, d, levels[d], slot, origins, asked) for d in table.defences]
     comparisons = _rank(found, levels, slot, alpha)
     return {
         "format": FORMAT, "suite": _suite(table, alpha), "attacks": _attacks(table, lines, origins), "entries": found,
@@ -115,18 +116,18 @@ def _origins(table: Table) -> dict[str, Row]:
     return {attack: origin for attack, origin in found if isinstance(origin, dict)}
 
 
-def _entry(table: Table, defence: str, levels: dict[str, Worst], slot: int, origins: dict[str, Row], require_adaptive: bool) -> Data:
+def _entry(table: Table, defence: str, levels: dict[str, Worst], slot: int, origins: dict[str, Row], asked: list[Asked] | None) -> Data:
     rows = [row for key in sorted(table.cells) if key.defence == defence for row in table.cells[key]]
     uses = [str(use) for use in rows[0]["uses"]]
     card = _card(defence)
     found = gates(table, defence)
     why = _reference(defence, uses, card) or failure(found) or _incomplete(table, levels["black"])
     status = "unranked" if why else "ranked"
-    if not why and require_adaptive and (short := _draft(table)):
+    if not why and asked is not None and (short := _draft(table)):
         status, why = "unranked", short
     if not why and card is None and (how := _claimed(rows)):
         status, why = "unranked", how
-    if not why and require_adaptive and (missing := _unmet(table, defence, origins)):
+    if not why and asked is not None and (missing := _unmet(table, defence, origins, asked)):
         status, why = "unattacked", missing
     whole = {k: worst for k, worst in levels.items() if worst.complete}
     critical: dict[tuple[tuple[str, int], ...], Data | None] = {}
@@ -192,27 +193,30 @@ def _claimed(rows: list[Row]) -> str:
     return "" if all(row.get("beacon") for row in rows) else "claimed: played on public seeds"
 
 
-def _unmet(table: Table, defence: str, origins: dict[str, Row]) -> str:
+def _unmet(table: Table, defence: str, origins: dict[str, Row], asked: list[Asked]) -> str:
     """What is missing of the attackers that the suite trains against a defence; empty where nothing is.
 
-    Of a suite with a plan (`adaptive`) every learner, knowledge and training seed is asked, trained as the plan says, and against these
-    very files of the defence. Without one, any policy that was trained against the defence will do.
+    asked: of a suite with a plan (`adaptive`) every scenario that is trained on, learner, knowledge and training seed, trained as the plan
+    says, against these very files of the defence, and played wherever the policy fits. Of a suite without one it is empty, and any policy
+    will do that was trained against the defence and played everywhere.
     """
     guard = table.defences.index(defence)
     digest = next(rows[0]["defence_digest"] for key, rows in table.cells.items() if key.defence == defence)
     met = [
-        origins[column.attack] for i, column in enumerate(table.columns)
+        (origins[column.attack], {name for name in table.scenarios if (table.state[name][guard, i] == PLAYED).all()})
+        for i, column in enumerate(table.columns)
         if column.attack in origins and column.attack not in table.withdrawn
         and (origins[column.attack]["defence"], origins[column.attack]["digest"]) == (defence, digest)
-        and all((table.state[name][guard, i] == PLAYED).all() for name in table.scenarios)
     ]  # fmt: skip
-    if not met:
+    if not asked:
+        met = [(origin, played) for origin, played in met if played == set(table.scenarios)]
+    if not any(played for _, played in met):
         return "no attack that was trained against this defence is among the rows"
-    if not table.suite.adaptive:
+    if not asked:
         return ""
-    found, wanted = {(origin["plan"], origin["seed"]) for origin in met}, asked_of(table.suite)
-    missing = [f"{name} seed {seed}" for name, plan, seed in wanted if (plan, seed) not in found]
-    return f"{len(missing)} of {len(wanted)} of the suite's own trainings are missing, first {missing[0]}" if missing else ""
+    found = {(origin["plan"], origin["seed"]): played for origin, played in met}
+    missing = [f"{name} seed {seed}" for name, plan, seed, where in asked if not found.get((plan, seed), set()) >= set(where)]
+    return f"{len(missing)} of {len(asked)} of the suite's own trainings are missing, first {missing[0]}" if missing else ""
 
 
 def _clean(table: Table, defence: str) -> dict[str, Data]:
