@@ -121,6 +121,26 @@ def test_the_map_shows_the_worst_scenario_at_the_middle_dose(index):
     assert shown[1:] == pytest.approx([by_attack[a] for a, *_ in boards.ATTACKS], abs=0.0051)
 
 
+def test_attackers_that_only_their_own_defence_met_share_a_column(tmp_path):
+    """At each knowledge: the worst of those trained against the row's defence. One that others met too keeps its own, and a shared reason
+    stands once.
+    """
+    board, own = make_board(), {"kf": ("a/p-0.json", "a/p-1.json"), "chi2_kf:eta=15": ("b/p-0.json",)}
+    for i, (defence, policies) in enumerate(own.items()):
+        for j, policy in enumerate(policies):
+            part = {"attack": policy, "knowledge": "black", "learned": True, "optimal": False}
+            board["attacks"].append(part | {"trained_on": defence, "admitted": None, "note": ""})
+            for c in [c for c in board["cells"] if c["attack"] == boards.ATTACKS[0][0] and c["defence"] == defence]:
+                board["cells"].append(c | part | {"damage": boards.share(20 + 60 * i + 30 * j)})
+    page = Outline(build_site([board], tmp_path, replays=False).read_text(encoding="utf-8"))
+    heads, *rows = page.rows("heat map")
+    assert heads.count("trained against it the worst") == 1 and "p-0" not in heads and "policy" in heads
+    first = {r.split()[0]: re.findall(r"(\d+%|n/a) ,", r)[1] for r in rows if " ," in r}
+    assert first["kf"] == "25%" and first["chi2_kf"] == "40%" and first["cusum_kf"] == "n/a"
+    lines = [row for row in page.rows("cells ranks") if row.startswith("Not attacked yet")]
+    assert lines and lines[0].endswith("(all: no attacker was trained against it)")
+
+
 def test_detection_is_shown_attack_by_attack(index):
     """At the middle time between false alarms: per attack a row, per defence the share in the scenario where it sees least of it."""
     cases = [c for c in make_board("x")["detection"]["entries"] if c["hours"] == 1]

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
-from .board_format import LEVELS, CellPart, Level
-from .build import percent
+from collections import Counter
+
+from .board_format import LEVELS, CellPart, Dose, Level
+from .build import Name, percent
 from .site_curves import curves_of, stealth_of, together_of
 from .site_suite import GROUPS, Data, Suite, cell_of, critical_of, dose_text, figure, gates_of, share_of, worse
 from .site_trust import trust_cell, trust_of
+
+OWN = ""  # in place of an attack: all that were trained against the row's defence
+TRAINED = Name("trained against it", ("the worst",))
 
 
 def _lines(suite: Suite) -> list[Data]:
@@ -39,22 +44,25 @@ def heat_of(suite: Suite) -> Data | None:
     optimal = {(c.attack, c.knowledge) for c in board.cells if c.optimal}
     apart = optimal | {(c.attack, c.knowledge) for c in board.cells if c.attack in withdrawn}
     learned = {(c.attack, c.knowledge) for c in board.cells if c.learned}
-    columns = list(dict.fromkeys((c.attack, c.knowledge) for c in board.cells))
-    columns.sort(key=lambda c: (c in optimal, LEVELS.index(c[1])))
+    own = _trained_for(suite)
+    columns = list(dict.fromkeys((OWN if c.attack in own else c.attack, c.knowledge) for c in board.cells))
+    columns.sort(key=lambda c: (c in optimal, LEVELS.index(c[1]), c[0] != OWN))
     heads = [
-        {"name": suite.attacks[a], "knowledge": k, "learned": (a, k) in learned or suite.attacks[a].policy, "optimal": (a, k) in optimal}
+        {"name": TRAINED if a == OWN else suite.attacks[a], "knowledge": k, "optimal": (a, k) in optimal,
+         "learned": (a, k) in learned or a == OWN or suite.attacks[a].policy}
         for a, k in columns
-    ]
+    ]  # fmt: skip
     scenarios = [s.name for s in board.suite.scenarios]
     entries = suite.ordered()
     first = None if len(scenarios) > 1 else scenarios[0]  # None: the worst of all
 
-    def look(scenario: str | None, defence: str, column: tuple[str, Level]) -> CellPart | None:
-        return worse(kept.get((s, suite.middle, defence, *column)) for s in (scenarios if scenario is None else [scenario]))
+    def look(where: list[str], dose: Dose, defence: str, column: tuple[str, Level]) -> CellPart | None:
+        mine = [a for a, d in own.items() if d == defence and a not in withdrawn] if column[0] == OWN else [column[0]]
+        return worse(kept.get((s, dose, defence, a, column[1])) for s in where for a in mine)
 
     rows = []
     for i, entry in enumerate(entries):
-        parts = [look(first, entry.defence, column) for column in columns]
+        parts = [look(scenarios if first is None else [first], suite.middle, entry.defence, column) for column in columns]
         counted = worse(p for p, column in zip(parts, columns, strict=True) if column not in apart)
         cells = [cell_of(p, board.suite.limit) for p in parts]
         rows.append({"index": i, "name": suite.defences[entry.defence], "page": suite.pages.get(entry.defence, ""), "cells": cells,
@@ -63,7 +71,7 @@ def heat_of(suite: Suite) -> Data | None:
     figures = []
     for scenario in scenarios:
         for dose in board.suite.doses:
-            grid = [_packed(kept.get((scenario, dose, e.defence, *c)), reasons) for e in entries for c in columns]
+            grid = [_packed(look([scenario], dose, e.defence, c), reasons) for e in entries for c in columns]
             figures.append(grid)
     data = {
         "scenarios": len(scenarios), "doses": len(board.suite.doses), "columns": len(columns), "limit": board.suite.limit,
@@ -75,6 +83,14 @@ def heat_of(suite: Suite) -> Data | None:
         "heads": heads, "groups": [g for g in groups if g[1]], "data": data, "doses": doses, "scenarios": scenarios, "all": first is None,
         "apart": bool(apart),
     }  # fmt: skip
+
+
+def _trained_for(suite: Suite) -> dict[str, str]:
+    """Learned attacks that only the defence has met that they were trained against, and this defence: one column stands for them all."""
+    met: dict[str, set[str]] = {}
+    for cell in suite.board.cells:
+        met.setdefault(cell.attack, set()).add(cell.defence)
+    return {a.attack: a.trained_on for a in suite.board.attacks if a.trained_on and met.get(a.attack) == {a.trained_on}}
 
 
 def _packed(cell: CellPart | None, reasons: dict[str, int]) -> int | list[float | int | None]:
@@ -124,7 +140,8 @@ def _each_attack(suite: Suite, hour: float) -> Data:
         {"name": suite.attacks[a], "cells": [percent(least[g, a]) if (g, a) in least else "\N{EN DASH}" for g in guards]} for a in names
     ]
     heads = [{"name": suite.defences[g], "page": suite.pages.get(g, "")} for g in guards]
-    return {"hour": figure(hour), "heads": heads, "rows": rows}
+    silent = any(suite.attacks[a].base == "dropout" for a in names)
+    return {"hour": figure(hour), "heads": heads, "rows": rows, "silent": silent}
 
 
 def comparisons_of(suite: Suite, defence: str | None = None) -> list[Data]:
@@ -169,11 +186,20 @@ def attacks_of(suite: Suite) -> list[Data]:
     return out
 
 
+def _group(title: str, about: str, rows: list[Data]) -> Data:
+    """Entries of one status. A reason that most of them have stands once, above them."""
+    reasons = Counter(row["why"] for row in rows if row["why"])
+    shared, n = reasons.most_common(1)[0] if reasons else ("", 0)
+    if n < 2 or 2 * n <= len(rows):
+        shared = ""
+    return {"title": title, "about": about, "rows": rows, "shared": shared, "scope": "all" if n == len(rows) else "unless said otherwise"}
+
+
 def section(suite: Suite) -> Data:
     """All that index.html shows of a suite."""
     board = suite.board
     rows = _lines(suite)
-    groups = [{"title": t, "about": about, "rows": [r for r in rows if r["status"] == s]} for s, t, about in GROUPS]
+    groups = [_group(t, about, [r for r in rows if r["status"] == s]) for s, t, about in GROUPS]
     doses = [{"text": dose_text(d), "why": board.suite.shown.get(str(d), "")} for d in suite.shown]
     return {
         "suite": board.suite, "round": suite.round, "trust": trust_of(suite), "damage": suite.damage, "folder": suite.folder,
