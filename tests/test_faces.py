@@ -350,7 +350,7 @@ BAD = [
     ({"value": float("nan")}, ["value", "nan", "finite"]), ({"render_mode": "ansi"}, ["render_mode", "'ansi'", "rgb_array"]),
     ({"threat": {"kinds": ["fdi"]}, "action": "timing", "kind": "dropout"}, ["action", "dropout", "fdi"]),
     ({"frames": 0}, ["frames", "0", "1 to 64"]), ({"frames": 2.0}, ["frames", "2.0", "whole"]),
-    ({"threat": {"agents": [1]}}, ["agents", "1", "0 to 0"]), ({"scenario": "thesis-ch5-v0", "defence": "dkf"}, ["reward", "'min_gap'", "error, stealth or final"]),
+    ({"threat": {"agents": [1]}}, ["agents", "1", "0 to 0"]), ({"scenario": "thesis-ch5-v0", "defence": "dkf"}, ["reward", "'min_gap'", "error, peak, stealth or final"]),
     ({"threat": {"targets": ["speed"]}}, ["targets", "'speed'", "velocity"]), ({"gamma": 0}, ["gamma", "0", "greater than 0"]),
 ]  # fmt: skip
 
