@@ -4,9 +4,11 @@ import dataclasses
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from tailgate.adaptive import configs_of, train_against
+from tailgate.draws import Draws
 from tailgate.errors import InputError
 from tailgate.evaluation import evaluate
 from tailgate.registry import Spec
@@ -14,6 +16,7 @@ from tailgate.rounds import seeds_of
 from tailgate.scenario import Suite, load_suite
 from tailgate.scoring import score
 from tailgate.submission import play_submission
+from tailgate.submission.isolated import IsolatedPlan, _shown, veiled
 from tailgate.verify import verify
 
 pytestmark = pytest.mark.skipif(shutil.which("bwrap") is None, reason="bubblewrap is not installed")
@@ -45,6 +48,22 @@ def test_it_plays_as_it_would_here_and_nobody_looks_into_it(folder: Path) -> Non
         assert theirs[row["attack"], row["seed"]]["trace_hash"] == row["trace_hash"]
     skipped = [row for row in theirs.values() if row["attack"] == "stealth"]
     assert len(skipped) == 4 and all(row["status"] == "skipped" and "cannot look ahead" in row["reason"] for row in skipped)
+
+
+def test_training_does_not_show_in_the_keys_that_it_draws_with() -> None:
+    """Within a veil the same episode has the same key, another one another, and no key or number of an episode is the real one."""
+    key, episode = np.array([5, 5, 9, 9], np.uint64), np.array([0, 1, 0, 1], np.uint32)
+    drawn, plan = Draws(key, episode, np.zeros(4, np.uint32), 0), IsolatedPlan(None, None)
+    assert _shown(plan, drawn)[0] is key and _shown(plan, drawn)[1] is episode
+    seen = []
+    for _ in range(2):
+        with veiled():
+            first, number = _shown(plan, drawn)
+            later, _ = _shown(plan, drawn._replace(episode=np.array([0, 2, 0, 1], np.uint32)))
+            again, _ = _shown(IsolatedPlan(None, None), drawn)
+        assert np.array_equal(first, again) and (first == later).tolist() == [True, False, True, True] and not number.any()
+        seen += [*first.tolist(), later[1]]
+    assert len(set(seen)) == 10 and not {5, 9} & set(seen)
 
 
 def test_a_file_may_name_a_class_in_a_sandbox_and_none_without(tmp_path: Path, folder: Path) -> None:

@@ -8,19 +8,23 @@ import numpy as np
 import pytest
 import yaml
 
+from tailgate import registry
 from tailgate.adaptive import configs_of, train_against
 from tailgate.cli import main
 from tailgate.errors import InputError
+from tailgate.estimators import Kalman
 from tailgate.evaluation import evaluate
+from tailgate.leaderboard.head import lines, title
 from tailgate.leaderboard.run import OWN, board_of, play
 from tailgate.rows import packed, read_rows
 from tailgate.scenario import Suite, load_suite
 from tailgate.scoring import Admitted, score
+from tailgate.scoring.attacks import admit
 
 spec = importlib.util.spec_from_file_location("scored", Path(__file__).with_name("scored.py"))
 scored = importlib.util.module_from_spec(spec)
 spec.loader.exec_module(scored)
-ROAD, board, cell, clean, entry, suite = scored.ROAD, scored.board, scored.cell, scored.clean, scored.entry, scored.suite
+ROAD, board, cell, clean, entry, rate, suite = scored.ROAD, scored.board, scored.cell, scored.clean, scored.entry, scored.rate, scored.suite
 PLAN = {
     "config": "car-following", "dose": 12, "changes": ["environment.interval=20", "environment.frames=1", "teacher=null"], "seeds": 2,
     "learners": {"cem": ["steps=600", "cem={population: 4, episodes: 5, hidden: []}"]}, "knowledge": ["black"],
@@ -103,7 +107,7 @@ def test_almost_half_of_the_episodes_cannot_be_ruined(changes: dict[str, float],
     share = 2 if gate == "every episode" else 9
     rows = [*clean("a"), *cell("none", "fdi"), *cell("a", "fdi")]
     for row in rows:
-        if row["defence"] == "a" and row["attack"] == "none" and row["seed"] < share:
+        if row["defence"] == "a" and row["attack"] == "none" and row["number"] < share:
             row |= changes
     found = entry(board(rows), "a")
     assert found["status"] == "unranked" and gate in [g["gate"] for g in found["gates"] if not g["passed"]], found["gates"]
@@ -140,3 +144,61 @@ def test_a_folder_is_scored_and_half_done_work_is_not(tmp_path: Path) -> None:
         read_rows(file)
 
 
+
+
+def test_an_episode_that_came_out_in_two_ways_is_refused() -> None:
+    """Else rows that are read last would stand for those before; the same result twice counts once."""
+    rows = [*clean("a"), *cell("none", "fdi"), *cell("a", "fdi", 20)]
+    assert entry(board([*rows, *cell("a", "fdi", 20)]), "a")["rates"] == entry(board(rows), "a")["rates"]
+    with pytest.raises(InputError, match=r"a, fdi \(black\), seed \d+: crashed: got \[1\.0, 0\.0\]"):
+        board([*rows, *cell("a", "fdi", 0)])
+
+
+def test_episodes_of_ones_own_choice_take_no_rank() -> None:
+    """Seeds have to be the first ones of the round, or of the suite."""
+    rows = [*clean("a"), *cell("none", "fdi"), *cell("a", "fdi")]
+    chosen = [row | {"seed": row["seed"] + 1} for row in rows]
+    assert "draft: the episodes on stop-and-go-v0 are not the first ones of the beacon" in entry(score(chosen, suite()), "a")["why"]
+    assert entry(score(rows, suite()), "a")["status"] == "unattacked"
+
+
+def test_a_clean_run_without_a_figure_is_named() -> None:
+    """A null where a gate needs a number."""
+    rows = [*clean("a"), *cell("none", "fdi"), *cell("a", "fdi")]
+    for metric in ("time_gap_inflation", "rms_jerk", "alarm_rate", "alarm_onsets"):
+        broken = [row | {metric: None} if row["defence"] == "a" and row["attack"] == "none" else row for row in rows]
+        with pytest.raises(InputError, match=f"stop-and-go-v0, a, none: {metric}"):
+            board(broken)
+
+
+def test_a_board_says_whether_it_ranks_what_nobody_was_trained_against() -> None:
+    """And who is alone in a class has no rank number."""
+    rows = [*clean("a"), *cell("none", "fdi"), *cell("a", "fdi")]
+    free, strict = board(rows), score(rows, suite())
+    assert not free["suite"]["require_adaptive"] and strict["suite"]["require_adaptive"]
+    assert "without attackers" in title(free) and "without attackers" not in title(strict)
+    assert next(line for line in lines(free) if line[0] == "a")[2] == "alone"
+
+
+def test_a_plug_in_is_somebody_elses_class(monkeypatch) -> None:
+    """A registered name that does not come with the package has to be handed in like any other class."""
+
+    class Mine(Kalman):
+        """Somebody's."""
+
+    monkeypatch.setitem(registry._entries["defence"], "mine", registry.entry_of("defence", "mine", Mine))
+    rows = [row | {"submission": None} for row in [*clean("kf", "mine"), *(r for d in ("none", "kf", "mine") for r in cell(d, "fdi"))]]
+    made = board(rows)
+    assert entry(made, "kf")["status"] == "ranked" and entry(made, "mine")["why"] == "claimed: not played by `leaderboard submit` in a sandbox"
+    assert entry(made, "mine")["card"] is None and len(registry.Spec("defence", "mine").digest) == 64
+
+
+def test_an_attack_that_was_tried_and_refused_counts_where_it_was_played(tmp_path) -> None:
+    """It is on no list, but what it did was done; an erratum alone takes that away. Code to import is not tried at all."""
+    where = suite(attacks=("none", "fdi"))
+    rows = [*clean("a"), *(row for d in ("none", "a") for row in (*cell(d, "fdi"), *cell(d, "jam", 20)))]
+    refused = Admitted("jam", "", "black", "2026-11-23", refused=True)
+    for lines_, damage in (([], 0.0), ([refused], 0.0), ([dataclasses.replace(refused, refused=False, erratum="wrong")], 1.0)):
+        assert rate(entry(score(rows, where, attacks=lines_, require_adaptive=False), "a"), 20)["undamaged"]["value"] == damage
+    with pytest.raises(InputError, match="the list of attacks"):
+        admit("mine:Mine", SMALL, ["kf"], tmp_path / "attacks.jsonl", "2026-11-23")

@@ -60,6 +60,11 @@ class Entry:
     sentinel: str = ""
 
     @property
+    def built_in(self) -> bool:
+        """Whether it comes with this package; a plug-in is somebody else's code under a name."""
+        return self.cls.__module__.partition(".")[0] == __package__
+
+    @property
     def learned(self) -> bool:
         """Whether this attack plays trained policies."""
         return bool(getattr(self.cls, "learned", False))
@@ -117,9 +122,15 @@ def _at_home(family: Family, name: str) -> Entry | None:
     return _entries[family].get(name)
 
 
-def _load(family: Family) -> dict[str, Entry]:
+def built_in(family: Family) -> dict[str, Entry]:
+    """The components that come with this package, by name; imports nobody else's."""
     for module in importlib.import_module(_MODULES[family]).HOMES:
         importlib.import_module(f"{_MODULES[family]}.{module}")
+    return {name: entry for name, entry in _entries[family].items() if entry.built_in}
+
+
+def _load(family: Family) -> dict[str, Entry]:
+    built_in(family)
     group = _GROUPS.get(family)
     if group and group not in _plugins_loaded:
         for point in entry_points(group=group):
@@ -259,6 +270,12 @@ class Spec:
         return not self.sandboxed and bool(self._imported())
 
     @property
+    def foreign(self) -> bool:
+        """Whether playing this runs somebody else's code outside of any sandbox: a class to import, or a plug-in."""
+        plugged = {point.name for point in entry_points(group=_GROUPS[self.family])} if self.family in _GROUPS else set()
+        return self.imports or (not self.sandboxed and self._parts()[0] in plugged)
+
+    @property
     def digest(self) -> str:
         """Of the files that somebody else's components, or the zoo's, come from; empty for other registered ones: they carry a version."""
         if self.sandboxed:
@@ -271,6 +288,8 @@ class Spec:
             paths = [Path(str(text)) for text in (head, params.get("path")) if Path(str(text)).suffix in _FILES] or paths
         if self.family == "defence" and (held := params.get("policy")) is not None:  # a defender that was trained
             paths += [Path(str(path)) for path in (held if isinstance(held, list) else [held])]
+        if not paths and not self.entry.built_in:
+            paths = [Path(inspect.getfile(self.entry.cls))]
         if not paths and hasattr(self.entry.cls, "sources"):  # a name that stands for a file
             paths = list(self.make().sources)
         blobs = [path.read_bytes() for path in paths if path.is_file()]

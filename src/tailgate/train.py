@@ -215,18 +215,20 @@ def _train_seed(config: TrainConfig, teacher: str | None, seed: int, resume: boo
     board = directory / "tensorboard" if config.tensorboard else None
     learner: Learner = module.Learner(seed, config.gamma, settings, environment_of(config), board)
     checkpoint = directory / f"checkpoint-{seed}.safetensors"
-    if resume and checkpoint.exists():
-        learner.load(checkpoint)
-    elif teacher is not None:
-        assert isinstance(learner, Teachable)
-        learner.imitate(demonstrate(learner.seat, Spec("attack", teacher).make(), seed))
     record = directory / f"curve-{seed}.json"
     spent = json.loads(record.read_text()).get("seconds", 0.0) if resume and record.is_file() else 0.0
     started = time.process_time()  # of this process alone: others on the machine do not count
-    learner.learn(config.steps, report, checkpoint, min(config.checkpoint_every, max(config.steps // 10, 1)))
+    with _apart(config.defence):
+        if resume and checkpoint.exists():
+            learner.load(checkpoint)
+        elif teacher is not None:
+            assert isinstance(learner, Teachable)
+            learner.imitate(demonstrate(learner.seat, Spec("attack", teacher).make(), seed))
+        learner.learn(config.steps, report, checkpoint, min(config.checkpoint_every, max(config.steps // 10, 1)))
     facts = {
         "learner": config.learner, "teacher": teacher, "seed": seed, "steps": learner.steps, "config": as_data(config),
-        "defence_digest": Spec("defence", config.defence).digest, config.learner: as_data(settings),
+        "defence_digest": Spec("defence", config.defence).digest, "defence_version": Spec("defence", config.defence).entry.version,
+        config.learner: as_data(settings),
         "environment": learner.seat.card()["hash"], "curve": learner.curve,
     }  # fmt: skip
     policy = learner.export(directory / f"policy-{seed}", facts)
@@ -234,6 +236,15 @@ def _train_seed(config: TrainConfig, teacher: str | None, seed: int, resume: boo
     write_atomic(record, json.dumps(curve).encode() + b"\n")
     learner.close()
     return policy
+
+
+def _apart(defence: str) -> contextlib.AbstractContextManager[None]:
+    """Within it a defence in a sandbox cannot tell training from scoring by the keys that it draws with."""
+    if Spec("defence", defence).sandboxed is None:
+        return contextlib.nullcontext()
+    from tailgate.submission.isolated import veiled
+
+    return veiled()
 
 
 _line: Any = None  # in a process that trains: where it reports to, and the event that stops it

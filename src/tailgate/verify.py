@@ -99,7 +99,7 @@ def verify(
                 found[i] = _compared(i + 1, rows[i], played[rows[i]["seed"]])
     for (i, _), row in zip(alone, run([cell for _, cell in alone], workers=workers) if alone else [], strict=True):
         found[i] = _compared(i + 1, rows[i], row)
-    return _report(rows, [(i, found[i]) for i in asked], sample)
+    return _report(rows, [(i, found[i]) for i in asked], sample) | ({} if sample is None else {"sample_seed": sample_seed})
 
 
 def _target(text: str) -> str:
@@ -205,7 +205,7 @@ def _readable(path: Path) -> bool:
 def _refused(family: str, row: Row, trust_code: bool) -> str:
     """Why a component of the row is not played; empty where it is."""
     spec = Spec(cast(Any, family), row[family])
-    if spec.imports and not trust_code:
+    if spec.foreign and not trust_code:
         return f"the {family} {row[family]!r} is code to import, which a row may not make us do; --trust-code allows it"
     recorded = str(row.get(f"{family}_digest") or "")
     if not spec.imports:

@@ -57,6 +57,7 @@ def add(actions: Any) -> None:
     admit.add_argument("--suite", required=True, metavar="NAME", help="suite by name or YAML file")
     admit.add_argument("--out", required=True, metavar="DIR", help="folder of the boards")
     admit.add_argument("--defence", action="append", metavar="NAME", help="only these defences (repeatable; default: the suite's)")
+    admit.add_argument("--beacon", default="", metavar="TEXT", help="random text of after the attack was handed in: its seeds are played")
     admit.add_argument("--date", metavar="YYYY-MM-DD", help="date of the line (default: today)")
     admit.add_argument("--erratum", metavar="REASON", help="take the attack back, for this reason")
     admit.set_defaults(run=_admit)
@@ -157,6 +158,8 @@ def _admit(options: argparse.Namespace) -> int:
     if options.erratum is not None:
         print(json.dumps(withdraw(options.attack, path, date, options.erratum).as_data(), indent=1))
         return 0
-    line, evidence = admit(options.attack, suite, options.defence or suite.defences, path, date)
+    if not options.beacon:
+        print("tailgate: without --beacon the select seeds are public ones, on which the attack may have been tuned", file=sys.stderr)
+    line, evidence = admit(options.attack, suite, options.defence or suite.defences, path, date, beacon=options.beacon)
     print(json.dumps({"admitted": line is not None, "evidence": evidence}, indent=1))
     return 0 if line is not None else 1

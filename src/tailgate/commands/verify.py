@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import secrets
 import sys
 from pathlib import Path
 from typing import Any
@@ -27,7 +28,7 @@ def add(actions: Any) -> None:
     )  # fmt: skip
     command.add_argument("--rows", nargs="+", required=True, metavar="FILE", help="JSON Lines files of `tailgate evaluate`")
     command.add_argument("--sample", type=int, metavar="N", help="so many rows, drawn at random (default: all)")
-    command.add_argument("--sample-seed", type=int, default=0, metavar="N", help="which ones (default 0)")
+    command.add_argument("--sample-seed", type=int, metavar="N", help="which ones (default: a new secret each time; the report names it)")
     command.add_argument("--workers", type=int, default=1, metavar="N", help="processes (default 1); changes no result")
     command.add_argument("--batch", type=int, metavar="N", help="episodes side by side instead of the rows' number; changes no result")
     command.add_argument("--trust-code", action="store_true", help="also import the classes that rows name; they run with your rights")
@@ -43,6 +44,7 @@ def _verify(options: argparse.Namespace) -> int:
     from tailgate.rows import read_rows
     from tailgate.verify import verify
 
+    seed = secrets.randbits(32) if options.sample_seed is None else options.sample_seed  # who could foresee it would forge the others
     rows, origin = [], []
     for name in options.rows:
         held = read_rows(Path(name))
@@ -52,7 +54,7 @@ def _verify(options: argparse.Namespace) -> int:
         sys.path.insert(0, "")  # module:Class is looked for in the working directory, as `tailgate evaluate` does
     with progress(Console(stderr=True)) as update:
         report = verify(
-            rows, sample=options.sample, sample_seed=options.sample_seed, workers=options.workers, batch=options.batch,
+            rows, sample=options.sample, sample_seed=seed, workers=options.workers, batch=options.batch,
             trust_code=options.trust_code, submissions=options.submission,
             progress=lambda done, total: update("playing", done, total, cells(done, total)),
         )  # fmt: skip
@@ -67,7 +69,8 @@ def _verify(options: argparse.Namespace) -> int:
 
 def _print(report: dict[str, Any]) -> None:
     out = console()
-    table = Table(title=f"{report['status']}: {report['asked']} of {report['rows']} rows played again")
+    drawn = "" if report["sample"] is None else f", drawn by the seed {report['sample_seed']}"
+    table = Table(title=f"{report['status']}: {report['asked']} of {report['rows']} rows played again{drawn}")
     for heading in ("defence", "status", "verified", "differs", "unchecked"):
         table.add_column(heading, overflow="fold")
     for entry in report["entries"]:

@@ -46,6 +46,7 @@ class SuitePart(Part):
     purpose: Text = ""
     beacon: Text | None = None  # empty: public seeds; None: not stated
     rows: Count | None = None
+    require_adaptive: bool = True  # only what met attackers that were trained against it is ranked
 
 
 class AttackPart(Part):

@@ -13,7 +13,8 @@ def title(board: Board) -> str:
     """Suite, episodes, and whose seeds they are."""
     suite = board["suite"]
     seeds = f"seeds of the beacon {suite['beacon']}" if suite["beacon"] else "public seeds: for development"
-    return f"{suite['name']}, {suite['episodes']} episodes a cell, black box, {seeds}"
+    free = "" if suite.get("require_adaptive", True) else ", ranked without attackers that were trained against each"
+    return f"{suite['name']}, {suite['episodes']} episodes a cell, black box, {seeds}{free}"
 
 
 def lines(board: Board) -> list[tuple[str, ...]]:
@@ -28,7 +29,8 @@ def lines(board: Board) -> list[tuple[str, ...]]:
         rank, critical = entry["rank"], entry["critical_dose"]["black"]
         rates = {str(rate["dose"]): rate["undamaged"] for rate in entry["rates"] if rate["knowledge"] == "black"}
         shown = [f"{100 * rates[d]['value']:.0f} % (at least {100 * rates[d]['low']:.0f})" if d in rates else "-" for d in doses]
-        place = "-" if rank is None else str(rank["best"]) if rank["best"] == rank["worst"] else f"{rank['best']} to {rank['worst']}"
+        rivals = sum(e["rank"] is not None and e["class"] == entry["class"] for e in board["entries"])
+        place = "-" if rank is None else "alone" if rivals == 1 else " to ".join(map(str, dict.fromkeys([rank["best"], rank["worst"]])))
         dose = "-" if critical is None else _dose(critical, suite["doses"])
         bound = [_trust(entry.get("trust"))] * trusted
         out.append((entry["defence"], entry["class"], place, dose, *shown, *bound, entry["why"]))

@@ -165,6 +165,8 @@ def _rank(suite: Suite, entry: EntryPart) -> str:
         return ""
     of = sum(e.class_ == entry.class_ and e.rank is not None for e in suite.board.entries)
     best, worst = entry.rank.best, entry.rank.worst
+    if of == 1:
+        return "alone"
     return f"{best if best == worst else f'{best} to {worst}'} of {of}"
 
 

@@ -22,8 +22,9 @@ def _lines(suite: Suite) -> list[Data]:
         rank = {"text": "\N{EN DASH}", "sort": "", "of": 0}
         if entry.rank:
             best, worst = entry.rank.best, entry.rank.worst
-            rank["text"] = str(best) if best == worst else f"{best}\N{EN DASH}{worst}"
-            rank |= {"sort": f"{best + worst / 1000:.3f}", "of": sum(e.class_ == entry.class_ for e in ranked)}
+            of = sum(e.class_ == entry.class_ for e in ranked)
+            rank["text"] = "alone" if of == 1 else str(best) if best == worst else f"{best}\N{EN DASH}{worst}"
+            rank |= {"sort": f"{best + worst / 1000:.3f}", "of": of}
         out.append({
             "index": i, "name": suite.defences[entry.defence], "page": suite.pages.get(entry.defence, ""),
             "class": entry.class_ or "not stated", "rank": rank,

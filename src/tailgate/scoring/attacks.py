@@ -111,6 +111,12 @@ def standing(lines: Sequence[Admitted]) -> dict[str, Admitted | None]:
     return {line.attack: None if line.erratum or line.refused else line for line in lines}
 
 
+def taken_back(lines: Sequence[Admitted]) -> list[str]:
+    """Attacks whose last line is an erratum: they count nowhere. One that was refused is on no list, and counts where it was played."""
+    last = {line.attack: line for line in lines}
+    return [attack for attack, line in last.items() if line.erratum]
+
+
 def next_level(lines: Sequence[Admitted], alpha: float) -> float:
     """At which the next try is tested."""
     tries = 1 + sum(not line.erratum for line in lines)
@@ -149,6 +155,7 @@ def admit(
     lines, asked = standing(tried), next_level(tried, alpha)
     listed = list(dict.fromkeys([*suite.attacks, *(text for text, line in lines.items() if line is not None)]))
     spec = Spec("attack", attack)
+    spec.refuse_imports("the list of attacks")  # it would run with the rights of whoever scores
     if attack in listed:
         raise InputError("attack", attack, "one that is not on the list")
     if spec.entry.optimal:

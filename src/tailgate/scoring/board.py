@@ -11,13 +11,14 @@ import numpy as np
 import tailgate
 from tailgate.adaptive import Asked, asked_of
 from tailgate.errors import InputError
-from tailgate.registry import Entry, entries, split_text
+from tailgate.registry import Entry, built_in, split_text
+from tailgate.rounds import numbered
 from tailgate.scenario import Suite
 from tailgate.stats import proportion
 from tailgate.strength.dose import CRITICAL
 from tailgate.threat import KNOWLEDGE
 
-from .attacks import Admitted, standing
+from .attacks import Admitted, standing, taken_back
 from .damage import CLEAN, PLAYED, SKIPPED, Key, Row, Table, damaged, has_road, named, tabulate
 from .doses import Worst
 from .flags import flags
@@ -49,8 +50,8 @@ def score(
         line = lines.get(row["attack"])
         if line is not None and row["attack_digest"] != line.digest:
             raise InputError(f"rows of {row['attack']}: attack_digest", row["attack_digest"], f"{line.digest}, as it was admitted")
-    withdrawn = [text for text, line in lines.items() if line is None]
-    table = tabulate(rows, suite, [text for text in lines if text not in withdrawn], withdrawn)
+    added = [text for text, line in lines.items() if line is not None]
+    table = tabulate(rows, suite, added, taken_back(attacks or ()))
     origins = _origins(table)
     slot = middle(table)
     levels: Levels = {d: {k: Worst(table, d, k, alpha) for k in KNOWLEDGE} for d in table.defences}
@@ -58,7 +59,7 @@ def score(
     found = [_entry(table, d, levels[d], slot, origins, asked) for d in table.defences]
     comparisons = _rank(found, levels, slot, alpha)
     return {
-        "format": FORMAT, "suite": _suite(table, alpha), "attacks": _attacks(table, lines, origins), "entries": found,
+        "format": FORMAT, "suite": _suite(table, alpha) | {"require_adaptive": require_adaptive}, "attacks": _attacks(table, lines, origins), "entries": found,
         "cells": _cells(table),
         "curves": [worst.curve() for d in table.defences for worst in levels[d].values() if worst.complete and worst.numbers],
         "comparisons": comparisons, "detection": None,
@@ -144,14 +145,14 @@ def _entry(table: Table, defence: str, levels: dict[str, Worst], slot: int, orig
     }  # fmt: skip
 
 
-@functools.cache
-def _cards() -> dict[str, Entry]:
-    return entries("defence")
-
-
 def _card(defence: str) -> Entry | None:
-    """The card of a registered defence. The text is never resolved further: a board must not import what a row names."""
-    return _cards().get(split_text(defence)[0])
+    """The card of a built-in defence; a plug-in is somebody else's class like any other. A board must not import what a row names."""
+    return _built_in().get(split_text(defence)[0])
+
+
+@functools.cache
+def _built_in() -> dict[str, Entry]:
+    return built_in("defence")
 
 
 def _reference(defence: str, uses: Sequence[str], card: Entry | None) -> str:
@@ -183,7 +184,13 @@ def _draft(table: Table) -> str:
     fewest = min(len(seeds) for seeds in table.seeds.values())
     if table.purpose != "report":
         return f"draft: seeds of the purpose {table.purpose}"
-    return f"draft: {fewest} of {table.suite.seeds} episodes" if fewest < table.suite.seeds else ""
+    if fewest < table.suite.seeds:
+        return f"draft: {fewest} of {table.suite.seeds} episodes"
+    for name, seeds in table.seeds.items():
+        if set(seeds) != set(numbered(table.beacon, table.suite.name, table.purpose, 0, len(seeds))):
+            whose = f"the beacon {table.beacon}" if table.beacon else "the suite, 0, 1, 2, ..."
+            return f"draft: the episodes on {name} are not the first ones of {whose}"
+    return ""
 
 
 def _claimed(rows: list[Row]) -> str:
@@ -197,16 +204,17 @@ def _unmet(table: Table, defence: str, origins: dict[str, Row], asked: list[Aske
     """What is missing of the attackers that the suite trains against a defence; empty where nothing is.
 
     asked: of a suite with a plan (`adaptive`) every scenario that is trained on, learner, knowledge and training seed, trained as the plan
-    says, against these very files of the defence, and played wherever the policy fits. Of a suite without one it is empty, and any policy
-    will do that was trained against the defence and played everywhere.
+    says, against these very files and this version of the defence, and played wherever the policy fits. Of a suite without one it is
+    empty, and any policy will do that was trained against the defence and played everywhere. All this is what the policies' files say.
     """
     guard = table.defences.index(defence)
-    digest = next(rows[0]["defence_digest"] for key, rows in table.cells.items() if key.defence == defence)
+    row = next(rows[0] for key, rows in table.cells.items() if key.defence == defence)
+    own = defence, row["defence_digest"], row.get("versions", {}).get("defence", 1)
     met = [
         (origins[column.attack], {name for name in table.scenarios if (table.state[name][guard, i] == PLAYED).all()})
         for i, column in enumerate(table.columns)
         if column.attack in origins and column.attack not in table.withdrawn
-        and (origins[column.attack]["defence"], origins[column.attack]["digest"]) == (defence, digest)
+        and tuple(origins[column.attack].get(key, 1) for key in ("defence", "digest", "version")) == own
     ]  # fmt: skip
     if not asked:
         met = [(origin, played) for origin, played in met if played == set(table.scenarios)]

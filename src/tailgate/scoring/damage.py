@@ -10,6 +10,7 @@ import numpy as np
 
 from tailgate.core import Array
 from tailgate.errors import InputError
+from tailgate.metrics import METRICS
 from tailgate.scenario import Scenario, Suite, load_scenario
 from tailgate.threat import KNOWLEDGE
 
@@ -99,7 +100,7 @@ class Table:
 
 
 def tabulate(rows: Iterable[Row], suite: Suite, added: Sequence[str] = (), withdrawn: Iterable[str] = ()) -> Table:
-    """The table. A seed of a cell counts once, its last row; `added` are attacks that joined the suite's after it was published.
+    """The table. A seed of a cell counts once, however often it was played; `added` are attacks that joined the suite's later.
 
     Raises InputError for rows that do not belong together.
     """
@@ -130,7 +131,7 @@ def tabulate(rows: Iterable[Row], suite: Suite, added: Sequence[str] = (), withd
         key = Key(row["scenario"], slot, row["defence"], Column(row["attack"], row["knowledge"]))
         by_seed = held.setdefault(key, {})
         _same_cell(key, next(iter(by_seed.values()), row), row)
-        by_seed[row["seed"]] = row
+        _same_result(key, by_seed.setdefault(row["seed"], row), row)
     for field in ("purpose", "version", "beacon"):
         found = sorted({str(row.get(field, "")) for row in rows})
         if len(found) > 1:
@@ -200,6 +201,13 @@ def _same_cell(key: Key, one: Row, other: Row) -> None:
     for field in ("config_hash", "defence_digest", "attack_digest", "version"):
         if one[field] != other[field]:
             raise InputError(f"rows of {named(key)}: {field}", [one[field], other[field]], "rows of one")
+
+
+def _same_result(key: Key, one: Row, other: Row) -> None:
+    """Raise InputError where an episode came out in two ways: else the file that is read last would decide."""
+    for field in ("trace_hash", "status", *METRICS):
+        if one.get(field) != other.get(field):
+            raise InputError(f"rows of {named(key)}, seed {one['seed']}: {field}", [one.get(field), other.get(field)], "rows of one result")
 
 
 def named(key: Key) -> str:

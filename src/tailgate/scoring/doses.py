@@ -1,13 +1,11 @@
 """The worst over attacks and scenarios at each dose: rates, curves and the critical dose.
 
-Everything here falls or stays when an attack or a scenario is added: values are maxima of damage, limits are corrected for their number,
-and the resamples of the bootstrap do not depend on what is compared.
+Every value here falls or stays when an attack or a scenario is added: values are maxima of damage, and limits are corrected for their
+number.
 """
 
 from __future__ import annotations
 
-import functools
-import hashlib
 import math
 from dataclasses import dataclass
 from functools import cached_property
@@ -18,12 +16,11 @@ from scipy import stats
 
 from tailgate.core import Array
 from tailgate.errors import InputError
-from tailgate.strength.dose import CRITICAL, LEVEL, critical_dose, fitted
+from tailgate.strength.dose import CRITICAL, critical_dose, fitted
 
 from .damage import MISSING, PLAYED, Table, damaged
 from .ranks import Harm
 
-RESAMPLES = 1000
 Data = dict[str, Any]
 
 
@@ -32,37 +29,6 @@ def limits(successes: Array, n: Array, alpha: float) -> tuple[Array, Array]:
     low = np.where(successes > 0, stats.beta.ppf(alpha, np.maximum(successes, 1), n - successes + 1), 0.0)
     high = np.where(successes < n, stats.beta.isf(alpha, successes + 1, np.maximum(n - successes, 1)), 1.0)
     return low, high
-
-
-@functools.cache
-def weights(scenario: str, episodes: int) -> Array:
-    """(episodes, RESAMPLES) how often each resample of a scenario holds each episode: the same for all attacks, doses and defences."""
-    seed = int.from_bytes(hashlib.blake2b(scenario.encode(), digest_size=8).digest(), "little")
-    rng = np.random.default_rng(seed)
-    return np.asarray(rng.multinomial(episodes, np.full(episodes, 1.0 / episodes), RESAMPLES).T, np.float64)
-
-
-def monotone(values: Array) -> Array:
-    """The monotone regression of each column of values (doses, resamples), as strength.dose.fitted gives for one."""
-    total = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values, axis=0)])
-    out = np.full(values.shape, -np.inf)
-    for i in range(len(values)):
-        for j in range(i + 1):  # the largest, over blocks that begin at j, of the least mean that ends at or behind i
-            means = [(total[k + 1] - total[j]) / (k + 1 - j) for k in range(i, len(values))]
-            out[i] = np.maximum(out[i], np.min(means, axis=0))
-    return out
-
-
-def crossings(doses: Array, curves: Array, limit: float) -> Array:
-    """(resamples,) the critical dose of each column of monotone curves (doses, resamples); inf where there is none."""
-    above = curves > limit
-    at = np.argmax(above, axis=0)
-    column = np.arange(curves.shape[1])
-    before = np.maximum(at - 1, 0)
-    low, high = curves[before, column], curves[at, column]
-    rise = np.where(high > low, (limit - low) / np.where(high > low, high - low, 1.0), 1.0)
-    found = np.where(at == 0, doses[0], doses[before] + rise * (doses[at] - doses[before]))
-    return np.where(above.any(axis=0), found, np.inf)
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,40 +156,27 @@ class Worst:
         return {"defence": self.defence, "knowledge": self.knowledge, "points": self.points, "fitted": line}
 
     def critical(self) -> Data | None:
-        """The critical dose with its bootstrap interval. None where no dose is a number.
+        """The critical dose with its interval. None where no dose is a number.
 
+        The interval is where the lower and the upper limits cross that hold together for all pairs and doses. A bootstrap of the worst
+        would not cover: the largest of many shares is biased upwards, and that of a resample once more (decision record 23).
         Values are null beyond the largest dose; the smallest dose stands for any up to it, and 0 for damage that needs no attack.
         """
         if not self.numbers:
             return None
-        doses = np.array([point["dose"] for point in self.points], np.float64)
-        first = len(doses) - len(self.numbers)  # below the smallest dose nothing was played: a line down to no attack would be a guess
-        line, lines = fitted(np.array([point["value"] for point in self.points])), monotone(self._drawn())
-        clean = line[:first].max(initial=0.0) > CRITICAL
-        value = 0.0 if clean else critical_dose(doses[first:], line[first:], CRITICAL)
-        cleans = lines[:first].max(axis=0, initial=0.0) > CRITICAL
-        drawn = np.sort(np.where(cleans, 0.0, crossings(doses[first:], lines[first:], CRITICAL)))
-        low, high = math.floor((1 - LEVEL) / 2 * (RESAMPLES - 1)), math.ceil((1 + LEVEL) / 2 * (RESAMPLES - 1))
+        doses = np.array([self.table.doses[slot] for slot in self.numbers], np.float64)
+        first = len(self.points) - len(doses)  # below the smallest dose nothing was played: a line down to no attack would be a guess
+        line = fitted(np.array([point["value"] for point in self.points]))
+        low, high = np.array([self.bounds(slot, sides=2 * len(doses)) for slot in self.numbers]).T
+        found = {
+            "value": critical_dose(doses, line[first:], CRITICAL),
+            "low": critical_dose(doses, np.minimum.accumulate(high[::-1])[::-1], CRITICAL),  # damage only rises with the dose
+            "high": critical_dose(doses, np.maximum.accumulate(low), CRITICAL),
+        }
+        if line[:first].max(initial=0.0) > CRITICAL:
+            found = dict.fromkeys(found, 0.0)
         at = next((point for point in self.points if point["value"] > CRITICAL), self.points[-1])
-        # the worst of a resample is worse than that of the rows: what it says too low is widened to what was measured
-        found = {"value": value, "low": min(float(drawn[low]), value), "high": max(float(drawn[high]), value)}
+        found |= {"low": min(found["low"], found["value"]), "high": max(found["high"], found["value"])}  # the regression may leave them
         return {key: x if math.isfinite(x) else None for key, x in found.items()} | {
             "worst": {"scenario": at["scenario"], "attack": at["attack"]}
         }
-
-    def _drawn(self) -> Array:
-        """(points, resamples) the worst share in each resample, chosen anew."""
-        worst = np.zeros((len(self.points), RESAMPLES))
-        first = len(self.points) - len(self.numbers)
-        for name in self.table.scenarios:
-            w = weights(name, len(self.table.seeds.get(name, ()))) if self.table.seeds.get(name) else None
-            if w is None:
-                continue
-            for scenario, clean in self._clean:
-                if scenario == name:
-                    worst[0] = np.maximum(worst[0], clean @ w / len(clean))
-            mine = [i for scenario, i in self.pairs if scenario == name]
-            if mine:
-                harm = np.stack([self._harm(name, i)[self.numbers] for i in mine])  # whole numbers: exact in any order of summation
-                worst[first:] = np.maximum(worst[first:], (harm @ w).max(axis=0) / harm.shape[-1])
-        return worst

@@ -11,6 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from tailgate.errors import InputError
+
 from .damage import CLEAN, Row, Table, damaged, has_road
 
 GAP = 0.10  # mean gap above that of the undefended car, as a share of it
@@ -21,12 +23,17 @@ FAR = 0.9  # of the undefended car's distance
 ALARMED = 0.5  # share of the time
 HOURS = 0.1  # mean time between alarm onsets [h]: the shortest that the detection board calibrates to
 HOUR = 3600.0  # [s]
+ALARMS = ("alarm_rate", "alarm_onsets")  # figures that a clean run is judged by
+COSTS = ("time_gap_inflation", "rms_jerk", "distance_travelled")
 
 Gate = dict[str, Any]
 
 
 def gates(table: Table, defence: str) -> list[Gate]:
-    """Every gate of a defence: {gate, scenario, value, limit, passed}; `value` is null where a figure cannot be had, and not passed."""
+    """Every gate of a defence: {gate, scenario, value, limit, passed}; `value` is null where a figure cannot be had, and not passed.
+
+    Raises InputError for a clean run that lacks a figure which its road has.
+    """
     return [gate for name in table.scenarios for gate in _of(table, defence, name)]
 
 
@@ -34,6 +41,10 @@ def _of(table: Table, defence: str, scenario: str) -> list[Gate]:
     own, bare = table.clean.get((scenario, defence)), table.clean.get((scenario, CLEAN))
     if own is None:
         return [_gate("clean run", scenario, None, None, False)]
+    for row in (*own, *(bare or ())):
+        for metric in (*ALARMS, *(COSTS if has_road(row) else ())):
+            if row[metric] is None:
+                raise InputError(f"rows of {scenario}, {row['defence']}, {CLEAN}: {metric}", None, "a number")
     harmed = sum(damaged(row, table.suite) for row in own)
     out = [_false_alarms(table, scenario, own)]
     if not has_road(own[0]):

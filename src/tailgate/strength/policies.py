@@ -93,16 +93,18 @@ def trained(text: str) -> Trained:
 
 
 def origin_of(text: str) -> dict[str, Any] | None:
-    """What the rows of a trained policy say of its training: against which defence (and digest), by which plan, and the training seed."""
+    """What a trained policy says of its training: against which defence (digest, version), by which plan, and the training seed."""
     if not is_policy(text):
         return None
     who = trained(text)
     config, digest = who.header.training.get("config"), who.header.training.get("defence_digest", "")
+    version = who.header.training.get("defence_version")
     if who.defence is None or not isinstance(config, dict) or not isinstance(digest, str):
         return None
     return {
         "defence": Spec("defence", who.defence).target, "digest": digest, "plan": plan_key(config), "seed": who.seed,
         "rising": rising(who.header.training.get("curve")),
+        **({"version": version} if isinstance(version, int) else {}),  # not recorded by those that met the first version
     }  # fmt: skip
 
 

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import contextlib
+import hashlib
+import os
+from collections.abc import Iterator, Sequence
+from contextvars import ContextVar
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,7 +21,31 @@ from tailgate.submission.process import Process
 from tailgate.submission.sandbox import Sandbox
 from tailgate.submission.wire import Outputs, model_arrays
 
+_veil: ContextVar[bytes] = ContextVar("veil", default=b"")  # a secret of this training; empty where nobody is trained
 _AHEAD = 50  # steps whose processor time is granted at once
+
+
+@contextlib.contextmanager
+def veiled() -> Iterator[None]:
+    """Hides in the keys that isolated defences draw with which episode is played, and that an attacker is trained in it.
+
+    Training seeds are small numbers and episodes are counted: a class that could recognise them would be weak where attackers are trained
+    and itself where it is scored. The secret is new each time, so that a defence which draws is not trained against twice alike.
+    """
+    token = _veil.set(os.urandom(32))
+    try:
+        yield
+    finally:
+        _veil.reset(token)
+
+
+class Veiled(NamedTuple):
+    """Keys as the process is given them, and what they were made of."""
+
+    key: Array  # (B,) uint64
+    episode: Array  # (B,)
+    shown: Array  # (B,) uint64
+    veil: bytes
 
 
 class Tickets(NamedTuple):
@@ -34,6 +62,7 @@ class IsolatedPlan:
     model: Model
     ticket: int = 0
     granted: int = 0  # rows times steps that are still granted
+    veiled: Veiled | None = None
 
 
 @dataclass(eq=False)
@@ -88,7 +117,8 @@ class Isolated:
             plan.granted += _AHEAD * batch
             plan.process.grant(self.limits.steps(_AHEAD, batch, model.agents))
         arrays = {name: value for name, value in received._asdict().items() if value is not None}
-        arrays |= {"known_u": known_u, "ticket": state.row, "key": draws.key, "episode": draws.episode, "step": draws.step}
+        key, episode = _shown(plan, draws)
+        arrays |= {"known_u": known_u, "ticket": state.row, "key": key, "episode": episode, "step": draws.step}
         outputs = Outputs(batch, model.agents, model.states, len(model.actuators))
         plan.process.make_room(outputs)
         answer = plan.process.ask("step", arrays, stream=int(draws.stream), ticket=plan.ticket)
@@ -107,6 +137,23 @@ class Isolated:
 
     def __exit__(self, *_: Sequence[Any]) -> None:
         self.close()
+
+
+def _shown(plan: IsolatedPlan, draws: Draws) -> tuple[Array, Array]:
+    """Key and number of each episode (B,), as the process may know them."""
+    veil = _veil.get()
+    if not veil:
+        return draws.key, draws.episode
+    held = plan.veiled
+    if held is None or held.veil != veil or len(held.key) != len(draws.key):
+        stale, shown = np.ones(len(draws.key), bool), np.zeros_like(draws.key)
+    else:
+        stale, shown = (held.key != draws.key) | (held.episode != draws.episode), held.shown.copy()
+    for i in np.flatnonzero(stale):
+        digest = hashlib.blake2b(f"{int(draws.key[i])}/{int(draws.episode[i])}".encode(), key=veil, digest_size=8).digest()
+        shown[i] = int.from_bytes(digest, "little")
+    plan.veiled = Veiled(draws.key.copy(), draws.episode.copy(), shown, veil)
+    return shown, np.zeros_like(draws.episode)
 
 
 def _tickets(plan: IsolatedPlan, batch: int) -> Tickets:
