@@ -136,28 +136,49 @@ def judged(cells: dict[str, Any]) -> dict[str, dict[str, str]]:
     """A verdict on each question of each cell's chosen learner, corrected after Holm for the cells that are asked it."""
     out: dict[str, dict[str, str]] = {name: {} for name in cells}
     for question in QUESTIONS:
-        gains = {name: cell["learners"][cell["best"]]["advantage"][question] for name, cell in cells.items()}
+        gains = {}
+        for name, cell in cells.items():
+            report = cell["learners"][cell["best"]]
+            row = line(report)
+            others = {"no attack": row["none"], "best scripted attack": row["script"], "own yoked schedule": np.array(row["yoked"])}
+            gains[name] = report["advantage"][question], (np.array(row["learned"]) - others[question]).tolist()
         for name, word in corrected(gains).items():
             out[name][question] = word
-    for name, word in corrected({name: cell["champion"]["gain"] for name, cell in cells.items()}).items():
+    for name, word in corrected({name: (cell["champion"]["gain"], []) for name, cell in cells.items()}).items():
         out[name]["champion"] = word
     return out
 
 
-def corrected(gains: dict[str, dict[str, float]]) -> dict[str, str]:
-    """A word for each difference, after Holm for all of them together; `same` where no episode differs."""
+def corrected(asked_of: dict[str, tuple[dict[str, float], list[float]]]) -> dict[str, str]:
+    """A word for each difference, given with that of each training seed, after Holm for all together; `same` where no episode differs."""
+    gains = {name: gain for name, (gain, _) in asked_of.items()}
     asked = [name for name, gain in gains.items() if gain["low"] < gain["high"]]
-    adjusted = dict(zip(asked, stats.holm([p_value(gains[name]) for name in asked]), strict=True))
+    adjusted = dict(zip(asked, stats.holm([p_value(*asked_of[name]) for name in asked]), strict=True))
     words = {name: "wins" if gain["value"] > 0 else "loses" for name, gain in gains.items()}
     return {name: "same" if name not in adjusted else "undecided" if adjusted[name] >= 0.05 else words[name] for name in gains}
 
 
-def p_value(gain: dict[str, float]) -> float:
-    """Two-sided, of a difference of 0, from the side of its 95 % interval that points there: below 0.05 where 0 is outside."""
-    from scipy.stats import norm
+def p_value(gain: dict[str, float], seeds: list[float]) -> float:
+    """Two-sided, of a difference of 0: 1 less the level at which its interval, as `stats.paired_difference` makes it, ends there.
 
+    seeds: the difference of each training seed, whose part of the interval is Student's t and has wider tails than that of the episodes.
+    """
+    from scipy import optimize
+    from scipy.stats import norm, t
+
+    size = abs(gain["value"])
     reach = gain["value"] - gain["low"] if gain["value"] > 0 else gain["high"] - gain["value"]
-    return float(2.0 * norm.sf(1.96 * abs(gain["value"]) / max(reach, 1e-12)))
+    runs = len(seeds)
+    of_seeds = float(np.std(seeds, ddof=1) / np.sqrt(runs)) if runs > 1 else 0.0
+    wide = float(t.ppf(0.975, runs - 1)) * of_seeds if runs > 1 else 0.0
+    of_episodes = float(np.sqrt(max(reach**2 - wide**2, 0.0)) / norm.ppf(0.975))
+
+    def beyond(log_p: float) -> float:
+        half = np.exp(log_p) / 2.0
+        return float(np.hypot(norm.isf(half) * of_episodes, t.isf(half, runs - 1) * of_seeds if runs > 1 else 0.0)) - size
+
+    least = -600.0  # of a logarithm: beyond it nothing is told apart
+    return 0.0 if beyond(least) < 0.0 else float(np.exp(optimize.brentq(beyond, least, 0.0)))
 
 
 def learners_of(cells: dict[str, Any]) -> list[tuple[str, str, dict[str, Any]]]:

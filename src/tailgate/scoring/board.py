@@ -59,8 +59,8 @@ def score(
     found = [_entry(table, d, levels[d], slot, origins, asked) for d in table.defences]
     comparisons = _rank(found, levels, slot, alpha)
     return {
-        "format": FORMAT, "suite": _suite(table, alpha) | {"require_adaptive": require_adaptive}, "attacks": _attacks(table, lines, origins), "entries": found,
-        "cells": _cells(table),
+        "format": FORMAT, "suite": _suite(table, alpha) | {"require_adaptive": require_adaptive},
+        "attacks": _attacks(table, lines, origins), "entries": found, "cells": _cells(table),
         "curves": [worst.curve() for d in table.defences for worst in levels[d].values() if worst.complete and worst.numbers],
         "comparisons": comparisons, "detection": None,
     }  # fmt: skip
