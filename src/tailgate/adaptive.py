@@ -64,6 +64,8 @@ def plan_of(suite: Suite) -> Adaptive:
 def configs_of(suite: Suite, defence: str, out: Path, *, seeds: int | None = None, extra: tuple[str, ...] = ()) -> list[train.TrainConfig]:
     """One training for each scenario that is trained on, learner and knowledge."""
     plan = plan_of(suite)
+    if seeds is not None and seeds < 1:
+        raise InputError("seeds", seeds, "a whole number not below 1")
     Spec("defence", defence).refuse_imports("adaptive attack")
     threat = suite.threat | ({} if plan.dose is None else {"budget": plan.dose})
     settings = [f"defence={json.dumps(defence)}", f"out={json.dumps(str(out))}", "tensorboard=false"]

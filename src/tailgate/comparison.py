@@ -70,6 +70,9 @@ def compare(
     def outcomes(attack: str) -> Array:
         return outcomes_of([r for r in rows if r["attack"] == attack and r["defence"] == guard], outcome)
 
+    # who may not look into a defence has no figures against it, which is no reason to lose the others
+    skipped = {r["attack"]: r["reason"] for r in rows if r["defence"] == guard and r["status"] == "skipped"}
+    left_out = {name: skipped[name] for name in config.white_box if name in skipped}
     built, uses = Spec("defence", guard).make(), Spec("defence", guard).entry.uses
     keys = draws.keys("report", range(config.episodes))
     verdicts = []
@@ -78,12 +81,13 @@ def compare(
         place = load_scenario(config.scenario).with_threat(**(threat | {"knowledge": policy.knowledge}))
         own, yoked = timing_advantage(place.loop(built, uses), policy, keys, outcome)
         verdicts.append(Verdict(seed, path, own, yoked))
-    return _report(config, verdicts, outcomes, scripts.best, outcome)
+    return _report(config, verdicts, outcomes, scripts.best, outcome, left_out)
 
 
 def _report(
-    config: TrainConfig, verdicts: list[Verdict], outcomes: Callable[[str], Array], best: str | None, outcome: str
+    config: TrainConfig, verdicts: list[Verdict], outcomes: Callable[[str], Array], best: str | None, outcome: str, left_out: dict[str, str]
 ) -> dict[str, Any]:
+    white_box = [name for name in config.white_box if name not in left_out]
     learned = np.array([v.learned for v in verdicts])
     yoked = np.array([v.yoked for v in verdicts])
     none = np.broadcast_to(outcomes("none"), learned.shape)
@@ -100,7 +104,7 @@ def _report(
         items.append((best, mean(outcomes(best)), "best scripted attack of equal knowledge and dose, chosen on other seeds"))
     items += [(f"learned, seed {v.seed}", mean(v.learned), "") for v in verdicts]
     items += [(f"learned, seed {v.seed}, yoked", mean(v.yoked), "its own values at another episode's times") for v in verdicts]
-    items += [(name, mean(outcomes(name)), _note(name)) for name in config.white_box]
+    items += [(name, mean(outcomes(name)), _note(name)) for name in white_box]
 
     def over(attack: str) -> Interval:
         return difference(np.broadcast_to(outcomes(attack), learned.shape))
@@ -120,8 +124,9 @@ def _report(
         "rivals": {name: {"outcome": mean(outcomes(name))._asdict(), "advantage": over(name)._asdict()} for name in config.rivals},
         "ceilings": {
             name: {"outcome": mean(outcomes(name))._asdict(), "reached": [_reached(v.learned, outcomes(name))._asdict() for v in verdicts]}
-            for name in config.white_box if Spec("attack", name).entry.optimal
+            for name in white_box if Spec("attack", name).entry.optimal
         },
+        "left_out": left_out,
     }  # fmt: skip
     write_atomic(config.directory / "report.json", json.dumps(report, indent=1, allow_nan=False).encode() + b"\n")
     return report

@@ -39,11 +39,11 @@ def build(cls: type[T], data: dict[str, Any], where: str) -> T:
         if key not in known:
             raise unknown(f"{where}: unknown field", key, known)
     if not known:
-        return cls()
+        return _made(cls, {}, where)
     try:
         adapter = _adapter(cls)  # type: ignore[arg-type]
     except PydanticSchemaGenerationError:  # a plug-in with fields that are not data: its own constructor decides
-        return cls(**data)
+        return _made(cls, data, where)
     try:
         return adapter.validate_python(data)  # type: ignore[no-any-return]
     except ValidationError as error:
@@ -53,6 +53,14 @@ def build(cls: type[T], data: dict[str, Any], where: str) -> T:
         path = ".".join(str(part) for part in first["loc"]) or cls.__name__
         message = (first["msg"][0].lower() + first["msg"][1:]).removeprefix("input should be ")
         raise InputError(f"{where}.{path}", first["input"], message) from None
+
+
+def _made(cls: type[T], data: dict[str, Any], where: str) -> T:
+    """What the class's own constructor makes of the data."""
+    try:
+        return cls(**data)
+    except TypeError as error:
+        raise InputError(where, data or None, f"parameters that its constructor takes ({error})") from None
 
 
 def as_data(value: Any) -> Any:
@@ -122,5 +130,6 @@ def override(data: dict[str, Any], assignments: list[str]) -> dict[str, Any]:
             if not isinstance(child, dict):
                 raise InputError(f"override {key}", value, f"a field below a mapping; {name} is {child!r}")
             node = child
-        node[leaf] = scalar(value)
+        held = scalar(value)
+        node[leaf] = "none" if leaf == "defence" and held is None else held  # a defence has this name, and always one
     return out

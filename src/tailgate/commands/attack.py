@@ -10,6 +10,7 @@ from typing import Any
 
 from rich.console import Console
 
+from tailgate.errors import InputError
 from tailgate.progress import cells, progress
 
 
@@ -39,6 +40,8 @@ def _attack(options: argparse.Namespace) -> int:
 
     sys.path.insert(0, "")  # module:Class is looked for in the working directory, as `leaderboard submit` does
 
+    if options.episodes is not None and options.episodes < 1:  # before anything is trained
+        raise InputError("episodes", options.episodes, "a whole number not below 1")
     suite, out = load_suite(options.suite), Path(options.out)
     extra = (*options.set, f"workers={options.workers}")
     configs = configs_of(suite, options.defence, out / "policies", seeds=options.seeds, extra=extra)

@@ -22,9 +22,9 @@ from tailgate.scenario import Suite
 def add(actions: Any) -> None:
     command = actions.add_parser(
         "run", help="play suites, score them, and build the page of their boards",
-        description="Play every defence of the suites against every attack, score the rows, and build the page: OUT/SUITE/rows.jsonl.xz, "
-        "OUT/SUITE/board.json, OUT/page. Rows that `leaderboard attack` or `submit` put below OUT/SUITE count as well. Interrupted, the "
-        "same command goes on.",
+        description="Play every defence of the suites against every attack, score the rows, and build the page: OUT/SUITE/rows.jsonl.xz "
+        "(with --defence the rows have a file of their own), OUT/SUITE/board.json, OUT/page. Rows that `leaderboard attack` or `submit` "
+        "put below OUT/SUITE count as well. Interrupted, the same command goes on.",
     )  # fmt: skip
     command.add_argument("suites", nargs="+", metavar="SUITE", help="suites by name or YAML file")
     command.add_argument("--out", required=True, metavar="DIR", help="folder of the boards")
@@ -75,10 +75,11 @@ def _run(options: argparse.Namespace) -> int:
         for suite in suites:
             folder = out / suite.name
             if not options.score_only:
-                play(
+                rows = play(
                     suite, folder, defences=options.defence, workers=options.workers, beacon=options.beacon,
                     progress=lambda name, done, total: update(name, done, total, cells(done, total)),
                 )  # fmt: skip
+                print(f"rows: {rows}", file=sys.stderr)
             board = board_of(suite, folder, require_adaptive=not options.unattacked)
             boards.append(_detected(board, suite, folder, update) if options.detection else board)
     page = build_site(boards, out / "page", replays=not options.no_replays)

@@ -7,6 +7,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+from rich.markup import escape
 from rich.table import Table
 
 from tailgate.errors import InputError
@@ -55,7 +56,7 @@ def _list(options: argparse.Namespace) -> int:
         table = Table("name", "what it is", "parameters (default)", title=title)
         for card in group:
             fields = ", ".join(f"{k} ({json.dumps(p['default'])})" for k, p in card.get("parameters", {}).items())
-            table.add_row(card["name"], card["summary"], fields)
+            table.add_row(*map(escape, (card["name"], card["summary"], fields)))
         out.print(table)
     return 0
 

@@ -22,7 +22,7 @@ def add(commands: Any) -> None:
     fields = "\n".join(f"  {p['name']:<18} {p['doc']} (default: {json.dumps(p['default'])})" for p in parameters())
     command = commands.add_parser(
         "train", help="train an adversary, compare it with scripted attacks on fresh seeds, write a page",
-        description="Train an adversary. Without --config, the preset `quickstart`.",
+        description="Train an adversary. Without --config, the preset `quickstart`, which sets some of the fields below.",
         epilog=f"keys (dotted below environment, threat and the learners, for example ppo.epochs=4):\n{fields}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )  # fmt: skip
@@ -37,6 +37,7 @@ def add(commands: Any) -> None:
 def _train(options: argparse.Namespace) -> int:
     from tailgate import comparison, train
 
+    sys.path.insert(0, "")  # a sandbox's module:Class is looked for in the working directory, as `leaderboard attack` does
     overrides = list(options.overrides) + ([f"first_seed={options.seed}"] if options.seed is not None else [])
     config = train.load_config(options.config, overrides, options.resume)
     errors = Console(stderr=True)
@@ -85,6 +86,8 @@ def _print_report(report: dict[str, Any]) -> None:
         table.add_row(escape(row["label"]), value, f"{low} to {high}", row["note"])
     out = console()
     out.print(table)
+    for name, why in report["left_out"].items():
+        out.print(f"left out: {name} ({why})", markup=False, highlight=False)
     for name, gain in report["advantage"].items():
         verdict = "wins" if gain["low"] > 0 else "loses" if gain["high"] < 0 else "undecided"
         scale, points = (100.0, " points") if report["unit"] == SHARE else (1.0, "")

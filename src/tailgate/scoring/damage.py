@@ -228,11 +228,10 @@ def _same_component(rows: Sequence[Row]) -> None:
 def _seeds(cells: dict[Key, list[Row]]) -> dict[str, tuple[int, ...]]:
     """The seeds of each scenario, which all cells share: without that no comparison is paired."""
     out: dict[str, tuple[tuple[int, ...], Key]] = {}
-    for key in sorted(cells):
+    for key in sorted(cells, key=lambda key: (-len(cells[key]), key)):  # whoever has fewer is the odd one
         mine = tuple(row["seed"] for row in cells[key])
         seeds, first = out.setdefault(key.scenario, (mine, key))
         if mine != seeds:
-            raise InputError(
-                f"rows of {named(key)}: seeds", f"{len(mine)} of them", f"the {len(seeds)} seeds of {first.defence}, {first.column.attack}"
-            )  # fmt: skip
+            most = f"the {len(seeds)} seeds of {first.defence}, {first.column.attack}: play as many"
+            raise InputError(f"rows of {named(key)}: seeds", f"{len(mine)} of them", most)
     return {name: seeds for name, (seeds, _) in out.items()}
