@@ -80,20 +80,36 @@ def test_a_failing_component_is_exit_code_1_and_its_rows_say_why(tmp_path: Path)
         (["leaderboard", "build", "--rows", "none.jsonl", "--out", "page"], ["rows", "none.jsonl"]),
         (["leaderboard", "build", "--rows", "bad.jsonl", "--out", "page"], ["bad.jsonl", "line 1"]),
         (["leaderboard", "build", "--rows", "file", "--out", "page"], ["rows"]),
-        (["train", "--config", "missing"], ["config", "missing", "quickstart"]),
+        (["train", "--config", "missing"], ["config", "missing", "quickstart"]), (["train", "defence=mine:Mine"], ["mine:Mine", "bwrap/module:Class"]),
+        (["leaderboard", "attack", "kf", "--suite", "quick-v0", "--out", "x", "--seeds", "0"], ["seeds", "0"]),
+        (["leaderboard", "attack", "kf", "--suite", "quick-v0", "--out", "x", "--episodes", "0"], ["episodes", "0"]),
+        (["evaluate", "--defence", "needs:Needs", "--seeds", "1"], ["needs:Needs", "'x'"]),
     ],
 )  # fmt: skip
 def test_bad_input_is_exit_code_2_and_one_line(run: Run, tmp_path: Path, arguments: list[str], words: list[str]) -> None:
     (tmp_path / "file").write_text("")
+    (tmp_path / "needs.py").write_text("class Needs:\n    def __init__(self, x): ...\n    prepare = start = step = print\n")
     (tmp_path / "bad.jsonl").write_text("{]\n")
     (tmp_path / "bad.yaml").write_text("scenarios: [braking-v0]\nseedz: 3\n")
-    before = sorted(p.name for p in tmp_path.rglob("*"))
+    before = sorted(p.name for p in tmp_path.rglob("*") if "__pycache__" not in p.parts and p.name != "__pycache__")
     code, _, said = run(*arguments)
     assert code == 2, said
     error = [line for line in said.splitlines() if line.startswith("tailgate: error: ")]
     assert len(error) == 1 and "Traceback" not in said
     assert all(word in error[0] for word in words) and "expected" in error[0]
-    assert sorted(p.name for p in tmp_path.rglob("*")) == before
+    assert sorted(p.name for p in tmp_path.rglob("*") if "__pycache__" not in p.parts and p.name != "__pycache__") == before
+
+
+def test_a_run_is_compared_also_where_nobody_can_look_into_the_defence(run: Run) -> None:
+    """The default white-box attack needs an innovation, which `none` has not: it is left out, with the reason. `none` is a name here."""
+    code, out, said = run(
+        "train", "defence=none", "steps=600", "learner=cem", "cem={population: 4, episodes: 5, hidden: []}", "environment.interval=20",
+        "teacher=null", "rivals=[]", "episodes=4", "others=[]", "workers=1", "tensorboard=false", "--json",
+    )  # fmt: skip
+    assert code == 0, said
+    report = json.loads(out)
+    (left,) = report["left_out"]
+    assert left.startswith("stealth") and "look" in report["left_out"][left] and report["defence"] == "none"
 
 
 def test_an_unknown_command_explains_itself(capsys: pytest.CaptureFixture[str]) -> None:

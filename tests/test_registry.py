@@ -226,6 +226,7 @@ def test_scalar_forms(text, value):
 def test_overrides():
     """Dotted assignments change nested fields of a copy; anything else is refused."""
     data = {"a": {"b": 1}, "c": 2}
+    assert override(data, ["defence=none", "teacher=none"])["defence"] == "none" and override(data, ["teacher=none"])["teacher"] is None
     assert override(data, ["a.b=5", "d.e=[1]", "c=x=y"]) == {"a": {"b": 5}, "c": "x=y", "d": {"e": [1]}}
     assert data == {"a": {"b": 1}, "c": 2}
     for bad in ("c", "=3", "c.d=1"):
