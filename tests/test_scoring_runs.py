@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from tailgate import make_attack, make_defence
+from tailgate.adaptive import asked_of
 from tailgate.agents.zoo import zoo_names
 from tailgate.draws import keys
 from tailgate.errors import InputError
@@ -15,7 +16,7 @@ from tailgate.evaluation import evaluate
 from tailgate.leaderboard.board_format import read_board
 from tailgate.metrics import max_error
 from tailgate.registry import entries
-from tailgate.scenario import Suite, load_scenario, load_suite
+from tailgate.scenario import Suite, list_suites, load_scenario, load_suite
 from tailgate.scoring import score
 from tailgate.scoring.detection import detection, deviation, plants, stealth_impact, threshold, with_detection
 from tailgate.trace import rollout
@@ -80,6 +81,13 @@ def test_a_suite_plays_every_built_in_attack_that_it_grants(name) -> None:
     rows = evaluate(suite, defences=suite.defences[:1], attacks=others, doses=[max(d for d in suite.doses if d)], scenarios=suite.scenarios[:1], seeds=1)
     assert len(rows) == len(others) > 10
     assert not {row["attack"] for row in rows if row["status"] == "error" or (row["attack_steps"] and not row["refused_commands"])}
+
+
+def test_every_plan_of_training_can_be_asked_for() -> None:
+    """Each learner's environment takes the suite's threat model: a board cannot be scored without knowing what it asks for."""
+    plans = {name: asked_of(suite) for name in list_suites() if (suite := load_suite(name)).adaptive}
+    assert {"car-following-v0", "highway-v0", "network-v0", "platoon-v0", "quick-v0", "radar-v0", "thesis-v0"} <= set(plans)
+    assert all(set(one.scenarios) <= set(load_suite(name).scenarios) and one.scenarios for name, asked in plans.items() for one in asked)
 
 
 WHERE = ("stop-and-go-v0",)
