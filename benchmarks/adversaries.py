@@ -30,6 +30,7 @@ from tailgate.schema import as_data, read_yaml
 
 HERE = Path(__file__).parent
 RISING = 0.05  # of the whole rise of the learning curve, that its last tenth may bring
+PARTS = ("budget", "no budget", "linear")  # of the record: the moment is chosen; values alone are; the best attack is known
 QUESTIONS = ("no attack", "own yoked schedule", "best scripted attack")
 
 
@@ -181,6 +182,12 @@ def p_value(gain: dict[str, float], seeds: list[float]) -> float:
     return 0.0 if beyond(least) < 0.0 else float(np.exp(optimize.brentq(beyond, least, 0.0)))
 
 
+def part_of(cell: dict[str, Any]) -> str:
+    """Of PARTS that of a cell."""
+    report = cell["learners"][cell["best"]]
+    return "linear" if report.get("ceilings") else "budget" if report["threat"]["budget"] is not None else "no budget"
+
+
 def learners_of(cells: dict[str, Any]) -> list[tuple[str, str, dict[str, Any]]]:
     """(cell, learner, report) of all."""
     return [(name, learner, report) for name, cell in cells.items() for learner, report in cell["learners"].items()]
@@ -200,7 +207,8 @@ def markdown(cells: dict[str, Any]) -> str:
         "Learned: the median over training seeds, with the least and the largest, of the learner that did best on select seeds. The best",
         "script is chosen on select seeds. Differences are paired, with 95 % intervals over episodes and training seeds; each verdict is",
         "corrected (Holm) for the cells of its column. *same*: no episode differs, as the attack's times are the same in all of them.",
-        "Champion: of all learners and seeds the one policy that did best on select seeds, as the script was chosen.", "",
+        "Champion: of all learners and seeds the one policy that did best on select seeds, as the script was chosen. On the linear",
+        "scenarios the best attack is computed (*Ceilings*); without a budget every step is attacked, with no moment to choose.", "",
         "| cell | dose | no attack | best script | learned | by | yoked | over no attack | over yoked | over script | champion over it |",
         "|---|---|---|---|---|---|---|---|---|---|---|",
     ]  # fmt: skip
@@ -218,10 +226,16 @@ def markdown(cells: dict[str, Any]) -> str:
         low, value, high = (comparison.shown(report, cell["champion"]["gain"][k], "+") for k in ("low", "value", "high"))
         gains.append(f"{value} [{low}, {high}] **{verdicts[name]['champion']}**")
         out.append(f"| {' | '.join([name, str(dose), none, script, learned, cell['best'], yoked, *gains])} |")
+    parts = {part: [name for name, cell in cells.items() if part_of(cell) == part] for part in PARTS}
+    out += ["", "| wins, same, undecided, loses | " + " | ".join(f"{part} ({len(of)})" for part, of in parts.items()) + " | all |"]
+    out += ["|---|" + "---|" * (len(parts) + 1)]
     for question in (*QUESTIONS, "champion"):
-        found = [verdicts[name][question] for name in cells]
-        what = "Champion over the best script" if question == "champion" else f"Over {question}"
-        out += ["", f"{what}: {', '.join(f'{found.count(word)} {word}' for word in ('wins', 'same', 'undecided', 'loses'))}."]
+        what = "champion over the best script" if question == "champion" else f"over {question}"
+        counts = []
+        for names in (*parts.values(), list(cells)):
+            found = [verdicts[name][question] for name in names]
+            counts.append(", ".join(str(found.count(word)) for word in ("wins", "same", "undecided", "loses")))
+        out.append(f"| {' | '.join([what, *counts])} |")
     out += [
         "", "## Every learner", "",
         "| cell | learner | shown first | decisions | learned | best on select | yoked | over the best script | training [min] |",
