@@ -15,7 +15,6 @@ from tailgate.errors import InputError
 from .codec import ActionCodec
 from .learning import SEED_STRIDE
 
-EPISODES = 1024  # that are shown
 FIRST = SEED_STRIDE // 2  # of them, among the episodes of a training seed
 
 
@@ -42,7 +41,7 @@ def nearest(codec: ActionCodec, command: Command) -> Array:
     return action
 
 
-def demonstrate(seat: Seat, attack: Attack, seed: int, episodes: int = EPISODES) -> Demonstration:
+def demonstrate(seat: Seat, attack: Attack, seed: int, episodes: int) -> Demonstration:
     """Play what comes nearest to a script at each decision, on training episodes of a seed. Discrete actions only."""
     if not seat.action.discrete:
         raise InputError("teacher", seat.action.spec.action, "a discrete action: timing, mode or ramp")

@@ -82,9 +82,9 @@ def test_a_changed_suite_or_scenario_is_named(monkeypatch: pytest.MonkeyPatch) -
     assert f"suite {name} has changed under its name: it needs a new version" in golden.moved_suites(HELD)
     assert any("scenario thesis-ch6-v0" in line and "new version" in line for line in golden.check("thesis-ch6-v0", HELD))
     suite = Suite("s", "one", ("braking-v0",), (5, 10), ("kf",), ("none",), 9, shown={5: "a"})
-    assert golden.suite_hash(suite) == golden.suite_hash(dataclasses.replace(suite, about="two", shown={5: "b"}))
+    assert suite.hash == dataclasses.replace(suite, about="two", shown={5: "b"}).hash
     for change in ({"seeds": 8}, {"doses": (5,)}, {"shown": {10: "a"}}, {"bound": 1.0}, {"held_out": ("fdi",)}, {"threat": {"budget": 1}}, {"attacks": ("fdi",)}):
-        assert golden.suite_hash(suite) != golden.suite_hash(dataclasses.replace(suite, **change)), change
+        assert suite.hash != dataclasses.replace(suite, **change).hash, change
 
 
 def test_the_attacks_that_are_recorded_take_effect() -> None:

@@ -12,7 +12,6 @@ those are the recorded ones.
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import hashlib
 import json
 import platform
@@ -36,7 +35,6 @@ from tailgate.loop import Loop
 from tailgate.progress import progress
 from tailgate.registry import Spec
 from tailgate.scenario import Scenario, Suite, list_suites, load_scenario, load_suite
-from tailgate.schema import canonical
 from tailgate.trace import Trace, rollout
 
 FORMAT = "tailgate-golden-1"
@@ -45,7 +43,6 @@ EPISODES = 16
 FEW = {"Highway": 2}  # of a plant that steps its episodes one by one
 DEFENCES, ATTACKS = 2, 3
 PURPOSE = "report"  # the first episodes of a board
-WORDS = ("about", "shown")  # of a suite: what is read, not played
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,17 +57,6 @@ class _Blocks(Mixture):
 def this_platform() -> str:
     """What a trace's last bits may depend on."""
     return f"{platform.machine()}, numpy {np.__version__}, numba {version('numba')}"
-
-
-def suite_hash(suite: Suite) -> str:
-    """Of everything in a suite that is played; fields at their defaults leave no mark, so that a new field moves no old suite."""
-    blank = Suite()
-    held = {
-        f.name: getattr(suite, f.name) for f in dataclasses.fields(suite)
-        if f.name not in WORDS and getattr(suite, f.name) != getattr(blank, f.name)
-    }  # fmt: skip
-    held["shown"] = sorted(suite.shown)
-    return hashlib.blake2b(canonical(held).encode(), digest_size=8).hexdigest()
 
 
 def users() -> dict[str, Suite]:
@@ -172,7 +158,7 @@ def read() -> dict[str, Any]:
 
 def moved_suites(held: dict[str, Any]) -> list[str]:
     """Which suites or scenarios are not the recorded ones, without playing."""
-    here, there = {name: suite_hash(load_suite(name)) for name in list_suites()}, held["suites"]
+    here, there = {name: load_suite(name).hash for name in list_suites()}, held["suites"]
     out = [f"suite {name} is not recorded: python -m tailgate.golden --write" for name in here if name not in there]
     out += [f"suite {name} is recorded and gone" for name in there if name not in here]
     changed = [name for name in here if there.get(name, here[name]) != here[name]]
@@ -266,7 +252,7 @@ def _write(only: list[str] | None) -> int:
         for done, name in enumerate(sorted(used), 1):
             scenarios[name] = record(name, used[name])
             update("playing", done, len(used), f"{done} of {len(used)} scenarios")
-    suites = {name: suite_hash(load_suite(name)) for name in only or list_suites()}
+    suites = {name: load_suite(name).hash for name in only or list_suites()}
     if only is not None:
         others = read()
         suites, scenarios = (dict(sorted((others[key] | new).items())) for key, new in (("suites", suites), ("scenarios", scenarios)))

@@ -18,6 +18,7 @@ from tailgate.schema import build, canonical, fields_of, read_yaml
 from tailgate.threat import Brief, ThreatModel
 
 LINK = ("loss", "latency")
+WORDS = ("about", "shown")  # of a suite: what is read, not played; of `shown` the doses count
 _COMPONENTS = ("plant", "sensor", "controller", "manoeuvre")
 
 
@@ -111,6 +112,16 @@ class Suite:
     adaptive: dict[str, Any] = dataclasses.field(default_factory=dict, metadata={"doc": "how attackers are trained against a defence"})
     held_out: tuple[str, ...] = param((), "attacks, by name, that are kept out of logs for those who learn a detector")
 
+
+    @property
+    def hash(self) -> str:
+        """Of everything that is played; fields at their defaults leave no mark, so that a new field moves no old suite."""
+        blank = Suite()
+        held = {
+            f.name: getattr(self, f.name) for f in dataclasses.fields(self)
+            if f.name not in WORDS and getattr(self, f.name) != getattr(blank, f.name)
+        }  # fmt: skip
+        return hashlib.blake2b(canonical(held | {"shown": sorted(self.shown)}).encode(), digest_size=8).hexdigest()
 
     @property
     def nominal(self) -> tuple[str, ...]:

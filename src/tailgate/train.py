@@ -39,6 +39,7 @@ from tailgate.threat import KNOWLEDGE
 ENVIRONMENT = (fields_of(ActionSpec) | fields_of(Reward) | {"frames": None}).keys() - {"gamma"}  # that `environment` may hold
 COMPARED = {"episodes", "white_box", "others", "workers"}  # fields that change no policy; the next do where the best rival teaches
 CHOSEN = {"rivals", "select_episodes", "outcome"}
+LATER = {"demonstrations"}  # fields that joined when policies had been published: at its default such a field leaves no mark
 Discount = Annotated[float, Field(gt=0, le=1)]
 
 
@@ -61,6 +62,7 @@ class TrainConfig:
     tqc: dict[str, Any] = field(default_factory=dict, metadata={"doc": "hyper-parameters of TQC"})
     cem: dict[str, Any] = field(default_factory=dict, metadata={"doc": "hyper-parameters of the cross-entropy method"})
     teacher: str | None = param(None, "script that PPO imitates before it learns: one by name, or `best` of the rivals; none: from scratch")
+    demonstrations: PositiveCount = param(1024, "episodes of its teacher that a learner is shown")
     gamma: Discount = param(0.995, "discount, of the learner and of the shaping [-]")
     steps: PositiveCount = param(3_000_000, "decisions per training seed, over all environments")
     first_seed: Count = param(0, "first training seed")
@@ -223,7 +225,7 @@ def _train_seed(config: TrainConfig, teacher: str | None, seed: int, resume: boo
             learner.load(checkpoint)
         elif teacher is not None:
             assert isinstance(learner, Teachable)
-            learner.imitate(demonstrate(learner.seat, Spec("attack", teacher).make(), seed))
+            learner.imitate(demonstrate(learner.seat, Spec("attack", teacher).make(), seed, config.demonstrations))
         learner.learn(config.steps, report, checkpoint, min(config.checkpoint_every, max(config.steps // 10, 1)))
     facts = {
         "learner": config.learner, "teacher": teacher, "seed": seed, "steps": learner.steps, "config": as_data(config),
@@ -307,6 +309,7 @@ def free_of(teacher: str | None) -> set[str]:
 def training_of(config: dict[str, Any]) -> str:
     """What decides the policies of a configuration, as JSON data, in text that is the same for the same training wherever it lies."""
     free = free_of(config.get("teacher")) | {"out", "name"}
+    free |= {f.name for f in dataclasses.fields(TrainConfig) if f.name in LATER and config.get(f.name) == f.default}
     return canonical({key: value for key, value in config.items() if key not in free})
 
 
@@ -318,10 +321,10 @@ def plan_key(config: dict[str, Any]) -> str:
 
 def _same_run(held: Path, config: TrainConfig) -> None:
     """Raise InputError when a run would be resumed with another training; the number of steps and the comparison may change."""
-    now, free = as_data(config), free_of(config.teacher) | {"steps"}
+    now, blank, free = as_data(config), as_data(TrainConfig()), free_of(config.teacher) | {"steps"}
     try:
         before = json.loads(held.read_text(encoding="utf-8"))
-        changed = [key for key in now if key not in free and before.get(key) != now[key]]
+        changed = [key for key in now if key not in free and before.get(key, blank[key]) != now[key]]
     except (OSError, ValueError, AttributeError, RecursionError) as error:
         raise InputError("resume", str(held), f"the configuration of the run ({error})") from None
     if changed:

@@ -53,6 +53,7 @@ def verify(
     batch: int | None = None,
     trust_code: bool = False,
     submissions: Sequence[str] = (),
+    files: Sequence[str] = (),
     progress: Callable[[int, int], None] | None = None,
 ) -> dict[str, Any]:
     """Play rows again and compare hashes, metrics and everything else that they record.
@@ -60,7 +61,8 @@ def verify(
     `sample`: so many rows, drawn by `sample_seed`; None: all. `batch`: episodes side by side instead of the row's own number, which
     changes no result. The report has `status` (verified: every row that was asked for agrees; else claimed), `counts`, `entries` (the
     same for each defence), `findings` (rows that differ or could not be checked, lines counted from 1) and `reasons`. `submissions`:
-    classes that rows of `leaderboard submit` are about, each in a sandbox, "bwrap/module:Class".
+    classes that rows of `leaderboard submit` are about, each in a sandbox, "bwrap/module:Class". `files`: the file that each row is from;
+    then the report has the counts of each file too.
     """
     apart = {_target(text): text for text in submissions}
     for name, value in (("sample", sample), ("batch", batch)):
@@ -99,7 +101,7 @@ def verify(
                 found[i] = _compared(i + 1, rows[i], played[rows[i]["seed"]])
     for (i, _), row in zip(alone, run([cell for _, cell in alone], workers=workers) if alone else [], strict=True):
         found[i] = _compared(i + 1, rows[i], row)
-    return _report(rows, [(i, found[i]) for i in asked], sample) | ({} if sample is None else {"sample_seed": sample_seed})
+    return _report(rows, [(i, found[i]) for i in asked], sample, files) | ({} if sample is None else {"sample_seed": sample_seed})
 
 
 def _target(text: str) -> str:
@@ -279,17 +281,23 @@ def _same(row: Any, here: Any) -> bool:
     return canonical(row) == canonical(here) if isinstance(here, dict | list) else bool(row == here)
 
 
-def _report(rows: Sequence[Row], found: list[tuple[int, Finding]], sample: int | None) -> dict[str, Any]:
+def _report(rows: Sequence[Row], found: list[tuple[int, Finding]], sample: int | None, files: Sequence[str]) -> dict[str, Any]:
     def counts(some: list[Finding]) -> dict[str, int]:
         return {verdict: sum(f.verdict == verdict for f in some) for verdict in ("verified", "differs", "unchecked")}
 
     def status(some: list[Finding]) -> str:
         return "verified" if some and all(f.verdict == "verified" for f in some) else "claimed"
 
+    def entries(of: dict[str, list[Finding]]) -> list[dict[str, Any]]:
+        return [{"defence": name, "status": status(some), **counts(some)} for name, some in of.items()]
+
     by_defence: dict[str, list[Finding]] = {}
+    by_file: dict[str, dict[str, list[Finding]]] = {name: {} for name in files}
     reasons: dict[str, int] = {}
     for i, finding in found:
         by_defence.setdefault(rows[i]["defence"], []).append(finding)
+        if files:
+            by_file[files[i]].setdefault(rows[i]["defence"], []).append(finding)
         if finding.verdict != "verified":
             reasons[f"{finding.verdict}: {finding.why}"] = reasons.get(f"{finding.verdict}: {finding.why}", 0) + 1
     names = ("scenario", "dose", "defence", "attack", "purpose", "seed")
@@ -297,7 +305,7 @@ def _report(rows: Sequence[Row], found: list[tuple[int, Finding]], sample: int |
     return {
         "format": "tailgate-verify-1", "status": status(every), "rows": len(rows), "asked": len(found), "sample": sample,
         "version": tailgate.__version__, "engine": ENGINE, "counts": counts(every),
-        "entries": [{"defence": name, "status": status(some), **counts(some)} for name, some in by_defence.items()],
+        "entries": entries(by_defence), "files": [{"file": name, "entries": entries(of)} for name, of in by_file.items()],
         "reasons": [{"why": why, "rows": n} for why, n in sorted(reasons.items(), key=lambda item: -item[1])],
         "findings": [
             {"line": f.line, "verdict": f.verdict, "why": f.why, **{name: rows[i][name] for name in names}, "differences": f.differences}

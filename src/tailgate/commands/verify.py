@@ -36,32 +36,43 @@ def add(actions: Any) -> None:
         "--submission", action="append", default=[], metavar="SANDBOX/module:Class",
         help="class that rows of `leaderboard submit` are about, played again in a sandbox: bwrap/mydefence:Saturated (repeatable)",
     )  # fmt: skip
+    command.add_argument("--out", metavar="FILE", help="also write the report here: OUT/SUITE/verified/NAME.json for the next board")
     command.add_argument("--json", action="store_true", help="print the report as JSON")
     command.set_defaults(run=_verify)
 
 
 def _verify(options: argparse.Namespace) -> int:
+    from tailgate.files import writable_directory, write_atomic
+    from tailgate.leaderboard.verified import digest
     from tailgate.rows import read_rows
     from tailgate.verify import verify
 
+    if options.out is not None:  # before anything is played
+        writable_directory(Path(options.out).parent)
+
     seed = secrets.randbits(32) if options.sample_seed is None else options.sample_seed  # who could foresee it would forge the others
-    rows, origin = [], []
+    rows, origin, held_in = [], [], []
     for name in options.rows:
         held = read_rows(Path(name))
         rows += held
         origin += [(name, line) for line in range(1, len(held) + 1)]
+        held_in += [digest(Path(name))] * len(held)
     if options.trust_code or options.submission:
         sys.path.insert(0, "")  # module:Class is looked for in the working directory, as `tailgate evaluate` does
     with progress(Console(stderr=True)) as update:
         report = verify(
             rows, sample=options.sample, sample_seed=seed, workers=options.workers, batch=options.batch,
-            trust_code=options.trust_code, submissions=options.submission,
+            trust_code=options.trust_code,
+            submissions=options.submission, files=held_in,
             progress=lambda done, total: update("playing", done, total, cells(done, total)),
         )  # fmt: skip
     for finding in report["findings"]:
         finding["file"], finding["line"] = origin[finding["line"] - 1]
+    text = json.dumps(report, indent=1, allow_nan=False)
+    if options.out is not None:
+        write_atomic(Path(options.out), text.encode() + b"\n")
     if options.json:
-        print(json.dumps(report, indent=1, allow_nan=False))
+        print(text)
     else:
         _print(report)
     return 1 if report["counts"]["differs"] or not report["counts"]["verified"] else 0

@@ -36,6 +36,7 @@ class SuitePart(Part):
     name: Text
     about: Text = ""
     version: Text | int = ""
+    hash: Text = ""  # of all that the suite plays
     doses: Annotated[list[Dose], Field(min_length=1)]
     shown: dict[str, Text] = {}
     limit: Share = 0.1
@@ -150,6 +151,20 @@ class EntryTrust(Part):
     why: Text = ""
 
 
+class Verified(Part):
+    """How many rows there are, and what came of those that were played again."""
+
+    rows: Count
+    verified: Count
+    differs: Count
+    unchecked: Count
+
+    @property
+    def sound(self) -> bool:
+        """Whether the entry counts as verified: all that was played again came out equal."""
+        return self.verified > 0 and self.differs == self.unchecked == 0
+
+
 class EntryPart(Part):
     defence: Text
     card: dict[str, Any] | None = None
@@ -167,6 +182,7 @@ class EntryPart(Part):
     robustness: list[Robust] = []
     stealth: list[Stealth] | None = None
     trust: EntryTrust | None = None
+    verified: Verified | None = None
 
 
 class CellPart(Part):

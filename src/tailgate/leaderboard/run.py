@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -19,11 +20,13 @@ from tailgate.scoring.damage import CLEAN
 from tailgate.trust.run import REPORT, with_trust
 
 from .card import with_cards
+from .verified import digest, with_verified
 
 OWN = "rows.jsonl.xz"  # what `run` plays; other files of rows beside it come from `attack` and `submit`
 LIST = "attacks.jsonl"
 CARDS = "cards"  # folder of what authors say of their entries
 TRUST = "trust"  # folder that `tailgate trust` wrote
+VERIFIED = "verified"  # folder of reports of `leaderboard verify`
 Progress = Callable[[str, int, int], None]  # suite, done, total
 
 
@@ -43,7 +46,7 @@ def play(
 
 
 def board_of(suite: Suite, folder: Path, **options: Any) -> dict[str, Any]:
-    """The board of all rows in a folder, with the bounds of its trust/trust.json; written there as board.json.
+    """The board of all rows in a folder, with what verified/*.json says of them and the bounds of trust/trust.json; written as board.json.
 
     Raises InputError where there are no rows, and for a report that cannot be read or is of something else.
     """
@@ -53,8 +56,10 @@ def board_of(suite: Suite, folder: Path, **options: Any) -> dict[str, Any]:
     files = [path for path, parts in within if not others & set(parts) and not any(part.startswith(".") for part in parts)]
     if not files:
         raise InputError("rows", str(folder), "a folder with rows of `leaderboard run`")
-    rows = [row for path in files for row in read_rows(path)]
-    board = with_cards(score(rows, suite, attacks=admitted.read(folder / LIST), **options), folder / CARDS)
+    parts = {path: read_rows(path) for path in files}
+    board = score((row for rows in parts.values() for row in rows), suite, attacks=admitted.read(folder / LIST), **options)
+    held = {digest(path): Counter(row["defence"] for row in rows) for path, rows in parts.items()}
+    board = with_verified(with_cards(board, folder / CARDS), folder / VERIFIED, held)
     if (report := folder / TRUST / REPORT).is_file():
         board = with_trust(board, _report(report), f"trust {report}", suite)
     write_atomic(folder / "board.json", json.dumps(board, indent=1, allow_nan=False).encode() + b"\n")

@@ -160,6 +160,19 @@ def _clean(suite: Suite, entry: EntryPart) -> list[Data]:
     return out
 
 
+def _verified(entry: EntryPart) -> str:
+    """What came of the rows that were played again; empty where nobody has said anything of them."""
+    held = entry.verified
+    if held is None:
+        return ""
+    asked = held.verified + held.differs + held.unchecked
+    which = f"{asked} of {held.rows} rows, drawn at random, were" if asked < held.rows else f"all {held.rows} rows were"
+    if held.sound:
+        return f"Verified: {which} played again and came out equal."
+    parts = [f"{n} {word}" for n, word in ((held.differs, "differ"), (held.unchecked, "could not be checked")) if n]
+    return f"Claimed: {which} played again; {' and '.join(parts)}." if asked else "Claimed: no row was played again."
+
+
 def _rank(suite: Suite, entry: EntryPart) -> str:
     if entry.rank is None:
         return ""
@@ -182,7 +195,8 @@ def entry_page(suite: Suite, entry: EntryPart, replayed: Replayed | None, also: 
     ]  # fmt: skip
     return {
         "suite": suite.board.suite, "damage": suite.damage, "limit": percent(suite.board.suite.limit), "scale": suite.scale,
-        "name": suite.defences[entry.defence], "status": entry.status, "why": entry.why, "class": entry.class_ or "not stated",
+        "name": suite.defences[entry.defence], "status": entry.status, "why": entry.why, "verified": _verified(entry),
+        "class": entry.class_ or "not stated",
         "rank": _rank(suite, entry), "also": also, "card": card_of(entry), "flags": entry.flags, "levels": LEVELS,
         "critical": [(level, critical_of(suite, entry.critical_dose.get(level))) for level in LEVELS],
         "rates": _rates(suite, entry), "worst": _worst(suite, entry), "cells": _every(suite, mine),

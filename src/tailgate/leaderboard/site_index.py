@@ -187,6 +187,17 @@ def attacks_of(suite: Suite) -> list[Data]:
     return out
 
 
+def checked_of(suite: Suite) -> str:
+    """How many entries are verified, and by how many rows; empty where no report is beside the board."""
+    told = [entry.verified for entry in suite.board.entries if entry.verified is not None]
+    if not told:
+        return ""
+    again = sum(v.verified + v.differs + v.unchecked for v in told)
+    off = sum(v.differs + v.unchecked for v in told)
+    outcome = "all equal" if not off else f"{off} not equal, or not to be checked here"
+    return f"{sum(v.sound for v in told)} of {len(suite.board.entries)} entries verified: {again} rows played again, {outcome}"
+
+
 def _group(title: str, about: str, rows: list[Data]) -> Data:
     """Entries of one status. A reason that most of them have stands once, above them."""
     reasons = Counter(row["why"] for row in rows if row["why"])
@@ -203,7 +214,8 @@ def section(suite: Suite) -> Data:
     groups = [_group(t, about, [r for r in rows if r["status"] == s]) for s, t, about in GROUPS]
     doses = [{"text": dose_text(d), "why": board.suite.shown.get(str(d), "")} for d in suite.shown]
     return {
-        "suite": board.suite, "round": suite.round, "trust": trust_of(suite), "damage": suite.damage, "folder": suite.folder,
+        "suite": board.suite, "round": suite.round, "checked": checked_of(suite),
+        "trust": trust_of(suite), "damage": suite.damage, "folder": suite.folder,
         "count": len(rows), "doses": doses,
         "all_doses": ", ".join(dose_text(d) for d in board.suite.doses), "limit": percent(board.suite.limit),
         "groups": [g for g in groups if g["rows"]], "classes": sorted({r["class"] for r in rows}),

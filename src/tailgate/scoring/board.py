@@ -80,7 +80,7 @@ def shown(table: Table) -> list[int]:
 def _suite(table: Table, alpha: float) -> Data:
     suite = table.suite
     return {
-        "name": suite.name, "about": suite.about, "version": tailgate.__version__, "doses": list(table.doses),
+        "name": suite.name, "about": suite.about, "version": tailgate.__version__, "hash": suite.hash, "doses": list(table.doses),
         "shown": {str(dose): why for dose, why in suite.shown.items()}, "limit": CRITICAL, "bound": suite.bound, "alpha": alpha,
         "scenarios": [
             {"name": name, "about": place.about, "robustness": name in suite.robustness, "hash": place.config_hash}

@@ -1,0 +1,87 @@
+"""Which entries of a board are verified: reports of `leaderboard verify` beside its rows say what came of playing them again."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from tailgate.errors import InputError
+
+Count = Annotated[int, Field(strict=True, ge=0)]
+
+
+class Again(BaseModel):
+    """What became of the rows of one defence that were asked for."""
+
+    model_config = ConfigDict(strict=True)
+    defence: str
+    verified: Count
+    differs: Count
+    unchecked: Count
+
+    @property
+    def asked(self) -> int:
+        return self.verified + self.differs + self.unchecked
+
+
+class File(BaseModel):
+    """A file of rows that was looked into, by its SHA-256."""
+
+    model_config = ConfigDict(strict=True)
+    file: str
+    entries: list[Again]
+
+
+class Report(BaseModel):
+    """Of a report of `leaderboard verify` what a board needs."""
+
+    model_config = ConfigDict(strict=True)
+    format: Literal["tailgate-verify-1"]
+    files: list[File]
+
+
+def digest(path: Path) -> str:
+    """SHA-256 of a file of rows as it lies on the disk."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def read_report(path: Path) -> Report:
+    """Raises InputError that names the file for anything else than a report of `leaderboard verify`."""
+    try:
+        return Report.model_validate_json(path.read_bytes())
+    except OSError as error:
+        raise InputError("verified", str(path), f"a readable report of leaderboard verify ({error})") from None
+    except ValidationError as error:
+        first = error.errors()[0]
+        field = ".".join(map(str, first["loc"])) or "report"
+        raise InputError(f"verified {path}: {field}", first["input"] if first["type"] != "missing" else None, first["msg"]) from None
+
+
+def with_verified(board: dict[str, Any], folder: Path, files: Mapping[str, Mapping[str, int]]) -> dict[str, Any]:
+    """The board with `verified` in each entry: {"rows", "verified", "differs", "unchecked"}, or null where nobody has played any again.
+
+    files: SHA-256 of each file of rows that the board is made of, and how many rows of each defence it has. What a report says of any
+    other file, or of one that has changed since, counts for nothing; of two reports on one file the one counts that asked for more rows.
+    A defence has figures only where rows of every file that it is in were played again.
+    """
+    looked: dict[tuple[str, str], Again] = {}
+    for path in sorted(folder.glob("*.json")):
+        for file in read_report(path).files:
+            for again in file.entries:
+                key = file.file, again.defence
+                if key not in looked or again.asked > looked[key].asked:
+                    looked[key] = again
+
+    def told(entry: dict[str, Any]) -> dict[str, Any]:
+        name = entry["defence"]
+        mine = {(sha, name): rows[name] for sha, rows in files.items() if name in rows}
+        if not set(mine) <= set(looked):
+            return entry | {"verified": None}
+        counts = {key: sum(getattr(looked[place], key) for place in mine) for key in ("verified", "differs", "unchecked")}
+        return entry | {"verified": {"rows": sum(mine.values())} | counts}
+
+    return board | {"entries": [told(entry) for entry in board["entries"]]}

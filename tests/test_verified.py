@@ -1,0 +1,126 @@
+"""A board says of each entry whether its rows were played again, and with what outcome."""
+
+import argparse
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tailgate.adaptive import asked_of
+from tailgate.commands import verify as command
+from tailgate.errors import InputError
+from tailgate.evaluation import cells_of, run
+from tailgate.leaderboard.board_format import read_board
+from tailgate.leaderboard.run import VERIFIED, board_of
+from tailgate.leaderboard.site import build_site
+from tailgate.rows import encode
+from tailgate.scenario import Suite, load_suite
+from tailgate.schema import as_data
+from tailgate.train import TrainConfig, plan_key
+
+ROOT = Path(__file__).parents[1]
+SUITE = Suite("small", "", ("thesis-ch4-v0",), (5,), ("none", "kf"), ("none", "fdi:value=5"), 4)
+BOARDS = sorted(path.parent.name for path in (ROOT / "results").glob("*/board.json"))
+
+
+@pytest.fixture(scope="module")
+def rows() -> list[dict[str, Any]]:
+    return run(cells_of(SUITE))
+
+
+def _verify(folder: Path, *arguments: str, name: str = "report") -> dict[str, Any]:
+    parser = argparse.ArgumentParser()
+    command.add(parser.add_subparsers())
+    out = folder / VERIFIED / f"{name}.json"
+    files = sorted(str(path) for path in folder.glob("*.jsonl"))
+    options = parser.parse_args(["verify", "--rows", *files, "--out", str(out), *arguments])
+    options.run(options)
+    held: dict[str, Any] = json.loads(out.read_text())
+    return held
+
+
+def _verified(folder: Path) -> dict[str, Any]:
+    board = board_of(SUITE, folder, require_adaptive=False)
+    return {entry["defence"]: entry["verified"] for entry in board["entries"]}
+
+
+def _write(folder: Path, name: str, rows: list[dict[str, Any]]) -> None:
+    (folder / name).write_bytes(encode(rows))
+
+
+def test_rows_that_come_out_equal_make_their_entries_verified(rows: list[dict[str, Any]], tmp_path: Path) -> None:
+    _write(tmp_path, "rows.jsonl", rows)
+    assert _verified(tmp_path) == {"none": None, "kf": None}
+    assert _verify(tmp_path)["status"] == "verified"
+    all_of = {"rows": 8, "verified": 8, "differs": 0, "unchecked": 0}
+    assert _verified(tmp_path) == {"none": all_of, "kf": all_of}
+    page = build_site([json.loads((tmp_path / "board.json").read_text())], tmp_path / "page", replays=False)
+    assert "2 of 2 entries verified: 16 rows played again, all equal" in page.read_text()
+    assert "Verified: all 8 rows were played again and came out equal." in next((page.parent).glob("*/kf.html")).read_text()
+
+
+def test_a_sample_says_how_many(rows: list[dict[str, Any]], tmp_path: Path) -> None:
+    _write(tmp_path, "rows.jsonl", rows)
+    _verify(tmp_path, "--sample", "10", "--sample-seed", "1")
+    held = _verified(tmp_path)
+    assert sum(v["verified"] for v in held.values()) == 10 and {v["rows"] for v in held.values()} == {8}
+
+
+def test_one_row_that_differs_leaves_its_entry_claimed(rows: list[dict[str, Any]], tmp_path: Path) -> None:
+    k = next(k for k, row in enumerate(rows) if row["defence"] == "kf")
+    _write(tmp_path, "rows.jsonl", [*rows[:k], rows[k] | {"min_gap": 99.0}, *rows[k + 1 :]])
+    _verify(tmp_path)
+    held = _verified(tmp_path)
+    assert held["kf"] == {"rows": 8, "verified": 7, "differs": 1, "unchecked": 0} and held["none"]["verified"] == 8
+    board = read_board(json.loads((tmp_path / "board.json").read_text()))
+    sound = {entry.defence: entry.verified.sound for entry in board.entries if entry.verified}
+    assert sound == {"none": True, "kf": False}
+    page = build_site([json.loads((tmp_path / "board.json").read_text())], tmp_path / "page", replays=False)
+    assert "1 of 2 entries verified: 16 rows played again, 1 not equal" in page.read_text()
+    assert "Claimed: all 8 rows were played again; 1 differ." in next((page.parent).glob("*/kf.html")).read_text()
+
+
+def test_a_report_on_other_rows_counts_for_nothing(rows: list[dict[str, Any]], tmp_path: Path) -> None:
+    """Rows that were made anew after the report, and rows of a file that no report has looked into."""
+    _write(tmp_path, "rows.jsonl", rows)
+    _verify(tmp_path)
+    more = run(cells_of(dataclasses.replace(SUITE, attacks=("dropout",))))
+    _write(tmp_path, "more.jsonl", [row for row in more if row["defence"] == "kf"])
+    held = _verified(tmp_path)
+    assert held["kf"] is None and held["none"]["verified"] == 8
+    _verify(tmp_path, name="both")
+    assert _verified(tmp_path)["kf"] == {"rows": 12, "verified": 12, "differs": 0, "unchecked": 0}
+    _write(tmp_path, "rows.jsonl", rows[::-1])
+    assert list(_verified(tmp_path).values()) == [None, None]
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [("{", "report"), ("[]", "report"), ('{"format": "other", "files": []}', "format"),
+     ('{"format": "tailgate-verify-1", "files": [{"file": "a", "entries": [{"defence": "kf", "verified": -1, "differs": 0, "unchecked": 0}]}]}', "verified")],
+)  # fmt: skip
+def test_a_report_that_is_none_is_named(rows: list[dict[str, Any]], tmp_path: Path, text: str, words: str) -> None:
+    _write(tmp_path, "rows.jsonl", rows)
+    (tmp_path / VERIFIED).mkdir()
+    (tmp_path / VERIFIED / "report.json").write_text(text)
+    with pytest.raises(InputError, match=words):
+        board_of(SUITE, tmp_path, require_adaptive=False)
+
+
+@pytest.mark.parametrize("name", [name for name in BOARDS if (ROOT / f"results/{name}/attacked").is_dir()])
+def test_published_attackers_are_those_that_the_suite_asks_for(name: str) -> None:
+    """A change of the fields of a training, or of a suite's plan, would leave every defence unattacked."""
+    asked = {(want.plan, want.seed) for want in asked_of(load_suite(name))}
+    found = sorted((ROOT / f"results/{name}/attacked/policies").glob("*/policy-*.json"))
+    assert found
+    for path in found:
+        training = json.loads(path.read_text(encoding="utf-8"))["training"]
+        assert (plan_key(training["config"]), training["seed"]) in asked, path
+
+
+def test_a_field_at_its_default_leaves_no_mark_on_a_plan() -> None:
+    config = as_data(TrainConfig())
+    before = {key: value for key, value in config.items() if key != "demonstrations"}
+    assert plan_key(config) == plan_key(before) != plan_key(config | {"demonstrations": 32})
