@@ -88,7 +88,7 @@ def load_config(source: str | None, overrides: list[str], resume: bool = False) 
     With `resume` the configuration that the run of this name was started with takes the preset's place.
     """
     path = config_path(".", source or "quickstart", "config")
-    config = _checked(override(read_yaml(path, "config"), overrides))
+    config = checked(override(read_yaml(path, "config"), overrides))
     held = config.directory / "config.json"
     if not resume:
         return config
@@ -100,10 +100,11 @@ def load_config(source: str | None, overrides: list[str], resume: bool = False) 
         del started["class"]
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise InputError("resume", str(held), f"the configuration of the run ({error})") from None
-    return _checked(override(started, overrides))
+    return checked(override(started, overrides))
 
 
-def _checked(data: dict[str, Any]) -> TrainConfig:
+def checked(data: dict[str, Any]) -> TrainConfig:
+    """A configuration from JSON data. Raises InputError for a field that makes no sense, and for one that names code to import."""
     for key in ("threat", "environment", *LEARNERS):
         if not isinstance(data.get(key, {}), dict):
             raise InputError(f"config.{key}", data[key], "a mapping of fields")
