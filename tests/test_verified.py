@@ -66,6 +66,11 @@ def test_a_sample_says_how_many(rows: list[dict[str, Any]], tmp_path: Path) -> N
     _verify(tmp_path, "--sample", "10", "--sample-seed", "1")
     held = _verified(tmp_path)
     assert sum(v["verified"] for v in held.values()) == 10 and {v["rows"] for v in held.values()} == {8}
+    page = build_site([json.loads((tmp_path / "board.json").read_text())], tmp_path / "page", replays=False)
+    n = held["kf"]["verified"]
+    most = round(100 * (1 - 0.05 ** (1 / n)))
+    words = f"Verified: {n} of 8 rows, drawn at random, were played again and came out equal. At most {most}% of them differ, at 95%."
+    assert words in next((page.parent).glob("*/kf.html")).read_text()
 
 
 def test_one_row_that_differs_leaves_its_entry_claimed(rows: list[dict[str, Any]], tmp_path: Path) -> None:

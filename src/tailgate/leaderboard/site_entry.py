@@ -168,7 +168,8 @@ def _verified(entry: EntryPart) -> str:
     asked = held.verified + held.differs + held.unchecked
     which = f"{asked} of {held.rows} rows, drawn at random, were" if asked < held.rows else f"all {held.rows} rows were"
     if held.sound:
-        return f"Verified: {which} played again and came out equal."
+        most = f" At most {percent(1.0 - 0.05 ** (1.0 / asked))} of them differ, at 95%." if asked < held.rows else ""
+        return f"Verified: {which} played again and came out equal.{most}"
     parts = [f"{n} {word}" for n, word in ((held.differs, "differ"), (held.unchecked, "could not be checked")) if n]
     return f"Claimed: {which} played again; {' and '.join(parts)}." if asked else "Claimed: no row was played again."
 
