@@ -61,6 +61,13 @@ def test_rows_that_come_out_equal_make_their_entries_verified(rows: list[dict[st
     assert "Verified: all 8 rows were played again and came out equal." in next((page.parent).glob("*/kf.html")).read_text()
 
 
+def test_files_without_rows_are_an_error(tmp_path: Path) -> None:
+    _write(tmp_path, "rows.jsonl", [])
+    with pytest.raises(InputError, match="at least one row"):
+        _verify(tmp_path)
+    assert not (tmp_path / VERIFIED / "report.json").exists()
+
+
 def test_a_sample_says_how_many(rows: list[dict[str, Any]], tmp_path: Path) -> None:
     _write(tmp_path, "rows.jsonl", rows)
     _verify(tmp_path, "--sample", "10", "--sample-seed", "1")

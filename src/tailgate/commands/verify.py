@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from tailgate.errors import InputError
 from tailgate.progress import cells, console, progress
 
 SHOWN = 20  # rows that are listed, at most
@@ -57,6 +58,8 @@ def _verify(options: argparse.Namespace) -> int:
         rows += held
         origin += [(name, line) for line in range(1, len(held) + 1)]
         held_in += [digest(Path(name))] * len(held)
+    if not rows:
+        raise InputError("--rows", options.rows, "at least one row of an evaluation in them")
     if options.trust_code or options.submission:
         sys.path.insert(0, "")  # module:Class is looked for in the working directory, as `tailgate evaluate` does
     with progress(Console(stderr=True)) as update:
