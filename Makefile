@@ -24,6 +24,7 @@ bench: $(VENV)/.ready  ## speed beside the peers, in one run; writes benchmarks/
 # torch comes first and pinned: left to the others it would be the largest build that exists
 $(VENV)/.ready: pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed: make PYTHON=python3.12")'
+	@echo 'Installing into $(VENV): one to five minutes, torch first'
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt torch

@@ -141,6 +141,14 @@ def test_the_command_trains_compares_and_writes_a_page(here: Path, tmp_path: Pat
     assert json.loads((run / "policy-0.json").read_text())["training"]["steps"] == 1920
 
 
+def test_decisions_beyond_those_that_were_asked_for_are_said(here: Path, capsys: pytest.CaptureFixture[str], small_run: tuple[str, ...]) -> None:
+    """Rollouts are 640 decisions here; what was asked for exactly is not worth a word."""
+    assert cli.main(["train", *small_run, "steps=1300"]) == 0
+    assert "1,920 decisions a seed (1,300 asked for)" in " ".join(capsys.readouterr().err.split())
+    assert cli.main(["train", *small_run]) == 0
+    assert "asked for" not in capsys.readouterr().err
+
+
 PRESETS = sorted(path.stem for path in (Path(__file__).parents[1] / "configs").glob("*.yaml"))
 SYSTEMS = {"platoon": "crashed", "network": "rmse_position"}
 

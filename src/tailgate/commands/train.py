@@ -44,10 +44,16 @@ def _train(options: argparse.Namespace) -> int:
     errors.print(f"[bold]{config.name}[/]: training against [bold]{config.defence}[/] on {config.scenario}, files in {config.directory}")
     with _resumable(config.name), progress(errors) as update:
 
+        decisions: dict[int, int] = {}
+
         def trained(seed: int, now: Any) -> None:
+            decisions[seed] = now.steps
             update(f"training, seed {seed}", min(now.steps, config.steps), config.steps, train.figures(now))
 
         policies = train.train(config, trained, resume=options.resume)
+
+        if (most := max(decisions.values(), default=0)) > config.steps:
+            errors.print(f"{most:,} decisions a seed ({config.steps:,} asked for): learners play whole rounds", highlight=False)
 
         def played(done: int, total: int) -> None:
             update("comparing on fresh seeds", done, total, cells(done, total))
