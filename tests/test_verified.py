@@ -16,7 +16,7 @@ from tailgate.leaderboard.board_format import read_board
 from tailgate.leaderboard.run import VERIFIED, board_of
 from tailgate.leaderboard.site import build_site
 from tailgate.rows import encode
-from tailgate.scenario import Suite, load_suite
+from tailgate.scenario import Suite, list_suites, load_suite
 from tailgate.schema import as_data
 from tailgate.train import TrainConfig, plan_key
 
@@ -119,6 +119,15 @@ def test_a_report_that_is_none_is_named(rows: list[dict[str, Any]], tmp_path: Pa
     (tmp_path / VERIFIED / "report.json").write_text(text)
     with pytest.raises(InputError, match=words):
         board_of(SUITE, tmp_path, require_adaptive=False)
+
+
+@pytest.mark.parametrize("name", BOARDS)
+def test_a_published_board_is_of_the_suite_that_is_here(name: str) -> None:
+    """A suite that changed leaves its board behind until its rows are played again."""
+    assert name in list_suites()
+    board = json.loads((ROOT / f"results/{name}/board.json").read_text(encoding="utf-8"))
+    assert board["suite"]["hash"] == load_suite(name).hash
+    assert all(entry["verified"] and read_board(board) for entry in board["entries"])
 
 
 @pytest.mark.parametrize("name", [name for name in BOARDS if (ROOT / f"results/{name}/attacked").is_dir()])
