@@ -30,7 +30,7 @@ from tailgate.schema import as_data, read_yaml
 
 HERE = Path(__file__).parent
 RISING = 0.05  # of the whole rise of the learning curve, that its last tenth may bring
-PARTS = ("budget", "no budget", "linear")  # of the record: the moment is chosen; values alone are; the best attack is known
+PARTS = ("a moment to choose", "none to choose", "linear")  # of the record; where there is none, values alone are learned
 QUESTIONS = ("no attack", "own yoked schedule", "best scripted attack")
 
 
@@ -185,7 +185,7 @@ def p_value(gain: dict[str, float], seeds: list[float]) -> float:
 def part_of(cell: dict[str, Any]) -> str:
     """Of PARTS that of a cell."""
     report = cell["learners"][cell["best"]]
-    return "linear" if report.get("ceilings") else "budget" if report["threat"]["budget"] is not None else "no budget"
+    return PARTS[2 if report.get("ceilings") else 0 if cell["moment"] and report["threat"]["budget"] is not None else 1]
 
 
 def learners_of(cells: dict[str, Any]) -> list[tuple[str, str, dict[str, Any]]]:
@@ -208,7 +208,8 @@ def markdown(cells: dict[str, Any]) -> str:
         "script is chosen on select seeds. Differences are paired, with 95 % intervals over episodes and training seeds; each verdict is",
         "corrected (Holm) for the cells of its column. *same*: no episode differs, as the attack's times are the same in all of them.",
         "Champion: of all learners and seeds the one policy that did best on select seeds, as the script was chosen. On the linear",
-        "scenarios the best attack is computed (*Ceilings*); without a budget every step is attacked, with no moment to choose.", "",
+        "scenarios the best attack is computed (*Ceilings*). There is no moment to choose without a budget, as every step is attacked,",
+        "nor where the best time is the same in every episode (`moment: false` in adversaries.yaml says where, and what was measured).", "",
         "| cell | dose | no attack | best script | learned | by | yoked | over no attack | over yoked | over script | champion over it |",
         "|---|---|---|---|---|---|---|---|---|---|---|",
     ]  # fmt: skip
@@ -226,13 +227,13 @@ def markdown(cells: dict[str, Any]) -> str:
         low, value, high = (comparison.shown(report, cell["champion"]["gain"][k], "+") for k in ("low", "value", "high"))
         gains.append(f"{value} [{low}, {high}] **{verdicts[name]['champion']}**")
         out.append(f"| {' | '.join([name, str(dose), none, script, learned, cell['best'], yoked, *gains])} |")
-    parts = {part: [name for name, cell in cells.items() if part_of(cell) == part] for part in PARTS}
-    out += ["", "| wins, same, undecided, loses | " + " | ".join(f"{part} ({len(of)})" for part, of in parts.items()) + " | all |"]
-    out += ["|---|" + "---|" * (len(parts) + 1)]
+    thirds = {part: [name for name, cell in cells.items() if part_of(cell) == part] for part in PARTS}
+    out += ["", "| wins, same, undecided, loses | " + " | ".join(f"{part} ({len(of)})" for part, of in thirds.items()) + " | all |"]
+    out += ["|---|" + "---|" * (len(thirds) + 1)]
     for question in (*QUESTIONS, "champion"):
         what = "champion over the best script" if question == "champion" else f"over {question}"
         counts = []
-        for names in (*parts.values(), list(cells)):
+        for names in (*thirds.values(), list(cells)):
             found = [verdicts[name][question] for name in names]
             counts.append(", ".join(str(found.count(word)) for word in ("wins", "same", "undecided", "loses")))
         out.append(f"| {' | '.join([what, *counts])} |")
@@ -331,6 +332,8 @@ def main() -> None:
     if (kept := out / "report.json").is_file():  # cells that were not asked for stay as they are
         record = json.loads(kept.read_text()) | record
         record = {name: record[name] for name in cells if name in record}
+    for name, cell in record.items():
+        cell["moment"] = cells[name].get("moment", True)
     write_atomic(out / "report.json", lines(record).encode())
     write_atomic(out / "report.md", markdown(record).encode())
     write_atomic(out / "adversaries.png", picture(record))
