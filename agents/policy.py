@@ -291,7 +291,8 @@ class PolicyAttack:
             raise InputError(f"policy {self.path.name}", f"observation {shown}", "the observation of this scenario and threat model")
         outputs = network.weights[-1].shape[1]
         if outputs != action.size:
-            raise InputError(f"policy {self.path.name}", f"{outputs} actions", f"{action.size} actions under this threat model")
+            wanted = f"{action.size}, as environment.action={header.action.action} has under this threat model"
+            raise InputError(f"policy {self.path.name}", f"a network with {outputs} outputs", wanted)
         if (header.masked and not action.discrete) or (header.squashed and action.discrete):
             made = "masked" if header.masked else "squashed"
             raise InputError(f"policy {self.path.name}.{made}", True, f"another kind of action than {header.action.action}")

@@ -280,6 +280,14 @@ def test_a_policy_of_another_observation_is_refused(tmp_path: Path) -> None:
         PolicyAttack(path).prepare(_place("black").brief())
 
 
+def test_a_policy_of_another_number_of_actions_is_refused(tmp_path: Path) -> None:
+    """A mode of one kind is no mode of two."""
+    place = _place("black")
+    fewer = place.with_threat(kinds=("fdi",))
+    with pytest.raises(InputError, match=r"a network with 4 outputs.*expected 3, as environment.action=mode"):
+        PolicyAttack(_policy(tmp_path, {"action": "mode"})).prepare(fewer.brief())
+
+
 def _special(path: Path, kind: str, seed: int = 1) -> Path:
     """A random policy with an LSTM, under masks, or squashed, that attacks now and then."""
     brief, rng = _place("black").brief(), np.random.default_rng(seed)
