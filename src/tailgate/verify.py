@@ -211,7 +211,7 @@ def _refused(family: str, row: Row, trust_code: bool) -> str:
         return f"the {family} {row[family]!r} is code to import, which a row may not make us do; --trust-code allows it"
     recorded = str(row.get(f"{family}_digest") or "")
     if not spec.imports:
-        for path in _files(spec):
+        for path in files_of(spec):
             if not _readable(path):
                 return f"the {family}'s file {str(path)!r} is not here"
     digest = spec.digest
@@ -235,7 +235,7 @@ def _unlike(row: Row, apart: dict[str, str]) -> str:
     return ""
 
 
-def _files(spec: Spec) -> list[Path]:
+def files_of(spec: Spec) -> list[Path]:
     """Files that the text itself names; the digest says whether they are the row's."""
     head, params = spec._parts()
     named = [head] if spec.family == "attack" and Path(head).suffix in (".json", *YAML) else []

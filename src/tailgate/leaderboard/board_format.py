@@ -165,6 +165,15 @@ class Verified(Part):
         return self.verified > 0 and self.differs == self.unchecked == 0
 
 
+class Checked(Part):
+    """How many cells there are, and what came of those that were played again from the board alone."""
+
+    cells: Count
+    equal: Count
+    differs: Count
+    unchecked: Count
+
+
 class EntryPart(Part):
     defence: Text
     card: dict[str, Any] | None = None
@@ -183,6 +192,7 @@ class EntryPart(Part):
     stealth: list[Stealth] | None = None
     trust: EntryTrust | None = None
     verified: Verified | None = None
+    checked: Checked | None = None
 
 
 class CellPart(Part):
@@ -197,6 +207,8 @@ class CellPart(Part):
     failed: Count = 0
     reason: Text = ""
     damage: Interval | None
+    decisions: Text | None = None
+    trace: Text | None = None
 
 
 class Point(Part):

@@ -174,6 +174,17 @@ def _verified(entry: EntryPart) -> str:
     return f"Claimed: {which} played again; {' and '.join(parts)}." if asked else "Claimed: no row was played again."
 
 
+def _checked(entry: EntryPart) -> str:
+    """What came of the cells that were played again from the board alone; empty where none was."""
+    held = entry.checked
+    if held is None:
+        return ""
+    asked = held.equal + held.differs + held.unchecked
+    which = f"{asked} of {held.cells}" if asked < held.cells else f"all {held.cells}"
+    parts = [(held.equal, "came out equal"), (held.differs, "differ"), (held.unchecked, "could not be checked")]
+    return f"Played again from this board alone, without its rows: {which} cells; {', '.join(f'{n} {word}' for n, word in parts if n)}."
+
+
 def _rank(suite: Suite, entry: EntryPart) -> str:
     if entry.rank is None:
         return ""
@@ -196,7 +207,8 @@ def entry_page(suite: Suite, entry: EntryPart, replayed: Replayed | None, also: 
     ]  # fmt: skip
     return {
         "suite": suite.board.suite, "damage": suite.damage, "limit": percent(suite.board.suite.limit), "scale": suite.scale,
-        "name": suite.defences[entry.defence], "status": entry.status, "why": entry.why, "verified": _verified(entry),
+        "name": suite.defences[entry.defence], "status": entry.status, "why": entry.why,
+        "verified": _verified(entry), "checked": _checked(entry),
         "class": entry.class_ or "not stated",
         "rank": _rank(suite, entry), "also": also, "card": card_of(entry), "flags": entry.flags, "levels": LEVELS,
         "critical": [(level, critical_of(suite, entry.critical_dose.get(level))) for level in LEVELS],

@@ -188,14 +188,19 @@ def attacks_of(suite: Suite) -> list[Data]:
 
 
 def checked_of(suite: Suite) -> str:
-    """How many entries are verified, and by how many rows; empty where no report is beside the board."""
-    told = [entry.verified for entry in suite.board.entries if entry.verified is not None]
-    if not told:
-        return ""
-    again = sum(v.verified + v.differs + v.unchecked for v in told)
-    off = sum(v.differs + v.unchecked for v in told)
-    outcome = "all equal" if not off else f"{off} not equal, or not to be checked here"
-    return f"{sum(v.sound for v in told)} of {len(suite.board.entries)} entries verified: {again} rows played again, {outcome}"
+    """How many entries are verified by rows, and how many cells were played again from the board alone; empty where nothing was."""
+    entries, said = suite.board.entries, []
+    if told := [entry.verified for entry in entries if entry.verified is not None]:
+        again, equal = sum(v.verified + v.differs + v.unchecked for v in told), sum(v.verified for v in told)
+        said.append(f"{sum(v.sound for v in told)} of {len(entries)} entries verified: {again} rows played again, {_outcome(again, equal)}")
+    if held := [entry.checked for entry in entries if entry.checked is not None]:
+        again, equal = sum(c.equal + c.differs + c.unchecked for c in held), sum(c.equal for c in held)
+        said.append(f"{again} of {len(suite.board.cells)} cells played again from the board alone, {_outcome(again, equal)}")
+    return "; ".join(said)
+
+
+def _outcome(again: int, equal: int) -> str:
+    return "all equal" if equal == again else f"{again - equal} not equal, or not to be checked here"
 
 
 def _group(title: str, about: str, rows: list[Data]) -> Data:

@@ -14,12 +14,12 @@ from tailgate.errors import InputError
 from tailgate.registry import Entry, built_in, split_text
 from tailgate.rounds import numbered
 from tailgate.scenario import Suite
-from tailgate.stats import proportion
 from tailgate.strength.dose import CRITICAL
 from tailgate.threat import KNOWLEDGE
 
 from .attacks import Admitted, standing, taken_back
-from .damage import CLEAN, PLAYED, SKIPPED, Key, Row, Table, damaged, has_road, named, tabulate
+from .cells import cells_of
+from .damage import CLEAN, PLAYED, SKIPPED, Key, Row, Table, has_road, named, tabulate
 from .doses import Worst
 from .flags import flags
 from .gates import failure, gates
@@ -60,7 +60,7 @@ def score(
     comparisons = _rank(found, levels, slot, alpha)
     return {
         "format": FORMAT, "suite": _suite(table, alpha) | {"require_adaptive": require_adaptive},
-        "attacks": _attacks(table, lines, origins), "entries": found, "cells": _cells(table),
+        "attacks": _attacks(table, lines, origins), "entries": found, "cells": cells_of(table),
         "curves": [worst.curve() for d in table.defences for worst in levels[d].values() if worst.complete and worst.numbers],
         "comparisons": comparisons, "detection": None,
     }  # fmt: skip
@@ -264,30 +264,6 @@ def _robustness(table: Table, worst: Worst | None, slot: int) -> list[Data]:
             out.append({
                 "scenario": name, "undamaged": {"value": value, "low": low}, "change": value - base, "worst": worst.named(pair),
             })  # fmt: skip
-    return out
-
-
-_share = functools.cache(proportion)  # a board has few different counts
-
-
-def _cells(table: Table) -> list[Data]:
-    """Every cell that has rows, in the order of the suite, clean runs first."""
-    columns = [column.attack for column in table.columns]
-    order = sorted(table.cells, key=lambda key: (
-        list(table.scenarios).index(key.scenario), key.slot, table.defences.index(key.defence),
-        columns.index(key.column.attack) if key.column.attack in columns else -1, key.column.knowledge,
-    ))  # fmt: skip
-    out = []
-    for key in order:
-        rows = table.cells[key]
-        good = [damaged(row, table.suite) for row in rows if row["status"] == "ok"]
-        share = _share(sum(good), len(good))._asdict() if good else None
-        out.append({
-            "scenario": key.scenario, "dose": table.doses[key.slot], "defence": key.defence, "attack": key.column.attack,
-            "knowledge": key.column.knowledge, "learned": bool(rows[0].get("learned")), "optimal": bool(rows[0].get("optimal")),
-            "n": len(good), "failed": sum(row["status"] == "error" for row in rows),
-            "reason": next((row["reason"] for row in rows if row["status"] != "ok"), ""), "damage": share,
-        })  # fmt: skip
     return out
 
 

@@ -1,0 +1,84 @@
+"""tailgate leaderboard check: cells of a board played again, without its rows."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import secrets
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from tailgate.errors import InputError
+from tailgate.progress import cells, console, progress
+
+SHOWN = 20  # cells that are listed, at most
+
+
+def add(actions: Any) -> None:
+    """Adds `check` to the actions of a command."""
+    command = actions.add_parser(
+        "check", help="play cells of a published board again, without its rows",
+        description="Play cells of a board again and compare how many episodes came to damage, and the fingerprint of all decisions. "
+        "Exit code 1 when a cell differs, or when none could be checked. Registered names, the zoo, and files of policies that are here "
+        "are played; a board never makes this command import code.",
+    )  # fmt: skip
+    command.add_argument("board", metavar="FILE", help="board.json")
+    command.add_argument("--sample", type=int, metavar="N", help="so many cells, drawn at random (default: all)")
+    command.add_argument("--sample-seed", type=int, metavar="N", help="which ones (default: a new secret each time; the report names it)")
+    command.add_argument("--defence", action="append", default=[], metavar="NAME", help="only the cells of these defences (repeatable)")
+    command.add_argument("--workers", type=int, default=1, metavar="N", help="processes (default 1); changes no result")
+    command.add_argument("--write", action="store_true", help="put into the board what was found, and the fingerprints of equal cells")
+    command.add_argument("--json", action="store_true", help="print the report as JSON")
+    command.set_defaults(run=_check)
+
+
+def _check(options: argparse.Namespace) -> int:
+    from tailgate.files import write_atomic
+    from tailgate.leaderboard.check import check, with_check
+
+    path = Path(options.board)
+    try:
+        board = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputError("board", str(path), f"a readable board.json ({error})") from None
+    seed = secrets.randbits(32) if options.sample_seed is None else options.sample_seed
+    with progress(Console(stderr=True)) as update:
+        report = check(
+            board, sample=options.sample, sample_seed=seed, defences=options.defence, workers=options.workers,
+            progress=lambda done, total: update("playing", done, total, cells(done, total)),
+        )  # fmt: skip
+    if options.write:
+        write_atomic(path, json.dumps(with_check(board, report), indent=1, allow_nan=False).encode() + b"\n")
+    if options.json:
+        print(json.dumps(report, indent=1, allow_nan=False))
+    else:
+        _print(report)
+    return 1 if report["counts"]["differs"] or not report["counts"]["equal"] else 0
+
+
+def _print(report: dict[str, Any]) -> None:
+    out = console()
+    drawn = "" if report["sample"] is None else f", drawn by the seed {report['sample_seed']}"
+    table = Table(title=f"{report['suite']}: {report['asked']} of {report['cells']} cells played again{drawn}")
+    for heading in ("defence", "cells", "equal", "differs", "unchecked"):
+        table.add_column(heading, overflow="fold")
+    entries: list[dict[str, Any]] = report["entries"]
+    for entry in entries:
+        table.add_row(escape(str(entry["defence"])), *(str(entry[key]) for key in ("cells", "equal", "differs", "unchecked")))
+    out.print(table)
+    reasons: list[dict[str, Any]] = report["reasons"]
+    for reason in reasons[:SHOWN]:
+        out.print(f"{reason['cells']} cells unchecked: {reason['why']}", markup=False, highlight=False)
+    if len(reasons) > SHOWN:
+        out.print(f"and {len(reasons) - SHOWN} more reasons; --json lists all cells", highlight=False)
+    findings: list[dict[str, Any]] = report["findings"]
+    wrong = [finding for finding in findings if finding["verdict"] == "differs"]
+    for finding in wrong[:SHOWN]:
+        named = f"{finding['scenario']}, {finding['defence']}, {finding['attack']}, dose {finding['dose']}"
+        out.print(f"{named}: {finding['why']}", markup=False, highlight=False)
+    if len(wrong) > SHOWN:
+        out.print(f"and {len(wrong) - SHOWN} more; --json lists them all", highlight=False)

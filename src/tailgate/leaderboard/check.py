@@ -1,0 +1,198 @@
+"""A board's cells played again from the board alone: a figure can be checked by who has none of its rows.
+
+A cell names a scenario, a dose, a defence and an attack of a suite that is here; its seeds are those of the suite's round. As with rows,
+nothing is imported that the board names.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import tailgate
+from tailgate.draws import constants
+from tailgate.errors import InputError, unknown
+from tailgate.evaluation import Cell, run
+from tailgate.registry import Family, Spec
+from tailgate.scenario import Suite, list_suites, load_suite
+from tailgate.scoring.cells import figures
+from tailgate.verify import files_of
+
+from .board_format import Board, CellPart, read_board
+
+Data = dict[str, Any]
+VERDICTS = ("equal", "differs", "unchecked")
+PRINTS = ("decisions", "trace")  # which a board of before cells had fingerprints lacks
+COMPARED = ("n", "failed", "damage", *PRINTS)
+EPISODES = 20_000  # whose rows are held at a time
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What became of a cell; `here`: what came out, None where it was not played."""
+
+    verdict: Literal["equal", "differs", "unchecked"]
+    why: str = ""
+    here: Data | None = None
+
+
+def check(
+    data: Data, *, sample: int | None = None, sample_seed: int = 0, defences: Sequence[str] = (), workers: int = 1,
+    progress: Callable[[int, int], None] | None = None,
+) -> Data:  # fmt: skip
+    """Play the cells of a board again, and compare how many episodes were played, failed and came to damage, and
+    the fingerprints of all.
+
+    data: a board, as JSON; sample: so many cells, drawn by sample_seed (default: all); defences: only the cells of these.
+    The report has `counts`, `entries` (the same for each defence), `reasons` and `findings`, cells that differ or could not be checked;
+    `prints` has the fingerprints of each cell that came out equal, by its place in the board.
+    Raises InputError for a board of another suite or version than is here, and for a defence that is not on it.
+    """
+    board = read_board(data)
+    suite = _suite_of(board)
+    if sample is not None and sample < 1:
+        raise InputError("sample", sample, "a whole number not below 1")
+    names = [entry.defence for entry in board.entries]
+    for name in defences:
+        if name not in names:
+            raise unknown("defence", name, names)
+    mine = [i for i, cell in enumerate(board.cells) if not defences or cell.defence in defences]
+    asked = _drawn(mine, sample, sample_seed)
+    seen: dict[int, Seen] = {}
+    cells: dict[int, Cell] = {}
+    for i in asked:
+        cell = _cell(board.cells[i], board, suite)
+        if isinstance(cell, str):
+            seen[i] = Seen("unchecked", cell)
+        else:
+            cells[i] = cell
+
+    def told(done: int, _: int) -> None:
+        if progress is not None:
+            progress(len(seen) + done, len(asked))
+
+    for some in _slices(cells):
+        rows = iter(run([cells[i] for i in some], workers=workers, progress=told))
+        seen |= {i: _compared(board.cells[i], figures([next(rows) for _ in range(cells[i].seeds)], suite)) for i in some}
+    return _report(board, asked, seen, sample, sample_seed)
+
+
+def _suite_of(board: Board) -> Suite:
+    """The suite of the package that the board is of."""
+    held = board.suite
+    if held.name not in list_suites():
+        raise unknown("board: suite.name", held.name, list_suites())
+    suite = load_suite(held.name)
+    if held.version != tailgate.__version__:
+        raise InputError("board: suite.version", held.version, f"{tailgate.__version__}, which is here")
+    if held.hash != suite.hash:
+        raise InputError("board: suite.hash", held.hash, f"{suite.hash}, which the suite {suite.name} has here")
+    if held.episodes is None or not 1 <= held.episodes <= 4096:
+        raise InputError("board: suite.episodes", held.episodes, "1 to 4096 episodes of a cell")
+    return suite
+
+
+def _drawn(places: list[int], sample: int | None, seed: int) -> list[int]:
+    if sample is None or sample >= len(places):
+        return places
+    order = constants("check", seed).uniform((len(places),))[0].argsort()
+    return sorted(places[int(i)] for i in order[:sample])
+
+
+def _cell(part: CellPart, board: Board, suite: Suite) -> Cell | str:
+    """The cell to play; or why it cannot be played here."""
+    try:
+        for family, text in (("defence", part.defence), ("attack", part.attack)):
+            if why := _refused(family, text):  # type: ignore[arg-type]
+                return why
+        cell = Cell(
+            suite.name, part.scenario, part.dose, part.defence, part.attack, board.suite.episodes or 0, board.suite.purpose or "report",
+            threat=suite.granted, beacon=board.suite.beacon or "",
+        )  # fmt: skip
+        spec = Spec("attack", part.attack)
+        knowledge = cell.place(spec.make(), spec.entry.knowledge).threat_model.knowledge
+        _ = Spec("defence", part.defence).make(), cell.episodes
+    except Exception as error:  # a board can hold anything
+        return str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
+    if knowledge != part.knowledge:
+        return f"the attack {part.attack!r} is granted the knowledge {knowledge} here"
+    return cell
+
+
+def _refused(family: Family, text: str) -> str:
+    spec = Spec(family, text)
+    if spec.foreign or spec.sandboxed:
+        return f"the {family} {text!r} is code to import, which a board may not make us do"
+    missing = [str(path) for path in files_of(spec) if not path.is_file()]
+    return f"the {family}'s file {missing[0]!r} is not here" if missing else ""
+
+
+def _slices(cells: dict[int, Cell]) -> Iterator[list[int]]:
+    """Places of cells whose rows are held together."""
+    some: list[int] = []
+    for i in cells:
+        some.append(i)
+        if sum(cells[k].seeds for k in some) >= EPISODES:
+            yield some
+            some = []
+    if some:
+        yield some
+
+
+def _compared(part: CellPart, here: Data) -> Seen:
+    says = {name: value for name, value in part.model_dump(include=set(COMPARED)).items() if name not in PRINTS or value is not None}
+    off = [name for name in COMPARED if name in says and says[name] != here[name]]
+    why = ", ".join(f"{name}: board {_short(says[name])}, here {_short(here[name])}" for name in off)
+    if off == ["trace"]:
+        why = "trace only: decisions and figures agree, as between two platforms whose last bits differ"
+    return Seen("differs", why, here) if off else Seen("equal", "", here)
+
+
+def _short(value: Any) -> str:
+    return f"{value['value']:.4g}" if isinstance(value, dict) else str(value)
+
+
+def _report(board: Board, asked: list[int], seen: dict[int, Seen], sample: int | None, sample_seed: int) -> Data:
+    total = Counter(cell.defence for cell in board.cells)
+    by_defence: dict[str, Counter[str]] = {}
+    for i in asked:
+        by_defence.setdefault(board.cells[i].defence, Counter())[seen[i].verdict] += 1
+    reasons = Counter(seen[i].why for i in asked if seen[i].verdict == "unchecked")
+    counts: Counter[str] = Counter(seen[i].verdict for i in asked)
+    return {
+        "format": "tailgate-check-1", "suite": board.suite.name, "version": tailgate.__version__, "cells": len(board.cells),
+        "asked": len(asked), "sample": sample, **({} if sample is None else {"sample_seed": sample_seed}),
+        "counts": {verdict: counts[verdict] for verdict in VERDICTS},
+        "entries": [
+            {"defence": name, "cells": total[name], **{verdict: held[verdict] for verdict in VERDICTS}} for name, held in by_defence.items()
+        ],
+        "reasons": [{"why": why, "cells": n} for why, n in reasons.most_common()],
+        "findings": [
+            {**board.cells[i].model_dump(include={"scenario", "dose", "defence", "attack", "knowledge"}),
+             "verdict": seen[i].verdict, "why": seen[i].why}
+            for i in asked if seen[i].verdict != "equal"
+        ],
+        "prints": {
+            str(i): {name: held.here[name] for name in PRINTS} for i in asked if (held := seen[i]).verdict == "equal" and held.here
+        },
+    }  # fmt: skip
+
+
+def with_check(data: Data, report: Data) -> Data:
+    """The board with what a check found: `checked` in the entries that it looked into, fingerprints in cells that came out equal.
+
+    Of two checks of an entry the one stays that looked into more cells.
+    """
+    found = {entry["defence"]: {key: entry[key] for key in ("cells", *VERDICTS)} for entry in report["entries"]}
+
+    def asked(held: Data | None) -> int:
+        return sum(held[verdict] for verdict in VERDICTS) if held else -1
+
+    def told(entry: Data) -> Data:
+        new = found.get(entry["defence"])
+        return entry | {"checked": new} if new is not None and asked(new) >= asked(entry.get("checked")) else entry
+
+    cells = [cell | report["prints"].get(str(i), {}) for i, cell in enumerate(data["cells"])]
+    return data | {"entries": [told(entry) for entry in data["entries"]], "cells": cells}

@@ -1,0 +1,173 @@
+"""A board's figures can be checked by who has none of its rows."""
+
+import argparse
+import copy
+import dataclasses
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import tailgate
+from tailgate.commands import check as command
+from tailgate.errors import InputError
+from tailgate.evaluation import cells_of, run
+from tailgate.leaderboard.check import check, with_check
+from tailgate.leaderboard.site import build_site
+from tailgate.rows import encode
+from tailgate.scenario import load_suite
+from tailgate.scoring.board import score
+
+ROOT = Path(__file__).parents[1]
+SUITE = dataclasses.replace(
+    load_suite("quick-v0"), scenarios=("gusty-stop-and-go-v0",), defences=("none", "kf"), attacks=("none", "dos_jam:start_step=100"), seeds=6
+)
+Data = dict[str, Any]
+
+
+@pytest.fixture(scope="module")
+def rows() -> list[Data]:
+    return run(cells_of(SUITE))
+
+
+@pytest.fixture(scope="module")
+def original(rows: list[Data]) -> Data:
+    return score(rows, load_suite("quick-v0"), require_adaptive=False)
+
+
+@pytest.fixture
+def board(original: Data) -> Data:
+    return copy.deepcopy(original)
+
+
+def test_an_honest_board_comes_out_equal(board: Data) -> None:
+    assert len(board["cells"]) == 4 and len({cell["trace"] for cell in board["cells"]}) == 4
+    report = check(board)
+    assert report["counts"] == {"equal": 4, "differs": 0, "unchecked": 0} and report["findings"] == report["reasons"] == []
+    assert report["entries"] == [{"defence": name, "cells": 2, "equal": 2, "differs": 0, "unchecked": 0} for name in ("none", "kf")]
+    assert report["prints"] == {str(i): {name: cell[name] for name in ("decisions", "trace")} for i, cell in enumerate(board["cells"])}
+    assert check(board, workers=2) == report
+
+
+def test_some_cells_are_drawn_or_named(board: Data) -> None:
+    drawn = [check(board, sample=2, sample_seed=seed) for seed in range(4)]
+    assert all(report["asked"] == 2 and report["sample_seed"] == seed for seed, report in enumerate(drawn))
+    assert len({tuple(report["prints"]) for report in drawn}) > 1
+    named = check(board, defences=["kf"])
+    assert [entry["defence"] for entry in named["entries"]] == ["kf"] and named["asked"] == 2 and named["cells"] == 4
+    with pytest.raises(InputError, match="rkf"):
+        check(board, defences=["rkf"])
+    with pytest.raises(InputError, match="sample"):
+        check(board, sample=0)
+
+
+@pytest.mark.parametrize(("field", "value"), [("n", 5), ("failed", 1), ("decisions", "0" * 16), ("trace", "0" * 16), ("damage", {"value": 0.5, "low": 0.1, "high": 0.9})])
+def test_a_changed_figure_differs_and_is_named(board: Data, field: str, value: Any) -> None:
+    board["cells"][3][field] = value
+    report = check(board)
+    assert report["counts"] == {"equal": 3, "differs": 1, "unchecked": 0}
+    [finding] = report["findings"]
+    assert finding["why"].startswith("trace only" if field == "trace" else f"{field}: board") and finding["defence"] == board["cells"][3]["defence"]
+    assert "3" not in report["prints"]
+
+
+def test_a_board_of_before_the_fingerprints_gets_them(board: Data, rows: list[Data]) -> None:
+    held = [(cell.pop("decisions"), cell.pop("trace")) for cell in board["cells"]]
+    checked = with_check(board, check(board))
+    assert [(cell["decisions"], cell["trace"]) for cell in checked["cells"]] == held
+    assert [entry["checked"] for entry in checked["entries"]] == [{"cells": 2, "equal": 2, "differs": 0, "unchecked": 0}] * 2
+    less = with_check(checked, check(board, sample=1))
+    assert less["entries"] == checked["entries"]  # of two checks the one that looked into more stays
+
+
+def test_a_change_of_one_episode_changes_a_fingerprint(board: Data, rows: list[Data]) -> None:
+    other = [dict(row) for row in rows]
+    for hashed, printed in (("decision_hash", "decisions"), ("trace_hash", "trace")):
+        other[0][hashed] = other[0][hashed][::-1]
+        cells = score(other, load_suite("quick-v0"), require_adaptive=False)["cells"]
+        assert [a[printed] == b[printed] for a, b in zip(cells, board["cells"], strict=True)].count(False) == 1
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "words"),
+    [("attack", "never_made:Attack", "code to import"), ("attack", "gone/policy-0.json", "is not here"), ("attack", "dos_jam:start=1", "start"),
+     ("knowledge", "white", "knowledge"), ("attack", "bwrap/never_made:Attack", "")],
+)  # fmt: skip
+def test_what_cannot_be_played_is_unchecked(board: Data, field: str, value: str, words: str) -> None:
+    board["cells"][1][field] = value
+    report = check(board)
+    assert report["counts"] == {"equal": 3, "differs": 0, "unchecked": 1} and words in report["reasons"][0]["why"]
+    assert "never_made" not in sys.modules
+
+
+def test_code_that_is_a_defence_is_not_imported(board: Data, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "guard_of_a_board.py").write_text("raise SystemExit('imported')\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    board["entries"][1]["defence"] = "guard_of_a_board:Guard"
+    for cell in board["cells"]:
+        cell["defence"] = {"kf": "guard_of_a_board:Guard"}.get(cell["defence"], cell["defence"])
+    board["curves"], board["comparisons"] = [], []
+    assert check(board)["counts"] == {"equal": 2, "differs": 0, "unchecked": 2}
+
+
+@pytest.mark.parametrize(("field", "value"), [("name", "slow-v0"), ("hash", "0" * 16), ("version", "0.0.1"), ("episodes", 0), ("episodes", 10**9)])
+def test_a_board_of_something_else_is_refused(board: Data, field: str, value: Any) -> None:
+    board["suite"][field] = value
+    with pytest.raises(InputError, match=field):
+        check(board)
+
+
+def _command(*arguments: str) -> int:
+    parser = argparse.ArgumentParser()
+    command.add(parser.add_subparsers())
+    options = parser.parse_args(["check", *arguments])
+    code: int = options.run(options)
+    return code
+
+
+def test_the_command(board: Data, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """It leaves the board alone, unless told to write; and its exit code says that a cell differs."""
+    path = tmp_path / "board.json"
+    for cell in board["cells"]:
+        del cell["decisions"], cell["trace"]
+    path.write_text(json.dumps(board))
+    assert _command(str(path)) == 0 and json.loads(path.read_text()) == board
+    assert "4 of 4 cells played again" in " ".join(capsys.readouterr().out.split())
+    assert _command(str(path), "--write", "--json") == 0
+    report = json.loads(capsys.readouterr().out)
+    held = json.loads(path.read_text())
+    assert held == with_check(board, report) and all(cell["decisions"] for cell in held["cells"])
+    held["cells"][0]["decisions"] = "1" * 16
+    held["cells"][1]["attack"] = "gone/policy-0.json"
+    path.write_text(json.dumps(held))
+    assert _command(str(path)) == 1
+    out = capsys.readouterr().out
+    assert "decisions: board 1111111111111111" in out and "1 cells unchecked: the attack's file 'gone/policy-0.json' is not here" in out
+    path.write_text("[]")
+    with pytest.raises(InputError, match="board"):
+        _command(str(path))
+    with pytest.raises(InputError, match="readable"):
+        _command(str(tmp_path / "none.json"))
+
+
+def test_the_page_tells(board: Data, tmp_path: Path) -> None:
+    page = build_site([with_check(board, check(board, defences=["kf"]))], tmp_path / "page", replays=False)
+    assert "2 of 4 cells played again from the board alone, all equal" in page.read_text()
+    [entry] = page.parent.glob("*/kf.html")
+    assert "Played again from this board alone, without its rows: all 2 cells; 2 came out equal." in entry.read_text()
+
+
+def test_a_published_board_comes_out_equal(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Some cells of it, here, from the repository alone; the fingerprints are the same on every platform."""
+    monkeypatch.chdir(ROOT)
+    board = json.loads((ROOT / "results/quick-v0/board.json").read_text(encoding="utf-8"))
+    assert board["suite"]["version"] == tailgate.__version__
+    report = check(board, sample=8, sample_seed=1)
+    assert report["counts"]["unchecked"] == 0 and all(finding["why"].startswith("trace only") for finding in report["findings"])
+
+
+def test_rows_on_disk_give_the_same_fingerprints(rows: list[Data], board: Data) -> None:
+    held = [json.loads(line) for line in encode(rows).splitlines()]
+    assert score(held[::-1], load_suite("quick-v0"), require_adaptive=False)["cells"] == board["cells"]
