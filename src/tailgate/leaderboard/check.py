@@ -125,8 +125,7 @@ def _refused(family: Family, text: str) -> str:
     spec = Spec(family, text)
     if spec.foreign or spec.sandboxed:
         return f"the {family} {text!r} is code to import, which a board may not make us do"
-    missing = [str(path) for path in files_of(spec) if not path.is_file()]
-    return f"the {family}'s file {missing[0]!r} is not here" if missing else ""
+    return f"the {family}'s file is not here" if any(not path.is_file() for path in files_of(spec)) else ""
 
 
 def _slices(cells: dict[int, Cell]) -> Iterator[list[int]]:
