@@ -32,7 +32,7 @@ def test_every_cell_of_quick_v0_that_has_a_meaning_is_fused():
             refused.add(cell.defence)
             with pytest.raises(NotApplicable, match="innovation"):
                 rollout(loop, attack, draws.keys("report", [0]))
-    assert refused == {"none", "imm", "safe_state_brake"}
+    assert refused == {"none", "imm", "safe_state", "safe_state_brake"}
 
 
 def test_only_scripts_are_white_boxes_in_a_lane():

@@ -83,6 +83,62 @@ def test_a_suite_plays_every_built_in_attack_that_it_grants(name) -> None:
     assert not {row["attack"] for row in rows if row["status"] == "error" or (row["attack_steps"] and not row["refused_commands"])}
 
 
+# Why a suite leaves a built-in defence out that fits its plants (docs/scoring.md).
+ALIKE = {"composed", "steered", "steered_cra", "filterpy_kf", "filterpy_ekf", "filterpy_ukf", "filterpy_imm"}  # as they stand, another one under a second name
+TALKING = {
+    "dkf", "norm_resilient", "lasso_dkf", "chi2_dkf", "saturated_dkf", "disagreement_dkf", "trust_dkf", "consensus_kf", "trimmed_consensus", "centralised_kf",
+    "centralised_lasso", "dkf_oracle",
+}  # fmt: skip
+STEERING = {"always_brake", "stand_still", "brake_kf", "widen_kf"}  # in a network nobody drives
+ALONE = {"imm", "chi2_kf", "chi2_kf_sparse", "windowed_chi2_kf", "cusum_kf", "mewma_kf", "reacquire_kf", "cusum_reacquire_kf", "oracle"}  # lost there, as `kf`
+FAILING = {"windowed_chi2_kf", "widen_kf", "brake_kf"}  # in a platoon, a gate: without an attack
+SLOW = {"filterpy_hinfinity"}  # episode by episode
+
+
+@pytest.mark.parametrize("name", ["quick-v0", "car-following-v0", "platoon-v0", "radar-v0", "network-v0", "thesis-v0", "highway-v0"])
+def test_a_suite_plays_every_built_in_defence_that_fits(name) -> None:
+    """What it leaves out refuses one of its scenarios, is another one under a second name, has nobody to talk to or hours to go, or is lost without an attack."""
+    if name == "highway-v0":
+        pytest.importorskip("highway_env")
+    suite = load_suite(name)
+    sizes = {load_scenario(scenario).brief().model.agents for scenario in suite.scenarios}
+    out = ALIKE | SLOW | (TALKING if sizes == {1} else set()) | (STEERING | ALONE if suite.bound is not None else set())
+    out |= FAILING if name == "platoon-v0" else set()
+    listed = {text.split(":")[0] for text in suite.defences}
+    assert not listed & out
+    others = [text for text in entries("defence") if text not in listed | out]
+    rows = evaluate(suite, defences=others, attacks=["none"], doses=[max(d for d in suite.doses if d)], seeds=1) if others else []
+    refused = {row["defence"] for row in rows if row["status"] == "skipped"}
+    assert set(others) == refused
+
+
+def test_an_agent_alone_is_lost_in_the_weak_network_whatever_its_filter() -> None:
+    """Without an attack, so that no gate can be passed: `kf` on the board says so for all of them."""
+    suite = load_suite("network-v0")
+    part = dataclasses.replace(suite, scenarios=("network-restless-weak-v0",), defences=("kf", "dkf", *sorted(ALONE)), attacks=("none",), seeds=4)
+    errors = {(row["defence"], row["seed"]): row["max_error"] for row in evaluate(part, doses=[1])}
+    assert all(error > suite.bound for (defence, _), error in errors.items() if defence != "dkf") and len(errors) == 4 * len(part.defences)
+    assert all(error < suite.bound for (defence, _), error in errors.items() if defence == "dkf")
+
+
+def test_detectors_that_are_off_where_sensors_are_noisier_than_told_fail_a_gate_of_a_platoon() -> None:
+    """Those that are left out of its board, and `chi2_kf`, which is on it, does not."""
+    noisy = {"scenarios": ("platoon-noisy-v0",), "robustness": ("platoon-noisy-v0",), "attacks": ("none",), "doses": (60,), "shown": {60: "6 s"}, "adaptive": {}}
+    part = dataclasses.replace(load_suite("platoon-v0"), defences=("none", "chi2_kf", *sorted(FAILING)), seeds=6, **noisy)
+    board = score(evaluate(part), part, require_adaptive=False)
+    failed = {entry["defence"] for entry in board["entries"] if not all(gate["passed"] for gate in entry["gates"])}
+    assert failed == FAILING
+
+
+@pytest.mark.parametrize(("frame", "one"), [("composed", "chi2_kf"), ("steered", "chi2_kf"), ("steered_cra", "cra")])
+def test_an_empty_frame_is_the_defence_that_it_holds(frame, one) -> None:
+    """So a board that has the one needs not the other."""
+    scenario, attack = ("radar-following-v0", make_attack("noise_jam", start_step=60)) if one == "cra" else ("stop-and-go-v0", make_attack("fdi", start_step=60, value=-5.0))
+    loops = [load_scenario(scenario).loop(make_defence(name), entries("defence")[name].uses) for name in (frame, one)]
+    first, second = (rollout(loop, attack, keys("report", range(4))).estimate for loop in loops)
+    np.testing.assert_array_equal(first, second)
+
+
 def test_every_plan_of_training_can_be_asked_for() -> None:
     """Each learner's environment takes the suite's threat model: a board cannot be scored without knowing what it asks for."""
     plans = {name: asked_of(suite) for name in list_suites() if (suite := load_suite(name)).adaptive}

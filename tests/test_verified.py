@@ -127,7 +127,9 @@ def test_a_published_board_is_of_the_suite_that_is_here(name: str) -> None:
     assert name in list_suites()
     board = json.loads((ROOT / f"results/{name}/board.json").read_text(encoding="utf-8"))
     assert board["suite"]["hash"] == load_suite(name).hash
-    assert all(entry["verified"] and read_board(board) for entry in board["entries"])
+    for entry in read_board(board).entries:
+        again = entry.checked
+        assert (entry.verified and entry.verified.sound) or (again and again.equal > 0 == again.differs), entry.defence
 
 
 @pytest.mark.parametrize("name", [name for name in BOARDS if (ROOT / f"results/{name}/attacked").is_dir()])
