@@ -152,6 +152,22 @@ def test_the_command(board: Data, tmp_path: Path, capsys: pytest.CaptureFixture[
         _command(str(tmp_path / "none.json"))
 
 
+def test_attackers_that_are_not_published_are_named_with_the_command_that_trains_them(
+    board: Data, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for i, seed in ((0, 3), (1, 4), (2, 3)):
+        board["cells"][i]["attack"] = f"held/attacked/policies/run/policy-{seed}.json"
+    names = [board["cells"][i]["defence"] for i in range(3)]
+    (tmp_path / "board.json").write_text(json.dumps(board))
+    assert _command(str(tmp_path / "board.json"), "--json") == 0
+    untrained = json.loads(capsys.readouterr().out)["untrained"]
+    assert untrained == [
+        {"defence": name, "folder": "held/attacked", "policies": names.count(name), "cells": names.count(name)} for name in dict.fromkeys(names)
+    ]
+    _command(str(tmp_path / "board.json"))
+    assert f"tailgate leaderboard attack {names[0]} --suite quick-v0 --out held/attacked " in capsys.readouterr().out
+
+
 def test_the_page_tells(board: Data, tmp_path: Path) -> None:
     page = build_site([with_check(board, check(board, defences=["kf"]))], tmp_path / "page", replays=False)
     assert "2 of 4 cells played again from the board alone, all equal" in page.read_text()

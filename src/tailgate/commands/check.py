@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import secrets
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -75,6 +76,15 @@ def _print(report: dict[str, Any]) -> None:
         out.print(f"{reason['cells']} cells unchecked: {reason['why']}", markup=False, highlight=False)
     if len(reasons) > SHOWN:
         out.print(f"and {len(reasons) - SHOWN} more reasons; --json lists all cells", highlight=False)
+    untrained: list[dict[str, Any]] = report["untrained"]
+    if untrained:
+        out.print("These attackers are trained again, to the last bit on one machine type, by:")
+    for held in untrained[:SHOWN]:
+        words = ["tailgate", "leaderboard", "attack", held["defence"], "--suite", report["suite"], "--out", held["folder"]]
+        many = f"{held['policies']} of {held['cells']} cells"
+        out.print(f"    {shlex.join(words)}    # {many}", markup=False, highlight=False, soft_wrap=True)
+    if len(untrained) > SHOWN:
+        out.print(f"and {len(untrained) - SHOWN} more; --json lists them all", highlight=False)
     findings: list[dict[str, Any]] = report["findings"]
     wrong = [finding for finding in findings if finding["verdict"] == "differs"]
     for finding in wrong[:SHOWN]:

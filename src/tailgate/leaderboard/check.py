@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal
 
 import tailgate
@@ -47,6 +48,7 @@ def check(
 
     data: a board, as JSON; sample: so many cells, drawn by sample_seed (default: all); defences: only the cells of these.
     The report has `counts`, `entries` (the same for each defence), `reasons` and `findings`, cells that differ or could not be checked;
+    `untrained`: attackers whose files are not here, though `leaderboard attack` would train them again, to the same weights;
     `prints` has the fingerprints of each cell that came out equal, by its place in the board.
     Raises InputError for a board of another suite or version than is here, and for a defence that is not on it.
     """
@@ -168,6 +170,7 @@ def _report(board: Board, asked: list[int], seen: dict[int, Seen], sample: int |
             {"defence": name, "cells": total[name], **{verdict: held[verdict] for verdict in VERDICTS}} for name, held in by_defence.items()
         ],
         "reasons": [{"why": why, "cells": n} for why, n in reasons.most_common()],
+        "untrained": _untrained(board, [i for i in asked if seen[i].verdict == "unchecked"]),
         "findings": [
             {**board.cells[i].model_dump(include={"scenario", "dose", "defence", "attack", "knowledge"}),
              "verdict": seen[i].verdict, "why": seen[i].why}
@@ -177,6 +180,19 @@ def _report(board: Board, asked: list[int], seen: dict[int, Seen], sample: int |
             str(i): {name: held.here[name] for name in PRINTS} for i in asked if (held := seen[i]).verdict == "equal" and held.here
         },
     }  # fmt: skip
+
+
+def _untrained(board: Board, places: list[int]) -> list[Data]:
+    """Of each defence the policies that lie where `leaderboard attack DEFENCE --out FOLDER` puts them, and are not here."""
+    cells: Counter[tuple[str, str]] = Counter()
+    files: dict[tuple[str, str], set[Path]] = {}
+    for cell in (board.cells[i] for i in places):
+        path = Path(cell.attack)
+        if path.suffix == ".json" and path.parts[-3:-2] == ("policies",) and not path.is_file():
+            held = cell.defence, path.parents[2].as_posix()
+            cells[held] += 1
+            files.setdefault(held, set()).add(path)
+    return [{"defence": name, "folder": folder, "policies": len(files[name, folder]), "cells": n} for (name, folder), n in cells.items()]
 
 
 def with_check(data: Data, report: Data) -> Data:
