@@ -170,9 +170,9 @@ def test_attackers_that_are_not_published_are_named_with_the_command_that_trains
 
 def test_the_page_tells(board: Data, tmp_path: Path) -> None:
     page = build_site([with_check(board, check(board, defences=["kf"]))], tmp_path / "page", replays=False)
-    assert "2 of 4 cells played again from the board alone, all equal" in page.read_text()
+    assert "played again from the board alone, without rows: 2 of 4 cells, all equal" in page.read_text()
     [entry] = page.parent.glob("*/kf.html")
-    assert "Played again from this board alone, without its rows: all 2 cells; 2 came out equal." in entry.read_text()
+    assert "Played again from this board alone, without its rows: all 2 cells, all equal." in entry.read_text()
 
 
 def test_a_published_board_comes_out_equal(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -57,7 +57,7 @@ def test_rows_that_come_out_equal_make_their_entries_verified(rows: list[dict[st
     all_of = {"rows": 8, "verified": 8, "differs": 0, "unchecked": 0}
     assert _verified(tmp_path) == {"none": all_of, "kf": all_of}
     page = build_site([json.loads((tmp_path / "board.json").read_text())], tmp_path / "page", replays=False)
-    assert "2 of 2 entries verified: 16 rows played again, all equal" in page.read_text()
+    assert "2 of 2 entries verified: played again all 16 rows, all equal" in page.read_text()
     assert "Verified: all 8 rows were played again and came out equal." in next((page.parent).glob("*/kf.html")).read_text()
 
 
@@ -90,7 +90,7 @@ def test_one_row_that_differs_leaves_its_entry_claimed(rows: list[dict[str, Any]
     sound = {entry.defence: entry.verified.sound for entry in board.entries if entry.verified}
     assert sound == {"none": True, "kf": False}
     page = build_site([json.loads((tmp_path / "board.json").read_text())], tmp_path / "page", replays=False)
-    assert "1 of 2 entries verified: 16 rows played again, 1 not equal" in page.read_text()
+    assert "1 of 2 entries verified: played again all 16 rows, 1 of them differ" in page.read_text()
     assert "Claimed: all 8 rows were played again; 1 differ." in next((page.parent).glob("*/kf.html")).read_text()
 
 

@@ -16,7 +16,7 @@ from .board_format import LEVELS, CellPart, EntryPart, Robust
 from .build import names_of, percent
 from .site_curves import curves_of
 from .site_index import compared_how, comparisons_of
-from .site_suite import Data, Suite, critical_of, dose_text, figure, share_of, worse
+from .site_suite import Data, Suite, critical_of, dose_text, figure, played, share_of, worse
 from .site_trust import trust_of, trust_page
 
 SHOWN = ("name", "summary", "parameters")  # of a card: shown in a place of their own
@@ -179,10 +179,8 @@ def _checked(entry: EntryPart) -> str:
     held = entry.checked
     if held is None:
         return ""
-    asked = held.equal + held.differs + held.unchecked
-    which = f"{asked} of {held.cells}" if asked < held.cells else f"all {held.cells}"
-    parts = [(held.equal, "came out equal"), (held.differs, "differ"), (held.unchecked, "could not be checked")]
-    return f"Played again from this board alone, without its rows: {which} cells; {', '.join(f'{n} {word}' for n, word in parts if n)}."
+    said = played(held.cells, held.equal, held.differs, held.unchecked, "cells")
+    return f"Played again from this board alone, without its rows: {said}."
 
 
 def _rank(suite: Suite, entry: EntryPart) -> str:

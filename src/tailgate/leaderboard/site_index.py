@@ -7,7 +7,7 @@ from collections import Counter
 from .board_format import LEVELS, CellPart, Dose, Level
 from .build import Name, percent
 from .site_curves import curves_of, stealth_of, together_of
-from .site_suite import GROUPS, Data, Suite, cell_of, critical_of, dose_text, figure, gates_of, share_of, worse
+from .site_suite import GROUPS, Data, Suite, cell_of, critical_of, dose_text, figure, gates_of, played, share_of, worse
 from .site_trust import trust_cell, trust_of
 
 OWN = ""  # in place of an attack: all that were trained against the row's defence
@@ -191,16 +191,14 @@ def checked_of(suite: Suite) -> str:
     """How many entries are verified by rows, and how many cells were played again from the board alone; empty where nothing was."""
     entries, said = suite.board.entries, []
     if told := [entry.verified for entry in entries if entry.verified is not None]:
-        again, equal = sum(v.verified + v.differs + v.unchecked for v in told), sum(v.verified for v in told)
-        said.append(f"{sum(v.sound for v in told)} of {len(entries)} entries verified: {again} rows played again, {_outcome(again, equal)}")
+        equal, differs, unchecked = sum(v.verified for v in told), sum(v.differs for v in told), sum(v.unchecked for v in told)
+        rows = played(sum(v.rows for v in told), equal, differs, unchecked, "rows")
+        said.append(f"{sum(v.sound for v in told)} of {len(entries)} entries verified: played again {rows}")
     if held := [entry.checked for entry in entries if entry.checked is not None]:
-        again, equal = sum(c.equal + c.differs + c.unchecked for c in held), sum(c.equal for c in held)
-        said.append(f"{again} of {len(suite.board.cells)} cells played again from the board alone, {_outcome(again, equal)}")
+        equal, differs, unchecked = sum(c.equal for c in held), sum(c.differs for c in held), sum(c.unchecked for c in held)
+        cells = played(len(suite.board.cells), equal, differs, unchecked, "cells")
+        said.append(f"played again from the board alone, without rows: {cells}")
     return "; ".join(said)
-
-
-def _outcome(again: int, equal: int) -> str:
-    return "all equal" if equal == again else f"{again - equal} not equal, or not to be checked here"
 
 
 def _group(title: str, about: str, rows: list[Data]) -> Data:

@@ -179,3 +179,11 @@ def worse(cells: Iterable[CellPart | None]) -> CellPart | None:
     there = [c for c in cells if c is not None]
     known = [c for c in there if c.damage is not None]
     return max(known, key=lambda c: c.damage.value if c.damage else 0.0) if known else next(iter(there), None)
+
+
+def played(there: int, equal: int, differs: int, unchecked: int, noun: str) -> str:
+    """What came of rows or cells of which some were played again."""
+    again = equal + differs
+    said = f"{again} of {there} {noun}" if again < there else f"all {there} {noun}"
+    said += f", {differs} of them differ" if differs else ", all equal" if equal else ""
+    return said + (f"; {unchecked} could not be played" if unchecked else "")
