@@ -19,6 +19,7 @@ from tailgate.leaderboard.site import build_site
 from tailgate.rows import encode
 from tailgate.scenario import load_suite
 from tailgate.scoring.board import score
+from tailgate.scoring.follow import strays
 
 ROOT = Path(__file__).parents[1]
 SUITE = dataclasses.replace(
@@ -49,6 +50,70 @@ def test_an_honest_board_comes_out_equal(board: Data) -> None:
     assert report["entries"] == [{"defence": name, "cells": 2, "equal": 2, "differs": 0, "unchecked": 0} for name in ("none", "kf")]
     assert report["prints"] == {str(i): {name: cell[name] for name in ("decisions", "trace")} for i, cell in enumerate(board["cells"])}
     assert check(board, workers=2) == report
+
+
+def test_seeds_of_a_round_come_out_equal_too(tmp_path: Path) -> None:
+    """They do not ascend, and a board's rows are by seed."""
+    beacon = "a beacon of sixteen letters or more"
+    board = score(run(cells_of(SUITE, beacon=beacon)), load_suite("quick-v0"), require_adaptive=False)
+    assert board["suite"]["beacon"] == beacon and check(board)["counts"] == {"equal": 4, "differs": 0, "unchecked": 0}
+
+
+@pytest.fixture
+def published() -> Data:
+    board: Data = json.loads((ROOT / "results/quick-v0/board.json").read_text(encoding="utf-8"))
+    return board
+
+
+@pytest.mark.parametrize("name", sorted(path.parent.name for path in ROOT.glob("results/*/board.json")))
+def test_what_is_published_follows_from_its_cells(name: str) -> None:
+    board = json.loads((ROOT / f"results/{name}/board.json").read_text(encoding="utf-8"))
+    assert strays(board, load_suite(name)) == []
+
+
+@pytest.mark.parametrize("field", ["rates", "critical_dose"])
+def test_figures_of_another_entry_are_named(published: Data, field: str) -> None:
+    entries = {entry["defence"]: entry for entry in published["entries"]}
+    entries["kf"][field] = entries["rkf"][field]
+    report = check(published, sample=1)
+    assert [(line["defence"], line["field"]) for line in report["strays"]] == [("kf", field)] and not report["scored"]
+
+
+def test_limits_doses_and_curves_follow_too(published: Data) -> None:
+    changed = [copy.deepcopy(published) for _ in range(4)]
+    changed[0]["cells"][1]["damage"]["high"] = 0.5
+    changed[1]["suite"]["shown"] = {}
+    changed[2]["curves"][0]["points"][-1]["value"] = 0.5
+    changed[3]["entries"][5]["rates"][0]["undamaged"]["low"] += 0.01
+    fields = [[line["field"] for line in strays(board, load_suite("quick-v0"))] for board in changed]
+    assert fields == [["cells[1].damage"], ["suite.shown"], ["curves"], ["rates"]]
+
+
+def test_cells_that_were_taken_out_are_missed(published: Data) -> None:
+    entries = {entry["defence"]: entry for entry in published["entries"]}
+    worst = entries["kf"]["rates"][0]["worst"]["attack"]
+    published["cells"] = [cell for cell in published["cells"] if cell["defence"] != "kf" or cell["attack"] != worst]
+    found = strays(published, load_suite("quick-v0"))
+    assert {"critical_dose", "rates"} <= {line["field"] for line in found} and {line["defence"] for line in found} == {"kf"}
+    listed = next(cell["attack"] for cell in published["cells"] if cell["defence"] == "rkf" and not cell["learned"] and cell["attack"] != "none")
+    published["cells"] = [cell for cell in published["cells"] if cell["defence"] != "rkf" or cell["attack"] != listed]
+    assert ("rkf", "status") in {(line["defence"], line["field"]) for line in strays(published, load_suite("quick-v0"))}
+    published["cells"] = [cell for cell in published["cells"] if cell["defence"] not in ("kf", "rkf")]
+    assert [(line["defence"], line["field"]) for line in strays(published, load_suite("quick-v0"))] == [("kf", "cells"), ("rkf", "cells")]
+
+
+def test_a_cell_that_is_there_twice_is_refused(published: Data) -> None:
+    published["cells"].append(published["cells"][7])
+    with pytest.raises(InputError, match="once"):
+        check(published, sample=1)
+
+
+@pytest.mark.parametrize(("field", "value"), [("rank", {"best": 1, "worst": 1}), ("why", ""), ("flags", ["a flag"]), ("gates", 99.0)])
+def test_ranks_gates_and_flags_are_made_again_where_all_cells_are_played(board: Data, field: str, value: Any) -> None:
+    entry = board["entries"][1]
+    entry[field] = [gate | {"limit": value} for gate in entry["gates"]] if field == "gates" else value
+    assert [(line["defence"], line["field"]) for line in check(board)["strays"]] == [("kf", field)]
+    assert check(board, sample=3)["strays"] == [] and not check(board, sample=3)["scored"]
 
 
 def test_some_cells_are_drawn_or_named(board: Data) -> None:

@@ -17,6 +17,7 @@ from tailgate.errors import InputError
 from tailgate.progress import cells, console, progress
 
 SHOWN = 20  # cells that are listed, at most
+LONGEST = 160  # characters of a figure that are shown
 
 
 def add(actions: Any) -> None:
@@ -24,8 +25,9 @@ def add(actions: Any) -> None:
     command = actions.add_parser(
         "check", help="play cells of a published board again, without its rows",
         description="Play cells of a board again and compare how many episodes came to damage, and the fingerprint of all decisions. "
-        "Exit code 1 when a cell differs, or when none could be checked. Registered names, the zoo, and files of policies that are here "
-        "are played; a board never makes this command import code.",
+        "Rates, critical doses and curves have to follow from the cells; where all cells of the board are played, ranks and gates are "
+        "made again as well. Exit code 1 when anything differs, or when no cell could be checked. Registered names, the zoo, and files "
+        "of policies that are here are played; a board never makes this command import code.",
     )  # fmt: skip
     command.add_argument("board", metavar="FILE", help="board.json")
     command.add_argument("--sample", type=int, metavar="N", help="so many cells, drawn at random (default: all)")
@@ -58,7 +60,7 @@ def _check(options: argparse.Namespace) -> int:
         print(json.dumps(report, indent=1, allow_nan=False))
     else:
         _print(report)
-    return 1 if report["counts"]["differs"] or not report["counts"]["equal"] else 0
+    return 1 if report["counts"]["differs"] or report["strays"] or not report["counts"]["equal"] else 0
 
 
 def _print(report: dict[str, Any]) -> None:
@@ -85,6 +87,21 @@ def _print(report: dict[str, Any]) -> None:
         out.print(f"    {shlex.join(words)}    # {many}", markup=False, highlight=False, soft_wrap=True)
     if len(untrained) > SHOWN:
         out.print(f"and {len(untrained) - SHOWN} more; --json lists them all", highlight=False)
+    strays: list[dict[str, Any]] = report["strays"]
+    if strays:
+        out.print(f"{len(strays)} figures differ from what the cells make:")
+    else:
+        out.print("Rates, critical doses and curves of all entries follow from the cells.")
+    for stray in strays[:SHOWN]:
+        place = ": ".join(filter(None, (stray["defence"], stray["field"])))
+        said = f"board {_words(stray['board'])}, here {_words(stray['here'])}"
+        out.print(f"    {place}: {said}", markup=False, highlight=False, soft_wrap=True)
+    if len(strays) > SHOWN:
+        out.print(f"and {len(strays) - SHOWN} more; --json lists them all", highlight=False)
+    if not report["scored"]:
+        out.print("Ranks, gates and clean figures were not made again: that takes all cells of the board.")
+    elif not strays:
+        out.print("Ranks, gates and clean figures came out as the board says.")
     findings: list[dict[str, Any]] = report["findings"]
     wrong = [finding for finding in findings if finding["verdict"] == "differs"]
     for finding in wrong[:SHOWN]:
@@ -92,3 +109,8 @@ def _print(report: dict[str, Any]) -> None:
         out.print(f"{named}: {finding['why']}", markup=False, highlight=False)
     if len(wrong) > SHOWN:
         out.print(f"and {len(wrong) - SHOWN} more; --json lists them all", highlight=False)
+
+
+def _words(value: Any) -> str:
+    text = json.dumps(value)
+    return text if len(text) <= LONGEST else text[:LONGEST] + "..."

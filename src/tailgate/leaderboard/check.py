@@ -1,7 +1,8 @@
 """A board's cells played again from the board alone: a figure can be checked by who has none of its rows.
 
 A cell names a scenario, a dose, a defence and an attack of a suite that is here; its seeds are those of the suite's round. As with rows,
-nothing is imported that the board names.
+nothing is imported that the board names. Figures of entries are made again: what follows from cells always, and all else where all cells
+of the board were played.
 """
 
 from __future__ import annotations
@@ -18,7 +19,12 @@ from tailgate.errors import InputError, unknown
 from tailgate.evaluation import Cell, run
 from tailgate.registry import Family, Spec
 from tailgate.scenario import Suite, list_suites, load_suite
+from tailgate.schema import build
+from tailgate.scoring.attacks import Admitted
+from tailgate.scoring.board import score
 from tailgate.scoring.cells import figures
+from tailgate.scoring.damage import Row
+from tailgate.scoring.follow import same, strays
 from tailgate.verify import files_of
 
 from .board_format import Board, CellPart, read_board
@@ -26,6 +32,7 @@ from .board_format import Board, CellPart, read_board
 Data = dict[str, Any]
 VERDICTS = ("equal", "differs", "unchecked")
 PRINTS = ("decisions", "trace")  # which a board of before cells had fingerprints lacks
+SCORED = ("class", "uses", "status", "why", "gates", "critical_dose", "rates", "rank", "clean", "flags", "robustness")  # of an entry
 COMPARED = ("n", "failed", "damage", *PRINTS)
 EPISODES = 20_000  # whose rows are held at a time
 
@@ -49,7 +56,8 @@ def check(
     data: a board, as JSON; sample: so many cells, drawn by sample_seed (default: all); defences: only the cells of these.
     The report has `counts`, `entries` (the same for each defence), `reasons` and `findings`, cells that differ or could not be checked;
     `untrained`: attackers whose files are not here, though `leaderboard attack` would train them again, to the same weights;
-    `prints` has the fingerprints of each cell that came out equal, by its place in the board.
+    `strays`: figures that do not follow from the cells, by `defence` and `field`; `scored`: whether ranks, gates and all else could be made
+    again, as all cells were played; `prints` has the fingerprints of each cell that came out equal, by its place in the board.
     Raises InputError for a board of another suite or version than is here, and for a defence that is not on it.
     """
     board = read_board(data)
@@ -75,10 +83,38 @@ def check(
         if progress is not None:
             progress(len(seen) + done, len(asked))
 
+    whole = len(cells) == len(board.cells)
+    held: list[Row] = []
     for some in _slices(cells):
-        rows = iter(run([cells[i] for i in some], workers=workers, progress=told))
-        seen |= {i: _compared(board.cells[i], figures([next(rows) for _ in range(cells[i].seeds)], suite)) for i in some}
-    return _report(board, asked, seen, sample, sample_seed)
+        rows = run([cells[i] for i in some], workers=workers, progress=told)
+        held += rows if whole else []
+        each = iter(rows)
+        seen |= {i: _compared(board.cells[i], figures([next(each) for _ in range(cells[i].seeds)], suite)) for i in some}
+    off = strays(data, suite)
+    known = {(stray["defence"], stray["field"]) for stray in off}
+    off += [stray for stray in _scored(data, held, suite) if (stray["defence"], stray["field"]) not in known]
+    return _report(board, asked, seen, sample, sample_seed) | {"strays": off, "scored": bool(held)}
+
+
+def _scored(data: Data, rows: list[Row], suite: Suite) -> Iterator[Data]:
+    """How the board differs from the one that these rows make; nothing without rows."""
+    if not rows:
+        return
+    said = data["suite"]
+    lines = [build(Admitted, a["admitted"], "board: attacks") for a in data["attacks"] if a.get("admitted")]
+    try:
+        here = score(rows, suite, attacks=lines, alpha=said.get("alpha", 0.05), require_adaptive=said.get("require_adaptive", True))
+    except InputError as error:
+        yield {"defence": "", "field": "cells", "board": f"{len(data['cells'])} cells", "here": str(error)}
+        return
+    entries = {entry["defence"]: entry for entry in here["entries"]}
+    for entry in data["entries"]:
+        mine = entries.get(entry["defence"], {})
+        for key in SCORED:
+            if not same(entry.get(key), mine.get(key)):
+                yield {"defence": entry["defence"], "field": key, "board": entry.get(key), "here": mine.get(key)}
+    if not same(data["comparisons"], here["comparisons"]):
+        yield {"defence": "", "field": "comparisons", "board": f"{len(data['comparisons'])} of them", "here": "others"}
 
 
 def _suite_of(board: Board) -> Suite:

@@ -61,7 +61,7 @@ def score(
     return {
         "format": FORMAT, "suite": _suite(table, alpha) | {"require_adaptive": require_adaptive},
         "attacks": _attacks(table, lines, origins), "entries": found, "cells": cells_of(table),
-        "curves": [worst.curve() for d in table.defences for worst in levels[d].values() if worst.complete and worst.numbers],
+        "curves": [curve for d in table.defences for curve in curves(levels[d])],
         "comparisons": comparisons, "detection": None,
     }  # fmt: skip
 
@@ -101,7 +101,7 @@ def _attacks(table: Table, lines: dict[str, Admitted | None], origins: dict[str,
         out.append({
             "attack": column.attack, "knowledge": column.knowledge, "learned": table.learned[column], "optimal": table.optimal[column],
             "trained_on": origins.get(column.attack, {}).get("defence"),
-            "admitted": None if line is None else line.as_data(), "note": "; ".join(notes),
+            "admitted": None if line is None else line.as_data(), "note": "; ".join(notes), "withdrawn": column.attack in table.withdrawn,
         })  # fmt: skip
     return out
 
@@ -131,18 +131,30 @@ def _entry(table: Table, defence: str, levels: dict[str, Worst], slot: int, orig
     if not why and asked is not None and (missing := _unmet(table, defence, origins, asked)):
         status, why = "unattacked", missing
     whole = {k: worst for k, worst in levels.items() if worst.complete}
+    return {
+        "defence": defence, "card": None if card is None else card.card(), "uses": uses, "class": class_of(uses),
+        "status": status, "why": why, "gates": found, "rank": None, "clean": _clean(table, defence),
+        "flags": flags(table, defence, levels, slot, origins), "worst_episode": _episode(table, whole, slot), "stealth": None,
+    } | of_worst(table, levels, slot)  # fmt: skip
+
+
+def of_worst(table: Table, levels: dict[str, Worst], slot: int) -> Data:
+    """The figures of an entry that are shares of damage: critical doses, rates and robustness."""
+    whole = {k: worst for k, worst in levels.items() if worst.complete}
     critical: dict[tuple[tuple[str, int], ...], Data | None] = {}
     for worst in whole.values():
         if tuple(worst.pairs) not in critical:  # of classes with the same attacks once
             critical[tuple(worst.pairs)] = worst.critical()
     return {
-        "defence": defence, "card": None if card is None else card.card(), "uses": uses, "class": class_of(uses),
-        "status": status, "why": why, "gates": found,
         "critical_dose": {k: critical[tuple(worst.pairs)] if k in whole else None for k, worst in levels.items()},
-        "rates": [worst.rate(s) for s in shown(table) for worst in whole.values()], "rank": None, "clean": _clean(table, defence),
-        "flags": flags(table, defence, levels, slot, origins), "worst_episode": _episode(table, whole, slot),
-        "robustness": _robustness(table, whole.get("black"), slot), "stealth": None,
-    }  # fmt: skip
+        "rates": [worst.rate(s) for s in shown(table) for worst in whole.values()],
+        "robustness": _robustness(table, whole.get("black"), slot),
+    }
+
+
+def curves(levels: dict[str, Worst]) -> list[Data]:
+    """Dose-response curves of an entry, by knowledge."""
+    return [worst.curve() for worst in levels.values() if worst.complete and worst.numbers]
 
 
 def _card(defence: str) -> Entry | None:

@@ -12,16 +12,17 @@ from tailgate.stats import proportion
 
 from .damage import Row, Table, damaged
 
-_share = functools.cache(proportion)  # a board has few different counts
+share = functools.cache(proportion)  # a board has few different counts
 
 
 def figures(rows: Sequence[Row], suite: Suite) -> dict[str, Any]:
-    """Of the rows of a cell, by seed: how many were played and failed, why, the share that came to damage, and two fingerprints."""
+    """Of the rows of a cell: how many were played and failed, why, the share that came to damage, and two fingerprints."""
+    rows = sorted(rows, key=lambda row: int(row["seed"]))  # a round's seeds are not played in ascending order
     good = [damaged(row, suite) for row in rows if row["status"] == "ok"]
     return {
         "n": len(good), "failed": sum(row["status"] == "error" for row in rows),
         "reason": next((row["reason"] for row in rows if row["status"] != "ok"), ""),
-        "damage": _share(sum(good), len(good))._asdict() if good else None,
+        "damage": share(sum(good), len(good))._asdict() if good else None,
         "decisions": _fingerprint(rows, "decision_hash"), "trace": _fingerprint(rows, "trace_hash"),
     }  # fmt: skip
 

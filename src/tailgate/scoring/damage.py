@@ -110,7 +110,7 @@ def tabulate(rows: Iterable[Row], suite: Suite, added: Sequence[str] = (), withd
     if not suite.scenarios or not suite.doses:
         raise InputError(f"suite {suite.name}", list(suite.scenarios), "at least one scenario and one dose")
     places = {place.name: place for place in (load_scenario(name) for name in suite.scenarios)}
-    doses = tuple(sorted(set(suite.doses), key=_dose_order))
+    doses = doses_of(suite)
     slots = {
         (name, suite.threat.get("budget", place.threat_model.budget) if dose is None else dose): slot
         for name, place in places.items() for slot, dose in reversed(list(enumerate(doses)))
@@ -139,14 +139,9 @@ def tabulate(rows: Iterable[Row], suite: Suite, added: Sequence[str] = (), withd
     _same_component(rows)
     cells = {key: [by_seed[seed] for seed in sorted(by_seed)] for key, by_seed in held.items()}
     seeds = _seeds(cells)
-    defences = _ordered({key.defence for key in cells}, suite.defences)
+    defences = in_order({key.defence for key in cells}, suite.defences)
     listed = tuple(dict.fromkeys([*suite.attacks, *added]))
-    names = _ordered({key.column.attack for key in cells} | set(listed), listed)
-    granted = {name: {key.column.knowledge for key in cells if key.column.attack == name} for name in names}
-    columns = tuple(
-        Column(name, level) for name in names if name != CLEAN
-        for level in sorted(granted[name] or {"black"}, key=order)
-    )  # fmt: skip
+    columns = columns_of((key.column for key in cells), listed)
     clean: dict[tuple[str, str], list[Row]] = {}
     for key in sorted(cells, key=lambda key: (key.slot, order(key.column.knowledge))):
         if key.column.attack == CLEAN and all(row["status"] == "ok" for row in cells[key]):
@@ -179,11 +174,23 @@ def hashes_of(place: Scenario, suite: Suite, dose: int | None, knowledge: str) -
     return tuple(dict.fromkeys(found))
 
 
-def _dose_order(dose: int | None) -> tuple[bool, int]:
-    return dose is None, dose or 0
+def doses_of(suite: Suite) -> tuple[int | None, ...]:
+    """The suite's doses, ascending, the scenario's own last."""
+    return tuple(sorted(set(suite.doses), key=lambda dose: (dose is None, dose or 0)))
 
 
-def _ordered(names: set[str], first: Sequence[str]) -> tuple[str, ...]:
+def columns_of(played: Iterable[Column], listed: Sequence[str]) -> tuple[Column, ...]:
+    """What was played and what is listed, in the order of the list and then by name, the least knowing first; clean runs have none."""
+    granted: dict[str, set[str]] = {name: set() for name in listed}
+    for column in played:
+        granted.setdefault(column.attack, set()).add(column.knowledge)
+    return tuple(
+        Column(name, level) for name in in_order(set(granted), listed) if name != CLEAN
+        for level in sorted(granted[name] or {"black"}, key=order)
+    )  # fmt: skip
+
+
+def in_order(names: set[str], first: Sequence[str]) -> tuple[str, ...]:
     """The names in the order of the suite; those that it does not know come last, by name."""
     return (*(name for name in dict.fromkeys(first) if name in names), *sorted(names - set(first)))
 
