@@ -138,6 +138,12 @@ def test_a_changed_figure_differs_and_is_named(board: Data, field: str, value: A
     assert "3" not in report["prints"]
 
 
+def test_of_a_share_the_limit_that_differs_is_named(board: Data) -> None:
+    board["cells"][3]["damage"] |= {"high": 0.875}
+    [finding] = check(board)["findings"]
+    assert finding["why"].startswith("damage.high: board 0.875, here ") and "damage.low" not in finding["why"]
+
+
 def test_a_board_of_before_the_fingerprints_gets_them(board: Data, rows: list[Data]) -> None:
     held = [(cell.pop("decisions"), cell.pop("trace")) for cell in board["cells"]]
     checked = with_check(board, check(board))

@@ -181,14 +181,18 @@ def _slices(cells: dict[int, Cell]) -> Iterator[list[int]]:
 def _compared(part: CellPart, here: Data) -> Seen:
     says = {name: value for name, value in part.model_dump(include=set(COMPARED)).items() if name not in PRINTS or value is not None}
     off = [name for name in COMPARED if name in says and says[name] != here[name]]
-    why = ", ".join(f"{name}: board {_short(says[name])}, here {_short(here[name])}" for name in off)
+    parts = [part for name in off for part in _parts(name, says[name], here[name])]
+    why = ", ".join(f"{name}: board {one}, here {other}" for name, one, other in parts)
     if off == ["trace"]:
         why = "trace only: decisions and figures agree, as between two platforms whose last bits differ"
     return Seen("differs", why, here) if off else Seen("equal", "", here)
 
 
-def _short(value: Any) -> str:
-    return f"{value['value']:.4g}" if isinstance(value, dict) else str(value)
+def _parts(name: str, says: Any, here: Any) -> list[tuple[str, Any, Any]]:
+    """What of a figure differs: of a share with limits each by itself."""
+    if not isinstance(says, dict) or not isinstance(here, dict):
+        return [(name, says, here)]
+    return [(name if key == "value" else f"{name}.{key}", value, here.get(key)) for key, value in says.items() if value != here.get(key)]
 
 
 def _report(board: Board, asked: list[int], seen: dict[int, Seen], sample: int | None, sample_seed: int) -> Data:
