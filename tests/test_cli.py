@@ -156,8 +156,8 @@ def test_a_detector_is_no_defence(run: Run) -> None:
     part = ["evaluate", "--scenario", "thesis-ch4-v0", "--dose", "none", "--attack", "dos_jam", "--seeds", "2", "--threat", "kinds=[fdi]"]
     code, _, said = run(*part, "--defence", "tailgate.estimators:Cusum")
     assert code == 2 and "composed:detector=module:Class" in said
-    code, table, _ = run(*part, "--defence", "kf")
-    assert code == 0 and "not granted" in " ".join(table.split())
+    code, table, said = run(*part, "--defence", "kf")
+    assert code == 0 and "refused: the scenario" in " ".join(table.split()) and "no attack took place" in said
 
 
 @pytest.mark.parametrize(
@@ -175,3 +175,24 @@ def test_a_module_that_cannot_be_loaded_is_one_line(run: Run, tmp_path: Path, mo
     importlib.invalidate_caches()
     done, _, said = run("evaluate", "--scenario", "thesis-ch4-v0", "--dose", "none", "--defence", "theirs:Mine", "--attack", "none", "--seeds", "2")
     assert done == 2 and "Traceback" not in said and len(said.strip().splitlines()) == 1 and all(word in said for word in words)
+
+
+def test_a_place_for_pictures_is_looked_at_before_anything_is_played(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "taken").write_text("")
+    monkeypatch.setattr("tailgate.evaluation.evaluate", lambda *_, **__: pytest.fail("episodes were played"))
+    code, _, said = run("evaluate", "--suite", "quick-v0", "--plot", "taken")
+    assert code == 2 and "plot" in said and "taken" in said
+
+
+def test_a_key_that_is_there_twice_is_refused(run: Run, tmp_path: Path) -> None:
+    """Of two values one would be lost without a word."""
+    (tmp_path / "twice.yaml").write_text("scenarios: [thesis-ch4-v0]\nattacks: [none]\ndefences: [kf]\nseeds: 2\nseeds: 3\n")
+    code, _, said = run("evaluate", "--suite", "twice.yaml")
+    assert code == 2 and "the key 'seeds' is there twice" in said and "line 5" in said
+
+
+@pytest.mark.parametrize("text", ["{}", "[]", '"board"', "{", '{"format": "tailgate-board-1"}'])
+def test_a_head_of_rubbish_is_refused(run: Run, tmp_path: Path, text: str) -> None:
+    (tmp_path / "board.json").write_text(text)
+    code, _, said = run("leaderboard", "head", "board.json")
+    assert code == 2 and "expected" in said and "Traceback" not in said

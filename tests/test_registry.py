@@ -108,7 +108,7 @@ def test_bad_specs(family, text, message, plugin):
 
 def test_configuration_files_name_registered_components_only(plugin):
     """A class to import is refused where a file names it; a mapping needs a name."""
-    with pytest.raises(InputError, match="command line only"):
+    with pytest.raises(InputError, match="imports nothing"):
         Spec("defence", f"{plugin}:Mine").refuse_imports("suite x")
     Spec("defence", "chi2_kf:eta=3").refuse_imports("suite x")
     with pytest.raises(InputError, match="defence"):

@@ -171,6 +171,7 @@ def test_an_entry_s_page_has_all_parts(site):
                  "Only A damaged", "steps: 20000", "../network-v0/chi2_kf", "other plant"):  # fmt: skip
         assert part in text, part
     assert text.count('class="plot ') == 2  # a chart on each scale
+    assert "leaderboard check board.json --defence chi2_kf:eta=15" in text and "check synthetic-v0/board.json" in site.read_text(encoding="utf-8")
     bare = entry(site, HOSTILE).read_text(encoding="utf-8")
     assert "came without a card" in bare and "No replay. The board holds no worst episode" in bare and "Stealth and impact" not in bare
 

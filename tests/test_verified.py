@@ -147,3 +147,15 @@ def test_a_field_at_its_default_leaves_no_mark_on_a_plan() -> None:
     config = as_data(TrainConfig())
     before = {key: value for key, value in config.items() if key != "demonstrations"}
     assert plan_key(config) == plan_key(before) != plan_key(config | {"demonstrations": 32})
+
+
+def test_rows_of_another_round_make_no_board(rows: list[dict[str, Any]], tmp_path: Path) -> None:
+    beacon = "a beacon of sixteen letters or more"
+    _write(tmp_path, "rows.jsonl", rows)
+    with pytest.raises(InputError, match="public seeds"):
+        board_of(SUITE, tmp_path, beacon=beacon, require_adaptive=False)
+    _write(tmp_path, "rows.jsonl", run(cells_of(SUITE, beacon=beacon)))
+    with pytest.raises(InputError, match="that of the rows, a beacon"):
+        board_of(SUITE, tmp_path, beacon="another beacon of such a length", require_adaptive=False)
+    assert board_of(SUITE, tmp_path, beacon=beacon, require_adaptive=False)["suite"]["beacon"] == beacon
+    assert board_of(SUITE, tmp_path, require_adaptive=False)["suite"]["beacon"] == beacon  # not asked for: the rows' own

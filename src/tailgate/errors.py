@@ -1,7 +1,8 @@
 """The one error that a user's input raises."""
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from typing import Any
 
 
 class InputError(ValueError):
@@ -19,6 +20,16 @@ class InputError(ValueError):
 
 class NotApplicable(InputError):
     """A pairing of components that has no meaning: its rows are skipped, with the reason."""
+
+
+def wanted(found: Mapping[str, Any]) -> str:
+    """What was expected, from the first of a validator's errors."""
+    if found["type"] == "missing":
+        return "a value: it is missing"
+    if found["type"] == "tuple_type":
+        return "a list, such as [a, b]"
+    text = str(found["msg"])
+    return (text[0].lower() + text[1:]).removeprefix("input should be ")
 
 
 def unknown(field: str, name: object, known: Iterable[str]) -> InputError:

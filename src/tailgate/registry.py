@@ -237,7 +237,7 @@ class Spec:
     def refuse_imports(self, where: str) -> None:
         """Raise InputError when this names a class to import: configuration files never run code."""
         if self.imports:
-            wanted = "a registered name, or a class in a sandbox (bwrap/module:Class); other code is named on the command line only"
+            wanted = "a registered name, or a class in a sandbox (bwrap/module:Class): a configuration imports nothing"
             raise InputError(f"{where}: {self.family}", self.text, wanted)
 
     @property

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import ConfigDict, Field, ValidationError, create_model
 
-from tailgate.errors import InputError
+from tailgate.errors import InputError, wanted
 from tailgate.metrics import METRICS
 
 # What tells one cell from another: rows that differ in one of these are never summed up together.
@@ -49,7 +49,7 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
             first = error.errors()[0]
             field = ".".join(str(part) for part in first["loc"])
             shown = first["input"] if isinstance(row, dict) and field in row else None
-            raise InputError(f"{where}: {field}", shown, first["msg"]) from None
+            raise InputError(f"{where}: {field}", shown, wanted(first)) from None
         if row["status"] == "ok" and row["crashed"] not in (0.0, 1.0):
             raise InputError(f"{where}: crashed", row["crashed"], "0 or 1")
         rows.append(row)

@@ -12,7 +12,7 @@ import yaml
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 from pydantic.errors import PydanticSchemaGenerationError, PydanticUserError
 
-from tailgate.errors import InputError, unknown
+from tailgate.errors import InputError, unknown, wanted
 
 T = TypeVar("T")
 
@@ -51,8 +51,7 @@ def build(cls: type[T], data: dict[str, Any], where: str) -> T:
         if isinstance(inner := first.get("ctx", {}).get("error"), InputError):
             raise inner from None
         path = ".".join(str(part) for part in first["loc"]) or cls.__name__
-        message = (first["msg"][0].lower() + first["msg"][1:]).removeprefix("input should be ")
-        raise InputError(f"{where}.{path}", first["input"], message) from None
+        raise InputError(f"{where}.{path}", first["input"], wanted(first)) from None
 
 
 def _made(cls: type[T], data: dict[str, Any], where: str) -> T:
@@ -87,10 +86,23 @@ def canonical(value: Any) -> str:
     return json.dumps(as_data(value), sort_keys=True, separators=(",", ":"))
 
 
+class _Once(yaml.SafeLoader):
+    """A safe loader that refuses a key that is there twice: of two values the first would be lost without a word."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        seen = set()
+        for key, _ in node.value:
+            if key.tag != "tag:yaml.org,2002:merge" and key.value in seen and isinstance(key.value, str):
+                raise yaml.constructor.ConstructorError(None, None, f"the key {key.value!r} is there twice", key.start_mark)
+            if isinstance(key.value, str):
+                seen.add(key.value)
+        return super().construct_mapping(node, deep)
+
+
 def read_yaml(path: Path, where: str) -> dict[str, Any]:
     """A mapping from a YAML file, read safely."""
     try:
-        data = yaml.safe_load(path.read_text(encoding="utf-8"))
+        data = yaml.load(path.read_text(encoding="utf-8"), _Once)
     except OSError as error:
         raise InputError(where, str(path), f"a readable YAML file ({error.strerror})") from None
     except (yaml.YAMLError, UnicodeDecodeError) as error:

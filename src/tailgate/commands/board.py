@@ -64,6 +64,7 @@ def add(actions: Any) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
+    sys.path.insert(0, "")  # module:Class is looked for in the working directory, as `tailgate evaluate` does
     from tailgate.leaderboard.run import board_of, play
     from tailgate.leaderboard.site import build_site
     from tailgate.scenario import load_suite
@@ -80,7 +81,7 @@ def _run(options: argparse.Namespace) -> int:
                     progress=lambda name, done, total: update(name, done, total, cells(done, total)),
                 )  # fmt: skip
                 print(f"rows: {rows}", file=sys.stderr)
-            board = board_of(suite, folder, require_adaptive=not options.unattacked)
+            board = board_of(suite, folder, beacon=options.beacon or None, require_adaptive=not options.unattacked)
             boards.append(_detected(board, suite, folder, update) if options.detection else board)
     page = build_site(boards, out / "page", replays=not options.no_replays)
     if options.json:
@@ -133,11 +134,14 @@ def _read(name: str) -> dict[str, Any]:
 
 
 def _head(options: argparse.Namespace) -> int:
+    from tailgate.leaderboard.board_format import read_board
     from tailgate.leaderboard.head import markdown
 
+    board = _read(options.board)
+    read_board(board)
     if options.most is not None and options.most < 1:
         raise InputError("most", options.most, "a whole number not below 1")
-    print(markdown(_read(options.board), options.most), end="")
+    print(markdown(board, options.most), end="")
     return 0
 
 

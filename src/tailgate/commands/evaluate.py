@@ -14,9 +14,11 @@ from rich.markup import escape
 from rich.table import Table
 
 from tailgate.errors import InputError
-from tailgate.files import aside
+from tailgate.files import aside, writable_directory
 from tailgate.progress import cells, console, progress
 from tailgate.schema import scalar
+
+REFUSED = "refused: the scenario does not grant it"
 
 
 def add(commands: Any) -> None:
@@ -60,6 +62,8 @@ def _evaluate(options: argparse.Namespace) -> int:
     suite: Any = options.suite or "quick-v0"
     if options.suite is None and options.scenario:  # a scenario by itself: what is not named is quick-v0's, but for the dose
         suite = dataclasses.replace(load_suite(suite), name="custom", doses=(None,))
+    if options.plot:
+        writable_directory(Path(options.plot), "plot")
     before = aside(options.out)
     with progress(Console(stderr=True)) as update:
         rows = evaluate(
@@ -82,6 +86,9 @@ def _evaluate(options: argparse.Namespace) -> int:
     failed = sum(entry["failed"] for entry in table)
     if failed:
         print(f"tailgate: {failed} of {len(rows)} rows failed; their reasons are in the rows", file=sys.stderr)
+    attacked = [row for row in rows if row["attack"] != "none" and row["status"] == "ok"]
+    if attacked and not any(row["attack_steps"] for row in attacked):
+        print("tailgate: no attack took place in any episode: --attack names others, --threat grants more", file=sys.stderr)
     idle = bool(rows) and all(entry["crash"] is None for entry in table)
     if idle and not failed:
         print(f"tailgate: nothing was played: {table[0]['reason']}", file=sys.stderr)
@@ -97,7 +104,7 @@ def _print_summary(table: list[dict[str, Any]]) -> None:
         shown = Table(title=f"{scenario}, budget {'unlimited' if dose is None else f'{dose} steps'}")
         errors = ("min gap [m]", "max error [m]") if road else ("RMS error", "max error")
         measures = ("n", *(("collisions", "95 % interval") if road else ()), *errors, "alarm onsets")
-        why = any(entry["crash"] is None for entry in here)
+        why = any(entry["crash"] is None or entry["refused_all"] for entry in here)
         for heading in ("defence", "attack", "knowledge", *measures, *(("why not",) if why else ())):
             shown.add_column(heading, overflow="fold")
         for entry in here:
@@ -107,7 +114,8 @@ def _print_summary(table: list[dict[str, Any]]) -> None:
                 shown.add_row(*head, *["-"] * (len(measures) - 1), escape(entry["reason"]))
                 continue
             if entry["refused_all"]:
-                head[1] += " (refused: not granted)"
+                shown.add_row(*head, *["-"] * (len(measures) - 1), escape(REFUSED))
+                continue
             figures = [f"{100 * crash['value']:.1f} %", f"{100 * crash['low']:.1f} to {100 * crash['high']:.1f} %"] if road else []
             keys = ("min_gap" if road else "rmse_position", "max_error", "alarm_onsets")
             figures += [f"{entry[k]['median']:.2f}" if entry[k] else "-" for k in keys]

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from tailgate.errors import InputError
+from tailgate.errors import InputError, wanted
 
 FORMAT = "tailgate-board-1"
 Level = Literal["black", "grey", "white"]
@@ -305,7 +305,8 @@ def read_board(data: Any, where: str = "board") -> Board:
     except ValidationError as error:
         first = error.errors()[0]
         place = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in first["loc"])
-        raise InputError(where + place, first["input"] if first["type"] != "missing" else None, first["msg"]) from None
+        missing = first["type"] == "missing"
+        raise InputError(where + place, None if missing else first["input"], wanted(first)) from None
     _agree(board, where)
     return board
 

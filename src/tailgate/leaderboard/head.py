@@ -40,6 +40,7 @@ def lines(board: Board) -> list[tuple[str, ...]]:
 def markdown(board: Board, most: int | None = None) -> str:
     """The head as a Markdown table, of so many defences at most; a column with nothing in it is left out."""
     heading, *body = lines(board)
+    heading = tuple(f"{text}, black box" if text.startswith(("critical", "undamaged")) else text for text in heading)
     told = [i for i in range(len(heading)) if any(line[i] for line in body[:most])]
     rows = [[line[i].replace("|", "\\|") for i in told] for line in (heading, *body[:most])]
     rows.insert(1, ["---"] * len(told))

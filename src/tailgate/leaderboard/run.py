@@ -45,10 +45,11 @@ def play(
     return file
 
 
-def board_of(suite: Suite, folder: Path, **options: Any) -> dict[str, Any]:
+def board_of(suite: Suite, folder: Path, beacon: str | None = None, **options: Any) -> dict[str, Any]:
     """The board of all rows in a folder, with what verified/*.json says of them and the bounds of trust/trust.json; written as board.json.
 
-    Raises InputError where there are no rows, and for a report that cannot be read or is of something else.
+    Raises InputError where there are no rows, or rows of another round than `beacon`, and for a report that cannot be read or is of
+    something else.
     """
     found = sorted(path for path in folder.glob("**/*") if path.name.endswith((".jsonl", ".jsonl.xz")) and path.name != LIST)
     within = [(path, path.relative_to(folder).parts) for path in found]
@@ -58,6 +59,8 @@ def board_of(suite: Suite, folder: Path, **options: Any) -> dict[str, Any]:
         raise InputError("rows", str(folder), "a folder with rows of `leaderboard run`")
     parts = {path: read_rows(path) for path in files}
     board = score((row for rows in parts.values() for row in rows), suite, attacks=admitted.read(folder / LIST), **options)
+    if beacon is not None and board["suite"]["beacon"] != beacon:
+        raise InputError("beacon", beacon, f"that of the rows, {board['suite']['beacon'] or 'which are of public seeds'}")
     held = {digest(path): Counter(row["defence"] for row in rows) for path, rows in parts.items()}
     board = with_verified(with_cards(board, folder / CARDS), folder / VERIFIED, held)
     if (report := folder / TRUST / REPORT).is_file():

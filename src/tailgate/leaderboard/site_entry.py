@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -206,7 +207,7 @@ def entry_page(suite: Suite, entry: EntryPart, replayed: Replayed | None, also: 
     return {
         "suite": suite.board.suite, "damage": suite.damage, "limit": percent(suite.board.suite.limit), "scale": suite.scale,
         "name": suite.defences[entry.defence], "status": entry.status, "why": entry.why,
-        "verified": _verified(entry), "checked": _checked(entry),
+        "verified": _verified(entry), "checked": _checked(entry), "typed": shlex.quote(entry.defence),
         "class": entry.class_ or "not stated",
         "rank": _rank(suite, entry), "also": also, "card": card_of(entry), "flags": entry.flags, "levels": LEVELS,
         "critical": [(level, critical_of(suite, entry.critical_dose.get(level))) for level in LEVELS],

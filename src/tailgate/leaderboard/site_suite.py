@@ -14,7 +14,7 @@ from .charts import Axis
 Data = dict[str, Any]
 SPREAD = 16  # ratio of the largest dose to the smallest above which doses are drawn on a logarithmic axis at first
 GROUPS = (  # status, title, what it means
-    ("ranked", "Ranked", "with figures against every attack, and through every gate"),
+    ("ranked", "Ranked", "with figures against every black-box attack, and through every gate"),
     ("unattacked", "Not attacked yet", "no attacker was trained against these: a good figure says little, and they take no rank"),
     ("unranked", "Unranked, for comparison", "baselines, references and those that fail a gate or lack figures"),
 )

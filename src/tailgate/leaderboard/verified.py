@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from tailgate.errors import InputError
+from tailgate.errors import InputError, wanted
 
 Count = Annotated[int, Field(strict=True, ge=0)]
 
@@ -58,7 +58,7 @@ def read_report(path: Path) -> Report:
     except ValidationError as error:
         first = error.errors()[0]
         field = ".".join(map(str, first["loc"])) or "report"
-        raise InputError(f"verified {path}: {field}", first["input"] if first["type"] != "missing" else None, first["msg"]) from None
+        raise InputError(f"verified {path}: {field}", first["input"] if first["type"] != "missing" else None, wanted(first)) from None
 
 
 def with_verified(board: dict[str, Any], folder: Path, files: Mapping[str, Mapping[str, int]]) -> dict[str, Any]:
