@@ -262,6 +262,26 @@ assert one == two and not compiled._inside()
     assert done.returncode == 0, done.stderr
 
 
+def test_code_is_linked_into_a_process_with_gigabytes_in_it():
+    """Small holes in the address space, and nothing else near them: code and data have to be placed together all the same."""
+    code = """
+import mmap
+import numba
+from tailgate import draws, make_attack, make_defence
+from tailgate.scenario import load_scenario
+from tailgate.trace import rollout
+holes = [mmap.mmap(-1, 2 * mmap.PAGESIZE) for _ in range(400)]
+far = mmap.mmap(-1, 3 << 30)
+for hole in holes[::2]:
+    hole.close()
+loop = load_scenario("stop-and-go-v0").loop(make_defence("chi2_kf"))
+one, two = (rollout(loop, make_attack("none"), draws.keys("train", [3]), plain=plain).trace_hash(0) for plain in (False, True))
+assert one == two
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
 def test_the_phases_are_vectorised():
     """Packed against single multiplications in what is compiled of the filter's update and of the vehicle's move: a guard, and not a time."""
     import re

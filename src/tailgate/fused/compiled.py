@@ -224,7 +224,8 @@ def _linked(symbol: str, code: bytes) -> Any:
 
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
-    linker, builder = llvm.create_lljit_compiler(suppress_errors=True), llvm.JITLibraryBuilder()
+    # JITLink takes one block for code and data: the other linker aborts where a process with gigabytes in it puts them far apart
+    linker, builder = llvm.create_lljit_compiler(use_jit_link=True, suppress_errors=True), llvm.JITLibraryBuilder()
     for name in _RAISING:
         builder.import_symbol(name, ctypes.cast(ctypes.CDLL(None).abort, ctypes.c_void_p).value)
     library = builder.add_object_img(code).add_current_process().export_symbol(symbol).link(linker, "kernel")
