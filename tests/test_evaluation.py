@@ -90,10 +90,17 @@ class Faulty(Kalman):
             estimate = estimate._replace(score=estimate.score[0])
         if self.how == "type":
             estimate = estimate._replace(alarm=estimate.alarm.astype(float))
-        return state, estimate
+        return {"nothing": None, "alone": estimate, "swapped": (estimate, state)}.get(self.how, (state, estimate))
 
 
-@pytest.mark.parametrize(("how", "reason"), [("raise", "broken"), ("nan", "NaN"), ("shape", "score"), ("type", "alarm")])
+PAIRS = [
+    ("nothing", "defence output: got 'NoneType'; expected a pair (state, Estimate)"),
+    ("alone", "defence output: got 'Estimate'; expected a pair"),
+    ("swapped", "defence output: got '(Estimate, "),
+]
+
+
+@pytest.mark.parametrize(("how", "reason"), [("raise", "broken"), ("nan", "NaN"), ("shape", "score"), ("type", "alarm"), *PAIRS])
 def test_a_defence_that_fails_costs_its_own_rows_only(how: str, reason: str) -> None:
     rows = tailgate.evaluate(scenarios=[PLACE], defences=["kf", Faulty(how=how)], attacks=["none"], seeds=3)
     assert [row["status"] for row in rows] == ["ok"] * 3 + ["error"] * 3

@@ -200,6 +200,14 @@ class Estimate(NamedTuple):
     limits: Array | None = None
 
 
+def pair_of(answer: Any) -> tuple[Any, Estimate]:
+    """What a defence's step has to return; raises InputError for anything else."""
+    if not isinstance(answer, tuple) or len(answer) != 2 or not isinstance(answer[1], Estimate):
+        got = f"({', '.join(type(part).__name__ for part in answer)})" if type(answer) is tuple else type(answer).__name__
+        raise InputError("defence output", got, "a pair (state, Estimate), which its step returns")
+    return answer
+
+
 class Innovation(NamedTuple):
     """r = y - C x- (B, N, q) and its covariance S (B, N, q, q)."""
 

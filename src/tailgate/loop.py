@@ -35,6 +35,7 @@ from tailgate.core import (
     Sensor,
     View,
     WhiteBox,
+    pair_of,
 )  # fmt: skip
 from tailgate.draws import Keys, Role
 from tailgate.errors import InputError, NotApplicable
@@ -231,9 +232,10 @@ class Loop:
             odometry=odometry if "odometry" in self.uses else None,
             attacked=received.attacked if "truth" in self.uses else None,
         )
-        defence, estimate = self.defence.step(
+        answer = self.defence.step(
             plan.defence, state.defence, frozen(heard), frozen(state.known_u), state.keys.at(Role.DEFENCE, state.k)
         )
+        defence, estimate = pair_of(answer)
         check_estimate(estimate, self.model, len(state.k))
         if "probe" not in self.uses:  # who does not say that it switches the probe off cannot
             estimate = estimate._replace(probe=num.full(estimate.probe.shape, True, bool))

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 import tailgate
-from tailgate.core import Array, Model, Prior, Received
+from tailgate.core import Array, Model, Prior, Received, pair_of
 from tailgate.draws import Draws
 from tailgate.errors import InputError
 from tailgate.registry import Spec
@@ -72,7 +72,7 @@ class Child:
         state = self._state(arrays["ticket"])
         received = Received(*(arrays.get(name) for name in RECEIVED))  # type: ignore[arg-type]
         draws = Draws(arrays["key"], arrays["episode"], arrays["step"], stream)
-        state, estimate = self.defence.step(self.plan, state, received, arrays["known_u"], draws)
+        state, estimate = pair_of(self.defence.step(self.plan, state, received, arrays["known_u"], draws))
         batch = len(received.y)
         self._keep(ticket, batch, state)
         return {"limits": self._write(estimate, batch)}
