@@ -130,6 +130,11 @@ class Program:
     def sheet(self) -> Sheet:
         return read_program(self.file)
 
+    @property
+    def sees_measurement(self) -> bool:
+        """Whether a phase has to see what is read."""
+        return any(phase.trigger.sees_measurement for phase in self.sheet.phases)
+
     def prepare(self, brief: Brief) -> ProgramPlan:
         where = f"program {self.file.name}"
         phases = tuple(_ready(phase, brief, f"{where}, phase {i}") for i, phase in enumerate(self.sheet.phases, start=1))

@@ -51,7 +51,7 @@ def _aimed(script: Script, brief: Brief, kind: str) -> ScriptPlan:
     attack = f"attack {kind}"
     target = on_receivers(brief, attack, chosen(brief, script.targets, brief.granted, script.agents), bool(script.targets))
     require(brief, attack, [kind], target)
-    return ScriptPlan(brief, target)
+    return script.plan(brief, target)
 
 
 @register("attack", "noise_jam", reference="Dutta 2018, (3.10)")
@@ -123,7 +123,7 @@ class RadarJam(OverTheAir):
         if not target.any():
             raise NotApplicable("attack radar_jam: threat_model.targets", brief.threat.targets, "a threat model that grants a sensor")
         require(brief, "attack radar_jam", ["dos_jam"], target)
-        return ScriptPlan(brief, target, PerWire(tuple((name, Uniform(*getattr(self, name))) for name in WIRES)))
+        return self.plan(brief, target, PerWire(tuple((name, Uniform(*getattr(self, name))) for name in WIRES)))
 
     def command(self, plan: ScriptPlan, on: Array, count: Array, view: View, draws: Draws) -> Command:
         return self.radiate(plan, on, Kind.DOS_JAM, plan.extra, count, view, draws)

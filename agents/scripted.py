@@ -13,7 +13,7 @@ from tailgate.errors import InputError, NotApplicable, unknown
 from tailgate.registry import register
 from tailgate.threat import Brief
 
-from .triggers import TAG, Closing, Fast, LeaderBraking, Near, Slow, Timing, Trigger, TriggerState, idle
+from .triggers import TAG, Closing, Fast, LeaderBraking, Near, Reading, Slow, Trigger, TriggerState, idle
 from .values import LAWS, TAGS, Constant, Gaussian, Law, Ramp, Uniform, check_wires, fit, law_of
 
 CHANCE = TAG - 1  # tag of the draws of `chance`
@@ -83,30 +83,43 @@ class Script:
     chance: Probability = param(1.0, "probability of an attack per step and agent, while the window is open [-]")
     start_step: PositiveCount = param(1, "first step of the window")
     length: PositiveCount | None = param(None, "steps in the window; none: to the end")
-    trigger: Literal["time", "closing", "near", "speed", "slow", "leader_braking"] = param(
+    trigger: Literal["time", "closing", "near", "speed", "slow", "leader_braking", "reading"] = param(
         "time",
         "time: open at start; closing: when the speed difference, near: when the gap passes the threshold; speed, slow: when the own speed "
-        "is above or below it; leader_braking: when the leader's deceleration is above it",
+        "is above or below it; leader_braking: when the leader's deceleration, reading: when the size of a reading is above it",
     )
-    threshold: NonNegative = param(3.0, "what the trigger waits for: a speed [m/s], a gap [m] or a deceleration [m/s^2]")
+    threshold: NonNegative = param(3.0, "what the trigger waits for: a speed [m/s], a gap [m], a deceleration [m/s^2] or a reading")
+    latest: PositiveCount | None = param(None, "of the trigger reading: step at which the window opens whatever is read", if_any=True)
     burst: PositiveCount | None = param(None, "steps of a burst, in a window of bursts with pauses; none: one burst, the whole window")
     pause: Count = param(10, "steps between two bursts")
+
+    @property
+    def sees_measurement(self) -> bool:
+        """Whether it has to see what is read."""
+        return self.when.sees_measurement
 
     @cached_property
     def when(self) -> Trigger:
         """The trigger that the fields describe."""
         if self.trigger == "time":
             return Trigger(start=self.start_step, window=self.length)
+        if self.trigger == "reading":
+            return Reading(start=self.start_step, window=self.length, threshold=self.threshold, latest=self.latest)
         return _CONDITIONS[self.trigger](start=self.start_step, window=self.length, threshold=self.threshold)
 
     def prepare(self, brief: Brief) -> ScriptPlan:
-        return ScriptPlan(brief, chosen(brief, self.targets, brief.granted, self.agents))
+        return self.plan(brief, chosen(brief, self.targets, brief.granted, self.agents))
+
+    def plan(self, brief: Brief, target: Array, extra: Any = None) -> ScriptPlan:
+        """A plan, where the threat model shows what the trigger looks at."""
+        self.when.prepare(brief)
+        return ScriptPlan(brief, target, extra)
 
     def start(self, plan: ScriptPlan, batch: int, draws: Draws) -> TriggerState:
         return idle(batch, plan.brief.model.agents)
 
     def decide(self, plan: ScriptPlan, state: TriggerState, view: View, draws: Draws) -> tuple[TriggerState, Command]:
-        timing = Timing(plan.brief.threat.onset, plan.brief.model.dt)
+        timing = self.when.prepare(plan.brief)
         after, on, count = self.when.step(timing, state, view, draws)
         on = on & view.allowed  # a script that knows its budget does not ask for more
         if self.burst is not None:
@@ -322,7 +335,7 @@ class InjectActuator(Script):
             if other:
                 raise InputError("attack actuator_fdi.targets", name, f"actuators ({', '.join(brief.model.actuators)})")
         require(brief, "attack actuator_fdi", ["fdi"], target)
-        return ScriptPlan(brief, target)
+        return self.plan(brief, target)
 
     def command(self, plan: ScriptPlan, on: Array, count: Array, view: View, draws: Draws) -> Command:
         return inject(plan, on, Constant(self.value), count, draws)

@@ -16,7 +16,7 @@ from pydantic import Field
 
 from tailgate.core import Array, Count, NonNegative, Positive, PositiveCount, Probability, View, param
 from tailgate.draws import Draws
-from tailgate.errors import InputError, unknown
+from tailgate.errors import InputError, NotApplicable, unknown
 from tailgate.schema import build
 from tailgate.threat import Brief
 
@@ -31,6 +31,7 @@ class Timing(NamedTuple):
 
     onset: int
     dt: float
+    reach: Array | None = None  # (N, q) bool: the readings that may be attacked, for a trigger that looks at them
 
 
 class TriggerState(NamedTuple):
@@ -73,6 +74,11 @@ class Trigger:
     def ends(self) -> bool:
         """Whether it ends by itself."""
         return self.window is not None
+
+    @property
+    def sees_measurement(self) -> bool:
+        """Whether it has to see what is read."""
+        return False
 
     def prepare(self, brief: Brief) -> Timing:
         return Timing(brief.threat.onset, brief.model.dt)
@@ -251,9 +257,32 @@ class LeaderBraking(Condition):
         return np.asarray((state.lead_speed - view.scene.lead_speed) / timing.dt > self.threshold)
 
 
+@dataclass(frozen=True)
+class Reading(Condition):
+    """Fires when a reading that may be attacked is large, before anything is done to it. Only for attackers that see readings."""
+
+    threshold: NonNegative = param(30.0, "size of a reading above [unit of the wire]")
+    latest: PositiveCount | None = param(None, "step at which it fires whatever is read; none: it waits for ever")
+
+    @property
+    def sees_measurement(self) -> bool:
+        return True
+
+    def prepare(self, brief: Brief) -> Timing:
+        threat = brief.threat
+        if not threat.sees_measurement and threat.knowledge != "white":
+            raise NotApplicable("threat_model.sees_measurement", False, "true: the trigger `reading` waits for what is read")
+        return super().prepare(brief)._replace(reach=brief.granted[:, : len(brief.model.sensors)])
+
+    def holds(self, timing: Timing, state: TriggerState, view: View) -> Array:
+        assert view.received is not None and timing.reach is not None
+        large = np.any((np.abs(view.received.y) > self.threshold) & timing.reach, axis=2)
+        return np.asarray(large if self.latest is None else large | (view.k >= self.latest)[:, None])
+
+
 TRIGGERS: dict[str, type[Trigger]] = {
     "time": Trigger, "steps": Steps, "chance": Chance, "bursts": Bursts, "near": Near, "closing": Closing, "speed": Fast, "slow": Slow,
-    "leader_braking": LeaderBraking,
+    "leader_braking": LeaderBraking, "reading": Reading,
 }  # fmt: skip
 
 

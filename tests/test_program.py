@@ -52,7 +52,7 @@ def steps(trace, kind, row=0):
 
 VALUE = {"fdi": "-2", "dos_jam": "{name: uniform, low: -1, high: 1}", "delay": "3", "replay": "4"}
 MINIMAL = {"steps": "at: [3, [7, 30]]", "chance": "probability: 0.3", "bursts": "share: 0.5", "near": "threshold: 90", "closing": "threshold: 0.1",
-           "speed": "threshold: 20", "slow": "threshold: 30", "leader_braking": "threshold: 0", "time": "start: 9"}  # fmt: skip
+           "speed": "threshold: 20", "slow": "threshold: 30", "leader_braking": "threshold: 0", "time": "start: 9", "reading": "threshold: 20, latest: 30"}  # fmt: skip
 
 
 @pytest.mark.parametrize("kind", ALL)
@@ -61,7 +61,8 @@ def test_every_trigger_plays_with_every_kind(trigger, kind, short, loop_of, writ
     """Each pair plays: the kind takes effect, nothing is refused, and a row does not depend on its companions."""
     value = f", value: {VALUE[kind]}" if kind in VALUE else ""
     program = write(f"phases: [{{kind: {kind}, targets: [velocity], trigger: {{name: {trigger}, {MINIMAL[trigger]}}}{value}}}]")
-    loop = loop_of(short("ornstein-uhlenbeck-v0", horizon=60, onset=1, kinds=(kind,)), "kf")
+    loop = loop_of(short("ornstein-uhlenbeck-v0", horizon=60, onset=1, kinds=(kind,), sees_measurement=trigger == "reading"), "kf")
+    assert program.sees_measurement == (trigger == "reading")
     whole = rollout(loop, program, keys("train", range(5)), terminate=False)
     assert set(np.unique(whole.kind)) <= {0, Kind[kind.upper()]} and (whole.kind != 0).any() and not whole.refused.any()
     assert not whole.target[..., [0, 2, 3, 4]].any()

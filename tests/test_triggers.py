@@ -14,6 +14,7 @@ from tailgate.agents.triggers import (
     Fast,
     LeaderBraking,
     Near,
+    Reading,
     Slow,
     Steps,
     Timing,
@@ -22,10 +23,12 @@ from tailgate.agents.triggers import (
     part,
     rearm,
 )
-from tailgate.core import Scene, View
+from tailgate.core import Received, Scene, View
 from tailgate.draws import Role, keys
-from tailgate.errors import InputError
+from tailgate.errors import InputError, NotApplicable
+from tailgate.registry import Spec
 from tailgate.scenario import load_scenario
+from tailgate.trace import rollout
 
 ONE = Timing(1, 0.1)
 
@@ -209,3 +212,50 @@ def test_flat_scripts_know_the_new_triggers(trigger, threshold, short, play):
         first = int(np.argmax(hit)) + 1
         assert hit.any() and first > 1
         assert (np.flatnonzero(trace.kind[:, row]) + 1).tolist() == list(range(first, first + 30))
+
+
+def read(trigger, values, reach):
+    """On (K,) where `values` (K, N, q) are read, step by step, of which `reach` (N, q) may be attacked."""
+    state, out = idle(1, values.shape[1]), []
+    for k, y in enumerate(values, start=1):
+        now = view(k, gap=np.zeros((1, values.shape[1])))._replace(received=Received(y[None], np.ones((1, *y.shape), bool), None))
+        state, on, _ = trigger.step(ONE._replace(reach=reach), state, now, None)
+        out.append(bool(on[0]))
+    return out
+
+
+def test_a_large_reading_of_a_wire_that_may_be_attacked():
+    """Of either sign, and on no other wire; at the latest step in any case; what was lost is not large."""
+    values, reach = np.zeros((6, 2, 2)), np.array([[True, False], [False, False]])
+    values[1, 0, 1] = values[1, 1, 0] = 90.0
+    values[2, 0, 0], values[3, 0, 0], values[4, 0, 0] = np.nan, -31.0, 3.0
+    assert read(Reading(threshold=30.0, latch=False), values, reach) == [False, False, False, True, False, False]
+    assert read(Reading(threshold=30.0), values, reach) == [False] * 3 + [True] * 3
+    assert read(Reading(threshold=30.0, window=2), values, reach) == [False] * 3 + [True] * 2 + [False]
+    assert read(Reading(threshold=40.0, latest=5), values, reach) == [False] * 4 + [True] * 2
+
+
+def test_readings_are_waited_for_only_where_they_are_seen():
+    """A script asks for the sight of readings, as a policy does; a threat model without it is refused, not played blindly."""
+    place = load_scenario("network-restless-v0").with_threat(kinds=["dos_hold"], agents=[1, 7], budget=5)
+    script = Spec("attack", "dos_hold:trigger=reading,threshold=36,latest=192").make()
+    loop = place.loop(tailgate.make_defence("dkf"))
+    assert script.sees_measurement and not Spec("attack", "dos_hold:start_step=21").make().sees_measurement
+    with pytest.raises(NotApplicable, match="sees_measurement"):
+        rollout(loop, script, keys("tune", range(2)))
+    rows = tailgate.evaluate(
+        scenarios=[place.name], defences=["dkf"], attacks=["dos_hold:start_step=21", "dos_hold:trigger=reading,threshold=36,latest=192"],
+        seeds=40, purpose="tune", threat={"kinds": ["dos_hold"], "agents": [1, 7], "budget": 5},
+    )  # fmt: skip
+    early, late = (np.mean([row["max_error"] for row in rows if row["attack"] == name]) for name in dict.fromkeys(row["attack"] for row in rows))
+    assert all(row["status"] == "ok" and row["attack_steps"] == 5 for row in rows) and late > 1.2 * early
+
+
+def test_a_script_that_waits_for_a_reading_plays_in_the_fused_loop_as_in_the_plain_one():
+    loop = load_scenario("gusty-stop-and-go-v0").with_threat(sees_measurement=True).loop(tailgate.make_defence("kf"))
+    script = Spec("attack", "fdi:trigger=reading,threshold=300,value=-5").make()
+    one, two = (rollout(loop, script, keys("tune", range(6)), plain=plain) for plain in (False, True))
+    assert [one.trace_hash(i) for i in range(6)] == [two.trace_hash(i) for i in range(6)]
+    first = (one.kind != 0).argmax(axis=0)
+    assert len(set(first.tolist())) > 1 and first.min() > loop.brief.threat.onset
+    assert (one.wires[first - 1, range(6), 0, 0] <= 300.0).all() and (one.clean[first, range(6), 0, 0] > 300.0).all()

@@ -39,9 +39,9 @@ Count = Annotated[int, Field(ge=0)]
 PositiveCount = Annotated[int, Field(ge=1)]
 
 
-def param(default: Any, doc: str) -> Any:
-    """A dataclass field with its default, unit and one sentence."""
-    return dataclasses.field(default=default, metadata={"doc": doc})
+def param(default: Any, doc: str, if_any: bool = False) -> Any:
+    """A dataclass field with its default, unit and one sentence; with `if_any` its data is written only where it is not empty."""
+    return dataclasses.field(default=default, metadata={"doc": doc, "if_any": if_any})
 
 
 @dataclass(frozen=True, eq=False)

@@ -60,7 +60,7 @@ _LANES = {
 
 def known(attack: Any) -> bool:
     """Whether an attack is a script that has a lane."""
-    return type(attack) in _LANES
+    return type(attack) in _LANES and type(getattr(attack, "when", Trigger())) in _WHEN
 
 
 def numbers(attack: Any, plan: Any) -> Array | None:
