@@ -17,7 +17,8 @@ from tailgate.errors import InputError
 from tailgate.registry import register
 from tailgate.threat import Brief
 
-from .scripted import Script, ScriptPlan, chosen, require
+from .aim import chosen, require
+from .scripted import Script, ScriptPlan
 from .triggers import TriggerState
 
 MOVE, LOSE = 0x100, 0x101  # tags of the draws

@@ -14,7 +14,8 @@ from tailgate.errors import NotApplicable
 from tailgate.registry import register
 from tailgate.threat import Brief
 
-from .scripted import Script, ScriptPlan, require
+from .aim import require
+from .scripted import Script, ScriptPlan
 
 
 class Ghost(NamedTuple):

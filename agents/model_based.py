@@ -15,7 +15,8 @@ from tailgate.errors import InputError, NotApplicable
 from tailgate.registry import register
 from tailgate.threat import Brief
 
-from .scripted import Script, ScriptPlan, chosen, require
+from .aim import chosen, require
+from .scripted import Script, ScriptPlan
 
 
 class Schedule(NamedTuple):

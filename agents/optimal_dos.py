@@ -14,7 +14,8 @@ from tailgate.optimal import Filtering, Objective, Rules, best_losses
 from tailgate.registry import register
 from tailgate.threat import Brief
 
-from .scripted import Script, ScriptPlan, chosen, require
+from .aim import chosen, require
+from .scripted import Script, ScriptPlan
 
 
 @register(

@@ -15,7 +15,7 @@ from tailgate.optimal import Grid, Holding, HoldTable, Objective, Rules, best_ho
 from tailgate.registry import register
 from tailgate.threat import Brief
 
-from .scripted import chosen, require
+from .aim import chosen, require
 
 
 class HoldPlan(NamedTuple):

@@ -17,7 +17,8 @@ from tailgate.optimal import farthest
 from tailgate.registry import register
 from tailgate.threat import Brief
 
-from .scripted import Script, ScriptPlan, chosen, require
+from .aim import chosen, require
+from .scripted import Script, ScriptPlan
 
 MARGIN = 1e-9  # share of the gate that rounding is left
 WIRES = 4  # wires of which every combination at its bound is tried

@@ -19,8 +19,8 @@ from tailgate.schema import build, read_yaml
 from tailgate.threat import Brief, KindName
 from tailgate.tree import map_leaves
 
+from .aim import chosen, require
 from .radio import on_receivers
-from .scripted import chosen, require
 from .triggers import TRIGGERS, Timing, Trigger, TriggerState, idle, part, rearm
 from .values import TAGS, Law, PerWire, check_wires, fit, law_of
 

@@ -12,7 +12,8 @@ from tailgate.errors import InputError, NotApplicable
 from tailgate.registry import register
 from tailgate.threat import Brief
 
-from .scripted import Script, ScriptPlan, chosen, require
+from .aim import chosen, require
+from .scripted import Script, ScriptPlan
 from .values import Constant, Law, PerWire, Ramp, Uniform, fit, receivers
 
 WIRES = ("distance", "relative_speed")  # of a radar

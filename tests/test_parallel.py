@@ -237,7 +237,7 @@ def test_the_box_reaches_the_ends_and_the_middle():
 @pytest.mark.parametrize("wrong, words", [
     ({"defence": "chi2_kff"}, ["did you mean 'chi2_kf'"]), ({"defence": "kf"}, ["steered defence", "ChiSquare"]), ({"defence": 3}, ["defence", "3"]),
     ({"defence": "steered:setting=2"}, ["knobs are free"]), ({"defence": "steered:defence=cra"}, ["steered_cra"]),
-    ({"defence": "steered:defence=composed,defence.detector=os:Mine"}, ["registered names"]), ({"defence": "os:path"}, ["command line only"]),
+    ({"defence": "steered:defence=composed,defence.detector=os:Mine"}, ["registered names"]), ({"defence": "os:path"}, ["imports nothing"]),
     ({"menu": {"levels": [1]}}, ["menu", "levels"]), ({"menu": {"thresholds": []}}, ["menu.thresholds"]), ({"menu": {"modes": ["fast"]}}, ["menu.modes"]),
     ({"menu": 3}, ["menu"]), ({"mode_cost": -1}, ["mode_cost"]), ({"payoff": "all"}, ["payoff"]), ({"defender_action": "x"}, ["menu"]),
     ({"scenarioo": "x"}, ["scenarioo"]), ({"interval": 0}, ["interval"]), ({"render_mode": "human"}, ["rgb_array"]),

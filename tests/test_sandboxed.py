@@ -73,7 +73,7 @@ def test_a_file_may_name_a_class_in_a_sandbox_and_none_without(tmp_path: Path, f
         if allowed:
             assert load_suite(str(tmp_path / "s.yaml")).defences == (MINE,)
         else:
-            with pytest.raises(InputError, match="named on the command line only"):
+            with pytest.raises(InputError, match="a configuration imports nothing"):
                 load_suite(str(tmp_path / "s.yaml"))
     assert not Spec("defence", MINE).imports and Spec("defence", MINE).target == "mine:Mine" and len(Spec("defence", MINE).digest) == 64
 

@@ -268,7 +268,7 @@ def test_a_damaged_configuration_is_one_error(text, tmp_path, monkeypatch):
     (["defence=kf"], ["steered defence"]), (["learner=xyz"], ["learner", "cem"]), (["attacker.populations=3"], ["populations"]),
     (["menu.interval=3"], ["environment.interval"]), (["scenario=thesis-ch5-v0", "defence=chi2_dkf:eta=22.8"], ["reward"]), (["name=a/b"], ["name"]),
     (["rivals=[stealth]"], ["rivals"]), (["environment.scenario=x"], ["environment", "scenario"]), (["menu=3"], ["menu", "mapping"]),
-    (["defence=os:path"], ["command line only"]), (["roundss=3"], ["rounds"]), (["payoff.scenario=x"], ["config.payoff", "scenario"]), (["--resume", "name=nobody"], ["nobody"]),
+    (["defence=os:path"], ["imports nothing"]), (["roundss=3"], ["rounds"]), (["payoff.scenario=x"], ["config.payoff", "scenario"]), (["--resume", "name=nobody"], ["nobody"]),
 ])  # fmt: skip
 def test_bad_configurations(wrong, words, tmp_path, monkeypatch, capsys):
     """One clear line, and nothing is written."""

@@ -102,7 +102,7 @@ class _Once(yaml.SafeLoader):
 def read_yaml(path: Path, where: str) -> dict[str, Any]:
     """A mapping from a YAML file, read safely."""
     try:
-        data = yaml.load(path.read_text(encoding="utf-8"), _Once)
+        data = _Once(path.read_text(encoding="utf-8")).get_single_data()
     except OSError as error:
         raise InputError(where, str(path), f"a readable YAML file ({error.strerror})") from None
     except (yaml.YAMLError, UnicodeDecodeError) as error:
