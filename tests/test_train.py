@@ -141,6 +141,19 @@ def test_the_command_trains_compares_and_writes_a_page(here: Path, tmp_path: Pat
     assert json.loads((run / "policy-0.json").read_text())["training"]["steps"] == 1920
 
 
+def test_the_final_comparison_begins_at_the_episode_that_is_named(here: Path, small_run: tuple[str, ...]) -> None:
+    """Learned, scripted and yoked alike play that block, and no policy depends on it."""
+    wanted, hashes = {}, set()
+    for first in (0, 1000):
+        assert cli.main(["train", *small_run, f"first_episode={first}"]) == 0
+        rows = [json.loads(line) for line in Path("runs/quickstart/rows.jsonl").read_text().splitlines()]
+        assert {row["seed"] for row in rows} == set(range(first, first + 12))
+        policy = json.loads(Path("runs/quickstart/policy-0.json").read_text())
+        hashes.add(policy["sha256"])
+        wanted[first] = [row["trace_hash"] for row in rows if row["attack"] == "none"]
+    assert len(hashes) == 1 and not set(wanted[0]) & set(wanted[1000])
+
+
 def test_decisions_beyond_those_that_were_asked_for_are_said(here: Path, capsys: pytest.CaptureFixture[str], small_run: tuple[str, ...]) -> None:
     """Rollouts are 640 decisions here; what was asked for exactly is not worth a word."""
     assert cli.main(["train", *small_run, "steps=1300"]) == 0

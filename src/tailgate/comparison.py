@@ -49,7 +49,7 @@ def play_scripts(config: TrainConfig, policies: list[Path], progress: Callable[[
     """Choose the best rival on select seeds, so that the choice does not favour it, and play all, and policies, on fresh report seeds."""
     best = best_of(rivals_of(config), dict(config.threat), outcome_of(config), "select", config.workers)
     attacks = tuple(dict.fromkeys(("none", *config.rivals, *config.white_box, *map(str, policies))))  # each once
-    cells = cells_of(suite_of(config, attacks), batch=BATCH, threat=dict(config.threat))
+    cells = cells_of(suite_of(config, attacks), batch=BATCH, threat=dict(config.threat), first_seed=config.first_episode)
     return Scripts(best, run(cells, config.directory / "rows.jsonl", config.workers, progress))
 
 
@@ -74,7 +74,7 @@ def compare(
     skipped = {r["attack"]: r["reason"] for r in rows if r["defence"] == guard and r["status"] == "skipped"}
     left_out = {name: skipped[name] for name in config.white_box if name in skipped}
     built, uses = Spec("defence", guard).make(), Spec("defence", guard).entry.uses
-    keys = draws.keys("report", range(config.episodes))
+    keys = draws.keys("report", range(config.first_episode, config.first_episode + config.episodes))
     verdicts = []
     for path, seed in zip(policies, range(config.first_seed, config.first_seed + config.seeds), strict=True):
         policy = PolicyAttack(path)

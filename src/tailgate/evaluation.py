@@ -174,15 +174,15 @@ def _sparing() -> Iterator[None]:
 
 
 def cells_of(
-    suite: Suite, *, batch: int = 256, purpose: str = "report", threat: dict[str, Any] | None = None, beacon: str = ""
+    suite: Suite, *, batch: int = 256, purpose: str = "report", threat: dict[str, Any] | None = None, beacon: str = "", first_seed: int = 0
 ) -> list[Cell]:
-    """Every cell of a suite, in its order. Raises InputError for anything that does not exist."""
+    """Every cell of a suite, in its order, from episode `first_seed` on. Raises InputError for anything that does not exist."""
     if purpose not in draws.PURPOSES:
         raise InputError("purpose", purpose, f"one of {', '.join(draws.PURPOSES)}")
     _ = numbered(beacon, suite.name, purpose, 0, 1)  # refuses a beacon that is none
     changes = suite.granted | dict(threat or {})
     out = [
-        Cell(suite.name, scenario, dose, defence, attack, suite.seeds, purpose, 0, batch, changes, beacon)
+        Cell(suite.name, scenario, dose, defence, attack, suite.seeds, purpose, first_seed, batch, changes, beacon)
         for scenario in suite.scenarios for dose in suite.doses for defence in suite.defences for attack in suite.attacks
     ]  # fmt: skip
     models: dict[str, Model] = {}

@@ -37,7 +37,8 @@ from tailgate.schema import as_data, build, canonical, fields_of, override, read
 from tailgate.threat import KNOWLEDGE
 
 ENVIRONMENT = (fields_of(ActionSpec) | fields_of(Reward) | {"frames": None}).keys() - {"gamma"}  # that `environment` may hold
-COMPARED = {"episodes", "white_box", "others", "workers"}  # fields that change no policy; the next do where the best rival teaches
+# fields that change no policy; those of CHOSEN do where the best rival teaches
+COMPARED = {"episodes", "first_episode", "white_box", "others", "workers"}
 CHOSEN = {"rivals", "select_episodes", "outcome"}
 LATER = {"demonstrations"}  # fields that joined when policies had been published: at its default such a field leaves no mark
 Discount = Annotated[float, Field(gt=0, le=1)]
@@ -71,6 +72,7 @@ class TrainConfig:
     tensorboard: bool = param(True, "write TensorBoard event files")
     outcome: str | None = param(None, "metric that is compared, the larger the worse; none: crashed, or rmse_position without a road")
     episodes: PositiveCount = param(400, "fresh episodes per attack in the final comparison")
+    first_episode: Count = param(0, "number of the first of them: another block has not been seen", if_any=True)
     select_episodes: PositiveCount = param(1024, "other episodes, that the best rival is chosen on: fewer choose by chance")
     workers: PositiveCount = param(2, "processes, of the training seeds and of the comparison; change no result")
     rivals: tuple[str, ...] = param((), "scripted attacks of equal knowledge and dose to compare with")
