@@ -196,3 +196,31 @@ def test_a_head_of_rubbish_is_refused(run: Run, tmp_path: Path, text: str) -> No
     (tmp_path / "board.json").write_text(text)
     code, _, said = run("leaderboard", "head", "board.json")
     assert code == 2 and "expected" in said and "Traceback" not in said
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["evaluate"], "nothing is kept: --out FILE would"),
+        (["evaluate", "--out", "rows.jsonl"], "the same command goes on with the rows of rows.jsonl"),
+        (["leaderboard", "run", "quick-v0", "--out", "boards"], "the same command goes on"),
+    ],
+)
+def test_an_interrupted_command_says_how_to_go_on(
+    arguments: list[str], told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def stop(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("tailgate.evaluation.evaluate", stop)
+    monkeypatch.setattr("tailgate.leaderboard.run.play", stop)
+    assert cli.main(arguments) == 130
+    assert capsys.readouterr().err.strip().endswith(f"interrupted; {told}")
+
+
+def test_training_says_nothing_before_it_has_been_checked(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    assert cli.main(["train", "ppo.envs=0", f"out={tmp_path}"]) == 2
+    assert "training against" not in capsys.readouterr().err
+    assert cli.main(["train", "learner=cem", "ppo.envs=0", f"out={tmp_path}"]) == 2
+    assert not list(tmp_path.iterdir())

@@ -170,7 +170,7 @@ SYSTEMS = {"platoon": "crashed", "network": "rmse_position"}
 def test_every_preset_can_be_played(name: str) -> None:
     """Scenario, defences, rivals, environment and learner of each fit together."""
     config = train.load_config(name, [])
-    train._check(config)
+    train.check(config)
     build(Config, dict(config.ppo), "ppo").check()
     assert config.name == name and config.rivals
 

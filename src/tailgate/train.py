@@ -140,8 +140,12 @@ def outcome_of(config: TrainConfig) -> str:
     return "crashed" if load_scenario(config.scenario).brief().model.followers.any() else "rmse_position"
 
 
-def _check(config: TrainConfig) -> None:
+def check(config: TrainConfig) -> None:
     """Everything that a run will need, tried before anything is written: a typing error shall not cost an hour."""
+    _settings(config)
+    for name in LEARNERS.keys() - {config.learner}:  # a typing error there as well, where that learner is installed
+        with contextlib.suppress(ImportError):
+            build(learner_of(name).Config, dict(getattr(config, name)), f"config.{name}")
     seat = Seat.make(**environment_of(config))
     check_action(config.learner, seat)
     if config.teacher is not None:
@@ -186,11 +190,7 @@ def teacher_of(config: TrainConfig) -> str | None:
 
 def train(config: TrainConfig, progress: Callable[[int, Any], None], resume: bool = False) -> list[Path]:
     """Train one policy per seed; returns their JSON files. `progress(seed, Progress)` is called after each rollout."""
-    _settings(config)
-    for name in LEARNERS.keys() - {config.learner}:  # a typing error there as well, where that learner is installed
-        with contextlib.suppress(ImportError):
-            build(learner_of(name).Config, dict(getattr(config, name)), f"config.{name}")
-    _check(config)
+    check(config)
     if not resume and config.directory.is_dir() and any(config.directory.iterdir()):
         set_aside(config.directory)
     directory = writable_directory(config.directory)

@@ -36,7 +36,7 @@ def add(actions: Any) -> None:
     command.add_argument("--unattacked", action="store_true", help="also rank defences that no attack was trained against")
     command.add_argument("--no-replays", action="store_true", help="leave out the replays of the worst episodes")
     command.add_argument("--json", action="store_true", help="print the entries as JSON")
-    command.set_defaults(run=_run)
+    command.set_defaults(run=_run, kept="the same command goes on")
     page = actions.add_parser("page", help="build the page of boards")
     page.add_argument("boards", nargs="+", metavar="FILE", help="board.json files")
     page.add_argument("--out", required=True, metavar="DIR", help="directory of the page")

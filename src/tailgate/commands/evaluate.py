@@ -64,6 +64,7 @@ def _evaluate(options: argparse.Namespace) -> int:
         suite = dataclasses.replace(load_suite(suite), name="custom", doses=(None,))
     if options.plot:
         writable_directory(Path(options.plot), "plot")
+    options.kept = f"the same command goes on with the rows of {options.out}" if options.out else "nothing is kept: --out FILE would"
     before = aside(options.out)
     with progress(Console(stderr=True)) as update:
         rows = evaluate(

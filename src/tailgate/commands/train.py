@@ -40,6 +40,7 @@ def _train(options: argparse.Namespace) -> int:
     sys.path.insert(0, "")  # a sandbox's module:Class is looked for in the working directory, as `leaderboard attack` does
     overrides = list(options.overrides) + ([f"first_seed={options.seed}"] if options.seed is not None else [])
     config = train.load_config(options.config, overrides, options.resume)
+    train.check(config)  # before a word of what is done
     errors = Console(stderr=True)
     errors.print(f"[bold]{config.name}[/]: training against [bold]{config.defence}[/] on {config.scenario}, files in {config.directory}")
     with _resumable(config.name), progress(errors) as update:
