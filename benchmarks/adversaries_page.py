@@ -82,6 +82,11 @@ def learners_of(cells: dict[str, Any]) -> list[tuple[str, str, dict[str, Any]]]:
     return [(name, learner, report) for name, cell in cells.items() for learner, report in cell["learners"].items()]
 
 
+def marked(name: str, cell: dict[str, Any]) -> str:
+    """The name of a cell; with a dagger where it was not played on fresh episodes, against searched scripts."""
+    return name if "found" in cell else f"{name} \u2020"
+
+
 def spread(report: dict[str, Any], values: list[float]) -> str:
     """The median, the least and the largest."""
     low, mid, high = (comparison.shown(report, float(f(values))) for f in (np.min, np.median, np.max))
@@ -92,8 +97,9 @@ def markdown(cells: dict[str, Any]) -> str:
     """The record as people read it."""
     out = [
         "# Learned attacks, cell by cell", "",
-        "`python benchmarks/adversaries.py` makes this page. Every figure is of report episodes that no setting was ever played on, at",
-        "equal knowledge, bounds, dose. Learned: the median over training seeds, with the least and the largest, of the learner that did",
+        "`python benchmarks/adversaries.py` makes this page. Every figure is of report episodes that no setting was ever played on (of a",
+        "cell with a dagger: on the public ones, where earlier settings had been played, and against listed scripts alone), at equal",
+        "knowledge, bounds, dose. Learned: the median over training seeds, with the least and the largest, of the learner that did",
         "best on select seeds. The best script is chosen on select seeds, of those that are listed in adversaries.yaml and those that a",
         "search of its templates found on tune seeds. Differences are paired, with 95 % intervals over episodes and training seeds; each",
         "verdict is corrected (Holm) for the cells of its column. *same*: no episode differs, as the attack's times are the same in all",
@@ -117,7 +123,7 @@ def markdown(cells: dict[str, Any]) -> str:
         none, learned = comparison.shown(report, row["none"]), spread(report, row["learned"])
         low, value, high = (comparison.shown(report, cell["champion"]["gain"][k], "+") for k in ("low", "value", "high"))
         gains.append(f"{value} [{low}, {high}] **{verdicts[name]['champion']}**")
-        out.append(f"| {' | '.join([name, str(dose), none, script, learned, cell['best'], yoked, *gains])} |")
+        out.append(f"| {' | '.join([marked(name, cell), str(dose), none, script, learned, cell['best'], yoked, *gains])} |")
     thirds = {part: [name for name, cell in cells.items() if part_of(cell) == part] for part in PARTS}
     out += ["", "| wins, same, undecided, loses | " + " | ".join(f"{part} ({len(of)})" for part, of in thirds.items()) + " | all |"]
     out += ["|---|" + "---|" * (len(thirds) + 1)]
@@ -138,7 +144,7 @@ def markdown(cells: dict[str, Any]) -> str:
         best = comparison.shown(report, row["learned"][int(np.argmax(report["select"]))])
         low, value, high = (comparison.shown(report, gain[k], "+") for k in ("low", "value", "high"))
         yoked = comparison.shown(report, float(np.median(row["yoked"])))
-        shown_first = f"`{report['teacher']}`{' (a copy)' if report['copies'] else ''}" if report["teacher"] else "nothing"
+        shown_first = f"`{report['teacher']}`{' (a copy)' if report.get('copies') else ''}" if report["teacher"] else "nothing"
         parts = [
             name, learner, shown_first, f"{report['steps']:,}", spread(report, row["learned"]), best, yoked, f"{value} [{low}, {high}]",
             f"{report['minutes']:.1f}",
@@ -152,10 +158,12 @@ def markdown(cells: dict[str, Any]) -> str:
             reached = ", ".join(f"{100 * s['value']:.1f} % [{100 * s['low']:.1f}, {100 * s['high']:.1f}]" for s in ceiling["reached"])
             out.append(f"| {name} | {learner} | `{attack}` | {comparison.shown(report, ceiling['outcome']['value'])} | {reached} |")
     out += ["", "## Scripts that the search found", "", "| cell | scripts |", "|---|---|"]
-    out += [f"| {name} | {', '.join(f'`{text}`' for text in cell['found'])} |" for name, cell in cells.items() if cell["found"]]
+    out += [f"| {name} | {', '.join(f'`{text}`' for text in cell['found'])} |" for name, cell in cells.items() if cell.get("found")]
     out += ["", "## Policies", "", "The first 16 digits of the SHA-256 of each training seed's weights; report.json has the whole.", ""]
     out += ["| cell | learner | weights |", "|---|---|---|"]
     for name, learner, report in learners_of(cells):
+        if "sha256" not in report:
+            continue
         out.append(f"| {name} | {learner} | {', '.join(digest[:16] for digest in report['sha256'])} |")
     out += ["", "## Threat models", "", "| cell | knowledge | kinds |", "|---|---|---|"]
     for name, cell in cells.items():
