@@ -240,7 +240,9 @@ def test_built_in_programs_play(name, short, play):
     """Every phase of a built-in program comes in some of the episodes, nothing is refused, and it says what it does."""
     program = Program(Path(name))
     assert program.sheet.about.endswith(".")
-    trace = play(short(horizon=600, onset=50, kinds=ALL), "chi2_kf", program, range(12), terminate=False)
+    of_platoons = any("distance" in phase.targets for phase in program.sheet.phases)
+    scenario, defence = ("platoon-gusty-v0", "dkf") if of_platoons else ("stop-and-go-v0", "chi2_kf")
+    trace = play(short(scenario, horizon=600, onset=50, kinds=ALL), defence, program, range(12), terminate=False)
     kinds = {int(Kind[phase.kind.upper()]) for phase in program.sheet.phases}
     assert set(np.unique(trace.kind)) == {0} | kinds and not trace.refused.any()
 
