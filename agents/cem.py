@@ -8,7 +8,10 @@ A generation draws `population` weight vectors from a normal distribution with a
 where `extra` falls to 0 over the first generations (Szita and Lorincz 2006), so that the search does not narrow too early. Member 0 is the
 mean itself. All members of a generation meet the same episodes: what differs is the policy.
 
-Random numbers are a function of (seed, generation), so that a resumed run gives the policy of an uninterrupted one.
+Where a search may end in one of several places, `starts` of them are begun, each for `trial` generations on the same episodes, and the one
+whose mean did best goes on.
+
+Random numbers are a function of (seed, generation, start), so that a resumed run gives the policy of an uninterrupted one.
 """
 
 from __future__ import annotations
@@ -39,7 +42,7 @@ from .policy import Network, save_policy
 from .teacher import Demonstration
 
 IMITATION_ROUNDS, IMITATION_BATCH, IMITATION_RATE = 400, 4096, 0.03
-FORMAT = "tailgate-cem-checkpoint-1"
+FORMAT = "tailgate-cem-checkpoint-2"
 Share = Annotated[float, Field(gt=0, le=1)]
 
 
@@ -54,6 +57,8 @@ class Config:
     sd: Positive = param(1.0, "standard deviation of the first generation's weights [-]")
     extra: NonNegative = param(0.1, "extra standard deviation of the first generations [-]")
     extra_until: PositiveCount = param(200, "generations until the extra has fallen to 0")
+    starts: PositiveCount = param(1, "searches that are begun, of which the best goes on")
+    trial: PositiveCount = param(10, "generations that each of several starts is tried for")
     hidden: tuple[PositiveCount, ...] = param((16,), "widths of the hidden layers")
     rest: Probability = param(0.5, "bias of the first mean towards rest: the probability of it that a softmax would give")
 
@@ -86,6 +91,15 @@ class Shape(NamedTuple):
         return out
 
 
+class Trial(NamedTuple):
+    """A start after its trial: its number, the distribution, and what its mean gained in the last third of the generations."""
+
+    start: int
+    mean: Array
+    sd: Array
+    score: float
+
+
 class Search:
     """The method, whoever's policy it is: a subclass says what is played. `lean`: an output of the first mean, and its bias."""
 
@@ -97,6 +111,9 @@ class Search:
         self.mean[self.shape.length - sizes[-1] + lean[0]] = lean[1]
         self.generation, self.steps = 0, 0
         self.curve: list[dict[str, Any]] = []
+        self.start, self.tried = 0, 0 if config.starts > 1 else 1
+        self.best: Trial | None = None
+        self._first: Array | None = None
 
     @property
     def card(self) -> str:
@@ -113,9 +130,15 @@ class Search:
         raise TypeError(f"{type(self).__name__} must define episodes()")
 
     def learn(self, steps: int, report: Callable[[Progress], None], checkpoint: Path | None = None, every: int = 1_000_000) -> None:
-        """Train until at least `steps` decisions in total; calls `report` after each generation, and writes a checkpoint: it is small."""
-        while self.steps < steps:
-            report(self._generation())
+        """Train until at least `steps` decisions in total, and every start has been tried.
+
+        Calls `report` after each generation, and writes a checkpoint: it is small.
+        """
+        while self.steps < steps or self.tried < self.config.starts:
+            now = self._generation()
+            if self.tried < self.config.starts and self.generation == self.config.trial:
+                self._next()
+            report(now)
             if checkpoint is not None:
                 self.save(checkpoint)
 
@@ -132,7 +155,9 @@ class Search:
 
     def _generation(self) -> Progress:
         config = self.config
-        rng = np.random.default_rng([self.seed, self.generation])
+        if self.generation == 0 and self.start == 0:
+            self._first = self.mean
+        rng = np.random.default_rng([self.seed, self.generation, self.start] if self.start else [self.seed, self.generation])
         theta = self.mean + self.sd * rng.standard_normal((config.population, self.shape.length))
         theta[0] = self.mean
         reward, crashed = self._play(theta)
@@ -145,6 +170,19 @@ class Search:
         crash = float(crashed[0]) if self.road else None
         self.curve.append({"steps": self.steps, "seed": self.seed, "crash": crash, "reward": float(reward[0])})
         return Progress(self.steps, crash, float(reward[0]))
+
+    def _next(self) -> None:
+        """A trial is over: begin the next start, or go on with the best."""
+        assert self._first is not None
+        score = float(np.mean([point["reward"] for point in self.curve[-max(self.config.trial // 3, 1) :]]))
+        if self.best is None or score > self.best.score:
+            self.best = Trial(self.start, self.mean, self.sd, score)
+        self.tried += 1
+        if self.tried < self.config.starts:
+            self.start, self.generation = self.tried, 0
+            self.mean, self.sd = self._first, np.full(self.shape.length, self.config.sd)
+        else:
+            self.start, self.mean, self.sd, _ = self.best
 
     def _play(self, theta: Array) -> tuple[Array, Array]:
         """Mean reward of an episode and share of collisions, (P,) each, of the weight vectors (P, length) on the generation's episodes."""
@@ -160,20 +198,29 @@ class Search:
         """Write a checkpoint."""
         facts = {
             "format": FORMAT, "seed": self.seed, "card": self.card, "learner": self.identity, "steps": self.steps,
-            "generation": self.generation, "curve": self.curve,
+            "generation": self.generation, "curve": self.curve, "start": self.start, "tried": self.tried,
         }  # fmt: skip
-        write_atomic(path, save_tensors({"mean": self.mean, "sd": self.sd}, {"facts": json.dumps(facts)}))
+        tensors = {"mean": self.mean, "sd": self.sd, "first": self.mean if self._first is None else self._first}
+        if self.best is not None:
+            facts["best"] = [self.best.start, self.best.score]
+            tensors |= {"best_mean": self.best.mean, "best_sd": self.best.sd}
+        write_atomic(path, save_tensors(tensors, {"facts": json.dumps(facts)}))
 
     def load(self, path: Path) -> None:
         """Continue from a checkpoint; raises InputError when it is damaged or of another run."""
         wanted = {"format": FORMAT, "seed": self.seed, "card": self.card, "learner": self.identity}
         tensors, facts = open_checkpoint(path, wanted, load_tensors)
         try:
-            mean, sd = (tensors[name].reshape(self.mean.shape) for name in ("mean", "sd"))
+            held = {name: tensor.reshape(self.mean.shape) for name, tensor in tensors.items()}
+            mean, sd, first = held["mean"], held["sd"], held["first"]
             steps, generation, curve = int(facts["steps"]), int(facts["generation"]), list(facts["curve"])
+            start, tried = int(facts["start"]), int(facts["tried"])
+            number, score = facts.get("best", (0, 0.0))
+            best = Trial(int(number), held["best_mean"], held["best_sd"], float(score)) if "best" in facts else None
         except (KeyError, ValueError, TypeError) as error:
             raise InputError("checkpoint", str(path), f"a checkpoint that fits this configuration ({error})") from None
         self.mean, self.sd, self.steps, self.generation, self.curve = mean, sd, steps, generation, curve
+        self.start, self.tried, self.best, self._first = start, tried, best, first
 
 
 def outputs(layers: list[tuple[Array, Array]], observation: Array) -> Array:

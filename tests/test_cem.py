@@ -1,5 +1,6 @@
 """The cross-entropy method: it learns, it resumes to the bit, and what it exports plays as it did in training."""
 
+import dataclasses
 import json
 
 import numpy as np
@@ -18,6 +19,7 @@ ROAD = {
     "reward": "min_gap", "gap_shaping": 0.0, "error_shaping": 0.0,
 }
 SMALL = Config(population=8, episodes=4, hidden=(4,))
+RACE = dataclasses.replace(SMALL, starts=3, trial=3)
 ROUND = 8 * 4 * 10  # decisions of a generation of `brief` without a collision
 
 
@@ -101,6 +103,46 @@ def test_two_runs_of_a_seed_and_a_resumed_one_agree(brief, tmp_path):
     second.learn(4 * ROUND, lambda progress: None)
     assert second.export(tmp_path / "resumed", {}).with_suffix(".safetensors").read_bytes() == whole
     assert run(brief, 4 * ROUND, seed=1).export(tmp_path / "other", {}).with_suffix(".safetensors").read_bytes() != whole
+
+
+def test_of_several_starts_the_best_goes_on(brief):
+    """After the trials the search is where its best start would have been by itself, and goes on as that one."""
+    alone = [Learner(0, 0.99, SMALL, brief) for _ in range(3)]
+    for start, learner in enumerate(alone):
+        learner.start = start
+        for _ in range(3):
+            learner._generation()
+    scores = [learner.curve[-1]["reward"] for learner in alone]
+    assert len(set(scores)) > 1
+    best = alone[int(np.argmax(scores))]
+    race = run(brief, 1, config=RACE)
+    assert [point["reward"] for point in race.curve] == [point["reward"] for learner in alone for point in learner.curve]
+    np.testing.assert_array_equal(race.mean, best.mean)
+    best._generation()
+    race.learn(race.steps + 1, lambda progress: None)
+    np.testing.assert_array_equal(race.mean, best.mean)
+    np.testing.assert_array_equal(race.sd, best.sd)
+
+
+@pytest.mark.parametrize("generations", [2, 3, 5, 9, 10])
+def test_a_search_that_is_interrupted_between_its_starts(brief, generations, tmp_path):
+    """Stopped within a trial, at its end or after the last: resumed, it comes to the same policy."""
+    whole = run(brief, 10 * ROUND, config=RACE)
+    assert len(whole.curve) > 10
+    left = iter(range(generations))
+
+    def stop(progress):
+        if next(left, None) is None:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        Learner(0, 0.99, RACE, brief).learn(10 * ROUND, stop, tmp_path / "check")
+    second = Learner(0, 0.99, RACE, brief)
+    second.load(tmp_path / "check")
+    assert len(second.curve) == generations
+    second.learn(10 * ROUND, lambda progress: None)
+    np.testing.assert_array_equal(second.mean, whole.mean)
+    assert second.curve == whole.curve
 
 
 def test_a_checkpoint_that_does_not_fit(brief, tmp_path):
