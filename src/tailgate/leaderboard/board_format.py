@@ -59,6 +59,7 @@ class AttackPart(Part):
     admitted: dict[str, Any] | None = None
     note: Text = ""
     withdrawn: bool = False
+    card: dict[str, Any] | None = None
 
 
 class Worst(Part):

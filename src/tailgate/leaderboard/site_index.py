@@ -6,6 +6,7 @@ from collections import Counter
 
 from .board_format import LEVELS, CellPart, Dose, Level
 from .build import Name, percent
+from .site_cards import attack_cards
 from .site_curves import curves_of, stealth_of, together_of
 from .site_suite import GROUPS, Data, Suite, cell_of, critical_of, dose_text, figure, gates_of, played, share_of, worse
 from .site_trust import trust_cell, trust_of
@@ -225,5 +226,5 @@ def section(suite: Suite) -> Data:
         "statuses": [s for s, *_ in GROUPS if any(r["status"] == s for r in rows)], "levels": LEVELS,
         "heat": heat_of(suite), "scale": suite.scale, "together": together_of(suite), "curves": curves_of(suite),
         "stealth": stealth_of(suite), "detection": detection_of(suite), "comparisons": comparisons_of(suite), "attacks": attacks_of(suite),
-        "how": compared_how(suite),
+        "how": compared_how(suite), "attack_cards": attack_cards(suite),
     }  # fmt: skip
