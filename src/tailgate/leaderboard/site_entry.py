@@ -133,7 +133,7 @@ def _clean(suite: Suite, entry: EntryPart) -> list[Data]:
     return out
 
 
-def _verified(entry: EntryPart) -> str:
+def _replayed(entry: EntryPart) -> str:
     """What came of the rows that were played again; empty where nobody has said anything of them."""
     held = entry.verified
     if held is None:
@@ -142,9 +142,9 @@ def _verified(entry: EntryPart) -> str:
     which = f"{asked} of {held.rows} rows, drawn at random, were" if asked < held.rows else f"all {held.rows} rows were"
     if held.sound:
         most = f" At most {percent(1.0 - 0.05 ** (1.0 / asked))} of them differ, at 95%." if asked < held.rows else ""
-        return f"Verified: {which} played again and came out equal.{most}"
+        return f"Replayed: {which} played again and came out equal.{most}"
     parts = [f"{n} {word}" for n, word in ((held.differs, "differ"), (held.unchecked, "could not be checked")) if n]
-    return f"Claimed: {which} played again; {' and '.join(parts)}." if asked else "Claimed: no row was played again."
+    return f"Replayed: {which} played again; {' and '.join(parts)}." if asked else "Not replayed: no row was played again."
 
 
 def _checked(entry: EntryPart) -> str:
@@ -179,7 +179,7 @@ def entry_page(suite: Suite, entry: EntryPart, replayed: Replayed | None, also: 
     return {
         "suite": suite.board.suite, "damage": suite.damage, "limit": percent(suite.board.suite.limit), "scale": suite.scale,
         "name": suite.defences[entry.defence], "status": entry.status, "why": entry.why,
-        "verified": _verified(entry), "checked": _checked(entry), "typed": shlex.quote(entry.defence),
+        "replayed": _replayed(entry), "checked": _checked(entry), "typed": shlex.quote(entry.defence),
         "class": entry.class_ or "not stated",
         "rank": _rank(suite, entry), "also": also, "card": card_of(suite, entry), "flags": entry.flags, "levels": LEVELS,
         "critical": [(level, critical_of(suite, entry.critical_dose.get(level))) for level in LEVELS],

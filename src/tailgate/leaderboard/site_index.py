@@ -189,12 +189,12 @@ def attacks_of(suite: Suite) -> list[Data]:
 
 
 def checked_of(suite: Suite) -> str:
-    """How many entries are verified by rows, and how many cells were played again from the board alone; empty where nothing was."""
+    """Of how many entries the rows that were played again came out equal, and how many cells from the board alone; empty for none."""
     entries, said = suite.board.entries, []
     if told := [entry.verified for entry in entries if entry.verified is not None]:
         equal, differs, unchecked = sum(v.verified for v in told), sum(v.differs for v in told), sum(v.unchecked for v in told)
         rows = played(sum(v.rows for v in told), equal, differs, unchecked, "rows")
-        said.append(f"{sum(v.sound for v in told)} of {len(entries)} entries verified: played again {rows}")
+        said.append(f"rows of {sum(v.sound for v in told)} of {len(entries)} entries replayed without a difference: {rows}")
     if held := [entry.checked for entry in entries if entry.checked is not None]:
         equal, differs, unchecked = sum(c.equal for c in held), sum(c.differs for c in held), sum(c.unchecked for c in held)
         cells = played(len(suite.board.cells), equal, differs, unchecked, "cells")
