@@ -83,7 +83,7 @@ def test_filters_hide_rows_of_table_and_map(tab):
 @pytest.mark.page
 def test_the_cards_of_attacks_are_folded_away_and_open(tab):
     """A click shows what came with an attack, and what is registered of the others; nothing of it is seen before."""
-    fold = tab.find_element("css selector", "#suite-1 details.cards")
+    fold = tab.find_element("css selector", "#suite-1 details.told-attacks")
     assert not fold.find_element("css selector", "dl").is_displayed()
     fold.find_element("css selector", "summary").click()
     assert fold.find_element("link text", "https://example.org/attack-code").is_displayed()
