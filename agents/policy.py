@@ -278,6 +278,11 @@ class PolicyAttack:
     def sees_measurement(self) -> bool:
         return self._loaded[0].sees_measurement
 
+    @property
+    def action(self) -> ActionSpec:
+        """Which decisions it takes."""
+        return self._loaded[0].action
+
     def prepare(self, brief: Brief) -> PolicyPlan:
         header, network = self._loaded
         agents = brief.model.agents

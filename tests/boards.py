@@ -36,6 +36,10 @@ ATTACKS = (  # text, knowledge, power, learned, optimal
     ("ghost:size=20,grow=20", "white", 1.1, False, False),
     ("optimal_stealth", "white", 2.5, False, True),
 )
+ATTACK_CARD = {
+    "name": "A bias that is held", "reference": "https://example.org/attack", "licence": "BSD-3-Clause", "threat_model": "Adds <b>any</b> value.",
+    "training": "none", "code": "https://example.org/attack-code",
+}  # fmt: skip
 
 
 def share(k, n=200):
@@ -179,7 +183,7 @@ def make_board(name="synthetic-v0", *, bound=None, beacon="", trusted=True, defe
             "bound": bound, "alpha": 0.05, "scenarios": [{"name": s, "about": "", "robustness": "heavy" in s, "hash": "ab12"} for s in scenarios],
             "episodes": 200, "purpose": "report", "beacon": beacon, "rows": 200 * len(cells),
         },
-        "attacks": [{"attack": a, "knowledge": k, "learned": l, "optimal": o, "trained_on": "chi2_kf:eta=15" if l else None, "admitted": None if i else {"date": "2026-11-22", "p": 0.001}}
+        "attacks": [{"attack": a, "knowledge": k, "learned": l, "optimal": o, "trained_on": "chi2_kf:eta=15" if l else None, "admitted": None if i else {"date": "2026-11-22", "p": 0.001}, "card": ATTACK_CARD if a.startswith("fdi:") else None}
                     for i, (a, k, _, l, o) in enumerate(attacks)],
         "entries": entries, "cells": cells, "curves": curves,
         "comparisons": [{"class": "measurements", "a": a, "b": b, "only_a": 42, "only_b": 3 + 30 * i, "weaker": a if i < 2 else b, "p": 1e-7 if i == 0 else 0.3, "adjusted": 1e-6 if i == 0 else 0.6}

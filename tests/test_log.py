@@ -1,6 +1,7 @@
 """A log has the episodes as they were, labels that agree with the trace, and nothing that a suite holds out."""
 
 import argparse
+import dataclasses
 import json
 import sys
 from pathlib import Path
@@ -12,12 +13,14 @@ import pytest
 
 import tailgate
 from tailgate import draws, files, log
+from tailgate.agents.zoo import zoo_path
 from tailgate.commands import log as command
 from tailgate.evaluation import Cell
+from tailgate.held_out import families
 from tailgate.kinds import Kind, Mode
 from tailgate.log import write_log
 from tailgate.registry import Spec
-from tailgate.scenario import Suite
+from tailgate.scenario import Suite, load_suite
 from tailgate.trace import rollout
 
 ATTACKS = ("none", "fdi:start_step=40,value=9,targets=[position]", "dropout:start_step=100", "fdi_ramp:start_step=20")
@@ -94,6 +97,51 @@ def test_what_is_held_out_is_in_no_file_and_is_refused_by_name(made: tuple[Path,
     with pytest.raises(tailgate.InputError, match=r"fdi_ramp:rate=1.*hold out"):
         write_log(SUITE, tmp_path / "log", attacks=["fdi_ramp:rate=1"])
     assert not (tmp_path / "log").exists()
+
+
+RAMPS = ("fdi_ramp", "echo_pull_off")
+PROGRAM = "phases:\n  - {{kind: fdi, value: 3.0, length: 9}}\n  - {{kind: {kind}, value: {value}, probability: {probability}}}\n"
+
+
+@pytest.mark.parametrize(
+    ("attack", "also"),
+    [
+        ("program:path=slow_ramp_then_hold", {"fdi_ramp", "dos_hold"}), ("program:path=scattered_bias", {"fdi", "fdi_bernoulli"}),
+        ("program:path=sudden_bias", {"fdi"}), ("program:path=burst_jamming", {"dos_jam", "radar_jam"}), ("fdi_sparse:value.name=ramp", {"fdi_ramp"}),
+        ("fdi_sparse:value=3", {"fdi", "fdi_bernoulli"}), ("fdi:chance=0.5", {"fdi_bernoulli"}), ("fdi", set()), ("stealth", set()),
+        ("zoo:name=platoon-chi2_dkf-0", set(RAMPS)), (str(zoo_path("platoon-chi2_dkf-0")), set(RAMPS)), ("zoo:name=car-following-kf-0", set()),
+        (PROGRAM.format(kind="fdi", value="{position: 1.0, velocity: {name: ramp, rate: 0.1}}", probability=1.0), {"fdi", "fdi_ramp"}),
+        (PROGRAM.format(kind="fdi", value=2.0, probability="{velocity: 0.2}"), {"fdi", "fdi_bernoulli"}),
+        (PROGRAM.format(kind="echo_delay", value="{name: ramp}", probability=1.0), {"fdi", "echo_pull_off"}),
+        (PROGRAM.format(kind="noise_jam", value="{name: gaussian}", probability=1.0), {"fdi", "noise_jam"}),
+    ],
+)  # fmt: skip
+def test_an_attack_is_of_every_family_whose_shape_it_has(attack: str, also: set[str], tmp_path: Path) -> None:
+    """Kind and law of a program's phases, of a law that a script takes, and of values that a policy changes step by step."""
+    if attack.startswith("phases"):
+        (tmp_path / "p.yaml").write_text(attack)
+        attack = str(tmp_path / "p.yaml")
+    assert families(attack) == {Spec("attack", attack).entry.name} | also
+
+
+def test_what_is_held_out_is_held_out_under_other_names(tmp_path: Path) -> None:
+    """A program with a ramp is refused by name, and left out of the suite's attacks, which the card says."""
+    attacks = ("none", "dropout", "program:path=slow_ramp_then_hold")
+    suite = dataclasses.replace(SUITE, attacks=attacks)
+    with pytest.raises(tailgate.InputError, match=r"slow_ramp_then_hold.*hold out of its logs, as it does fdi_ramp"):
+        write_log(suite, tmp_path / "log", attacks=attacks)
+    assert not (tmp_path / "log").exists()
+    held = write_log(suite, tmp_path / "log", episodes=1, dev_episodes=1)
+    assert held["attacks"] == list(attacks[:2]) and held["left_out"] == list(attacks[2:])
+    assert "`program:path=slow_ramp_then_hold`" in (tmp_path / "log/README.md").read_text()
+
+
+def test_a_policy_that_grows_its_values_is_in_no_log_where_ramps_are_held_out(tmp_path: Path) -> None:
+    """The policy of the zoo that the suite of platoons plays; those that choose moments alone are in the logs."""
+    suite = dataclasses.replace(load_suite("platoon-v0"), scenarios=("platoon-gusty-v0",))
+    growing, choosing = "zoo:name=platoon-chi2_dkf-0", "zoo:name=platoon-dkf-0"
+    held = write_log(dataclasses.replace(suite, attacks=(growing, choosing)), tmp_path / "log", episodes=1, dev_episodes=1)
+    assert held["attacks"] == ["none", choosing] and held["left_out"] == [growing]
 
 
 def test_no_seed_is_one_of_a_board() -> None:

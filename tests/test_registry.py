@@ -110,6 +110,8 @@ def test_configuration_files_name_registered_components_only(plugin):
     """A class to import is refused where a file names it; a mapping needs a name."""
     with pytest.raises(InputError, match="imports nothing"):
         Spec("defence", f"{plugin}:Mine").refuse_imports("suite x")
+    with pytest.raises(InputError, match=r"a program \(YAML\) or a policy \(JSON\)"):  # no sandbox plays an attack
+        Spec("attack", f"{plugin}:Mine").refuse_imports("suite x")
     Spec("defence", "chi2_kf:eta=3").refuse_imports("suite x")
     with pytest.raises(InputError, match="defence"):
         make_from("defence", f"{plugin}:Mine", "suite x")

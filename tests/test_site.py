@@ -18,10 +18,12 @@ from tailgate.leaderboard.board_format import read_board
 from tailgate.leaderboard.build import percent
 from tailgate.leaderboard.charts import Axis, Dot, Line, chart, nice, spread, ticks_at
 from tailgate.leaderboard.site import build_site, slug
+from tailgate.leaderboard.site_cards import LICENCE
 from tailgate.leaderboard.site_entry import replay_of
 from tailgate.leaderboard.site_suite import figure
 from tailgate.leaderboard.site_trust import at_least
 
+ROOT = Path(__file__).parent.parent
 spec = importlib.util.spec_from_file_location("boards", Path(__file__).with_name("boards.py"))
 boards = importlib.util.module_from_spec(spec)
 spec.loader.exec_module(boards)
@@ -176,6 +178,40 @@ def test_an_entry_s_page_has_all_parts(site):
     assert "came without a card" in bare and "No replay. The board holds no worst episode" in bare and "Stealth and impact" not in bare
 
 
+def facts(text, heading, level=2):
+    """The names and texts of the first list of facts after a heading."""
+    part = text.replace("<wbr>", "").split(f">{heading}</h{level}>")[1].split("</dl>")[0]
+    return dict(re.findall(r"<dt>(.*?)</dt><dd>(?:<a [^>]*>)?(.*?)(?:</a>)?</dd>", part))
+
+
+def test_every_entry_and_attack_of_a_published_board_has_a_whole_card(tmp_path):
+    """Made of the registry and the suite, as the board stores none of it: code, licence, uses, threat model and training."""
+    board = json.loads((ROOT / "results/quick-v0/board.json").read_text(encoding="utf-8"))
+    page = build_site([board], tmp_path, replays=False)
+    granted = "dos_jam, dos_hold, dos_hold_fresh, dropout, fdi of every sensor; fdi_bound 50.0; jam_range -108.0, 3000.0; onset 50; end 500"
+    for held in board["entries"]:
+        assert not {"licence", "threat_model", "training"} & set(held["card"])
+        told = facts(entry(page, held["defence"], "quick-v0").read_text(encoding="utf-8"), "Card")
+        assert told["Licence"] == "MIT" and told["Threat model"] == granted and told["Training"] == "none" and told["Uses"] == ", ".join(held["uses"])
+        path, cls = told["Code"].split(", ")
+        assert re.search(rf"^class {cls}\b", (ROOT / path).read_text(encoding="utf-8"), re.MULTILINE)
+    text = page.read_text(encoding="utf-8")
+    for name in dict.fromkeys("policy" if a["learned"] else a["attack"].split(":")[0] for a in board["attacks"]):
+        told = facts(text, name, 4)
+        assert told["Licence"] == "MIT" and told["Threat model"] == granted and (ROOT / told["Code"].split(", ")[0]).is_file()
+        assert "cem (gamma=1.0" in told["Training"] if name == "policy" else told["Training"] == "none"
+    board["suite"]["hash"] = "0" * 16  # of another suite under the name: nothing is said of what it grants
+    other = facts(entry(build_site([board], tmp_path, replays=False), "kf", "quick-v0").read_text(encoding="utf-8"), "Card")
+    assert "Threat model" not in other and other["Licence"] == "MIT"
+
+
+def test_the_card_that_came_with_an_attack_is_drawn(site):
+    """Over what is registered of it; the package's licence is the one that stands in pyproject.toml."""
+    told = facts(site.read_text(encoding="utf-8"), "A bias that is held", 4)
+    assert {"Reference": "https://example.org/attack", "Licence": "BSD-3-Clause", "Threat model": "Adds &lt;b&gt;any&lt;/b&gt; value."}.items() <= told.items()
+    assert f'license = "{LICENCE}"' in (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+
+
 def cell_of(site, path, defence):
     """Text and title of the trust cell of a defence, and the heads of the tables that it stands in."""
     found = re.search(rf'<th scope="row" data-sort="{defence}">.*?<td class="num" data-sort="([^"]*)" title="([^"]*)"><b>([^<]*)</b></td>\n<td', path.read_text(), re.DOTALL)
@@ -214,7 +250,7 @@ def test_round_and_weaker_are_said(site, index):
 def test_a_board_of_before_these_fields_is_drawn(tmp_path):
     """Without round, trust, trainings and weaker nothing is claimed of them; no dose at all is damage without an attack."""
     board = make_board(trusted=False)
-    for part, key in ((board["suite"], "beacon"), *((a, "trained_on") for a in board["attacks"]), *((c, "weaker") for c in board["comparisons"]), (board, "trust")):
+    for part, key in ((board["suite"], "beacon"), *((a, key) for a in board["attacks"] for key in ("trained_on", "card")), *((c, "weaker") for c in board["comparisons"]), (board, "trust")):
         del part[key]
     board["entries"][0]["critical_dose"]["black"] |= {"value": 0.0, "low": 0.0}
     text = build_site([board], tmp_path, replays=False).read_text(encoding="utf-8")
@@ -329,6 +365,7 @@ def test_links_lead_somewhere(site):
         (lambda b: b["comparisons"][0].update(weaker="cra"), "board.comparisons[0].weaker"),
         (lambda b: b["suite"].update(beacon=7), "board.suite.beacon"),
         (lambda b: b["attacks"][0].update(trained_on=["kf"]), "board.attacks[0].trained_on"),
+        (lambda b: b["attacks"][0].update(card="mine"), "board.attacks[0].card"),
         (lambda b: b.update(trust=None), "board.entries[0].trust"),
         (lambda b: b["trust"].update(alpha="5 %"), "board.trust.alpha"),
         (lambda b: b["entries"][0]["trust"].pop("safety"), "board.entries[0].trust.safety"),

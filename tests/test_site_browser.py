@@ -80,6 +80,17 @@ def test_filters_hide_rows_of_table_and_map(tab):
     assert len(texts(tab, "#suite-2 .ranks tr[data-row]:not([hidden])")) == 2  # the other suite keeps its rows
 
 
+@pytest.mark.page
+def test_the_cards_of_attacks_are_folded_away_and_open(tab):
+    """A click shows what came with an attack, and what is registered of the others; nothing of it is seen before."""
+    fold = tab.find_element("css selector", "#suite-1 details.told-attacks")
+    assert not fold.find_element("css selector", "dl").is_displayed()
+    fold.find_element("css selector", "summary").click()
+    assert fold.find_element("link text", "https://example.org/attack-code").is_displayed()
+    assert fold.find_element("css selector", "summary").text == "Cards of the attacks (10)"
+    assert "the receiver reads uniform random values" in fold.text and "BSD-3-Clause" in fold.text
+
+
 def pick(tab, selector, value):
     script = "const m = document.querySelector(arguments[0]); m.value = arguments[1]; m.dispatchEvent(new Event('change')); return m.value"
     assert tab.execute_script(script, selector, value) == value

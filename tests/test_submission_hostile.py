@@ -1,8 +1,10 @@
 """A hostile submission costs its own rows or gains nothing: the others are played, the reason names it, nothing is left running."""
 
 import os
+import shutil
 import tempfile
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +16,7 @@ from tailgate.rows import read_rows
 from tailgate.scenario import Suite
 from tailgate.submission import Limits, play_mixed, play_submission
 from tailgate.submission.mixed import Submission
+from tailgate.submission.sandbox import sandbox_of
 from tailgate.submission.source import staged
 
 LIMITS = Limits(memory=2 * 2**30, start_time=30.0, silence=3.0, output=2**16, file_size=2**20, processes=4)
@@ -163,6 +166,11 @@ class Hostile(Kalman):
         with open("large", "wb") as file:
             file.write(bytes(2**22))
 
+    def flood(self, model, *rest):
+        for i in range(64):
+            with open(f"small{i}", "wb") as file:
+                file.write(bytes(2**16))
+
 class Median(Kalman):
     """Takes the batch's median away: a common attack would be gone."""
 
@@ -210,15 +218,13 @@ def world(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def _left(world: Path) -> set[int]:
-    """Every process that was started for a submission of this test: their scratch directory is their home."""
+    """Every process that was started for a submission of this test: their scratch directory is their home, or their sandbox has its files."""
+    signs = (("environ", f"HOME={world}/tailgate-scratch-"), ("mountinfo", f"{world}/tailgate-"), ("cmdline", f"{world}/tailgate-"))
     found = set()
     for name in filter(str.isdigit, os.listdir("/proc")):
-        try:
-            environment = Path(f"/proc/{name}/environ").read_bytes()
-        except OSError:
-            continue
-        if f"HOME={world}/tailgate-scratch-".encode() in environment:
-            found.add(int(name))
+        for file, sign in signs:
+            with suppress(OSError):
+                found |= {int(name)} if sign.encode() in Path(f"/proc/{name}/{file}").read_bytes() else set()
     return found
 
 
@@ -227,26 +233,27 @@ def _cells(world: Path, scenario: str, attacks: tuple[str, ...], seeds: int) -> 
 
 
 def _play(
-    world: Path, text: str, scenario: str, attacks: tuple[str, ...], seeds: int = 3, limits: Limits = LIMITS, played: list[int] | None = None
-) -> list[dict[str, Any]]:
+    world: Path, text: str, scenario: str, attacks: tuple[str, ...], seeds: int = 3, limits: Limits = LIMITS, played: list[int] | None = None,
+    sandbox: str = "",
+) -> list[dict[str, Any]]:  # fmt: skip
     with staged(text) as source:
-        submission = Submission(source, {"uses": ("measurements",), "version": 1, "reference": ""}, limits)
+        submission = Submission(source, {"uses": ("measurements",), "version": 1, "reference": ""}, limits, sandbox_of(sandbox))
         return play_mixed(_cells(world, scenario, attacks, seeds), submission, played)
 
 
 FDI = "fdi:start_step=6,value=50"
 
 
-def _hostile(world: Path, how: str, *, others: bool, **limits: Any) -> list[dict[str, Any]]:
+def _hostile(world: Path, how: str, *, others: bool, sandbox: str = "", **limits: Any) -> list[dict[str, Any]]:
     """The rows of the scenario in which it is hostile, checked for everything that has to hold whatever it does."""
     began = time.monotonic()
     text, kept = f"hostile:Hostile:how={how}", Limits(**{**LIMITS.__dict__, **limits})
-    rows = _play(world, text, "bad", ("none", FDI), limits=kept)
+    rows = _play(world, text, "bad", ("none", FDI), limits=kept, sandbox=sandbox)
     assert len(rows) == 6
     assert not _left(world), "something is left running"
     assert not list(world.glob("tailgate-*"))
     if others:
-        (other,) = _play(world, text, "good", ("none",), seeds=1)
+        (other,) = _play(world, text, "good", ("none",), seeds=1, sandbox=sandbox)
         assert other["status"] == "ok", other["reason"]
     assert time.monotonic() - began < BOUND
     return rows
@@ -304,6 +311,22 @@ def test_processes_that_change_their_session_are_dead_afterwards(world: Path) ->
     """A child in a session of its own, and a daemon of it: the rows are good, and nobody is left."""
     rows = _hostile(world, "escape", others=True)
     assert {row["status"] for row in rows} == {"ok"}
+
+
+@pytest.mark.skipif(shutil.which("bwrap") is None, reason="bubblewrap is not installed")
+@pytest.mark.parametrize(
+    ("how", "reason", "limits"),
+    [
+        ("allocate", "MemoryError: Unable to allocate 100. GiB", {}), ("escape", "", {}), ("bomb", "processes: ", {"silence": 20.0}),
+        ("fill", "OSError: [Errno 27] File too large", {}), ("flood", "OSError: [Errno 28] No space left on device", {}),
+        ("leave", "the process ended with exit code 3; printed last: goodbye", {}), ("loop", "silence: no answer for 3 s", {}),
+    ],
+)  # fmt: skip
+def test_in_a_sandbox_it_ends_in_the_same_way(world: Path, how: str, reason: str, limits: dict[str, Any]) -> None:
+    """Strangers' code is played in bubblewrap: limits, guard and reasons hold there too, many small files fill the scratch directory alone."""
+    rows = _hostile(world, how, others=True, sandbox="bwrap", **limits)
+    assert {(row["status"], row["reason"][: len(reason)]) for row in rows} == {("error" if reason else "ok", reason)}
+    assert {row["submission"]["sandbox"] for row in rows} == {"bwrap"}
 
 
 def test_a_loop_at_import_costs_all_rows_in_bounded_time(world: Path, tmp_path: Path) -> None:

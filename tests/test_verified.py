@@ -50,15 +50,15 @@ def _write(folder: Path, name: str, rows: list[dict[str, Any]]) -> None:
     (folder / name).write_bytes(encode(rows))
 
 
-def test_rows_that_come_out_equal_make_their_entries_verified(rows: list[dict[str, Any]], tmp_path: Path) -> None:
+def test_rows_that_come_out_equal_are_said_of_their_entries(rows: list[dict[str, Any]], tmp_path: Path) -> None:
     _write(tmp_path, "rows.jsonl", rows)
     assert _verified(tmp_path) == {"none": None, "kf": None}
     assert _verify(tmp_path)["status"] == "verified"
     all_of = {"rows": 8, "verified": 8, "differs": 0, "unchecked": 0}
     assert _verified(tmp_path) == {"none": all_of, "kf": all_of}
     page = build_site([json.loads((tmp_path / "board.json").read_text())], tmp_path / "page", replays=False)
-    assert "2 of 2 entries verified: played again all 16 rows, all equal" in page.read_text()
-    assert "Verified: all 8 rows were played again and came out equal." in next((page.parent).glob("*/kf.html")).read_text()
+    assert "rows of 2 of 2 entries replayed without a difference: all 16 rows, all equal" in page.read_text()
+    assert "Replayed: all 8 rows were played again and came out equal." in next((page.parent).glob("*/kf.html")).read_text()
 
 
 def test_files_without_rows_are_an_error(tmp_path: Path) -> None:
@@ -76,11 +76,11 @@ def test_a_sample_says_how_many(rows: list[dict[str, Any]], tmp_path: Path) -> N
     page = build_site([json.loads((tmp_path / "board.json").read_text())], tmp_path / "page", replays=False)
     n = held["kf"]["verified"]
     most = round(100 * (1 - 0.05 ** (1 / n)))
-    words = f"Verified: {n} of 8 rows, drawn at random, were played again and came out equal. At most {most}% of them differ, at 95%."
+    words = f"Replayed: {n} of 8 rows, drawn at random, were played again and came out equal. At most {most}% of them differ, at 95%."
     assert words in next((page.parent).glob("*/kf.html")).read_text()
 
 
-def test_one_row_that_differs_leaves_its_entry_claimed(rows: list[dict[str, Any]], tmp_path: Path) -> None:
+def test_one_row_that_differs_is_said_of_its_entry(rows: list[dict[str, Any]], tmp_path: Path) -> None:
     k = next(k for k, row in enumerate(rows) if row["defence"] == "kf")
     _write(tmp_path, "rows.jsonl", [*rows[:k], rows[k] | {"min_gap": 99.0}, *rows[k + 1 :]])
     _verify(tmp_path)
@@ -90,8 +90,8 @@ def test_one_row_that_differs_leaves_its_entry_claimed(rows: list[dict[str, Any]
     sound = {entry.defence: entry.verified.sound for entry in board.entries if entry.verified}
     assert sound == {"none": True, "kf": False}
     page = build_site([json.loads((tmp_path / "board.json").read_text())], tmp_path / "page", replays=False)
-    assert "1 of 2 entries verified: played again all 16 rows, 1 of them differ" in page.read_text()
-    assert "Claimed: all 8 rows were played again; 1 differ." in next((page.parent).glob("*/kf.html")).read_text()
+    assert "rows of 1 of 2 entries replayed without a difference: all 16 rows, 1 of them differ" in page.read_text()
+    assert "Replayed: all 8 rows were played again; 1 differ." in next((page.parent).glob("*/kf.html")).read_text()
 
 
 def test_a_report_on_other_rows_counts_for_nothing(rows: list[dict[str, Any]], tmp_path: Path) -> None:

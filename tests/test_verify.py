@@ -13,7 +13,7 @@ import pytest
 import tailgate
 from tailgate import evaluation
 from tailgate.commands import verify as command
-from tailgate.evaluation import Cell, cells_of, run, run_cell
+from tailgate.evaluation import Cell, cells_of, episodes_at_once, run, run_cell
 from tailgate.rows import encode
 from tailgate.scenario import Suite
 from tailgate.verify import verify
@@ -41,12 +41,12 @@ def test_honest_rows_are_verified(rows: list[dict[str, Any]]) -> None:
 
 
 def test_a_row_is_the_same_with_other_workers_batches_and_companions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """300 episodes: one process and two, 256 at once and all, each by itself, backwards, and after an interruption."""
+    """300 episodes: one process and two, 256 at once, each by itself, backwards, and after an interruption."""
     (cell,) = cells_of(dataclasses.replace(SUITE, scenarios=("thesis-ch4-v0",), doses=(5,), attacks=("fdi:value=5",), seeds=300))
     held = run([cell])
-    for workers, batch in ((1, 256), (2, 256), (1, 4096)):
-        report = verify(held, workers=workers, batch=batch)
-        assert report["counts"] == {"verified": 300, "differs": 0, "unchecked": 0}, (workers, batch)
+    for workers in (1, 2):
+        report = verify(held, workers=workers, batch=256)
+        assert report["counts"] == {"verified": 300, "differs": 0, "unchecked": 0}, workers
     assert verify(held[::-1][:12], batch=1)["counts"]["verified"] == 12
     assert verify(held, sample=7, batch=4)["counts"] == {"verified": 7, "differs": 0, "unchecked": 0}
     other = Cell(**(dataclasses.asdict(cell) | {"attack": "none", "seeds": 2}))
@@ -63,6 +63,26 @@ def test_a_row_is_the_same_with_other_workers_batches_and_companions(tmp_path: P
         run([cell, other], tmp_path / "rows.jsonl")
     again = run([cell, other], tmp_path / "rows.jsonl")
     assert len(calls) == 3 and [row["trace_hash"] for row in again[:300]] == [row["trace_hash"] for row in held]
+
+
+def test_a_row_is_the_same_in_a_batch_of_4096() -> None:
+    """4100 episodes that were played 256 at once, again as a full batch and four that are left."""
+    (cell,) = cells_of(dataclasses.replace(SUITE, scenarios=("thesis-ch4-v0",), doses=(5,), attacks=("fdi:value=5",), seeds=4100))
+    loop = cell.place(tailgate.make_attack("fdi"), "black").loop(tailgate.make_defence("kf"))
+    assert episodes_at_once(loop.model, loop.horizon, 4096) == 4096
+    assert verify(run([cell]), batch=4096)["counts"] == {"verified": 4100, "differs": 0, "unchecked": 0}
+
+
+def test_rows_of_a_radar_a_platoon_and_a_network_are_the_same_too() -> None:
+    """Filters of one car and of many agents, over the air and on wires: side by side, three at once in two processes, and each by itself."""
+    cells = [
+        Cell("s", "radar-braking-v0", 4, "chi2_kf", "noise_jam:trigger=leader_braking,threshold=0.3", 40),
+        Cell("s", "platoon-gusty-v0", 20, "dkf", "fdi:value=5", 8), Cell("s", "network-restless-v0", 5, "dkf", "fdi:value=5", 8),
+    ]  # fmt: skip
+    held = run(cells)
+    assert {row["status"] for row in held} == {"ok"} and all(row["attack_steps"] == row["dose"] for row in held)
+    assert verify(held, batch=3, workers=2)["counts"] == {"verified": 56, "differs": 0, "unchecked": 0}
+    assert verify(held[::-7], batch=1)["counts"] == {"verified": 8, "differs": 0, "unchecked": 0}
 
 
 @pytest.mark.parametrize(

@@ -25,6 +25,7 @@ from tailgate.draws import Role
 from tailgate.errors import InputError, NotApplicable
 from tailgate.evaluation import Cell, cell_id, cells_of
 from tailgate.files import replacing, sweep, writable_directory, write_atomic
+from tailgate.held_out import families
 from tailgate.kinds import Kind, Mode
 from tailgate.log_card import Column, columns_of, readme
 from tailgate.loop import Loop, LoopState
@@ -49,11 +50,6 @@ def pyarrow() -> tuple[Any, Any]:
     except ImportError as error:
         raise ImportError("logs need pyarrow: pip install 'tailgate[log]'") from error
     return pyarrow, pyarrow.parquet
-
-
-def family(text: str) -> str:
-    """The family of an attack: the name that it is registered under."""
-    return Spec("attack", text).entry.name
 
 
 def write_log(
@@ -104,17 +100,25 @@ def _chosen(
     attacks: Sequence[str] | None,
 ) -> Suite:  # fmt: skip
     """The part of the suite that is logged, with the episodes without attack."""
-    held_out = {family(name) for name in base.held_out}
     for text in attacks or ():
-        if family(text) in held_out:
-            raise InputError("attack", text, f"an attack that {base.name} does not hold out of its logs ({', '.join(sorted(held_out))})")
-    played = [text for text in (base.attacks if attacks is None else attacks) if family(text) not in held_out]
+        if hidden := _hidden(base, text):
+            raise InputError("attack", text, f"an attack that {base.name} does not hold out of its logs, as it does {', '.join(hidden)}")
+    played = [text for text in (base.attacks if attacks is None else attacks) if not _hidden(base, text)]
     standard = ("kf",) if "kf" in base.defences else base.defences[:1]
     return dataclasses.replace(
         base, scenarios=tuple(base.scenarios if scenarios is None else scenarios), attacks=tuple(dict.fromkeys(["none", *played])),
         doses=tuple((base.doses[len(base.doses) // 2],) if doses is None else doses),
         defences=tuple(standard if defences is None else defences), shown={}, robustness=(),
     )  # fmt: skip
+
+
+def _held_out(base: Suite) -> set[str]:
+    return {Spec("attack", text).entry.name for text in base.held_out}
+
+
+def _hidden(base: Suite, text: str) -> list[str]:
+    """The families that the suite holds out and the attack belongs to."""
+    return sorted(families(text) & _held_out(base))
 
 
 def _whole(folder: Path) -> dict[str, Any] | None:
@@ -153,7 +157,7 @@ def _written(
     ]  # fmt: skip
     held = {
         "format": FORMAT, "identity": identity, "suite": base.name, "about": base.about, "version": tailgate.__version__,
-        "held_out": sorted({family(name) for name in base.held_out}), "splits": SPLITS,
+        "held_out": sorted(_held_out(base)), "left_out": [text for text in base.attacks if _hidden(base, text)], "splits": SPLITS,
         "attacks": list(chosen.attacks), "defences": list(chosen.defences), "doses": list(chosen.doses), "files": files, "skipped": skipped,
         "scenarios": {
             name: {

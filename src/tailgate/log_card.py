@@ -109,7 +109,8 @@ def readme(held: dict[str, Any]) -> str:
         "To learn detectors of attacks on sensors. The columns say what a detector may read. A row's neighbours in an episode are not "
         "independent of it: split by episode, never by row, and use `dev` for every choice. The boards are scored on other seeds.",
         "",
-        f"**Held out:** {', '.join(held['held_out']) or 'nothing'}. Attacks of these families are in no file here, and the board has them. "
+        f"**Held out:** {', '.join(held['held_out']) or 'nothing'}. Attacks of these families are in no file here, and the board has them"
+        f"{': ' if held['left_out'] else ''}{', '.join(f'`{text}`' for text in held['left_out'])}. "
         f"Within a family that is here, the board's other doses and scenarios are new to a detector too.",
         "",
         "| split | seeds of the purpose | file | rows | row groups | SHA-256 |",

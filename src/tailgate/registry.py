@@ -237,8 +237,8 @@ class Spec:
     def refuse_imports(self, where: str) -> None:
         """Raise InputError when this names a class to import: configuration files never run code."""
         if self.imports:
-            wanted = "a registered name, or a class in a sandbox (bwrap/module:Class): a configuration imports nothing"
-            raise InputError(f"{where}: {self.family}", self.text, wanted)
+            other = "or a class in a sandbox (bwrap/module:Class)" if self.family == "defence" else "a program (YAML) or a policy (JSON)"
+            raise InputError(f"{where}: {self.family}", self.text, f"a registered name, {other}: a configuration imports nothing")
 
     @property
     def sandboxed(self) -> tuple[str, str] | None:

@@ -5,15 +5,14 @@ from __future__ import annotations
 import os
 import platform
 import statistics
-import subprocess
 import time
 from collections.abc import Callable, Iterable, Sequence
 from importlib.metadata import PackageNotFoundError, version
-from pathlib import Path
 from typing import Any
 
 import tailgate
 from tailgate.errors import InputError
+from tailgate.machine import commit, cpuinfo, processor
 
 from .lines import RATE, Line, Missing, only
 from .targets import Scaling, Target, chosen, groups
@@ -30,7 +29,7 @@ Report = Callable[[str, int, int, str], None]  # label, done, total, figures
 def machine() -> dict[str, Any]:
     """What the figures were made on."""
     found: dict[str, Any] = {
-        "processor": _processor(), "vectors": _vectors(), "cores": os.cpu_count(), "system": f"{platform.system()} {platform.machine()}",
+        "processor": processor(), "vectors": _vectors(), "cores": os.cpu_count(), "system": f"{platform.system()} {platform.machine()}",
         "python": platform.python_version(), "packages": {},
     }  # fmt: skip
     for name in PACKAGES:
@@ -45,34 +44,10 @@ def machine() -> dict[str, Any]:
     return found
 
 
-def _cpuinfo(key: str) -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-    except OSError:
-        return ""
-    return next((line.partition(":")[2].strip() for line in lines if line.startswith(key)), "")
-
-
-def _processor() -> str:
-    return _cpuinfo("model name") or platform.processor() or "unknown"
-
-
 def _vectors() -> str:
     """The widest vector instructions of this processor, as far as known."""
-    flags = _cpuinfo("flags").split()
+    flags = cpuinfo("flags").split()
     return next((words for flag, words in (("avx512f", "AVX-512"), ("avx2", "AVX2"), ("asimd", "NEON")) if flag in flags), "unknown")
-
-
-def commit() -> str | None:
-    """The commit of the source, marked where files differ from it; None outside of a repository."""
-    def asked(*words: str) -> str:
-        command = ["git", "--no-optional-locks", "-C", str(Path(tailgate.__file__).resolve().parent), *words]
-        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
-
-    try:
-        return asked("rev-parse", "HEAD") + (" with changes" if asked("status", "--porcelain", "-uno", ".") else "")
-    except (OSError, subprocess.CalledProcessError):
-        return None
 
 
 def interval(values: Sequence[float], level: float = LEVEL) -> tuple[float, float, float]:

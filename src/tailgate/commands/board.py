@@ -66,6 +66,7 @@ def add(actions: Any) -> None:
 def _run(options: argparse.Namespace) -> int:
     sys.path.insert(0, "")  # module:Class is looked for in the working directory, as `tailgate evaluate` does
     from tailgate.leaderboard.run import board_of, play
+    from tailgate.leaderboard.run_record import Record
     from tailgate.leaderboard.site import build_site
     from tailgate.scenario import load_suite
 
@@ -75,13 +76,15 @@ def _run(options: argparse.Namespace) -> int:
     with progress(Console(stderr=True)) as update:
         for suite in suites:
             folder = out / suite.name
+            record = Record(suite, folder, options.workers)
             if not options.score_only:
                 rows = play(
                     suite, folder, defences=options.defence, workers=options.workers, beacon=options.beacon,
-                    progress=lambda name, done, total: update(name, done, total, cells(done, total)),
+                    progress=record.counting(lambda name, done, total: update(name, done, total, cells(done, total))),
                 )  # fmt: skip
                 print(f"rows: {rows}", file=sys.stderr)
             board = board_of(suite, folder, beacon=options.beacon or None, require_adaptive=not options.unattacked)
+            print(record.finish(board["suite"]["rows"]), file=sys.stderr)
             boards.append(_detected(board, suite, folder, update) if options.detection else board)
     page = build_site(boards, out / "page", replays=not options.no_replays)
     if options.json:

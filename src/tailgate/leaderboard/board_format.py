@@ -59,6 +59,7 @@ class AttackPart(Part):
     admitted: dict[str, Any] | None = None
     note: Text = ""
     withdrawn: bool = False
+    card: dict[str, Any] | None = None
 
 
 class Worst(Part):
@@ -161,7 +162,7 @@ class Verified(Part):
 
     @property
     def sound(self) -> bool:
-        """Whether the entry counts as verified: all that was played again came out equal."""
+        """Whether rows were played again and all of them came out equal."""
         return self.verified > 0 and self.differs == self.unchecked == 0
 
 

@@ -15,13 +15,11 @@ from tailgate.replay.replay import play
 
 from .board_format import LEVELS, CellPart, EntryPart, Robust
 from .build import names_of, percent
+from .site_cards import card_of
 from .site_curves import curves_of
 from .site_index import compared_how, comparisons_of
 from .site_suite import Data, Suite, critical_of, dose_text, figure, played, share_of, worse
 from .site_trust import trust_of, trust_page
-
-SHOWN = ("name", "summary", "parameters")  # of a card: shown in a place of their own
-ORDER = ("reference", "code", "licence", "uses", "authors", "threat_model", "training", "digest", "sentinel", "version")
 
 
 @dataclass(frozen=True)
@@ -62,32 +60,6 @@ def _reason(error: Exception, row: Mapping[str, Any]) -> str:
         if isinstance(value, str) and "/" in value:
             text = text.replace(value, names_of([value])[value].label)
     return text[:1].upper() + text[1:] + "."
-
-
-def _plain(value: Any) -> str:
-    """JSON data in a line."""
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    if isinstance(value, Mapping):
-        return "; ".join(f"{k}: {_plain(v)}" for k, v in value.items())
-    if isinstance(value, list | tuple):
-        return ", ".join(_plain(v) for v in value)
-    return "none" if value is None else str(value)
-
-
-def card_of(entry: EntryPart) -> Data:
-    """A card's fields in order: those that are known first, then the others as they stand."""
-    card = entry.card or {}
-    keys = [*(k for k in ORDER if k in card), *(k for k in card if k not in ORDER and k not in SHOWN)]
-    fields = [(key.replace("_", " ").capitalize(), _plain(card[key])) for key in keys if card[key] not in (None, "", [], {})]
-    if "uses" not in card and entry.uses:
-        fields.append(("Uses", ", ".join(entry.uses)))
-    given = card.get("parameters")
-    parameters = []
-    for name, item in given.items() if isinstance(given, Mapping) else ():
-        known = isinstance(item, Mapping) and "doc" in item
-        parameters.append((str(name), _plain(item.get("default")) if known else _plain(item), str(item["doc"]) if known else ""))
-    return {"known": bool(card), "summary": _plain(card.get("summary", "")), "fields": fields, "parameters": parameters}
 
 
 def _rates(suite: Suite, entry: EntryPart) -> list[Data]:
@@ -161,7 +133,7 @@ def _clean(suite: Suite, entry: EntryPart) -> list[Data]:
     return out
 
 
-def _verified(entry: EntryPart) -> str:
+def _replayed(entry: EntryPart) -> str:
     """What came of the rows that were played again; empty where nobody has said anything of them."""
     held = entry.verified
     if held is None:
@@ -170,9 +142,9 @@ def _verified(entry: EntryPart) -> str:
     which = f"{asked} of {held.rows} rows, drawn at random, were" if asked < held.rows else f"all {held.rows} rows were"
     if held.sound:
         most = f" At most {percent(1.0 - 0.05 ** (1.0 / asked))} of them differ, at 95%." if asked < held.rows else ""
-        return f"Verified: {which} played again and came out equal.{most}"
+        return f"Replayed: {which} played again and came out equal.{most}"
     parts = [f"{n} {word}" for n, word in ((held.differs, "differ"), (held.unchecked, "could not be checked")) if n]
-    return f"Claimed: {which} played again; {' and '.join(parts)}." if asked else "Claimed: no row was played again."
+    return f"Replayed: {which} played again; {' and '.join(parts)}." if asked else "Not replayed: no row was played again."
 
 
 def _checked(entry: EntryPart) -> str:
@@ -207,9 +179,9 @@ def entry_page(suite: Suite, entry: EntryPart, replayed: Replayed | None, also: 
     return {
         "suite": suite.board.suite, "damage": suite.damage, "limit": percent(suite.board.suite.limit), "scale": suite.scale,
         "name": suite.defences[entry.defence], "status": entry.status, "why": entry.why,
-        "verified": _verified(entry), "checked": _checked(entry), "typed": shlex.quote(entry.defence),
+        "replayed": _replayed(entry), "checked": _checked(entry), "typed": shlex.quote(entry.defence),
         "class": entry.class_ or "not stated",
-        "rank": _rank(suite, entry), "also": also, "card": card_of(entry), "flags": entry.flags, "levels": LEVELS,
+        "rank": _rank(suite, entry), "also": also, "card": card_of(suite, entry), "flags": entry.flags, "levels": LEVELS,
         "critical": [(level, critical_of(suite, entry.critical_dose.get(level))) for level in LEVELS],
         "rates": _rates(suite, entry), "worst": _worst(suite, entry), "cells": _every(suite, mine),
         "doses": [dose_text(d) for d in suite.board.suite.doses],

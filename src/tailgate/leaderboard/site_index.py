@@ -6,6 +6,7 @@ from collections import Counter
 
 from .board_format import LEVELS, CellPart, Dose, Level
 from .build import Name, percent
+from .site_cards import attack_cards
 from .site_curves import curves_of, stealth_of, together_of
 from .site_suite import GROUPS, Data, Suite, cell_of, critical_of, dose_text, figure, gates_of, played, share_of, worse
 from .site_trust import trust_cell, trust_of
@@ -188,12 +189,12 @@ def attacks_of(suite: Suite) -> list[Data]:
 
 
 def checked_of(suite: Suite) -> str:
-    """How many entries are verified by rows, and how many cells were played again from the board alone; empty where nothing was."""
+    """Of how many entries the rows that were played again came out equal, and how many cells from the board alone; empty for none."""
     entries, said = suite.board.entries, []
     if told := [entry.verified for entry in entries if entry.verified is not None]:
         equal, differs, unchecked = sum(v.verified for v in told), sum(v.differs for v in told), sum(v.unchecked for v in told)
         rows = played(sum(v.rows for v in told), equal, differs, unchecked, "rows")
-        said.append(f"{sum(v.sound for v in told)} of {len(entries)} entries verified: played again {rows}")
+        said.append(f"rows of {sum(v.sound for v in told)} of {len(entries)} entries replayed without a difference: {rows}")
     if held := [entry.checked for entry in entries if entry.checked is not None]:
         equal, differs, unchecked = sum(c.equal for c in held), sum(c.differs for c in held), sum(c.unchecked for c in held)
         cells = played(len(suite.board.cells), equal, differs, unchecked, "cells")
@@ -225,5 +226,5 @@ def section(suite: Suite) -> Data:
         "statuses": [s for s, *_ in GROUPS if any(r["status"] == s for r in rows)], "levels": LEVELS,
         "heat": heat_of(suite), "scale": suite.scale, "together": together_of(suite), "curves": curves_of(suite),
         "stealth": stealth_of(suite), "detection": detection_of(suite), "comparisons": comparisons_of(suite), "attacks": attacks_of(suite),
-        "how": compared_how(suite),
+        "how": compared_how(suite), "attack_cards": attack_cards(suite),
     }  # fmt: skip

@@ -22,7 +22,7 @@ from contextlib import suppress
 from typing import Any
 
 _SUBREAPER = 36  # PR_SET_CHILD_SUBREAPER
-_TICK = 1.0 / os.sysconf("SC_CLK_TCK")
+TICK = 1.0 / os.sysconf("SC_CLK_TCK")
 _LOOK = 0.2  # [s] between two looks at the processes
 _TAIL = 1000  # [bytes] of what was printed last
 _KILLING = 20.0  # [s] after which the guard gives up
@@ -102,7 +102,7 @@ class Guard:
         held = _memory(list(found), self.job["memory"])
         if held > self.job["memory"]:
             return f"memory: {held / 2**30:.2f} GiB held, {self.job['memory'] / 2**30:.2f} GiB allowed"
-        used = self.reaped + sum(_TICK * sum(int(ticks) for ticks in fields[11:15]) for fields in found.values())
+        used = self.reaped + sum(TICK * sum(int(ticks) for ticks in fields[11:15]) for fields in found.values())
         if used > self.granted:
             return f"processor time: {used:.1f} s used, {self.granted:.1f} s allowed"
         return ""
