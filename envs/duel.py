@@ -149,7 +149,7 @@ class Duel:
         return held.seen
 
     def mask(self, state: DuelState) -> Array:
-        """(B, actions) bool: the attacker's actions that the channel would accept. Discrete action spaces only."""
+        """(B, actions) bool: the attacker's discrete actions that the channel would accept in a step of the next decision."""
         return self.seat.action.mask(self.seat.loop.sense(state.loop))
 
     def step(

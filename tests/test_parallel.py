@@ -101,21 +101,23 @@ def test_rows_are_steered_on_their_own():
     assert len({float(score) for score in whole[1][:, -2]}) == 3  # where the threshold stands
 
 
-def test_masks_agree_with_what_the_channel_accepts():
-    """In random play no allowed action is refused, and every other one than none is refused where its mask is 0."""
-    env = tailgate.parallel_env(scenario="gusty-stop-and-go-v0", interval=1, threat={"budget": 25, "duration": 6, "cooldown": 4, "onset": 20})
+@pytest.mark.parametrize("interval", [1, 7, 20])
+def test_masks_agree_with_what_the_channel_accepts(interval):
+    """In random play no allowed action is refused throughout, and every other one than none is where its mask is 0."""
+    threat = {"budget": 25, "duration": 6, "cooldown": 4, "onset": 20, "end": 200}
+    env = tailgate.parallel_env(scenario="gusty-stop-and-go-v0", interval=interval, threat=threat)
     rng, accepted, refused = np.random.default_rng(0), 0, 0
     for seed in range(2):
         _, info = env.reset(seed=seed)
-        for _ in range(200):
-            mask = info["attacker"]["action_mask"]
+        while env.agents:
+            used, mask = int(env.game.loop.channel.used[0]), info["attacker"]["action_mask"]
             action = int(rng.integers(len(mask)))
             _, _, _, _, info = env.step({"attacker": action, "defender": int(rng.integers(15))})
             assert info["attacker"]["illegal"] == (mask[action] == 0)
-            accepted, refused = accepted + bool(mask[action] and action), refused + (not mask[action])
-            if not env.agents:
-                break
-    assert accepted == 2 * 25 and refused > 100
+            cost = int(env.game.loop.channel.used[0]) - used
+            assert (cost > 0) == bool(mask[action] and action)
+            accepted, refused = accepted + cost, refused + (not mask[action])
+    assert accepted == 2 * 25 and refused > 10
 
 
 def test_the_defender_sees_the_attack_only_through_what_arrives():
