@@ -52,7 +52,7 @@ class DuelEnv(ParallelEnv[str, Array, Any]):  # type: ignore[misc]
         return self.action_spaces[agent]
 
     def card(self) -> dict[str, Any]:
-        """JSON data that names this game completely."""
+        """JSON data that names this game completely, with a hash."""
         return self.duel.card()
 
     def reset(

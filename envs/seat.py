@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import json
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -18,7 +17,7 @@ from tailgate.errors import InputError, unknown
 from tailgate.loop import Loop, LoopState
 from tailgate.registry import Spec
 from tailgate.scenario import load_scenario
-from tailgate.schema import as_data, build, canonical, fields_of
+from tailgate.schema import as_data, build, digest, fields_of
 from tailgate.threat import ThreatModel
 
 CAR_FOLLOWING = "tailgate/CarFollowing-v0"
@@ -109,9 +108,8 @@ class Seat:
         """What papers and rows cite: the whole configuration, and its hash."""
         from tailgate import __version__
 
-        digest = hashlib.blake2b(canonical(self.config).encode(), digest_size=8).hexdigest()
         features, actions = list(self.observation.names), [mode.name for mode in self.action.modes] if self.action.discrete else None
-        card = self.config | {"observation": features, "actions": actions, "version": __version__, "hash": digest}
+        card = self.config | {"observation": features, "actions": actions, "version": __version__, "hash": digest(self.config)}
         return json.loads(json.dumps(card))  # type: ignore[no-any-return]
 
     # -- playing

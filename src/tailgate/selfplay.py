@@ -16,7 +16,6 @@ A member is trained for certain opponents: a run that goes on trains anew what w
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import itertools
 import json
 from collections.abc import Callable
@@ -40,7 +39,7 @@ from tailgate.estimators.steering import nearest
 from tailgate.files import set_aside, writable_directory, write_atomic
 from tailgate.registry import Spec
 from tailgate.scenario import config_path
-from tailgate.schema import as_data, build, canonical, override, read_yaml
+from tailgate.schema import as_data, build, digest, override, read_yaml
 from tailgate.stats import Interval, paired_difference, proportion
 from tailgate.train import TrainConfig, environment_of
 
@@ -202,8 +201,7 @@ class Game:
         path, steps = self.directory / name, self.config.steps
         if _finished(path.with_suffix(".json"), facts):
             return path.with_suffix(".json")
-        digest = hashlib.blake2b(canonical(facts).encode(), digest_size=8).hexdigest()  # the run may have been cut off with other opponents
-        checkpoint = self.directory / f"checkpoint-{name}-{digest}.safetensors"
+        checkpoint = self.directory / f"checkpoint-{name}-{digest(facts)}.safetensors"  # the run may have been cut off with other opponents
         learner = make()
         if checkpoint.is_file():
             learner.load(checkpoint)
