@@ -292,3 +292,20 @@ def test_the_preset():
     assert isinstance(config, GameConfig) and config.steps == 7 and config.defence == "chi2_kf"
     assert Duel.make(config.scenario, config.defence, config.menu).settings.shape == (15, 2)
     assert isinstance(Duel.make(config.scenario, config.defence, config.menu).guard, Steered)
+
+
+@pytest.mark.parametrize("name", ["ppo", "maskable_ppo"])
+def test_the_attacker_learns_by_other_learners_too(name, brief, tmp_path, monkeypatch, capsys):
+    """A round and its report; what is exported chooses as it was trained to, and the run goes on."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(selfplay, "SELECT_EPISODES", 4)
+    small = [line for line in TINY if not line.startswith(("attacker", "steps"))]
+    words = [*small, "steps=16", f"learner={name}", "attacker={envs: 2, rollout: 8, batch_size: 8, epochs: 1, hidden: [4]}", f"scenario={brief['scenario']}"]
+    assert cli.main(["selfplay", *words, "--json"]) == 0
+    out, home = json.loads(capsys.readouterr().out), tmp_path / "runs/tiny"
+    assert {row["attack"] for row in out["table"]} == set(NAMES)
+    header = json.loads((home / "attacker-1.json").read_text())
+    assert header["training"]["learner"] == name and header.get("masked", False) == (name == "maskable_ppo") and header["training"]["steps"] >= 16
+    kept = {path.name: path.read_bytes() for path in home.glob("*.safetensors")}
+    assert cli.main(["selfplay", "--resume", "name=tiny", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == out and kept == {path.name: path.read_bytes() for path in home.glob("*.safetensors")}
