@@ -11,7 +11,7 @@ import numpy as np
 from tailgate import num
 from tailgate.core import AIRED, Array, Command, Finite, Kind, Positive, PositiveCount, View, param
 from tailgate.errors import InputError
-from tailgate.threat import Brief, KindName
+from tailgate.threat import Brief, Channel, ChannelPlan, KindName
 
 from .values import fit, receivers
 
@@ -95,6 +95,11 @@ class ActionCodec:
     def carried(self) -> tuple[Kind, ...]:
         """The granted kinds that a vector can carry."""
         return tuple(kind for kind in VECTOR if kind.name.lower() in self.brief.threat.kinds)
+
+    @cached_property
+    def channel(self) -> ChannelPlan:
+        """What the channel makes of the brief."""
+        return Channel().prepare(self.brief)
 
     @cached_property
     def wires(self) -> Array:
@@ -201,8 +206,9 @@ class ActionCodec:
         return fit(brief, kind, most * (0.5 + 0.5 * share))
 
     def mask(self, view: View) -> Array:
-        """(B, size) bool of the discrete actions that the channel would accept."""
-        out = np.repeat(np.asarray(view.allowed)[:, None], self.size, axis=1)
+        """(B, size) bool of the discrete actions that the channel would accept in at least one step of the decision that is due."""
+        free = Channel().open(self.channel, view.k, view.budget_left, view.burst, view.cooldown, self.spec.interval)
+        out = np.repeat(free[:, None], self.size, axis=1)
         out[:, 0] = True
         return out
 

@@ -1,7 +1,7 @@
 """PPO that never chooses what the channel would refuse (Huang and Ontanon 2022), from sb3-contrib (extra: train).
 
-The masks are those of `ActionCodec.mask`: rest always, every attack where the budget, the cooldown and the onset allow one. The exported
-policy chooses under the same masks. Discrete actions only.
+The masks are those of `ActionCodec.mask`: rest always, every attack where budget, burst, cooldown, onset and end allow one in some step
+of the decision. The exported policy chooses under the same masks. Discrete actions only.
 """
 
 from __future__ import annotations

@@ -51,7 +51,7 @@ class Reward:
     gap_shaping: NonNegative = param(0.5, "weight of the closeness of the car ahead as a potential [-]")
     error_shaping: NonNegative = param(1.0, "weight of the believed extra gap, per 10 m and capped at 20 m, as a potential [-]")
     gamma: Positive = param(0.995, "discount in the potential's difference [-]")
-    illegal_penalty: NonNegative = param(0.0, "cost of a refused command [-]")
+    illegal_penalty: NonNegative = param(0.0, "cost of a decision whose command is refused in every step [-]")
     attack_cost: NonNegative = param(0.0, "cost of a step under attack: what makes waiting for the right moment pay [-]")
 
     def potential(self, gap: Array, belief: Array | float = 0.0) -> Array:
@@ -74,7 +74,7 @@ class Reward:
         fall (B,) of the smallest gap [m]; rise (B,) of the largest error, which only `peak` asks for.
         """
         crashed = frame.collided | frame.rear_collided
-        out = -self.illegal_penalty * frame.refused - self.attack_cost * (frame.command.kind != Kind.NONE)
+        out = -self.attack_cost * (frame.command.kind != Kind.NONE)
         if self.reward in ("collision", "min_gap"):
             out = out + crashed
             if self.reward == "min_gap":
@@ -88,6 +88,6 @@ class Reward:
                 out = out - model.dt * frame.estimate.alarm.any(axis=1)
         return np.asarray(out)
 
-    def shaped(self, raw: Array, before: Array, after: Array, terminated: Array) -> Array:
-        """(B,) reward of a decision from its raw reward and the potentials (B,) before and after it."""
-        return np.asarray(raw + self.gamma * np.where(terminated, 0.0, after) - before)
+    def decided(self, raw: Array, illegal: Array, before: Array, after: Array, terminated: Array) -> Array:
+        """(B,) reward of a decision from that of its steps, whether it was illegal, and the potentials (B,) before and after it."""
+        return np.asarray(raw - self.illegal_penalty * illegal + self.gamma * np.where(terminated, 0.0, after) - before)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,7 +13,7 @@ from tailgate.draws import Keys
 from tailgate.envs.duel import Duel, Rival
 from tailgate.estimators.steered import save_defender
 from tailgate.estimators.steering import nearest
-from tailgate.schema import as_data, canonical
+from tailgate.schema import digest
 
 from .cem import Config, Search, lean, outputs
 from .mixture import Mixture
@@ -55,8 +54,7 @@ class Learner(Search):
 
     def __init__(self, seed: int, gamma: float, config: Config, duel: Duel, attacks: tuple[Attack, ...]) -> None:
         self.duel, self.gamma, self.attack = duel, gamma, Mixture(attacks)
-        known = canonical([duel.card(), [as_data(attack) for attack in attacks]])
-        self._card = hashlib.blake2b(known.encode(), digest_size=8).hexdigest()
+        self._card = digest([duel.card(), attacks])
         names, actions = duel.plan.sight.names, len(duel.settings)
         first = (nearest(duel.guard.hand.knobs), lean(config.rest, actions) if actions > 1 else 0.0)
         super().__init__(seed, gamma, config, (len(names), *config.hidden, actions), first)

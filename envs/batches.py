@@ -52,7 +52,7 @@ class Episodes(Protocol):
     def facts(self) -> Facts: ...
 
     def mask(self) -> Array:
-        """(B, actions) bool: the discrete actions that the channel would accept."""
+        """(B, actions) bool: the discrete actions that the channel would accept in a step of the next decision."""
 
     def held(self) -> dict[str, Array]:
         """All that changes from step to step, by name."""

@@ -23,7 +23,7 @@ from tailgate.estimators.steered import Steered, SteeredChallenge, SteeredPlan, 
 from tailgate.estimators.steering import LIMIT, Menu
 from tailgate.loop import LoopState
 from tailgate.registry import Spec, entry_for
-from tailgate.schema import as_data, build, fields_of
+from tailgate.schema import as_data, build, digest, fields_of
 from tailgate.tree import put_rows
 
 from .seat import CAR_FOLLOWING, FACES, Outcome, Seat, Tally
@@ -112,9 +112,10 @@ class Duel:
         guard = steered(defence, dataclasses.replace(menu, interval=interval))
         return cls(Seat.make(scenario=scenario, defence=guard, **arguments), guard, payoff, defender_action)
 
-    def card(self) -> dict[str, Any]:
-        """What names this game completely: the seat's card, and the defender's side."""
-        return {"seat": self.seat.card(), "payoff": as_data(self.payoff), "defender_action": self.action}
+    def card(self, **more: Any) -> dict[str, Any]:
+        """JSON data that names this game completely: the seat's card, the defender's side and what is added, with a hash of all."""
+        side = as_data({"payoff": self.payoff, "defender_action": self.action, **more})
+        return {"seat": self.seat.card(), **side, "hash": digest({"seat": self.seat.config, **side})}
 
     @property
     def plan(self) -> SteeredPlan:
@@ -149,7 +150,7 @@ class Duel:
         return held.seen
 
     def mask(self, state: DuelState) -> Array:
-        """(B, actions) bool: the attacker's actions that the channel would accept. Discrete action spaces only."""
+        """(B, actions) bool: the attacker's discrete actions that the channel would accept in a step of the next decision."""
         return self.seat.action.mask(self.seat.loop.sense(state.loop))
 
     def step(
@@ -247,6 +248,10 @@ class DefenderEnv(gymnasium.Env[Array, Any]):
         self.state: DuelState | None = None
         self.rival: Rival | None = None
         self.over = np.zeros(1, bool)
+
+    def card(self) -> dict[str, Any]:
+        """JSON data that names this environment completely, its attacks among them, with a hash."""
+        return self.duel.card(attack=self.attack)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Array, dict[str, Any]]:
         super().reset(seed=seed)

@@ -144,7 +144,7 @@ class AdversaryVectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
             raise InputError("step", np.flatnonzero(over).tolist(), "rows that are over to be reset with options['reset_mask'] first")
         outcome = self.episodes.decide(actions, over, resets)
         terminated, truncated = outcome.terminated, outcome.truncated
-        happened = (outcome.refused, outcome.collided, outcome.rear_collided)
+        happened = (outcome.illegal, outcome.collided, outcome.rear_collided)
         self.over = terminated | truncated
         if self._frames > 1:
             self.observed = framed(self.episodes.seen(), self.observed, self._frames)
@@ -161,7 +161,7 @@ class AdversaryVectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
         return observation, outcome.reward, terminated, truncated, info
 
     def action_masks(self) -> Array:
-        """(B, actions) bool: what the channel would accept now. Discrete action spaces only."""
+        """(B, actions) bool: what the channel would accept in a step of the next decision. Discrete action spaces only."""
         if not self.begun or not self.seat.action.discrete:
             raise InputError("action_masks", self.seat.action.spec.action, "a running episode with a discrete action space")
         return self.episodes.mask().copy()
@@ -278,7 +278,7 @@ class AdversaryEnv(gymnasium.Env[Array, Any]):
         return observation[0], float(reward[0]), bool(terminated[0]), bool(truncated[0]), self._row(info)
 
     def action_masks(self) -> Array:
-        """(actions,) bool: what the channel would accept now. Discrete action spaces only."""
+        """(actions,) bool: what the channel would accept in a step of the next decision. Discrete action spaces only."""
         return np.asarray(self.batch.action_masks()[0])
 
     def render(self) -> Any:

@@ -52,7 +52,7 @@ class DuelEnv(ParallelEnv[str, Array, Any]):  # type: ignore[misc]
         return self.action_spaces[agent]
 
     def card(self) -> dict[str, Any]:
-        """JSON data that names this game completely."""
+        """JSON data that names this game completely, with a hash."""
         return self.duel.card()
 
     def reset(
@@ -75,7 +75,7 @@ class DuelEnv(ParallelEnv[str, Array, Any]):  # type: ignore[misc]
         attack, defend = (checked(self.action_spaces[who], actions[who], who) for who in self.possible_agents)
         self.game, outcome, paid, self.frame = self.duel.step(self.game, attack, defend, np.zeros(1, bool))
         terminated, truncated = bool(outcome.terminated[0]), bool(outcome.truncated[0])
-        infos = self._infos(*(bool(part[0]) for part in (outcome.refused, outcome.collided, outcome.rear_collided)))
+        infos = self._infos(*(bool(part[0]) for part in (outcome.illegal, outcome.collided, outcome.rear_collided)))
         rewards = {ATTACKER: float(outcome.reward[0]), GUARD: float(paid[0])}
         out = self._observed(), rewards, dict.fromkeys(self.agents, terminated), dict.fromkeys(self.agents, truncated), infos
         if terminated or truncated:
@@ -94,10 +94,10 @@ class DuelEnv(ParallelEnv[str, Array, Any]):  # type: ignore[misc]
         assert self.game is not None
         return {ATTACKER: self.game.seen[0].copy(), GUARD: self.duel.defender_sees(self.game)[0].copy()}
 
-    def _infos(self, refused: bool, collided: bool, rear: bool) -> dict[str, dict[str, Any]]:
+    def _infos(self, illegal: bool, collided: bool, rear: bool) -> dict[str, dict[str, Any]]:
         """What happened is told to the attacker alone: the defender learns of it by its own means."""
         assert self.game is not None
-        told: dict[str, Any] = {"illegal": refused, "collided": collided, "rear_collided": rear, "step": int(self.game.loop.k[0])}
+        told: dict[str, Any] = {"illegal": illegal, "collided": collided, "rear_collided": rear, "step": int(self.game.loop.k[0])}
         if self.duel.seat.action.discrete:
             told["action_mask"] = self.duel.mask(self.game)[0].astype(np.int8)
         return {ATTACKER: told, GUARD: self.duel.told(self.game)}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import json
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -13,12 +12,12 @@ import numpy as np
 from tailgate.agents.codec import ActionCodec, ActionSpec
 from tailgate.agents.observation import FRAMES, ObservationCodec
 from tailgate.agents.reward import Reward
-from tailgate.core import Array, Command, Frame, View
+from tailgate.core import Array, Command, Frame, Kind, View
 from tailgate.errors import InputError, unknown
 from tailgate.loop import Loop, LoopState
 from tailgate.registry import Spec
 from tailgate.scenario import load_scenario
-from tailgate.schema import as_data, build, canonical, fields_of
+from tailgate.schema import as_data, build, digest, fields_of
 from tailgate.threat import ThreatModel
 
 CAR_FOLLOWING = "tailgate/CarFollowing-v0"
@@ -46,7 +45,7 @@ class Outcome(NamedTuple):
     reward: Array
     collided: Array
     rear_collided: Array
-    refused: Array
+    illegal: Array  # a command was refused, and in no step of the decision one was accepted
     terminated: Array  # a collision ended the episode
     truncated: Array  # the horizon did
 
@@ -109,9 +108,8 @@ class Seat:
         """What papers and rows cite: the whole configuration, and its hash."""
         from tailgate import __version__
 
-        digest = hashlib.blake2b(canonical(self.config).encode(), digest_size=8).hexdigest()
         features, actions = list(self.observation.names), [mode.name for mode in self.action.modes] if self.action.discrete else None
-        card = self.config | {"observation": features, "actions": actions, "version": __version__, "hash": digest}
+        card = self.config | {"observation": features, "actions": actions, "version": __version__, "hash": digest(self.config)}
         return json.loads(json.dumps(card))  # type: ignore[no-any-return]
 
     # -- playing
@@ -140,7 +138,7 @@ class Seat:
         """
         loop, reward = self.loop, self.reward
         raw, (potential, least, largest, peak) = np.zeros(len(over)), tally
-        collided, rear, refused = (np.zeros(len(over), bool) for _ in range(3))
+        collided, rear, refused, accepted = (np.zeros(len(over), bool) for _ in range(4))
         for _ in range(self.action.spec.interval):
             live = ~over & ~state.ended & (state.k <= loop.horizon)
             view = loop.sense(state)
@@ -155,7 +153,9 @@ class Seat:
                 largest = np.where(live, np.max(loop.model.error(frame.estimate.x, frame.truth), axis=1), largest)
             collided, rear = collided | (frame.collided & live), rear | (frame.rear_collided & live)
             refused = refused | (frame.refused & live)
+            accepted = accepted | (frame.command.kind != Kind.NONE)  # also behind a collision, which no mask foresees
+        illegal = refused & ~accepted
         terminated = state.ended & ~over
         truncated = ~terminated & ~over & (state.k > loop.horizon)
-        gained = np.where(over, 0.0, reward.shaped(raw, tally.potential, potential, terminated))
-        return state, Tally(potential, least, largest, peak), Outcome(gained, collided, rear, refused, terminated, truncated), frame
+        gained = np.where(over, 0.0, reward.decided(raw, illegal, tally.potential, potential, terminated))
+        return state, Tally(potential, least, largest, peak), Outcome(gained, collided, rear, illegal, terminated, truncated), frame

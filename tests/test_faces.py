@@ -18,7 +18,6 @@ from gymnasium.vector import AutoresetMode
 import tailgate
 from tailgate.agents.codec import ActionName, ActionSpec
 from tailgate.agents.reward import Reward, RewardName
-from tailgate.core import Kind
 from tailgate.envs.faces import FACES, AdversaryEnv, AdversaryVectorEnv
 from tailgate.errors import InputError
 from tailgate.schema import fields_of
@@ -272,27 +271,6 @@ def test_a_reset_with_seeds_by_row(brief_scenario, same_bits):
     assert same_bits(observation[1], single.reset()[0])
     with pytest.raises(InputError, match=r"seed.*one seed per row \(3\)"):
         vec.reset(seed=[1, 2])
-
-
-@pytest.mark.parametrize("action", ["timing", "mode", "ramp"])
-def test_masks_are_what_the_channel_accepts(action, brief_scenario):
-    """An action is illegal exactly where its mask was False, under a budget, a duration, a cooldown and an end."""
-    threat = {"budget": 9, "duration": 3, "cooldown": 2, "end": 35, "fdi_bound": 10.0}
-    vec = AdversaryVectorEnv(16, scenario=brief_scenario, action=action, threat=threat, per_sensor=action != "timing", engine="plain")
-    _, info = vec.reset(seed=0)
-    rng, seen = np.random.default_rng(1), {True: 0, False: 0}
-    for _ in range(90):
-        mask = vec.action_masks()
-        assert np.array_equal(mask, info["action_mask"]) and mask[:, 0].all()
-        actions = rng.integers(0, mask.shape[1], 16)
-        over = vec.over.copy()
-        *_, info = vec.step(actions)
-        legal = mask[np.arange(16), actions]
-        assert np.array_equal(info["illegal"][~over], ~legal[~over])
-        took = vec.frame.command.kind != Kind.NONE
-        assert np.array_equal(took[~over], (legal & (actions != 0))[~over])
-        seen = {ok: n + int((legal[~over] == ok).sum()) for ok, n in seen.items()}
-    assert min(seen.values()) > 100
 
 
 def test_the_spec_survives_a_round_trip(brief_scenario, same_bits):

@@ -200,7 +200,7 @@ def test_the_masks_in_training_are_those_of_the_channel(paid: dict[str, Any]) ->
 
         def counted(*given: Any, decide: Any = decide, count: Any = count) -> Any:
             out = decide(*given)
-            count.append(out.refused.sum())
+            count.append(out.illegal.sum())
             return out
 
         episodes.decide = counted

@@ -15,7 +15,7 @@ import tailgate
 from tailgate.agents.selfplay import constant, export
 from tailgate.core import Kind, Mode
 from tailgate.draws import keys
-from tailgate.envs.duel import Duel, Rival
+from tailgate.envs.duel import DefenderEnv, Duel, Rival
 from tailgate.errors import InputError, NotApplicable
 from tailgate.estimators import Steered, SteeredChallenge, compose
 from tailgate.estimators.distributed import TailChiSquare
@@ -36,14 +36,18 @@ def played(place, text, attack, seeds, **options):
     return rollout(place.loop(made, uses), tailgate.make_attack(attack, **options), keys("train", list(seeds)))
 
 
-def test_pettingzoo_is_content():
-    """parallel_api_test and parallel_seed_test pass without a warning, with numbers and with vectors as the defender's actions."""
+@pytest.mark.parametrize("game, cycles", [
+    (GUSTY | {"interval": 100}, 10), (GUSTY | {"interval": 100, "defender_action": "box"}, 3),  # six decisions are an episode
+    ({"scenario": "platoon-braking-v0", "defence": "chi2_dkf:eta=22.8", "interval": 110}, 6),
+    ({"scenario": "radar-following-v0", "defence": "cra", "interval": 40}, 8),
+    ({"scenario": "thesis-ch5-v0", "defence": "chi2_dkf:eta=22.8", "interval": 10, "reward": "error"}, 6),
+], ids=["car", "box", "platoon", "challenge", "network"])  # fmt: skip
+def test_pettingzoo_is_content(game, cycles):
+    """parallel_api_test and parallel_seed_test pass without a warning, over the end of an episode and on every kind of system."""
     with warnings.catch_warnings():
         warnings.simplefilter("error", UserWarning)
-        for kind, cycles in (("menu", 10), ("box", 3)):  # six decisions are an episode
-            game = GUSTY | {"interval": 100, "defender_action": kind}
-            parallel_api_test(tailgate.parallel_env(**game), num_cycles=cycles)
-            parallel_seed_test(lambda game=game: tailgate.parallel_env(**game), num_cycles=cycles)
+        parallel_api_test(tailgate.parallel_env(**game), num_cycles=cycles)
+        parallel_seed_test(lambda: tailgate.parallel_env(**game), num_cycles=cycles)
 
 
 @pytest.mark.parametrize("place, plain, steered", [
@@ -101,21 +105,23 @@ def test_rows_are_steered_on_their_own():
     assert len({float(score) for score in whole[1][:, -2]}) == 3  # where the threshold stands
 
 
-def test_masks_agree_with_what_the_channel_accepts():
-    """In random play no allowed action is refused, and every other one than none is refused where its mask is 0."""
-    env = tailgate.parallel_env(scenario="gusty-stop-and-go-v0", interval=1, threat={"budget": 25, "duration": 6, "cooldown": 4, "onset": 20})
+@pytest.mark.parametrize("interval", [1, 7, 20])
+def test_masks_agree_with_what_the_channel_accepts(interval):
+    """In random play no allowed action is refused throughout, and every other one than none is where its mask is 0."""
+    threat = {"budget": 25, "duration": 6, "cooldown": 4, "onset": 20, "end": 200}
+    env = tailgate.parallel_env(scenario="gusty-stop-and-go-v0", interval=interval, threat=threat)
     rng, accepted, refused = np.random.default_rng(0), 0, 0
     for seed in range(2):
         _, info = env.reset(seed=seed)
-        for _ in range(200):
-            mask = info["attacker"]["action_mask"]
+        while env.agents:
+            used, mask = int(env.game.loop.channel.used[0]), info["attacker"]["action_mask"]
             action = int(rng.integers(len(mask)))
             _, _, _, _, info = env.step({"attacker": action, "defender": int(rng.integers(15))})
             assert info["attacker"]["illegal"] == (mask[action] == 0)
-            accepted, refused = accepted + bool(mask[action] and action), refused + (not mask[action])
-            if not env.agents:
-                break
-    assert accepted == 2 * 25 and refused > 100
+            cost = int(env.game.loop.channel.used[0]) - used
+            assert (cost > 0) == bool(mask[action] and action)
+            accepted, refused = accepted + cost, refused + (not mask[action])
+    assert accepted == 2 * 25 and refused > 10
 
 
 def test_the_defender_sees_the_attack_only_through_what_arrives():
@@ -205,13 +211,15 @@ def test_a_trained_defender_is_an_ordinary_defence(tmp_path, short):
 
 
 def test_the_defenders_view_is_a_gymnasium_environment():
-    """The checker is content, episodes of a seed repeat, a list of attacks draws one each, and the game of the parallel API is the same."""
+    """Both checkers are content without a warning, episodes of a seed repeat, a list of attacks draws one each, and the game of the parallel API is the same."""
     from gymnasium.utils.env_checker import check_env
+    from stable_baselines3.common.env_checker import check_env as check_sb3
 
     env = gymnasium.make("tailgate.envs.duel:tailgate/Defender-v0", attack=["none", "fdi:trigger=near,threshold=40,value=-4"], **GUSTY)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+        warnings.simplefilter("error")
         check_env(env.unwrapped, skip_render_check=True)
+        check_sb3(env.unwrapped, skip_render_check=True)
     first, again = env.reset(seed=4)[0], env.reset(seed=4)[0]
     np.testing.assert_array_equal(first, again)
     quiet = gymnasium.make("tailgate.envs.duel:tailgate/Defender-v0", attack="none", **GUSTY)
@@ -223,6 +231,21 @@ def test_the_defenders_view_is_a_gymnasium_environment():
         both, rewards, *_ = game.step({"attacker": 0, "defender": action})
         np.testing.assert_array_equal(seen, both["defender"])
         assert paid == rewards["defender"]
+
+
+def test_cards_name_the_whole_game():
+    """JSON with a hash of its own: every argument of either side counts, and for the defender's view the attack."""
+    game = {"interval": 20}
+    changes = [
+        {"payoff": "zero_sum"}, {"mode_cost": 0.02}, {"alarm_cost": 0.02}, {"gap_cost": 0.02}, {"menu": {"modes": ["normal"]}}, {"menu": {"thresholds": [9]}},
+        {"defender_action": "box"}, {"defence": "cusum_kf"}, {"scenario": "braking-v0"}, {"threat": {"budget": 5}}, {"interval": 21}, {"value": -3.0},
+    ]  # fmt: skip
+    cards = [tailgate.parallel_env(**(game | change)).card() for change in ({}, *changes)]
+    assert cards[0] == json.loads(json.dumps(tailgate.parallel_env(**game).card())) and len({card["hash"] for card in cards}) == 1 + len(changes)
+    views = [DefenderEnv(attack=attack, **game).card() for attack in ("none", "fdi", "fdi:value=-3", ["none", "fdi"])]
+    assert json.loads(json.dumps(views[2])) == views[2] == DefenderEnv(attack="fdi:value=-3", **game).card()
+    assert len({card["hash"] for card in (cards[0], *views)}) == 1 + len(views)
+    assert DefenderEnv(attack="fdi", payoff="zero_sum", **game).card()["hash"] != views[1]["hash"]
 
 
 def test_the_box_reaches_the_ends_and_the_middle():

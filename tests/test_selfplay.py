@@ -160,10 +160,12 @@ def test_a_run_from_the_command_line(tiny):
     assert out == json.loads((home / "report.json").read_text())
     share = {(row["defender"], row["attack"]): row["collisions"]["value"] for row in out["table"]}
     assert set(share) == {(guard, name) for guard in GUARDS for name in NAMES}
-    assert out["exploitability"]["trained"]["value"] == share["trained", "fresh-0"] - share["trained", "attacker-1"]
     worst = {guard: out["worst"][guard]["attack"] for guard in GUARDS[1:]}
-    for guard, name in worst.items():
+    for guard, fresh in zip(GUARDS[1:], ("fresh-fixed-0", "fresh-0"), strict=True):
+        found, name = out["exploitability"][guard], worst[guard]
         assert out["worst"][guard]["collisions"]["value"] == share[guard, name]
+        assert found["attack"] == name and found["value"] == pytest.approx(share[guard, name] - share[guard, "attacker-1"], abs=1e-12)
+        assert found["fresh"] == {"attack": fresh, "collisions": found["fresh"]["collisions"]} and found["fresh"]["collisions"]["value"] == share[guard, fresh]
     assert out["worst_fixed_minus_trained"]["value"] == pytest.approx(share[GUARDS[1], worst[GUARDS[1]]] - share["trained", worst["trained"]], abs=1e-12)
     assert not list(home.glob("checkpoint*"))
     code, said = command("--resume", "name=tiny", "gamma=0.5")
@@ -187,14 +189,15 @@ def test_the_worst_attack_is_chosen_on_select_seeds(tiny):
 
 
 @pytest.mark.parametrize(
-    "select, report, worst, bound",
+    "select, report, worst, weak",
     [  # collisions in 8 episodes of: none, the script, self-play's last attacker, fresh against trained, fresh against fixed
-        ([0, 3, 2, 5, 6], [0, 3, 2, 4, 4], ("fresh-fixed-0", "fresh-fixed-0"), True), ([0, 6, 2, 5, 5], [0, 3, 2, 4, 4], ("dos_jam", "dos_jam"), True),
-        ([0, 3, 2, 6, 5], [0, 3, 6, 4, 4], ("fresh-0", "fresh-0"), False), ([0, 0, 0, 0, 0], [0, 0, 0, 0, 0], ("none", "none"), True),
+        ([0, 3, 2, 5, 6], [0, 3, 2, 4, 4], ("fresh-fixed-0", "fresh-fixed-0"), False), ([0, 6, 2, 5, 5], [0, 3, 2, 4, 4], ("dos_jam", "dos_jam"), False),
+        ([0, 3, 2, 6, 5], [0, 3, 6, 4, 4], ("fresh-0", "fresh-0"), True), ([0, 0, 0, 0, 0], [0, 0, 0, 0, 0], ("none", "none"), False),
+        ([0, 8, 0, 0, 0], [0, 8, 0, 0, 0], ("dos_jam", "dos_jam"), True), ([0, 1, 6, 0, 0], [0, 1, 6, 0, 0], ("attacker-1", "attacker-1"), True),
     ],
 )  # fmt: skip
-def test_a_weak_search_is_said_to_be_one(select, report, worst, bound, brief, tmp_path, monkeypatch, capsys):
-    """No bound where self-play's last attacker does more than the fresh one; the worst attack is chosen on one purpose's seeds, reported on the other's."""
+def test_a_weak_search_is_said_to_be_one(select, report, worst, weak, brief, tmp_path, monkeypatch, capsys):
+    """Exploitability is that under the worst known attack, chosen on one purpose's seeds and reported on the other's; weak is a search that found less."""
     monkeypatch.chdir(tmp_path)
     game = Game(load_config(None, [*TINY, "episodes=8", f"scenario={brief['scenario']}"]), lambda *_: None)
     other = {"select": select, "report": report}
@@ -211,11 +214,15 @@ def test_a_weak_search_is_said_to_be_one(select, report, worst, bound, brief, tm
     assert out["worst"]["best fixed setting"]["collisions"]["value"] == report[NAMES.index(worst[1])] / 8
     assert out["worst"]["trained"]["select"]["value"] == select[NAMES.index(worst[0])] / 8
     assert out["worst_fixed_minus_trained"]["value"] == (report[NAMES.index(worst[0])] > 0) / 8
-    assert out["exploitability"]["best fixed setting"]["bound"] is bound
-    assert out["exploitability"]["best fixed setting"]["value"] == (report[4] - report[2]) / 8
+    found = out["exploitability"]["best fixed setting"]
+    assert found["weak_search"] is weak and found["attack"] == worst[1] and found["fresh"]["collisions"]["value"] == report[4] / 8
+    assert found["value"] == (report[NAMES.index(worst[1])] - report[2]) / 8
     _print_report(out)
     said = " ".join(capsys.readouterr().out.split())
-    assert ("best fixed setting: " in said) and said.count("the fresh attacker is weaker than known attacks: not a bound") == (0 if bound else 2)
+    assert f"exploitability, best fixed setting: at least {100 * found['value']:+.1f} points" in said
+    assert said.count("the search was too weak: its fresh attacker does") == 2 * weak
+    several = game._report({name: name for name in GUARDS}, files[:1], files[1:], files[1:], 0)["exploitability"]["trained"]
+    assert several["fresh"]["attack"] == max(("fresh-0", "fresh-fixed-0"), key=lambda name: select[NAMES.index(name)])  # of several the best
 
 
 def test_a_run_that_goes_on_trains_for_the_opponents_of_now(tiny):
@@ -285,3 +292,20 @@ def test_the_preset():
     assert isinstance(config, GameConfig) and config.steps == 7 and config.defence == "chi2_kf"
     assert Duel.make(config.scenario, config.defence, config.menu).settings.shape == (15, 2)
     assert isinstance(Duel.make(config.scenario, config.defence, config.menu).guard, Steered)
+
+
+@pytest.mark.parametrize("name", ["ppo", "maskable_ppo"])
+def test_the_attacker_learns_by_other_learners_too(name, brief, tmp_path, monkeypatch, capsys):
+    """A round and its report; what is exported chooses as it was trained to, and the run goes on."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(selfplay, "SELECT_EPISODES", 4)
+    small = [line for line in TINY if not line.startswith(("attacker", "steps"))]
+    words = [*small, "steps=16", f"learner={name}", "attacker={envs: 2, rollout: 8, batch_size: 8, epochs: 1, hidden: [4]}", f"scenario={brief['scenario']}"]
+    assert cli.main(["selfplay", *words, "--json"]) == 0
+    out, home = json.loads(capsys.readouterr().out), tmp_path / "runs/tiny"
+    assert {row["attack"] for row in out["table"]} == set(NAMES)
+    header = json.loads((home / "attacker-1.json").read_text())
+    assert header["training"]["learner"] == name and header.get("masked", False) == (name == "maskable_ppo") and header["training"]["steps"] >= 16
+    kept = {path.name: path.read_bytes() for path in home.glob("*.safetensors")}
+    assert cli.main(["selfplay", "--resume", "name=tiny", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == out and kept == {path.name: path.read_bytes() for path in home.glob("*.safetensors")}

@@ -307,13 +307,17 @@ def test_a_fresh_start_forgets_the_run_before_and_resume_wants_the_same_learner(
     assert "resume" in capsys.readouterr().err
 
 
-def test_a_seed_trained_in_a_process_of_its_own_gives_the_same_policy(tmp_path: Path) -> None:
+@pytest.mark.parametrize("settings", [
+    ["learner=ppo", "steps=1280", "ppo.envs=16", "ppo.rollout=20", "ppo.batch_size=160", "ppo.epochs=1"],
+    ["learner=cem", "steps=2400", "cem={population: 6, episodes: 4, hidden: [4]}"],
+], ids=["ppo", "cem"])  # fmt: skip
+def test_a_seed_trained_in_a_process_of_its_own_gives_the_same_policy(settings: list[str], tmp_path: Path) -> None:
     """Two seeds side by side, and one after the other: the same files, whatever ran beside them."""
     files = []
     for workers in (1, 2):
         config = train.load_config(None, [
-            f"out={tmp_path / str(workers)}", "seeds=2", f"workers={workers}", "steps=1280", "environment.interval=20", "ppo.envs=16",
-            "ppo.rollout=20", "ppo.batch_size=160", "ppo.epochs=1", "tensorboard=false", "rivals=[none]",
+            f"out={tmp_path / str(workers)}", "seeds=2", f"workers={workers}", "environment.interval=20", "tensorboard=false", "rivals=[none]",
+            *settings,
         ])  # fmt: skip
         seen: set[int] = set()
         policies = train.train(config, lambda seed, now, seen=seen: seen.add(seed))  # type: ignore[misc]

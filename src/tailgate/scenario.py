@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -14,7 +13,7 @@ from tailgate.errors import InputError, unknown
 from tailgate.link import Link
 from tailgate.loop import Loop
 from tailgate.registry import Spec, make_from
-from tailgate.schema import build, canonical, fields_of, read_yaml
+from tailgate.schema import build, digest, fields_of, read_yaml
 from tailgate.threat import Brief, ThreatModel
 
 LINK = ("loss", "latency")
@@ -70,7 +69,7 @@ class Scenario:
 
     @property
     def config_hash(self) -> str:
-        return hashlib.blake2b(canonical(self).encode(), digest_size=8).hexdigest()
+        return digest(self)
 
 
 def _changed(part: Any, changes: Any, where: str) -> Any:
@@ -121,7 +120,7 @@ class Suite:
             f.name: getattr(self, f.name) for f in dataclasses.fields(self)
             if f.name not in WORDS and getattr(self, f.name) != getattr(blank, f.name)
         }  # fmt: skip
-        return hashlib.blake2b(canonical(held | {"shown": sorted(self.shown)}).encode(), digest_size=8).hexdigest()
+        return digest(held | {"shown": sorted(self.shown)})
 
     @property
     def nominal(self) -> tuple[str, ...]:

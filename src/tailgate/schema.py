@@ -86,6 +86,11 @@ def canonical(value: Any) -> str:
     return json.dumps(as_data(value), sort_keys=True, separators=(",", ":"))
 
 
+def digest(value: Any) -> str:
+    """Sixteen hexadecimal digits that are the same for the same parameters."""
+    return hashlib.blake2b(canonical(value).encode(), digest_size=8).hexdigest()
+
+
 class _Once(yaml.SafeLoader):
     """A safe loader that refuses a key that is there twice: of two values the first would be lost without a word."""
 

@@ -4,11 +4,11 @@ Round r trains attacker r against the uniform mixture of defenders 0 to r - 1, t
 to r; defender 0 is the defence with its knobs at the menu's setting nearest to its own values. At the end the last defender is frozen,
 and an attacker with new seeds and the same budget is trained against it: the best response. The same is done for the best fixed setting.
 
-    exploitability = collisions under the fresh best response - collisions under the last attacker of self-play
+    exploitability = collisions under the worst known attack - collisions under the last attacker of self-play
 
-The best answer there is does at least as much more. Where the search was too weak the difference is negative and bounds nothing: the report
-says so. The worst of all known attacks (scripts, pool, fresh; chosen on select seeds, reported on report seeds) is shown beside it, for the
-trained defender and for the best fixed setting, with their difference.
+Known are scripts, pool and fresh attackers; the worst is chosen on select seeds and reported on report seeds, for the trained defender and
+for the best fixed setting. The best answer there is does at least as much. Where the fresh attacker does less than what was known without
+it the search was too weak to say how much more, and the report says so.
 
 A member is trained for certain opponents: a run that goes on trains anew what was trained for others.
 """
@@ -16,7 +16,6 @@ A member is trained for certain opponents: a run that goes on trains anew what w
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import itertools
 import json
 from collections.abc import Callable
@@ -40,7 +39,7 @@ from tailgate.estimators.steering import nearest
 from tailgate.files import set_aside, writable_directory, write_atomic
 from tailgate.registry import Spec
 from tailgate.scenario import config_path
-from tailgate.schema import as_data, build, canonical, override, read_yaml
+from tailgate.schema import as_data, build, digest, override, read_yaml
 from tailgate.stats import Interval, paired_difference, proportion
 from tailgate.train import TrainConfig, environment_of
 
@@ -202,8 +201,7 @@ class Game:
         path, steps = self.directory / name, self.config.steps
         if _finished(path.with_suffix(".json"), facts):
             return path.with_suffix(".json")
-        digest = hashlib.blake2b(canonical(facts).encode(), digest_size=8).hexdigest()  # the run may have been cut off with other opponents
-        checkpoint = self.directory / f"checkpoint-{name}-{digest}.safetensors"
+        checkpoint = self.directory / f"checkpoint-{name}-{digest(facts)}.safetensors"  # the run may have been cut off with other opponents
         learner = make()
         if checkpoint.is_file():
             learner.load(checkpoint)
@@ -256,14 +254,13 @@ class Game:
             self.update("final table", len(table), total, f"{len(table)} of {total} pairs")
         return table, crashed
 
-    def _worst(self, guard: str, defence: Steered, attacks: dict[str, Attack]) -> tuple[str, Interval]:
-        """The attack with the most collisions on select seeds, of equal ones the first, and its collisions there."""
+    def _select(self, guard: str, defence: Steered, attacks: dict[str, Attack]) -> dict[str, Interval]:
+        """The collisions of each attack on select seeds."""
         shares = {}
         for name, attack in attacks.items():
             shares[name] = _share(self._play(defence, attack, "select", SELECT_EPISODES).crashed)
             self.update(f"worst attack, {guard}", len(shares), len(attacks), "")
-        worst = max(shares, key=lambda name: shares[name].value)
-        return worst, shares[worst]
+        return shares
 
     def _report(
         self, guards: dict[str, Steered], attackers: list[Path], fresh: list[Path], other: list[Path], setting: int
@@ -274,12 +271,15 @@ class Game:
         worst: dict[str, dict[str, Any]] = {}
         exploitability: dict[str, dict[str, Any]] = {}
         for guard, own in {TRAINED: [path.stem for path in fresh], FIXED: [path.stem for path in other]}.items():
-            name, chosen = self._worst(guard, guards[guard], attacks)
-            reported = _share(crashed[guard, name])
-            worst[guard] = {"attack": name, "select": chosen._asdict(), "collisions": reported._asdict()}
-            best = np.array([crashed[guard, one] for one in own])
-            gain = paired_difference(best, np.broadcast_to(crashed[guard, last], best.shape), share=True)
-            exploitability[guard] = {**gain._asdict(), "bound": gain.value >= 0.0}
+            shares = self._select(guard, guards[guard], attacks)
+            name, found = (max(names, key=lambda one: shares[one].value) for names in (attacks, own))  # of equal ones the first
+            share = {one: _share(crashed[guard, one]) for one in (name, found, last)}
+            worst[guard] = {"attack": name, "select": shares[name]._asdict(), "collisions": share[name]._asdict()}
+            exploitability[guard] = {
+                **paired_difference(crashed[guard, name], crashed[guard, last], share=True)._asdict(), "attack": name,
+                "fresh": {"attack": found, "collisions": share[found]._asdict()},
+                "weak_search": share[found].value < max(share[name].value, share[last].value),
+            }  # fmt: skip
         fixed, trained = (crashed[guard, worst[guard]["attack"]] for guard in (FIXED, TRAINED))
         saved = paired_difference(fixed, trained, share=True)
         knobs = self.duel.guard.hand.knobs

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Annotated, Literal, NamedTuple, get_args
+from typing import Annotated, Any, Literal, NamedTuple, get_args
 
 import numpy as np
 from pydantic import Field
@@ -26,6 +26,7 @@ from tailgate.core import (
     no_command,
     param,
 )  # fmt: skip
+from tailgate.elementwise import select
 from tailgate.errors import InputError, unknown
 
 # Plain numbers: in every comparison with a member of an enumeration numpy looks for array methods of it.
@@ -149,6 +150,17 @@ class ChannelState(NamedTuple):
     last: Command
 
 
+def accepts(k: Any, steps: Any, left: Any, burst: Any, cooldown: Any, onset: Any, last: Any, longest: Any, pause: Any) -> Any:
+    """Whether a command that is legal in itself, given in each of the `steps` steps from k on, is accepted in at least one; elementwise.
+
+    left: attack steps in the budget. burst, cooldown: lengths so far and still [steps]. onset, last, longest, pause: of the threat model.
+    Until the first step that is accepted nothing is charged: a cooldown counts down, a burst that is full ends and is followed by its
+    pause, of which the step that ends it is the first. So it is one moment that decides.
+    """
+    first = np.maximum(k + select(burst < longest, cooldown, np.maximum(pause, 1)), onset)
+    return (left > 0) & (first <= last) & (first < k + steps)
+
+
 class Channel:
     """Applies commands to the wires and enforces the threat model, for scripts and learned policies alike.
 
@@ -189,12 +201,13 @@ class Channel:
 
     def allowed(self, plan: ChannelPlan, state: ChannelState, k: Array) -> Array:
         """(B,) bool: a command of a granted kind, target and value would be accepted at step k (B,)."""
-        ok = (k >= plan.threat.onset) & (k <= plan.last_step) & (state.cooldown == 0)
-        if plan.threat.budget is not None:
-            ok &= state.used < plan.threat.budget
-        if plan.threat.duration is not None:
-            ok &= state.burst < plan.threat.duration
-        return np.asarray(ok)
+        return self.open(plan, k, self.budget_left(plan, state), state.burst, state.cooldown)
+
+    def open(self, plan: ChannelPlan, k: Array, left: Array, burst: Array, cooldown: Array, steps: int = 1) -> Array:
+        """(B,) bool: such a command would be accepted in at least one of so many steps from k on, if it were given in all (`accepts`)."""
+        threat = plan.threat
+        longest = np.inf if threat.duration is None else threat.duration
+        return np.asarray(accepts(k, steps, left, burst, cooldown, threat.onset, plan.last_step, longest, threat.cooldown))
 
     def apply(
         self, plan: ChannelPlan, state: ChannelState, sent: Array, received: Received, command: Command, k: Array,

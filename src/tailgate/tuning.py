@@ -14,7 +14,6 @@ A space is a mapping of dotted fields of the training's configuration to one of
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import json
 import multiprocessing
 import time
@@ -36,7 +35,7 @@ from tailgate.files import writable_directory, write_atomic
 from tailgate.metrics import METRICS
 from tailgate.pool import abandon
 from tailgate.registry import Spec
-from tailgate.schema import as_data, canonical, fields_of, read_yaml
+from tailgate.schema import as_data, digest, fields_of, read_yaml
 from tailgate.trace import episodes_at_once, rollout
 from tailgate.train import ENVIRONMENT, TrainConfig, load_config, outcome_of, train
 
@@ -91,7 +90,7 @@ class Search:
     @property
     def digest(self) -> str:
         """Of everything that decides what a trial gives: a search goes on with the same one only."""
-        return hashlib.blake2b(canonical([self.trained, self.space, self.episodes, self.seed]).encode(), digest_size=8).hexdigest()
+        return digest([self.trained, self.space, self.episodes, self.seed])
 
 
 def optuna() -> Any:

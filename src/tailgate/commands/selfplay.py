@@ -67,8 +67,10 @@ def _print_report(report: dict[str, Any]) -> None:
     out = console()
     out.print(table, highlight=False)
     for guard, gain in report["exploitability"].items():
-        weak = "" if gain["bound"] else "; the fresh attacker is weaker than known attacks: not a bound"
-        out.print(f"exploitability, {guard}: {_points(gain)} (fresh best response less self-play's last attacker){weak}", highlight=False)
+        found = gain["fresh"]["collisions"]
+        weak = f"; the search was too weak: its fresh attacker does {_share(found)}, less than known ones" if gain["weak_search"] else ""
+        told = f"{escape(gain['attack'])} less self-play's last attacker"
+        out.print(f"exploitability, {guard}: at least {_points(gain)} ({told}){weak}", highlight=False)
     for guard, most in report["worst"].items():
         out.print(f"worst known attack, {guard}: {_share(most['collisions'])} by {escape(most['attack'])}", highlight=False)
     out.print(f"worst known attacks, fixed less trained: {_points(report['worst_fixed_minus_trained'])}", highlight=False)

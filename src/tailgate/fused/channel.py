@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from tailgate import threat
 from tailgate.kinds import Kind
 
 from . import constants as of
@@ -33,15 +34,16 @@ from .rows import (
 
 JAM, HOLD, HOLD_FRESH, DROPOUT, FDI = (float(kind) for kind in (Kind.DOS_JAM, Kind.DOS_HOLD, Kind.DOS_HOLD_FRESH, Kind.DROPOUT, Kind.FDI))
 NOISE_JAM, ECHO_DELAY = float(Kind.NOISE_JAM), float(Kind.ECHO_DELAY)
+accepts = formula(threat.accepts)
 _0, _1, _2, _3, _4 = (np.uint64(LANES * i) for i in range(5))  # rows further down
 
 
 @phase
-def allowed(s, c, out, n):
-    """Whether a legal command would be accepted now, into row `out`."""
-    onset, last, budget, longest = c[of.ONSET], c[of.LAST], c[of.BUDGET], c[of.LONGEST]
+def open_within(s, c, steps, out, n):
+    """Whether a legal command would be accepted in one of so many steps from now on, into row `out`."""
+    onset, last, budget, longest, pause = c[of.ONSET], c[of.LAST], c[of.BUDGET], c[of.LONGEST], c[of.PAUSE]
     for i in range(n):
-        s[out + i] = (s[K + i] >= onset) & (s[K + i] <= last) & (s[COOLDOWN + i] == 0.0) & (s[USED + i] < budget) & (s[BURST + i] < longest)
+        s[out + i] = accepts(s[K + i], steps, budget - s[USED + i], s[BURST + i], s[COOLDOWN + i], onset, last, longest, pause)
 
 
 @phase

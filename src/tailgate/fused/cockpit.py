@@ -56,7 +56,7 @@ def fuse_seat(seat: Seat) -> Constants | Refused:
         return Refused("vectors of values over the air have no lane")
     c[of.REWARD_SCALE], c[of.GAP_SHAPING], c[of.ERROR_SHAPING] = paid.error_scale, paid.gap_shaping, paid.error_shaping
     c[of.GAMMA_PAID], c[of.ILLEGAL], c[of.COST] = paid.gamma, paid.illegal_penalty, paid.attack_cost
-    c[of.BUDGET_SHARE] = threat.budget or 1.0
+    c[of.BUDGET_SHARE], c[of.INTERVAL] = threat.budget or 1.0, action.spec.interval
     if many:
         c[of.BELIEF] = 1.0
     else:

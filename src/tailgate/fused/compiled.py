@@ -114,7 +114,7 @@ def written_in(function: Callable[..., Any]) -> Jitted:
 
 _SOURCES = {  # by package, which may lie in folders of their own
     "tailgate.fused": ("",),
-    "tailgate": ("elementwise.py", "jit.py", "kernels.py", "kinds.py", "draws.py", "lanes.py", "linear.py", "vector.py"),
+    "tailgate": ("elementwise.py", "jit.py", "kernels.py", "kinds.py", "draws.py", "lanes.py", "linear.py", "threat.py", "vector.py"),
     "tailgate.agents": ("reward.py", "scripted.py", "triggers.py", "values.py"),
     "tailgate.estimators": (
         "algorithm2.py", "detectors.py", "imm.py", "kinematic.py", "predictors.py", "reactive_brake.py", "robust.py", "safe_state.py",

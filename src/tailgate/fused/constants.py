@@ -71,6 +71,7 @@ WIRE = _number("wire", 5)  # whether it may be attacked
 BOUND, LOW, HIGH = _number("bound", 5), _number("low", 5), _number("high", 5)
 # seat: what is decided, what is paid
 RATE, TABLE = _number("rate"), _number("mode", MODE_WIDTH * MODES)  # of a ramp; the discrete actions
+INTERVAL = _number("interval")  # steps of a decision
 BELIEF = _number("belief")  # how the believed gap depends on the first state
 REWARD_SCALE, GAP_SHAPING, ERROR_SHAPING = _number("reward_scale"), _number("gap_shaping"), _number("error_shaping")
 GAMMA_PAID, ILLEGAL, COST = _number("gamma_paid"), _number("illegal"), _number("cost")

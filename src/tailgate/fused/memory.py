@@ -50,7 +50,7 @@ ASKED = 1 + 2 * WIRES  # rows of a command: kind, targets, values
 OBEY, SCRIPTED, SEATED = range(3)  # who decides
 DESKS = 2  # rooms of ROWS at a desk: for a block that is played, and for episodes that begin
 PAID = 2  # rows of numbers of what a decision brought: reward, gap
-FLAGS = 6  # and of truth values: terminated, truncated, refused, collided, rear, allowed
+FLAGS = 6  # and of truth values: terminated, truncated, illegal, collided, rear, allowed
 
 
 def _lined_up(size: int, dtype: type) -> Array:

@@ -92,6 +92,7 @@ LIVE, RAW, BEFORE = _row("live"), _row("raw"), _row("before")  # of a seat: this
 EARNED, PART = _row("earned"), _row("part")  # this step's pay, and a part of it
 OFF = _row("off")  # of several cars: the largest error of a gap
 ANY_REFUSED, ANY_HIT, ANY_REAR = _row("any_refused"), _row("any_hit"), _row("any_rear")
+ACCEPTED, OPEN = _row("accepted"), _row("open")  # any step of the decision, and of the next one
 LEFT_OVER, ATTACKING, ZERO, INFINITE = _row("left_over"), _row("attacking"), _row("zero"), _row("infinite")  # of an observation
 POWER, DELAY = _row("power"), _row("delay")  # radiated at a radar
 BEAT, SNR, DEALT = _row("beat", 2), _row("snr"), _row("dealt", 4)  # how it measures: beats, signal over noise, uniforms

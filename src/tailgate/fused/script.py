@@ -157,7 +157,7 @@ def open_now(s, c, p, n):
         for i in range(n):
             count = s[ELAPSED + i] - s[OPENED + i]
             s[ON + i] = s[ON + i] if count - whole * np.floor(count / whole) < on_for else 0.0
-    channel.allowed(s, c, WANT_KIND, n)
+    channel.open_within(s, c, 1.0, WANT_KIND, n)
     some = False
     for i in range(n):
         on = (s[ON + i] != 0.0) & (s[WANT_KIND + i] != 0.0)

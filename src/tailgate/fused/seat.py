@@ -14,6 +14,7 @@ from . import channel
 from . import constants as of
 from .compiled import formula, phase
 from .rows import (
+    ACCEPTED,
     ALARM,
     ANY_HIT,
     ANY_REAR,
@@ -36,6 +37,7 @@ from .rows import (
     LIVE,
     OFF,
     ON,
+    OPEN,
     OVER,
     PART,
     PEAK,
@@ -139,7 +141,7 @@ def begin(s, c, n):
 def before(s, n):
     """Before a decision is played."""
     for i in range(n):
-        s[RAW + i] = s[ANY_REFUSED + i] = s[ANY_HIT + i] = s[ANY_REAR + i] = 0.0
+        s[RAW + i] = s[ANY_REFUSED + i] = s[ACCEPTED + i] = s[ANY_HIT + i] = s[ANY_REAR + i] = 0.0
         s[BEFORE + i] = s[POTENTIAL + i]
 
 
@@ -152,9 +154,9 @@ def alive(s, c, n):
 
 
 @formula
-def _costs(s, illegal, cost, i):
+def _costs(s, cost, i):
     """What a step's attack costs, below zero."""
-    return -illegal * s[REFUSED + i] - cost * (1.0 if s[KIND + i] != 0.0 else 0.0)
+    return -cost * (1.0 if s[KIND + i] != 0.0 else 0.0)
 
 
 def paying(many):
@@ -166,19 +168,19 @@ def paying(many):
     @phase
     def pay(s, c, f, n):
         """After a step of it: its reward, and what happened."""
-        kind, illegal, cost, scale, dt, horizon = f[of.REWARD], c[of.ILLEGAL], c[of.COST], c[of.REWARD_SCALE], c[of.DT], c[of.HORIZON]
+        kind, cost, scale, dt, horizon = f[of.REWARD], c[of.COST], c[of.REWARD_SCALE], c[of.DT], c[of.HORIZON]
         gap_shaping, error_shaping, sign = c[of.GAP_SHAPING], c[of.ERROR_SHAPING], c[of.BELIEF]
         if kind == of.CRASH or kind == of.MIN_GAP:
             nearer = kind == of.MIN_GAP
             for i in range(n):
                 before = s[LEAST + i]
                 least = np.minimum(small(s[LEAD_X + i] - s[EGO + i]), before)
-                earned = _costs(s, illegal, cost, i) + (1.0 if (s[HIT + i] != 0.0) | (s[REAR_HIT + i] != 0.0) else 0.0)
+                earned = _costs(s, cost, i) + (1.0 if (s[HIT + i] != 0.0) | (s[REAR_HIT + i] != 0.0) else 0.0)
                 s[EARNED + i] = earned + (before - least) / NEAR if nearer else earned
                 s[LEAST + i] = least
         else:
             for i in range(n):
-                s[EARNED + i] = _costs(s, illegal, cost, i)
+                s[EARNED + i] = _costs(s, cost, i)
                 s[PART + i] = s[OFF + i] if many else abs(0.0 + sign * (s[X + i] - s[TRUTH + i]))
             if kind == of.PEAK:
                 for i in range(n):
@@ -202,6 +204,7 @@ def paying(many):
             s[RAW + i] += earned if live else 0.0
             s[POTENTIAL + i] = now if live else before
             s[ANY_REFUSED + i] = 1.0 if (live & refused) | (s[ANY_REFUSED + i] != 0.0) else 0.0
+            s[ACCEPTED + i] = 1.0 if (s[KIND + i] != 0.0) | (s[ACCEPTED + i] != 0.0) else 0.0
             s[ANY_HIT + i] = 1.0 if (live & hit) | (s[ANY_HIT + i] != 0.0) else 0.0
             s[ANY_REAR + i] = 1.0 if (live & rear) | (s[ANY_REAR + i] != 0.0) else 0.0
 
@@ -214,17 +217,17 @@ pay = paying(many=False)
 @phase
 def settle(s, c, paid, flags, first, n):
     """After a decision: what it brought, into paid (PAID, B) and flags (FLAGS, B); of rows that were over before it nothing."""
-    gamma, horizon = c[of.GAMMA_PAID], c[of.HORIZON]
+    gamma, horizon, penalty = c[of.GAMMA_PAID], c[of.HORIZON], c[of.ILLEGAL]
     for i in range(n):
         open_row = s[OVER + i] == 0.0
         terminated = open_row & (s[ENDED + i] != 0.0)
         truncated = open_row & (not terminated) & (s[K + i] > horizon)
         after = 0.0 if terminated else s[POTENTIAL + i]
-        paid[0, first + i] = s[RAW + i] + gamma * after - s[BEFORE + i] if open_row else 0.0
-        flags[0, first + i], flags[1, first + i] = terminated, truncated
+        illegal = (s[ANY_REFUSED + i] != 0.0) & (s[ACCEPTED + i] == 0.0)
+        paid[0, first + i] = s[RAW + i] - penalty * (1.0 if illegal else 0.0) + gamma * after - s[BEFORE + i] if open_row else 0.0
+        flags[0, first + i], flags[1, first + i], flags[2, first + i] = terminated, truncated, illegal
     for i in range(n):
-        flags[2, first + i], flags[3, first + i] = s[ANY_REFUSED + i] != 0.0, s[ANY_HIT + i] != 0.0
-        flags[4, first + i] = s[ANY_REAR + i] != 0.0
+        flags[3, first + i], flags[4, first + i] = s[ANY_HIT + i] != 0.0, s[ANY_REAR + i] != 0.0
 
 
 @phase
@@ -237,7 +240,8 @@ def close(s, flags, first, n):
 @phase
 def look(s, window, c, f, table, paid, flags, count, mask, first, n):
     """What the information of a step shows of the state that it led to, and what the observation needs of it."""
-    channel.allowed(s, c, ON, n)
+    channel.open_within(s, c, 1.0, ON, n)
+    channel.open_within(s, c, c[of.INTERVAL], OPEN, n)
     budget, share = c[of.BUDGET], c[of.BUDGET_SHARE]
     bounded = budget < np.inf
     for i in range(n):
@@ -245,7 +249,7 @@ def look(s, window, c, f, table, paid, flags, count, mask, first, n):
         flags[5, first + i], count[first + i] = s[ON + i] != 0.0, np.int64(s[K + i])
     for j in range(mask.shape[1]):
         for i in range(n):
-            mask[first + i, j] = flags[5, first + i] | (j == 0)
+            mask[first + i, j] = (s[OPEN + i] != 0.0) | (j == 0)
     for i in range(n):
         s[LEFT_OVER + i] = (budget - s[USED + i]) / share if bounded else 1.0
         s[ATTACKING + i] = 1.0 if s[KIND + i] != 0.0 else 0.0
