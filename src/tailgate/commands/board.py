@@ -125,19 +125,11 @@ def _print_board(board: dict[str, Any]) -> None:
     console().print(table)
 
 
-def _read(name: str) -> dict[str, Any]:
-    try:
-        held: dict[str, Any] = json.loads(Path(name).read_text(encoding="utf-8"))
-        return held
-    except (OSError, ValueError) as error:
-        raise InputError("boards", name, f"a readable board.json ({error})") from None
-
-
 def _head(options: argparse.Namespace) -> int:
-    from tailgate.leaderboard.board_format import read_board
+    from tailgate.leaderboard.board_format import load, read_board
     from tailgate.leaderboard.head import markdown
 
-    board = _read(options.board)
+    board = load(Path(options.board))
     read_board(board)
     if options.most is not None and options.most < 1:
         raise InputError("most", options.most, "a whole number not below 1")
@@ -146,9 +138,10 @@ def _head(options: argparse.Namespace) -> int:
 
 
 def _page(options: argparse.Namespace) -> int:
+    from tailgate.leaderboard.board_format import load
     from tailgate.leaderboard.site import build_site
 
-    print(build_site([_read(name) for name in options.boards], Path(options.out), title=options.title, replays=not options.no_replays))
+    print(build_site([load(Path(name)) for name in options.boards], Path(options.out), title=options.title, replays=not options.no_replays))
     return 0
 
 

@@ -13,7 +13,6 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from tailgate.errors import InputError
 from tailgate.progress import cells, console, progress
 
 SHOWN = 20  # cells that are listed, at most
@@ -40,14 +39,11 @@ def add(actions: Any) -> None:
 
 
 def _check(options: argparse.Namespace) -> int:
-    from tailgate.files import write_atomic
+    from tailgate.leaderboard.board_format import load, save
     from tailgate.leaderboard.check import check, with_check
 
     path = Path(options.board)
-    try:
-        board = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError("board", str(path), f"a readable board.json ({error})") from None
+    board = load(path)
     seed = secrets.randbits(32) if options.sample_seed is None else options.sample_seed
     with progress(Console(stderr=True)) as update:
         report = check(
@@ -55,7 +51,7 @@ def _check(options: argparse.Namespace) -> int:
             progress=lambda done, total: update("playing", done, total, cells(done, total)),
         )  # fmt: skip
     if options.write:
-        write_atomic(path, json.dumps(with_check(board, report), indent=1, allow_nan=False).encode() + b"\n")
+        save(with_check(board, report), path)
     if options.json:
         print(json.dumps(report, indent=1, allow_nan=False))
     else:

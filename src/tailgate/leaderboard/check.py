@@ -89,7 +89,7 @@ def check(
         rows = run([cells[i] for i in some], workers=workers, progress=told)
         held += rows if whole else []
         each = iter(rows)
-        seen |= {i: _compared(board.cells[i], figures([next(each) for _ in range(cells[i].seeds)], suite)) for i in some}
+        seen |= {i: compared(board.cells[i], figures([next(each) for _ in range(cells[i].seeds)], suite)) for i in some}
     off = strays(data, suite)
     known = {(stray["defence"], stray["field"]) for stray in off}
     off += [stray for stray in _scored(data, held, suite) if (stray["defence"], stray["field"]) not in known]
@@ -178,7 +178,8 @@ def _slices(cells: dict[int, Cell]) -> Iterator[list[int]]:
         yield some
 
 
-def _compared(part: CellPart, here: Data) -> Seen:
+def compared(part: CellPart, here: Data) -> Seen:
+    """What the figures of a cell, as `scoring.cells.figures` makes them, say of the cell of a board."""
     says = {name: value for name, value in part.model_dump(include=set(COMPARED)).items() if name not in PRINTS or value is not None}
     off = [name for name in COMPARED if name in says and says[name] != here[name]]
     parts = [part for name in off for part in _parts(name, says[name], here[name])]
