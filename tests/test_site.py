@@ -231,6 +231,21 @@ def test_the_worst_episode_is_played_again(site, worst_row):
     assert "No replay. The row lacks the field" in entry(site, "imm").read_text(encoding="utf-8")
 
 
+def test_of_the_worst_episode_dose_and_attack_are_said(site, worst_row, tmp_path):
+    """And that it is none with damage, where there is none."""
+    words = "gusty-stop-and-go-v0, at a dose of 12 steps."
+    text = entry(site, "kf").read_text(encoding="utf-8").replace("<wbr>", "")
+    assert words in text and "this one came nearest" not in text and "at a dose of" not in entry(site, "imm").read_text(encoding="utf-8")
+    board = network()
+    for held in board["entries"]:
+        held["worst_episode"] = worst_row
+    for rate in board["entries"][0]["rates"]:
+        rate["undamaged"] = {"value": 1.0, "low": 0.9}
+    page = build_site([board], tmp_path, replays=False)
+    near = ["this one came nearest" in entry(page, held["defence"], "network-v0").read_text(encoding="utf-8") for held in board["entries"]]
+    assert near == [True, False]
+
+
 def test_rows_that_cannot_be_played(worst_row, tmp_path):
     """A policy that is not here and a class to import are reasons, without the place of a file; nothing is imported or written."""
     for change, reason in (

@@ -64,6 +64,17 @@ def _reason(error: Exception, row: Mapping[str, Any]) -> str:
     return text[:1].upper() + text[1:] + "."
 
 
+def _episode(suite: Suite, entry: EntryPart) -> str:
+    """Which episode is the worst one, in words; empty where the board does not say."""
+    row = entry.worst_episode or {}
+    scenario, attack, dose = (row.get(key) for key in ("scenario", "attack", "dose"))
+    if not (isinstance(scenario, str) and isinstance(attack, str) and isinstance(dose, int)):
+        return ""
+    spared = all(rate.undamaged is not None and rate.undamaged.value == 1.0 for rate in entry.rates)
+    near = " No episode at the doses that are shown came to damage; this one came nearest." if spared else ""
+    return f"{suite.where(scenario, attack)}, at a dose of {dose} steps.{near}"
+
+
 def _plain(value: Any) -> str:
     """JSON data in a line."""
     if isinstance(value, bool):
@@ -221,4 +232,5 @@ def entry_page(suite: Suite, entry: EntryPart, replayed: Replayed | None, also: 
                     for s in entry.stealth or ()],
         "detection": detection, "comparisons": comparisons_of(suite, entry.defence), "how": compared_how(suite),
         "round": suite.round, "about_trust": trust_of(suite), "trust": trust_page(suite, entry), "replay": replayed,
+        "episode": _episode(suite, entry),
     }  # fmt: skip
