@@ -171,9 +171,18 @@ def test_the_looser_threshold_lets_a_stealthy_attacker_further() -> None:
     """The curve of deviation against false-alarm time rises; it goes into the entry of the board."""
     curve = stealth_impact(ROAD, "chi2_kf", (0.02, 0.1), dose=100, episodes=8, **FEW)
     assert [p["hours"] for p in curve] == [0.02, 0.1] and 0.0 < curve[0]["deviation"] < curve[1]["deviation"]
+    assert all(p["low"] < p["deviation"] < p["high"] and "reason" not in p for p in curve)
     assert stealth_impact(ROAD, "none", (0.02,), **FEW) is None
     made = with_detection({"entries": [{"defence": "chi2_kf"}, {"defence": "none"}]}, {"hours": []}, {"chi2_kf": curve})
     assert made["entries"][0]["stealth"] == curve and made["entries"][1]["stealth"] is None
+
+
+def test_of_a_deviation_that_is_missing_the_reason_is_given() -> None:
+    """`imm` shows no gate to stay below; a mean time that is out of reach has no threshold; five episodes have a median without limits."""
+    [shut] = stealth_impact(ROAD, "imm", (0.02,), episodes=2, **FEW)
+    assert shut["threshold"] is not None and shut["deviation"] is shut["low"] is shut["high"] is None and "innovation" in shut["reason"]
+    near, far = stealth_impact(ROAD, "chi2_kf", (0.02, 10.0), dose=20, episodes=5, **FEW)
+    assert far["threshold"] is None and "hours" in far["reason"] and near["deviation"] > 0.0 and near["low"] is near["high"] is None
 
 
 def test_what_comes_after_an_attack_is_no_deviation() -> None:

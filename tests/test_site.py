@@ -170,10 +170,23 @@ def test_an_entry_s_page_has_all_parts(site):
     for part in ("https://example.org/paper", "Licence", "threshold of the gate [1]", "the budget was not spent", "car-following-heavy-v0", "\N{MINUS SIGN}7%", "false alarms",
                  "Only A damaged", "steps: 20000", "../network-v0/chi2_kf", "other plant"):  # fmt: skip
         assert part in text, part
-    assert text.count('class="plot ') == 2  # a chart on each scale
+    assert text.count('class="plot ') == 3  # a chart on each scale, and that of stealth impact
     assert "leaderboard check board.json --defence chi2_kf:eta=15" in text and "check synthetic-v0/board.json" in site.read_text(encoding="utf-8")
     bare = entry(site, HOSTILE).read_text(encoding="utf-8")
     assert "came without a card" in bare and "No replay. The board holds no worst episode" in bare and "Stealth and impact" not in bare
+
+
+def test_stealth_impact_has_its_interval_and_a_reason_where_there_is_none(site, index, tmp_path):
+    """On the curve and in the tables; a board of before the intervals is drawn without them."""
+    assert "kf 3.36 3.16 to 3.66 4.36 4.16 to 4.66 5.36 5.16 to 5.66" in index.rows("plain")
+    held = make_board()
+    page = entry(site, "kf").read_text(encoding="utf-8")
+    assert Outline(page).rows("plain").count("0.1 9.1 3.36 3.16 to 3.66") == 1 and "no &lt;b&gt;gate" in entry(site, "imm").read_text(encoding="utf-8")
+    for item in held["entries"][0]["stealth"]:
+        del item["low"], item["high"]
+    old = entry(build_site([held], tmp_path, replays=False), "kf").read_text(encoding="utf-8")
+    whiskers = [text.split('id="stealth"')[1].count('class="whisker') for text in (page, old)]
+    assert whiskers == [3, 0] and "0.1 9.1 3.36 \N{EN DASH}" in Outline(old).rows("plain")
 
 
 def cell_of(site, path, defence):

@@ -129,6 +129,9 @@ class Stealth(Part):
     hours: Number
     threshold: Number | None = None
     deviation: Number | None
+    low: Number | None = None
+    high: Number | None = None
+    reason: Text = ""  # why there is none
 
 
 class Bound(Part):

@@ -20,12 +20,14 @@ from tailgate.errors import InputError, NotApplicable
 from tailgate.evaluation import Cell, run_cell
 from tailgate.registry import Spec
 from tailgate.scenario import Suite, load_scenario
-from tailgate.stats import proportion
+from tailgate.stats import median_limits, proportion
 from tailgate.trace import Trace, episodes_at_once, rollout
 
 HOURS = (0.1, 1.0, 10.0)
 ONSETS = 100  # false alarms that a threshold is found on: its mean time is known to 20 %
 STEPS = 8_000_000  # of the longest clean run: 20 alarms at 10 h in steps of 0.1 s
+LEVEL = 0.95  # of intervals
+UNTOUCHED = "no attack took effect"
 Progress = Callable[[str, int, int, str], None]  # label, done, total, figures
 Data = dict[str, Any]
 
@@ -98,7 +100,7 @@ def _detected(rows: Sequence[Data]) -> Data:
     """Of the episodes in which an attack took effect."""
     met = [row for row in rows if row["status"] == "ok" and row["missed_deadline"] is not None]
     if not met or any(row["status"] == "error" for row in rows):
-        reason = next((row["reason"] for row in rows if row["status"] != "ok"), "no attack took effect")
+        reason = next((row["reason"] for row in rows if row["status"] != "ok"), UNTOUCHED)
         return {"detected": None, "delay": None, "reason": reason}
     delays = [row["detection_delay"] for row in met if row["detection_delay"] is not None]
     share = proportion(sum(row["missed_deadline"] == 0.0 for row in met), len(met))
@@ -111,7 +113,8 @@ def stealth_impact(
 ) -> list[Data] | None:  # fmt: skip
     """The field `stealth` of an entry: by the mean time between false alarms, the error that the stealth attack reaches per time.
 
-    The median `deviation` [m/s] of episodes, the most of scenarios.
+    `deviation` [m/s] is the median of episodes, the most of scenarios; `low` and `high` its limits of 95 %, which hold together for all
+    scenarios, null for few episodes; `reason` says why there is none.
     None for a defence without a threshold. In the scenarios, under the threat model and at the dose of `detection`.
     """
     update = progress or (lambda *_: None)
@@ -119,15 +122,25 @@ def stealth_impact(
         raise InputError(f"suite {suite.name}: scenarios", list(suite.nominal), "scenarios of one plant")
     out: list[Data] = []
     for done, h in enumerate(hours, start=1):
-        level, _ = _found(defence, suite.nominal, h, onsets, most_steps)
-        if level is not None:
-            reached = [_reached(level, _cell(suite, name, dose, defence, attack, episodes, beacon)) for name in suite.nominal]
-            out.append({"hours": h, "threshold": level, "deviation": max((x for x in reached if x is not None), default=None)})
+        level, why = _found(defence, suite.nominal, h, onsets, most_steps)
+        cells = [] if level is None else [_cell(suite, name, dose, defence, attack, episodes, beacon) for name in suite.nominal]
+        out.append({"hours": h, "threshold": level} | _impact([_reached(level, cell) for cell in cells if level is not None], why))
         update(f"stealth against {defence}", done, len(hours), f"{h:g} h")
-    return out or None
+    return out if any(item["threshold"] is not None for item in out) else None
 
 
-def _reached(level: float, cell: Cell) -> float | None:
+def _impact(found: Sequence[Array | str], why: str) -> Data:
+    """Of the deviations in each scenario, or why there are none, the largest median, with limits that hold for all together."""
+    reached = [values for values in found if not isinstance(values, str)]
+    if not reached:
+        return dict.fromkeys(("deviation", "low", "high")) | {"reason": next((x for x in found if isinstance(x, str)), why)}
+    limits = [median_limits(values, 1.0 - (1.0 - LEVEL) / len(reached)) for values in reached]
+    low, high = map(max, zip(*limits, strict=True)) if None not in limits else (None, None)
+    return {"deviation": max(float(np.median(values)) for values in reached), "low": low, "high": high}
+
+
+def _reached(level: float, cell: Cell) -> Array | str:
+    """(n,) deviations of the episodes that were attacked, or why there are none."""
     made, rival = Bench.of(cell.defence, [cell.scenario], cell.seeds, None).at(level), Spec("attack", cell.attack)
     attack, guard = rival.make(), Spec("defence", cell.defence)
     values: list[Array] = []
@@ -136,10 +149,10 @@ def _reached(level: float, cell: Cell) -> float | None:
         size = episodes_at_once(loop.model, loop.horizon, cell.batch)
         for first in range(0, cell.seeds, size):
             values.append(deviation(rollout(loop, attack, draws.keys(cell.purpose, cell.episodes[first : first + size]))))
-    except NotApplicable:
-        return None
+    except NotApplicable as error:
+        return str(error)
     reached = np.concatenate(values)
-    return float(np.nanmedian(reached)) if np.isfinite(reached).any() else None
+    return reached[np.isfinite(reached)] if np.isfinite(reached).any() else UNTOUCHED
 
 
 def deviation(trace: Trace) -> Array:
