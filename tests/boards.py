@@ -166,8 +166,8 @@ def make_board(name="synthetic-v0", *, bound=None, beacon="", trusted=True, defe
             "flags": ["the budget was not spent", "seed spread 12 %"] if text.startswith("chi2") else [],
             "worst_episode": {"scenario": "nowhere-v0"} if text == "imm" else None,
             "robustness": [{"scenario": scenarios[-1], "undamaged": {"value": 0.8, "low": 0.74}, "change": -0.07}],
-            "stealth": [{"hours": h, "threshold": 9.0 + h, "deviation": strength * 0 + 1.5 + math.log10(h) + 40 / strength} for h in (0.1, 1, 10)]
-            if text in ("kf", "chi2_kf:eta=15", "cusum_kf", "reacquire_kf") else None,
+            "stealth": [{"hours": h, "threshold": 9.0 + h, "deviation": (x := 1.5 + math.log10(h) + 40 / strength), "low": x - 0.2, "high": x + 0.3} for h in (0.1, 1, 10)]
+            if text in ("kf", "chi2_kf:eta=15", "cusum_kf", "reacquire_kf") else [{"hours": 1, "threshold": 3.0, "deviation": None, "low": None, "high": None, "reason": "shows no <b>gate</b>"}] if text == "imm" else None,
             "trust": trust_of(text, attacks, scenarios, doses[-1]) if trusted else None,
         })  # fmt: skip
     ranked = [e["defence"] for e in entries if e["rank"] and e["class"] == "measurements"]

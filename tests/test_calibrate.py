@@ -12,7 +12,7 @@ from scipy import stats
 
 import tailgate
 from tailgate import cli
-from tailgate.calibrate import MIXTURE, Bench, Count, Crossings, calibrate, count_onsets
+from tailgate.calibrate import MIXTURE, Bench, Count, Crossings, _fused, calibrate, count_onsets
 from tailgate.draws import keys
 from tailgate.errors import InputError, NotApplicable
 from tailgate.estimators import Cusum, GateOut, KalmanFilter, Mewma, WindowedChiSquare, compose
@@ -66,6 +66,20 @@ def test_onsets_are_those_of_the_metric(short):
     trace = rollout(loop, tailgate.make_attack("none"), held)
     np.testing.assert_array_equal(onsets, METRICS["alarm_onsets"](trace))
     assert steps == trace.length.sum() < 40 * 150 and onsets.min() < onsets.max()
+
+
+@pytest.mark.parametrize(("defence", "scenario"), [("chi2_kf", "braking-v0"), ("imm", "stop-and-go-v0"), ("cusum_kf", "radar-braking-v0")])
+def test_the_fused_engine_finds_the_same_threshold(monkeypatch, defence, scenario):
+    """To the last digit, with the same alarms in as many steps."""
+    found = {}
+    for engine in (True, False):
+        if not engine:
+            monkeypatch.setattr("tailgate.calibrate._fused", lambda loop: False)
+        else:
+            bench = Bench.of(defence, [scenario], 4096, None)
+            assert _fused(bench.places[0].loop(bench.at(9.0), bench.uses))
+        found[engine] = calibrate(defence, 0.02, scenarios=[scenario], onsets=40, most_steps=200_000).as_data()
+    assert found[True] == found[False] and found[True]["measured"]["onsets"] > 0
 
 
 def test_the_interval_is_exact_poisson():

@@ -252,14 +252,44 @@ def test_robustness_is_the_change_against_the_worst_of_the_plants_that_are_told(
     assert [(r["scenario"], r["undamaged"]["value"]) for r in found] == [(OTHER, 0.75)] and found[0]["change"] == pytest.approx(-0.15)
 
 
+def _worst(rows, defence, where=None):
+    """(attack, dose, number) of a defence's worst episode."""
+    row = entry(board([*clean(defence), *cell("none", "fdi"), *rows], where), defence)["worst_episode"]
+    return row["attack"], row["dose"], row["number"]
+
+
+def _with_gaps(rows, gap):
+    return [row | {"min_gap": gap(row)} for row in rows]
+
+
 def test_the_worst_episode_is_a_damaged_one_with_the_smallest_gap() -> None:
-    """Of the worst attack at the middle dose; none where nothing was damaged."""
-    hit = cell("a", "fdi", [0, 3, 3])
-    for row in hit:
-        row["min_gap"] = -float(row["number"] % 3)
-    made = board([*clean("a", "b"), *cell("none", "fdi"), *hit, *cell("b", "fdi")])
-    assert (entry(made, "a")["worst_episode"]["number"], entry(made, "a")["worst_episode"]["dose"]) == (2, 20)
-    assert entry(made, "b")["worst_episode"] is None
+    """Of the worst attack at the middle dose, whatever came nearer without damage."""
+    assert _worst(_with_gaps(cell("a", "fdi", [0, 3, 3]), lambda row: -float(row["number"] % 3)), "a") == ("fdi", 20, 2)
+    assert _worst(_with_gaps(cell("a", "fdi", [1, [7], 3]), lambda row: -9.0 if row["dose"] == 10 else float(row["number"])), "a") == ("fdi", 20, 7)
+
+
+def test_an_entry_that_is_undamaged_at_the_middle_dose_shows_the_smallest_with_damage() -> None:
+    """Of doses that are shown; the least knowing attacker first."""
+    doses = (5, 10, 20, 40)
+    where = suite(attacks=("none", "fdi", "seer"), doses=doses, shown={10: "a", 20: "b", 40: "c"})
+    rows = [row for defence in ("a", "none") for row in cell(defence, doses=doses)]
+    rows += cell("none", "fdi", doses=doses) + cell("none", "seer", doses=doses, knowledge="grey")
+    for hits, seen, found in (([2, 0, 0, 4], [0] * 4, ("fdi", 40)), ([0, 3, 0, 4], [0, 9, 0, 0], ("fdi", 10)), ([0] * 4, [0, 0, 0, 9], ("seer", 40))):
+        mine = cell("a", "fdi", hits, doses=doses) + cell("a", "seer", seen, doses=doses, knowledge="grey")
+        row = entry(board([*rows, *mine], where), "a")["worst_episode"]
+        assert (row["attack"], row["dose"], row["crashed"]) == (*found, 1.0)
+
+
+def test_where_nothing_is_damaged_the_episode_that_came_nearest_is_shown() -> None:
+    """The smallest gap at a shown dose; without a road the largest error."""
+    near = {(10, 4): 0.5, (40, 11): 0.25}
+    assert _worst(_with_gaps(cell("a", "fdi"), lambda row: near.get((row["dose"], row["number"]), 8.0)), "a") == ("fdi", 40, 11)
+    assert _worst(_with_gaps(cell("a", "fdi"), lambda row: near.get((row["dose"], row["number"]), 8.0)), "a", suite(shown={10: "a"})) == ("fdi", 10, 4)
+    still = {"scenario": NETWORK, "distance_travelled": None, "min_gap": None}
+    rows = [*cell("a", **still), *cell("none", **still), *cell("none", "fdi", **still), *cell("a", "fdi", **still)]
+    rows[-9]["max_error"] = 5.0
+    row = entry(board(rows, suite(scenarios=(NETWORK,), bound=9.0)), "a")["worst_episode"]
+    assert (row["dose"], row["number"], row["max_error"]) == (40, 11, 5.0)
 
 
 def test_flags_name_unspent_budgets_and_transfers_that_beat_own_training() -> None:

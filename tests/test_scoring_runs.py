@@ -18,7 +18,7 @@ from tailgate.metrics import max_error
 from tailgate.registry import entries
 from tailgate.scenario import Suite, list_suites, load_scenario, load_suite
 from tailgate.scoring import score
-from tailgate.scoring.detection import detection, deviation, plants, stealth_impact, threshold, with_detection
+from tailgate.scoring.detection import Effort, detection, deviation, plants, stealth_impact, threshold
 from tailgate.trace import rollout
 
 SENTINELS = {name: e.sentinel for name, e in entries("defence").items() if e.sentinel}
@@ -148,13 +148,16 @@ def test_every_plan_of_training_can_be_asked_for() -> None:
 
 WHERE = ("stop-and-go-v0",)
 ROAD = Suite("s", "", WHERE)
-FEW = {"onsets": 20, "most_steps": 80_000}
+
+
+def few(*hours, episodes=8, most_steps=80_000):
+    return Effort(hours, episodes, 20, most_steps)
 
 
 @pytest.mark.long
 def test_detection_holds_all_to_one_mean_time_between_false_alarms(monkeypatch) -> None:
     """A bias of ten standard deviations is seen at once at either threshold; the looser one is the higher; a plain filter has none."""
-    found = detection(ROAD, ["chi2_kf", "none"], ["fdi:start_step=100,value=-10"], (0.02, 0.1), dose=20, episodes=8, **FEW)
+    found = detection(ROAD, ["chi2_kf", "none"], ["fdi:start_step=100,value=-10"], few(0.02, 0.1), dose=20)
     tight, loose = found["entries"]
     assert tight["threshold"] < loose["threshold"] and [e["detected"]["value"] for e in (tight, loose)] == [1.0, 1.0]
     assert tight["delay"] <= loose["delay"] <= 1.0 and 0.6 < tight["detected"]["low"] < 1.0
@@ -163,17 +166,24 @@ def test_detection_holds_all_to_one_mean_time_between_false_alarms(monkeypatch) 
 
 def test_a_mean_time_that_is_out_of_reach_is_listed_and_not_an_error() -> None:
     """10 h need more steps than were allowed."""
-    found = detection(ROAD, ["chi2_kf"], ["none"], (10.0,), episodes=2, most_steps=1000)
+    found = detection(ROAD, ["chi2_kf"], ["none"], few(10.0, episodes=2, most_steps=1000))
     assert not found["entries"] and "hours" in found["without"][0]["reason"]
 
 
 def test_the_looser_threshold_lets_a_stealthy_attacker_further() -> None:
-    """The curve of deviation against false-alarm time rises; it goes into the entry of the board."""
-    curve = stealth_impact(ROAD, "chi2_kf", (0.02, 0.1), dose=100, episodes=8, **FEW)
+    """The curve of deviation against false-alarm time rises; a plain filter has none."""
+    curve = stealth_impact(ROAD, "chi2_kf", few(0.02, 0.1), dose=100)
     assert [p["hours"] for p in curve] == [0.02, 0.1] and 0.0 < curve[0]["deviation"] < curve[1]["deviation"]
-    assert stealth_impact(ROAD, "none", (0.02,), **FEW) is None
-    made = with_detection({"entries": [{"defence": "chi2_kf"}, {"defence": "none"}]}, {"hours": []}, {"chi2_kf": curve})
-    assert made["entries"][0]["stealth"] == curve and made["entries"][1]["stealth"] is None
+    assert all(p["low"] < p["deviation"] < p["high"] and "reason" not in p for p in curve)
+    assert stealth_impact(ROAD, "none", few(0.02)) is None
+
+
+def test_of_a_deviation_that_is_missing_the_reason_is_given() -> None:
+    """`imm` shows no gate to stay below; a mean time that is out of reach has no threshold; five episodes have a median without limits."""
+    [shut] = stealth_impact(ROAD, "imm", few(0.02, episodes=2))
+    assert shut["threshold"] is not None and shut["deviation"] is shut["low"] is shut["high"] is None and "innovation" in shut["reason"]
+    near, far = stealth_impact(ROAD, "chi2_kf", few(0.02, 10.0, episodes=5), dose=20)
+    assert far["threshold"] is None and "hours" in far["reason"] and near["deviation"] > 0.0 and near["low"] is near["high"] is None
 
 
 def test_what_comes_after_an_attack_is_no_deviation() -> None:

@@ -172,7 +172,7 @@ def test_an_entry_s_page_has_all_parts(site):
     for part in ("https://example.org/paper", "Licence", "threshold of the gate [1]", "the budget was not spent", "car-following-heavy-v0", "\N{MINUS SIGN}7%", "false alarms",
                  "Only A damaged", "steps: 20000", "../network-v0/chi2_kf", "other plant"):  # fmt: skip
         assert part in text, part
-    assert text.count('class="plot ') == 2  # a chart on each scale
+    assert text.count('class="plot ') == 3  # a chart on each scale, and that of stealth impact
     assert "leaderboard check board.json --defence chi2_kf:eta=15" in text and "check synthetic-v0/board.json" in site.read_text(encoding="utf-8")
     bare = entry(site, HOSTILE).read_text(encoding="utf-8")
     assert "came without a card" in bare and "No replay. The board holds no worst episode" in bare and "Stealth and impact" not in bare
@@ -210,6 +210,19 @@ def test_the_card_that_came_with_an_attack_is_drawn(site):
     told = facts(site.read_text(encoding="utf-8"), "A bias that is held", 4)
     assert {"Reference": "https://example.org/attack", "Licence": "BSD-3-Clause", "Threat model": "Adds &lt;b&gt;any&lt;/b&gt; value."}.items() <= told.items()
     assert f'license = "{LICENCE}"' in (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+
+
+def test_stealth_impact_has_its_interval_and_a_reason_where_there_is_none(site, index, tmp_path):
+    """On the curve and in the tables; a board of before the intervals is drawn without them."""
+    assert "kf 3.36 3.16 to 3.66 4.36 4.16 to 4.66 5.36 5.16 to 5.66" in index.rows("plain")
+    held = make_board()
+    page = entry(site, "kf").read_text(encoding="utf-8")
+    assert Outline(page).rows("plain").count("0.1 9.1 3.36 3.16 to 3.66") == 1 and "no &lt;b&gt;gate" in entry(site, "imm").read_text(encoding="utf-8")
+    for item in held["entries"][0]["stealth"]:
+        del item["low"], item["high"]
+    old = entry(build_site([held], tmp_path, replays=False), "kf").read_text(encoding="utf-8")
+    whiskers = [text.split('id="stealth"')[1].count('class="whisker') for text in (page, old)]
+    assert whiskers == [3, 0] and "0.1 9.1 3.36 \N{EN DASH}" in Outline(old).rows("plain")
 
 
 def cell_of(site, path, defence):
@@ -265,6 +278,21 @@ def test_the_worst_episode_is_played_again(site, worst_row):
     assert 'href="kf-replay.html"' in text and "The same trace, bit for bit" in text and "Collision" in text
     assert worst_row["trace_hash"] in (site.parent / "synthetic-v0" / "kf-replay.html").read_text(encoding="utf-8")
     assert "No replay. The row lacks the field" in entry(site, "imm").read_text(encoding="utf-8")
+
+
+def test_of_the_worst_episode_dose_and_attack_are_said(site, worst_row, tmp_path):
+    """And that it is none with damage, where there is none."""
+    words = "gusty-stop-and-go-v0, at a dose of 12 steps."
+    text = entry(site, "kf").read_text(encoding="utf-8").replace("<wbr>", "")
+    assert words in text and "this one came nearest" not in text and "at a dose of" not in entry(site, "imm").read_text(encoding="utf-8")
+    board = network()
+    for held in board["entries"]:
+        held["worst_episode"] = worst_row
+    for rate in board["entries"][0]["rates"]:
+        rate["undamaged"] = {"value": 1.0, "low": 0.9}
+    page = build_site([board], tmp_path, replays=False)
+    near = ["this one came nearest" in entry(page, held["defence"], "network-v0").read_text(encoding="utf-8") for held in board["entries"]]
+    assert near == [True, False]
 
 
 def test_rows_that_cannot_be_played(worst_row, tmp_path):

@@ -20,12 +20,14 @@ import numpy as np
 from scipy import stats
 
 from tailgate import draws
-from tailgate.core import Array, Estimate, Model, no_command
+from tailgate.agents.scripted import NoAttack
+from tailgate.core import Array, Model, no_command
 from tailgate.errors import InputError, NotApplicable
+from tailgate.fused import Constants, fuse
 from tailgate.loop import Loop
 from tailgate.registry import Spec, entry_for, text_of
 from tailgate.scenario import Scenario, load_scenario
-from tailgate.trace import MEMORY
+from tailgate.trace import MEMORY, episodes_at_once, rollout
 
 MIXTURE = ("braking-v0", "stop-and-go-v0", "ornstein-uhlenbeck-v0")  # equal shares of the running time
 SILENT = 1e12  # a threshold that nothing reaches
@@ -33,6 +35,8 @@ TOLERANCE = 0.02  # of the mean time, on the seeds of the calibration
 RUNS = 8  # closed-loop runs at most
 LEAST = 20  # onsets in a run that the limit of steps has cut
 DIGITS = 4  # of a threshold
+RECORDED = 512  # episodes of the fused engine at a time
+NOTHING = NoAttack()
 HOUR = 3600.0
 
 Progress = Callable[[str, int, int, str], None]  # label, done, total, figures
@@ -125,8 +129,15 @@ def most_at_once(model: Model, most: int) -> int:
     return int(max(1, min(most, MEMORY // (80 * model.agents * model.states * model.states))))
 
 
-def play_clean(loop: Loop, keys: draws.Keys) -> Iterator[tuple[Estimate, Array]]:
-    """(estimate, live (B,)) of each step without an attack; an episode ends with a collision."""
+def play_clean(loop: Loop, keys: draws.Keys) -> Iterator[tuple[Array, Array, Array]]:
+    """(alarm (B, agents), score (B, agents), live (B,)) of each step without an attack; an episode ends with a collision.
+
+    A loop that has lanes is played by the fused engine, whose record is to the same bits.
+    """
+    if _fused(loop):
+        trace = rollout(loop, NOTHING, keys)
+        yield from zip(trace.alarm, trace.score, trace.live, strict=True)
+        return
     state = loop.start(keys)
     nothing = no_command(len(keys.key), loop.model.agents, len(loop.model.wires))
     for _ in range(loop.horizon):
@@ -134,7 +145,11 @@ def play_clean(loop: Loop, keys: draws.Keys) -> Iterator[tuple[Estimate, Array]]
         if not live.any():
             return
         state, frame = loop.advance(state, nothing)
-        yield frame.estimate, live
+        yield frame.estimate.alarm, frame.estimate.score, live
+
+
+def _fused(loop: Loop) -> bool:
+    return isinstance(fuse(loop, NOTHING), Constants)
 
 
 @dataclass(frozen=True)
@@ -207,7 +222,9 @@ class Bench:
         loops = {place.name: place.loop(guard, self.uses) for place in self.places}
         chunks = []
         for place, seeds in zip(self.places, self.seeds(hours), strict=True):
-            size = most_at_once(loops[place.name].model, self.batch)
+            loop = loops[place.name]
+            size = most_at_once(loop.model, self.batch)
+            size = episodes_at_once(loop.model, loop.horizon, min(size, RECORDED)) if _fused(loop) else size
             chunks += [(place, seeds[first : first + size]) for first in range(0, len(seeds), size)]
         counts: list[Array] = []
         steps = dict.fromkeys((place.name for place in self.places), 0)
@@ -228,13 +245,13 @@ def count_onsets(loop: Loop, keys: draws.Keys, crossings: Crossings | None = Non
     alarmed, onsets, last = np.zeros(batch, bool), np.zeros(batch, np.int64), np.full(batch, -np.inf)
     low: list[Array] = []
     high: list[Array] = []
-    for estimate, live in play_clean(loop, keys):
-        alarm = estimate.alarm.any(axis=1) & live
+    for alarms, scores, live in play_clean(loop, keys):
+        alarm = alarms.any(axis=1) & live
         onsets += alarm & ~alarmed
         alarmed = alarm
         steps += int(np.count_nonzero(live))
         if crossings is not None:
-            score = estimate.score.max(axis=1)
+            score = scores.max(axis=1)
             climbed = live & (score > last)
             low.append(last[climbed])
             high.append(score[climbed])

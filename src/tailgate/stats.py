@@ -1,4 +1,4 @@
-"""Intervals. Proportions by Clopper and Pearson (scipy); paired differences by a bootstrap with its own seed."""
+"""Intervals. Proportions by Clopper and Pearson, medians by ranks (scipy); paired differences by a bootstrap with its own seed."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -21,6 +21,16 @@ def proportion(successes: int, n: int, level: float = 0.95) -> Interval:
     """Share of successes with the exact (Clopper-Pearson) interval."""
     ci = stats.binomtest(successes, n).proportion_ci(confidence_level=level, method="exact")
     return Interval(successes / n, float(ci.low), float(ci.high))
+
+
+def median_limits(values: Array, level: float = 0.95) -> tuple[float, float] | None:
+    """The exact interval of the median of what values (n,) are drawn from: two of them, by the binomial distribution of their ranks.
+
+    It covers with a chance of at least `level` whatever the distribution is. None where so few values cannot. Source: scipy's
+    `quantile_test`; Conover, Practical Nonparametric Statistics, 1999, section 3.2.
+    """
+    ends = stats.quantile_test(values, q=0.0, p=0.5).confidence_interval(confidence_level=level)
+    return None if np.isnan(ends.low) or np.isnan(ends.high) else (float(ends.low), float(ends.high))
 
 
 def paired_difference(a: Array, b: Array, level: float = 0.95, resamples: int = 4000, seed: int = 0, share: bool = False) -> Interval:

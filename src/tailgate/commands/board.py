@@ -16,7 +16,6 @@ from rich.table import Table
 
 from tailgate.errors import InputError
 from tailgate.progress import cells, console, progress
-from tailgate.scenario import Suite
 
 
 def add(actions: Any) -> None:
@@ -32,7 +31,7 @@ def add(actions: Any) -> None:
     command.add_argument("--workers", type=int, default=2, metavar="N", help="processes (default 2); change no result")
     command.add_argument("--beacon", default="", metavar="TEXT", help="the round: random text of after the submissions (default: none)")
     command.add_argument("--score-only", action="store_true", help="play nothing: score the rows that are there")
-    command.add_argument("--detection", action="store_true", help="also the detection board and stealth-impact curves: calibrates, slow")
+    command.add_argument("--detection", action="store_true", help="then play detection as `leaderboard detect` does: slow")
     command.add_argument("--unattacked", action="store_true", help="also rank defences that no attack was trained against")
     command.add_argument("--no-replays", action="store_true", help="leave out the replays of the worst episodes")
     command.add_argument("--json", action="store_true", help="print the entries as JSON")
@@ -65,7 +64,8 @@ def add(actions: Any) -> None:
 
 def _run(options: argparse.Namespace) -> int:
     sys.path.insert(0, "")  # module:Class is looked for in the working directory, as `tailgate evaluate` does
-    from tailgate.leaderboard.run import board_of, play
+    from tailgate.leaderboard.detect import detect
+    from tailgate.leaderboard.run import BOARD, board_of, play
     from tailgate.leaderboard.run_record import Record
     from tailgate.leaderboard.site import build_site
     from tailgate.scenario import load_suite
@@ -85,7 +85,7 @@ def _run(options: argparse.Namespace) -> int:
                 print(f"rows: {rows}", file=sys.stderr)
             board = board_of(suite, folder, beacon=options.beacon or None, require_adaptive=not options.unattacked)
             print(record.finish(board["suite"]["rows"]), file=sys.stderr)
-            boards.append(_detected(board, suite, folder, update) if options.detection else board)
+            boards.append(detect(folder / BOARD, suite, workers=options.workers, progress=update) if options.detection else board)
     page = build_site(boards, out / "page", replays=not options.no_replays)
     if options.json:
         print(json.dumps([{"suite": b["suite"]["name"], "entries": b["entries"]} for b in boards], indent=1, allow_nan=False))
@@ -94,26 +94,6 @@ def _run(options: argparse.Namespace) -> int:
             _print_board(board)
     print(f"page: {page} ({(time.perf_counter() - started) / 60:.1f} min)", file=sys.stderr)
     return 0
-
-
-def _detected(board: dict[str, Any], suite: Suite, folder: Path, update: Any) -> dict[str, Any]:
-    """The board with detection and stealth impact, written again."""
-    from tailgate.files import write_atomic
-    from tailgate.scoring.detection import detection, stealth_impact, with_detection
-
-    guards = [e["defence"] for e in board["entries"] if e["card"] is not None and e["defence"] != "none" and "truth" not in e["uses"]]
-    scripts = [a for a in board["attacks"] if not a["optimal"] and not a["learned"]]
-    against = [a["attack"] for a in scripts if a["knowledge"] == "black"]
-
-    def told(label: str, done: int, total: int, text: str) -> None:
-        update(label, done, total, text)
-
-    beacon = board["suite"]["beacon"]
-    found = detection(suite, guards, against, beacon=beacon, progress=told)
-    stealth = {guard: stealth_impact(suite, guard, beacon=beacon, progress=told) for guard in guards}
-    board = with_detection(board, found, stealth)
-    write_atomic(folder / "board.json", json.dumps(board, indent=1, allow_nan=False).encode() + b"\n")
-    return board
 
 
 def _print_board(board: dict[str, Any]) -> None:
@@ -128,19 +108,11 @@ def _print_board(board: dict[str, Any]) -> None:
     console().print(table)
 
 
-def _read(name: str) -> dict[str, Any]:
-    try:
-        held: dict[str, Any] = json.loads(Path(name).read_text(encoding="utf-8"))
-        return held
-    except (OSError, ValueError) as error:
-        raise InputError("boards", name, f"a readable board.json ({error})") from None
-
-
 def _head(options: argparse.Namespace) -> int:
-    from tailgate.leaderboard.board_format import read_board
+    from tailgate.leaderboard.board_format import load, read_board
     from tailgate.leaderboard.head import markdown
 
-    board = _read(options.board)
+    board = load(Path(options.board))
     read_board(board)
     if options.most is not None and options.most < 1:
         raise InputError("most", options.most, "a whole number not below 1")
@@ -149,9 +121,10 @@ def _head(options: argparse.Namespace) -> int:
 
 
 def _page(options: argparse.Namespace) -> int:
+    from tailgate.leaderboard.board_format import load
     from tailgate.leaderboard.site import build_site
 
-    print(build_site([_read(name) for name in options.boards], Path(options.out), title=options.title, replays=not options.no_replays))
+    print(build_site([load(Path(name)) for name in options.boards], Path(options.out), title=options.title, replays=not options.no_replays))
     return 0
 
 

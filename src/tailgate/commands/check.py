@@ -26,53 +26,82 @@ def add(actions: Any) -> None:
         "check", help="play cells of a published board again, without its rows",
         description="Play cells of a board again and compare how many episodes came to damage, and the fingerprint of all decisions. "
         "Rates, critical doses and curves have to follow from the cells; where all cells of the board are played, ranks and gates are "
-        "made again as well. Exit code 1 when anything differs, or when no cell could be checked. Registered names, the zoo, and files "
-        "of policies that are here are played; a board never makes this command import code.",
+        "made again as well. With --detection, detection and stealth impact are played again instead. Exit code 1 when anything differs, "
+        "or when nothing could be checked. Registered names, the zoo, and files of policies that are here are played; a board never makes "
+        "this command import code.",
     )  # fmt: skip
     command.add_argument("board", metavar="FILE", help="board.json")
     command.add_argument("--sample", type=int, metavar="N", help="so many cells, drawn at random (default: all)")
     command.add_argument("--sample-seed", type=int, metavar="N", help="which ones (default: a new secret each time; the report names it)")
     command.add_argument("--defence", action="append", default=[], metavar="NAME", help="only the cells of these defences (repeatable)")
     command.add_argument("--workers", type=int, default=1, metavar="N", help="processes (default 1); changes no result")
+    command.add_argument("--detection", action="store_true",
+                         help="in place of the cells play detection and stealth impact again: --sample then counts entries")  # fmt: skip
     command.add_argument("--write", action="store_true", help="put into the board what was found, and the fingerprints of equal cells")
     command.add_argument("--json", action="store_true", help="print the report as JSON")
     command.set_defaults(run=_check)
 
 
 def _check(options: argparse.Namespace) -> int:
-    from tailgate.files import write_atomic
+    from tailgate.leaderboard.board_format import load, save
     from tailgate.leaderboard.check import check, with_check
+    from tailgate.leaderboard.detect import check_detection
 
+    if options.detection and options.write:
+        raise InputError("--write", True, "the cells of a board, without --detection")
     path = Path(options.board)
-    try:
-        board = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError("board", str(path), f"a readable board.json ({error})") from None
+    board = load(path)
     seed = secrets.randbits(32) if options.sample_seed is None else options.sample_seed
+    asked = {"sample": options.sample, "sample_seed": seed, "defences": options.defence, "workers": options.workers}
     with progress(Console(stderr=True)) as update:
-        report = check(
-            board, sample=options.sample, sample_seed=seed, defences=options.defence, workers=options.workers,
-            progress=lambda done, total: update("playing", done, total, cells(done, total)),
-        )  # fmt: skip
+        if options.detection:
+            report = check_detection(board, **asked, progress=update)
+        else:
+            report = check(board, **asked, progress=lambda done, total: update("playing", done, total, cells(done, total)))
     if options.write:
-        write_atomic(path, json.dumps(with_check(board, report), indent=1, allow_nan=False).encode() + b"\n")
+        save(with_check(board, report), path)
     if options.json:
         print(json.dumps(report, indent=1, allow_nan=False))
+    elif options.detection:
+        _print_detection(report)
     else:
         _print(report)
-    return 1 if report["counts"]["differs"] or report["strays"] or not report["counts"]["equal"] else 0
+    return 1 if report["counts"]["differs"] or report.get("strays") or not report["counts"]["equal"] else 0
+
+
+def _table(report: dict[str, Any], title: str, columns: tuple[str, ...]) -> Table:
+    """A line for each entry."""
+    table = Table(title=title)
+    for heading in columns:
+        table.add_column(heading, overflow="fold")
+    for entry in report["entries"]:
+        table.add_row(*(escape(str(entry[key])) for key in columns))
+    return table
+
+
+def _print_detection(report: dict[str, Any]) -> None:
+    out = console()
+    title = f"{report['suite']}: detection of {report['asked']} of {report['of']} entries played again{_seed(report)}; figures"
+    out.print(_table(report, title, ("defence", "equal", "differs", "unchecked")))
+    for reason in report["reasons"]:
+        out.print(f"{reason['defence']} unchecked: {reason['why']}", markup=False, highlight=False)
+    findings: list[dict[str, Any]] = report["findings"]
+    for found in findings[:SHOWN]:
+        words = (found["of"], found["scenario"] or found["plant"], found["attack"], f"{found['hours']:g} h", found["field"])
+        said = f"board {_words(found['board'])}, here {_words(found['here'])}"
+        out.print(f"    {found['defence']}: {', '.join(filter(None, words))}: {said}", markup=False, highlight=False, soft_wrap=True)
+    if len(findings) > SHOWN:
+        out.print(f"and {len(findings) - SHOWN} more; --json lists them all", highlight=False)
+
+
+def _seed(report: dict[str, Any]) -> str:
+    return "" if report["sample"] is None else f", drawn by the seed {report['sample_seed']}"
 
 
 def _print(report: dict[str, Any]) -> None:
     out = console()
-    drawn = "" if report["sample"] is None else f", drawn by the seed {report['sample_seed']}"
-    table = Table(title=f"{report['suite']}: {report['asked']} of {report['cells']} cells played again{drawn}")
-    for heading in ("defence", "cells", "equal", "differs", "unchecked"):
-        table.add_column(heading, overflow="fold")
-    entries: list[dict[str, Any]] = report["entries"]
-    for entry in entries:
-        table.add_row(escape(str(entry["defence"])), *(str(entry[key]) for key in ("cells", "equal", "differs", "unchecked")))
-    out.print(table)
+    title = f"{report['suite']}: {report['asked']} of {report['cells']} cells played again{_seed(report)}"
+    out.print(_table(report, title, ("defence", "cells", "equal", "differs", "unchecked")))
     reasons: list[dict[str, Any]] = report["reasons"]
     for reason in reasons[:SHOWN]:
         out.print(f"{reason['cells']} cells unchecked: {reason['why']}", markup=False, highlight=False)

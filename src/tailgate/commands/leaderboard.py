@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from tailgate.commands import attack, board, check, retrain, submit, verify
+from tailgate.commands import attack, board, check, detect, retrain, submit, verify
 
 
 def add(commands: Any) -> None:
@@ -17,6 +17,7 @@ def add(commands: Any) -> None:
     submit.add(actions)
     verify.add(actions)
     check.add(actions)
+    detect.add(actions)
     retrain.add(actions)
     build = actions.add_parser("build", help="one self-contained HTML page from rows files, unranked")
     build.add_argument("--rows", nargs="+", required=True, metavar="FILE", help="JSON Lines files of `tailgate evaluate`")

@@ -5,11 +5,14 @@ Fields that are not named here are let through: a board may hold more than a pag
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from tailgate.errors import InputError, wanted
+from tailgate.files import write_atomic
 
 FORMAT = "tailgate-board-1"
 Level = Literal["black", "grey", "white"]
@@ -127,6 +130,9 @@ class Stealth(Part):
     hours: Number
     threshold: Number | None = None
     deviation: Number | None
+    low: Number | None = None
+    high: Number | None = None
+    reason: Text = ""  # why there is none
 
 
 class Bound(Part):
@@ -293,6 +299,19 @@ class Board(Part):
     comparisons: list[Comparison] = []
     detection: Detection | None = None
     trust: TrustPart | None = None
+
+
+def load(path: Path) -> Any:
+    """The JSON data of a file, to be read by `read_board`; raises InputError for a file that is none."""
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputError("board", str(path), f"a readable board.json ({error})") from None
+
+
+def save(board: dict[str, Any], path: Path) -> None:
+    """Put a board, as JSON data, into a file, in one step."""
+    write_atomic(path, json.dumps(board, indent=1, allow_nan=False).encode() + b"\n")
 
 
 def read_board(data: Any, where: str = "board") -> Board:

@@ -61,15 +61,10 @@ def check(
     Raises InputError for a board of another suite or version than is here, and for a defence that is not on it.
     """
     board = read_board(data)
-    suite = _suite_of(board)
-    if sample is not None and sample < 1:
-        raise InputError("sample", sample, "a whole number not below 1")
-    names = [entry.defence for entry in board.entries]
-    for name in defences:
-        if name not in names:
-            raise unknown("defence", name, names)
+    suite = suite_of(board)
+    known(defences, [entry.defence for entry in board.entries])
     mine = [i for i, cell in enumerate(board.cells) if not defences or cell.defence in defences]
-    asked = _drawn(mine, sample, sample_seed)
+    asked = drawn(mine, sample, sample_seed)
     seen: dict[int, Seen] = {}
     cells: dict[int, Cell] = {}
     for i in asked:
@@ -89,10 +84,10 @@ def check(
         rows = run([cells[i] for i in some], workers=workers, progress=told)
         held += rows if whole else []
         each = iter(rows)
-        seen |= {i: _compared(board.cells[i], figures([next(each) for _ in range(cells[i].seeds)], suite)) for i in some}
+        seen |= {i: compared(board.cells[i], figures([next(each) for _ in range(cells[i].seeds)], suite)) for i in some}
     off = strays(data, suite)
-    known = {(stray["defence"], stray["field"]) for stray in off}
-    off += [stray for stray in _scored(data, held, suite) if (stray["defence"], stray["field"]) not in known]
+    listed = {(stray["defence"], stray["field"]) for stray in off}
+    off += [stray for stray in _scored(data, held, suite) if (stray["defence"], stray["field"]) not in listed]
     return _report(board, asked, seen, sample, sample_seed) | {"strays": off, "scored": bool(held)}
 
 
@@ -117,22 +112,37 @@ def _scored(data: Data, rows: list[Row], suite: Suite) -> Iterator[Data]:
         yield {"defence": "", "field": "comparisons", "board": f"{len(data['comparisons'])} of them", "here": "others"}
 
 
-def _suite_of(board: Board) -> Suite:
-    """The suite of the package that the board is of."""
+def suite_of(board: Board) -> Suite:
+    """The suite of the package that the board is of. Raises InputError where there is none."""
+    if board.suite.name not in list_suites():
+        raise unknown("board: suite.name", board.suite.name, list_suites())
+    suite = load_suite(board.suite.name)
+    agree(board, suite)
+    return suite
+
+
+def agree(board: Board, suite: Suite) -> None:
+    """Raise InputError for a board of another suite or version than is here."""
     held = board.suite
-    if held.name not in list_suites():
-        raise unknown("board: suite.name", held.name, list_suites())
-    suite = load_suite(held.name)
     if held.version != tailgate.__version__:
         raise InputError("board: suite.version", held.version, f"{tailgate.__version__}, which is here")
     if held.hash != suite.hash:
         raise InputError("board: suite.hash", held.hash, f"{suite.hash}, which the suite {suite.name} has here")
     if held.episodes is None or not 1 <= held.episodes <= 4096:
         raise InputError("board: suite.episodes", held.episodes, "1 to 4096 episodes of a cell")
-    return suite
 
 
-def _drawn(places: list[int], sample: int | None, seed: int) -> list[int]:
+def known(names: Sequence[str], entries: Sequence[str]) -> None:
+    """Raise InputError for a name that is none of the entries'."""
+    for name in names:
+        if name not in entries:
+            raise unknown("defence", name, entries)
+
+
+def drawn(places: list[int], sample: int | None, seed: int) -> list[int]:
+    """So many of the places, ascending; all where no number is asked for, or a larger one. Raises InputError for one below 1."""
+    if sample is not None and sample < 1:
+        raise InputError("sample", sample, "a whole number not below 1")
     if sample is None or sample >= len(places):
         return places
     order = constants("check", seed).uniform((len(places),))[0].argsort()
@@ -143,7 +153,7 @@ def _cell(part: CellPart, board: Board, suite: Suite) -> Cell | str:
     """The cell to play; or why it cannot be played here."""
     try:
         for family, text in (("defence", part.defence), ("attack", part.attack)):
-            if why := _refused(family, text):  # type: ignore[arg-type]
+            if why := refused(family, text):  # type: ignore[arg-type]
                 return why
         cell = Cell(
             suite.name, part.scenario, part.dose, part.defence, part.attack, board.suite.episodes or 0, board.suite.purpose or "report",
@@ -159,7 +169,8 @@ def _cell(part: CellPart, board: Board, suite: Suite) -> Cell | str:
     return cell
 
 
-def _refused(family: Family, text: str) -> str:
+def refused(family: Family, text: str) -> str:
+    """Why a component that a board names is not played here; empty where it is."""
     spec = Spec(family, text)
     if spec.foreign or spec.sandboxed:
         return f"the {family} {text!r} is code to import, which a board may not make us do"
@@ -178,7 +189,8 @@ def _slices(cells: dict[int, Cell]) -> Iterator[list[int]]:
         yield some
 
 
-def _compared(part: CellPart, here: Data) -> Seen:
+def compared(part: CellPart, here: Data) -> Seen:
+    """What the figures of a cell, as `scoring.cells.figures` makes them, say of the cell of a board."""
     says = {name: value for name, value in part.model_dump(include=set(COMPARED)).items() if name not in PRINTS or value is not None}
     off = [name for name in COMPARED if name in says and says[name] != here[name]]
     parts = [part for name in off for part in _parts(name, says[name], here[name])]

@@ -11,7 +11,6 @@ from typing import Any
 
 from tailgate.errors import InputError
 from tailgate.evaluation import evaluate
-from tailgate.files import write_atomic
 from tailgate.rows import read_rows
 from tailgate.scenario import Suite
 from tailgate.scoring import attacks as admitted
@@ -19,10 +18,13 @@ from tailgate.scoring.board import score
 from tailgate.scoring.damage import CLEAN
 from tailgate.trust.run import REPORT, with_trust
 
+from .board_format import load, save
 from .card import with_cards
+from .kept import with_kept
 from .verified import digest, with_verified
 
 OWN = "rows.jsonl.xz"  # what `run` plays; other files of rows beside it come from `attack` and `submit`
+BOARD = "board.json"
 LIST = "attacks.jsonl"
 CARDS = "cards"  # folder of what authors say of their entries
 TRUST = "trust"  # folder that `tailgate trust` wrote
@@ -48,8 +50,8 @@ def play(
 def board_of(suite: Suite, folder: Path, beacon: str | None = None, **options: Any) -> dict[str, Any]:
     """The board of all rows in a folder, with what verified/*.json says of them and the bounds of trust/trust.json; written as board.json.
 
-    Raises InputError where there are no rows, or rows of another round than `beacon`, and for a report that cannot be read or is of
-    something else.
+    Of the board.json that is there it keeps what does not come from rows (`with_kept`). Raises InputError where there are no rows, or rows
+    of another round than `beacon`, and for a report that cannot be read or is of something else.
     """
     found = sorted(path for path in folder.glob("**/*") if path.name.endswith((".jsonl", ".jsonl.xz")) and path.name != LIST)
     within = [(path, path.relative_to(folder).parts) for path in found]
@@ -65,7 +67,9 @@ def board_of(suite: Suite, folder: Path, beacon: str | None = None, **options: A
     board = with_verified(with_cards(board, folder / CARDS), folder / VERIFIED, held)
     if (report := folder / TRUST / REPORT).is_file():
         board = with_trust(board, _report(report), f"trust {report}", suite)
-    write_atomic(folder / "board.json", json.dumps(board, indent=1, allow_nan=False).encode() + b"\n")
+    if (path := folder / BOARD).is_file():
+        board = with_kept(board, load(path))
+    save(board, path)
     return board
 
 

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from .board_format import LEVELS, CurvePart, EntryPart
+from .board_format import LEVELS, CurvePart, EntryPart, Stealth
 from .charts import STYLES, Axis, Dot, Line, chart, nice, path_of, ticks_at
 from .site_suite import Data, Suite, figure
 
 TOGETHER = STYLES  # defences with a line each in the chart of all: as many as there are line styles
 SCALES = ("log", "linear")
+BLANK = {"text": figure(None), "span": "", "reason": ""}  # of a figure that a board has not
 
 
 def dots_of(curve: CurvePart) -> Line:
@@ -57,26 +58,33 @@ def together_of(suite: Suite) -> Data | None:
     return {"charts": charts, "named": len(named), "of": len(there)}
 
 
-def stealth_of(suite: Suite) -> Data | None:
-    """Deviation that a stealthy attacker reaches against the mean time between false alarms: a chart and a table."""
-    there = [e for e in suite.ordered() if e.stealth]
-    hours = sorted({s.hours for e in there for s in e.stealth or ()})
-    reached = [s.deviation for e in there for s in e.stealth or () if s.deviation is not None]
-    if not reached:
+def stealth_of(suite: Suite, wanted: Sequence[EntryPart] | None = None) -> Data | None:
+    """Deviation that a stealthy attacker reaches against the mean time between false alarms, of some or all entries: chart and table."""
+    there = [(e, sorted(e.stealth, key=lambda s: s.hours)) for e in (suite.ordered() if wanted is None else wanted) if e.stealth]
+    hours = sorted({s.hours for _, held in there for s in held})
+    tops = [s.deviation if s.high is None else s.high for _, held in there for s in held if s.deviation is not None]
+    if not tops:
         return None
-    axis, top = Axis(hours[0], hours[-1], "decades"), nice(max(reached))
+    axis = Axis(hours[0], hours[-1], "decades")
     lines = [
-        Line(suite.defences[e.defence].full, i, [Dot(s.hours, s.deviation) for s in sorted(e.stealth or (), key=lambda s: s.hours)
-                                                if s.deviation is not None])
-        for i, e in enumerate(there[:TOGETHER])
+        Line(suite.defences[e.defence].full, i, [Dot(s.hours, s.deviation, s.low, s.high) for s in held if s.deviation is not None])
+        for i, (e, held) in enumerate(there[:TOGETHER])
     ]  # fmt: skip
-    drawn = chart(lines, axis, ticks_at(axis, hours), top=top)
+    drawn = chart(lines, axis, ticks_at(axis, hours), top=nice(max(tops)))
     for tick in drawn["yticks"]:
         tick["text"] = figure(tick["value"], 3)
     rows = []
-    for e in there:
-        by_hour = {s.hours: s for s in e.stealth or ()}
-        cells = [by_hour.get(h) for h in hours]
-        rows.append({"name": suite.defences[e.defence], "page": suite.pages.get(e.defence, ""),
-                     "cells": [figure(c.deviation if c else None, 3) for c in cells]})  # fmt: skip
+    for e, held in there:
+        by_hour = {s.hours: reached_of(s) for s in held}
+        cells = [by_hour.get(h, BLANK) for h in hours]
+        rows.append({"name": suite.defences[e.defence], "page": suite.pages.get(e.defence, ""), "cells": cells})
     return {"chart": drawn, "hours": [figure(h) for h in hours], "rows": rows, "named": min(len(there), TOGETHER), "of": len(there)}
+
+
+def reached_of(item: Stealth) -> Data:
+    """One figure of stealth impact in words."""
+    span = "" if item.low is None or item.high is None else f"{figure(item.low, 3)} to {figure(item.high, 3)}"
+    return BLANK | {
+        "hours": figure(item.hours), "threshold": figure(item.threshold), "text": figure(item.deviation, 3), "span": span,
+        "reason": item.reason,
+    }  # fmt: skip

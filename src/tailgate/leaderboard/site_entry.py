@@ -16,7 +16,7 @@ from tailgate.replay.replay import play
 from .board_format import LEVELS, CellPart, EntryPart, Robust
 from .build import names_of, percent
 from .site_cards import card_of
-from .site_curves import curves_of
+from .site_curves import curves_of, reached_of, stealth_of
 from .site_index import compared_how, comparisons_of
 from .site_suite import Data, Suite, critical_of, dose_text, figure, played, share_of, worse
 from .site_trust import trust_of, trust_page
@@ -60,6 +60,17 @@ def _reason(error: Exception, row: Mapping[str, Any]) -> str:
         if isinstance(value, str) and "/" in value:
             text = text.replace(value, names_of([value])[value].label)
     return text[:1].upper() + text[1:] + "."
+
+
+def _episode(suite: Suite, entry: EntryPart) -> str:
+    """Which episode is the worst one, in words; empty where the board does not say."""
+    row = entry.worst_episode or {}
+    scenario, attack, dose = (row.get(key) for key in ("scenario", "attack", "dose"))
+    if not (isinstance(scenario, str) and isinstance(attack, str) and isinstance(dose, int)):
+        return ""
+    spared = all(rate.undamaged is not None and rate.undamaged.value == 1.0 for rate in entry.rates)
+    near = " No episode at the doses that are shown came to damage; this one came nearest." if spared else ""
+    return f"{suite.where(scenario, attack)}, at a dose of {dose} steps.{near}"
 
 
 def _rates(suite: Suite, entry: EntryPart) -> list[Data]:
@@ -170,6 +181,7 @@ def entry_page(suite: Suite, entry: EntryPart, replayed: Replayed | None, also: 
     """All that an entry's page shows. also: names of other suites with an entry of the same text, and their pages."""
     curves = curves_of(suite, [entry], gap=7.0)
     mine = [c for c in suite.board.cells if c.defence == entry.defence]
+    stealth = stealth_of(suite, [entry])
     detection = [
         {"attack": suite.attacks[d.attack], "scenario": d.scenario, "hours": figure(d.hours), "threshold": figure(d.threshold),
          "text": percent(d.detected.value) if d.detected else "n/a", "sort": f"{d.detected.value:.6g}" if d.detected else "",
@@ -189,8 +201,8 @@ def entry_page(suite: Suite, entry: EntryPart, replayed: Replayed | None, also: 
                    "passed": g.passed} for g in entry.gates],
         "charts": curves[0]["charts"] if curves else [], "clean": _clean(suite, entry),
         "robustness": [_robust(suite, r) for r in entry.robustness],
-        "stealth": [{"hours": figure(s.hours), "threshold": figure(s.threshold), "deviation": figure(s.deviation, 3)}
-                    for s in entry.stealth or ()],
+        "stealth": [reached_of(s) for s in entry.stealth or ()], "stealth_chart": stealth["chart"] if stealth else None,
         "detection": detection, "comparisons": comparisons_of(suite, entry.defence), "how": compared_how(suite),
         "round": suite.round, "about_trust": trust_of(suite), "trust": trust_page(suite, entry), "replay": replayed,
+        "episode": _episode(suite, entry),
     }  # fmt: skip

@@ -252,15 +252,22 @@ def _clean(table: Table, defence: str) -> dict[str, Data]:
 
 
 def _episode(table: Table, whole: dict[str, Worst], slot: int) -> Row | None:
-    """An episode that the worst attack won at the middle dose: the smallest gap, or the largest error, the least knowing attacker first."""
-    for worst in whole.values():
-        pair, share = worst.at(slot)
-        if share > 0.0:
-            name, i = worst.pairs[pair]
-            rows = table.cells[Key(name, slot, worst.defence, table.columns[i])]
-            hit = [row for row, harm in zip(rows, worst.harm(pair, slot)[1], strict=True) if harm]
-            return min(hit, key=lambda row: row["min_gap"] if has_road(row) else -row["max_error"])
-    return None
+    """The worst episode: a damaged one of the worst attack at the middle dose, else at the smallest shown one at which there is damage,
+    the least knowing attacker first. Where nothing is damaged, the one of all attacks and shown doses that came nearest to it."""
+    for at in (slot, *shown(table)):
+        for worst in whole.values():
+            pair, share = worst.at(at)
+            if share > 0.0:
+                hit = zip(worst.rows(pair, at), worst.harm(pair, at)[1], strict=True)
+                return min((row for row, harm in hit if harm), key=_margin)
+    most = list(whole.values())[-1:]  # who knows most may do all that the others do
+    rows = (row for worst in most for pair in range(len(worst.pairs)) for at in shown(table) for row in worst.rows(pair, at))
+    return min(rows, key=_margin, default=None)
+
+
+def _margin(row: Row) -> float:
+    """How far an episode was from damage: its smallest gap; without a road the largest error counts."""
+    return float(row["min_gap"] if has_road(row) else -row["max_error"])
 
 
 def _robustness(table: Table, worst: Worst | None, slot: int) -> list[Data]:

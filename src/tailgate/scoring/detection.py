@@ -7,8 +7,11 @@ below the same threshold, so that a looser one lets it through with more.
 
 from __future__ import annotations
 
+import dataclasses
 import functools
+import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -20,14 +23,32 @@ from tailgate.errors import InputError, NotApplicable
 from tailgate.evaluation import Cell, run_cell
 from tailgate.registry import Spec
 from tailgate.scenario import Suite, load_scenario
-from tailgate.stats import proportion
+from tailgate.stats import median_limits, proportion
 from tailgate.trace import Trace, episodes_at_once, rollout
 
-HOURS = (0.1, 1.0, 10.0)
-ONSETS = 100  # false alarms that a threshold is found on: its mean time is known to 20 %
-STEPS = 8_000_000  # of the longest clean run: 20 alarms at 10 h in steps of 0.1 s
+LEVEL = 0.95  # of intervals
+UNTOUCHED = "no attack took effect"
 Progress = Callable[[str, int, int, str], None]  # label, done, total, figures
 Data = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Effort:
+    """What decides the figures beside a suite and its round."""
+
+    hours: tuple[float, ...] = (0.1, 1.0, 10.0)  # wanted mean times between false alarms
+    episodes: int = 100  # of a scenario and an attack
+    onsets: int = 100  # false alarms that a threshold is found on: its mean time is known to 20 %
+    most_steps: int = 8_000_000  # of the longest clean run: 20 alarms at 10 h in steps of 0.1 s
+
+    def __post_init__(self) -> None:
+        if not self.hours or not all(math.isfinite(h) and h > 0.0 for h in self.hours):
+            raise InputError("hours", list(self.hours), "finite numbers above 0")
+        if not 1 <= self.episodes <= 4096:
+            raise InputError("episodes", self.episodes, "1 to 4096")
+
+
+EFFORT = Effort()
 
 
 def plants(scenarios: Sequence[str]) -> dict[str, tuple[str, ...]]:
@@ -47,10 +68,10 @@ def threshold(defence: str, scenarios: tuple[str, ...], hours: float, onsets: in
     return calibrate(defence, hours, scenarios=scenarios, onsets=onsets, most_steps=most_steps).threshold
 
 
-def _found(defence: str, places: tuple[str, ...], hours: float, onsets: int, most_steps: int) -> tuple[float | None, str]:
+def _found(defence: str, places: tuple[str, ...], hours: float, effort: Effort) -> tuple[float | None, str]:
     """A threshold, or why there is none."""
     try:
-        return threshold(defence, places, float(hours), onsets, most_steps), ""
+        return threshold(defence, places, float(hours), effort.onsets, effort.most_steps), ""
     except NotApplicable as error:
         return None, str(error)
     except InputError as error:
@@ -60,8 +81,8 @@ def _found(defence: str, places: tuple[str, ...], hours: float, onsets: int, mos
 
 
 def detection(
-    suite: Suite, defences: Sequence[str], attacks: Sequence[str], hours: Sequence[float] = HOURS, *, dose: int | None = None,
-    episodes: int = 100, onsets: int = ONSETS, most_steps: int = STEPS, beacon: str = "", progress: Progress | None = None,
+    suite: Suite, defences: Sequence[str], attacks: Sequence[str], effort: Effort = EFFORT, *, dose: int | None = None, beacon: str = "",
+    progress: Progress | None = None,
 ) -> Data:  # fmt: skip
     """The field `detection` of a board: the share of attacked episodes with an alarm within the deadline, and the median delay [steps].
 
@@ -72,20 +93,20 @@ def detection(
     update = progress or (lambda *_: None)
     found: list[Data] = []
     without: list[Data] = []
-    work = [(guard, plant, names, h) for plant, names in plants(suite.nominal).items() for guard in defences for h in hours]
+    work = [(guard, plant, names, h) for plant, names in plants(suite.nominal).items() for guard in defences for h in effort.hours]
     for done, (guard, plant, names, h) in enumerate(work, start=1):
-        level, why = _found(guard, names, h, onsets, most_steps)
+        level, why = _found(guard, names, h, effort)
         if level is None:
             without.append({"defence": guard, "plant": plant, "hours": h, "reason": why})
         else:
             for name in names:
-                made = Bench.of(guard, [name], episodes, None).at(level)
+                made = Bench.of(guard, [name], effort.episodes, None).at(level)
                 for attack in attacks:
-                    rows = run_cell(_cell(suite, name, dose, guard, attack, episodes, beacon), made)
+                    rows = run_cell(_cell(suite, name, dose, guard, attack, effort.episodes, beacon), made)
                     head = {"defence": guard, "scenario": name, "attack": attack, "hours": h, "threshold": level}
                     found.append(head | _detected(rows))
         update("detection", done, len(work), guard)
-    return {"hours": list(hours), "entries": found, "without": without}
+    return dataclasses.asdict(effort) | {"hours": list(effort.hours), "entries": found, "without": without}
 
 
 def _cell(suite: Suite, scenario: str, dose: int | None, defence: str, attack: str, episodes: int, beacon: str) -> Cell:
@@ -98,7 +119,7 @@ def _detected(rows: Sequence[Data]) -> Data:
     """Of the episodes in which an attack took effect."""
     met = [row for row in rows if row["status"] == "ok" and row["missed_deadline"] is not None]
     if not met or any(row["status"] == "error" for row in rows):
-        reason = next((row["reason"] for row in rows if row["status"] != "ok"), "no attack took effect")
+        reason = next((row["reason"] for row in rows if row["status"] != "ok"), UNTOUCHED)
         return {"detected": None, "delay": None, "reason": reason}
     delays = [row["detection_delay"] for row in met if row["detection_delay"] is not None]
     share = proportion(sum(row["missed_deadline"] == 0.0 for row in met), len(met))
@@ -106,28 +127,39 @@ def _detected(rows: Sequence[Data]) -> Data:
 
 
 def stealth_impact(
-    suite: Suite, defence: str, hours: Sequence[float] = HOURS, *, attack: str = "stealth", dose: int | None = None,
-    episodes: int = 100, onsets: int = ONSETS, most_steps: int = STEPS, beacon: str = "", progress: Progress | None = None,
+    suite: Suite, defence: str, effort: Effort = EFFORT, *, attack: str = "stealth", dose: int | None = None, beacon: str = "",
+    progress: Progress | None = None,
 ) -> list[Data] | None:  # fmt: skip
     """The field `stealth` of an entry: by the mean time between false alarms, the error that the stealth attack reaches per time.
 
-    The median `deviation` [m/s] of episodes, the most of scenarios.
+    `deviation` [m/s] is the median of episodes, the most of scenarios; `low` and `high` its limits of 95 %, which hold together for all
+    scenarios, null for few episodes; `reason` says why there is none.
     None for a defence without a threshold. In the scenarios, under the threat model and at the dose of `detection`.
     """
     update = progress or (lambda *_: None)
     if len(plants(suite.nominal)) != 1:
         raise InputError(f"suite {suite.name}: scenarios", list(suite.nominal), "scenarios of one plant")
     out: list[Data] = []
-    for done, h in enumerate(hours, start=1):
-        level, _ = _found(defence, suite.nominal, h, onsets, most_steps)
-        if level is not None:
-            reached = [_reached(level, _cell(suite, name, dose, defence, attack, episodes, beacon)) for name in suite.nominal]
-            out.append({"hours": h, "threshold": level, "deviation": max((x for x in reached if x is not None), default=None)})
-        update(f"stealth against {defence}", done, len(hours), f"{h:g} h")
-    return out or None
+    for done, h in enumerate(effort.hours, start=1):
+        level, why = _found(defence, suite.nominal, h, effort)
+        cells = [] if level is None else [_cell(suite, name, dose, defence, attack, effort.episodes, beacon) for name in suite.nominal]
+        out.append({"hours": h, "threshold": level} | _impact([_reached(level, cell) for cell in cells if level is not None], why))
+        update(f"stealth against {defence}", done, len(effort.hours), f"{h:g} h")
+    return out if any(item["threshold"] is not None for item in out) else None
 
 
-def _reached(level: float, cell: Cell) -> float | None:
+def _impact(found: Sequence[Array | str], why: str) -> Data:
+    """Of the deviations in each scenario, or why there are none, the largest median, with limits that hold for all together."""
+    reached = [values for values in found if not isinstance(values, str)]
+    if not reached:
+        return dict.fromkeys(("deviation", "low", "high")) | {"reason": next((x for x in found if isinstance(x, str)), why)}
+    limits = [median_limits(values, 1.0 - (1.0 - LEVEL) / len(reached)) for values in reached]
+    low, high = map(max, zip(*limits, strict=True)) if None not in limits else (None, None)
+    return {"deviation": max(float(np.median(values)) for values in reached), "low": low, "high": high}
+
+
+def _reached(level: float, cell: Cell) -> Array | str:
+    """(n,) deviations of the episodes that were attacked, or why there are none."""
     made, rival = Bench.of(cell.defence, [cell.scenario], cell.seeds, None).at(level), Spec("attack", cell.attack)
     attack, guard = rival.make(), Spec("defence", cell.defence)
     values: list[Array] = []
@@ -136,10 +168,10 @@ def _reached(level: float, cell: Cell) -> float | None:
         size = episodes_at_once(loop.model, loop.horizon, cell.batch)
         for first in range(0, cell.seeds, size):
             values.append(deviation(rollout(loop, attack, draws.keys(cell.purpose, cell.episodes[first : first + size]))))
-    except NotApplicable:
-        return None
+    except NotApplicable as error:
+        return str(error)
     reached = np.concatenate(values)
-    return float(np.nanmedian(reached)) if np.isfinite(reached).any() else None
+    return reached[np.isfinite(reached)] if np.isfinite(reached).any() else UNTOUCHED
 
 
 def deviation(trace: Trace) -> Array:
@@ -151,9 +183,3 @@ def deviation(trace: Trace) -> Array:
     error = np.max(trace.model.error(trace.estimate, trace.truth), axis=2)
     steps = np.count_nonzero(attacked, axis=0)
     return np.asarray(np.max(np.where(attacked, error, 0.0), axis=0) / np.where(steps, steps * trace.model.dt, np.nan))
-
-
-def with_detection(board: Data, found: Data, stealth: dict[str, list[Data] | None]) -> Data:
-    """A board with the field `detection`, and each entry with its own of `stealth` (by defence)."""
-    filled = [entry | {"stealth": stealth.get(entry["defence"])} for entry in board["entries"]]
-    return board | {"entries": filled, "detection": found}

@@ -18,7 +18,7 @@ from tailgate.core import Array
 from tailgate.errors import InputError
 from tailgate.strength.dose import CRITICAL, critical_dose, fitted
 
-from .damage import MISSING, PLAYED, Table, damaged
+from .damage import MISSING, PLAYED, Key, Row, Table, damaged
 from .ranks import Harm
 
 Data = dict[str, Any]
@@ -94,6 +94,11 @@ class Worst:
         """Seeds and damage (episodes,) of a pair."""
         name, i = self.pairs[pair]
         return self.table.seeds[name], self._harm(name, i)[slot]
+
+    def rows(self, pair: int, slot: int) -> list[Row]:
+        """The rows of a pair at a dose, by seed."""
+        name, i = self.pairs[pair]
+        return self.table.cells[Key(name, slot, self.defence, self.table.columns[i])]
 
     def all_harm(self, slot: int) -> Harm:
         """Of all pairs at a dose. Raises InputError where the scenarios have not the same seeds: nothing would be paired."""

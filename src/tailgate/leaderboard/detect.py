@@ -1,0 +1,169 @@
+"""Detection and stealth impact of a board's entries, played from the board alone, entry by entry; and played again, to be checked."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from concurrent.futures import as_completed
+from pathlib import Path
+from typing import Any
+
+import tailgate
+from tailgate.errors import InputError
+from tailgate.pool import abandon, processes
+from tailgate.scenario import Suite
+from tailgate.scoring.detection import EFFORT, Effort, Progress, detection, plants, stealth_impact
+from tailgate.scoring.follow import same
+
+from .board_format import load, read_board, save
+from .check import VERDICTS, agree, drawn, known, refused, suite_of
+
+Data = dict[str, Any]
+LINES = ("entries", "without")  # of a detection board: figures, and why there are none
+PLACE = ("plant", "scenario", "attack", "hours")  # what a figure is of
+
+
+def detect(
+    path: Path, suite: Suite, *, defences: Sequence[str] = (), effort: Effort = EFFORT, workers: int = 1, progress: Progress | None = None
+) -> Data:
+    """Play detection and stealth impact of the board in a file; returns it. It is written as soon as an entry is done, and resumes.
+
+    defences: only these entries; of all, those that come with the package, `none` and those who are told the truth left out. Attacks are
+    the board's black-box scripts that can be played here. Raises InputError for a board of another suite or version, or with figures of
+    another effort, and for a defence that takes no place here.
+    """
+    board = load(path)
+    agree(read_board(board), suite)
+    guards = [e["defence"] for e in board["entries"] if e.get("card") and e["defence"] != "none" and "truth" not in e["uses"]]
+    known(defences, guards)
+    attacks = [a["attack"] for a in board["attacks"] if a["knowledge"] == "black" and not (a.get("optimal") or a.get("learned"))]
+    attacks = [attack for attack in attacks if not refused("attack", attack)]
+    held = board.get("detection") or _nothing(effort)
+    if _effort(held) != effort:
+        raise InputError("board: detection", dataclasses.asdict(_effort(held)), f"{dataclasses.asdict(effort)}, as is asked for")
+    asked = [guard for guard in defences or guards if not _whole(held, guard, suite, attacks, effort)]
+    for guard, found in _play(suite, asked, attacks, effort, board["suite"].get("beacon") or "", workers, progress):
+        board = _with(load(path), guard, found, effort)  # read again: it may have been marked in the meantime
+        save(board, path)
+    return dict(board)
+
+
+def _nothing(effort: Effort) -> Data:
+    return dataclasses.asdict(effort) | {"hours": list(effort.hours)} | {key: [] for key in LINES}
+
+
+def _effort(held: Data) -> Effort:
+    """With which the figures of a board were made; boards of before do not say, and had the usual one."""
+    given = {f.name: held[f.name] for f in dataclasses.fields(Effort) if f.name in held}
+    return dataclasses.replace(EFFORT, **given | {"hours": tuple(map(float, held["hours"]))})
+
+
+def _whole(held: Data, guard: str, suite: Suite, attacks: Sequence[str], effort: Effort) -> bool:
+    """Whether an entry has all figures, or the reasons why it has none."""
+    there = {tuple(line[key] for key in PLACE if key in line) for part in LINES for line in held[part] if line["defence"] == guard}
+    return all(
+        (plant, h) in there or all((name, attack, h) in there for name in names for attack in attacks)
+        for plant, names in plants(suite.nominal).items() for h in effort.hours
+    )  # fmt: skip
+
+
+def _with(board: Data, guard: str, found: Data, effort: Effort) -> Data:
+    """The board with the figures of one entry, in the order of its entries."""
+    order = [entry["defence"] for entry in board["entries"]]
+    held = board.get("detection") or _nothing(effort)
+    lines = {
+        part: sorted([line for line in held[part] if line["defence"] != guard] + found[part], key=lambda line: order.index(line["defence"]))
+        for part in LINES
+    }
+    entries = [entry | {"stealth": found["stealth"]} if entry["defence"] == guard else entry for entry in board["entries"]]
+    return board | {"entries": entries, "detection": held | lines}
+
+
+def figures(suite: Suite, guard: str, attacks: Sequence[str], effort: Effort, beacon: str, progress: Progress | None = None) -> Data:
+    """`entries` and `without` of the detection board of one defence, and its `stealth`."""
+    stealth = stealth_impact(suite, guard, effort, beacon=beacon, progress=progress)
+    return detection(suite, [guard], attacks, effort, beacon=beacon, progress=progress) | {"stealth": stealth}
+
+
+def _play(
+    suite: Suite, guards: Sequence[str], attacks: Sequence[str], effort: Effort, beacon: str, workers: int, progress: Progress | None
+) -> Iterator[tuple[str, Data]]:
+    """Figures of each defence, as they are done."""
+    if workers < 1:
+        raise InputError("workers", workers, "a whole number not below 1")
+    update, rest = progress or (lambda *_: None), (attacks, effort, beacon)
+    if workers == 1 or len(guards) < 2:
+        each = 2 * len(effort.hours)  # of an entry: the stealth attack and the others at each threshold
+        for i, guard in enumerate(guards):
+            steps = itertools.count(i * each + 1)
+            yield guard, figures(suite, guard, *rest, lambda *_, of=guard, at=steps: update("detection", next(at), each * len(guards), of))
+        return
+    with processes(workers) as pool:
+        waiting = {pool.submit(figures, suite, guard, *rest): guard for guard in guards}
+        try:
+            for done, future in enumerate(as_completed(waiting), start=1):
+                yield waiting[future], future.result()
+                update("detection", done, len(guards), waiting[future])
+        except BaseException:  # an interrupt shall not wait for what is still to play
+            abandon(pool)
+            raise
+
+
+def check_detection(
+    data: Data, *, sample: int | None = None, sample_seed: int = 0, defences: Sequence[str] = (), workers: int = 1,
+    progress: Progress | None = None,
+) -> Data:  # fmt: skip
+    """Play detection and stealth impact of entries of a board again, and compare them figure by figure, numbers to six digits.
+
+    data: a board, as JSON; sample: so many entries, drawn by sample_seed (default: all that have figures); defences: only of these.
+    The report has `counts` of figures, `entries` (the same for each defence) and `findings`: figures that differ, by `field`, with what the
+    `board` says and what is `here`; `reasons`: why entries could not be played. Raises InputError for a board without such figures, and as
+    `check.check` does.
+    """
+    board = read_board(data)
+    suite = suite_of(board)
+    if not (held := data.get("detection")):
+        raise InputError("board: detection", None, "figures of `leaderboard detect`")
+    names = list(dict.fromkeys(line["defence"] for part in LINES for line in held.get(part, ())))
+    known(defences, names)
+    mine = list(defences) or names
+    asked = [mine[i] for i in drawn(list(range(len(mine))), sample, sample_seed)]
+    attacks = list(dict.fromkeys(line["attack"] for line in held["entries"]))
+    away = {name: why for name in asked if (why := refused("defence", name))}
+    if why := next(filter(None, (refused("attack", attack) for attack in attacks)), ""):
+        away = dict.fromkeys(asked, why)
+    effort, counts, findings = _effort(held), {name: Counter[str]() for name in asked}, []
+    stealth = {entry["defence"]: entry.get("stealth") for entry in data["entries"]}
+    guards = [name for name in asked if name not in away]
+    for guard, here in _play(suite, guards, attacks, effort, board.suite.beacon or "", workers, progress):
+        says, made = _by_place(held | {"stealth": stealth.get(guard)}, guard), _by_place(here, guard)
+        for place in dict.fromkeys((*says, *made)):
+            off = _differences(says.get(place), made.get(place))
+            counts[guard]["differs" if off else "equal"] += 1
+            findings += [dict(zip((*PLACE, "of"), place, strict=True)) | {"defence": guard} | one for one in off]
+    for name in away:
+        counts[name]["unchecked"] = len(_by_place(held | {"stealth": stealth.get(name)}, name))
+    total: Counter[str] = sum(counts.values(), Counter())
+    return {
+        "format": "tailgate-check-detection-1", "suite": board.suite.name, "version": tailgate.__version__, "of": len(names),
+        "asked": len(asked), "sample": sample, **({} if sample is None else {"sample_seed": sample_seed}),
+        "counts": {verdict: total[verdict] for verdict in VERDICTS},
+        "entries": [{"defence": name, **{verdict: counts[name][verdict] for verdict in VERDICTS}} for name in asked],
+        "findings": findings, "reasons": [{"defence": name, "why": why} for name, why in away.items()],
+    }  # fmt: skip
+
+
+def _by_place(held: Data, guard: str) -> dict[tuple[Any, ...], Data]:
+    """The figures of an entry by what they are of."""
+    lines = [(part, line) for part in LINES for line in held.get(part, ()) if line["defence"] == guard]
+    lines += [("stealth", item) for item in held["stealth"] or ()]
+    return {(*(line.get(key) for key in PLACE), part): line for part, line in lines}
+
+
+def _differences(says: Data | None, here: Data | None) -> list[Data]:
+    """Field by field; a board of before a field was there says nothing of it."""
+    if says is None or here is None:
+        return [{"field": "", "board": says, "here": here}]
+    return [{"field": key, "board": says[key], "here": here.get(key)} for key in says if not same(says[key], here.get(key))]

@@ -1,0 +1,144 @@
+"""Detection and stealth impact of a board that has no rows: played entry by entry, and played again to be checked."""
+
+import copy
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tailgate.cli import main
+from tailgate.errors import InputError
+from tailgate.evaluation import cells_of, run
+from tailgate.leaderboard import detect as module
+from tailgate.leaderboard.board_format import read_board
+from tailgate.leaderboard.detect import check_detection, detect
+from tailgate.scenario import load_suite
+from tailgate.scoring.board import score
+from tailgate.scoring.detection import Effort
+
+Data = dict[str, Any]
+QUICK = load_suite("quick-v0")
+FEW = ["--hours", "0.02", "--hours", "0.05", "--onsets", "20", "--steps", "60000", "--episodes", "8"]
+EFFORT = Effort((0.02, 0.05), 8, 20, 60_000)
+ATTACKS = ("dos_jam:trigger=near,threshold=40", "fdi:trigger=near,threshold=30,value=-4")
+
+
+@pytest.fixture(scope="module")
+def bare() -> Data:
+    part = dataclasses.replace(QUICK, scenarios=QUICK.scenarios[:1], defences=("none", "kf", "chi2_kf", "cusum_kf"), attacks=("none", *ATTACKS), seeds=2)
+    board = score(run(cells_of(part)), QUICK, require_adaptive=False)
+    return board | {"attacks": [attack for attack in board["attacks"] if attack["attack"] in ATTACKS]}
+
+
+def _written(board: Data, folder: Path) -> Path:
+    path = folder / "quick-v0" / "board.json"
+    path.parent.mkdir(parents=True)
+    path.write_text(json.dumps(board))
+    return path
+
+
+@pytest.fixture(scope="module")
+def detected(bare: Data, tmp_path_factory: pytest.TempPathFactory) -> Data:
+    folder = tmp_path_factory.mktemp("boards")
+    path = _written(bare, folder)
+    assert main(["leaderboard", "detect", "quick-v0", "--out", str(folder), "--workers", "1", *FEW]) == 0
+    held: Data = json.loads(path.read_text())
+    return held
+
+
+@pytest.fixture
+def board(detected: Data) -> Data:
+    return copy.deepcopy(detected)
+
+
+def test_a_board_without_rows_gets_its_detection(bare: Data, detected: Data) -> None:
+    """All else stays; a plain filter has no threshold, and a looser one lets more through."""
+    read_board(detected)
+    found = detected["detection"]
+    names = [(line["defence"], line["hours"], line["scenario"], line["attack"]) for line in found["entries"]]
+    assert names == [(d, h, s, a) for d in ("chi2_kf", "cusum_kf") for h in (0.02, 0.05) for s in QUICK.nominal for a in ATTACKS]
+    assert {(line["defence"], line["hours"]) for line in found["without"]} == {("kf", 0.02), ("kf", 0.05)}
+    stealth = {entry["defence"]: entry["stealth"] for entry in detected["entries"]}
+    assert stealth["none"] is stealth["kf"] is None and all(0.0 < item["low"] <= item["deviation"] <= item["high"] for item in stealth["chi2_kf"])
+    rest = [entry | {"stealth": None} for entry in detected["entries"]]
+    assert detected | {"detection": None, "entries": rest} == bare
+
+
+def test_a_finished_entry_is_kept_and_an_interrupted_one_costs_only_itself(
+    bare: Data, detected: Data, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, played, make = _written(bare, tmp_path), [], module.figures
+    command = ["leaderboard", "detect", "quick-v0", "--out", str(tmp_path), "--workers", "1", *FEW]
+
+    def interrupted(suite: Any, guard: str, *rest: Any) -> Data:
+        played.append(guard)
+        if guard == "cusum_kf" and played.count(guard) == 1:
+            raise KeyboardInterrupt
+        return make(suite, guard, *rest)
+
+    monkeypatch.setattr(module, "figures", interrupted)
+    assert main([*command, "--defence", "chi2_kf"]) == 0 and played == ["chi2_kf"]
+    assert main(command) == 130 and played == ["chi2_kf", "kf", "cusum_kf"]
+    half = json.loads(path.read_text())
+    assert {line["defence"] for line in half["detection"]["entries"]} == {"chi2_kf"} and half["entries"][1]["stealth"] is None
+    assert main(command) == 0 and played[3:] == ["cusum_kf"] and json.loads(path.read_text()) == detected
+    assert main(command) == 0 and len(played) == 4
+
+
+def test_workers_change_no_figure(bare: Data, detected: Data, tmp_path: Path) -> None:
+    path = _written(bare, tmp_path)
+    assert detect(path, QUICK, effort=EFFORT, workers=2) == detected == json.loads(path.read_text())
+
+
+@pytest.mark.parametrize(
+    ("change", "arguments", "words"),
+    [({}, ["--defence", "rkf"], "defence"), ({}, ["--defence", "none"], "defence"), ({}, ["--onsets", "30"], "detection"), ({}, ["--hours", "0"], "hours"),
+     ({}, ["--episodes", "0"], "episodes"), ({"hash": "0"}, [], r"suite\.hash"), ({"version": "0"}, [], r"suite\.version")],
+)  # fmt: skip
+def test_what_does_not_fit_is_refused(board: Data, tmp_path: Path, change: Data, arguments: list[str], words: str, capsys: pytest.CaptureFixture[str]) -> None:
+    board["suite"] |= change
+    path = _written(board, tmp_path)
+    assert main(["leaderboard", "detect", "quick-v0", "--out", str(tmp_path), *FEW, *arguments]) == 2
+    assert words.replace("\\", "") in capsys.readouterr().err and json.loads(path.read_text()) == board
+
+
+def test_an_honest_detection_board_comes_out_equal(board: Data) -> None:
+    """Figures of fields that a board of before lacks are not asked for."""
+    for entry in board["entries"]:
+        for item in entry["stealth"] or ():
+            del item["low"], item["high"]
+    report = check_detection(board, defences=["chi2_kf", "kf"])
+    assert report["counts"] == {"equal": 2 * 2 * 2 + 2 + 2, "differs": 0, "unchecked": 0} and report["findings"] == report["reasons"] == []
+    drawn = [check_detection(board, sample=1, sample_seed=seed)["entries"][0]["defence"] for seed in range(4)]
+    assert len(set(drawn)) > 1
+
+
+def test_an_altered_figure_is_found(board: Data, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """By its name, through the command; one that was taken out as well."""
+    lines = [line for line in board["detection"]["entries"] if line["defence"] == "chi2_kf"]
+    lines[0]["detected"]["value"] += 0.01
+    lines[1]["threshold"] += 0.01
+    board["detection"]["entries"].remove(lines[2])
+    stealth = next(entry["stealth"] for entry in board["entries"] if entry["defence"] == "chi2_kf")
+    stealth[1]["high"] += 0.01
+    path = _written(board, tmp_path)
+    assert main(["leaderboard", "check", str(path), "--detection", "--defence", "chi2_kf", "--json"]) == 1
+    report = json.loads(capsys.readouterr().out)
+    assert [(line["of"], line["hours"], line["field"]) for line in report["findings"]] == [
+        ("entries", 0.02, "detected"), ("entries", 0.02, "threshold"), ("stealth", 0.05, "high"), ("entries", 0.02, ""),
+    ]  # fmt: skip
+    assert report["counts"] == {"equal": 6, "differs": 4, "unchecked": 0}
+    assert main(["leaderboard", "check", str(path), "--detection", "--defence", "chi2_kf"]) == 1
+    said = capsys.readouterr().out
+    assert f"chi2_kf: entries, {QUICK.scenarios[0]}, {lines[1]['attack']}, 0.02 h, threshold: board {lines[1]['threshold']}" in said
+    assert "figures" in said and path.read_text() == json.dumps(board)
+
+
+def test_what_a_board_names_is_not_imported(board: Data, bare: Data) -> None:
+    board["detection"]["entries"][0]["attack"] = "never_made:Attack"
+    report = check_detection(board, defences=["chi2_kf"])
+    assert report["counts"] == {"equal": 0, "differs": 0, "unchecked": 10} and "code to import" in report["reasons"][0]["why"]
+    with pytest.raises(InputError, match="detection"):
+        check_detection(bare)
