@@ -21,7 +21,7 @@ from typing import Annotated, Any
 from pydantic import Field
 
 from tailgate.agents.codec import ActionSpec
-from tailgate.agents.learning import DISCRETE, LEARNERS, Learner, Progress, Teachable, check_action, learner_of
+from tailgate.agents.learning import DISCRETE, LEARNERS, Learner, Progress, Teachable, check_action, learner_of, made_with
 from tailgate.agents.reward import Reward
 from tailgate.agents.teacher import demonstrate
 from tailgate.core import Count, PositiveCount, param
@@ -233,7 +233,7 @@ def _train_seed(config: TrainConfig, teacher: str | None, seed: int, resume: boo
     facts = {
         "learner": config.learner, "teacher": teacher, "seed": seed, "steps": learner.steps, "config": as_data(config),
         "defence_digest": Spec("defence", config.defence).digest, "defence_version": Spec("defence", config.defence).entry.version,
-        config.learner: as_data(settings),
+        "made_with": made_with(config.learner), config.learner: as_data(settings),
         "environment": learner.seat.card()["hash"], "curve": learner.curve,
     }  # fmt: skip
     policy = learner.export(directory / f"policy-{seed}", facts)
