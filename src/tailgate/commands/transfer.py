@@ -23,7 +23,8 @@ def add(commands: Any) -> None:
     )  # fmt: skip
     command.add_argument("policies", nargs="+", metavar="POLICY", help="JSON file of an exported policy, or zoo:name=NAME")
     command.add_argument("--defence", action="append", metavar="NAME", default=[],
-                         help="a defence to play on (repeatable; default: those that the policies were trained on)")  # fmt: skip
+                         help="a defence to play on (repeatable; default: those that the policies were trained on); all: every "
+                         "registered one that has a meaning in the scenario")  # fmt: skip
     command.add_argument("--scenario", metavar="NAME", help="scenario instead of the one that they were trained in")
     command.add_argument("--threat", action="append", metavar="key=value", help="the threat model's changes instead of the training's")
     command.add_argument("--dose", type=int, metavar="STEPS", help="attack budget instead of the training's")
