@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import platform
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
+from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
@@ -27,6 +29,7 @@ LEARNERS = {
     "sac": "soft actor-critic, for continuous actions",
     "tqc": "soft actor-critic with truncated quantile critics",
 }
+CONTRIBUTED = {"maskable_ppo", "recurrent_ppo", "tqc"}  # that come from sb3-contrib
 SEED_STRIDE = 1_000_000  # between the episodes of two training seeds
 DISCRETE, CONTINUOUS = ("timing", "mode", "ramp"), ("continuous", "increment")
 ACTIONS = {"maskable_ppo": DISCRETE, "dqn": DISCRETE, "sac": CONTINUOUS, "tqc": CONTINUOUS}  # what a learner can decide; else: everything
@@ -81,6 +84,17 @@ def learner_of(name: str) -> Any:
     if name not in LEARNERS:
         raise unknown("learner", name, LEARNERS)
     return import_module(f"tailgate.agents.{name}")
+
+
+def made_with(name: str) -> dict[str, str]:
+    """What the last bits of a learner's weights may depend on: the machine type, numpy, and torch with what it adds, where it is used."""
+    found = {"machine": platform.machine(), "numpy": version("numpy")}
+    if name == "cem":
+        return found
+    import torch
+
+    packages = ("torch", "stable-baselines3", *(["sb3-contrib"] if name in CONTRIBUTED else []))
+    return found | {package: version(package) for package in packages} | {"torch CPU capability": torch.backends.cpu.get_cpu_capability()}
 
 
 def check_action(name: str, seat: Seat) -> None:

@@ -9,6 +9,8 @@ from typing import Any
 import pytest
 
 from tailgate import cli, train
+from tailgate.agents.learning import made_with
+from tailgate.strength.collect import add_policy
 from tailgate.strength.retrain import retrain
 
 SETTINGS = ["scenario=gusty-stop-and-go-v0", "defence=kf", "seeds=2", "workers=1", "tensorboard=false", "environment.interval=5"]
@@ -34,8 +36,33 @@ def test_the_weights_come_out_again(policies: list[Path]) -> None:
     assert len({retrain(str(path)).here for path in policies}) == 2
 
 
+def test_a_policy_of_the_zoo_is_its_source(policies: list[Path], tmp_path: Path) -> None:
+    """Its weights are packed, PPO's into half the bytes; a record that claims another source changes nothing."""
+    path = add_policy(policies[0], "packed", "a copy", episodes=2, folder=tmp_path)
+    assert retrain(str(path)).verdict == "same"
+    assert retrain(str(_changed(path, tmp_path / "other", source_sha256="x"))).verdict == "same"
+    other = add_policy(policies[1], "other", "a copy", episodes=2, folder=tmp_path)
+    source = json.loads(path.read_text())["training"]
+    again = retrain(str(_changed(other, tmp_path / "other", seed=source["seed"], source_sha256=source["source_sha256"])))
+    assert again.verdict == "differs" and again.here == retrain(str(path)).here
+
+
+def test_what_was_trained_with_is_recorded_and_told(policies: list[Path], tmp_path: Path) -> None:
+    training = json.loads(policies[0].read_text())["training"]
+    held, torch = training["made_with"], training["learner"] == "ppo"
+    assert held == made_with(training["learner"]) and held["numpy"] and ("torch" in held) == ("torch CPU capability" in held) == torch
+    for made, words in (
+        (held, "the same versions"),
+        (held | {"numpy": "1.0"}, f"numpy 1.0 there, {held['numpy']} here"),
+        ({}, "machine none there"),
+        (None, "not recorded"),
+    ):
+        assert words in retrain(str(_changed(policies[0], tmp_path, seed=7, made_with=made))).why
+
+
 def _changed(path: Path, folder: Path, **training: Any) -> Path:
     """A copy of a policy whose record says something else."""
+    folder.mkdir(exist_ok=True)
     copy = folder / path.name
     shutil.copy(path.with_suffix(".safetensors"), folder)
     data = json.loads(path.read_text())

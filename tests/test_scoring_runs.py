@@ -71,13 +71,17 @@ def test_built_in_suites_name_doses_that_have_a_reason() -> None:
         assert "none" in suite.attacks and ("none" in suite.defences or suite.bound is not None)
 
 
+LATER = {"platoon-dkf-45-0"}  # of the zoo, joined when the suites had boards, which another list of attacks would make void: for a suite's next version
+
+
 @pytest.mark.parametrize("name", ["car-following-v0", "platoon-v0", "radar-v0", "network-v0", "thesis-v0"])
 def test_a_suite_plays_every_built_in_attack_that_it_grants(name) -> None:
     """What it leaves out is refused, wholly or in part, does nothing, or is a ceiling; of each search of the zoo it plays the first policy."""
+    assert set(zoo_names()) > LATER
     suite = load_suite(name)
     listed = {text.split(":")[0] for text in suite.attacks}
     others = [text for text, entry in entries("attack").items() if not (text in listed or entry.optimal or entry.learned)]
-    others += [text for n in zoo_names() if n.endswith("-0") and (text := f"zoo:name={n}") not in suite.attacks]
+    others += [text for n in zoo_names() if n.endswith("-0") and n not in LATER and (text := f"zoo:name={n}") not in suite.attacks]
     rows = evaluate(suite, defences=suite.defences[:1], attacks=others, doses=[max(d for d in suite.doses if d)], scenarios=suite.scenarios[:1], seeds=1)
     assert len(rows) == len(others) > 10
     assert not {row["attack"] for row in rows if row["status"] == "error" or (row["attack_steps"] and not row["refused_commands"])}

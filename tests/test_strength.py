@@ -18,14 +18,14 @@ from tailgate.agents.zoo import ZooAttack
 from tailgate.draws import Role
 from tailgate.errors import InputError
 from tailgate.metrics import METRICS
-from tailgate.registry import Spec
+from tailgate.registry import Spec, entries
 from tailgate.scenario import load_scenario
 from tailgate.strength.collect import add_run
 from tailgate.strength.dose import critical_dose, critical_interval, dose_response, fitted
 from tailgate.strength.figures import dose_figure, timing_figure, transfer_figure
 from tailgate.strength.policies import label, loop_for, mean, trained
 from tailgate.strength.timing import periodic, play, shuffled, timing
-from tailgate.strength.transfer import difference, transfer
+from tailgate.strength.transfer import _registered, difference, transfer
 from tailgate.trace import MEMORY, Trace, episodes_at_once, rollout
 
 PLACE = "gusty-stop-and-go-v0"
@@ -353,6 +353,25 @@ def test_transferred_beats_own_is_flagged(tmp_path: Path, half_place: str) -> No
     assert report["no_attack"] == {"chi2_kf": 0.0, "kf": 0.0}
     assert [item["defence"] for item in report["skipped"]] == ["cra"]
     assert transfer_figure(report)[:4] == b"\x89PNG"
+
+
+def test_all_defences_are_those_that_have_a_meaning_there() -> None:
+    """First what was trained on, then what suites play in the scenario; everybody else is named with a reason."""
+    report = transfer([ZOO], ["all"], episodes=1)
+    columns, skipped = report["played_on"], {item["defence"]: item["reason"] for item in report["skipped"]}
+    assert columns[0] == "chi2_kf" and {"none", "kf", "rkf", "safe_state", "oracle"} < set(columns) and len(set(columns)) == len(columns)
+    assert [entry["played_on"] for entry in report["entries"]] == columns == list(report["no_attack"])
+    assert not set(columns) & set(skipped) and set(entries("defence")) <= set(columns) | set(skipped)
+    for name, word in (("always_brake", "sentinel"), ("filterpy_kf", "one episode after the other"), ("dkf", "no suite")):
+        assert word in skipped[name] and "named" in skipped[name]
+
+
+def test_where_no_suite_goes_all_are_the_registered_ones() -> None:
+    """Whether the scenario admits them is found when they are played."""
+    found, skipped = _registered("thesis-ch3-switched-v0.yaml", ["coast"])
+    assert {"kf", "dkf", "cra"} < set(found) and "coast" not in found
+    assert {"always_alarm", "filterpy_imm"} < {item["defence"] for item in skipped}
+    assert not any("no suite" in item["reason"] for item in skipped)
 
 
 def _copy_as(directory: Path, defence: str) -> Path:

@@ -1,5 +1,6 @@
 """Training: exact resume, clear errors, and the whole run end to end on a small budget."""
 
+import dataclasses
 import json
 import subprocess
 import sys
@@ -12,7 +13,9 @@ import pytest
 import yaml
 
 from tailgate import cli, train
+from tailgate.agents.cem import Config as CemConfig
 from tailgate.agents.ppo import Config, Learner
+from tailgate.envs.seat import Seat
 from tailgate.errors import InputError
 from tailgate.rivals import outcomes
 from tailgate.schema import build
@@ -169,10 +172,35 @@ SYSTEMS = {"platoon": "crashed", "network": "rmse_position"}
 @pytest.mark.parametrize("name", PRESETS)
 def test_every_preset_can_be_played(name: str) -> None:
     """Scenario, defences, rivals, environment and learner of each fit together."""
+    if name == "highway":
+        pytest.importorskip("highway_env")
     config = train.load_config(name, [])
     train.check(config)
     build(Config, dict(config.ppo), "ppo").check()
     assert config.name == name and config.rivals
+
+
+@pytest.mark.parametrize("name", [name for name in PRESETS if train.load_config(name, []).learner == "cem"])
+def test_a_preset_of_the_cross_entropy_method_searches_for_twenty_generations(name: str) -> None:
+    """Even where every episode is played to its horizon."""
+    if name == "highway":
+        pytest.importorskip("highway_env")
+    config = train.load_config(name, [])
+    seat, cem = Seat.make(**train.environment_of(config)), build(CemConfig, dict(config.cem), "cem")
+    decisions = -(-seat.loop.horizon // seat.action.spec.interval)
+    assert config.steps >= 20 * cem.population * cem.episodes * decisions
+
+
+def test_a_preset_may_change_another(tmp_path: Path) -> None:
+    """Field by field, each as a whole; a base has no base, and is one by name or file."""
+    mine = tmp_path / "mine.yaml"
+    mine.write_text("base: radar\nname: mine\nthreat: {budget: 3}\nenvironment: {action: mode}\n")
+    changed, radar = train.load_config(str(mine), ["steps=7"]), train.load_config("radar", [])
+    assert changed == dataclasses.replace(radar, name="mine", threat={"budget": 3}, environment={"action": "mode"}, steps=7)
+    for base in ("radar-cem", "[1]", "none-such"):
+        mine.write_text(f"base: {base}\n")
+        with pytest.raises(InputError, match=r"config\.base"):
+            train.load_config(str(mine), [])
 
 
 @pytest.mark.parametrize("name", SYSTEMS)

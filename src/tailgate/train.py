@@ -21,7 +21,7 @@ from typing import Annotated, Any
 from pydantic import Field
 
 from tailgate.agents.codec import ActionSpec
-from tailgate.agents.learning import DISCRETE, LEARNERS, Learner, Progress, Teachable, check_action, learner_of
+from tailgate.agents.learning import DISCRETE, LEARNERS, Learner, Progress, Teachable, check_action, learner_of, made_with
 from tailgate.agents.reward import Reward
 from tailgate.agents.teacher import demonstrate
 from tailgate.core import Count, PositiveCount, param
@@ -89,8 +89,7 @@ def load_config(source: str | None, overrides: list[str], resume: bool = False) 
 
     With `resume` the configuration that the run of this name was started with takes the preset's place.
     """
-    path = config_path(".", source or "quickstart", "config")
-    config = checked(override(read_yaml(path, "config"), overrides))
+    config = checked(override(_preset(source or "quickstart"), overrides))
     held = config.directory / "config.json"
     if not resume:
         return config
@@ -103,6 +102,18 @@ def load_config(source: str | None, overrides: list[str], resume: bool = False) 
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise InputError("resume", str(held), f"the configuration of the run ({error})") from None
     return checked(override(started, overrides))
+
+
+def _preset(source: str) -> dict[str, Any]:
+    """The fields of a preset; those of its `base`, another preset, where it does not have them. A field is replaced as a whole."""
+    data = read_yaml(config_path(".", source, "config"), "config")
+    base = data.pop("base", None)
+    if base is None:
+        return data
+    under = read_yaml(config_path(".", base, "config.base"), "config.base") if isinstance(base, str) else {"base": base}
+    if "base" in under:  # one level, so that nobody looks for a field in many files
+        raise InputError("config.base", base, "a preset, by name or YAML file, that has no base")
+    return under | data
 
 
 def checked(data: dict[str, Any]) -> TrainConfig:
@@ -233,7 +244,7 @@ def _train_seed(config: TrainConfig, teacher: str | None, seed: int, resume: boo
     facts = {
         "learner": config.learner, "teacher": teacher, "seed": seed, "steps": learner.steps, "config": as_data(config),
         "defence_digest": Spec("defence", config.defence).digest, "defence_version": Spec("defence", config.defence).entry.version,
-        config.learner: as_data(settings),
+        "made_with": made_with(config.learner), config.learner: as_data(settings),
         "environment": learner.seat.card()["hash"], "curve": learner.curve,
     }  # fmt: skip
     policy = learner.export(directory / f"policy-{seed}", facts)

@@ -14,6 +14,8 @@ from rich.table import Table
 
 from tailgate.progress import cells, console, progress
 
+MANY = 8  # columns, above which a line has no room for intervals
+
 
 def add(commands: Any) -> None:
     command = commands.add_parser(
@@ -23,7 +25,8 @@ def add(commands: Any) -> None:
     )  # fmt: skip
     command.add_argument("policies", nargs="+", metavar="POLICY", help="JSON file of an exported policy, or zoo:name=NAME")
     command.add_argument("--defence", action="append", metavar="NAME", default=[],
-                         help="a defence to play on (repeatable; default: those that the policies were trained on)")  # fmt: skip
+                         help="a defence to play on (repeatable; default: those that the policies were trained on); all: every "
+                         "registered one that has a meaning in the scenario")  # fmt: skip
     command.add_argument("--scenario", metavar="NAME", help="scenario instead of the one that they were trained in")
     command.add_argument("--threat", action="append", metavar="key=value", help="the threat model's changes instead of the training's")
     command.add_argument("--dose", type=int, metavar="STEPS", help="attack budget instead of the training's")
@@ -65,7 +68,9 @@ def _print(report: dict[str, Any]) -> None:
 
     share, out = report["unit"] == "0/1", console()
     held = {(entry["trained_on"], entry["played_on"]): entry for entry in report["entries"]}
-    table = Table(title=f"{report['scenario']}: {report['outcome']}, {report['episodes']} episodes", caption="95 % intervals")
+    wide = len(report["played_on"]) > MANY
+    caption = "95 % intervals: --json, or --out" if wide else "95 % intervals"
+    table = Table(title=f"{report['scenario']}: {report['outcome']}, {report['episodes']} episodes", caption=caption)
     table.add_column("trained on", overflow="fold")
     for column in report["played_on"]:
         table.add_column(f"on {escape(column)}", overflow="fold")
@@ -75,7 +80,8 @@ def _print(report: dict[str, Any]) -> None:
         texts = []
         for column in report["played_on"]:
             entry = held.get((row, column))
-            texts.append("-" if entry is None else f"{shown(entry['value'], share)} ({between(entry, share)})")
+            interval = "" if entry is None or wide else f" ({between(entry, share)})"
+            texts.append("-" if entry is None else shown(entry["value"], share) + interval)
         seeds = next((entry["seeds"] for entry in report["entries"] if entry["trained_on"] == row), 0)
         table.add_row(f"{escape(row)}, {seeds} seed{'' if seeds == 1 else 's'}", *texts)
     out.print(table)
@@ -84,5 +90,6 @@ def _print(report: dict[str, Any]) -> None:
             gain = entry["over_own"]
             out.print(f"flag: {flag}: {entry['trained_on']} on {entry['played_on']}, {shown(gain['value'], share, '+')} "
                       f"({between(gain, share, '+')})", markup=False)  # fmt: skip
-    for item in report["skipped"]:
-        out.print(f"skipped: {item.get('policy', item.get('defence'))}: {item['reason']}", markup=False)
+    for reason in dict.fromkeys(item["reason"] for item in report["skipped"]):
+        names = ", ".join(item.get("policy", item.get("defence")) for item in report["skipped"] if item["reason"] == reason)
+        out.print(f"skipped: {names}: {reason}", markup=False)

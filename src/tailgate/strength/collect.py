@@ -43,6 +43,11 @@ def single(x: Array) -> Array:
     return small if np.array_equal(small.astype(np.float64), x) else x
 
 
+def packed(file: Path) -> bytes:
+    """A tensor file as the zoo keeps it, its arrays as `single` has them: of equal values, of equal bytes."""
+    return save_tensors({key: single(x) for key, x in load_tensors(file.read_bytes()).items()})
+
+
 def add_policy(policy: Path, name: str, summary: str, *, episodes: int = EPISODES, replace: bool = False, folder: Path = FOLDER) -> Path:
     """Copy a trained policy into the zoo as `name`; returns its JSON file. Its outcome is measured anew, on report seeds.
 
@@ -63,7 +68,7 @@ def add_policy(policy: Path, name: str, summary: str, *, episodes: int = EPISODE
     if not isinstance(curve, list) or not all(isinstance(point, dict) for point in curve):
         raise InputError(f"policy {who.name}.training.curve", curve, "a list of points, a mapping each")
     loop = loop_for(who, scenario, defence_of(who), who.threat)
-    blob = save_tensors({key: single(x) for key, x in load_tensors(policy.with_name(header.tensors).read_bytes()).items()})
+    blob = packed(policy.with_name(header.tensors))
     if len(blob) > BYTES:
         raise InputError("zoo", f"a tensor file of {len(blob)} bytes", f"at most {BYTES}")
     keys = draws.keys("report", range(episodes))

@@ -9,7 +9,7 @@ import numpy as np
 
 from tailgate.plots import MARKERS, canvas, png
 
-from .policies import label, shown
+from .policies import label
 from .timing import TWINS
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")  # Okabe and Ito
@@ -98,33 +98,34 @@ def dose_figure(report: dict[str, Any]) -> bytes:
 
 
 def transfer_figure(report: dict[str, Any]) -> bytes:
-    """Trained on (rows) x played on (columns): the mean outcome; framed where both are the same, starred where flagged."""
-    rows, columns = report["trained_on"], report["played_on"]
+    """Trained on (rows, below a row without an attack) x played on (columns): the mean outcome; framed where both are the same, starred
+    where flagged. Shades are of the logarithm where the outcome is no share."""
+    rows, columns, share = ["(no attack)", *report["trained_on"]], report["played_on"], report["unit"] == "0/1"
     grid = np.full((len(rows), len(columns)), np.nan)
+    grid[0] = [report["no_attack"].get(column, np.nan) for column in columns]
     flagged = np.zeros(grid.shape, bool)
     for entry in report["entries"]:
-        at = rows.index(entry["trained_on"]), columns.index(entry["played_on"])
+        at = rows.index(entry["trained_on"], 1), columns.index(entry["played_on"])
         grid[at], flagged[at] = entry["value"], bool(entry.get("flags"))
-    share = report["unit"] == "0/1"
-    figure, axes = canvas(2.6 + 1.0 * len(columns), 2.6 + 0.5 * len(rows))
+    shade = grid if share else np.log(np.maximum(grid, 1e-9))
+    figure, axes = canvas(2.8 + 0.62 * len(columns), 2.4 + 0.34 * len(rows))
     ax = axes[0, 0]
     ax.set_facecolor("#dddddd")  # what was not played
-    low, high = (0.0, 100.0) if share else (float(np.nanmin(grid)), float(np.nanmax(grid)) + 1e-9)
-    image = ax.imshow(_scale(report["unit"]) * grid, cmap="Reds", vmin=low, vmax=high, aspect="auto")
+    low, high = (0.0, 1.0) if share else (float(np.nanmin(shade)), float(np.nanmax(shade)) + 1e-9)
+    image = ax.imshow(shade, cmap="Reds", vmin=low, vmax=high, aspect="auto")
     for (i, j), number in np.ndenumerate(grid):
-        if np.isfinite(number):
-            dark = sum(image.cmap(image.norm(_scale(report["unit"]) * number))[:3]) < 1.5
-            text = shown(number, share) + (" *" if flagged[i, j] else "")
-            ax.text(j, i, text, ha="center", va="center", fontsize=8, color="white" if dark else "black")
-        else:
-            ax.text(j, i, "-", ha="center", va="center", fontsize=8)
-        if rows[i] == columns[j]:
+        there = bool(np.isfinite(number))
+        dark = there and sum(image.cmap(image.norm(shade[i, j]))[:3]) < 1.5
+        text = (f"{100 * number:.0f}" if share else f"{number:.3g}") + (" *" if flagged[i, j] else "") if there else "-"
+        ax.text(j, i, text, ha="center", va="center", fontsize=8, color="white" if dark else "black")
+        if i and rows[i] == columns[j]:
             ax.add_patch(_frame(j, i))
-    ax.set_xticks(range(len(columns)), [label(name, 14) for name in columns], rotation=40, ha="right", rotation_mode="anchor", fontsize=8)
+    ax.axhline(0.5, color="black", linewidth=0.8)
+    ax.set_xticks(range(len(columns)), [label(name, 20) for name in columns], rotation=40, ha="right", rotation_mode="anchor", fontsize=8)
     ax.set_yticks(range(len(rows)), [label(name, 24) for name in rows], fontsize=8)
     ax.set(xlabel="played on", ylabel="trained on")
-    note = "framed: trained on it" + ("\n*: better than what was trained on it" if flagged.any() else "")
-    ax.set_title(f"{report['scenario']}\n{axis_label(report['outcome'], report['unit'])}\n{note}", fontsize=9)
+    note = "framed: trained on it" + ("; *: better than what was trained on it" if flagged.any() else "")
+    ax.set_title(f"{report['scenario']}: {axis_label(report['outcome'], report['unit'])}\n{note}", fontsize=9)
     return png(figure)
 
 

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import tempfile
 from collections.abc import Callable
 from typing import Any, Literal, NamedTuple
 
 from tailgate import train
-from tailgate.agents.learning import Progress
+from tailgate.agents.learning import Progress, made_with
 from tailgate.agents.policy import load_policy
 from tailgate.errors import InputError
 from tailgate.registry import Spec
 
+from .collect import packed
 from .policies import Trained, place_of, trained
 
 Verdict = Literal["same", "differs", "unchecked"]
@@ -34,7 +36,7 @@ def retrain(text: str, progress: Callable[[train.TrainConfig, Progress], None] |
 
     A record is read and never run: one that names code to import, a scenario that is not built in, or a defence of other files or of
     another version than here cannot be checked, and the reason is returned. Weights are the same to the last bit on one machine type
-    with the versions of constraints.txt; PPO and what else rests on torch may differ elsewhere.
+    with the versions of constraints.txt; PPO and what else rests on torch may differ elsewhere, and `why` names what is another here.
     """
     try:
         who = trained(text)
@@ -52,10 +54,23 @@ def retrain(text: str, progress: Callable[[train.TrainConfig, Progress], None] |
             (path,) = train.train(config, told)
         except (InputError, ImportError) as error:  # a learner that is not installed, a field that this version does not know
             return Again(text, "unchecked", str(error), who.header.sha256)
-        here, _ = load_policy(path)
-    same = here.sha256 == who.header.sha256
-    why = "" if same else f"weights {who.header.sha256[:12]} there, {here.sha256[:12]} here"
-    return Again(text, "same" if same else "differs", why, who.header.sha256, here.sha256, int(here.training["steps"]))
+        made, _ = load_policy(path)
+        here, there = made.sha256, who.header.sha256
+        if "source_sha256" in who.header.training:  # of the zoo, whose weights are packed: these, as the record might claim any hash
+            here = hashlib.sha256(packed(path.with_name(made.tensors))).hexdigest()
+    steps = int(made.training["steps"])
+    if here == there:
+        return Again(text, "same", "", there, here, steps)
+    return Again(text, "differs", f"weights {there[:12]} there, {here[:12]} here; {_unlike(who)}", there, here, steps)
+
+
+def _unlike(who: Trained) -> str:
+    """In which versions the training of a policy's file was another than one here is, in words."""
+    held, here = who.header.training.get("made_with"), made_with(who.learner)
+    if not isinstance(held, dict):
+        return "not recorded what it was trained with"
+    differing = [f"{key} {str(held.get(key, 'none'))[:40]} there, {mine} here" for key, mine in here.items() if held.get(key) != mine]
+    return "; ".join(differing) or "the same versions and instructions"
 
 
 def _config(who: Trained) -> train.TrainConfig:

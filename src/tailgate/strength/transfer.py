@@ -7,7 +7,7 @@ not trained to its worst: the entry is flagged.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,15 +16,19 @@ from scipy import stats
 
 from tailgate.core import Array
 from tailgate.errors import InputError
+from tailgate.estimators.per_episode import EpisodeByEpisode
 from tailgate.evaluation import Cell, cells_of, run
 from tailgate.metrics import unit_in
-from tailgate.scenario import Suite, load_scenario
+from tailgate.registry import Spec
+from tailgate.registry import entries as registered
+from tailgate.scenario import Suite, list_suites, load_scenario, load_suite
 from tailgate.schema import as_data, canonical
 from tailgate.stats import Interval, paired_difference
 
-from .policies import defence_of, is_share, mean, misfit, outcome_for, place_of, trained
+from .policies import Trained, defence_of, is_share, mean, misfit, outcome_for, place_of, trained
 
 LEVEL = 0.95
+ALL = "all"  # the word for every registered defence
 
 
 def difference(a: Array, b: Array, share: bool = False) -> Interval:
@@ -49,6 +53,10 @@ def transfer(
 ) -> dict[str, Any]:  # fmt: skip
     """The report. Without `defences` the policies are played on those that they were trained on.
 
+    The word `all` stands for these and every registered defence that has a meaning in the scenario: those that a suite plays there, or,
+    where no suite goes, those that it admits; sentinels and what plays one episode after the other have to be named. `skipped` says who
+    is left out, and why.
+
     Scenario and threat model are those of the training, which have to agree where nothing else is given. A policy that does not fit them
     (another observation or action) is skipped, with the reason.
     """
@@ -60,7 +68,12 @@ def transfer(
     counted = outcome_for(outcome or next((who.outcome for who in members if who.outcome), None), where)
     origins = {who.text: defence_of(who) for who in members}
     columns = tuple(dict.fromkeys(defences or origins.values()))
-    good, skipped = [], []
+    good: list[Trained] = []
+    skipped: list[dict[str, Any]] = []
+    if ALL in columns:
+        named = dict.fromkeys((*origins.values(), *(name for name in columns if name != ALL)))
+        found, skipped = _registered(where, named)
+        columns = (*named, *found)
     for who in members:
         reason = misfit(Cell("transfer", where, dose, columns[0], who.text, episodes, purpose, threat=changed))
         if reason:
@@ -79,6 +92,8 @@ def transfer(
         elif cell.attack == "none":
             reason = bad["reason"] or f"{counted} is undefined in some episodes"
             skipped.append({"defence": cell.defence, "reason": reason})
+    if ALL in defences:
+        columns = tuple(column for column in columns if ("none", column) in held)
     origin_rows = dict.fromkeys(origins[who.text] for who in good)
     entries: list[dict[str, Any]] = []
     for column in columns:
@@ -109,6 +124,27 @@ def transfer(
         "no_attack": {column: float(held["none", column].mean()) for column in columns if ("none", column) in held},
         "entries": entries, "skipped": skipped,
     }  # fmt: skip
+
+
+def _registered(scenario: str, named: Collection[str]) -> tuple[list[str], list[dict[str, Any]]]:
+    """The defences that have a meaning in a scenario beside those that are named, and which others there are, with the reason."""
+    listed = [name for suite in map(load_suite, list_suites()) if scenario in suite.scenarios for name in suite.defences]
+    found, skipped = [], []
+    for name in dict.fromkeys((*listed, *registered("defence"))):
+        entry = Spec("defence", name).entry
+        if name in named:
+            continue
+        if entry.sentinel:
+            reason = f"a sentinel ({entry.sentinel})"
+        elif issubclass(entry.cls, EpisodeByEpisode):
+            reason = "it plays one episode after the other"
+        elif listed and entry.built_in and name not in listed:
+            reason = "no suite plays it in this scenario (docs/scoring.md)"
+        else:
+            found.append(name)
+            continue
+        skipped.append({"defence": name, "reason": f"{reason}; it can be named"})
+    return found, skipped
 
 
 def _common(field: str, values: dict[str, Any]) -> Any:
