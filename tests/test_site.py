@@ -170,7 +170,7 @@ def test_an_entry_s_page_has_all_parts(site):
     """Card, gates, flags, worst attacks, curves, robustness, stealth, detection, comparisons, and a link to the other suite."""
     text = entry(site, "chi2_kf:eta=15").read_text(encoding="utf-8")
     for part in ("https://example.org/paper", "Licence", "threshold of the gate [1]", "the budget was not spent", "car-following-heavy-v0", "\N{MINUS SIGN}7%", "false alarms",
-                 "Only A damaged", "steps: 20000", "../network-v0/chi2_kf", "other plant"):  # fmt: skip
+                 "Only A damaged", "steps: 20000", "../network-v0/chi2_kf", "other plant", "Delay [steps]"):  # fmt: skip
         assert part in text, part
     assert text.count('class="plot ') == 3  # a chart on each scale, and that of stealth impact
     assert "leaderboard check board.json --defence chi2_kf:eta=15" in text and "check synthetic-v0/board.json" in site.read_text(encoding="utf-8")
