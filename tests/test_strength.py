@@ -316,6 +316,11 @@ def test_what_cannot_be_played_is_skipped_with_the_reason(tmp_path: Path) -> Non
             dose_response(["none"], ["kf"], PLACE, bad, episodes=2)  # type: ignore[arg-type]
     with pytest.raises(InputError, match="yes or no"):
         dose_response(["none"], ["kf"], PLACE, [5], episodes=2, exceeds=1.0)
+    for few in (0, -3):
+        with pytest.raises(InputError, match=rf"episodes: got {few}"):
+            dose_response(["none"], ["kf"], PLACE, [5], episodes=few)
+        with pytest.raises(InputError, match=rf"episodes: got {few}"):
+            transfer([other], episodes=few)
 
 
 # -- transfer

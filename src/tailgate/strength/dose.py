@@ -23,7 +23,7 @@ from tailgate.registry import Spec
 from tailgate.scenario import Suite, load_scenario
 from tailgate.schema import as_data
 
-from .policies import is_policy, is_share, mean, misfit, outcome_for
+from .policies import check_episodes, is_policy, is_share, mean, misfit, outcome_for
 
 CRITICAL = 0.10  # share of episodes with damage at which a dose is critical
 RESAMPLES = 2000
@@ -68,6 +68,7 @@ def dose_response(
     outcome: a metric. exceeds: count the episodes in which it exceeds this value, instead of its mean. limit: of the mean or the share that
     makes a dose critical; 0.1 of shares, and none of means.
     """
+    check_episodes(episodes)
     counted = outcome_for(outcome, scenario)
     if exceeds is not None and is_share(counted):
         raise InputError("exceeds", exceeds, f"nothing for {counted}, which is yes or no")

@@ -167,6 +167,12 @@ def outcome_for(outcome: str | None, scenario: str) -> str:
     return outcome_of(TrainConfig(scenario=scenario, outcome=outcome))
 
 
+def check_episodes(episodes: int) -> None:
+    """Raise InputError unless there is an episode to play."""
+    if episodes < 1:
+        raise InputError("episodes", episodes, "a whole number not below 1")
+
+
 def loop_for(who: Trained, scenario: str, defence: str, threat: dict[str, Any], dose: int | None = None) -> Loop:
     """The loop that a policy is played in, with the knowledge that it was trained with."""
     place = Cell("", scenario, dose, defence, who.text, 1, threat=threat).place(who.policy, who.header.knowledge)

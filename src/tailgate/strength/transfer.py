@@ -25,7 +25,7 @@ from tailgate.scenario import Suite, list_suites, load_scenario, load_suite
 from tailgate.schema import as_data, canonical
 from tailgate.stats import Interval, paired_difference
 
-from .policies import Trained, defence_of, is_share, mean, misfit, outcome_for, place_of, trained
+from .policies import Trained, check_episodes, defence_of, is_share, mean, misfit, outcome_for, place_of, trained
 
 LEVEL = 0.95
 ALL = "all"  # the word for every registered defence
@@ -60,6 +60,7 @@ def transfer(
     Scenario and threat model are those of the training, which have to agree where nothing else is given. A policy that does not fit them
     (another observation or action) is skipped, with the reason.
     """
+    check_episodes(episodes)
     members = [trained(text) for text in dict.fromkeys(texts)]
     if not members:
         raise InputError("policies", list(texts), "at least one")
