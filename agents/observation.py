@@ -11,7 +11,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from tailgate import num
-from tailgate.core import AIRED, Array, Kind, View
+from tailgate.core import AIRED, Array, Kind, Model, View
 from tailgate.threat import Brief
 
 from .values import receivers
@@ -37,6 +37,11 @@ class Sight(NamedTuple):
     error: Array | None = None  # the state's, 2-norm
     noise: Array | None = None  # the readings', 2-norm
     reading: Array | None = None
+
+
+def spread(model: Model) -> float:
+    """The standard deviation of all that moves the state in a step, as the defence is told it."""
+    return math.sqrt(sum(model.Q.diagonal().tolist()))
 
 
 Column = tuple[str, Callable[[Sight], Array]]  # a component of the observation: its name, and its values (B,)
@@ -84,7 +89,7 @@ class ObservationCodec:
     @cached_property
     def spread(self) -> float:
         """How far the state goes in a step that nobody can foresee, as the defence is told: the scale of a state's error."""
-        return math.sqrt(sum(self.brief.model.Q.diagonal().tolist()))
+        return spread(self.brief.model)
 
     @cached_property
     def columns(self) -> tuple[Column, ...]:

@@ -74,7 +74,9 @@ def fuse_seat(seat: Seat) -> Constants | Refused:
 
         quantities = quantities | radar.QUANTITIES
     if not road:
-        quantities = several.shown(seat.loop, f)
+        from . import network_seat
+
+        quantities = network_seat.quantities(seat.loop, f)
     elif many:
         from . import platoon_seat
 

@@ -91,6 +91,7 @@ RESPONSE, CLEARANCE, DISTANCE, WATCH = _number("response"), _number("clearance")
 GAPS, PRIOR_SD, NOISE_SD, FADES = _number("gaps", 3), _number("prior_sd"), _number("noise_sd", 3), _number("fades")
 LOSS = _number("loss")  # probability that a reading or a message is lost
 STATE_SD, WALK_SD, READ_SD = _number("state_sd"), _number("walk_sd"), _number("read_sd")  # a network: of its start, of a step, of readings
+SPREAD = _number("spread")  # the scale of the readings' size, where it is shown
 NUMBERS = len(_numbers)
 
 AIRED = _choice("aired")  # a car with a radar
@@ -125,6 +126,7 @@ SENSED, SENTS, BELIEFS = _choice("sensed"), _choice("sents"), _choice("beliefs")
 ARRIVALS, VALIDS, RESIDUES, TAKEN = (_choice(name) for name in ("arrivals", "valids", "residues", "taken"))
 SCORES, ALARMS, ABSENT, ASIDE = (_choice(name) for name in ("scores", "alarms", "absent", "aside"))
 IN_OWN, IN_MEASURE, IN_SOME_WIDE = (_choice(name) for name in ("own", "measure", "some wide"))
+SIZES = _choice("sizes")  # of what each agent reads, where that is shown
 CHOICES = len(_choices)
 
 # manoeuvres, detectors, mitigations

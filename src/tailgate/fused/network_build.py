@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from tailgate import num
+from tailgate.agents.observation import spread
 from tailgate.core import Array, Attack
 from tailgate.envs.network import LinearSensors, NoControl, SensorNetwork
 from tailgate.estimators.consensus import ConsensusFilter
@@ -43,15 +44,16 @@ def fill(loop: Loop, attack: Attack | None, c: Array, f: Array, profile: Array) 
     f[of.SENSED], f[of.WIRED] = len(loop.model.sensors), np.count_nonzero(loop.plan.channel.granted)
     f[of.IN_OWN], f[of.IN_MEASURE] = table.add(plant.A[0]), table.add(sensor.C)
     c[of.DT], c[of.STATE_SD], c[of.WALK_SD], c[of.READ_SD] = loop.plant.dt, loop.plant.initial_sd, plant.noise_sd, sensor.sd
-    window = _places(f)
+    c[of.SPREAD] = spread(loop.model)
+    window = _places(f, f[of.CARS] if loop.threat.sees_measurement else 0)
     several.listed(loop, f, table, lambda i, w: _wires(f, i, w))
     _filter(loop, platoon.drops(loop, attack), c, f, table)
     platoon.detector(loop.plan.defence, c, f)
     return np.concatenate(table.parts), window
 
 
-def _places(f: Array) -> int:
-    """Where what begins. -> rows of the window."""
+def _places(f: Array, sizes: int) -> int:
+    """Where what begins; of so many agents the size of what is read is shown. -> rows of the window."""
     agents, states, q, count = (int(f[at]) for at in (of.CARS, of.STATES, of.SENSED, of.WIRED))
     from .network_defence import room
 
@@ -63,9 +65,10 @@ def _places(f: Array) -> int:
         (of.AIMS, count * several.WIRE_ROWS + agents), (of.TRUTHS, states), (of.FUSED, agents * states), (of.SENDS, agents * states),
         (of.FORE, states), (of.ARRIVALS, agents * q), (of.VALIDS, agents * q), (of.RESIDUES, agents * q), (of.TAKEN, agents * q),
         (of.SCORES, agents), (of.ALARMS, agents), (of.ABSENT, agents), (of.ASIDE, room(q, states)), (of.DEALT, max(states, agents * q) + 1),
+        (of.SIZES, int(sizes)),
     ):  # fmt: skip
         f[name], last = last * LANES, last + rows
-    f[of.ROOM] = last - ROWS
+    f[of.ROOM], f[of.SIZES] = last - ROWS, f[of.SIZES] if sizes else 0
     return window
 
 
