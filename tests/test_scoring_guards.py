@@ -32,6 +32,18 @@ PLAN = {
 SMALL = Suite("small-v0", "", (ROAD,), (12,), ("none", "kf"), ("none", "fdi:value=-4"), 3, {"kinds": ["fdi"], "fdi_bound": 5.0})
 
 
+def test_a_knowledge_whose_own_attacks_nobody_met_has_no_figures() -> None:
+    """A white box that cannot look into the only defence: its figures would be the black box's. Where another defence was met, too."""
+    where, gone = suite(attacks=("none", "fdi", "white")), {"knowledge": "white", "status": "skipped", "reason": "no look"}
+    rows = [*clean("a"), *cell("none", "fdi", 20), *cell("a", "fdi", 4)]
+    for others in ([*cell("none", "white", **gone)], [*cell("none", "white", 20, knowledge="white")]):
+        made = board([*rows, *cell("a", "white", **gone), *others], where)
+        found = entry(made, "a")
+        assert {r["knowledge"] for r in found["rates"]} == {"black", "grey"} and found["critical_dose"]["white"] is None
+        assert {c["knowledge"] for c in made["curves"] if c["defence"] == "a"} == {"black", "grey"}
+    assert rate(entry(made, "none"), 20, "white")["attacks"] == 2
+
+
 def test_rows_of_another_threat_model_are_refused() -> None:
     """A weaker attacker under the suite's name: the scenario's hash tells."""
     rows = evaluate(SMALL)
