@@ -23,7 +23,7 @@ from safetensors.numpy import save as save_tensors
 from tailgate import num
 from tailgate.core import Array, Command, PositiveCount, View, param
 from tailgate.draws import Draws, Keys, Role
-from tailgate.errors import InputError
+from tailgate.errors import InputError, said
 from tailgate.files import write_atomic
 from tailgate.registry import register
 from tailgate.schema import as_data, build
@@ -202,7 +202,7 @@ def read_trained(kind: type[T], form: str, path: Path, field: str, where: str) -
     try:
         blob = path.with_name(header.tensors).read_bytes()
     except (OSError, ValueError) as error:  # ValueError: what no name of a file can hold
-        raise InputError(f"{where}.tensors", header.tensors, f"a readable file ({getattr(error, 'strerror', None) or error})") from None
+        raise InputError(f"{where}.tensors", header.tensors, f"a readable file ({said(error)})") from None
     if hashlib.sha256(blob).hexdigest() != header.sha256:
         raise InputError(f"{where}.sha256", header.sha256, f"the digest of {header.tensors}: the file is damaged or another one")
     try:

@@ -12,7 +12,7 @@ from pydantic import Field
 from tailgate import num
 from tailgate.core import Array, Finite, NonNegative, Positive, param
 from tailgate.draws import Draws
-from tailgate.errors import InputError
+from tailgate.errors import InputError, said
 from tailgate.registry import register
 
 Span = Annotated[tuple[NonNegative, NonNegative], Field(min_length=2, max_length=2)]
@@ -265,7 +265,7 @@ def read_profile(path: Path) -> tuple[Array, Array]:
     try:
         rows = list(csv.reader(path.read_text(encoding="utf-8-sig").splitlines()))
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(where, str(path), f"a readable CSV file ({error})") from None
+        raise InputError(where, str(path), f"a readable CSV file ({said(error)})") from None
     if not rows or [c.strip() for c in rows[0]] != ["t", "v"]:
         raise InputError(where, rows[0] if rows else "an empty file", "the header t,v (seconds, metres per second)")
     times: list[float] = []

@@ -40,6 +40,28 @@ def test_list_shows_every_component_with_its_parameters(capsys: pytest.CaptureFi
     assert "chi2_kf" in table and "stealth" not in table
 
 
+@pytest.mark.parametrize(("arguments", "words"), [
+    (["leaderboard", "head", "board.json", "--nothing"], "tailgate leaderboard head: error: unrecognized arguments: --nothing"),
+    (["train", "--nothing"], "tailgate train: error: unrecognized arguments: --nothing"),
+])  # fmt: skip
+def test_an_unknown_option_is_answered_by_the_command_that_was_asked(arguments: list[str], words: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        cli.main(arguments)
+    assert words in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("arguments", "words"), [
+    (["check", "nowhere.json"], "readable board.json (No such file or directory)"), (["check", "."], "(Is a directory)"),
+    (["check", "rows.jsonl"], "leaderboard verify`"), (["verify", "--rows", "board.json"], "leaderboard check`"),
+])  # fmt: skip
+def test_what_is_no_board_or_no_rows_is_named(arguments: list[str], words: str, run: Run) -> None:
+    """And what it may be instead."""
+    Path("rows.jsonl").write_text('{"seed": 1}\n{"seed": 2}\n')
+    Path("board.json").write_text('{\n "format": "board"\n}\n')
+    code, _, errors = run("leaderboard", *arguments)
+    assert code == 2 and words in errors and "Errno" not in errors
+
+
 def test_evaluate_prints_a_table_or_json_and_writes_rows(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     part = ["evaluate", "--scenario", "gusty-stop-and-go-v0", "--defence", "kf", "--attack", "none", "--seeds", "4"]

@@ -323,7 +323,24 @@ def test_what_cannot_be_played_is_skipped_with_the_reason(tmp_path: Path) -> Non
             transfer([other], episodes=few)
 
 
+def test_a_dose_response_of_nothing_says_so(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    other = str(_always(tmp_path, "p", kinds=["fdi"]))
+    assert cli.main(["dose-response", other, "--defence", "kf", "--scenario", PLACE, "--doses", "5", "--episodes", "2"]) == 1
+    assert "nothing was played; --threat" in capsys.readouterr().out
+
+
 # -- transfer
+
+
+def test_many_defences_have_a_line_each(capsys: pytest.CaptureFixture[str], tmp_path: Path, half_place: str) -> None:
+    """A few of them are columns beside their intervals."""
+    policy = str(_recorded(_always(tmp_path, "policy-0"), scenario=half_place))
+    many = ["none", "kf", "rkf", "chi2_kf", "imm", "cusum_kf", "mewma_kf", "widen_kf", "brake_kf"]
+    for some, head in ((many, "played on"), (many[:2], "trained on")):
+        arguments = [word for name in some for word in ("--defence", name)]
+        assert cli.main(["transfer", policy, "--scenario", half_place, "--episodes", "2", *arguments]) == 0
+        said = capsys.readouterr().out
+        assert head in said and all(name in said for name in some)
 
 
 def test_a_difference_of_unequal_numbers_of_runs() -> None:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import yaml
 
-from tailgate import cli, train
+from tailgate import cli, comparison, train
 from tailgate.agents.cem import Config as CemConfig
 from tailgate.agents.ppo import Config, Learner
 from tailgate.envs.seat import Seat
@@ -141,7 +141,23 @@ def test_the_command_trains_compares_and_writes_a_page(here: Path, tmp_path: Pat
     page = (run / "page" / "index.html").read_text(encoding="utf-8")
     assert "quickstart" in page and "learned" in page
     assert cli.main(["train", "steps=1920", "--resume"]) == 0  # the rest of the configuration is the run's own
-    assert json.loads((run / "policy-0.json").read_text())["training"]["steps"] == 1920
+    decisions = json.loads((run / "policy-0.json").read_text())["training"]["steps"]
+    assert decisions == 1920 and f"{decisions:,} decisions" in (run / "page" / "index.html").read_text(encoding="utf-8")
+
+
+def test_a_finished_comparison_is_not_played_again(
+    here: Path, tmp_path: Path, small_run: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As long as policies and comparison are the same; a report that was cut counts as none."""
+    assert cli.main(["train", *small_run]) == 0
+    first, report = capsys.readouterr().out, tmp_path / "runs" / "quickstart" / "report.json"
+    with monkeypatch.context() as patch:
+        patch.setattr(comparison, "play_scripts", lambda *_: pytest.fail("played again"))
+        assert cli.main(["train", "--resume"]) == 0 and capsys.readouterr().out == first
+    held = report.read_text()
+    report.write_text(held[:-20])
+    assert cli.main(["train", "--resume"]) == 0 and report.read_text() == held
+    assert cli.main(["train", "--resume", "episodes=5"]) == 0 and json.loads(report.read_text())["episodes"] == 5
 
 
 def test_the_final_comparison_begins_at_the_episode_that_is_named(here: Path, small_run: tuple[str, ...]) -> None:
@@ -333,6 +349,9 @@ def test_a_fresh_start_forgets_the_run_before_and_resume_wants_the_same_learner(
     capsys.readouterr()
     assert cli.main(["train", *small_run, "--resume"]) == 2
     assert "resume" in capsys.readouterr().err
+    assert cli.main(["train", *small_run]) == 0
+    assert cli.main(["train", "--resume", "gamma=0.5"]) == 2
+    assert "got 'gamma=0.5'; expected gamma=0.99, as in" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("settings", [

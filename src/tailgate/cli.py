@@ -9,6 +9,7 @@ import argparse
 import sys
 from collections.abc import Sequence
 from importlib import import_module
+from typing import Any
 
 import tailgate
 from tailgate.errors import InputError
@@ -42,8 +43,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0
 
 
+class _Parser(argparse.ArgumentParser):
+    """Says of an argument that it does not know how the command is called, where argparse says how all are."""
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        found, rest = super().parse_known_args(args, namespace)
+        if rest:
+            self.error(f"unrecognized arguments: {' '.join(rest)}")
+        return found, rest
+
+
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="tailgate", description=(tailgate.__doc__ or "").split("\n")[0])
+    parser = _Parser(prog="tailgate", description=(tailgate.__doc__ or "").split("\n")[0])
     parser.add_argument("--version", action="version", version=f"tailgate {tailgate.__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     for name in COMMANDS:

@@ -112,13 +112,14 @@ def _report(
     versus = {"no attack": difference(none), "own yoked schedule": difference(yoked)}
     if best is not None:
         versus["best scripted attack"] = over(best)
-    place = load_scenario(config.scenario).with_threat(**config.threat)
+    place, heads = load_scenario(config.scenario).with_threat(**config.threat), [load_policy(v.policy)[0] for v in verdicts]
     report = {
         "name": config.name, "scenario": config.scenario, "defence": config.defence, "episodes": config.episodes, "steps": config.steps,
         "outcome": outcome, "unit": unit_in(outcome, place.brief().model), "learner": config.learner,
-        "teacher": load_policy(verdicts[0].policy)[0].training.get("teacher"),
+        "teacher": heads[0].training.get("teacher"), "decisions": [head.training["steps"] for head in heads],
         "threat": as_data(place.threat_model),
         "config": json.loads(canonical(config)), "policies": [str(v.policy) for v in verdicts], "best_scripted": best,
+        "sha256": [head.sha256 for head in heads],
         "attacks": [{"label": label, **interval._asdict(), "note": note} for label, interval, note in items],
         "advantage": {name: interval._asdict() for name, interval in versus.items()},
         "rivals": {name: {"outcome": mean(outcomes(name))._asdict(), "advantage": over(name)._asdict()} for name in config.rivals},
@@ -130,6 +131,19 @@ def _report(
     }  # fmt: skip
     write_atomic(config.directory / "report.json", json.dumps(report, indent=1, allow_nan=False).encode() + b"\n")
     return report
+
+
+def finished(config: TrainConfig, policies: list[Path]) -> dict[str, Any] | None:
+    """The report that `compare` wrote of these policies and this comparison; None where there is none."""
+    file, rows = config.directory / "report.json", config.directory / "rows.jsonl"
+    if not (file.is_file() and rows.is_file()):
+        return None
+    try:
+        held: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
+        same = held["config"] == json.loads(canonical(config)) and held["sha256"] == [load_policy(path)[0].sha256 for path in policies]
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return None
+    return held if same else None
 
 
 def _reached(learned: Array, optimum: Array) -> Interval:
@@ -164,8 +178,9 @@ def headline(report: dict[str, Any]) -> dict[str, Any]:
     which = {"crashed": " that end in a collision"}.get(report["outcome"], f" with {report['outcome']}" if share else "")
     runs = len(report["policies"])
     speaks = "of this one policy: other training seeds differ" if runs == 1 else f"over {runs} training seeds"
+    most = max(report["decisions"])
     text = (
-        f"An adversary was trained for {report['steps']:,} decisions against {report['defence']} on {report['scenario']}. "
+        f"An adversary was trained for {most:,} decisions against {report['defence']} on {report['scenario']}. "
         f"{what} {report['episodes']} fresh episodes{which}: {gains} (paired, 95 %; {speaks})."
     )
     return {"text": text, "items": report["attacks"] if share else []}

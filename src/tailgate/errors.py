@@ -22,6 +22,11 @@ class NotApplicable(InputError):
     """A pairing of components that has no meaning: its rows are skipped, with the reason."""
 
 
+def said(error: Exception) -> str:
+    """What an error says: of the operating system's the words alone, as whoever reports it names the file."""
+    return getattr(error, "strerror", None) or str(error)
+
+
 def wanted(found: Mapping[str, Any]) -> str:
     """What was expected, from the first of a validator's errors."""
     if found["type"] == "missing":

@@ -29,7 +29,7 @@ from rich.console import Console
 from tailgate import draws
 from tailgate.agents.mixture import Mixture, MixtureState
 from tailgate.draws import Draws, Keys
-from tailgate.errors import InputError, NotApplicable, unknown
+from tailgate.errors import InputError, NotApplicable, said, unknown
 from tailgate.files import write_atomic
 from tailgate.loop import Loop
 from tailgate.progress import progress
@@ -157,7 +157,7 @@ def read() -> dict[str, Any]:
     try:
         held: dict[str, Any] = json.loads(FILE.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
-        raise InputError("golden", str(FILE), f"a readable JSON file ({error})") from None
+        raise InputError("golden", str(FILE), f"a readable JSON file ({said(error)})") from None
     if held.get("format") != FORMAT:
         raise InputError("golden.format", held.get("format"), FORMAT)
     return held

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import ConfigDict, Field, ValidationError, create_model
 
-from tailgate.errors import InputError, wanted
+from tailgate.errors import InputError, said, wanted
 from tailgate.metrics import METRICS
 
 # What tells one cell from another: rows that differ in one of these are never summed up together.
@@ -34,7 +34,7 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
         held = path.read_bytes()
         text = (_unpacked(held) if path.suffix == ".xz" else held).decode("utf-8")
     except (OSError, UnicodeDecodeError, EOFError, lzma.LZMAError) as error:
-        raise InputError("rows", str(path), f"a readable JSON Lines file ({error})") from None
+        raise InputError("rows", str(path), f"a readable JSON Lines file ({said(error)})") from None
     rows, lines = [], text.splitlines()
     for number, line in enumerate(lines, start=1):
         where = f"rows {path.name}, line {number}"
@@ -42,7 +42,8 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
             row = json.loads(line)
         except ValueError:
             cut = "; the file was cut here: run the same command again" if number == len(lines) and not text.endswith("\n") else ""
-            raise InputError(where, line[:60], f"a JSON object{cut}") from None
+            board = ", a row; a board is played again by `tailgate leaderboard check`" if path.suffix == ".json" else ""
+            raise InputError(where, line[:60], f"a JSON object{board or cut}") from None
         try:
             _Row.model_validate(row)
         except ValidationError as error:

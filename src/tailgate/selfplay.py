@@ -33,7 +33,7 @@ from tailgate.agents.policy import PolicyAttack
 from tailgate.agents.selfplay import Learner, Played, constant, export, play
 from tailgate.core import Array, Attack, Count, PositiveCount, param
 from tailgate.envs.duel import Duel, Payoff
-from tailgate.errors import InputError
+from tailgate.errors import InputError, said
 from tailgate.estimators.steered import Steered
 from tailgate.estimators.steering import nearest
 from tailgate.files import set_aside, writable_directory, write_atomic
@@ -95,7 +95,7 @@ def _started(held: Path) -> dict[str, Any]:
         started: dict[str, Any] = json.loads(held.read_text(encoding="utf-8"))
         del started["class"]
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-        raise InputError("resume", str(held), f"the configuration of a run ({error})") from None
+        raise InputError("resume", str(held), f"the configuration of a run ({said(error)})") from None
     return started
 
 
@@ -309,7 +309,7 @@ def _finished(path: Path, facts: dict[str, Any]) -> bool:
         held = json.loads(path.read_text(encoding="utf-8"))["training"]
         return all(held.get(key) == value for key, value in facts.items())
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise InputError("resume", str(path), f"a policy of this run ({error})") from None
+        raise InputError("resume", str(path), f"a policy of this run ({said(error)})") from None
 
 
 def parameters() -> list[dict[str, Any]]:

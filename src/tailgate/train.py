@@ -26,7 +26,7 @@ from tailgate.agents.reward import Reward
 from tailgate.agents.teacher import demonstrate
 from tailgate.core import Count, PositiveCount, param
 from tailgate.envs.seat import Seat
-from tailgate.errors import InputError, unknown
+from tailgate.errors import InputError, said, unknown
 from tailgate.evaluation import cells_of
 from tailgate.files import set_aside, writable_directory, write_atomic
 from tailgate.metrics import METRICS
@@ -100,7 +100,7 @@ def load_config(source: str | None, overrides: list[str], resume: bool = False) 
         started = json.loads(held.read_text(encoding="utf-8"))
         del started["class"]
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-        raise InputError("resume", str(held), f"the configuration of the run ({error})") from None
+        raise InputError("resume", str(held), f"the configuration of the run ({said(error)})") from None
     return checked(override(started, overrides))
 
 
@@ -338,11 +338,14 @@ def _same_run(held: Path, config: TrainConfig) -> None:
     now, blank, free = as_data(config), as_data(TrainConfig()), free_of(config.teacher) | {"steps"}
     try:
         before = json.loads(held.read_text(encoding="utf-8"))
-        changed = [key for key in now if key not in free and before.get(key, blank[key]) != now[key]]
+        pairs = {key: (before.get(key, blank[key]), now[key]) for key in now if key not in free}
+        changed = {key: pair for key, pair in pairs.items() if pair[0] != pair[1]}
     except (OSError, ValueError, AttributeError, RecursionError) as error:
-        raise InputError("resume", str(held), f"the configuration of the run ({error})") from None
+        raise InputError("resume", str(held), f"the configuration of the run ({said(error)})") from None
     if changed:
-        raise InputError("resume", ", ".join(changed), f"the configuration in {held}, apart from steps and the comparison's fields")
+        was = ", ".join(f"{key}={json.dumps(old)}" for key, (old, _) in changed.items())
+        asked = ", ".join(f"{key}={json.dumps(new)}" for key, (_, new) in changed.items())
+        raise InputError("resume", asked, f"{was}, as in {held}: steps and the comparison's fields may change")
 
 
 def main(arguments: list[str] | None = None) -> int:

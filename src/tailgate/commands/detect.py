@@ -32,6 +32,7 @@ def add(actions: Any) -> None:
 
 
 def _detect(options: argparse.Namespace) -> int:
+    from tailgate.leaderboard.board_format import load
     from tailgate.leaderboard.detect import detect
     from tailgate.leaderboard.run import BOARD
     from tailgate.scenario import load_suite
@@ -42,7 +43,10 @@ def _detect(options: argparse.Namespace) -> int:
     hours = None if options.hours is None else tuple(options.hours)
     given = {"hours": hours, "episodes": options.episodes, "onsets": options.onsets, "most_steps": options.steps}
     effort = Effort(**{name: value for name, value in given.items() if value is not None})
-    with progress(Console(stderr=True)) as update:
-        detect(path, suite, defences=options.defence, effort=effort, workers=options.workers, progress=update)
+    before, errors = load(path), Console(stderr=True)
+    with progress(errors) as update:
+        after = detect(path, suite, defences=options.defence, effort=effort, workers=options.workers, progress=update)
+    if after == before:
+        errors.print("nothing was left to play: the board has these figures", highlight=False)
     print(path)
     return 0

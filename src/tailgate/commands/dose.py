@@ -64,7 +64,7 @@ def _dose(options: argparse.Namespace) -> int:
         picture = dose_figure(report) if any("points" in curve for curve in report["curves"]) else None
         for path in write_report(Path(options.out), "dose-response", report, picture):
             print(f"written: {path}", file=sys.stderr)
-    return 0
+    return 1 if _nothing(report) else 0
 
 
 def _print(report: dict[str, Any]) -> None:
@@ -91,6 +91,12 @@ def _print(report: dict[str, Any]) -> None:
     for curve in report["curves"]:
         if "skipped" in curve:
             out.print(f"skipped: {curve['attack']} on {curve['defence']}: {curve['skipped']}", markup=False)
+    if _nothing(report):
+        out.print("nothing was played; --threat, --scenario or another attack change that", markup=False, highlight=False)
+
+
+def _nothing(report: dict[str, Any]) -> bool:
+    return all("skipped" in curve for curve in report["curves"])
 
 
 def _critical(found: dict[str, float | None], doses: list[int]) -> str:

@@ -59,7 +59,11 @@ def _train(options: argparse.Namespace) -> int:
         def played(done: int, total: int) -> None:
             update("comparing on fresh seeds", done, total, cells(done, total))
 
-        report = comparison.compare(config, policies, played)
+        report = comparison.finished(config, policies) if options.resume else None
+        if report is not None:
+            errors.print("the comparison of these policies is there", highlight=False)
+        else:
+            report = comparison.compare(config, policies, played)
     page = comparison.make_page(config, report)
     if options.json:
         print(json.dumps(report | {"page": str(page)}, indent=1))

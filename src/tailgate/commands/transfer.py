@@ -14,7 +14,7 @@ from rich.table import Table
 
 from tailgate.progress import cells, console, progress
 
-MANY = 8  # columns, above which a line has no room for intervals
+MANY = 8  # defences, above which each has a line of its own, without intervals
 
 
 def add(commands: Any) -> None:
@@ -68,22 +68,28 @@ def _print(report: dict[str, Any]) -> None:
 
     share, out = report["unit"] == "0/1", console()
     held = {(entry["trained_on"], entry["played_on"]): entry for entry in report["entries"]}
+    seeds = {entry["trained_on"]: entry["seeds"] for entry in report["entries"]}
     wide = len(report["played_on"]) > MANY
+
+    def figure(trained: str, played: str) -> str:
+        entry = held.get((trained, played))
+        if entry is None:
+            return "-"
+        return shown(entry["value"], share) + ("" if wide else f" ({between(entry, share)})")
+
+    trained = [f"{escape(name)}, {seeds.get(name, 0)} seed{'' if seeds.get(name) == 1 else 's'}" for name in report["trained_on"]]
+    played, none = report["played_on"], report["no_attack"]
+    lines = [["(no attack)", *(shown(none[name], share) if name in none else "-" for name in played)]]
+    lines += [[label, *(figure(name, at) for at in played)] for label, name in zip(trained, report["trained_on"], strict=True)]
+    head = ["trained on", *(f"on {escape(name)}" for name in played)]
+    if wide:  # many defences: a line each
+        head, *lines = [list(line) for line in zip(["played on", *map(escape, played)], *lines, strict=True)]
     caption = "95 % intervals: --json, or --out" if wide else "95 % intervals"
     table = Table(title=f"{report['scenario']}: {report['outcome']}, {report['episodes']} episodes", caption=caption)
-    table.add_column("trained on", overflow="fold")
-    for column in report["played_on"]:
-        table.add_column(f"on {escape(column)}", overflow="fold")
-    none = (shown(report["no_attack"][c], share) if c in report["no_attack"] else "-" for c in report["played_on"])
-    table.add_row("(no attack)", *none)
-    for row in report["trained_on"]:
-        texts = []
-        for column in report["played_on"]:
-            entry = held.get((row, column))
-            interval = "" if entry is None or wide else f" ({between(entry, share)})"
-            texts.append("-" if entry is None else shown(entry["value"], share) + interval)
-        seeds = next((entry["seeds"] for entry in report["entries"] if entry["trained_on"] == row), 0)
-        table.add_row(f"{escape(row)}, {seeds} seed{'' if seeds == 1 else 's'}", *texts)
+    for heading in head:
+        table.add_column(heading, overflow="fold")
+    for line in lines:
+        table.add_row(*line)
     out.print(table)
     for entry in report["entries"]:
         for flag in entry.get("flags", ()):

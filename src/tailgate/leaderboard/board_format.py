@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from tailgate.errors import InputError, wanted
+from tailgate.errors import InputError, said, wanted
 from tailgate.files import write_atomic
 
 FORMAT = "tailgate-board-1"
@@ -306,7 +306,8 @@ def load(path: Path) -> Any:
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
-        raise InputError("board", str(path), f"a readable board.json ({error})") from None
+        rows = "; rows are played again by `tailgate leaderboard verify`" if ".jsonl" in path.suffixes else ""
+        raise InputError("board", str(path), f"a readable board.json ({said(error)}){rows}") from None
 
 
 def save(board: dict[str, Any], path: Path) -> None:

@@ -110,7 +110,7 @@ def ticks(end: float) -> list[Data]:
 
 def breakable(text: str) -> Markup:
     """Escaped, with places where a narrow column may break it."""
-    return Markup(re.sub(r"([=_/:])", r"\1<wbr>", str(escape(text))))
+    return Markup(re.sub(r"([=_/:,])", r"\1<wbr>", str(escape(text))))
 
 
 def unranked(name: Name, uses: Iterable[str], card: Entry | None) -> str:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from tailgate.core import param
-from tailgate.errors import InputError, unknown
+from tailgate.errors import InputError, said, unknown
 from tailgate.registry import USES
 from tailgate.schema import as_data, build
 
@@ -47,7 +47,7 @@ def read_card(path: Path) -> Card:
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
-        raise InputError(where, str(path), f"a readable JSON file ({error})") from None
+        raise InputError(where, str(path), f"a readable JSON file ({said(error)})") from None
     if not isinstance(data, dict):
         raise InputError(where, data, "a mapping of fields")
     card = build(Card, data, where)

@@ -41,8 +41,9 @@ def detect(
     attacks = [a["attack"] for a in board["attacks"] if a["knowledge"] == "black" and not (a.get("optimal") or a.get("learned"))]
     attacks = [attack for attack in attacks if not refused("attack", attack)]
     held = board.get("detection") or _nothing(effort)
-    if _effort(held) != effort:
-        raise InputError("board: detection", dataclasses.asdict(_effort(held)), f"{dataclasses.asdict(effort)}, as is asked for")
+    for name, value in dataclasses.asdict(_effort(held)).items():
+        if value != getattr(effort, name):
+            raise InputError(f"detection: {name}", getattr(effort, name), f"{value}, with which the figures of the board were made")
     asked = [guard for guard in defences or guards if not _whole(held, guard, suite, attacks, effort)]
     for guard, found in _play(suite, asked, attacks, effort, board["suite"].get("beacon") or "", workers, progress):
         board = _with(load(path), guard, found, effort)  # read again: it may have been marked in the meantime

@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from tailgate.errors import InputError
+from tailgate.errors import InputError, said
 from tailgate.evaluation import evaluate
 from tailgate.rows import read_rows
 from tailgate.scenario import Suite
@@ -80,4 +80,4 @@ def _report(path: Path) -> Any:
     try:
         return json.loads(path.read_text(encoding="utf-8"), parse_constant=refuse)
     except (OSError, ValueError) as error:
-        raise InputError("trust", str(path), f"a readable JSON file ({error})") from None
+        raise InputError("trust", str(path), f"a readable JSON file ({said(error)})") from None

@@ -10,6 +10,7 @@ from typing import Any
 
 from tailgate.errors import InputError
 from tailgate.metrics import ERRORS, METRICS, UNITS
+from tailgate.registry import built_in, split_text
 from tailgate.replay.page import VERDICTS, outcome, write_page
 from tailgate.replay.replay import play
 
@@ -192,6 +193,7 @@ def entry_page(suite: Suite, entry: EntryPart, replayed: Replayed | None, also: 
         "suite": suite.board.suite, "damage": suite.damage, "limit": percent(suite.board.suite.limit), "scale": suite.scale,
         "name": suite.defences[entry.defence], "status": entry.status, "why": entry.why,
         "replayed": _replayed(entry), "checked": _checked(entry), "typed": shlex.quote(entry.defence),
+        "imported": split_text(entry.defence)[0] not in built_in("defence"),
         "class": entry.class_ or "not stated",
         "rank": _rank(suite, entry), "also": also, "card": card_of(suite, entry), "flags": entry.flags, "levels": LEVELS,
         "critical": [(level, critical_of(suite, entry.critical_dose.get(level))) for level in LEVELS],

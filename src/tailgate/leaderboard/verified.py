@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from tailgate.errors import InputError, wanted
+from tailgate.errors import InputError, said, wanted
 
 Count = Annotated[int, Field(strict=True, ge=0)]
 
@@ -54,7 +54,7 @@ def read_report(path: Path) -> Report:
     try:
         return Report.model_validate_json(path.read_bytes())
     except OSError as error:
-        raise InputError("verified", str(path), f"a readable report of leaderboard verify ({error})") from None
+        raise InputError("verified", str(path), f"a readable report of leaderboard verify ({said(error)})") from None
     except ValidationError as error:
         first = error.errors()[0]
         field = ".".join(map(str, first["loc"])) or "report"

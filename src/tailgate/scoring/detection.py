@@ -46,6 +46,9 @@ class Effort:
             raise InputError("hours", list(self.hours), "finite numbers above 0")
         if not 1 <= self.episodes <= 4096:
             raise InputError("episodes", self.episodes, "1 to 4096")
+        for name in ("onsets", "most_steps"):
+            if (value := getattr(self, name)) < 1:
+                raise InputError(name, value, "a whole number not below 1")
 
 
 EFFORT = Effort()
