@@ -6,6 +6,7 @@ import threading
 
 import pytest
 
+from tailgate.cli import main
 from tailgate.errors import InputError
 from tailgate.rows import read_rows
 from tailgate.scenario import load_suite
@@ -104,6 +105,21 @@ def test_an_attack_is_admitted_by_what_it_does_on_select_seeds_and_else_not(part
         admit(line.attack, part, ["chi2_kf"], path, "2026-11-22")
     with pytest.raises(InputError, match="ceiling"):
         admit("optimal_stealth", part, ["chi2_kf"], path, "2026-11-22")
+
+
+def test_the_command_says_whom_an_attack_beats(part, tmp_path, capsys, monkeypatch) -> None:
+    """Admitted, refused and taken back; each a line of the list."""
+    monkeypatch.setattr("tailgate.scenario.load_suite", lambda name: part)
+    words = ["leaderboard", "admit", "--suite", "quick-v0", "--out", str(tmp_path), "--defence", "chi2_kf", "--workers", "1"]
+    assert main([*words, "fdi_ramp:trigger=near,threshold=40,rate=-0.5"]) == 0
+    said = capsys.readouterr().out
+    assert "admitted" in said and "yes" in said and "fdi:start_step=480" in said
+    assert main([*words, "fdi:start_step=100,value=0.5", "--json"]) == 1
+    told = json.loads(capsys.readouterr().out)
+    assert told["admitted"] is False and told["evidence"][0]["defence"] == "chi2_kf"
+    assert main([*words, "fdi:start_step=101,value=0.5"]) == 1 and "refused" in capsys.readouterr().out
+    assert main([*words, "fdi_ramp:trigger=near,threshold=40,rate=-0.5", "--erratum", "wrong bound"]) == 0
+    assert "taken back" in capsys.readouterr().out and len(read_attacks(tmp_path / "quick-v0" / "attacks.jsonl")) == 4
 
 
 def test_a_board_asks_every_defence_for_what_was_admitted_and_forgets_what_was_taken_back(part) -> None:

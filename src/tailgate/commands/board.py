@@ -1,4 +1,4 @@
-"""tailgate leaderboard run, page, head and admit: boards from suites, the page of boards, and the list of attacks."""
+"""tailgate leaderboard run, page and head: boards from suites, and the page of boards."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import argparse
 import json
 import sys
 import time
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -46,20 +45,6 @@ def add(actions: Any) -> None:
     head.add_argument("board", metavar="FILE", help="board.json")
     head.add_argument("--most", type=int, metavar="N", help="so many defences at most (default: all)")
     head.set_defaults(run=_head)
-    admit = actions.add_parser(
-        "admit", help="put an attack on a suite's list if it beats the worst that is there",
-        description="Play an attack on select seeds against the worst of its knowledge, and append it to OUT/SUITE/attacks.jsonl if a "
-        "paired test says that it does more damage to at least one defence. Nothing is ever removed from the list; --erratum takes an "
-        "attack back.",
-    )  # fmt: skip
-    admit.add_argument("attack", metavar="ATTACK", help="attack, as on any command line")
-    admit.add_argument("--suite", required=True, metavar="NAME", help="suite by name or YAML file")
-    admit.add_argument("--out", required=True, metavar="DIR", help="folder of the boards")
-    admit.add_argument("--defence", action="append", metavar="NAME", help="only these defences (repeatable; default: the suite's)")
-    admit.add_argument("--beacon", default="", metavar="TEXT", help="random text of after the attack was handed in: its seeds are played")
-    admit.add_argument("--date", metavar="YYYY-MM-DD", help="date of the line (default: today)")
-    admit.add_argument("--erratum", metavar="REASON", help="take the attack back, for this reason")
-    admit.set_defaults(run=_admit)
 
 
 def _run(options: argparse.Namespace) -> int:
@@ -126,21 +111,3 @@ def _page(options: argparse.Namespace) -> int:
 
     print(build_site([load(Path(name)) for name in options.boards], Path(options.out), title=options.title, replays=not options.no_replays))
     return 0
-
-
-def _admit(options: argparse.Namespace) -> int:
-    from tailgate.leaderboard.run import LIST
-    from tailgate.scenario import load_suite
-    from tailgate.scoring.attacks import admit, withdraw
-
-    suite = load_suite(options.suite)
-    path = Path(options.out) / suite.name / LIST
-    date = options.date or datetime.now(UTC).date().isoformat()
-    if options.erratum is not None:
-        print(json.dumps(withdraw(options.attack, path, date, options.erratum).as_data(), indent=1))
-        return 0
-    if not options.beacon:
-        print("tailgate: without --beacon the select seeds are public ones, on which the attack may have been tuned", file=sys.stderr)
-    line, evidence = admit(options.attack, suite, options.defence or suite.defences, path, date, beacon=options.beacon)
-    print(json.dumps({"admitted": line is not None, "evidence": evidence}, indent=1))
-    return 0 if line is not None else 1

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from tailgate.commands import attack, board, check, detect, retrain, submit, verify
+from tailgate.commands import admit, attack, board, check, detect, retrain, submit, verify
 
 
 def add(commands: Any) -> None:
@@ -19,6 +19,7 @@ def add(commands: Any) -> None:
     check.add(actions)
     detect.add(actions)
     retrain.add(actions)
+    admit.add(actions)
     build = actions.add_parser("build", help="one self-contained HTML page from rows files, unranked")
     build.add_argument("--rows", nargs="+", required=True, metavar="FILE", help="JSON Lines files of `tailgate evaluate`")
     build.add_argument("--out", required=True, metavar="DIR", help="directory of the page")
