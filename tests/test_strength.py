@@ -1,5 +1,6 @@
-"""Measures of strength: twins of a schedule, monotone curves and critical doses, and the matrix of transfer."""
+"""Measures of strength: twins of a schedule, monotone curves and critical doses; pictures and commands of all."""
 
+import importlib.util
 import json
 import math
 import sys
@@ -8,67 +9,27 @@ from typing import Any
 
 import numpy as np
 import pytest
-import yaml
 
 from tailgate import cli, draws
-from tailgate.agents.codec import ActionCodec, ActionSpec
-from tailgate.agents.observation import ObservationCodec
-from tailgate.agents.policy import Network, PolicyAttack, Yoked, save_policy, timing_advantage
-from tailgate.agents.zoo import ZooAttack
+from tailgate.agents.policy import Yoked, timing_advantage
 from tailgate.draws import Role
 from tailgate.errors import InputError
 from tailgate.metrics import METRICS
-from tailgate.registry import Spec, entries
-from tailgate.scenario import load_scenario
+from tailgate.registry import Spec
 from tailgate.strength.collect import add_run
 from tailgate.strength.dose import critical_dose, critical_interval, dose_response, fitted
-from tailgate.strength.figures import dose_figure, timing_figure, transfer_figure
-from tailgate.strength.policies import label, loop_for, mean, trained
+from tailgate.strength.figures import dose_figure, timing_figure
+from tailgate.strength.policies import label, loop_for, trained
 from tailgate.strength.timing import periodic, play, shuffled, timing
-from tailgate.strength.transfer import _registered, difference, transfer
+from tailgate.strength.transfer import transfer
 from tailgate.trace import MEMORY, Trace, episodes_at_once, rollout
 
-PLACE = "gusty-stop-and-go-v0"
-THREAT: dict[str, Any] = {"kinds": ["dos_jam", "fdi"], "budget": 20, "fdi_bound": 3.0}
-ZOO = f"zoo:name={ZooAttack().name}"
-
-
-def _cut(directory: Path, horizon: int, **threat: Any) -> str:
-    """The scenario cut to so many steps, as a file."""
-    source = Path(__file__).parents[1] / "configs" / "scenarios" / f"{PLACE}.yaml"
-    data = yaml.safe_load(source.read_text())
-    data |= {"horizon": horizon, "threat_model": data["threat_model"] | {"end": None} | threat}
-    path = directory / "brief.yaml"
-    path.write_text(yaml.safe_dump(data))
-    return str(path)
-
-
-@pytest.fixture(scope="module")
-def brief_place(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """The scenario cut to 60 steps, attacked from step 10 on."""
-    return _cut(tmp_path_factory.mktemp("scenario"), 60, onset=10)
-
-
-@pytest.fixture(scope="module")
-def half_place(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """The first 320 steps, within which the zoo's policy attacks and some of its episodes collide."""
-    return _cut(tmp_path_factory.mktemp("scenario"), 320)
-
-
-def _always(directory: Path, name: str, value: float = -3.0, seed: int = 0, **threat: Any) -> Path:
-    """A policy that attacks whenever it may, from the first step on, with the record of a training."""
-    changed = THREAT | threat
-    brief = load_scenario(PLACE).with_threat(**changed).brief()
-    names, spec = ObservationCodec(brief).names, ActionSpec(action="mode", value=value)
-    size = ActionCodec(spec, brief).size
-    bias = np.zeros(size)
-    bias[-1] = 1.0
-    config = {"scenario": PLACE, "defence": "chi2_kf", "threat": changed, "outcome": None}
-    header = {
-        "action": spec, "observation": names, "knowledge": "black", "agents": 1,
-        "training": {"learner": "hand", "seed": seed, "config": config},
-    }  # fmt: skip
-    return save_policy(directory / name, Network((np.zeros((len(names), size)),), (bias,)), header)
+spec = importlib.util.spec_from_file_location("strong", Path(__file__).with_name("strong.py"))
+assert spec is not None and spec.loader is not None
+strong = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(strong)
+PLACE, THREAT, ZOO, _always, _recorded = strong.PLACE, strong.THREAT, strong.ZOO, strong.always, strong.recorded
+brief_place, half_place = strong.brief_place, strong.half_place
 
 
 # -- twins of a schedule
@@ -187,14 +148,6 @@ def module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.delitem(sys.modules, "somebodys", raising=False)
     return mark
-
-
-def _recorded(path: Path, **fields: Any) -> Path:
-    """The policy with other fields in its training's configuration."""
-    data = json.loads(path.read_text())
-    data["training"]["config"] |= fields
-    path.write_text(json.dumps(data))
-    return path
 
 
 NAMES = [
@@ -327,93 +280,6 @@ def test_a_dose_response_of_nothing_says_so(capsys: pytest.CaptureFixture[str], 
     other = str(_always(tmp_path, "p", kinds=["fdi"]))
     assert cli.main(["dose-response", other, "--defence", "kf", "--scenario", PLACE, "--doses", "5", "--episodes", "2"]) == 1
     assert "nothing was played; --threat" in capsys.readouterr().out
-
-
-# -- transfer
-
-
-def test_many_defences_have_a_line_each(capsys: pytest.CaptureFixture[str], tmp_path: Path, half_place: str) -> None:
-    """A few of them are columns beside their intervals."""
-    policy = str(_recorded(_always(tmp_path, "policy-0"), scenario=half_place))
-    many = ["none", "kf", "rkf", "chi2_kf", "imm", "cusum_kf", "mewma_kf", "widen_kf", "brake_kf"]
-    for some, head in ((many, "played on"), (many[:2], "trained on")):
-        arguments = [word for name in some for word in ("--defence", name)]
-        assert cli.main(["transfer", policy, "--scenario", half_place, "--episodes", "2", *arguments]) == 0
-        said = capsys.readouterr().out
-        assert head in said and all(name in said for name in some)
-
-
-def test_a_difference_of_unequal_numbers_of_runs() -> None:
-    """Welch by hand: with equal episodes the interval is t times the root of s1^2 / n1 + s2^2 / n2."""
-    from scipy import stats
-
-    a, b = np.repeat([[0.6], [0.8], [0.7]], 50, axis=1), np.repeat([[0.1], [0.3]], 50, axis=1)
-    found = difference(a, b)
-    va, vb = 0.01 / 3, 0.02 / 2
-    freedom = (va + vb) ** 2 / (va**2 / 2 + vb**2 / 1)
-    assert found.value == pytest.approx(0.5)
-    assert found.high - found.value == pytest.approx(stats.t.ppf(0.975, freedom) * math.sqrt(va + vb))
-    single = difference(a[:1], b[:1])
-    assert single.low == single.high == pytest.approx(0.5)  # one policy each, and no difference among episodes
-
-
-def test_a_mean_over_seeds_stays_a_share() -> None:
-    """All ones: the interval ends at 1 and does not have zero width."""
-    found = mean(np.ones((3, 40)), "crashed")
-    assert found.value == found.high == 1.0 and 0.5 < found.low < 1.0
-
-
-def test_transferred_beats_own_is_flagged(tmp_path: Path, half_place: str) -> None:
-    """A policy 'trained on kf' that collides against chi2_kf beats one 'trained on chi2_kf' that injects nothing harmful."""
-    weak = [str(_always(tmp_path, f"weak{i}", value=0.01, seed=i)) for i in range(2)]
-    strong = _copy_as(tmp_path, "kf")
-    report = transfer([*weak, str(strong)], ["chi2_kf", "kf", "cra"], scenario=half_place, episodes=40)
-    held = {(e["trained_on"], e["played_on"]): e for e in report["entries"]}
-    assert held["kf", "chi2_kf"]["flags"] == ["transferred beats own"] and held["kf", "chi2_kf"]["over_own"]["low"] > 0.0
-    assert held["chi2_kf", "kf"]["flags"] == [] and "over_own" not in held["kf", "kf"]
-    assert held["chi2_kf", "chi2_kf"]["seeds"] == 2 and held["chi2_kf", "chi2_kf"]["value"] == 0.0
-    assert report["no_attack"] == {"chi2_kf": 0.0, "kf": 0.0}
-    assert [item["defence"] for item in report["skipped"]] == ["cra"]
-    assert transfer_figure(report)[:4] == b"\x89PNG"
-
-
-def test_all_defences_are_those_that_have_a_meaning_there() -> None:
-    """First what was trained on, then what suites play in the scenario; everybody else is named with a reason."""
-    report = transfer([ZOO], ["all"], episodes=1)
-    columns, skipped = report["played_on"], {item["defence"]: item["reason"] for item in report["skipped"]}
-    assert columns[0] == "chi2_kf" and {"none", "kf", "rkf", "safe_state", "oracle"} < set(columns) and len(set(columns)) == len(columns)
-    assert [entry["played_on"] for entry in report["entries"]] == columns == list(report["no_attack"])
-    assert not set(columns) & set(skipped) and set(entries("defence")) <= set(columns) | set(skipped)
-    for name, word in (("always_brake", "sentinel"), ("filterpy_kf", "one episode after the other"), ("dkf", "no suite")):
-        assert word in skipped[name] and "named" in skipped[name]
-
-
-def test_where_no_suite_goes_all_are_the_registered_ones() -> None:
-    """Whether the scenario admits them is found when they are played."""
-    found, skipped = _registered("thesis-ch3-switched-v0.yaml", ["coast"])
-    assert {"kf", "dkf", "cra"} < set(found) and "coast" not in found
-    assert {"always_alarm", "filterpy_imm"} < {item["defence"] for item in skipped}
-    assert not any("no suite" in item["reason"] for item in skipped)
-
-
-def _copy_as(directory: Path, defence: str) -> Path:
-    """The zoo's first policy with another record."""
-    source = PolicyAttack(trained(ZOO).policy.path).path
-    data = json.loads(source.read_text())
-    data["training"]["config"] |= {"defence": defence, "threat": THREAT}
-    (directory / data["tensors"]).write_bytes(source.with_suffix(".safetensors").read_bytes())
-    (directory / "strong.json").write_text(json.dumps(data))
-    return directory / "strong.json"
-
-
-def test_policies_of_different_cells_need_one_named(tmp_path: Path, brief_place: str) -> None:
-    """Their threat models differ: which one is meant has to be said, and what then does not fit is skipped."""
-    texts = [str(_always(tmp_path, "a")), str(_always(tmp_path, "b", kinds=["fdi"]))]
-    with pytest.raises(InputError, match="--threat"):
-        transfer(texts, episodes=2)
-    report = transfer(texts, scenario=brief_place, threat=THREAT, episodes=2)
-    assert [item["policy"].split("/")[-1] for item in report["skipped"]] == ["b"] and "outputs" in report["skipped"][0]["reason"]
-    assert [e["seeds"] for e in report["entries"]] == [1]
 
 
 # -- pictures and commands
