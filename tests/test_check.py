@@ -205,7 +205,7 @@ def test_the_command(board: Data, tmp_path: Path, capsys: pytest.CaptureFixture[
         del cell["decisions"], cell["trace"]
     path.write_text(json.dumps(board))
     assert _command(str(path)) == 0 and json.loads(path.read_text()) == board
-    assert "4 of 4 cells played again" in " ".join(capsys.readouterr().out.split())
+    assert "4 of 4 cells played again, 4 asked for" in " ".join(capsys.readouterr().out.split())
     assert _command(str(path), "--write", "--json") == 0
     report = json.loads(capsys.readouterr().out)
     held = json.loads(path.read_text())

@@ -107,7 +107,7 @@ def test_what_does_not_fit_is_refused(board: Data, tmp_path: Path, change: Data,
 def test_a_board_that_has_its_figures_is_left_alone_with_a_word(board: Data, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = _written(board, tmp_path)
     assert main(["leaderboard", "detect", "quick-v0", "--out", str(tmp_path), *FEW]) == 0
-    assert "nothing was left to play" in capsys.readouterr().err and json.loads(path.read_text()) == board
+    assert "the board is as it was" in capsys.readouterr().err and json.loads(path.read_text()) == board
 
 
 def test_an_honest_detection_board_comes_out_equal(board: Data) -> None:

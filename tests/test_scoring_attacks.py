@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import threading
+from pathlib import Path
 
 import pytest
 
@@ -11,8 +12,9 @@ from tailgate.errors import InputError
 from tailgate.rows import read_rows
 from tailgate.scenario import load_suite
 from tailgate.scoring import admit, read_attacks, score, withdraw
-from tailgate.scoring.attacks import Admitted, append, next_level, standing
+from tailgate.scoring.attacks import Admitted, append, attacks_of, next_level, published, standing
 
+ROOT = Path(__file__).parents[1]
 LINE = Admitted("fdi:value=-4", "", "black", "2026-11-22", ({"defence": "kf", "p": 0.01},))
 
 
@@ -72,6 +74,23 @@ def test_an_erratum_takes_back_and_stays(tmp_path) -> None:
         append(path, dataclasses.replace(LINE, date="yesterday"))
 
 
+def test_a_list_that_was_published_holds_wherever_a_folder_has_none(tmp_path) -> None:
+    """For a board, a submission and trust alike; a folder's list goes on from it. A suite that was changed under its name has none."""
+    suite, own = load_suite("quick-v0"), tmp_path / "attacks.jsonl"
+    ramps = attacks_of(suite)[len(suite.attacks) :]
+    assert len(ramps) == 2 and all(text.startswith("fdi_ramp:") for text in ramps) and attacks_of(suite, own) == attacks_of(suite)
+    assert attacks_of(dataclasses.replace(suite, seeds=3)) == suite.attacks and published(load_suite("radar-v0")) is None
+    assert published(suite).read_bytes() == (ROOT / "results/quick-v0/attacks.jsonl").read_bytes()
+    small = dataclasses.replace(suite, defences=("none", "kf"))
+    with pytest.raises(InputError, match="not on the list"):
+        admit(ramps[0], suite, ["kf"], own, "2026-11-25")
+    line, _ = admit("fdi:start_step=400,value=0.1", suite, ["kf"], own, "2026-11-25", episodes=2)
+    held = read_attacks(own)
+    assert line is None and len(held) == 5 and held[-1].refused and attacks_of(small, own) == (*small.attacks, *ramps)
+    append(own, dataclasses.replace(LINE, attack=ramps[0], erratum="wrong"))
+    assert attacks_of(suite, own) == (*suite.attacks, ramps[1])
+
+
 def test_every_try_costs_the_next_one(tmp_path) -> None:
     """Over any number of tries the levels add up to alpha; an erratum is no try."""
     levels, lines = [], []
@@ -117,7 +136,11 @@ def test_the_command_says_whom_an_attack_beats(part, tmp_path, capsys, monkeypat
     assert main([*words, "fdi:start_step=100,value=0.5", "--json"]) == 1
     told = json.loads(capsys.readouterr().out)
     assert told["admitted"] is False and told["evidence"][0]["defence"] == "chi2_kf"
-    assert main([*words, "fdi:start_step=101,value=0.5"]) == 1 and "refused" in capsys.readouterr().out
+    assert main([*words, "fdi:start_step=101,value=0.5,targets=[velocity]"]) == 1
+    said = capsys.readouterr().out
+    assert "refused" in said and "targets=[velocity]" in said
+    (tmp_path / "file").touch()
+    assert main([*words[:4], "--out", str(tmp_path / "file"), "fdi:value=1"]) == 2 and "writable directory" in capsys.readouterr().err
     assert main([*words, "fdi_ramp:trigger=near,threshold=40,rate=-0.5", "--erratum", "wrong bound"]) == 0
     assert "taken back" in capsys.readouterr().out and len(read_attacks(tmp_path / "quick-v0" / "attacks.jsonl")) == 4
 

@@ -20,6 +20,7 @@ from tailgate.rows import packed, read_rows
 from tailgate.scenario import Suite, load_suite
 from tailgate.scoring import Admitted, score
 from tailgate.scoring.attacks import admit
+from tailgate.scoring.follow import strays
 
 spec = importlib.util.spec_from_file_location("scored", Path(__file__).with_name("scored.py"))
 scored = importlib.util.module_from_spec(spec)
@@ -32,16 +33,19 @@ PLAN = {
 SMALL = Suite("small-v0", "", (ROAD,), (12,), ("none", "kf"), ("none", "fdi:value=-4"), 3, {"kinds": ["fdi"], "fdi_bound": 5.0})
 
 
-def test_a_knowledge_whose_own_attacks_nobody_met_has_no_figures() -> None:
-    """A white box that cannot look into the only defence: its figures would be the black box's. Where another defence was met, too."""
+def test_a_knowledge_that_nobody_was_met_with_has_no_figures() -> None:
+    """They would be a lower one's: where no attack knows so much, where none can look into the only defence, and where another was met."""
     where, gone = suite(attacks=("none", "fdi", "white")), {"knowledge": "white", "status": "skipped", "reason": "no look"}
     rows = [*clean("a"), *cell("none", "fdi", 20), *cell("a", "fdi", 4)]
-    for others in ([*cell("none", "white", **gone)], [*cell("none", "white", 20, knowledge="white")]):
-        made = board([*rows, *cell("a", "white", **gone), *others], where)
+    met, blind, trained = {"knowledge": "white"}, [*cell("none", "white", **gone), *cell("a", "white", **gone)], "policies/a.json"
+    for others in ([], blind, [*cell("none", "white", 20, **met), *cell("a", "white", **gone)]):
+        made = board([*rows, *others], where if others else suite())
         found = entry(made, "a")
-        assert {r["knowledge"] for r in found["rates"]} == {"black", "grey"} and found["critical_dose"]["white"] is None
-        assert {c["knowledge"] for c in made["curves"] if c["defence"] == "a"} == {"black", "grey"}
+        assert {r["knowledge"] for r in found["rates"]} == {"black"} and found["critical_dose"]["white"] is None
+        assert {c["knowledge"] for c in made["curves"] if c["defence"] == "a"} == {"black"} and not strays(made, where if others else suite())
     assert rate(entry(made, "none"), 20, "white")["attacks"] == 2
+    own = board([*rows, *blind, *cell("a", trained, 9, learned=True, **met)], where)  # trained against it, and on no list
+    assert rate(entry(own, "a"), 20, "white")["worst"]["attack"] == trained and rate(entry(own, "a"), 20)["undamaged"]["value"] == 0.8
 
 
 def test_rows_of_another_threat_model_are_refused() -> None:

@@ -14,7 +14,7 @@ import pytest
 from tailgate.leaderboard.build import percent
 from tailgate.leaderboard.site import build_site
 from tailgate.leaderboard.site_cards import LICENCE
-from tailgate.leaderboard.site_entry import replay_of
+from tailgate.leaderboard.site_entry import _imported, replay_of
 from tailgate.leaderboard.site_trust import at_least
 
 ROOT = Path(__file__).parent.parent
@@ -171,6 +171,7 @@ def test_an_entry_s_page_has_all_parts(site):
     bare = entry(site, HOSTILE).read_text(encoding="utf-8")
     assert "came without a card" in bare and "No replay. The board holds no worst episode" in bare and "Stealth and impact" not in bare
     assert "a class of somebody's own" in bare and "leaderboard check" not in bare  # a board does not import it
+    assert [_imported(text) for text in ("chi2_kf:eta=3", "composed:detector=mine:D", "bwrap/mine:D", HOSTILE)] == [False, True, True, True]
 
 
 def facts(text, heading, level=2):

@@ -269,6 +269,9 @@ def test_what_cannot_be_played_is_skipped_with_the_reason(tmp_path: Path) -> Non
             dose_response(["none"], ["kf"], PLACE, bad, episodes=2)  # type: ignore[arg-type]
     with pytest.raises(InputError, match="yes or no"):
         dose_response(["none"], ["kf"], PLACE, [5], episodes=2, exceeds=1.0)
+    for limit in (-1.0, 1.0, float("nan")):
+        with pytest.raises(InputError, match="limit"):
+            dose_response(["none"], ["kf"], PLACE, [5], episodes=2, limit=limit)
     for few in (0, -3):
         with pytest.raises(InputError, match=rf"episodes: got {few}"):
             dose_response(["none"], ["kf"], PLACE, [5], episodes=few)

@@ -5,6 +5,7 @@ import json
 import subprocess
 import sys
 import time
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -154,9 +155,18 @@ def test_a_finished_comparison_is_not_played_again(
     with monkeypatch.context() as patch:
         patch.setattr(comparison, "play_scripts", lambda *_: pytest.fail("played again"))
         assert cli.main(["train", "--resume"]) == 0 and capsys.readouterr().out == first
-    held = report.read_text()
+    held, rows = report.read_text(), report.with_name("rows.jsonl")
     report.write_text(held[:-20])
     assert cli.main(["train", "--resume"]) == 0 and report.read_text() == held
+    lines = rows.read_text()
+    rows.write_text("".join(lines.splitlines(keepends=True)[:4]))  # rows that the report is not of
+    assert cli.main(["train", "--resume"]) == 0 and rows.read_text() == lines and report.read_text() == held
+    mine = json.loads((report.with_name("config.json")).read_text())["rivals"]
+    program = tmp_path / "mine.yaml"
+    for step in (20, 30):  # a rival whose file has changed since
+        program.write_text(files("tailgate.configs").joinpath("attacks/brake_and_blind.yaml").read_text() + f"# {step}\n")
+        assert cli.main(["train", "--resume", f"rivals={json.dumps([*mine, f'program:path={program}'])}"]) == 0
+        assert "the comparison of these policies is there" not in capsys.readouterr().err
     assert cli.main(["train", "--resume", "episodes=5"]) == 0 and json.loads(report.read_text())["episodes"] == 5
 
 

@@ -35,6 +35,15 @@ def test_many_defences_have_a_line_each(capsys: pytest.CaptureFixture[str], tmp_
         assert head in said and all(name in said for name in some)
 
 
+def test_a_copy_is_no_training_seed_more(tmp_path: Path, half_place: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """Under another name; and a matrix of which nothing was played says so by its exit code."""
+    first, copy = (str(_recorded(_always(tmp_path, name), scenario=half_place)) for name in ("first", "copy"))
+    report = transfer([first, copy], ["kf"], scenario=half_place, episodes=2)
+    assert [entry["seeds"] for entry in report["entries"]] == [1]
+    assert cli.main(["transfer", first, "--scenario", half_place, "--episodes", "2", "--defence", "cra"]) == 1
+    assert "skipped" in capsys.readouterr().out
+
+
 def test_a_difference_of_unequal_numbers_of_runs() -> None:
     """Welch by hand: with equal episodes the interval is t times the root of s1^2 / n1 + s2^2 / n2."""
     from scipy import stats

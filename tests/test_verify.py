@@ -13,7 +13,7 @@ import pytest
 import tailgate
 from tailgate import evaluation
 from tailgate.commands import verify as command
-from tailgate.evaluation import DIED, Cell, cells_of, episodes_at_once, failed_rows, run, run_cell
+from tailgate.evaluation import Cell, cells_of, episodes_at_once, run, run_cell
 from tailgate.rows import encode
 from tailgate.scenario import Suite
 from tailgate.verify import verify
@@ -195,13 +195,6 @@ def _command(*arguments: str) -> int:
     command.add(parser.add_subparsers())
     options = parser.parse_args(["verify", *arguments])
     return int(options.run(options))
-
-
-def test_a_cell_whose_process_dies_here_is_not_held_against_its_rows(rows: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch) -> None:
-    """As below a script that starts workers without a main guard."""
-    monkeypatch.setattr("tailgate.verify.run", lambda cells, **_: [row for cell in cells for row in failed_rows(cell, DIED)])
-    report = verify(rows[:2])
-    assert report["counts"] == {"verified": 0, "differs": 0, "unchecked": 2} and DIED in report["reasons"][0]["why"]
 
 
 def test_the_command_says_which_line_of_which_file_differs(rows: list[dict[str, Any]], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -13,7 +14,7 @@ import numpy as np
 from tailgate import draws
 from tailgate.agents.policy import load_policy
 from tailgate.core import Array
-from tailgate.evaluation import cells_of, run
+from tailgate.evaluation import Cell, cell_id, cells_of, run
 from tailgate.files import write_atomic
 from tailgate.metrics import UNITS, unit_in
 from tailgate.registry import Spec
@@ -24,6 +25,7 @@ from tailgate.schema import as_data, canonical
 from tailgate.stats import Interval, paired_difference, paired_ratio, proportion
 from tailgate.train import TrainConfig, outcome_of, rivals_of, suite_of
 
+ROWS = "rows.jsonl"
 SHARE = "0/1"  # unit of a metric that is yes or no
 
 
@@ -48,9 +50,19 @@ class Scripts:
 def play_scripts(config: TrainConfig, policies: list[Path], progress: Callable[[int, int], None] | None = None) -> Scripts:
     """Choose the best rival on select seeds, so that the choice does not favour it, and play all, and policies, on fresh report seeds."""
     best = best_of(rivals_of(config), dict(config.threat), outcome_of(config), "select", config.workers)
+    return Scripts(best, run(_cells(config, policies), config.directory / ROWS, config.workers, progress))
+
+
+def _cells(config: TrainConfig, policies: list[Path]) -> list[Cell]:
+    """What is played on report seeds."""
     attacks = tuple(dict.fromkeys(("none", *config.rivals, *config.white_box, *map(str, policies))))  # each once
-    cells = cells_of(suite_of(config, attacks), batch=BATCH, threat=dict(config.threat), first_seed=config.first_episode)
-    return Scripts(best, run(cells, config.directory / "rows.jsonl", config.workers, progress))
+    return cells_of(suite_of(config, attacks), batch=BATCH, threat=dict(config.threat), first_seed=config.first_episode)
+
+
+def _made_of(config: TrainConfig, policies: list[Path]) -> str:
+    """A hash of everything that decides a comparison: what is played, whatever files it names, and the rows that came of it."""
+    parts = [cell_id(cell) for cell in _cells(config, policies)] + [hashlib.sha256((config.directory / ROWS).read_bytes()).hexdigest()]
+    return hashlib.blake2b(canonical([parts, config]).encode(), digest_size=16).hexdigest()
 
 
 def compare(
@@ -119,7 +131,7 @@ def _report(
         "teacher": heads[0].training.get("teacher"), "decisions": [head.training["steps"] for head in heads],
         "threat": as_data(place.threat_model),
         "config": json.loads(canonical(config)), "policies": [str(v.policy) for v in verdicts], "best_scripted": best,
-        "sha256": [head.sha256 for head in heads],
+        "made_of": _made_of(config, [v.policy for v in verdicts]),
         "attacks": [{"label": label, **interval._asdict(), "note": note} for label, interval, note in items],
         "advantage": {name: interval._asdict() for name, interval in versus.items()},
         "rivals": {name: {"outcome": mean(outcomes(name))._asdict(), "advantage": over(name)._asdict()} for name in config.rivals},
@@ -134,16 +146,12 @@ def _report(
 
 
 def finished(config: TrainConfig, policies: list[Path]) -> dict[str, Any] | None:
-    """The report that `compare` wrote of these policies and this comparison; None where there is none."""
-    file, rows = config.directory / "report.json", config.directory / "rows.jsonl"
-    if not (file.is_file() and rows.is_file()):
-        return None
+    """The report that `compare` wrote of this comparison and of the rows that are there; None where something is another now."""
     try:
-        held: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
-        same = held["config"] == json.loads(canonical(config)) and held["sha256"] == [load_policy(path)[0].sha256 for path in policies]
+        held: dict[str, Any] = json.loads((config.directory / "report.json").read_text(encoding="utf-8"))
+        return held if held["made_of"] == _made_of(config, policies) else None
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return None
-    return held if same else None
 
 
 def _reached(learned: Array, optimum: Array) -> Interval:
@@ -195,7 +203,7 @@ def make_page(config: TrainConfig, report: dict[str, Any]) -> Path:
         point for seed in range(config.first_seed, config.first_seed + config.seeds)
         for point in json.loads((config.directory / f"curve-{seed}.json").read_text())["curve"]
     ]  # fmt: skip
-    rows = read_rows(config.directory / "rows.jsonl")
+    rows = read_rows(config.directory / ROWS)
     title = f"{config.name}: {config.defence} under attack"
     drawn = curve if all(point["crash"] is not None for point in curve) else None
     return build_page(rows, config.directory / "page", title=title, curve=drawn, headline=headline(report))

@@ -227,9 +227,6 @@ def run(
     return rows
 
 
-DIED = "the process that played this cell died"  # reason of a row
-
-
 def _play(cells: Sequence[Cell], workers: int) -> Iterator[tuple[int, list[dict[str, Any]]]]:
     foreign = any(Spec("defence", cell.defence).imports or Spec("attack", cell.attack).imports for cell in cells)
     if not foreign and (workers == 1 or len(cells) < 2):
@@ -253,7 +250,7 @@ def _play(cells: Sequence[Cell], workers: int) -> Iterator[tuple[int, list[dict[
             try:
                 rows = pool.submit(run_cell, cells[i]).result()
             except BrokenProcessPool:
-                rows = failed_rows(cells[i], DIED)
+                rows = failed_rows(cells[i], "the process that played this cell died")
         yield i, rows
 
 

@@ -42,7 +42,7 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
             row = json.loads(line)
         except ValueError:
             cut = "; the file was cut here: run the same command again" if number == len(lines) and not text.endswith("\n") else ""
-            board = ", a row; a board is played again by `tailgate leaderboard check`" if path.suffix == ".json" else ""
+            board = ", a row; a board is played again by `tailgate leaderboard check`" if '"format"' in text[:200] else ""
             raise InputError(where, line[:60], f"a JSON object{board or cut}") from None
         try:
             _Row.model_validate(row)

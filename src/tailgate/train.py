@@ -208,7 +208,7 @@ def train(config: TrainConfig, progress: Callable[[int, Any], None], resume: boo
     snapshot = json.dumps(as_data(config), indent=1).encode() + b"\n"
     held = directory / "config.json"
     if resume and held.is_file():
-        _same_run(held, config)
+        same_run(config)
     write_atomic(held, snapshot)
     teacher, seeds = teacher_of(config), range(config.first_seed, config.first_seed + config.seeds)
     if min(config.workers, len(seeds)) == 1:
@@ -333,8 +333,9 @@ def plan_key(config: dict[str, Any]) -> str:
     return hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
 
 
-def _same_run(held: Path, config: TrainConfig) -> None:
+def same_run(config: TrainConfig) -> None:
     """Raise InputError when a run would be resumed with another training; the number of steps and the comparison may change."""
+    held = config.directory / "config.json"
     now, blank, free = as_data(config), as_data(TrainConfig()), free_of(config.teacher) | {"steps"}
     try:
         before = json.loads(held.read_text(encoding="utf-8"))

@@ -17,7 +17,7 @@ import tailgate
 from tailgate import draws
 from tailgate.draws import constants
 from tailgate.errors import InputError
-from tailgate.evaluation import DIED, ENGINE, Cell, run
+from tailgate.evaluation import ENGINE, Cell, run
 from tailgate.registry import SANDBOXES, Spec
 from tailgate.rounds import seeds_of
 from tailgate.scenario import list_scenarios, load_scenario
@@ -262,8 +262,6 @@ def _compared(line: int, row: Row, here: Row) -> Finding:
     """The row against what came out, field by field."""
     if row["status"] == "error" and here["status"] != "error":
         return Finding(line, "unchecked", f"it failed there ({row['reason'][:80]}) and plays here")
-    if row["status"] != "error" and here["reason"] == DIED:  # or could not begin, as below a script without a main guard
-        return Finding(line, "unchecked", f"{DIED} here")
     off = [
         {"field": name, "row": row.get(name), "here": value}
         for name, value in here.items() if name not in FREE and not _same(row.get(name), value)

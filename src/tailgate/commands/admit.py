@@ -37,10 +37,12 @@ def add(actions: Any) -> None:
 
 
 def _admit(options: argparse.Namespace) -> int:
+    from tailgate.files import writable_directory
     from tailgate.leaderboard.run import LIST
     from tailgate.scenario import load_suite
     from tailgate.scoring.attacks import admit, withdraw
 
+    sys.path.insert(0, "")  # a defence module:Class is looked for in the working directory, as `tailgate evaluate` does
     suite = load_suite(options.suite)
     path = Path(options.out) / suite.name / LIST
     date = options.date or datetime.now(UTC).date().isoformat()
@@ -48,6 +50,7 @@ def _admit(options: argparse.Namespace) -> int:
         line = withdraw(options.attack, path, date, options.erratum)
         print(json.dumps(line.as_data(), indent=1) if options.json else f"{path}: {options.attack} is taken back")
         return 0
+    writable_directory(path.parent)  # before anything is played
     if not options.beacon:
         print("tailgate: without --beacon the select seeds are public ones, on which the attack may have been tuned", file=sys.stderr)
     with progress(Console(stderr=True)) as update:
@@ -66,14 +69,17 @@ def _admit(options: argparse.Namespace) -> int:
 def _print(attack: str, admitted: bool, tests: list[dict[str, Any]]) -> None:
     """A line for each defence and scenario, what speaks most for the attack first."""
     out = console()
-    table = Table(title=f"{attack} beside the worst on the list, at dose {tests[0]['dose']}: episodes that only one of them damages")
+    title = f"{attack} beside the worst on the list, at dose {tests[0]['dose']}: episodes that only one of them damages"
+    table = Table(title=escape(title))
     for heading in ("defence", "scenario", "worst so far", "this alone", "that alone", "of", "p (Holm)", "more"):
         table.add_column(heading, overflow="fold")
     for test in sorted(tests, key=lambda test: (test["only_new"] <= test["only_worst"], test["adjusted"])):
         worst = test["worst"]["attack"] if test["worst"] else "-"
         more = test["only_new"] > test["only_worst"] and test["adjusted"] <= test["level"]
         counts = (str(test[key]) for key in ("only_new", "only_worst", "episodes"))
-        table.add_row(escape(test["defence"]), test["scenario"], escape(worst), *counts, f"{test['adjusted']:.2g}", "yes" if more else "")
+        names = (escape(name) for name in (test["defence"], test["scenario"], worst))
+        p = f"{test['adjusted']:.2g}" if test["only_new"] > test["only_worst"] else "-"  # two-sided: of one that does less it says nothing
+        table.add_row(*names, *counts, p, "yes" if more else "")
     out.print(table)
     verdict = "admitted: it does surely more to at least one defence" if admitted else "refused: it does surely more to no defence"
     out.print(f"{verdict} (level {tests[0]['level']:.2g})", markup=False, highlight=False)

@@ -100,7 +100,8 @@ def _seed(report: dict[str, Any]) -> str:
 
 def _print(report: dict[str, Any]) -> None:
     out = console()
-    title = f"{report['suite']}: {report['asked']} of {report['cells']} cells played again{_seed(report)}"
+    played = report["counts"]["equal"] + report["counts"]["differs"]
+    title = f"{report['suite']}: {played} of {report['cells']} cells played again, {report['asked']} asked for{_seed(report)}"
     out.print(_table(report, title, ("defence", "cells", "equal", "differs", "unchecked")))
     reasons: list[dict[str, Any]] = report["reasons"]
     for reason in reasons[:SHOWN]:

@@ -47,6 +47,6 @@ def _detect(options: argparse.Namespace) -> int:
     with progress(errors) as update:
         after = detect(path, suite, defences=options.defence, effort=effort, workers=options.workers, progress=update)
     if after == before:
-        errors.print("nothing was left to play: the board has these figures", highlight=False)
+        errors.print("the board is as it was: nothing was left to play, or nothing can be", highlight=False)
     print(path)
     return 0

@@ -39,6 +39,7 @@ def _timing(options: argparse.Namespace) -> int:
     from tailgate.strength.policies import changes, write_report
     from tailgate.strength.timing import timing
 
+    sys.path.insert(0, "")  # module:Class is looked for in the working directory, as `tailgate evaluate` does
     with progress(Console(stderr=True)) as update:
         report = timing(
             options.policies, scenario=options.scenario, defence=options.defence, threat=changes(options.threat), dose=options.dose,

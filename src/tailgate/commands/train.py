@@ -41,6 +41,8 @@ def _train(options: argparse.Namespace) -> int:
     overrides = list(options.overrides) + ([f"first_seed={options.seed}"] if options.seed is not None else [])
     config = train.load_config(options.config, overrides, options.resume)
     train.check(config)  # before a word of what is done
+    if options.resume:
+        train.same_run(config)
     errors = Console(stderr=True)
     errors.print(f"[bold]{config.name}[/]: training against [bold]{config.defence}[/] on {config.scenario}, files in {config.directory}")
     with _resumable(config.name), progress(errors) as update:

@@ -43,6 +43,7 @@ def _transfer(options: argparse.Namespace) -> int:
     from tailgate.strength.policies import changes, write_report
     from tailgate.strength.transfer import transfer
 
+    sys.path.insert(0, "")  # module:Class is looked for in the working directory, as `tailgate evaluate` does
     threat = None if options.threat is None else changes(options.threat)
     with progress(Console(stderr=True)) as update:
         report = transfer(
@@ -60,7 +61,7 @@ def _transfer(options: argparse.Namespace) -> int:
 
         for path in write_report(Path(options.out), "transfer", report, transfer_figure(report) if report["entries"] else None):
             print(f"written: {path}", file=sys.stderr)
-    return 0
+    return 0 if report["entries"] else 1
 
 
 def _print(report: dict[str, Any]) -> None:

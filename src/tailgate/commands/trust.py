@@ -72,8 +72,10 @@ def _values(option: str, texts: list[str]) -> dict[str, Any]:
 def _suite(options: argparse.Namespace) -> Any:
     """The suite, or the part of it that the options name."""
     from tailgate.scenario import load_suite
+    from tailgate.scoring.attacks import attacks_of
 
     suite = load_suite(options.suite or "quick-v0")
+    suite = dataclasses.replace(suite, attacks=attacks_of(suite))
     if options.suite is None and options.scenario:  # a scenario by itself: what is not named is quick-v0's, but for the dose
         suite = dataclasses.replace(suite, name="custom", doses=(None,))
     parts = {"defences": options.defence, "attacks": options.attack, "scenarios": options.scenario}

@@ -84,7 +84,8 @@ def _verify(options: argparse.Namespace) -> int:
 def _print(report: dict[str, Any]) -> None:
     out = console()
     drawn = "" if report["sample"] is None else f", drawn by the seed {report['sample_seed']}"
-    table = Table(title=f"{report['status']}: {report['asked']} of {report['rows']} rows played again{drawn}")
+    played = report["counts"]["verified"] + report["counts"]["differs"]
+    table = Table(title=f"{report['status']}: {played} of {report['rows']} rows played again, {report['asked']} asked for{drawn}")
     for heading in ("defence", "status", "verified", "differs", "unchecked"):
         table.add_column(heading, overflow="fold")
     for entry in report["entries"]:

@@ -37,13 +37,12 @@ def play(
     progress: Progress | None = None,
 ) -> Path:  # fmt: skip
     """The rows of a suite and of the attacks that were admitted since, against its defences; returns their file. It resumes."""
-    lines = admitted.standing(admitted.read(folder / LIST))
-    attacks = [*suite.attacks, *(text for text, line in lines.items() if line is not None)]
+    attacks = admitted.attacks_of(suite, folder / LIST)
     if defences is not None:
         defences = list(dict.fromkeys([CLEAN, *defences]))  # the undefended car is what gates measure against
     file = folder / (OWN if defences is None else f"rows-{hashlib.blake2b(repr(defences).encode(), digest_size=4).hexdigest()}.jsonl.xz")
     update = None if progress is None else lambda done, total: progress(suite.name, done, total)
-    evaluate(suite, defences=defences, attacks=list(dict.fromkeys(attacks)), workers=workers, out=file, beacon=beacon, progress=update)
+    evaluate(suite, defences=defences, attacks=attacks, workers=workers, out=file, beacon=beacon, progress=update)
     return file
 
 
@@ -60,7 +59,7 @@ def board_of(suite: Suite, folder: Path, beacon: str | None = None, **options: A
     if not files:
         raise InputError("rows", str(folder), "a folder with rows of `leaderboard run`")
     parts = {path: read_rows(path) for path in files}
-    board = score((row for rows in parts.values() for row in rows), suite, attacks=admitted.read(folder / LIST), **options)
+    board = score((row for rows in parts.values() for row in rows), suite, attacks=admitted.list_of(suite, folder / LIST), **options)
     if beacon is not None and board["suite"]["beacon"] != beacon:
         raise InputError("beacon", beacon, f"that of the rows, {board['suite']['beacon'] or 'which are of public seeds'}")
     held = {digest(path): Counter(row["defence"] for row in rows) for path, rows in parts.items()}

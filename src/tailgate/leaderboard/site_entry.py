@@ -10,12 +10,12 @@ from typing import Any
 
 from tailgate.errors import InputError
 from tailgate.metrics import ERRORS, METRICS, UNITS
-from tailgate.registry import built_in, split_text
 from tailgate.replay.page import VERDICTS, outcome, write_page
 from tailgate.replay.replay import play
 
 from .board_format import LEVELS, CellPart, EntryPart, Robust
 from .build import names_of, percent
+from .check import refused
 from .site_cards import card_of
 from .site_curves import curves_of, reached_of, stealth_of
 from .site_index import compared_how, comparisons_of
@@ -178,6 +178,14 @@ def _rank(suite: Suite, entry: EntryPart) -> str:
     return f"{best if best == worst else f'{best} to {worst}'} of {of}"
 
 
+def _imported(defence: str) -> bool:
+    """Whether a check of the board would have to import it, and so does not."""
+    try:
+        return bool(refused("defence", defence))
+    except InputError:  # nothing that is known here
+        return True
+
+
 def entry_page(suite: Suite, entry: EntryPart, replayed: Replayed | None, also: list[tuple[str, str]]) -> Data:
     """All that an entry's page shows. also: names of other suites with an entry of the same text, and their pages."""
     curves = curves_of(suite, [entry], gap=7.0)
@@ -193,7 +201,7 @@ def entry_page(suite: Suite, entry: EntryPart, replayed: Replayed | None, also: 
         "suite": suite.board.suite, "damage": suite.damage, "limit": percent(suite.board.suite.limit), "scale": suite.scale,
         "name": suite.defences[entry.defence], "status": entry.status, "why": entry.why,
         "replayed": _replayed(entry), "checked": _checked(entry), "typed": shlex.quote(entry.defence),
-        "imported": split_text(entry.defence)[0] not in built_in("defence"),
+        "imported": _imported(entry.defence),
         "class": entry.class_ or "not stated",
         "rank": _rank(suite, entry), "also": also, "card": card_of(suite, entry), "flags": entry.flags, "levels": LEVELS,
         "critical": [(level, critical_of(suite, entry.critical_dose.get(level))) for level in LEVELS],

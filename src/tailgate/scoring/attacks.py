@@ -26,7 +26,7 @@ from tailgate.errors import InputError, unknown
 from tailgate.evaluation import cells_of, run
 from tailgate.files import write_atomic
 from tailgate.registry import Spec
-from tailgate.scenario import Suite
+from tailgate.scenario import Suite, config_path, list_suites, load_suite
 from tailgate.schema import build
 from tailgate.stats import holm
 
@@ -48,10 +48,12 @@ class Admitted:
     erratum: str = ""
     before: str = ""  # hash of the line before
     hash: str = ""  # of this line
+    beacon: str = ""  # the round of the seeds that it was tried on; empty: the public ones, on which it may have been tuned
 
     def as_data(self) -> dict[str, Any]:
-        """JSON data of the line."""
-        return dataclasses.asdict(self) | {"evidence": list(self.evidence)}
+        """JSON data of the line; lines of before there were beacons say none."""
+        data = dataclasses.asdict(self) | {"evidence": list(self.evidence)}
+        return data if self.beacon else {key: value for key, value in data.items() if key != "beacon"}
 
     def sealed(self, before: str) -> Admitted:
         """The same line behind another, with the hashes that it has there."""
@@ -78,6 +80,28 @@ def read(path: Path) -> list[Admitted]:
             raise InputError(where, line.attack, "the line as it was written, behind the one that was before it")
         out.append(line)
     return out
+
+
+def published(suite: Suite) -> Path | None:
+    """The list of a suite of the package, which holds where no folder of boards has one of its own; None for a suite that has none."""
+    if suite.name not in list_suites():
+        return None
+    path = config_path("suites", suite.name, "suite").with_suffix(".attacks.jsonl")
+    return path if path.is_file() and load_suite(suite.name).hash == suite.hash else None
+
+
+def list_of(suite: Suite, path: Path | None = None) -> list[Admitted]:
+    """What has joined a suite's attacks: by a folder's list, else by that of the package."""
+    if path is not None and path.is_file():
+        return read(path)
+    shipped = published(suite)
+    return [] if shipped is None else read(shipped)
+
+
+def attacks_of(suite: Suite, path: Path | None = None) -> tuple[str, ...]:
+    """The attacks of a suite, and those that have joined them."""
+    joined = (text for text, line in standing(list_of(suite, path)).items() if line is not None)
+    return tuple(dict.fromkeys([*suite.attacks, *joined]))
 
 
 def append(path: Path, line: Admitted) -> Admitted:
@@ -151,9 +175,7 @@ def admit(
     paired test, adjusted after Holm for all defences and scenarios, at `next_level` of alpha. dose: the middle one of those that the suite
     shows unless given. beacon: of whose round the seeds are.
     """
-    tried = read(path)
-    lines, asked = standing(tried), next_level(tried, alpha)
-    listed = list(dict.fromkeys([*suite.attacks, *(text for text, line in lines.items() if line is not None)]))
+    asked, listed = next_level(list_of(suite, path), alpha), list(attacks_of(suite, path))
     spec = Spec("attack", attack)
     spec.refuse_imports("the list of attacks")  # it would run with the rights of whoever scores
     if attack in listed:
@@ -190,6 +212,8 @@ def admit(
         raise InputError("attack", attack, "one that can be played against some of the defences")
     for test, adjusted in zip(tests, holm([test["p"] for test in tests]), strict=True):
         test["adjusted"], test["level"] = adjusted, asked
+    if not path.is_file() and (shipped := published(suite)) is not None:  # a folder's list goes on from the package's
+        write_atomic(path, shipped.read_bytes())
     wins = any(test["only_new"] > test["only_worst"] and test["adjusted"] <= asked for test in tests)
-    line = append(path, Admitted(attack, spec.digest, level, date, tuple(tests), refused=not wins))
+    line = append(path, Admitted(attack, spec.digest, level, date, tuple(tests), refused=not wins, beacon=beacon))
     return line if wins else None, tests

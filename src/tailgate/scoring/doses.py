@@ -62,15 +62,8 @@ class Worst:
 
     @property
     def complete(self) -> bool:
-        """Whether every figure of this class can be had."""
-        return bool(self.pairs) and not self.lost and not self._unmet
-
-    @cached_property
-    def _unmet(self) -> bool:
-        """Whether nobody met any of the listed attacks of just this knowledge: its figures would be those of a lower one."""
-        listed = [i for i in self.table.known(self.knowledge) if self.table.columns[i].attack in self.table.listed]
-        own = [i for i in listed if self.table.columns[i].knowledge == self.knowledge]
-        return bool(own) and not any(self.table.applies(name)[own].any() for name in self.table.scenarios)
+        """Whether every figure of this class can be had, and somebody who knows just this was met: else it would be a lower one's."""
+        return any(self.table.columns[i].knowledge == self.knowledge for _, i in self.pairs) and not self.lost
 
     @cached_property
     def shares(self) -> Array:

@@ -74,6 +74,8 @@ def dose_response(
         raise InputError("exceeds", exceeds, f"nothing for {counted}, which is yes or no")
     share = is_share(counted) or exceeds is not None
     limit = CRITICAL if limit is None and share else limit
+    if share and limit is not None and not 0.0 <= limit < 1.0:
+        raise InputError("limit", limit, "a share from 0 on and below 1")
     steps = sorted(set(doses))
     if not steps or any(isinstance(dose, bool) or not isinstance(dose, int) or dose < 1 for dose in steps):
         raise InputError("doses", list(doses), "whole numbers of attack steps, at least 1")

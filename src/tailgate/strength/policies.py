@@ -19,7 +19,7 @@ from tailgate.loop import Loop
 from tailgate.metrics import METRICS, UNITS
 from tailgate.registry import Family, Spec
 from tailgate.scenario import list_scenarios
-from tailgate.schema import fields_of
+from tailgate.schema import canonical, fields_of
 from tailgate.stats import Interval, paired_difference, proportion
 from tailgate.threat import ThreatModel
 from tailgate.train import TrainConfig, outcome_of, plan_key
@@ -90,6 +90,15 @@ def trained(text: str) -> Trained:
         text, policy, header, str(record.get("learner", "unknown")), seed if isinstance(seed, int) else None,
         _text(config.get("scenario")), _text(config.get("defence")), threat, _text(config.get("outcome")),
     )  # fmt: skip
+
+
+def distinct(texts: Sequence[str]) -> list[Trained]:
+    """The policies, each once: a copy of one under another name is no training seed more."""
+    out: dict[str, Trained] = {}
+    for text in texts:
+        who = trained(text)
+        out.setdefault(canonical([who.header.sha256, who.header.action, who.seed, who.scenario, who.defence, who.threat]), who)
+    return list(out.values())
 
 
 def origin_of(text: str) -> dict[str, Any] | None:

@@ -25,7 +25,7 @@ from tailgate.schema import as_data, canonical
 from tailgate.stats import Interval, paired_difference
 from tailgate.trace import Trace, episodes_at_once, rollout
 
-from .policies import BATCH, Trained, defence_of, is_share, loop_for, mean, outcome_for, place_of, trained
+from .policies import BATCH, Trained, defence_of, distinct, is_share, loop_for, mean, outcome_for, place_of
 
 TWINS = {  # each schedule, and what it is
     "own": "when the policy attacks",
@@ -119,8 +119,7 @@ def timing(
     if episodes < 2:
         raise InputError("episodes", episodes, "at least 2: the schedule of another episode is needed")
     groups: dict[str, list[tuple[Trained, Loop, dict[str, Any]]]] = {}
-    for text in dict.fromkeys(texts):
-        who = trained(text)
+    for who in distinct(texts):
         where, guard = place_of(who, scenario), defence_of(who, defence)
         changed = who.threat | dict(threat or {})
         counted = outcome_for(outcome or who.outcome, where)

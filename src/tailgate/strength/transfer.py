@@ -25,7 +25,7 @@ from tailgate.scenario import Suite, list_suites, load_scenario, load_suite
 from tailgate.schema import as_data, canonical
 from tailgate.stats import Interval, paired_difference
 
-from .policies import Trained, check_episodes, defence_of, is_share, mean, misfit, outcome_for, place_of, trained
+from .policies import Trained, check_episodes, defence_of, distinct, is_share, mean, misfit, outcome_for, place_of
 
 LEVEL = 0.95
 ALL = "all"  # the word for every registered defence
@@ -61,7 +61,7 @@ def transfer(
     (another observation or action) is skipped, with the reason.
     """
     check_episodes(episodes)
-    members = [trained(text) for text in dict.fromkeys(texts)]
+    members = distinct(texts)
     if not members:
         raise InputError("policies", list(texts), "at least one")
     where = scenario or _common("scenario", {who.name: place_of(who) for who in members})

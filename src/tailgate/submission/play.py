@@ -14,6 +14,7 @@ from tailgate.evaluation import Cell, cells_of
 from tailgate.parts import Parts
 from tailgate.pool import abandon, processes
 from tailgate.scenario import Suite, load_suite
+from tailgate.scoring.attacks import attacks_of
 from tailgate.submission.limits import Limits, Lost
 from tailgate.submission.mixed import Submission, part_of, play_mixed
 from tailgate.submission.process import Process
@@ -37,7 +38,9 @@ def play_submission(
     episodes: int | None = None,
     purpose: str = "report",
 ) -> Rows:
-    """Rows of a suite for one submission, "module:Class:key=value": one for each scenario, dose, attack of the suite and episode.
+    """Rows of a suite for one submission, "module:Class:key=value": one for each scenario, dose, attack and episode.
+
+    The attacks are the suite's, and those that joined them by its published list.
 
     The class is imported in processes of its own only, from a copy of its files. The episodes' seeds are those of the beacon's round
     (`tailgate.rounds`), without one the public ones 0, 1, ..., for development. Whatever goes wrong costs rows, with a reason: those of
@@ -50,7 +53,8 @@ def play_submission(
     for name, value in (("episodes", count), ("workers", workers)):
         if value < 1:
             raise InputError(name, value, "a whole number not below 1")
-    named = dataclasses.replace(base, defences=("none",), seeds=count, scenarios=tuple(base.scenarios if scenarios is None else scenarios))
+    places = tuple(base.scenarios if scenarios is None else scenarios)
+    named = dataclasses.replace(base, attacks=attacks_of(base), defences=("none",), seeds=count, scenarios=places)
     with staged(text) as source:
         cells = [dataclasses.replace(cell, defence=source.text) for cell in cells_of(named, purpose=purpose, beacon=beacon)]
         if not cells:

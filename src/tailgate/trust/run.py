@@ -216,7 +216,7 @@ def with_trust(board: dict[str, Any], found: Any, where: str = "trust", suite: S
             if mine != other:
                 raise InputError(f"{where}: {name}", mine, repr(other))
         if suite is not None:
-            _of_suite(found, suite, board["suite"]["alpha"], where)
+            _of_suite(found, suite, _listed(suite, board), board["suite"]["alpha"], where)
         head = {key: found[key] for key in ("alpha", "runs", "purpose", "attacks", "scenarios", "doses", "unsafe", "demands")}
         head |= {"beacon": found["beacon"], "properties": _asked(found)}
         bounds = {e["defence"]: {"all": e["trust"], "safety": e["safety"], "why": e["why"]} for e in found["defences"]}
@@ -229,12 +229,18 @@ def with_trust(board: dict[str, Any], found: Any, where: str = "trust", suite: S
     }  # fmt: skip
 
 
-def _of_suite(found: Mapping[str, Any], suite: Suite, alpha: float, where: str) -> None:
-    """Raise InputError unless a report is of all that the suite asks for, and of nothing easier."""
+def _listed(suite: Suite, board: Mapping[str, Any]) -> list[str]:
+    """The attacks of a suite, and those that joined it by the list of a board."""
+    joined = (a["attack"] for a in board.get("attacks", ()) if a.get("admitted") and not a.get("withdrawn"))
+    return list(dict.fromkeys([*suite.attacks, *joined]))
+
+
+def _of_suite(found: Mapping[str, Any], suite: Suite, asked: Sequence[str], alpha: float, where: str) -> None:
+    """Raise InputError unless a report is of all that the suite asks for, these attacks among it, and of nothing easier."""
     for name, mine, other in (
         ("purpose", found["purpose"], "report"), ("alpha", found["alpha"], alpha), ("demands", found["demands"], _plain(Demands())),
         ("unsafe", found["unsafe"], _plain(SafeDistance())), ("scenarios", found["scenarios"], list(suite.scenarios)),
-        ("doses", found["doses"], list(suite.doses)), ("attacks", [a["attack"] for a in found["attacks"]], list(suite.attacks)),
+        ("doses", found["doses"], list(suite.doses)), ("attacks", [a["attack"] for a in found["attacks"]], list(asked)),
     ):  # fmt: skip
         if mine != other:
             raise InputError(f"{where}: {name}", mine, repr(other))
