@@ -258,3 +258,12 @@ def test_a_published_board_comes_out_equal(monkeypatch: pytest.MonkeyPatch) -> N
 def test_rows_on_disk_give_the_same_fingerprints(rows: list[Data], board: Data) -> None:
     held = [json.loads(line) for line in encode(rows).splitlines()]
     assert score(held[::-1], load_suite("quick-v0"), require_adaptive=False)["cells"] == board["cells"]
+
+
+def test_what_differs_is_named_down_to_the_number() -> None:
+    """A list may be long, and the difference at its end."""
+    held: Any = [{"defence": "none", "points": [0.1, 0.2, {"value": 0.3}]}]
+    other = copy.deepcopy(held)
+    other[0]["points"][2]["value"] = 0.4
+    assert command._first(held, other) == ("[0].points[2].value", 0.3, 0.4)
+    assert command._first([1], [1, 2]) == ("", [1], [1, 2]) and command._first({"a": None}, {"a": {"b": 1}}) == (".a", None, {"b": 1})

@@ -119,12 +119,13 @@ def _print(report: dict[str, Any]) -> None:
         out.print(f"and {len(untrained) - SHOWN} more; --json lists them all", highlight=False)
     strays: list[dict[str, Any]] = report["strays"]
     if strays:
-        out.print(f"{len(strays)} figures differ from what the cells make:")
+        out.print(f"{len(strays)} figure{'s differ' if len(strays) > 1 else ' differs'} from what is made here:")
     else:
         out.print("Rates, critical doses and curves of all entries follow from the cells.")
     for stray in strays[:SHOWN]:
-        place = ": ".join(filter(None, (stray["defence"], stray["field"])))
-        said = f"board {_words(stray['board'])}, here {_words(stray['here'])}"
+        where, board, here = _first(stray["board"], stray["here"])
+        place = ": ".join(filter(None, (stray["defence"], stray["field"] + where)))
+        said = f"board {_words(board)}, here {_words(here)}"
         out.print(f"    {place}: {said}", markup=False, highlight=False, soft_wrap=True)
     if len(strays) > SHOWN:
         out.print(f"and {len(strays) - SHOWN} more; --json lists them all", highlight=False)
@@ -139,6 +140,23 @@ def _print(report: dict[str, Any]) -> None:
         out.print(f"{named}: {finding['why']}", markup=False, highlight=False)
     if len(wrong) > SHOWN:
         out.print(f"and {len(wrong) - SHOWN} more; --json lists them all", highlight=False)
+
+
+def _first(board: Any, here: Any) -> tuple[str, Any, Any]:
+    """Where two pieces of JSON first differ, and what stands there: a list may be long, and its difference at the end."""
+    from tailgate.scoring.follow import same
+
+    if isinstance(board, dict) and isinstance(here, dict):
+        names = [name for name in dict.fromkeys((*board, *here)) if not same(board.get(name), here.get(name))]
+        pairs = [(f".{name}", board.get(name), here.get(name)) for name in names[:1]]
+    elif isinstance(board, list) and isinstance(here, list) and len(board) == len(here):
+        pairs = [(f"[{i}]", one, other) for i, (one, other) in enumerate(zip(board, here, strict=True)) if not same(one, other)][:1]
+    else:
+        pairs = []
+    for step, one, other in pairs:
+        where, one, other = _first(one, other)
+        return step + where, one, other
+    return "", board, here
 
 
 def _words(value: Any) -> str:

@@ -20,7 +20,7 @@ def add(commands: Any) -> None:
     detect.add(actions)
     retrain.add(actions)
     admit.add(actions)
-    build = actions.add_parser("build", help="one self-contained HTML page from rows files, unranked")
+    build = actions.add_parser("build", help="one self-contained HTML page from rows files, without gates and limits of a board")
     build.add_argument("--rows", nargs="+", required=True, metavar="FILE", help="JSON Lines files of `tailgate evaluate`")
     build.add_argument("--out", required=True, metavar="DIR", help="directory of the page")
     build.add_argument("--title", help="title of the page")
