@@ -205,7 +205,7 @@ def test_a_plug_in_is_somebody_elses_class(monkeypatch) -> None:
     monkeypatch.setitem(registry._entries["defence"], "mine", registry.entry_of("defence", "mine", Mine))
     rows = [row | {"submission": None} for row in [*clean("kf", "mine"), *(r for d in ("none", "kf", "mine") for r in cell(d, "fdi"))]]
     made = board(rows)
-    assert entry(made, "kf")["status"] == "ranked" and entry(made, "mine")["why"] == "claimed: not played by `leaderboard submit` in a sandbox"
+    assert entry(made, "kf")["status"] == "ranked" and entry(made, "mine")["why"] == "claimed: not played by leaderboard submit in a sandbox"
     assert entry(made, "mine")["card"] is None and len(registry.Spec("defence", "mine").digest) == 64
 
 

@@ -208,7 +208,7 @@ def _draft(table: Table) -> str:
 def _claimed(rows: list[Row]) -> str:
     """Why rows of somebody else's class stand for nothing yet: who made them could have tuned on the episodes, or have run free."""
     if not all((row.get("submission") or {}).get("sandbox") for row in rows):
-        return "claimed: not played by `leaderboard submit` in a sandbox"
+        return "claimed: not played by leaderboard submit in a sandbox"
     return "" if all(row.get("beacon") for row in rows) else "claimed: played on public seeds"
 
 
