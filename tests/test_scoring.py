@@ -344,7 +344,8 @@ def _random_rows(seed, attacks=("fdi", "jam")):
     rows = [*clean("a", "b")]
     for defence in ("none", "a", "b"):
         for attack in attacks:
-            rows += cell(defence, attack, [int(x) for x in np.sort(rng.integers(0, 21, 3))])
+            level = "white" if attack == "white" else "black"
+            rows += cell(defence, attack, [int(x) for x in np.sort(rng.integers(0, 21, 3))], knowledge=level)
     return rows
 
 
@@ -364,13 +365,13 @@ def test_the_order_of_rows_and_rows_that_come_twice_change_nothing(seed) -> None
 @given(st.integers(0, 10_000))
 def test_an_attack_more_never_makes_a_figure_better(seed) -> None:
     """Rates, their limits, critical doses and the lower ends of their intervals fall or stay, whatever the new attack does."""
-    few, more = suite(), suite(attacks=("none", "fdi", "jam"))
-    rows = _random_rows(seed, ("fdi", "jam"))
+    few, more = suite(attacks=("none", "fdi", "white")), suite(attacks=("none", "fdi", "white", "jam"))
+    rows = _random_rows(seed, ("fdi", "jam", "white"))
     before = board([row for row in rows if row["attack"] != "jam"], few)
     after = board(rows, more)
     for name in ("a", "b"):
         old, new = entry(before, name), entry(after, name)
-        for level in ("black",):
+        for level in ("black", "white"):
             for key in ("value", "low"):
                 x, y = (e["critical_dose"][level][key] for e in (old, new))
                 assert (math.inf if y is None else y) <= (math.inf if x is None else x)

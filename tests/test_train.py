@@ -170,6 +170,16 @@ def test_a_finished_comparison_is_not_played_again(
     assert cli.main(["train", "--resume", "episodes=5"]) == 0 and json.loads(report.read_text())["episodes"] == 5
 
 
+def test_learners_may_share_what_was_played(here: Path, small_run: tuple[str, ...]) -> None:
+    """Rows lie with the first of them; the report of the second is no comparison that its own run could go on from."""
+    configs = [train.load_config(None, [*small_run, f"name={name}"]) for name in ("one", "two")]
+    policies = [train.train(config, lambda *_: None) for config in configs]
+    scripts = comparison.play_scripts(configs[0], [path for found in policies for path in found])
+    reports = [comparison.compare(config, found, scripts=scripts) for config, found in zip(configs, policies, strict=True)]
+    assert reports[0]["attacks"] == reports[1]["attacks"] and not (configs[1].directory / "rows.jsonl").exists()
+    assert [comparison.finished(config, found) for config, found in zip(configs, policies, strict=True)] == [None, None]
+
+
 def test_the_final_comparison_begins_at_the_episode_that_is_named(here: Path, small_run: tuple[str, ...]) -> None:
     """Learned, scripted and yoked alike play that block, and no policy depends on it."""
     wanted, hashes = {}, set()

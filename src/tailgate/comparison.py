@@ -45,12 +45,14 @@ class Scripts:
 
     best: str | None
     rows: list[dict[str, Any]]
+    made_of: str  # a hash of everything that decides them
 
 
 def play_scripts(config: TrainConfig, policies: list[Path], progress: Callable[[int, int], None] | None = None) -> Scripts:
     """Choose the best rival on select seeds, so that the choice does not favour it, and play all, and policies, on fresh report seeds."""
     best = best_of(rivals_of(config), dict(config.threat), outcome_of(config), "select", config.workers)
-    return Scripts(best, run(_cells(config, policies), config.directory / ROWS, config.workers, progress))
+    rows = run(_cells(config, policies), config.directory / ROWS, config.workers, progress)
+    return Scripts(best, rows, _made_of(config, policies))
 
 
 def _cells(config: TrainConfig, policies: list[Path]) -> list[Cell]:
@@ -93,12 +95,13 @@ def compare(
         place = load_scenario(config.scenario).with_threat(**(threat | {"knowledge": policy.knowledge}))
         own, yoked = timing_advantage(place.loop(built, uses), policy, keys, outcome)
         verdicts.append(Verdict(seed, path, own, yoked))
-    return _report(config, verdicts, outcomes, scripts.best, outcome, left_out)
+    return _report(config, verdicts, outcomes, scripts, outcome, left_out)
 
 
 def _report(
-    config: TrainConfig, verdicts: list[Verdict], outcomes: Callable[[str], Array], best: str | None, outcome: str, left_out: dict[str, str]
+    config: TrainConfig, verdicts: list[Verdict], outcomes: Callable[[str], Array], scripts: Scripts, outcome: str, left_out: dict[str, str]
 ) -> dict[str, Any]:
+    best = scripts.best
     white_box = [name for name in config.white_box if name not in left_out]
     learned = np.array([v.learned for v in verdicts])
     yoked = np.array([v.yoked for v in verdicts])
@@ -131,7 +134,7 @@ def _report(
         "teacher": heads[0].training.get("teacher"), "decisions": [head.training["steps"] for head in heads],
         "threat": as_data(place.threat_model),
         "config": json.loads(canonical(config)), "policies": [str(v.policy) for v in verdicts], "best_scripted": best,
-        "made_of": _made_of(config, [v.policy for v in verdicts]),
+        "made_of": scripts.made_of,
         "attacks": [{"label": label, **interval._asdict(), "note": note} for label, interval, note in items],
         "advantage": {name: interval._asdict() for name, interval in versus.items()},
         "rivals": {name: {"outcome": mean(outcomes(name))._asdict(), "advantage": over(name)._asdict()} for name in config.rivals},

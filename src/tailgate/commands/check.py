@@ -146,16 +146,15 @@ def _first(board: Any, here: Any) -> tuple[str, Any, Any]:
     """Where two pieces of JSON first differ, and what stands there: a list may be long, and its difference at the end."""
     from tailgate.scoring.follow import same
 
+    pairs: list[tuple[str, Any, Any]] = []
     if isinstance(board, dict) and isinstance(here, dict):
-        names = [name for name in dict.fromkeys((*board, *here)) if not same(board.get(name), here.get(name))]
-        pairs = [(f".{name}", board.get(name), here.get(name)) for name in names[:1]]
+        pairs = [(f".{name}", board.get(name), here.get(name)) for name in dict.fromkeys((*board, *here))]
     elif isinstance(board, list) and isinstance(here, list) and len(board) == len(here):
-        pairs = [(f"[{i}]", one, other) for i, (one, other) in enumerate(zip(board, here, strict=True)) if not same(one, other)][:1]
-    else:
-        pairs = []
+        pairs = [(f"[{i}]", *both) for i, both in enumerate(zip(board, here, strict=True))]
     for step, one, other in pairs:
-        where, one, other = _first(one, other)
-        return step + where, one, other
+        if not same(one, other):
+            where, one, other = _first(one, other)
+            return step + where, one, other
     return "", board, here
 
 

@@ -10,12 +10,12 @@ from typing import Any
 
 from tailgate.errors import InputError
 from tailgate.metrics import ERRORS, METRICS, UNITS
+from tailgate.registry import Spec
 from tailgate.replay.page import VERDICTS, outcome, write_page
 from tailgate.replay.replay import play
 
 from .board_format import LEVELS, CellPart, EntryPart, Robust
 from .build import names_of, percent
-from .check import refused
 from .site_cards import card_of
 from .site_curves import curves_of, reached_of, stealth_of
 from .site_index import compared_how, comparisons_of
@@ -181,7 +181,8 @@ def _rank(suite: Suite, entry: EntryPart) -> str:
 def _imported(defence: str) -> bool:
     """Whether a check of the board would have to import it, and so does not."""
     try:
-        return bool(refused("defence", defence))
+        spec = Spec("defence", defence)
+        return spec.foreign or bool(spec.sandboxed)
     except InputError:  # nothing that is known here
         return True
 
