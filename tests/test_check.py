@@ -5,6 +5,7 @@ import copy
 import dataclasses
 import json
 import sys
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -151,6 +152,18 @@ def test_a_board_of_before_the_fingerprints_gets_them(board: Data, rows: list[Da
     assert [entry["checked"] for entry in checked["entries"]] == [{"cells": 2, "equal": 2, "differs": 0, "unchecked": 0}] * 2
     less = with_check(checked, check(board, sample=1))
     assert less["entries"] == checked["entries"]  # of two checks the one that looked into more stays
+    for entry in checked["entries"]:
+        entry["checked"] = {"cells": 9, "equal": 8, "differs": 0, "unchecked": 1}  # of the board when it had more cells
+    assert {entry["checked"]["cells"] for entry in with_check(checked, check(board))["entries"]} == {2}
+
+
+@pytest.mark.parametrize("name", sorted(path.parent.name for path in (ROOT / "results").glob("*-v0/board.json")))
+def test_what_a_published_board_says_of_checks_is_of_its_cells(name: str) -> None:
+    published = json.loads((ROOT / "results" / name / "board.json").read_text(encoding="utf-8"))
+    there = Counter(cell["defence"] for cell in published["cells"])
+    for entry in published["entries"]:
+        held = entry.get("checked") or {"cells": there[entry["defence"]], "equal": 0, "differs": 0, "unchecked": 0}
+        assert held["cells"] == there[entry["defence"]] >= held["equal"] + held["differs"] + held["unchecked"], entry["defence"]
 
 
 def test_a_change_of_one_episode_changes_a_fingerprint(board: Data, rows: list[Data]) -> None:

@@ -11,10 +11,12 @@ from urllib.parse import unquote, urlsplit
 
 import pytest
 
+from tailgate.leaderboard.board_format import read_board
 from tailgate.leaderboard.build import percent
 from tailgate.leaderboard.site import build_site
 from tailgate.leaderboard.site_cards import LICENCE
 from tailgate.leaderboard.site_entry import _imported, replay_of
+from tailgate.leaderboard.site_suite import Suite, critical_of
 from tailgate.leaderboard.site_trust import at_least
 
 ROOT = Path(__file__).parent.parent
@@ -172,6 +174,17 @@ def test_an_entry_s_page_has_all_parts(site):
     assert "came without a card" in bare and "No replay. The board holds no worst episode" in bare and "Stealth and impact" not in bare
     assert "a class of somebody's own" in bare and "leaderboard check" not in bare  # a board does not import it
     assert [_imported(text) for text in ("chi2_kf:eta=3", "composed:detector=mine:D", "bwrap/mine:D", HOSTILE)] == [False, True, True, True]
+
+
+def test_why_a_knowledge_has_no_critical_dose(site):
+    """An attack of it without full figures, or none at all."""
+    board = copy.deepcopy(make_board())
+    name = board["entries"][0]["defence"]
+    board["entries"][0]["critical_dose"] |= {"grey": None, "white": None}
+    board["cells"] = [cell for cell in board["cells"] if (cell["defence"], cell["knowledge"]) != (name, "grey")]
+    suite = Suite(read_board(board), "")
+    told = {level: critical_of(suite, suite.board.entries[0], level)["about"] for level in ("grey", "white")}
+    assert told == {"grey": "no attack that knows just this was met", "white": "not every attack of this knowledge has full figures"}
 
 
 def facts(text, heading, level=2):

@@ -247,19 +247,23 @@ def _untrained(board: Board, places: list[int]) -> list[Data]:
     return [{"defence": name, "folder": folder, "policies": len(files[name, folder]), "cells": n} for (name, folder), n in cells.items()]
 
 
+def _asked(found: Data) -> int:
+    """How many cells a check looked into."""
+    return sum(found[verdict] for verdict in VERDICTS)
+
+
 def with_check(data: Data, report: Data) -> Data:
     """The board with what a check found: `checked` in the entries that it looked into, fingerprints in cells that came out equal.
 
-    Of two checks of an entry the one stays that looked into more cells.
+    Of two checks of an entry the one stays that looked into more cells; one that was of another number of cells is of another board.
     """
     found = {entry["defence"]: {key: entry[key] for key in ("cells", *VERDICTS)} for entry in report["entries"]}
 
-    def asked(held: Data | None) -> int:
-        return sum(held[verdict] for verdict in VERDICTS) if held else -1
-
     def told(entry: Data) -> Data:
-        new = found.get(entry["defence"])
-        return entry | {"checked": new} if new is not None and asked(new) >= asked(entry.get("checked")) else entry
+        new, held = found.get(entry["defence"]), entry.get("checked")
+        if new is None or (held and held["cells"] == new["cells"] and _asked(held) > _asked(new)):
+            return entry
+        return entry | {"checked": new}
 
     cells = [cell | report["prints"].get(str(i), {}) for i, cell in enumerate(data["cells"])]
     return data | {"entries": [told(entry) for entry in data["entries"]], "cells": cells}

@@ -205,7 +205,7 @@ def entry_page(suite: Suite, entry: EntryPart, replayed: Replayed | None, also: 
         "imported": _imported(entry.defence),
         "class": entry.class_ or "not stated",
         "rank": _rank(suite, entry), "also": also, "card": card_of(suite, entry), "flags": entry.flags, "levels": LEVELS,
-        "critical": [(level, critical_of(suite, entry.critical_dose.get(level))) for level in LEVELS],
+        "critical": [(level, critical_of(suite, entry, level)) for level in LEVELS],
         "rates": _rates(suite, entry), "worst": _worst(suite, entry), "cells": _every(suite, mine),
         "doses": [dose_text(d) for d in suite.board.suite.doses],
         "gates": [{"gate": g.gate.replace("_", " "), "scenario": g.scenario, "value": figure(g.value), "limit": figure(g.limit),

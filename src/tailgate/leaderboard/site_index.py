@@ -29,7 +29,7 @@ def _lines(suite: Suite) -> list[Data]:
         out.append({
             "index": i, "name": suite.defences[entry.defence], "page": suite.pages.get(entry.defence, ""),
             "class": entry.class_ or "not stated", "rank": rank,
-            "critical": [critical_of(suite, entry.critical_dose.get(level)) for level in ("black", "white")],
+            "critical": [critical_of(suite, entry, level) for level in ("black", "white")],
             "rates": [{level: rates.get((dose, level), share_of(None)) for level in LEVELS} for dose in suite.shown],
             "trust": trust_cell(suite, entry), "gates": gates_of(entry), "flags": entry.flags, "status": entry.status, "why": entry.why,
         })  # fmt: skip

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
-from .board_format import LEVELS, Board, CellPart, Critical, Dose, EntryPart, Limited
+from .board_format import LEVELS, Board, CellPart, Critical, Dose, EntryPart, Level, Limited
 from .build import Name, names_of, percent, shade
 from .charts import Axis
 
@@ -117,10 +117,12 @@ def _sort_dose(critical: Critical | None) -> float:
     return math.inf if critical.value is None else critical.value
 
 
-def critical_of(suite: Suite, critical: Critical | None) -> Data:
-    """A critical dose in words, and its interval as places on the dose axis."""
+def critical_of(suite: Suite, entry: EntryPart, level: Level) -> Data:
+    """An entry's critical dose in words, and its interval as places on the dose axis."""
+    critical = entry.critical_dose.get(level)
     if critical is None:
-        why = "not every attack of this knowledge has full figures"
+        met = any(c.knowledge == level for c in suite.board.cells if c.defence == entry.defence)
+        why = "not every attack of this knowledge has full figures" if met else "no attack that knows just this was met"
         return {"text": "\N{EN DASH}", "sort": "", "span": "", "bar": None, "worst": "", "about": why}
     largest = suite.largest
     least = min((d for d in suite.board.suite.doses if d), default=0)
