@@ -1,5 +1,6 @@
 """The site of boards: what its pages say, and that nothing in a board becomes markup."""
 
+import copy
 import hashlib
 import importlib.util
 import json
@@ -176,7 +177,7 @@ def test_an_entry_s_page_has_all_parts(site):
     assert [_imported(text) for text in ("chi2_kf:eta=3", "composed:detector=mine:D", "bwrap/mine:D", HOSTILE)] == [False, True, True, True]
 
 
-def test_why_a_knowledge_has_no_critical_dose(site):
+def test_why_a_knowledge_has_no_critical_dose():
     """An attack of it without full figures, or none at all."""
     board = copy.deepcopy(make_board())
     name = board["entries"][0]["defence"]
