@@ -23,7 +23,8 @@ VECTOR = (Kind.FDI, Kind.ECHO_DELAY, Kind.NOISE_JAM)  # kinds that a vector of v
 class ActionSpec:
     """Which decisions the learner takes.
 
-    timing: {none, attack}, the attack is `kind` with its value. mode: {none, then one per granted kind, +value and -value for fdi}.
+    timing: {none, attack}, the attack is `kind` with its value. mode: {none, then one per granted kind, +value and -value for fdi}, and
+    fdi and echo_delay once for each of `shares`, so that an attacker chooses the size too.
     ramp: as mode, but fdi and echo_delay have three: raise, keep or lower the value sent last by `rate`, from +-`value` or from `delay`
     at the start of a burst. continuous: [trigger, value per wire] in [-1, 1], attack when trigger > 0, values in units of the bound.
     increment: the same, but each value is the change since the value sent last, in units of `rate`.
@@ -37,6 +38,7 @@ class ActionSpec:
     value: Finite = param(-4.0, "timing, mode, ramp: bias of fdi, jammer's value of dos_jam [unit of the wire]")
     power: Positive = param(0.1, "timing, mode, ramp: power of noise_jam [W]")
     delay: Positive = param(6.0, "timing, mode, ramp: extra range of echo_delay [m]")
+    shares: tuple[Positive, ...] = param((1.0,), "mode: what of `value` and `delay` is sent, in (0, 1]: an action for each")
     steps: PositiveCount = param(10, "age of a delay, window of a replay [steps]")
     rate: Positive = param(0.5, "ramp, increment: (largest) change per step [unit of the wire]")
     per_sensor: bool = param(False, "mode, ramp: also one mode per single wire")
@@ -84,6 +86,10 @@ class ActionCodec:
                 raise InputError(field, size, f"at most the threat model's {bound} ({most})")
             if name in used and not receivers(self.brief).any():
                 raise InputError("action", f"{self.spec.action} with {name}", "a granted sensor that listens to its own echo")
+        if self.spec.shares != (1.0,) and self.spec.action != "mode":
+            raise InputError("shares", list(self.spec.shares), f"action mode, which has an action for each; not {self.spec.action}")
+        if not self.spec.shares or max(self.spec.shares) > 1.0 or len(set(self.spec.shares)) < len(self.spec.shares):
+            raise InputError("shares", list(self.spec.shares), "at least one number in (0, 1], each once")
         if not self.brief.granted.any():
             raise InputError("threat_model.targets", threat.targets, "at least one wire")
 
@@ -133,7 +139,9 @@ class ActionCodec:
                     out += [] if suffix.startswith(":") else self._aired(kind, suffix, target & receivers(self.brief))
                 elif kind == Kind.FDI and self.spec.action != "timing":
                     signs = {"+": 1, "-": -1} if self.spec.action == "mode" else {"+": 1, "=": 0, "-": -1}
-                    out += [Mode(f"fdi{t}{suffix}", kind, target, sign * np.minimum(abs(value), bounds), sign) for t, sign in signs.items()]
+                    for share, mark in self._shares:
+                        sent = np.minimum(share * abs(value), bounds)
+                        out += [Mode(f"fdi{t}{mark}{suffix}", kind, target, sign * sent, sign) for t, sign in signs.items()]
                 elif kind in (Kind.FDI, Kind.DOS_JAM):  # what is too much for an actuator is cut
                     cut = np.clip(value, -bounds, bounds)
                     sent = cut if kind == Kind.FDI else np.where(self.brief.is_actuator, cut, value)
@@ -149,9 +157,16 @@ class ActionCodec:
             return []
         name = kind.name.lower()
         value = np.full(target.shape[1], self.spec.power if kind == Kind.NOISE_JAM else self.spec.delay)
+        if kind == Kind.ECHO_DELAY and self.spec.action == "mode":
+            return [Mode(f"{name}{mark}{suffix}", kind, target, share * value) for share, mark in self._shares]
         if kind == Kind.ECHO_DELAY and self.spec.action == "ramp":
             return [Mode(f"{name}{t}{suffix}", kind, target, value, sign) for t, sign in (("+", 1), ("=", 0), ("-", -1))]
         return [Mode(name + suffix, kind, target, value)]
+
+    @cached_property
+    def _shares(self) -> list[tuple[float, str]]:
+        """What is sent of a value, and what a mode's name says of it: nothing where it is all."""
+        return [(share, "" if share == 1.0 else f"*{share:g}") for share in self.spec.shares]
 
     @property
     def size(self) -> int:

@@ -278,6 +278,8 @@ def test_modes_carry_power_and_delay(loop):
     assert [mode.name for mode in codec.modes] == ["none", "noise_jam", "echo_delay"]
     assert [mode.value.max() for mode in codec.modes] == [0.0, 0.02, 4.0]
     assert all((mode.target == [[True, True, False]]).all() for mode in codec.modes[1:])
+    sizes = ActionCodec(ActionSpec(delay=4.0, shares=(0.5, 1.0)), brief).modes
+    assert [(mode.name, mode.value.max()) for mode in sizes[2:]] == [("echo_delay*0.5", 2.0), ("echo_delay", 4.0)]
     ramp = ActionCodec(ActionSpec(action="ramp"), brief)
     assert [mode.name for mode in ramp.modes] == ["none", "noise_jam", "echo_delay+", "echo_delay=", "echo_delay-"]
 

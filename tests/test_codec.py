@@ -261,6 +261,24 @@ def test_modes_per_agent_and_sensor():
     assert [mode.name for mode in plain.modes] == ["none", "fdi+", "fdi-", "dos_hold"]
 
 
+def test_modes_of_several_sizes():
+    """Shares of the value: both signs of each, within the bounds; held readings have no size, and a plain action no mark."""
+    codec = ActionCodec(ActionSpec(value=-4.0, shares=(0.25, 1.0)), _platoon(5, kinds=("fdi", "dos_hold")).brief())
+    by_name = {mode.name: mode for mode in codec.modes}
+    assert list(by_name) == ["none", "fdi+*0.25", "fdi-*0.25", "fdi+", "fdi-", "dos_hold"]
+    assert by_name["fdi+*0.25"].value.max() == 1.0 and by_name["fdi-*0.25"].value.min() == -1.0 and by_name["fdi-"].value.min() == -4.0
+
+
+@pytest.mark.parametrize(("fields", "said"), [
+    ({"shares": ()}, r"\(0, 1\]"), ({"shares": (0.5, 0.5)}, "each once"), ({"shares": (0.5, 2.0)}, r"\(0, 1\]"),
+    ({"shares": (0.5,), "action": "ramp"}, "action mode"), ({"shares": (0.5, 1.0), "action": "continuous"}, "action mode"),
+])  # fmt: skip
+def test_shares_that_mean_nothing_are_refused(fields, said):
+    """None, one twice, more than all of the value, and an action that has sizes of its own."""
+    with pytest.raises(InputError, match="shares.*" + said):
+        ActionCodec(ActionSpec(value=3.0, **fields), _platoon(5, kinds=("fdi",)).brief())
+
+
 def test_a_mode_hits_its_agent_in_the_loop():
     """The wires of the chosen agent arrive changed, all others as they were sent."""
     env = AdversaryVectorEnv(2, scenario="platoon-braking-v0", defence="dkf", value=5.0, per_agent=True, engine="plain",

@@ -85,7 +85,7 @@ ENVIRONMENTS = [
      "threat": {"kinds": ["fdi", "echo_delay", "dropout"]}, "attack_cost": 0.1, "illegal_penalty": 0.2, "per_sensor": True},
     {"scenario": "radar-following-v0", "defence": "none", "action": "increment", "reward": "collision", "autoreset": "next_step",
      "threat": {"kinds": ["fdi"], "targets": ["distance", "acceleration"]}},
-    {"scenario": "radar-following-v0", "defence": "cra", "autoreset": "same_step", "delay": 60.0, "knowledge": "grey",
+    {"scenario": "radar-following-v0", "defence": "cra", "autoreset": "same_step", "delay": 60.0, "shares": [0.04, 0.14, 1.0], "knowledge": "grey",
      "threat": {"budget": None, "sees_measurement": True}},
     {"scenario": "radar-braking-v0", "defence": "pycra:suspicion=20", "autoreset": "next_step", "action": "ramp", "interval": 2},
     {"scenario": "radar-following-v0", "defence": "kf", "action": "timing", "kind": "echo_delay", "autoreset": "same_step"},
