@@ -79,8 +79,9 @@ def test_a_list_that_was_published_holds_wherever_a_folder_has_none(tmp_path) ->
     suite, own = load_suite("quick-v0"), tmp_path / "attacks.jsonl"
     ramps = attacks_of(suite)[len(suite.attacks) :]
     assert len(ramps) == 2 and all(text.startswith("fdi_ramp:") for text in ramps) and attacks_of(suite, own) == attacks_of(suite)
-    assert attacks_of(dataclasses.replace(suite, seeds=3)) == suite.attacks and published(load_suite("radar-v0")) is None
-    assert published(suite).read_bytes() == (ROOT / "results/quick-v0/attacks.jsonl").read_bytes()
+    assert attacks_of(dataclasses.replace(suite, seeds=3)) == suite.attacks and published(load_suite("thesis-v0")) is None
+    for name in ("quick-v0", "radar-v0"):
+        assert published(load_suite(name)).read_bytes() == (ROOT / "results" / name / "attacks.jsonl").read_bytes()
     small = dataclasses.replace(suite, defences=("none", "kf"))
     with pytest.raises(InputError, match="not on the list"):
         admit(ramps[0], suite, ["kf"], own, "2026-11-25")
@@ -120,6 +121,11 @@ def test_an_attack_is_admitted_by_what_it_does_on_select_seeds_and_else_not(part
     assert worse is None and tests[0]["worst"]["attack"] == line.attack
     lines = read_attacks(path)
     assert [held.refused for held in lines] == [False, True] and standing(lines)["fdi:start_step=100,value=0.5"] is None
+    late, tests = admit("fdi:trigger=near,threshold=20,value=-0.5", part, ["chi2_kf"], path, "2026-11-22", dose=20, episodes=4)
+    assert late is None and tests[0]["dose"] == 20
+    with pytest.raises(InputError, match="dose.*7.*20"):
+        admit("fdi:start_step=100,value=0.4", part, ["chi2_kf"], path, "2026-11-22", dose=7)
+    assert len(read_attacks(path)) == 3
     with pytest.raises(InputError, match="not on the list"):
         admit(line.attack, part, ["chi2_kf"], path, "2026-11-22")
     with pytest.raises(InputError, match="ceiling"):
@@ -138,7 +144,7 @@ def test_the_command_says_whom_an_attack_beats(part, tmp_path, capsys, monkeypat
     assert told["admitted"] is False and told["evidence"][0]["defence"] == "chi2_kf"
     assert main([*words, "fdi:start_step=101,value=0.5,targets=[velocity]"]) == 1
     said = capsys.readouterr().out
-    assert "refused" in said and "targets=[velocity]" in said
+    assert "refused" in said and "targets=[velocity] damages no episode" in said and "in 1 of 1 pairs" in said
     (tmp_path / "file").touch()
     assert main([*words[:4], "--out", str(tmp_path / "file"), "fdi:value=1"]) == 2 and "writable directory" in capsys.readouterr().err
     assert main([*words, "fdi_ramp:trigger=near,threshold=40,rate=-0.5", "--erratum", "wrong bound"]) == 0

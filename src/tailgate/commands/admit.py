@@ -28,6 +28,7 @@ def add(actions: Any) -> None:
     command.add_argument("--suite", required=True, metavar="NAME", help="suite by name or YAML file")
     command.add_argument("--out", required=True, metavar="DIR", help="folder of the boards")
     command.add_argument("--defence", action="append", metavar="NAME", help="only these defences (repeatable; default: the suite's)")
+    command.add_argument("--dose", type=int, metavar="N", help="one of the suite's doses (default: its middle one)")
     command.add_argument("--beacon", default="", metavar="TEXT", help="random text of after the attack was handed in: its seeds are played")
     command.add_argument("--date", metavar="YYYY-MM-DD", help="date of the line (default: today)")
     command.add_argument("--erratum", metavar="REASON", help="take the attack back, for this reason")
@@ -55,7 +56,7 @@ def _admit(options: argparse.Namespace) -> int:
         print("tailgate: without --beacon the select seeds are public ones, on which the attack may have been tuned", file=sys.stderr)
     with progress(Console(stderr=True)) as update:
         admitted, tests = admit(
-            options.attack, suite, options.defence or suite.defences, path, date, beacon=options.beacon, workers=options.workers,
+            options.attack, suite, options.defence or suite.defences, path, date, dose=options.dose, beacon=options.beacon, workers=options.workers,
             progress=lambda done, total: update("playing", done, total, cells(done, total)),
         )  # fmt: skip
     if options.json:
@@ -67,19 +68,24 @@ def _admit(options: argparse.Namespace) -> int:
 
 
 def _print(attack: str, admitted: bool, tests: list[dict[str, Any]]) -> None:
-    """A line for each defence and scenario, what speaks most for the attack first."""
+    """A line for each defence and scenario in which the attack did something that the worst did not, what speaks most for it first."""
     out = console()
     title = f"{attack} beside the worst on the list, at dose {tests[0]['dose']}: episodes that only one of them damages"
     table = Table(title=escape(title))
     for heading in ("defence", "scenario", "worst so far", "this alone", "that alone", "of", "p (Holm)", "more"):
         table.add_column(heading, overflow="fold")
-    for test in sorted(tests, key=lambda test: (test["only_new"] <= test["only_worst"], test["adjusted"])):
+    telling = [test for test in tests if test["only_new"] > 0]
+    for test in sorted(telling, key=lambda test: (test["only_new"] <= test["only_worst"], test["adjusted"])):
         worst = test["worst"]["attack"] if test["worst"] else "-"
         more = test["only_new"] > test["only_worst"] and test["adjusted"] <= test["level"]
         counts = (str(test[key]) for key in ("only_new", "only_worst", "episodes"))
         names = (escape(name) for name in (test["defence"], test["scenario"], worst))
         p = f"{test['adjusted']:.2g}" if test["only_new"] > test["only_worst"] else "-"  # two-sided: of one that does less it says nothing
         table.add_row(*names, *counts, p, "yes" if more else "")
-    out.print(table)
+    if telling:
+        out.print(table)
+    if silent := len(tests) - len(telling):
+        pairs = f"in {silent} of {len(tests)} pairs of a defence and a scenario"
+        out.print(f"{attack} damages no episode that the worst does not {pairs} (--json has them)", markup=False, highlight=False)
     verdict = "admitted: it does surely more to at least one defence" if admitted else "refused: it does surely more to no defence"
     out.print(f"{verdict} (level {tests[0]['level']:.2g})", markup=False, highlight=False)

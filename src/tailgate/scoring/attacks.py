@@ -183,6 +183,8 @@ def admit(
     if spec.entry.optimal:
         raise InputError("attack", attack, "a rival: a computed optimum is a ceiling")
     at = suite.middle_dose if dose is None else dose
+    if dose is not None and dose not in suite.doses:
+        raise InputError("dose", dose, f"one of the doses of {suite.name}: {', '.join(map(str, suite.doses))}")
     level = knowledge_of(attack, suite)
     rivals = [text for text in listed if text != CLEAN and not Spec("attack", text).entry.optimal]
     rivals = [text for text in rivals if order(knowledge_of(text, suite)) <= order(level)]
