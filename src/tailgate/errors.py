@@ -42,4 +42,4 @@ def unknown(field: str, name: object, known: Iterable[str]) -> InputError:
     names = sorted(known)
     near = difflib.get_close_matches(str(name), names, n=1, cutoff=0.5)
     hint = f" (did you mean {near[0]!r}?)" if near else ""
-    return InputError(field, name, f"one of {', '.join(names) or 'nothing: none is registered'}{hint}")
+    return InputError(field, name, f"one of {', '.join(names)}{hint}" if names else "no name: there is none to choose from")

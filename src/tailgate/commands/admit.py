@@ -56,8 +56,8 @@ def _admit(options: argparse.Namespace) -> int:
         print("tailgate: without --beacon the select seeds are public ones, on which the attack may have been tuned", file=sys.stderr)
     with progress(Console(stderr=True)) as update:
         admitted, tests = admit(
-            options.attack, suite, options.defence or suite.defences, path, date, dose=options.dose, beacon=options.beacon, workers=options.workers,
-            progress=lambda done, total: update("playing", done, total, cells(done, total)),
+            options.attack, suite, options.defence or suite.defences, path, date, dose=options.dose, beacon=options.beacon,
+            workers=options.workers, progress=lambda done, total: update("playing", done, total, cells(done, total)),
         )  # fmt: skip
     if options.json:
         print(json.dumps({"admitted": admitted is not None, "evidence": tests}, indent=1))

@@ -49,6 +49,7 @@ def add(actions: Any) -> None:
 
 def _run(options: argparse.Namespace) -> int:
     sys.path.insert(0, "")  # module:Class is looked for in the working directory, as `tailgate evaluate` does
+    from tailgate.leaderboard.clock import beside
     from tailgate.leaderboard.detect import detect
     from tailgate.leaderboard.run import BOARD, board_of, play
     from tailgate.leaderboard.run_record import Record
@@ -71,7 +72,8 @@ def _run(options: argparse.Namespace) -> int:
             board = board_of(suite, folder, beacon=options.beacon or None, require_adaptive=not options.unattacked)
             print(record.finish(board["suite"]["rows"]), file=sys.stderr)
             boards.append(detect(folder / BOARD, suite, workers=options.workers, progress=update) if options.detection else board)
-    page = build_site(boards, out / "page", replays=not options.no_replays)
+    clocks = {suite.name: beside(out / suite.name / BOARD) for suite in suites}
+    page = build_site(boards, out / "page", replays=not options.no_replays, clocks=clocks)
     if options.json:
         print(json.dumps([{"suite": b["suite"]["name"], "entries": b["entries"]} for b in boards], indent=1, allow_nan=False))
     else:
@@ -107,7 +109,11 @@ def _head(options: argparse.Namespace) -> int:
 
 def _page(options: argparse.Namespace) -> int:
     from tailgate.leaderboard.board_format import load
+    from tailgate.leaderboard.clock import beside
     from tailgate.leaderboard.site import build_site
 
-    print(build_site([load(Path(name)) for name in options.boards], Path(options.out), title=options.title, replays=not options.no_replays))
+    boards = {name: load(Path(name)) for name in options.boards}
+    clocks = {clock.suite: clock for clock in map(beside, map(Path, boards)) if clock is not None}
+    page = build_site(list(boards.values()), Path(options.out), title=options.title, replays=not options.no_replays, clocks=clocks)
+    print(page)
     return 0

@@ -73,7 +73,7 @@ def _evaluate(options: argparse.Namespace) -> int:
             out=options.out, threat=threat, progress=lambda done, total: update("playing", done, total, cells(done, total)),
         )  # fmt: skip
     for earlier in sorted(aside(options.out) - before):
-        print(f"tailgate: {options.out} held other rows; they are in {earlier}", file=sys.stderr)
+        print(f"tailgate: {options.out} held something else than these rows; it is in {earlier}", file=sys.stderr)
     table = summarise(rows)
     if options.json:
         print(json.dumps(table, indent=1, allow_nan=False))

@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from tailgate.replay.page import embedded
 
 from .board_format import read_board
 from .build import TITLE, _asset, _inline, breakable
+from .clock import Clock
 from .site_entry import Replayed, entry_page, replay_of
 from .site_index import section
 from .site_suite import GROUPS, Data, Suite
@@ -68,10 +69,13 @@ def _environment() -> Environment:
     return environment
 
 
-def build_site(boards: Sequence[dict[str, Any]], out: Path, *, title: str | None = None, replays: bool = True) -> Path:
+def build_site(
+    boards: Sequence[dict[str, Any]], out: Path, *, title: str | None = None, replays: bool = True, clocks: Mapping[str, Clock | None] = {},
+) -> Path:  # fmt: skip
     """Writes the site of `boards` (format tailgate-board-1) to the folder `out` and returns the path of its first page.
 
     replays: play each entry's worst episode again and write its page; without, the entries' pages say that it was not done.
+    clocks: step times by the name of the suite, where somebody has measured them.
     Raises InputError, before anything is written, for no board, two of a suite, and for one that is not of the format (names the field).
     """
     suites = _suites(boards)
@@ -97,7 +101,7 @@ def build_site(boards: Sequence[dict[str, Any]], out: Path, *, title: str | None
             done = replay_of(entry.worst_episode, replay, source) if replays else Replayed(why="Replays were not asked for.")
             if done.page:
                 written[str(replay.relative_to(folder))] = replay.read_bytes()
-            context = entry_page(suite, entry, done, also)
+            context = entry_page(suite, entry, done, also, clocks.get(suite.board.suite.name))
             written[where] = _utf8(template.render(entry=context, **common))
             listed.append({
                 "suite": suite.board.suite.name, "defence": entry.defence, "status": entry.status, "class": entry.class_, "page": where,

@@ -16,6 +16,7 @@ from tailgate.replay.replay import play
 
 from .board_format import LEVELS, CellPart, EntryPart, Robust
 from .build import names_of, percent
+from .clock import Clock
 from .site_cards import card_of
 from .site_curves import curves_of, reached_of, stealth_of
 from .site_index import compared_how, comparisons_of
@@ -187,7 +188,19 @@ def _imported(defence: str) -> bool:
         return True
 
 
-def entry_page(suite: Suite, entry: EntryPart, replayed: Replayed | None, also: list[tuple[str, str]]) -> Data:
+def _clocked(clock: Clock | None, defence: str) -> str:
+    """What a step costs; empty where nobody has measured it."""
+    found = next((entry for entry in clock.entries if entry.defence == defence), None) if clock else None
+    if clock is None or found is None:
+        return ""
+    who = "one car" if clock.agents == 1 else f"{clock.agents} agents"
+    spread = f"{figure(found.low)} to {figure(found.high)} in {clock.rounds} rounds, {clock.processor}"
+    return f"A step takes {figure(found.median)} \N{MICRO SIGN}s for one episode of {who} ({spread})."
+
+
+def entry_page(
+    suite: Suite, entry: EntryPart, replayed: Replayed | None, also: list[tuple[str, str]], clock: Clock | None = None
+) -> Data:
     """All that an entry's page shows. also: names of other suites with an entry of the same text, and their pages."""
     curves = curves_of(suite, [entry], gap=7.0)
     mine = [c for c in suite.board.cells if c.defence == entry.defence]
@@ -201,7 +214,8 @@ def entry_page(suite: Suite, entry: EntryPart, replayed: Replayed | None, also: 
     return {
         "suite": suite.board.suite, "damage": suite.damage, "limit": percent(suite.board.suite.limit), "scale": suite.scale,
         "name": suite.defences[entry.defence], "status": entry.status, "why": entry.why,
-        "replayed": _replayed(entry), "checked": _checked(entry), "typed": shlex.quote(entry.defence),
+        "replayed": _replayed(entry), "checked": _checked(entry), "clocked": _clocked(clock, entry.defence),
+        "typed": shlex.quote(entry.defence),
         "imported": _imported(entry.defence),
         "class": entry.class_ or "not stated",
         "rank": _rank(suite, entry), "also": also, "card": card_of(suite, entry), "flags": entry.flags, "levels": LEVELS,

@@ -1,0 +1,56 @@
+"""tailgate leaderboard clock: what a step of each defence costs."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from tailgate.progress import cells, console, progress
+
+
+def add(actions: Any) -> None:
+    """Adds `clock` to the actions of a command."""
+    command = actions.add_parser(
+        "clock", help="measure what a step of each defence costs",
+        description="Time the defences of a suite alone, step by step in one episode, in turn, and write OUT/SUITE/step_time.json, which "
+        "the pages of the entries show. The machine should have nothing else to do.",
+    )  # fmt: skip
+    command.add_argument("suite", metavar="SUITE", help="suite by name or YAML file")
+    command.add_argument("--out", required=True, metavar="DIR", help="folder of the boards")
+    command.add_argument("--defence", action="append", default=[], metavar="NAME", help="only these (repeatable; default: the suite's)")
+    command.add_argument("--rounds", type=int, default=5, metavar="N", help="episodes of each (default 5)")
+    command.add_argument("--json", action="store_true", help="print the file")
+    command.set_defaults(run=_clock)
+
+
+def _clock(options: argparse.Namespace) -> int:
+    from tailgate.files import writable_directory, write_atomic
+    from tailgate.leaderboard.clock import FILE, measure
+    from tailgate.scenario import load_suite
+
+    suite = load_suite(options.suite)
+    path = writable_directory(Path(options.out) / suite.name) / FILE
+    with progress(Console(stderr=True)) as update:
+        clock = measure(
+            suite, options.defence, rounds=options.rounds,
+            progress=lambda done, total: update("timing", done, total, cells(done, total)),
+        )  # fmt: skip
+    held = clock.model_dump_json(indent=1) + "\n"
+    write_atomic(path, held.encode())
+    if options.json:
+        print(held, end="")
+        return 0
+    table = Table(title=escape(f"a step in {clock.scenario}, one episode, {clock.agents} agents, {clock.processor} [us]"))
+    for heading in ("defence", "median", "least", "largest"):
+        table.add_column(heading, overflow="fold", justify="left" if heading == "defence" else "right")
+    for entry in sorted(clock.entries, key=lambda entry: entry.median):
+        table.add_row(escape(entry.defence), *(f"{value:.1f}" for value in (entry.median, entry.low, entry.high)))
+    out = console()
+    out.print(table)
+    print(path)
+    return 0

@@ -1,0 +1,143 @@
+"""What a step of each defence costs: step_time.json beside a board, which, as a pure function of rows, says nothing of clocks.
+
+    {"format": "tailgate-step-time-1", "suite", "scenario", "agents", "rounds", "processor", "version", "commit", "entries": [..]}
+
+Each entry has its defence and the `median`, `low` and `high` of its rounds [us]: of one step of the defence alone, for one episode with
+all its agents, without an attack, in the plain loop. Rounds of all defences are played in turn, so that a busy moment meets them all.
+"""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+import tailgate
+from tailgate import draws
+from tailgate.core import no_command
+from tailgate.errors import InputError, said, wanted
+from tailgate.loop import Loop
+from tailgate.machine import commit, processor
+from tailgate.registry import Spec
+from tailgate.scenario import Suite, load_scenario
+
+FILE = "step_time.json"
+ROUNDS, MOST = 5, 200  # episodes of each defence that count; steps of an episode that are looked at
+Progress = Callable[[int, int], None]
+Microseconds = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+
+
+class StepTime(BaseModel):
+    """One defence: the median of its rounds, the least and the largest of them [us]."""
+
+    model_config = ConfigDict(strict=True)
+    defence: str
+    median: Microseconds
+    low: Microseconds
+    high: Microseconds
+
+
+class Clock(BaseModel):
+    """A file of step times."""
+
+    model_config = ConfigDict(strict=True)
+    format: Literal["tailgate-step-time-1"] = "tailgate-step-time-1"
+    suite: str
+    scenario: str
+    agents: Annotated[int, Field(ge=1)]
+    rounds: Annotated[int, Field(ge=1)]
+    processor: str
+    version: str
+    commit: str | None
+    entries: list[StepTime]
+
+
+class _Timed:
+    """A defence that keeps how long each of its steps took [ns]."""
+
+    def __init__(self, defence: Any) -> None:
+        self._defence = defence
+        self.taken: list[int] = []
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._defence, name)
+
+    def step(self, *arguments: Any) -> Any:
+        began = time.perf_counter_ns()
+        answer = self._defence.step(*arguments)
+        self.taken.append(time.perf_counter_ns() - began)
+        return answer
+
+
+def _round(loop: Loop, timed: _Timed, seed: int) -> float:
+    """The median step of one clean episode [us]."""
+    timed.taken.clear()
+    state, nothing = loop.start(draws.keys("calibrate", [seed])), no_command(1, loop.model.agents, len(loop.model.wires))
+    for _ in range(min(loop.horizon, MOST)):
+        if state.ended.all():
+            break
+        state, _ = loop.advance(state, nothing)
+    return float(statistics.median(timed.taken)) / 1e3
+
+
+def measure(suite: Suite, defences: Sequence[str] = (), *, rounds: int = ROUNDS, progress: Progress | None = None) -> Clock:
+    """Step times of a suite's registered defences in its first scenario, those left out that mean nothing there.
+
+    The first episode of each is not counted: it loads what the defence needs. Raises InputError for a defence that does not exist or is a
+    class of somebody's own, and where none is left.
+    """
+    if rounds < 1:
+        raise InputError("rounds", rounds, "a whole number not below 1")
+    place = load_scenario(suite.scenarios[0])
+    seats: dict[str, tuple[Loop, _Timed]] = {}
+    for text in dict.fromkeys(defences or suite.defences):
+        spec = Spec("defence", text)
+        spec.refuse_imports("step times")
+        timed = _Timed(spec.make())
+        try:
+            loop = place.loop(timed, spec.entry.uses)
+            _round(loop, timed, 0)
+        except InputError:
+            if defences:
+                raise
+            continue
+        seats[text] = loop, timed
+    if not seats:
+        raise InputError("defences", list(suite.defences), f"one that means something in {place.name}")
+    taken: dict[str, list[float]] = {text: [] for text in seats}
+    for seed in range(1, rounds + 1):
+        for i, (text, (loop, timed)) in enumerate(seats.items()):
+            taken[text].append(_round(loop, timed, seed))
+            if progress is not None:
+                progress((seed - 1) * len(seats) + i + 1, rounds * len(seats))
+    entries = [
+        StepTime(defence=text, median=round(statistics.median(us), 1), low=round(min(us), 1), high=round(max(us), 1))
+        for text, us in taken.items()
+    ]
+    model = next(iter(seats.values()))[0].model
+    return Clock(
+        suite=suite.name, scenario=place.name, agents=model.agents, rounds=rounds, processor=processor(),
+        version=tailgate.__version__, commit=commit(), entries=entries,
+    )  # fmt: skip
+
+
+def read_clock(path: Path) -> Clock:
+    """Raises InputError that names the file and the field for anything else than step times."""
+    try:
+        return Clock.model_validate_json(path.read_bytes())
+    except OSError as error:
+        raise InputError("step times", str(path), f"a readable file of leaderboard clock ({said(error)})") from None
+    except ValidationError as error:
+        first = error.errors()[0]
+        field = ".".join(map(str, first["loc"])) or "file"
+        raise InputError(f"step times {path}: {field}", first["input"] if first["type"] != "missing" else None, wanted(first)) from None
+
+
+def beside(board: Path) -> Clock | None:
+    """The step times that lie beside a board's file; none where there are none."""
+    path = board.parent / FILE
+    return read_clock(path) if path.is_file() else None

@@ -1,0 +1,103 @@
+"""Step times: what is measured is the defence's own step, and a page says it."""
+
+import json
+import time
+from pathlib import Path
+
+import pytest
+
+from tailgate.cli import main
+from tailgate.errors import InputError
+from tailgate.evaluation import cells_of, run
+from tailgate.leaderboard.clock import Clock, StepTime, _round, _Timed, beside, measure, read_clock
+from tailgate.leaderboard.run import board_of
+from tailgate.leaderboard.site import build_site
+from tailgate.registry import Spec
+from tailgate.rows import encode
+from tailgate.scenario import Suite, load_scenario
+
+SUITE = Suite("small", "", ("thesis-ch4-v0",), (5,), ("none", "kf"), ("none",), 4)
+
+
+class Slow:
+    """A defence whose step takes two milliseconds more."""
+
+    def __init__(self) -> None:
+        self.inner = Spec("defence", "kf").make()
+
+    def __getattr__(self, name):
+        return getattr(self.inner, name)
+
+    def step(self, *arguments):
+        time.sleep(0.002)
+        return self.inner.step(*arguments)
+
+
+def test_what_is_timed_is_the_step_of_the_defence() -> None:
+    """Two milliseconds more in a step are two milliseconds more, and the loop around it is not counted."""
+    place = load_scenario("thesis-ch4-v0")
+    timed = {name: _Timed(defence) for name, defence in (("kf", Spec("defence", "kf").make()), ("slow", Slow()))}
+    taken = {name: min(_round(place.loop(one), one, seed) for seed in range(3)) for name, one in timed.items()}
+    assert 2000 < taken["slow"] - taken["kf"] < 20_000 and len(timed["kf"].taken) == min(place.horizon, 200)
+
+
+def test_the_defences_of_a_suite_are_timed_in_turn() -> None:
+    """Each has a median between its least and its largest round; who means nothing in the scenario is left out, and refused by name."""
+    told: list[tuple[int, int]] = []
+    clock = measure(SUITE, rounds=3, progress=lambda done, total: told.append((done, total)))
+    assert [entry.defence for entry in clock.entries] == ["none", "kf"] and told == [(i, 6) for i in range(1, 7)]
+    assert all(0 < entry.low <= entry.median <= entry.high for entry in clock.entries)
+    mixed = Suite("mixed", "", ("thesis-ch4-v0",), (5,), ("none", "cra"), ("none",), 4)
+    assert [entry.defence for entry in measure(mixed, rounds=1).entries] == ["none"]
+    with pytest.raises(InputError):
+        measure(mixed, ["cra"])
+    with pytest.raises(InputError, match="rounds"):
+        measure(SUITE, rounds=0)
+    with pytest.raises(InputError, match="step times"):
+        measure(SUITE, ["mine:Mine"])
+
+
+def test_a_page_says_what_a_step_costs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """From the file that the command writes beside the board; without one it says nothing."""
+    (tmp_path / "rows.jsonl").write_bytes(encode(run(cells_of(SUITE))))
+    board_of(SUITE, tmp_path, require_adaptive=False)
+    board, path = tmp_path / "board.json", tmp_path / "step_time.json"
+    assert beside(board) is None
+    assert main(["leaderboard", "page", str(board), "--out", str(tmp_path / "page"), "--no-replays"]) == 0
+    assert "A step takes" not in (tmp_path / "page/small/kf.html").read_text()
+    held = Clock(suite="small", scenario="thesis-ch4-v0", agents=1, rounds=3, processor="A <chip>", version="1", commit=None,
+                 entries=[StepTime(defence="kf", median=12.5, low=12.0, high=13.0)])  # fmt: skip
+    path.write_text(held.model_dump_json())
+    assert main(["leaderboard", "page", str(board), "--out", str(tmp_path / "page"), "--no-replays"]) == 0
+    said = (tmp_path / "page/small/kf.html").read_text()
+    assert "A step takes 12.5 \N{MICRO SIGN}s for one episode of one car (12 to 13 in 3 rounds, A &lt;chip&gt;)." in said
+    assert "A step takes" not in (tmp_path / "page/small/none.html").read_text()
+    assert build_site([json.loads(board.read_text())], tmp_path / "page", replays=False).is_file()
+
+
+@pytest.mark.parametrize(("change", "field"), [
+    ({"format": "other"}, "format"), ({"agents": 0}, "agents"), ({"entries": [{"defence": "kf"}]}, "entries.0.median"),
+    ({"entries": [{"defence": "kf", "median": -1.0, "low": 0.0, "high": 0.0}]}, "entries.0.median"),
+])  # fmt: skip
+def test_anything_else_than_step_times_is_refused(tmp_path: Path, change: dict, field: str) -> None:
+    """It names the file and the field."""
+    good = {"format": "tailgate-step-time-1", "suite": "s", "scenario": "x", "agents": 1, "rounds": 1, "processor": "", "version": "",
+            "commit": None, "entries": []}  # fmt: skip
+    path = tmp_path / "step_time.json"
+    path.write_text(json.dumps(good))
+    assert read_clock(path).suite == "s"
+    path.write_text(json.dumps(good | change))
+    with pytest.raises(InputError, match=f"step_time.json: {field}"):
+        read_clock(path)
+
+
+def test_the_command_writes_a_table_and_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The fastest first; --json prints the file."""
+    words = ["leaderboard", "clock", "quick-v0", "--out", str(tmp_path), "--defence", "kf", "--defence", "none", "--rounds", "1"]
+    assert main(words) == 0
+    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("\N{BOX DRAWINGS LIGHT VERTICAL}")]
+    assert ["none" in lines[0], "kf" in lines[1], len(lines)] == [True, True, 2]
+    assert main([*words, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == json.loads((tmp_path / "quick-v0/step_time.json").read_text())
+    assert main(["leaderboard", "clock", "quick-v0", "--out", str(tmp_path), "--defence", "kff"]) == 2
+    assert "did you mean 'kf'" in capsys.readouterr().err
