@@ -123,7 +123,7 @@ def test_an_attack_is_admitted_by_what_it_does_on_select_seeds_and_else_not(part
     assert [held.refused for held in lines] == [False, True] and standing(lines)["fdi:start_step=100,value=0.5"] is None
     late, tests = admit("fdi:trigger=near,threshold=20,value=-0.5", part, ["chi2_kf"], path, "2026-11-22", dose=20, episodes=4)
     assert late is None and tests[0]["dose"] == 20
-    with pytest.raises(InputError, match="dose.*7.*20"):
+    with pytest.raises(InputError, match=r"dose.*7.*20"):
         admit("fdi:start_step=100,value=0.4", part, ["chi2_kf"], path, "2026-11-22", dose=7)
     assert len(read_attacks(path)) == 3
     with pytest.raises(InputError, match="not on the list"):
