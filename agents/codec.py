@@ -38,7 +38,7 @@ class ActionSpec:
     value: Finite = param(-4.0, "timing, mode, ramp: bias of fdi, jammer's value of dos_jam [unit of the wire]")
     power: Positive = param(0.1, "timing, mode, ramp: power of noise_jam [W]")
     delay: Positive = param(6.0, "timing, mode, ramp: extra range of echo_delay [m]")
-    shares: tuple[Positive, ...] = param((1.0,), "mode: what of `value` and `delay` is sent, in (0, 1]: an action for each")
+    shares: tuple[Positive, ...] = param((), "mode: parts of the bias and of `delay` in (0, 1], an action each; none: all", if_any=True)
     steps: PositiveCount = param(10, "age of a delay, window of a replay [steps]")
     rate: Positive = param(0.5, "ramp, increment: (largest) change per step [unit of the wire]")
     per_sensor: bool = param(False, "mode, ramp: also one mode per single wire")
@@ -86,10 +86,12 @@ class ActionCodec:
                 raise InputError(field, size, f"at most the threat model's {bound} ({most})")
             if name in used and not receivers(self.brief).any():
                 raise InputError("action", f"{self.spec.action} with {name}", "a granted sensor that listens to its own echo")
-        if self.spec.shares != (1.0,) and self.spec.action != "mode":
-            raise InputError("shares", list(self.spec.shares), f"action mode, which has an action for each; not {self.spec.action}")
-        if not self.spec.shares or max(self.spec.shares) > 1.0 or len(set(self.spec.shares)) < len(self.spec.shares):
-            raise InputError("shares", list(self.spec.shares), "at least one number in (0, 1], each once")
+        if shares := self.spec.shares:
+            if self.spec.action != "mode" or not {"fdi", "echo_delay"} & set(used):
+                found = f"{self.spec.action} with {', '.join(used)}"
+                raise InputError("shares", list(shares), f"action mode with fdi or echo_delay, not {found}")
+            if max(shares) > 1.0 or len(set(shares)) < len(shares):
+                raise InputError("shares", list(shares), "numbers in (0, 1], each once")
         if not self.brief.granted.any():
             raise InputError("threat_model.targets", threat.targets, "at least one wire")
 
@@ -140,7 +142,7 @@ class ActionCodec:
                 elif kind == Kind.FDI and self.spec.action != "timing":
                     signs = {"+": 1, "-": -1} if self.spec.action == "mode" else {"+": 1, "=": 0, "-": -1}
                     for share, mark in self._shares:
-                        sent = np.minimum(share * abs(value), bounds)
+                        sent = share * np.minimum(abs(value), bounds)
                         out += [Mode(f"fdi{t}{mark}{suffix}", kind, target, sign * sent, sign) for t, sign in signs.items()]
                 elif kind in (Kind.FDI, Kind.DOS_JAM):  # what is too much for an actuator is cut
                     cut = np.clip(value, -bounds, bounds)
@@ -166,7 +168,7 @@ class ActionCodec:
     @cached_property
     def _shares(self) -> list[tuple[float, str]]:
         """What is sent of a value, and what a mode's name says of it: nothing where it is all."""
-        return [(share, "" if share == 1.0 else f"*{share:g}") for share in self.spec.shares]
+        return [(share, "" if share == 1.0 else f"*{share!r}") for share in self.spec.shares or (1.0,)]
 
     @property
     def size(self) -> int:

@@ -1,5 +1,7 @@
 """Step times: what is measured is the defence's own step, and a page says it."""
 
+import copy
+import dataclasses
 import json
 import time
 from pathlib import Path
@@ -19,6 +21,20 @@ from tailgate.scenario import Suite, load_scenario
 SUITE = Suite("small", "", ("thesis-ch4-v0",), (5,), ("none", "kf"), ("none",), 4)
 
 
+class Late:
+    """A controller whose command takes two milliseconds more."""
+
+    def __init__(self, inner) -> None:
+        self.inner = inner
+
+    def __getattr__(self, name):
+        return getattr(self.inner, name)
+
+    def step(self, *arguments):
+        time.sleep(0.002)
+        return self.inner.step(*arguments)
+
+
 class Slow:
     """A defence whose step takes two milliseconds more."""
 
@@ -33,12 +49,16 @@ class Slow:
         return self.inner.step(*arguments)
 
 
-def test_what_is_timed_is_the_step_of_the_defence() -> None:
-    """Two milliseconds more in a step are two milliseconds more, and the loop around it is not counted."""
+def test_what_is_timed_is_the_step_of_the_defence_alone() -> None:
+    """Two milliseconds more in its step count, and in the controller beside it they do not."""
     place = load_scenario("thesis-ch4-v0")
-    timed = {name: _Timed(defence) for name, defence in (("kf", Spec("defence", "kf").make()), ("slow", Slow()))}
-    taken = {name: min(_round(place.loop(one), one, seed) for seed in range(3)) for name, one in timed.items()}
-    assert 2000 < taken["slow"] - taken["kf"] < 20_000 and len(timed["kf"].taken) == min(place.horizon, 200)
+    loops = {
+        "kf": (place.loop(kf := _Timed(Spec("defence", "kf").make())), kf), "slow": (place.loop(slow := _Timed(Slow())), slow),
+        "beside": (dataclasses.replace(place.loop(one := _Timed(Spec("defence", "kf").make())), controller=Late(place.controller)), one),
+    }  # fmt: skip
+    taken = {name: min(_round(loop, timed, seed) for seed in range(3)) for name, (loop, timed) in loops.items()}
+    assert taken["slow"] > 2000 > taken["beside"] and taken["kf"] < 2000 and len(kf.taken) == min(place.horizon, 200)
+    assert copy.copy(kf).taken == kf.taken
 
 
 def test_the_defences_of_a_suite_are_timed_in_turn() -> None:
@@ -62,7 +82,7 @@ def test_a_page_says_what_a_step_costs(tmp_path: Path, capsys: pytest.CaptureFix
     (tmp_path / "rows.jsonl").write_bytes(encode(run(cells_of(SUITE))))
     board_of(SUITE, tmp_path, require_adaptive=False)
     board, path = tmp_path / "board.json", tmp_path / "step_time.json"
-    assert beside(board) is None
+    assert beside(board, "small") is None
     assert main(["leaderboard", "page", str(board), "--out", str(tmp_path / "page"), "--no-replays"]) == 0
     assert "A step takes" not in (tmp_path / "page/small/kf.html").read_text()
     held = Clock(suite="small", scenario="thesis-ch4-v0", agents=1, rounds=3, processor="A <chip>", version="1", commit=None,
@@ -72,6 +92,10 @@ def test_a_page_says_what_a_step_costs(tmp_path: Path, capsys: pytest.CaptureFix
     said = (tmp_path / "page/small/kf.html").read_text()
     assert "A step takes 12.5 \N{MICRO SIGN}s for one episode of one car (12 to 13 in 3 rounds, A &lt;chip&gt;)." in said
     assert "A step takes" not in (tmp_path / "page/small/none.html").read_text()
+    with pytest.raises(InputError, match=r"step_time\.json: suite"):
+        beside(board, "other")
+    assert main(["leaderboard", "page", str(board), str(board), "--out", str(tmp_path / "page")]) == 2
+    assert "no other board" in capsys.readouterr().err
     assert build_site([json.loads(board.read_text())], tmp_path / "page", replays=False).is_file()
 
 
@@ -89,15 +113,33 @@ def test_anything_else_than_step_times_is_refused(tmp_path: Path, change: dict, 
     path.write_text(json.dumps(good | change))
     with pytest.raises(InputError, match=f"step_time.json: {field}"):
         read_clock(path)
+    path.write_text("{")
+    with pytest.raises(InputError, match="which is JSON"):
+        read_clock(path)
 
 
-def test_the_command_writes_a_table_and_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """The fastest first; --json prints the file."""
-    words = ["leaderboard", "clock", "quick-v0", "--out", str(tmp_path), "--defence", "kf", "--defence", "none", "--rounds", "1"]
+def test_the_command_writes_a_table_and_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """The fastest first; --json prints the file. Of some defences alone it prints the figures, and leaves the file as it is."""
+    monkeypatch.setattr("tailgate.scenario.load_suite", lambda name: SUITE)
+    words = ["leaderboard", "clock", "small", "--out", str(tmp_path), "--rounds", "1"]
     assert main(words) == 0
     lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("\N{BOX DRAWINGS LIGHT VERTICAL}")]
     assert ["none" in lines[0], "kf" in lines[1], len(lines)] == [True, True, 2]
     assert main([*words, "--json"]) == 0
-    assert json.loads(capsys.readouterr().out) == json.loads((tmp_path / "quick-v0/step_time.json").read_text())
-    assert main(["leaderboard", "clock", "quick-v0", "--out", str(tmp_path), "--defence", "kff"]) == 2
+    held = (tmp_path / "small/step_time.json").read_text()
+    assert json.loads(capsys.readouterr().out) == json.loads(held)
+    assert main([*words, "--defence", "chi2_kf"]) == 0 and (tmp_path / "small/step_time.json").read_text() == held
+    assert "chi2_kf" in capsys.readouterr().out
+    assert main([*words, "--defence", "kff"]) == 2
     assert "did you mean 'kf'" in capsys.readouterr().err
+
+
+def test_a_defence_that_fails_is_not_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Only what means nothing in the scenario is; a failure is said."""
+
+    def broken(*arguments):
+        raise InputError("defence output x", "NaN or infinity", "finite numbers")
+
+    monkeypatch.setattr("tailgate.leaderboard.clock._round", broken)
+    with pytest.raises(InputError, match="defence output x"):
+        measure(SUITE, rounds=1)

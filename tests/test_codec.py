@@ -21,6 +21,7 @@ from tailgate.errors import InputError
 from tailgate.metrics import METRICS
 from tailgate.registry import Spec
 from tailgate.scenario import load_scenario
+from tailgate.schema import as_data
 from tailgate.trace import rollout
 
 ROOT = Path(__file__).parents[1]
@@ -270,13 +271,24 @@ def test_modes_of_several_sizes():
 
 
 @pytest.mark.parametrize(("fields", "said"), [
-    ({"shares": ()}, r"\(0, 1\]"), ({"shares": (0.5, 0.5)}, "each once"), ({"shares": (0.5, 2.0)}, r"\(0, 1\]"),
+    ({"shares": (0.5, 0.5)}, "each once"), ({"shares": (0.5, 2.0)}, r"\(0, 1\]"),
     ({"shares": (0.5,), "action": "ramp"}, "action mode"), ({"shares": (0.5, 1.0), "action": "continuous"}, "action mode"),
 ])  # fmt: skip
 def test_shares_that_mean_nothing_are_refused(fields, said):
     """None, one twice, more than all of the value, and an action that has sizes of its own."""
     with pytest.raises(InputError, match="shares.*" + said):
         ActionCodec(ActionSpec(value=3.0, **fields), _platoon(5, kinds=("fdi",)).brief())
+    with pytest.raises(InputError, match=r"shares.*dos_hold"):  # held readings have no size
+        ActionCodec(ActionSpec(shares=(0.5, 1.0)), _platoon(5, kinds=("dos_hold",)).brief())
+
+
+def test_an_action_without_shares_is_what_it_was():
+    """Its data says nothing of them, so that cards, hashes and checkpoints of before hold; one share of all is the same action."""
+    assert "shares" not in as_data(ActionSpec()) and as_data(ActionSpec(shares=(0.5,)))["shares"] == [0.5]
+    brief = _platoon(5, kinds=("fdi", "dos_hold")).brief()
+    one, two = (ActionCodec(ActionSpec(shares=shares), brief).modes for shares in ((), (1.0,)))
+    assert [mode.name for mode in one] == [mode.name for mode in two]
+    assert all(np.array_equal(a.value, b.value) for a, b in zip(one, two, strict=True))
 
 
 def test_a_mode_hits_its_agent_in_the_loop():

@@ -18,7 +18,7 @@ def add(actions: Any) -> None:
     command = actions.add_parser(
         "clock", help="measure what a step of each defence costs",
         description="Time the defences of a suite alone, step by step in one episode, in turn, and write OUT/SUITE/step_time.json, which "
-        "the pages of the entries show. The machine should have nothing else to do.",
+        "the pages of the entries show. The machine should have nothing else to do. With --defence figures are printed, not written.",
     )  # fmt: skip
     command.add_argument("suite", metavar="SUITE", help="suite by name or YAML file")
     command.add_argument("--out", required=True, metavar="DIR", help="folder of the boards")
@@ -34,23 +34,28 @@ def _clock(options: argparse.Namespace) -> int:
     from tailgate.scenario import load_suite
 
     suite = load_suite(options.suite)
-    path = writable_directory(Path(options.out) / suite.name) / FILE
+    path = None if options.defence else writable_directory(Path(options.out) / suite.name) / FILE  # part of a file would lose the rest
     with progress(Console(stderr=True)) as update:
         clock = measure(
             suite, options.defence, rounds=options.rounds,
             progress=lambda done, total: update("timing", done, total, cells(done, total)),
         )  # fmt: skip
     held = clock.model_dump_json(indent=1) + "\n"
-    write_atomic(path, held.encode())
+    if path is not None:
+        write_atomic(path, held.encode())
     if options.json:
         print(held, end="")
         return 0
-    table = Table(title=escape(f"a step in {clock.scenario}, one episode, {clock.agents} agents, {clock.processor} [us]"))
+    of = "one car" if clock.agents == 1 else f"{clock.agents} agents"
+    table = Table(title=escape(f"a step in {clock.scenario}, one episode of {of}, {clock.processor} [us]"))
     for heading in ("defence", "median", "least", "largest"):
         table.add_column(heading, overflow="fold", justify="left" if heading == "defence" else "right")
     for entry in sorted(clock.entries, key=lambda entry: entry.median):
         table.add_row(escape(entry.defence), *(f"{value:.1f}" for value in (entry.median, entry.low, entry.high)))
-    out = console()
-    out.print(table)
-    print(path)
+    console().print(table)
+    timed = {entry.defence for entry in clock.entries}
+    if missing := [name for name in suite.defences if not options.defence and name not in timed]:
+        print(f"without a meaning there: {', '.join(missing)}")
+    if path is not None:
+        print(path)
     return 0

@@ -82,7 +82,7 @@ def percent(value: float) -> str:
     if value < 0:
         return f"\N{MINUS SIGN}{percent(-value)}"
     if value in (0, 1) or 0.005 <= value < 0.995:
-        return f"{math.floor(round(100 * value, 9) + 0.5)}%"  # a half goes up, as people count: 57.5 is 58
+        return f"{100 * value:.0f}%"
     if value < 0.0005 or value > 0.9995:
         return "<0.1%" if value < 0.5 else ">99.9%"
     return f"{100 * value:.1f}%"

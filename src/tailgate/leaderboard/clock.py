@@ -3,7 +3,8 @@
     {"format": "tailgate-step-time-1", "suite", "scenario", "agents", "rounds", "processor", "version", "commit", "entries": [..]}
 
 Each entry has its defence and the `median`, `low` and `high` of its rounds [us]: of one step of the defence alone, for one episode with
-all its agents, without an attack, in the plain loop. Rounds of all defences are played in turn, so that a busy moment meets them all.
+all its agents, without an attack, in the plain loop. A round is the first 200 steps of an episode, the first round is not counted, and
+rounds of all defences are played in turn, so that a busy moment meets them all.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 import tailgate
 from tailgate import draws
 from tailgate.core import no_command
-from tailgate.errors import InputError, said, wanted
+from tailgate.errors import InputError, NotApplicable, said, wanted
 from tailgate.loop import Loop
 from tailgate.machine import commit, processor
 from tailgate.registry import Spec
@@ -60,15 +61,17 @@ class _Timed:
     """A defence that keeps how long each of its steps took [ns]."""
 
     def __init__(self, defence: Any) -> None:
-        self._defence = defence
+        self.defence = defence
         self.taken: list[int] = []
 
     def __getattr__(self, name: str) -> Any:
-        return getattr(self._defence, name)
+        if name.startswith("__") or name == "defence":  # of a copy that has no attributes yet
+            raise AttributeError(name)
+        return getattr(self.defence, name)
 
     def step(self, *arguments: Any) -> Any:
         began = time.perf_counter_ns()
-        answer = self._defence.step(*arguments)
+        answer = self.defence.step(*arguments)
         self.taken.append(time.perf_counter_ns() - began)
         return answer
 
@@ -87,8 +90,8 @@ def _round(loop: Loop, timed: _Timed, seed: int) -> float:
 def measure(suite: Suite, defences: Sequence[str] = (), *, rounds: int = ROUNDS, progress: Progress | None = None) -> Clock:
     """Step times of a suite's registered defences in its first scenario, those left out that mean nothing there.
 
-    The first episode of each is not counted: it loads what the defence needs. Raises InputError for a defence that does not exist or is a
-    class of somebody's own, and where none is left.
+    The first round of each loads what the defence needs. Raises InputError for a defence that does not exist, that fails, or is a class of
+    somebody's own, for a named one that means nothing there, and where none is left.
     """
     if rounds < 1:
         raise InputError("rounds", rounds, "a whole number not below 1")
@@ -101,7 +104,7 @@ def measure(suite: Suite, defences: Sequence[str] = (), *, rounds: int = ROUNDS,
         try:
             loop = place.loop(timed, spec.entry.uses)
             _round(loop, timed, 0)
-        except InputError:
+        except NotApplicable:
             if defences:
                 raise
             continue
@@ -133,11 +136,18 @@ def read_clock(path: Path) -> Clock:
         raise InputError("step times", str(path), f"a readable file of leaderboard clock ({said(error)})") from None
     except ValidationError as error:
         first = error.errors()[0]
-        field = ".".join(map(str, first["loc"])) or "file"
+        field = ".".join(map(str, first["loc"]))
+        if not field:
+            raise InputError("step times", str(path), "a file of leaderboard clock, which is JSON") from None
         raise InputError(f"step times {path}: {field}", first["input"] if first["type"] != "missing" else None, wanted(first)) from None
 
 
-def beside(board: Path) -> Clock | None:
-    """The step times that lie beside a board's file; none where there are none."""
+def beside(board: Path, suite: str) -> Clock | None:
+    """The step times that lie beside a board's file; none where there are none. Raises InputError for those of another suite."""
     path = board.parent / FILE
-    return read_clock(path) if path.is_file() else None
+    if not path.is_file():
+        return None
+    clock = read_clock(path)
+    if clock.suite != suite:
+        raise InputError(f"step times {path}: suite", clock.suite, f"{suite}, whose board is beside it")
+    return clock
