@@ -132,15 +132,22 @@ def test_a_published_board_is_of_the_suite_that_is_here(name: str) -> None:
         assert (entry.verified and entry.verified.sound) or (again and again.equal > 0 == again.differs), entry.defence
 
 
+# Plans of before whose policies count on: those of radar-v0 answered late by 60 m (decision 30).
+EARLIER = {"radar-v0": {"1ea5def9aee4fb47", "20e6fc0e71aa5875", "49a9e01c935738ac", "7ea5b769dc8e2028"}}
+
+
 @pytest.mark.parametrize("name", [name for name in BOARDS if (ROOT / f"results/{name}/attacked").is_dir()])
 def test_published_attackers_are_those_that_the_suite_asks_for(name: str) -> None:
-    """A change of the fields of a training, or of a suite's plan, would leave every defence unattacked."""
+    """A change of the fields of a training, or of a suite's plan, would leave every defence unattacked; those of an earlier plan are told."""
     asked = {(want.plan, want.seed) for want in asked_of(load_suite(name))}
     found = sorted((ROOT / f"results/{name}/attacked/policies").glob("*/policy-*.json"))
-    assert found
+    met = set()
     for path in found:
         training = json.loads(path.read_text(encoding="utf-8"))["training"]
-        assert (plan_key(training["config"]), training["seed"]) in asked, path
+        plan = plan_key(training["config"])
+        assert (plan, training["seed"]) in asked or plan in EARLIER.get(name, ()), path
+        met.add(plan)
+    assert met & {plan for plan, _ in asked}
 
 
 def test_a_field_at_its_default_leaves_no_mark_on_a_plan() -> None:
