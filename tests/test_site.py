@@ -380,3 +380,12 @@ def test_links_lead_somewhere(site):
                 assert parts.path or parts.fragment in ids, href
                 count += 1
     assert count > 50
+
+
+def test_where_nobody_did_damage_no_attack_is_called_the_worst() -> None:
+    """`safe_state_brake` on radar-v0: no attack did anything at any dose, where `chi2_kf_sparse` has a worst one."""
+    held = json.loads((ROOT / "results/radar-v0/board.json").read_text(encoding="utf-8"))
+    suite = Suite(read_board(held), "radar-v0")
+    by_name = {e.defence: critical_of(suite, e, "black") for e in suite.board.entries}
+    assert by_name["safe_state_brake"]["worst"] == "" and "no attack of this knowledge did damage" in by_name["safe_state_brake"]["about"]
+    assert "chi2_kf_sparse-ppo-black" in by_name["chi2_kf_sparse"]["worst"] and "did damage" not in by_name["chi2_kf_sparse"]["about"]

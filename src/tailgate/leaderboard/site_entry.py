@@ -82,7 +82,8 @@ def _rates(suite: Suite, entry: EntryPart) -> list[Data]:
         cells = []
         for level in LEVELS:
             rate = kept.get((dose, level))
-            worst = suite.where(rate.worst.scenario, rate.worst.attack) if rate and rate.worst else ""
+            spared = rate is not None and rate.undamaged is not None and rate.undamaged.value == 1.0
+            worst = "none did damage" if spared else suite.where(rate.worst.scenario, rate.worst.attack) if rate and rate.worst else ""
             cells.append(share_of(rate.undamaged if rate else None) | {"worst": worst, "attacks": rate.attacks if rate else None})
         out.append({"dose": dose_text(dose), "cells": cells})
     return out
