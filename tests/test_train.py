@@ -372,6 +372,9 @@ def test_a_fresh_start_forgets_the_run_before_and_resume_wants_the_same_learner(
     assert cli.main(["train", *small_run]) == 0
     assert cli.main(["train", "--resume", "gamma=0.5"]) == 2
     assert "got 'gamma=0.5'; expected gamma=0.99, as in" in capsys.readouterr().err
+    held = {path: path.read_bytes() for path in run.glob("*.json")}
+    assert cli.main(["train", "--resume", "steps=10"]) == 2
+    assert "steps: got 10; expected at least" in capsys.readouterr().err and all(path.read_bytes() == text for path, text in held.items())
 
 
 @pytest.mark.parametrize("settings", [

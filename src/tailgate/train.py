@@ -334,7 +334,7 @@ def plan_key(config: dict[str, Any]) -> str:
 
 
 def same_run(config: TrainConfig) -> None:
-    """Raise InputError when a run would be resumed with another training; the number of steps and the comparison may change."""
+    """Raise InputError when a run would be resumed with another training; more steps, and another comparison, may be asked for."""
     held = config.directory / "config.json"
     now, blank, free = as_data(config), as_data(TrainConfig()), free_of(config.teacher) | {"steps"}
     try:
@@ -347,6 +347,9 @@ def same_run(config: TrainConfig) -> None:
         was = ", ".join(f"{key}={json.dumps(old)}" for key, (old, _) in changed.items())
         asked = ", ".join(f"{key}={json.dumps(new)}" for key, (_, new) in changed.items())
         raise InputError("resume", asked, f"{was}, as in {held}: steps and the comparison's fields may change")
+    made = before.get("steps", blank["steps"])
+    if done := sorted(config.directory.glob("policy-*.json")) if config.steps < made else []:
+        raise InputError("steps", config.steps, f"at least {made}, as {done[0]} was trained: what was learned is not taken back")
 
 
 def main(arguments: list[str] | None = None) -> int:
