@@ -387,5 +387,5 @@ def test_where_nobody_did_damage_no_attack_is_called_the_worst() -> None:
     held = json.loads((ROOT / "results/radar-v0/board.json").read_text(encoding="utf-8"))
     suite = Suite(read_board(held), "radar-v0")
     by_name = {e.defence: critical_of(suite, e, "black") for e in suite.board.entries}
-    assert by_name["safe_state_brake"]["worst"] == "" and "no attack of this knowledge did damage" in by_name["safe_state_brake"]["about"]
+    assert by_name["safe_state_brake"]["worst"] == "" and "no attack that knows at most this did damage" in by_name["safe_state_brake"]["about"]
     assert "chi2_kf_sparse-ppo-black" in by_name["chi2_kf_sparse"]["worst"] and "did damage" not in by_name["chi2_kf_sparse"]["about"]

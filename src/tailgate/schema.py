@@ -9,12 +9,13 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import yaml
-from pydantic import ConfigDict, TypeAdapter, ValidationError
+from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 from pydantic.errors import PydanticSchemaGenerationError, PydanticUserError
 
-from tailgate.errors import InputError, unknown, wanted
+from tailgate.errors import InputError, said, unknown, wanted
 
 T = TypeVar("T")
+M = TypeVar("M", bound=BaseModel)
 
 
 def fields_of(cls: type) -> dict[str, Any]:
@@ -102,6 +103,20 @@ class _Once(yaml.SafeLoader):
             if isinstance(key.value, str):
                 seen.add(key.value)
         return super().construct_mapping(node, deep)
+
+
+def read_model(model: type[M], path: Path, what: str, made_by: str) -> M:
+    """A JSON file of a model. Raises InputError that names the file, and the field, for anything else than what `made_by` writes."""
+    try:
+        return model.model_validate_json(path.read_bytes())
+    except OSError as error:
+        raise InputError(what, str(path), f"a readable report of {made_by} ({said(error)})") from None
+    except ValidationError as error:
+        first = error.errors()[0]
+        field = ".".join(map(str, first["loc"]))
+        if not field:
+            raise InputError(what, str(path), f"a report of {made_by}, which is a JSON object") from None
+        raise InputError(f"{what} {path}: {field}", first["input"] if first["type"] != "missing" else None, wanted(first)) from None
 
 
 def read_yaml(path: Path, where: str) -> dict[str, Any]:

@@ -58,7 +58,7 @@ def _run(options: argparse.Namespace) -> int:
 
     out, started = Path(options.out), time.perf_counter()
     suites = [load_suite(name) for name in options.suites]
-    clocks = {suite.name: beside(out / suite.name / BOARD, suite.name) for suite in suites}  # before anything is played
+    clocks = [beside(out / suite.name / BOARD) for suite in suites]  # before anything is played
     boards = []
     with progress(Console(stderr=True)) as update:
         for suite in suites:
@@ -108,13 +108,12 @@ def _head(options: argparse.Namespace) -> int:
 
 
 def _page(options: argparse.Namespace) -> int:
-    from tailgate.leaderboard.board_format import load, read_board
+    from tailgate.leaderboard.board_format import load
     from tailgate.leaderboard.clock import beside
     from tailgate.leaderboard.site import build_site
 
     boards = [load(Path(name)) for name in options.boards]
-    names = [read_board(board).suite.name for board in boards]
-    clocks = {name: beside(Path(file), name) for file, name in zip(options.boards, names, strict=True)}
+    clocks = [beside(Path(name)) for name in options.boards]
     page = build_site(boards, Path(options.out), title=options.title, replays=not options.no_replays, clocks=clocks)
     print(page)
     return 0

@@ -15,16 +15,17 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
 import tailgate
 from tailgate import draws
 from tailgate.core import no_command
-from tailgate.errors import InputError, NotApplicable, said, wanted
+from tailgate.errors import InputError, NotApplicable
 from tailgate.loop import Loop
 from tailgate.machine import commit, processor
 from tailgate.registry import Spec
 from tailgate.scenario import Suite, load_scenario
+from tailgate.schema import read_model
 
 FILE = "step_time.json"
 ROUNDS, MOST = 5, 200  # episodes of each defence that count; steps of an episode that are looked at
@@ -77,7 +78,7 @@ class _Timed:
 
 
 def _round(loop: Loop, timed: _Timed, seed: int) -> float:
-    """The median step of one clean episode [us]."""
+    """The median of the first steps of a clean episode [us]."""
     timed.taken.clear()
     state, nothing = loop.start(draws.keys("calibrate", [seed])), no_command(1, loop.model.agents, len(loop.model.wires))
     for _ in range(min(loop.horizon, MOST)):
@@ -130,24 +131,10 @@ def measure(suite: Suite, defences: Sequence[str] = (), *, rounds: int = ROUNDS,
 
 def read_clock(path: Path) -> Clock:
     """Raises InputError that names the file and the field for anything else than step times."""
-    try:
-        return Clock.model_validate_json(path.read_bytes())
-    except OSError as error:
-        raise InputError("step times", str(path), f"a readable file of leaderboard clock ({said(error)})") from None
-    except ValidationError as error:
-        first = error.errors()[0]
-        field = ".".join(map(str, first["loc"]))
-        if not field:
-            raise InputError("step times", str(path), "a file of leaderboard clock, which is JSON") from None
-        raise InputError(f"step times {path}: {field}", first["input"] if first["type"] != "missing" else None, wanted(first)) from None
+    return read_model(Clock, path, "step times", "leaderboard clock")
 
 
-def beside(board: Path, suite: str) -> Clock | None:
-    """The step times that lie beside a board's file; none where there are none. Raises InputError for those of another suite."""
+def beside(board: Path) -> Clock | None:
+    """The step times that lie beside a board's file; none where there are none."""
     path = board.parent / FILE
-    if not path.is_file():
-        return None
-    clock = read_clock(path)
-    if clock.suite != suite:
-        raise InputError(f"step times {path}: suite", clock.suite, f"{suite}, whose board is beside it")
-    return clock
+    return read_clock(path) if path.is_file() else None

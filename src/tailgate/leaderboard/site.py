@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -70,15 +70,20 @@ def _environment() -> Environment:
 
 
 def build_site(
-    boards: Sequence[dict[str, Any]], out: Path, *, title: str | None = None, replays: bool = True, clocks: Mapping[str, Clock | None] = {},
+    boards: Sequence[dict[str, Any]], out: Path, *, title: str | None = None, replays: bool = True, clocks: Sequence[Clock | None] = (),
 ) -> Path:  # fmt: skip
     """Writes the site of `boards` (format tailgate-board-1) to the folder `out` and returns the path of its first page.
 
     replays: play each entry's worst episode again and write its page; without, the entries' pages say that it was not done.
-    clocks: step times by the name of the suite, where somebody has measured them.
-    Raises InputError, before anything is written, for no board, two of a suite, and for one that is not of the format (names the field).
+    clocks: step times of each board, where somebody has measured them.
+    Raises InputError, before anything is written, for no board, two of a suite, one that is not of the format (names the field), and for
+    step times of another suite.
     """
     suites = _suites(boards)
+    timed = list(clocks) or [None] * len(suites)
+    for suite, clock in zip(suites, timed, strict=True):
+        if clock is not None and clock.suite != suite.board.suite.name:
+            raise InputError("step times: suite", clock.suite, f"{suite.board.suite.name}, whose board they lie beside")
     held = [_encoded(data, "board") for data in boards]
     heading = title or TITLE
     environment = _environment()
@@ -92,7 +97,7 @@ def build_site(
     written["index.html"] = _utf8(page)
     template = environment.get_template("site_entry.html")
     listed: list[Data] = []
-    for suite in suites:
+    for suite, clock in zip(suites, timed, strict=True):
         for entry in suite.ordered():
             where = suite.pages[entry.defence]
             also = [(s.board.suite.name, f"../{s.pages[entry.defence]}") for s in suites if s is not suite and entry.defence in s.pages]
@@ -101,7 +106,7 @@ def build_site(
             done = replay_of(entry.worst_episode, replay, source) if replays else Replayed(why="Replays were not asked for.")
             if done.page:
                 written[str(replay.relative_to(folder))] = replay.read_bytes()
-            context = entry_page(suite, entry, done, also, clocks.get(suite.board.suite.name))
+            context = entry_page(suite, entry, done, also, clock)
             written[where] = _utf8(template.render(entry=context, **common))
             listed.append({
                 "suite": suite.board.suite.name, "defence": entry.defence, "status": entry.status, "class": entry.class_, "page": where,

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
-from .board_format import LEVELS, Board, CellPart, Critical, Dose, EntryPart, Level, Limited, Worst
+from .board_format import LEVELS, Board, CellPart, Critical, Dose, EntryPart, Level, Limited
 from .build import Name, names_of, percent, shade
 from .charts import Axis
 
@@ -55,10 +55,11 @@ class Suite:
         trusted = [a.attack for a in b.trust.attacks] if b.trust else []
         self.attacks = names_of(dict.fromkeys([*own, *worst, *points, *heard, *robust, *trusted]))
 
-    def harmless(self, defence: str, worst: Worst) -> bool:
-        """Whether the worst attack on a defence, and so every one, did no damage at any dose."""
-        mine = [c.damage for c in self.board.cells if (c.defence, c.scenario, c.attack) == (defence, worst.scenario, worst.attack)]
-        return bool(mine) and all(damage is not None and damage.value == 0.0 for damage in mine)
+    def harmless(self, defence: str, level: Level) -> bool:
+        """Whether no attack that knows at most so much did damage to a defence, at any dose and in any scenario."""
+        known = LEVELS[: LEVELS.index(level) + 1]
+        mine = [c.damage.value for c in self.board.cells if c.defence == defence and c.knowledge in known and not c.optimal and c.damage]
+        return bool(mine) and not any(mine)
 
     @property
     def largest(self) -> int | None:
@@ -142,10 +143,10 @@ def critical_of(suite: Suite, entry: EntryPart, level: Level) -> Data:
 
     span = "" if critical.low is None else f"{words(critical.low)} to {words(critical.high)}"
     clean = critical.value == 0.0  # then no attack is to blame
-    harmless = critical.worst is not None and not clean and suite.harmless(entry.defence, critical.worst)
+    harmless = suite.harmless(entry.defence, level)
     worst = suite.where(critical.worst.scenario, critical.worst.attack) if critical.worst and not clean and not harmless else ""
     bar = {"low": at(critical.low), "x": at(critical.value), "high": at(critical.high), "beyond": critical.value is None}
-    about = ["damage without any attack"] * clean + ["no attack of this knowledge did damage in any episode"] * harmless
+    about = ["damage without any attack"] * clean + ["no attack that knows at most this did damage"] * harmless
     about += [f"{percent(1 - suite.board.suite.alpha)} interval {span}"] * bool(span) + [f"worst: {worst}"] * bool(worst)
     sort = _sort_dose(critical)
     return {

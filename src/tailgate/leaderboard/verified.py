@@ -7,9 +7,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
-from tailgate.errors import InputError, said, wanted
+from tailgate.schema import read_model
 
 Count = Annotated[int, Field(strict=True, ge=0)]
 
@@ -51,14 +51,7 @@ def digest(path: Path) -> str:
 
 def read_report(path: Path) -> Report:
     """Raises InputError that names the file for anything else than a report of `leaderboard verify`."""
-    try:
-        return Report.model_validate_json(path.read_bytes())
-    except OSError as error:
-        raise InputError("verified", str(path), f"a readable report of leaderboard verify ({said(error)})") from None
-    except ValidationError as error:
-        first = error.errors()[0]
-        field = ".".join(map(str, first["loc"])) or "report"
-        raise InputError(f"verified {path}: {field}", first["input"] if first["type"] != "missing" else None, wanted(first)) from None
+    return read_model(Report, path, "verified", "leaderboard verify")
 
 
 def with_verified(board: dict[str, Any], folder: Path, files: Mapping[str, Mapping[str, int]]) -> dict[str, Any]:
