@@ -49,7 +49,7 @@ def test_an_honest_board_comes_out_equal(board: Data) -> None:
     report = check(board)
     assert report["counts"] == {"equal": 4, "differs": 0, "unchecked": 0} and report["findings"] == report["reasons"] == []
     assert report["entries"] == [{"defence": name, "cells": 2, "equal": 2, "differs": 0, "unchecked": 0} for name in ("none", "kf")]
-    assert report["prints"] == {str(i): {name: cell[name] for name in ("decisions", "trace")} for i, cell in enumerate(board["cells"])}
+    assert report["prints"] == {str(i): {name: cell[name] for name in ("hits", "decisions", "trace")} for i, cell in enumerate(board["cells"])}
     assert check(board, workers=2) == report
 
 

@@ -30,6 +30,8 @@ def add(actions: Any) -> None:
     command.add_argument("--workers", type=int, default=2, metavar="N", help="processes (default 2); change no result")
     command.add_argument("--beacon", default="", metavar="TEXT", help="the round: random text of after the submissions (default: none)")
     command.add_argument("--score-only", action="store_true", help="play nothing: score the rows that are there")
+    command.add_argument("--keep-entries", action="store_true",
+                         help="entries of OUT/SUITE/board.json stay that have no rows here, or not those of all their cells")  # fmt: skip
     command.add_argument("--detection", action="store_true", help="then play detection as `leaderboard detect` does: slow")
     command.add_argument("--unattacked", action="store_true", help="also rank defences that no attack was trained against")
     command.add_argument("--no-replays", action="store_true", help="leave out the replays of the worst episodes")
@@ -51,7 +53,7 @@ def _run(options: argparse.Namespace) -> int:
     sys.path.insert(0, "")  # module:Class is looked for in the working directory, as `tailgate evaluate` does
     from tailgate.leaderboard.clock import beside
     from tailgate.leaderboard.detect import detect
-    from tailgate.leaderboard.run import BOARD, board_of, play
+    from tailgate.leaderboard.run import BOARD, board_of, kept_board, play
     from tailgate.leaderboard.run_record import Record
     from tailgate.leaderboard.site import build_site
     from tailgate.scenario import load_suite
@@ -59,6 +61,8 @@ def _run(options: argparse.Namespace) -> int:
     out, started = Path(options.out), time.perf_counter()
     suites = [load_suite(name) for name in options.suites]
     clocks = [beside(out / suite.name / BOARD) for suite in suites]  # before anything is played
+    for suite in suites if options.keep_entries else ():
+        kept_board(out / suite.name / BOARD, suite)
     boards = []
     with progress(Console(stderr=True)) as update:
         for suite in suites:
@@ -70,7 +74,9 @@ def _run(options: argparse.Namespace) -> int:
                     progress=record.counting(lambda name, done, total: update(name, done, total, cells(done, total))),
                 )  # fmt: skip
                 print(f"rows: {rows}", file=sys.stderr)
-            board = board_of(suite, folder, beacon=options.beacon or None, require_adaptive=not options.unattacked)
+            board = board_of(
+                suite, folder, beacon=options.beacon or None, keep=options.keep_entries, require_adaptive=not options.unattacked
+            )
             print(record.finish(board["suite"]["rows"]), file=sys.stderr)
             boards.append(detect(folder / BOARD, suite, workers=options.workers, progress=update) if options.detection else board)
     page = build_site(boards, out / "page", replays=not options.no_replays, clocks=clocks)

@@ -25,10 +25,10 @@ def add(actions: Any) -> None:
     command = actions.add_parser(
         "check", help="play cells of a published board again, without its rows",
         description="Play cells of a board again and compare how many episodes came to damage, and the fingerprint of all decisions. "
-        "Rates, critical doses and curves have to follow from the cells; where all cells of the board are played, ranks and gates are "
-        "made again as well. With --detection, detection and stealth impact are played again instead. Exit code 1 when anything differs, "
-        "or when nothing could be checked. Registered names, the zoo, and files of policies that are here are played; a board never makes "
-        "this command import code.",
+        "Rates, critical doses and curves have to follow from the cells, ranks too where the cells say which episodes came to damage; "
+        "where all cells of the board are played, gates, flags and all else are made again as well. With --detection, detection and "
+        "stealth impact are played again instead. Exit code 1 when anything differs, or nothing could be checked. Registered names, the "
+        "zoo, and files of policies that are here are played; a board never makes this command import code.",
     )  # fmt: skip
     command.add_argument("board", metavar="FILE", help="board.json")
     command.add_argument("--sample", type=int, metavar="N", help="so many cells, drawn at random (default: all)")
@@ -37,7 +37,7 @@ def add(actions: Any) -> None:
     command.add_argument("--workers", type=int, default=1, metavar="N", help="processes (default 1); changes no result")
     command.add_argument("--detection", action="store_true",
                          help="in place of the cells play detection and stealth impact again: --sample then counts entries")  # fmt: skip
-    command.add_argument("--write", action="store_true", help="put into the board what was found, and the fingerprints of equal cells")
+    command.add_argument("--write", action="store_true", help="put into the board what was found, and hits and fingerprints of equal cells")
     command.add_argument("--json", action="store_true", help="print the report as JSON")
     command.set_defaults(run=_check)
 
@@ -121,7 +121,7 @@ def _print(report: dict[str, Any]) -> None:
     if strays:
         out.print(f"{len(strays)} figure{'s differ' if len(strays) > 1 else ' differs'} from what is made here:")
     else:
-        out.print("Rates, critical doses and curves of all entries follow from the cells.")
+        out.print(f"Rates, critical doses{'' if report['untold'] else ', ranks'} and curves of all entries follow from the cells.")
     for stray in strays[:SHOWN]:
         where, board, here = _first(stray["board"], stray["here"])
         place = ": ".join(filter(None, (stray["defence"], stray["field"] + where)))
@@ -130,7 +130,8 @@ def _print(report: dict[str, Any]) -> None:
     if len(strays) > SHOWN:
         out.print(f"and {len(strays) - SHOWN} more; --json lists them all", highlight=False)
     if not report["scored"]:
-        out.print("Ranks, gates and clean figures were not made again: that takes all cells of the board.")
+        which = "Ranks, gates" if report["untold"] else "Gates"
+        out.print(f"{which} and clean figures were not made again: that takes all cells of the board.")
     elif not strays:
         out.print("Ranks, gates and clean figures came out as the board says.")
     findings: list[dict[str, Any]] = report["findings"]

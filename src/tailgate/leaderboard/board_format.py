@@ -214,6 +214,7 @@ class CellPart(Part):
     failed: Count = 0
     reason: Text = ""
     damage: Interval | None
+    hits: Annotated[str, Field(strict=True, pattern="^([0-9a-f]{2})*$")] | None = None  # a bit for each episode, by seed; None: not told
     decisions: Text | None = None
     trace: Text | None = None
 
@@ -346,6 +347,8 @@ def _agree(board: Board, where: str) -> None:
             raise InputError(f"{where}.cells[{i}].scenario", cell.scenario, "one of the suite's scenarios")
         if cell.dose not in board.suite.doses:
             raise InputError(f"{where}.cells[{i}].dose", cell.dose, f"one of the suite's doses {board.suite.doses}")
+        if cell.hits is not None and len(cell.hits) != 2 * -(-cell.n // 8):
+            raise InputError(f"{where}.cells[{i}].hits", cell.hits, f"{2 * -(-cell.n // 8)} hexadecimal digits, for {cell.n} episodes")
     for i, curve in enumerate(board.curves):
         if curve.defence not in names:
             raise InputError(f"{where}.curves[{i}].defence", curve.defence, "one of the entries' defences")

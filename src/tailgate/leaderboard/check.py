@@ -24,14 +24,14 @@ from tailgate.scoring.attacks import Admitted
 from tailgate.scoring.board import score
 from tailgate.scoring.cells import figures
 from tailgate.scoring.damage import Row
-from tailgate.scoring.follow import same, strays
+from tailgate.scoring.follow import same, strays, untold
 from tailgate.verify import files_of
 
 from .board_format import Board, CellPart, read_board
 
 Data = dict[str, Any]
 VERDICTS = ("equal", "differs", "unchecked")
-PRINTS = ("decisions", "trace")  # which a board of before cells had fingerprints lacks
+PRINTS = ("hits", "decisions", "trace")  # which a board of before they were made lacks
 SCORED = ("class", "uses", "status", "why", "gates", "critical_dose", "rates", "rank", "clean", "flags", "robustness")  # of an entry
 COMPARED = ("n", "failed", "damage", *PRINTS)
 EPISODES = 20_000  # whose rows are held at a time
@@ -50,14 +50,15 @@ def check(
     data: Data, *, sample: int | None = None, sample_seed: int = 0, defences: Sequence[str] = (), workers: int = 1,
     progress: Callable[[int, int], None] | None = None,
 ) -> Data:  # fmt: skip
-    """Play the cells of a board again, and compare how many episodes were played, failed and came to damage, and
-    the fingerprints of all.
+    """Play the cells of a board again, and compare how many episodes were played, failed and came to damage, which these
+    were, and the fingerprints of all.
 
     data: a board, as JSON; sample: so many cells, drawn by sample_seed (default: all); defences: only the cells of these.
     The report has `counts`, `entries` (the same for each defence), `reasons` and `findings`, cells that differ or could not be checked;
     `untrained`: attackers whose files are not here, though `leaderboard attack` would train them again, to the same weights;
-    `strays`: figures that do not follow from the cells, by `defence` and `field`; `scored`: whether ranks, gates and all else could be made
-    again, as all cells were played; `prints` has the fingerprints of each cell that came out equal, by its place in the board.
+    `strays`: figures that do not follow from the cells, by `defence` and `field`; `untold`: ranked entries whose ranks nobody can make of
+    cells, as these do not say which episodes came to damage; `scored`: whether ranks, gates and all else could be made
+    again, as all cells were played; `prints` has hits and fingerprints of each cell that came out equal, by its place in the board.
     Raises InputError for a board of another suite or version than is here, and for a defence that is not on it.
     """
     board = read_board(data)
@@ -88,7 +89,7 @@ def check(
     off = strays(data, suite)
     listed = {(stray["defence"], stray["field"]) for stray in off}
     off += [stray for stray in _scored(data, held, suite) if (stray["defence"], stray["field"]) not in listed]
-    return _report(board, asked, seen, sample, sample_seed) | {"strays": off, "scored": bool(held)}
+    return _report(board, asked, seen, sample, sample_seed) | {"strays": off, "untold": untold(data, suite), "scored": bool(held)}
 
 
 def _scored(data: Data, rows: list[Row], suite: Suite) -> Iterator[Data]:

@@ -18,8 +18,9 @@ from tailgate.scoring.board import score
 from tailgate.scoring.damage import CLEAN
 from tailgate.trust.run import REPORT, with_trust
 
-from .board_format import load, save
+from .board_format import load, read_board, save
 from .card import with_cards
+from .check import agree
 from .kept import with_kept
 from .verified import digest, with_verified
 
@@ -46,11 +47,12 @@ def play(
     return file
 
 
-def board_of(suite: Suite, folder: Path, beacon: str | None = None, **options: Any) -> dict[str, Any]:
+def board_of(suite: Suite, folder: Path, beacon: str | None = None, keep: bool = False, **options: Any) -> dict[str, Any]:
     """The board of all rows in a folder, with what verified/*.json says of them and the bounds of trust/trust.json; written as board.json.
 
-    Of the board.json that is there it keeps what does not come from rows (`with_kept`). Raises InputError where there are no rows, or rows
-    of another round than `beacon`, and for a report that cannot be read or is of something else.
+    Of the board.json that is there it keeps what does not come from rows (`with_kept`); with `keep` also the entries that have none, or
+    not those of all their cells. Raises InputError where there are no rows, or rows of another round than `beacon`, for a report that
+    cannot be read or is of something else, and for rows that do not fit beside the board.
     """
     found = sorted(path for path in folder.glob("**/*") if path.name.endswith((".jsonl", ".jsonl.xz")) and path.name != LIST)
     within = [(path, path.relative_to(folder).parts) for path in found]
@@ -58,18 +60,31 @@ def board_of(suite: Suite, folder: Path, beacon: str | None = None, **options: A
     files = [path for path, parts in within if not others & set(parts) and not any(part.startswith(".") for part in parts)]
     if not files:
         raise InputError("rows", str(folder), "a folder with rows of `leaderboard run`")
+    before = kept_board(folder / BOARD, suite) if keep else load(folder / BOARD) if (folder / BOARD).is_file() else None
     parts = {path: read_rows(path) for path in files}
-    board = score((row for rows in parts.values() for row in rows), suite, attacks=admitted.list_of(suite, folder / LIST), **options)
+    board = score(
+        (row for rows in parts.values() for row in rows), suite, attacks=admitted.list_of(suite, folder / LIST),
+        board=before if keep else None, **options,
+    )  # fmt: skip
     if beacon is not None and board["suite"]["beacon"] != beacon:
         raise InputError("beacon", beacon, f"that of the rows, {board['suite']['beacon'] or 'which are of public seeds'}")
     held = {digest(path): Counter(row["defence"] for row in rows) for path, rows in parts.items()}
     board = with_verified(with_cards(board, folder / CARDS), folder / VERIFIED, held)
     if (report := folder / TRUST / REPORT).is_file():
         board = with_trust(board, _report(report), f"trust {report}", suite)
-    if (path := folder / BOARD).is_file():
-        board = with_kept(board, load(path))
-    save(board, path)
+    if before is not None:
+        board = with_kept(board, before)
+    save(board, folder / BOARD)
     return board
+
+
+def kept_board(path: Path, suite: Suite) -> Any:
+    """The JSON of a board whose entries are to stay. Raises InputError where there is none, and for one of another suite or version."""
+    if not path.is_file():
+        raise InputError("--keep-entries", str(path), "a board whose entries can stay")
+    data = load(path)
+    agree(read_board(data, str(path)), suite)
+    return data
 
 
 def _report(path: Path) -> Any:

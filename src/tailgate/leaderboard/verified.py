@@ -71,6 +71,8 @@ def with_verified(board: dict[str, Any], folder: Path, files: Mapping[str, Mappi
 
     def told(entry: dict[str, Any]) -> dict[str, Any]:
         name = entry["defence"]
+        if "verified" in entry:
+            return entry
         mine = {(sha, name): rows[name] for sha, rows in files.items() if name in rows}
         if not set(mine) <= set(looked):
             return entry | {"verified": None}

@@ -18,8 +18,9 @@ from tailgate.strength.dose import CRITICAL
 from tailgate.threat import KNOWLEDGE
 
 from .attacks import Admitted, standing, taken_back
-from .cells import cells_of
-from .damage import CLEAN, PLAYED, SKIPPED, Key, Row, Table, has_road, named, tabulate
+from .beside import Beside, beside, silent
+from .cells import cells_of, ordered
+from .damage import CLEAN, PLAYED, SKIPPED, Column, Key, Row, Table, doses_of, has_road, named, tabulate
 from .doses import Worst
 from .flags import flags
 from .gates import failure, gates
@@ -35,13 +36,15 @@ Levels = dict[str, dict[str, Worst]]  # by defence and knowledge
 
 
 def score(
-    rows: Iterable[Row], suite: Suite, *, attacks: Sequence[Admitted] | None = None, alpha: float = 0.05, require_adaptive: bool = True
-) -> Data:
+    rows: Iterable[Row], suite: Suite, *, attacks: Sequence[Admitted] | None = None, alpha: float = 0.05, require_adaptive: bool = True,
+    board: Data | None = None,
+) -> Data:  # fmt: skip
     """The board of a suite from its rows, in the format of decision record 14. The order of the rows changes nothing.
 
     attacks: what joined the suite's attacks after it was published (`attacks.read`); every defence has to have met these too.
     require_adaptive: rank only defences that met an attack which was trained against them.
-    Raises InputError for rows that do not belong together.
+    board: of the same suite; what it says of other defences stands beside these rows (`beside`), and ranks are made of both.
+    Raises InputError for rows that do not belong together, or not beside the board.
     """
     if not 0.0 < alpha < 1.0:
         raise InputError("alpha", alpha, "a number above 0 and below 1")
@@ -52,29 +55,33 @@ def score(
             raise InputError(f"rows of {row['attack']}: attack_digest", row["attack_digest"], f"{line.digest}, as it was admitted")
     added = [text for text, line in lines.items() if line is not None]
     table = tabulate(rows, suite, added, taken_back(attacks or ()))
+    held = None if board is None else beside(table, board, suite, alpha)
+    table = table if held is None else held.table
+    kept = {} if held is None else held.entries
     origins = _origins(table)
-    slot = middle(table)
+    slot = middle(suite)
     levels: Levels = {d: {k: Worst(table, d, k, alpha) for k in KNOWLEDGE} for d in table.defences}
     asked = asked_of(suite) if require_adaptive and suite.adaptive else [] if require_adaptive else None
-    found = [_entry(table, d, levels[d], slot, origins, asked) for d in table.defences]
-    comparisons = _rank(found, levels, slot, alpha)
+    found = [dict(kept[d]) if d in kept else _entry(table, d, levels[d], slot, origins, asked) for d in table.defences]
+    cells = ordered([*cells_of(table), *(held.cells if held else ())], table)
     return {
         "format": FORMAT, "suite": _suite(table, alpha) | {"require_adaptive": require_adaptive},
-        "attacks": _attacks(table, lines, origins), "entries": found, "cells": cells_of(table),
-        "curves": [curve for d in table.defences for curve in curves(levels[d])],
-        "comparisons": comparisons, "detection": None,
-    }  # fmt: skip
+        "attacks": _attacks(table, lines, origins, cells, held), "entries": found, "cells": cells,
+        "curves": [curve for d in table.defences for curve in (held.of("curves", d) if held and d in kept else curves(levels[d]))],
+        "comparisons": _rank(found, levels, slot, alpha, held), "detection": None,
+    } | ({"trust": board["trust"]} if board is not None and board.get("trust") else {})  # fmt: skip
 
 
-def middle(table: Table) -> int:
+def middle(suite: Suite) -> int:
     """Slot of the middle one of the doses that are shown; of all where none is named."""
-    chosen = shown(table)
+    chosen = shown(suite)
     return chosen[len(chosen) // 2]
 
 
-def shown(table: Table) -> list[int]:
+def shown(suite: Suite) -> list[int]:
     """Slots of the doses that rates are shown at."""
-    return [slot for slot, dose in enumerate(table.doses) if dose in table.suite.shown] or list(range(len(table.doses)))
+    doses = doses_of(suite)
+    return [slot for slot, dose in enumerate(doses) if dose in suite.shown] or list(range(len(doses)))
 
 
 def _suite(table: Table, alpha: float) -> Data:
@@ -90,25 +97,29 @@ def _suite(table: Table, alpha: float) -> Data:
     }  # fmt: skip
 
 
-def _attacks(table: Table, lines: dict[str, Admitted | None], origins: dict[str, Row]) -> list[Data]:
+def _attacks(
+    table: Table, lines: dict[str, Admitted | None], origins: dict[str, Row], cells: list[Data], held: Beside | None
+) -> list[Data]:  # fmt: skip
     out = []
+    told = {} if held is None else {attack["attack"]: attack.get("trained_on") for attack in held.board["attacks"]}
     for i, column in enumerate(table.columns):
         line = lines.get(column.attack)
         left_out = [name for name in table.scenarios if (table.state[name][:, i] == SKIPPED).all()]
-        notes = [f"left out on {', '.join(left_out)}: {_reason(table, i)}"] if left_out else []
+        notes = [f"left out on {', '.join(left_out)}: {_reason(cells, column)}"] if left_out else []
         notes += ["a computed optimum: shown, and not counted"] if table.optimal[column] else []
         notes += ["taken back by an erratum: not counted"] if column.attack in table.withdrawn else []
         out.append({
             "attack": column.attack, "knowledge": column.knowledge, "learned": table.learned[column], "optimal": table.optimal[column],
-            "trained_on": origins.get(column.attack, {}).get("defence"),
+            "trained_on": origins.get(column.attack, {}).get("defence") or told.get(column.attack),
             "admitted": None if line is None else line.as_data(), "note": "; ".join(notes), "withdrawn": column.attack in table.withdrawn,
         })  # fmt: skip
     return out
 
 
-def _reason(table: Table, i: int) -> str:
-    keys = (key for key in sorted(table.cells) if key.column == table.columns[i])
-    return next((row["reason"] for key in keys for row in table.cells[key] if row["status"] == "skipped"), "")
+def _reason(cells: list[Data], column: Column) -> str:
+    """Why an attack was left out."""
+    mine = (c for c in cells if (c["attack"], c["knowledge"]) == column)
+    return next((str(c["reason"]) for c in mine if c["reason"] and not c["failed"]), "")
 
 
 def _origins(table: Table) -> dict[str, Row]:
@@ -147,7 +158,7 @@ def of_worst(table: Table, levels: dict[str, Worst], slot: int) -> Data:
             critical[tuple(worst.pairs)] = worst.critical()
     return {
         "critical_dose": {k: critical[tuple(worst.pairs)] if k in whole else None for k, worst in levels.items()},
-        "rates": [worst.rate(s) for s in shown(table) for worst in whole.values()],
+        "rates": [worst.rate(s) for s in shown(table.suite) for worst in whole.values()],
         "robustness": _robustness(table, whole.get("black"), slot),
     }
 
@@ -254,14 +265,14 @@ def _clean(table: Table, defence: str) -> dict[str, Data]:
 def _episode(table: Table, whole: dict[str, Worst], slot: int) -> Row | None:
     """The worst episode: a damaged one of the worst attack at the middle dose, else at the smallest shown one at which there is damage,
     the least knowing attacker first. Where nothing is damaged, the one of all attacks and shown doses that came nearest to it."""
-    for at in (slot, *shown(table)):
+    for at in (slot, *shown(table.suite)):
         for worst in whole.values():
             pair, share = worst.at(at)
             if share > 0.0:
                 hit = zip(worst.rows(pair, at), worst.harm(pair, at)[1], strict=True)
                 return min((row for row, harm in hit if harm), key=_margin)
     most = list(whole.values())[-1:]  # who knows most may do all that the others do
-    rows = (row for worst in most for pair in range(len(worst.pairs)) for at in shown(table) for row in worst.rows(pair, at))
+    rows = (row for worst in most for pair in range(len(worst.pairs)) for at in shown(table.suite) for row in worst.rows(pair, at))
     return min(rows, key=_margin, default=None)
 
 
@@ -286,18 +297,25 @@ def _robustness(table: Table, worst: Worst | None, slot: int) -> list[Data]:
     return out
 
 
-def _rank(found: list[Data], levels: Levels, slot: int, alpha: float) -> list[Data]:
-    """Comparisons within each class; puts the rank sets into the entries that take one."""
-    out = []
+def _rank(found: list[Data], levels: Levels, slot: int, alpha: float, held: Beside | None) -> list[Data]:
+    """Comparisons within each class; puts the rank sets into the entries that take one. A class all of which is kept stays as it was."""
+    out: list[Data] = []
     ranked = [entry for entry in found if entry["status"] == "ranked"]
+    fresh: set[str] = set()  # classes that an entry has joined, or left, or stayed in with other rows
+    if held is not None:
+        before = (entry for entry in held.board["entries"] if entry["status"] == "ranked")
+        fresh = {entry["class"] for entry in (*ranked, *before) if entry["defence"] not in held.entries}
     for group in dict.fromkeys(entry["class"] for entry in ranked):
-        harm = {}
-        for entry in (e for e in ranked if e["class"] == group):
-            worst = levels[entry["defence"]]["black"]
-            harm[entry["defence"]] = worst.all_harm(slot)
-        duels, ranks = compare(harm, group, alpha)
+        mine = [entry for entry in ranked if entry["class"] == group]
+        if held is not None and group not in fresh:
+            out += [duel for duel in held.board["comparisons"] if duel["class"] == group]
+            continue
+        unknown = () if held is None else silent(held.cells, held.table.doses[slot])
+        if lacking := [entry["defence"] for entry in mine if entry["defence"] in unknown]:
+            how = "which episodes came to damage, to compare with: `leaderboard check --write --defence` finds out"
+            raise InputError(f"board: cells of {', '.join(lacking)}: hits", None, how)
+        duels, ranks = compare({e["defence"]: levels[e["defence"]]["black"].all_harm(slot) for e in mine}, group, alpha)
         out += duels
-        for entry in ranked:
-            if entry["defence"] in ranks:
-                entry["rank"] = ranks[entry["defence"]]
+        for entry in mine:
+            entry["rank"] = ranks[entry["defence"]]
     return out

@@ -1,0 +1,206 @@
+"""Rows of some defences, scored beside a board that has the others, make the board that all rows make."""
+
+import argparse
+import copy
+import dataclasses
+import importlib.util
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tailgate.commands import board as command
+from tailgate.errors import InputError
+from tailgate.evaluation import cells_of, run
+from tailgate.leaderboard.board_format import read_board
+from tailgate.rows import encode
+from tailgate.scenario import load_suite
+from tailgate.scoring.attacks import Admitted
+from tailgate.scoring.cells import digits, hits_of
+from tailgate.scoring.follow import strays
+
+spec = importlib.util.spec_from_file_location("scored", Path(__file__).with_name("scored.py"))
+assert spec is not None and spec.loader is not None
+scored = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(scored)
+BEACON, ROAD, board, cell, entry, suite = scored.BEACON, scored.ROAD, scored.board, scored.cell, scored.entry, scored.suite
+Data = dict[str, Any]
+GUARDS = ("none", "kf", "rkf", "imm", "safe_state")
+POLICY = "runs/a/policy-0.json"
+
+
+def _rows(*guards: str, own: bool = True, attacks: tuple[str, ...] = ("fdi",)) -> list[Data]:
+    """Clean and attacked rows; with a policy that was trained against kf, and one against rkf. Which episodes are hit differs by guard."""
+    hits = {"none": [9, 15, 20], "kf": [[1, 4], [2, 5, 7], list(range(0, 20, 2))], "rkf": [0, 1, 2], "imm": [3, [0, 19, 9, 8], 20], "safe_state": 1}
+    out = []
+    for guard in guards:
+        uses = ["measurements", "v2v"] if guard == "safe_state" else ["measurements"]
+        out += cell(guard, uses=uses)
+        for attack in attacks:
+            out += cell(guard, attack, hits[guard], uses=uses)
+        if own and guard in ("kf", "rkf"):
+            trained = {"defence": guard, "digest": "", "version": 1, "plan": "p", "seed": 0}
+            out += cell(guard, POLICY.replace("a", guard), [2, 6, 12], learned=True, trained=trained)
+    return out
+
+
+def _as_read(made: Data) -> Data:
+    """As it is on the disk."""
+    read_board(held := json.loads(json.dumps(made)))
+    return dict(held)
+
+
+@pytest.mark.parametrize("guards", [("kf",), ("rkf",), ("imm", "rkf"), ("safe_state",), ("kf", "rkf", "imm", "safe_state")], ids=",".join)
+def test_rows_beside_a_board_make_what_all_rows_make(guards: tuple[str, ...]) -> None:
+    whole = board(_rows(*GUARDS))
+    before = _as_read(board(_rows(*(guard for guard in GUARDS if guard not in guards))))
+    assert board(_rows("none", *guards), board=before) == whole
+    assert board(_rows("none", *guards), board=_as_read(whole)) == whole  # an entry that is there is made again
+
+
+def test_an_entry_that_meets_more_takes_the_place_of_the_old_one() -> None:
+    before = _as_read(board(_rows(*GUARDS, own=False)))
+    made = board(_rows("none", "kf"), board=before)
+    assert made == board([*_rows("none", "kf"), *_rows("rkf", "imm", "safe_state", own=False)])
+    assert [c["attack"] for c in made["cells"] if c["learned"]] == [POLICY.replace("a", "kf")] * 3
+
+
+def test_what_a_class_does_not_know_of_another_it_need_not_know() -> None:
+    """Hits are asked for in the class of an entry that changed, at the dose of the ranks."""
+    before = _as_read(board(_rows("none", "kf", "rkf")))
+    for c in before["cells"]:
+        del c["hits"]
+    made = board(_rows("none", "safe_state"), board=before)
+    assert entry(made, "safe_state")["rank"] == {"best": 1, "worst": 1}
+    assert [entry(made, name)["rank"] for name in ("kf", "rkf")] == [entry(before, name)["rank"] for name in ("kf", "rkf")]
+    assert made["comparisons"] == before["comparisons"] != []
+    with pytest.raises(InputError, match=r"cells of kf, rkf: hits.*check --write"):
+        board(_rows("none", "imm"), board=before)
+    known = board(_rows("none", "kf", "rkf", "imm"), board=before)
+    assert known["comparisons"] == board(_rows("none", "kf", "rkf", "imm"))["comparisons"]
+
+
+def test_rows_of_some_cells_only_say_which_episodes_were_hit() -> None:
+    whole = board(_rows(*GUARDS))
+    before = _as_read(whole)
+    for c in before["cells"]:
+        del c["hits"]
+    before["entries"][1]["why"] = "as it was"
+    made = board([*_rows("none"), *cell("kf"), *_rows("rkf", own=False)], board=before)
+    assert entry(made, "kf")["why"] == "as it was"
+    lacking = [c["defence"] for c in made["cells"] if "hits" not in c]
+    assert set(lacking) == {"kf", "rkf", "imm", "safe_state"} and lacking.count("kf") == 6 and lacking.count("rkf") == 3
+    held = {(c["defence"], c["attack"], c["dose"]): c for c in whole["cells"]}
+    assert all(c == held[c["defence"], c["attack"], c["dose"]] for c in made["cells"] if "hits" in c)
+
+
+def test_what_is_no_cell_of_the_same_board_is_refused() -> None:
+    whole = _as_read(board(_rows(*GUARDS)))
+    with pytest.raises(InputError, match=r"rows of kf: .*rows of all 9 cells that the board has"):
+        board([*_rows("none"), *cell("kf", "dos_jam", 3)], board=whole)
+    wrong = _rows("none", "rkf")
+    wrong[0] = wrong[0] | {"crashed": 1.0}
+    assert wrong[0]["defence"] == "none"
+    whole_none = board([*wrong, *_rows("kf")])  # the rows of `none` are all there: they count
+    assert entry(whole_none, "none") != entry(whole, "none")
+    with pytest.raises(InputError, match=r"none, none, dose 10: damage"):
+        board([row for row in wrong if (row["defence"], row["attack"]) != ("none", "fdi")], board=whole)
+    for field, value in (("hash", "0" * 16), ("purpose", "tune"), ("beacon", "another beacon of sixteen"), ("alpha", 0.1)):
+        other = copy.deepcopy(whole)
+        other["suite"][field] = value
+        with pytest.raises(InputError, match=field):
+            board(_rows("none", "kf"), board=other)
+    with pytest.raises(InputError, match="seeds"):
+        board([row for row in _rows("none", "kf") if row["number"] > 0], board=whole)
+
+
+def test_a_board_of_another_list_of_attacks_is_refused() -> None:
+    """Its entries have not met what joined since."""
+    line = Admitted("dropout", "", "black", "2026-11-25")
+    rows = _rows("none", "kf", attacks=("fdi", "dropout"))
+    with pytest.raises(InputError, match="dropout"):
+        board(rows, board=_as_read(board(_rows(*GUARDS))), attacks=[line])
+    before = _as_read(board(_rows(*GUARDS, attacks=("fdi", "dropout")), attacks=[line]))
+    assert board(rows, board=before, attacks=[line]) == before
+
+
+def test_attacks_that_are_left_out_keep_their_reason() -> None:
+    skipped = [r | {"status": "skipped", "reason": f"no gate on {r['defence']}"} for g in ("none", "kf", "rkf") for r in cell(g, "stealth")]
+    where = suite(attacks=("none", "fdi", "stealth"))
+    before = _as_read(board([*_rows("none", "kf"), *(r for r in skipped if r["defence"] != "rkf")], where))
+    made = board([*_rows("none", "rkf"), *(r for r in skipped if r["defence"] != "kf")], where, board=before)
+    assert made == board([*_rows("none", "kf", "rkf"), *skipped], where)
+    assert next(a["note"] for a in made["attacks"] if a["attack"] == "stealth") == f"left out on {ROAD}: no gate on kf"
+
+
+@pytest.mark.parametrize("n", [1, 7, 8, 9, 100])
+def test_digits_and_back(n: int) -> None:
+    rng = np.random.default_rng(n)
+    for _ in range(20):
+        hits = rng.integers(2, size=n).astype(bool)
+        made = {"n": n, "hits": digits(list(hits)), "damage": {"value": hits.mean()}}
+        assert np.array_equal(hits_of(made), hits)
+        assert hits_of(made | {"hits": None}).sum() == hits.sum()
+    assert digits([True, *[False] * 8, True]) == "8040"
+
+
+def test_ranks_and_comparisons_follow_from_the_cells() -> None:
+    """Nobody has to play anything to see that they do."""
+    made, held = _as_read(board(_rows(*GUARDS))), suite()
+    assert made["suite"]["beacon"] == BEACON and strays(made, held) == []
+    entry(made, "kf")["rank"] = {"best": 1, "worst": 1}
+    made["comparisons"][0]["only_a"] += 1
+    assert [(s["defence"], s["field"]) for s in strays(made, held)] == [("", "comparisons"), ("kf", "rank")]
+    for c in made["cells"]:
+        c["hits"] = None
+    assert strays(made, held) == []
+
+
+def test_hits_that_are_not_of_the_cell() -> None:
+    made = _as_read(board(_rows(*GUARDS)))
+    changed = copy.deepcopy(made)
+    changed["cells"][-1]["hits"] = "0" * len(changed["cells"][-1]["hits"])
+    assert any(s["field"].endswith("damage") for s in strays(changed, suite()))
+    for value in ("ff", "zz", "ff" * 9, 7):
+        changed["cells"][0]["hits"] = value
+        with pytest.raises(InputError, match=r"cells\[0\]\.hits"):
+            read_board(changed)
+
+
+TEXT = "about: s\nscenarios: [thesis-ch4-v0]\ndoses: [5]\ndefences: [none, kf, chi2_kf]\nattacks: [none, 'fdi:value=5']\nseeds: 4\n"
+
+
+def _run(*arguments: str) -> None:
+    parser = argparse.ArgumentParser()
+    command.add(parser.add_subparsers())
+    options = parser.parse_args(["run", *arguments, "--no-replays", "--unattacked", "--workers", "1"])
+    assert options.run(options) == 0
+
+
+def test_the_command(tmp_path: Path) -> None:
+    """A board that is there grows by an entry; without the flag it is one of the rows alone."""
+    file, out = tmp_path / "small-v0.yaml", tmp_path / "out"
+    file.write_text(TEXT)
+    place = out / "small-v0" / "board.json"
+    with pytest.raises(InputError, match="keep-entries"):
+        _run(str(file), "--out", str(out), "--keep-entries")
+    assert not list(out.glob("**/rows*"))  # said before anything is played
+    _run(str(file), "--out", str(out))
+    whole = json.loads(place.read_text())
+    for path in out.glob("small-v0/rows*"):
+        path.unlink()
+    held = copy.deepcopy(whole)
+    held["entries"][1] |= {"verified": {"rows": 8, "verified": 8, "differs": 0, "unchecked": 0}, "checked": {"cells": 2, "equal": 2, "differs": 0, "unchecked": 0}}
+    held["entries"][2]["checked"] = held["entries"][1]["checked"]
+    place.write_text(json.dumps(held))
+    rows = run(cells_of(dataclasses.replace(load_suite(str(file)), defences=("chi2_kf",), attacks=("dropout",))))
+    (out / "small-v0" / "more.jsonl").write_bytes(encode(rows))
+    _run(str(file), "--out", str(out), "--defence", "chi2_kf", "--keep-entries")
+    made = json.loads(place.read_text())
+    assert [e["defence"] for e in made["entries"]] == ["none", "kf", "chi2_kf"] and made["entries"][1] == held["entries"][1]
+    assert made["entries"][2]["checked"]["cells"] == 3 and made["suite"]["rows"] == whole["suite"]["rows"] + 4
+    assert [c["attack"] for c in made["cells"] if c["defence"] == "chi2_kf"] == ["none", "fdi:value=5", "dropout"]
+    _run(str(file), "--out", str(out), "--defence", "chi2_kf", "--score-only")
+    assert [e["defence"] for e in json.loads(place.read_text())["entries"]] == ["none", "chi2_kf"]
