@@ -22,7 +22,7 @@ from tailgate.core import Array, Estimate, Finite, Innovation, Mode, Model, Posi
 from tailgate.draws import Draws
 from tailgate.registry import register
 
-from .kalman import KalmanFilter, KalmanPlan, KalmanState
+from .kalman import SMALL, KalmanFilter, KalmanPlan, KalmanState
 
 Inside = Annotated[float, Field(gt=0, lt=1)]
 Factors = Annotated[tuple[Positive, ...], Field(min_length=1)]
@@ -106,13 +106,15 @@ def mix(state: ImmState, moves: Array) -> list[tuple[KalmanState, Array]]:
         c = _total(parts)
         w = [part / c for part in parts]
         x = _total([w[i][..., None] * m.x for i, m in enumerate(state.models)])
-        P = []
-        for i, m in enumerate(state.models):
-            assert m.P is not None
-            off = m.x - x
-            P.append(w[i][..., None, None] * (m.P + off[..., :, None] * off[..., None, :]))
-        out.append((KalmanState(x, _total(P)), c))
+        out.append((KalmanState(x, _spread(w, [m.P for m in state.models], [m.x - x for m in state.models])), c))
     return out
+
+
+def _spread(w: Sequence[Array], P: Sequence[Any], off: Sequence[Array]) -> Array:
+    """sum_i w_i (P_i + off_i off_i') (B, N, n, n)."""
+    if off[0].shape[-1] > SMALL:
+        return num.moment(w, P, off)
+    return _total([a[..., None, None] * (p + d[..., :, None] * d[..., None, :]) for a, p, d in zip(w, P, off, strict=True)])
 
 
 def log_likelihood(innovation: Innovation, valid: Array) -> Array:

@@ -24,6 +24,7 @@ from tailgate.registry import register
 from .compose import AcceptAll, Composed, Detector, Filter, Mitigation, Score
 
 Gain = Literal["varying", "steady"]
+SMALL = 4  # states: matrices up to here are multiplied as they stand, larger ones by kernels of whole passes, to the same bits
 GAIN = "varying: the gain follows the covariance; steady: both are held where they settle when nothing is missed"
 
 
@@ -132,6 +133,8 @@ class LinearFilter:
         x = num.matvec(plan.A, state.x) + num.matvec(plan.B, known_u) + plan.c
         if state.P is None:
             return KalmanState(x, None)
+        if len(plan.A) > SMALL:
+            return KalmanState(x, num.congruent(plan.A, state.P, plan.Q))
         half = num.matmul(plan.A, state.P)
         return KalmanState(x, num.matmul(plan.A, num.transpose(half)) + plan.Q)
 
@@ -145,8 +148,10 @@ class LinearFilter:
         return num.matmul(cross, num.inverse(innovation.S))
 
     def update(self, plan: Any, state: KalmanState, innovation: Innovation, accept: Array) -> KalmanState:
-        cross = self._cross(plan, state)
         S, r = innovation.S, innovation.r
+        if len(plan.A) > SMALL and state.P is not None and plan.held is None:
+            return KalmanState(*num.corrected(plan.C, num.inverse(alone(S, accept)), state.x, state.P, r, accept))
+        cross = self._cross(plan, state)
         if not accept.all():  # multiplying by one would change no bit of the other rows
             keep = accept.astype(np.float64)
             cross = cross * keep[..., None]

@@ -8,7 +8,9 @@ import sys
 import numpy as np
 import pytest
 
+import tailgate
 from tailgate import num
+from tailgate.estimators import imm, kalman
 
 RNG = np.random.default_rng(11)
 BATCHES = (1, 2, 7, 8, 9, 31, 32, 33, 70)
@@ -161,3 +163,19 @@ def test_no_kernel_has_lost_its_vectors(tmp_path):
         if "pd" not in code and "xmm" not in code:
             pytest.skip("not the instructions of an x86 processor")
         assert packed >= 4 and single == 0
+
+
+@pytest.mark.parametrize("defence", ["kf", "chi2_kf", "chi2_kf_sparse", "imm"])
+def test_filters_of_many_states_are_the_textbook_recursion(defence, monkeypatch, short, play, same_bits):
+    """Kernels of whole passes are products one after the other: five cars, each with 19 states, some of whose readings go missing."""
+    place = short("platoon-lossy-v0", horizon=50)
+
+    def played():
+        return play(place, defence, tailgate.make_attack("fdi", start_step=20, value=-20.0), range(11), plain=True)
+
+    fast = played()
+    for module in (imm, kalman):
+        monkeypatch.setattr(module, "SMALL", 100)
+    slow = played()
+    assert same_bits(fast.estimate, slow.estimate) and fast.estimate.shape[-1] == 19
+    assert [fast.trace_hash(row) for row in range(11)] == [slow.trace_hash(row) for row in range(11)]

@@ -60,6 +60,22 @@ def times_each(x: np.ndarray, y: np.ndarray, out: np.ndarray) -> None:
 
 
 @_jit
+def add_moment(weight: np.ndarray, P: np.ndarray, off: np.ndarray, out: np.ndarray, first: bool) -> None:
+    """out (N, n, n, B) takes on weight (P + off off') for weight (N, B), P as out and off (N, n, B); the first is what it begins with."""
+    for m in range(P.shape[0]):
+        w = weight[m]
+        for i in range(P.shape[1]):
+            for j in range(P.shape[2]):
+                p, x, y, total = P[m, i, j], off[m, i], off[m, j], out[m, i, j]
+                if first:
+                    for b in range(len(total)):
+                        total[b] = w[b] * (p[b] + x[b] * y[b])
+                else:
+                    for b in range(len(total)):
+                        total[b] = total[b] + w[b] * (p[b] + x[b] * y[b])
+
+
+@_jit
 def product(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """x (i, k) times y (k, j), summed over k in ascending order."""
     out = np.zeros((x.shape[0], y.shape[1]))
