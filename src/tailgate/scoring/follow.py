@@ -61,11 +61,11 @@ def untold(board: Data, suite: Suite) -> list[str]:
 
 def _ranks(board: Data, levels: Levels, unknown: list[str], slot: int, alpha: float) -> list[Data]:
     """Comparisons and ranks of the classes all of whose cells say which episodes came to damage."""
-    ranked = [entry for entry in board["entries"] if entry["status"] == "ranked" and entry["defence"] in levels]
+    ranked = [entry for entry in board["entries"] if entry["status"] == "ranked"]
     out: list[Data] = []
     for group in dict.fromkeys(entry["class"] for entry in ranked):
         mine = {entry["defence"]: entry for entry in ranked if entry["class"] == group}
-        if any(name in unknown or not levels[name]["black"].complete for name in mine):
+        if any(name not in levels or name in unknown or not levels[name]["black"].complete for name in mine):
             continue
         duels, ranks = compare({name: levels[name]["black"].all_harm(slot) for name in mine}, group, alpha)
         said = [duel for duel in board["comparisons"] if duel["class"] == group]
