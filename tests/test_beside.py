@@ -19,7 +19,7 @@ from tailgate.rows import encode
 from tailgate.scenario import load_suite
 from tailgate.scoring.attacks import Admitted
 from tailgate.scoring.cells import digits, hits_of
-from tailgate.scoring.follow import strays
+from tailgate.scoring.follow import strays, untold
 
 spec = importlib.util.spec_from_file_location("scored", Path(__file__).with_name("scored.py"))
 assert spec is not None and spec.loader is not None
@@ -100,13 +100,21 @@ def test_what_is_no_cell_of_the_same_board_is_refused() -> None:
     whole = _as_read(board(_rows(*GUARDS)))
     with pytest.raises(InputError, match=r"rows of kf: .*rows of all 9 cells that the board has"):
         board([*_rows("none"), *cell("kf", "dos_jam", 3)], board=whole)
-    wrong = _rows("none", "rkf")
-    wrong[0] = wrong[0] | {"crashed": 1.0}
-    assert wrong[0]["defence"] == "none"
-    whole_none = board([*wrong, *_rows("kf")])  # the rows of `none` are all there: they count
-    assert entry(whole_none, "none") != entry(whole, "none")
-    with pytest.raises(InputError, match=r"none, none, dose 10: damage"):
-        board([row for row in wrong if (row["defence"], row["attack"]) != ("none", "fdi")], board=whole)
+    for guards in (("none",), ("none", "rkf")):  # the rows cover some cells of `none`, or all
+        wrong = _rows(*guards)
+        wrong[0] = wrong[0] | {"crashed": 1.0}
+        for kept in (wrong, [row for row in wrong if (row["defence"], row["attack"]) != ("none", "fdi")]):
+            with pytest.raises(InputError, match=r"none, none, dose 10: damage"):
+                board(kept, board=whole)
+    forged = copy.deepcopy(whole)
+    cell_of = next(c for c in forged["cells"] if (c["defence"], c["attack"], c["dose"]) == ("none", "fdi", 10))
+    cell_of["hits"] = digits(hits_of(cell_of)[::-1])  # as many, but others
+    with pytest.raises(InputError, match=r"none, fdi, dose 10: hits"):
+        board(_rows("none", "rkf"), board=forged)
+    with pytest.raises(InputError, match="none too"):
+        board(_rows("imm"), board=whole)
+    with pytest.raises(InputError, match="require_adaptive"):
+        board(_rows("none", "kf"), board=whole, require_adaptive=True)
     for field, value in (("hash", "0" * 16), ("purpose", "tune"), ("beacon", "another beacon of sixteen"), ("alpha", 0.1)):
         other = copy.deepcopy(whole)
         other["suite"][field] = value
@@ -124,6 +132,26 @@ def test_a_board_of_another_list_of_attacks_is_refused() -> None:
         board(rows, board=_as_read(board(_rows(*GUARDS))), attacks=[line])
     before = _as_read(board(_rows(*GUARDS, attacks=("fdi", "dropout")), attacks=[line]))
     assert board(rows, board=before, attacks=[line]) == before
+    for attack in before["attacks"]:
+        if attack["admitted"]:
+            attack["admitted"]["digest"] = "aa"
+    with pytest.raises(InputError, match="digest of dropout"):
+        board(rows, board=before, attacks=[line])
+
+
+def test_an_attack_that_begins_to_count_against_the_others_is_refused() -> None:
+    """It was left out for everybody; a new entry can be attacked by it, so that the others lack figures."""
+    where = suite(attacks=("none", "fdi", "stealth"))
+
+    def left_out(*guards: str) -> list[Data]:
+        return [r | {"status": "skipped", "reason": "no gate"} for guard in guards for r in cell(guard, "stealth")]
+
+    before = _as_read(board([*_rows("none", "kf"), *left_out("none", "kf")], where))
+    assert entry(before, "kf")["status"] == "ranked"
+    rows = [*_rows("none", "imm"), *left_out("none"), *cell("imm", "stealth", 0)]
+    assert entry(board([*_rows("none", "kf", "imm"), *left_out("none", "kf"), *cell("imm", "stealth", 0)], where), "kf")["status"] == "unranked"
+    with pytest.raises(InputError, match=r"stealth on .*play the whole suite"):
+        board(rows, where, board=before)
 
 
 def test_attacks_that_are_left_out_keep_their_reason() -> None:
@@ -153,9 +181,13 @@ def test_ranks_and_comparisons_follow_from_the_cells() -> None:
     entry(made, "kf")["rank"] = {"best": 1, "worst": 1}
     made["comparisons"][0]["only_a"] += 1
     assert [(s["defence"], s["field"]) for s in strays(made, held)] == [("", "comparisons"), ("kf", "rank")]
+    entry(made, "none")["rank"] = {"best": 1, "worst": 1}
+    entry(made, "imm")["class"] = "measurements + odometry"
+    assert {("none", "rank"), ("imm", "class")} <= {(s["defence"], s["field"]) for s in strays(made, held)}
+    made = _as_read(board(_rows(*GUARDS)))
     for c in made["cells"]:
         c["hits"] = None
-    assert strays(made, held) == []
+    assert strays(made, held) == [] and set(untold(made, held)) <= {"kf", "rkf", "imm", "safe_state"} != set()
 
 
 def test_hits_that_are_not_of_the_cell() -> None:
@@ -163,7 +195,7 @@ def test_hits_that_are_not_of_the_cell() -> None:
     changed = copy.deepcopy(made)
     changed["cells"][-1]["hits"] = "0" * len(changed["cells"][-1]["hits"])
     assert any(s["field"].endswith("damage") for s in strays(changed, suite()))
-    for value in ("ff", "zz", "ff" * 9, 7):
+    for value in ("ff", "zz", "ff" * 9, 7, "00000f"):
         changed["cells"][0]["hits"] = value
         with pytest.raises(InputError, match=r"cells\[0\]\.hits"):
             read_board(changed)

@@ -115,7 +115,8 @@ def test_ranks_gates_and_flags_are_made_again_where_all_cells_are_played(board: 
     entry = board["entries"][1]
     entry[field] = [gate | {"limit": value} for gate in entry["gates"]] if field == "gates" else value
     assert [(line["defence"], line["field"]) for line in check(board)["strays"]] == [("kf", field)]
-    assert check(board, sample=3)["strays"] == [] and not check(board, sample=3)["scored"]
+    less = check(board, sample=3)
+    assert bool(less["strays"]) == (field == "rank") and not less["scored"]  # who takes no rank has none, whatever was played
 
 
 def test_some_cells_are_drawn_or_named(board: Data) -> None:

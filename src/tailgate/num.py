@@ -197,6 +197,8 @@ def congruent(A: Array, P: Array, Q: Array) -> Array:
 def moment(weights: Sequence[Array], covariances: Sequence[Array], offsets: Sequence[Array]) -> Array:
     """sum_i w_i (P_i + d_i d_i') (B, N, n, n) in that order, of w_i (B, N), P_i (B, N, n, n) and d_i (B, N, n)."""
     out = np.empty(first_to_last(covariances[0]).shape)
+    if any(len(part) != len(covariances[0]) for part in (*weights, *covariances, *offsets)):
+        raise ValueError("weights, covariances and offsets have the same rows")
     for i, parts in enumerate(zip(weights, covariances, offsets, strict=True)):
         linear.add_moment(*(np.ascontiguousarray(first_to_last(part), np.float64) for part in parts), out, i == 0)
     return last_to_first(out)

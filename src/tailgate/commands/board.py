@@ -62,7 +62,7 @@ def _run(options: argparse.Namespace) -> int:
     suites = [load_suite(name) for name in options.suites]
     clocks = [beside(out / suite.name / BOARD) for suite in suites]  # before anything is played
     for suite in suites if options.keep_entries else ():
-        kept_board(out / suite.name / BOARD, suite)
+        kept_board(out / suite.name / BOARD, suite, options.beacon)
     boards = []
     with progress(Console(stderr=True)) as update:
         for suite in suites:

@@ -122,6 +122,9 @@ def _print(report: dict[str, Any]) -> None:
         out.print(f"{len(strays)} figure{'s differ' if len(strays) > 1 else ' differs'} from what is made here:")
     else:
         out.print(f"Rates, critical doses{'' if report['untold'] else ', ranks'} and curves of all entries follow from the cells.")
+    if report["untold"]:
+        out.print(f"Ranks cannot be made of the cells of {', '.join(report['untold'])}, which do not say which episodes came to damage.",
+                  markup=False, highlight=False)  # fmt: skip
     for stray in strays[:SHOWN]:
         where, board, here = _first(stray["board"], stray["here"])
         place = ": ".join(filter(None, (stray["defence"], stray["field"] + where)))

@@ -347,8 +347,9 @@ def _agree(board: Board, where: str) -> None:
             raise InputError(f"{where}.cells[{i}].scenario", cell.scenario, "one of the suite's scenarios")
         if cell.dose not in board.suite.doses:
             raise InputError(f"{where}.cells[{i}].dose", cell.dose, f"one of the suite's doses {board.suite.doses}")
-        if cell.hits is not None and len(cell.hits) != 2 * -(-cell.n // 8):
-            raise InputError(f"{where}.cells[{i}].hits", cell.hits, f"{2 * -(-cell.n // 8)} hexadecimal digits, for {cell.n} episodes")
+        if cell.hits is not None and (len(cell.hits) != 2 * -(-cell.n // 8) or int(cell.hits or "0", 16) % (1 << -cell.n % 8)):
+            wanted = f"{2 * -(-cell.n // 8)} hexadecimal digits, for {cell.n} episodes, and zeros after the last"
+            raise InputError(f"{where}.cells[{i}].hits", cell.hits, wanted)
     for i, curve in enumerate(board.curves):
         if curve.defence not in names:
             raise InputError(f"{where}.curves[{i}].defence", curve.defence, "one of the entries' defences")

@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import tailgate
 from tailgate.errors import InputError, said
 from tailgate.evaluation import evaluate
 from tailgate.rows import read_rows
@@ -60,8 +61,10 @@ def board_of(suite: Suite, folder: Path, beacon: str | None = None, keep: bool =
     files = [path for path, parts in within if not others & set(parts) and not any(part.startswith(".") for part in parts)]
     if not files:
         raise InputError("rows", str(folder), "a folder with rows of `leaderboard run`")
-    before = kept_board(folder / BOARD, suite) if keep else load(folder / BOARD) if (folder / BOARD).is_file() else None
+    before = kept_board(folder / BOARD, suite, beacon or "") if keep else load(folder / BOARD) if (folder / BOARD).is_file() else None
     parts = {path: read_rows(path) for path in files}
+    if keep and (other := {row["version"] for rows in parts.values() for row in rows} - {tailgate.__version__}):
+        raise InputError("rows: version", min(other), f"{tailgate.__version__}, as the board's")
     board = score(
         (row for rows in parts.values() for row in rows), suite, attacks=admitted.list_of(suite, folder / LIST),
         board=before if keep else None, **options,
@@ -78,12 +81,15 @@ def board_of(suite: Suite, folder: Path, beacon: str | None = None, keep: bool =
     return board
 
 
-def kept_board(path: Path, suite: Suite) -> Any:
-    """The JSON of a board whose entries are to stay. Raises InputError where there is none, and for one of another suite or version."""
+def kept_board(path: Path, suite: Suite, beacon: str) -> Any:
+    """The JSON of a board whose entries are to stay. Raises InputError where there is none, and for another suite, version or round."""
     if not path.is_file():
         raise InputError("--keep-entries", str(path), "a board whose entries can stay")
     data = load(path)
-    agree(read_board(data, str(path)), suite)
+    board = read_board(data, str(path))
+    agree(board, suite)
+    if (board.suite.beacon or "") != beacon:
+        raise InputError("beacon", beacon, f"that of the board, {board.suite.beacon or 'whose seeds are public ones'}")
     return data
 
 

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from tailgate.errors import InputError
 from tailgate.scenario import Suite
+from tailgate.threat import KNOWLEDGE
 
 from .cells import cells_of, joined, place_of, table_of
-from .damage import Table
+from .damage import CLEAN, Column, Table
+from .doses import Worst
 
 Data = dict[str, Any]
-SAME = ("n", "failed", "damage", "decisions")  # of a cell that was played again
+SAME = ("n", "failed", "damage", "hits", "decisions")  # of a cell that was played again
 
 
 @dataclass(frozen=True)
@@ -30,24 +33,37 @@ class Beside:
         return [line for line in self.board[part] if line["defence"] == defence]
 
 
-def silent(cells: list[Data], dose: int | None) -> list[str]:
+def silent(cells: Iterable[Data], dose: int | None) -> list[str]:
     """Defences of which nobody knows which episodes came to damage in some cell at a dose that ranks depend on."""
-    counted = (c for c in cells if c["dose"] == dose and c["knowledge"] == "black" and not c["optimal"])
+    counted = (c for c in cells if c["dose"] == dose and c["knowledge"] == "black" and not c.get("optimal"))
     some = (c for c in counted if c.get("hits") is None and c["damage"] and 0.0 < c["damage"]["value"] < 1.0)
     return list(dict.fromkeys(c["defence"] for c in some))
 
 
-def beside(table: Table, board: Data, suite: Suite, alpha: float) -> Beside:
-    """A defence whose rows cover all cells that the board has of it is made of rows. Of one whose rows cover some, the board's entry stays,
-    and these cells have to come out equal: which of their episodes came to damage is then known, if it was not. Without rows it stays too.
+def beside(table: Table, board: Data, suite: Suite, alpha: float, require_adaptive: bool, digests: Mapping[str, str]) -> Beside:
+    """A defence whose rows cover all cells that the board has of it is made of rows, others stay as the board has them. Cells that both
+    have must come out equal; which of their episodes came to damage is then known, if it was not.
 
-    board: JSON that `read_board` has read. Raises InputError for a board of another suite, round, purpose or alpha, for one whose list of
-    attacks is another, for rows that differ from it, and for new cells of a defence that leave out some of its old ones.
+    board: JSON that `read_board` has read; digests: of the files of the attacks that joined the list. Raises InputError for a board of
+    another suite, round, purpose, alpha, list of attacks or rule of who is ranked, for rows that differ from it, for new cells of a defence
+    that leave out some of its old ones, and where the rows change which attacks count against an entry that stays.
     """
-    for name, mine in (("hash", suite.hash), ("purpose", table.purpose), ("beacon", table.beacon), ("alpha", alpha)):
-        if (said := board["suite"].get(name) or "") != mine:
-            raise InputError(f"board: suite.{name}", said, f"{mine!r}, as the rows have it")
+    said = {"beacon": "", "require_adaptive": True} | {key: value for key, value in board["suite"].items() if value is not None}
+    mine = {"hash": suite.hash, "purpose": table.purpose, "beacon": table.beacon, "alpha": alpha, "require_adaptive": require_adaptive}
+    for name, value in mine.items():
+        if said.get(name) != value:
+            raise InputError(f"board: suite.{name}", said.get(name), f"{value!r}, as the rows have it")
+    for attack in board["attacks"]:
+        if (line := attack.get("admitted")) and (digest := digests.get(attack["attack"], line["digest"])) != line["digest"]:
+            raise InputError(f"board: digest of {attack['attack']}", line["digest"], f"{digest}, as on the list: play the whole suite")
+    if CLEAN not in table.defences and any(entry["defence"] == CLEAN for entry in board["entries"]):
+        raise InputError("rows: defence", list(table.defences), f"{CLEAN} too: what a defence costs is measured against it")
     held = table_of(board, suite)
+    for name, seeds in held.seeds.items():
+        if table.seeds.get(name, ()) != seeds:
+            raise InputError(f"rows of {name}: seeds", f"{len(table.seeds.get(name, ()))} of them", f"the board's, which are {len(seeds)}")
+    if other := ({*table.listed} - table.withdrawn) ^ ({*held.listed} - held.withdrawn):
+        raise InputError("board: attacks", min(other), "the list of attacks that is here: play the whole suite")
     new = {place_of(cell): cell for cell in cells_of(table)}
     entries: dict[str, Data] = {}
     cells: list[Data] = []
@@ -55,19 +71,33 @@ def beside(table: Table, board: Data, suite: Suite, alpha: float) -> Beside:
         name = entry["defence"]
         old = {place_of(cell): cell for cell in board["cells"] if cell["defence"] == name}
         again = {place: cell for place, cell in new.items() if cell["defence"] == name}
-        lost = [place for place in old if place not in again]
-        if not lost and again:
+        for place in (place for place in again if place in old):
+            if off := [field for field in SAME if old[place].get(field) is not None and old[place][field] != again[place][field]]:
+                wanted = f"{old[place][off[0]]}, as the board has it: else play the whole suite"
+                raise InputError(f"rows of {_said([place])}: {off[0]}", again[place][off[0]], wanted)
+        lost = [place for place, cell in old.items() if place not in again and cell["attack"] not in held.withdrawn]
+        if again and not lost:
             continue
         if more := [place for place in again if place not in old]:
             raise InputError(f"rows of {name}", _said(more), f"rows of all {len(old)} cells that the board has, {_said(lost)} among them")
-        for place, cell in again.items():
-            if off := [field for field in SAME if old[place].get(field) is not None and old[place][field] != cell[field]]:
-                raise InputError(f"rows of {_said([place])}: {off[0]}", cell[off[0]], f"{old[place][off[0]]}, as the board has it")
         entries[name] = entry
         cells += [cell | {"hits": again[place]["hits"]} if place in again else cell for place, cell in old.items()]
     both = joined(table, held, entries)
+    for name in entries:
+        if (before := _counted(held, name)) != (now := _counted(both, name)):
+            where, column, _ = min(before ^ now)
+            wanted = f"an attack that counts against {name} as before: play the whole suite"
+            raise InputError(f"rows of {column.attack} on {where}", "played", wanted)
     own = sum(len(rows) for rows in both.cells.values())
     return Beside(board, dataclasses.replace(both, rows=own + sum(len(held.seeds[c["scenario"]]) for c in cells)), entries, cells)
+
+
+def _counted(table: Table, defence: str) -> set[tuple[str, Column, bool]]:
+    """Scenario and column of every attack that counts against a defence, and whether its figures are whole."""
+    if defence not in table.defences:
+        return set()
+    worst = Worst(table, defence, KNOWLEDGE[-1], 0.05)
+    return {(name, table.columns[i], (name, i) in worst.lost) for name, i in worst.pairs}
 
 
 def _said(places: list[tuple[Any, ...]]) -> str:

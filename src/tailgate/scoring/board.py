@@ -55,7 +55,8 @@ def score(
             raise InputError(f"rows of {row['attack']}: attack_digest", row["attack_digest"], f"{line.digest}, as it was admitted")
     added = [text for text, line in lines.items() if line is not None]
     table = tabulate(rows, suite, added, taken_back(attacks or ()))
-    held = None if board is None else beside(table, board, suite, alpha)
+    digests = {text: line.digest for text, line in lines.items() if line is not None}
+    held = None if board is None else beside(table, board, suite, alpha, require_adaptive, digests)
     table = table if held is None else held.table
     kept = {} if held is None else held.entries
     origins = _origins(table)
@@ -310,7 +311,8 @@ def _rank(found: list[Data], levels: Levels, slot: int, alpha: float, held: Besi
         if held is not None and group not in fresh:
             out += [duel for duel in held.board["comparisons"] if duel["class"] == group]
             continue
-        unknown = () if held is None else silent(held.cells, held.table.doses[slot])
+        counted = () if held is None else (c for c in held.cells if c["attack"] not in held.table.withdrawn)
+        unknown = () if held is None else silent(counted, held.table.doses[slot])
         if lacking := [entry["defence"] for entry in mine if entry["defence"] in unknown]:
             how = "which episodes came to damage, to compare with: `leaderboard check --write --defence` finds out"
             raise InputError(f"board: cells of {', '.join(lacking)}: hits", None, how)

@@ -117,7 +117,7 @@ def table_of(board: Data, suite: Suite) -> Table:
     marked = {mark: {key.column.attack for key, cell in cells.items() if cell.get(mark)} for mark in ("optimal", "learned")}
     marks = {mark: {column: column.attack in names for column in columns} for mark, names in marked.items()}
     withdrawn = frozenset(a["attack"] for a in board["attacks"] if a.get("withdrawn"))
-    purpose, beacon = board["suite"].get("purpose", ""), board["suite"].get("beacon") or ""
+    purpose, beacon = board["suite"].get("purpose") or "report", board["suite"].get("beacon") or ""
     seeds = {name: tuple(sorted(numbered(beacon, suite.name, purpose, 0, n))) for name, n in episodes.items()}
     return Table(
         suite, places, doses, defences, columns, seeds, {}, clean, harm, state, marks["optimal"], marks["learned"],
@@ -128,14 +128,8 @@ def table_of(board: Data, suite: Suite) -> Table:
 def joined(table: Table, held: Table, kept: Collection[str]) -> Table:
     """The table of rows, and beside it what another one knows of the defences that are kept.
 
-    Rows of a defence that is kept say nothing here but what it does when nobody attacks. Raises InputError where the two are not of the
-    same round, episodes and attacks.
+    Both are of the same episodes and attacks. Rows of a defence that is kept say nothing here but what it does when nobody attacks.
     """
-    for name, seeds in held.seeds.items():
-        if table.seeds.get(name) != seeds:
-            raise InputError(f"rows of {name}: seeds", f"{len(table.seeds.get(name, ()))} of them", f"the board's, which are {len(seeds)}")
-    if other := ({*table.listed} - table.withdrawn) ^ ({*held.listed} - held.withdrawn):
-        raise InputError("board: attacks", min(other), "the list of attacks that is here: play the whole suite")
     parts = [(table, [name for name in table.defences if name not in kept]), (held, [name for name in held.defences if name in kept])]
     defences = in_order({name for _, names in parts for name in names}, table.suite.defences)
     met = {
@@ -156,6 +150,6 @@ def joined(table: Table, held: Table, kept: Collection[str]) -> Table:
     learned = {column: any(part.learned.get(column, False) for part, _ in parts) for column in columns}
     own = {key: rows for key, rows in table.cells.items() if key.defence not in kept}
     return dataclasses.replace(
-        table, defences=defences, columns=columns, cells=own, clean=held.clean | table.clean, harm=harm, state=state, optimal=optimal,
+        table, defences=defences, columns=columns, cells=own, harm=harm, state=state, optimal=optimal,
         learned=learned,
     )  # fmt: skip

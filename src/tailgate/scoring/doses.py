@@ -105,7 +105,10 @@ class Worst:
         found = {self.table.seeds[name] for name, _ in self.pairs}
         if len(found) != 1:
             raise InputError(f"rows of {self.defence}: seeds", f"{len(found)} sets of them", "the same seeds in every scenario")
-        return Harm(found.pop(), np.stack([self._harm(name, i)[slot] for name, i in self.pairs]), self.at(slot)[0])
+        harm = np.stack([self._harm(name, i)[slot] for name, i in self.pairs])
+        if np.isnan(harm).any():
+            raise InputError(f"rows of {self.defence}", "attacks without full figures", "all episodes of every attack that counts")
+        return Harm(found.pop(), harm, self.at(slot)[0])
 
     def bounds(self, slot: int, scenarios: list[str] | None = None, sides: int = 1) -> tuple[float, float]:
         """Limits of the worst share of damage that hold together for all pairs: alpha over their number, and over the sides."""

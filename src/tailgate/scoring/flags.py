@@ -6,7 +6,7 @@ import numpy as np
 
 from tailgate.core import Array
 
-from .damage import PLAYED, Key, Row, Table
+from .damage import MISSING, PLAYED, Key, Row, Table
 from .doses import Worst
 from .ranks import mcnemar
 
@@ -25,10 +25,12 @@ def flags(table: Table, defence: str, levels: dict[str, Worst], slot: int, origi
 
 def _trainings(table: Table, defence: str, slot: int, origins: dict[str, Row]) -> list[str]:
     """What the attackers that were trained on this defence say of their training: unfinished, or a matter of the seed's luck."""
-    mine = [i for i, column in enumerate(table.columns) if origins.get(column.attack, {}).get("defence") == defence]
+    guard = table.defences.index(defence)
+    met = [any((state[guard, i] != MISSING).any() for state in table.state.values()) for i in range(len(table.columns))]
+    mine = [i for i, column in enumerate(table.columns) if met[i] and origins.get(column.attack, {}).get("defence") == defence]
     rising = sum(bool(origins[table.columns[i].attack].get("rising")) for i in mine)
     out = [f"still learning: the curves of {rising} of {len(mine)} attackers rose when training ended"] if rising else []
-    guard, plans = table.defences.index(defence), dict.fromkeys(origins[table.columns[i].attack].get("plan") for i in mine)
+    plans = dict.fromkeys(origins[table.columns[i].attack].get("plan") for i in mine)
     for name in table.nominal()[:1]:
         for plan in plans:
             same = [i for i in mine if origins[table.columns[i].attack].get("plan") == plan and table.state[name][guard, i, slot] == PLAYED]

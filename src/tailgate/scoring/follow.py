@@ -16,7 +16,7 @@ from .board import Levels, curves, middle, of_worst, shown
 from .cells import hits_of, share, table_of
 from .damage import doses_of
 from .doses import Worst
-from .ranks import compare
+from .ranks import class_of, compare
 
 Data = dict[str, Any]
 CLOSE = 1e-6  # two libraries of special functions may differ in the last digits
@@ -55,23 +55,34 @@ def strays(board: Data, suite: Suite) -> list[Data]:
 
 def untold(board: Data, suite: Suite) -> list[str]:
     """Ranked entries whose cells at the dose of the ranks do not say which episodes came to damage."""
-    unknown = silent(board["cells"], doses_of(suite)[middle(suite)])
+    withdrawn = {attack["attack"] for attack in board["attacks"] if attack.get("withdrawn")}
+    counted = (cell for cell in board["cells"] if cell["attack"] not in withdrawn)
+    unknown = silent(counted, doses_of(suite)[middle(suite)])
     return [entry["defence"] for entry in board["entries"] if entry["status"] == "ranked" and entry["defence"] in unknown]
 
 
 def _ranks(board: Data, levels: Levels, unknown: list[str], slot: int, alpha: float) -> list[Data]:
-    """Comparisons and ranks of the classes all of whose cells say which episodes came to damage."""
-    ranked = [entry for entry in board["entries"] if entry["status"] == "ranked"]
+    """Who is in which class, and comparisons and ranks of the classes all of whose cells say which episodes came to damage."""
     out: list[Data] = []
-    for group in dict.fromkeys(entry["class"] for entry in ranked):
-        mine = {entry["defence"]: entry for entry in ranked if entry["class"] == group}
+    groups: dict[str, dict[str, Data]] = {}
+    for entry in board["entries"]:
+        name, group = entry["defence"], entry.get("class", "")
+        if group != (own := class_of(entry.get("uses", ()))):
+            out.append(_stray(name, "class", group, own))
+        if entry["status"] == "ranked":
+            groups.setdefault(group, {})[name] = entry
+        elif entry.get("rank") is not None:
+            out.append(_stray(name, "rank", entry["rank"], None))
+    duels_of = {group: [duel for duel in board.get("comparisons", ()) if duel.get("class", "") == group] for group in groups}
+    if others := len(board.get("comparisons", ())) - sum(map(len, duels_of.values())):
+        out.append(_stray("", "comparisons", f"{others} of classes that nobody is ranked in", None))
+    for group, mine in groups.items():
         if any(name not in levels or name in unknown or not levels[name]["black"].complete for name in mine):
             continue
         duels, ranks = compare({name: levels[name]["black"].all_harm(slot) for name in mine}, group, alpha)
-        said = [duel for duel in board["comparisons"] if duel["class"] == group]
-        if not same(said, duels):
-            out.append(_stray("", "comparisons", f"{len(said)} of the class {group}", "others"))
-        out += [_stray(name, "rank", entry["rank"], ranks[name]) for name, entry in mine.items() if not same(entry["rank"], ranks[name])]
+        if not same(duels_of[group], duels):
+            out.append(_stray("", "comparisons", f"{len(duels_of[group])} of the class {group}", "others"))
+        out += [_stray(name, "rank", e.get("rank"), ranks[name]) for name, e in mine.items() if not same(e.get("rank"), ranks[name])]
     return out
 
 
