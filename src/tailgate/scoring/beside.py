@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -33,9 +33,10 @@ class Beside:
         return [line for line in self.board[part] if line["defence"] == defence]
 
 
-def silent(cells: Iterable[Data], dose: int | None) -> list[str]:
+def silent(cells: Iterable[Data], dose: int | None, withdrawn: Collection[str]) -> list[str]:
     """Defences of which nobody knows which episodes came to damage in some cell at a dose that ranks depend on."""
-    counted = (c for c in cells if c["dose"] == dose and c["knowledge"] == "black" and not c.get("optimal"))
+    asked = (c for c in cells if c["dose"] == dose and c["knowledge"] == "black")
+    counted = (c for c in asked if not c.get("optimal") and c["attack"] not in withdrawn)
     some = (c for c in counted if c.get("hits") is None and c["damage"] and 0.0 < c["damage"]["value"] < 1.0)
     return list(dict.fromkeys(c["defence"] for c in some))
 

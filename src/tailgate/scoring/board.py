@@ -311,8 +311,7 @@ def _rank(found: list[Data], levels: Levels, slot: int, alpha: float, held: Besi
         if held is not None and group not in fresh:
             out += [duel for duel in held.board["comparisons"] if duel["class"] == group]
             continue
-        counted = () if held is None else (c for c in held.cells if c["attack"] not in held.table.withdrawn)
-        unknown = () if held is None else silent(counted, held.table.doses[slot])
+        unknown = () if held is None else silent(held.cells, held.table.doses[slot], held.table.withdrawn)
         if lacking := [entry["defence"] for entry in mine if entry["defence"] in unknown]:
             how = "which episodes came to damage, to compare with: `leaderboard check --write --defence` finds out"
             raise InputError(f"board: cells of {', '.join(lacking)}: hits", None, how)

@@ -56,8 +56,7 @@ def strays(board: Data, suite: Suite) -> list[Data]:
 def untold(board: Data, suite: Suite) -> list[str]:
     """Ranked entries whose cells at the dose of the ranks do not say which episodes came to damage."""
     withdrawn = {attack["attack"] for attack in board["attacks"] if attack.get("withdrawn")}
-    counted = (cell for cell in board["cells"] if cell["attack"] not in withdrawn)
-    unknown = silent(counted, doses_of(suite)[middle(suite)])
+    unknown = silent(board["cells"], doses_of(suite)[middle(suite)], withdrawn)
     return [entry["defence"] for entry in board["entries"] if entry["status"] == "ranked" and entry["defence"] in unknown]
 
 
