@@ -44,6 +44,31 @@ def test_policies_play_as_attacks_and_are_trained_once(tmp_path: Path) -> None:
     assert json.loads(policies[0].read_text())["training"]["config"]["defence"] == "kf"
 
 
+def test_published_policies_are_not_trained_again(tmp_path: Path) -> None:
+    """Without checkpoints what is there stays byte by byte and what is missing comes back the same; what is of another training is refused."""
+    black = configs_of(SUITE, "kf", tmp_path, extra=("workers=1",))[:1]
+    first, second = train_against(black, lambda *args: None)
+    held = [path.with_suffix(".safetensors").read_bytes() for path in (first, second)]
+    for path in (*tmp_path.glob("*/checkpoint-*"), second, second.with_suffix(".safetensors")):
+        path.unlink()
+    record = json.loads(first.read_text())
+    record["training"]["made_with"] = {"machine": "another"}
+    first.write_text(json.dumps(record))
+    labels: list[str] = []
+    assert train_against(black, lambda label, *rest: labels.append(label)) == [first, second]
+    assert set(labels) == {"kf-cem-black, seed 1"}
+    assert json.loads(first.read_text()) == record
+    assert [path.with_suffix(".safetensors").read_bytes() for path in (first, second)] == held
+    for path in tmp_path.glob("*/checkpoint-*"):
+        path.unlink()
+    second.unlink()
+    for name, value in (("seed", 1), ("defence_digest", "f"), ("defence_version", 99), ("config", record["training"]["config"] | {"gamma": 0.5})):
+        first.write_text(json.dumps(record | {"training": record["training"] | {name: value}}))
+        with pytest.raises(InputError, match="policy-0.json"):
+            train_against(black, lambda *args: None)
+    assert first.with_suffix(".safetensors").read_bytes() == held[0]
+
+
 def test_policies_play_where_the_attacker_sees_and_may_do_as_much() -> None:
     """Networks of another shape are trained on apart, and asked for apart; another car with the same radio is not."""
     plan = {"config": "network", "dose": 5, "learners": {"cem": ["steps=600"]}, "knowledge": ["black"], "seeds": 1}

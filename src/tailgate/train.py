@@ -22,6 +22,7 @@ from pydantic import Field
 
 from tailgate.agents.codec import ActionSpec
 from tailgate.agents.learning import DISCRETE, LEARNERS, Learner, Progress, Teachable, check_action, learner_of, made_with
+from tailgate.agents.policy import load_policy
 from tailgate.agents.reward import Reward
 from tailgate.agents.teacher import demonstrate
 from tailgate.core import Count, PositiveCount, param
@@ -226,6 +227,8 @@ def _settings(config: TrainConfig) -> tuple[Any, Any]:
 
 def _train_seed(config: TrainConfig, teacher: str | None, seed: int, resume: bool, report: Callable[[Progress], None]) -> Path:
     """Train the policy of one seed, shown its teacher's decisions first; returns its JSON file."""
+    if resume and (done := _published(config, seed)):
+        return done
     module, settings = _settings(config)
     directory = config.directory
     board = directory / "tensorboard" if config.tensorboard else None
@@ -252,6 +255,23 @@ def _train_seed(config: TrainConfig, teacher: str | None, seed: int, resume: boo
     write_atomic(record, json.dumps(curve).encode() + b"\n")
     learner.close()
     return policy
+
+
+def _published(config: TrainConfig, seed: int) -> Path | None:
+    """The policy of a seed that was trained and has no checkpoint to go on from: it is not trained again, whatever would come of it.
+
+    Raises InputError where it is of another training, which would be written over.
+    """
+    path = config.directory / f"policy-{seed}.json"
+    if not path.is_file() or (config.directory / f"checkpoint-{seed}.safetensors").exists():
+        return None
+    record, spec = load_policy(path)[0].training, Spec("defence", config.defence)
+    held, version = record.get("config"), record.get("defence_version", spec.entry.version)  # first policies do not say which version
+    same = isinstance(held, dict) and training_of(held) == training_of(as_data(config))
+    if not (same and record.get("seed") == seed and record.get("defence_digest") == spec.digest and version == spec.entry.version):
+        expected = f"a policy of this training against {config.defence}, or a checkpoint to go on from: move it, or train elsewhere"
+        raise InputError("resume", str(path), expected)
+    return path
 
 
 def _apart(defence: str) -> contextlib.AbstractContextManager[None]:
