@@ -4,6 +4,7 @@ import argparse
 import copy
 import dataclasses
 import importlib.util
+import itertools
 import json
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from tailgate.scenario import load_suite
 from tailgate.scoring.attacks import Admitted
 from tailgate.scoring.cells import digits, hits_of
 from tailgate.scoring.follow import strays, untold
+from tailgate.scoring.ranks import Harm, outdone
 
 spec = importlib.util.spec_from_file_location("scored", Path(__file__).with_name("scored.py"))
 assert spec is not None and spec.loader is not None
@@ -67,26 +69,76 @@ def test_an_entry_that_meets_more_takes_the_place_of_the_old_one() -> None:
     assert [c["attack"] for c in made["cells"] if c["learned"]] == [POLICY.replace("a", "kf")] * 3
 
 
-def test_what_a_class_does_not_know_of_another_it_need_not_know() -> None:
-    """Hits are asked for in the class of an entry that changed, at the dose of the ranks."""
-    before = _as_read(board(_rows("none", "kf", "rkf")))
-    for c in before["cells"]:
+def _without_hits(made: Data) -> Data:
+    """A board of before cells said which episodes came to damage."""
+    held = copy.deepcopy(made)
+    for c in held["cells"]:
         del c["hits"]
-    made = board(_rows("none", "safe_state"), board=before)
+    return held
+
+
+def test_what_a_board_does_not_know_makes_ranks_wider_and_never_wrong() -> None:
+    """Pairs that stay keep what was found of them when all was known; new pairs count as different as numbers of hits allow."""
+    hits = {"none": 20, "kf": list(range(13)), "rkf": [0, 19], "imm": [3, 4, 5], "safe_state": 1}
+
+    def rows(*guards: str) -> list[Data]:
+        uses = {name: ["measurements", "v2v"] if name == "safe_state" else ["measurements"] for name in guards}
+        return [r for g in guards for r in (*cell(g, uses=uses[g]), *cell(g, "fdi", [0, hits[g], 20], uses=uses[g]))]
+
+    whole, before = board(rows(*GUARDS)), _without_hits(_as_read(board(rows("none", "kf", "rkf"))))
+    made = board(rows("none", "safe_state"), board=before)
     assert entry(made, "safe_state")["rank"] == {"best": 1, "worst": 1}
     assert [entry(made, name)["rank"] for name in ("kf", "rkf")] == [entry(before, name)["rank"] for name in ("kf", "rkf")]
-    assert made["comparisons"] == before["comparisons"] != []
-    with pytest.raises(InputError, match=r"cells of kf, rkf: hits.*check --write"):
-        board(_rows("none", "imm"), board=before)
-    known = board(_rows("none", "kf", "rkf", "imm"), board=before)
-    assert known["comparisons"] == board(_rows("none", "kf", "rkf", "imm"))["comparisons"]
+    assert made["comparisons"] == before["comparisons"] != [] and strays(made, suite()) == []
+    made = _as_read(board(rows("none", "imm", "safe_state"), board=before))
+    duels = {(d["a"], d["b"]): (d, e) for d, e in zip(made["comparisons"], whole["comparisons"], strict=True)}
+    assert {pair: d.get("bound") for pair, (d, _) in duels.items()} == {("imm", "kf"): True, ("imm", "rkf"): True, ("kf", "rkf"): None}
+    assert duels["kf", "rkf"][0]["p"] == duels["kf", "rkf"][1]["p"]
+    assert all(d["p"] >= e["p"] and d["only_a"] - d["only_b"] == e["only_a"] - e["only_b"] for d, e in duels.values())
+    assert any(d["p"] > e["p"] for d, e in duels.values())
+    for name in ("kf", "rkf", "imm"):
+        wide, rank = entry(made, name)["rank"], entry(whole, name)["rank"]
+        assert wide["best"] <= rank["best"] and rank["worst"] <= wide["worst"]
+    assert strays(made, suite()) == [] and untold(made, suite()) == ["kf", "rkf"]
+    told = copy.deepcopy(made)
+    for mine, full in zip(told["cells"], whole["cells"], strict=True):
+        mine["hits"] = full["hits"]
+    assert strays(told, suite()) == [] and untold(told, suite()) == []  # bounds are allowed where cells tell more by now
+    assert board(rows("none", "imm"), board=told)["comparisons"] == whole["comparisons"]
+    exact, bound = whole["comparisons"][0], made["comparisons"][0]
+    assert exact["p"] < bound["p"] < 0.05 and duels["kf", "rkf"][0]["p"] < 0.01 and entry(made, "kf")["rank"] == {"best": 3, "worst": 3}
+    for at, changes in ((0, {"p": exact["p"] / 2}), (0, {"p": 2 * bound["p"]}), (0, {"weaker": "imm"}), (0, {"only_a": 17}), (2, {"p": 1.0}), (2, {"weaker": "rkf"})):
+        forged = copy.deepcopy(made if at == 2 else told)
+        forged["comparisons"][at] |= changes
+        assert ("", "comparisons") in {(s["defence"], s["field"]) for s in strays(forged, suite())}, changes
+
+
+def test_the_largest_p_that_numbers_allow() -> None:
+    """Over all ways in which as many episodes can have come to damage (a search of all of them)."""
+    n = 6
+    sets = [np.isin(range(n), which).astype(float) for k in range(n + 1) for which in itertools.combinations(range(n), k)]
+    both = np.zeros(2, bool)
+    for k, other in itertools.product(range(n + 1), repeat=2):
+        mine = np.array([np.arange(n) < k, np.zeros(n)], float)
+        found = [outdone(Harm((), mine, 0, both), Harm((), theirs[None], 0, both[:1])) for theirs in sets if theirs.sum() == other]
+        theirs = (np.arange(n) >= n - other).astype(float)[None]
+        for a, b in ((~both, both), (both, ~both), (~both, ~both)):
+            assert outdone(Harm((), mine, 0, a), Harm((), theirs, 0, b[:1])) == pytest.approx(max(found), abs=1e-12), (k, other)
+
+
+def test_hits_of_rows_count_where_a_defence_stays() -> None:
+    """Rows of some cells of it say which episodes were hit, and its comparisons are made of these."""
+    rows = [*_rows("none", "imm"), *cell("kf"), *cell("kf", POLICY.replace("a", "kf"), [[19], [18, 19], list(range(8, 20))], learned=True), *cell("kf", "fdi", 0)]
+    whole = board([*rows, *cell("rkf"), *cell("rkf", "fdi", [[3], [0, 9, 10], 5])])
+    before = _without_hits(_as_read(board([r for r in [*rows, *cell("rkf"), *cell("rkf", "fdi", [[3], [0, 9, 10], 5])] if r["defence"] != "imm"])))
+    some = [r for r in rows if r["attack"] != "fdi" or r["defence"] != "kf"]
+    made = board([*some, *cell("rkf", "fdi", [[3], [0, 9, 10], 5])], board=before)
+    assert made["comparisons"] == whole["comparisons"] and not any(d.get("bound") for d in made["comparisons"])
 
 
 def test_rows_of_some_cells_only_say_which_episodes_were_hit() -> None:
     whole = board(_rows(*GUARDS))
-    before = _as_read(whole)
-    for c in before["cells"]:
-        del c["hits"]
+    before = _without_hits(_as_read(whole))
     before["entries"][1]["why"] = "as it was"
     made = board([*_rows("none"), *cell("kf"), *_rows("rkf", own=False)], board=before)
     assert entry(made, "kf")["why"] == "as it was"

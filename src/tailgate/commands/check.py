@@ -121,9 +121,10 @@ def _print(report: dict[str, Any]) -> None:
     if strays:
         out.print(f"{len(strays)} figure{'s differ' if len(strays) > 1 else ' differs'} from what is made here:")
     else:
-        out.print(f"Rates, critical doses{'' if report['untold'] else ', ranks'} and curves of all entries follow from the cells.")
+        what = "ranks from its comparisons" if report["untold"] else "comparisons and ranks too"
+        out.print(f"Rates, critical doses and curves of all entries follow from the cells, {what}.")
     if report["untold"]:
-        out.print(f"Ranks cannot be made of the cells of {', '.join(report['untold'])}, which do not say which episodes came to damage.",
+        out.print(f"Cells of {', '.join(report['untold'])} do not say which episodes came to damage, and tell limits of their comparisons.",
                   markup=False, highlight=False)  # fmt: skip
     for stray in strays[:SHOWN]:
         where, board, here = _first(stray["board"], stray["here"])
@@ -133,7 +134,7 @@ def _print(report: dict[str, Any]) -> None:
     if len(strays) > SHOWN:
         out.print(f"and {len(strays) - SHOWN} more; --json lists them all", highlight=False)
     if not report["scored"]:
-        which = "Ranks, gates" if report["untold"] else "Gates"
+        which = "Comparisons, gates" if report["untold"] else "Gates"
         out.print(f"{which} and clean figures were not made again: that takes all cells of the board.")
     elif not strays:
         out.print("Ranks, gates and clean figures came out as the board says.")

@@ -236,7 +236,8 @@ class CurvePart(Part):
 
 
 class Comparison(Part):
-    """Two defences on the same seeds; only_a: episodes in which a alone came to damage; weaker: the side that p speaks of."""
+    """Two defences on the same seeds; only_a: episodes in which a alone came to damage; weaker: the side that p speaks of; bound: whether
+    p is the largest that the numbers of damaged episodes allow, and these are as many as can be."""
 
     class_: Text = Field("", alias="class")
     a: Text
@@ -246,6 +247,7 @@ class Comparison(Part):
     p: Share
     adjusted: Share
     weaker: Text | None = None
+    bound: bool = False
 
 
 class Detected(Part):

@@ -56,8 +56,8 @@ def check(
     data: a board, as JSON; sample: so many cells, drawn by sample_seed (default: all); defences: only the cells of these.
     The report has `counts`, `entries` (the same for each defence), `reasons` and `findings`, cells that differ or could not be checked;
     `untrained`: attackers whose files are not here, though `leaderboard attack` would train them again, to the same weights;
-    `strays`: figures that do not follow from the cells, by `defence` and `field`; `untold`: ranked entries whose ranks nobody can make of
-    cells, as these do not say which episodes came to damage; `scored`: whether ranks, gates and all else could be made
+    `strays`: figures that do not follow from the cells, by `defence` and `field`; `untold`: ranked entries of whose comparisons cells tell
+    the limits only, as these do not say which episodes came to damage; `scored`: whether ranks, gates and all else could be made
     again, as all cells were played; `prints` has hits and fingerprints of each cell that came out equal, by its place in the board.
     Raises InputError for a board of another suite or version than is here, and for a defence that is not on it.
     """
@@ -104,13 +104,21 @@ def _scored(data: Data, rows: list[Row], suite: Suite) -> Iterator[Data]:
         yield {"defence": "", "field": "cells", "board": f"{len(data['cells'])} cells", "here": str(error)}
         return
     entries = {entry["defence"]: entry for entry in here["entries"]}
+    bounds = {duel["class"] for duel in data["comparisons"] if duel.get("bound")}
     for entry in data["entries"]:
         mine = entries.get(entry["defence"], {})
         for key in SCORED:
-            if not same(entry.get(key), mine.get(key)):
+            wide = key == "rank" and entry.get("class") in bounds and _within(mine.get(key), entry.get(key))
+            if not wide and not same(entry.get(key), mine.get(key)):
                 yield {"defence": entry["defence"], "field": key, "board": entry.get(key), "here": mine.get(key)}
-    if not same(data["comparisons"], here["comparisons"]):
+    exact = [[duel for duel in board["comparisons"] if duel["class"] not in bounds] for board in (data, here)]
+    if not same(*exact):
         yield {"defence": "", "field": "comparisons", "board": f"{len(data['comparisons'])} of them", "here": "others"}
+
+
+def _within(rank: Data | None, wider: Data | None) -> bool:
+    """Whether a rank set lies in one that was made of bounds, of which fewer are significant."""
+    return rank is not None and wider is not None and bool(wider["best"] <= rank["best"] and rank["worst"] <= wider["worst"])
 
 
 def suite_of(board: Board) -> Suite:

@@ -153,12 +153,20 @@ def comparisons_of(suite: Suite, defence: str | None = None) -> list[Data]:
         if defence in (None, duel.a, duel.b):
             weaker = duel.weaker or (duel.a if duel.only_a > duel.only_b else duel.b)
             sure = duel.adjusted <= suite.board.suite.alpha and (duel.weaker is not None or duel.only_a != duel.only_b)
+            most = "≤ " if duel.bound else ""
             out.append({
                 "class": duel.class_ or "not stated", "a": suite.defences[duel.a], "b": suite.defences[duel.b],
-                "only_a": duel.only_a, "only_b": duel.only_b, "p": _small(duel.p), "adjusted": _small(duel.adjusted),
+                "only_a": f"{most}{duel.only_a}", "only_b": f"{most}{duel.only_b}", "p": _small(duel.p, duel.bound),
+                "adjusted": _small(duel.adjusted, duel.bound), "sort_a": duel.only_a, "sort_b": duel.only_b,
                 "sort": f"{duel.p:.6g}", "sort_adjusted": f"{duel.adjusted:.6g}", "weaker": suite.defences[weaker] if sure else None,
             })  # fmt: skip
     return out
+
+
+BOUND = (
+    " ≤ stands where the board does not know which episodes came to damage, but how many: the largest p that these numbers allow, and as "
+    "many episodes as can be."
+)
 
 
 def compared_how(suite: Suite) -> str:
@@ -170,10 +178,13 @@ def compared_how(suite: Suite) -> str:
         "One is surely weaker where its worst attack at the middle dose does more damage than every attack of the other does to that one, "
         "on the same seeds: McNemar's exact tests, the largest p of them (intersection-union), times the number of attacks that the worst "
         f"was chosen from (Bonferroni), two-sided, and corrected after Holm for the pairs of the class, at {alpha}."
+        + (BOUND if any(duel.bound for duel in suite.board.comparisons) else "")
     )
 
 
-def _small(p: float) -> str:
+def _small(p: float, bound: bool = False) -> str:
+    if bound and 1e-4 <= p < 1.0:
+        return f"≤ {_small(p)}"
     return "< 0.0001" if p < 1e-4 else f"{p:.2g}" if p < 0.1 else f"{p:.2f}"
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -33,14 +33,6 @@ class Beside:
         return [line for line in self.board[part] if line["defence"] == defence]
 
 
-def silent(cells: Iterable[Data], dose: int | None, withdrawn: Collection[str]) -> list[str]:
-    """Defences of which nobody knows which episodes came to damage in some cell at a dose that ranks depend on."""
-    asked = (c for c in cells if c["dose"] == dose and c["knowledge"] == "black")
-    counted = (c for c in asked if not c.get("optimal") and c["attack"] not in withdrawn)
-    some = (c for c in counted if c.get("hits") is None and c["damage"] and 0.0 < c["damage"]["value"] < 1.0)
-    return list(dict.fromkeys(c["defence"] for c in some))
-
-
 def beside(table: Table, board: Data, suite: Suite, alpha: float, require_adaptive: bool, digests: Mapping[str, str]) -> Beside:
     """A defence whose rows cover all cells that the board has of it is made of rows, others stay as the board has them. Cells that both
     have must come out equal; which of their episodes came to damage is then known, if it was not.
@@ -59,13 +51,14 @@ def beside(table: Table, board: Data, suite: Suite, alpha: float, require_adapti
             raise InputError(f"board: digest of {attack['attack']}", line["digest"], f"{digest}, as on the list: play the whole suite")
     if CLEAN not in table.defences and any(entry["defence"] == CLEAN for entry in board["entries"]):
         raise InputError("rows: defence", list(table.defences), f"{CLEAN} too: what a defence costs is measured against it")
-    held = table_of(board, suite)
+    new = {place_of(cell): cell for cell in cells_of(table)}
+    told = {place: cell["hits"] for place, cell in new.items()}
+    held = table_of(board | {"cells": [cell | {"hits": told.get(place_of(cell), cell.get("hits"))} for cell in board["cells"]]}, suite)
     for name, seeds in held.seeds.items():
         if table.seeds.get(name, ()) != seeds:
             raise InputError(f"rows of {name}: seeds", f"{len(table.seeds.get(name, ()))} of them", f"the board's, which are {len(seeds)}")
     if other := ({*table.listed} - table.withdrawn) ^ ({*held.listed} - held.withdrawn):
         raise InputError("board: attacks", min(other), "the list of attacks that is here: play the whole suite")
-    new = {place_of(cell): cell for cell in cells_of(table)}
     entries: dict[str, Data] = {}
     cells: list[Data] = []
     for entry in board["entries"]:
@@ -82,7 +75,7 @@ def beside(table: Table, board: Data, suite: Suite, alpha: float, require_adapti
         if more := [place for place in again if place not in old]:
             raise InputError(f"rows of {name}", _said(more), f"rows of all {len(old)} cells that the board has, {_said(lost)} among them")
         entries[name] = entry
-        cells += [cell | {"hits": again[place]["hits"]} if place in again else cell for place, cell in old.items()]
+        cells += [cell | {"hits": told[place]} if place in again else cell for place, cell in old.items()]
     both = joined(table, held, entries)
     for name in entries:
         if (before := _counted(held, name)) != (now := _counted(both, name)):

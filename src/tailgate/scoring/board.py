@@ -18,7 +18,7 @@ from tailgate.strength.dose import CRITICAL
 from tailgate.threat import KNOWLEDGE
 
 from .attacks import Admitted, standing, taken_back
-from .beside import Beside, beside, silent
+from .beside import Beside, beside
 from .cells import cells_of, ordered
 from .damage import CLEAN, PLAYED, SKIPPED, Column, Key, Row, Table, doses_of, has_road, named, tabulate
 from .doses import Worst
@@ -304,18 +304,16 @@ def _rank(found: list[Data], levels: Levels, slot: int, alpha: float, held: Besi
     ranked = [entry for entry in found if entry["status"] == "ranked"]
     fresh: set[str] = set()  # classes that an entry has joined, or left, or stayed in with other rows
     if held is not None:
-        before = (entry for entry in held.board["entries"] if entry["status"] == "ranked")
-        fresh = {entry["class"] for entry in (*ranked, *before) if entry["defence"] not in held.entries}
+        former = (entry for entry in held.board["entries"] if entry["status"] == "ranked")
+        fresh = {entry["class"] for entry in (*ranked, *former) if entry["defence"] not in held.entries}
     for group in dict.fromkeys(entry["class"] for entry in ranked):
         mine = [entry for entry in ranked if entry["class"] == group]
         if held is not None and group not in fresh:
             out += [duel for duel in held.board["comparisons"] if duel["class"] == group]
             continue
-        unknown = () if held is None else silent(held.cells, held.table.doses[slot], held.table.withdrawn)
-        if lacking := [entry["defence"] for entry in mine if entry["defence"] in unknown]:
-            how = "which episodes came to damage, to compare with: `leaderboard check --write --defence` finds out"
-            raise InputError(f"board: cells of {', '.join(lacking)}: hits", None, how)
-        duels, ranks = compare({e["defence"]: levels[e["defence"]]["black"].all_harm(slot) for e in mine}, group, alpha)
+        before = {} if held is None else {(duel["a"], duel["b"]): duel for duel in held.board["comparisons"]}
+        stay = {pair: duel for pair, duel in before.items() if held is not None and held.entries.keys() >= set(pair)}
+        duels, ranks = compare({e["defence"]: levels[e["defence"]]["black"].all_harm(slot) for e in mine}, group, alpha, stay)
         out += duels
         for entry in mine:
             entry["rank"] = ranks[entry["defence"]]

@@ -52,6 +52,11 @@ def hits_of(cell: Data) -> Array:
     return np.arange(cell["n"]) < (round(cell["damage"]["value"] * cell["n"]) if cell["damage"] else 0)
 
 
+def vague(cell: Data) -> bool:
+    """Whether nobody can tell from a cell which of its episodes came to damage."""
+    return cell.get("hits") is None and cell["damage"] is not None and 0.0 < cell["damage"]["value"] < 1.0
+
+
 def ordered(cells: Sequence[Data], table: Table) -> list[Data]:
     """Cells in the order of the suite, clean runs first."""
     places, slots = list(table.scenarios), {dose: slot for slot, dose in enumerate(table.doses)}
@@ -122,6 +127,7 @@ def table_of(board: Data, suite: Suite) -> Table:
     return Table(
         suite, places, doses, defences, columns, seeds, {}, clean, harm, state, marks["optimal"], marks["learned"],
         tuple(dict.fromkeys(listed)), withdrawn, purpose, beacon, sum(episodes[key.scenario] for key in cells),
+        frozenset(key for key, cell in cells.items() if vague(cell)),
     )  # fmt: skip
 
 
@@ -151,5 +157,5 @@ def joined(table: Table, held: Table, kept: Collection[str]) -> Table:
     own = {key: rows for key, rows in table.cells.items() if key.defence not in kept}
     return dataclasses.replace(
         table, defences=defences, columns=columns, cells=own, harm=harm, state=state, optimal=optimal,
-        learned=learned,
+        learned=learned, vague=frozenset(key for key in held.vague if key.defence in kept),
     )  # fmt: skip

@@ -79,6 +79,7 @@ class Table:
     purpose: str
     beacon: str  # of the round; empty for public seeds
     rows: int
+    vague: frozenset[Key] = frozenset()  # cells of a board that do not say which episodes came to damage: the first ones stand for them
 
     def known(self, knowledge: str) -> list[int]:
         """Columns of attacks that know no more than this. Computed optima are ceilings, and count nowhere."""

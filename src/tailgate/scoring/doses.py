@@ -108,7 +108,8 @@ class Worst:
         harm = np.stack([self._harm(name, i)[slot] for name, i in self.pairs])
         if np.isnan(harm).any():
             raise InputError(f"rows of {self.defence}", "attacks without full figures", "all episodes of every attack that counts")
-        return Harm(found.pop(), harm, self.at(slot)[0])
+        keys = [Key(name, slot, self.defence, self.table.columns[i]) for name, i in self.pairs]
+        return Harm(found.pop(), harm, self.at(slot)[0], np.array([key in self.table.vague for key in keys], bool))
 
     def bounds(self, slot: int, scenarios: list[str] | None = None, sides: int = 1) -> tuple[float, float]:
         """Limits of the worst share of damage that hold together for all pairs: alpha over their number, and over the sides."""

@@ -6,17 +6,17 @@ Shares of damage decide its rates, critical doses, curves and robustness; which 
 from __future__ import annotations
 
 import math
+from itertools import combinations
 from typing import Any
 
 from tailgate.scenario import Suite
 from tailgate.threat import KNOWLEDGE
 
-from .beside import silent
 from .board import Levels, curves, middle, of_worst, shown
-from .cells import hits_of, share, table_of
+from .cells import hits_of, share, table_of, vague
 from .damage import doses_of
 from .doses import Worst
-from .ranks import class_of, compare
+from .ranks import Harm, class_of, duel, settled
 
 Data = dict[str, Any]
 CLOSE = 1e-6  # two libraries of special functions may differ in the last digits
@@ -50,18 +50,21 @@ def strays(board: Data, suite: Suite) -> list[Data]:
         if entry["status"] != "unranked" and (lost := levels[name]["black"].lost):
             where, column = lost[0][0], table.columns[lost[0][1]]
             out.append(_stray(name, "status", entry["status"], f"unranked: not all cells of {column.attack} on {where} are there"))
-    return out + _ranks(board, levels, untold(board, suite), slot, alpha)
+    return out + _ranks(board, levels, slot, alpha)
 
 
 def untold(board: Data, suite: Suite) -> list[str]:
-    """Ranked entries whose cells at the dose of the ranks do not say which episodes came to damage."""
+    """Ranked entries some of whose cells at the dose of the ranks do not say which episodes came to damage: of their comparisons, cells
+    tell within which limits p lies."""
     withdrawn = {attack["attack"] for attack in board["attacks"] if attack.get("withdrawn")}
-    unknown = silent(board["cells"], doses_of(suite)[middle(suite)], withdrawn)
+    dose = doses_of(suite)[middle(suite)]
+    asked = (c for c in board["cells"] if c["dose"] == dose and c["knowledge"] == "black" and not c.get("optimal"))
+    unknown = {c["defence"] for c in asked if c["attack"] not in withdrawn and vague(c)}
     return [entry["defence"] for entry in board["entries"] if entry["status"] == "ranked" and entry["defence"] in unknown]
 
 
-def _ranks(board: Data, levels: Levels, unknown: list[str], slot: int, alpha: float) -> list[Data]:
-    """Who is in which class, and comparisons and ranks of the classes all of whose cells say which episodes came to damage."""
+def _ranks(board: Data, levels: Levels, slot: int, alpha: float) -> list[Data]:
+    """Who is in which class, comparisons of its pairs, and the ranks that follow from these."""
     out: list[Data] = []
     groups: dict[str, dict[str, Data]] = {}
     for entry in board["entries"]:
@@ -76,13 +79,32 @@ def _ranks(board: Data, levels: Levels, unknown: list[str], slot: int, alpha: fl
     if others := len(board.get("comparisons", ())) - sum(map(len, duels_of.values())):
         out.append(_stray("", "comparisons", f"{others} of classes that nobody is ranked in", None))
     for group, mine in groups.items():
-        if any(name not in levels or name in unknown or not levels[name]["black"].complete for name in mine):
+        if any(name not in levels or not levels[name]["black"].complete for name in mine):
             continue
-        duels, ranks = compare({name: levels[name]["black"].all_harm(slot) for name in mine}, group, alpha)
-        if not same(duels_of[group], duels):
-            out.append(_stray("", "comparisons", f"{len(duels_of[group])} of the class {group}", "others"))
+        harm, said = {name: levels[name]["black"].all_harm(slot) for name in mine}, {(d["a"], d["b"]): d for d in duels_of[group]}
+        duels = [_believed(said.get((a, b), {}), duel(group, a, b, harm[a], harm[b]), harm) for a, b in combinations(harm, 2)]
+        made, ranks = settled(duels, list(harm), alpha)
+        if not same(duels_of[group], made):
+            off = [f"{one['a']} and {one['b']}" for one in made if not same(said.get((one["a"], one["b"])), one)]
+            here = f"others of {', '.join(off[:2])}" if off else f"{len(made)} of them"
+            out.append(_stray("", "comparisons", f"{len(duels_of[group])} of the class {group}", here))
         out += [_stray(name, "rank", e.get("rank"), ranks[name]) for name, e in mine.items() if not same(e.get("rank"), ranks[name])]
     return out
+
+
+def _believed(said: Data, here: Data, harm: dict[str, Harm]) -> Data:
+    """What a board says of a pair, where its cells allow that and do not tell what it is; else what they make.
+
+    A bound may have been made when cells told less; a pair that is no bound, of cells that do not tell, was compared when all was known.
+    """
+    bound, a, b = bool(said.get("bound")), here["a"], here["b"]
+    if not said or not (bound or here.get("bound")):
+        return here
+    least, most = (here, duel("", a, b, harm[a].by_count, harm[b].by_count)) if bound else ({"p": 0.0}, here)
+    difference = here["only_a"] - here["only_b"]  # which numbers tell
+    fits = least["p"] * (1.0 - CLOSE) <= said["p"] <= most["p"] * (1.0 + CLOSE) and said["only_a"] - said["only_b"] == difference
+    likely = said["weaker"] == (a if difference > 0 else b) or (said["p"] >= 1.0 and said["weaker"] in (a, b))
+    return {key: value for key, value in said.items() if key != "adjusted"} if fits and likely else here
 
 
 def same(a: Any, b: Any) -> bool:

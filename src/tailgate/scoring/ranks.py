@@ -14,6 +14,8 @@ from tailgate.errors import InputError
 from tailgate.registry import USES
 from tailgate.stats import holm
 
+Data = dict[str, Any]
+
 
 class Harm(NamedTuple):
     """A defence against all its attacks in all scenarios, at one dose."""
@@ -21,11 +23,17 @@ class Harm(NamedTuple):
     seeds: tuple[int, ...]
     damage: Array  # (attacks, episodes), 0 or 1
     worst: int  # the attack that does the most
+    vague: Array  # (attacks,) bool: how many episodes came to damage is known, and not which
 
     @property
     def of_worst(self) -> Array:
         """(episodes,) what the worst attack does."""
         return np.asarray(self.damage[self.worst])
+
+    @property
+    def by_count(self) -> Harm:
+        """The same, had only numbers been written down."""
+        return self._replace(vague=np.ones(len(self.damage), bool))
 
 
 def class_of(uses: Sequence[str]) -> str:
@@ -43,38 +51,57 @@ def outdone(a: Harm, b: Harm) -> float:
     """p of the null hypothesis that some attack harms b at least as much as a's worst harms a: small where a is surely the weaker one.
 
     a's worst attack is tested against every attack of b, one-sided, and the largest p counts (an intersection-union test, which needs no
-    correction). That a's worst was chosen on these very episodes costs the factor of its attacks (Bonferroni).
+    correction). That a's worst was chosen on these very episodes costs the factor of its attacks (Bonferroni). Where nobody knows which
+    episodes came to damage, p is the largest that their numbers allow.
     """
-    mine = a.of_worst
-    only_a, only_b = np.sum(mine > b.damage, axis=1), np.sum(b.damage > mine, axis=1)
+    only_a, only_b = apart(a.of_worst, b.damage, a.vague[a.worst] | b.vague)
     p = np.where(only_a + only_b > 0, binom.sf(only_a - 1, only_a + only_b, 0.5), 1.0)
     return float(min(1.0, len(a.damage) * p.max()))
 
 
-def compare(harm: Mapping[str, Harm], group: str, alpha: float) -> tuple[list[dict[str, Any]], dict[str, dict[str, int]]]:
-    """Comparisons of all pairs of a class, and each one's rank set: best, 1 + those that are surely better, and worst.
+def apart(mine: Array, others: Array, vague: Array) -> tuple[Array, Array]:
+    """(attacks,) each: episodes in which `mine` (episodes,) alone shows damage, and in which `others` (attacks, episodes) alone do.
 
-    only_a counts the episodes in which a alone came to damage, each against its worst attack. p is twice the smaller of the two sides of
-    `outdone`, adjusted after Holm for all pairs of the class; `weaker` is the side that it speaks of.
+    Of vague pairs as many as their numbers allow: with a given difference, p below one half rises with the number of pairs that differ.
     """
-    pairs: list[tuple[str, str, int, int, str]] = []
-    p = []
+    only, other = np.sum(mine > others, axis=1), np.sum(others > mine, axis=1)
+    most = np.minimum(others.sum(axis=1), len(mine) - mine.sum()).astype(int)
+    return np.where(vague, most + only - other, only), np.where(vague, most, other)
+
+
+def duel(group: str, a: str, b: str, x: Harm, y: Harm) -> Data:
+    """Two defences of a class. only_a counts the episodes in which a alone came to damage, each against its worst attack; p is twice the
+    smaller of the two sides of `outdone`; `weaker` is the side that it speaks of. `bound`: some cell does not say which of its episodes
+    came to damage, so that p, and what counts episodes, are as large as they can be. Raises InputError for other seeds."""
+    if x.seeds != y.seeds:
+        raise InputError(f"rows of {a} and {b}: seeds", f"{len(x.seeds)} and {len(y.seeds)}", "the same seeds in every scenario")
+    worst = np.array([x.vague[x.worst] | y.vague[y.worst]])
+    only_a, only_b = (int(n[0]) for n in apart(x.of_worst, y.of_worst[None], worst))
+    sides = outdone(x, y), outdone(y, x)
+    made: Data = {"class": group, "a": a, "b": b, "only_a": only_a, "only_b": only_b, "weaker": a if sides[0] <= sides[1] else b}
+    return made | {"p": min(1.0, 2.0 * min(sides))} | ({"bound": True} if x.vague.any() or y.vague.any() else {})
+
+
+def settled(duels: Sequence[Data], names: Sequence[str], alpha: float) -> tuple[list[Data], dict[str, dict[str, int]]]:
+    """Duels of all pairs of a class, with p adjusted after Holm, and each one's rank set: best, 1 + those that are surely better, and
+    worst."""
+    out = [made | {"adjusted": adjusted} for made, adjusted in zip(duels, holm([made["p"] for made in duels]), strict=True)]
+    better, worse = dict.fromkeys(names, 0), dict.fromkeys(names, 0)
+    for made in out:
+        if made["adjusted"] <= alpha:
+            better[made["weaker"]] += 1
+            worse[made["b"] if made["weaker"] == made["a"] else made["a"]] += 1
+    return out, {name: {"best": 1 + better[name], "worst": len(names) - worse[name]} for name in names}
+
+
+def compare(
+    harm: Mapping[str, Harm], group: str, alpha: float, held: Mapping[tuple[str, str], Data] | None = None
+) -> tuple[list[Data], dict[str, dict[str, int]]]:  # fmt: skip
+    """Comparisons of all pairs of a class, and the rank set of each. held: pairs that were compared when every episode was known, which
+    count where that is no longer so."""
+    duels = []
     for a, b in combinations(harm, 2):
-        if harm[a].seeds != harm[b].seeds:
-            raise InputError(
-                f"rows of {a} and {b}: seeds", f"{len(harm[a].seeds)} and {len(harm[b].seeds)}", "the same seeds in every scenario"
-            )
-        x, y = harm[a].of_worst, harm[b].of_worst
-        sides = outdone(harm[a], harm[b]), outdone(harm[b], harm[a])
-        pairs.append((a, b, int(np.sum(x > y)), int(np.sum(y > x)), a if sides[0] <= sides[1] else b))
-        p.append(min(1.0, 2.0 * min(sides)))
-    out: list[dict[str, Any]] = [
-        {"class": group, "a": a, "b": b, "only_a": only_a, "only_b": only_b, "weaker": weaker, "p": raw, "adjusted": adjusted}
-        for (a, b, only_a, only_b, weaker), raw, adjusted in zip(pairs, p, holm(p), strict=True)
-    ]  # fmt: skip
-    better, worse = dict.fromkeys(harm, 0), dict.fromkeys(harm, 0)
-    for duel in out:
-        if duel["adjusted"] <= alpha:
-            better[duel["weaker"]] += 1
-            worse[duel["b"] if duel["weaker"] == duel["a"] else duel["a"]] += 1
-    return out, {name: {"best": 1 + better[name], "worst": len(harm) - worse[name]} for name in harm}
+        made, before = duel(group, a, b, harm[a], harm[b]), (held or {}).get((a, b))
+        use = before is not None and made.get("bound") and not before.get("bound")
+        duels.append({key: value for key, value in before.items() if key != "adjusted"} if before is not None and use else made)
+    return settled(duels, list(harm), alpha)

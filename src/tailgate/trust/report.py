@@ -167,6 +167,6 @@ def _compared(entries: Sequence[Data], counted: Sequence[Row], name: str, alpha:
             mine = [row for row in counted if row["defence"] == entry["defence"] and row["knowledge"] == KNOWLEDGE[0]]
             seeds = tuple(range(mine[0]["n"]))  # numbers of the runs, of the same seeds for all
             fails = np.array([~runs_of(row, name) for row in mine], np.float64)
-            harm[entry["defence"]] = Harm(seeds, fails, int(np.argmax(fails.sum(axis=1))))
+            harm[entry["defence"]] = Harm(seeds, fails, int(np.argmax(fails.sum(axis=1))), np.zeros(len(fails), bool))
         out += [{"of": name, **duel} for duel in compare(harm, group, alpha)[0]]
     return out

@@ -1,0 +1,99 @@
+"""A board that grows, where all that rows can be is in it: two scenarios, every knowledge, optima, failures, errata, classes that change."""
+
+import dataclasses
+import importlib.util
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tailgate.errors import InputError
+from tailgate.leaderboard.board_format import read_board
+from tailgate.scoring.attacks import Admitted
+from tailgate.scoring.follow import strays
+
+spec = importlib.util.spec_from_file_location("scored", Path(__file__).with_name("scored.py"))
+assert spec is not None and spec.loader is not None
+scored = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(scored)
+OTHER, ROAD, board, cell, entry = scored.OTHER, scored.ROAD, scored.board, scored.cell, scored.entry
+Data = dict[str, Any]
+GUARDS = ("none", "kf", "rkf", "imm", "chi2_kf", "safe_state", "brake_kf")
+USES = {"safe_state": ["measurements", "v2v"], "brake_kf": ["measurements", "v2v"]}
+SUITE = scored.suite(scenarios=(ROAD, OTHER), robustness=(OTHER,), attacks=("none", "fdi", "dos_jam", "stealth", "ghost"), defences=GUARDS)
+LISTED = Admitted("dropout", "", "black", "2026-11-25")
+LINES = [LISTED, Admitted("echo", "", "grey", "2026-11-25"), dataclasses.replace(Admitted("echo", "", "grey", "2026-11-25"), erratum="its bound was wrong")]
+
+
+def _rows(*guards: str, uses: dict[str, list[str]] = USES) -> list[Data]:
+    """The rows of each guard do not depend on who else is there; which episodes are hit is drawn, from none to all."""
+    out: list[Data] = []
+    for guard in guards:
+        rng = np.random.default_rng([*guard.encode()])
+        known = {"uses": uses.get(guard, ["measurements"])}
+
+        def hits(most: int, rng: np.random.Generator = rng) -> list[list[int]]:
+            return [sorted(rng.permutation(20)[: rng.integers(most + 1)].tolist()) for _ in range(3)]
+
+        for place in (ROAD, OTHER):
+            where = known | {"scenario": place}
+            out += cell(guard, hits=1 if guard == "brake_kf" and place == OTHER else 0, **where)
+            out += cell(guard, "fdi", hits(20 if guard in ("kf", "none") else 4), **where)
+            out += cell(guard, "dos_jam", hits(8), **where, knowledge="grey")
+            out += cell(guard, "ghost", hits(20), **where, knowledge="white", optimal=True)
+            out += cell(guard, "dropout", hits(6), **where)
+            out += cell(guard, "echo", 20, **where, knowledge="grey")
+            skipped = guard == "none" or place == OTHER
+            out += [r | ({"status": "skipped", "reason": f"no gate in {guard}"} if skipped else {}) for r in cell(guard, "stealth", hits(5), **where)]
+            own = {"defence": guard, "digest": "", "version": 1, "plan": "p", "seed": 0}
+            if guard != "none":
+                policy = cell(guard, f"runs/{guard}/policy-0.json", hits(10), **where, learned=True, trained=own, knowledge="grey" if guard == "imm" else "black")
+                out += [r | ({"status": "error", "reason": "it broke"} if guard == "rkf" and r["number"] == 3 and place == ROAD else {}) for r in policy]
+    return out
+
+
+def _whole(*guards: str, **options: Any) -> Data:
+    return dict(board(_rows(*guards), SUITE, attacks=LINES, **options))
+
+
+def _as_read(made: Data) -> Data:
+    read_board(held := json.loads(json.dumps(made)))
+    return dict(held)
+
+
+def test_what_is_in_the_board() -> None:
+    """Else the tests below would compare less than they say."""
+    made = _whole(*GUARDS)
+    status = {e["defence"]: e["why"].partition(":")[0] for e in made["entries"]}
+    assert status["rkf"] == "incomplete" and status["none"] == "baseline" and status["brake_kf"] == "gate collisions"
+    assert [e["defence"] for e in made["entries"] if e["status"] == "ranked"] == ["kf", "imm", "chi2_kf", "safe_state"]
+    assert {c["knowledge"] for c in made["cells"]} == {"black", "grey", "white"} and sum(c["failed"] for c in made["cells"]) == 3
+    assert {e["class"] for e in made["entries"]} == {"measurements", "measurements + v2v"}
+    assert [a["attack"] for a in made["attacks"] if a["withdrawn"]] == ["echo"] and any(e["robustness"] for e in made["entries"])
+    assert len({d["p"] for d in made["comparisons"]}) > 2 and strays(_as_read(made), SUITE) == []
+
+
+@pytest.mark.parametrize("guards", [*((guard,) for guard in GUARDS[1:]), ("kf", "safe_state"), ("rkf", "imm", "chi2_kf", "brake_kf"), GUARDS[1:]], ids=",".join)
+def test_rows_beside_a_board_make_what_all_rows_make(guards: tuple[str, ...]) -> None:
+    whole = _whole(*GUARDS)
+    before = _as_read(_whole(*(guard for guard in GUARDS if guard not in guards)))
+    assert board(_rows("none", *guards), SUITE, attacks=LINES, board=before) == whole
+    assert board(_rows("none", *guards), SUITE, attacks=LINES, board=_as_read(whole)) == whole
+
+
+@pytest.mark.parametrize("guard", ["kf", "safe_state", "brake_kf"])
+def test_an_entry_that_changes_its_class(guard: str) -> None:
+    """Ranks of the class that it left, and of the one that it joined, are made again."""
+    uses = USES | {guard: ["measurements"] if guard in USES else ["measurements", "v2v"]}
+    whole = board(_rows(*GUARDS, uses=uses), SUITE, attacks=LINES)
+    made = board(_rows("none", guard, uses=uses), SUITE, attacks=LINES, board=_as_read(_whole(*GUARDS)))
+    assert made == whole and (made["comparisons"] != _whole(*GUARDS)["comparisons"] or guard == "brake_kf")  # which takes no rank
+
+
+def test_an_attack_that_was_taken_back_since_is_refused() -> None:
+    """All figures of the others change with it."""
+    before = _as_read(_whole(*GUARDS))
+    with pytest.raises(InputError, match="dropout"):
+        board(_rows("none", "kf"), SUITE, attacks=[*LINES, dataclasses.replace(LISTED, erratum="wrong")], board=before)
