@@ -16,6 +16,7 @@ from tailgate.commands import board as command
 from tailgate.errors import InputError
 from tailgate.evaluation import cells_of, run
 from tailgate.leaderboard.board_format import read_board
+from tailgate.leaderboard.check import _scored
 from tailgate.rows import encode
 from tailgate.scenario import load_suite
 from tailgate.scoring.attacks import Admitted
@@ -100,6 +101,11 @@ def test_what_a_board_does_not_know_makes_ranks_wider_and_never_wrong() -> None:
         wide, rank = entry(made, name)["rank"], entry(whole, name)["rank"]
         assert wide["best"] <= rank["best"] and rank["worst"] <= wide["worst"]
     assert strays(made, suite()) == [] and untold(made, suite()) == ["kf", "rkf"]
+    everything = rows(*GUARDS)
+    assert list(_scored(made, everything, suite())) == []  # what `check` says once it has played all cells
+    narrow = copy.deepcopy(made)
+    entry(narrow, "imm")["rank"] = {"best": 3, "worst": 3}
+    assert [stray["field"] for stray in _scored(narrow, everything, suite())] == ["rank"]
     told = copy.deepcopy(made)
     for mine, full in zip(told["cells"], whole["cells"], strict=True):
         mine["hits"] = full["hits"]

@@ -49,7 +49,7 @@ def _rows(*guards: str, uses: dict[str, list[str]] = USES) -> list[Data]:
             out += [r | ({"status": "skipped", "reason": f"no gate in {guard}"} if skipped else {}) for r in cell(guard, "stealth", hits(5), **where)]
             own = {"defence": guard, "digest": "", "version": 1, "plan": "p", "seed": 0}
             if guard != "none":
-                policy = cell(guard, f"runs/{guard}/policy-0.json", hits(10), **where, learned=True, trained=own, knowledge="grey" if guard == "imm" else "black")
+                policy = cell(guard, f"runs/{guard}/policy-0.json", hits(10), **where, learned=True, trained=own, attack_digest=f"of {guard}", knowledge="grey" if guard == "imm" else "black")
                 out += [r | ({"status": "error", "reason": "it broke"} if guard == "rkf" and r["number"] == 3 and place == ROAD else {}) for r in policy]
     return out
 
@@ -72,6 +72,7 @@ def test_what_is_in_the_board() -> None:
     assert {c["knowledge"] for c in made["cells"]} == {"black", "grey", "white"} and sum(c["failed"] for c in made["cells"]) == 3
     assert {e["class"] for e in made["entries"]} == {"measurements", "measurements + v2v"}
     assert [a["attack"] for a in made["attacks"] if a["withdrawn"]] == ["echo"] and any(e["robustness"] for e in made["entries"])
+    assert [a["digest"] for a in made["attacks"] if a["learned"]] == [f"of {guard}" for guard in sorted(GUARDS[1:])]
     assert len({d["p"] for d in made["comparisons"]}) > 2 and strays(_as_read(made), SUITE) == []
 
 

@@ -254,6 +254,22 @@ def test_attackers_that_are_not_published_are_named_with_the_command_that_trains
     assert f"tailgate leaderboard attack {names[0]} --suite quick-v0 --out held/attacked " in capsys.readouterr().out
 
 
+def test_an_attack_whose_file_is_another_one_is_told_apart(tmp_path: Path) -> None:
+    """That its cells differ is then no wonder; a file that says the same in other words plays the same."""
+    path = tmp_path / "own.yaml"
+    phase = "about: Holds.\nphases:\n  - kind: dos_hold\n    trigger: {name: chance, probability: 0.02, latch: true}\n"
+    path.write_text(phase)
+    own = dataclasses.replace(SUITE, attacks=("none", f"program:path={path}"))
+    made = score(run(cells_of(own)), load_suite("quick-v0"), require_adaptive=False)
+    digests = {attack["attack"]: attack["digest"] for attack in made["attacks"]}
+    assert len(str(digests[own.attacks[1]])) == 64 and set(digests.values()) == {None, digests[own.attacks[1]]}
+    for text, differs in ((phase.replace("Holds.", "Holds a sample."), 0), (phase.replace("0.02", "0.9"), 2)):
+        path.write_text(text)
+        report = check(made)
+        assert report["counts"] == {"equal": 4 - differs, "differs": differs, "unchecked": 0}
+        assert all("file here is another one" in finding["why"] for finding in report["findings"])
+
+
 def test_the_page_tells(board: Data, tmp_path: Path) -> None:
     page = build_site([with_check(board, check(board, defences=["kf"]))], tmp_path / "page", replays=False)
     assert "played again from the board alone, without rows: 2 of 4 cells, all equal" in page.read_text()

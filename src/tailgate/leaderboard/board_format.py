@@ -59,6 +59,7 @@ class AttackPart(Part):
     learned: bool = False
     optimal: bool = False
     trained_on: Text | None = None
+    digest: Text | None = None  # of the file that it was read from
     admitted: dict[str, Any] | None = None
     note: Text = ""
     withdrawn: bool = False

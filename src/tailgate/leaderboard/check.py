@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -67,6 +67,7 @@ def check(
     mine = [i for i, cell in enumerate(board.cells) if not defences or cell.defence in defences]
     asked = drawn(mine, sample, sample_seed)
     seen: dict[int, Seen] = {}
+    files = {attack.attack: attack.digest for attack in board.attacks}
     cells: dict[int, Cell] = {}
     for i in asked:
         cell = _cell(board.cells[i], board, suite)
@@ -85,7 +86,11 @@ def check(
         rows = run([cells[i] for i in some], workers=workers, progress=told)
         held += rows if whole else []
         each = iter(rows)
-        seen |= {i: compared(board.cells[i], figures([next(each) for _ in range(cells[i].seeds)], suite)) for i in some}
+        for i in some:
+            found = compared(board.cells[i], figures([next(each) for _ in range(cells[i].seeds)], suite))
+            if found.verdict == "differs" and files.get(cells[i].attack) not in (None, Spec("attack", cells[i].attack).digest):
+                found = replace(found, why=f"the attack's file here is another one than that of the board; {found.why}")
+            seen[i] = found
     off = strays(data, suite)
     listed = {(stray["defence"], stray["field"]) for stray in off}
     off += [stray for stray in _scored(data, held, suite) if (stray["defence"], stray["field"]) not in listed]

@@ -102,7 +102,8 @@ def _attacks(
     table: Table, lines: dict[str, Admitted | None], origins: dict[str, Row], cells: list[Data], held: Beside | None
 ) -> list[Data]:  # fmt: skip
     out = []
-    told = {} if held is None else {attack["attack"]: attack.get("trained_on") for attack in held.board["attacks"]}
+    told = {} if held is None else {attack["attack"]: attack for attack in held.board["attacks"]}
+    files = {key.column.attack: rows[0]["attack_digest"] for key, rows in table.cells.items()}
     for i, column in enumerate(table.columns):
         line = lines.get(column.attack)
         left_out = [name for name in table.scenarios if (table.state[name][:, i] == SKIPPED).all()]
@@ -111,7 +112,8 @@ def _attacks(
         notes += ["taken back by an erratum: not counted"] if column.attack in table.withdrawn else []
         out.append({
             "attack": column.attack, "knowledge": column.knowledge, "learned": table.learned[column], "optimal": table.optimal[column],
-            "trained_on": origins.get(column.attack, {}).get("defence") or told.get(column.attack),
+            "trained_on": origins.get(column.attack, {}).get("defence") or told.get(column.attack, {}).get("trained_on"),
+            "digest": files.get(column.attack, told.get(column.attack, {}).get("digest")) or None,
             "admitted": None if line is None else line.as_data(), "note": "; ".join(notes), "withdrawn": column.attack in table.withdrawn,
         })  # fmt: skip
     return out
