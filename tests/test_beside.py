@@ -22,7 +22,7 @@ from tailgate.scenario import load_suite
 from tailgate.scoring.attacks import Admitted
 from tailgate.scoring.cells import digits, hits_of
 from tailgate.scoring.follow import strays, untold
-from tailgate.scoring.ranks import Harm, outdone
+from tailgate.scoring.ranks import Harm, outdone, settled
 
 spec = importlib.util.spec_from_file_location("scored", Path(__file__).with_name("scored.py"))
 assert spec is not None and spec.loader is not None
@@ -116,7 +116,12 @@ def test_what_a_board_does_not_know_makes_ranks_wider_and_never_wrong() -> None:
     for at, changes in ((0, {"p": exact["p"] / 2}), (0, {"p": 2 * bound["p"]}), (0, {"weaker": "imm"}), (0, {"only_a": 17}), (2, {"p": 1.0}), (2, {"weaker": "rkf"})):
         forged = copy.deepcopy(made if at == 2 else told)
         forged["comparisons"][at] |= changes
+        forged["comparisons"], ranks = settled(forged["comparisons"], ["imm", "kf", "rkf"], 0.05)
+        for name, rank in ranks.items():
+            entry(forged, name)["rank"] = rank
         assert ("", "comparisons") in {(s["defence"], s["field"]) for s in strays(forged, suite())}, changes
+    more = board([*rows("none", "kf"), *cell("kf", POLICY, 1, learned=True)], board=before)
+    assert more["comparisons"][0]["bound"] and not before["comparisons"][0].get("bound")  # of an entry that met more
 
 
 def test_the_largest_p_that_numbers_allow() -> None:
