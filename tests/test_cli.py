@@ -43,11 +43,15 @@ def test_list_shows_every_component_with_its_parameters(capsys: pytest.CaptureFi
 @pytest.mark.parametrize(("arguments", "words"), [
     (["leaderboard", "head", "board.json", "--nothing"], "tailgate leaderboard head: error: unrecognized arguments: --nothing"),
     (["train", "--nothing"], "tailgate train: error: unrecognized arguments: --nothing"),
+    (["leaderboard", "run"], "tailgate leaderboard run: error: the following arguments are required: SUITE, --out"),
 ])  # fmt: skip
-def test_an_unknown_option_is_answered_by_the_command_that_was_asked(arguments: list[str], words: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_wrong_arguments_are_answered_in_a_line_by_the_command_that_was_asked(
+    arguments: list[str], words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     with pytest.raises(SystemExit, match="2"):
         cli.main(arguments)
-    assert words in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert said == f"{words} (see {words.partition(':')[0]} --help)\n"
 
 
 @pytest.mark.parametrize(("arguments", "words"), [
