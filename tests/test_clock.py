@@ -11,7 +11,7 @@ import pytest
 from tailgate.cli import main
 from tailgate.errors import InputError
 from tailgate.evaluation import cells_of, run
-from tailgate.leaderboard.clock import Clock, StepTime, _round, _Timed, beside, measure, read_clock
+from tailgate.leaderboard.clock import Clock, StepTime, _round, _Timed, clock_of, measure, read_clock
 from tailgate.leaderboard.run import board_of
 from tailgate.leaderboard.site import build_site
 from tailgate.registry import Spec
@@ -82,7 +82,7 @@ def test_a_page_says_what_a_step_costs(tmp_path: Path, capsys: pytest.CaptureFix
     (tmp_path / "rows.jsonl").write_bytes(encode(run(cells_of(SUITE))))
     board_of(SUITE, tmp_path, require_adaptive=False)
     board, path = tmp_path / "board.json", tmp_path / "step_time.json"
-    assert beside(board) is None
+    assert clock_of(board) is None
     assert main(["leaderboard", "page", str(board), "--out", str(tmp_path / "page"), "--no-replays"]) == 0
     assert "A step takes" not in (tmp_path / "page/small/kf.html").read_text()
     held = Clock(suite="small", scenario="thesis-ch4-v0", agents=1, rounds=3, processor="A <chip>", version="1", commit=None,

@@ -51,7 +51,7 @@ def add(actions: Any) -> None:
 
 def _run(options: argparse.Namespace) -> int:
     sys.path.insert(0, "")  # module:Class is looked for in the working directory, as `tailgate evaluate` does
-    from tailgate.leaderboard.clock import beside
+    from tailgate.leaderboard.clock import clock_of
     from tailgate.leaderboard.detect import detect
     from tailgate.leaderboard.run import BOARD, board_of, kept_board, play
     from tailgate.leaderboard.run_record import Record
@@ -60,7 +60,7 @@ def _run(options: argparse.Namespace) -> int:
 
     out, started = Path(options.out), time.perf_counter()
     suites = [load_suite(name) for name in options.suites]
-    clocks = [beside(out / suite.name / BOARD) for suite in suites]  # before anything is played
+    clocks = [clock_of(out / suite.name / BOARD) for suite in suites]  # before anything is played
     for suite in suites if options.keep_entries else ():
         kept_board(out / suite.name / BOARD, suite, options.beacon)
     boards = []
@@ -115,11 +115,11 @@ def _head(options: argparse.Namespace) -> int:
 
 def _page(options: argparse.Namespace) -> int:
     from tailgate.leaderboard.board_format import load
-    from tailgate.leaderboard.clock import beside
+    from tailgate.leaderboard.clock import clock_of
     from tailgate.leaderboard.site import build_site
 
     boards = [load(Path(name)) for name in options.boards]
-    clocks = [beside(Path(name)) for name in options.boards]
+    clocks = [clock_of(Path(name)) for name in options.boards]
     page = build_site(boards, Path(options.out), title=options.title, replays=not options.no_replays, clocks=clocks)
     print(page)
     return 0

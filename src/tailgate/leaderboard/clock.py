@@ -134,7 +134,7 @@ def read_clock(path: Path) -> Clock:
     return read_model(Clock, path, "step times", "leaderboard clock")
 
 
-def beside(board: Path) -> Clock | None:
+def clock_of(board: Path) -> Clock | None:
     """The step times that lie beside a board's file; none where there are none."""
     path = board.parent / FILE
     return read_clock(path) if path.is_file() else None

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from .board_format import Board, CellPart, read_board
+from tailgate.scoring.cells import place_of
+
+from .board_format import Board, read_board
 from .check import compared
 
 Data = dict[str, Any]
@@ -20,7 +22,7 @@ def with_kept(board: Data, old: Data) -> Data:
     before = read_board(old, "board.json")
     if any(old["suite"].get(key) != board["suite"][key] for key in SAME):
         return board
-    kept = _unchanged(read_board(board), before)
+    kept = _unchanged(board, before)
     entries = {entry["defence"]: entry for entry in old["entries"] if entry["defence"] in kept}
 
     def told(entry: Data) -> Data:
@@ -33,17 +35,13 @@ def with_kept(board: Data, old: Data) -> Data:
     return board | {"entries": [told(entry) for entry in board["entries"]], "detection": _of(old.get("detection"), kept)}
 
 
-def _unchanged(board: Board, old: Board) -> dict[str, int]:
+def _unchanged(board: Data, old: Board) -> dict[str, int]:
     """Defences all of whose old cells are on the board as they were, and how many cells they have there."""
-    cells = {_place(cell): cell for cell in board.cells}
-    moved = {part.defence for part in old.cells if (here := cells.get(_place(part))) is None or compared(part, here.model_dump()).why}
+    cells = {place_of(cell): cell for cell in board["cells"]}
+    moved = {part.defence for part in old.cells if (here := cells.get(place_of(part.model_dump()))) is None or compared(part, here).why}
     names = [entry.defence for entry in old.entries if entry.defence not in moved]
-    counts = {name: sum(cell.defence == name for cell in board.cells) for name in names}
+    counts = {name: sum(cell["defence"] == name for cell in board["cells"]) for name in names}
     return {name: n for name, n in counts.items() if n}
-
-
-def _place(cell: CellPart) -> tuple[Any, ...]:
-    return cell.scenario, cell.dose, cell.defence, cell.attack, cell.knowledge
 
 
 def _of(detection: Data | None, defences: dict[str, int]) -> Data | None:
