@@ -1,5 +1,6 @@
 """Attackers that a suite trains against a defence."""
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -9,6 +10,7 @@ from tailgate.adaptive import asked_of, configs_of, fitting, plan_of, train_agai
 from tailgate.errors import InputError
 from tailgate.evaluation import evaluate
 from tailgate.scenario import Suite
+from tailgate.train import train
 
 PLAN = {
     "config": "car-following", "dose": 12, "changes": ["environment.interval=20", "environment.frames=1"],
@@ -66,7 +68,15 @@ def test_published_policies_are_not_trained_again(tmp_path: Path) -> None:
         first.write_text(json.dumps(record | {"training": record["training"] | {name: value}}))
         with pytest.raises(InputError, match=r"policy-0\.json"):
             train_against(black, lambda *args: None)
-    assert first.with_suffix(".safetensors").read_bytes() == held[0]
+    first.write_text(json.dumps(record))
+    (told,) = tmp_path.glob("*/config.json")
+    before = told.read_bytes()
+    with pytest.raises(InputError, match=r"policy-0\.json"):
+        train(dataclasses.replace(black[0], steps=1200), lambda *args: None, resume=True)
+    assert told.read_bytes() == before and first.with_suffix(".safetensors").read_bytes() == held[0]
+    first.with_suffix(".safetensors").unlink()  # a policy without weights is none
+    assert train_against(black, lambda *args: None) == [first, second]
+    assert [path.with_suffix(".safetensors").read_bytes() for path in (first, second)] == held
 
 
 def test_policies_play_where_the_attacker_sees_and_may_do_as_much() -> None:

@@ -21,8 +21,8 @@ from tailgate.rows import encode
 from tailgate.scenario import load_suite
 from tailgate.scoring.attacks import Admitted
 from tailgate.scoring.cells import digits, hits_of
-from tailgate.scoring.follow import strays, untold
-from tailgate.scoring.ranks import Harm, outdone, settled
+from tailgate.scoring.follow import sharpened, strays, untold
+from tailgate.scoring.ranks import Harm, credible, duel, settled
 
 spec = importlib.util.spec_from_file_location("scored", Path(__file__).with_name("scored.py"))
 assert spec is not None and spec.loader is not None
@@ -109,32 +109,61 @@ def test_what_a_board_does_not_know_makes_ranks_wider_and_never_wrong() -> None:
     told = copy.deepcopy(made)
     for mine, full in zip(told["cells"], whole["cells"], strict=True):
         mine["hits"] = full["hits"]
-    assert strays(told, suite()) == [] and untold(told, suite()) == []  # bounds are allowed where cells tell more by now
+    assert ("", "comparisons") in {(s["defence"], s["field"]) for s in strays(told, suite())} and untold(told, suite()) == []  # bounds are for cells that do not tell
+    sharp = sharpened(told, suite())
+    assert sharp["comparisons"] == whole["comparisons"] and strays(sharp, suite()) == [] and entry(sharp, "imm")["rank"] == entry(whole, "imm")["rank"]
     assert board(rows("none", "imm"), board=told)["comparisons"] == whole["comparisons"]
-    exact, bound = whole["comparisons"][0], made["comparisons"][0]
-    assert exact["p"] < bound["p"] < 0.05 and duels["kf", "rkf"][0]["p"] < 0.01 and entry(made, "kf")["rank"] == {"best": 3, "worst": 3}
-    for at, changes in ((0, {"p": exact["p"] / 2}), (0, {"p": 2 * bound["p"]}), (0, {"weaker": "imm"}), (0, {"only_a": 17}), (2, {"p": 1.0}), (2, {"weaker": "rkf"})):
-        forged = copy.deepcopy(made if at == 2 else told)
+    exact, bound = whole["comparisons"], made["comparisons"]
+    assert exact[0]["p"] < bound[0]["p"] < 0.05 and exact[2]["p"] < 0.01 and entry(made, "kf")["rank"] == {"best": 3, "worst": 3}
+    lies: list[tuple[int, Data]] = [
+        (0, {"p": exact[0]["p"]}), (0, {"p": 1.0}), (0, {"weaker": "imm"}), (0, {"only_a": 17}),  # of a bound
+        (2, {"p": 0.0}), (2, {"p": 1e-9}), (2, {"p": 1.0}), (2, {"weaker": "rkf"}), (2, {"only_a": 1000, "only_b": 989}), (2, {"weaker": None}),  # of a pair that stayed
+    ]  # fmt: skip
+    for at, changes in lies:
+        forged = copy.deepcopy(made)
         forged["comparisons"][at] |= changes
-        forged["comparisons"], ranks = settled(forged["comparisons"], ["imm", "kf", "rkf"], 0.05)
-        for name, rank in ranks.items():
-            entry(forged, name)["rank"] = rank
+        if forged["comparisons"][at]["weaker"]:
+            forged["comparisons"], ranks = settled(forged["comparisons"], ["imm", "kf", "rkf"], 0.05)
+            for name, rank in ranks.items():
+                entry(forged, name)["rank"] = rank
         assert ("", "comparisons") in {(s["defence"], s["field"]) for s in strays(forged, suite())}, changes
+        if at == 2:
+            assert any(stray["field"] == "comparisons" for stray in _scored(forged, everything, suite()))
+            with pytest.raises(InputError, match="comparison of kf and rkf"):
+                board(rows("none", "safe_state"), board=forged)
+    again = board(rows("none", "kf"), board=before)
+    assert again["comparisons"] == before["comparisons"] and entry(again, "kf")["rank"] == entry(before, "kf")["rank"]  # nothing is gained by playing again
     more = board([*rows("none", "kf"), *cell("kf", POLICY, 1, learned=True)], board=before)
     assert more["comparisons"][0]["bound"] and not before["comparisons"][0].get("bound")  # of an entry that met more
 
 
-def test_the_largest_p_that_numbers_allow() -> None:
-    """Over all ways in which as many episodes can have come to damage (a search of all of them)."""
-    n = 6
-    sets = [np.isin(range(n), which).astype(float) for k in range(n + 1) for which in itertools.combinations(range(n), k)]
-    both = np.zeros(2, bool)
-    for k, other in itertools.product(range(n + 1), repeat=2):
-        mine = np.array([np.arange(n) < k, np.zeros(n)], float)
-        found = [outdone(Harm((), mine, 0, both), Harm((), theirs[None], 0, both[:1])) for theirs in sets if theirs.sum() == other]
-        theirs = (np.arange(n) >= n - other).astype(float)[None]
-        for a, b in ((~both, both), (both, ~both), (~both, ~both)):
-            assert outdone(Harm((), mine, 0, a), Harm((), theirs, 0, b[:1])) == pytest.approx(max(found), abs=1e-12), (k, other)
+def _sets(n: int, k: int) -> list[Any]:
+    """All ways in which k of n episodes can have come to damage, the first ones first."""
+    return [np.isin(range(n), which).astype(float) for which in itertools.combinations(range(n), k)]
+
+
+@pytest.mark.parametrize(("k", "counts"), [(k, (m,)) for k in range(6) for m in range(6)] + [(4, (1, 2)), (4, (0, 3)), (3, (2, 2))])
+def test_p_lies_between_what_numbers_allow(k: int, counts: tuple[int, ...]) -> None:
+    """Over all ways in which as many episodes can have come to damage, of one attack of a and some of b (a search of all of them)."""
+    one, sure = np.ones(1, bool), np.zeros(len(counts), bool)
+    mine = Harm((), _sets(5, k)[0][None], 0, ~one)
+    found = [duel("g", "a", "b", mine, Harm((), np.stack(ways), int(np.argmax(counts)), sure)) for ways in itertools.product(*(_sets(5, m) for m in counts))]
+    first = np.stack([_sets(5, m)[0] for m in counts])
+    for x, y in (((~one), ~sure), (one, sure), (one, ~sure)):
+        a, b = mine._replace(vague=x), Harm((), first, int(np.argmax(counts)), y)
+        here = duel("g", "a", "b", a, b)
+        assert here["bound"] and here["p"] == pytest.approx(max(made["p"] for made in found), abs=1e-12)
+        assert here["only_a"] == max(made["only_a"] for made in found)
+        assert all(credible(made, here, a, b) for made in found)
+        for made in found:
+            assert not credible(made | {"only_a": made["only_a"] + 1}, here, a, b)
+            assert here["p"] == 1.0 or not credible(made | {"weaker": "b" if made["weaker"] == "a" else "a"}, here, a, b)
+        low = min(made["p"] for made in found)
+        assert not any(credible(made | {"p": low * 0.99}, here, a, b) for made in found)
+    if len(counts) > 1:  # one attack of b is known, the other not
+        some, held = np.array([True, False]), first[1]
+        mixed = [made["p"] for made in (duel("g", "a", "b", mine, Harm((), np.stack([way, held]), int(np.argmax(counts)), sure)) for way in _sets(5, counts[0]))]
+        assert duel("g", "a", "b", mine, Harm((), first, int(np.argmax(counts)), some))["p"] == pytest.approx(max(mixed), abs=1e-12)
 
 
 def test_hits_of_rows_count_where_a_defence_stays() -> None:
@@ -200,6 +229,19 @@ def test_a_board_of_another_list_of_attacks_is_refused() -> None:
             attack["admitted"]["digest"] = "aa"
     with pytest.raises(InputError, match="digest of dropout"):
         board(rows, board=before, attacks=[line])
+
+
+def test_an_attack_whose_file_became_another_one_is_refused() -> None:
+    """Entries that stay have met the old one; what only the newcomer meets has the digest of its rows."""
+    def rows(digest: str, *guards: str) -> list[Data]:
+        return [r for g in guards for r in (*cell(g), *cell(g, "fdi", 1, attack_digest=digest))]
+
+    before = _as_read(board(rows("a" * 16, "none", "kf")))
+    new = [*rows("a" * 16, "none"), *cell("rkf"), *cell("rkf", POLICY, 1, attack_digest="c" * 16, learned=True)]
+    made = board([*new, *cell("rkf", "fdi", 1, attack_digest="a" * 16)], board=before)
+    assert {a["attack"]: a["digest"] for a in made["attacks"]} == {"fdi": "a" * 16, POLICY: "c" * 16}
+    with pytest.raises(InputError, match="rows of fdi: attack_digest"):
+        board(rows("b" * 16, "none", "kf", "rkf")[-len(cell("kf")) * 2 :] + cell("none"), board=before)
 
 
 def test_an_attack_that_begins_to_count_against_the_others_is_refused() -> None:

@@ -43,6 +43,7 @@ def test_list_shows_every_component_with_its_parameters(capsys: pytest.CaptureFi
 @pytest.mark.parametrize(("arguments", "words"), [
     (["leaderboard", "head", "board.json", "--nothing"], "tailgate leaderboard head: error: unrecognized arguments: --nothing"),
     (["train", "--nothing"], "tailgate train: error: unrecognized arguments: --nothing"),
+    (["train", "--a\nb"], "tailgate train: error: unrecognized arguments: --a b"),
     (["leaderboard", "run"], "tailgate leaderboard run: error: the following arguments are required: SUITE, --out"),
 ])  # fmt: skip
 def test_wrong_arguments_are_answered_in_a_line_by_the_command_that_was_asked(
@@ -239,6 +240,7 @@ def test_an_interrupted_command_says_how_to_go_on(
         raise KeyboardInterrupt
 
     monkeypatch.chdir(tmp_path)
+    importlib.import_module("tailgate.leaderboard.run")  # else it would import what is patched next, and keep it
     monkeypatch.setattr("tailgate.evaluation.evaluate", stop)
     monkeypatch.setattr("tailgate.leaderboard.run.play", stop)
     assert cli.main(arguments) == 130

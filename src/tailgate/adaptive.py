@@ -128,7 +128,7 @@ def train_against(configs: list[train.TrainConfig], progress: Progress) -> list[
     for config in configs:
         held, policies = config.directory / "config.json", policies_of(config)
         again = held.is_file() and train.training_of(json.loads(held.read_text(encoding="utf-8"))) == train.training_of(as_data(config))
-        if not (again and all(path.is_file() for path in policies)):
+        if not (again and all(path.is_file() and path.with_suffix(".safetensors").is_file() for path in policies)):
 
             def learned(seed: int, now: Any, config: train.TrainConfig = config) -> None:
                 progress(f"{config.name}, seed {seed}", min(now.steps, config.steps), config.steps, train.figures(now))

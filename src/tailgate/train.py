@@ -210,11 +210,17 @@ def train(config: TrainConfig, progress: Callable[[int, Any], None], resume: boo
     held = directory / "config.json"
     if resume and held.is_file():
         same_run(config)
+    seeds = range(config.first_seed, config.first_seed + config.seeds)
+    done = {seed: _done(config, seed) if resume else None for seed in seeds}  # before anything is written
     write_atomic(held, snapshot)
-    teacher, seeds = teacher_of(config), range(config.first_seed, config.first_seed + config.seeds)
-    if min(config.workers, len(seeds)) == 1:
-        return [_train_seed(config, teacher, seed, resume, partial(progress, seed)) for seed in seeds]
-    return _train_apart(config, teacher, seeds, resume, progress)
+    left = [seed for seed in seeds if done[seed] is None]
+    teacher = teacher_of(config) if left else None
+    if min(config.workers, len(left)) <= 1:
+        new = [_train_seed(config, teacher, seed, resume, partial(progress, seed)) for seed in left]
+    else:
+        new = _train_apart(config, teacher, left, resume, progress)
+    found = dict(zip(left, new, strict=True))
+    return [done[seed] or found[seed] for seed in seeds]
 
 
 def _settings(config: TrainConfig) -> tuple[Any, Any]:
@@ -227,8 +233,6 @@ def _settings(config: TrainConfig) -> tuple[Any, Any]:
 
 def _train_seed(config: TrainConfig, teacher: str | None, seed: int, resume: bool, report: Callable[[Progress], None]) -> Path:
     """Train the policy of one seed, shown its teacher's decisions first; returns its JSON file."""
-    if resume and (done := _published(config, seed)):
-        return done
     module, settings = _settings(config)
     directory = config.directory
     board = directory / "tensorboard" if config.tensorboard else None
@@ -257,21 +261,29 @@ def _train_seed(config: TrainConfig, teacher: str | None, seed: int, resume: boo
     return policy
 
 
-def _published(config: TrainConfig, seed: int) -> Path | None:
-    """The policy of a seed that was trained and has no checkpoint to go on from: it is not trained again, whatever would come of it.
+def _done(config: TrainConfig, seed: int) -> Path | None:
+    """The policy of a seed whose training is over: it is not trained again, whatever would come of it.
 
-    Raises InputError where it is of another training, which would be written over.
+    Raises InputError where one is of another training and has no checkpoint to go on from: it would be written over.
     """
-    path = config.directory / f"policy-{seed}.json"
-    if not path.is_file() or (config.directory / f"checkpoint-{seed}.safetensors").exists():
+    path, spec = config.directory / f"policy-{seed}.json", Spec("defence", config.defence)
+    checkpoint, curve = (config.directory / f"{name}-{seed}.{end}" for name, end in (("checkpoint", "safetensors"), ("curve", "json")))
+    if not path.is_file() or not path.with_suffix(".safetensors").is_file():
         return None
-    record, spec = load_policy(path)[0].training, Spec("defence", config.defence)
+    try:
+        record = load_policy(path)[0].training
+    except InputError:  # stopped between the two files, perhaps
+        if checkpoint.exists():
+            return None
+        raise
     held, version = record.get("config"), record.get("defence_version", spec.entry.version)  # first policies do not say which version
     same = isinstance(held, dict) and training_of(held) == training_of(as_data(config))
-    if not (same and record.get("seed") == seed and record.get("defence_digest") == spec.digest and version == spec.entry.version):
-        expected = f"a policy of this training against {config.defence}, or a checkpoint to go on from: move it, or train elsewhere"
-        raise InputError("resume", str(path), expected)
-    return path
+    if same and record.get("seed") == seed and record.get("defence_digest") == spec.digest and version == spec.entry.version:
+        return path if curve.exists() or not checkpoint.exists() else None  # stopped between the two
+    if checkpoint.exists():
+        return None
+    expected = f"a policy of this training against {config.defence}, or a checkpoint to go on from: move it, or train elsewhere"
+    raise InputError("resume", str(path), expected)
 
 
 def _apart(defence: str) -> contextlib.AbstractContextManager[None]:

@@ -24,7 +24,8 @@ from tailgate.scoring.attacks import Admitted
 from tailgate.scoring.board import score
 from tailgate.scoring.cells import figures
 from tailgate.scoring.damage import Row
-from tailgate.scoring.follow import same, strays, untold
+from tailgate.scoring.follow import same, sharpened, strays, untold
+from tailgate.scoring.ranks import CLOSE, PAIR
 from tailgate.verify import files_of
 
 from .board_format import Board, CellPart, read_board
@@ -109,21 +110,34 @@ def _scored(data: Data, rows: list[Row], suite: Suite) -> Iterator[Data]:
         yield {"defence": "", "field": "cells", "board": f"{len(data['cells'])} cells", "here": str(error)}
         return
     entries = {entry["defence"]: entry for entry in here["entries"]}
-    bounds = {duel["class"] for duel in data["comparisons"] if duel.get("bound")}
+    bounds = {duel.get("class") for duel in data["comparisons"] if duel.get("bound")}
     for entry in data["entries"]:
         mine = entries.get(entry["defence"], {})
         for key in SCORED:
             wide = key == "rank" and entry.get("class") in bounds and _within(mine.get(key), entry.get(key))
             if not wide and not same(entry.get(key), mine.get(key)):
                 yield {"defence": entry["defence"], "field": key, "board": entry.get(key), "here": mine.get(key)}
-    exact = [[duel for duel in board["comparisons"] if duel["class"] not in bounds] for board in (data, here)]
-    if not same(*exact):
+    if not _same_pairs(data["comparisons"], here["comparisons"]):
         yield {"defence": "", "field": "comparisons", "board": f"{len(data['comparisons'])} of them", "here": "others"}
 
 
 def _within(rank: Data | None, wider: Data | None) -> bool:
     """Whether a rank set lies in one that was made of bounds, of which fewer are significant."""
     return rank is not None and wider is not None and bool(wider["best"] <= rank["best"] and rank["worst"] <= wider["worst"])
+
+
+def _same_pairs(board: list[Data], here: list[Data]) -> bool:
+    """Whether all pairs came out as a board has them, those that it has as bounds within these."""
+    if [(duel["a"], duel["b"]) for duel in board] != [(duel["a"], duel["b"]) for duel in here]:
+        return False
+    for told, made in zip(board, here, strict=True):
+        if told.get("bound"):
+            fits = told["p"] >= made["p"] * (1.0 - CLOSE) and told["only_a"] - told["only_b"] == made["only_a"] - made["only_b"]
+        else:
+            fits = all(same(told.get(key), made[key]) for key in PAIR)
+        if not fits:
+            return False
+    return True
 
 
 def suite_of(board: Board) -> Suite:
@@ -270,6 +284,7 @@ def with_check(data: Data, report: Data) -> Data:
     """The board with what a check found: `checked` in the entries that it looked into, fingerprints in cells that came out equal.
 
     Of two checks of an entry the one stays that looked into more cells; one that was of another number of cells is of another board.
+    Comparisons that were bounds are made again of cells that tell now which episodes came to damage, and ranks with them.
     """
     found = {entry["defence"]: {key: entry[key] for key in ("cells", *VERDICTS)} for entry in report["entries"]}
 
@@ -280,4 +295,4 @@ def with_check(data: Data, report: Data) -> Data:
         return entry | {"checked": new}
 
     cells = [cell | report["prints"].get(str(i), {}) for i, cell in enumerate(data["cells"])]
-    return data | {"entries": [told(entry) for entry in data["entries"]], "cells": cells}
+    return sharpened(data | {"entries": [told(entry) for entry in data["entries"]], "cells": cells}, suite_of(read_board(data)))

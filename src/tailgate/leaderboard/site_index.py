@@ -149,6 +149,7 @@ def _each_attack(suite: Suite, hour: float) -> Data:
 def comparisons_of(suite: Suite, defence: str | None = None) -> list[Data]:
     """Pairs of a class, and which of the two is surely weaker; of one defence only, those that it is in."""
     out = []
+    wide = {duel.class_ for duel in suite.board.comparisons if duel.bound}  # whose corrected p are no smaller than of all that is known
     for duel in suite.board.comparisons:
         if defence in (None, duel.a, duel.b):
             weaker = duel.weaker or (duel.a if duel.only_a > duel.only_b else duel.b)
@@ -157,7 +158,7 @@ def comparisons_of(suite: Suite, defence: str | None = None) -> list[Data]:
             out.append({
                 "class": duel.class_ or "not stated", "a": suite.defences[duel.a], "b": suite.defences[duel.b],
                 "only_a": f"{most}{duel.only_a}", "only_b": f"{most}{duel.only_b}", "p": _small(duel.p, duel.bound),
-                "adjusted": _small(duel.adjusted, duel.bound), "sort_a": duel.only_a, "sort_b": duel.only_b,
+                "adjusted": _small(duel.adjusted, duel.class_ in wide), "sort_a": duel.only_a, "sort_b": duel.only_b,
                 "sort": f"{duel.p:.6g}", "sort_adjusted": f"{duel.adjusted:.6g}", "weaker": suite.defences[weaker] if sure else None,
             })  # fmt: skip
     return out
@@ -165,7 +166,7 @@ def comparisons_of(suite: Suite, defence: str | None = None) -> list[Data]:
 
 BOUND = (
     " ≤ stands where the board does not know which episodes came to damage, but how many: the largest p that these numbers allow, and as "
-    "many episodes as can be."
+    "many episodes as can be; and at what is corrected for such pairs of the class."
 )
 
 

@@ -27,6 +27,7 @@ class Beside:
     table: Table
     entries: dict[str, Data]  # by defence
     cells: list[Data]
+    steady: frozenset[str]  # defences that met no more than they had: of two of them the board's comparison stands
 
     def of(self, part: str, defence: str) -> list[Data]:
         """The board's lines of a defence: of `curves`, say."""
@@ -59,8 +60,10 @@ def beside(table: Table, board: Data, suite: Suite, alpha: float, require_adapti
             raise InputError(f"rows of {name}: seeds", f"{len(table.seeds.get(name, ()))} of them", f"the board's, which are {len(seeds)}")
     if other := ({*table.listed} - table.withdrawn) ^ ({*held.listed} - held.withdrawn):
         raise InputError("board: attacks", min(other), "the list of attacks that is here: play the whole suite")
+    files = {key.column.attack: rows[0]["attack_digest"] for key, rows in table.cells.items()}
     entries: dict[str, Data] = {}
     cells: list[Data] = []
+    steady: set[str] = set()
     for entry in board["entries"]:
         name = entry["defence"]
         old = {place_of(cell): cell for cell in board["cells"] if cell["defence"] == name}
@@ -69,6 +72,7 @@ def beside(table: Table, board: Data, suite: Suite, alpha: float, require_adapti
             if off := [field for field in SAME if old[place].get(field) is not None and old[place][field] != again[place][field]]:
                 wanted = f"{old[place][off[0]]}, as the board has it: else play the whole suite"
                 raise InputError(f"rows of {_said([place])}: {off[0]}", again[place][off[0]], wanted)
+        steady |= {name} if again.keys() <= old.keys() else set()
         lost = [place for place, cell in old.items() if place not in again and cell["attack"] not in held.withdrawn]
         if again and not lost:
             continue
@@ -76,6 +80,10 @@ def beside(table: Table, board: Data, suite: Suite, alpha: float, require_adapti
             raise InputError(f"rows of {name}", _said(more), f"rows of all {len(old)} cells that the board has, {_said(lost)} among them")
         entries[name] = entry
         cells += [cell | {"hits": told[place]} if place in again else cell for place, cell in old.items()]
+    shared = {cell["attack"] for cell in cells} & {cell["attack"] for cell in new.values() if cell["defence"] not in entries}
+    for attack in (attack for attack in board["attacks"] if attack["attack"] in shared and attack.get("digest")):
+        if (digest := files[attack["attack"]]) != attack["digest"]:
+            raise InputError(f"rows of {attack['attack']}: attack_digest", digest, f"{attack['digest']}, which the others have met")
     both = joined(table, held, entries)
     for name in entries:
         if (before := _counted(held, name)) != (now := _counted(both, name)):
@@ -83,7 +91,8 @@ def beside(table: Table, board: Data, suite: Suite, alpha: float, require_adapti
             wanted = f"an attack that counts against {name} as before: play the whole suite"
             raise InputError(f"rows of {column.attack} on {where}", "played", wanted)
     own = sum(len(rows) for rows in both.cells.values())
-    return Beside(board, dataclasses.replace(both, rows=own + sum(len(held.seeds[c["scenario"]]) for c in cells)), entries, cells)
+    whole = dataclasses.replace(both, rows=own + sum(len(held.seeds[c["scenario"]]) for c in cells))
+    return Beside(board, whole, entries, cells, frozenset(steady))
 
 
 def _counted(table: Table, defence: str) -> set[tuple[str, Column, bool]]:

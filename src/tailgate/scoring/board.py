@@ -56,11 +56,11 @@ def score(
     added = [text for text, line in lines.items() if line is not None]
     table = tabulate(rows, suite, added, taken_back(attacks or ()))
     digests = {text: line.digest for text, line in lines.items() if line is not None}
+    slot = middle(suite)
     held = None if board is None else beside(table, board, suite, alpha, require_adaptive, digests)
     table = table if held is None else held.table
     kept = {} if held is None else held.entries
     origins = _origins(table)
-    slot = middle(suite)
     levels: Levels = {d: {k: Worst(table, d, k, alpha) for k in KNOWLEDGE} for d in table.defences}
     asked = asked_of(suite) if require_adaptive and suite.adaptive else [] if require_adaptive else None
     found = [dict(kept[d]) if d in kept else _entry(table, d, levels[d], slot, origins, asked) for d in table.defences]
@@ -113,7 +113,7 @@ def _attacks(
         out.append({
             "attack": column.attack, "knowledge": column.knowledge, "learned": table.learned[column], "optimal": table.optimal[column],
             "trained_on": origins.get(column.attack, {}).get("defence") or told.get(column.attack, {}).get("trained_on"),
-            "digest": files.get(column.attack, told.get(column.attack, {}).get("digest")) or None,
+            "digest": told.get(column.attack, {}).get("digest") or files.get(column.attack) or None,
             "admitted": None if line is None else line.as_data(), "note": "; ".join(notes), "withdrawn": column.attack in table.withdrawn,
         })  # fmt: skip
     return out
@@ -301,22 +301,21 @@ def _robustness(table: Table, worst: Worst | None, slot: int) -> list[Data]:
 
 
 def _rank(found: list[Data], levels: Levels, slot: int, alpha: float, held: Beside | None) -> list[Data]:
-    """Comparisons within each class; puts the rank sets into the entries that take one. A class all of which is kept stays as it was."""
+    """Comparisons within each class; puts the rank sets into the entries that take one. Raises InputError where those that a board has of
+    entries that stay do not fit their cells."""
     out: list[Data] = []
     ranked = [entry for entry in found if entry["status"] == "ranked"]
-    fresh: set[str] = set()  # classes that an entry has joined, or left, or stayed in with other rows
-    if held is not None:
-        former = (entry for entry in held.board["entries"] if entry["status"] == "ranked")
-        fresh = {entry["class"] for entry in (*ranked, *former) if entry["defence"] not in held.entries}
+    told = [] if held is None else [duel for duel in held.board["comparisons"] if held.steady >= {duel["a"], duel["b"]}]
     for group in dict.fromkeys(entry["class"] for entry in ranked):
-        mine = [entry for entry in ranked if entry["class"] == group]
-        if held is not None and group not in fresh:
-            out += [duel for duel in held.board["comparisons"] if duel["class"] == group]
-            continue
-        before = {} if held is None else {(duel["a"], duel["b"]): duel for duel in held.board["comparisons"]}
-        stay = {pair: duel for pair, duel in before.items() if held is not None and held.entries.keys() >= set(pair)}
-        duels, ranks = compare({e["defence"]: levels[e["defence"]]["black"].all_harm(slot) for e in mine}, group, alpha, stay)
+        mine = [entry["defence"] for entry in ranked if entry["class"] == group]
+        duels, ranks = compare({name: levels[name]["black"].all_harm(slot) for name in mine}, group, alpha, told)
+        made = {(duel["a"], duel["b"]): duel for duel in duels}
+        for duel in (duel for duel in told if not duel.get("bound") and (duel["a"], duel["b"]) in made):
+            here = made[duel["a"], duel["b"]]
+            if not all(np.isclose(here[key], duel[key]) for key in ("only_a", "only_b", "p")):
+                expected = f"{here['p']:.3g}, as follows from the cells"
+                raise InputError(f"board: comparison of {duel['a']} and {duel['b']}", duel["p"], expected)
         out += duels
-        for entry in mine:
+        for entry in (entry for entry in ranked if entry["defence"] in ranks):
             entry["rank"] = ranks[entry["defence"]]
     return out

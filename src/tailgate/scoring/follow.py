@@ -6,7 +6,6 @@ Shares of damage decide its rates, critical doses, curves and robustness; which 
 from __future__ import annotations
 
 import math
-from itertools import combinations
 from typing import Any
 
 from tailgate.scenario import Suite
@@ -16,10 +15,10 @@ from .board import Levels, curves, middle, of_worst, shown
 from .cells import hits_of, share, table_of, vague
 from .damage import doses_of
 from .doses import Worst
-from .ranks import Harm, class_of, duel, settled
+from .ranks import CLOSE, class_of, compare, settled
+from .ranks import duel as duel_of
 
 Data = dict[str, Any]
-CLOSE = 1e-6  # two libraries of special functions may differ in the last digits
 
 
 def strays(board: Data, suite: Suite) -> list[Data]:
@@ -75,36 +74,41 @@ def _ranks(board: Data, levels: Levels, slot: int, alpha: float) -> list[Data]:
             groups.setdefault(group, {})[name] = entry
         elif entry.get("rank") is not None:
             out.append(_stray(name, "rank", entry["rank"], None))
-    duels_of = {group: [duel for duel in board.get("comparisons", ()) if duel.get("class", "") == group] for group in groups}
-    if others := len(board.get("comparisons", ())) - sum(map(len, duels_of.values())):
+    told = [{key: value for key, value in duel.items() if key != "bound" or value} for duel in board.get("comparisons", ())]
+    duels_of = {group: [duel for duel in told if duel.get("class", "") == group] for group in groups}
+    if others := len(told) - sum(map(len, duels_of.values())):
         out.append(_stray("", "comparisons", f"{others} of classes that nobody is ranked in", None))
     for group, mine in groups.items():
         if any(name not in levels or not levels[name]["black"].complete for name in mine):
             continue
-        harm, said = {name: levels[name]["black"].all_harm(slot) for name in mine}, {(d["a"], d["b"]): d for d in duels_of[group]}
-        duels = [_believed(said.get((a, b), {}), duel(group, a, b, harm[a], harm[b]), harm) for a, b in combinations(harm, 2)]
-        made, ranks = settled(duels, list(harm), alpha)
-        if not same(duels_of[group], made):
-            off = [f"{one['a']} and {one['b']}" for one in made if not same(said.get((one["a"], one["b"])), one)]
+        said = duels_of[group]
+        made, ranks = compare({name: levels[name]["black"].all_harm(slot) for name in mine}, group, alpha, said)
+        if not same(said, made):
+            pairs = {(duel["a"], duel["b"]): duel for duel in said}
+            off = [f"{one['a']} and {one['b']}" for one in made if not same(pairs.get((one["a"], one["b"])), one)]
             here = f"others of {', '.join(off[:2])}" if off else f"{len(made)} of them"
-            out.append(_stray("", "comparisons", f"{len(duels_of[group])} of the class {group}", here))
+            out.append(_stray("", "comparisons", f"{len(said)} of the class {group}", here))
         out += [_stray(name, "rank", e.get("rank"), ranks[name]) for name, e in mine.items() if not same(e.get("rank"), ranks[name])]
     return out
 
 
-def _believed(said: Data, here: Data, harm: dict[str, Harm]) -> Data:
-    """What a board says of a pair, where its cells allow that and do not tell what it is; else what they make.
-
-    A bound may have been made when cells told less; a pair that is no bound, of cells that do not tell, was compared when all was known.
-    """
-    bound, a, b = bool(said.get("bound")), here["a"], here["b"]
-    if not said or not (bound or here.get("bound")):
-        return here
-    least, most = (here, duel("", a, b, harm[a].by_count, harm[b].by_count)) if bound else ({"p": 0.0}, here)
-    difference = here["only_a"] - here["only_b"]  # which numbers tell
-    fits = least["p"] * (1.0 - CLOSE) <= said["p"] <= most["p"] * (1.0 + CLOSE) and said["only_a"] - said["only_b"] == difference
-    likely = said["weaker"] == (a if difference > 0 else b) or (said["p"] >= 1.0 and said["weaker"] in (a, b))
-    return {key: value for key, value in said.items() if key != "adjusted"} if fits and likely else here
+def sharpened(board: Data, suite: Suite) -> Data:
+    """The board with bounds made again of its cells, which may tell more by now, and the ranks that follow."""
+    before = board.get("comparisons", [])
+    if not any(duel.get("bound") for duel in before):
+        return board
+    table, slot, alpha = table_of(board, suite), middle(suite), board["suite"].get("alpha", 0.05)
+    duels: list[Data] = []
+    ranks: dict[str, Data] = {}
+    for group in dict.fromkeys(duel.get("class", "") for duel in before):
+        told = [duel for duel in before if duel.get("class", "") == group]
+        names = list(dict.fromkeys(name for duel in told for name in (duel["a"], duel["b"])))
+        harm = {name: Worst(table, name, KNOWLEDGE[0], alpha).all_harm(slot) for name in names}
+        made = [duel_of(group, d["a"], d["b"], harm[d["a"]], harm[d["b"]]) if d.get("bound") else d for d in told]
+        again, places = settled(made, names, alpha)
+        duels, ranks = duels + again, ranks | places
+    entries = [entry | {"rank": ranks[entry["defence"]]} if entry["defence"] in ranks else entry for entry in board["entries"]]
+    return board | {"entries": entries, "comparisons": duels}
 
 
 def same(a: Any, b: Any) -> bool:

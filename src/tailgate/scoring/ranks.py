@@ -15,6 +15,8 @@ from tailgate.registry import USES
 from tailgate.stats import holm
 
 Data = dict[str, Any]
+PAIR = ("only_a", "only_b", "weaker", "p")  # what was found of two defences
+CLOSE = 1e-6  # two libraries of special functions may differ in the last digits
 
 
 class Harm(NamedTuple):
@@ -30,11 +32,6 @@ class Harm(NamedTuple):
         """(episodes,) what the worst attack does."""
         return np.asarray(self.damage[self.worst])
 
-    @property
-    def by_count(self) -> Harm:
-        """The same, had only numbers been written down."""
-        return self._replace(vague=np.ones(len(self.damage), bool))
-
 
 def class_of(uses: Sequence[str]) -> str:
     """The class of a defence: what it uses, in the registry's order."""
@@ -47,26 +44,30 @@ def mcnemar(only_a: int, only_b: int) -> float:
     return float(binomtest(only_a, n).pvalue) if n else 1.0
 
 
-def outdone(a: Harm, b: Harm) -> float:
+def outdone(a: Harm, b: Harm, least: bool = False) -> float:
     """p of the null hypothesis that some attack harms b at least as much as a's worst harms a: small where a is surely the weaker one.
 
     a's worst attack is tested against every attack of b, one-sided, and the largest p counts (an intersection-union test, which needs no
     correction). That a's worst was chosen on these very episodes costs the factor of its attacks (Bonferroni). Where nobody knows which
-    episodes came to damage, p is the largest that their numbers allow.
+    episodes came to damage, p is the largest that their numbers allow, or the least, and 1 where b came to damage as often.
     """
-    only_a, only_b = apart(a.of_worst, b.damage, a.vague[a.worst] | b.vague)
-    p = np.where(only_a + only_b > 0, binom.sf(only_a - 1, only_a + only_b, 0.5), 1.0)
+    vague = a.vague[a.worst] | b.vague
+    only_a, only_b = apart(a.of_worst, b.damage, vague, least)
+    blank = (only_a + only_b == 0) | (vague & (only_a <= only_b))
+    p = np.where(blank, 1.0, binom.sf(only_a - 1, only_a + only_b, 0.5))
     return float(min(1.0, len(a.damage) * p.max()))
 
 
-def apart(mine: Array, others: Array, vague: Array) -> tuple[Array, Array]:
+def apart(mine: Array, others: Array, vague: Array, least: bool = False) -> tuple[Array, Array]:
     """(attacks,) each: episodes in which `mine` (episodes,) alone shows damage, and in which `others` (attacks, episodes) alone do.
 
-    Of vague pairs as many as their numbers allow: with a given difference, p below one half rises with the number of pairs that differ.
+    Of vague pairs as many as their numbers allow, or as few: the difference being given, a p below one half rises with the number of pairs
+    that differ.
     """
     only, other = np.sum(mine > others, axis=1), np.sum(others > mine, axis=1)
     most = np.minimum(others.sum(axis=1), len(mine) - mine.sum()).astype(int)
-    return np.where(vague, most + only - other, only), np.where(vague, most, other)
+    some = np.maximum(other - only, 0) if least else most
+    return np.where(vague, some + only - other, only), np.where(vague, some, other)
 
 
 def duel(group: str, a: str, b: str, x: Harm, y: Harm) -> Data:
@@ -82,6 +83,20 @@ def duel(group: str, a: str, b: str, x: Harm, y: Harm) -> Data:
     return made | {"p": min(1.0, 2.0 * min(sides))} | ({"bound": True} if x.vague.any() or y.vague.any() else {})
 
 
+def credible(told: Data, here: Data, x: Harm, y: Harm) -> bool:
+    """Whether a pair can have been found like that when every episode was known, of which cells tell no more than the bound `here`."""
+    if told.get("bound") or told.get("weaker") not in (told["a"], told["b"]):
+        return False
+    worst = np.array([x.vague[x.worst] | y.vague[y.worst]])
+    few, many = (apart(x.of_worst, y.of_worst[None], worst, least)[0][0] for least in (True, False))
+    only = told["only_a"], told["only_b"]
+    weak, strong, first = (x, y, only[0]) if told["weaker"] == told["a"] else (y, x, only[1])
+    alone = len(weak.damage) * float(binom.sf(first - 1, sum(only), 0.5))  # against the worst of the other: p is the largest of all
+    low = 2.0 * max(outdone(weak, strong, least=True), alone)
+    fits = few <= only[0] <= many and only[0] - only[1] == here["only_a"] - here["only_b"]
+    return bool(fits and min(1.0, low) * (1.0 - CLOSE) <= told["p"] <= here["p"] * (1.0 + CLOSE))
+
+
 def settled(duels: Sequence[Data], names: Sequence[str], alpha: float) -> tuple[list[Data], dict[str, dict[str, int]]]:
     """Duels of all pairs of a class, with p adjusted after Holm, and each one's rank set: best, 1 + those that are surely better, and
     worst."""
@@ -95,13 +110,18 @@ def settled(duels: Sequence[Data], names: Sequence[str], alpha: float) -> tuple[
 
 
 def compare(
-    harm: Mapping[str, Harm], group: str, alpha: float, held: Mapping[tuple[str, str], Data] | None = None
+    harm: Mapping[str, Harm], group: str, alpha: float, found: Sequence[Data] = ()
 ) -> tuple[list[Data], dict[str, dict[str, int]]]:  # fmt: skip
-    """Comparisons of all pairs of a class, and the rank set of each. held: pairs that were compared when every episode was known, which
-    count where that is no longer so."""
+    """Comparisons of all pairs of a class, and the rank set of each.
+
+    found: pairs that were compared when every episode was known; they count where that is no longer so, if numbers allow them (`credible`).
+    """
+    before = {(duel["a"], duel["b"]): duel for duel in found}
     duels = []
     for a, b in combinations(harm, 2):
-        made, before = duel(group, a, b, harm[a], harm[b]), (held or {}).get((a, b))
-        use = before is not None and made.get("bound") and not before.get("bound")
-        duels.append({key: value for key, value in before.items() if key != "adjusted"} if before is not None and use else made)
+        made, told = duel(group, a, b, harm[a], harm[b]), before.get((a, b))
+        kept = told is not None and made.get("bound") and credible(told, made, harm[a], harm[b])
+        duels.append(made | {key: told[key] for key in PAIR} if told is not None and kept else made)
+        if kept:
+            del duels[-1]["bound"]
     return settled(duels, list(harm), alpha)
