@@ -270,6 +270,20 @@ def test_round_and_weaker_are_said(site, index):
     assert any(row.startswith("radar-ppo-3 black box learned chi2_kf eta=15") for row in index.rows("cells"))
 
 
+def test_a_comparison_by_numbers_is_marked(tmp_path):
+    """Where the numbers leave no choice nothing is marked, but what is corrected for the other pairs of the class."""
+    board = make_board()
+    first, second, *_ = board["comparisons"]
+    first |= {"only_b": 0, "bound": True}
+    second |= {"bound": True}
+    text = build_site([board], tmp_path, replays=False).read_text(encoding="utf-8")
+    ends = {" ".join(row.split()[:2]): row.partition("measurements ")[2] for row in Outline(text).rows("cells")}
+    assert ends[f"{first['a']} {first['b']}"] == "42 0 < 0.0001 < 0.0001 kf"
+    assert ends[f"{second['a']} {second['b']}"] == "≤ 42 ≤ 33 ≤ 0.30 ≤ 0.60 undecided"
+    assert "≤ stands where the board does not know" in text
+    assert "≤ stands" not in build_site([make_board()], tmp_path / "other", replays=False).read_text(encoding="utf-8")
+
+
 def test_a_board_of_before_these_fields_is_drawn(tmp_path):
     """Without round, trust, trainings and weaker nothing is claimed of them; no dose at all is damage without an attack."""
     board = make_board(trusted=False)

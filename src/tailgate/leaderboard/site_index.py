@@ -154,7 +154,7 @@ def comparisons_of(suite: Suite, defence: str | None = None) -> list[Data]:
         if defence in (None, duel.a, duel.b):
             weaker = duel.weaker or (duel.a if duel.only_a > duel.only_b else duel.b)
             sure = duel.adjusted <= suite.board.suite.alpha and (duel.weaker is not None or duel.only_a != duel.only_b)
-            most = "≤ " if duel.bound else ""
+            most = "≤ " if duel.bound and min(duel.only_a, duel.only_b) > 0 else ""  # as many on both sides could be fewer
             out.append({
                 "class": duel.class_ or "not stated", "a": suite.defences[duel.a], "b": suite.defences[duel.b],
                 "only_a": f"{most}{duel.only_a}", "only_b": f"{most}{duel.only_b}", "p": _small(duel.p, duel.bound),
@@ -166,7 +166,7 @@ def comparisons_of(suite: Suite, defence: str | None = None) -> list[Data]:
 
 BOUND = (
     " ≤ stands where the board does not know which episodes came to damage, but how many: the largest p that these numbers allow, and as "
-    "many episodes as can be; and at what is corrected for such pairs of the class."
+    "many episodes as can be; where a class has such pairs, at its corrected p too."
 )
 
 
