@@ -190,8 +190,6 @@ def test_rows_of_some_cells_only_say_which_episodes_were_hit() -> None:
 
 def test_what_is_no_cell_of_the_same_board_is_refused() -> None:
     whole = _as_read(board(_rows(*GUARDS)))
-    with pytest.raises(InputError, match=r"rows of kf: .*rows of all 9 cells that the board has"):
-        board([*_rows("none"), *cell("kf", "dos_jam", 3)], board=whole)
     for guards in (("none",), ("none", "rkf")):  # the rows cover some cells of `none`, or all
         wrong = _rows(*guards)
         wrong[0] = wrong[0] | {"crashed": 1.0}
@@ -339,5 +337,18 @@ def test_the_command(tmp_path: Path) -> None:
     assert [e["defence"] for e in made["entries"]] == ["none", "kf", "chi2_kf"] and made["entries"][1] == held["entries"][1]
     assert made["entries"][2]["checked"]["cells"] == 3 and made["suite"]["rows"] == whole["suite"]["rows"] + 4
     assert [c["attack"] for c in made["cells"] if c["defence"] == "chi2_kf"] == ["none", "fdi:value=5", "dropout"]
+    with pytest.raises(InputError, match="keep-entries too"):
+        _run(str(file), "--out", str(out), "--attack", "dos_jam")
+    for path in out.glob("small-v0/*rows*"):
+        path.unlink()
+    _run(str(file), "--out", str(out), "--defence", "kf", "--attack", "dos_jam:start_step=20", "--keep-entries")
+    more = json.loads(place.read_text())
+    met = {d: [c["attack"] for c in more["cells"] if c["defence"] == d] for d in ("none", "kf", "chi2_kf")}
+    assert met["kf"] == ["none", "fdi:value=5", "dos_jam:start_step=20"] and met["chi2_kf"] == ["none", "fdi:value=5", "dropout"]
+    assert more["entries"][1]["checked"] == held["entries"][1]["checked"] | {"cells": 3} and more["suite"]["rows"] == made["suite"]["rows"] + 4
+    place.write_text(json.dumps(made))
+    for path in out.glob("small-v0/*rows*"):
+        path.unlink()
+    _run(str(file), "--out", str(out), "--defence", "chi2_kf", "--keep-entries")
     _run(str(file), "--out", str(out), "--defence", "chi2_kf", "--score-only")
     assert [e["defence"] for e in json.loads(place.read_text())["entries"]] == ["none", "chi2_kf"]

@@ -93,6 +93,60 @@ def test_an_entry_that_changes_its_class(guard: str) -> None:
     assert made == whole and (made["comparisons"] != _whole(*GUARDS)["comparisons"] or guard == "brake_kf")  # which takes no rank
 
 
+def _more(*guards: str, hits: int = 20) -> list[Data]:
+    """Rows of an attacker that was trained on somebody else, against every guard that is named, in both scenarios."""
+    origin = {"defence": "chi2_dkf", "digest": "", "version": 1, "plan": "p", "seed": 0}
+    out: list[Data] = []
+    for guard in guards:
+        rng = np.random.default_rng([7, *guard.encode()])
+        for place in (ROAD, OTHER):
+            some = [sorted(rng.permutation(20)[: rng.integers(hits + 1)].tolist()) for _ in range(3)]
+            rows = cell(guard, "zoo:name=x", some, scenario=place, uses=USES.get(guard, ["measurements"]), learned=True, trained=origin)
+            out += [r | {"min_gap": float(r["seed"] % 7), "attack_steps": 2.0} for r in rows]
+    return out
+
+
+def _sorted(made: Data) -> Data:
+    return dict(made | {"entries": [e | {"flags": sorted(e["flags"])} for e in made["entries"]]})
+
+
+@pytest.mark.parametrize("hits", [0, 2, 20])
+@pytest.mark.parametrize("guards", [("safe_state",), ("kf", "imm", "brake_kf"), GUARDS], ids=",".join)
+def test_entries_that_meet_one_attack_more(guards: tuple[str, ...], hits: int) -> None:
+    """Its rows alone make what all rows make, whether it does the most or nothing; another entry may join at once."""
+    more, before = _more(*guards, hits=hits), _as_read(_whole(*GUARDS))
+    whole = board([*_rows(*GUARDS), *more], SUITE, attacks=LINES)
+    made = board(more, SUITE, attacks=LINES, board=before)
+    assert _sorted(made) == _sorted(whole) and strays(_as_read(made), SUITE) == []
+    if hits == 20:
+        assert made["entries"] != before["entries"] and any(e["worst_episode"] != b["worst_episode"] for e, b in zip(made["entries"], before["entries"], strict=True))
+    less = _as_read(_whole(*(guard for guard in GUARDS if guard != "chi2_kf")))
+    both = [*_more(*(guard for guard in guards if guard != "none"), hits=hits), *_rows("none", "chi2_kf"), *(_more("none", hits=hits) if "none" in guards else [])]
+    assert _sorted(board(both, SUITE, attacks=LINES, board=less)) == _sorted(whole)
+
+
+def test_an_attack_that_joined_the_list_is_met_by_all() -> None:
+    """Whoever has not met it would lack figures; its rows against all entries are enough."""
+    rows, late = _rows(*GUARDS), [LISTED]
+    before = _as_read(board([row for row in rows if row["attack"] not in ("dropout", "echo")], SUITE))
+    new = [row for row in rows if row["attack"] == "dropout"]
+    made = board(new, SUITE, attacks=late, board=before)
+    assert _sorted(made) == _sorted(board([row for row in rows if row["attack"] != "echo"], SUITE, attacks=late))
+    with pytest.raises(InputError, match=r"dropout on .*counts against imm"):
+        board([row for row in new if row["defence"] != "imm"], SUITE, attacks=late, board=before)
+
+
+def test_what_a_defence_has_met_or_was_trained_for_it_is_not_given_by_the_way() -> None:
+    """Half of a cell's doses would be half of an attack; attackers that were made for it belong to all its rows."""
+    before = _as_read(board([row for row in _rows(*GUARDS) if row["attack"] != "echo"], SUITE, attacks=[LISTED]))
+    with pytest.raises(InputError, match=r"rows of kf: got .*all .* cells that the board has"):
+        board([row | {"knowledge": "grey", "config_hash": scored.hash_of(row["scenario"], row["dose"], "grey")} for row in cell("kf", "fdi", 3)]
+              + cell("kf", "fdi", 3, scenario=OTHER, knowledge="grey"), SUITE, attacks=[LISTED], board=before)  # fmt: skip
+    own = [row | {"trained": row["trained"] | {"defence": "kf"}} for row in _more("kf")]
+    with pytest.raises(InputError, match=r"rows of kf: got .*zoo:name=x"):
+        board(own, SUITE, attacks=[LISTED], board=before)
+
+
 def test_an_attack_that_was_taken_back_since_is_refused() -> None:
     """All figures of the others change with it."""
     before = _as_read(_whole(*GUARDS))

@@ -27,11 +27,14 @@ def add(actions: Any) -> None:
     command.add_argument("suites", nargs="+", metavar="SUITE", help="suites by name or YAML file")
     command.add_argument("--out", required=True, metavar="DIR", help="folder of the boards")
     command.add_argument("--defence", action="append", metavar="NAME", help="only these defences (repeatable)")
+    command.add_argument("--attack", action="append", metavar="TEXT",
+                         help="only these attacks, which the entries that --keep-entries keeps have not met (repeatable)")  # fmt: skip
     command.add_argument("--workers", type=int, default=2, metavar="N", help="processes (default 2); change no result")
     command.add_argument("--beacon", default="", metavar="TEXT", help="the round: random text of after the submissions (default: none)")
     command.add_argument("--score-only", action="store_true", help="play nothing: score the rows that are there")
     command.add_argument("--keep-entries", action="store_true",
-                         help="entries of OUT/SUITE/board.json stay that have no rows here, or not those of all their cells")  # fmt: skip
+                         help="entries of OUT/SUITE/board.json stay that have no rows here, or not those of all their cells; "
+                         "they may meet more attacks")  # fmt: skip
     command.add_argument("--detection", action="store_true", help="then play detection as `leaderboard detect` does: slow")
     command.add_argument("--unattacked", action="store_true", help="also rank defences that no attack was trained against")
     command.add_argument("--no-replays", action="store_true", help="leave out the replays of the worst episodes")
@@ -58,6 +61,8 @@ def _run(options: argparse.Namespace) -> int:
     from tailgate.leaderboard.site import build_site
     from tailgate.scenario import load_suite
 
+    if options.attack and not options.keep_entries:
+        raise InputError("--attack", options.attack[0], "--keep-entries too: a board of some attacks alone would say too little")
     out, started = Path(options.out), time.perf_counter()
     suites = [load_suite(name) for name in options.suites]
     clocks = [clock_of(out / suite.name / BOARD) for suite in suites]  # before anything is played
@@ -70,7 +75,7 @@ def _run(options: argparse.Namespace) -> int:
             record = Record(suite, folder, options.workers)
             if not options.score_only:
                 rows = play(
-                    suite, folder, defences=options.defence, workers=options.workers, beacon=options.beacon,
+                    suite, folder, defences=options.defence, attacks=options.attack, workers=options.workers, beacon=options.beacon,
                     progress=record.counting(lambda name, done, total: update(name, done, total, cells(done, total))),
                 )  # fmt: skip
                 print(f"rows: {rows}", file=sys.stderr)

@@ -35,14 +35,16 @@ Progress = Callable[[str, int, int], None]  # suite, done, total
 
 
 def play(
-    suite: Suite, folder: Path, *, defences: Sequence[str] | None = None, workers: int = 1, beacon: str = "",
-    progress: Progress | None = None,
+    suite: Suite, folder: Path, *, defences: Sequence[str] | None = None, attacks: Sequence[str] | None = None, workers: int = 1,
+    beacon: str = "", progress: Progress | None = None,
 ) -> Path:  # fmt: skip
-    """The rows of a suite and of the attacks that were admitted since, against its defences; returns their file. It resumes."""
-    attacks = admitted.attacks_of(suite, folder / LIST)
-    if defences is not None:
+    """The rows of a suite and of the attacks that were admitted since, or of some, against its defences; returns their file. It resumes."""
+    if attacks is None and defences is not None:
         defences = list(dict.fromkeys([CLEAN, *defences]))  # the undefended car is what gates measure against
-    file = folder / (OWN if defences is None else f"rows-{hashlib.blake2b(repr(defences).encode(), digest_size=4).hexdigest()}.jsonl.xz")
+    some = repr(defences if attacks is None else (defences, list(attacks)))
+    name = hashlib.blake2b(some.encode(), digest_size=4).hexdigest()
+    file = folder / (OWN if defences is None and attacks is None else f"rows-{name}.jsonl.xz")
+    attacks = admitted.attacks_of(suite, folder / LIST) if attacks is None else attacks
     update = None if progress is None else lambda done, total: progress(suite.name, done, total)
     evaluate(suite, defences=defences, attacks=attacks, workers=workers, out=file, beacon=beacon, progress=update)
     return file

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import hashlib
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -131,17 +131,19 @@ def table_of(board: Data, suite: Suite) -> Table:
     )  # fmt: skip
 
 
-def joined(table: Table, held: Table, kept: Collection[str]) -> Table:
+def joined(table: Table, held: Table, kept: Collection[str], added: Mapping[str, Collection[str]]) -> Table:
     """The table of rows, and beside it what another one knows of the defences that are kept.
 
-    Both are of the same episodes and attacks. Rows of a defence that is kept say nothing here but what it does when nobody attacks.
+    Both are of the same episodes. Of a defence that is kept rows say what it does when nobody attacks, and against attacks that it had
+    not met (`added`).
     """
+    fresh = {key: rows for key, rows in table.cells.items() if key.defence not in kept or key.column.attack in added.get(key.defence, ())}
     parts = [(table, [name for name in table.defences if name not in kept]), (held, [name for name in held.defences if name in kept])]
     defences = in_order({name for _, names in parts for name in names}, table.suite.defences)
     met = {
         column for part, names in parts for i, column in enumerate(part.columns) for state in part.state.values()
         if (state[[part.defences.index(name) for name in names], i] != MISSING).any()
-    }  # fmt: skip
+    } | {key.column for key in fresh}  # fmt: skip
     columns = columns_of(met, table.listed)
     shape = len(defences), len(columns), len(table.doses)
     harm = {name: np.full((*shape, len(seeds)), np.nan) for name, seeds in held.seeds.items()}
@@ -152,10 +154,14 @@ def joined(table: Table, held: Table, kept: Collection[str]) -> Table:
         here = np.ix_([defences.index(name) for name in names], [columns.index(column) for column in shared])
         for name in held.seeds:
             harm[name][here], state[name][here] = part.harm[name][mine], part.state[name][mine]
+    for key in (key for key in fresh if key.defence in kept and key.column in columns):
+        at = defences.index(key.defence), columns.index(key.column), key.slot
+        cell = table.defences.index(key.defence), table.columns.index(key.column), key.slot
+        harm[key.scenario][at], state[key.scenario][at] = table.harm[key.scenario][cell], table.state[key.scenario][cell]
     optimal = {column: any(part.optimal.get(column, False) for part, _ in parts) for column in columns}
     learned = {column: any(part.learned.get(column, False) for part, _ in parts) for column in columns}
-    own = {key: rows for key, rows in table.cells.items() if key.defence not in kept}
+    clean = {at: rows for at, rows in held.clean.items() if at[1] in kept} | table.clean
     return dataclasses.replace(
-        table, defences=defences, columns=columns, cells=own, harm=harm, state=state, optimal=optimal,
+        table, defences=defences, columns=columns, cells=fresh, clean=clean, harm=harm, state=state, optimal=optimal,
         learned=learned, vague=frozenset(key for key in held.vague if key.defence in kept),
     )  # fmt: skip

@@ -95,10 +95,15 @@ class Worst:
         name, i = self.pairs[pair]
         return self.table.seeds[name], self._harm(name, i)[slot]
 
-    def rows(self, pair: int, slot: int) -> list[Row]:
-        """The rows of a pair at a dose, by seed."""
+    def vague(self, pair: int, slot: int) -> bool:
+        """Whether nobody knows which episodes of a pair came to damage."""
         name, i = self.pairs[pair]
-        return self.table.cells[Key(name, slot, self.defence, self.table.columns[i])]
+        return Key(name, slot, self.defence, self.table.columns[i]) in self.table.vague
+
+    def rows(self, pair: int, slot: int) -> list[Row]:
+        """The rows of a pair at a dose, by seed; none of those that a board alone knows of."""
+        name, i = self.pairs[pair]
+        return self.table.cells.get(Key(name, slot, self.defence, self.table.columns[i]), [])
 
     def all_harm(self, slot: int) -> Harm:
         """Of all pairs at a dose. Raises InputError where the scenarios have not the same seeds: nothing would be paired."""
@@ -108,8 +113,7 @@ class Worst:
         harm = np.stack([self._harm(name, i)[slot] for name, i in self.pairs])
         if np.isnan(harm).any():
             raise InputError(f"rows of {self.defence}", "attacks without full figures", "all episodes of every attack that counts")
-        keys = [Key(name, slot, self.defence, self.table.columns[i]) for name, i in self.pairs]
-        return Harm(found.pop(), harm, self.at(slot)[0], np.array([key in self.table.vague for key in keys], bool))
+        return Harm(found.pop(), harm, self.at(slot)[0], np.array([self.vague(k, slot) for k in range(len(self.pairs))], bool))
 
     def bounds(self, slot: int, scenarios: list[str] | None = None, sides: int = 1) -> tuple[float, float]:
         """Limits of the worst share of damage that hold together for all pairs: alpha over their number, and over the sides."""

@@ -2,25 +2,43 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection, Sequence
+
 import numpy as np
 
 from tailgate.core import Array
 
 from .damage import MISSING, PLAYED, Key, Row, Table
 from .doses import Worst
-from .ranks import mcnemar
+from .ranks import apart, mcnemar
 
 SPENT = 0.9  # of the budget, by the mean of the episodes without damage: those that end early leave some
 LEVEL = 0.05
+UNSPENT = "unspent budget: the worst attack"
+BEATEN = "black box beats grey and white box: those who know more were not made to use it"
 SPREAD = 0.2  # between the training seeds of one plan, of the share of damage
 
 
 def flags(table: Table, defence: str, levels: dict[str, Worst], slot: int, origins: dict[str, Row]) -> list[str]:
     """Of one entry; `origins` says how each learned attack was trained, as far as that is known."""
+    trained = {attack: str(origin["defence"]) for attack, origin in origins.items()}
+    return [*of_attacks(table, defence, levels, slot, trained), *_trainings(table, defence, slot, origins)]
+
+
+def of_attacks(table: Table, defence: str, levels: dict[str, Worst], slot: int, trained: dict[str, str]) -> list[str]:
+    """All but what they say of training; `trained`: the defence that each learned attack was trained on."""
     out = [*_failures(table, defence), *_unspent(table, levels, slot)]
     for knowledge in levels:
-        out += _transferred(table, defence, levels[knowledge], slot, origins)
-    return [*dict.fromkeys(out), *_weaker(levels, slot), *_trainings(table, defence, slot, origins)]
+        out += _transferred(table, defence, levels[knowledge], slot, trained)
+    return [*dict.fromkeys(out), *_weaker(levels, slot)]
+
+
+def standing(told: Sequence[str], levels: dict[str, Worst], slot: int, added: Collection[str]) -> list[str]:
+    """Flags of an entry that hold when it has met more attacks: those of a worst attack where that is still the same one."""
+    worst = [one.named(one.at(slot)[0]) for one in levels.values() if one.complete]
+    same = not any(one["attack"] in added for one in worst)
+    kept = tuple(f"{UNSPENT}, {one['attack']} on {one['scenario']}," for one in worst)
+    return [flag for flag in told if flag.startswith(kept) or not (flag.startswith(UNSPENT) or (flag == BEATEN and not same))]
 
 
 def _trainings(table: Table, defence: str, slot: int, origins: dict[str, Row]) -> list[str]:
@@ -54,23 +72,23 @@ def _failures(table: Table, defence: str) -> list[str]:
 
 
 def _unspent(table: Table, levels: dict[str, Worst], slot: int) -> list[str]:
-    """The worst attack kept some of its budget back in episodes that it did not win."""
+    """The worst attack kept some of its budget back in episodes that it did not win, as far as there are rows of it."""
     dose, out = table.doses[slot], []
     for worst in levels.values():
         if not dose or not worst.complete:
             continue
         pair, _ = worst.at(slot)
         name, i = worst.pairs[pair]
-        rows = table.cells[Key(name, slot, worst.defence, table.columns[i])]
+        rows = table.cells.get(Key(name, slot, worst.defence, table.columns[i]), ())
         _, harm = worst.harm(pair, slot)
-        left = [row["attack_steps"] for row, hit in zip(rows, harm, strict=True) if not hit]
+        left = [row["attack_steps"] for row, hit in zip(rows, harm, strict=bool(rows)) if not hit]
         if left and float(np.mean(left)) < SPENT * dose:
             spends = f"spends {np.mean(left):.1f} of {dose} steps where it does no damage"
-            out.append(f"unspent budget: the worst attack, {table.columns[i].attack} on {name}, {spends}")
+            out.append(f"{UNSPENT}, {table.columns[i].attack} on {name}, {spends}")
     return out
 
 
-def _transferred(table: Table, defence: str, worst: Worst, slot: int, origins: dict[str, Row]) -> list[str]:
+def _transferred(table: Table, defence: str, worst: Worst, slot: int, trained: dict[str, str]) -> list[str]:
     """A policy trained on another defence does surely more damage than every one that was trained on this one knowing as much."""
     out = []
     guard = table.defences.index(defence)
@@ -79,17 +97,25 @@ def _transferred(table: Table, defence: str, worst: Worst, slot: int, origins: d
         others: list[tuple[str, Array]] = []
         for i in (i for scenario, i in worst.pairs if scenario == name):
             column = table.columns[i]
-            if column.knowledge != worst.knowledge or column.attack not in origins or table.state[name][guard, i, slot] != PLAYED:
+            if column.knowledge != worst.knowledge or column.attack not in trained or table.state[name][guard, i, slot] != PLAYED:
                 continue
-            (mine if origins[column.attack]["defence"] == defence else others).append((column.attack, table.harm[name][guard, i, slot]))
+            (mine if trained[column.attack] == defence else others).append((column.attack, table.harm[name][guard, i, slot]))
         if not mine or not others:
             continue
-        _, own = max(mine, key=lambda held: float(held[1].mean()))
+        best, own = max(mine, key=lambda held: float(held[1].mean()))
+        unknown = {k.column.attack for k in table.vague if (k.scenario, k.slot, k.defence) == (name, slot, defence)}
+        vague = best in unknown
         for attack, harm in others:
-            more, less = int(np.sum(harm > own)), int(np.sum(own > harm))
+            more, less = surely(harm, own, vague or attack in unknown)
             if more > less and mcnemar(more, less) * len(others) <= LEVEL:
-                out.append(f"transferred beats own: {attack}, trained on {origins[attack]['defence']}, on {name} ({worst.knowledge} box)")
+                out.append(f"transferred beats own: {attack}, trained on {trained[attack]}, on {name} ({worst.knowledge} box)")
     return out
+
+
+def surely(x: Array, y: Array, vague: bool) -> tuple[int, int]:
+    """In how many episodes x alone and y alone show damage; as many as can be where only numbers are known."""
+    more, less = apart(x, y[None], np.array([vague]))
+    return int(more[0]), int(less[0])
 
 
 def _weaker(levels: dict[str, Worst], slot: int) -> list[str]:
@@ -103,6 +129,7 @@ def _weaker(levels: dict[str, Worst], slot: int) -> list[str]:
     best = max(more, key=lambda k: float(white.shares[k, slot]))
     pair, _ = black.at(slot)
     (seeds, x), (others, y) = black.harm(pair, slot), white.harm(best, slot)
-    if seeds != others or mcnemar(int(np.sum(x > y)), int(np.sum(y > x))) > LEVEL or x.mean() <= y.mean():
+    unknown = any(worst.vague(k, slot) for worst, k in ((black, pair), (white, best)))
+    if seeds != others or mcnemar(*surely(x, y, unknown)) > LEVEL or x.mean() <= y.mean():
         return []
-    return ["black box beats grey and white box: those who know more were not made to use it"]
+    return [BEATEN]

@@ -11,10 +11,10 @@ from typing import Any
 from tailgate.scenario import Suite
 from tailgate.threat import KNOWLEDGE
 
-from .board import Levels, curves, middle, of_worst, shown
 from .cells import hits_of, share, table_of, vague
 from .damage import doses_of
 from .doses import Worst
+from .entry import Levels, curves, middle, of_worst, shown
 from .ranks import CLOSE, class_of, compare, settled
 from .ranks import duel as duel_of
 
