@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import sys
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,7 @@ from typing import Any
 from rich.console import Console
 
 from tailgate.errors import InputError
-from tailgate.progress import cells, progress
+from tailgate.progress import progress
 
 
 def add(actions: Any) -> None:
@@ -32,43 +31,19 @@ def add(actions: Any) -> None:
 
 
 def _attack(options: argparse.Namespace) -> int:
-    from tailgate.adaptive import configs_of, fitting, policies_of, stem, train_against
-    from tailgate.evaluation import evaluate
-    from tailgate.registry import Spec
+    from tailgate.leaderboard.attacked import attack
     from tailgate.scenario import load_suite
-    from tailgate.submission import play_submission
 
     sys.path.insert(0, "")  # module:Class is looked for in the working directory, as `leaderboard submit` does
 
     if options.episodes is not None and options.episodes < 1:  # before anything is trained
         raise InputError("episodes", options.episodes, "a whole number not below 1")
-    suite, out = load_suite(options.suite), Path(options.out)
-    extra = (*options.set, f"workers={options.workers}")
-    configs = configs_of(suite, options.defence, out / "policies", seeds=options.seeds, extra=extra)
     with progress(Console(stderr=True)) as update:
-        policies = train_against(configs, update)
-        groups: dict[tuple[str, ...], list[str]] = {}  # a policy plays where the attacker sees and may do what it learned with
-        for config in configs:
-            groups.setdefault(fitting(suite, config), []).extend(map(str, policies_of(config)))
-        count = 0
-        for scenarios, attacks in groups.items():
-            file = out / f"{stem(options.defence)}{f'-{scenarios[0]}' if len(groups) > 1 else ''}.jsonl"
-            part = dataclasses.replace(suite, scenarios=scenarios, attacks=tuple(attacks))
-
-            def told(done: int, total: int) -> None:
-                update("playing", done, total, cells(done, total))
-
-            if apart := Spec("defence", options.defence).sandboxed:
-                rows = play_submission(
-                    apart[1], part, sandbox=apart[0], beacon=options.beacon, episodes=options.episodes, workers=options.workers, out=file,
-                    progress=told,
-                )  # fmt: skip
-            else:
-                rows = evaluate(
-                    part, defences=[options.defence], seeds=options.episodes, workers=options.workers, out=file, beacon=options.beacon,
-                    progress=told,
-                )  # fmt: skip
-            print(file)
-            count += len(rows)
-    print(f"{len(policies)} policies, {count} rows", file=sys.stderr)
+        made = attack(
+            load_suite(options.suite), options.defence, Path(options.out), seeds=options.seeds, episodes=options.episodes,
+            beacon=options.beacon, workers=options.workers, changes=tuple(options.set), progress=update,
+        )  # fmt: skip
+    for file in made.files:
+        print(file)
+    print(f"{len(made.policies)} policies, {made.rows} rows", file=sys.stderr)
     return 0

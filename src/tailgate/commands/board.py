@@ -35,6 +35,8 @@ def add(actions: Any) -> None:
     command.add_argument("--keep-entries", action="store_true",
                          help="entries of OUT/SUITE/board.json stay that have no rows here, or not those of all their cells; "
                          "they may meet more attacks")  # fmt: skip
+    command.add_argument("--train", action="store_true",
+                         help="then train the suite's attackers against every defence that passes the gates, and play them")  # fmt: skip
     command.add_argument("--detection", action="store_true", help="then play detection as `leaderboard detect` does: slow")
     command.add_argument("--unattacked", action="store_true", help="also rank defences that no attack was trained against")
     command.add_argument("--no-replays", action="store_true", help="leave out the replays of the worst episodes")
@@ -54,6 +56,7 @@ def add(actions: Any) -> None:
 
 def _run(options: argparse.Namespace) -> int:
     sys.path.insert(0, "")  # module:Class is looked for in the working directory, as `tailgate evaluate` does
+    from tailgate.leaderboard.attacked import attack
     from tailgate.leaderboard.clock import clock_of
     from tailgate.leaderboard.detect import detect
     from tailgate.leaderboard.run import BOARD, board_of, kept_board, play
@@ -63,6 +66,8 @@ def _run(options: argparse.Namespace) -> int:
 
     if options.attack and not options.keep_entries:
         raise InputError("--attack", options.attack[0], "--keep-entries too: a board of some attacks alone would say too little")
+    if options.train and options.unattacked:
+        raise InputError("--train", True, "no --unattacked: that ranks defences which were not attacked")
     out, started = Path(options.out), time.perf_counter()
     suites = [load_suite(name) for name in options.suites]
     clocks = [clock_of(out / suite.name / BOARD) for suite in suites]  # before anything is played
@@ -82,6 +87,14 @@ def _run(options: argparse.Namespace) -> int:
             board = board_of(
                 suite, folder, beacon=options.beacon or None, keep=options.keep_entries, require_adaptive=not options.unattacked
             )
+            left = [entry["defence"] for entry in board["entries"] if entry["status"] == "unattacked"] if options.train else []
+            for defence in left:
+                attack(
+                    suite, defence, folder / "attacked", beacon=options.beacon, workers=options.workers, progress=update,
+                    counting=record.counting,
+                )  # fmt: skip
+            if left:
+                board = board_of(suite, folder, beacon=options.beacon or None, keep=options.keep_entries)
             print(record.finish(board["suite"]["rows"]), file=sys.stderr)
             boards.append(detect(folder / BOARD, suite, workers=options.workers, progress=update) if options.detection else board)
     page = build_site(boards, out / "page", replays=not options.no_replays, clocks=clocks)

@@ -25,7 +25,6 @@ from tailgate.submission.guard import TICK, descendants
 FORMAT = "tailgate-run-1"
 FILE = "run.json"
 EVERY = 10.0  # [s] between two writes while rows are played: what a killed command loses
-Progress = Callable[[str, int, int], None]  # suite, cells done, cells in all
 
 
 def processor_time() -> float:
@@ -47,11 +46,11 @@ class Record:
             "workers": workers, "processor": processor(), "cores": cores(), "version": tailgate.__version__, "commit": commit(),
         }  # fmt: skip
 
-    def counting(self, told: Progress) -> Progress:
-        """The progress of `play`, which is called after each cell that it has played."""
+    def counting(self, told: Callable[..., None]) -> Callable[..., None]:
+        """A progress that is called after each cell that was played."""
 
-        def counted(name: str, done: int, total: int) -> None:
-            told(name, done, total)
+        def counted(*now: Any) -> None:
+            told(*now)
             self.played += self.suite.seeds
             if time.perf_counter() - self.written > EVERY:
                 self._write(None)
