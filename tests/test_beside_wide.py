@@ -125,6 +125,23 @@ def test_entries_that_meet_one_attack_more(guards: tuple[str, ...], hits: int) -
     assert _sorted(board(both, SUITE, attacks=LINES, board=less)) == _sorted(whole)
 
 
+@pytest.mark.parametrize("hits", [0, 2, 20])
+@pytest.mark.parametrize("guards", [("kf",), ("imm", "chi2_kf"), GUARDS], ids=",".join)
+def test_what_was_compared_still_bounds_what_met_more(guards: tuple[str, ...], hits: int) -> None:
+    """Where cells do not tell which episodes were hit: p is no smaller than of all rows, and hardly larger where the new attack does little."""
+    before, more = _as_read(_whole(*GUARDS)), _more(*guards, hits=hits)
+    for c in before["cells"]:
+        c["hits"] = None
+    made, whole = _as_read(board(more, SUITE, attacks=LINES, board=before)), board([*_rows(*GUARDS), *more], SUITE, attacks=LINES)
+    pairs = list(zip(made["comparisons"], whole["comparisons"], strict=True))
+    assert all(one["p"] >= all_["p"] * (1 - 1e-9) for one, all_ in pairs) and strays(made, SUITE) == []
+    if hits == 0:
+        assert [one["p"] for one, _ in pairs] == pytest.approx([all_["p"] for _, all_ in pairs])
+    for name in ("kf", "imm", "chi2_kf", "safe_state"):
+        wide, rank = entry(made, name)["rank"], entry(whole, name)["rank"]
+        assert wide["best"] <= rank["best"] and rank["worst"] <= wide["worst"]
+
+
 def test_an_attack_that_joined_the_list_is_met_by_all() -> None:
     """Whoever has not met it would lack figures; its rows against all entries are enough."""
     rows, late = _rows(*GUARDS), [LISTED]

@@ -27,6 +27,7 @@ class Beside:
     table: Table
     entries: dict[str, Data]  # by defence
     cells: list[Data]
+    before: Table  # of the board alone
     added: dict[str, frozenset[str]]  # attacks that entries which stay have met in rows, and had not met
     steady: frozenset[str]  # defences that met no more than they had: of two of them the board's comparison stands
 
@@ -99,7 +100,7 @@ def beside(table: Table, board: Data, suite: Suite, alpha: float, require_adapti
             raise InputError(f"rows of {column.attack} on {where}", "played", wanted)
     own = sum(len(rows) for rows in both.cells.values())
     whole = dataclasses.replace(both, rows=own + sum(len(held.seeds[c["scenario"]]) for c in cells))
-    return Beside(board, whole, entries, cells, added, frozenset(steady))
+    return Beside(board, whole, entries, cells, held, added, frozenset(steady))
 
 
 def _counted(table: Table, defence: str) -> set[tuple[str, Column, bool]]:

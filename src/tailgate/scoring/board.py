@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
@@ -19,7 +19,8 @@ from .cells import cells_of, ordered
 from .damage import SKIPPED, Column, Row, Table, tabulate
 from .doses import Worst
 from .entry import Data, Levels, curves, entry_of, extended, middle
-from .ranks import compare
+from .ranks import Harm, compare, outgrown
+from .ranks import duel as duel_of
 
 FORMAT = "tailgate-board-1"
 
@@ -125,7 +126,9 @@ def _rank(found: list[Data], levels: Levels, slot: int, alpha: float, held: Besi
     told = [] if held is None else [duel for duel in held.board["comparisons"] if held.steady >= {duel["a"], duel["b"]}]
     for group in dict.fromkeys(entry["class"] for entry in ranked):
         mine = [entry["defence"] for entry in ranked if entry["class"] == group]
-        duels, ranks = compare({name: levels[name]["black"].all_harm(slot) for name in mine}, group, alpha, told)
+        harm = {name: levels[name]["black"].all_harm(slot) for name in mine}
+        more = [] if held is None else _outgrown(held, levels, harm, slot, group)
+        duels, ranks = compare(harm, group, alpha, [*told, *more])
         made = {(duel["a"], duel["b"]): duel for duel in duels}
         for duel in (duel for duel in told if not duel.get("bound") and (duel["a"], duel["b"]) in made):
             here = made[duel["a"], duel["b"]]
@@ -135,4 +138,23 @@ def _rank(found: list[Data], levels: Levels, slot: int, alpha: float, held: Besi
         out += duels
         for entry in (entry for entry in ranked if entry["defence"] in ranks):
             entry["rank"] = ranks[entry["defence"]]
+    return out
+
+
+def _outgrown(held: Beside, levels: Levels, harm: Mapping[str, Harm], slot: int, group: str) -> list[Data]:
+    """Comparisons of a board of entries that stayed and have met more attacks since, as far as they still bound p."""
+    out = []
+    for duel in held.board["comparisons"]:
+        a, b, weak = duel["a"], duel["b"], duel.get("weaker")
+        if held.steady >= {a, b} or not held.entries.keys() & harm.keys() >= {a, b} or weak not in (a, b) or duel["p"] >= 1.0:
+            continue
+        strong = b if weak == a else a
+        before, now = Worst(held.before, weak, KNOWLEDGE[0], 0.05), levels[weak][KNOWLEDGE[0]]
+        if before.named(before.at(slot)[0]) != now.named(now.at(slot)[0]):
+            continue
+        fresh, met = held.added.get(strong, frozenset()), levels[strong][KNOWLEDGE[0]]
+        new = np.array([met.named(k)["attack"] in fresh for k in range(len(met.pairs))], bool)
+        here = duel_of(group, a, b, harm[a], harm[b])
+        p = min(here["p"], outgrown(duel, harm[weak], harm[strong], len(before.pairs), new))
+        out.append(here | {"p": p, "weaker": weak, "bound": True})
     return out

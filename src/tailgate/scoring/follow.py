@@ -16,7 +16,6 @@ from .damage import doses_of
 from .doses import Worst
 from .entry import Levels, curves, middle, of_worst, shown
 from .ranks import CLOSE, class_of, compare, settled
-from .ranks import duel as duel_of
 
 Data = dict[str, Any]
 
@@ -104,9 +103,10 @@ def sharpened(board: Data, suite: Suite) -> Data:
         told = [duel for duel in before if duel.get("class", "") == group]
         names = list(dict.fromkeys(name for duel in told for name in (duel["a"], duel["b"])))
         harm = {name: Worst(table, name, KNOWLEDGE[0], alpha).all_harm(slot) for name in names}
-        made = [duel_of(group, d["a"], d["b"], harm[d["a"]], harm[d["b"]]) if d.get("bound") else d for d in told]
-        again, places = settled(made, names, alpha)
-        duels, ranks = duels + again, ranks | places
+        again = {(duel["a"], duel["b"]): duel for duel in compare(harm, group, alpha, told)[0]}
+        made = [again[d["a"], d["b"]] if d.get("bound") else d for d in told]
+        new, places = settled(made, names, alpha)
+        duels, ranks = duels + new, ranks | places
     entries = [entry | {"rank": ranks[entry["defence"]]} if entry["defence"] in ranks else entry for entry in board["entries"]]
     return board | {"entries": entries, "comparisons": duels}
 

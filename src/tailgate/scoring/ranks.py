@@ -84,17 +84,29 @@ def duel(group: str, a: str, b: str, x: Harm, y: Harm) -> Data:
 
 
 def credible(told: Data, here: Data, x: Harm, y: Harm) -> bool:
-    """Whether a pair can have been found like that when every episode was known, of which cells tell no more than the bound `here`."""
-    if told.get("bound") or told.get("weaker") not in (told["a"], told["b"]):
+    """Whether a pair can have been found like that when more episodes were known, of which cells tell no more than the bound `here`."""
+    if told.get("weaker") not in (told["a"], told["b"]):
         return False
-    worst = np.array([x.vague[x.worst] | y.vague[y.worst]])
-    few, many = (apart(x.of_worst, y.of_worst[None], worst, least)[0][0] for least in (True, False))
     only = told["only_a"], told["only_b"]
     weak, strong, first = (x, y, only[0]) if told["weaker"] == told["a"] else (y, x, only[1])
-    alone = len(weak.damage) * float(binom.sf(first - 1, sum(only), 0.5))  # against the worst of the other: p is the largest of all
-    low = 2.0 * max(outdone(weak, strong, least=True), alone)
-    fits = few <= only[0] <= many and only[0] - only[1] == here["only_a"] - here["only_b"]
-    return bool(fits and min(1.0, low) * (1.0 - CLOSE) <= told["p"] <= here["p"] * (1.0 + CLOSE))
+    low = outdone(weak, strong, least=True)
+    if told.get("bound"):
+        fits = only == (here["only_a"], here["only_b"])
+    else:
+        worst = np.array([x.vague[x.worst] | y.vague[y.worst]])
+        few, many = (apart(x.of_worst, y.of_worst[None], worst, least)[0][0] for least in (True, False))
+        fits = few <= only[0] <= many and only[0] - only[1] == here["only_a"] - here["only_b"]
+        low = max(low, len(weak.damage) * float(binom.sf(first - 1, sum(only), 0.5)))  # against the other's worst: p is the largest of all
+    return bool(fits and min(1.0, 2.0 * low) * (1.0 - CLOSE) <= told["p"] <= here["p"] * (1.0 + CLOSE))
+
+
+def outgrown(told: Data, weak: Harm, strong: Harm, tried: int, new: Array) -> float:
+    """The largest p of a pair that was compared, once both have met more attacks and the weaker one's worst is still the same.
+
+    tried: attacks that the weaker one had met; new (attacks,) bool: those that the other one had not.
+    """
+    met = strong._replace(damage=strong.damage[new], vague=strong.vague[new], worst=0)
+    return float(min(1.0, max(told["p"] * len(weak.damage) / tried, 2.0 * outdone(weak, met) if new.any() else 0.0)))
 
 
 def settled(duels: Sequence[Data], names: Sequence[str], alpha: float) -> tuple[list[Data], dict[str, dict[str, int]]]:
@@ -114,14 +126,14 @@ def compare(
 ) -> tuple[list[Data], dict[str, dict[str, int]]]:  # fmt: skip
     """Comparisons of all pairs of a class, and the rank set of each.
 
-    found: pairs that were compared when every episode was known; they count where that is no longer so, if numbers allow them (`credible`).
+    found: pairs that were compared when more episodes were known; they count where that is no longer so, if numbers allow it (`credible`).
     """
     before = {(duel["a"], duel["b"]): duel for duel in found}
     duels = []
     for a, b in combinations(harm, 2):
         made, told = duel(group, a, b, harm[a], harm[b]), before.get((a, b))
-        kept = told is not None and made.get("bound") and credible(told, made, harm[a], harm[b])
-        duels.append(made | {key: told[key] for key in PAIR} if told is not None and kept else made)
-        if kept:
-            del duels[-1]["bound"]
+        if told is not None and made.get("bound") and credible(told, made, harm[a], harm[b]):
+            made |= {key: told[key] for key in PAIR}
+            made = made if told.get("bound") else {key: value for key, value in made.items() if key != "bound"}
+        duels.append(made)
     return settled(duels, list(harm), alpha)
