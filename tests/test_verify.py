@@ -15,7 +15,7 @@ from tailgate import evaluation
 from tailgate.commands import verify as command
 from tailgate.evaluation import Cell, cells_of, episodes_at_once, run, run_cell
 from tailgate.rows import encode
-from tailgate.scenario import Suite
+from tailgate.scenario import Suite, load_suite
 from tailgate.verify import verify
 
 ATTACKS = ("none", "fdi:value=5", "dropout:probability=0.5")
@@ -71,6 +71,40 @@ def test_a_row_is_the_same_in_a_batch_of_4096() -> None:
     loop = cell.place(tailgate.make_attack("fdi"), "black").loop(tailgate.make_defence("kf"))
     assert episodes_at_once(loop.model, loop.horizon, 4096) == 4096
     assert verify(run([cell]), batch=4096)["counts"] == {"verified": 4100, "differs": 0, "unchecked": 0}
+
+
+@pytest.mark.parametrize(("suite", "scenario", "dose", "defence", "attack", "seeds"), [
+    ("car-following-v0", "car-following-noisy-v0", 10, "chi2_kf", "stealth:trigger=near,threshold=40", 300),
+    ("car-following-v0", "car-following-lossy-v0", 10, "imm", "zoo:name=car-following-chi2_kf-0", 300),
+    ("radar-v0", "radar-following-v0", 4, "cra", "zoo:name=radar-following-cra-0", 300),
+    ("thesis-v0", "thesis-ch3-v0", 10, "cra", "noise_jam:start_step=182", 300),
+    ("network-v0", "network-restless-v0", 5, "chi2_dkf", "ghost:size=20,grow=20", 40),
+    ("platoon-v0", "platoon-lossy-v0", 20, "chi2_dkf", "zoo:name=platoon-chi2_dkf-0", 10),
+])  # fmt: skip
+def test_rows_of_boards_are_the_same_in_any_batch_company_and_order(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suite: str, scenario: str, dose: int, defence: str, attack: str, seeds: int
+) -> None:
+    """256 and 4096 at once, one process and two, few of them alone, and where the second half of a run was stopped and played later."""
+    cells = [
+        Cell(suite, scenario, dose, defence, text, seeds, first_seed=first, threat=load_suite(suite).granted)
+        for text, first in ((attack, 0), ("none", 0), (attack, seeds))
+    ]  # fmt: skip
+    real, calls = run_cell, []
+
+    def stopped(played: Cell) -> list[dict[str, Any]]:
+        calls.append(played)
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        return real(played)
+
+    with monkeypatch.context() as context:
+        context.setattr(evaluation, "run_cell", stopped)
+        with pytest.raises(KeyboardInterrupt):
+            run(cells, tmp_path / "rows.jsonl")
+    held = run(cells, tmp_path / "rows.jsonl")
+    assert {row["status"] for row in held} == {"ok"} and any(row["attack_steps"] for row in held)
+    assert verify(held, batch=4096)["counts"] == {"verified": 3 * seeds, "differs": 0, "unchecked": 0}
+    assert verify(held[:: max(1, seeds // 10)], workers=2, batch=7)["counts"]["differs"] == 0
 
 
 def test_rows_of_a_radar_a_platoon_and_a_network_are_the_same_too() -> None:
