@@ -51,6 +51,17 @@ def test_one_command_makes_the_whole_board(tmp_path: Path, capsys: pytest.Captur
     assert "no row was played anew" in capsys.readouterr().err
 
 
+def test_rows_of_another_round_are_said_before_anything_is_played(tmp_path: Path) -> None:
+    """A folder holds one round; which file is of another is named, and nothing is moved."""
+    file, out = tmp_path / "small-v0.yaml", tmp_path / "out"
+    file.write_text(TEXT)
+    _run(str(file), "--out", str(out), "--unattacked")
+    before = {path: path.read_bytes() for path in out.glob("**/*") if path.is_file()}
+    with pytest.raises(InputError, match=r"beacon of .*rows\.jsonl\.xz.*folder of its own"):
+        _run(str(file), "--out", str(out), "--beacon", "0123456789abcdef0123")
+    assert {path: path.read_bytes() for path in out.glob("**/*") if path.is_file()} == before
+
+
 def test_what_contradicts_itself_is_refused(tmp_path: Path) -> None:
     """Before anything is played."""
     with pytest.raises(InputError, match="--train"):

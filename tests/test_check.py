@@ -230,7 +230,7 @@ def test_the_command(board: Data, tmp_path: Path, capsys: pytest.CaptureFixture[
     path.write_text(json.dumps(held))
     assert _command(str(path)) == 1
     out = capsys.readouterr().out
-    assert "decisions: board 1111111111111111" in out and "1 cells unchecked: the attack's file is not here" in out
+    assert "decisions: board 1111111111111111" in out and "1 cell unchecked: the attack's file is not here" in out
     path.write_text("[]")
     with pytest.raises(InputError, match="board"):
         _command(str(path))

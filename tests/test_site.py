@@ -170,7 +170,7 @@ def test_an_entry_s_page_has_all_parts(site):
                  "Only A damaged", "steps: 20000", "../network-v0/chi2_kf", "other plant", "Delay [steps]"):  # fmt: skip
         assert part in text, part
     assert text.count('class="plot ') == 3  # a chart on each scale, and that of stealth impact
-    assert "leaderboard check board.json --defence chi2_kf:eta=15" in text and "check synthetic-v0/board.json" in site.read_text(encoding="utf-8")
+    assert "leaderboard check board.json --defence chi2_kf:eta=15" in text and "leaderboard check FILE" in site.read_text(encoding="utf-8")
     bare = entry(site, HOSTILE).read_text(encoding="utf-8")
     assert "came without a card" in bare and "No replay. The board holds no worst episode" in bare and "Stealth and impact" not in bare
     assert "a class of somebody's own" in bare and "leaderboard check" not in bare  # a board does not import it

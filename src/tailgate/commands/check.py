@@ -39,7 +39,7 @@ def add(actions: Any) -> None:
                          help="in place of the cells play detection and stealth impact again: --sample then counts entries")  # fmt: skip
     command.add_argument("--write", action="store_true", help="put into the board what was found, and hits and fingerprints of equal cells")
     command.add_argument("--json", action="store_true", help="print the report as JSON")
-    command.set_defaults(run=_check)
+    command.set_defaults(run=_check, kept="nothing of it is kept")
 
 
 def _check(options: argparse.Namespace) -> int:
@@ -105,15 +105,15 @@ def _print(report: dict[str, Any]) -> None:
     out.print(_table(report, title, ("defence", "cells", "equal", "differs", "unchecked")))
     reasons: list[dict[str, Any]] = report["reasons"]
     for reason in reasons[:SHOWN]:
-        out.print(f"{reason['cells']} cells unchecked: {reason['why']}", markup=False, highlight=False)
+        out.print(f"{reason['cells']} cell{'s' * (reason['cells'] != 1)} unchecked: {reason['why']}", markup=False, highlight=False)
     if len(reasons) > SHOWN:
         out.print(f"and {len(reasons) - SHOWN} more reasons; --json lists all cells", highlight=False)
     untrained: list[dict[str, Any]] = report["untrained"]
     if untrained:
-        out.print("These attackers are trained again, to the last bit on one machine type, by:")
+        out.print("Attackers whose files are not here are trained again, those of PPO to the same weights on one machine type alone, by:")
     for held in untrained[:SHOWN]:
         words = ["tailgate", "leaderboard", "attack", held["defence"], "--suite", report["suite"], "--out", held["folder"]]
-        many = f"{held['policies']} of {held['cells']} cells"
+        many = f"{held['policies']} attackers, for {held['cells']} cells"
         out.print(f"    {shlex.join(words)}    # {many}", markup=False, highlight=False, soft_wrap=True)
     if len(untrained) > SHOWN:
         out.print(f"and {len(untrained) - SHOWN} more; --json lists them all", highlight=False)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import lzma
 from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -41,6 +42,7 @@ def play(
     """The rows of a suite and of the attacks that were admitted since, or of some, against its defences; returns their file. It resumes."""
     if attacks is None and defences is not None:
         defences = list(dict.fromkeys([CLEAN, *defences]))  # the undefended car is what gates measure against
+    _one_round(folder, beacon)
     some = repr(defences if attacks is None else (defences, list(attacks)))
     name = hashlib.blake2b(some.encode(), digest_size=4).hexdigest()
     file = folder / (OWN if defences is None and attacks is None else f"rows-{name}.jsonl.xz")
@@ -50,6 +52,26 @@ def play(
     return file
 
 
+def files_of_rows(folder: Path) -> list[Path]:
+    """Files of rows in a suite's folder; those of policies, of trust and hidden ones are others."""
+    found = sorted(path for path in folder.glob("**/*") if path.name.endswith((".jsonl", ".jsonl.xz")) and path.name != LIST)
+    within = [(path, path.relative_to(folder).parts) for path in found]
+    others = {"policies", TRUST}
+    return [path for path, parts in within if not others & set(parts) and not any(part.startswith(".") for part in parts)]
+
+
+def _one_round(folder: Path, beacon: str) -> None:
+    """Raise InputError where a file holds rows of another round: before anything is played that could not be scored with them."""
+    for path in files_of_rows(folder):
+        try:
+            with lzma.open(path, "rt", encoding="utf-8") if path.suffix == ".xz" else path.open(encoding="utf-8") as file:
+                held = json.loads(file.readline() or "{}").get("beacon", beacon)
+        except (OSError, ValueError, AttributeError, EOFError, lzma.LZMAError):
+            continue  # what is wrong with it is said where it is read
+        if held != beacon:
+            raise InputError(f"beacon of {path}", held, f"{beacon!r}, as asked for now: another round needs a folder of its own")
+
+
 def board_of(suite: Suite, folder: Path, beacon: str | None = None, keep: bool = False, **options: Any) -> dict[str, Any]:
     """The board of all rows in a folder, with what verified/*.json says of them and the bounds of trust/trust.json; written as board.json.
 
@@ -57,10 +79,7 @@ def board_of(suite: Suite, folder: Path, beacon: str | None = None, keep: bool =
     not those of all their cells. Raises InputError where there are no rows, or rows of another round than `beacon`, for a report that
     cannot be read or is of something else, and for rows that do not fit beside the board.
     """
-    found = sorted(path for path in folder.glob("**/*") if path.name.endswith((".jsonl", ".jsonl.xz")) and path.name != LIST)
-    within = [(path, path.relative_to(folder).parts) for path in found]
-    others = {"policies", TRUST}
-    files = [path for path, parts in within if not others & set(parts) and not any(part.startswith(".") for part in parts)]
+    files = files_of_rows(folder)
     if not files:
         raise InputError("rows", str(folder), "a folder with rows of `leaderboard run`")
     before = kept_board(folder / BOARD, suite, beacon or "") if keep else load(folder / BOARD) if (folder / BOARD).is_file() else None

@@ -192,12 +192,23 @@ def _small(p: float, bound: bool = False) -> str:
 def attacks_of(suite: Suite) -> list[Data]:
     out = []
     for attack in suite.board.attacks:
-        admitted = "with the suite" if attack.admitted is None else "; ".join(f"{k} {v}" for k, v in attack.admitted.items())
+        admitted = "with the suite" if attack.admitted is None else _admitted(attack.admitted)
         name = suite.attacks[attack.attack]
         on = suite.defences[attack.trained_on] if attack.trained_on else None
         out.append({"name": name, "knowledge": attack.knowledge, "learned": attack.learned or name.policy, "optimal": attack.optimal,
                     "trained_on": on, "admitted": admitted, "note": attack.note})  # fmt: skip
     return out
+
+
+def _admitted(line: Data) -> str:
+    """When, and for which test: the one with the smallest p against what is asked of it."""
+    tests = [test for test in line.get("evidence", ()) if isinstance(test, dict) and isinstance(test.get("adjusted"), int | float)]
+    best = min(tests, key=lambda test: test["adjusted"], default=None)
+    if best is None:
+        return "; ".join(f"{k} {v}" for k, v in line.items() if isinstance(v, str) and v)
+    gain = f"{best.get('only_new')} of {best.get('episodes')} episodes of {best.get('defence')} that the worst before did not damage"
+    asked = f"dose {best.get('dose')}; p {_small(best['adjusted'])}, adjusted for {len(tests)} tests, at level {best.get('level')}"
+    return f"{line.get('date', '')}: {gain}, {best.get('only_worst')} the other way, {asked}"
 
 
 def checked_of(suite: Suite) -> str:
