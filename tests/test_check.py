@@ -152,6 +152,8 @@ def test_a_board_of_before_the_fingerprints_gets_them(board: Data, rows: list[Da
     checked = with_check(board, check(board))
     assert [(cell["decisions"], cell["trace"]) for cell in checked["cells"]] == held
     assert [entry["checked"] for entry in checked["entries"]] == [{"cells": 2, "equal": 2, "differs": 0, "unchecked": 0}] * 2
+    away = check(board) | {"entries": [{"defence": e["defence"], "cells": 2, "equal": 1, "differs": 0, "unchecked": 1} for e in checked["entries"]]}
+    assert with_check(checked, away)["entries"] == checked["entries"]  # some files were not there
     less = with_check(checked, check(board, sample=1))
     assert less["entries"] == checked["entries"]  # of two checks the one that looked into more stays
     for entry in checked["entries"]:

@@ -275,22 +275,22 @@ def _untrained(board: Board, places: list[int]) -> list[Data]:
     return [{"defence": name, "folder": folder, "policies": len(files[name, folder]), "cells": n} for (name, folder), n in cells.items()]
 
 
-def _asked(found: Data) -> int:
-    """How many cells a check looked into."""
-    return sum(found[verdict] for verdict in VERDICTS)
+def _played(found: Data) -> int:
+    """How many cells a check has played."""
+    return int(found["equal"] + found["differs"])
 
 
 def with_check(data: Data, report: Data) -> Data:
     """The board with what a check found: `checked` in the entries that it looked into, fingerprints in cells that came out equal.
 
-    Of two checks of an entry the one stays that looked into more cells; one that was of another number of cells is of another board.
+    Of two checks of an entry the one stays that played more cells; one that was of another number of cells is of another board.
     Comparisons that were bounds are made again of cells that tell now which episodes came to damage, and ranks with them.
     """
     found = {entry["defence"]: {key: entry[key] for key in ("cells", *VERDICTS)} for entry in report["entries"]}
 
     def told(entry: Data) -> Data:
         new, held = found.get(entry["defence"]), entry.get("checked")
-        if new is None or (held and held["cells"] == new["cells"] and _asked(held) > _asked(new)):
+        if new is None or (held and held["cells"] == new["cells"] and _played(held) > _played(new)):
             return entry
         return entry | {"checked": new}
 
