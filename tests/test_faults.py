@@ -1,5 +1,7 @@
 """Killed at every write, fsync, rename and remove: no finished cell is lost, nothing broken is read as good, a rerun gives the same bytes."""
 
+import contextlib
+import json
 import os
 import random
 import signal
@@ -15,7 +17,9 @@ import pytest
 from tailgate import evaluation, files
 from tailgate.evaluation import Cell, cells_of, run, run_cell
 from tailgate.rows import encode, read_rows
-from tailgate.scenario import Suite
+from tailgate.scenario import Suite, load_suite
+from tailgate.scoring import read_attacks
+from tailgate.scoring.attacks import Admitted, append
 
 SUITE = Suite("small", "", ("thesis-ch4-v0",), (5,), ("kf",), ("none", "fdi:value=5", "dos_hold"), 3)
 
@@ -173,12 +177,84 @@ def test_only_what_a_killed_writer_left_is_swept(tmp_path: Path) -> None:
     assert sorted(os.listdir(tmp_path)) == sorted(names[1:])
 
 
+SMALL = "about: s\nscenarios: [thesis-ch4-v0]\ndoses: [5]\ndefences: [none, kf]\nattacks: [none, 'fdi:value=5']\nseeds: 3\n"
+BOARD = """
+import os, signal, sys
+from pathlib import Path
+from tailgate import files
+from tailgate.leaderboard.run import board_of, play
+from tailgate.leaderboard.run_record import Record
+from tailgate.scenario import load_suite
+
+def make(suite, place):
+    record = Record(suite, place, 1)
+    play(suite, place, progress=record.counting(lambda *now: None))
+    record.finish(board_of(suite, place, require_adaptive=False)["suite"]["rows"])
+
+def killed(folder):
+    suite = load_suite(str(folder / "small-v0.yaml"))
+    for at in range(1, 500):
+        child = os.fork()
+        if not child:
+            signal.alarm(60)
+            seen = []
+            def step(what, path):
+                seen.append(what)
+                if len(seen) == at:
+                    os._exit(9)
+            files.step = step
+            make(suite, folder / str(at))
+            os._exit(0)
+        if os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) != 9:
+            return at
+
+if __name__ == "__main__":
+    print(killed(Path(sys.argv[1])))
+"""
+
+
+def test_a_board_that_is_killed_at_any_step_is_made_whole_by_the_same_command(tmp_path: Path) -> None:
+    """Packed rows, board.json and run.json: dead at a call of the hook, nothing broken lies there, and a rerun gives the same rows and board."""
+    (tmp_path / "small-v0.yaml").write_text(SMALL)
+    done = subprocess.run([sys.executable, "-c", BOARD, str(tmp_path)], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    last = int(done.stdout.split()[-1])
+    whole, suite = tmp_path / str(last), load_suite(str(tmp_path / "small-v0.yaml"))
+    assert last > 30 and sorted(os.listdir(whole)) == ["board.json", "rows.jsonl.xz", "run.json"]
+    space: dict[str, Any] = {"__name__": "driver"}
+    exec(BOARD, space)
+    for folder in (tmp_path / str(at) for at in range(1, last)):
+        for path in folder.glob("*.json"):
+            json.loads(path.read_text())
+        for path in folder.glob("**/rows*.jsonl*"):
+            read_rows(path)
+        space["make"](suite, folder)
+        assert all((folder / name).read_bytes() == (whole / name).read_bytes() for name in ("rows.jsonl.xz", "board.json")), folder
+        assert {*os.listdir(folder)} - {"run.json"} == {"board.json", "rows.jsonl.xz"}, folder  # what played nothing records nothing
+
+
+def test_a_list_of_attacks_survives_every_kill(tmp_path: Path, kill_at: Any) -> None:
+    """It holds all lines that were there, and the new one or not."""
+    path = tmp_path / "attacks.jsonl"
+    kill_at(None)
+    append(path, Admitted("fdi", "", "black", "2026-11-25"))
+    for at in range(1, 20):
+        calls = kill_at(at)
+        with contextlib.suppress(Killed):
+            append(path, Admitted(f"fdi:value={at}", "", "black", "2026-11-25"))
+        held = [line.attack for line in read_attacks(path)]
+        assert held[0] == "fdi" and len(held) - 1 <= at
+        if len(calls) < at:
+            break
+    assert held[-1] == f"fdi:value={at}" and at > 3
+
+
 DRIVER = """
 import os, signal, sys
 from pathlib import Path
 from tailgate import files
 from tailgate.evaluation import cells_of, run
-from tailgate.scenario import Suite
+from tailgate.scenario import Suite, load_suite
 
 suite = Suite("small", "", ("thesis-ch4-v0",), (5,), ("kf",), ("none", "fdi:value=5"), 3)
 folder, at = Path(sys.argv[1]), 0
