@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from tailgate.errors import InputError, said, wanted
-from tailgate.files import write_atomic
+from tailgate.files import sweep, write_atomic
 
 FORMAT = "tailgate-board-1"
 Level = Literal["black", "grey", "white"]
@@ -315,8 +315,9 @@ def load(path: Path) -> Any:
 
 
 def save(board: dict[str, Any], path: Path) -> None:
-    """Put a board, as JSON data, into a file, in one step."""
+    """Put a board, as JSON data, into a file, in one step, and remove what a killed writer of it left."""
     write_atomic(path, json.dumps(board, indent=1, allow_nan=False).encode() + b"\n")
+    sweep(path)
 
 
 def read_board(data: Any, where: str = "board") -> Board:

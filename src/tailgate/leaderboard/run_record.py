@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import tailgate
-from tailgate.files import write_atomic
+from tailgate.files import sweep, write_atomic
 from tailgate.machine import commit, cores, processor
 from tailgate.scenario import Suite
 from tailgate.submission.guard import TICK, descendants
@@ -39,6 +39,7 @@ class Record:
 
     def __init__(self, suite: Suite, folder: Path, workers: int) -> None:
         self.suite, self.path = suite, folder / FILE
+        sweep(self.path)
         left = any(any(folder.glob(pattern)) for pattern in ("rows*.jsonl*", ".rows*.parts"))
         self.before = _commands(self.path, suite) if left else []
         self.began, self.used, self.written, self.played = time.perf_counter(), processor_time(), time.perf_counter(), 0
