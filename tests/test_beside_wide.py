@@ -153,15 +153,22 @@ def test_an_attack_that_joined_the_list_is_met_by_all() -> None:
         board([row for row in new if row["defence"] != "imm"], SUITE, attacks=late, board=before)
 
 
-def test_what_a_defence_has_met_or_was_trained_for_it_is_not_given_by_the_way() -> None:
-    """Half of a cell's doses would be half of an attack; attackers that were made for it belong to all its rows."""
+@pytest.mark.parametrize("hits", [0, 20])
+def test_an_attacker_of_ones_own_that_joins(hits: int) -> None:
+    """It counts as any other; that others do more than one's own is said of all of one's own. Whose trainings were met is not."""
+    more = [row | {"trained": row["trained"] | {"defence": "kf", "plan": "q"}} for row in _more("kf", hits=hits)]
+    other = [row | {"attack": "zoo:name=y"} for row in _more("kf", hits=20)]
+    before = _as_read(board([*_rows(*GUARDS), *other], SUITE, attacks=LINES))
+    made = board(more, SUITE, attacks=LINES, board=before)
+    assert _sorted(made) == _sorted(board([*_rows(*GUARDS), *other, *more], SUITE, attacks=LINES))
+
+
+def test_what_a_defence_has_met_is_not_given_by_the_way() -> None:
+    """Half of a cell's doses would be half of an attack."""
     before = _as_read(board([row for row in _rows(*GUARDS) if row["attack"] != "echo"], SUITE, attacks=[LISTED]))
     with pytest.raises(InputError, match=r"rows of kf: got .*all .* cells that the board has"):
         board([row | {"knowledge": "grey", "config_hash": scored.hash_of(row["scenario"], row["dose"], "grey")} for row in cell("kf", "fdi", 3)]
               + cell("kf", "fdi", 3, scenario=OTHER, knowledge="grey"), SUITE, attacks=[LISTED], board=before)  # fmt: skip
-    own = [row | {"trained": row["trained"] | {"defence": "kf"}} for row in _more("kf")]
-    with pytest.raises(InputError, match=r"rows of kf: got .*zoo:name=x"):
-        board(own, SUITE, attacks=[LISTED], board=before)
 
 
 def test_an_attack_that_was_taken_back_since_is_refused() -> None:

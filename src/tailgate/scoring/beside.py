@@ -78,8 +78,7 @@ def beside(table: Table, board: Data, suite: Suite, alpha: float, require_adapti
         if again and not lost:
             continue
         met, more = {cell["attack"] for cell in old.values()}, [place for place in again if place not in old]
-        trained = {key.column.attack for key, rows in table.cells.items() if (rows[0].get("trained") or {}).get("defence") == name}
-        if late := [place for place in more if place[3] in met | trained]:
+        if late := [place for place in more if place[3] in met]:
             raise InputError(f"rows of {name}", _said(late), f"rows of all {len(old)} cells that the board has, {_said(lost)} among them")
         entries[name] = entry
         if more:

@@ -63,8 +63,8 @@ def entry_of(table: Table, defence: str, levels: dict[str, Worst], slot: int, or
 def extended(entry: Data, table: Table, levels: dict[str, Worst], slot: int, trained: dict[str, str], added: Collection[str]) -> Data:
     """An entry of a board that has met more attacks, of which there are rows: shares of damage, status, flags and worst episode.
 
-    What it does without an attack, its gates among that, and how it was trained against stay as they are; so does what only rows can say
-    of the attacks that it had met. trained: the defence that each learned attack was trained on.
+    What it does without an attack, its gates among that, and which of the suite's trainings it stood stay as they are; so does what only
+    rows can say of the attacks that it had met. trained: the defence that each learned attack was trained on.
     """
     out = entry | of_worst(table, levels, slot)
     if entry["status"] != "unranked" and (why := _incomplete(table, levels["black"])):
@@ -76,8 +76,9 @@ def extended(entry: Data, table: Table, levels: dict[str, Worst], slot: int, tra
         out["worst_episode"] = min((row for row in (old, new) if row is not None), key=_margin, default=None)
     elif hit[0].named(hit[0].at(hit[1])[0])["attack"] in added:
         out["worst_episode"] = _episode(table, whole, slot)
+    own = any(trained.get(attack) == entry["defence"] for attack in added)
     said = of_attacks(table, entry["defence"], levels, slot, trained)
-    return out | {"flags": [*dict.fromkeys([*standing(entry["flags"], levels, slot, added), *said])]}
+    return out | {"flags": [*dict.fromkeys([*standing(entry["flags"], levels, slot, added, own), *said])]}
 
 
 def of_worst(table: Table, levels: dict[str, Worst], slot: int) -> Data:

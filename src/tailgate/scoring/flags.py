@@ -15,6 +15,7 @@ from .ranks import apart, mcnemar
 SPENT = 0.9  # of the budget, by the mean of the episodes without damage: those that end early leave some
 LEVEL = 0.05
 UNSPENT = "unspent budget: the worst attack"
+TRANSFERRED = "transferred beats own"
 BEATEN = "black box beats grey and white box: those who know more were not made to use it"
 SPREAD = 0.2  # between the training seeds of one plan, of the share of damage
 
@@ -33,12 +34,14 @@ def of_attacks(table: Table, defence: str, levels: dict[str, Worst], slot: int, 
     return [*dict.fromkeys(out), *_weaker(levels, slot)]
 
 
-def standing(told: Sequence[str], levels: dict[str, Worst], slot: int, added: Collection[str]) -> list[str]:
-    """Flags of an entry that hold when it has met more attacks: those of a worst attack where that is still the same one."""
+def standing(told: Sequence[str], levels: dict[str, Worst], slot: int, added: Collection[str], own: bool) -> list[str]:
+    """Flags of an entry that hold when it has met more attacks: those of a worst attack where that is still the same one, and, unless the
+    entry's own attackers are among them (`own`), that others do more than these."""
     worst = [one.named(one.at(slot)[0]) for one in levels.values() if one.complete]
     same = not any(one["attack"] in added for one in worst)
     kept = tuple(f"{UNSPENT}, {one['attack']} on {one['scenario']}," for one in worst)
-    return [flag for flag in told if flag.startswith(kept) or not (flag.startswith(UNSPENT) or (flag == BEATEN and not same))]
+    gone = (UNSPENT, *((TRANSFERRED,) if own else ()), *(() if same else (BEATEN,)))
+    return [flag for flag in told if flag.startswith(kept) or not flag.startswith(gone)]
 
 
 def _trainings(table: Table, defence: str, slot: int, origins: dict[str, Row]) -> list[str]:
@@ -108,7 +111,7 @@ def _transferred(table: Table, defence: str, worst: Worst, slot: int, trained: d
         for attack, harm in others:
             more, less = surely(harm, own, vague or attack in unknown)
             if more > less and mcnemar(more, less) * len(others) <= LEVEL:
-                out.append(f"transferred beats own: {attack}, trained on {trained[attack]}, on {name} ({worst.knowledge} box)")
+                out.append(f"{TRANSFERRED}: {attack}, trained on {trained[attack]}, on {name} ({worst.knowledge} box)")
     return out
 
 
