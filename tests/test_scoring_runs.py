@@ -1,5 +1,6 @@
 """Scoring of real runs: sentinels fail their gates, a small board, and the figures of detection."""
 
+import contextlib
 import dataclasses
 import json
 import math
@@ -16,7 +17,7 @@ from tailgate.errors import InputError
 from tailgate.evaluation import evaluate
 from tailgate.leaderboard.board_format import read_board
 from tailgate.metrics import max_error
-from tailgate.registry import entries
+from tailgate.registry import Spec, entries
 from tailgate.scenario import Suite, list_suites, load_scenario, load_suite
 from tailgate.scoring import score
 from tailgate.scoring.detection import Effort, detection, deviation, plants, stealth_impact, threshold
@@ -84,17 +85,26 @@ def test_built_in_suites_name_doses_that_have_a_reason() -> None:
         assert "none" in suite.attacks and ("none" in suite.defences or suite.bound is not None)
 
 
+UNPLAYED = {"car-following-v0": ("burst_jamming", "scattered_bias", "sudden_bias"), "platoon-v0": ("scattered_bias", "speed_then_hold", "sudden_bias")}
 LATER = {"platoon-dkf-45-0"}  # of the zoo, joined when the suites had boards, which another list of attacks would make void: for a suite's next version
 
 
 @pytest.mark.parametrize("name", ["car-following-v0", "platoon-v0", "radar-v0", "network-v0", "thesis-v0"])
 def test_a_suite_plays_every_built_in_attack_that_it_grants(name) -> None:
-    """What it leaves out is refused, wholly or in part, does nothing, or is a ceiling; of each search of the zoo it plays the first policy."""
+    """What it leaves out is refused, wholly or in part, does nothing, or is a ceiling; of each search of the zoo it plays the first policy, and
+    all programs but those that are named."""
     assert set(zoo_names()) > LATER
     suite = load_suite(name)
     listed = {text.split(":")[0] for text in suite.attacks}
     others = [text for text, entry in entries("attack").items() if not (text in listed or entry.optimal or entry.learned)]
     others += [text for n in zoo_names() if n.endswith("-0") and n not in LATER and (text := f"zoo:name={n}") not in suite.attacks]
+    programs = {f"program:path={path.stem}" for path in (ROOT / "configs/attacks").glob("*.yaml")}
+    left = {f"program:path={program}" for program in UNPLAYED.get(name, ())}
+    assert left < programs and not left & {*suite.attacks}
+    for program in sorted(programs - left - {*suite.attacks}):
+        with contextlib.suppress(InputError):  # it aims at wires that are not there
+            Spec("attack", program).make().prepare(load_scenario(suite.scenarios[0]).with_threat(**suite.granted).brief())
+            others.append(program)
     rows = evaluate(suite, defences=suite.defences[:1], attacks=others, doses=[max(d for d in suite.doses if d)], scenarios=suite.scenarios[:1], seeds=1)
     assert len(rows) == len(others) > 10
     assert not {row["attack"] for row in rows if row["status"] == "error" or (row["attack_steps"] and not row["refused_commands"])}
