@@ -21,8 +21,8 @@ from typing import Annotated, Any
 from pydantic import Field
 
 from tailgate.agents.codec import ActionSpec
+from tailgate.agents.finished import finished
 from tailgate.agents.learning import DISCRETE, LEARNERS, Learner, Progress, Teachable, check_action, learner_of, made_with
-from tailgate.agents.policy import load_policy
 from tailgate.agents.reward import Reward
 from tailgate.agents.teacher import demonstrate
 from tailgate.core import Count, PositiveCount, param
@@ -211,7 +211,9 @@ def train(config: TrainConfig, progress: Callable[[int, Any], None], resume: boo
     if resume and held.is_file():
         same_run(config)
     seeds = range(config.first_seed, config.first_seed + config.seeds)
-    done = {seed: _done(config, seed) if resume else None for seed in seeds}  # before anything is written
+    same = partial(_same_training, as_data(config))
+    # before anything is written
+    done = {seed: finished(config.directory, seed, config.defence, same) if resume else None for seed in seeds}
     write_atomic(held, snapshot)
     left = [seed for seed in seeds if done[seed] is None]
     teacher = teacher_of(config) if left else None
@@ -259,31 +261,6 @@ def _train_seed(config: TrainConfig, teacher: str | None, seed: int, resume: boo
     write_atomic(record, json.dumps(curve).encode() + b"\n")
     learner.close()
     return policy
-
-
-def _done(config: TrainConfig, seed: int) -> Path | None:
-    """The policy of a seed whose training is over: it is not trained again, whatever would come of it.
-
-    Raises InputError where one is of another training and has no checkpoint to go on from: it would be written over.
-    """
-    path, spec = config.directory / f"policy-{seed}.json", Spec("defence", config.defence)
-    checkpoint, curve = (config.directory / f"{name}-{seed}.{end}" for name, end in (("checkpoint", "safetensors"), ("curve", "json")))
-    if not path.is_file() or not path.with_suffix(".safetensors").is_file():
-        return None
-    try:
-        record = load_policy(path)[0].training
-    except InputError:  # stopped between the two files, perhaps
-        if checkpoint.exists():
-            return None
-        raise
-    held, version = record.get("config"), record.get("defence_version", spec.entry.version)  # first policies do not say which version
-    same = isinstance(held, dict) and training_of(held) == training_of(as_data(config))
-    if same and record.get("seed") == seed and record.get("defence_digest") == spec.digest and version == spec.entry.version:
-        return path if curve.exists() or not checkpoint.exists() else None  # stopped between the two
-    if checkpoint.exists():
-        return None
-    expected = f"a policy of this training against {config.defence}, or a checkpoint to go on from: move it, or train elsewhere"
-    raise InputError("resume", str(path), expected)
 
 
 def _apart(defence: str) -> contextlib.AbstractContextManager[None]:
@@ -357,6 +334,11 @@ def training_of(config: dict[str, Any]) -> str:
     free = free_of(config.get("teacher")) | {"out", "name"}
     free |= {f.name for f in dataclasses.fields(TrainConfig) if f.name in LATER and config.get(f.name) == f.default}
     return canonical({key: value for key, value in config.items() if key not in free})
+
+
+def _same_training(config: dict[str, Any], other: Any) -> bool:
+    """Whether what stands in a file is a configuration of the same training."""
+    return isinstance(other, dict) and training_of(other) == training_of(config)
 
 
 def plan_key(config: dict[str, Any]) -> str:

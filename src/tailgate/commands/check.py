@@ -113,7 +113,7 @@ def _print(report: dict[str, Any]) -> None:
         out.print("Attackers whose files are not here are trained again, those of PPO to the same weights on one machine type alone, by:")
     for held in untrained[:SHOWN]:
         words = ["tailgate", "leaderboard", "attack", held["defence"], "--suite", report["suite"], "--out", held["folder"]]
-        many = f"{held['policies']} attackers, for {held['cells']} cells"
+        many = f"attackers: {held['policies']}, cells: {held['cells']}"
         out.print(f"    {shlex.join(words)}    # {many}", markup=False, highlight=False, soft_wrap=True)
     if len(untrained) > SHOWN:
         out.print(f"and {len(untrained) - SHOWN} more; --json lists them all", highlight=False)
