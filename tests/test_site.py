@@ -215,6 +215,18 @@ def test_every_entry_and_attack_of_a_published_board_has_a_whole_card(tmp_path):
     assert "Threat model" not in other and other["Licence"] == "MIT"
 
 
+def test_an_attack_that_joined_names_the_test_that_it_won(tmp_path):
+    """And no other: against most defences something known before does more."""
+    board = make_board()
+    lost = {"defence": "kf", "scenario": "s", "dose": 12, "episodes": 100, "only_new": 0, "only_worst": 90, "p": 1e-20, "adjusted": 1e-18, "level": 0.025}
+    won = lost | {"defence": "rkf", "only_new": 31, "only_worst": 2, "p": 1e-6, "adjusted": 0.0004, "level": 0.0083333}
+    attack = next(a for a in board["attacks"] if not a["admitted"])
+    attack["admitted"] = {"attack": attack["attack"], "digest": "", "knowledge": "black", "date": "2026-11-25", "evidence": [lost, won]}
+    text = build_site([board], tmp_path, replays=False).read_text(encoding="utf-8").replace("<wbr>", "")
+    said = "2026-11-25: 31 of 100 episodes of rkf that the worst before did not damage, 2 the other way, dose 12; p 0.0004, adjusted for 2 tests, at level 0.0083"
+    assert said in text and "evidence" not in text
+
+
 def test_the_card_that_came_with_an_attack_is_drawn(site):
     """Over what is registered of it; the package's licence is the one that stands in pyproject.toml."""
     told = facts(site.read_text(encoding="utf-8"), "A bias that is held", 4)

@@ -201,13 +201,14 @@ def attacks_of(suite: Suite) -> list[Data]:
 
 
 def _admitted(line: Data) -> str:
-    """When, and for which test: the one with the smallest p against what is asked of it."""
+    """When, and by which test: of those that it wins the one with the smallest p."""
     tests = [test for test in line.get("evidence", ()) if isinstance(test, dict) and isinstance(test.get("adjusted"), int | float)]
-    best = min(tests, key=lambda test: test["adjusted"], default=None)
+    won = [test for test in tests if (test.get("only_new") or 0) > (test.get("only_worst") or 0)]
+    best = min(won, key=lambda test: test["adjusted"], default=None)
     if best is None:
         return "; ".join(f"{k} {v}" for k, v in line.items() if isinstance(v, str) and v)
     gain = f"{best.get('only_new')} of {best.get('episodes')} episodes of {best.get('defence')} that the worst before did not damage"
-    asked = f"dose {best.get('dose')}; p {_small(best['adjusted'])}, adjusted for {len(tests)} tests, at level {best.get('level')}"
+    asked = f"dose {best.get('dose')}; p {_small(best['adjusted'])}, adjusted for {len(tests)} tests, at level {best.get('level', 0.0):.2g}"
     return f"{line.get('date', '')}: {gain}, {best.get('only_worst')} the other way, {asked}"
 
 
