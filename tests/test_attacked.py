@@ -64,6 +64,7 @@ def test_rows_of_another_round_are_said_before_anything_is_played(tmp_path: Path
 
 def test_what_contradicts_itself_is_refused(tmp_path: Path) -> None:
     """Before anything is played."""
-    with pytest.raises(InputError, match="--train"):
-        _run("quick-v0", "--out", str(tmp_path), "--train", "--unattacked")
+    for other in ("--unattacked", "--score-only"):
+        with pytest.raises(InputError, match=f"--train.*{other}"):
+            _run("quick-v0", "--out", str(tmp_path), "--train", other)
     assert not list(tmp_path.iterdir())

@@ -66,8 +66,9 @@ def _run(options: argparse.Namespace) -> int:
 
     if options.attack and not options.keep_entries:
         raise InputError("--attack", options.attack[0], "--keep-entries too: a board of some attacks alone would say too little")
-    if options.train and options.unattacked:
-        raise InputError("--train", True, "no --unattacked: that ranks defences which were not attacked")
+    for name in ("unattacked", "score_only") if options.train else ():
+        if getattr(options, name):
+            raise InputError("--train", True, f"no --{name.replace('_', '-')}: it trains and plays whoever was not attacked")
     out, started = Path(options.out), time.perf_counter()
     suites = [load_suite(name) for name in options.suites]
     clocks = [clock_of(out / suite.name / BOARD) for suite in suites]  # before anything is played

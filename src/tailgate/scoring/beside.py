@@ -58,7 +58,7 @@ def beside(table: Table, board: Data, suite: Suite, alpha: float, require_adapti
     for name, seeds in held.seeds.items():
         if table.seeds.get(name, ()) != seeds:
             raise InputError(f"rows of {name}: seeds", f"{len(table.seeds.get(name, ()))} of them", f"the board's, which are {len(seeds)}")
-    if other := ({*held.listed} - held.withdrawn) ^ ({*table.listed} - table.withdrawn) - ({*table.listed} - {*held.listed}):
+    if other := ({*held.listed} - held.withdrawn) ^ ({*held.listed} & {*table.listed} - table.withdrawn):
         raise InputError("board: attacks", min(other), "the list of attacks that is here: play the whole suite")
     files = {key.column.attack: rows[0]["attack_digest"] for key, rows in table.cells.items()}
     entries: dict[str, Data] = {}
