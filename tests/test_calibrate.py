@@ -14,12 +14,13 @@ import tailgate
 from tailgate import cli
 from tailgate.calibrate import MIXTURE, Bench, Count, Crossings, _fused, calibrate, count_onsets
 from tailgate.draws import keys
-from tailgate.errors import InputError, NotApplicable
-from tailgate.estimators import Cusum, GateOut, KalmanFilter, Mewma, WindowedChiSquare, compose
+from tailgate.errors import InputError
+from tailgate.estimators import ChiSquare, Cusum, GateOut, KalmanFilter, Mewma, WindowedChiSquare, compose
 from tailgate.metrics import METRICS
 from tailgate.scenario import config_path
 from tailgate.schema import fields_of
 from tailgate.trace import rollout
+from tailgate.watch import Watched
 
 RECORDS = json.loads((Path(__file__).parents[1] / "benchmarks/results/calibration.json").read_text(encoding="utf-8"))
 ENTRIES = [entry | {"command": record["command"]} for record in RECORDS for entry in record["results"]]
@@ -165,11 +166,19 @@ def test_bad_input(changes, expected, roads):
         calibrate(arguments.pop("defence"), arguments.pop("hours"), **arguments)
 
 
-@pytest.mark.parametrize("defence", ["none", "kf", "oracle", "always_alarm", "composed:detector=score"])
-def test_a_defence_without_a_threshold(defence, roads):
-    """NotApplicable, with the reason."""
-    with pytest.raises(NotApplicable, match=r"defence: got .*alarms at a threshold"):
-        Bench.of(defence, roads, 64, None)
+@pytest.mark.parametrize("defence", ["none", "always_alarm"])
+def test_a_score_that_does_not_move(defence, roads):
+    """There is nothing that a threshold could be held against."""
+    with pytest.raises(InputError, match="score does not climb that often"):
+        calibrate(defence, 0.01, scenarios=roads, onsets=5)
+
+
+def test_a_score_that_jumps_gets_the_threshold_that_alarms_more_rarely():
+    """A leader that uses all the acceleration it may puts a safe set's reading on its very edge, once in each run, whatever the threshold below."""
+    found = calibrate("safe_state", 0.1, scenarios=["stop-and-go-v0"], onsets=100, most_steps=120_000)
+    assert not found.settled and 1.0 <= found.threshold < 1.05 and found.measured.onsets == 0 and found.field == "score"
+    below = Bench.of("safe_state", ["stop-and-go-v0"], 4096, None).run(0.98, 2.0, "calibrate", "")
+    assert below.onsets == sum(map(len, Bench.of("safe_state", ["stop-and-go-v0"], 4096, None).seeds(2.0)))
 
 
 def test_objects_have_thresholds_too(roads):
@@ -194,18 +203,17 @@ def test_the_command(roads, capsys):
     assert "closed loop, run 1" in err
     assert cli.main(part) == 0
     assert f"{result['threshold']:g}" in capsys.readouterr().out
-    assert cli.main(["calibrate", "--defence", "kf", "--hours", "1"]) == cli.EXIT_INPUT
-    assert "threshold" in capsys.readouterr().err
+    assert cli.main(["calibrate", "--defence", "none", "--hours", "1", "--scenario", roads[0], "--onsets", "20"]) == cli.EXIT_INPUT
+    assert "score" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("name", tailgate.list_defences())
-def test_every_defence_has_a_threshold_or_says_that_it_has_none(name):
-    """What is set is what is named: the defence at a threshold carries it in the field that the table prints, or it does not apply."""
+def test_every_defence_has_a_threshold_or_is_watched(name):
+    """What is set is what is named: the defence at a threshold carries it in the field that the table prints, or its score is held against it."""
     bench = Bench(tailgate.make_defence(name), (), name, (), 1, lambda *_: None)
-    try:
-        turned = bench.at(12.5)
-    except NotApplicable as error:
-        assert "threshold" in str(error)
+    turned = bench.at(12.5)
+    if bench.field == "score":
+        assert turned.defence == bench.defence and turned.threshold == 12.5 if isinstance(turned, Watched) else turned.parts()[1] == ChiSquare(12.5)
         return
     holder = turned if bench.field in fields_of(type(turned)) else turned.parts()[1]
     assert getattr(holder, bench.field.rpartition(".")[2]) == 12.5

@@ -54,14 +54,14 @@ def board(detected: Data) -> Data:
 
 
 def test_a_board_without_rows_gets_its_detection(bare: Data, detected: Data) -> None:
-    """All else stays; a plain filter has no threshold, and a looser one lets more through."""
+    """All else stays; a plain filter is watched, and a looser threshold lets more through."""
     read_board(detected)
     found = detected["detection"]
     names = [(line["defence"], line["hours"], line["scenario"], line["attack"]) for line in found["entries"]]
-    assert names == [(d, h, s, a) for d in ("chi2_kf", "cusum_kf") for h in (0.02, 0.05) for s in QUICK.nominal for a in ATTACKS]
-    assert {(line["defence"], line["hours"]) for line in found["without"]} == {("kf", 0.02), ("kf", 0.05)}
+    assert names == [(d, h, s, a) for d in ("kf", "chi2_kf", "cusum_kf") for h in (0.02, 0.05) for s in QUICK.nominal for a in ATTACKS]
+    assert not found["without"] and {(line["defence"], line["field"]) for line in found["entries"]} == {("kf", "score"), ("chi2_kf", "eta"), ("cusum_kf", "threshold")}
     stealth = {entry["defence"]: entry["stealth"] for entry in detected["entries"]}
-    assert stealth["none"] is stealth["kf"] is None and all(0.0 < item["low"] <= item["deviation"] <= item["high"] for item in stealth["chi2_kf"])
+    assert stealth["none"] is None and all(0.0 < item["low"] <= item["deviation"] <= item["high"] for name in ("kf", "chi2_kf") for item in stealth[name])
     rest = [entry | {"stealth": None} for entry in detected["entries"]]
     assert detected | {"detection": None, "entries": rest} == bare
 
@@ -82,7 +82,7 @@ def test_a_finished_entry_is_kept_and_an_interrupted_one_costs_only_itself(
     assert main([*command, "--defence", "chi2_kf"]) == 0 and played == ["chi2_kf"]
     assert main(command) == 130 and played == ["chi2_kf", "kf", "cusum_kf"]
     half = json.loads(path.read_text())
-    assert {line["defence"] for line in half["detection"]["entries"]} == {"chi2_kf"} and half["entries"][1]["stealth"] is None
+    assert {line["defence"] for line in half["detection"]["entries"]} == {"kf", "chi2_kf"} and half["entries"][3]["stealth"] is None
     assert main(command) == 0 and played[3:] == ["cusum_kf"] and json.loads(path.read_text()) == detected
     assert main(command) == 0 and len(played) == 4
 
@@ -116,7 +116,7 @@ def test_an_honest_detection_board_comes_out_equal(board: Data) -> None:
         for item in entry["stealth"] or ():
             del item["low"], item["high"]
     report = check_detection(board, defences=["chi2_kf", "kf"])
-    assert report["counts"] == {"equal": 2 * 2 * 2 + 2 + 2, "differs": 0, "unchecked": 0} and report["findings"] == report["reasons"] == []
+    assert report["counts"] == {"equal": 2 * (2 * 2 * 2 + 2), "differs": 0, "unchecked": 0} and report["findings"] == report["reasons"] == []
     drawn = [check_detection(board, sample=1, sample_seed=seed)["entries"][0]["defence"] for seed in range(4)]
     assert len(set(drawn)) > 1
 

@@ -183,12 +183,12 @@ def few(*hours, episodes=8, most_steps=80_000):
 
 @pytest.mark.long
 def test_detection_holds_all_to_one_mean_time_between_false_alarms(monkeypatch) -> None:
-    """A bias of ten standard deviations is seen at once at either threshold; the looser one is the higher; a plain filter has none."""
+    """A bias of ten standard deviations is seen at once at either threshold; the looser one is the higher; who has no score has none."""
     found = detection(ROAD, ["chi2_kf", "none"], ["fdi:start_step=100,value=-10"], few(0.02, 0.1), dose=20)
     tight, loose = found["entries"]
     assert tight["threshold"] < loose["threshold"] and [e["detected"]["value"] for e in (tight, loose)] == [1.0, 1.0]
     assert tight["delay"] <= loose["delay"] <= 1.0 and 0.6 < tight["detected"]["low"] < 1.0
-    assert {(w["defence"], w["hours"]) for w in found["without"]} == {("none", 0.02), ("none", 0.1)} and "threshold" in found["without"][0]["reason"]
+    assert {(w["defence"], w["hours"]) for w in found["without"]} == {("none", 0.02), ("none", 0.1)} and "score" in found["without"][0]["reason"]
 
 
 def test_a_mean_time_that_is_out_of_reach_is_listed_and_not_an_error() -> None:
@@ -198,7 +198,7 @@ def test_a_mean_time_that_is_out_of_reach_is_listed_and_not_an_error() -> None:
 
 
 def test_the_looser_threshold_lets_a_stealthy_attacker_further() -> None:
-    """The curve of deviation against false-alarm time rises; a plain filter has none."""
+    """The curve of deviation against false-alarm time rises; who has no score has none."""
     curve = stealth_impact(ROAD, "chi2_kf", few(0.02, 0.1), dose=100)
     assert [p["hours"] for p in curve] == [0.02, 0.1] and 0.0 < curve[0]["deviation"] < curve[1]["deviation"]
     assert all(p["low"] < p["deviation"] < p["high"] and "reason" not in p for p in curve)
@@ -233,4 +233,4 @@ def test_scenarios_of_one_plant_share_a_threshold() -> None:
     }  # fmt: skip
     with pytest.raises(InputError, match="one plant"):
         stealth_impact(dataclasses.replace(ROAD, scenarios=("stop-and-go-v0", "thesis-ch5-v0")), "chi2_kf")
-    assert math.isfinite(threshold("chi2_kf", WHERE, 0.02, 20, 80_000))
+    assert math.isfinite(threshold("chi2_kf", WHERE, 0.02, 20, 80_000).threshold)

@@ -10,6 +10,7 @@ N agents that alarm independently have N times as long each. A step of a network
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import math
 from collections.abc import Callable, Iterator, Sequence
@@ -28,8 +29,10 @@ from tailgate.loop import Loop
 from tailgate.registry import Spec, entry_for, text_of
 from tailgate.scenario import Scenario, load_scenario
 from tailgate.trace import MEMORY, episodes_at_once, rollout
+from tailgate.watch import unwatched, watched
 
 MIXTURE = ("braking-v0", "stop-and-go-v0", "ornstein-uhlenbeck-v0")  # equal shares of the running time
+SCORE = "score"  # what a threshold is of that is not the defence's own
 SILENT = 1e12  # a threshold that nothing reaches
 TOLERANCE = 0.02  # of the mean time, on the seeds of the calibration
 RUNS = 8  # closed-loop runs at most
@@ -65,6 +68,11 @@ class Count(NamedTuple):
         low = time / float(0.5 * stats.chi2.ppf(1.0 - tail, 2.0 * n + 2.0))
         return low, time / float(0.5 * stats.chi2.ppf(tail, 2.0 * n)) if n else None
 
+    def may_be(self, hours: float) -> bool:
+        """Whether the interval holds this mean time."""
+        low, high = self.interval()
+        return low <= hours and (high is None or hours <= high)
+
     def as_data(self) -> dict[str, Any]:
         low, high = self.interval()
         return {
@@ -81,7 +89,7 @@ class Calibration:
     field: str
     threshold: float
     wanted_hours: float
-    settled: bool  # within the tolerance; else it is the best of the runs
+    settled: bool  # within the tolerance; else the best of the runs, or the least threshold among them that alarms more rarely
     measured: Count
     fresh: Count | None
     seeds: dict[str, tuple[int, int]]  # of each scenario: first and last
@@ -149,7 +157,7 @@ def play_clean(loop: Loop, keys: draws.Keys) -> Iterator[tuple[Array, Array, Arr
 
 
 def _fused(loop: Loop) -> bool:
-    return isinstance(fuse(loop, NOTHING), Constants)
+    return isinstance(fuse(unwatched(loop), NOTHING), Constants)
 
 
 @dataclass(frozen=True)
@@ -173,7 +181,7 @@ class Bench:
             made, uses, text = defence, entry.uses, text_of(entry, defence)
         if not scenarios:
             raise InputError("scenario", list(scenarios), "at least one")
-        places = tuple(load_scenario(name) for name in scenarios)
+        places = tuple(load_scenario(name).with_threat(knowledge="black") for name in scenarios)  # nobody attacks
         if len({place.name for place in places}) < len(places):
             raise InputError("scenario", list(scenarios), "each scenario once")
         bench = cls(made, uses, text, places, batch, progress or (lambda *_: None))
@@ -182,23 +190,23 @@ class Bench:
         return bench
 
     def at(self, threshold: float) -> Any:
-        """The defence at a threshold. Raises NotApplicable where it has none."""
-        reason = NotApplicable("defence", self.text, "a defence that alarms at a threshold, its own or its detector's (`threshold_field`)")
+        """The defence at a threshold: its own, its detector's (`threshold_field`), or of a watch on its score where it has none."""
         if hasattr(self.defence, "with_threshold"):
-            try:
+            with contextlib.suppress(NotApplicable):
                 return self.defence.with_threshold(threshold)
-            except NotApplicable:
-                raise reason from None
         name = getattr(self.defence, "threshold_field", None)
         if name is None or not dataclasses.is_dataclass(self.defence):
-            raise reason
+            return watched(self.defence, threshold)
         return dataclasses.replace(self.defence, **{name: threshold})  # type: ignore[type-var]
 
     @property
     def field(self) -> str:
-        """The parameter that is the threshold, as the command line names it."""
-        own = getattr(self.defence, "threshold_field", None)
-        return str(own) if own is not None else f"detector.{self.defence.parts()[1].threshold_field}"
+        """The parameter that is the threshold, as the command line names it; `score` where it is that of a watch."""
+        if (own := getattr(self.defence, "threshold_field", None)) is not None:
+            return str(own)
+        detector = self.defence.parts()[1] if hasattr(self.defence, "with_threshold") else None
+        name = getattr(detector, "threshold_field", None)
+        return SCORE if name is None else f"detector.{name}"
 
     def seeds(self, hours: float) -> list[range]:
         """Seeds of each scenario, so that all together last `hours` (a little more, as episodes are whole) in equal shares.
@@ -333,6 +341,8 @@ class Search:
             if not low < level < high:
                 level = 0.5 * (low + high) if math.isfinite(high) else 2.0 * low
         best = min(tried, key=lambda held: abs(tried[held][0]))
+        if not tried[best][1].may_be(self.wanted) and math.isfinite(high):
+            best = high  # a score that jumps: too many alarms below, too few above
         return best, tried[best][1]
 
     def _guess(self) -> tuple[float, float]:
@@ -340,7 +350,7 @@ class Search:
         crossings = Crossings(keep=max(20_000, round(50 * self.running / self.wanted)))
         wanted = self._run(SILENT, "run without alarms", crossings).seconds / HOUR / self.wanted
         at, above, below = (crossings.level(share * wanted) for share in (1.0, 0.5, 2.0))
-        if at is None or above is None:
+        if at is None or above is None or len(np.unique(crossings.high)) == 1:
             raise InputError("hours", self.wanted, f"a mean time that {self.bench.text} can have: its score does not climb that often")
         spread, ratio = (above - at, 2.0) if below is None else (above - below, 4.0)
         return at, math.log(ratio) / spread if spread > 0.0 else 0.5

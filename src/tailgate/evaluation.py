@@ -78,8 +78,8 @@ def _component(family: Any, value: Any) -> tuple[Any, Any, str]:
     return value, entry, text_of(entry, value)
 
 
-def run_cell(cell: Cell, defence: Any = None, attack: Any = None) -> list[dict[str, Any]]:
-    """The rows of a cell. `defence` and `attack` stand in for the cell's texts when they are objects."""
+def run_cell(cell: Cell, defence: Any = None, attack: Any = None, *, uses: tuple[str, ...] | None = None) -> list[dict[str, Any]]:
+    """The rows of a cell. `defence` and `attack` stand in for the cell's texts when they are objects; `uses`: what is granted to them."""
     guard, guard_entry, _ = _component("defence", cell.defence if defence is None else defence)
     rival, rival_entry, _ = _component("attack", cell.attack if attack is None else attack)
     place = cell.place(rival, rival_entry.knowledge)
@@ -87,7 +87,7 @@ def run_cell(cell: Cell, defence: Any = None, attack: Any = None) -> list[dict[s
     rows: list[dict[str, Any]] = []
     seeds = cell.episodes
     try:
-        loop = place.loop(guard, guard_entry.uses)
+        loop = place.loop(guard, guard_entry.uses if uses is None else uses)
         size = episodes_at_once(loop.model, loop.horizon, cell.batch)
     except Exception as error:
         return _failed(head, seeds, *_why(error))

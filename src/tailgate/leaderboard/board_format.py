@@ -257,8 +257,15 @@ class Detected(Part):
     attack: Text
     hours: Number
     threshold: Number | None = None
+    field: Text = ""
+    rarer: bool = False
     detected: Interval | None
     delay: Number | None = None
+
+    @property
+    def watched(self) -> bool:
+        """Whether the threshold is not the defence's own, but held against its score (tailgate.watch)."""
+        return self.field == "score"
 
 
 class Detection(Part):

@@ -30,13 +30,13 @@ def detect(
 ) -> Data:
     """Play detection and stealth impact of the board in a file; returns it. It is written as soon as an entry is done, and resumes.
 
-    defences: only these entries; of all, those that come with the package, `none` and those who are told the truth left out. Attacks are
+    defences: only these entries; of all, those that come with the package; not `none`, sentinels, or who is told the truth. Attacks are
     the board's black-box scripts that can be played here. Raises InputError for a board of another suite or version, or with figures of
     another effort, and for a defence that takes no place here.
     """
     board = load(path)
     agree(read_board(board), suite)
-    guards = [e["defence"] for e in board["entries"] if e.get("card") and e["defence"] != "none" and "truth" not in e["uses"]]
+    guards = [e["defence"] for e in board["entries"] if e.get("card") and _takes_part(e)]
     known(defences, guards)
     attacks = [a["attack"] for a in board["attacks"] if a["knowledge"] == "black" and not (a.get("optimal") or a.get("learned"))]
     attacks = [attack for attack in attacks if not refused("attack", attack)]
@@ -49,6 +49,11 @@ def detect(
         board = _with(load(path), guard, found, effort)  # read again: it may have been marked in the meantime
         save(board, path)
     return dict(board)
+
+
+def _takes_part(entry: Data) -> bool:
+    """Not the undefended car, nor who is told the truth, nor a sentinel."""
+    return entry["defence"] != "none" and "truth" not in entry["uses"] and not entry["card"].get("sentinel")
 
 
 def _nothing(effort: Effort) -> Data:

@@ -206,11 +206,12 @@ def entry_page(
     curves = curves_of(suite, [entry], gap=7.0)
     mine = [c for c in suite.board.cells if c.defence == entry.defence]
     stealth = stealth_of(suite, [entry])
+    found = [d for d in (suite.board.detection.entries if suite.board.detection else ()) if d.defence == entry.defence]
     detection = [
         {"attack": suite.attacks[d.attack], "scenario": d.scenario, "hours": figure(d.hours), "threshold": figure(d.threshold),
          "text": percent(d.detected.value) if d.detected else "n/a", "sort": f"{d.detected.value:.6g}" if d.detected else "",
          "span": f"{percent(d.detected.low)} to {percent(d.detected.high)}" if d.detected else "", "delay": figure(d.delay, 3)}
-        for d in (suite.board.detection.entries if suite.board.detection else ()) if d.defence == entry.defence
+        for d in found
     ]  # fmt: skip
     return {
         "suite": suite.board.suite, "damage": suite.damage, "limit": percent(suite.board.suite.limit), "scale": suite.scale,
@@ -228,7 +229,8 @@ def entry_page(
         "charts": curves[0]["charts"] if curves else [], "clean": _clean(suite, entry),
         "robustness": [_robust(suite, r) for r in entry.robustness],
         "stealth": [reached_of(s) for s in entry.stealth or ()], "stealth_chart": stealth["chart"] if stealth else None,
-        "detection": detection, "comparisons": comparisons_of(suite, entry.defence), "how": compared_how(suite),
+        "detection": detection, "watched": any(d.watched for d in found),
+        "comparisons": comparisons_of(suite, entry.defence), "how": compared_how(suite),
         "round": suite.round, "about_trust": trust_of(suite), "trust": trust_page(suite, entry), "replay": replayed,
         "episode": _episode(suite, entry),
     }  # fmt: skip

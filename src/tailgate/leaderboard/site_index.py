@@ -123,8 +123,13 @@ def detection_of(suite: Suite) -> Data | None:
                 "text": percent(least.detected.value), "sort": f"{least.detected.value:.6g}", "low": percent(least.detected.low),
                 "about": suite.where(least.scenario, least.attack), "delay": figure(least.delay, 3) if least.delay is not None else "",
             })  # fmt: skip
-        rows.append({"name": suite.defences[defence], "page": suite.pages.get(defence, ""), "cells": cells})
-    return {"hours": [figure(h) for h in hours], "rows": rows, "each": _each_attack(suite, sorted(hours)[len(hours) // 2])}
+        mine = [c for c in cases if c.defence == defence]
+        rows.append({
+            "name": suite.defences[defence], "page": suite.pages.get(defence, ""), "cells": cells, "watched": any(c.watched for c in mine),
+            "rarer": any(c.rarer for c in mine),
+        })  # fmt: skip
+    some = {key: any(r[key] for r in rows) for key in ("watched", "rarer")}
+    return {"hours": [figure(h) for h in hours], "rows": rows, **some, "each": _each_attack(suite, sorted(hours)[len(hours) // 2])}
 
 
 def _each_attack(suite: Suite, hour: float) -> Data:

@@ -2,7 +2,8 @@
 
 One threshold per defence, plant and wanted mean time between false alarms, found on clean runs of the plant's scenarios (calibrate).
 At that threshold attacks are played: what counts is whether the alarm comes within the metrics' deadline. The stealth attack aims just
-below the same threshold, so that a looser one lets it through with more.
+below the same threshold, so that a looser one lets it through with more. A defence without a threshold is watched: its score is held
+against one, which is the standard chi-square on its innovation for those that only filter (tailgate.watch).
 """
 
 from __future__ import annotations
@@ -12,12 +13,12 @@ import functools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from tailgate import draws
-from tailgate.calibrate import Bench, calibrate
+from tailgate.calibrate import Bench, Calibration, calibrate
 from tailgate.core import Array
 from tailgate.errors import InputError, NotApplicable
 from tailgate.evaluation import Cell, run_cell
@@ -63,24 +64,35 @@ def plants(scenarios: Sequence[str]) -> dict[str, tuple[str, ...]]:
 
 
 @functools.lru_cache(maxsize=256)
-def threshold(defence: str, scenarios: tuple[str, ...], hours: float, onsets: int, most_steps: int) -> float:
-    """The threshold of a defence for a mean time between false alarms [h] on these clean runs.
+def threshold(defence: str, scenarios: tuple[str, ...], hours: float, onsets: int, most_steps: int) -> Calibration:
+    """The threshold of a defence for a mean time between false alarms [h] on these clean runs, and what it gave.
 
-    Raises NotApplicable for a defence without one, and InputError where the time cannot be had in so many steps.
+    Raises InputError where the time cannot be had: in so many steps, or as the score does not climb that often.
     """
-    return calibrate(defence, hours, scenarios=scenarios, onsets=onsets, most_steps=most_steps).threshold
+    return calibrate(defence, hours, scenarios=scenarios, onsets=onsets, most_steps=most_steps)
 
 
-def _found(defence: str, places: tuple[str, ...], hours: float, effort: Effort) -> tuple[float | None, str]:
-    """A threshold, or why there is none."""
+class Found(NamedTuple):
+    """A threshold, or why there is none; `rarer`: with every lower one that was tried the alarm is too frequent, with this one too rare."""
+
+    level: float | None
+    why: str = ""
+    rarer: bool = False
+
+
+def _found(defence: str, places: tuple[str, ...], hours: float, effort: Effort) -> Found:
     try:
-        return threshold(defence, places, float(hours), effort.onsets, effort.most_steps), ""
-    except NotApplicable as error:
-        return None, str(error)
+        made = threshold(defence, places, float(hours), effort.onsets, effort.most_steps)
     except InputError as error:
         if error.field != "hours":
             raise
-        return None, str(error)
+        return Found(None, str(error))
+    if made.settled or made.measured.may_be(hours):
+        return Found(made.threshold)
+    if made.measured.hours is None or made.measured.hours > hours:
+        return Found(made.threshold, rarer=True)
+    had = f"{made.measured.hours:.3g} at {made.threshold:g}"
+    return Found(None, str(InputError("hours", hours, f"a mean time that {defence} can have ({had})")))
 
 
 def detection(
@@ -90,23 +102,25 @@ def detection(
     """The field `detection` of a board: the share of attacked episodes with an alarm within the deadline, and the median delay [steps].
 
     In the suite's scenarios of the told plant, under its threat model, at its middle dose unless given; thresholds are found on the clean
-    runs of all scenarios of a plant together. `without` lists what takes no place here, and why: a defence without a threshold, a mean
-    time that is out of reach.
+    runs of all scenarios of a plant together; `field` says of what they are: the parameter, or `score` of one that is watched, and
+    `rarer` that no threshold alarms as often as wanted, only more often or, as this one, more rarely. `without` lists what takes no place
+    here, and why: a mean time that is out of reach.
     """
     update = progress or (lambda *_: None)
     found: list[Data] = []
     without: list[Data] = []
     work = [(guard, plant, names, h) for plant, names in plants(suite.nominal).items() for guard in defences for h in effort.hours]
     for done, (guard, plant, names, h) in enumerate(work, start=1):
-        level, why = _found(guard, names, h, effort)
+        level, why, rarer = _found(guard, names, h, effort)
         if level is None:
             without.append({"defence": guard, "plant": plant, "hours": h, "reason": why})
         else:
             for name in names:
-                made = Bench.of(guard, [name], effort.episodes, None).at(level)
+                bench = Bench.of(guard, [name], effort.episodes, None)
                 for attack in attacks:
-                    rows = run_cell(_cell(suite, name, dose, guard, attack, effort.episodes, beacon), made)
-                    head = {"defence": guard, "scenario": name, "attack": attack, "hours": h, "threshold": level}
+                    rows = run_cell(_cell(suite, name, dose, guard, attack, effort.episodes, beacon), bench.at(level), uses=bench.uses)
+                    head = {"defence": guard, "scenario": name, "attack": attack, "hours": h, "threshold": level, "field": bench.field}
+                    head |= {"rarer": True} if rarer else {}
                     found.append(head | _detected(rows))
         update("detection", done, len(work), guard)
     return dataclasses.asdict(effort) | {"hours": list(effort.hours), "entries": found, "without": without}
@@ -137,14 +151,14 @@ def stealth_impact(
 
     `deviation` [m/s] is the median of episodes, the most of scenarios; `low` and `high` its limits of 95 %, which hold together for all
     scenarios, null for few episodes; `reason` says why there is none.
-    None for a defence without a threshold. In the scenarios, under the threat model and at the dose of `detection`.
+    None where no threshold was found. In the scenarios, under the threat model and at the dose of `detection`.
     """
     update = progress or (lambda *_: None)
     if len(plants(suite.nominal)) != 1:
         raise InputError(f"suite {suite.name}: scenarios", list(suite.nominal), "scenarios of one plant")
     out: list[Data] = []
     for done, h in enumerate(effort.hours, start=1):
-        level, why = _found(defence, suite.nominal, h, effort)
+        level, why, _ = _found(defence, suite.nominal, h, effort)
         cells = [] if level is None else [_cell(suite, name, dose, defence, attack, effort.episodes, beacon) for name in suite.nominal]
         out.append({"hours": h, "threshold": level} | _impact([_reached(level, cell) for cell in cells if level is not None], why))
         update(f"stealth against {defence}", done, len(effort.hours), f"{h:g} h")

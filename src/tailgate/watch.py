@@ -1,0 +1,63 @@
+"""A threshold of the scorer's on the score of a defence that has none of its own: it tells, and changes nothing of what is done.
+
+Of a filter without a test the score is r' S^-1 r, so that a watch is the standard chi-square test on its innovation; of challenges the
+energy that was heard while the probe was muted; of a safe set how far a reading lies from what was predicted, 1 being the edge.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from tailgate.core import Array, Defence, Estimate, Model, Prior, Received
+from tailgate.draws import Draws
+from tailgate.estimators.chi_square import ChiSquare
+from tailgate.estimators.compose import AcceptAll, Composed, Score, compose
+from tailgate.loop import Loop
+
+
+@dataclass(frozen=True)
+class Watched:
+    """A defence with an alarm where its score is above a threshold [of the score], in place of its own alarm, which acts as before."""
+
+    defence: Defence
+    threshold: float
+
+    @property
+    def opaque(self) -> str:
+        """Why no white box looks into it."""
+        return str(getattr(self.defence, "opaque", "")) or "the alarm is the scorer's, on a score with no gate that one could stay below"
+
+    def prepare(self, model: Model) -> Any:
+        return self.defence.prepare(model)
+
+    def start(self, plan: Any, prior: Prior) -> Any:
+        return self.defence.start(plan, prior)
+
+    def step(self, plan: Any, state: Any, received: Received, known_u: Array, draws: Draws) -> tuple[Any, Estimate]:
+        state, told = self.defence.step(plan, state, received, known_u, draws)
+        return state, told._replace(alarm=self.alarms(told.score))
+
+    def alarms(self, score: Array) -> Array:
+        """Of the same shape, bool."""
+        return np.asarray(score > self.threshold)
+
+
+def watched(defence: Defence, threshold: float) -> Composed | Watched:
+    """The defence with an alarm at a threshold on its score.
+
+    What only filters is composed with the chi-square test, whose alarm then changes nothing: a white box has a gate to stay below.
+    """
+    if isinstance(defence, Composed) and all(getattr(type(defence), name) is getattr(Composed, name) for name in ("step", "look", "start")):
+        filter_, detector, mitigation = defence.parts()
+        if type(detector) is Score and type(mitigation) is AcceptAll and mitigation.mode == "normal":
+            return compose(filter_, ChiSquare(threshold), mitigation)
+    return Watched(defence, threshold)
+
+
+def unwatched(loop: Loop) -> Loop:
+    """The loop without the watch: it plays the same episodes, alarms apart."""
+    return dataclasses.replace(loop, defence=loop.defence.defence) if isinstance(loop.defence, Watched) else loop

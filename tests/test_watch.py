@@ -1,0 +1,87 @@
+"""A watch on a score: what it sees, and that the defence does not know of it."""
+
+import numpy as np
+import pytest
+
+from tailgate.agents.scripted import NoAttack
+from tailgate.calibrate import Bench
+from tailgate.draws import Role, keys
+from tailgate.errors import NotApplicable
+from tailgate.estimators import AcceptAll, ChiSquare, GateOut, KalmanFilter, Score, compose
+from tailgate.num import inverse, quadratic
+from tailgate.registry import Spec
+from tailgate.scenario import Suite, load_scenario
+from tailgate.scoring.detection import Effort, detection, stealth_impact
+from tailgate.trace import Trace, rollout
+from tailgate.watch import Watched, watched
+
+BIAS = "fdi:value=-3,start_step=40,length=20"
+ECHO = "echo_delay:start_step=30,delay=60"
+CASES = [
+    ("stop-and-go-v0", "kf", BIAS), ("gusty-stop-and-go-v0", "safe_state", BIAS), ("radar-following-v0", "cra", ECHO),
+    ("radar-following-v0", "algorithm2", ECHO), ("platoon-braking-v0", "lasso_dkf", BIAS), ("platoon-braking-v0", "centralised_kf", BIAS),
+]  # fmt: skip
+
+
+def _played(scenario: str, guard: object, uses: tuple[str, ...], attack: str, *, plain: bool = False) -> Trace:
+    loop = load_scenario(scenario).with_threat(budget=20).loop(guard, uses)
+    return rollout(loop, Spec("attack", attack).make(), keys("tune", range(6)), plain=plain)
+
+
+@pytest.mark.parametrize(("scenario", "name", "attack"), CASES)
+def test_a_watch_alarms_by_the_score_and_changes_nothing_else(scenario: str, name: str, attack: str) -> None:
+    """In both engines, to the last bit; alarms are those of the score."""
+    bench = Bench.of(name, [scenario], 8, None)
+    bare = _played(scenario, bench.defence, bench.uses, attack)
+    level = float(np.quantile(bare.score[bare.live], 0.9))
+    for plain in (False, True):
+        seen = _played(scenario, bench.at(level), bench.uses, attack, plain=plain)
+        assert np.array_equal(seen.length, bare.length)
+        for signal, held in bare.signals.items():
+            expected = bare.score > level if signal == "alarm" else held
+            assert np.array_equal(seen.signals[signal][seen.live], expected[bare.live]), signal
+    assert 0.0 < seen.alarm[seen.live].mean() < 0.5
+
+
+def test_of_a_filter_the_score_is_the_chi_square_of_its_innovation() -> None:
+    """r' S^-1 r, written out here, of what the filter was about to believe."""
+    loop = load_scenario("stop-and-go-v0").loop(Bench.of("kf", ["stop-and-go-v0"], 8, None).at(6.0), ("measurements",))
+    held, attack = keys("tune", range(4)), NoAttack()
+    state, plan = loop.start(held), attack.prepare(loop.brief)
+    memory = attack.start(plan, 4, held.at(Role.ATTACK, np.zeros(4, np.int64)))
+    for _ in range(30):
+        seen = loop.defence.look(loop.plan.defence, state.defence, state.received, state.known_u)  # type: ignore[attr-defined]
+        g = quadratic(seen.innovation.r, inverse(seen.innovation.S))
+        state, memory, frame = loop.step(state, attack, plan, memory)
+        np.testing.assert_array_equal(frame.estimate.score, g)
+        np.testing.assert_array_equal(frame.estimate.alarm, g > 6.0)
+        assert seen.gate == 6.0
+
+
+def test_what_acts_on_suspicion_is_not_composed_with_a_test() -> None:
+    """A gate would shut; a mode would be asked for."""
+    assert isinstance(watched(compose(KalmanFilter(), Score(), GateOut()), 9.0), Watched)
+    assert isinstance(watched(compose(KalmanFilter(), Score(), AcceptAll(mode="brake")), 9.0), Watched)
+    assert watched(compose(KalmanFilter(), Score(), AcceptAll()), 9.0).parts() == (KalmanFilter(), ChiSquare(9.0), AcceptAll())  # type: ignore[union-attr]
+
+
+def test_a_white_box_finds_no_gate_where_the_alarm_is_the_scorers() -> None:
+    bench = Bench.of("safe_state", ["stop-and-go-v0"], 8, None)
+    with pytest.raises(NotApplicable, match="the scorer's"):
+        load_scenario("stop-and-go-v0").with_threat(knowledge="white").loop(bench.at(0.9), bench.uses)
+
+
+def test_filters_and_challenges_have_figures_of_detection() -> None:
+    """A challenge is answered by a jump of the energy; a filter sees a late echo at once, and a stealthy attacker stays below its chi-square."""
+    effort = Effort((0.02,), 8, 20, 40_000)
+    over_air = Suite("s", "", ("radar-following-v0",))
+    (heard,) = detection(over_air, ["cra:probability=0.5"], [ECHO], effort, dose=20)["entries"]
+    assert heard["field"] == "score" and heard["detected"]["value"] == 1.0 and heard["threshold"] > 0.0
+    road = Suite("s", "", ("stop-and-go-v0",))
+    (seen,) = detection(road, ["kf"], ["fdi:start_step=100,value=-10"], effort, dose=20)["entries"]
+    (gated,) = detection(road, ["composed:mitigation=accept_all"], ["fdi:start_step=100,value=-10"], effort, dose=20)["entries"]
+    assert seen["field"] == "score" and {**seen, "defence": "", "field": ""} == {**gated, "defence": "", "field": ""}
+    (curve,) = stealth_impact(road, "kf", effort, dose=100) or [{}]
+    assert curve["deviation"] > 0.0
+    (none,) = stealth_impact(road, "safe_state", effort, dose=100) or [{}]
+    assert none["deviation"] is None and "the scorer's" in none["reason"]
