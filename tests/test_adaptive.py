@@ -75,7 +75,8 @@ def test_published_policies_are_not_trained_again(tmp_path: Path) -> None:
         train(dataclasses.replace(black[0], steps=1200), lambda *args: None, resume=True)
     assert told.read_bytes() == before and first.with_suffix(".safetensors").read_bytes() == held[0]
     first.with_suffix(".safetensors").unlink()  # a policy without weights is none
-    assert train_against(black, lambda *args: None) == [first, second]
+    busy = [dataclasses.replace(black[0], workers=2)]  # changes no result, and so not the file that was published
+    assert train_against(busy, lambda *args: None) == [first, second] and told.read_bytes() == before
     assert [path.with_suffix(".safetensors").read_bytes() for path in (first, second)] == held
 
 

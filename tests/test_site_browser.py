@@ -1,6 +1,7 @@
 """The site of boards in a browser: sorting, filters, menus, links, widths, colours, and that it asks for nothing."""
 
 import importlib.util
+import itertools
 from pathlib import Path
 
 import pytest
@@ -166,6 +167,36 @@ def test_dark_light_and_numbers(tab, show):
     assert (light, tab.execute_script(ground)) == ("rgb(255, 255, 255)", "rgb(20, 22, 26)")
     style = "const s = getComputedStyle(document.querySelector('.ranks td.num')); return [s.textAlign, s.fontVariantNumeric]"
     assert tab.execute_script(style) == ["right", "tabular-nums"]
+
+
+GREYS = """
+const value = c => { const [r, g, b] = c.match(/[\\d.]+/g).map(Number); return 0.2126 * lin(r) + 0.7152 * lin(g) + 0.0722 * lin(b) }
+const lin = x => (x /= 255) <= 0.04045 ? x / 12.92 : ((x + 0.055) / 1.055) ** 2.4
+return [...document.querySelectorAll('#suite-1 .map tr[data-row] td')].map(t => {
+  const s = getComputedStyle(t), clear = s.backgroundColor === 'rgba(0, 0, 0, 0)', ground = clear ? getComputedStyle(document.body).backgroundColor : s.backgroundColor
+  const [low, high] = [value(s.color), value(ground)].sort((a, b) => a - b)
+  return {text: t.firstChild.textContent.trim(), contrast: (high + 0.05) / (low + 0.05), grey: value(ground), marked: s.textDecorationLine === 'underline', over: parseInt(t.firstChild.textContent) > 10}
+})"""
+
+
+@pytest.mark.page
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_nothing_is_told_by_colour_alone(tab, show, scheme):
+    """In greys: each cell has its figure in readable contrast, damage above the limit is underlined and more damage is further from no damage;
+    lines of a chart that have their names are dashed differently."""
+    show(1280, scheme)
+    cells = tab.execute_script(GREYS)
+    assert len(cells) > 100 and all(c["text"] and c["contrast"] >= 4.5 for c in cells)
+    told = [c for c in cells if c["text"].endswith("%") and c["text"] != "10%"]  # 10.4 % is above 10
+    assert all(c["marked"] == c["over"] for c in told) and {c["over"] for c in told} == {True, False}
+    greys: dict[int, list[float]] = {}
+    for cell in told:
+        greys.setdefault(int(cell["text"].rstrip("%")), []).append(cell["grey"] if scheme == "dark" else -cell["grey"])
+    shades = [greys[percent] for percent in sorted(greys)]
+    assert len(shades) > 20 and all(max(less) <= min(more) for less, more in itertools.pairwise(shades))
+    dashes = "return [...document.querySelectorAll('#suite-1 .plot')].map(p => [...p.querySelectorAll('.field polyline.run')].map(l => getComputedStyle(l).strokeDasharray))"
+    charts = [held for held in tab.execute_script(dashes) if len(held) > 1]
+    assert charts and all(len(set(held)) == len(held) for held in charts)
 
 
 @pytest.mark.page

@@ -23,9 +23,9 @@ COMMANDS = (
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; returns the exit code: 0 done, 1 a component failed, 2 bad input, 130 interrupted."""
-    parser = _parser()
-    chosen = parser.parse_args(arguments)
+    chosen = argparse.Namespace()
     try:
+        chosen = _parser().parse_args(arguments)
         return int(chosen.run(chosen))
     except InputError as error:
         print(f"tailgate: error: {error}", file=sys.stderr)

@@ -20,7 +20,7 @@ def progress(shown_on: Console) -> Iterator[Update]:
             tenth = 10 * done // max(total, 1)
             if tenth > shown.get(label, 0):
                 shown[label] = tenth
-                shown_on.print(f"{label}: {10 * tenth} % {figures}".rstrip(), highlight=False)
+                shown_on.print(f"{label}: {10 * tenth} % {figures}".rstrip(), highlight=False, soft_wrap=True)
 
         yield line
         return

@@ -206,7 +206,6 @@ def train(config: TrainConfig, progress: Callable[[int, Any], None], resume: boo
     if not resume and config.directory.is_dir() and any(config.directory.iterdir()):
         set_aside(config.directory)
     directory = writable_directory(config.directory)
-    snapshot = json.dumps(as_data(config), indent=1).encode() + b"\n"
     held = directory / "config.json"
     if resume and held.is_file():
         same_run(config)
@@ -214,7 +213,8 @@ def train(config: TrainConfig, progress: Callable[[int, Any], None], resume: boo
     same = partial(_same_training, as_data(config))
     # before anything is written
     done = {seed: finished(config.directory, seed, config.defence, same) if resume else None for seed in seeds}
-    write_atomic(held, snapshot)
+    if not _is_held(config, held):
+        write_atomic(held, json.dumps(as_data(config), indent=1).encode() + b"\n")
     left = [seed for seed in seeds if done[seed] is None]
     teacher = teacher_of(config) if left else None
     if min(config.workers, len(left)) <= 1:
@@ -223,6 +223,15 @@ def train(config: TrainConfig, progress: Callable[[int, Any], None], resume: boo
         new = _train_apart(config, teacher, left, resume, progress)
     found = dict(zip(left, new, strict=True))
     return [done[seed] or found[seed] for seed in seeds]
+
+
+def _is_held(config: TrainConfig, held: Path) -> bool:
+    """Whether a file has this configuration already, the number of workers apart, which changes no result: published files stay as they are."""
+    try:
+        before = json.loads(held.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
+    return isinstance(before, dict) and before | {"workers": config.workers} == as_data(config)
 
 
 def _settings(config: TrainConfig) -> tuple[Any, Any]:

@@ -38,7 +38,6 @@ def add(actions: Any) -> None:
 
 
 def _admit(options: argparse.Namespace) -> int:
-    from tailgate.files import writable_directory
     from tailgate.leaderboard.run import LIST
     from tailgate.scenario import load_suite
     from tailgate.scoring.attacks import admit, withdraw
@@ -51,7 +50,6 @@ def _admit(options: argparse.Namespace) -> int:
         line = withdraw(options.attack, path, date, options.erratum)
         print(json.dumps(line.as_data(), indent=1) if options.json else f"{path}: {options.attack} is taken back")
         return 0
-    writable_directory(path.parent)  # before anything is played
     if not options.beacon:
         print("tailgate: without --beacon the select seeds are public ones, on which the attack may have been tuned", file=sys.stderr)
     with progress(Console(stderr=True)) as update:

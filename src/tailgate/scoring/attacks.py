@@ -24,7 +24,7 @@ import numpy as np
 
 from tailgate.errors import InputError, unknown
 from tailgate.evaluation import cells_of, run
-from tailgate.files import write_atomic
+from tailgate.files import writable_directory, write_atomic
 from tailgate.registry import Spec
 from tailgate.scenario import Suite, config_path, list_suites, load_suite
 from tailgate.schema import build
@@ -191,7 +191,9 @@ def admit(
     part = dataclasses.replace(
         suite, doses=(at,), shown={}, defences=tuple(defences), attacks=(*rivals, attack), seeds=episodes or suite.seeds
     )  # fmt: skip
-    rows = run(cells_of(part, purpose="select", beacon=beacon), rows_file, workers, progress)
+    work = cells_of(part, purpose="select", beacon=beacon)
+    writable_directory(path.parent)  # before anything is played
+    rows = run(work, rows_file, workers, progress)
     table = tabulate(rows, part)
     tests: list[dict[str, Any]] = []
     for defence in defences:
