@@ -226,7 +226,7 @@ def train(config: TrainConfig, progress: Callable[[int, Any], None], resume: boo
 
 
 def _is_held(config: TrainConfig, held: Path) -> bool:
-    """Whether a file has this configuration already, the number of workers apart, which changes no result: published files stay as they are."""
+    """Whether a file has this configuration already, workers apart, which change no result: published files stay as they are."""
     try:
         before = json.loads(held.read_text(encoding="utf-8"))
     except (OSError, ValueError):
