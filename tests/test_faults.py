@@ -1,6 +1,7 @@
 """Killed at every write, fsync, rename and remove: no finished cell is lost, nothing broken is read as good, a rerun gives the same bytes."""
 
 import contextlib
+import importlib.util
 import json
 import os
 import random
@@ -17,10 +18,14 @@ import pytest
 from tailgate import evaluation, files
 from tailgate.evaluation import Cell, cells_of, run, run_cell
 from tailgate.rows import encode, read_rows
-from tailgate.scenario import Suite, load_suite
+from tailgate.scenario import Suite
 from tailgate.scoring import read_attacks
 from tailgate.scoring.attacks import Admitted, append
 
+spec = importlib.util.spec_from_file_location("dying", Path(__file__).with_name("dying.py"))
+assert spec is not None and spec.loader is not None
+dying = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(dying)
 SUITE = Suite("small", "", ("thesis-ch4-v0",), (5,), ("kf",), ("none", "fdi:value=5", "dos_hold"), 3)
 
 
@@ -177,58 +182,27 @@ def test_only_what_a_killed_writer_left_is_swept(tmp_path: Path) -> None:
     assert sorted(os.listdir(tmp_path)) == sorted(names[1:])
 
 
-SMALL = "about: s\nscenarios: [thesis-ch4-v0]\ndoses: [5]\ndefences: [none, kf]\nattacks: [none, 'fdi:value=5']\nseeds: 3\n"
-BOARD = """
-import os, signal, sys
-from pathlib import Path
-from tailgate import files
-from tailgate.leaderboard.run import board_of, play
-from tailgate.leaderboard.run_record import Record
-from tailgate.scenario import load_suite
-
-def make(suite, place):
-    record = Record(suite, place, 1)
-    play(suite, place, progress=record.counting(lambda *now: None))
-    record.finish(board_of(suite, place, require_adaptive=False)["suite"]["rows"])
-
-def killed(folder):
-    suite = load_suite(str(folder / "small-v0.yaml"))
-    for at in range(1, 500):
-        child = os.fork()
-        if not child:
-            signal.alarm(60)
-            seen = []
-            def step(what, path):
-                seen.append(what)
-                if len(seen) == at:
-                    os._exit(9)
-            files.step = step
-            make(suite, folder / str(at))
-            os._exit(0)
-        if os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) != 9:
-            return at
-
-if __name__ == "__main__":
-    print(killed(Path(sys.argv[1])))
-"""
+def _all_die(job: str, folder: Path) -> int:
+    """Processes that do a job die at every call of the hook, in a folder each; -> the number of the one that came to its end."""
+    done = subprocess.run([sys.executable, dying.__file__ or "", job, str(folder)], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    last, code = map(int, done.stdout.split())
+    assert code == 0, done.stderr
+    return last
 
 
 def test_a_board_that_is_killed_at_any_step_is_made_whole_by_the_same_command(tmp_path: Path) -> None:
     """Packed rows, board.json and run.json: dead at a call of the hook, nothing broken lies there, and a rerun gives the same rows and board."""
-    (tmp_path / "small-v0.yaml").write_text(SMALL)
-    done = subprocess.run([sys.executable, "-c", BOARD, str(tmp_path)], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    last = int(done.stdout.split()[-1])
-    whole, suite = tmp_path / str(last), load_suite(str(tmp_path / "small-v0.yaml"))
+    (tmp_path / dying.NAME).write_text(dying.FILE)
+    last = _all_die("board", tmp_path)
+    whole = tmp_path / str(last)
     assert last > 30 and sorted(os.listdir(whole)) == ["board.json", "rows.jsonl.xz", "run.json"]
-    space: dict[str, Any] = {"__name__": "driver"}
-    exec(BOARD, space)
     for folder in (tmp_path / str(at) for at in range(1, last)):
         for path in folder.glob("*.json"):
             json.loads(path.read_text())
         for path in folder.glob("**/rows*.jsonl*"):
             read_rows(path)
-        space["make"](suite, folder)
+        dying.board(folder)
         assert all((folder / name).read_bytes() == (whole / name).read_bytes() for name in ("rows.jsonl.xz", "board.json")), folder
         assert {*os.listdir(folder)} - {"run.json"} == {"board.json", "rows.jsonl.xz"}, folder  # what played nothing records nothing
 
@@ -249,50 +223,17 @@ def test_a_list_of_attacks_survives_every_kill(tmp_path: Path, kill_at: Any) -> 
     assert held[-1] == f"fdi:value={at}" and at > 3
 
 
-DRIVER = """
-import os, signal, sys
-from pathlib import Path
-from tailgate import files
-from tailgate.evaluation import cells_of, run
-from tailgate.scenario import Suite, load_suite
-
-suite = Suite("small", "", ("thesis-ch4-v0",), (5,), ("kf",), ("none", "fdi:value=5"), 3)
-folder, at = Path(sys.argv[1]), 0
-while True:  # each kill in a process of its own, all of one parent that has done the imports and nothing else
-    at += 1
-    (folder / str(at)).mkdir()
-    child = os.fork()
-    if not child:
-        signal.alarm(60)
-        seen = []
-        def step(what, path):
-            seen.append(what)
-            if len(seen) == at:
-                os._exit(9)
-        files.step = step
-        run(cells_of(suite), folder / str(at) / "rows.jsonl")
-        os._exit(0)
-    code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
-    if code != 9:
-        break
-print(at, code)
-"""
-
-
 def test_a_process_that_dies_at_any_step_leaves_nothing_broken(tmp_path: Path, kill_at: Any) -> None:
     """os._exit at every call: nothing is tidied up, and the rerun still gives the same bytes and leaves no temporary file."""
-    done = subprocess.run([sys.executable, "-c", DRIVER, str(tmp_path)], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    last, code = map(int, done.stdout.split())
-    assert code == 0 and last > 12, done.stderr
-    suite = Suite("small", "", ("thesis-ch4-v0",), (5,), ("kf",), ("none", "fdi:value=5"), 3)
+    last = _all_die("rows", tmp_path)
+    assert last > 12
     whole = (tmp_path / str(last) / "rows.jsonl").read_bytes()
     left = 0
     for at in range(1, last):
         folder = tmp_path / str(at)
         _finished(folder)
         left += len([*folder.glob(".*.tmp"), *folder.glob(".*/.*.tmp")])
-        run(cells_of(suite), folder / "rows.jsonl")
+        dying.rows(folder)
         assert (folder / "rows.jsonl").read_bytes() == whole
         assert [path.name for path in folder.iterdir()] == ["rows.jsonl"]
     assert left >= 6  # of two cells and the output, killed before the fsync and before the rename

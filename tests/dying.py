@@ -1,0 +1,62 @@
+"""A job that is done again and again, in processes of its own that each die at a later call of the hook, until one comes to the end.
+
+Run as `python dying.py JOB FOLDER`; prints at which call nobody died any more, and that one's exit code.
+"""
+
+import os
+import signal
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+from tailgate import files
+from tailgate.evaluation import cells_of, run
+from tailgate.leaderboard.run import board_of, play
+from tailgate.leaderboard.run_record import Record
+from tailgate.scenario import Suite, load_suite
+
+SUITE = Suite("small", "", ("thesis-ch4-v0",), (5,), ("kf",), ("none", "fdi:value=5"), 3)
+FILE = "about: s\nscenarios: [thesis-ch4-v0]\ndoses: [5]\ndefences: [none, kf]\nattacks: [none, 'fdi:value=5']\nseeds: 3\n"
+NAME = "small-v0.yaml"  # of the suite's file, beside the folders
+
+
+def rows(folder: Path) -> None:
+    run(cells_of(SUITE), folder / "rows.jsonl")
+
+
+def board(folder: Path) -> None:
+    suite = load_suite(str(folder.parent / NAME))
+    record = Record(suite, folder, 1)
+    play(suite, folder, progress=record.counting(lambda *now: None))
+    record.finish(board_of(suite, folder, require_adaptive=False)["suite"]["rows"])
+
+
+JOBS: dict[str, Callable[[Path], None]] = {"rows": rows, "board": board}
+
+
+def _die(job: Callable[[Path], None], folder: Path, at: int) -> None:
+    signal.alarm(60)
+    seen: list[str] = []
+
+    def step(what: str, path: Path) -> None:
+        seen.append(what)
+        if len(seen) == at:
+            os._exit(9)
+
+    files.step = step
+    job(folder)
+    os._exit(0)
+
+
+def main(name: str, folder: Path) -> None:
+    for at in range(1, 500):
+        (folder / str(at)).mkdir()
+        if not (child := os.fork()):  # of one parent that has done the imports and nothing else
+            _die(JOBS[name], folder / str(at), at)
+        if (code := os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])) != 9:
+            print(at, code)
+            return
+
+
+if __name__ == "__main__":
+    main(sys.argv[1], Path(sys.argv[2]))
