@@ -36,6 +36,7 @@ SCORE = "score"  # what a threshold is of that is not the defence's own
 SILENT = 1e12  # a threshold that nothing reaches
 TOLERANCE = 0.02  # of the mean time, on the seeds of the calibration
 RUNS = 8  # closed-loop runs at most
+NARROWING = 16  # more of them, to find where a score jumps
 LEAST = 20  # onsets in a run that the limit of steps has cut
 DIGITS = 4  # of a threshold
 RECORDED = 512  # episodes of the fused engine at a time
@@ -317,33 +318,49 @@ class Search:
         self.bench, self.wanted, self.running = bench, wanted, running
         self.played = 0
         self.settled = False  # found within the tolerance
+        self.tried: dict[float, tuple[float, Count]] = {}  # log of the mean time over the wanted one
+        self.low, self.high = 0.0, math.inf  # with the one the alarm is too frequent, with the other too rare
 
     def solve(self) -> tuple[float, Count]:
         """The threshold, rounded, and what it gave."""
         level, slope = self._guess()
-        tried: dict[float, tuple[float, Count]] = {}  # log of the mean time over the wanted one
-        low, high = 0.0, math.inf
-        for number in range(1, RUNS + 1):
+        for _ in range(RUNS):
             level = rounded(level)
-            if level in tried:
+            if level in self.tried:
                 break
-            count = self._run(level, f"closed loop, run {number}")
-            error = math.log(count.seconds / HOUR / max(count.onsets, 0.5) / self.wanted)
-            self.settled = abs(error) <= max(TOLERANCE, 0.6 * self.wanted / self.running)  # of few onsets, one
+            before = min(self.tried, key=lambda held: abs(held - level)) if self.tried else None
+            error = self._try(level)
             if self.settled:
-                return level, count
-            before = min(tried, key=lambda held: abs(held - level)) if tried else None
-            if before is not None and (secant := (error - tried[before][0]) / (level - before)) > 0.0:
+                return level, self.tried[level][1]
+            if before is not None and (secant := (error - self.tried[before][0]) / (level - before)) > 0.0:
                 slope = secant
-            tried[level] = error, count
-            low, high = (max(low, level), high) if error < 0.0 else (low, min(high, level))
             level -= error / slope
-            if not low < level < high:
-                level = 0.5 * (low + high) if math.isfinite(high) else 2.0 * low
-        best = min(tried, key=lambda held: abs(tried[held][0]))
-        if not tried[best][1].may_be(self.wanted) and math.isfinite(high):
-            best = high  # a score that jumps: too many alarms below, too few above
-        return best, tried[best][1]
+            if not self.low < level < self.high:
+                level = self._between()
+        return self._best()
+
+    def _try(self, level: float) -> float:
+        """Log of the mean time over the wanted one, in a closed-loop run."""
+        count = self._run(level, f"closed loop, run {len(self.tried) + 1}")
+        error = math.log(count.seconds / HOUR / max(count.onsets, 0.5) / self.wanted)
+        self.tried[level] = error, count
+        self.low, self.high = (max(self.low, level), self.high) if error < 0.0 else (self.low, min(self.high, level))
+        self.settled = abs(error) <= max(TOLERANCE, 0.6 * self.wanted / self.running)  # of few onsets, one
+        return error
+
+    def _between(self) -> float:
+        return 0.5 * (self.low + self.high) if math.isfinite(self.high) else 2.0 * self.low
+
+    def _best(self) -> tuple[float, Count]:
+        """That of the nearest mean time; where its interval does not hold the wanted one, as the score jumps, the least that is rarer."""
+        for _ in range(NARROWING):
+            best = min(self.tried, key=lambda held: abs(self.tried[held][0]))
+            if self.tried[best][1].may_be(self.wanted):
+                return best, self.tried[best][1]
+            if (level := rounded(self._between())) in self.tried:
+                break
+            self._try(level)
+        return (self.high, self.tried[self.high][1]) if math.isfinite(self.high) else (best, self.tried[best][1])
 
     def _guess(self) -> tuple[float, float]:
         """From a run without alarms: the level, and the slope of the log mean time there."""
