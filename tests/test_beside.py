@@ -20,7 +20,7 @@ from tailgate.leaderboard.check import _scored
 from tailgate.rows import encode
 from tailgate.scenario import load_suite
 from tailgate.scoring.attacks import Admitted
-from tailgate.scoring.cells import digits, hits_of
+from tailgate.scoring.cells import digits, hits_of, shared_of
 from tailgate.scoring.follow import sharpened, strays, untold
 from tailgate.scoring.ranks import Harm, credible, duel, settled
 
@@ -229,6 +229,20 @@ def test_a_board_of_another_list_of_attacks_is_refused() -> None:
         board(rows, board=before, attacks=[line])
 
 
+def test_who_joins_meets_what_all_others_have_met() -> None:
+    """An attack on no list that every entry met is asked of the newcomer, who would be ranked beside them for having met less; policies that
+    were trained against one of them are not."""
+    more = ("fdi", "dropout")
+    before = _as_read(board(_rows("none", "kf", "rkf", attacks=more)))
+    spared = board(_rows("none", "imm"), board=before)
+    assert entry(spared, "imm")["status"] == "unranked" and "dropout" in entry(spared, "imm")["why"] and "not played" in entry(spared, "imm")["why"]
+    assert [entry(spared, g)["rates"] for g in ("kf", "rkf")] == [entry(before, g)["rates"] for g in ("kf", "rkf")]
+    assert board(_rows("none", "imm", attacks=more), board=before) == board(_rows("none", "kf", "rkf", "imm", attacks=more))
+    some = _as_read(board([*_rows("none", "kf", "rkf"), *cell("kf", "dropout", 1)]))  # which only one has met
+    assert entry(board(_rows("none", "imm"), board=some), "imm")["status"] == "ranked"
+    assert shared_of(before) == more[::-1] and shared_of(some) == ("fdi",)
+
+
 def test_an_attack_whose_file_became_another_one_is_refused() -> None:
     """Entries that stay have met the old one; what only the newcomer meets has the digest of its rows."""
     def rows(digest: str, *guards: str) -> list[Data]:
@@ -352,3 +366,27 @@ def test_the_command(tmp_path: Path) -> None:
     _run(str(file), "--out", str(out), "--defence", "chi2_kf", "--keep-entries")
     _run(str(file), "--out", str(out), "--defence", "chi2_kf", "--score-only")
     assert [e["defence"] for e in json.loads(place.read_text())["entries"]] == ["none", "chi2_kf"]
+
+
+def test_the_command_plays_what_all_others_have_met(tmp_path: Path) -> None:
+    """Whoever joins by name meets it without being asked; a board that names code to import is refused, and a suite of one's own is not."""
+    file, out = tmp_path / "small-v0.yaml", tmp_path / "out"
+    file.write_text(TEXT)
+    place, late = out / "small-v0" / "board.json", "dos_jam:start_step=20"
+    _run(str(file), "--out", str(out), "--defence", "kf")
+    for path in out.glob("small-v0/rows*"):
+        path.unlink()
+    _run(str(file), "--out", str(out), "--attack", late, "--defence", "none", "--defence", "kf", "--keep-entries")
+    before = json.loads(place.read_text())
+    for path in out.glob("small-v0/rows*"):
+        path.unlink()
+    _run(str(file), "--out", str(out), "--defence", "chi2_kf", "--keep-entries")
+    made = json.loads(place.read_text())
+    assert [c["attack"] for c in made["cells"] if c["defence"] == "chi2_kf"] == ["none", "fdi:value=5", late]
+    assert [e["defence"] for e in before["entries"]] == ["none", "kf"] and "incomplete" not in made["entries"][2]["why"]
+    for path in out.glob("small-v0/rows*"):
+        path.unlink()
+    place.write_text(json.dumps(before).replace(late, "never_made:Attack"))
+    with pytest.raises(InputError, match="code to import"):
+        _run(str(file), "--out", str(out), "--defence", "chi2_kf", "--keep-entries")
+    assert not list(out.glob("small-v0/rows*"))

@@ -72,17 +72,17 @@ def _run(options: argparse.Namespace) -> int:
     out, started = Path(options.out), time.perf_counter()
     suites = [load_suite(name) for name in options.suites]
     clocks = [clock_of(out / suite.name / BOARD) for suite in suites]  # before anything is played
-    for suite in suites if options.keep_entries else ():
-        kept_board(out / suite.name / BOARD, suite, options.beacon)
+    kept = {suite.name: kept_board(out / suite.name / BOARD, suite, options.beacon) for suite in suites if options.keep_entries}
     boards = []
     with progress(Console(stderr=True)) as update:
         for suite in suites:
             folder = out / suite.name
             record = Record(suite, folder, options.workers)
             if not options.score_only:
+                told = record.counting(lambda name, done, total: update(name, done, total, cells(done, total)))
                 rows = play(
                     suite, folder, defences=options.defence, attacks=options.attack, workers=options.workers, beacon=options.beacon,
-                    progress=record.counting(lambda name, done, total: update(name, done, total, cells(done, total))),
+                    board=kept.get(suite.name), progress=told,
                 )  # fmt: skip
                 print(f"rows: {rows}", file=sys.stderr)
             board = board_of(

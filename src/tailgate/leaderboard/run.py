@@ -17,12 +17,13 @@ from tailgate.rows import read_rows
 from tailgate.scenario import Suite
 from tailgate.scoring import attacks as admitted
 from tailgate.scoring.board import score
+from tailgate.scoring.cells import shared_of
 from tailgate.scoring.damage import CLEAN
 from tailgate.trust.run import REPORT, with_trust
 
 from .board_format import load, read_board, save
 from .card import with_cards
-from .check import agree
+from .check import agree, refused
 from .kept import with_kept
 from .verified import digest, with_verified
 
@@ -37,19 +38,33 @@ Progress = Callable[[str, int, int], None]  # suite, done, total
 
 def play(
     suite: Suite, folder: Path, *, defences: Sequence[str] | None = None, attacks: Sequence[str] | None = None, workers: int = 1,
-    beacon: str = "", progress: Progress | None = None,
+    board: Any = None, beacon: str = "", progress: Progress | None = None,
 ) -> Path:  # fmt: skip
-    """The rows of a suite and of the attacks that were admitted since, or of some, against its defences; returns their file. It resumes."""
+    """The rows of a suite and of the attacks that were admitted since, or of some, against its defences; returns their file. It resumes.
+
+    board: JSON of the one that they join: what all of its entries have met is played too. Raises InputError where that cannot be.
+    """
     if attacks is None and defences is not None:
         defences = list(dict.fromkeys([CLEAN, *defences]))  # the undefended car is what gates measure against
     _one_round(folder, beacon)
     some = repr(defences if attacks is None else (defences, list(attacks)))
     name = hashlib.blake2b(some.encode(), digest_size=4).hexdigest()
     file = folder / (OWN if defences is None and attacks is None else f"rows-{name}.jsonl.xz")
-    attacks = admitted.attacks_of(suite, folder / LIST) if attacks is None else attacks
+    if attacks is None:
+        listed = admitted.attacks_of(suite, folder / LIST)
+        attacks = (*listed, *_met_by_all(board, listed)) if board is not None else listed
     update = None if progress is None else lambda done, total: progress(suite.name, done, total)
     evaluate(suite, defences=defences, attacks=attacks, workers=workers, out=file, beacon=beacon, progress=update)
     return file
+
+
+def _met_by_all(board: Any, listed: Sequence[str]) -> list[str]:
+    """Attacks on no list that all entries of a board have met. Raises InputError for one that is code to import, or is not here."""
+    found = [text for text in shared_of(board) if text not in listed]
+    for text in found:
+        if why := refused("attack", text):
+            raise InputError("board: attacks", text, f"an attack that can be played here ({why})")
+    return found
 
 
 def files_of_rows(folder: Path) -> list[Path]:

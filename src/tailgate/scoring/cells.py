@@ -83,6 +83,19 @@ def place_of(cell: Data) -> tuple[Any, ...]:
     return cell["scenario"], cell["dose"], cell["defence"], cell["attack"], cell["knowledge"]
 
 
+def shared_of(board: Data) -> tuple[str, ...]:
+    """Attacks that all entries of a board have met in each of its cells: whoever joins has to meet them too, listed or not.
+
+    Files of policies are left out: they were trained against one of the entries.
+    """
+    places = {(cell["defence"], cell["scenario"], cell["dose"]) for cell in board["cells"]}
+    met: dict[str, set[tuple[Any, ...]]] = {}
+    for cell in board["cells"]:
+        if cell["attack"] != CLEAN and not cell["attack"].endswith(".json"):
+            met.setdefault(cell["attack"], set()).add((cell["defence"], cell["scenario"], cell["dose"]))
+    return tuple(sorted(attack for attack, held in met.items() if held == places))
+
+
 def table_of(board: Data, suite: Suite) -> Table:
     """The table that a board's cells come from, without rows: clean runs know their damage alone.
 
@@ -127,7 +140,7 @@ def table_of(board: Data, suite: Suite) -> Table:
     return Table(
         suite, places, doses, defences, columns, seeds, {}, clean, harm, state, marks["optimal"], marks["learned"],
         tuple(dict.fromkeys(listed)), withdrawn, purpose, beacon, sum(episodes[key.scenario] for key in cells),
-        frozenset(key for key, cell in cells.items() if vague(cell)),
+        frozenset(key for key, cell in cells.items() if vague(cell)), frozenset(shared_of(board)),
     )  # fmt: skip
 
 
@@ -163,5 +176,5 @@ def joined(table: Table, held: Table, kept: Collection[str], added: Mapping[str,
     clean = {at: rows for at, rows in held.clean.items() if at[1] in kept} | table.clean
     return dataclasses.replace(
         table, defences=defences, columns=columns, cells=fresh, clean=clean, harm=harm, state=state, optimal=optimal,
-        learned=learned, vague=frozenset(key for key in held.vague if key.defence in kept),
+        learned=learned, vague=frozenset(key for key in held.vague if key.defence in kept), shared=held.shared,
     )  # fmt: skip

@@ -74,12 +74,18 @@ class Table:
     state: dict[str, Array]
     optimal: dict[Column, bool]
     learned: dict[Column, bool]
-    listed: tuple[str, ...]  # attacks that every defence has to have met
+    listed: tuple[str, ...]  # the suite's attacks, and those that were admitted
     withdrawn: frozenset[str]  # attacks that an erratum took back
     purpose: str
     beacon: str  # of the round; empty for public seeds
     rows: int
     vague: frozenset[Key] = frozenset()  # cells of a board that do not say which episodes came to damage: the first ones stand for them
+    shared: frozenset[str] = frozenset()  # what is on no list and all entries of a board have met: who joins has to have met it too
+
+    @property
+    def asked(self) -> frozenset[str]:
+        """Attacks that every defence has to have met."""
+        return self.shared.union(self.listed)
 
     def known(self, knowledge: str) -> list[int]:
         """Columns of attacks that know no more than this. Computed optima are ceilings, and count nowhere."""
@@ -96,8 +102,8 @@ class Table:
         """(columns,) bool: not left out in this scenario. One that has no meaning against any defence is, and one that nobody owes."""
         state = self.state[scenario]
         played = ~np.isin(state, (SKIPPED, MISSING)).all(axis=(0, 2))
-        listed = np.array([column.attack in self.listed for column in self.columns], bool)
-        return np.asarray(played | (listed & (state == MISSING).any(axis=(0, 2))))
+        owed = np.array([column.attack in self.asked for column in self.columns], bool)
+        return np.asarray(played | (owed & (state == MISSING).any(axis=(0, 2))))
 
 
 def tabulate(rows: Iterable[Row], suite: Suite, added: Sequence[str] = (), withdrawn: Iterable[str] = ()) -> Table:

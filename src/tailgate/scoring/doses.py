@@ -42,15 +42,14 @@ class Worst:
 
     @cached_property
     def pairs(self) -> list[tuple[str, int]]:
-        """(scenario, column) of every attack that has a meaning there. One that is not listed counts against
-        the defences that it was played against, and is asked of nobody else."""
+        """(scenario, column) of every attack that has a meaning there. One that is not asked of everybody counts against
+        the defences that it was played against."""
         guard = self.table.defences.index(self.defence)
         out: list[tuple[str, int]] = []
         for name in self.table.scenarios:
             applies, mine = self.table.applies(name), self.table.state[name][guard]
             for i in self.table.known(self.knowledge):
-                listed = self.table.columns[i].attack in self.table.listed
-                if applies[i] and (listed or (mine[i] != MISSING).any()):
+                if applies[i] and (self.table.columns[i].attack in self.table.asked or (mine[i] != MISSING).any()):
                     out.append((name, i))
         return out
 
