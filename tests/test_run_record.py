@@ -14,6 +14,7 @@ from tailgate.leaderboard import run_record
 from tailgate.leaderboard.run_record import FILE, Record, processor_time
 from tailgate.machine import cores, processor
 from tailgate.scenario import load_suite
+from tailgate.scoring.attacks import attacks_of
 
 SUITE = "name: mine\nscenarios: [gusty-stop-and-go-v0]\ndoses: [12]\ndefences: [none, kf]\nattacks: [none, dropout, 'fdi:value=5']\nseeds: 3\n"
 
@@ -101,8 +102,10 @@ def test_a_damaged_record_stops_nothing(suite: Path, tmp_path: Path, text: str) 
 
 @pytest.mark.long
 def test_quick_is_played_in_five_minutes_on_two_cores(tmp_path: Path) -> None:
-    """All built-in defences of quick-v0 against its scripts, scored and drawn: from one command, with two workers."""
+    """All built-in defences of quick-v0 against its scripts and what joined its list, scored and drawn: from one command, with two workers."""
     began = time.perf_counter()
     folder = _run("quick-v0", tmp_path, "--workers", "2")
     assert time.perf_counter() - began < 300.0
-    assert _held(folder)["rows"] == {"played": 40_000, "kept": 0} and _held(folder)["commands"][0]["workers"] == 2
+    suite = load_suite("quick-v0")
+    cells = len(suite.scenarios) * len(suite.doses) * len(suite.defences) * len(attacks_of(suite))
+    assert _held(folder)["rows"] == {"played": suite.seeds * cells, "kept": 0} and _held(folder)["commands"][0]["workers"] == 2

@@ -31,14 +31,15 @@ def detect(
     """Play detection and stealth impact of the board in a file; returns it. It is written as soon as an entry is done, and resumes.
 
     defences: only these entries; of all, those that come with the package; not `none`, sentinels, or who is told the truth. Attacks are
-    the board's black-box scripts that can be played here. Raises InputError for a board of another suite or version, or with figures of
+    the black-box scripts of the board's list that can be played here. Raises InputError for a board of another suite or version, or with figures of
     another effort, and for a defence that takes no place here.
     """
     board = load(path)
     agree(read_board(board), suite)
     guards = [e["defence"] for e in board["entries"] if e.get("card") and _takes_part(e)]
     known(defences, guards)
-    attacks = [a["attack"] for a in board["attacks"] if a["knowledge"] == "black" and not (a.get("optimal") or a.get("learned"))]
+    listed = [a for a in board["attacks"] if a["attack"] in suite.attacks or a.get("admitted")]
+    attacks = [a["attack"] for a in listed if a["knowledge"] == "black" and not (a.get("optimal") or a.get("learned"))]
     attacks = [attack for attack in attacks if not refused("attack", attack)]
     held = board.get("detection") or _nothing(effort)
     for name, value in dataclasses.asdict(_effort(held)).items():
