@@ -31,8 +31,8 @@ def detect(
     """Play detection and stealth impact of the board in a file; returns it. It is written as soon as an entry is done, and resumes.
 
     defences: only these entries; of all, those that come with the package; not `none`, sentinels, or who is told the truth. Attacks are
-    the black-box scripts of the board's list that can be played here. Raises InputError for a board of another suite or version, or with figures of
-    another effort, and for a defence that takes no place here.
+    the black-box scripts of the board's list that can be played here. Raises InputError for a board of another suite or version, or with
+    figures of another effort, and for a defence that takes no place here.
     """
     board = load(path)
     agree(read_board(board), suite)
