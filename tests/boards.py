@@ -1,6 +1,8 @@
 """A made-up board in the format tailgate-board-1: deterministic, with what real ones have (nulls, optima, failures, long names)."""
 
 import math
+import re
+from html.parser import HTMLParser
 
 from tailgate.evaluation import evaluate
 from tailgate.leaderboard.site import build_site, slug
@@ -40,6 +42,29 @@ ATTACK_CARD = {
     "name": "A bias that is held", "reference": "https://example.org/attack", "licence": "BSD-3-Clause", "threat_model": "Adds <b>any</b> value.",
     "training": "none", "code": "https://example.org/attack-code",
 }  # fmt: skip
+
+
+class Outline(HTMLParser):
+    """Tags with their attributes, and the text of every table row by the table's class."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.tags, self.lines, self.table = [], [], None
+        self.feed(text.replace("<wbr>", ""))
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append((tag, dict(attrs)))
+        if tag == "table":
+            self.table = dict(attrs)["class"]
+        if tag == "tr":
+            self.lines.append([self.table, ""])
+
+    def handle_data(self, data):
+        if self.lines:
+            self.lines[-1][1] += " " + data
+
+    def rows(self, table):
+        return [re.sub(r"\s+", " ", text).strip() for kind, text in self.lines if kind == table]
 
 
 def share(k, n=200):
@@ -174,7 +199,7 @@ def make_board(name="synthetic-v0", *, bound=None, beacon="", trusted=True, defe
     duels = [(a, b) for i, a in enumerate(ranked) for b in ranked[i + 1 :]]
     seen = [
         {"defence": e["defence"], "scenario": scenarios[0], "attack": attacks[0][0], "hours": h, "threshold": 9.0 + h, "detected": share(150 - 20 * i),
-         "delay": 2.0} for e in entries[:4] for i, h in enumerate((0.1, 1, 10))
+         "delay": 2.0} | ({"watched": True} if e["defence"] == "kf" else {}) | ({"rarer": True} if e["defence"] == "kf" and h == 10 else {}) for e in entries[:4] for i, h in enumerate((0.1, 1, 10))
     ]
     return {
         "format": "tailgate-board-1",

@@ -6,7 +6,6 @@ import importlib.util
 import json
 import math
 import re
-from html.parser import HTMLParser
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
@@ -24,30 +23,7 @@ ROOT = Path(__file__).parent.parent
 spec = importlib.util.spec_from_file_location("boards", Path(__file__).with_name("boards.py"))
 boards = importlib.util.module_from_spec(spec)
 spec.loader.exec_module(boards)
-make_board, network, entry, HOSTILE, LONG = boards.make_board, boards.network, boards.entry, boards.HOSTILE, boards.LONG
-
-
-class Outline(HTMLParser):
-    """Tags with their attributes, and the text of every table row by the table's class."""
-
-    def __init__(self, text):
-        super().__init__()
-        self.tags, self.lines, self.table = [], [], None
-        self.feed(text.replace("<wbr>", ""))
-
-    def handle_starttag(self, tag, attrs):
-        self.tags.append((tag, dict(attrs)))
-        if tag == "table":
-            self.table = dict(attrs)["class"]
-        if tag == "tr":
-            self.lines.append([self.table, ""])
-
-    def handle_data(self, data):
-        if self.lines:
-            self.lines[-1][1] += " " + data
-
-    def rows(self, table):
-        return [re.sub(r"\s+", " ", text).strip() for kind, text in self.lines if kind == table]
+make_board, network, entry, Outline, HOSTILE, LONG = boards.make_board, boards.network, boards.entry, boards.Outline, boards.HOSTILE, boards.LONG
 
 
 @pytest.fixture(scope="module")
@@ -138,19 +114,6 @@ def test_attackers_that_only_their_own_defence_met_share_a_column(tmp_path):
     assert first["kf"] == "25%" and first["chi2_kf"] == "40%" and first["cusum_kf"] == "n/a"
     lines = [row for row in page.rows("cells ranks") if row.startswith("Not attacked yet")]
     assert lines and lines[0].endswith("(all: no attacker was trained against it)")
-
-
-def test_detection_is_shown_attack_by_attack(index):
-    """At the middle time between false alarms: per attack a row, per defence the share in the scenario where it sees least of it."""
-    cases = [c for c in make_board("x")["detection"]["entries"] if c["hours"] == 1]
-    lines = [re.sub(r"\s+", " ", text).strip() for _, text in index.lines]
-    for attack in dict.fromkeys(c["attack"] for c in cases):
-        least = {}
-        for c in cases:
-            if c["attack"] == attack and c["detected"]:
-                least[c["defence"]] = min(least.get(c["defence"], 1.0), c["detected"]["value"])
-        shown = [percent(least[g]) if g in least else "\N{EN DASH}" for g in dict.fromkeys(c["defence"] for c in cases)]
-        assert any(line.startswith(attack.split(":")[0]) and " ".join(["", *shown]) in line for line in lines)
 
 
 def test_a_board_without_a_road_names_its_bound(site):

@@ -1,13 +1,19 @@
 """A watch on a score: what it sees, and that the defence does not know of it."""
 
+import dataclasses
+from dataclasses import dataclass
+from typing import Any
+
 import numpy as np
 import pytest
 
+import tailgate
 from tailgate.agents.scripted import NoAttack
 from tailgate.calibrate import Bench
+from tailgate.core import Model
 from tailgate.draws import Role, keys
 from tailgate.errors import NotApplicable
-from tailgate.estimators import AcceptAll, ChiSquare, GateOut, KalmanFilter, Score, compose
+from tailgate.estimators import AcceptAll, ChiSquare, Composed, GatedKalman, GateOut, KalmanFilter, Score, compose
 from tailgate.num import inverse, quadratic
 from tailgate.registry import Spec
 from tailgate.scenario import Suite, load_scenario
@@ -65,10 +71,63 @@ def test_what_acts_on_suspicion_is_not_composed_with_a_test() -> None:
     assert watched(compose(KalmanFilter(), Score(), AcceptAll()), 9.0).parts() == (KalmanFilter(), ChiSquare(9.0), AcceptAll())  # type: ignore[union-attr]
 
 
-def test_a_white_box_finds_no_gate_where_the_alarm_is_the_scorers() -> None:
+def test_a_white_box_sees_the_defence_and_not_the_watch() -> None:
+    """A script needs to look at nothing, and plays; who looks finds no innovation of a safe set."""
     bench = Bench.of("safe_state", ["stop-and-go-v0"], 8, None)
-    with pytest.raises(NotApplicable, match="the scorer's"):
-        load_scenario("stop-and-go-v0").with_threat(knowledge="white").loop(bench.at(0.9), bench.uses)
+    loop = load_scenario("stop-and-go-v0").with_threat(knowledge="white", budget=20).loop(bench.at(0.9), bench.uses)
+    assert rollout(loop, Spec("attack", BIAS).make(), keys("tune", range(2))).alarm.any()
+    with pytest.raises(NotApplicable, match="innovation"):
+        rollout(loop, Spec("attack", "stealth").make(), keys("tune", range(2)))
+
+
+@dataclass(frozen=True)
+class Deaf(Composed):
+    """Is told that its sensors are ten times worse."""
+
+    def parts(self) -> Any:
+        return KalmanFilter(), Score(), AcceptAll()
+
+    def prepare(self, model: Model) -> Any:
+        return super().prepare(dataclasses.replace(model, R=100.0 * model.R))
+
+
+class Named:
+    """A threshold of its own, and no dataclass."""
+
+    threshold_field = "eta"
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(KF, name)
+
+
+class OwnTurn(Named):
+    """Sets its threshold itself."""
+
+    threshold_field = None
+
+    def with_threshold(self, value: float) -> Any:
+        return GatedKalman(eta=value)
+
+
+KF = tailgate.make_defence("kf")
+
+
+def test_a_composed_defence_with_a_plan_of_its_own_is_left_as_it_is() -> None:
+    bare, held = (_played("stop-and-go-v0", Deaf(), ("measurements",), BIAS, plain=plain) for plain in (True, False))
+    seen = _played("stop-and-go-v0", watched(Deaf(), 0.01), ("measurements",), BIAS)
+    assert np.array_equal(bare.score, held.score) and np.array_equal(bare.score, seen.score) and np.median(bare.score) < 0.1
+
+
+def test_what_is_turned_is_what_is_named() -> None:
+    for defence, kind, field in ((Named(), Watched, ""), (OwnTurn(), GatedKalman, "threshold"), (GatedKalman(), GatedKalman, "eta")):
+        bench = Bench.of(defence, ["stop-and-go-v0"], 8, None)
+        assert isinstance(bench.at(9.0), kind) and bench.field == field
+
+
+def test_a_loop_has_one_bare_loop() -> None:
+    """Its plan is made once, which for a submission means a process."""
+    loop = load_scenario("stop-and-go-v0").loop(watched(OwnTurn(), 9.0), ("measurements",))
+    assert loop.bare is loop.bare and loop.bare.bare is loop.bare and not isinstance(loop.bare.defence, Watched)
 
 
 def test_filters_and_challenges_have_figures_of_detection() -> None:
@@ -76,12 +135,15 @@ def test_filters_and_challenges_have_figures_of_detection() -> None:
     effort = Effort((0.02,), 8, 20, 40_000)
     over_air = Suite("s", "", ("radar-following-v0",))
     (heard,) = detection(over_air, ["cra:probability=0.5"], [ECHO], effort, dose=20)["entries"]
-    assert heard["field"] == "score" and heard["detected"]["value"] == 1.0 and heard["threshold"] > 0.0
+    assert heard["watched"] and "rarer" not in heard and heard["detected"]["value"] == 1.0 and heard["threshold"] > 0.0
     road = Suite("s", "", ("stop-and-go-v0",))
     (seen,) = detection(road, ["kf"], ["fdi:start_step=100,value=-10"], effort, dose=20)["entries"]
     (gated,) = detection(road, ["composed:mitigation=accept_all"], ["fdi:start_step=100,value=-10"], effort, dose=20)["entries"]
-    assert seen["field"] == "score" and {**seen, "defence": "", "field": ""} == {**gated, "defence": "", "field": ""}
+    assert seen == {**gated, "defence": "kf", "watched": True}
     (curve,) = stealth_impact(road, "kf", effort, dose=100) or [{}]
     assert curve["deviation"] > 0.0
-    (none,) = stealth_impact(road, "safe_state", effort, dose=100) or [{}]
-    assert none["deviation"] is None and "the scorer's" in none["reason"]
+    seldom = Effort((0.1,), 8, 20, 80_000)  # a reading on the edge once in each minute
+    (none,) = stealth_impact(road, "safe_state", seldom, dose=100) or [{}]
+    assert none["deviation"] is None and "the scorer's" in none["reason"] and none["rarer"]
+    (rare,) = detection(road, ["safe_state"], [BIAS], seldom, dose=20)["entries"]
+    assert rare["watched"] and rare["rarer"] and 0.9999 < rare["threshold"] <= 1.0

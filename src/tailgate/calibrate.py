@@ -15,6 +15,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -29,16 +30,17 @@ from tailgate.loop import Loop
 from tailgate.registry import Spec, entry_for, text_of
 from tailgate.scenario import Scenario, load_scenario
 from tailgate.trace import MEMORY, episodes_at_once, rollout
-from tailgate.watch import unwatched, watched
+from tailgate.watch import watched
 
 MIXTURE = ("braking-v0", "stop-and-go-v0", "ornstein-uhlenbeck-v0")  # equal shares of the running time
-SCORE = "score"  # what a threshold is of that is not the defence's own
 SILENT = 1e12  # a threshold that nothing reaches
 TOLERANCE = 0.02  # of the mean time, on the seeds of the calibration
 RUNS = 8  # closed-loop runs at most
-NARROWING = 16  # more of them, to find where a score jumps
+NARROWING = 24  # more of them, to find where a score jumps
 LEAST = 20  # onsets in a run that the limit of steps has cut
 DIGITS = 4  # of a threshold
+MOST_DIGITS = 7  # of one where the score is crowded, as near 1
+COARSE = 0.1  # what the last digit may change of the log mean time
 RECORDED = 512  # episodes of the fused engine at a time
 NOTHING = NoAttack()
 HOUR = 3600.0
@@ -112,6 +114,7 @@ class Crossings:
     def __init__(self, keep: int) -> None:
         self.keep = keep
         self.low, self.high = np.empty(0), np.empty(0)
+        self.least, self.most = math.inf, -math.inf  # scores that were seen
 
     def add(self, low: Array, high: Array) -> None:
         """The climbs of some runs. Only the `keep` highest are kept: levels below them are not asked for."""
@@ -158,7 +161,7 @@ def play_clean(loop: Loop, keys: draws.Keys) -> Iterator[tuple[Array, Array, Arr
 
 
 def _fused(loop: Loop) -> bool:
-    return isinstance(fuse(unwatched(loop), NOTHING), Constants)
+    return isinstance(fuse(loop.bare, NOTHING), Constants)
 
 
 @dataclass(frozen=True)
@@ -192,22 +195,23 @@ class Bench:
 
     def at(self, threshold: float) -> Any:
         """The defence at a threshold: its own, its detector's (`threshold_field`), or of a watch on its score where it has none."""
+        return self._turned(threshold)[0]
+
+    @cached_property
+    def field(self) -> str:
+        """The parameter that is the threshold, as the command line names it; empty where it is that of a watch on the score."""
+        return self._turned(SILENT)[1]
+
+    def _turned(self, threshold: float) -> tuple[Any, str]:
+        own = getattr(self.defence, "threshold_field", None)
+        if own is not None and dataclasses.is_dataclass(self.defence):
+            return dataclasses.replace(self.defence, **{own: threshold}), str(own)  # type: ignore[type-var]
         if hasattr(self.defence, "with_threshold"):
             with contextlib.suppress(NotApplicable):
-                return self.defence.with_threshold(threshold)
-        name = getattr(self.defence, "threshold_field", None)
-        if name is None or not dataclasses.is_dataclass(self.defence):
-            return watched(self.defence, threshold)
-        return dataclasses.replace(self.defence, **{name: threshold})  # type: ignore[type-var]
-
-    @property
-    def field(self) -> str:
-        """The parameter that is the threshold, as the command line names it; `score` where it is that of a watch."""
-        if (own := getattr(self.defence, "threshold_field", None)) is not None:
-            return str(own)
-        detector = self.defence.parts()[1] if hasattr(self.defence, "with_threshold") else None
-        name = getattr(detector, "threshold_field", None)
-        return SCORE if name is None else f"detector.{name}"
+                detector = self.defence.parts()[1] if hasattr(self.defence, "parts") else None
+                inner = getattr(detector, "threshold_field", "")
+                return self.defence.with_threshold(threshold), f"detector.{inner}" if inner else "threshold"
+        return watched(self.defence, threshold), ""
 
     def seeds(self, hours: float) -> list[range]:
         """Seeds of each scenario, so that all together last `hours` (a little more, as episodes are whole) in equal shares.
@@ -241,7 +245,7 @@ class Bench:
             onsets, played = count_onsets(loops[place.name], draws.keys(purpose, seeds), crossings)
             counts.append(onsets)
             steps[place.name] += played
-            self.progress(label, done, len(chunks), f"threshold {threshold:.{DIGITS}g}" if threshold < SILENT else "no alarms")
+            self.progress(label, done, len(chunks), f"threshold {threshold:.{MOST_DIGITS}g}" if threshold < SILENT else "no alarms")
         each = np.concatenate(counts)
         mean = float(each.mean())
         seconds = math.fsum(steps[place.name] * place.brief().model.dt for place in self.places)
@@ -254,6 +258,7 @@ def count_onsets(loop: Loop, keys: draws.Keys, crossings: Crossings | None = Non
     alarmed, onsets, last = np.zeros(batch, bool), np.zeros(batch, np.int64), np.full(batch, -np.inf)
     low: list[Array] = []
     high: list[Array] = []
+    least, most = math.inf, -math.inf
     for alarms, scores, live in play_clean(loop, keys):
         alarm = alarms.any(axis=1) & live
         onsets += alarm & ~alarmed
@@ -261,12 +266,14 @@ def count_onsets(loop: Loop, keys: draws.Keys, crossings: Crossings | None = Non
         steps += int(np.count_nonzero(live))
         if crossings is not None:
             score = scores.max(axis=1)
+            least, most = min(least, score[live].min(initial=math.inf)), max(most, score[live].max(initial=-math.inf))
             climbed = live & (score > last)
             low.append(last[climbed])
             high.append(score[climbed])
             last = score
     if crossings is not None:
         crossings.add(np.concatenate(low), np.concatenate(high))
+        crossings.least, crossings.most = min(crossings.least, least), max(crossings.most, most)
     return onsets, steps
 
 
@@ -285,7 +292,7 @@ def calibrate(
 
     A run lasts `onsets` times that, on seeds of the purpose `calibrate`, or `most_steps` steps if that is less: the interval then says
     how little it knows. With `check` it is measured again on fresh seeds of the purpose `report`.
-    Raises InputError for bad values, NotApplicable for a defence without a threshold.
+    Raises InputError for bad values, and where the time cannot be had. A defence without a threshold is watched (tailgate.watch).
     """
     if not (isinstance(hours, (int, float)) and math.isfinite(hours) and hours > 0.0):
         raise InputError("hours", hours, "a finite number above 0")
@@ -306,9 +313,14 @@ def calibrate(
     return Calibration(bench.text, bench.field, threshold, float(hours), search.settled, measured, fresh, seeds, played)
 
 
-def rounded(threshold: float) -> float:
+def rounded(threshold: float, digits: int) -> float:
     """To the digits that are reported: what was measured is what stands there."""
-    return float(f"{threshold:.{DIGITS}g}")
+    return float(f"{threshold:.{digits}g}")
+
+
+def _digit(threshold: float, digits: int) -> float:
+    """The last digit's worth."""
+    return 10.0 ** (math.floor(math.log10(abs(threshold))) + 1 - digits) if threshold else 0.0
 
 
 class Search:
@@ -316,16 +328,16 @@ class Search:
 
     def __init__(self, bench: Bench, wanted: float, running: float) -> None:
         self.bench, self.wanted, self.running = bench, wanted, running
-        self.played = 0
+        self.played, self.digits = 0, DIGITS
         self.settled = False  # found within the tolerance
         self.tried: dict[float, tuple[float, Count]] = {}  # log of the mean time over the wanted one
-        self.low, self.high = 0.0, math.inf  # with the one the alarm is too frequent, with the other too rare
+        self.low, self.high = -math.inf, math.inf  # with the one the alarm is too frequent, with the other too rare
 
     def solve(self) -> tuple[float, Count]:
         """The threshold, rounded, and what it gave."""
         level, slope = self._guess()
         for _ in range(RUNS):
-            level = rounded(level)
+            level = rounded(level, self.digits)
             if level in self.tried:
                 break
             before = min(self.tried, key=lambda held: abs(held - level)) if self.tried else None
@@ -349,15 +361,17 @@ class Search:
         return error
 
     def _between(self) -> float:
-        return 0.5 * (self.low + self.high) if math.isfinite(self.high) else 2.0 * self.low
+        return 0.5 * (self.low + self.high) if math.isfinite(self.high) else self.low + (abs(self.low) or 1.0)
 
     def _best(self) -> tuple[float, Count]:
         """That of the nearest mean time; where its interval does not hold the wanted one, as the score jumps, the least that is rarer."""
-        for _ in range(NARROWING):
+        while True:
             best = min(self.tried, key=lambda held: abs(self.tried[held][0]))
             if self.tried[best][1].may_be(self.wanted):
                 return best, self.tried[best][1]
-            if (level := rounded(self._between())) in self.tried:
+            if (level := rounded(self._between(), self.digits)) in self.tried and self.digits < MOST_DIGITS:
+                self.digits, level = MOST_DIGITS, rounded(self._between(), MOST_DIGITS)
+            if level in self.tried or len(self.tried) >= RUNS + NARROWING:
                 break
             self._try(level)
         return (self.high, self.tried[self.high][1]) if math.isfinite(self.high) else (best, self.tried[best][1])
@@ -367,10 +381,16 @@ class Search:
         crossings = Crossings(keep=max(20_000, round(50 * self.running / self.wanted)))
         wanted = self._run(SILENT, "run without alarms", crossings).seconds / HOUR / self.wanted
         at, above, below = (crossings.level(share * wanted) for share in (1.0, 0.5, 2.0))
-        if at is None or above is None or len(np.unique(crossings.high)) == 1:
+        if crossings.least == crossings.most:
+            raise InputError("hours", self.wanted, f"a mean time that {self.bench.text} can have: its score does not move")
+        if at is None or above is None:
             raise InputError("hours", self.wanted, f"a mean time that {self.bench.text} can have: its score does not climb that often")
+        self.low = crossings.least
         spread, ratio = (above - at, 2.0) if below is None else (above - below, 4.0)
-        return at, math.log(ratio) / spread if spread > 0.0 else 0.5
+        slope = math.log(ratio) / spread if spread > 0.0 else 0.5
+        while self.digits < MOST_DIGITS and _digit(at, self.digits) * slope > COARSE:
+            self.digits += 1
+        return at, slope
 
     def _run(self, level: float, label: str, crossings: Crossings | None = None) -> Count:
         count = self.bench.run(level, self.running, "calibrate", f"{self.bench.text}, {self.wanted:.3g} h: {label}", crossings)

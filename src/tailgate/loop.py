@@ -9,6 +9,7 @@ measured step is a predict and an update. `sense` and `advance` are the two halv
 from __future__ import annotations
 
 import copy
+import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -42,6 +43,7 @@ from tailgate.errors import InputError, NotApplicable
 from tailgate.link import Link, LinkState
 from tailgate.threat import Brief, Channel, ChannelPlan, ChannelState, ThreatModel
 from tailgate.tree import duplicate, frozen, lock, put_rows
+from tailgate.watch import Watched
 
 PERFECT = Link()
 _START = np.uint32(0xFFFFFFFF)  # the step under which start() draws: no episode reaches it
@@ -118,6 +120,11 @@ class Loop:
     told: Model | None = None
     load: float = 1.0
     link: Link = PERFECT
+
+    @cached_property
+    def bare(self) -> Loop:
+        """The loop without a watch on the defence's score: it plays the same episodes, alarms apart."""
+        return dataclasses.replace(self, defence=self.defence.defence) if isinstance(self.defence, Watched) else self
 
     @cached_property
     def model(self) -> Model:

@@ -16,7 +16,7 @@ from tailgate.fused import Constants, fuse
 from tailgate.fused.play import nearest as _nearest
 from tailgate.fused.play import play
 from tailgate.loop import Loop, LoopState
-from tailgate.watch import Watched, unwatched
+from tailgate.watch import Watched
 
 MEMORY = 1e9  # [bytes] that a trace may take: who plays many episodes plays so many at a time
 _DECISIONS = ("kind", "target", "alarm", "mode", "refused", "collided", "rear_collided")
@@ -131,8 +131,8 @@ def rollout(loop: Loop, attack: Attack, keys: Keys, *, terminate: bool = True, p
 
     A loop whose parts have lanes is played by the fused engine, to the same bits; with `plain` it is not.
     """
-    if not plain and isinstance(guard := loop.defence, Watched) and loop.threat.knowledge != "white":
-        seen = rollout(unwatched(loop), attack, keys, terminate=terminate)
+    if not plain and isinstance(guard := loop.defence, Watched):
+        seen = rollout(loop.bare, attack, keys, terminate=terminate)
         return dataclasses.replace(seen, signals=seen.signals | {"alarm": guard.alarms(seen.score)})
     if not plain and isinstance(fused := fuse(loop, attack), Constants):
         return Trace(loop.model, loop.horizon, *play(loop, fused, attack, keys, terminate), loop.controller.desired_gap)

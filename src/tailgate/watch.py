@@ -6,7 +6,6 @@ energy that was heard while the probe was muted; of a safe set how far a reading
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,7 +15,8 @@ from tailgate.core import Array, Defence, Estimate, Model, Prior, Received
 from tailgate.draws import Draws
 from tailgate.estimators.chi_square import ChiSquare
 from tailgate.estimators.compose import AcceptAll, Composed, Score, compose
-from tailgate.loop import Loop
+
+OWN = ("prepare", "start", "step", "look")  # what a composed defence does as its parts say, unless it is written anew
 
 
 @dataclass(frozen=True)
@@ -28,8 +28,8 @@ class Watched:
 
     @property
     def opaque(self) -> str:
-        """Why no white box looks into it."""
-        return str(getattr(self.defence, "opaque", "")) or "the alarm is the scorer's, on a score with no gate that one could stay below"
+        """Why no white box looks into the defence; of the watch it sees nothing."""
+        return str(getattr(self.defence, "opaque", ""))
 
     def prepare(self, model: Model) -> Any:
         return self.defence.prepare(model)
@@ -51,13 +51,8 @@ def watched(defence: Defence, threshold: float) -> Composed | Watched:
 
     What only filters is composed with the chi-square test, whose alarm then changes nothing: a white box has a gate to stay below.
     """
-    if isinstance(defence, Composed) and all(getattr(type(defence), name) is getattr(Composed, name) for name in ("step", "look", "start")):
+    if isinstance(defence, Composed) and all(getattr(type(defence), name) is getattr(Composed, name) for name in OWN):
         filter_, detector, mitigation = defence.parts()
         if type(detector) is Score and type(mitigation) is AcceptAll and mitigation.mode == "normal":
             return compose(filter_, ChiSquare(threshold), mitigation)
     return Watched(defence, threshold)
-
-
-def unwatched(loop: Loop) -> Loop:
-    """The loop without the watch: it plays the same episodes, alarms apart."""
-    return dataclasses.replace(loop, defence=loop.defence.defence) if isinstance(loop.defence, Watched) else loop

@@ -19,9 +19,10 @@ def add(commands: Any) -> None:
     command = commands.add_parser(
         "calibrate", help="find the threshold of a defence for a wanted mean time between false alarms",
         description="Play clean runs (no attack) and find the threshold at which the alarm goes on once in a wanted time. Alarms act on "
-        "the filter while this is done. NAME: a registered defence, NAME:key=value,key=value, or module:Class.",
+        "the filter while this is done; for a defence without a threshold it is one on its score, whose alarm acts on "
+        "nothing. NAME: a registered defence, NAME:key=value,key=value, or module:Class.",
     )  # fmt: skip
-    command.add_argument("--defence", action="append", metavar="NAME", required=True, help="a defence with a threshold (repeatable)")
+    command.add_argument("--defence", action="append", metavar="NAME", required=True, help="a defence (repeatable)")
     command.add_argument("--hours", action="append", type=float, metavar="H", required=True, help="wanted mean time [h] (repeatable)")
     command.add_argument("--scenario", action="append", metavar="NAME",
                          help="a scenario of the clean mixture, equal shares (repeatable; default: the long ones at 0.1 s)")  # fmt: skip
@@ -70,7 +71,7 @@ def _print_results(results: list[dict[str, Any]]) -> None:
         measured, fresh = result["measured"], result["fresh"]
         note = "" if result["settled"] else " (not settled)"
         table.add_row(
-            result["defence"], result["field"], f"{result['threshold']:g}{note}", f"{result['wanted_hours']:g}",
+            result["defence"], result["field"] or "watched", f"{result['threshold']:g}{note}", f"{result['wanted_hours']:g}",
             _hours(measured["hours"]), _between(measured), str(measured["onsets"]),
             f"{_hours(fresh['hours'])} ({_between(fresh)})" if fresh else "-",
         )  # fmt: skip

@@ -196,7 +196,8 @@ def _defence(loop: Loop, c: Array, f: Array) -> str:
         return _safe_set(defence, loop, c, f)
     if not isinstance(defence, Composed):
         return f"defence {type(defence).__name__} has no lane"
-    if "step" in vars(type(defence)) or type(defence).step is not Composed.step or type(defence).start is not Composed.start:
+    kind = type(defence)
+    if kind.step is not Composed.step or kind.start is not Composed.start or kind.prepare is not Composed.prepare:
         return f"defence {type(defence).__name__} has a step of its own"
     parts, plan = defence.parts(), loop.plan.defence
     for fill, part in zip((_filter, _detector, _mitigation), parts, strict=True):

@@ -130,6 +130,7 @@ class Robust(Part):
 class Stealth(Part):
     hours: Number
     threshold: Number | None = None
+    rarer: bool = False  # as in detection
     deviation: Number | None
     low: Number | None = None
     high: Number | None = None
@@ -257,15 +258,10 @@ class Detected(Part):
     attack: Text
     hours: Number
     threshold: Number | None = None
-    field: Text = ""
-    rarer: bool = False
+    watched: bool = False  # the threshold is held against the score of a defence that has none
+    rarer: bool = False  # with every lower threshold the alarm is more frequent than wanted, with this one rarer
     detected: Interval | None
     delay: Number | None = None
-
-    @property
-    def watched(self) -> bool:
-        """Whether the threshold is not the defence's own, but held against its score (tailgate.watch)."""
-        return self.field == "score"
 
 
 class Detection(Part):

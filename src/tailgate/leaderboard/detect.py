@@ -54,7 +54,7 @@ def detect(
 
 def _takes_part(entry: Data) -> bool:
     """Not the undefended car, nor who is told the truth, nor a sentinel."""
-    return entry["defence"] != "none" and "truth" not in entry["uses"] and not entry["card"].get("sentinel")
+    return entry["defence"] != "none" and "truth" not in entry["uses"] and not (entry.get("card") or {}).get("sentinel")
 
 
 def _nothing(effort: Effort) -> Data:
@@ -69,21 +69,25 @@ def _effort(held: Data) -> Effort:
 
 def _whole(held: Data, guard: str, suite: Suite, attacks: Sequence[str], effort: Effort) -> bool:
     """Whether an entry has all figures, or the reasons why it has none."""
-    there = {tuple(line[key] for key in PLACE if key in line) for part in LINES for line in held[part] if line["defence"] == guard}
+    lines = [line for part in LINES for line in held[part] if line["defence"] == guard and not _outdated(line)]
+    there = {tuple(line[key] for key in PLACE if key in line) for line in lines}
     return all(
         (plant, h) in there or all((name, attack, h) in there for name in names for attack in attacks)
         for plant, names in plants(suite.nominal).items() for h in effort.hours
     )  # fmt: skip
 
 
+def _outdated(line: Data) -> bool:
+    """Why an entry had no threshold when only its own was looked for."""
+    return str(line.get("reason", "")).startswith("defence: ")
+
+
 def _with(board: Data, guard: str, found: Data, effort: Effort) -> Data:
     """The board with the figures of one entry, in the order of its entries."""
     order = [entry["defence"] for entry in board["entries"]]
-    held = board.get("detection") or _nothing(effort)
-    lines = {
-        part: sorted([line for line in held[part] if line["defence"] != guard] + found[part], key=lambda line: order.index(line["defence"]))
-        for part in LINES
-    }
+    held, apart = board.get("detection") or _nothing(effort), {guard, *(e["defence"] for e in board["entries"] if not _takes_part(e))}
+    lines = {part: [line for line in held[part] if line["defence"] not in apart] + found[part] for part in LINES}
+    lines = {part: sorted(mine, key=lambda line: order.index(line["defence"])) for part, mine in lines.items()}
     entries = [entry | {"stealth": found["stealth"]} if entry["defence"] == guard else entry for entry in board["entries"]]
     return board | {"entries": entries, "detection": held | lines}
 
@@ -133,7 +137,8 @@ def check_detection(
     suite = suite_of(board)
     if not (held := data.get("detection")):
         raise InputError("board: detection", None, "figures of `leaderboard detect`")
-    names = list(dict.fromkeys(line["defence"] for part in LINES for line in held.get(part, ())))
+    part = {entry["defence"] for entry in data["entries"] if _takes_part(entry)}
+    names = list(dict.fromkeys(line["defence"] for key in LINES for line in held.get(key, ()) if line["defence"] in part))
     known(defences, names)
     mine = list(defences) or names
     asked = [mine[i] for i in drawn(list(range(len(mine))), sample, sample_seed)]

@@ -10,7 +10,7 @@ from .site_suite import Data, Suite, figure
 
 TOGETHER = STYLES  # defences with a line each in the chart of all: as many as there are line styles
 SCALES = ("log", "linear")
-BLANK = {"text": figure(None), "span": "", "reason": ""}  # of a figure that a board has not
+BLANK = {"text": figure(None), "span": "", "reason": "", "rarer": False}  # of a figure that a board has not
 
 
 def dots_of(curve: CurvePart) -> Line:
@@ -86,5 +86,5 @@ def reached_of(item: Stealth) -> Data:
     span = "" if item.low is None or item.high is None else f"{figure(item.low, 3)} to {figure(item.high, 3)}"
     return BLANK | {
         "hours": figure(item.hours), "threshold": figure(item.threshold), "text": figure(item.deviation, 3), "span": span,
-        "reason": item.reason,
+        "reason": item.reason, "rarer": item.rarer,
     }  # fmt: skip

@@ -209,6 +209,7 @@ def entry_page(
     found = [d for d in (suite.board.detection.entries if suite.board.detection else ()) if d.defence == entry.defence]
     detection = [
         {"attack": suite.attacks[d.attack], "scenario": d.scenario, "hours": figure(d.hours), "threshold": figure(d.threshold),
+         "rarer": d.rarer,
          "text": percent(d.detected.value) if d.detected else "n/a", "sort": f"{d.detected.value:.6g}" if d.detected else "",
          "span": f"{percent(d.detected.low)} to {percent(d.detected.high)}" if d.detected else "", "delay": figure(d.delay, 3)}
         for d in found
@@ -229,7 +230,7 @@ def entry_page(
         "charts": curves[0]["charts"] if curves else [], "clean": _clean(suite, entry),
         "robustness": [_robust(suite, r) for r in entry.robustness],
         "stealth": [reached_of(s) for s in entry.stealth or ()], "stealth_chart": stealth["chart"] if stealth else None,
-        "detection": detection, "watched": any(d.watched for d in found),
+        "detection": detection, "watched": any(d.watched for d in found), "rarer": any(d.rarer for d in found),
         "comparisons": comparisons_of(suite, entry.defence), "how": compared_how(suite),
         "round": suite.round, "about_trust": trust_of(suite), "trust": trust_page(suite, entry), "replay": replayed,
         "episode": _episode(suite, entry),

@@ -117,18 +117,16 @@ def detection_of(suite: Suite) -> Data | None:
             known = [c for c in cases if c.defence == defence and c.hours == hour and c.detected is not None]
             least = min(known, key=lambda c: c.detected.value if c.detected else 0.0, default=None)
             if least is None or least.detected is None:
-                cells.append({"text": "\N{EN DASH}", "sort": "", "low": "", "about": "", "delay": ""})
+                cells.append({"text": "\N{EN DASH}", "sort": "", "low": "", "about": "", "delay": "", "rarer": False})
                 continue
             cells.append({
                 "text": percent(least.detected.value), "sort": f"{least.detected.value:.6g}", "low": percent(least.detected.low),
                 "about": suite.where(least.scenario, least.attack), "delay": figure(least.delay, 3) if least.delay is not None else "",
+                "rarer": least.rarer,
             })  # fmt: skip
-        mine = [c for c in cases if c.defence == defence]
-        rows.append({
-            "name": suite.defences[defence], "page": suite.pages.get(defence, ""), "cells": cells, "watched": any(c.watched for c in mine),
-            "rarer": any(c.rarer for c in mine),
-        })  # fmt: skip
-    some = {key: any(r[key] for r in rows) for key in ("watched", "rarer")}
+        watched = any(c.watched for c in cases if c.defence == defence)
+        rows.append({"name": suite.defences[defence], "page": suite.pages.get(defence, ""), "cells": cells, "watched": watched})
+    some = {"watched": any(r["watched"] for r in rows), "rarer": any(case.rarer for case in cases)}
     return {"hours": [figure(h) for h in hours], "rows": rows, **some, "each": _each_attack(suite, sorted(hours)[len(hours) // 2])}
 
 

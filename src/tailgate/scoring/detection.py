@@ -26,9 +26,11 @@ from tailgate.registry import Spec
 from tailgate.scenario import Suite, load_scenario
 from tailgate.stats import median_limits, proportion
 from tailgate.trace import Trace, episodes_at_once, rollout
+from tailgate.watch import Watched
 
 LEVEL = 0.95  # of intervals
 UNTOUCHED = "no attack took effect"
+NO_GATE = "the alarm is the scorer's, on a score with no gate that one could stay below"
 Progress = Callable[[str, int, int, str], None]  # label, done, total, figures
 Data = dict[str, Any]
 
@@ -102,9 +104,9 @@ def detection(
     """The field `detection` of a board: the share of attacked episodes with an alarm within the deadline, and the median delay [steps].
 
     In the suite's scenarios of the told plant, under its threat model, at its middle dose unless given; thresholds are found on the clean
-    runs of all scenarios of a plant together; `field` says of what they are: the parameter, or `score` of one that is watched, and
-    `rarer` that no threshold alarms as often as wanted, only more often or, as this one, more rarely. `without` lists what takes no place
-    here, and why: a mean time that is out of reach.
+    runs of all scenarios of a plant together. `watched`: the threshold is held against the score of a defence that has none; `rarer`: no
+    threshold alarms as often as wanted, lower ones do more often and this one more rarely. `without` lists what takes no place here, and
+    why: a mean time that is out of reach.
     """
     update = progress or (lambda *_: None)
     found: list[Data] = []
@@ -119,8 +121,8 @@ def detection(
                 bench = Bench.of(guard, [name], effort.episodes, None)
                 for attack in attacks:
                     rows = run_cell(_cell(suite, name, dose, guard, attack, effort.episodes, beacon), bench.at(level), uses=bench.uses)
-                    head = {"defence": guard, "scenario": name, "attack": attack, "hours": h, "threshold": level, "field": bench.field}
-                    head |= {"rarer": True} if rarer else {}
+                    head = {"defence": guard, "scenario": name, "attack": attack, "hours": h, "threshold": level}
+                    head |= {name: True for name, holds in (("watched", not bench.field), ("rarer", rarer)) if holds}
                     found.append(head | _detected(rows))
         update("detection", done, len(work), guard)
     return dataclasses.asdict(effort) | {"hours": list(effort.hours), "entries": found, "without": without}
@@ -158,9 +160,10 @@ def stealth_impact(
         raise InputError(f"suite {suite.name}: scenarios", list(suite.nominal), "scenarios of one plant")
     out: list[Data] = []
     for done, h in enumerate(effort.hours, start=1):
-        level, why, _ = _found(defence, suite.nominal, h, effort)
+        level, why, rarer = _found(defence, suite.nominal, h, effort)
         cells = [] if level is None else [_cell(suite, name, dose, defence, attack, effort.episodes, beacon) for name in suite.nominal]
-        out.append({"hours": h, "threshold": level} | _impact([_reached(level, cell) for cell in cells if level is not None], why))
+        head = {"hours": h, "threshold": level} | ({"rarer": True} if rarer else {})
+        out.append(head | _impact([_reached(level, cell) for cell in cells if level is not None], why))
         update(f"stealth against {defence}", done, len(effort.hours), f"{h:g} h")
     return out if any(item["threshold"] is not None for item in out) else None
 
@@ -179,6 +182,8 @@ def _reached(level: float, cell: Cell) -> Array | str:
     """(n,) deviations of the episodes that were attacked, or why there are none."""
     made, rival = Bench.of(cell.defence, [cell.scenario], cell.seeds, None).at(level), Spec("attack", cell.attack)
     attack, guard = rival.make(), Spec("defence", cell.defence)
+    if isinstance(made, Watched):
+        return NO_GATE
     values: list[Array] = []
     try:
         loop = cell.place(attack, rival.entry.knowledge).loop(made, guard.entry.uses)
