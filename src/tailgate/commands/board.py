@@ -57,8 +57,8 @@ def add(actions: Any) -> None:
 def _run(options: argparse.Namespace) -> int:
     sys.path.insert(0, "")  # module:Class is looked for in the working directory, as `tailgate evaluate` does
     from tailgate.leaderboard.attacked import attack
-    from tailgate.leaderboard.clock import clock_of
     from tailgate.leaderboard.detect import detect
+    from tailgate.leaderboard.measured import measured_of
     from tailgate.leaderboard.run import BOARD, board_of, kept_board, play
     from tailgate.leaderboard.run_record import Record
     from tailgate.leaderboard.site import build_site
@@ -71,7 +71,7 @@ def _run(options: argparse.Namespace) -> int:
             raise InputError("--train", True, f"no --{name.replace('_', '-')}: it trains and plays whoever was not attacked")
     out, started = Path(options.out), time.perf_counter()
     suites = [load_suite(name) for name in options.suites]
-    clocks = [clock_of(out / suite.name / BOARD) for suite in suites]  # before anything is played
+    measured = [measured_of(out / suite.name / BOARD) for suite in suites]  # before anything is played
     kept = {suite.name: kept_board(out / suite.name / BOARD, suite, options.beacon) for suite in suites if options.keep_entries}
     boards = []
     with progress(Console(stderr=True)) as update:
@@ -98,7 +98,7 @@ def _run(options: argparse.Namespace) -> int:
                 board = board_of(suite, folder, beacon=options.beacon or None, keep=options.keep_entries)
             print(record.finish(board["suite"]["rows"]), file=sys.stderr)
             boards.append(detect(folder / BOARD, suite, workers=options.workers, progress=update) if options.detection else board)
-    page = build_site(boards, out / "page", replays=not options.no_replays, clocks=clocks)
+    page = build_site(boards, out / "page", replays=not options.no_replays, measured=measured)
     if options.json:
         print(json.dumps([{"suite": b["suite"]["name"], "entries": b["entries"]} for b in boards], indent=1, allow_nan=False))
     else:
@@ -134,11 +134,11 @@ def _head(options: argparse.Namespace) -> int:
 
 def _page(options: argparse.Namespace) -> int:
     from tailgate.leaderboard.board_format import load
-    from tailgate.leaderboard.clock import clock_of
+    from tailgate.leaderboard.measured import measured_of
     from tailgate.leaderboard.site import build_site
 
     boards = [load(Path(name)) for name in options.boards]
-    clocks = [clock_of(Path(name)) for name in options.boards]
-    page = build_site(boards, Path(options.out), title=options.title, replays=not options.no_replays, clocks=clocks)
+    measured = [measured_of(Path(name)) for name in options.boards]
+    page = build_site(boards, Path(options.out), title=options.title, replays=not options.no_replays, measured=measured)
     print(page)
     return 0

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from tailgate.commands import admit, attack, board, check, clock, detect, retrain, submit, verify
+from tailgate.commands import admit, attack, board, check, clock, detect, retrain, schedules, submit, verify
 
 
 def add(commands: Any) -> None:
@@ -19,6 +19,7 @@ def add(commands: Any) -> None:
     check.add(actions)
     detect.add(actions)
     clock.add(actions)
+    schedules.add(actions)
     retrain.add(actions)
     admit.add(actions)
     build = actions.add_parser("build", help="one self-contained HTML page from rows files, without gates and limits of a board")

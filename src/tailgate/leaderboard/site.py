@@ -21,7 +21,7 @@ from tailgate.replay.page import embedded
 
 from .board_format import read_board
 from .build import TITLE, _asset, _inline, breakable
-from .clock import Clock
+from .measured import Measured
 from .site_entry import Replayed, entry_page, replay_of
 from .site_index import section
 from .site_suite import GROUPS, Data, Suite
@@ -70,20 +70,19 @@ def _environment() -> Environment:
 
 
 def build_site(
-    boards: Sequence[dict[str, Any]], out: Path, *, title: str | None = None, replays: bool = True, clocks: Sequence[Clock | None] = (),
+    boards: Sequence[dict[str, Any]], out: Path, *, title: str | None = None, replays: bool = True, measured: Sequence[Measured] = (),
 ) -> Path:  # fmt: skip
     """Writes the site of `boards` (format tailgate-board-1) to the folder `out` and returns the path of its first page.
 
     replays: play each entry's worst episode again and write its page; without, the entries' pages say that it was not done.
-    clocks: step times of each board, where somebody has measured them.
+    measured: what lies beside each board.
     Raises InputError, before anything is written, for no board, two of a suite, one that is not of the format (names the field), and for
-    step times of another suite.
+    what was measured of another suite.
     """
     suites = _suites(boards)
-    timed = list(clocks) or [None] * len(suites)
-    for suite, clock in zip(suites, timed, strict=True):
-        if clock is not None and clock.suite != suite.board.suite.name:
-            raise InputError("step times: suite", clock.suite, f"{suite.board.suite.name}, whose board they lie beside")
+    found = list(measured) or [Measured()] * len(suites)
+    for suite, beside in zip(suites, found, strict=True):
+        beside.belongs(suite.board.suite.name)
     held = [_encoded(data, "board") for data in boards]
     heading = title or TITLE
     environment = _environment()
@@ -92,12 +91,12 @@ def build_site(
     written: dict[str, bytes] = {}
     for suite, content in zip(suites, held, strict=True):
         written[f"{suite.folder}/board.json"] = content
-    sections = [section(s) | {"hash": hashlib.sha256(c).hexdigest()} for s, c in zip(suites, held, strict=True)]
+    sections = [section(s, m) | {"hash": hashlib.sha256(c).hexdigest()} for s, m, c in zip(suites, found, held, strict=True)]
     page = environment.get_template("site_index.html").render(sections=sections, statuses=GROUPS, **common)
     written["index.html"] = _utf8(page)
     template = environment.get_template("site_entry.html")
     listed: list[Data] = []
-    for suite, clock in zip(suites, timed, strict=True):
+    for suite, beside in zip(suites, found, strict=True):
         for entry in suite.ordered():
             where = suite.pages[entry.defence]
             also = [(s.board.suite.name, f"../{s.pages[entry.defence]}") for s in suites if s is not suite and entry.defence in s.pages]
@@ -106,7 +105,7 @@ def build_site(
             done = replay_of(entry.worst_episode, replay, source) if replays else Replayed(why="Replays were not asked for.")
             if done.page:
                 written[str(replay.relative_to(folder))] = replay.read_bytes()
-            context = entry_page(suite, entry, done, also, clock)
+            context = entry_page(suite, entry, done, also, beside)
             written[where] = _utf8(template.render(entry=context, **common))
             listed.append({
                 "suite": suite.board.suite.name, "defence": entry.defence, "status": entry.status, "class": entry.class_, "page": where,

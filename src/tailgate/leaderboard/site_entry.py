@@ -17,10 +17,12 @@ from tailgate.replay.replay import play
 from .board_format import LEVELS, CellPart, EntryPart, Robust
 from .build import names_of, percent
 from .clock import Clock
+from .measured import Measured
 from .site_cards import card_of
 from .site_curves import curves_of, reached_of, stealth_of
 from .site_index import compared_how, comparisons_of
 from .site_suite import Data, Suite, critical_of, dose_text, figure, played, share_of, worse
+from .site_timing import flags_of, timed_of
 from .site_trust import trust_of, trust_page
 
 
@@ -200,7 +202,7 @@ def _clocked(clock: Clock | None, defence: str) -> str:
 
 
 def entry_page(
-    suite: Suite, entry: EntryPart, replayed: Replayed | None, also: list[tuple[str, str]], clock: Clock | None = None
+    suite: Suite, entry: EntryPart, replayed: Replayed | None, also: list[tuple[str, str]], measured: Measured
 ) -> Data:
     """All that an entry's page shows. also: names of other suites with an entry of the same text, and their pages."""
     curves = curves_of(suite, [entry], gap=7.0)
@@ -217,11 +219,13 @@ def entry_page(
     return {
         "suite": suite.board.suite, "damage": suite.damage, "limit": percent(suite.board.suite.limit), "scale": suite.scale,
         "name": suite.defences[entry.defence], "status": entry.status, "why": entry.why,
-        "replayed": _replayed(entry), "checked": _checked(entry), "clocked": _clocked(clock, entry.defence),
+        "replayed": _replayed(entry), "checked": _checked(entry), "clocked": _clocked(measured.clock, entry.defence),
+        "timed": timed_of(measured.timing, entry.defence),
         "typed": shlex.quote(entry.defence),
         "imported": _imported(entry.defence),
         "class": entry.class_ or "not stated",
-        "rank": _rank(suite, entry), "also": also, "card": card_of(suite, entry), "flags": entry.flags, "levels": LEVELS,
+        "rank": _rank(suite, entry), "also": also, "card": card_of(suite, entry), "levels": LEVELS,
+        "flags": [*entry.flags, *flags_of(measured.timing, entry.defence)],
         "critical": [(level, critical_of(suite, entry, level)) for level in LEVELS],
         "rates": _rates(suite, entry), "worst": _worst(suite, entry), "cells": _every(suite, mine),
         "doses": [dose_text(d) for d in suite.board.suite.doses],

@@ -6,16 +6,18 @@ from collections import Counter
 
 from .board_format import LEVELS, CellPart, Dose, Level
 from .build import Name, percent
+from .measured import Measured
 from .site_cards import attack_cards
 from .site_curves import curves_of, stealth_of, together_of
 from .site_suite import GROUPS, Data, Suite, cell_of, critical_of, dose_text, figure, gates_of, played, share_of, worse
+from .site_timing import flags_of
 from .site_trust import trust_cell, trust_of
 
 OWN = ""  # in place of an attack: all that were trained against the row's defence
 TRAINED = Name("trained against it", ("the worst",))
 
 
-def _lines(suite: Suite) -> list[Data]:
+def _lines(suite: Suite, measured: Measured) -> list[Data]:
     ranked = [e for e in suite.board.entries if e.rank]
     out = []
     for i, entry in enumerate(suite.ordered()):
@@ -31,7 +33,8 @@ def _lines(suite: Suite) -> list[Data]:
             "class": entry.class_ or "not stated", "rank": rank,
             "critical": [critical_of(suite, entry, level) for level in ("black", "white")],
             "rates": [{level: rates.get((dose, level), share_of(None)) for level in LEVELS} for dose in suite.shown],
-            "trust": trust_cell(suite, entry), "gates": gates_of(entry), "flags": entry.flags, "status": entry.status, "why": entry.why,
+            "trust": trust_cell(suite, entry), "gates": gates_of(entry),
+            "flags": [*entry.flags, *flags_of(measured.timing, entry.defence)], "status": entry.status, "why": entry.why,
         })  # fmt: skip
     return out
 
@@ -238,10 +241,10 @@ def _group(title: str, about: str, rows: list[Data]) -> Data:
     return {"title": title, "about": about, "rows": rows, "shared": shared, "scope": "all" if n == len(rows) else "unless said otherwise"}
 
 
-def section(suite: Suite) -> Data:
+def section(suite: Suite, measured: Measured) -> Data:
     """All that index.html shows of a suite."""
     board = suite.board
-    rows = _lines(suite)
+    rows = _lines(suite, measured)
     groups = [_group(t, about, [r for r in rows if r["status"] == s]) for s, t, about in GROUPS]
     doses = [{"text": dose_text(d), "why": board.suite.shown.get(str(d), "")} for d in suite.shown]
     return {

@@ -91,16 +91,20 @@ def yoked_to(schedule: Array) -> Array:
     return np.roll(schedule, 1, axis=1)
 
 
-def play(loop: Loop, policy: PolicyAttack, keys: Keys, outcome: str) -> Played:
-    """Play a policy at its own times and at those of its twins, the same episodes each."""
+def schedules(loop: Loop, policy: PolicyAttack, keys: Keys) -> dict[str, Array | None]:
+    """(K, B) bool of each twin: when it attacks; none for the policy itself, which decides as it goes."""
     times = recorded(loop, policy, keys)
     first, last = loop.threat.onset, min(loop.threat.end or loop.horizon, loop.horizon)
     chance = keys.at(Role.POLICY, np.zeros(len(keys.key), np.int64))
-    schedules = {
+    return {
         "own": None, "yoked": yoked_to(times), "shuffled": shuffled(times, first, last, chance), "periodic": periodic(times, first, last),
     }  # fmt: skip
+
+
+def play(loop: Loop, policy: PolicyAttack, keys: Keys, outcome: str) -> Played:
+    """Play a policy at its own times and at those of its twins, the same episodes each."""
     results = Played({}, {})
-    for name, schedule in schedules.items():
+    for name, schedule in schedules(loop, policy, keys).items():
         results.outcome[name], results.steps[name] = played(loop, policy, keys, schedule, [METRICS[outcome], attack_steps])
     if any(np.isnan(values).any() for values in results.outcome.values()):
         raise InputError("outcome", outcome, "a metric that every episode has")

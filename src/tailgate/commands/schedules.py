@@ -1,0 +1,65 @@
+"""tailgate leaderboard timing: what the timing of a board's trained attackers is worth."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from tailgate.progress import console, progress
+
+
+def add(actions: Any) -> None:
+    """Adds `timing` to the actions of a command."""
+    command = actions.add_parser(
+        "timing", help="measure what the timing of a board's trained attackers is worth",
+        description="Play a trained attacker of each ranked entry again, at its own times and at those of its twins (another episode's, "
+        "shuffled, evenly spread), and write OUT/SUITE/timing.json, which the pages of the entries show. With --defence figures are "
+        "printed, not written.",
+    )  # fmt: skip
+    command.add_argument("suite", metavar="SUITE", help="suite by name or YAML file")
+    command.add_argument("--out", required=True, metavar="DIR", help="folder of the boards")
+    command.add_argument("--defence", action="append", default=[], metavar="NAME", help="only these (repeatable; default: all ranked)")
+    command.add_argument("--json", action="store_true", help="print the file")
+    command.set_defaults(run=_timing)
+
+
+def _timing(options: argparse.Namespace) -> int:
+    from tailgate.files import write_atomic
+    from tailgate.leaderboard.board_format import load
+    from tailgate.leaderboard.run import BOARD
+    from tailgate.leaderboard.timing import FILE, measure_timing
+    from tailgate.scenario import load_suite
+
+    suite = load_suite(options.suite)
+    folder = Path(options.out) / suite.name
+    board = load(folder / BOARD)
+    with progress(Console(stderr=True)) as update:
+        timing = measure_timing(
+            board, suite, options.defence, lambda done, total: update("schedules", done, total, f"{done} of {total} entries"),
+        )  # fmt: skip
+    held = timing.model_dump_json(indent=1) + "\n"
+    if not options.defence:  # part of a file would lose the rest
+        write_atomic(folder / FILE, held.encode())
+    if options.json:
+        print(held, end="")
+        return 0
+    table = Table(title=escape(f"{suite.name}: damage [%] at own times, and at those of twins"), caption="* yoked equals own")
+    for heading in ("defence", "attacker", "scenario", "dose", "own", "yoked", "shuffled", "periodic", "advantage"):
+        table.add_column(heading, overflow="fold")
+    for entry in timing.entries:
+        shares = (f"{100 * share.value:.0f}" for share in (entry.own, entry.yoked, entry.shuffled, entry.periodic))
+        gain = f"{100 * entry.advantage.value:+.0f} ({100 * entry.advantage.low:.0f} to {100 * entry.advantage.high:.0f})"
+        who = "/".join(Path(entry.attack).with_suffix("").parts[-2:])
+        texts = (entry.defence, who, entry.scenario, "own" if entry.dose is None else str(entry.dose), *shares)
+        table.add_row(*map(escape, texts), gain + " *" * entry.flagged)
+    console().print(table)
+    for missing in timing.without:
+        print(f"{missing.defence}: {missing.why}")
+    if not options.defence:
+        print(folder / FILE)
+    return 0
