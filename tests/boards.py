@@ -55,13 +55,13 @@ class Outline(HTMLParser):
     def handle_starttag(self, tag, attrs):
         self.tags.append((tag, dict(attrs)))
         if tag == "table":
-            self.table = dict(attrs)["class"]
+            self.table = dict(attrs).get("class")
         if tag == "tr":
             self.lines.append([self.table, ""])
 
     def handle_data(self, data):
         if self.lines:
-            self.lines[-1][1] += " " + data
+            self.lines[-1][1] += " " + " ".join(data.split())
 
     def rows(self, table):
         return [re.sub(r"\s+", " ", text).strip() for kind, text in self.lines if kind == table]

@@ -1,9 +1,10 @@
 """The leaderboard page: what it says, that nothing in the rows becomes markup, and how it behaves in a browser."""
 
+import importlib.util
 import json
 import re
-from html.parser import HTMLParser
 from importlib.resources import files
+from pathlib import Path
 
 import pytest
 
@@ -11,6 +12,10 @@ from tailgate.errors import InputError
 from tailgate.leaderboard.build import breakable, build, names_of, percent, shade, spans, steps, ticks
 from tailgate.metrics import METRICS
 
+spec = importlib.util.spec_from_file_location("boards", Path(__file__).with_name("boards.py"))
+boards = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(boards)
+Outline = boards.Outline
 HOSTILE = "evil:<script>document.title='owned'</script>&\"'"
 LONG = "a_very_long_module_name_without_any_space." * 4 + "Defence"
 NONE, JAM, STEALTH, POLICY = "none", "dos_jam:trigger=near,threshold=40", "stealth", "/home/x/runs/sac-a/policy.json"
@@ -59,29 +64,6 @@ HEADLINE = {
         {"label": "Scripted & best", "value": 0.25, "low": 0.1, "high": 0.4, "note": ""},
     ],
 }
-
-
-class Outline(HTMLParser):
-    """Tags with their attributes, and the text of every table row."""
-
-    def __init__(self, text):
-        super().__init__()
-        self.tags, self.lines, self.table = [], [], None
-        self.feed(text.replace("<wbr>", ""))
-
-    def handle_starttag(self, tag, attrs):
-        self.tags.append((tag, dict(attrs)))
-        if tag == "table":
-            self.table = dict(attrs).get("class")
-        if tag == "tr":
-            self.lines.append([self.table, ""])
-
-    def handle_data(self, data):
-        if self.lines:
-            self.lines[-1][1] += " " + " ".join(data.split())
-
-    def rows(self, table):
-        return [re.sub(r"\s+", " ", text).strip() for kind, text in self.lines if kind == table]
 
 
 @pytest.fixture(scope="module")
