@@ -132,6 +132,18 @@ def test_a_published_board_is_of_the_suite_that_is_here(name: str) -> None:
         assert (entry.verified and entry.verified.sound) or (again and again.equal > 0 == again.differs), entry.defence
 
 
+@pytest.mark.parametrize("name", BOARDS)
+def test_no_figure_of_a_published_board_rests_on_a_policy_that_is_not_here(name: str) -> None:
+    """The worst of rates, critical doses and robustness rows, and worst episodes, can be played by whoever clones."""
+    board = json.loads((ROOT / f"results/{name}/board.json").read_text(encoding="utf-8"))
+    named = set()
+    for entry in board["entries"]:
+        worst = [*entry["rates"], *(dose for dose in entry["critical_dose"].values() if dose), *entry["robustness"]]
+        named |= {one["worst"]["attack"] for one in worst} | ({entry["worst_episode"]["attack"]} if entry["worst_episode"] else set())
+    files = [attack for attack in named if attack.endswith(".json")]
+    assert files and all((ROOT / file).is_file() for file in files)
+
+
 # Plans of before whose policies count on: those of radar-v0 answered late by 60 m (decision 30).
 EARLIER = {"radar-v0": {"1ea5def9aee4fb47", "20e6fc0e71aa5875", "49a9e01c935738ac", "7ea5b769dc8e2028"}}
 
