@@ -141,7 +141,7 @@ def test_no_figure_of_a_published_board_rests_on_a_policy_that_is_not_here(name:
         worst = [*entry["rates"], *(dose for dose in entry["critical_dose"].values() if dose), *entry["robustness"]]
         named |= {one["worst"]["attack"] for one in worst} | ({entry["worst_episode"]["attack"]} if entry["worst_episode"] else set())
     files = [attack for attack in named if attack.endswith(".json")]
-    assert files and all((ROOT / file).is_file() for file in files)
+    assert named and all((ROOT / file).is_file() for file in files)
 
 
 # Plans of before whose policies count on: those of radar-v0 answered late by 60 m (decision 30).
