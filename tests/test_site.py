@@ -129,11 +129,11 @@ def test_a_board_without_a_road_names_its_bound(site):
 def test_an_entry_s_page_has_all_parts(site):
     """Card, gates, flags, worst attacks, curves, robustness, stealth, detection, comparisons, and a link to the other suite."""
     text = entry(site, "chi2_kf:eta=15").read_text(encoding="utf-8")
-    for part in ("https://example.org/paper", "Licence", "threshold of the gate [1]", "the budget was not spent", "car-following-heavy-v0", "\N{MINUS SIGN}7%", "false alarms",
+    for part in ("https://example.org/paper", "Licence", "threshold of the gate [1]", "the budget was not spent", "car-following-heavy-v0", "<td>\N{MINUS SIGN}7</td>", "false alarms",
                  "Only A damaged", "steps: 20000", "../network-v0/chi2_kf", "other plant", "Delay [steps]"):  # fmt: skip
         assert part in text, part
     assert text.count('class="plot ') == 3  # a chart on each scale, and that of stealth impact
-    assert "leaderboard check board.json --defence chi2_kf:eta=15" in text and "leaderboard check FILE" in site.read_text(encoding="utf-8")
+    assert "leaderboard check OUT/synthetic-v0/board.json --defence chi2_kf:eta=15" in text and "leaderboard check FILE" in site.read_text(encoding="utf-8")
     bare = entry(site, HOSTILE).read_text(encoding="utf-8")
     assert "came without a card" in bare and "No replay. The board holds no worst episode" in bare and "Stealth and impact" not in bare
     assert "a class of somebody's own" in bare and "leaderboard check" not in bare  # a board does not import it

@@ -6,7 +6,10 @@ from pathlib import Path
 
 import pytest
 
+from tailgate.leaderboard.board_format import read_board
 from tailgate.leaderboard.build import percent
+from tailgate.leaderboard.site_index import detection_of
+from tailgate.leaderboard.site_suite import Suite
 
 spec = importlib.util.spec_from_file_location("boards", Path(__file__).with_name("boards.py"))
 boards = importlib.util.module_from_spec(spec)
@@ -37,9 +40,27 @@ def test_detection_is_shown_attack_by_attack(index):
         assert any(line.startswith(attack.split(":")[0]) and " ".join(["", *shown]) in line for line in lines)
 
 
+def test_the_headline_is_the_mean_and_the_least_stands_below(index):
+    """Each script and scenario weighs the same; in the made-up board there is one."""
+    (case,) = [c for c in make_board()["detection"]["entries"] if c["defence"] == "cusum_kf" and c["hours"] == 1]
+    share = percent(case["detected"]["value"])
+    rows = [re.sub(r"\s+", " ", text).strip() for _, text in index.lines]
+    assert any(row.startswith("cusum_kf") and f"{share} {share}, at least {percent(case['detected']['low'])}:" in row for row in rows)
+
+
+def test_a_mean_is_of_all_scripts_and_scenarios():
+    """Two scripts, of which one is not seen; one that could not be played does not count."""
+    board = make_board()
+    told = next(c for c in board["detection"]["entries"] if c["defence"] == "kf" and c["hours"] == 1)
+    more = [told | {"attack": "dropout:trigger=near,threshold=40", "detected": {"value": v, "low": 0.0, "high": 1.0} if v is not None else None} for v in (0.0, None)]
+    board["detection"]["entries"] = [told | {"detected": {"value": 1.0, "low": 0.9, "high": 1.0}}, *more]
+    row = detection_of(Suite(read_board(board), ""))["rows"][0]
+    assert [(c["text"], c["least"]) for c in row["cells"] if c["least"]] == [("50%", "0%")]
+
+
 def test_what_is_watched_and_what_is_rarer_is_said(index, site):
     """Beside the defence, and beside the figure that it is of; the entry's page says so too, another's does not."""
     rows = [re.sub(r"\s+", " ", text) for _, text in index.lines if re.match(r"\s*kf\s+watched", text)]
-    assert rows and all(row.count("rarer") == 1 and row.index("rarer") > row.rindex("%") for row in rows)
+    assert rows and all(re.fullmatch(r"( kf watched)( \d+% \d+%, at least [^%]*%: [^%]*){2} \d+% rarer \d+%, at least [^%]*%: [^%]*", row) for row in rows)
     mine, other = (entry(site, name).read_text(encoding="utf-8") for name in ("kf", "cusum_kf"))
     assert mine.count('<span class="param">rarer</span>') == 1 and "no threshold of its own" in mine and "no threshold of its own" not in other

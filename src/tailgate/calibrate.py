@@ -245,7 +245,7 @@ class Bench:
             onsets, played = count_onsets(loops[place.name], draws.keys(purpose, seeds), crossings)
             counts.append(onsets)
             steps[place.name] += played
-            self.progress(label, done, len(chunks), f"threshold {threshold:.{MOST_DIGITS}g}" if threshold < SILENT else "no alarms")
+            self.progress(label, done, len(chunks), f"threshold {threshold:.{MOST_DIGITS}g}" if threshold < SILENT else "")
         each = np.concatenate(counts)
         mean = float(each.mean())
         seconds = math.fsum(steps[place.name] * place.brief().model.dt for place in self.places)

@@ -64,18 +64,30 @@ def _command(options: argparse.Namespace) -> str:
 
 
 def _print_results(results: list[dict[str, Any]]) -> None:
-    table = Table(title=f"Thresholds on {', '.join(results[0]['seeds'])}", caption="mean times in hours; 95 % intervals (Poisson)")
+    caption = "mean times in hours; 95 % intervals (Poisson)" + _words(results)
+    table = Table(title=f"Thresholds on {', '.join(results[0]['seeds'])}", caption=caption)
     for heading in ("defence", "parameter", "threshold", "wanted", "measured", "interval", "alarms", "fresh runs"):
         table.add_column(heading, overflow="fold")
     for result in results:
         measured, fresh = result["measured"], result["fresh"]
-        note = "" if result["settled"] else " (not settled)"
+        note = "" if result["settled"] else " (rarer)" if _rarer(result) else " (not settled)"
         table.add_row(
             result["defence"], result["field"] or "watched", f"{result['threshold']:g}{note}", f"{result['wanted_hours']:g}",
             _hours(measured["hours"]), _between(measured), str(measured["onsets"]),
             f"{_hours(fresh['hours'])} ({_between(fresh)})" if fresh else "-",
         )  # fmt: skip
     console().print(table)
+
+
+def _rarer(result: dict[str, Any]) -> bool:
+    """Whether the wanted time is below all that the runs allow: the score jumps."""
+    return bool(result["measured"]["low"] > result["wanted_hours"])
+
+
+def _words(results: list[dict[str, Any]]) -> str:
+    watched, rarer = any(not result["field"] for result in results), any(not result["settled"] and _rarer(result) for result in results)
+    said = "\nwatched: a threshold on the score of a defence that has none; nothing acts on its alarm" if watched else ""
+    return said + ("\nrarer: its score jumps, and with every lower threshold it alarms more often than wanted" if rarer else "")
 
 
 def _hours(value: float | None) -> str:

@@ -60,6 +60,5 @@ def _timing(options: argparse.Namespace) -> int:
     console().print(table)
     for missing in timing.without:
         print(f"{missing.defence}: {missing.why}")
-    if not options.defence:
-        print(folder / FILE)
+    print("figures of some entries are not written" if options.defence else folder / FILE)
     return 0

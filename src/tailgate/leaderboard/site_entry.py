@@ -25,6 +25,9 @@ from .site_suite import Data, Suite, critical_of, dose_text, figure, played, sha
 from .site_timing import flags_of, timed_of
 from .site_trust import trust_of, trust_page
 
+LEAST = ("progress", "every episode")  # gates whose limit is one from below
+WAYS = ("\N{LESS-THAN OR EQUAL TO}", "\N{GREATER-THAN OR EQUAL TO}")
+
 
 @dataclass(frozen=True)
 class Replayed:
@@ -134,7 +137,7 @@ def _robust(suite: Suite, item: Robust) -> Data:
         share: Data = {"text": percent(item.undamaged), "low": "", "sort": item.undamaged}
     else:
         share = share_of(item.undamaged)
-    change = "\N{EN DASH}" if item.change is None else percent(item.change) if item.change <= 0 else f"+{percent(item.change)}"
+    change = "\N{EN DASH}" if item.change is None else f"{100 * item.change:+.0f}".replace("-", "\N{MINUS SIGN}")
     worst = suite.where("", item.worst.attack) if item.worst else ""
     return {"scenario": item.scenario, "undamaged": share, "change": change, "worst": worst}
 
@@ -221,7 +224,7 @@ def entry_page(
         "name": suite.defences[entry.defence], "status": entry.status, "why": entry.why,
         "replayed": _replayed(entry), "checked": _checked(entry), "clocked": _clocked(measured.clock, entry.defence),
         "timed": timed_of(measured.timing, entry.defence),
-        "typed": shlex.quote(entry.defence),
+        "typed": shlex.quote(entry.defence), "board": f"OUT/{suite.folder}/board.json", "road": suite.board.suite.bound is None,
         "imported": _imported(entry.defence),
         "class": entry.class_ or "not stated",
         "rank": _rank(suite, entry), "also": also, "card": card_of(suite, entry), "levels": LEVELS,
@@ -230,6 +233,7 @@ def entry_page(
         "rates": _rates(suite, entry), "worst": _worst(suite, entry), "cells": _every(suite, mine),
         "doses": [dose_text(d) for d in suite.board.suite.doses],
         "gates": [{"gate": g.gate.replace("_", " "), "scenario": g.scenario, "value": figure(g.value), "limit": figure(g.limit),
+                   "way": WAYS[g.gate in LEAST],
                    "passed": g.passed} for g in entry.gates],
         "charts": curves[0]["charts"] if curves else [], "clean": _clean(suite, entry),
         "robustness": [_robust(suite, r) for r in entry.robustness],

@@ -118,12 +118,13 @@ def detection_of(suite: Suite) -> Data | None:
         cells = []
         for hour in hours:
             known = [c for c in cases if c.defence == defence and c.hours == hour and c.detected is not None]
+            mean = sum(c.detected.value for c in known if c.detected) / max(len(known), 1)
             least = min(known, key=lambda c: c.detected.value if c.detected else 0.0, default=None)
             if least is None or least.detected is None:
-                cells.append({"text": "\N{EN DASH}", "sort": "", "low": "", "about": "", "delay": "", "rarer": False})
+                cells.append({"text": "\N{EN DASH}", "sort": "", "least": "", "low": "", "about": "", "delay": "", "rarer": False})
                 continue
             cells.append({
-                "text": percent(least.detected.value), "sort": f"{least.detected.value:.6g}", "low": percent(least.detected.low),
+                "text": percent(mean), "sort": f"{mean:.6g}", "least": percent(least.detected.value), "low": percent(least.detected.low),
                 "about": suite.where(least.scenario, least.attack), "delay": figure(least.delay, 3) if least.delay is not None else "",
                 "rarer": least.rarer,
             })  # fmt: skip
@@ -223,7 +224,7 @@ def checked_of(suite: Suite) -> str:
     entries, said = suite.board.entries, []
     if told := [entry.verified for entry in entries if entry.verified is not None]:
         equal, differs, unchecked = sum(v.verified for v in told), sum(v.differs for v in told), sum(v.unchecked for v in told)
-        rows = played(sum(v.rows for v in told), equal, differs, unchecked, "rows")
+        rows = played(max(sum(v.rows for v in told), suite.board.suite.rows or 0), equal, differs, unchecked, "rows")
         said.append(f"rows of {sum(v.sound for v in told)} of {len(entries)} entries replayed without a difference: {rows}")
     if held := [entry.checked for entry in entries if entry.checked is not None]:
         equal, differs, unchecked = sum(c.equal for c in held), sum(c.differs for c in held), sum(c.unchecked for c in held)
