@@ -85,7 +85,7 @@ def test_built_in_suites_name_doses_that_have_a_reason() -> None:
         assert "none" in suite.attacks and ("none" in suite.defences or suite.bound is not None)
 
 
-@pytest.mark.parametrize("name", ["quick-v0", "car-following-v0", "radar-v0", "network-v0", "thesis-v0"])
+@pytest.mark.parametrize("name", ["quick-v0", "car-following-v0", "platoon-v0", "radar-v0", "network-v0", "thesis-v0"])
 def test_the_entries_of_a_published_board_met_every_built_in_attack_that_its_suite_grants(name) -> None:
     """Scripts, programs and all of the zoo: what they did not meet is refused, wholly or in part, does nothing, or is a ceiling. Nobody was spared."""
     suite, board = load_suite(name), json.loads((ROOT / f"results/{name}/board.json").read_text())
