@@ -14,12 +14,13 @@ from tailgate.core import Model
 from tailgate.draws import Role, keys
 from tailgate.errors import NotApplicable
 from tailgate.estimators import AcceptAll, ChiSquare, Composed, GatedKalman, GateOut, KalmanFilter, Score, compose
+from tailgate.estimators.watched import watched
 from tailgate.num import inverse, quadratic
 from tailgate.registry import Spec
 from tailgate.scenario import Suite, load_scenario
 from tailgate.scoring.detection import Effort, detection, stealth_impact
 from tailgate.trace import Trace, rollout
-from tailgate.watch import Watched, watched
+from tailgate.watch import Watched
 
 BIAS = "fdi:value=-3,start_step=40,length=20"
 ECHO = "echo_delay:start_step=30,delay=60"

@@ -25,12 +25,12 @@ from tailgate import draws
 from tailgate.agents.scripted import NoAttack
 from tailgate.core import Array, Model, no_command
 from tailgate.errors import InputError, NotApplicable
+from tailgate.estimators.watched import watched
 from tailgate.fused import Constants, fuse
 from tailgate.loop import Loop
 from tailgate.registry import Spec, entry_for, text_of
 from tailgate.scenario import Scenario, load_scenario
 from tailgate.trace import MEMORY, episodes_at_once, rollout
-from tailgate.watch import watched
 
 MIXTURE = ("braking-v0", "stop-and-go-v0", "ornstein-uhlenbeck-v0")  # equal shares of the running time
 SILENT = 1e12  # a threshold that nothing reaches

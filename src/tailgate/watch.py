@@ -2,6 +2,7 @@
 
 Of a filter without a test the score is r' S^-1 r, so that a watch is the standard chi-square test on its innovation; of challenges the
 energy that was heard while the probe was muted; of a safe set how far a reading lies from what was predicted, 1 being the edge.
+`tailgate.estimators.watched` makes one.
 """
 
 from __future__ import annotations
@@ -13,10 +14,6 @@ import numpy as np
 
 from tailgate.core import Array, Defence, Estimate, Model, Prior, Received
 from tailgate.draws import Draws
-from tailgate.estimators.chi_square import ChiSquare
-from tailgate.estimators.compose import AcceptAll, Composed, Score, compose
-
-OWN = ("prepare", "start", "step", "look")  # what a composed defence does as its parts say, unless it is written anew
 
 
 @dataclass(frozen=True)
@@ -44,15 +41,3 @@ class Watched:
     def alarms(self, score: Array) -> Array:
         """Of the same shape, bool."""
         return np.asarray(score > self.threshold)
-
-
-def watched(defence: Defence, threshold: float) -> Composed | Watched:
-    """The defence with an alarm at a threshold on its score.
-
-    What only filters is composed with the chi-square test, whose alarm then changes nothing: a white box has a gate to stay below.
-    """
-    if isinstance(defence, Composed) and all(getattr(type(defence), name) is getattr(Composed, name) for name in OWN):
-        filter_, detector, mitigation = defence.parts()
-        if type(detector) is Score and type(mitigation) is AcceptAll and mitigation.mode == "normal":
-            return compose(filter_, ChiSquare(threshold), mitigation)
-    return Watched(defence, threshold)

@@ -1,0 +1,21 @@
+"""A defence with a watch on its score (tailgate.watch)."""
+
+from tailgate.core import Defence
+from tailgate.watch import Watched
+
+from .chi_square import ChiSquare
+from .compose import AcceptAll, Composed, Score, compose
+
+OWN = ("prepare", "start", "step", "look")  # what a composed defence does as its parts say, unless it is written anew
+
+
+def watched(defence: Defence, threshold: float) -> Composed | Watched:
+    """The defence with an alarm at a threshold on its score.
+
+    What only filters is composed with the chi-square test, whose alarm then changes nothing: a white box has a gate to stay below.
+    """
+    if isinstance(defence, Composed) and all(getattr(type(defence), name) is getattr(Composed, name) for name in OWN):
+        filter_, detector, mitigation = defence.parts()
+        if type(detector) is Score and type(mitigation) is AcceptAll and mitigation.mode == "normal":
+            return compose(filter_, ChiSquare(threshold), mitigation)
+    return Watched(defence, threshold)
