@@ -237,7 +237,15 @@ def test_who_joins_meets_what_all_others_have_met() -> None:
     spared = board(_rows("none", "imm"), board=before)
     assert entry(spared, "imm")["status"] == "unranked" and "dropout" in entry(spared, "imm")["why"] and "not played" in entry(spared, "imm")["why"]
     assert [entry(spared, g)["rates"] for g in ("kf", "rkf")] == [entry(before, g)["rates"] for g in ("kf", "rkf")]
-    assert board(_rows("none", "imm", attacks=more), board=before) == board(_rows("none", "kf", "rkf", "imm", attacks=more))
+    made = board(_rows("none", "imm", attacks=more), board=before)
+    assert [a["attack"] for a in made["attacks"] if a.pop("shared", False)] == ["dropout"]
+    assert made == board(_rows("none", "kf", "rkf", "imm", attacks=more))
+    again = board(_rows("none", "imm"), board=_as_read(spared))  # who was spared does not end the rule, for himself or for the next
+    assert entry(again, "imm")["status"] == "unranked" == entry(board(_rows("none", "safe_state"), board=_as_read(again)), "safe_state")["status"]
+    everything = [*_rows("none", "kf", "rkf", attacks=more), *_rows("imm")]
+    assert strays(again, suite()) == [] == list(_scored(again, everything, suite()))
+    late = _as_read(board([*_rows("none", "imm"), *cell("imm", "dropout", 1)], board=_as_read(again)))
+    assert entry(late, "imm")["status"] == "ranked" and shared_of(late) == more[::-1]
     some = _as_read(board([*_rows("none", "kf", "rkf"), *cell("kf", "dropout", 1)]))  # which only one has met
     assert entry(board(_rows("none", "imm"), board=some), "imm")["status"] == "ranked"
     assert shared_of(before) == more[::-1] and shared_of(some) == ("fdi",)
@@ -384,6 +392,7 @@ def test_the_command_plays_what_all_others_have_met(tmp_path: Path) -> None:
     made = json.loads(place.read_text())
     assert [c["attack"] for c in made["cells"] if c["defence"] == "chi2_kf"] == ["none", "fdi:value=5", late]
     assert [e["defence"] for e in before["entries"]] == ["none", "kf"] and "incomplete" not in made["entries"][2]["why"]
+    assert [a["attack"] for a in made["attacks"] if a.get("shared")] == [late]
     for path in out.glob("small-v0/rows*"):
         path.unlink()
     place.write_text(json.dumps(before).replace(late, "never_made:Attack"))

@@ -63,6 +63,7 @@ class AttackPart(Part):
     admitted: dict[str, Any] | None = None
     note: Text = ""
     withdrawn: bool = False
+    shared: bool = False  # on no list, but met by all entries when somebody joined them
     card: dict[str, Any] | None = None
 
 

@@ -22,7 +22,7 @@ from tailgate.scenario import Suite, list_suites, load_suite
 from tailgate.schema import build
 from tailgate.scoring.attacks import Admitted
 from tailgate.scoring.board import score
-from tailgate.scoring.cells import figures
+from tailgate.scoring.cells import figures, shared_of
 from tailgate.scoring.damage import Row
 from tailgate.scoring.follow import same, sharpened, strays, untold
 from tailgate.scoring.ranks import CLOSE, PAIR
@@ -105,7 +105,8 @@ def _scored(data: Data, rows: list[Row], suite: Suite) -> Iterator[Data]:
     said = data["suite"]
     lines = [build(Admitted, a["admitted"], "board: attacks") for a in data["attacks"] if a.get("admitted")]
     try:
-        here = score(rows, suite, attacks=lines, alpha=said.get("alpha", 0.05), require_adaptive=said.get("require_adaptive", True))
+        adaptive = said.get("require_adaptive", True)
+        here = score(rows, suite, attacks=lines, alpha=said.get("alpha", 0.05), require_adaptive=adaptive, shared=shared_of(data))
     except InputError as error:
         yield {"defence": "", "field": "cells", "board": f"{len(data['cells'])} cells", "here": str(error)}
         return

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
@@ -27,13 +28,14 @@ FORMAT = "tailgate-board-1"
 
 def score(
     rows: Iterable[Row], suite: Suite, *, attacks: Sequence[Admitted] | None = None, alpha: float = 0.05, require_adaptive: bool = True,
-    board: Data | None = None,
+    board: Data | None = None, shared: Sequence[str] = (),
 ) -> Data:  # fmt: skip
     """The board of a suite from its rows, in the format of decision record 14. The order of the rows changes nothing.
 
     attacks: what joined the suite's attacks after it was published (`attacks.read`); every defence has to have met these too.
     require_adaptive: rank only defences that met an attack which was trained against them.
     board: of the same suite; what it says of other defences stands beside these rows (`beside`), and ranks are made of both.
+    shared: what every defence has to have met though it is on no list; of a board it is known (`cells.shared_of`).
     Raises InputError for rows that do not belong together, or not beside the board.
     """
     if not 0.0 < alpha < 1.0:
@@ -48,7 +50,7 @@ def score(
     digests = {text: line.digest for text, line in lines.items() if line is not None}
     slot = middle(suite)
     held = None if board is None else beside(table, board, suite, alpha, require_adaptive, digests)
-    table = table if held is None else held.table
+    table = dataclasses.replace(table, shared=frozenset(shared)) if held is None else held.table
     kept = {} if held is None else held.entries
     origins = _origins(table)
     levels: Levels = {d: {k: Worst(table, d, k, alpha) for k in KNOWLEDGE} for d in table.defences}
@@ -102,7 +104,7 @@ def _attacks(
             "trained_on": origins.get(column.attack, {}).get("defence") or told.get(column.attack, {}).get("trained_on"),
             "digest": told.get(column.attack, {}).get("digest") or files.get(column.attack) or None,
             "admitted": None if line is None else line.as_data(), "note": "; ".join(notes), "withdrawn": column.attack in table.withdrawn,
-        })  # fmt: skip
+        } | ({"shared": True} if column.attack in table.shared.difference(table.listed) else {}))  # fmt: skip
     return out
 
 

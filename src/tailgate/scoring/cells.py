@@ -84,16 +84,18 @@ def place_of(cell: Data) -> tuple[Any, ...]:
 
 
 def shared_of(board: Data) -> tuple[str, ...]:
-    """Attacks that all entries of a board have met in each of its cells: whoever joins has to meet them too, listed or not.
+    """Attacks that all entries of a board have met in each of its cells, or had when somebody joined: who joins has to meet them too.
 
-    Files of policies are left out: they were trained against one of the entries.
+    Files of policies are left out, as they were trained against one of the entries, and what counts nowhere.
     """
+    idle = {attack["attack"] for attack in board["attacks"] if attack.get("withdrawn") or attack.get("optimal")}
     places = {(cell["defence"], cell["scenario"], cell["dose"]) for cell in board["cells"]}
     met: dict[str, set[tuple[Any, ...]]] = {}
     for cell in board["cells"]:
         if cell["attack"] != CLEAN and not cell["attack"].endswith(".json"):
             met.setdefault(cell["attack"], set()).add((cell["defence"], cell["scenario"], cell["dose"]))
-    return tuple(sorted(attack for attack, held in met.items() if held == places))
+    marked = {attack["attack"] for attack in board["attacks"] if attack.get("shared")}
+    return tuple(sorted((marked | {attack for attack, held in met.items() if held == places}) - idle))
 
 
 def table_of(board: Data, suite: Suite) -> Table:
