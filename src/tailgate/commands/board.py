@@ -71,7 +71,8 @@ def _run(options: argparse.Namespace) -> int:
             raise InputError("--train", True, f"no --{name.replace('_', '-')}: it trains and plays whoever was not attacked")
     out, started = Path(options.out), time.perf_counter()
     suites = [load_suite(name) for name in options.suites]
-    measured = [measured_of(out / suite.name / BOARD) for suite in suites]  # before anything is played
+    for suite in suites:
+        measured_of(out / suite.name / BOARD)  # refuses what is no such file before anything is played
     kept = {suite.name: kept_board(out / suite.name / BOARD, suite, options.beacon) for suite in suites if options.keep_entries}
     boards = []
     with progress(Console(stderr=True)) as update:
@@ -98,6 +99,7 @@ def _run(options: argparse.Namespace) -> int:
                 board = board_of(suite, folder, beacon=options.beacon or None, keep=options.keep_entries)
             print(record.finish(board["suite"]["rows"]), file=sys.stderr)
             boards.append(detect(folder / BOARD, suite, workers=options.workers, progress=update) if options.detection else board)
+    measured = [measured_of(out / suite.name / BOARD) for suite in suites]
     page = build_site(boards, out / "page", replays=not options.no_replays, measured=measured)
     if options.json:
         print(json.dumps([{"suite": b["suite"]["name"], "entries": b["entries"]} for b in boards], indent=1, allow_nan=False))

@@ -12,6 +12,8 @@ from rich.table import Table
 
 from tailgate.progress import console, progress
 
+WORDS = {"more": "do more", "equal": "yoked equals own", "unknown": "cannot be told"}
+
 
 def add(actions: Any) -> None:
     """Adds `timing` to the actions of a command."""
@@ -24,6 +26,7 @@ def add(actions: Any) -> None:
     command.add_argument("suite", metavar="SUITE", help="suite by name or YAML file")
     command.add_argument("--out", required=True, metavar="DIR", help="folder of the boards")
     command.add_argument("--defence", action="append", default=[], metavar="NAME", help="only these (repeatable; default: all ranked)")
+    command.add_argument("--episodes", type=int, metavar="N", help="fresh ones for each schedule (default: four times those of a cell)")
     command.add_argument("--json", action="store_true", help="print the file")
     command.set_defaults(run=_timing)
 
@@ -40,7 +43,8 @@ def _timing(options: argparse.Namespace) -> int:
     board = load(folder / BOARD)
     with progress(Console(stderr=True)) as update:
         timing = measure_timing(
-            board, suite, options.defence, lambda done, total: update("schedules", done, total, f"{done} of {total} entries"),
+            board, suite, options.defence, episodes=options.episodes,
+            progress=lambda done, total: update("schedules", done, total, f"{done} of {total} entries"),
         )  # fmt: skip
     held = timing.model_dump_json(indent=1) + "\n"
     if not options.defence:  # part of a file would lose the rest
@@ -48,15 +52,17 @@ def _timing(options: argparse.Namespace) -> int:
     if options.json:
         print(held, end="")
         return 0
-    table = Table(title=escape(f"{suite.name}: damage [%] at own times, and at those of twins"), caption="* yoked equals own")
-    for heading in ("defence", "attacker", "scenario", "dose", "own", "yoked", "shuffled", "periodic", "advantage"):
+    title = f"{suite.name}: damage [%] at own times, and at those of twins"
+    table = Table(title=escape(title), caption="on fresh episodes; 95 %, p after Holm")
+    for heading in ("defence", "attacker", "scenario", "dose", "own", "yoked", "shuffled", "periodic", "advantage", "p", "own times"):
         table.add_column(heading, overflow="fold")
     for entry in timing.entries:
         shares = (f"{100 * share.value:.0f}" for share in (entry.own, entry.yoked, entry.shuffled, entry.periodic))
         gain = f"{100 * entry.advantage.value:+.0f} ({100 * entry.advantage.low:.0f} to {100 * entry.advantage.high:.0f})"
         who = "/".join(Path(entry.attack).with_suffix("").parts[-2:])
         texts = (entry.defence, who, entry.scenario, "own" if entry.dose is None else str(entry.dose), *shares)
-        table.add_row(*map(escape, texts), gain + " *" * entry.flagged)
+        said = WORDS[entry.verdict] + "; twins do more" * entry.outdone
+        table.add_row(*map(escape, texts), gain, f"{entry.advantage.adjusted:.2g}", said)
     console().print(table)
     for missing in timing.without:
         print(f"{missing.defence}: {missing.why}")

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 from tailgate.errors import InputError
 
+from .board_format import Board
 from .clock import Clock, clock_of
 from .timing import Timing, timing_of
 
@@ -17,11 +18,19 @@ class Measured(NamedTuple):
     clock: Clock | None = None
     timing: Timing | None = None
 
-    def belongs(self, suite: str) -> None:
-        """Raise InputError where something is of another suite than the board that it lies beside."""
-        for what, held in (("step times", self.clock), ("timing advantages", self.timing)):
-            if held is not None and held.suite != suite:
-                raise InputError(f"{what}: suite", held.suite, f"{suite}, whose board they lie beside")
+    def belongs(self, board: Board) -> Measured:
+        """What is of this board: an attacker's timing as long as its cell says the same. Raises InputError for what is of another suite."""
+        mine, clock, timing = board.suite, self.clock, self.timing
+        if clock is not None and clock.suite != mine.name:
+            raise InputError("step times: suite", clock.suite, f"{mine.name}, whose board they lie beside")
+        if timing is None:
+            return self
+        for name, wanted in (("suite", mine.name), ("hash", mine.hash), ("beacon", mine.beacon or "")):
+            if (told := getattr(timing, name)) != wanted:
+                raise InputError(f"timing advantages: {name}", told, f"{wanted!r}, as of the board that they lie beside")
+        held = {(c.defence, c.attack, c.scenario, c.dose): c.damage.value for c in board.cells if c.damage}
+        kept = [e for e in timing.entries if held.get((e.defence, e.attack, e.scenario, e.dose)) == e.board]
+        return self._replace(timing=timing.model_copy(update={"entries": kept}))
 
 
 def measured_of(board: Path) -> Measured:

@@ -80,9 +80,8 @@ def build_site(
     what was measured of another suite.
     """
     suites = _suites(boards)
-    found = list(measured) or [Measured()] * len(suites)
-    for suite, beside in zip(suites, found, strict=True):
-        beside.belongs(suite.board.suite.name)
+    given = list(measured) or [Measured()] * len(suites)
+    found = [beside.belongs(suite.board) for suite, beside in zip(suites, given, strict=True)]
     held = [_encoded(data, "board") for data in boards]
     heading = title or TITLE
     environment = _environment()

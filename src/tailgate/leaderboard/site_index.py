@@ -126,7 +126,7 @@ def detection_of(suite: Suite) -> Data | None:
             cells.append({
                 "text": percent(mean), "sort": f"{mean:.6g}", "least": percent(least.detected.value), "low": percent(least.detected.low),
                 "about": suite.where(least.scenario, least.attack), "delay": figure(least.delay, 3) if least.delay is not None else "",
-                "rarer": least.rarer,
+                "rarer": any(c.rarer for c in known),
             })  # fmt: skip
         watched = any(c.watched for c in cases if c.defence == defence)
         rows.append({"name": suite.defences[defence], "page": suite.pages.get(defence, ""), "cells": cells, "watched": watched})

@@ -11,6 +11,12 @@ TIMES = (  # as the twins of tailgate.strength.timing
 )  # fmt: skip
 
 
+VERDICTS = {
+    "more": "Its own times surely do more", "equal": "They surely do no more than a little more",
+    "unknown": "Whether they do more cannot be told",
+}  # fmt: skip
+
+
 def timed_of(timing: Timing | None, defence: str) -> Data | None:
     """An entry's figures, or why there are none; None where nobody has looked."""
     if timing is None:
@@ -21,8 +27,9 @@ def timed_of(timing: Timing | None, defence: str) -> Data | None:
     shares, gain = (found.own, found.yoked, found.shuffled, found.periodic), found.advantage
     return {
         "why": "", "attack": names_of([found.attack])[found.attack], "knowledge": found.knowledge, "where": found.scenario,
-        "dose": dose_text(found.dose), "episodes": timing.episodes,
-        "gain": f"{100 * gain.value:+.0f}", "span": f"{100 * gain.low:.0f} to {100 * gain.high:.0f}",
+        "dose": dose_text(found.dose), "episodes": found.episodes, "verdict": VERDICTS[found.verdict], "alike": found.schedules == 1,
+        "gain": points(gain.value), "span": f"{points(gain.low)} to {points(gain.high)}", "p": f"{gain.adjusted:.2g}",
+        "most": percent(found.most) if found.most > found.board else "", "board": percent(found.board),
         "rows": [
             {"name": words, "text": percent(share.value), "span": f"{percent(share.low)} to {percent(share.high)}"}
             for words, share in zip(TIMES, shares, strict=True)
@@ -30,8 +37,19 @@ def timed_of(timing: Timing | None, defence: str) -> Data | None:
     }  # fmt: skip
 
 
+def points(change: float) -> str:
+    """A change of a share in points, with its sign."""
+    text = f"{100 * change:+.0f}"
+    return "0" if text in ("+0", "-0") else text.replace("-", "\N{MINUS SIGN}")
+
+
 def flags_of(timing: Timing | None, defence: str) -> list[str]:
     """What its schedule says against the worth of an entry's attacker."""
-    found = [entry for entry in timing.entries if entry.defence == defence and entry.flagged] if timing else []
-    told = "does not surely do more at its own times than at those of another of its episodes"
-    return [f"yoked equals own: {names_of([entry.attack])[entry.attack].full} on {entry.scenario} {told}" for entry in found]
+    out = []
+    for entry in (entry for entry in timing.entries if entry.defence == defence) if timing else ():
+        who = f"{names_of([entry.attack])[entry.attack].full} on {entry.scenario}"
+        if entry.verdict == "equal":
+            out.append(f"yoked equals own: {who} surely does no more than a little more at its own times than at another episode's")
+        if entry.outdone:
+            out.append(f"outdone by its twins: {who} surely does less at its own times than at random or evenly spread ones")
+    return out
