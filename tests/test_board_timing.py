@@ -158,7 +158,7 @@ def test_the_command_writes_the_file_and_the_pages_show_it(board: Data, tmp_path
     assert main(["leaderboard", "page", str(folder / "board.json"), "--out", str(tmp_path / "page"), "--no-replays"]) == 0
     pages = {name: (tmp_path / f"page/quick-v0/{name}.html").read_text() for name in (*ranked, "kf")}
     gain = made.entries[1].advantage
-    assert f"<b>+{100 * gain.value:.0f} points</b>" in pages["chi2_kf_sparse"] and "Its own times surely do more" in pages["chi2_kf_sparse"]
+    assert f"<b>+{100 * gain.value:.0f} points</b>" in pages["chi2_kf_sparse"] and "At its own times it surely does more" in pages["chi2_kf_sparse"]
     assert "cannot be told" in pages["rkf"] and 'id="timing"' not in pages["kf"] and "No attacker that was trained against it did damage" in pages["safe_state_brake"]
     assert "yoked equals own" not in (tmp_path / "page/index.html").read_text()
     held["entries"][1]["advantage"] |= {"adjusted": 1.0, "high": 0.05}

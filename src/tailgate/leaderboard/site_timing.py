@@ -12,8 +12,8 @@ TIMES = (  # as the twins of tailgate.strength.timing
 
 
 VERDICTS = {
-    "more": "Its own times surely do more", "equal": "They surely do no more than a little more",
-    "unknown": "Whether they do more cannot be told",
+    "more": "At its own times it surely does more", "equal": "At its own times it surely does hardly more",
+    "unknown": "Whether it does more at its own times cannot be told",
 }  # fmt: skip
 
 
@@ -49,7 +49,7 @@ def flags_of(timing: Timing | None, defence: str) -> list[str]:
     for entry in (entry for entry in timing.entries if entry.defence == defence) if timing else ():
         who = f"{names_of([entry.attack])[entry.attack].full} on {entry.scenario}"
         if entry.verdict == "equal":
-            out.append(f"yoked equals own: {who} surely does no more than a little more at its own times than at another episode's")
+            out.append(f"yoked equals own: {who} surely does hardly more at its own times than at another episode's")
         if entry.outdone:
             out.append(f"outdone by its twins: {who} surely does less at its own times than at random or evenly spread ones")
     return out
