@@ -241,8 +241,9 @@ def test_the_command(board: Data, tmp_path: Path, capsys: pytest.CaptureFixture[
 
 
 def test_attackers_that_are_not_published_are_named_with_the_command_that_trains_them(
-    board: Data, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    board: Data, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """And where the paths do not begin here, that they begin elsewhere."""
     for i, seed in ((0, 3), (1, 4), (2, 3)):
         board["cells"][i]["attack"] = f"held/attacked/policies/run/policy-{seed}.json"
     names = [board["cells"][i]["defence"] for i in range(3)]
@@ -253,7 +254,12 @@ def test_attackers_that_are_not_published_are_named_with_the_command_that_trains
         {"defence": name, "folder": "held/attacked", "policies": names.count(name), "cells": names.count(name)} for name in dict.fromkeys(names)
     ]
     _command(str(tmp_path / "board.json"))
-    assert f"tailgate leaderboard attack {names[0]} --suite quick-v0 --out held/attacked " in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert f"tailgate leaderboard attack {names[0]} --suite quick-v0 --out held/attacked " in said and "Paths begin elsewhere" in said
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "held/attacked").mkdir(parents=True)
+    _command("board.json")
+    assert "Paths begin elsewhere" not in capsys.readouterr().out
 
 
 def test_an_attack_whose_file_is_another_one_is_told_apart(tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """What the pages of a board say of detection."""
 
 import importlib.util
+import json
 import re
 from pathlib import Path
 
@@ -8,9 +9,10 @@ import pytest
 
 from tailgate.leaderboard.board_format import read_board
 from tailgate.leaderboard.build import percent
-from tailgate.leaderboard.site_index import detection_of
+from tailgate.leaderboard.site_index import attacks_of, detection_of
 from tailgate.leaderboard.site_suite import Suite
 
+ROOT = Path(__file__).parents[1]
 spec = importlib.util.spec_from_file_location("boards", Path(__file__).with_name("boards.py"))
 boards = importlib.util.module_from_spec(spec)
 spec.loader.exec_module(boards)
@@ -64,3 +66,12 @@ def test_what_is_watched_and_what_is_rarer_is_said(index, site):
     assert rows and all(re.fullmatch(r"( kf watched)( \d+% \d+%, at least [^%]*%: [^%]*){2} \d+% rarer \d+%, at least [^%]*%: [^%]*", row) for row in rows)
     mine, other = (entry(site, name).read_text(encoding="utf-8") for name in ("kf", "cusum_kf"))
     assert mine.count('<span class="param">rarer</span>') == 1 and "no threshold of its own" in mine and "no threshold of its own" not in other
+
+
+def test_attacks_that_joined_later_are_told_from_those_of_the_suite():
+    """Of a board of a suite of the package; of another nobody knows."""
+    board = json.loads((ROOT / "results/quick-v0/board.json").read_text(encoding="utf-8"))
+    told = {line["name"].full.split(" ")[0]: line["admitted"] for line in attacks_of(Suite(read_board(board), "quick-v0"))}
+    assert told["burst_loss"] == "met later, beside the suite" and told["dropout"] == "with the suite" and "p " in told["fdi_ramp"]
+    board["suite"]["hash"] = "0"
+    assert {line["admitted"] for line in attacks_of(Suite(read_board(board), "quick-v0")) if line["name"].full == "burst_loss"} == {"with the suite"}

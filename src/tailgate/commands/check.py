@@ -111,6 +111,8 @@ def _print(report: dict[str, Any]) -> None:
     untrained: list[dict[str, Any]] = report["untrained"]
     if untrained:
         out.print("Attackers whose files are not here are trained again, those of PPO to the same weights on one machine type alone, by:")
+    if untrained and not any(Path(held["folder"]).is_dir() for held in untrained):
+        out.print("(Paths begin elsewhere: of a published board in the root of a clone, where most of these files are.)")
     for held in untrained[:SHOWN]:
         words = ["tailgate", "leaderboard", "attack", held["defence"], "--suite", report["suite"], "--out", held["folder"]]
         many = f"attackers: {held['policies']}, cells: {held['cells']}"

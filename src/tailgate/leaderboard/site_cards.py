@@ -59,7 +59,7 @@ def _granted(threat: ThreatModel) -> str:
 
 
 @functools.cache
-def _suite(name: str, digest: str) -> Played | None:
+def suite_of(name: str, digest: str) -> Played | None:
     """The suite of a board, if it is one of the package as it is here."""
     held = load_suite(name) if name in list_suites() else None
     return held if held is not None and held.hash == digest else None
@@ -68,7 +68,7 @@ def _suite(name: str, digest: str) -> Played | None:
 @functools.cache
 def threat_of(name: str, digest: str) -> str:
     """What a suite of the package, named with its hash, grants an attacker; empty for any other."""
-    suite = _suite(name, digest)
+    suite = suite_of(name, digest)
     if suite is None:
         return ""
     where: dict[str, list[str]] = {}
@@ -102,7 +102,7 @@ def own_card(suite: Suite, family: Family, name: Name) -> Data:
     board = suite.board.suite
     return entry.card() | {
         "code": f"src/{entry.cls.__module__.replace('.', '/')}.py, {entry.cls.__name__}", "licence": LICENCE,
-        "threat_model": threat_of(board.name, board.hash), "training": _training(family, name, _suite(board.name, board.hash)),
+        "threat_model": threat_of(board.name, board.hash), "training": _training(family, name, suite_of(board.name, board.hash)),
     }  # fmt: skip
 
 

@@ -7,7 +7,7 @@ from collections import Counter
 from .board_format import LEVELS, CellPart, Dose, Level
 from .build import Name, percent
 from .measured import Measured
-from .site_cards import attack_cards
+from .site_cards import attack_cards, suite_of
 from .site_curves import curves_of, stealth_of, together_of
 from .site_suite import GROUPS, Data, Suite, cell_of, critical_of, dose_text, figure, gates_of, played, share_of, worse
 from .site_timing import flags_of
@@ -197,9 +197,11 @@ def _small(p: float, bound: bool = False) -> str:
 
 
 def attacks_of(suite: Suite) -> list[Data]:
-    out = []
+    own, out = suite_of(suite.board.suite.name, suite.board.suite.hash), []
     for attack in suite.board.attacks:
-        admitted = "with the suite" if attack.admitted is None else _admitted(attack.admitted)
+        late = own is not None and attack.attack not in own.attacks and not attack.attack.endswith(".json")
+        admitted = "met later, beside the suite" if late else "with the suite"
+        admitted = admitted if attack.admitted is None else _admitted(attack.admitted)
         name = suite.attacks[attack.attack]
         on = suite.defences[attack.trained_on] if attack.trained_on else None
         out.append({"name": name, "knowledge": attack.knowledge, "learned": attack.learned or name.policy, "optimal": attack.optimal,
