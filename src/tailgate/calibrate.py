@@ -98,11 +98,16 @@ class Calibration:
     seeds: dict[str, tuple[int, int]]  # of each scenario: first and last
     played: int  # steps in all runs together
 
+    @property
+    def rarer(self) -> bool:
+        """Whether the alarm is surely rarer than wanted: the score jumps, and below the threshold it is too frequent."""
+        return not self.settled and self.measured.interval()[0] > self.wanted_hours
+
     def as_data(self) -> dict[str, Any]:
         fresh = None if self.fresh is None else self.fresh.as_data() | {"purpose": "report"}
         return {
             "defence": self.defence, "field": self.field, "threshold": self.threshold,
-            "wanted_hours": self.wanted_hours, "settled": self.settled,
+            "wanted_hours": self.wanted_hours, "settled": self.settled, "rarer": self.rarer,
             "measured": self.measured.as_data() | {"purpose": "calibrate"}, "fresh": fresh,
             "seeds": {name: list(ends) for name, ends in self.seeds.items()}, "steps_played": self.played,
         }  # fmt: skip

@@ -70,7 +70,7 @@ def _print_results(results: list[dict[str, Any]]) -> None:
         table.add_column(heading, overflow="fold")
     for result in results:
         measured, fresh = result["measured"], result["fresh"]
-        note = "" if result["settled"] else " (rarer)" if _rarer(result) else " (not settled)"
+        note = "" if result["settled"] else " (rarer)" if result["rarer"] else " (not settled)"
         table.add_row(
             result["defence"], result["field"] or "watched", f"{result['threshold']:g}{note}", f"{result['wanted_hours']:g}",
             _hours(measured["hours"]), _between(measured), str(measured["onsets"]),
@@ -79,13 +79,8 @@ def _print_results(results: list[dict[str, Any]]) -> None:
     console().print(table)
 
 
-def _rarer(result: dict[str, Any]) -> bool:
-    """Whether the wanted time is below all that the runs allow: the score jumps."""
-    return bool(result["measured"]["low"] > result["wanted_hours"])
-
-
 def _words(results: list[dict[str, Any]]) -> str:
-    watched, rarer = any(not result["field"] for result in results), any(not result["settled"] and _rarer(result) for result in results)
+    watched, rarer = any(not result["field"] for result in results), any(result["rarer"] for result in results)
     said = "\nwatched: a threshold on the score of a defence that has none; nothing acts on its alarm" if watched else ""
     return said + ("\nrarer: its score jumps, and with every lower threshold it alarms more often than wanted" if rarer else "")
 

@@ -35,6 +35,7 @@ def _timing(options: argparse.Namespace) -> int:
     from tailgate.files import write_atomic
     from tailgate.leaderboard.board_format import load
     from tailgate.leaderboard.run import BOARD
+    from tailgate.leaderboard.site_timing import points
     from tailgate.leaderboard.timing import FILE, measure_timing
     from tailgate.scenario import load_suite
 
@@ -58,7 +59,7 @@ def _timing(options: argparse.Namespace) -> int:
         table.add_column(heading, overflow="fold")
     for entry in timing.entries:
         shares = (f"{100 * share.value:.0f}" for share in (entry.own, entry.yoked, entry.shuffled, entry.periodic))
-        gain = f"{100 * entry.advantage.value:+.0f} ({100 * entry.advantage.low:.0f} to {100 * entry.advantage.high:.0f})"
+        gain = f"{points(entry.advantage.value)} ({points(entry.advantage.low)} to {points(entry.advantage.high)})"
         who = "/".join(Path(entry.attack).with_suffix("").parts[-2:])
         texts = (entry.defence, who, entry.scenario, "own" if entry.dose is None else str(entry.dose), *shares)
         said = WORDS[entry.verdict] + "; twins do more" * entry.outdone

@@ -78,7 +78,7 @@ def _whole(held: Data, guard: str, suite: Suite, attacks: Sequence[str], effort:
 
 
 def _outdated(line: Data) -> bool:
-    """Why an entry had no threshold when only its own was looked for."""
+    """Whether a line says that an entry has no threshold, of when only one of its own was looked for."""
     return str(line.get("reason", "")).startswith("defence: ")
 
 

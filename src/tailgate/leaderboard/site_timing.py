@@ -9,8 +9,6 @@ from .timing import Timing
 TIMES = (  # as the twins of tailgate.strength.timing
     "its own times", "those of another of its episodes (yoked)", "as many steps at random (shuffled)", "as many, evenly spread (periodic)",
 )  # fmt: skip
-
-
 VERDICTS = {
     "more": "At its own times it surely does more", "equal": "At its own times it surely does hardly more",
     "unknown": "Whether it does more at its own times cannot be told",

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 import tailgate
 from tailgate import draws
@@ -33,7 +33,7 @@ from tailgate.strength.policies import loop_for, trained
 from tailgate.strength.timing import TWINS, played, schedules
 from tailgate.trace import Trace
 
-from .board_format import LEVELS, read_board
+from .board_format import LEVELS, Count, Dose, Interval, Limited, Part, Share, read_board
 from .check import agree, known, refused
 
 FILE = "timing.json"
@@ -41,41 +41,30 @@ ALPHA = 0.05  # of all entries of a board together
 LITTLE = 0.1  # an advantage that surely stays below this is as good as none
 Data = dict[str, Any]
 Progress = Callable[[int, int], None]
-Share = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
-Change = Annotated[float, Field(ge=-1, le=1, allow_inf_nan=False)]
-Number = Annotated[int, Field(ge=0)]
 
 
-class Shown(BaseModel):
+class Shown(Limited):
     """A share of damaged episodes with its exact limits, 95 %."""
 
-    model_config = ConfigDict(strict=True)
-    value: Share
-    low: Share
     high: Share
 
 
-class Gain(BaseModel):
+class Gain(Interval):
     """Own over yoked: the difference with limits, 95 %, the episodes that only one of them damages, and McNemar's exact two-sided p."""
 
-    model_config = ConfigDict(strict=True)
-    value: Change
-    low: Change
-    high: Change
-    only_own: Number
-    only_yoked: Number
+    only_own: Count
+    only_yoked: Count
     p: Share
     adjusted: Share = 1.0  # after Holm, for all entries
 
 
-class Timed(BaseModel):
+class Timed(Part):
     """A trained attacker of an entry, and its twins."""
 
-    model_config = ConfigDict(strict=True)
     defence: str
     attack: str
     scenario: str
-    dose: int | None
+    dose: Dose
     knowledge: str
     board: Share  # its damage on the board
     most: Share  # that of all attackers that were trained against the entry, at this dose
@@ -105,18 +94,16 @@ class Timed(BaseModel):
         return max(self.shuffled.low, self.periodic.low) > self.own.high
 
 
-class Untimed(BaseModel):
+class Untimed(Part):
     """An entry of which nothing can be said, and why."""
 
-    model_config = ConfigDict(strict=True)
     defence: str
     why: str
 
 
-class Timing(BaseModel):
+class Timing(Part):
     """A file of timing advantages."""
 
-    model_config = ConfigDict(strict=True)
     format: Literal["tailgate-board-timing-1"] = "tailgate-board-timing-1"
     suite: str
     hash: str

@@ -89,10 +89,8 @@ def _found(defence: str, places: tuple[str, ...], hours: float, effort: Effort) 
         if error.field != "hours":
             raise
         return Found(None, str(error))
-    if made.settled or made.measured.may_be(hours):
-        return Found(made.threshold)
-    if made.measured.hours is None or made.measured.hours > hours:
-        return Found(made.threshold, rarer=True)
+    if made.rarer or made.settled or made.measured.may_be(hours):
+        return Found(made.threshold, rarer=made.rarer)
     had = f"{made.measured.hours:.3g} at {made.threshold:g}"
     return Found(None, str(InputError("hours", hours, f"a mean time that {defence} can have ({had})")))
 
@@ -119,8 +117,9 @@ def detection(
         else:
             for name in names:
                 bench = Bench.of(guard, [name], effort.episodes, None)
+                made = bench.at(level)
                 for attack in attacks:
-                    rows = run_cell(_cell(suite, name, dose, guard, attack, effort.episodes, beacon), bench.at(level), uses=bench.uses)
+                    rows = run_cell(_cell(suite, name, dose, guard, attack, effort.episodes, beacon), made, uses=bench.uses)
                     head = {"defence": guard, "scenario": name, "attack": attack, "hours": h, "threshold": level}
                     head |= {name: True for name, holds in (("watched", not bench.field), ("rarer", rarer)) if holds}
                     found.append(head | _detected(rows))
