@@ -73,8 +73,7 @@ class Count(NamedTuple):
 
     def may_be(self, hours: float) -> bool:
         """Whether the interval holds this mean time."""
-        low, high = self.interval()
-        return low <= hours and (high is None or hours <= high)
+        return (ends := self.interval())[0] <= hours and (ends[1] is None or hours <= ends[1])
 
     def as_data(self) -> dict[str, Any]:
         low, high = self.interval()
@@ -213,8 +212,7 @@ class Bench:
             return dataclasses.replace(self.defence, **{own: threshold}), str(own)  # type: ignore[type-var]
         if hasattr(self.defence, "with_threshold"):
             with contextlib.suppress(NotApplicable):
-                detector = self.defence.parts()[1] if hasattr(self.defence, "parts") else None
-                inner = getattr(detector, "threshold_field", "")
+                inner = getattr(self.defence.parts()[1], "threshold_field", "") if hasattr(self.defence, "parts") else ""
                 return self.defence.with_threshold(threshold), f"detector.{inner}" if inner else "threshold"
         return watched(self.defence, threshold), ""
 
@@ -263,7 +261,6 @@ def count_onsets(loop: Loop, keys: draws.Keys, crossings: Crossings | None = Non
     alarmed, onsets, last = np.zeros(batch, bool), np.zeros(batch, np.int64), np.full(batch, -np.inf)
     low: list[Array] = []
     high: list[Array] = []
-    least, most = math.inf, -math.inf
     for alarms, scores, live in play_clean(loop, keys):
         alarm = alarms.any(axis=1) & live
         onsets += alarm & ~alarmed
@@ -271,14 +268,14 @@ def count_onsets(loop: Loop, keys: draws.Keys, crossings: Crossings | None = Non
         steps += int(np.count_nonzero(live))
         if crossings is not None:
             score = scores.max(axis=1)
-            least, most = min(least, score[live].min(initial=math.inf)), max(most, score[live].max(initial=-math.inf))
+            crossings.least = min(crossings.least, score[live].min(initial=math.inf))
+            crossings.most = max(crossings.most, score[live].max(initial=-math.inf))
             climbed = live & (score > last)
             low.append(last[climbed])
             high.append(score[climbed])
             last = score
     if crossings is not None:
         crossings.add(np.concatenate(low), np.concatenate(high))
-        crossings.least, crossings.most = min(crossings.least, least), max(crossings.most, most)
     return onsets, steps
 
 
