@@ -13,7 +13,8 @@ from scipy import stats
 
 import tailgate
 from tailgate import cli
-from tailgate.calibrate import MIXTURE, Bench, Count, Crossings, _fused, calibrate, count_onsets
+from tailgate.calibrate import MIXTURE, calibrate
+from tailgate.clean import Bench, Count, Crossings, _fused, count_onsets
 from tailgate.draws import keys
 from tailgate.errors import InputError
 from tailgate.estimators import ChiSquare, Cusum, GateOut, KalmanFilter, Mewma, WindowedChiSquare, compose
@@ -76,7 +77,7 @@ def test_the_fused_engine_finds_the_same_threshold(monkeypatch, defence, scenari
     found = {}
     for engine in (True, False):
         if not engine:
-            monkeypatch.setattr("tailgate.calibrate._fused", lambda loop: False)
+            monkeypatch.setattr("tailgate.clean._fused", lambda loop: False)
         else:
             bench = Bench.of(defence, [scenario], 4096, None)
             assert _fused(bench.places[0].loop(bench.at(9.0), bench.uses))

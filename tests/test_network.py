@@ -8,7 +8,7 @@ import pytest
 
 import tailgate
 from tailgate import cli
-from tailgate.calibrate import Bench, count_onsets, most_at_once
+from tailgate.clean import Bench, count_onsets, most_at_once
 from tailgate.core import Model
 from tailgate.draws import keys
 from tailgate.envs import LinearSensors, SensorNetwork

@@ -9,7 +9,7 @@ import pytest
 
 import tailgate
 from tailgate.agents.scripted import NoAttack
-from tailgate.calibrate import Bench
+from tailgate.clean import Bench
 from tailgate.core import Model
 from tailgate.draws import Role, keys
 from tailgate.errors import NotApplicable

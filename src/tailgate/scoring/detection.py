@@ -18,7 +18,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tailgate import draws
-from tailgate.calibrate import Bench, Calibration, calibrate
+from tailgate.calibrate import Calibration, calibrate
+from tailgate.clean import Bench
 from tailgate.core import Array
 from tailgate.errors import InputError, NotApplicable
 from tailgate.evaluation import Cell, run_cell
