@@ -213,9 +213,16 @@ def make_board(name="synthetic-v0", *, bound=None, beacon="", trusted=True, defe
         "entries": entries, "cells": cells, "curves": curves,
         "comparisons": [{"class": "measurements", "a": a, "b": b, "only_a": 42, "only_b": 3 + 30 * i, "weaker": a if i < 2 else b, "p": 1e-7 if i == 0 else 0.3, "adjusted": 1e-6 if i == 0 else 0.6}
                         for i, (a, b) in enumerate(duels)],
-        "detection": {"hours": [0.1, 1, 10], "entries": seen},
+        "detection": {"hours": [0.1, 1, 10], "entries": seen, "alarms": [alarm | {"scenario": s} for alarm in false_alarms(seen) for s in scenarios]},
         "trust": about_trust(attacks, scenarios, doses) if trusted else None,
     }  # fmt: skip
+
+
+def false_alarms(seen):
+    """As often as wanted, but ten times as often at one an hour."""
+    often = {0.1: (20, 2.0, 0.1, 0.07, 0.16), 1: (200, 20.0, 0.1, 0.09, 0.12), 10: (0, 20.0, None, 5.4, None)}
+    names = ("onsets", "running", "mean", "low", "high")
+    return [{k: line[k] for k in ("defence", "hours", "threshold")} | dict(zip(names, often[line["hours"]], strict=True)) | {"first": 0, "p": 1.0} for line in seen]
 
 
 def network():

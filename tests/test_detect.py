@@ -102,6 +102,18 @@ def test_what_an_older_version_could_not_have_is_played(bare: Data, detected: Da
         check_detection(old, defences=["none"])
 
 
+def test_false_alarms_alone_are_added_where_a_board_lacks_them(detected: Data, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of thresholds that stand there; nothing is calibrated again, and a check asks an older board for none."""
+    old = copy.deepcopy(detected)
+    del old["detection"]["alarms"], old["detection"]["checked"]
+    path = _written(old, tmp_path)
+    assert check_detection(old, defences=["kf"])["counts"] == {"equal": 10, "differs": 0, "unchecked": 0}
+    monkeypatch.setattr(module, "detection", None)
+    monkeypatch.setattr(module, "stealth_impact", None)
+    assert detect(path, QUICK, effort=EFFORT, defences=["kf"])["detection"]["alarms"] == detected["detection"]["alarms"][:4]
+    assert detect(path, QUICK, effort=EFFORT, workers=2) == detected == json.loads(path.read_text())
+
+
 def test_workers_change_no_figure(bare: Data, detected: Data, tmp_path: Path) -> None:
     path = _written(bare, tmp_path)
     assert detect(path, QUICK, effort=EFFORT, workers=2) == detected == json.loads(path.read_text())
@@ -131,7 +143,7 @@ def test_an_honest_detection_board_comes_out_equal(board: Data) -> None:
         for item in entry["stealth"] or ():
             del item["low"], item["high"]
     report = check_detection(board, defences=["chi2_kf", "kf"])
-    assert report["counts"] == {"equal": 2 * (2 * 2 * 2 + 2), "differs": 0, "unchecked": 0} and report["findings"] == report["reasons"] == []
+    assert report["counts"] == {"equal": 2 * (2 * 2 * 2 + 2 + 2 * 2), "differs": 0, "unchecked": 0} and report["findings"] == report["reasons"] == []
     drawn = [check_detection(board, sample=1, sample_seed=seed)["entries"][0]["defence"] for seed in range(4)]
     assert len(set(drawn)) > 1
 
@@ -144,13 +156,15 @@ def test_an_altered_figure_is_found(board: Data, tmp_path: Path, capsys: pytest.
     board["detection"]["entries"].remove(lines[2])
     stealth = next(entry["stealth"] for entry in board["entries"] if entry["defence"] == "chi2_kf")
     stealth[1]["high"] += 0.01
+    next(line for line in board["detection"]["alarms"] if line["defence"] == "chi2_kf")["onsets"] += 1
     path = _written(board, tmp_path)
     assert main(["leaderboard", "check", str(path), "--detection", "--defence", "chi2_kf", "--json"]) == 1
     report = json.loads(capsys.readouterr().out)
     assert [(line["of"], line["hours"], line["field"]) for line in report["findings"]] == [
-        ("entries", 0.02, "detected"), ("entries", 0.02, "threshold"), ("stealth", 0.05, "high"), ("entries", 0.02, ""),
+        ("entries", 0.02, "detected"), ("entries", 0.02, "threshold"), ("alarms", 0.02, "onsets"), ("stealth", 0.05, "high"),
+        ("entries", 0.02, ""),
     ]  # fmt: skip
-    assert report["counts"] == {"equal": 6, "differs": 4, "unchecked": 0}
+    assert report["counts"] == {"equal": 9, "differs": 5, "unchecked": 0}
     assert main(["leaderboard", "check", str(path), "--detection", "--defence", "chi2_kf"]) == 1
     said = capsys.readouterr().out
     assert f"chi2_kf: entries, {QUICK.scenarios[0]}, {lines[1]['attack']}, 0.02 h, threshold: board {lines[1]['threshold']}" in said
@@ -160,6 +174,6 @@ def test_an_altered_figure_is_found(board: Data, tmp_path: Path, capsys: pytest.
 def test_what_a_board_names_is_not_imported(board: Data, bare: Data) -> None:
     board["detection"]["entries"][0]["attack"] = "never_made:Attack"
     report = check_detection(board, defences=["chi2_kf"])
-    assert report["counts"] == {"equal": 0, "differs": 0, "unchecked": 10} and "code to import" in report["reasons"][0]["why"]
+    assert report["counts"] == {"equal": 0, "differs": 0, "unchecked": 14} and "code to import" in report["reasons"][0]["why"]
     with pytest.raises(InputError, match="detection"):
         check_detection(bare)

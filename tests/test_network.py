@@ -374,6 +374,7 @@ def test_the_alarm_of_a_group_is_on_while_any_agent_alarms():
     loop = place.loop(make("defence", "chi2_dkf", eta=8.0, gain="steady"))
     trace = rollout(loop, tailgate.make_attack("none"), keys("calibrate", range(30)))
     onsets, steps = count_onsets(loop, keys("calibrate", range(30)))
+    onsets = onsets.sum(axis=1)
     np.testing.assert_array_equal(onsets, measure(trace)["alarm_onsets"])
     any_on = trace.alarm.any(axis=2)
     np.testing.assert_array_equal(onsets, any_on[0] + (any_on[1:] & ~any_on[:-1]).sum(axis=0))

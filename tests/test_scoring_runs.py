@@ -226,10 +226,11 @@ def test_what_comes_after_an_attack_is_no_deviation() -> None:
 
 
 def test_scenarios_of_one_plant_share_a_threshold() -> None:
-    """Groups by what is driven; the curve of a defence is of one plant."""
+    """Groups by what is driven and how much of it is read: fourteen readings have another chi-square than two."""
     assert plants(["stop-and-go-v0", "braking-v0", "thesis-ch5-v0"]) == {
         "CarFollowing": ("stop-and-go-v0", "braking-v0"), "SensorNetwork": ("thesis-ch5-v0",),
     }  # fmt: skip
-    with pytest.raises(InputError, match="one plant"):
-        stealth_impact(dataclasses.replace(ROAD, scenarios=("stop-and-go-v0", "thesis-ch5-v0")), "chi2_kf")
+    both = plants(["network-restless-v0", "stop-and-go-v0", "network-restless-weak-v0"])
+    assert list(both.values()) == [("network-restless-v0",), ("stop-and-go-v0",), ("network-restless-weak-v0",)]
+    assert list(both)[2] == "SensorNetwork of 10 agents with 10 states and 2 readings each"
     assert math.isfinite(threshold("chi2_kf", WHERE, 0.02, 20, 80_000).threshold)

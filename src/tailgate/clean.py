@@ -45,6 +45,12 @@ class Count(NamedTuple):
     steps: int
     dispersion: float
 
+    @classmethod
+    def of(cls, each: Array, seconds: float, steps: int) -> Count:
+        """each (B,): onsets of each episode."""
+        mean = float(each.mean())
+        return cls(int(each.sum()), seconds, steps, float(each.var() / mean) if mean > 0.0 else 1.0)
+
     @property
     def hours(self) -> float | None:
         """Mean time between onsets [h]; None without any."""
@@ -103,6 +109,12 @@ class Crossings:
 def most_at_once(model: Model, most: int) -> int:
     """How many episodes, at most `most`, have room in memory side by side: a filter works on some ten covariances of each agent."""
     return int(max(1, min(most, MEMORY // (80 * model.agents * model.states * model.states))))
+
+
+def side_by_side(loop: Loop, most: int) -> int:
+    """How many clean episodes of a loop, at most `most`, are played at once; it changes no bit of them."""
+    size = most_at_once(loop.model, most)
+    return episodes_at_once(loop.model, loop.horizon, min(size, RECORDED)) if _fused(loop) else size
 
 
 def play_clean(loop: Loop, keys: draws.Keys) -> Iterator[tuple[Array, Array, Array]]:
@@ -198,32 +210,31 @@ class Bench:
         loops = {place.name: place.loop(guard, self.uses) for place in self.places}
         chunks = []
         for place, seeds in zip(self.places, self.seeds(hours), strict=True):
-            loop = loops[place.name]
-            size = most_at_once(loop.model, self.batch)
-            size = episodes_at_once(loop.model, loop.horizon, min(size, RECORDED)) if _fused(loop) else size
+            size = side_by_side(loops[place.name], self.batch)
             chunks += [(place, seeds[first : first + size]) for first in range(0, len(seeds), size)]
         counts: list[Array] = []
         steps = dict.fromkeys((place.name for place in self.places), 0)
         for done, (place, seeds) in enumerate(chunks, start=1):
             onsets, played = count_onsets(loops[place.name], draws.keys(purpose, seeds), crossings)
-            counts.append(onsets)
+            counts.append(onsets.sum(axis=1))
             steps[place.name] += played
             self.progress(label, done, len(chunks), f"threshold {threshold:.{MOST_DIGITS}g}" if threshold < SILENT else "")
-        each = np.concatenate(counts)
-        mean = float(each.mean())
         seconds = math.fsum(steps[place.name] * place.brief().model.dt for place in self.places)
-        return Count(int(each.sum()), seconds, sum(steps.values()), float(each.var() / mean) if mean > 0.0 else 1.0)
+        return Count.of(np.concatenate(counts), seconds, sum(steps.values()))
 
 
 def count_onsets(loop: Loop, keys: draws.Keys, crossings: Crossings | None = None) -> tuple[Array, int]:
-    """(B,) alarm onsets of clean episodes, as the metric of that name counts them, and the steps played. Of several agents any alarms."""
+    """(B, 2) alarm onsets of clean episodes in both halves of the drive, counted as the metric does, and the steps played.
+
+    Of several agents any alarms.
+    """
     batch, steps = len(keys.key), 0
-    alarmed, onsets, last = np.zeros(batch, bool), np.zeros(batch, np.int64), np.full(batch, -np.inf)
+    alarmed, onsets, last = np.zeros(batch, bool), np.zeros((batch, 2), np.int64), np.full(batch, -np.inf)
     low: list[Array] = []
     high: list[Array] = []
-    for alarms, scores, live in play_clean(loop, keys):
+    for k, (alarms, scores, live) in enumerate(play_clean(loop, keys)):
         alarm = alarms.any(axis=1) & live
-        onsets += alarm & ~alarmed
+        onsets[:, int(2 * k >= loop.horizon)] += alarm & ~alarmed
         alarmed = alarm
         steps += int(np.count_nonzero(live))
         if crossings is not None:

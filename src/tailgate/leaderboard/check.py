@@ -28,7 +28,8 @@ from tailgate.scoring.follow import same, sharpened, strays, untold
 from tailgate.scoring.ranks import CLOSE, PAIR
 from tailgate.verify import files_of
 
-from .board_format import Board, CellPart, read_board
+from .board_format import read_board
+from .board_parts import Board, CellPart
 
 Data = dict[str, Any]
 VERDICTS = ("equal", "differs", "unchecked")

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import as_completed
 from pathlib import Path
 from typing import Any
@@ -15,13 +16,14 @@ from tailgate.errors import InputError
 from tailgate.pool import abandon, processes
 from tailgate.scenario import Suite
 from tailgate.scoring.detection import EFFORT, Effort, Progress, detection, plants, stealth_impact
+from tailgate.scoring.false_alarms import false_alarms
 from tailgate.scoring.follow import same
 
 from .board_format import load, read_board, save
 from .check import VERDICTS, agree, drawn, known, refused, suite_of
 
 Data = dict[str, Any]
-LINES = ("entries", "without")  # of a detection board: figures, and why there are none
+LINES = ("entries", "without", "alarms")  # of a detection board: figures, why there are none, and false alarms at the thresholds
 PLACE = ("plant", "scenario", "attack", "hours")  # what a figure is of
 
 
@@ -46,7 +48,8 @@ def detect(
         if value != getattr(effort, name):
             raise InputError(f"detection: {name}", getattr(effort, name), f"{value}, with which the figures of the board were made")
     asked = [guard for guard in defences or guards if not _whole(held, guard, suite, attacks, effort)]
-    for guard, found in _play(suite, asked, attacks, effort, board["suite"].get("beacon") or "", workers, progress):
+    there = {guard: _of(board, held, guard) for guard in defences or guards if guard not in asked and not _checked(held, guard, suite)}
+    for guard, found in _play(suite, asked, attacks, effort, board["suite"].get("beacon") or "", workers, progress, there):
         board = _with(load(path), guard, found, effort)  # read again: it may have been marked in the meantime
         save(board, path)
     return dict(board)
@@ -58,7 +61,11 @@ def _takes_part(entry: Data) -> bool:
 
 
 def _nothing(effort: Effort) -> Data:
-    return dataclasses.asdict(effort) | {"hours": list(effort.hours)} | {key: [] for key in LINES}
+    return _said(effort) | {key: [] for key in LINES}
+
+
+def _said(effort: Effort) -> Data:
+    return dataclasses.asdict(effort) | {"hours": list(effort.hours)}
 
 
 def _effort(held: Data) -> Effort:
@@ -69,12 +76,24 @@ def _effort(held: Data) -> Effort:
 
 def _whole(held: Data, guard: str, suite: Suite, attacks: Sequence[str], effort: Effort) -> bool:
     """Whether an entry has all figures, or the reasons why it has none."""
-    lines = [line for part in LINES for line in held[part] if line["defence"] == guard and not _outdated(line)]
+    lines = [line for part in LINES for line in held.get(part, ()) if line["defence"] == guard and not _outdated(line)]
     there = {tuple(line[key] for key in PLACE if key in line) for line in lines}
     return all(
         (plant, h) in there or all((name, attack, h) in there for name in names for attack in attacks)
         for plant, names in plants(suite.nominal).items() for h in effort.hours
     )  # fmt: skip
+
+
+def _of(board: Data, held: Data, guard: str) -> Data:
+    """What a board says of the detection of one entry."""
+    stealth = next(entry.get("stealth") for entry in board["entries"] if entry["defence"] == guard)
+    return {part: [line for line in held.get(part, ()) if line["defence"] == guard] for part in LINES} | {"stealth": stealth}
+
+
+def _checked(held: Data, guard: str, suite: Suite) -> bool:
+    """Whether false alarms at all thresholds of an entry are there, or nothing is."""
+    wanted = {(line["scenario"], line["hours"]) for line in held["entries"] if line["defence"] == guard}
+    return wanted <= {(line["scenario"], line["hours"]) for line in held.get("alarms", ()) if line["defence"] == guard}
 
 
 def _outdated(line: Data) -> bool:
@@ -86,22 +105,30 @@ def _with(board: Data, guard: str, found: Data, effort: Effort) -> Data:
     """The board with the figures of one entry, in the order of its entries."""
     order = [entry["defence"] for entry in board["entries"]]
     held, apart = board.get("detection") or _nothing(effort), {guard, *(e["defence"] for e in board["entries"] if not _takes_part(e))}
-    lines = {part: [line for line in held[part] if line["defence"] not in apart] + found[part] for part in LINES}
+    lines = {part: [line for line in held.get(part, ()) if line["defence"] not in apart] + found[part] for part in LINES}
     lines = {part: sorted(mine, key=lambda line: order.index(line["defence"])) for part, mine in lines.items()}
     entries = [entry | {"stealth": found["stealth"]} if entry["defence"] == guard else entry for entry in board["entries"]]
-    return board | {"entries": entries, "detection": held | lines}
+    return board | {"entries": entries, "detection": held | _said(effort) | lines}
 
 
-def figures(suite: Suite, guard: str, attacks: Sequence[str], effort: Effort, beacon: str, progress: Progress | None = None) -> Data:
-    """`entries` and `without` of the detection board of one defence, and its `stealth`."""
-    stealth = stealth_impact(suite, guard, effort, beacon=beacon, progress=progress)
-    return detection(suite, [guard], attacks, effort, beacon=beacon, progress=progress) | {"stealth": stealth}
+def figures(
+    suite: Suite, guard: str, attacks: Sequence[str], effort: Effort, beacon: str, there: Data | None = None,
+    progress: Progress | None = None,
+) -> Data:  # fmt: skip
+    """`entries`, `without` and `alarms` of the detection board of one defence, and its `stealth`. there: of these all but the alarms."""
+    found = there or detection(suite, [guard], attacks, effort, beacon=beacon, progress=progress)
+    if there is None:
+        found = found | {"stealth": stealth_impact(suite, guard, effort, beacon=beacon, progress=progress)}
+    return found | {"alarms": false_alarms(suite, found["entries"], effort.checked, effort.most_steps, beacon=beacon)}
 
 
 def _play(
-    suite: Suite, guards: Sequence[str], attacks: Sequence[str], effort: Effort, beacon: str, workers: int, progress: Progress | None
-) -> Iterator[tuple[str, Data]]:
-    """Figures of each defence, as they are done."""
+    suite: Suite, asked: Sequence[str], attacks: Sequence[str], effort: Effort, beacon: str, workers: int, progress: Progress | None,
+    there: Mapping[str, Data] | None = None,
+) -> Iterator[tuple[str, Data]]:  # fmt: skip
+    """Figures of each defence, as they are done; of those that are there in part, what is missing."""
+    have = there or {}
+    guards = [*asked, *have]
     if workers < 1:
         raise InputError("workers", workers, "a whole number not below 1")
     update, rest = progress or (lambda *_: None), (attacks, effort, beacon)
@@ -109,10 +136,11 @@ def _play(
         each = 2 * len(effort.hours)  # of an entry: the stealth attack and the others at each threshold
         for i, guard in enumerate(guards):
             steps = itertools.count(i * each + 1)
-            yield guard, figures(suite, guard, *rest, lambda *_, of=guard, at=steps: update("detection", next(at), each * len(guards), of))
+            tick = functools.partial(_tick, update, steps, each * len(guards), guard)
+            yield guard, figures(suite, guard, *rest, have.get(guard), tick)
         return
     with processes(workers) as pool:
-        waiting = {pool.submit(figures, suite, guard, *rest): guard for guard in guards}
+        waiting = {pool.submit(figures, suite, guard, *rest, have.get(guard)): guard for guard in guards}
         try:
             for done, future in enumerate(as_completed(waiting), start=1):
                 yield waiting[future], future.result()
@@ -120,6 +148,10 @@ def _play(
         except BaseException:  # an interrupt shall not wait for what is still to play
             abandon(pool)
             raise
+
+
+def _tick(update: Progress, steps: Iterator[int], total: int, guard: str, *_: Any) -> None:
+    update("detection", next(steps), total, guard)
 
 
 def check_detection(
@@ -150,7 +182,8 @@ def check_detection(
     stealth = {entry["defence"]: entry.get("stealth") for entry in data["entries"]}
     guards = [name for name in asked if name not in away]
     for guard, here in _play(suite, guards, attacks, effort, board.suite.beacon or "", workers, progress):
-        says, made = _by_place(held | {"stealth": stealth.get(guard)}, guard), _by_place(here, guard)
+        told = {part: lines for part, lines in here.items() if part not in LINES or part in held}
+        says, made = _by_place(held | {"stealth": stealth.get(guard)}, guard), _by_place(told, guard)
         for place in dict.fromkeys((*says, *made)):
             off = _differences(says.get(place), made.get(place))
             counts[guard]["differs" if off else "equal"] += 1

@@ -6,8 +6,10 @@ from typing import Any
 
 from tailgate.scoring.cells import place_of
 
-from .board_format import Board, read_board
+from .board_format import read_board
+from .board_parts import Board
 from .check import compared
+from .detect import LINES
 
 Data = dict[str, Any]
 SAME = ("hash", "version", "beacon")  # of the suite: what its episodes depend on
@@ -48,5 +50,5 @@ def _of(detection: Data | None, defences: dict[str, int]) -> Data | None:
     """The figures of some defences; None where nothing is left."""
     if not detection:
         return None
-    parts = {key: [line for line in detection.get(key, ()) if line["defence"] in defences] for key in ("entries", "without")}
+    parts = {key: [line for line in detection[key] if line["defence"] in defences] for key in LINES if key in detection}
     return detection | parts if any(parts.values()) else None

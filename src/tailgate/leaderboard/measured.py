@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from tailgate.errors import InputError
 
-from .board_format import Board
+from .board_parts import Board
 from .clock import Clock, clock_of
 from .timing import Timing, timing_of
 

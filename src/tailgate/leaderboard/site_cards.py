@@ -17,7 +17,7 @@ from tailgate.scenario import Suite as Played
 from tailgate.scenario import list_suites, load_scenario, load_suite
 from tailgate.threat import ThreatModel
 
-from .board_format import EntryPart
+from .board_parts import EntryPart
 from .build import Name
 from .site_suite import Data, Suite
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from .board_format import LEVELS, CurvePart, EntryPart, Stealth
+from .board_parts import LEVELS, CurvePart, EntryPart, Stealth
 from .charts import STYLES, Axis, Dot, Line, chart, nice, path_of, ticks_at
 from .site_suite import Data, Suite, figure
 

@@ -14,7 +14,8 @@ from tailgate.registry import Spec
 from tailgate.replay.page import VERDICTS, outcome, write_page
 from tailgate.replay.replay import play
 
-from .board_format import LEVELS, CellPart, EntryPart, Robust
+from . import site_alarms
+from .board_parts import LEVELS, CellPart, EntryPart, Robust
 from .build import names_of, percent
 from .clock import Clock
 from .measured import Measured
@@ -228,7 +229,8 @@ def entry_page(
         "imported": _imported(entry.defence),
         "class": entry.class_ or "not stated",
         "rank": _rank(suite, entry), "also": also, "card": card_of(suite, entry), "levels": LEVELS,
-        "flags": [*entry.flags, *flags_of(measured.timing, entry.defence)],
+        "flags": [*entry.flags, *flags_of(measured.timing, entry.defence), *site_alarms.drifts_of(suite, entry.defence)],
+        "alarms": site_alarms.table_of(suite, entry.defence),
         "critical": [(level, critical_of(suite, entry, level)) for level in LEVELS],
         "rates": _rates(suite, entry), "worst": _worst(suite, entry), "cells": _every(suite, mine),
         "doses": [dose_text(d) for d in suite.board.suite.doses],

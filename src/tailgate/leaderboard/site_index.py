@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections import Counter
 
-from .board_format import LEVELS, CellPart, Dose, Level
+from . import site_alarms
+from .board_parts import LEVELS, CellPart, Dose, Level
 from .build import Name, percent
 from .measured import Measured
 from .site_cards import attack_cards, suite_of
@@ -34,7 +35,8 @@ def _lines(suite: Suite, measured: Measured) -> list[Data]:
             "critical": [critical_of(suite, entry, level) for level in ("black", "white")],
             "rates": [{level: rates.get((dose, level), share_of(None)) for level in LEVELS} for dose in suite.shown],
             "trust": trust_cell(suite, entry), "gates": gates_of(entry),
-            "flags": [*entry.flags, *flags_of(measured.timing, entry.defence)], "status": entry.status, "why": entry.why,
+            "flags": [*entry.flags, *flags_of(measured.timing, entry.defence), *site_alarms.drifts_of(suite, entry.defence)],
+            "status": entry.status, "why": entry.why,
         })  # fmt: skip
     return out
 
@@ -131,7 +133,8 @@ def detection_of(suite: Suite) -> Data | None:
         watched = any(c.watched for c in cases if c.defence == defence)
         rows.append({"name": suite.defences[defence], "page": suite.pages.get(defence, ""), "cells": cells, "watched": watched})
     some = {"watched": any(r["watched"] for r in rows), "rarer": any(case.rarer for case in cases)}
-    return {"hours": [figure(h) for h in hours], "rows": rows, **some, "each": _each_attack(suite, sorted(hours)[len(hours) // 2])}
+    each = _each_attack(suite, site_alarms.middle(suite))
+    return {"hours": [figure(h) for h in hours], "rows": rows, **some, "alarms": site_alarms.together_of(suite), "each": each}
 
 
 def _each_attack(suite: Suite, hour: float) -> Data:

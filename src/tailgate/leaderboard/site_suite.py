@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
-from .board_format import LEVELS, Board, CellPart, Critical, Dose, EntryPart, Level, Limited
+from .board_parts import LEVELS, Board, CellPart, Critical, Dose, EntryPart, Level, Limited
 from .build import Name, names_of, percent, shade
 from .charts import Axis
 

@@ -6,7 +6,7 @@ import math
 
 from tailgate.scoring.damage import CLEAN
 
-from .board_format import LEVELS, Bound, EntryPart, Level, TrustPart
+from .board_parts import LEVELS, Bound, EntryPart, Level, TrustPart
 from .site_suite import Data, Suite, dose_text, figure
 
 SPEED, ACCEL = "m/s", "m/s\N{SUPERSCRIPT TWO}"

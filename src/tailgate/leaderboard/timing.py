@@ -33,7 +33,8 @@ from tailgate.strength.policies import loop_for, trained
 from tailgate.strength.timing import TWINS, played, schedules
 from tailgate.trace import Trace
 
-from .board_format import LEVELS, Count, Dose, Interval, Limited, Part, Share, read_board
+from .board_format import read_board
+from .board_parts import LEVELS, Count, Dose, Interval, Limited, Part, Share
 from .check import agree, known, refused
 
 FILE = "timing.json"

@@ -44,13 +44,14 @@ class Effort:
     episodes: int = 100  # of a scenario and an attack
     onsets: int = 100  # false alarms that a threshold is found on: its mean time is known to 20 %
     most_steps: int = 8_000_000  # of the longest clean run: 20 alarms at 10 h in steps of 0.1 s
+    checked: int = 20  # false alarms that a run of one scenario at a threshold that was found should have
 
     def __post_init__(self) -> None:
         if not self.hours or not all(math.isfinite(h) and h > 0.0 for h in self.hours):
             raise InputError("hours", list(self.hours), "finite numbers above 0")
         if not 1 <= self.episodes <= 4096:
             raise InputError("episodes", self.episodes, "1 to 4096")
-        for name in ("onsets", "most_steps"):
+        for name in ("onsets", "most_steps", "checked"):
             if (value := getattr(self, name)) < 1:
                 raise InputError(name, value, "a whole number not below 1")
 
@@ -59,11 +60,18 @@ EFFORT = Effort()
 
 
 def plants(scenarios: Sequence[str]) -> dict[str, tuple[str, ...]]:
-    """Scenarios by the plant that is driven: those of one plant share a threshold."""
-    out: dict[str, list[str]] = {}
+    """Scenarios by the plant that is driven, and as many agents, states and readings: those of one plant share a threshold.
+
+    A score of fourteen readings is another than one of two; where a plant has several shapes, its name says which.
+    """
+    out: dict[tuple[str, tuple[int, ...]], list[str]] = {}
     for name in scenarios:
-        out.setdefault(type(load_scenario(name).plant).__name__, []).append(name)
-    return {plant: tuple(names) for plant, names in out.items()}
+        place = load_scenario(name)
+        model = place.brief().model
+        out.setdefault((type(place.plant).__name__, (model.agents, model.states, len(model.sensors))), []).append(name)
+    kinds = [kind for kind, _ in out]
+    shape = "{} of {} agents with {} states and {} readings each"
+    return {kind if kinds.count(kind) == 1 else shape.format(kind, *size): tuple(names) for (kind, size), names in out.items()}
 
 
 @functools.lru_cache(maxsize=256)
@@ -152,30 +160,36 @@ def stealth_impact(
     """The field `stealth` of an entry: by the mean time between false alarms, the error that the stealth attack reaches per time.
 
     `deviation` [m/s] is the median of episodes, the most of scenarios; `low` and `high` its limits of 95 %, which hold together for all
-    scenarios, null for few episodes; `reason` says why there is none.
+    scenarios, null for few episodes; `reason` says why there is none. `threshold` is that of the plant where the deviation is.
     None where no threshold was found. In the scenarios, under the threat model and at the dose of `detection`.
     """
     update = progress or (lambda *_: None)
-    if len(plants(suite.nominal)) != 1:
-        raise InputError(f"suite {suite.name}: scenarios", list(suite.nominal), "scenarios of one plant")
     out: list[Data] = []
     for done, h in enumerate(effort.hours, start=1):
-        level, why, rarer = _found(defence, suite.nominal, h, effort)
-        cells = [] if level is None else [_cell(suite, name, dose, defence, attack, effort.episodes, beacon) for name in suite.nominal]
-        head = {"hours": h, "threshold": level} | ({"rarer": True} if rarer else {})
-        out.append(head | _impact([_reached(level, cell) for cell in cells if level is not None], why))
+        reached: list[tuple[Found, Array | str]] = []
+        for names in plants(suite.nominal).values():
+            found = _found(defence, names, h, effort)
+            cells = [] if found.level is None else [_cell(suite, name, dose, defence, attack, effort.episodes, beacon) for name in names]
+            reached += [(found, _reached(found.level, cell)) for cell in cells if found.level is not None] or [(found, found.why)]
+        out.append({"hours": h} | _impact(reached))
         update(f"stealth against {defence}", done, len(effort.hours), f"{h:g} h")
     return out if any(item["threshold"] is not None for item in out) else None
 
 
-def _impact(found: Sequence[Array | str], why: str) -> Data:
+def _impact(found: Sequence[tuple[Found, Array | str]]) -> Data:
     """Of the deviations in each scenario, or why there are none, the largest median, with limits that hold for all together."""
-    reached = [values for values in found if not isinstance(values, str)]
+    reached = [(held, values) for held, values in found if not isinstance(values, str)]
     if not reached:
-        return dict.fromkeys(("deviation", "low", "high")) | {"reason": next((x for x in found if isinstance(x, str)), why)}
-    limits = [median_limits(values, 1.0 - (1.0 - LEVEL) / len(reached)) for values in reached]
+        held, why = next(((held, why) for held, why in found if held.level is not None), found[0])
+        return _level(held) | dict.fromkeys(("deviation", "low", "high")) | {"reason": why}
+    limits = [median_limits(values, 1.0 - (1.0 - LEVEL) / len(reached)) for _, values in reached]
     low, high = map(max, zip(*limits, strict=True)) if None not in limits else (None, None)
-    return {"deviation": max(float(np.median(values)) for values in reached), "low": low, "high": high}
+    most, held = max(((float(np.median(values)), held) for held, values in reached), key=lambda pair: pair[0])
+    return _level(held) | {"deviation": most, "low": low, "high": high}
+
+
+def _level(found: Found) -> Data:
+    return {"threshold": found.level} | ({"rarer": True} if found.rarer else {})
 
 
 def _reached(level: float, cell: Cell) -> Array | str:

@@ -1,0 +1,321 @@
+"""The parts of the format `tailgate-board-1`, as the page reads them: docs/decisions/0014-boards.md says what the fields mean.
+
+Fields that are not named here are let through: a board may hold more than a page shows.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+Level = Literal["black", "grey", "white"]
+LEVELS: tuple[Level, ...] = ("black", "grey", "white")  # what an attacker knows, from the least
+Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
+Share = Annotated[float, Field(strict=True, ge=0.0, le=1.0)]
+Text = Annotated[str, Field(strict=True)]
+Count = Annotated[int, Field(strict=True, ge=0)]
+Dose = Count | None  # None: the scenario's own budget
+
+
+class Part(BaseModel):
+    model_config = ConfigDict(extra="allow", strict=True)
+
+
+class ScenarioPart(Part):
+    name: Text
+    about: Text = ""
+    robustness: bool = False
+    hash: Text = ""
+
+
+class SuitePart(Part):
+    name: Text
+    about: Text = ""
+    version: Text | int = ""
+    hash: Text = ""  # of all that the suite plays
+    doses: Annotated[list[Dose], Field(min_length=1)]
+    shown: dict[str, Text] = {}
+    limit: Share = 0.1
+    bound: Number | None = None
+    alpha: Share = 0.05
+    scenarios: list[ScenarioPart]
+    episodes: Count | None = None
+    purpose: Text = ""
+    beacon: Text | None = None  # empty: public seeds; None: not stated
+    rows: Count | None = None
+    require_adaptive: bool = True  # only what met attackers that were trained against it is ranked
+
+
+class AttackPart(Part):
+    attack: Text
+    knowledge: Level
+    learned: bool = False
+    optimal: bool = False
+    trained_on: Text | None = None
+    digest: Text | None = None  # of the file that it was read from
+    admitted: dict[str, Any] | None = None
+    note: Text = ""
+    withdrawn: bool = False
+    shared: bool = False  # on no list, but met by all entries when somebody joined them
+    card: dict[str, Any] | None = None
+
+
+class Worst(Part):
+    scenario: Text
+    attack: Text
+
+
+class Interval(Part):
+    value: Number
+    low: Number
+    high: Number
+
+
+class Limited(Part):
+    """A share with its lower limit."""
+
+    value: Share
+    low: Share
+
+
+class Gate(Part):
+    gate: Text
+    scenario: Text = ""
+    value: Number | None
+    limit: Number | None
+    passed: bool
+
+
+class Critical(Part):
+    """A dose; None: beyond the largest of the suite."""
+
+    value: Number | None
+    low: Number | None = None
+    high: Number | None = None
+    worst: Worst | None = None
+
+
+class Rate(Part):
+    dose: Dose
+    knowledge: Level
+    undamaged: Limited | None
+    worst: Worst | None = None
+    attacks: Count | None = None
+
+
+class Rank(Part):
+    best: Count
+    worst: Count
+
+
+class Spread(Part):
+    median: Number
+    q25: Number
+    q75: Number
+
+
+class Robust(Part):
+    scenario: Text
+    undamaged: Limited | Number | None
+    change: Number | None = None
+    worst: Worst | None = None
+
+
+class Stealth(Part):
+    hours: Number
+    threshold: Number | None = None
+    rarer: bool = False  # as in detection
+    deviation: Number | None
+    low: Number | None = None
+    high: Number | None = None
+    reason: Text = ""  # why there is none
+
+
+class Bound(Part):
+    """A lower bound of the probability that a run keeps to properties, and the cell that it comes from."""
+
+    lower: Share
+    k: Count
+    n: Count
+    of: list[Text]
+    scenario: Text
+    dose: Dose
+    attack: Text
+    cells: Count
+    alpha: Share
+    attacks: list[Text]
+
+
+class EntryTrust(Part):
+    """Bounds of all properties together, and of those without detection; None where a cell has no figure, `why` says which."""
+
+    all: dict[Level, Bound | None]
+    safety: dict[Level, Bound | None]
+    why: Text = ""
+
+
+class Verified(Part):
+    """How many rows there are, and what came of those that were played again."""
+
+    rows: Count
+    verified: Count
+    differs: Count
+    unchecked: Count
+
+    @property
+    def sound(self) -> bool:
+        """Whether rows were played again and all of them came out equal."""
+        return self.verified > 0 and self.differs == self.unchecked == 0
+
+
+class Checked(Part):
+    """How many cells there are, and what came of those that were played again from the board alone."""
+
+    cells: Count
+    equal: Count
+    differs: Count
+    unchecked: Count
+
+
+class EntryPart(Part):
+    defence: Text
+    card: dict[str, Any] | None = None
+    uses: list[Text] = []
+    class_: Text = Field("", alias="class")
+    status: Literal["ranked", "unattacked", "unranked"]
+    why: Text = ""
+    gates: list[Gate] = []
+    critical_dose: dict[Level, Critical | None] = {}
+    rates: list[Rate] = []
+    rank: Rank | None = None
+    clean: dict[str, Spread | None] = {}
+    flags: list[Text] = []
+    worst_episode: dict[str, Any] | None = None
+    robustness: list[Robust] = []
+    stealth: list[Stealth] | None = None
+    trust: EntryTrust | None = None
+    verified: Verified | None = None
+    checked: Checked | None = None
+
+
+class CellPart(Part):
+    scenario: Text
+    dose: Dose
+    defence: Text
+    attack: Text
+    knowledge: Level
+    learned: bool = False
+    optimal: bool = False
+    n: Count = 0
+    failed: Count = 0
+    reason: Text = ""
+    damage: Interval | None
+    hits: Annotated[str, Field(strict=True, pattern="^([0-9a-f]{2})*$")] | None = None  # a bit for each episode, by seed; None: not told
+    decisions: Text | None = None
+    trace: Text | None = None
+
+
+class Point(Part):
+    dose: Dose
+    value: Share
+    low: Share | None = None
+    high: Share | None = None
+    scenario: Text = ""
+    attack: Text = ""
+
+
+class CurvePart(Part):
+    defence: Text
+    knowledge: Level
+    points: list[Point]
+    fitted: list[Number] = []
+
+
+class Comparison(Part):
+    """Two defences on the same seeds; only_a: episodes in which a alone came to damage; weaker: the side that p speaks of; bound: whether
+    p is the largest that the numbers of damaged episodes allow, and these are as many as can be."""
+
+    class_: Text = Field("", alias="class")
+    a: Text
+    b: Text
+    only_a: Count
+    only_b: Count
+    p: Share
+    adjusted: Share
+    weaker: Text | None = None
+    bound: bool = False
+
+
+class Detected(Part):
+    defence: Text
+    scenario: Text
+    attack: Text
+    hours: Number
+    threshold: Number | None = None
+    watched: bool = False  # the threshold is held against the score of a defence that has none
+    rarer: bool = False  # with every lower threshold the alarm is more frequent than wanted, with this one rarer
+    detected: Interval | None
+    delay: Number | None = None
+
+
+class AlarmPart(Part):
+    """False alarms of an entry at a threshold of its detection, on fresh clean runs of a scenario."""
+
+    defence: Text
+    scenario: Text
+    hours: Number
+    threshold: Number
+    rarer: bool = False  # as in detection
+    onsets: Count
+    running: Number
+    mean: Number | None  # time between them [h]; None without any
+    low: Number
+    high: Number | None = None
+    first: Count  # in the first half of the drive
+    p: Share  # that both halves have as many
+
+
+class Detection(Part):
+    hours: list[Number]
+    entries: list[Detected]
+    alarms: list[AlarmPart] = []
+
+
+class TrustAttack(Part):
+    attack: Text
+    knowledge: Level
+    note: Text = ""
+
+
+class TrustProperty(Part):
+    name: Text
+    about: Text = ""
+    safety: bool
+
+
+class TrustPart(Part):
+    """What the bounds of all entries are about."""
+
+    alpha: Share
+    runs: Count
+    purpose: Text = ""
+    beacon: Text = ""
+    attacks: list[TrustAttack]
+    scenarios: list[Text] = []
+    doses: list[Dose] = []
+    unsafe: dict[str, Number] = {}
+    demands: dict[str, Number] = {}
+    properties: list[TrustProperty] = []
+
+
+class Board(Part):
+    format: Literal["tailgate-board-1"]
+    suite: SuitePart
+    attacks: list[AttackPart] = []
+    entries: list[EntryPart] = []
+    cells: list[CellPart] = []
+    curves: list[CurvePart] = []
+    comparisons: list[Comparison] = []
+    detection: Detection | None = None
+    trust: TrustPart | None = None
