@@ -15,9 +15,9 @@ def add(actions: Any) -> None:
     """Adds `detect` to the actions of a command."""
     command = actions.add_parser(
         "detect", help="play detection and stealth impact of a board, without its rows",
-        description="Find each defence's threshold for the wanted mean times between false alarms, and play the black-box scripts of "
-        "OUT/SUITE/board.json and the stealth attack at it. The board is written as soon as an entry is done, and an entry that it has is "
-        "not played again: interrupted, the same command goes on.",
+        description="Find each defence's threshold for the wanted mean times between false alarms, play the black-box scripts of "
+        "OUT/SUITE/board.json and the stealth attack at it, and count false alarms in every scenario. The board is written as soon as an "
+        "entry is done, and an entry that it has is not played again: interrupted, the same command goes on.",
     )  # fmt: skip
     command.add_argument("suite", metavar="SUITE", help="suite by name or YAML file")
     command.add_argument("--out", required=True, metavar="DIR", help="folder of the boards")
@@ -28,6 +28,7 @@ def add(actions: Any) -> None:
     command.add_argument("--episodes", type=int, metavar="N", help="episodes of a scenario and an attack (default 100)")
     command.add_argument("--onsets", type=int, metavar="N", help="false alarms that a threshold is found on (default 100: +-20 %%)")
     command.add_argument("--steps", type=int, metavar="N", help="longest clean run (default 8 million steps)")
+    command.add_argument("--checked", type=int, metavar="N", help="false alarms of a run that says what a threshold gives (default 20)")
     command.set_defaults(run=_detect, kept="the same command goes on")
 
 
@@ -42,6 +43,7 @@ def _detect(options: argparse.Namespace) -> int:
     path = Path(options.out) / suite.name / BOARD
     hours = None if options.hours is None else tuple(options.hours)
     given = {"hours": hours, "episodes": options.episodes, "onsets": options.onsets, "most_steps": options.steps}
+    given["checked"] = options.checked
     effort = Effort(**{name: value for name, value in given.items() if value is not None})
     before, errors = load(path), Console(stderr=True)
     with progress(errors) as update:

@@ -24,6 +24,7 @@ from .check import VERDICTS, agree, drawn, known, refused, suite_of
 
 Data = dict[str, Any]
 LINES = ("entries", "without", "alarms")  # of a detection board: figures, why there are none, and false alarms at the thresholds
+PARTS = 4  # of the longest clean run: what one scenario may take of it when a threshold is checked
 PLACE = ("plant", "scenario", "attack", "hours")  # what a figure is of
 
 
@@ -119,7 +120,8 @@ def figures(
     found = there or detection(suite, [guard], attacks, effort, beacon=beacon, progress=progress)
     if there is None:
         found = found | {"stealth": stealth_impact(suite, guard, effort, beacon=beacon, progress=progress)}
-    return found | {"alarms": false_alarms(suite, found["entries"], effort.checked, effort.most_steps, beacon=beacon)}
+    most = max(1, effort.most_steps // PARTS)
+    return found | {"alarms": false_alarms(suite, found["entries"], effort.checked, most, beacon=beacon)}
 
 
 def _play(
