@@ -21,7 +21,7 @@ from tailgate.errors import InputError
 from tailgate.rounds import seeds_of
 from tailgate.scenario import Scenario, load_scenario
 from tailgate.submission import Isolated, Limits, digest_of, mixed
-from tailgate.submission.sandbox import bwrap, docker, sandbox_of
+from tailgate.submission.sandbox import Sandbox, bwrap, docker, sandbox_of
 from tailgate.submission.source import staged
 from tailgate.submission.table import order_of
 from tailgate.submission.wire import pack, unpack
@@ -174,6 +174,15 @@ def test_sandboxes_have_no_network_and_can_write_to_one_file_only(tmp_path: Path
         assert line[line.index(flag) + 1] == value
     assert [line[i + 1].rpartition(":")[2] for i, word in enumerate(line) if word == "--volume"] == ["ro", "rw", "ro"]
     assert "PATH=/bin" not in line and "OMP_NUM_THREADS=1" in line
+
+
+def test_a_container_s_client_finds_its_engine_and_bubblewrap_hands_on_nothing_of_ours(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where the engine listens stands in DOCKER_HOST, or below HOME; the submission gets its variables one by one."""
+    monkeypatch.setenv("DOCKER_HOST", "unix:///run/mine.sock")
+    given = {"HOME": "/scratch", "TMPDIR": "/scratch"}
+    outside = Sandbox("docker").outside(given)
+    assert outside["DOCKER_HOST"] == "unix:///run/mine.sock" and outside.get("HOME") == os.environ.get("HOME") and "/scratch" not in outside.values()
+    assert Sandbox("bwrap").outside(given) == given
 
 
 def test_a_wrong_parameter_is_told_and_a_prior_may_be_a_view() -> None:

@@ -68,6 +68,7 @@ class Process:
         command, after = [sys.executable, *module], list[str]()
         if sandbox is not None:
             command, after = sandbox.command(module, self.folder, source, environment, self.limits)
+            environment = sandbox.outside(environment)
         child_in, self.ask_fd = os.pipe()
         self.answer_fd, child_out = os.pipe()
         job = {

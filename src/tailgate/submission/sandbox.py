@@ -48,6 +48,11 @@ class Sandbox:
         return [*docker(name, folder, source, environment, limits), self.image, "python", *module], ["docker", "rm", "--force", name]
 
 
+    def outside(self, environment: dict[str, str]) -> dict[str, str]:
+        """Variables of the sandbox's own process: bwrap hands on all it has; a container's client has ours, to find its engine."""
+        return environment if self.program == "bwrap" else dict(os.environ)
+
+
 def sandbox_of(text: str | None) -> Sandbox | None:
     """A sandbox by its name: bwrap, docker, docker:IMAGE; none for an empty one. Raises InputError for one that is not installed."""
     if not text:
