@@ -19,7 +19,7 @@ lint: $(VENV)/.ready
 	$(BIN)/mypy
 
 bench: $(VENV)/.ready  ## speed beside the peers, in one run; writes benchmarks/results/speed.*
-	$(BIN)/python -m tailgate.cli bench --out benchmarks/results
+	$(BIN)/python -m tailgate bench --out benchmarks/results
 
 # torch comes first and pinned: left to the others it would be the largest build that exists
 $(VENV)/.ready: pyproject.toml constraints.txt

@@ -87,7 +87,7 @@ def test_a_failing_component_is_exit_code_1_and_its_rows_say_why(tmp_path: Path)
         "class Bad:\n    def prepare(self, model):\n        raise RuntimeError('out of order')\n    def start(self): ...\n    def step(self, plan, state, received, known_u, draws): ...\n"
     )
     command = (
-        sys.executable, "-m", "tailgate.cli", "evaluate", "--scenario", "gusty-stop-and-go-v0", "--defence", "kf", "--defence", "bad:Bad",
+        sys.executable, "-m", "tailgate", "evaluate", "--scenario", "gusty-stop-and-go-v0", "--defence", "kf", "--defence", "bad:Bad",
         "--attack", "none", "--seeds", "2", "--out", "rows.jsonl",
     )  # fmt: skip
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
@@ -137,6 +137,16 @@ def test_a_run_is_compared_also_where_nobody_can_look_into_the_defence(run: Run)
     report = json.loads(out)
     (left,) = report["left_out"]
     assert left.startswith("stealth") and "look" in report["left_out"][left] and report["defence"] == "none"
+
+
+def test_python_runs_the_package_as_the_command(tmp_path: Path) -> None:
+    """With two workers, which are spawned: they import the main module anew, and must not run it."""
+    command = [sys.executable, "-m", "tailgate", "evaluate", "--suite", "quick-v0", "--defence", "none", "--seeds", "1", "--workers", "2", "--json"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert {row["defence"] for row in json.loads(done.stdout)} == {"none"}
+    refused = subprocess.run([*command[:4], "--suite", "none-v0"], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert refused.returncode == 2 and refused.stderr.startswith("tailgate: error: ")
 
 
 def test_an_unknown_command_explains_itself(capsys: pytest.CaptureFixture[str]) -> None:

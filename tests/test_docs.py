@@ -28,7 +28,7 @@ def test_the_new_defence_has_at_most_30_lines_of_code() -> None:
 
 def test_the_new_defence_is_evaluated_from_the_command_line(package: Path) -> None:
     """Found in the working directory, played in two spawned processes, and on the page."""
-    command = [sys.executable, "-m", "tailgate.cli", "evaluate", "--suite", "quick-v0", "--scenario", "gusty-stop-and-go-v0"]
+    command = [sys.executable, "-m", "tailgate", "evaluate", "--suite", "quick-v0", "--scenario", "gusty-stop-and-go-v0"]
     command += ["--defence", "mydefence:Saturated:gain=0.1", "--attack", "none", "--attack", "fdi:trigger=near,threshold=30,value=-4"]
     done = subprocess.run(
         [*command, "--seeds", "20", "--workers", "2", "--out", "rows.jsonl", "--json"], cwd=package, capture_output=True, text=True, check=False
@@ -39,7 +39,7 @@ def test_the_new_defence_is_evaluated_from_the_command_line(package: Path) -> No
     assert table[0]["crash"]["value"] == 0.0
     rows = [json.loads(line) for line in (package / "rows.jsonl").read_text().splitlines()]
     assert {row["status"] for row in rows} == {"ok"}
-    build = [sys.executable, "-m", "tailgate.cli", "leaderboard", "build", "--rows", "rows.jsonl", "--out", "page"]
+    build = [sys.executable, "-m", "tailgate", "leaderboard", "build", "--rows", "rows.jsonl", "--out", "page"]
     assert subprocess.run(build, cwd=package, capture_output=True, text=True, check=False).returncode == 0
     assert "mydefence:Saturated" in (package / "page" / "index.html").read_text(encoding="utf-8")
 
@@ -57,7 +57,7 @@ def test_the_new_defence_plays_as_an_object(package: Path, monkeypatch: pytest.M
 def test_the_radar_example_challenges_and_hears(package: Path) -> None:
     """A fifth of the steps are muted, and an attacker who radiates is heard."""
     (package / "myradar.py").write_text(_blocks("docs/new-defence.md", "python")[2], encoding="utf-8")
-    command = [sys.executable, "-m", "tailgate.cli", "evaluate", "--scenario", "radar-following-v0", "--defence", "myradar:Listening"]
+    command = [sys.executable, "-m", "tailgate", "evaluate", "--scenario", "radar-following-v0", "--defence", "myradar:Listening"]
     command += ["--attack", "none", "--attack", "echo_delay:start_step=60", "--seeds", "20", "--out", "rows.jsonl"]
     done = subprocess.run(command, cwd=package, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
@@ -89,7 +89,7 @@ def test_the_scenario_of_the_documentation_plays(tmp_path: Path) -> None:
 
 
 def _evaluated(folder: Path, *arguments: str) -> list[dict[str, object]]:
-    command = [sys.executable, "-m", "tailgate.cli", "evaluate", "--scenario", "thesis-ch4-v0", "--dose", "none", "--seeds", "4", "--json"]
+    command = [sys.executable, "-m", "tailgate", "evaluate", "--scenario", "thesis-ch4-v0", "--dose", "none", "--seeds", "4", "--json"]
     done = subprocess.run([*command, *arguments], cwd=folder, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     return list(json.loads(done.stdout))

@@ -242,7 +242,7 @@ def test_a_process_that_dies_at_any_step_leaves_nothing_broken(tmp_path: Path, k
 def test_a_run_that_is_killed_at_a_random_time_goes_on(tmp_path: Path) -> None:
     """SIGKILL at some time after the first cell: the smoke test of the command. Its two workers end with it, and the rerun is whole."""
     defences, attacks, out = ("kf", "chi2_kf"), ("none", "fdi:value=5", "dos_hold"), tmp_path / "rows.jsonl"
-    command = [sys.executable, "-m", "tailgate.cli", "evaluate", "--scenario", "thesis-ch4-v0", "--seeds", "3", "--workers", "2", "--out", str(out)]
+    command = [sys.executable, "-m", "tailgate", "evaluate", "--scenario", "thesis-ch4-v0", "--seeds", "3", "--workers", "2", "--out", str(out)]
     command += [word for name in defences for word in ("--defence", name)] + [word for name in attacks for word in ("--attack", name)]
     wait = random.random()
     running = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)

@@ -107,7 +107,7 @@ SMALL_RUN = (
     "steps=1280", "ppo={envs: 16, rollout: 40, batch_size: 160, epochs: 1}", "episodes=12", "rivals=['fdi:trigger=near,threshold=30']", "others=[]",
     "white_box=[]", "tensorboard=false", "workers=1",
 )  # fmt: skip
-COMMAND = (sys.executable, "-m", "tailgate.cli", "train")
+COMMAND = (sys.executable, "-m", "tailgate", "train")
 
 
 @pytest.fixture(scope="module")
