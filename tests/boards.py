@@ -6,6 +6,7 @@ from html.parser import HTMLParser
 
 from tailgate.evaluation import evaluate
 from tailgate.leaderboard.site import build_site, slug
+from tailgate.stats import mean_time
 
 LEVELS = ("black", "grey", "white")
 DOSES = [5, 10, 20, 40, 200]
@@ -220,9 +221,17 @@ def make_board(name="synthetic-v0", *, bound=None, beacon="", trusted=True, defe
 
 def false_alarms(seen):
     """As often as wanted, but ten times as often at one an hour."""
-    often = {0.1: (20, 2.0, 0.1, 0.07, 0.16), 1: (200, 20.0, 0.1, 0.09, 0.12), 10: (0, 20.0, None, 5.4, None)}
-    names = ("onsets", "running", "mean", "low", "high")
-    return [{k: line[k] for k in ("defence", "hours", "threshold")} | dict(zip(names, often[line["hours"]], strict=True)) | {"first": 0, "p": 1.0} for line in seen]
+    lines = [{k: line[k] for k in ("defence", "hours", "threshold")} for line in seen]
+    return [line | gave({0.1: 20, 1: 200, 10: 0}[line["hours"]], {0.1: 2.0, 1: 20.0, 10: 20.0}[line["hours"]], first=0, late=5) for line in lines]
+
+
+def gave(onsets, running, dispersion=1.0, first=0, early=0, late=0):
+    """What so many false alarms in so many hours say."""
+    low, high = mean_time(onsets, running, dispersion)
+    mean = running / onsets if onsets else None
+    if not onsets:
+        early = late = 0
+    return {"onsets": onsets, "running": running, "dispersion": dispersion, "mean": mean, "low": low, "high": high, "first": first, "early": early, "late": late}
 
 
 def network():

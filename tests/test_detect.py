@@ -3,6 +3,7 @@
 import copy
 import dataclasses
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from tailgate.evaluation import cells_of, run
 from tailgate.leaderboard import detect as module
 from tailgate.leaderboard.board_format import read_board
 from tailgate.leaderboard.detect import check_detection, detect
-from tailgate.scenario import load_suite
+from tailgate.scenario import load_scenario, load_suite
 from tailgate.scoring.board import score
 from tailgate.scoring.detection import Effort
 
@@ -110,8 +111,39 @@ def test_false_alarms_alone_are_added_where_a_board_lacks_them(detected: Data, t
     assert check_detection(old, defences=["kf"])["counts"] == {"equal": 10, "differs": 0, "unchecked": 0}
     monkeypatch.setattr(module, "detection", None)
     monkeypatch.setattr(module, "stealth_impact", None)
+    more = dataclasses.replace(EFFORT, checked=30)
+    assert detect(_written(old, tmp_path / "more"), QUICK, effort=more, defences=["kf"])["detection"]["checked"] == 30
+    with pytest.raises(InputError, match=r"checked: got 20; expected 30"):
+        detect(path.parent.parent / "more" / "quick-v0" / "board.json", QUICK, effort=EFFORT)
     assert detect(path, QUICK, effort=EFFORT, defences=["kf"])["detection"]["alarms"] == detected["detection"]["alarms"][:4]
     assert detect(path, QUICK, effort=EFFORT, workers=2) == detected == json.loads(path.read_text())
+
+
+def test_a_threshold_is_checked_for_a_quarter_of_the_longest_run_at_most(detected: Data) -> None:
+    place = load_scenario(QUICK.scenarios[0])
+    seconds = {line["hours"]: line["running"] * 3600.0 for line in detected["detection"]["alarms"] if line["defence"] == "kf" and line["scenario"] == place.name}
+    drive = place.horizon * (dt := place.brief().model.dt)
+    assert seconds == pytest.approx({0.02: drive * math.ceil(20 * 0.02 * 3600.0 / drive), 0.05: drive * math.ceil(15_000 * dt / drive)})
+
+
+def test_thresholds_of_other_plants_are_played_again_only_when_asked_for(detected: Data, tmp_path: Path) -> None:
+    """Figures of a threshold that two networks of other shapes shared would otherwise stay as if it was that of each."""
+    assert detected["detection"]["plants"] == [list(QUICK.nominal)]
+    other = copy.deepcopy(detected)
+    other["detection"]["plants"] = [[name] for name in QUICK.nominal]
+    with pytest.raises(InputError, match=r"detection: plants.*without its field"):
+        detect(_written(other, tmp_path / "other"), QUICK, effort=EFFORT)
+    del other["detection"]["plants"]
+    assert detect(_written(other, tmp_path / "silent"), QUICK, effort=EFFORT)["detection"].get("plants") is None
+    networks = load_suite("network-v0")
+    assert len(module._shared(networks)) == 2 and module._by_class(networks) == [list(networks.nominal)]
+
+
+@pytest.mark.parametrize(("part", "field"), [("entries", "watched"), ("alarms", "watched"), ("entries", "delay")])
+def test_a_field_that_was_taken_out_is_found(board: Data, part: str, field: str) -> None:
+    next(line for line in board["detection"][part] if line["defence"] == "kf").pop(field)
+    report = check_detection(board, defences=["kf"])
+    assert [(line["of"], line["field"], line["board"]) for line in report["findings"]] == [(part, field, None)]
 
 
 def test_workers_change_no_figure(bare: Data, detected: Data, tmp_path: Path) -> None:
@@ -156,12 +188,13 @@ def test_an_altered_figure_is_found(board: Data, tmp_path: Path, capsys: pytest.
     board["detection"]["entries"].remove(lines[2])
     stealth = next(entry["stealth"] for entry in board["entries"] if entry["defence"] == "chi2_kf")
     stealth[1]["high"] += 0.01
-    next(line for line in board["detection"]["alarms"] if line["defence"] == "chi2_kf")["onsets"] += 1
+    line = next(line for line in board["detection"]["alarms"] if line["defence"] == "chi2_kf")
+    line["early"] += 1 if line["early"] + line["late"] < line["onsets"] else -1
     path = _written(board, tmp_path)
     assert main(["leaderboard", "check", str(path), "--detection", "--defence", "chi2_kf", "--json"]) == 1
     report = json.loads(capsys.readouterr().out)
     assert [(line["of"], line["hours"], line["field"]) for line in report["findings"]] == [
-        ("entries", 0.02, "detected"), ("entries", 0.02, "threshold"), ("alarms", 0.02, "onsets"), ("stealth", 0.05, "high"),
+        ("entries", 0.02, "detected"), ("entries", 0.02, "threshold"), ("alarms", 0.02, "early"), ("stealth", 0.05, "high"),
         ("entries", 0.02, ""),
     ]  # fmt: skip
     assert report["counts"] == {"equal": 9, "differs": 5, "unchecked": 0}

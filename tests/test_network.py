@@ -379,7 +379,7 @@ def test_the_alarm_of_a_group_is_on_while_any_agent_alarms():
     any_on = trace.alarm.any(axis=2)
     np.testing.assert_array_equal(onsets, any_on[0] + (any_on[1:] & ~any_on[:-1]).sum(axis=0))
     single = (trace.alarm[1:] & ~trace.alarm[:-1]).sum() + trace.alarm[0].sum()
-    assert steps == 1800 and 0 < onsets.sum() < single  # agents that alarm together are one alarm
+    assert (steps == 60).all() and 0 < onsets.sum() < single  # agents that alarm together are one alarm
     held = "chi2_dkf:gain=steady"
     whole, parts = (Bench.of(held, ["network-noisy-v0"], batch, None).run(8.0, 0.5, "calibrate", "") for batch in (4096, 4))
     assert whole == parts and whole.seconds == whole.steps == 1800 and whole.onsets > 0

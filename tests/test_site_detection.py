@@ -54,7 +54,7 @@ def test_a_mean_is_of_all_scripts_and_scenarios():
     """Two scripts, of which one is not seen; one that could not be played does not count."""
     board = make_board()
     told = next(c for c in board["detection"]["entries"] if c["defence"] == "kf" and c["hours"] == 1)
-    more = [told | {"attack": "dropout:trigger=near,threshold=40", "detected": {"value": v, "low": 0.0, "high": 1.0} if v is not None else None} for v in (0.0, None)]
+    more = [told | {"attack": f"dropout:trigger=near,threshold={at}", "detected": {"value": v, "low": 0.0, "high": 1.0} if v is not None else None} for at, v in ((40, 0.0), (50, None))]
     board["detection"]["entries"] = [told | {"detected": {"value": 1.0, "low": 0.9, "high": 1.0}}, *more]
     row = detection_of(Suite(read_board(board), ""))["rows"][0]
     assert [(c["text"], c["least"]) for c in row["cells"] if c["least"]] == [("50%", "0%")]

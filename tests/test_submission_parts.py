@@ -21,6 +21,7 @@ from tailgate.errors import InputError
 from tailgate.rounds import seeds_of
 from tailgate.scenario import Scenario, load_scenario
 from tailgate.submission import Isolated, Limits, digest_of, mixed
+from tailgate.submission.limits import Lost
 from tailgate.submission.sandbox import Sandbox, bwrap, docker, sandbox_of
 from tailgate.submission.source import staged
 from tailgate.submission.table import order_of
@@ -176,12 +177,19 @@ def test_sandboxes_have_no_network_and_can_write_to_one_file_only(tmp_path: Path
     assert "PATH=/bin" not in line and "OMP_NUM_THREADS=1" in line
 
 
-def test_a_container_s_client_finds_its_engine_and_bubblewrap_hands_on_nothing_of_ours(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where the engine listens stands in DOCKER_HOST, or below HOME; the submission gets its variables one by one."""
-    monkeypatch.setenv("DOCKER_HOST", "unix:///run/mine.sock")
-    given = {"HOME": "/scratch", "TMPDIR": "/scratch"}
-    outside = Sandbox("docker").outside(given)
-    assert outside["DOCKER_HOST"] == "unix:///run/mine.sock" and outside.get("HOME") == os.environ.get("HOME") and "/scratch" not in outside.values()
+def test_a_container_s_client_finds_its_engine_and_nobody_reads_our_variables(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where the engine listens stands in DOCKER_HOST, or below HOME: the client inherits them. The guard's arguments, which all users of
+    a machine can read, have none of ours; a submission gets its own, one by one."""
+    (tmp_path / "docker").write_text("#!/bin/sh\nenv > \"$MY_TRACE\"; tr '\\0' ' ' < /proc/$PPID/cmdline >> \"$MY_TRACE\"\n")
+    (tmp_path / "docker").chmod(0o755)
+    for name, value in {"PATH": f"{tmp_path}:{os.environ['PATH']}", "DOCKER_HOST": "unix:///mine.sock", "MY_TRACE": str(tmp_path / "seen"), "MY_TOKEN": "hunter2"}.items():
+        monkeypatch.setenv(name, value)
+    with pytest.raises(Lost):
+        _ = Isolated(KALMAN, sandbox=Sandbox("docker")).card
+    variables, _, arguments = (tmp_path / "seen").read_text().rpartition("\n")
+    assert "DOCKER_HOST=unix:///mine.sock" in variables and "MY_TOKEN=hunter2" in variables and f"HOME={os.environ.get('HOME')}" in variables
+    assert "guard.py" in arguments and "hunter2" not in arguments and "mine.sock" not in arguments
+    given = {"HOME": "/scratch"}
     assert Sandbox("bwrap").outside(given) == given
 
 

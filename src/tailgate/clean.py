@@ -15,7 +15,6 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy import stats
 
 from tailgate import draws
 from tailgate.agents.scripted import NoAttack
@@ -26,6 +25,7 @@ from tailgate.fused import Constants, fuse
 from tailgate.loop import Loop
 from tailgate.registry import Spec, entry_for, text_of
 from tailgate.scenario import Scenario, load_scenario
+from tailgate.stats import mean_time
 from tailgate.trace import MEMORY, episodes_at_once, rollout
 
 SILENT = 1e12  # a threshold that nothing reaches
@@ -57,14 +57,8 @@ class Count(NamedTuple):
         return self.seconds / HOUR / self.onsets if self.onsets else None
 
     def interval(self, level: float = 0.95) -> tuple[float, float | None]:
-        """Exact Poisson interval of the mean time [h]; its upper end is None without any onset.
-
-        Onsets that come in clusters tell less than their number says: it and the time are divided by the dispersion where that is above 1.
-        """
-        clusters = max(self.dispersion, 1.0)
-        n, time, tail = self.onsets / clusters, self.seconds / HOUR / clusters, (1.0 - level) / 2.0
-        low = time / float(0.5 * stats.chi2.ppf(1.0 - tail, 2.0 * n + 2.0))
-        return low, time / float(0.5 * stats.chi2.ppf(tail, 2.0 * n)) if n else None
+        """Limits of the mean time [h], for clusters of such dispersion; the upper one is None without any onset."""
+        return mean_time(self.onsets, self.seconds / HOUR, self.dispersion, level)
 
     def may_be(self, hours: float) -> bool:
         """Whether the interval holds this mean time."""
@@ -217,26 +211,27 @@ class Bench:
         for done, (place, seeds) in enumerate(chunks, start=1):
             onsets, played = count_onsets(loops[place.name], draws.keys(purpose, seeds), crossings)
             counts.append(onsets.sum(axis=1))
-            steps[place.name] += played
+            steps[place.name] += int(played.sum())
             self.progress(label, done, len(chunks), f"threshold {threshold:.{MOST_DIGITS}g}" if threshold < SILENT else "")
         seconds = math.fsum(steps[place.name] * place.brief().model.dt for place in self.places)
         return Count.of(np.concatenate(counts), seconds, sum(steps.values()))
 
 
-def count_onsets(loop: Loop, keys: draws.Keys, crossings: Crossings | None = None) -> tuple[Array, int]:
-    """(B, 2) alarm onsets of clean episodes in both halves of the drive, counted as the metric does, and the steps played.
+def count_onsets(loop: Loop, keys: draws.Keys, crossings: Crossings | None = None) -> tuple[Array, Array]:
+    """(B, 2) alarm onsets of clean episodes in both halves of the drive, counted as the metric does, and the (B,) steps played.
 
     Of several agents any alarms.
     """
-    batch, steps = len(keys.key), 0
+    batch = len(keys.key)
     alarmed, onsets, last = np.zeros(batch, bool), np.zeros((batch, 2), np.int64), np.full(batch, -np.inf)
+    steps = np.zeros(batch, np.int64)
     low: list[Array] = []
     high: list[Array] = []
     for k, (alarms, scores, live) in enumerate(play_clean(loop, keys)):
         alarm = alarms.any(axis=1) & live
         onsets[:, int(2 * k >= loop.horizon)] += alarm & ~alarmed
         alarmed = alarm
-        steps += int(np.count_nonzero(live))
+        steps += live
         if crossings is not None:
             score = scores.max(axis=1)
             crossings.least = min(crossings.least, score[live].min(initial=math.inf))

@@ -1,4 +1,4 @@
-"""Intervals. Proportions by Clopper and Pearson, medians by ranks (scipy); paired differences by a bootstrap with its own seed."""
+"""Intervals. Proportions by Clopper and Pearson, mean times by Poisson, medians by ranks (scipy); differences by a seeded bootstrap."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -21,6 +21,18 @@ def proportion(successes: int, n: int, level: float = 0.95) -> Interval:
     """Share of successes with the exact (Clopper-Pearson) interval."""
     ci = stats.binomtest(successes, n).proportion_ci(confidence_level=level, method="exact")
     return Interval(successes / n, float(ci.low), float(ci.high))
+
+
+def mean_time(events: int, time: float, dispersion: float = 1.0, level: float = 0.95) -> tuple[float, float | None]:
+    """Limits of the mean time between events that came in so much of it: a Poisson interval, exact where they are independent.
+
+    Events that come in clusters tell less than their number says: it and the time are divided by the dispersion (variance over mean of
+    their number in a run) where that is above 1. The upper end is None without any event.
+    """
+    clusters = max(dispersion, 1.0)
+    n, time, tail = events / clusters, time / clusters, (1.0 - level) / 2.0
+    low = time / float(0.5 * stats.chi2.ppf(1.0 - tail, 2.0 * n + 2.0))
+    return low, time / float(0.5 * stats.chi2.ppf(tail, 2.0 * n)) if n else None
 
 
 def median_limits(values: Array, level: float = 0.95) -> tuple[float, float] | None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +12,9 @@ from pydantic import ValidationError
 
 from tailgate.errors import InputError, said, wanted
 from tailgate.files import sweep, write_atomic
+from tailgate.stats import mean_time
 
-from .board_parts import Board, EntryTrust
+from .board_parts import AtThreshold, Board, Detection, EntryTrust
 
 FORMAT = "tailgate-board-1"
 
@@ -76,12 +79,41 @@ def _agree(board: Board, where: str) -> None:
                 raise InputError(f"{where}.comparisons[{i}].{side}", getattr(duel, side), "one of the entries' defences")
         if duel.weaker not in (None, duel.a, duel.b):
             raise InputError(f"{where}.comparisons[{i}].weaker", duel.weaker, f"{duel.a} or {duel.b}")
+    if board.detection is not None:
+        _detected(board.detection, set(names), known, f"{where}.detection")
     for i, entry in enumerate(board.entries):
         if entry.trust is not None:
             _bounded(board, entry.trust, f"{where}.entries[{i}].trust")
     for key in board.suite.shown:
         if key not in {str(dose) for dose in board.suite.doses}:
             raise InputError(f"{where}.suite.shown", key, f"one of the suite's doses {board.suite.doses}")
+
+
+def _detected(held: Detection, names: set[str], scenarios: set[str], where: str) -> None:
+    """Figures are of entries and scenarios of the board, each there once, and false alarms and their mean times are of one another."""
+    parts: dict[str, Sequence[AtThreshold]] = {"entries": held.entries, "alarms": held.alarms}
+    for part, lines in parts.items():
+        met = set[tuple[object, ...]]()
+        for i, line in enumerate(lines):
+            place = f"{where}.{part}[{i}]"
+            if line.defence not in names:
+                raise InputError(f"{place}.defence", line.defence, "one of the entries' defences")
+            if line.scenario not in scenarios:
+                raise InputError(f"{place}.scenario", line.scenario, "one of the suite's scenarios")
+            if (key := (line.defence, line.scenario, line.hours, getattr(line, "attack", ""))) in met:
+                raise InputError(place, " ".join(map(str, key)).strip(), "figures that are there once")
+            met.add(key)
+    for i, line in enumerate(held.alarms):
+        low, high = mean_time(line.onsets, line.running, line.dispersion)
+        follows = {"mean": line.running / line.onsets if line.onsets else None, "low": low, "high": high}
+        for name, value in follows.items():
+            given = getattr(line, name)
+            if not (given is value is None or (given is not None and value is not None and math.isclose(given, value, rel_tol=1e-6))):
+                raise InputError(f"{where}.alarms[{i}].{name}", given, f"{value}, which follows from onsets, running and dispersion")
+        if line.first > line.onsets:
+            raise InputError(f"{where}.alarms[{i}].first", line.first, f"at most {line.onsets}, the onsets")
+        if line.early + line.late > line.onsets:
+            raise InputError(f"{where}.alarms[{i}].early", line.early, f"at most {line.onsets} drives with late, as many as onsets")
 
 
 def _bounded(board: Board, trust: EntryTrust, where: str) -> None:

@@ -247,11 +247,16 @@ class Comparison(Part):
     bound: bool = False
 
 
-class Detected(Part):
+class AtThreshold(Part):
+    """A figure of an entry at its threshold for a wanted mean time between false alarms [h]."""
+
     defence: Text
     scenario: Text
-    attack: Text
     hours: Number
+
+
+class Detected(AtThreshold):
+    attack: Text
     threshold: Number | None = None
     watched: bool = False  # the threshold is held against the score of a defence that has none
     rarer: bool = False  # with every lower threshold the alarm is more frequent than wanted, with this one rarer
@@ -259,25 +264,25 @@ class Detected(Part):
     delay: Number | None = None
 
 
-class AlarmPart(Part):
-    """False alarms of an entry at a threshold of its detection, on fresh clean runs of a scenario."""
+class AlarmPart(AtThreshold):
+    """False alarms on fresh clean runs of a scenario."""
 
-    defence: Text
-    scenario: Text
-    hours: Number
     threshold: Number
     rarer: bool = False  # as in detection
     onsets: Count
-    running: Number
+    running: Annotated[Number, Field(gt=0.0)]  # [h]
+    dispersion: Annotated[Number, Field(ge=0.0)]  # variance over mean of the onsets of a drive
     mean: Number | None  # time between them [h]; None without any
     low: Number
-    high: Number | None = None
-    first: Count  # in the first half of the drive
-    p: Share  # that both halves have as many
+    high: Number | None
+    first: Count  # onsets in the first half of the drive
+    early: Count  # drives with more of them in the first half
+    late: Count
 
 
 class Detection(Part):
     hours: list[Number]
+    plants: list[list[Text]] | None = None  # scenarios that share a threshold; None: those of one class of plant
     entries: list[Detected]
     alarms: list[AlarmPart] = []
 

@@ -14,7 +14,7 @@ from typing import Any
 import tailgate
 from tailgate.errors import InputError
 from tailgate.pool import abandon, processes
-from tailgate.scenario import Suite
+from tailgate.scenario import Suite, load_scenario
 from tailgate.scoring.detection import EFFORT, Effort, Progress, detection, plants, stealth_impact
 from tailgate.scoring.false_alarms import false_alarms
 from tailgate.scoring.follow import same
@@ -25,6 +25,7 @@ from .check import VERDICTS, agree, drawn, known, refused, suite_of
 Data = dict[str, Any]
 LINES = ("entries", "without", "alarms")  # of a detection board: figures, why there are none, and false alarms at the thresholds
 PARTS = 4  # of the longest clean run: what one scenario may take of it when a threshold is checked
+YOUNG = ("low", "high")  # fields of stealth that older boards lack
 PLACE = ("plant", "scenario", "attack", "hours")  # what a figure is of
 
 
@@ -44,14 +45,17 @@ def detect(
     listed = [a for a in board["attacks"] if a["attack"] in suite.attacks or a.get("admitted")]
     attacks = [a["attack"] for a in listed if a["knowledge"] == "black" and not (a.get("optimal") or a.get("learned"))]
     attacks = [attack for attack in attacks if not refused("attack", attack)]
-    held = board.get("detection") or _nothing(effort)
-    for name, value in dataclasses.asdict(_effort(held)).items():
+    held = board.get("detection") or _nothing(effort, suite)
+    for name, value in dataclasses.asdict(_effort(held, effort)).items():
         if value != getattr(effort, name):
             raise InputError(f"detection: {name}", getattr(effort, name), f"{value}, with which the figures of the board were made")
+    if (told := held.get("plants", _by_class(suite))) != _shared(suite):
+        wanted = f"{_shared(suite)}, scenarios that share a threshold; without its field `detection` a board is played again"
+        raise InputError("detection: plants", told, wanted)
     asked = [guard for guard in defences or guards if not _whole(held, guard, suite, attacks, effort)]
     there = {guard: _of(board, held, guard) for guard in defences or guards if guard not in asked and not _checked(held, guard, suite)}
     for guard, found in _play(suite, asked, attacks, effort, board["suite"].get("beacon") or "", workers, progress, there):
-        board = _with(load(path), guard, found, effort)  # read again: it may have been marked in the meantime
+        board = _with(load(path), guard, found, effort, suite)  # read again: it may have been marked in the meantime
         save(board, path)
     return dict(board)
 
@@ -61,18 +65,32 @@ def _takes_part(entry: Data) -> bool:
     return entry["defence"] != "none" and "truth" not in entry["uses"] and not (entry.get("card") or {}).get("sentinel")
 
 
-def _nothing(effort: Effort) -> Data:
-    return _said(effort) | {key: [] for key in LINES}
+def _nothing(effort: Effort, suite: Suite) -> Data:
+    return _said(effort, suite) | {key: [] for key in LINES}
 
 
-def _said(effort: Effort) -> Data:
-    return dataclasses.asdict(effort) | {"hours": list(effort.hours)}
+def _said(effort: Effort, suite: Suite) -> Data:
+    return dataclasses.asdict(effort) | {"hours": list(effort.hours), "plants": _shared(suite)}
 
 
-def _effort(held: Data) -> Effort:
-    """With which the figures of a board were made; boards of before do not say, and had the usual one."""
+def _shared(suite: Suite) -> list[list[str]]:
+    """Scenarios that share a threshold."""
+    return [list(names) for names in plants(suite.nominal).values()]
+
+
+def _by_class(suite: Suite) -> list[list[str]]:
+    """The same on boards of before, which do not say so: those of one class of plant, whatever its shape."""
+    out: dict[str, list[str]] = {}
+    for name in suite.nominal:
+        out.setdefault(type(load_scenario(name).plant).__name__, []).append(name)
+    return list(out.values())
+
+
+def _effort(held: Data, effort: Effort = EFFORT) -> Effort:
+    """With which the figures of a board were made; boards of before do not say, and had the usual one. A number that none is of is free."""
     given = {f.name: held[f.name] for f in dataclasses.fields(Effort) if f.name in held}
-    return dataclasses.replace(EFFORT, **given | {"hours": tuple(map(float, held["hours"]))})
+    free = {} if held.get("alarms") else {"checked": effort.checked}
+    return dataclasses.replace(EFFORT, **given | free | {"hours": tuple(map(float, held["hours"]))})
 
 
 def _whole(held: Data, guard: str, suite: Suite, attacks: Sequence[str], effort: Effort) -> bool:
@@ -102,14 +120,15 @@ def _outdated(line: Data) -> bool:
     return str(line.get("reason", "")).startswith("defence: ")
 
 
-def _with(board: Data, guard: str, found: Data, effort: Effort) -> Data:
+def _with(board: Data, guard: str, found: Data, effort: Effort, suite: Suite) -> Data:
     """The board with the figures of one entry, in the order of its entries."""
     order = [entry["defence"] for entry in board["entries"]]
-    held, apart = board.get("detection") or _nothing(effort), {guard, *(e["defence"] for e in board["entries"] if not _takes_part(e))}
+    held = board.get("detection") or _nothing(effort, suite)
+    apart = {guard, *(e["defence"] for e in board["entries"] if not _takes_part(e))}
     lines = {part: [line for line in held.get(part, ()) if line["defence"] not in apart] + found[part] for part in LINES}
     lines = {part: sorted(mine, key=lambda line: order.index(line["defence"])) for part, mine in lines.items()}
     entries = [entry | {"stealth": found["stealth"]} if entry["defence"] == guard else entry for entry in board["entries"]]
-    return board | {"entries": entries, "detection": held | _said(effort) | lines}
+    return board | {"entries": entries, "detection": held | _said(effort, suite) | lines}
 
 
 def figures(
@@ -210,7 +229,8 @@ def _by_place(held: Data, guard: str) -> dict[tuple[Any, ...], Data]:
 
 
 def _differences(says: Data | None, here: Data | None) -> list[Data]:
-    """Field by field; a board of before a field was there says nothing of it."""
+    """Field by field; a board of before the limits of stealth were there says nothing of them."""
     if says is None or here is None:
         return [{"field": "", "board": says, "here": here}]
-    return [{"field": key, "board": says[key], "here": here.get(key)} for key in says if not same(says[key], here.get(key))]
+    keys = [*says, *(key for key in here if key not in says and key not in YOUNG)]
+    return [{"field": key, "board": says.get(key), "here": here.get(key)} for key in keys if not same(says.get(key), here.get(key))]

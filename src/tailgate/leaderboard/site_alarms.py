@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from scipy import stats
+
+from tailgate.stats import mean_time
 
 from .board_parts import AlarmPart
 from .build import percent
 from .site_suite import Data, Suite
 
 FACTOR = 2.0  # times as often as wanted, or as rarely, from which on it is a flag
-LEVEL = 0.05  # of the test of both halves, for all scenarios of an entry together
-APART = 0.9  # of the false alarms in one half
+APART = 0.75  # of the drives with more false alarms in one half than in the other, from which on it is a flag
+LEVEL = 0.05  # of each of the three, for all scenarios of an entry together
 
 
 def alarms_of(suite: Suite) -> list[AlarmPart]:
@@ -62,25 +64,26 @@ def together_of(suite: Suite) -> Data | None:
 def drifts_of(suite: Suite, defence: str) -> list[str]:
     """The flag of an entry whose false alarms surely come far more often or rarely than its threshold was set for, or in one half alone."""
     hour = middle(suite)
-    lines = [line for line in alarms_of(suite) if line.defence == defence and line.hours == hour and line.mean is not None]
-    quiet = [line for line in alarms_of(suite) if line.defence == defence and line.hours == hour and not line.rarer]
+    lines = [line for line in alarms_of(suite) if line.defence == defence and line.hours == hour]
     told = [line for line in lines if line.scenario not in robust(suite)]
-    often = sorted((line for line in lines if line.high is not None and line.high < hour / FACTOR), key=lambda line: line.mean or 0.0)
-    rare = [line for line in quiet if line.low > FACTOR * hour and line.scenario not in robust(suite)]
+    ends = {line.scenario: mean_time(line.onsets, line.running, line.dispersion, 1.0 - LEVEL / len(lines)) for line in lines}
+    often = [line for line in lines if (most := ends[line.scenario][1]) is not None and most < hour / FACTOR]
+    often.sort(key=lambda line: line.mean or 0.0)
     out, set_to = [], f"alarm drift: set to one false alarm in {time_text(hour)}, it raises"
     if often:
         more = f", and on {len(often) - 1} more surely twice as often" if len(often) > 1 else ""
         out.append(f"{set_to} one in {_mean(often[0])} on {often[0].scenario}{more}")
-    out += [f"{set_to} {_rarely(line)} on {line.scenario}" for line in rare]
-    return out + [f"alarm drift: {said}" for line in told if (said := _early(line, told))]
+    out += [f"{set_to} {_rarely(line)} on {line.scenario}" for line in told if not line.rarer and ends[line.scenario][0] > FACTOR * hour]
+    return out + [f"alarm drift: {said}" for line in told if (said := _aside(line, LEVEL / len(told)))]
 
 
-def _early(line: AlarmPart, told: Sequence[AlarmPart]) -> str:
-    share = line.first / line.onsets
-    if line.p > LEVEL / len(told) or max(share, 1.0 - share) < APART:
+def _aside(line: AlarmPart, level: float) -> str:
+    """Of drives, which are independent: onsets of one drive come in clusters."""
+    drives, most = line.early + line.late, max(line.early, line.late)
+    if not drives or stats.binomtest(most, drives, APART, alternative="greater").pvalue > level / 2.0:
         return ""
-    half, part = ("first", share) if share > 0.5 else ("second", 1.0 - share)
-    return f"{percent(part)} of its false alarms on {line.scenario} come in the {half} half of the drive"
+    half = "first" if line.early > line.late else "second"
+    return f"its false alarms on {line.scenario} come in the {half} half of the drive, in {most} of {drives} drives with more in one half"
 
 
 def _rarely(line: AlarmPart) -> str:
@@ -93,10 +96,10 @@ def _mean(line: AlarmPart) -> str:
 
 def _cell(line: AlarmPart | None) -> Data:
     if line is None:
-        return {"text": "\N{EN DASH}", "span": "", "sort": ""}
+        return {"text": "\N{EN DASH}", "span": "", "rarer": False, "sort": ""}
     span = f"{time_text(line.low)} or more" if line.high is None else f"{time_text(line.low)} to {time_text(line.high)}"
     text = f"none in {time_text(line.running)}" if line.mean is None else _mean(line)
-    return {"text": text, "span": span, "sort": f"{line.low if line.mean is None else line.mean:.6g}"}
+    return {"text": text, "span": span, "rarer": line.rarer, "sort": f"{line.low if line.mean is None else line.mean:.6g}"}
 
 
 def time_text(hours: float) -> str:

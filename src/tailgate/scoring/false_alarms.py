@@ -7,11 +7,11 @@ come more often, and within a drive it may come early or late: a filter with a c
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy import stats
 
 from tailgate import draws
 from tailgate.clean import HOUR, Bench, Count, count_onsets, side_by_side
@@ -22,54 +22,82 @@ from tailgate.scenario import Suite
 from .detection import plants
 
 PURPOSE = "report"
+FIRST = 4096  # number of the first seed: cells of a board and detection have no more episodes, which are numbered from 0
 BATCH = 4096  # episodes at once; changes no figure
 Data = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Drives:
+    """Clean drives of a scenario: alarm onsets (B, 2) in both halves, steps played (B,), the most that there can be, and the step [s]."""
+
+    halves: Array
+    steps: Array
+    horizon: int
+    dt: float
+
+    @property
+    def count(self) -> Count:
+        return Count.of(self.halves.sum(axis=1), float(self.steps.sum()) * self.dt, int(self.steps.sum()))
+
+    @property
+    def sides(self) -> tuple[int, int]:
+        """How many whole drives have more onsets in their first half, and in their second: drives are independent, onsets are not."""
+        first, second = self.halves[self.steps == self.horizon].T
+        return int(np.count_nonzero(first > second)), int(np.count_nonzero(first < second))
 
 
 def false_alarms(suite: Suite, detected: Sequence[Data], wanted: int, most_steps: int, *, beacon: str = "") -> list[Data]:
     """The field `alarms` of a detection board: for each threshold in the lines `detected`, what it gives in each scenario of its plant.
 
-    Each line has the `onsets` in so many hours of `running`, the mean time between them with its limits [h] (`mean`, None without any,
-    `low`, `high`), how many of them came in the `first` half of the drive, and `p`, of a sign test over episodes that both halves have as
-    many. A run lasts as long as `wanted` false alarms should take, or `most_steps` steps if that is less.
+    Each line has the `onsets` in so many hours of `running`, their `dispersion` by drives, the mean time between them with its limits [h]
+    (`mean`, None without any, `low`, `high`), how many of them came in the `first` half of the drive, and how many drives had more of
+    them `early` and `late`. A run lasts as long as `wanted` false alarms should take, or `most_steps` steps if that is less. No two
+    scenarios of a plant share a seed: a filter that knows its input sees the noise alone, and would see it twice.
     """
     out, done = [], set[tuple[str, tuple[str, ...], float]]()
     for line in detected:
-        names = _of_plant(suite, line["scenario"])
+        names = next(names for names in plants(suite.scenarios).values() if line["scenario"] in names)
         if (key := (line["defence"], names, line["hours"])) in done:
             continue
         done.add(key)
-        head = {name: line[name] for name in ("defence", "hours", "threshold", "watched", "rarer") if name in line}
+        first, drives = FIRST, dict[str, Drives]()
         for name in names:
-            out.append(head | {"scenario": name} | _counted(suite.name, name, line, wanted, most_steps, beacon))
+            drives[name] = _drive(suite.name, name, line, wanted, most_steps, first, beacon)
+            first += len(drives[name].steps)
+        least = dispersion([drives[name] for name in names if name not in suite.robustness])
+        head = {name: line[name] for name in ("defence", "hours", "threshold", "watched", "rarer") if name in line}
+        out += [head | {"scenario": name} | _figures(drives[name], least) for name in names]
     return out
 
 
-def _of_plant(suite: Suite, scenario: str) -> tuple[str, ...]:
-    return next(names for names in plants(suite.scenarios).values() if scenario in names)
-
-
-def _counted(suite: str, scenario: str, line: Data, wanted: int, most_steps: int, beacon: str) -> Data:
+def _drive(suite: str, scenario: str, line: Mapping[str, Any], wanted: int, most_steps: int, first: int, beacon: str) -> Drives:
     bench = Bench.of(line["defence"], [scenario], BATCH, None)
     loop = bench.places[0].loop(bench.at(line["threshold"]), bench.uses)
-    dt = loop.model.dt
-    steps = min(wanted * line["hours"] * HOUR / dt, float(most_steps))
-    seeds = numbered(beacon, suite, PURPOSE, 0, max(1, math.ceil(steps / loop.horizon - 1e-9)))
-    size, each, played = side_by_side(loop, BATCH), [], 0
-    for first in range(0, len(seeds), size):
-        onsets, some = count_onsets(loop, draws.keys(PURPOSE, seeds[first : first + size]))
-        each.append(onsets)
-        played += some
-    halves = np.concatenate(each)
-    count = Count.of(halves.sum(axis=1), played * dt, played)
+    steps = min(wanted * line["hours"] * HOUR / loop.model.dt, float(most_steps))
+    seeds = numbered(beacon, suite, PURPOSE, first, max(1, math.ceil(steps / loop.horizon - 1e-9)))
+    size = side_by_side(loop, BATCH)
+    parts = [count_onsets(loop, draws.keys(PURPOSE, seeds[at : at + size])) for at in range(0, len(seeds), size)]
+    halves, played = (np.concatenate(part) for part in zip(*parts, strict=True))
+    return Drives(halves, played, loop.horizon, loop.model.dt)
+
+
+def dispersion(drives: Sequence[Drives]) -> float:
+    """Variance over mean of the onsets of a drive, within scenarios, of all together; 1 without any.
+
+    What is set for several scenarios together may be silent in one, which then says nothing of its clusters.
+    """
+    each = [one.halves.sum(axis=1) for one in drives]
+    mean = math.fsum(float(x.sum()) for x in each)
+    return math.fsum(float(x.var()) * len(x) for x in each) / mean if mean else 1.0
+
+
+def _figures(drives: Drives, least: float) -> Data:
+    count = drives.count
+    count = count._replace(dispersion=max(count.dispersion, least))
     low, high = count.interval()
+    early, late = drives.sides
     return {
-        "onsets": count.onsets, "running": count.seconds / HOUR, "mean": count.hours, "low": low, "high": high,
-        "first": int(halves[:, 0].sum()), "p": sign_test(halves[:, 0], halves[:, 1]),
+        "onsets": count.onsets, "running": count.seconds / HOUR, "dispersion": count.dispersion, "mean": count.hours, "low": low,
+        "high": high, "first": int(drives.halves[:, 0].sum()), "early": early, "late": late,
     }  # fmt: skip
-
-
-def sign_test(x: Array, y: Array) -> float:
-    """Exact two-sided p of as many episodes with x > y as with x < y; alarms that come in clusters count once an episode."""
-    more, less = int(np.count_nonzero(x > y)), int(np.count_nonzero(x < y))
-    return float(stats.binomtest(more, more + less).pvalue) if more + less else 1.0

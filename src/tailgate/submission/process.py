@@ -64,15 +64,16 @@ class Process:
         options = json.dumps({name: asdict(self.limits)[name] for name in ("memory", "cpu", "file_size")})
         module = ["-P", "-B", "-m", "tailgate.submission.child", str(self.folder), options]
         home = str(self.scratch) if sandbox is None else HOME
-        environment = _environment(home, str(_ROOT))
+        inside = _environment(home, str(_ROOT))
+        outside: dict[str, str] | None = inside
         command, after = [sys.executable, *module], list[str]()
         if sandbox is not None:
-            command, after = sandbox.command(module, self.folder, source, environment, self.limits)
-            environment = sandbox.outside(environment)
+            command, after = sandbox.command(module, self.folder, source, inside, self.limits)
+            outside = sandbox.outside(inside)
         child_in, self.ask_fd = os.pipe()
         self.answer_fd, child_out = os.pipe()
         job = {
-            "command": command, "environment": environment, "scratch": str(self.scratch), "pipes": [child_in, child_out], "after": after,
+            "command": command, "environment": outside, "scratch": str(self.scratch), "pipes": [child_in, child_out], "after": after,
             "remove": [str(self.scratch), str(self.folder)], "cpu": self.granted, "memory": self.limits.memory,
             "output": self.limits.output, "cpu_limit": self.limits.cpu,
             "processes": self.limits.processes + (0 if sandbox is None else sandbox.processes),

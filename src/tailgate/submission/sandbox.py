@@ -47,10 +47,10 @@ class Sandbox:
         name = f"tailgate-{uuid.uuid4().hex}"
         return [*docker(name, folder, source, environment, limits), self.image, "python", *module], ["docker", "rm", "--force", name]
 
+    def outside(self, environment: dict[str, str]) -> dict[str, str] | None:
+        """Variables of the sandbox's own process: bwrap hands on all it has; a container's client inherits ours (None): its engine."""
+        return environment if self.program == "bwrap" else None
 
-    def outside(self, environment: dict[str, str]) -> dict[str, str]:
-        """Variables of the sandbox's own process: bwrap hands on all it has; a container's client has ours, to find its engine."""
-        return environment if self.program == "bwrap" else dict(os.environ)
 
 
 def sandbox_of(text: str | None) -> Sandbox | None:
