@@ -17,15 +17,12 @@ from tailgate.scenario import Suite, list_suites, load_suite
 HELD = golden.read()
 
 
-SLOW = {"highway-v0": (), "highway-braking-v0": (), "highway-cut-in-v0": ("kf",)}  # what is played of a scene here; `--check` plays all
-
-
 @pytest.mark.parametrize("name", sorted(HELD["scenarios"]))
 def test_nothing_moved(name: str) -> None:
     """Decisions on every platform, traces where they were recorded on such a one. Moved on purpose? A new version of suite or scenario."""
-    if SLOW.get(name):
+    if name.startswith("highway-"):
         pytest.importorskip("highway_env")
-    assert golden.check(name, HELD, SLOW.get(name)) == []
+    assert golden.check(name, HELD) == []
 
 
 def test_every_suite_and_every_scenario_of_one_is_recorded_as_it_is() -> None:
@@ -41,7 +38,7 @@ def test_every_scenario_has_two_defences_and_three_attacks() -> None:
     for name, entry in HELD["scenarios"].items():
         pairs = [(cell["defence"], cell["attack"]) for cell in entry["cells"]]
         defences, attacks = ({pair[i] for pair in pairs} for i in (0, 1))
-        count = 2 if name == "highway-v0" else 3
+        count = 2 if name == "highway-v0/highway-v0" else 3
         assert len(pairs) == len(set(pairs)) == 2 * count and len(defences) == 2 and len(attacks) == count and "none" in attacks, name
         by_defence = [[cell["trace"] for cell in entry["cells"] if cell["defence"] == defence] for defence in defences]
         assert all(len(set(traces)) == count for traces in by_defence), name  # each attack takes effect
@@ -50,8 +47,8 @@ def test_every_scenario_has_two_defences_and_three_attacks() -> None:
 def test_a_fingerprint_is_of_the_rows_of_a_board() -> None:
     """Played in one batch with other attacks, the episodes have the hashes of rows that are played by themselves."""
     name = "thesis-ch6-v0"
-    entry = HELD["scenarios"][name]
-    suite = load_suite(entry["suite"])
+    entry = HELD["scenarios"][f"ch6-v0/{name}"]
+    suite = load_suite("ch6-v0")
     for cell in entry["cells"]:
         dose = suite.doses[len(suite.doses) // 2]
         rows = run_cell(Cell("s", name, dose, cell["defence"], cell["attack"], 16, "report", 0, 5, suite.threat))
@@ -62,7 +59,7 @@ def test_a_fingerprint_is_of_the_rows_of_a_board() -> None:
 
 def test_what_moved_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     """A decision anywhere, a trace only on the platform that it was recorded on; the scenario, the defence and the attack are said."""
-    name = "thesis-ch6-v0"
+    name = "ch6-v0/thesis-ch6-v0"
     held: dict[str, Any] = copy.deepcopy(HELD)
     held["platform"] = golden.this_platform()
     one, two = held["scenarios"][name]["cells"][1:3]
@@ -80,10 +77,10 @@ def test_what_moved_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_changed_suite_or_scenario_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     """Seeds, doses and threat count; words that explain do not."""
     real = load_suite
-    name = HELD["scenarios"]["thesis-ch6-v0"]["suite"]
+    name = "ch6-v0"
     monkeypatch.setattr(golden, "load_suite", lambda asked: dataclasses.replace(real(asked), seeds=7, threat={"fdi_bound": 3.0}))
     assert f"suite {name} has changed under its name: it needs a new version" in golden.moved_suites(HELD)
-    assert any("scenario thesis-ch6-v0" in line and "new version" in line for line in golden.check("thesis-ch6-v0", HELD))
+    assert any("ch6-v0/thesis-ch6-v0 has changed" in line and "new version" in line for line in golden.check("ch6-v0/thesis-ch6-v0", HELD))
     suite = Suite("s", "one", ("braking-v0",), (5, 10), ("kf",), ("none",), 9, shown={5: "a"})
     assert suite.hash == dataclasses.replace(suite, about="two", shown={5: "b"}).hash
     for change in ({"seeds": 8}, {"doses": (5,)}, {"shown": {10: "a"}}, {"bound": 1.0}, {"held_out": ("fdi",)}, {"threat": {"budget": 1}}, {"attacks": ("fdi",)}):
@@ -104,7 +101,7 @@ def test_the_attacks_that_are_recorded_take_effect() -> None:
 
 def test_the_command_says_what_moved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     held = copy.deepcopy(HELD)
-    held["scenarios"]["thesis-ch5-v0"]["cells"][0]["decision"] = "0" * 32
+    held["scenarios"]["ch5-v0/thesis-ch5-v0"]["cells"][0]["decision"] = "0" * 32
     path = tmp_path / "golden.json"
     path.write_text(json.dumps(held))
     monkeypatch.setattr(golden, "FILE", path)
@@ -119,22 +116,22 @@ def test_no_more_episodes_are_recorded_than_a_board_has_and_few_of_a_slow_plant(
     """16, those of a small suite, two of a road scene; an entry says so where it is another number."""
     road, scene = (golden.place_of(name, load_suite(suite)) for name, suite in (("braking-v0", "car-following-v0"), ("highway-v0", "highway-v0")))
     assert [golden.episodes_of(place, Suite(seeds=n)) for place, n in ((road, 100), (road, 5), (scene, 100), (scene, 1))] == [16, 5, 2, 1]
-    assert HELD["scenarios"]["highway-v0"]["episodes"] == 2 and "episodes" not in HELD["scenarios"]["braking-v0"]
+    assert HELD["scenarios"]["highway-v0/highway-v0"]["episodes"] == 2 and "episodes" not in HELD["scenarios"]["car-following-v0/braking-v0"]
 
 
 def test_a_new_suite_is_recorded_beside_the_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """--write --suite writes this suite and its scenarios, and leaves every other entry as it was; another platform's file is refused."""
     held = copy.deepcopy(HELD)
-    del held["suites"]["ch6-v0"], held["scenarios"]["thesis-ch6-v0"]
+    del held["suites"]["ch6-v0"], held["scenarios"]["ch6-v0/thesis-ch6-v0"]
     path = tmp_path / "golden.json"
     path.write_text(json.dumps(held | {"platform": golden.this_platform()}))
     monkeypatch.setattr(golden, "FILE", path)
-    monkeypatch.setattr(golden, "record", lambda name, suite: {"suite": suite.name, "cells": [name]})
+    monkeypatch.setattr(golden, "record", lambda name, suite: {"cells": [name, suite.name]})
     assert golden.main(["--write", "--suite", "ch6-v0"]) == 0
     after = golden.read()
     assert after["suites"] == HELD["suites"] and list(after["scenarios"]) == sorted(HELD["scenarios"])
-    fresh = {name for name, entry in HELD["scenarios"].items() if entry["suite"] == "ch6-v0"}
-    assert all(entry == ({"suite": "ch6-v0", "cells": [name]} if name in fresh else held["scenarios"][name]) for name, entry in after["scenarios"].items())
+    new = {key: {"cells": [key.partition("/")[2], "ch6-v0"]} for key in HELD["scenarios"] if key.startswith("ch6-v0/")}
+    assert len(new) == 2 and after["scenarios"] == held["scenarios"] | new
     path.write_text(json.dumps(held | {"platform": "another"}))
     assert golden.main(["--write", "--suite", "ch6-v0"]) == golden.main(["--write", "--suite", "ch6"]) == golden.main(["--check", "--suite", "ch6-v0"]) == 2
     assert "another" in capsys.readouterr().err

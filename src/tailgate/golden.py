@@ -1,4 +1,4 @@
-"""Golden traces: fingerprints of a few episodes of every scenario that a suite uses, kept in the repository.
+"""Golden traces: fingerprints of a few episodes of every scenario of every suite, as the suite plays it, kept in the repository.
 
 A published suite never changes under its name. `check` plays 16 episodes (fewer of a slow plant, or of a suite with fewer) x two defences
 x three attacks of each scenario again and says what moved; `write` records them anew, which is for a new version and never for an old one.
@@ -37,7 +37,7 @@ from tailgate.registry import Spec
 from tailgate.scenario import Scenario, Suite, list_suites, load_scenario, load_suite
 from tailgate.trace import Trace, rollout
 
-FORMAT = "tailgate-golden-1"
+FORMAT = "tailgate-golden-2"
 FILE = Path(str(files("tailgate.configs").joinpath("golden"))) / "golden.json"
 EPISODES = 16
 FEW = {"Highway": 2}  # of a plant that steps its episodes one by one
@@ -65,13 +65,9 @@ def instructions() -> str:
     return " ".join(np.show_config(mode="dicts")["SIMD Extensions"]["found"])
 
 
-def users() -> dict[str, Suite]:
-    """Every scenario that a built-in suite uses, and the first suite, by name, that does."""
-    out: dict[str, Suite] = {}
-    for suite in map(load_suite, list_suites()):
-        for scenario in suite.scenarios:
-            out.setdefault(scenario, suite)
-    return out
+def uses() -> dict[str, tuple[str, Suite]]:
+    """Every scenario of every built-in suite, by `suite/scenario`: a suite has its own threat model, doses and attacks."""
+    return {f"{suite.name}/{name}": (name, suite) for suite in map(load_suite, list_suites()) for name in suite.scenarios}
 
 
 def place_of(name: str, suite: Suite) -> Scenario:
@@ -141,7 +137,7 @@ def record(name: str, suite: Suite) -> dict[str, Any]:
     acting.sort(key=lambda text: text not in kinds.values())
     attacks = ["none", *acting[: ATTACKS - 1]]
     return {
-        "suite": suite.name, "hash": place.config_hash, **({} if episodes == EPISODES else {"episodes": episodes}),
+        "hash": place.config_hash, **({} if episodes == EPISODES else {"episodes": episodes}),
         **({"instructions": instructions()} if type(place.plant).__name__ in FOREIGN else {}),
         "cells": [cell for defence, loop in chosen for cell in cells(loop, defence, attacks, episodes)],
     }  # fmt: skip
@@ -170,9 +166,9 @@ def moved_suites(held: dict[str, Any]) -> list[str]:
     out += [f"suite {name} is recorded and gone" for name in there if name not in here]
     changed = [name for name in here if there.get(name, here[name]) != here[name]]
     out += [f"suite {name} has changed under its name: it needs a new version" for name in changed]
-    used = users()
-    out += [f"scenario {name} is not recorded" for name in used if name not in held["scenarios"]]
-    out += [f"scenario {name} is recorded, and no suite uses it" for name in held["scenarios"] if name not in used]
+    used = uses()
+    out += [f"{key} is not recorded" for key in used if key not in held["scenarios"]]
+    out += [f"{key} is recorded, and there is no such scenario of a suite" for key in held["scenarios"] if key not in used]
     return out
 
 
@@ -181,32 +177,32 @@ def comparable(held: dict[str, Any], entry: dict[str, Any]) -> bool:
     return held["platform"] == this_platform() and entry.get("instructions", "") in ("", instructions())
 
 
-def check(name: str, held: dict[str, Any], defences: Sequence[str] | None = None) -> list[str]:
-    """What moved in a scenario, a sentence each; empty when nothing did. Traces are compared where the platform is the recorded one.
+def check(name: str, held: dict[str, Any]) -> list[str]:
+    """What moved in a scenario of a suite, a sentence each; empty when nothing did. Traces are compared on the platform that was recorded.
 
-    With `defences`, only cells of these are played. Raises ImportError where the scenario needs what is not installed.
+    name: `suite/scenario`. Raises ImportError where the scenario needs what is not installed.
     """
     entry = held["scenarios"].get(name)
     if entry is None:
         raise unknown("golden.scenario", name, held["scenarios"])
-    if entry["suite"] not in list_suites():
-        return [f"scenario {name}: its suite {entry['suite']} is gone"]
-    suite = load_suite(entry["suite"])
-    place = place_of(name, suite)
+    used = uses()
+    if name not in used:
+        return [f"{name}: there is no such scenario of a suite any more"]
+    scenario, suite = used[name]
+    place = place_of(scenario, suite)
     out = []
     if place.config_hash != entry["hash"]:
-        out.append(f"scenario {name} of {suite.name} has changed under its name: it needs a new version")
+        out.append(f"{name} has changed under its name: it needs a new version")
     exact = comparable(held, entry)
-    played = [name for name in dict.fromkeys(cell["defence"] for cell in entry["cells"]) if defences is None or name in defences]
-    for defence in played:
+    for defence in dict.fromkeys(cell["defence"] for cell in entry["cells"]):
         mine = [cell for cell in entry["cells"] if cell["defence"] == defence]
         found = list(loops(place, (defence,)))
         if not found:
-            out.append(f"scenario {name}: {defence} can no longer serve it")
+            out.append(f"{name}: {defence} can no longer serve it")
             continue
         attacks, episodes = [cell["attack"] for cell in mine], entry.get("episodes", EPISODES)
         for was, now in zip(mine, cells(found[0][1], defence, attacks, episodes), strict=True):
-            where = f"{suite.name}, {name}, {defence} against {was['attack']}"
+            where = f"{name}, {defence} against {was['attack']}"
             if was["decision"] != now["decision"]:
                 out.append(f"{where}: decisions (commands, alarms, modes, collisions) moved")
             elif exact and was["trace"] != now["trace"]:
@@ -220,7 +216,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     what = parser.add_mutually_exclusive_group(required=True)
     what.add_argument("--check", action="store_true", help="play them again and say what moved")
     what.add_argument("--write", action="store_true", help="record them anew: for a new version")
-    parser.add_argument("--scenario", action="append", metavar="NAME", help="only this one (repeatable; with --check)")
+    parser.add_argument("--scenario", action="append", metavar="NAME", help="only this one, under all suites (repeatable; with --check)")
     parser.add_argument("--suite", action="append", metavar="NAME", help="only this one, a new one (repeatable; with --write)")
     options = parser.parse_args(arguments)
     try:
@@ -236,13 +232,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _check(only: list[str] | None) -> int:
     held = read()
-    names, moved, left = only or sorted(held["scenarios"]), [] if only else moved_suites(held), []
+    there = {key: key.partition("/")[2] for key in sorted(held["scenarios"])}
+    for name in only or ():
+        if name not in there.values():
+            raise unknown("--scenario", name, sorted(set(there.values())))
+    names = [key for key, name in there.items() if not only or name in only]
+    moved, left = [] if only else moved_suites(held), []
     with progress(Console(stderr=True)) as update:
         for done, name in enumerate(names, 1):
             try:
                 moved += check(name, held)
             except ImportError as error:
-                left.append(f"scenario {name} is not played: {error}")
+                left.append(f"{name} is not played: {error}")
             update("playing", done, len(names), f"{done} of {len(names)} scenarios")
     for line in [*left, *moved]:
         print(line)
@@ -252,17 +253,17 @@ def _check(only: list[str] | None) -> int:
 
 
 def _write(only: list[str] | None) -> int:
-    """Everything, or the suites `only` beside what is recorded of the others: their scenarios that no other suite has recorded."""
+    """Everything, or the suites `only` beside what is recorded of the others."""
     for name in only or ():
         if name not in list_suites():
             raise unknown("--suite", name, list_suites())
-    used = {name: suite for name, suite in users().items() if only is None or suite.name in only}
+    used = {key: (name, suite) for key, (name, suite) in uses().items() if only is None or suite.name in only}
     if only is not None and (platform_of := read()["platform"]) != this_platform():
         raise InputError("--suite", this_platform(), f"the platform of the other suites' traces ({platform_of}), or all of them anew")
     scenarios = {}
     with progress(Console(stderr=True)) as update:
-        for done, name in enumerate(sorted(used), 1):
-            scenarios[name] = record(name, used[name])
+        for done, key in enumerate(sorted(used), 1):
+            scenarios[key] = record(*used[key])
             update("playing", done, len(used), f"{done} of {len(used)} scenarios")
     suites = {name: load_suite(name).hash for name in only or list_suites()}
     if only is not None:

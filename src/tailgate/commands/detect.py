@@ -29,7 +29,7 @@ def add(actions: Any) -> None:
     command.add_argument("--onsets", type=int, metavar="N", help="false alarms that a threshold is found on (default 100: +-20 %%)")
     command.add_argument("--steps", type=int, metavar="N", help="longest clean run (default 8 million steps)")
     command.add_argument("--checked", type=int, metavar="N",
-                         help="false alarms wanted of a run at a found threshold (default 20), in a quarter of --steps at most")  # fmt: skip
+                         help="false alarms wanted at a found threshold (default 20), in a quarter of --steps at most")  # fmt: skip
     command.set_defaults(run=_detect, kept="the same command goes on")
 
 
