@@ -1,4 +1,4 @@
-"""What lies beside a board and is not of its rows: step times, and what the timing of its attackers is worth."""
+"""What lies beside a board and is not of its rows: step times, what the timing of its attackers is worth, and what was wrong before."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from tailgate.errors import InputError
 
 from .board_parts import Board
 from .clock import Clock, clock_of
+from .errata import Errata, Erratum, errata_of
 from .timing import Timing, timing_of
 
 
@@ -17,10 +18,13 @@ class Measured(NamedTuple):
 
     clock: Clock | None = None
     timing: Timing | None = None
+    errata: Errata | None = None
 
     def belongs(self, board: Board) -> Measured:
         """What is of this board: an attacker's timing as long as its cell says the same. Raises InputError for what is of another suite."""
-        mine, clock, timing = board.suite, self.clock, self.timing
+        mine, clock, timing, errata = board.suite, self.clock, self.timing, self.errata
+        if errata is not None and errata.suite != mine.name:
+            raise InputError("errata: suite", errata.suite, f"{mine.name}, whose board they lie beside")
         if clock is not None and clock.suite != mine.name:
             raise InputError("step times: suite", clock.suite, f"{mine.name}, whose board they lie beside")
         if timing is None:
@@ -33,6 +37,12 @@ class Measured(NamedTuple):
         return self._replace(timing=timing.model_copy(update={"entries": kept}))
 
 
+    def superseded(self, defence: str | None = None) -> list[Erratum]:
+        """What was wrong, of all entries or of one, the latest first."""
+        told = self.errata.errata if self.errata is not None else []
+        return [one for one in reversed(told) if defence is None or one.about(defence)]
+
+
 def measured_of(board: Path) -> Measured:
     """What lies beside a board's file."""
-    return Measured(clock_of(board), timing_of(board))
+    return Measured(clock_of(board), timing_of(board), errata_of(board))

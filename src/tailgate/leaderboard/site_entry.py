@@ -230,7 +230,7 @@ def entry_page(
         "class": entry.class_ or "not stated",
         "rank": _rank(suite, entry), "also": also, "card": card_of(suite, entry), "levels": LEVELS,
         "flags": [*entry.flags, *flags_of(measured.timing, entry.defence), *site_alarms.drifts_of(suite, entry.defence)],
-        "alarms": site_alarms.table_of(suite, entry.defence),
+        "alarms": site_alarms.table_of(suite, entry.defence), "errata": measured.superseded(entry.defence),
         "critical": [(level, critical_of(suite, entry, level)) for level in LEVELS],
         "rates": _rates(suite, entry), "worst": _worst(suite, entry), "cells": _every(suite, mine),
         "doses": [dose_text(d) for d in suite.board.suite.doses],

@@ -262,5 +262,5 @@ def section(suite: Suite, measured: Measured) -> Data:
         "statuses": [s for s, *_ in GROUPS if any(r["status"] == s for r in rows)], "levels": LEVELS,
         "heat": heat_of(suite), "scale": suite.scale, "together": together_of(suite), "curves": curves_of(suite),
         "stealth": stealth_of(suite), "detection": detection_of(suite), "comparisons": comparisons_of(suite), "attacks": attacks_of(suite),
-        "how": compared_how(suite), "attack_cards": attack_cards(suite),
+        "how": compared_how(suite), "attack_cards": attack_cards(suite), "errata": measured.superseded(),
     }  # fmt: skip
