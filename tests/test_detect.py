@@ -146,6 +146,21 @@ def test_a_field_that_was_taken_out_is_found(board: Data, part: str, field: str)
     assert [(line["of"], line["field"], line["board"]) for line in report["findings"]] == [(part, field, None)]
 
 
+def test_a_class_of_somebody_s_own_is_played_where_it_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Only then: without its name it is passed over, as a board runs no code by itself."""
+    (tmp_path / "mine_detected.py").write_text("from tailgate.estimators import GatedKalman\nclass Mine(GatedKalman):\n    pass\n", encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    part = dataclasses.replace(QUICK, scenarios=QUICK.scenarios[:1], defences=("none", "mine_detected:Mine", "chi2_kf"), attacks=("none", *ATTACKS), seeds=2)
+    board = score(run(cells_of(part)), QUICK, require_adaptive=False)
+    path = _written(board | {"attacks": [attack for attack in board["attacks"] if attack["attack"] in ATTACKS]}, tmp_path)
+    few = dataclasses.replace(EFFORT, hours=(0.02,))
+    assert {line["defence"] for line in detect(path, QUICK, effort=few)["detection"]["entries"]} == {"chi2_kf"}
+    lines = detect(path, QUICK, effort=few, defences=["mine_detected:Mine"])["detection"]["entries"]
+    mine, built_in = ([line | {"defence": ""} for line in lines if line["defence"] == name] for name in ("mine_detected:Mine", "chi2_kf"))
+    assert mine == built_in != []
+
+
 def test_workers_change_no_figure(bare: Data, detected: Data, tmp_path: Path) -> None:
     path = _written(bare, tmp_path)
     assert detect(path, QUICK, effort=EFFORT, workers=2) == detected == json.loads(path.read_text())

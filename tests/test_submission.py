@@ -13,6 +13,7 @@ import pytest
 from tailgate.commands import submit
 from tailgate.errors import InputError
 from tailgate.evaluation import Cell, cells_of, run_cell
+from tailgate.registry import Spec
 from tailgate.rounds import seeds_of
 from tailgate.rows import read_rows
 from tailgate.scenario import Suite
@@ -201,3 +202,5 @@ def test_the_command_writes_rows_and_prints_a_summary(
     assert told["digest"] == digest == digest_of("own_sub") and told["rows"] == 1 and told["failed"] == 0 and told["table"][0]["n"] == 1
     assert "public ones" in printed.err
     assert read_rows(tmp_path / "rows.jsonl")[0]["defence"] == "own_sub:Own"
+    assert Spec("defence", "own_sub:Own").digest == digest  # rows of `evaluate` are of the same class
+    assert Spec("defence", "tailgate.estimators:Kalman").digest != "" == digest_of("tailgate.estimators")

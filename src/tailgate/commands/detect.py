@@ -21,7 +21,8 @@ def add(actions: Any) -> None:
     )  # fmt: skip
     command.add_argument("suite", metavar="SUITE", help="suite by name or YAML file")
     command.add_argument("--out", required=True, metavar="DIR", help="folder of the boards")
-    command.add_argument("--defence", action="append", default=[], metavar="NAME", help="only these entries (repeatable)")
+    command.add_argument("--defence", action="append", default=[], metavar="NAME",
+                         help="only these entries (repeatable); module:Class of the board is imported when it is named here")  # fmt: skip
     command.add_argument("--workers", type=int, default=2, metavar="N", help="processes, an entry each (default 2); change no result")
     command.add_argument("--hours", action="append", type=float, metavar="H",
                          help="mean time between false alarms [h] (repeatable; default 0.1, 1 and 10)")  # fmt: skip

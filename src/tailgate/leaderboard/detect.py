@@ -34,14 +34,14 @@ def detect(
 ) -> Data:
     """Play detection and stealth impact of the board in a file; returns it. It is written as soon as an entry is done, and resumes.
 
-    defences: only these entries; of all, those that come with the package; not `none`, sentinels, or who is told the truth. Attacks are
-    the black-box scripts of the board's list that can be played here. Raises InputError for a board of another suite or version, or with
-    figures of another effort, and for a defence that takes no place here.
+    defences: only these entries; classes of somebody's own are imported where they are named here. Of all, those that come with the package;
+    not `none`, sentinels, or who is told the truth. Attacks are the black-box scripts of the board's list that can be played here. Raises
+    InputError for a board of another suite or version, or with figures of another effort, and for a defence that takes no place here.
     """
     board = load(path)
     agree(read_board(board), suite)
     guards = [e["defence"] for e in board["entries"] if e.get("card") and _takes_part(e)]
-    known(defences, guards)
+    known(defences, [e["defence"] for e in board["entries"] if _takes_part(e)])
     listed = [a for a in board["attacks"] if a["attack"] in suite.attacks or a.get("admitted")]
     attacks = [a["attack"] for a in listed if a["knowledge"] == "black" and not (a.get("optimal") or a.get("learned"))]
     attacks = [attack for attack in attacks if not refused("attack", attack)]
