@@ -34,7 +34,7 @@ def detect(
 ) -> Data:
     """Play detection and stealth impact of the board in a file; returns it. It is written as soon as an entry is done, and resumes.
 
-    defences: only these entries; classes of somebody's own are imported where they are named here. Of all, those that come with the package;
+    defences: only these entries; classes of somebody's own are imported where they are named here. Of all, those that come with it;
     not `none`, sentinels, or who is told the truth. Attacks are the black-box scripts of the board's list that can be played here. Raises
     InputError for a board of another suite or version, or with figures of another effort, and for a defence that takes no place here.
     """
