@@ -111,6 +111,24 @@ def test_the_adapted_filter_of_the_documentation_plays(tmp_path: Path) -> None:
     assert entry["n"] == 4 and 0.3 < entry["rmse_position"]["median"] < 1.5  # type: ignore[index]
 
 
+def test_the_kalman_filter_of_the_documentation_is_the_built_in_one(package: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Trace for trace, while every reading arrives."""
+    from tailgate import draws, make_attack, make_defence
+    from tailgate.scenario import load_scenario
+    from tailgate.trace import rollout
+
+    code = _blocks("docs/new-defence.md", "python")[4]
+    assert len([line for line in code.splitlines() if line.strip()]) <= 31
+    (package / "mykalman.py").write_text(code, encoding="utf-8")
+    monkeypatch.syspath_prepend(package)
+    from mykalman import Textbook  # type: ignore[import-not-found]
+
+    scenario, keys = load_scenario("gusty-stop-and-go-v0"), draws.keys("tune", range(2))
+    own, built_in = (rollout(scenario.loop(defence), make_attack("none"), keys) for defence in (Textbook(), make_defence("kf")))
+    assert [own.trace_hash(row) for row in range(2)] == [built_in.trace_hash(row) for row in range(2)]
+    sys.modules.pop("mykalman", None)
+
+
 def test_the_published_head_is_that_of_the_published_board() -> None:
     """Figure for figure; and no board speaks of another machine's directories."""
     from tailgate.leaderboard.head import markdown
