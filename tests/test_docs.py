@@ -1,5 +1,6 @@
 """The documentation's examples run as they stand."""
 
+import importlib
 import json
 import re
 import subprocess
@@ -9,6 +10,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
+PAGES = ["README.md", *(f"docs/{name.name}" for name in sorted((ROOT / "docs").glob("*.md")))]
 
 
 def _blocks(name: str, language: str) -> list[str]:
@@ -68,12 +70,56 @@ def test_the_radar_example_challenges_and_hears(package: Path) -> None:
     assert sum(row["alarm_onsets"] > 0 for row in attacked) > 10
 
 
-@pytest.mark.parametrize("name", ["README.md", "CONTRIBUTING.md", *(f"docs/{name.name}" for name in sorted((ROOT / "docs").glob("*.md")))])
+@pytest.mark.parametrize("name", ["CONTRIBUTING.md", *PAGES])
 def test_links_to_files_exist(name: str) -> None:
     text = (ROOT / name).read_text(encoding="utf-8")
     for target in re.findall(r"\]\(([^)#]+?)(?:#[^)]*)?\)", text):
         if "://" not in target:
             assert ((ROOT / name).parent / target).exists(), f"{name}: {target}"
+
+
+def _code(text: str) -> str:
+    """Code blocks and code spans."""
+    blocks = re.findall(r"^```.*?^```", text, flags=re.S | re.M)
+    return "\n".join([*blocks, *re.findall(r"`([^`\n]+)`", re.sub(r"^```.*?^```", "", text, flags=re.S | re.M))])
+
+
+def _named(code: str) -> set[str]:
+    """Dotted names of the package: as they stand, of `from tailgate.x import y, z`, and of `num`."""
+    names = set(re.findall(r"(?<![\w./\-])tailgate(?:\.[A-Za-z_]\w*)+", code))
+    for module, listed in re.findall(r"from (tailgate[\w.]*) import ([\w, ]+)", code):
+        names |= {f"{module}.{name.strip().split()[0]}" for name in listed.split(",")}
+    return names | {f"tailgate.{name}" for name in re.findall(r"(?<![\w./\-])num\.[a-z_]+", code)}
+
+
+def _is_there(name: str) -> bool:
+    parts = name.split(".")
+    for n in range(len(parts), 0, -1):
+        try:
+            found: object = importlib.import_module(".".join(parts[:n]))
+        except ModuleNotFoundError as error:
+            if error.name and not f"{name}.".startswith(f"{error.name}."):
+                raise  # a library that it needs
+            continue
+        for part in parts[n:]:
+            if not hasattr(found, part):
+                return False
+            found = getattr(found, part)
+        return True
+    return False
+
+
+def test_what_is_no_name_of_the_package_is_seen() -> None:
+    text = "`tailgate.make_vec` and `num.dot(x, y)`\n```python\nfrom tailgate.core import Mode, Nothing\n```\n`src/tailgate/num.py`, `tailgate[train]`, `tailgate log`"
+    named = _named(_code(text))
+    assert named == {"tailgate.make_vec", "tailgate.num.dot", "tailgate.core", "tailgate.core.Mode", "tailgate.core.Nothing"}
+    assert {name for name in named if not _is_there(name)} == {"tailgate.make_vec", "tailgate.core.Nothing"}
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_names_of_the_package_are_there(name: str) -> None:
+    named = _named(_code((ROOT / name).read_text(encoding="utf-8")))
+    assert not {found for found in named if not _is_there(found)}
 
 
 def test_the_scenario_of_the_documentation_plays(tmp_path: Path) -> None:
