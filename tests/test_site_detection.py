@@ -9,7 +9,7 @@ import pytest
 
 from tailgate.leaderboard.board_format import read_board
 from tailgate.leaderboard.build import percent
-from tailgate.leaderboard.site_index import attacks_of, detection_of
+from tailgate.leaderboard.site_index import attacks_of, detection_of, plan_of
 from tailgate.leaderboard.site_suite import Suite
 
 ROOT = Path(__file__).parents[1]
@@ -75,3 +75,16 @@ def test_attacks_that_joined_later_are_told_from_those_of_the_suite():
     assert told["burst_loss"] == "met later, beside the suite" and told["dropout"] == "with the suite" and "p " in told["fdi_ramp"]
     board["suite"]["hash"] = "0"
     assert {line["admitted"] for line in attacks_of(Suite(read_board(board), "quick-v0")) if line["name"].full == "burst_loss"} == {"with the suite"}
+
+
+@pytest.mark.parametrize(("name", "said"), [
+    ("quick-v0", "CEM, black box, 2 training seeds of each (less than the full plan: PPO and CEM, black and grey box, 5 seeds)"),
+    ("network-v0", "PPO and CEM, black box, 5 training seeds of each (less than the full plan: PPO and CEM, black and grey box, 5 seeds)"),
+    ("thesis-v0", "PPO and CEM, black and grey box, 5 training seeds of each"),
+])  # fmt: skip
+def test_a_board_says_which_attackers_a_rank_asks_for(name, said):
+    """And where that is less than the full plan; of a suite that is not of the package nobody can tell."""
+    board = json.loads((ROOT / f"results/{name}/board.json").read_text(encoding="utf-8"))
+    assert plan_of(Suite(read_board(board), name)) == said
+    board["suite"]["hash"] = "another"
+    assert plan_of(Suite(read_board(board), name)) == ""

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections import Counter
 
+from tailgate import adaptive
+
 from . import site_alarms
 from .board_parts import LEVELS, CellPart, Dose, Level
 from .build import Name, percent
@@ -199,6 +201,21 @@ def _small(p: float, bound: bool = False) -> str:
     return "< 0.0001" if p < 1e-4 else f"{p:.2g}" if p < 0.1 else f"{p:.2f}"
 
 
+WHOLE = ({"ppo", "cem"}, {"black", "grey"}, 5)  # learners, knowledge and training seeds of the full plan
+
+
+def plan_of(suite: Suite) -> str:
+    """Which attackers a rank asks for; empty where nobody can tell."""
+    own = suite_of(suite.board.suite.name, suite.board.suite.hash)
+    if own is None or not own.adaptive:
+        return ""
+    plan = adaptive.plan_of(own)
+    learners = " and ".join(name.upper() for name in plan.learners)
+    said = f"{learners}, {' and '.join(plan.knowledge)} box, {plan.seeds} training seeds of each"
+    less = not ({*plan.learners} >= WHOLE[0] and {*plan.knowledge} >= WHOLE[1] and plan.seeds >= WHOLE[2])
+    return said + (" (less than the full plan: PPO and CEM, black and grey box, 5 seeds)" if less else "")
+
+
 def attacks_of(suite: Suite) -> list[Data]:
     own, out = suite_of(suite.board.suite.name, suite.board.suite.hash), []
     for attack in suite.board.attacks:
@@ -262,5 +279,5 @@ def section(suite: Suite, measured: Measured) -> Data:
         "statuses": [s for s, *_ in GROUPS if any(r["status"] == s for r in rows)], "levels": LEVELS,
         "heat": heat_of(suite), "scale": suite.scale, "together": together_of(suite), "curves": curves_of(suite),
         "stealth": stealth_of(suite), "detection": detection_of(suite), "comparisons": comparisons_of(suite), "attacks": attacks_of(suite),
-        "how": compared_how(suite), "attack_cards": attack_cards(suite), "errata": measured.superseded(),
+        "how": compared_how(suite), "attack_cards": attack_cards(suite), "errata": measured.superseded(), "plan": plan_of(suite),
     }  # fmt: skip
