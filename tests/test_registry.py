@@ -8,6 +8,7 @@ import re
 import sys
 import textwrap
 from dataclasses import dataclass
+from functools import partial
 from importlib.metadata import EntryPoint
 from pathlib import Path
 
@@ -22,6 +23,8 @@ from tailgate.errors import InputError, NotApplicable, unknown
 from tailgate.estimators import GatedKalman, Kalman
 from tailgate.registry import Entry, Spec, entries, find, make_from, put, register
 from tailgate.schema import as_data, build, canonical, override, read_yaml, scalar
+from tailgate.selfplay import GameConfig
+from tailgate.train import TrainConfig
 
 PLUGIN = """
     from dataclasses import dataclass
@@ -86,7 +89,7 @@ def test_somebody_elses_class(plugin):
 
 
 BAD = [
-    ("defence", "chi2_fk", r"defence: got 'chi2_fk'; expected one of .*kf.*did you mean 'chi2_kf'"),
+    ("defence", "chi2_fk", r"defence: got 'chi2_fk'; expected one of these \(did you mean 'chi2_kf'\?\): .*kf"),
     ("attack", "fdi_rampp", r"attack.*did you mean 'fdi_ramp'"), ("defence", "", r"defence: got ''; expected one of"),
     ("defence", "chi2_kf:etta=3", r"chi2_kf: unknown field: got 'etta'.*did you mean 'eta'"),
     ("defence", "chi2_kf:eta=big", r"chi2_kf\.eta: got 'big'; expected"), ("defence", "chi2_kf:eta=-1", r"chi2_kf\.eta: got -1"),
@@ -227,13 +230,19 @@ def test_scalar_forms(text, value):
 
 def test_overrides():
     """Dotted assignments change nested fields of a copy; anything else is refused."""
-    data = {"a": {"b": 1}, "c": 2}
-    assert override(data, ["defence=none", "teacher=none"])["defence"] == "none" and override(data, ["teacher=none"])["teacher"] is None
-    assert override(data, ["a.b=5", "d.e=[1]", "c=x=y"]) == {"a": {"b": 5}, "c": "x=y", "d": {"e": [1]}}
+    data, put_in = {"a": {"b": 1}, "c": 2}, partial(override, cls=TrainConfig)
+    assert put_in(data, ["defence=none", "teacher=none"])["defence"] == "none" and put_in(data, ["teacher=none"])["teacher"] is None
+    assert put_in(data, ["a.b=5", "d.e=[1]", "c=x=y"]) == {"a": {"b": 5}, "c": "x=y", "d": {"e": [1]}}
     assert data == {"a": {"b": 1}, "c": 2}
     for bad in ("c", "=3", "c.d=1"):
         with pytest.raises(InputError, match="override"):
-            override(data, [bad])
+            put_in(data, [bad])
+
+
+@pytest.mark.parametrize("text", ["nan", "5", "1e5", "true", "none", "2026-01-01"])
+def test_a_text_field_takes_any_word(text: str) -> None:
+    assert override({}, [f"name={text}"], TrainConfig)["name"] == override({}, [f'name="{text}"'], GameConfig)["name"] == text
+    assert override({}, ["steps=5", "name=[5]"], TrainConfig) == {"steps": 5, "name": [5]}
 
 
 UNSAFE = "a: !!python/object/apply:os.getcwd []"

@@ -38,8 +38,8 @@ def wanted(found: Mapping[str, Any]) -> str:
 
 
 def unknown(field: str, name: object, known: Iterable[str]) -> InputError:
-    """An InputError for a name that does not exist: lists what does, the nearest first."""
+    """An InputError for a name that does not exist: says the nearest that does, then all of them, which may be many."""
     names = sorted(known)
     near = difflib.get_close_matches(str(name), names, n=1, cutoff=0.5)
-    hint = f" (did you mean {near[0]!r}?)" if near else ""
-    return InputError(field, name, f"one of {', '.join(names)}{hint}" if names else "no name: there is none to choose from")
+    head = f"one of these (did you mean {near[0]!r}?):" if near else "one of"
+    return InputError(field, name, f"{head} {', '.join(names)}" if names else "no name: there is none to choose from")

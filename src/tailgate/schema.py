@@ -6,7 +6,7 @@ import json
 import types
 from functools import cache
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_type_hints
 
 import yaml
 from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
@@ -148,9 +148,10 @@ def scalar(text: str) -> Any:
     return value
 
 
-def override(data: dict[str, Any], assignments: list[str]) -> dict[str, Any]:
-    """`data` with dotted `key=value` assignments put in."""
+def override(data: dict[str, Any], assignments: list[str], cls: type) -> dict[str, Any]:
+    """`data`, the fields of `cls`, with dotted `key=value` assignments put in. Whatever is given for a text field is that text."""
     out: dict[str, Any] = json.loads(json.dumps(data))
+    kinds = get_type_hints(cls)
     for text in assignments:
         key, sep, value = text.partition("=")
         if not sep or not key:
@@ -163,5 +164,7 @@ def override(data: dict[str, Any], assignments: list[str]) -> dict[str, Any]:
                 raise InputError(f"override {key}", value, f"a field below a mapping; {name} is {child!r}")
             node = child
         held = scalar(value)
+        if not isinstance(held, (str, list, dict)) and (kinds.get(key) is str or (kinds.get(key) == str | None and held is not None)):
+            held = value.strip("'\"")  # such as nan, 5 or true
         node[leaf] = "none" if leaf == "defence" and held is None else held  # a defence has this name, and always one
     return out

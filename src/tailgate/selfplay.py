@@ -83,10 +83,10 @@ class GameConfig:
 def load_config(source: str | None, overrides: list[str], resume: bool = False) -> GameConfig:
     """A preset by name or YAML file (default: selfplay) with `key=value` overrides; with `resume` the run's own configuration."""
     path = config_path("games", source or "selfplay", "config")
-    config = _checked(override(read_yaml(path, "config"), overrides))
+    config = _checked(override(read_yaml(path, "config"), overrides, GameConfig))
     if not resume:
         return config
-    return _checked(override(_started(config.directory / "config.json"), overrides))
+    return _checked(override(_started(config.directory / "config.json"), overrides, GameConfig))
 
 
 def _started(held: Path) -> dict[str, Any]:

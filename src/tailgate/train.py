@@ -90,7 +90,7 @@ def load_config(source: str | None, overrides: list[str], resume: bool = False) 
 
     With `resume` the configuration that the run of this name was started with takes the preset's place.
     """
-    config = checked(override(_preset(source or "quickstart"), overrides))
+    config = checked(override(_preset(source or "quickstart"), overrides, TrainConfig))
     held = config.directory / "config.json"
     if not resume:
         return config
@@ -102,7 +102,7 @@ def load_config(source: str | None, overrides: list[str], resume: bool = False) 
         del started["class"]
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise InputError("resume", str(held), f"the configuration of the run ({said(error)})") from None
-    return checked(override(started, overrides))
+    return checked(override(started, overrides, TrainConfig))
 
 
 def _preset(source: str) -> dict[str, Any]:
