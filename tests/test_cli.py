@@ -235,26 +235,43 @@ def test_a_head_of_rubbish_is_refused(run: Run, tmp_path: Path, text: str) -> No
     assert code == 2 and "expected" in said and "Traceback" not in said
 
 
-@pytest.mark.parametrize(
-    ("arguments", "told"),
-    [
-        (["evaluate"], "nothing is kept: --out FILE would"),
-        (["evaluate", "--out", "rows.jsonl"], "the same command goes on with the rows of rows.jsonl"),
-        (["leaderboard", "run", "quick-v0", "--out", "boards"], "the same command goes on"),
-    ],
-)
-def test_an_interrupted_command_says_how_to_go_on(
-    arguments: list[str], told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+NOTHING = "nothing of it is kept"
+
+
+@pytest.mark.parametrize(("arguments", "stopped", "told"), [
+    (["evaluate"], "evaluation.evaluate", "nothing is kept: --out FILE would"),
+    (["evaluate", "--out", "rows.jsonl"], "evaluation.evaluate", "the same command goes on with the rows of rows.jsonl"),
+    (["leaderboard", "run", "quick-v0", "--out", "boards"], "leaderboard.run.play", "the same command goes on"),
+    (["leaderboard", "attack", "kf", "--suite", "quick-v0", "--out", "x"], "leaderboard.attacked.attack", "the same command goes on"),
+    (["leaderboard", "submit", "mine:Mine"], "submission.play_submission", "nothing is kept: --out FILE would"),
+    (["leaderboard", "submit", "mine:Mine", "--out", "rows.jsonl"], "submission.play_submission",
+     "the same command goes on after the scenarios that are finished"),
+    (["leaderboard", "clock", "quick-v0", "--out", "x"], "leaderboard.clock.measure", NOTHING),
+    (["leaderboard", "admit", "fdi", "--suite", "quick-v0", "--out", "x"], "scoring.attacks.admit", NOTHING),
+    (["calibrate", "--defence", "chi2_kf", "--hours", "1"], "calibrate.calibrate", NOTHING),
+    (["timing", "zoo:name=none"], "strength.timing.timing", NOTHING), (["bench"], "bench.run.bench", NOTHING),
+    (["transfer", "zoo:name=none"], "strength.transfer.transfer", "nothing is kept: --out DIR would"),
+    (["trust", "--out", "x"], "trust.run.check", "the same command goes on"),
+    (["dose-response", "fdi", "--defence", "kf", "--scenario", "braking-v0", "--doses", "5"], "strength.dose.dose_response",
+     "nothing is kept: --out DIR would"),
+    (["log", "--out", "x"], "log.write_log", "the same command goes on"),
+    (["tune", "--trials", "1"], "tuning.tune", "the same command goes on"),
+    (["train", "out=x"], "train.train", "train --resume name=quickstart out=x\ntailgate: interrupted; what was finished is kept"),
+    (["reproduce", "ch3"], "reproduce.whole.chapter", NOTHING),
+    (["reproduce"], "reproduce.whole.reproduce_whole", "the same command goes on after the chapters that are finished"),
+])  # fmt: skip
+def test_an_interrupted_command_says_what_is_kept_and_how_to_go_on(
+    arguments: list[str], stopped: str, told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def stop(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.chdir(tmp_path)
-    importlib.import_module("tailgate.leaderboard.run")  # else it would import what is patched next, and keep it
-    monkeypatch.setattr("tailgate.evaluation.evaluate", stop)
-    monkeypatch.setattr("tailgate.leaderboard.run.play", stop)
+    module, _, function = stopped.rpartition(".")
+    monkeypatch.setattr(importlib.import_module(f"tailgate.{module}"), function, stop)
     assert cli.main(arguments) == 130
-    assert capsys.readouterr().err.strip().endswith(f"interrupted; {told}")
+    said = capsys.readouterr().err.strip()
+    assert said.endswith(told) and said.splitlines()[-1].startswith("tailgate: interrupted; ")
 
 
 def test_training_says_nothing_before_it_has_been_checked(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:

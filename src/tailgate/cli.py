@@ -36,7 +36,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"tailgate: error: {error}", file=sys.stderr)
         return EXIT_INPUT
     except KeyboardInterrupt:
-        print(f"tailgate: interrupted; {getattr(chosen, 'kept', 'what was finished is kept')}", file=sys.stderr)
+        print(f"tailgate: interrupted; {getattr(chosen, 'kept', 'nothing of it is kept')}", file=sys.stderr)
         return 130
     except BrokenPipeError:  # the reader of our output has gone
         sys.stderr.close()

@@ -27,7 +27,7 @@ def add(actions: Any) -> None:
     command.add_argument("--beacon", default="", metavar="TEXT", help="the round of the board: its seeds are played")
     command.add_argument("--workers", type=int, default=2, metavar="N", help="processes (default 2); change no result")
     command.add_argument("--set", action="append", default=[], metavar="key=value", help="change the training (repeatable): steps=10000")
-    command.set_defaults(run=_attack)
+    command.set_defaults(run=_attack, kept="the same command goes on")
 
 
 def _attack(options: argparse.Namespace) -> int:

@@ -39,7 +39,7 @@ def add(actions: Any) -> None:
                          help="in place of the cells play detection and stealth impact again: --sample then counts entries")  # fmt: skip
     command.add_argument("--write", action="store_true", help="put into the board what was found, and hits and fingerprints of equal cells")
     command.add_argument("--json", action="store_true", help="print the report as JSON")
-    command.set_defaults(run=_check, kept="nothing of it is kept")
+    command.set_defaults(run=_check)
 
 
 def _check(options: argparse.Namespace) -> int:

@@ -47,6 +47,7 @@ def _dose(options: argparse.Namespace) -> int:
         doses = [int(text) for text in options.doses.split(",")]
     except ValueError:
         raise InputError("--doses", options.doses, "whole numbers with commas between, for example 5,10,20") from None
+    options.kept = "the same command goes on" if options.out else "nothing is kept: --out DIR would"
     with progress(Console(stderr=True)) as update:
         report = dose_response(
             options.attacks, options.defence, options.scenario, doses, episodes=options.episodes, threat=changes(options.threat),

@@ -40,6 +40,7 @@ def _reproduce(options: argparse.Namespace) -> int:
         errors.print(text, highlight=False, markup=False)
 
     if options.chapter is None:
+        options.kept = "the same command goes on after the chapters that are finished"
         return _whole(options, tick)
     place = Path(options.out) if options.out else Path("reproduction") / options.chapter
     report = chapter(options.chapter, options.seeds, place, tick)[0]

@@ -31,7 +31,7 @@ def add(commands: Any) -> None:
     )  # fmt: skip
     command.add_argument("--json", action="store_true", help="print the report as JSON")
     command.add_argument("overrides", nargs="*", metavar="key=value", help="change a field of the configuration")
-    command.set_defaults(run=_selfplay)
+    command.set_defaults(run=_selfplay, kept="what was finished is kept")
 
 
 def _selfplay(options: argparse.Namespace) -> int:
@@ -44,7 +44,8 @@ def _selfplay(options: argparse.Namespace) -> int:
         with progress(errors) as update:
             report = Game(config, update, options.resume).run()
     except KeyboardInterrupt:
-        print(f"tailgate: go on with: tailgate selfplay --resume name={config.name}", file=sys.stderr)
+        place = f" out={config.out}" if config.out != type(config)().out else ""
+        print(f"tailgate: go on with: tailgate selfplay --resume name={config.name}{place}", file=sys.stderr)
         raise
     if options.json:
         print(json.dumps(report, indent=1))

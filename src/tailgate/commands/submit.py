@@ -56,6 +56,8 @@ def _submit(options: argparse.Namespace) -> int:
     limits = build(Limits, dataclasses.asdict(Limits()) | changes, "limit")
     if not options.beacon:
         print("tailgate: without --beacon the seeds are public ones: for development, not for a board", file=sys.stderr)
+    goes_on = "the same command goes on after the scenarios that are finished"
+    options.kept = goes_on if options.out else "nothing is kept: --out FILE would"
     with progress(Console(stderr=True)) as update:
         rows = play_submission(
             options.defence, options.suite or "quick-v0", limits=limits, sandbox=options.sandbox, beacon=options.beacon,

@@ -31,7 +31,7 @@ def add(commands: Any) -> None:
     command.add_argument("--resume", action="store_true", help="continue, with the run's own configuration; steps may change")
     command.add_argument("--json", action="store_true", help="print the report as JSON")
     command.add_argument("overrides", nargs="*", metavar="key=value", help="change a field of the configuration")
-    command.set_defaults(run=_train)
+    command.set_defaults(run=_train, kept="what was finished is kept")
 
 
 def _train(options: argparse.Namespace) -> int:
@@ -45,7 +45,7 @@ def _train(options: argparse.Namespace) -> int:
         train.same_run(config)
     errors = Console(stderr=True)
     errors.print(f"[bold]{config.name}[/]: training against [bold]{config.defence}[/] on {config.scenario}, files in {config.directory}")
-    with _resumable(config.name), progress(errors) as update:
+    with _resumable(config), progress(errors) as update:
 
         decisions: dict[int, int] = {}
 
@@ -76,12 +76,13 @@ def _train(options: argparse.Namespace) -> int:
 
 
 @contextlib.contextmanager
-def _resumable(name: str) -> Iterator[None]:
+def _resumable(config: Any) -> Iterator[None]:
     """Says how to go on after an interrupt."""
     try:
         yield
     except KeyboardInterrupt:
-        print(f"tailgate: go on with: tailgate train --resume name={name}", file=sys.stderr)
+        place = f" out={config.out}" if config.out != type(config)().out else ""
+        print(f"tailgate: go on with: tailgate train --resume name={config.name}{place}", file=sys.stderr)
         raise
 
 

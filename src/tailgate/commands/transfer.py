@@ -45,6 +45,7 @@ def _transfer(options: argparse.Namespace) -> int:
 
     sys.path.insert(0, "")  # module:Class is looked for in the working directory, as `tailgate evaluate` does
     threat = None if options.threat is None else changes(options.threat)
+    options.kept = "the same command goes on" if options.out else "nothing is kept: --out DIR would"
     with progress(Console(stderr=True)) as update:
         report = transfer(
             options.policies, options.defence, scenario=options.scenario, threat=threat, dose=options.dose,

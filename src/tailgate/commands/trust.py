@@ -117,6 +117,7 @@ def _trust(options: argparse.Namespace) -> int:
         runs = 10_000
     place = Path(options.out) / ROWS if options.out else None
     before = aside(place)
+    options.kept = "the same command goes on" if options.out else "nothing is kept: --out DIR would"
     with progress(Console(stderr=True)) as update:
         found = check(
             suite, runs=runs, formulas=options.property, alpha=options.alpha, purpose=options.purpose, beacon=options.beacon,

@@ -29,7 +29,7 @@ def add(commands: Any) -> None:
     command.add_argument("--workers", type=int, default=1, metavar="N", help="trials at a time (default 1); more change what is proposed")
     command.add_argument("--json", action="store_true", help="print the report as JSON")
     command.add_argument("overrides", nargs="*", metavar="key=value", help="change a field of the configuration, as for `tailgate train`")
-    command.set_defaults(run=_tune)
+    command.set_defaults(run=_tune, kept="the same command goes on")
 
 
 def _tune(options: argparse.Namespace) -> int:

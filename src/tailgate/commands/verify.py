@@ -39,7 +39,7 @@ def add(actions: Any) -> None:
     )  # fmt: skip
     command.add_argument("--out", metavar="FILE", help="also write the report here: OUT/SUITE/verified/NAME.json for the next board")
     command.add_argument("--json", action="store_true", help="print the report as JSON")
-    command.set_defaults(run=_verify, kept="nothing of it is kept")
+    command.set_defaults(run=_verify)
 
 
 def _verify(options: argparse.Namespace) -> int:

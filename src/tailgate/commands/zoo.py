@@ -26,7 +26,7 @@ def add(commands: Any) -> None:
     more.add_argument("--episodes", type=int, default=400, metavar="N", help="episodes that the outcome is measured on (default 400)")
     more.add_argument("--replace", action="store_true", help="replace policies of the same names")
     more.add_argument("--json", action="store_true", help="print what was added as JSON")
-    more.set_defaults(run=_add)
+    more.set_defaults(run=_add, kept="policies that were added stay")
 
 
 def _add(options: argparse.Namespace) -> int:
