@@ -67,6 +67,27 @@ def test_what_is_no_board_or_no_rows_is_named(arguments: list[str], words: str, 
     assert code == 2 and words in errors and "Errno" not in errors
 
 
+@pytest.mark.parametrize(("name", "words"), [
+    ("cut.jsonl", "cut.jsonl, line 2: got '{\"suite\": "), ("damaged.jsonl", "damaged.jsonl, line 2: got '{'"), ("cut.jsonl.xz", "(the file was cut)"),
+])  # fmt: skip
+def test_of_a_cut_file_of_rows_is_said_which_and_what_makes_it_whole(name: str, words: str, run: Run) -> None:
+    """Not the command that reads it. A board's file is named with its folder, as every suite has one of that name."""
+    part = ["evaluate", "--scenario", "gusty-stop-and-go-v0", "--defence", "kf", "--attack", "none", "--seeds", "2"]
+    assert run(*part, "--out", "whole.jsonl")[0] == run(*part, "--out", "whole.jsonl.xz")[0] == 0
+    first, second = Path("whole.jsonl").read_text().splitlines()
+    Path("boards/quick-v0").mkdir(parents=True)
+    held = {"cut.jsonl": f"{first}\n{second[:-9]}", "damaged.jsonl": f"{first}\n{{\n{second}\n"}
+    content = held[name].encode() if name in held else Path("whole.jsonl.xz").read_bytes()[:-9]
+    place = Path("boards/quick-v0", name)
+    place.write_bytes(content)
+    for command in (
+        ["leaderboard", "build", "--rows", str(place), "--out", "page"], ["leaderboard", "verify", "--rows", str(place)],
+        ["replay", str(place), "--out", "page"], ["leaderboard", "run", "quick-v0", "--out", "boards", "--score-only"],
+    ):  # fmt: skip
+        code, _, errors = run(*command)
+        assert code == 2 and str(place) in errors and words in errors and "the command that wrote it makes it whole" in errors
+
+
 def test_evaluate_prints_a_table_or_json_and_writes_rows(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     part = ["evaluate", "--scenario", "gusty-stop-and-go-v0", "--defence", "kf", "--attack", "none", "--seeds", "4"]
@@ -103,7 +124,8 @@ def test_a_failing_component_is_exit_code_1_and_its_rows_say_why(tmp_path: Path)
         (["evaluate", "--defence", "kff"], ["defence", "kff", "kf"]), (["evaluate", "--suite", "quik-v0"], ["quik-v0", "quick-v0"]),
         (["evaluate", "--seeds", "0"], ["seeds", "0"]), (["evaluate", "--dose", "-4"], ["dose", "-4"]), (["evaluate", "--dose", "x"], ["dose", "x"]),
         (["evaluate", "--threat", "budget"], ["--threat", "budget", "key=value"]), (["evaluate", "--attack", "missing.json"], ["missing.json"]),
-        (["evaluate", "--out", "file/rows.jsonl"], ["out", "file", "writable"]), (["evaluate", "--suite", "bad.yaml"], ["suite bad", "seedz", "seeds"]),
+        (["evaluate", "--out", "file/rows.jsonl"], ["out: got 'file';", "a writable directory, not a file"]),
+        (["leaderboard", "run", "quick-v0", "--out", "file"], ["out: got 'file';", "a writable directory, not a file"]), (["evaluate", "--suite", "bad.yaml"], ["suite bad", "seedz", "seeds"]),
         (["leaderboard", "build", "--rows", "none.jsonl", "--out", "page"], ["rows", "none.jsonl"]),
         (["leaderboard", "build", "--rows", "bad.jsonl", "--out", "page"], ["bad.jsonl", "line 1"]),
         (["leaderboard", "build", "--rows", "file", "--out", "page"], ["rows"]),

@@ -54,7 +54,7 @@ def replacing(path: Path, field: str = "out") -> Iterator[IO[bytes]]:
         _make(path.parent)
         handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=TEMPORARY)
     except OSError as error:
-        raise InputError(field, str(path), f"a writable path ({error.strerror})") from None
+        raise _refused(field, path, "path", error) from None
     try:
         with os.fdopen(handle, "wb") as file:
             _before("write", path)
@@ -93,14 +93,21 @@ def remove(path: Path) -> None:
     path.unlink(missing_ok=True)
 
 
-def writable_directory(path: Path, field: str = "out") -> Path:
-    """The directory, made if needed; raises InputError when nothing can be written there."""
+def _refused(field: str, path: Path, what: str, error: OSError) -> InputError:
+    """The error of what cannot be written: it names the file that stands where a directory has to be, if that is why."""
+    if files := [str(above) for above in path.parents if above.is_file()]:
+        return InputError(field, files[0], "a writable directory, not a file")
+    return InputError(field, str(path), f"a writable {what} ({error.strerror})")
+
+
+def writable_directory(path: Path, field: str = "out", asked: Path | None = None) -> Path:
+    """The directory, made if needed; raises InputError when nothing can be written there. asked: what the user named, if not this."""
     try:
         _make(path)
         with tempfile.TemporaryFile(dir=path):
             pass
     except OSError as error:
-        raise InputError(field, str(path), f"a writable directory ({error.strerror})") from None
+        raise _refused(field, asked or path, "path" if asked else "directory", error) from None
     return path
 
 

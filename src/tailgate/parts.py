@@ -21,7 +21,7 @@ class Parts:
     def __init__(self, out: Path) -> None:
         if out.is_dir():
             raise InputError("out", str(out), "a file, not a directory")
-        self.out, self.folder = out, writable_directory(out.with_name(f".{out.name}.parts"))
+        self.out, self.folder = out, writable_directory(out.with_name(f".{out.name}.parts"), asked=out)
         for place in (out, self.folder):
             sweep(place)
 

@@ -17,6 +17,7 @@ KEYS = (
     "suite", "scenario", "dose", "knowledge", "defence", "attack", "purpose", "config_hash", "version", "defence_digest", "attack_digest",
 )  # fmt: skip
 
+AGAIN = "the command that wrote it makes it whole, given once more"
 LARGEST = 8_000_000_000  # bytes of rows in a compressed file
 _Text = Annotated[str, Field(strict=True)]
 _Number = Annotated[float, Field(strict=True, allow_inf_nan=False)] | None
@@ -34,15 +35,18 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
     try:
         held = path.read_bytes()
         text = (_unpacked(held) if path.suffix == ".xz" else held).decode("utf-8")
-    except (OSError, UnicodeDecodeError, EOFError, lzma.LZMAError) as error:
+    except (EOFError, lzma.LZMAError) as error:
+        raise InputError("rows", str(path), f"a readable JSON Lines file ({said(error)}): {AGAIN}") from None
+    except (OSError, UnicodeDecodeError) as error:
         raise InputError("rows", str(path), f"a readable JSON Lines file ({said(error)})") from None
     rows, lines = [], text.splitlines()
     for number, line in enumerate(lines, start=1):
-        where = f"rows {path.name}, line {number}"
+        where = f"rows {path}, line {number}"
         try:
             row = json.loads(line)
         except ValueError:
-            cut = "; the file was cut here: run the same command again" if number == len(lines) and not text.endswith("\n") else ""
+            what = "cut" if number == len(lines) and not text.endswith("\n") else "damaged" if rows else ""
+            cut = f"; the file was {what} here: {AGAIN}" if what else ""
             board = ", a row; a board is played again by `tailgate leaderboard check`" if '"format"' in text[:200] else ""
             raise InputError(where, line[:60], f"a JSON object{board or cut}") from None
         try:
