@@ -63,6 +63,16 @@ def test_mixed_rows_equal_those_of_a_cell_played_alone(places: tuple[str, str]) 
     assert all("white-box" in row["reason"] for row in rows[black:]) and {row["knowledge"] for row in rows[black:]} == {"white"}
 
 
+def test_a_module_that_lies_beside_the_submission_is_not_found_and_the_error_says_why(
+    places: tuple[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "patient.py").write_text("from tailgate.estimators import Kalman as Patient\n", encoding="utf-8")
+    (tmp_path / "hurried.py").write_text("from patient import Patient\n", encoding="utf-8")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    with pytest.raises(InputError, match=r"No module named 'patient'\); nothing beside the submitted file or folder is found$"):
+        play_submission("hurried:Patient", _suite(places[1], seeds=1))
+
+
 MUTING = """
 from tailgate.estimators import Kalman
 

@@ -55,7 +55,12 @@ class Child:
         if path is not None:
             sys.path.insert(0, path)
         spec = Spec("defence", text)
-        entry, self.defence = spec.entry, spec.make()
+        try:
+            entry, self.defence = spec.entry, spec.make()
+        except InputError as error:
+            if path is None or not isinstance(error.__context__, ImportError):
+                raise
+            raise InputError(error.field, error.value, f"{error.expected}; nothing beside the submitted file or folder is found") from None
         return {"uses": list(entry.uses), "version": entry.version, "reference": entry.reference, "tailgate": tailgate.__version__}
 
     def prepare(self, arrays: dict[str, Array], rest: dict[str, Any]) -> dict[str, Any]:
