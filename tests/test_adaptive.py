@@ -2,6 +2,8 @@
 
 import dataclasses
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -9,7 +11,7 @@ import pytest
 from tailgate.adaptive import asked_of, configs_of, fitting, plan_of, train_against
 from tailgate.errors import InputError
 from tailgate.evaluation import evaluate
-from tailgate.scenario import Suite
+from tailgate.scenario import Suite, config_path, load_suite
 from tailgate.train import train
 
 PLAN = {
@@ -107,6 +109,35 @@ def test_a_plan_that_makes_no_sense_is_one_clear_error(plan: dict[str, object], 
     with pytest.raises(InputError) as error:
         plan_of(Suite("own-v0", adaptive=plan))
     assert all(word in str(error.value) for word in words), str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("there", "typed", "words"),
+    [
+        ("gamma=1.0", "gama=1.0", "adaptive: config: unknown field: got 'gama'"), ("population", "popul", "adaptive: config.cem: unknown field: got 'popul'"),
+        ("environment.action", "environment.act", "adaptive: config.environment: unknown field: got 'act'"),
+        ("knowledge: [black]", "knowledge: [blck]", "adaptive.knowledge: got 'blck'"), ("  config: car-", "  confg: car-", "adaptive: unknown field: got 'confg'"),
+        ("  - chi2_kf\n", "  - chi2_fk\n", "defence: got 'chi2_fk'"), ("  - fdi_ramp:", "  - fdi_rmp:", "attack: got 'fdi_rmp'"),
+        (", stop-and-go-v0", ", stop-and-go-v1", "scenario: got 'stop-and-go-v1'"), ("held_out: [fdi_", "held_out: [fd_", "attack: got 'fd_bernoulli'"),
+        ("sd=4", "sdd=4", "attack fdi_gaussian: unknown field: got 'sdd'"),
+    ],
+)  # fmt: skip
+def test_a_typing_error_in_the_file_of_a_suite_is_told_when_it_is_read(there: str, typed: str, words: str, tmp_path: Path) -> None:
+    """With the file, and the field in it; what is right loads."""
+    text, path = Path(config_path("suites", "quick-v0", "suite")).read_text(), tmp_path / "mine.yaml"
+    path.write_text(text)
+    assert dataclasses.replace(load_suite(str(path)), name="quick-v0") == load_suite("quick-v0")
+    assert text.count(there) == 1
+    path.write_text(text.replace(there, typed))
+    with pytest.raises(InputError) as error:
+        load_suite(str(path))
+    assert str(error.value).startswith(f"suite {path}: {words}; expected ")
+
+
+def test_a_file_of_a_suite_is_looked_through_without_torch() -> None:
+    path = config_path("suites", "radar-v0", "suite")
+    done = f"import sys; from tailgate.scenario import load_suite; load_suite({str(path)!r}); assert 'torch' not in sys.modules"
+    assert subprocess.run([sys.executable, "-c", done], check=False).returncode == 0
 
 
 def test_a_defence_is_never_imported_for_training(tmp_path: Path) -> None:

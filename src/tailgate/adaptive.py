@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 from tailgate import train
 from tailgate.agents.codec import ActionCodec, ActionSpec
-from tailgate.agents.learning import LEARNERS
+from tailgate.agents.learning import LEARNERS, learner_of
 from tailgate.agents.observation import ObservationCodec
 from tailgate.core import PositiveCount, param
 from tailgate.errors import InputError, unknown
@@ -80,6 +80,19 @@ def configs_of(suite: Suite, defence: str, out: Path, *, seeds: int | None = Non
                 own = [f"name={name}", f"learner={learner}", f"scenario={place}", *settings, granted, *plan.changes, *changes, *extra]
                 found.append(train.load_config(plan.config, own))
     return found
+
+
+def check_plan(suite: Suite) -> None:
+    """Raise InputError for a plan that no training could begin with. Settings of learners that need torch are left to the training."""
+    where = f"suite {suite.name}: adaptive"
+    try:
+        for config in configs_of(suite, "none", Path("runs")):
+            train.environment_of(config)
+            build(learner_of("cem").Config, dict(config.cem), "config.cem")
+    except InputError as error:
+        if error.field.startswith(where):
+            raise
+        raise InputError(f"{where}: {error.field}", error.value, error.expected) from None
 
 
 def stem(defence: str) -> str:

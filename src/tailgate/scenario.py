@@ -188,8 +188,34 @@ def load_scenario(name: str) -> Scenario:
 
 
 def load_suite(name: str) -> Suite:
-    """A suite by name, or from a YAML file."""
+    """A suite by name, or from a YAML file, which is then looked through: a typing error shall not show hours later."""
     path = config_path("suites", name, "suite")
+    suite = _read_suite(path)
+    if name.endswith((".yaml", ".yml")):
+        try:
+            _look_through(suite)
+        except InputError as error:
+            raise InputError(f"suite {name}: {error.field.removeprefix(f'suite {suite.name}: ')}", error.value, error.expected) from None
+    return suite
+
+
+def _look_through(suite: Suite) -> None:
+    """Raise InputError for a component that does not exist, and for attackers that cannot be trained."""
+    for scenario in suite.scenarios:
+        load_scenario(scenario)
+    for spec in (*(Spec("defence", text) for text in suite.defences), *(Spec("attack", text) for text in suite.attacks)):
+        if not spec.sandboxed:
+            spec.make()
+    for text in suite.held_out:
+        _ = Spec("attack", text).entry
+    if suite.adaptive:
+        from tailgate.adaptive import check_plan
+
+        check_plan(suite)
+
+
+def _read_suite(path: Path) -> Suite:
+    """The suite of a file, its own fields checked."""
     suite = build(Suite, {"name": path.stem} | read_yaml(path, "suite"), f"suite {path.stem}")
     for key in suite.threat:
         if key not in fields_of(ThreatModel):
@@ -204,6 +230,4 @@ def load_suite(name: str) -> Suite:
     for dose in suite.shown:
         if dose not in suite.doses:
             raise InputError(f"suite {path.stem}: shown", dose, f"one of the doses {list(suite.doses)}")
-    for name in suite.held_out:
-        _ = Spec("attack", name).entry
     return suite
