@@ -86,6 +86,8 @@ class Faulty(Kalman):
             raise RuntimeError("broken")
         if self.how == "nan":
             estimate.x[..., 0] = np.nan
+        if self.how == "late":
+            estimate.score[(draws.step >= 20) & (np.arange(len(draws.step)) >= 2)] = np.inf
         if self.how == "shape":
             estimate = estimate._replace(score=estimate.score[0])
         if self.how == "type":
@@ -107,6 +109,13 @@ def test_a_defence_that_fails_costs_its_own_rows_only(how: str, reason: str) -> 
     assert reason in rows[-1]["reason"] and rows[-1]["crashed"] is None and rows[-1]["trace_hash"] is None
     good, bad = summarise(rows)
     assert good["n"] == 3 and bad["failed"] == 3 and bad["crash"] is None
+
+
+def test_of_what_is_not_finite_the_first_step_the_rows_and_a_seed_are_told() -> None:
+    cell = Cell("s", PLACE, None, "kf", "none", 5, first_seed=40, batch=4)
+    first, *_, last = run_cell(cell, defence=Faulty(how="late"))
+    told = "defence output score: got 'NaN or infinity in step 20, in 2 of 4 rows, the first of them row 2'; expected finite numbers (row 2: seed 42)"
+    assert first["reason"] == f"InputError: {told}" and first["status"] == "error" and (last["seed"], last["status"]) == (44, "ok")
 
 
 def test_a_defence_that_kills_its_process_costs_its_own_rows_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

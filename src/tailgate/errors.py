@@ -6,7 +6,9 @@ from typing import Any
 
 
 class InputError(ValueError):
-    """Bad input: names the field, the value and what was expected, in one line."""
+    """Bad input: names the field, the value and what was expected, in one line. `row`: one of the batch that it is about, if it is."""
+
+    row: int | None = None
 
     def __init__(self, field: str, value: object, expected: str) -> None:
         shown = " ".join(repr(value).split())

@@ -97,7 +97,7 @@ def run_cell(cell: Cell, defence: Any = None, attack: Any = None, *, uses: tuple
             trace = rollout(loop, rival, draws.keys(cell.purpose, chunk))
             values = measure(trace)
         except Exception as error:  # whatever a component raises costs its own rows, and only them
-            rows += _failed(head, chunk, *_why(error))
+            rows += _failed(head, chunk, *_why(error, chunk))
             continue
         for i, seed in enumerate(chunk):
             numbers = {name: None if np.isnan(v[i]) else float(v[i]) for name, v in values.items()}
@@ -106,11 +106,12 @@ def run_cell(cell: Cell, defence: Any = None, attack: Any = None, *, uses: tuple
     return rows
 
 
-def _why(error: Exception) -> tuple[str, str]:
-    """Reason and status of the rows that an error costs."""
+def _why(error: Exception, seeds: Sequence[int] = ()) -> tuple[str, str]:
+    """Reason and status of the rows, of these seeds, that an error costs."""
     if isinstance(error, NotApplicable):
         return str(error), "skipped"
-    return said(error), "error"
+    row = error.row if isinstance(error, InputError) else None
+    return said(error) + (f" (row {row}: seed {seeds[row]})" if row is not None and row < len(seeds) else ""), "error"
 
 
 def _head(cell: Cell, place: Scenario, guard: Entry, rival: Entry, identity: str) -> dict[str, Any]:

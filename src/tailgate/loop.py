@@ -49,8 +49,8 @@ PERFECT = Link()
 _START = np.uint32(0xFFFFFFFF)  # the step under which start() draws: no episode reaches it
 
 
-def check_estimate(estimate: Estimate, model: Model, batch: int) -> None:
-    """Raise InputError when a defence's output has not the type, shape or finiteness that the loop needs."""
+def check_estimate(estimate: Estimate, model: Model, batch: int, k: Array) -> None:
+    """Raise InputError when a defence's output, of step k (B,), has not the type, shape or finiteness that the loop needs."""
     shape = (batch, model.agents)
     wanted = {
         "x": ((*shape, model.states), "f"), "score": (shape, "f"), "alarm": (shape, "b"), "mode": (shape, "iu"), "probe": (shape, "b"),
@@ -60,8 +60,12 @@ def check_estimate(estimate: Estimate, model: Model, batch: int) -> None:
         if not isinstance(value, np.ndarray) or value.shape != size or value.dtype.kind not in kinds:
             got = f"{value.dtype} {value.shape}" if isinstance(value, np.ndarray) else type(value).__name__
             raise InputError(f"defence output {name}", got, f"an array of shape {size}, kind {kinds!r}")
-        if kinds == "f" and not np.isfinite(value).all():
-            raise InputError(f"defence output {name}", "NaN or infinity", "finite numbers")
+        if kinds == "f" and not (finite := np.isfinite(value)).all():
+            rows = np.flatnonzero(~finite.all(axis=tuple(range(1, finite.ndim))))
+            found = f"NaN or infinity in step {k[rows[0]]}, in {len(rows)} of {batch} rows, the first of them row {rows[0]}"
+            error = InputError(f"defence output {name}", found, "finite numbers")
+            error.row = int(rows[0])
+            raise error
     if estimate.limits is not None:
         size = (*shape, len(model.actuators), 2)
         if estimate.limits.shape != size or not (estimate.limits[..., 0] <= estimate.limits[..., 1]).all():
@@ -243,7 +247,7 @@ class Loop:
             plan.defence, state.defence, frozen(heard), frozen(state.known_u), state.keys.at(Role.DEFENCE, state.k)
         )
         defence, estimate = pair_of(answer)
-        check_estimate(estimate, self.model, len(state.k))
+        check_estimate(estimate, self.model, len(state.k), state.k)
         if "probe" not in self.uses:  # who does not say that it switches the probe off cannot
             estimate = estimate._replace(probe=num.full(estimate.probe.shape, True, bool))
         assert received.v2v is not None

@@ -101,7 +101,7 @@ class Isolated:
     def step(self, plan: IsolatedPlan, state: Tickets, received: Received, known_u: Array, draws: Draws) -> tuple[Tickets, Estimate]:
         """One step of B episodes, its outputs checked."""
         state, estimate = self.step_unchecked(plan, state, received, known_u, draws)
-        check_estimate(estimate, plan.model, len(received.y))
+        check_estimate(estimate, plan.model, len(received.y), draws.step)
         return state, estimate
 
     def step_unchecked(
