@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import shlex
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -34,6 +35,7 @@ from .observation import FRAMES, ObservationCodec
 
 FORMAT = "tailgate-policy-1"
 SOME = 8  # names in an error, at most
+LONGEST = 500  # characters of options in an error, at most
 DEPTH = 64  # of lists and mappings in each other in a JSON file, at most
 T = TypeVar("T")
 
@@ -293,10 +295,11 @@ class PolicyAttack:
         if observation.names != header.observation:
             differing = sorted(set(header.observation) ^ set(observation.names)) or ["in another order"]
             shown = ", ".join(differing[:SOME]) + (f" and {len(differing) - SOME} more" if len(differing) > SOME else "")
-            raise InputError(f"policy {self.path.name}", f"observation {shown}", "the observation of this scenario and threat model")
+            wanted = f"the observation of this scenario and threat model{_trained_with(header)}"
+            raise InputError(f"policy {self.path.name}", f"observation {shown}", wanted)
         outputs = network.weights[-1].shape[1]
         if outputs != action.size:
-            wanted = f"{action.size}, as environment.action={header.action.action} has under this threat model"
+            wanted = f"{action.size}, as environment.action={header.action.action} has under this threat model{_trained_with(header)}"
             raise InputError(f"policy {self.path.name}", f"a network with {outputs} outputs", wanted)
         if (header.masked and not action.discrete) or (header.squashed and action.discrete):
             made = "masked" if header.masked else "squashed"
@@ -331,6 +334,19 @@ class PolicyAttack:
         chosen = choose(plan.network, plan.action, read, chance, always, plan.action.mask(view) if plan.masked else None)
         action = np.where(due if chosen.ndim == 1 else due[:, None], chosen, state.action)
         return PolicyState(action, np.where(due[:, None], seen, state.seen), memory)
+
+
+def _trained_with(header: Header) -> str:
+    """The options that stand for the scenario and the threat model of its training, as far as a policy's file knows them."""
+    config = header.training.get("config")
+    config = config if isinstance(config, dict) else {}
+    scenario, threat = config.get("scenario"), config.get("threat")
+    words = ["--scenario", scenario] if isinstance(scenario, str) else []
+    if isinstance(threat, dict):
+        texts = {key: value if isinstance(value, str) else json.dumps(value) for key, value in threat.items()}
+        words += [word for key, text in texts.items() for word in ("--threat", f"{key}={text}")]
+    text = shlex.join(words)
+    return f"; it was trained with {text}" if text and text.isprintable() and len(text) <= LONGEST else ""
 
 
 def _count(agents: int) -> str:

@@ -288,6 +288,20 @@ def test_a_policy_of_another_number_of_actions_is_refused(tmp_path: Path) -> Non
         PolicyAttack(_policy(tmp_path, {"action": "mode"})).prepare(fewer.brief())
 
 
+def test_a_policy_that_does_not_fit_names_the_options_of_its_training(tmp_path: Path) -> None:
+    """As a command line takes them; nothing of a file that does not know them, or has anything else there."""
+    threat = {"kinds": ["dos_jam", "fdi"], "fdi_bound": 3.0, "end": None, "knowledge": "black"}
+    path = _policy(tmp_path, {"action": "mode"})
+    plain, fewer = json.loads(path.read_text()), _place("black").with_threat(kinds=("fdi",)).brief()
+    told = r"; it was trained with --scenario braking-v0 --threat 'kinds=\[\"dos_jam\", \"fdi\"\]' --threat fdi_bound=3.0 --threat end=null --threat knowledge=black$"
+    for config, words in (({"scenario": "braking-v0", "threat": threat}, told), (5, "threat model$"), ({"scenario": 5, "threat": "\x1b["}, "threat model$"),
+                          ({"scenario": "\x1b[2J"}, "threat model$")):  # fmt: skip
+        path.write_text(json.dumps(plain | {"training": {"config": config}}))
+        for brief in (fewer, _place("white").brief()):
+            with pytest.raises(InputError, match=words):
+                PolicyAttack(path).prepare(brief)
+
+
 def _special(path: Path, kind: str, seed: int = 1) -> Path:
     """A random policy with an LSTM, under masks, or squashed, that attacks now and then."""
     brief, rng = _place("black").brief(), np.random.default_rng(seed)
