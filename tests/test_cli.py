@@ -103,6 +103,33 @@ def test_evaluate_prints_a_table_or_json_and_writes_rows(tmp_path: Path, capsys:
     assert (tmp_path / "page" / "index.html").is_file()
 
 
+DEPENDENT = """
+from tailgate.estimators import Kalman
+
+class Alone(Kalman):
+    pass
+
+class Mean(Kalman):
+    def step(self, *arguments):
+        state, estimate = super().step(*arguments)
+        return state, estimate._replace(x=estimate.x - 0.1 * estimate.x.mean(axis=0))
+"""
+
+
+@pytest.mark.parametrize("batch", ["256", "1"])
+def test_a_defence_whose_rows_depend_on_one_another_is_warned_of(batch: str, tmp_path: Path) -> None:
+    """Its rows are kept, and the exit code is as it was. With one row at a time they do so only when somebody plays more."""
+    (tmp_path / "two.py").write_text(DEPENDENT)
+    command = (
+        sys.executable, "-m", "tailgate", "evaluate", "--scenario", "gusty-stop-and-go-v0", "--attack", "none", "--defence", "two:Mean",
+        "--defence", "two:Alone", "--defence", "kf", "--seeds", "4", "--batch", batch, "--out", "rows.jsonl",
+    )  # fmt: skip
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    (warning,) = [line for line in done.stderr.splitlines() if "warning" in line]
+    assert done.returncode == 0 and warning.startswith("tailgate: warning: rows of two:Mean depend on one another")
+    assert warning.endswith("3 of 3 came out otherwise in another batch") and len((tmp_path / "rows.jsonl").read_text().splitlines()) == 12
+
+
 def test_a_failing_component_is_exit_code_1_and_its_rows_say_why(tmp_path: Path) -> None:
     (tmp_path / "bad.py").write_text(
         "class Bad:\n    def prepare(self, model):\n        raise RuntimeError('out of order')\n    def start(self): ...\n    def step(self, plan, state, received, known_u, draws): ...\n"

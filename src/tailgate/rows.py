@@ -39,7 +39,8 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
         raise InputError("rows", str(path), f"a readable JSON Lines file ({said(error)}): {AGAIN}") from None
     except (OSError, UnicodeDecodeError) as error:
         raise InputError("rows", str(path), f"a readable JSON Lines file ({said(error)})") from None
-    rows, lines = [], text.splitlines()
+    rows: list[dict[str, Any]] = []
+    lines = text.splitlines()
     for number, line in enumerate(lines, start=1):
         where = f"rows {path}, line {number}"
         try:

@@ -18,6 +18,7 @@ from tailgate.files import aside, writable_directory
 from tailgate.progress import cells, console, progress
 from tailgate.schema import scalar
 
+AGAIN = 3  # rows of a defence that are played again
 REFUSED = "refused: the scenario does not grant it"
 
 
@@ -90,10 +91,35 @@ def _evaluate(options: argparse.Namespace) -> int:
     attacked = [row for row in rows if row["attack"] != "none" and row["status"] == "ok"]
     if attacked and not any(row["attack_steps"] for row in attacked):
         print("tailgate: no attack took place in any episode: --attack names others, --threat grants more", file=sys.stderr)
+    for warning in _dependent(rows):
+        print(f"tailgate: warning: {warning}", file=sys.stderr)
     idle = bool(rows) and all(entry["crash"] is None for entry in table)
     if idle and not failed:
         print(f"tailgate: nothing was played: {table[0]['reason']}", file=sys.stderr)
     return 1 if failed or idle else 0
+
+
+def _dependent(rows: list[dict[str, Any]]) -> list[str]:
+    """What is to be said of somebody's own defences: of a cell of each a few rows are played again, by themselves or, if they were, not."""
+    from tailgate.registry import Spec
+    from tailgate.verify import verify
+
+    out = []
+    for defence in dict.fromkeys(row["defence"] for row in rows if row["status"] == "ok"):
+        spec = Spec("defence", defence)
+        if not spec.imports and spec.sandboxed is None:
+            continue
+        mine = [row for row in rows if row["defence"] == defence and row["status"] == "ok"]
+        some = [row for row in mine if row["cell"] == mine[0]["cell"]][:AGAIN]
+        if len(some) < 2:  # it had no companion
+            continue
+        differ = verify(some, batch=AGAIN if some[0]["batch"] == 1 else 1, trust_code=True)["counts"]["differs"]
+        if differ:
+            out.append(
+                f"rows of {defence} depend on one another, or on chance that is none of their draws, so that they cannot be made again: "
+                f"{differ} of {len(some)} came out otherwise in another batch"
+            )
+    return out
 
 
 def _print_summary(table: list[dict[str, Any]]) -> None:
