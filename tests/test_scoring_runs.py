@@ -1,6 +1,5 @@
 """Scoring of real runs: sentinels fail their gates, a small board, and the figures of detection."""
 
-import contextlib
 import dataclasses
 import json
 import math
@@ -13,7 +12,7 @@ from tailgate import make_attack, make_defence
 from tailgate.adaptive import asked_of
 from tailgate.agents.zoo import zoo_names
 from tailgate.draws import keys
-from tailgate.errors import InputError
+from tailgate.errors import InputError, NotApplicable
 from tailgate.evaluation import evaluate
 from tailgate.leaderboard.board_format import read_board
 from tailgate.metrics import max_error
@@ -85,9 +84,20 @@ def test_built_in_suites_name_doses_that_have_a_reason() -> None:
         assert "none" in suite.attacks and ("none" in suite.defences or suite.bound is not None)
 
 
+def _fits(text, brief):
+    """Whether an attack can be prepared at all: what a threat model refuses, it refuses when it is played."""
+    try:
+        Spec("attack", text).make().prepare(brief)
+    except InputError:
+        return False
+    except NotApplicable:
+        return True
+    return True
+
+
 @pytest.mark.parametrize("name", ["quick-v0", "car-following-v0", "platoon-v0", "radar-v0", "network-v0", "thesis-v0"])
 def test_the_entries_of_a_published_board_met_every_built_in_attack_that_its_suite_grants(name) -> None:
-    """Scripts, programs and all of the zoo: what they did not meet is refused, wholly or in part, does nothing, or is a ceiling. Nobody was spared."""
+    """Scripts, programs and all of the zoo: what they did not meet is refused, does nothing in any scenario, or is a ceiling. Nobody was spared."""
     suite, board = load_suite(name), json.loads((ROOT / f"results/{name}/board.json").read_text())
     met = {attack["attack"] for attack in board["attacks"]}
     assert met >= {*suite.attacks} - {"none"}
@@ -95,15 +105,12 @@ def test_the_entries_of_a_published_board_met_every_built_in_attack_that_its_sui
     others = [text for text, entry in entries("attack").items() if not (text in heads or entry.optimal or entry.learned)]
     programs = [f"program:path={path.stem}" for path in sorted((ROOT / "configs/attacks").glob("*.yaml"))]
     others += [text for text in (*programs, *(f"zoo:name={policy}" for policy in zoo_names())) if text not in met]
-    brief = load_scenario(suite.scenarios[0]).with_threat(**suite.granted).brief()
-    for program in programs:
-        with contextlib.suppress(InputError):
-            Spec("attack", program).make().prepare(brief)
-            continue
-        others = [text for text in others if text != program]  # it aims at wires that are not there
-    rows = evaluate(suite, defences=suite.defences[:1], attacks=others, doses=[max(d for d in suite.doses if d)], scenarios=suite.scenarios[:1], seeds=1)
-    assert len(rows) == len(others) > 10
-    assert not {row["attack"] for row in rows if row["status"] == "error" or (row["attack_steps"] and not row["refused_commands"])}
+    briefs = [load_scenario(scenario).with_threat(**suite.granted).brief() for scenario in suite.nominal]
+    others = [text for text in others if any(_fits(text, brief) for brief in briefs)]  # a program may aim at wires that are not there
+    ranked = [entry["defence"] for entry in board["entries"] if entry["status"] == "ranked"][:1]
+    rows = evaluate(suite, defences=ranked, attacks=others, doses=[max(d for d in suite.doses if d)], scenarios=suite.nominal, seeds=2)
+    assert len(rows) == 2 * len(others) * len(suite.nominal) > 0
+    assert not {(row["attack"], row["status"]) for row in rows if row["status"] == "error" or row["attack_steps"]}
     shared = {text for text in met if not text.endswith(".json") or text in suite.attacks}  # files are of those that were trained against one
     for defence in suite.defences:
         assert {cell["attack"] for cell in board["cells"] if cell["defence"] == defence} >= shared, defence
