@@ -3,6 +3,7 @@
 import os
 import re
 import shutil
+import subprocess
 import tempfile
 import time
 from contextlib import suppress
@@ -360,3 +361,19 @@ def test_a_median_over_the_batch_is_found_out(world: Path) -> None:
     rows = _play(world, "hostile:Median", "good", ("none", FDI))
     assert {row["status"] for row in rows} == {"error"}
     assert {row["reason"] for row in rows} == {"batch dependent: 3 of 3 rows differ among other companions, 0 of them in a decision"}
+
+
+def _docker() -> bool:
+    """Whether an engine answers and has the image."""
+    with suppress(OSError, subprocess.TimeoutExpired):
+        return subprocess.run(["docker", "image", "inspect", "tailgate"], capture_output=True, check=False, timeout=10).returncode == 0
+    return False
+
+
+@pytest.mark.skipif(not _docker(), reason="there is no docker with an image `tailgate` (docs/submissions.md)")
+@pytest.mark.parametrize("how", ["allocate", "leave"])
+def test_a_container_plays_what_bubblewrap_plays_and_ends_what_it_ends(world: Path, how: str) -> None:
+    """The same traces; a hostile class costs its own rows."""
+    plays = [_play(world, "tailgate.estimators:Kalman", "good", ("none", FDI), sandbox=sandbox) for sandbox in ("", "docker")]
+    assert [row["trace_hash"] for row in plays[0]] == [row["trace_hash"] for row in plays[1]] and {row["status"] for row in plays[1]} == {"ok"}
+    assert {row["status"] for row in _hostile(world, how, others=True, sandbox="docker")} == {"error"}
