@@ -88,3 +88,12 @@ def test_a_board_says_which_attackers_a_rank_asks_for(name, said):
     assert plan_of(Suite(read_board(board), name)) == said
     board["suite"]["hash"] = "another"
     assert plan_of(Suite(read_board(board), name)) == ""
+
+
+def test_a_class_of_one_s_own_comes_before_sentinels():
+    """Who plays a class for development looks for it among the unranked."""
+    board = make_board()
+    mine = board["entries"][-1]
+    mine |= {"status": "unranked", "rank": None, "why": "claimed: played on public seeds"}
+    ordered = [entry.defence for entry in Suite(read_board(board), "").ordered() if entry.status == "unranked"]
+    assert ordered[0] == mine["defence"] and len(ordered) > 2

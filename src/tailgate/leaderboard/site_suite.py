@@ -16,7 +16,7 @@ SPREAD = 16  # ratio of the largest dose to the smallest above which doses are d
 GROUPS = (  # status, title, what it means
     ("ranked", "Ranked", "with figures against every black-box attack, and through every gate"),
     ("unattacked", "Not attacked yet", "no attacker was trained against these: a good figure says little, and they take no rank"),
-    ("unranked", "Unranked, for comparison", "baselines, references and those that fail a gate or lack figures"),
+    ("unranked", "Unranked, for comparison", "classes of somebody's own outside a round, baselines, references, those that fail a gate or lack figures"),
 )
 
 
@@ -107,14 +107,14 @@ class Suite:
         return f"{name}, {scenario}" if scenario else name
 
     def ordered(self) -> list[EntryPart]:
-        """Entries as the tables list them: by group, then class, rank and critical dose."""
+        """Entries as the tables list them: by group, classes that claim their figures first, then class, rank and critical dose."""
         return sorted(self.board.entries, key=self._order)
 
     def _order(self, entry: EntryPart) -> tuple[Any, ...]:
         status = [name for name, *_ in GROUPS].index(entry.status)
         rank = (entry.rank.best, entry.rank.worst) if entry.rank else (math.inf, math.inf)
         doses = [-_sort_dose(entry.critical_dose.get(level)) for level in LEVELS]
-        return (status, entry.class_.count("+"), entry.class_, rank, doses)
+        return (status, not entry.why.startswith("claimed"), entry.class_.count("+"), entry.class_, rank, doses)
 
 
 def _sort_dose(critical: Critical | None) -> float:
