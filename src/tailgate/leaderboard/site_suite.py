@@ -16,7 +16,7 @@ SPREAD = 16  # ratio of the largest dose to the smallest above which doses are d
 GROUPS = (  # status, title, what it means
     ("ranked", "Ranked", "with figures against every black-box attack, and through every gate"),
     ("unattacked", "Not attacked yet", "no attacker was trained against these: a good figure says little, and they take no rank"),
-    ("unranked", "Unranked, for comparison", "classes of somebody's own outside a round, baselines, references, those that fail a gate or lack figures"),
+    ("unranked", "Unranked, for comparison", "classes outside a round, baselines, references and those that fail a gate or lack figures"),
 )
 
 
