@@ -4,6 +4,8 @@ import copy
 import dataclasses
 import json
 import math
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -152,13 +154,24 @@ def test_a_class_of_somebody_s_own_is_played_where_it_is_named(tmp_path: Path, m
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(str(tmp_path))
     part = dataclasses.replace(QUICK, scenarios=QUICK.scenarios[:1], defences=("none", "mine_detected:Mine", "chi2_kf"), attacks=("none", *ATTACKS), seeds=2)
-    board = score(run(cells_of(part)), QUICK, require_adaptive=False)
+    board = score(rows := run(cells_of(part)), QUICK, require_adaptive=False)
+    for entry in board["entries"]:
+        entry["worst_episode"] = next(row for row in rows if row["defence"] == entry["defence"])
     path = _written(board | {"attacks": [attack for attack in board["attacks"] if attack["attack"] in ATTACKS]}, tmp_path)
     few = dataclasses.replace(EFFORT, hours=(0.02,))
     assert {line["defence"] for line in detect(path, QUICK, effort=few)["detection"]["entries"]} == {"chi2_kf"}
-    lines = detect(path, QUICK, effort=few, defences=["mine_detected:Mine"])["detection"]["entries"]
+    (tmp_path / "boards").mkdir()
+    (tmp_path / "quick-v0").rename(tmp_path / "boards" / "quick-v0")
+    command = [sys.executable, "-m", "tailgate", "leaderboard", "detect", "quick-v0", "--out", "boards", "--workers", "1", "--defence", "mine_detected:Mine"]
+    command += [*FEW[:2], *FEW[4:]]  # one mean time
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    lines = json.loads((tmp_path / "boards" / "quick-v0" / "board.json").read_text())["detection"]["entries"]
     mine, built_in = ([line | {"defence": ""} for line in lines if line["defence"] == name] for name in ("mine_detected:Mine", "chi2_kf"))
     assert mine == built_in != []
+    (tmp_path / "mine_detected.py").write_text("from tailgate.estimators import GatedKalman\nclass Mine(GatedKalman):\n    version = 1\n", encoding="utf-8")
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 2 and "mine_detected:Mine: digest" in done.stderr
 
 
 def test_workers_change_no_figure(bare: Data, detected: Data, tmp_path: Path) -> None:

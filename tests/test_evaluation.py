@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 
 import tailgate
 from tailgate import draws, evaluation, trace
@@ -187,10 +188,15 @@ def test_damaged_rows_are_refused_with_their_line(tmp_path: Path) -> None:
         read_rows(path)
 
 
-def test_a_suite_file_never_imports_code(tmp_path: Path) -> None:
-    (tmp_path / "s.yaml").write_text("scenarios: [braking-v0]\ndefences: ['os:system']\nattacks: [none]\n")
-    with pytest.raises(InputError, match="os:system"):
+@pytest.mark.parametrize("part", ["defences", "attacks", "held_out"])
+def test_a_suite_file_never_imports_code(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, part: str) -> None:
+    (tmp_path / "evil_part.py").write_text("from pathlib import Path\nPath('ran').touch()\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    (tmp_path / "s.yaml").write_text(yaml.safe_dump({"scenarios": ["braking-v0"], "defences": ["kf"], "attacks": ["none"], part: ["evil_part:Mine"]}))
+    with pytest.raises(InputError, match="evil_part:Mine.*imports nothing"):
         tailgate.evaluate(str(tmp_path / "s.yaml"))
+    assert not (tmp_path / "ran").exists()
 
 
 def test_rows_of_objects_are_written_too(tmp_path: Path) -> None:

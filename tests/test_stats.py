@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tailgate.stats import holm, median_limits, paired_difference, paired_ratio, proportion
+from tailgate.stats import holm, mean_time, median_limits, paired_difference, paired_ratio, proportion
 
 
 def test_clopper_pearson_known_values() -> None:
@@ -85,3 +85,12 @@ def test_the_median_lies_within_its_limits_as_often_as_they_say() -> None:
     drawn = np.random.default_rng(1).exponential(size=(2000, 30))
     held = [low <= np.log(2.0) <= high for low, high in map(median_limits, drawn)]
     assert 0.95 <= np.mean(held) <= 0.98
+
+
+def test_few_events_in_large_clusters_are_one_cluster_at_least():
+    """One event is one cluster, however large clusters are elsewhere; without any, clusters are as rare as they are large."""
+    assert mean_time(1, 20.0, 300.0) == mean_time(1, 20.0)
+    assert mean_time(7, 20.0, 300.0) == pytest.approx([end / 7.0 for end in mean_time(1, 20.0)])
+    assert mean_time(0, 20.0, 10.0) == (pytest.approx(mean_time(0, 20.0)[0] / 10.0), None)
+    low, high = mean_time(20, 20.0)
+    assert low == pytest.approx(0.6475, abs=1e-3) and high == pytest.approx(1.637, abs=1e-3)  # 20 events: 12.22 to 30.89

@@ -213,4 +213,7 @@ def test_the_command_writes_rows_and_prints_a_summary(
     assert "public ones" in printed.err
     assert read_rows(tmp_path / "rows.jsonl")[0]["defence"] == "own_sub:Own"
     assert Spec("defence", "own_sub:Own").digest == digest  # rows of `evaluate` are of the same class
-    assert Spec("defence", "tailgate.estimators:Kalman").digest != "" == digest_of("tailgate.estimators")
+    (tmp_path / "other_sub.py").write_text("from own_sub import Own\n", encoding="utf-8")
+    named = Spec("defence", "other_sub:Own").digest  # the class lies elsewhere: its file decides, as rows of an older one shall not be kept
+    (tmp_path / "own_sub.py").write_text((tmp_path / "own_sub.py").read_text() + "# changed\n", encoding="utf-8")
+    assert Spec("defence", "other_sub:Own").digest != named and Spec("defence", "own_sub:Own").digest != digest

@@ -63,3 +63,7 @@ def _parser() -> argparse.ArgumentParser:
     for name in COMMANDS:
         import_module(f"tailgate.commands.{name}").add(commands)
     return parser
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

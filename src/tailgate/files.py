@@ -95,7 +95,7 @@ def remove(path: Path) -> None:
 
 def _refused(field: str, path: Path, what: str, error: OSError) -> InputError:
     """The error of what cannot be written: it names the file that stands where a directory has to be, if that is why."""
-    if files := [str(above) for above in path.parents if above.is_file()]:
+    if files := [str(above) for above in path.parents if os.path.isfile(above)]:
         return InputError(field, files[0], "a writable directory, not a file")
     return InputError(field, str(path), f"a writable {what} ({error.strerror})")
 

@@ -4,7 +4,6 @@ Built-in ones register where they are defined; others come from the entry-point 
 from `module:Class` on the command line, or as objects in Python. A configuration file names registered components only.
 """
 
-import contextlib
 import hashlib
 import importlib
 import inspect
@@ -297,9 +296,8 @@ class Spec:
         if self.family == "defence" and len(paths) == 1 and (":" in head or not self.entry.built_in):
             from tailgate.submission import source
 
-            with contextlib.suppress(InputError):  # what cannot be handed in has the digest of its file
-                if told := source.digest_of(head.partition(":")[0] if ":" in head else self.entry.cls.__module__):
-                    return told  # as a submission's: rows of both are of one class
+            if told := source.digest_of_file(head.partition(":")[0] if ":" in head else self.entry.cls.__module__, paths[0]):
+                return told  # as a submission's: rows of both are of one class
         blobs = [path.read_bytes() for path in paths if path.is_file()]
         return hashlib.sha256(b"".join(blobs)).hexdigest() if blobs else ""
 

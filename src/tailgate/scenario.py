@@ -222,7 +222,7 @@ def _read_suite(path: Path) -> Suite:
             raise unknown(f"suite {path.stem}: threat: unknown field", key, fields_of(ThreatModel))
     for text in suite.defences:
         Spec("defence", text).refuse_imports(f"suite {path.stem}")
-    for text in suite.attacks:
+    for text in (*suite.attacks, *suite.held_out):
         Spec("attack", text).refuse_imports(f"suite {path.stem}")
     for name in suite.robustness:
         if name not in suite.scenarios:

@@ -30,6 +30,8 @@ def mean_time(events: int, time: float, dispersion: float = 1.0, level: float = 
     their number in a run) where that is above 1. The upper end is None without any event.
     """
     clusters = max(dispersion, 1.0)
+    if events:  # and one at least
+        clusters = min(clusters, float(events))
     n, time, tail = events / clusters, time / clusters, (1.0 - level) / 2.0
     low = time / float(0.5 * stats.chi2.ppf(1.0 - tail, 2.0 * n + 2.0))
     return low, time / float(0.5 * stats.chi2.ppf(tail, 2.0 * n)) if n else None

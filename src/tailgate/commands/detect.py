@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +42,7 @@ def _detect(options: argparse.Namespace) -> int:
     from tailgate.scenario import load_suite
     from tailgate.scoring.detection import Effort
 
+    sys.path.insert(0, "")  # module:Class is looked for in the working directory, as `tailgate evaluate` does
     suite = load_suite(options.suite)
     path = Path(options.out) / suite.name / BOARD
     hours = None if options.hours is None else tuple(options.hours)

@@ -14,6 +14,7 @@ from typing import Any
 import tailgate
 from tailgate.errors import InputError
 from tailgate.pool import abandon, processes
+from tailgate.registry import Spec
 from tailgate.scenario import Suite, load_scenario
 from tailgate.scoring.detection import EFFORT, Effort, Progress, detection, plants, stealth_impact
 from tailgate.scoring.false_alarms import false_alarms
@@ -42,6 +43,11 @@ def detect(
     agree(read_board(board), suite)
     guards = [e["defence"] for e in board["entries"] if e.get("card") and _takes_part(e)]
     known(defences, [e["defence"] for e in board["entries"] if _takes_part(e)])
+    for entry in (e for e in board["entries"] if e["defence"] in defences):
+        told, here = (entry.get("worst_episode") or {}).get("defence_digest"), Spec("defence", entry["defence"]).digest
+        if told is not None and told != here:
+            wanted = f"{told[:12] or 'none'}, of the class that the board's rows are of"
+            raise InputError(f"defence {entry['defence']}: digest", here[:12] or "none", wanted)
     listed = [a for a in board["attacks"] if a["attack"] in suite.attacks or a.get("admitted")]
     attacks = [a["attack"] for a in listed if a["knowledge"] == "black" and not (a.get("optimal") or a.get("learned"))]
     attacks = [attack for attack in attacks if not refused("attack", attack)]

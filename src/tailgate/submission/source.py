@@ -68,14 +68,18 @@ def _files(module: str) -> tuple[Path, list[Path], bool]:
 
 
 def digest_of(module: str) -> str:
-    """SHA-256 of a module's source, names and contents: its one file, or every file of the top-level package. Nothing is imported.
-
-    Empty for what tailgate itself holds: its version stands for it.
-    """
-    if module.partition(".")[0] == "tailgate":
-        return ""
+    """SHA-256 of a module's source, names and contents: its one file, or every file of the top-level package. Nothing is imported."""
     root, files, _ = _files(module)
     return _digest(root, files)
+
+
+def digest_of_file(module: str, path: Path) -> str:
+    """The same of a module that is the file at this path and no package; else empty."""
+    with contextlib.suppress(InputError):  # what cannot be handed in
+        root, files, package = _files(module)
+        if not package and files == [path.resolve()]:
+            return _digest(root, files)
+    return ""
 
 
 def _digest(root: Path, files: list[Path]) -> str:
