@@ -194,7 +194,7 @@ def test_a_suite_file_never_imports_code(tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(str(tmp_path))
     (tmp_path / "s.yaml").write_text(yaml.safe_dump({"scenarios": ["braking-v0"], "defences": ["kf"], "attacks": ["none"], part: ["evil_part:Mine"]}))
-    with pytest.raises(InputError, match="evil_part:Mine.*imports nothing"):
+    with pytest.raises(InputError, match=r"evil_part:Mine.*imports nothing"):
         tailgate.evaluate(str(tmp_path / "s.yaml"))
     assert not (tmp_path / "ran").exists()
 
