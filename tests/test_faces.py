@@ -369,10 +369,11 @@ def test_the_documentation_runs_as_written(tmp_path):
     pytest.importorskip("stable_baselines3")
     text = (ROOT / "docs/environment.md").read_text(encoding="utf-8")
     blocks = re.findall(r"```python\n(.*?)```", text, flags=re.S)
-    assert len(blocks) == 2 and "learn(150_000)" in blocks[1]
+    assert len(blocks) == 3 and "learn(150_000)" in blocks[1]
     code = "\n".join(blocks).replace("learn(150_000)", "learn(7_000)")
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
+    assert (tmp_path / "mine.json").is_file() and (tmp_path / "mine.safetensors").is_file()
     assert set(re.findall(r"tailgate/\w+-v0", text)) == set(FACES)
     named = {name for cell in re.findall(r"^\| (`[^|]*) \|", text, flags=re.M) for name in re.findall(r"`(\w+)`", cell)}
     assert set(fields_of(ActionSpec)) | set(fields_of(Reward)) <= named
