@@ -9,7 +9,7 @@ import pytest
 
 from tailgate.leaderboard.board_format import read_board
 from tailgate.leaderboard.build import percent
-from tailgate.leaderboard.site_index import attacks_of, detection_of, plan_of
+from tailgate.leaderboard.site_index import attacks_of, detection_of, ranked_against
 from tailgate.leaderboard.site_suite import Suite
 
 ROOT = Path(__file__).parents[1]
@@ -85,9 +85,9 @@ def test_attacks_that_joined_later_are_told_from_those_of_the_suite():
 def test_a_board_says_which_attackers_a_rank_asks_for(name, said):
     """And where that is less than the full plan; of a suite that is not of the package nobody can tell."""
     board = json.loads((ROOT / f"results/{name}/board.json").read_text(encoding="utf-8"))
-    assert plan_of(Suite(read_board(board), name)) == said
+    assert ranked_against(Suite(read_board(board), name)) == said
     board["suite"]["hash"] = "another"
-    assert plan_of(Suite(read_board(board), name)) == ""
+    assert ranked_against(Suite(read_board(board), name)) == ""
 
 
 def test_a_class_of_one_s_own_comes_before_sentinels():

@@ -185,10 +185,9 @@ def check(name: str, held: dict[str, Any]) -> list[str]:
     entry = held["scenarios"].get(name)
     if entry is None:
         raise unknown("golden.scenario", name, held["scenarios"])
-    used = uses()
-    if name not in used:
+    of, _, scenario = name.partition("/")
+    if of not in list_suites() or scenario not in (suite := load_suite(of)).scenarios:
         return [f"{name}: there is no such scenario of a suite any more"]
-    scenario, suite = used[name]
     place = place_of(scenario, suite)
     out = []
     if place.config_hash != entry["hash"]:

@@ -204,7 +204,7 @@ def _small(p: float, bound: bool = False) -> str:
 WHOLE = ({"ppo", "cem"}, {"black", "grey"}, 5)  # learners, knowledge and training seeds of the full plan
 
 
-def plan_of(suite: Suite) -> str:
+def ranked_against(suite: Suite) -> str:
     """Which attackers a rank asks for; empty where nobody can tell."""
     own = suite_of(suite.board.suite.name, suite.board.suite.hash)
     if own is None or not own.adaptive:
@@ -279,5 +279,6 @@ def section(suite: Suite, measured: Measured) -> Data:
         "statuses": [s for s, *_ in GROUPS if any(r["status"] == s for r in rows)], "levels": LEVELS,
         "heat": heat_of(suite), "scale": suite.scale, "together": together_of(suite), "curves": curves_of(suite),
         "stealth": stealth_of(suite), "detection": detection_of(suite), "comparisons": comparisons_of(suite), "attacks": attacks_of(suite),
-        "how": compared_how(suite), "attack_cards": attack_cards(suite), "errata": measured.superseded(), "plan": plan_of(suite),
+        "how": compared_how(suite), "attack_cards": attack_cards(suite), "errata": measured.superseded(),
+        "ranked_against": ranked_against(suite),
     }  # fmt: skip

@@ -52,7 +52,6 @@ class Sandbox:
         return environment if self.program == "bwrap" else None
 
 
-
 def sandbox_of(text: str | None) -> Sandbox | None:
     """A sandbox by its name: bwrap, docker, docker:IMAGE; none for an empty one. Raises InputError for one that is not installed."""
     if not text:
