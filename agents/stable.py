@@ -21,6 +21,7 @@ import numpy as np
 try:
     import torch
     from stable_baselines3.common.callbacks import BaseCallback
+    from stable_baselines3.common.logger import Logger
     from stable_baselines3.common.save_util import recursive_getattr
 except ImportError as error:
     raise ImportError("torch or Stable-Baselines3 is missing: pip install 'tailgate[train]'") from error
@@ -60,6 +61,8 @@ class StableLearner:
         self.env = BatchVecEnv(config.envs, gamma=gamma, **environment)
         check_action(self.name, self.seat)
         self.model = self.make_model(str(tensorboard) if tensorboard else None)
+        if tensorboard is None:
+            self.model.set_logger(Logger(folder=None, output_formats=[]))  # `learn` would make one with a temporary folder
         self.env.seed(seed * SEED_STRIDE)  # Stable-Baselines3 has seeded the rows with seed, seed + 1, ...: training seeds would share them
         self.curve: list[dict[str, Any]] = []
         # rows start together and end together: a window of two batches of episodes is steady, one rollout's are not

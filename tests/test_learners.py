@@ -3,6 +3,7 @@
 import hashlib
 import json
 import re
+import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -130,15 +131,19 @@ def test_a_resumed_run_gives_the_policy_of_an_uninterrupted_one(name: str, paid:
 
 
 @pytest.mark.parametrize("name", SMALL)
-def test_two_runs_of_one_seed_are_equal_and_of_two_seeds_are_not(name: str, paid: dict[str, Any], tmp_path: Path) -> None:
-    """By the digest of the policy's file."""
+def test_two_runs_of_one_seed_are_equal_and_of_two_seeds_are_not(
+    name: str, paid: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By the digest of the policy's file; and a run leaves nothing among temporary files."""
+    (tmp_path / "temporary").mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
     digests = []
     for seed in (3, 3, 4):
         run = learner(name, paid, seed)
         run.learn(1000, lambda progress: None)
         digests.append(json.loads(run.export(tmp_path / "policy", {}).read_text())["sha256"])
         assert digests[-1] == hashlib.sha256((tmp_path / "policy.safetensors").read_bytes()).hexdigest()
-    assert digests[0] == digests[1] != digests[2]
+    assert digests[0] == digests[1] != digests[2] and not [*(tmp_path / "temporary").iterdir()]
 
 
 def predicted(run: Any, observation: Any, memory: Any, first: bool, mask: Any) -> tuple[Any, Any, Any]:
