@@ -158,6 +158,29 @@ def test_only_tables_scroll_sideways(tab, site, width, show):
     assert wide or width > 375  # so that this does test something
 
 
+SEEN = """return [...document.querySelectorAll(arguments[0])].map(t => [t.innerText.replace(/\\s+/g, ' ').trim(), t.offsetParent !== null
+  && t.getBoundingClientRect().right <= t.closest('.scroll').getBoundingClientRect().right])"""
+
+
+@pytest.mark.page
+def test_what_tells_most_stands_in_a_phone_without_scrolling(tab, site, show):
+    """Rank and critical doses beside the name, which has the class below it; of an entry the gates passed, the worst damage and who is weaker."""
+    show(420, "light")
+    tab.get(site.as_uri())
+    heads = dict(tab.execute_script(SEEN, "#suite-1 .ranks thead th"))
+    whole = [head for head, seen in heads.items() if seen]
+    assert whole[:2] == ["Defence", "Rank"] and sum("Critical dose" in head for head in whole) == 2 and heads["Class"] is False
+    below = "return getComputedStyle(document.querySelector('#suite-1 tr[data-row=\"0\"] th'), '::after').content"
+    assert tab.execute_script(below) == '"measurements"'
+    tab.get(entry(site, "chi2_kf:eta=15").as_uri())
+    for section, head in (("gates", "Passed"), ("worst", "Damaged"), ("detection", "Detected"), ("pairs", "Surely weaker")):
+        assert dict(tab.execute_script(SEEN, f"section[aria-labelledby={section}] thead th"))[head], section
+    show(1280, "light")
+    tab.get(site.as_uri())
+    assert dict(tab.execute_script(SEEN, "#suite-1 .ranks thead th"))["Class"]
+    assert tab.execute_script(below) == "none"
+
+
 @pytest.mark.page
 def test_dark_light_and_numbers(tab, show):
     """The ground follows the wish of the reader; figures stand to the right in figures of one width."""
