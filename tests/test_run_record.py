@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import shutil
 import time
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,11 @@ import pytest
 from tailgate import evaluation
 from tailgate.commands import board as command
 from tailgate.leaderboard import run_record
-from tailgate.leaderboard.run_record import FILE, Record, processor_time
+from tailgate.leaderboard.board_format import load
+from tailgate.leaderboard.measured import measured_of
+from tailgate.leaderboard.run_record import Record, processor_time
+from tailgate.leaderboard.run_time import FILE, RunTime, lasting, run_of
+from tailgate.leaderboard.site import build_site
 from tailgate.machine import cores, processor
 from tailgate.scenario import load_suite
 from tailgate.scoring.attacks import attacks_of
@@ -95,9 +100,40 @@ def test_a_damaged_record_stops_nothing(suite: Path, tmp_path: Path, text: str) 
     (tmp_path / "rows.jsonl").touch()
     (tmp_path / FILE).write_text(text.replace("HASH", played.hash))
     assert Record(played, tmp_path, 2).before == []
-    good = {"format": "tailgate-run-1", "hash": played.hash, "commands": [{"seconds": 1.0, "processor_seconds": 2.0, "played": 3}]}
+    good = _record("mine", played.hash)
     (tmp_path / FILE).write_text(json.dumps(good))
     assert Record(played, tmp_path, 2).before == good["commands"]
+    (tmp_path / FILE).write_text(json.dumps(good | {"hash": "0" * 16}))
+    assert Record(played, tmp_path, 2).before == []
+
+
+def _record(suite: str, identity: str, count: int = 1) -> dict[str, Any]:
+    commands = [
+        {"seconds": 104.23, "processor_seconds": 181.5, "played": 30, "workers": 2, "processor": "A", "cores": 2, "version": "0.1.0", "commit": None}
+    ] * count  # fmt: skip
+    sums = {"seconds": 104.23 * count, "processor_seconds": 181.5 * count, "rows": {"played": 30 * count, "kept": 0}}
+    return {"format": "tailgate-run-1", "suite": suite, "hash": identity, **sums, "commands": commands}
+
+
+def test_a_page_says_what_playing_its_board_took(tmp_path: Path) -> None:
+    """In a sentence, of the record beside the board; one of another suite, or another version of it, is left out."""
+    once, twice = (RunTime.model_validate(_record("mine", "0" * 16, count)) for count in (1, 2))
+    assert once.said(30) == "all 30 rows by one command in 104 s, 3 min of processor time (2 workers, A)"
+    assert twice.said(90) == "60 of 90 rows by 2 commands in 3.5 min, 6 min of processor time (2 workers, A)"
+    assert [lasting(seconds) for seconds in (0.0, 1.5, 119.0, 120.0, 7199.0, 7200.0, 12_803.0, 720_000.0)] == [
+        "0 s", "1.5 s", "119 s", "2 min", "120 min", "2 h", "3.6 h", "200 h",
+    ]  # fmt: skip
+    assert run_of(tmp_path / "board.json") is None
+    source = Path("results/quick-v0/board.json")
+    board = tmp_path / "quick-v0" / source.name
+    board.parent.mkdir()
+    shutil.copy(source, board)
+    identity = json.loads(board.read_bytes())["suite"]["hash"]
+    for suite, mark, shown in (("quick-v0", identity, True), ("quick-v0", "0" * 16, False), ("radar-v0", identity, False)):
+        (board.parent / FILE).write_text(json.dumps(_record(suite, mark)))
+        assert run_of(board)
+        page = build_site([load(board)], tmp_path / "page", replays=False, measured=[measured_of(board)]).read_text()
+        assert ("rows by one command in 104 s" in page) == shown, (suite, mark)
 
 
 @pytest.mark.long

@@ -1,4 +1,4 @@
-"""What lies beside a board and is not of its rows: step times, what the timing of its attackers is worth, and what was wrong before."""
+"""What lies beside a board and is not of its rows: step times, what timing is worth, what was wrong before, and what playing it took."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from tailgate.errors import InputError
 from .board_parts import Board
 from .clock import Clock, clock_of
 from .errata import Errata, Erratum, errata_of
+from .run_time import RunTime, run_of
 from .timing import Timing, timing_of
 
 
@@ -19,10 +20,13 @@ class Measured(NamedTuple):
     clock: Clock | None = None
     timing: Timing | None = None
     errata: Errata | None = None
+    run: RunTime | None = None
 
     def belongs(self, board: Board) -> Measured:
         """What is of this board: an attacker's timing as long as its cell says the same. Raises InputError for what is of another suite."""
         mine, clock, timing, errata = board.suite, self.clock, self.timing, self.errata
+        if self.run is not None and (self.run.suite, self.run.hash) != (mine.name, mine.hash):
+            return self._replace(run=None).belongs(board)
         if errata is not None and errata.suite != mine.name:
             raise InputError("errata: suite", errata.suite, f"{mine.name}, whose board they lie beside")
         if clock is not None and clock.suite != mine.name:
@@ -36,7 +40,6 @@ class Measured(NamedTuple):
         kept = [e for e in timing.entries if held.get((e.defence, e.attack, e.scenario, e.dose)) == e.board]
         return self._replace(timing=timing.model_copy(update={"entries": kept}))
 
-
     def superseded(self, defence: str | None = None) -> list[Erratum]:
         """What was wrong, of all entries or of one, the latest first."""
         told = self.errata.errata if self.errata is not None else []
@@ -45,4 +48,4 @@ class Measured(NamedTuple):
 
 def measured_of(board: Path) -> Measured:
     """What lies beside a board's file."""
-    return Measured(clock_of(board), timing_of(board), errata_of(board))
+    return Measured(clock_of(board), timing_of(board), errata_of(board), run_of(board))

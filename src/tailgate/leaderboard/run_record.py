@@ -22,8 +22,8 @@ from tailgate.machine import commit, cores, processor
 from tailgate.scenario import Suite
 from tailgate.submission.guard import TICK, descendants
 
-FORMAT = "tailgate-run-1"
-FILE = "run.json"
+from .run_time import FILE, RunTime, run_of
+
 EVERY = 10.0  # [s] between two writes while rows are played: what a killed command loses
 
 
@@ -41,7 +41,8 @@ class Record:
         self.suite, self.path = suite, folder / FILE
         sweep(self.path)
         left = any(any(folder.glob(pattern)) for pattern in ("rows*.jsonl*", ".rows*.parts"))
-        self.before = _commands(self.path, suite) if left else []
+        held = run_of(self.path) if left else None
+        self.before = [command.model_dump() for command in held.commands] if held and held.hash == suite.hash else []
         self.began, self.used, self.written, self.played = time.perf_counter(), processor_time(), time.perf_counter(), 0
         self.about = {
             "workers": workers, "processor": processor(), "cores": cores(), "version": tailgate.__version__, "commit": commit(),
@@ -75,20 +76,9 @@ class Record:
         sums = {key: round(sum(command[key] for command in commands), 2) for key in ("seconds", "processor_seconds", "played")}
         played = int(sums.pop("played"))
         held = {
-            "format": FORMAT, "suite": self.suite.name, "hash": self.suite.hash, **sums,
+            "format": RunTime.model_fields["format"].default, "suite": self.suite.name, "hash": self.suite.hash, **sums,
             "rows": {"played": played, "kept": None if rows is None else max(0, rows - played)}, "commands": commands,
         }  # fmt: skip
         write_atomic(self.path, json.dumps(held, indent=1, allow_nan=False).encode() + b"\n")
         self.written = time.perf_counter()
         return held
-
-
-def _commands(path: Path, suite: Suite) -> list[dict[str, Any]]:
-    """The commands of an earlier record of this very suite; of anything else none, as a record decides nothing."""
-    try:
-        held = json.loads(path.read_text(encoding="utf-8"))
-        commands = [dict(command) for command in held["commands"]]
-        good = all(float(command[key]) >= 0 for command in commands for key in ("seconds", "processor_seconds", "played"))
-        return commands if good and (held["format"], held["hash"]) == (FORMAT, suite.hash) else []
-    except (OSError, ValueError, KeyError, TypeError):
-        return []

@@ -281,4 +281,5 @@ def section(suite: Suite, measured: Measured) -> Data:
         "stealth": stealth_of(suite), "detection": detection_of(suite), "comparisons": comparisons_of(suite), "attacks": attacks_of(suite),
         "how": compared_how(suite), "attack_cards": attack_cards(suite), "errata": measured.superseded(),
         "ranked_against": ranked_against(suite),
+        "run": measured.run.said(board.suite.rows) if measured.run is not None and board.suite.rows is not None else "",
     }  # fmt: skip
