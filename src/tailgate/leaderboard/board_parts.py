@@ -282,7 +282,7 @@ class AlarmPart(AtThreshold):
 
 class Detection(Part):
     hours: list[Number]
-    plants: list[list[Text]] | None = None  # scenarios that share a threshold; None: those of one class of plant
+    plants: list[list[Text]] | None = None  # scenarios that share a threshold
     entries: list[Detected]
     alarms: list[AlarmPart] = []
 

@@ -15,7 +15,7 @@ import tailgate
 from tailgate.errors import InputError
 from tailgate.pool import abandon, processes
 from tailgate.registry import Spec
-from tailgate.scenario import Suite, load_scenario
+from tailgate.scenario import Suite
 from tailgate.scoring.detection import EFFORT, Effort, Progress, detection, plants, stealth_impact
 from tailgate.scoring.false_alarms import false_alarms
 from tailgate.scoring.follow import same
@@ -55,7 +55,7 @@ def detect(
     for name, value in dataclasses.asdict(_effort(held, effort)).items():
         if value != getattr(effort, name):
             raise InputError(f"detection: {name}", getattr(effort, name), f"{value}, with which the figures of the board were made")
-    if (told := held.get("plants", _by_class(suite))) != _shared(suite):
+    if (told := held.get("plants")) != _shared(suite):
         wanted = f"{_shared(suite)}, scenarios that share a threshold; without its field `detection` a board is played again"
         raise InputError("detection: plants", told, wanted)
     asked = [guard for guard in defences or guards if not _whole(held, guard, suite, attacks, effort)]
@@ -82,14 +82,6 @@ def _said(effort: Effort, suite: Suite) -> Data:
 def _shared(suite: Suite) -> list[list[str]]:
     """Scenarios that share a threshold."""
     return [list(names) for names in plants(suite.nominal).values()]
-
-
-def _by_class(suite: Suite) -> list[list[str]]:
-    """The same on boards of before, which do not say so: those of one class of plant, whatever its shape."""
-    out: dict[str, list[str]] = {}
-    for name in suite.nominal:
-        out.setdefault(type(load_scenario(name).plant).__name__, []).append(name)
-    return list(out.values())
 
 
 def _effort(held: Data, effort: Effort = EFFORT) -> Effort:
