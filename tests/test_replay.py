@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import yaml
 
-from tailgate import cli
+from tailgate import cli, files
 from tailgate.core import Kind
 from tailgate.errors import InputError
 from tailgate.evaluation import Cell, evaluate, run_cell
@@ -363,8 +363,8 @@ def test_mp4_names_what_it_needs(monkeypatch, tmp_path, folder, capsys):
     assert "pip install 'tailgate[video]'" in capsys.readouterr().err and not list(tmp_path.iterdir())
 
 
-def test_mp4_is_written(pick, tmp_path):
-    """A file that the decoder reads back: as many frames as pictures, and the last one held."""
+def test_mp4_is_written(pick, tmp_path, monkeypatch):
+    """A file that the decoder reads back: as many frames as pictures, and the last one held. A writer that dies leaves the film of before."""
     decoder = pytest.importorskip("imageio_ffmpeg")
     from tailgate.replay.video import write_video
 
@@ -373,3 +373,13 @@ def test_mp4_is_written(pick, tmp_path):
     count, _ = decoder.count_frames_and_secs(str(tmp_path / "film.mp4"))
     assert count == int(replay.trace.length[0]) + 1 + 20  # two seconds at 10 frames
     assert [p.name for p in tmp_path.iterdir()] == ["film.mp4"]
+    before = (tmp_path / "film.mp4").read_bytes()
+    for place in ("write", "fsync", "rename"):
+        def die(what, path, place=place):
+            if what == place:
+                raise KeyboardInterrupt
+
+        monkeypatch.setattr(files, "step", die)
+        with pytest.raises(KeyboardInterrupt):
+            write_video(play(pick("chi2_kf:eta=9", "none")), tmp_path / "film.mp4")
+        assert [p.name for p in tmp_path.iterdir()] == ["film.mp4"] and (tmp_path / "film.mp4").read_bytes() == before

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import math
-import os
+import shutil
 import tempfile
 from collections.abc import Iterator
-from contextlib import suppress
 from importlib.util import find_spec
 from io import BytesIO
 from itertools import chain
@@ -16,7 +15,7 @@ from typing import Any
 from tailgate.core import Array
 from tailgate.envs.render_viewer import Viewer
 from tailgate.errors import InputError
-from tailgate.files import writable_directory, write_atomic
+from tailgate.files import replacing, writable_directory, write_atomic
 from tailgate.leaderboard.build import names_of
 
 from .replay import Replay, episode
@@ -92,12 +91,11 @@ def _write_mp4(pictures: Iterator[Array], path: Path, rate: float) -> None:
 
     first = next(pictures)
     writable_directory(path.parent, "video")
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}.", suffix=".mp4")
-    os.close(handle)
-    try:
+    with tempfile.TemporaryDirectory() as folder:
+        film = Path(folder) / "film.mp4"  # the encoder goes back in it
         size = (first.shape[1], first.shape[0])
         options: dict[str, Any] = {"codec": "libx264", "quality": 7, "macro_block_size": 2, "ffmpeg_log_level": "error"}
-        encoder = imageio_ffmpeg.write_frames(name, size, fps=rate, **options)
+        encoder = imageio_ffmpeg.write_frames(str(film), size, fps=rate, **options)
         encoder.send(None)
         picture = first
         for picture in chain([first], pictures):
@@ -105,9 +103,5 @@ def _write_mp4(pictures: Iterator[Array], path: Path, rate: float) -> None:
         for _ in range(round(HOLD * rate)):
             encoder.send(picture.tobytes())
         encoder.close()
-        os.chmod(name, 0o644)
-        os.replace(name, path)
-    except BaseException:
-        with suppress(OSError):
-            os.unlink(name)
-        raise
+        with film.open("rb") as whole, replacing(path, "video") as file:
+            shutil.copyfileobj(whole, file)
