@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from tailgate.errors import InputError
-from tailgate.leaderboard.build import breakable, build, names_of, percent, shade, spans, steps, ticks
+from tailgate.leaderboard.build import at_least, breakable, build, names_of, percent, shade, spans, steps, ticks
 from tailgate.metrics import METRICS
 
 spec = importlib.util.spec_from_file_location("boards", Path(__file__).with_name("boards.py"))
@@ -196,6 +196,8 @@ def test_numbers_in_words():
     assert [percent(x) for x in (0, 0.0001, 0.004, 0.5, 0.997, 0.9999, 1, -0.2)] == [
         "0%", "<0.1%", "0.4%", "50%", "99.7%", ">99.9%", "100%", "\N{MINUS SIGN}20%",
     ]  # fmt: skip
+    assert [at_least(x) for x in (0, 0.0001, 0.0079, 0.0299, 0.876, 0.995, 0.9999, 1)] == ["0%", "0.0%", "0.7%", "2%", "87%", "99%", "99%", "100%"]
+    assert [at_least(x, 1) for x in (0, 0.0079, 0.29, 0.99999, 1)] == ["0.0%", "0.7%", "29.0%", "99.9%", "100.0%"]
     assert [shade(x) for x in (0, 0.001, 0.1, 0.3, 0.31, 1)] == ["s0", "s1", "s1", "s3", "s4", "s10"]
     assert spans([3, 1, 2, 7]) == "1\N{EN DASH}3, 7"
     assert [steps(x) for x in (0, 999, 1500, 999_999, 2e6)] == ["0", "999", "1.5k", "1000k", "2M"]

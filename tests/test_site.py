@@ -12,12 +12,11 @@ from urllib.parse import unquote, urlsplit
 import pytest
 
 from tailgate.leaderboard.board_format import read_board
-from tailgate.leaderboard.build import percent
+from tailgate.leaderboard.build import at_least, percent
 from tailgate.leaderboard.site import build_site
 from tailgate.leaderboard.site_cards import LICENCE
 from tailgate.leaderboard.site_entry import _imported, replay_of
 from tailgate.leaderboard.site_suite import Suite, critical_of
-from tailgate.leaderboard.site_trust import at_least
 
 ROOT = Path(__file__).parent.parent
 spec = importlib.util.spec_from_file_location("boards", Path(__file__).with_name("boards.py"))
@@ -73,7 +72,7 @@ def test_groups_order_and_figures(index):
     assert f"{dose['value']:.3g} {dose['low']:.3g} to {dose['high']:.3g}" in rows[2]
     rates = {(r["dose"], r["knowledge"]): r["undamaged"] for r in kf["rates"]}
     for dose in (10, 20, 40):
-        assert f"{percent(rates[dose, 'white']['value'])} ≥ {percent(rates[dose, 'white']['low'])}" in rows[1]
+        assert f"{percent(rates[dose, 'white']['value'])} ≥ {at_least(rates[dose, 'white']['low'])}" in rows[1]
     brake = next(row for row in rows if row.startswith("brake_kf"))
     assert "> 200" in brake and "to > 200" in brake  # beyond the largest dose
     assert any(row.startswith("none baseline: no defence") for row in rows)
@@ -222,11 +221,11 @@ def test_trust_names_its_attacks_and_is_never_rounded_up(site):
     by_name = {e["defence"]: e["trust"] for e in board["entries"]}
     black = by_name["kf"]["safety"]["black"]
     sort, about, text = cell_of(site, site, "kf")
-    assert float(sort) == pytest.approx(black["lower"]) and text == f"{math.floor(1000 * black['lower']) / 10:.1f}%" and at_least(0.99999) == "99.9%"
+    assert float(sort) == pytest.approx(black["lower"]) and text == f"{math.floor(1000 * black['lower']) / 10:.1f}%" and at_least(0.99999, 1) == "99.9%"
     assert f"{black['k']} of 200 runs: radar-ppo-3" in about and "all properties" in about
     assert cell_of(site, site, "oracle")[1].startswith("200 of 200 runs: no attack, car-following-heavy-v0, dose 200")
     lines = Outline(entry(site, "none").read_text(encoding="utf-8")).rows("plain trust")
-    assert lines[2].startswith(f"black box {at_least(by_name['none']['safety']['black']['lower'])} {by_name['none']['safety']['black']['k']} of 200 5 0.05 / 12 radar-ppo-3")
+    assert lines[2].startswith(f"black box {at_least(by_name['none']['safety']['black']['lower'], 1)} {by_name['none']['safety']['black']['k']} of 200 5 0.05 / 12 radar-ppo-3")
     assert lines[4] == "white box " + " ".join("\N{EN DASH}" * 4) and lines[5] == "All properties : no collision, brakes, detects" and len(lines) == 9
     text = entry(site, "none").read_text(encoding="utf-8")
     for part in ("incomplete: stealth: no gate to pass", "5 black box, 2 grey box, 3 white box", "a computed optimum: shown", "brakes within 600 ms", "detection 10 steps"):

@@ -19,8 +19,8 @@ from tailgate.commands.board import _print_board
 from tailgate.errors import InputError
 from tailgate.evaluation import evaluate, run_cell
 from tailgate.leaderboard.board_format import read_board
+from tailgate.leaderboard.build import at_least
 from tailgate.leaderboard.run import board_of
-from tailgate.leaderboard.site_trust import at_least
 from tailgate.metrics import measure
 from tailgate.registry import Spec
 from tailgate.rounds import seeds_of
@@ -303,7 +303,7 @@ def test_a_board_takes_up_the_report_that_lies_beside_its_rows(found: Found, sho
     board["suite"]["beacon"] = "[b]1"
     _print_board(board)
     words = " ".join(capsys.readouterr().out.split())
-    assert "trust" in words and "seeds of the beacon [b]1" in words and at_least(found[0]["defences"][0]["safety"]["black"]["lower"]) in words
+    assert "trust" in words and "seeds of the beacon [b]1" in words and at_least(found[0]["defences"][0]["safety"]["black"]["lower"], 1) in words
     for text in ("{", "[]", '{"a": NaN}', json.dumps(found[0] | {"version": "0"})):
         (tmp_path / "trust" / "trust.json").write_text(text)
         with pytest.raises(InputError, match=r"trust\.json"):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
-import math
 import sys
 from pathlib import Path
 from typing import Any
@@ -151,11 +150,6 @@ def _why_nothing(found: dict[str, Any]) -> str:
     return next(filter(None, reasons), "no property has a meaning here")
 
 
-def at_least(share: float) -> str:
-    """A lower bound in percent, never rounded up."""
-    return f"{math.floor(1000 * share + 1e-9) / 10:.1f} %"
-
-
 def _percent(value: float) -> str:
     return f"{100 * value:.1f} %"
 
@@ -167,6 +161,8 @@ def _place(held: dict[str, Any]) -> str:
 
 def _print_bounds(found: dict[str, Any]) -> None:
     """The lower bounds of every defence, at the least and at the most knowledge of the attackers."""
+    from tailgate.leaderboard.build import at_least
+
     out, names = console(), [name for name in ("safety", "trust") if any(name in entry for entry in found["defences"])]
     attacks = [a for a in found["attacks"] if a["attack"] != "none"]
     table = Table(
@@ -182,8 +178,8 @@ def _print_bounds(found: dict[str, Any]) -> None:
             figures: list[str] = []
             for name in names:
                 held = entry[name][level]
-                shown = ["-", "-", "-"] if held is None else [at_least(held["lower"]), f"{held['k']} of {held['n']}", _place(held)]
-                figures += shown
+                told = [] if held is None else [at_least(held["lower"], 1), f"{held['k']} of {held['n']}", _place(held)]
+                figures += told or ["-", "-", "-"]
             table.add_row(escape(entry["defence"]), level, *figures, escape(entry["why"]) if "-" in figures else "")
     out.print(table)
     for name in names:

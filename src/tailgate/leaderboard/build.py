@@ -88,6 +88,13 @@ def percent(value: float) -> str:
     return f"{100 * value:.1f}%"
 
 
+def at_least(share: float, digits: int = 0) -> str:
+    """A lower limit in percent, never rounded up; of less than one percent a tenth is told."""
+    digits = max(digits, 1) if 0.0 < share < 0.01 else digits
+    unit = 10**digits
+    return f"{math.floor(100 * unit * share + 1e-9) / unit:.{digits}f}%"
+
+
 def shade(value: float) -> str:
     """Class of the colour scale: s0 for none at all, then one per ten percent."""
     return f"s{math.ceil(min(max(value, 0.0), 1.0) * 10 - 1e-9)}"

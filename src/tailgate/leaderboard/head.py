@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from .site_trust import at_least
+from .build import at_least
 
 Board = dict[str, Any]
 
@@ -28,7 +28,7 @@ def lines(board: Board) -> list[tuple[str, ...]]:
     for entry in sorted(board["entries"], key=lambda e: (e["rank"] is None, (e["rank"] or {}).get("best", 0))):
         rank, critical = entry["rank"], entry["critical_dose"]["black"]
         rates = {str(rate["dose"]): rate["undamaged"] for rate in entry["rates"] if rate["knowledge"] == "black"}
-        shown = [f"{100 * rates[d]['value']:.0f} % (at least {100 * rates[d]['low']:.0f})" if d in rates else "-" for d in doses]
+        shown = [_share(rates[d]) if d in rates else "-" for d in doses]
         rivals = sum(e["rank"] is not None and e["class"] == entry["class"] for e in board["entries"])
         place = "-" if rank is None else "alone" if rivals == 1 else " to ".join(map(str, dict.fromkeys([rank["best"], rank["worst"]])))
         dose = "-" if critical is None else _dose(critical, suite["doses"])
@@ -47,9 +47,13 @@ def markdown(board: Board, most: int | None = None) -> str:
     return "\n".join(f"| {' | '.join(cells)} |" for cells in rows) + "\n"
 
 
+def _share(undamaged: Board) -> str:
+    return f"{100 * undamaged['value']:.0f} % (at least {at_least(undamaged['low']).rstrip('%')})"
+
+
 def _trust(held: Board | None) -> str:
     bound = held["safety"]["black"] if held else None
-    return "-" if bound is None else f"at least {at_least(bound['lower'])}"
+    return "-" if bound is None else f"at least {at_least(bound['lower'], 1)}"
 
 
 def _dose(critical: Board, doses: list[int | None]) -> str:

@@ -8,7 +8,7 @@ from tailgate import adaptive
 
 from . import site_alarms
 from .board_parts import LEVELS, CellPart, Dose, Level
-from .build import Name, percent
+from .build import Name, at_least, percent
 from .measured import Measured
 from .site_cards import attack_cards, suite_of
 from .site_curves import curves_of, stealth_of, together_of
@@ -128,7 +128,7 @@ def detection_of(suite: Suite) -> Data | None:
                 cells.append({"text": "\N{EN DASH}", "sort": "", "least": "", "low": "", "about": "", "delay": "", "rarer": False})
                 continue
             cells.append({
-                "text": percent(mean), "sort": f"{mean:.6g}", "least": percent(least.detected.value), "low": percent(least.detected.low),
+                "text": percent(mean), "sort": f"{mean:.6g}", "least": percent(least.detected.value), "low": at_least(least.detected.low),
                 "about": suite.where(least.scenario, least.attack), "delay": figure(least.delay, 3) if least.delay is not None else "",
                 "rarer": any(c.rarer for c in known),
             })  # fmt: skip

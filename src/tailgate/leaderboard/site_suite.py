@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from .board_parts import LEVELS, Board, CellPart, Critical, Dose, EntryPart, Level, Limited
-from .build import Name, names_of, percent, shade
+from .build import Name, at_least, names_of, percent, shade
 from .charts import Axis
 
 Data = dict[str, Any]
@@ -158,7 +158,7 @@ def critical_of(suite: Suite, entry: EntryPart, level: Level) -> Data:
 def share_of(share: Limited | None) -> Data:
     if share is None:
         return {"text": "\N{EN DASH}", "low": "", "sort": ""}
-    return {"text": percent(share.value), "low": percent(share.low), "sort": f"{share.value:.6g}"}
+    return {"text": percent(share.value), "low": at_least(share.low), "sort": f"{share.value:.6g}"}
 
 
 def gates_of(entry: EntryPart) -> Data:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import math
-
 from tailgate.scoring.damage import CLEAN
 
 from .board_parts import LEVELS, Bound, EntryPart, Level, TrustPart
+from .build import at_least
 from .site_suite import Data, Suite, dose_text, figure
 
 SPEED, ACCEL = "m/s", "m/s\N{SUPERSCRIPT TWO}"
@@ -14,11 +13,6 @@ UNITS = {
     "deadline": "s", "steps": "steps at least", "braking": ACCEL, "stands": SPEED, "detection": "steps", "response": "s", "accel": ACCEL,
     "brake": ACCEL, "lead_brake": ACCEL,
 }  # fmt: skip
-
-
-def at_least(share: float) -> str:
-    """A lower bound in percent, never rounded up."""
-    return f"{math.floor(1000 * share + 1e-9) / 10:.1f}%"
 
 
 def trust_of(suite: Suite) -> Data | None:
@@ -47,8 +41,8 @@ def trust_cell(suite: Suite, entry: EntryPart) -> Data:
         return {"text": "\N{EN DASH}", "sort": "", "about": _why(suite, entry)}
     whole = entry.trust.all.get("black")
     about = [f"{bound.k} of {bound.n} runs: {_worst(suite, bound)}"]
-    about += [f"all properties: {at_least(whole.lower)}, {whole.k} of {whole.n} runs: {_worst(suite, whole)}"] if whole else []
-    return {"text": at_least(bound.lower), "sort": f"{bound.lower:.6g}", "about": "; ".join(about)}
+    about += [f"all properties: {at_least(whole.lower, 1)}, {whole.k} of {whole.n} runs: {_worst(suite, whole)}"] if whole else []
+    return {"text": at_least(bound.lower, 1), "sort": f"{bound.lower:.6g}", "about": "; ".join(about)}
 
 
 def trust_page(suite: Suite, entry: EntryPart) -> Data | None:
@@ -64,7 +58,7 @@ def trust_page(suite: Suite, entry: EntryPart) -> Data | None:
             row: Data = {"level": level, "text": "\N{EN DASH}", "runs": "", "attacks": "", "alpha": "", "worst": ""}
             if bound is not None:
                 row |= {
-                    "text": at_least(bound.lower), "runs": f"{bound.k} of {bound.n}", "attacks": len(bound.attacks),
+                    "text": at_least(bound.lower, 1), "runs": f"{bound.k} of {bound.n}", "attacks": len(bound.attacks),
                     "alpha": f"{figure(bound.alpha)} / {bound.cells}", "worst": _worst(suite, bound),
                 }  # fmt: skip
             rows.append(row)
