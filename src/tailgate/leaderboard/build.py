@@ -89,8 +89,9 @@ def percent(value: float) -> str:
 
 
 def at_least(share: float, digits: int = 0) -> str:
-    """A lower limit in percent, never rounded up; of less than one percent a tenth is told."""
-    digits = max(digits, 1) if 0.0 < share < 0.01 else digits
+    """A lower limit in percent, never rounded up; of less than one percent a tenth is told, if there is one."""
+    if digits == 0 and 0.001 <= share < 0.01:
+        digits = 1
     unit = 10**digits
     return f"{math.floor(100 * unit * share + 1e-9) / unit:.{digits}f}%"
 
