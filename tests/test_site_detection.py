@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from tailgate.leaderboard.board_format import read_board
-from tailgate.leaderboard.build import at_least, percent
 from tailgate.leaderboard.site_index import attacks_of, detection_of, ranked_against
 from tailgate.leaderboard.site_suite import Suite
+from tailgate.leaderboard.words import at_least, percent
 
 ROOT = Path(__file__).parents[1]
 spec = importlib.util.spec_from_file_location("boards", Path(__file__).with_name("boards.py"))

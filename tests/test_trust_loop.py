@@ -19,8 +19,8 @@ from tailgate.commands.board import _print_board
 from tailgate.errors import InputError
 from tailgate.evaluation import evaluate, run_cell
 from tailgate.leaderboard.board_format import read_board
-from tailgate.leaderboard.build import at_least
 from tailgate.leaderboard.run import board_of
+from tailgate.leaderboard.words import at_least
 from tailgate.metrics import measure
 from tailgate.registry import Spec
 from tailgate.rounds import seeds_of

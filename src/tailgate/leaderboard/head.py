@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from .build import at_least
+from .words import at_least
 
 Board = dict[str, Any]
 

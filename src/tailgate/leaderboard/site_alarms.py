@@ -7,8 +7,8 @@ from scipy import stats
 from tailgate.stats import mean_time
 
 from .board_parts import AlarmPart
-from .build import percent
 from .site_suite import Data, Suite
+from .words import percent
 
 FACTOR = 2.0  # times as often as wanted, or as rarely, from which on it is a flag
 APART = 0.75  # of the drives with more false alarms in one half than in the other, from which on it is a flag

@@ -18,8 +18,8 @@ from tailgate.scenario import list_suites, load_scenario, load_suite
 from tailgate.threat import ThreatModel
 
 from .board_parts import EntryPart
-from .build import Name
 from .site_suite import Data, Suite
+from .words import Name
 
 LICENCE = "MIT"  # of the package
 SHOWN = ("name", "summary", "parameters", "knowledge", "learned", "optimal")  # of a card: shown in a place of their own

@@ -16,7 +16,6 @@ from tailgate.replay.replay import play
 
 from . import site_alarms
 from .board_parts import LEVELS, CellPart, EntryPart, Robust
-from .build import names_of, percent
 from .clock import Clock
 from .measured import Measured
 from .site_cards import card_of
@@ -25,6 +24,7 @@ from .site_index import compared_how, comparisons_of
 from .site_suite import Data, Suite, critical_of, dose_text, figure, played, share_of, worse
 from .site_timing import flags_of, timed_of
 from .site_trust import trust_of, trust_page
+from .words import names_of, percent
 
 LEAST = ("progress", "every episode")  # gates whose limit is one from below
 WAYS = ("\N{LESS-THAN OR EQUAL TO}", "\N{GREATER-THAN OR EQUAL TO}")

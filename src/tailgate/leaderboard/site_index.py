@@ -8,13 +8,13 @@ from tailgate import adaptive
 
 from . import site_alarms
 from .board_parts import LEVELS, CellPart, Dose, Level
-from .build import Name, at_least, percent
 from .measured import Measured
 from .site_cards import attack_cards, suite_of
 from .site_curves import curves_of, stealth_of, together_of
 from .site_suite import GROUPS, Data, Suite, cell_of, critical_of, dose_text, figure, gates_of, played, share_of, worse
 from .site_timing import flags_of
 from .site_trust import trust_cell, trust_of
+from .words import Name, at_least, percent
 
 OWN = ""  # in place of an attack: all that were trained against the row's defence
 TRAINED = Name("trained against it", ("the worst",))

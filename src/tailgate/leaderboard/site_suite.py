@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from .board_parts import LEVELS, Board, CellPart, Critical, Dose, EntryPart, Level, Limited
-from .build import Name, at_least, names_of, percent, shade
 from .charts import Axis
+from .words import Name, at_least, names_of, percent, shade
 
 Data = dict[str, Any]
 SPREAD = 16  # ratio of the largest dose to the smallest above which doses are drawn on a logarithmic axis at first

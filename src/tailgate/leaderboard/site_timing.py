@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from .build import names_of, percent
 from .site_suite import Data, dose_text
 from .timing import Timing
+from .words import names_of, percent
 
 TIMES = (  # as the twins of tailgate.strength.timing
     "its own times", "those of another of its episodes (yoked)", "as many steps at random (shuffled)", "as many, evenly spread (periodic)",

@@ -5,8 +5,8 @@ from __future__ import annotations
 from tailgate.scoring.damage import CLEAN
 
 from .board_parts import LEVELS, Bound, EntryPart, Level, TrustPart
-from .build import at_least
 from .site_suite import Data, Suite, dose_text, figure
+from .words import at_least
 
 SPEED, ACCEL = "m/s", "m/s\N{SUPERSCRIPT TWO}"
 UNITS = {

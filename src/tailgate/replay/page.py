@@ -18,7 +18,7 @@ from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 
 from tailgate.files import writable_directory, write_atomic
-from tailgate.leaderboard.build import names_of
+from tailgate.leaderboard.words import names_of
 from tailgate.metrics import METRICS, unit_in
 
 from .episode import Data, episode_of, first_step, noun

@@ -16,7 +16,7 @@ from tailgate.core import Array
 from tailgate.envs.render_viewer import Viewer
 from tailgate.errors import InputError
 from tailgate.files import replacing, writable_directory, write_atomic
-from tailgate.leaderboard.build import names_of
+from tailgate.leaderboard.words import names_of
 
 from .replay import Replay, episode
 

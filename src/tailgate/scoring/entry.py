@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from typing import Any
 
 import numpy as np
@@ -44,7 +44,7 @@ def entry_of(table: Table, defence: str, levels: dict[str, Worst], slot: int, or
     uses = [str(use) for use in rows[0]["uses"]]
     card = _card(defence)
     found = gates(table, defence)
-    why = _reference(defence, uses, card) or failure(found) or _incomplete(table, levels["black"])
+    why = reference(defence, uses, card) or failure(found) or _incomplete(table, levels["black"])
     status = "unranked" if why else "ranked"
     if not why and asked is not None and (short := _draft(table)):
         status, why = "unranked", short
@@ -110,7 +110,7 @@ def _built_in() -> dict[str, Entry]:
     return built_in("defence")
 
 
-def _reference(defence: str, uses: Sequence[str], card: Entry | None) -> str:
+def reference(defence: str, uses: Collection[str], card: Entry | None) -> str:
     """Why a defence takes no rank whatever it does; empty where it may."""
     if split_text(defence)[0] == CLEAN:
         return "baseline: no defence"
