@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from tailgate.leaderboard.board_format import read_board
+from tailgate.leaderboard.order import ordered
 from tailgate.leaderboard.site_index import attacks_of, detection_of, ranked_against
 from tailgate.leaderboard.site_suite import Suite
 from tailgate.leaderboard.words import at_least, percent
@@ -95,5 +96,5 @@ def test_a_class_of_one_s_own_comes_before_sentinels():
     board = make_board()
     mine = board["entries"][-1]
     mine |= {"status": "unranked", "rank": None, "why": "claimed: played on public seeds"}
-    ordered = [entry.defence for entry in Suite(read_board(board), "").ordered() if entry.status == "unranked"]
-    assert ordered[0] == mine["defence"] and len(ordered) > 2
+    there = [entry.defence for entry in ordered(read_board(board).entries) if entry.status == "unranked"]
+    assert there[0] == mine["defence"] and len(there) > 2

@@ -11,6 +11,7 @@ from tailgate.errors import InputError
 from tailgate.leaderboard import head
 from tailgate.leaderboard.board_format import read_board
 from tailgate.leaderboard.charts import Axis, Dot, Line, chart, nice, spread, ticks_at
+from tailgate.leaderboard.order import ordered
 from tailgate.leaderboard.site import build_site, slug
 from tailgate.leaderboard.site_suite import figure
 
@@ -95,8 +96,9 @@ def test_numbers_in_words():
 
 
 def test_the_head_in_words_is_the_board_in_figures():
-    """A line for each defence, those with a rank first, cut where it is asked; a bar in a name does not end a cell."""
+    """A line for each defence, in the order of the page, cut where it is asked; a bar in a name does not end a cell."""
     board = make_board()
+    assert [line[0] for line in head.lines(board)[1:]] == [entry.defence for entry in ordered(read_board(board).entries)]
     board["entries"][0]["defence"] = "a|b"
     heading, *body = head.lines(board)
     assert len(body) == len(board["entries"]) and all(len(line) == len(heading) for line in body)

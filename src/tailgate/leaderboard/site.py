@@ -22,9 +22,10 @@ from tailgate.replay.page import embedded
 from .assets import asset, inline
 from .board_format import read_board
 from .measured import Measured
+from .order import GROUPS, ordered
 from .site_entry import Replayed, entry_page, replay_of
 from .site_index import section
-from .site_suite import GROUPS, Data, Suite
+from .site_suite import Data, Suite
 from .words import TITLE, breakable
 
 SUMMARY = "tailgate-site-1"
@@ -97,7 +98,7 @@ def build_site(
     template = environment.get_template("site_entry.html")
     listed: list[Data] = []
     for suite, beside in zip(suites, found, strict=True):
-        for entry in suite.ordered():
+        for entry in ordered(suite.board.entries):
             where = suite.pages[entry.defence]
             also = [(s.board.suite.name, f"../{s.pages[entry.defence]}") for s in suites if s is not suite and entry.defence in s.pages]
             replay = folder / f"{where.removesuffix('.html')}-replay.html"

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 from .board_parts import LEVELS, CurvePart, EntryPart, Stealth
 from .charts import STYLES, Axis, Dot, Line, chart, nice, path_of, ticks_at
+from .order import ordered
 from .site_suite import Data, Suite, figure
 
 TOGETHER = STYLES  # defences with a line each in the chart of all: as many as there are line styles
@@ -25,7 +26,7 @@ def dots_of(curve: CurvePart) -> Line:
 def curves_of(suite: Suite, wanted: Sequence[EntryPart] | None = None, gap: float = 14.0) -> list[Data]:
     """One chart per defence on each scale, with a line per knowledge."""
     out = []
-    for entry in suite.ordered() if wanted is None else wanted:
+    for entry in ordered(suite.board.entries) if wanted is None else wanted:
         lines = [line for c in suite.board.curves if c.defence == entry.defence and (line := dots_of(c)).dots]
         if lines:
             lines.sort(key=lambda line: line.style)
@@ -41,7 +42,7 @@ def curves_of(suite: Suite, wanted: Sequence[EntryPart] | None = None, gap: floa
 def together_of(suite: Suite) -> Data | None:
     """The black-box curves of all defences on one field: the first in the table with a line each, the others faint."""
     by_defence = {c.defence: dots_of(c) for c in suite.board.curves if c.knowledge == "black"}
-    there = [(e, by_defence[e.defence]) for e in suite.ordered() if e.defence in by_defence and by_defence[e.defence].dots]
+    there = [(e, by_defence[e.defence]) for e in ordered(suite.board.entries) if e.defence in by_defence and by_defence[e.defence].dots]
     if not there:
         return None
     named = there[:TOGETHER]
@@ -60,7 +61,8 @@ def together_of(suite: Suite) -> Data | None:
 
 def stealth_of(suite: Suite, wanted: Sequence[EntryPart] | None = None) -> Data | None:
     """Deviation that a stealthy attacker reaches against the mean time between false alarms, of some or all entries: chart and table."""
-    there = [(e, sorted(e.stealth, key=lambda s: s.hours)) for e in (suite.ordered() if wanted is None else wanted) if e.stealth]
+    entries = ordered(suite.board.entries) if wanted is None else wanted
+    there = [(e, sorted(e.stealth, key=lambda s: s.hours)) for e in entries if e.stealth]
     hours = sorted({s.hours for _, held in there for s in held})
     tops = [s.deviation if s.high is None else s.high for _, held in there for s in held if s.deviation is not None]
     if not tops:

@@ -9,9 +9,10 @@ from tailgate import adaptive
 from . import site_alarms
 from .board_parts import LEVELS, CellPart, Dose, Level
 from .measured import Measured
+from .order import GROUPS, ordered
 from .site_cards import attack_cards, suite_of
 from .site_curves import curves_of, stealth_of, together_of
-from .site_suite import GROUPS, Data, Suite, cell_of, critical_of, dose_text, figure, gates_of, played, share_of, worse
+from .site_suite import Data, Suite, cell_of, critical_of, dose_text, figure, gates_of, played, share_of, worse
 from .site_timing import flags_of
 from .site_trust import trust_cell, trust_of
 from .words import Name, at_least, percent
@@ -23,7 +24,7 @@ TRAINED = Name("trained against it", ("the worst",))
 def _lines(suite: Suite, measured: Measured) -> list[Data]:
     ranked = [e for e in suite.board.entries if e.rank]
     out = []
-    for i, entry in enumerate(suite.ordered()):
+    for i, entry in enumerate(ordered(suite.board.entries)):
         rates = {(r.dose, r.knowledge): share_of(r.undamaged) for r in entry.rates}
         rank = {"text": "\N{EN DASH}", "sort": "", "of": 0}
         if entry.rank:
@@ -62,7 +63,7 @@ def heat_of(suite: Suite) -> Data | None:
         for a, k in columns
     ]  # fmt: skip
     scenarios = [s.name for s in board.suite.scenarios]
-    entries = suite.ordered()
+    entries = ordered(suite.board.entries)
     first = None if len(scenarios) > 1 else scenarios[0]  # None: the worst of all
 
     def look(where: list[str], dose: Dose, defence: str, column: tuple[str, Level]) -> CellPart | None:

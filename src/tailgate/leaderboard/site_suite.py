@@ -7,17 +7,13 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
-from .board_parts import LEVELS, Board, CellPart, Critical, Dose, EntryPart, Level, Limited
+from .board_parts import LEVELS, Board, CellPart, Dose, EntryPart, Level, Limited
 from .charts import Axis
+from .order import sort_dose
 from .words import Name, at_least, names_of, percent, shade
 
 Data = dict[str, Any]
 SPREAD = 16  # ratio of the largest dose to the smallest above which doses are drawn on a logarithmic axis at first
-GROUPS = (  # status, title, what it means
-    ("ranked", "Ranked", "with figures against every black-box attack, and through every gate"),
-    ("unattacked", "Not attacked yet", "no attacker was trained against these: a good figure says little, and they take no rank"),
-    ("unranked", "Unranked, for comparison", "classes outside a round, baselines, references and those that fail a gate or lack figures"),
-)
 
 
 def figure(value: float | None, digits: int = 4) -> str:
@@ -106,22 +102,6 @@ class Suite:
         name = self.attacks[attack].full if attack in self.attacks else attack
         return f"{name}, {scenario}" if scenario else name
 
-    def ordered(self) -> list[EntryPart]:
-        """Entries as the tables list them: by group, classes that claim their figures first, then class, rank and critical dose."""
-        return sorted(self.board.entries, key=self._order)
-
-    def _order(self, entry: EntryPart) -> tuple[Any, ...]:
-        status = [name for name, *_ in GROUPS].index(entry.status)
-        rank = (entry.rank.best, entry.rank.worst) if entry.rank else (math.inf, math.inf)
-        doses = [-_sort_dose(entry.critical_dose.get(level)) for level in LEVELS]
-        return (status, not entry.why.startswith("claimed"), entry.class_.count("+"), entry.class_, rank, doses)
-
-
-def _sort_dose(critical: Critical | None) -> float:
-    if critical is None:
-        return -1.0
-    return math.inf if critical.value is None else critical.value
-
 
 def critical_of(suite: Suite, entry: EntryPart, level: Level) -> Data:
     """An entry's critical dose in words, and its interval as places on the dose axis."""
@@ -148,7 +128,7 @@ def critical_of(suite: Suite, entry: EntryPart, level: Level) -> Data:
     bar = {"low": at(critical.low), "x": at(critical.value), "high": at(critical.high), "beyond": critical.value is None}
     about = ["damage without any attack"] * clean + ["no attack that knows at most this did damage"] * harmless
     about += [f"{percent(1 - suite.board.suite.alpha)} interval {span}"] * bool(span) + [f"worst: {worst}"] * bool(worst)
-    sort = _sort_dose(critical)
+    sort = sort_dose(critical)
     return {
         "text": words(critical.value), "sort": "Infinity" if sort == math.inf else f"{sort:.6g}", "span": span, "bar": bar, "worst": worst,
         "about": "; ".join(about),
