@@ -377,20 +377,19 @@ def test_a_fresh_start_forgets_the_run_before_and_resume_wants_the_same_learner(
     assert "steps: got 10; expected at least" in capsys.readouterr().err and all(path.read_bytes() == text for path, text in held.items())
 
 
-@pytest.mark.parametrize("settings", [
-    ["learner=ppo", "steps=1280", "ppo.envs=16", "ppo.rollout=20", "ppo.batch_size=160", "ppo.epochs=1"],
-    ["learner=cem", "steps=2400", "cem={population: 6, episodes: 4, hidden: [4]}"],
-], ids=["ppo", "cem"])  # fmt: skip
-def test_a_seed_trained_in_a_process_of_its_own_gives_the_same_policy(settings: list[str], tmp_path: Path) -> None:
-    """Two seeds side by side, and one after the other: the same files, whatever ran beside them."""
-    files = []
-    for workers in (1, 2):
-        config = train.load_config(None, [
-            f"out={tmp_path / str(workers)}", "seeds=2", f"workers={workers}", "environment.interval=20", "tensorboard=false", "rivals=[none]",
-            *settings,
-        ])  # fmt: skip
-        seen: set[int] = set()
-        policies = train.train(config, lambda seed, now, seen=seen: seen.add(seed))  # type: ignore[misc]
-        assert seen == {0, 1}
-        files.append([path.with_suffix(".safetensors").read_bytes() for path in policies])
-    assert files[0] == files[1] and files[0][0] != files[0][1]
+def test_trainings_that_share_processes_give_the_same_policies(tmp_path: Path) -> None:
+    """Two seeds of two learners side by side, and one after the other: the same files, whatever ran beside or before them."""
+    learners = {
+        "ppo": ["steps=1280", "ppo.envs=16", "ppo.rollout=20", "ppo.batch_size=160", "ppo.epochs=1"],
+        "cem": ["steps=2400", "cem={population: 6, episodes: 4, hidden: [4]}"],
+    }
+    shared = [f"out={tmp_path}", "seeds=2", "workers=2", "environment.interval=20", "tensorboard=false", "rivals=[none]"]
+    configs = [train.load_config(None, [f"name={name}", f"learner={name}", *shared, *settings]) for name, settings in learners.items()]
+    seen: set[tuple[str, int]] = set()
+    together = train.train_together([(config, False) for config in configs], lambda config, seed, now: seen.add((config.name, seed)), 2)
+    assert seen == {(name, seed) for name in learners for seed in (0, 1)}
+    for config, policies in zip(configs, together, strict=True):
+        assert [path.parent for path in policies] == [config.directory] * 2
+        alone = train.train(dataclasses.replace(config, name=f"{config.name}-alone", workers=1), lambda seed, now: None)
+        first, second = ([path.with_suffix(".safetensors").read_bytes() for path in found] for found in (policies, alone))
+        assert first == second and first[0] != first[1]

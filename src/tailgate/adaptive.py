@@ -126,26 +126,26 @@ def asked_of(suite: Suite) -> list[Asked]:
     out = []
     for config in configs_of(suite, "none", Path("runs")):
         name, key, where = config.name.removeprefix("none-"), train.plan_key(as_data(config)), fitting(suite, config)
-        out += [Asked(name, key, seed, where) for seed in range(config.first_seed, config.first_seed + config.seeds)]
+        out += [Asked(name, key, seed, where) for seed in train.seeds_of(config)]
     return out
 
 
 def policies_of(config: train.TrainConfig) -> list[Path]:
     """Where a training's policies lie once it is done."""
-    return [config.directory / f"policy-{seed}.json" for seed in range(config.first_seed, config.first_seed + config.seeds)]
+    return [config.directory / f"policy-{seed}.json" for seed in train.seeds_of(config)]
 
 
 def train_against(configs: list[train.TrainConfig], progress: Progress) -> list[Path]:
     """The policies of all trainings, in their order. A finished one is not trained again, and one that was interrupted goes on."""
-    out = []
+    runs = []
     for config in configs:
-        held, policies = config.directory / "config.json", policies_of(config)
+        held = config.directory / "config.json"
         again = held.is_file() and train.training_of(json.loads(held.read_text(encoding="utf-8"))) == train.training_of(as_data(config))
-        if not (again and all(path.is_file() and path.with_suffix(".safetensors").is_file() for path in policies)):
+        if not (again and all(path.is_file() and path.with_suffix(".safetensors").is_file() for path in policies_of(config))):
+            runs.append((config, again))
 
-            def learned(seed: int, now: Any, config: train.TrainConfig = config) -> None:
-                progress(f"{config.name}, seed {seed}", min(now.steps, config.steps), config.steps, train.figures(now))
+    def learned(config: train.TrainConfig, seed: int, now: Any) -> None:
+        progress(f"{config.name}, seed {seed}", min(now.steps, config.steps), config.steps, train.figures(now))
 
-            train.train(config, learned, resume=again)
-        out += policies
-    return out
+    train.train_together(runs, learned, max((config.workers for config in configs), default=1))
+    return [path for config in configs for path in policies_of(config)]

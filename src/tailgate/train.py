@@ -1,4 +1,4 @@
-"""Training: from a configuration to policies, one process for each training seed."""
+"""Training: from a configuration to policies, one for each training seed."""
 
 from __future__ import annotations
 
@@ -6,25 +6,18 @@ import contextlib
 import dataclasses
 import hashlib
 import json
-import multiprocessing
-import signal
-import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from queue import Empty
 from typing import Annotated, Any
 
 from pydantic import Field
 
 from tailgate.agents.codec import ActionSpec
 from tailgate.agents.finished import finished
-from tailgate.agents.learning import DISCRETE, LEARNERS, Learner, Progress, Teachable, check_action, learner_of, made_with
+from tailgate.agents.learning import DISCRETE, LEARNERS, Progress, Teachable, check_action, learner_of
 from tailgate.agents.reward import Reward
-from tailgate.agents.teacher import demonstrate
 from tailgate.core import Count, PositiveCount, param
 from tailgate.envs.seat import Seat
 from tailgate.errors import InputError, said, unknown
@@ -36,6 +29,7 @@ from tailgate.rivals import best_of
 from tailgate.scenario import Suite, config_path, load_scenario
 from tailgate.schema import as_data, build, canonical, fields_of, override, read_yaml
 from tailgate.threat import KNOWLEDGE
+from tailgate.trainings import Training, train_all
 
 ENVIRONMENT = (fields_of(ActionSpec) | fields_of(Reward) | {"frames": None}).keys() - {"gamma"}  # that `environment` may hold
 # fields that change no policy; those of CHOSEN do where the best rival teaches
@@ -202,27 +196,44 @@ def teacher_of(config: TrainConfig) -> str | None:
 
 def train(config: TrainConfig, progress: Callable[[int, Any], None], resume: bool = False) -> list[Path]:
     """Train one policy per seed; returns their JSON files. `progress(seed, Progress)` is called after each rollout."""
-    check(config)
+    (found,) = train_together([(config, resume)], lambda _, seed, now: progress(seed, now), config.workers)
+    return found
+
+
+def train_together(
+    runs: Sequence[tuple[TrainConfig, bool]], progress: Callable[[TrainConfig, int, Progress], None], workers: int
+) -> list[list[Path]]:
+    """The policies of several runs, a list for each; their seeds share the workers. A run comes with whether it is resumed."""
+    for config, _ in runs:
+        check(config)
+    ready = [_prepared(config, resume) for config, resume in runs]
+    new = iter(train_all([training for _, left in ready for training in left], lambda t, now: progress(t.config, t.seed, now), workers))
+    found = [done | {training.seed: next(new) for training in left} for done, left in ready]
+    return [[paths[seed] for seed in seeds_of(config)] for (config, _), paths in zip(runs, found, strict=True)]
+
+
+def seeds_of(config: TrainConfig) -> range:
+    """The training seeds of a run."""
+    return range(config.first_seed, config.first_seed + config.seeds)
+
+
+def _prepared(config: TrainConfig, resume: bool) -> tuple[dict[int, Path], list[Training]]:
+    """Of a run's seeds the policies that are there, and the trainings that are left; its directory holds its configuration then."""
     if not resume and config.directory.is_dir() and any(config.directory.iterdir()):
         set_aside(config.directory)
-    directory = writable_directory(config.directory)
-    held = directory / "config.json"
+    held = writable_directory(config.directory) / "config.json"
     if resume and held.is_file():
         same_run(config)
-    seeds = range(config.first_seed, config.first_seed + config.seeds)
     same = partial(_same_training, as_data(config))
     # before anything is written
-    done = {seed: finished(config.directory, seed, config.defence, same) if resume else None for seed in seeds}
+    found = {seed: finished(config.directory, seed, config.defence, same) if resume else None for seed in seeds_of(config)}
     if not _is_held(config, held):
         write_atomic(held, json.dumps(as_data(config), indent=1).encode() + b"\n")
-    left = [seed for seed in seeds if done[seed] is None]
-    teacher = teacher_of(config) if left else None
-    if min(config.workers, len(left)) <= 1:
-        new = [_train_seed(config, teacher, seed, resume, partial(progress, seed)) for seed in left]
-    else:
-        new = _train_apart(config, teacher, left, resume, progress)
-    found = dict(zip(left, new, strict=True))
-    return [done[seed] or found[seed] for seed in seeds]
+    done = {seed: path for seed, path in found.items() if path is not None}
+    if len(done) == len(found):
+        return done, []
+    shared = _settings(config)[1], environment_of(config), teacher_of(config)
+    return done, [Training(config, seed, resume, *shared) for seed in found if seed not in done]
 
 
 def _is_held(config: TrainConfig, held: Path) -> bool:
@@ -240,97 +251,6 @@ def _settings(config: TrainConfig) -> tuple[Any, Any]:
     settings = build(module.Config, dict(getattr(config, config.learner)), f"config.{config.learner}")
     settings.check()
     return module, settings
-
-
-def _train_seed(config: TrainConfig, teacher: str | None, seed: int, resume: bool, report: Callable[[Progress], None]) -> Path:
-    """Train the policy of one seed, shown its teacher's decisions first; returns its JSON file."""
-    module, settings = _settings(config)
-    directory = config.directory
-    board = directory / "tensorboard" if config.tensorboard else None
-    learner: Learner = module.Learner(seed, config.gamma, settings, environment_of(config), board)
-    checkpoint = directory / f"checkpoint-{seed}.safetensors"
-    record = directory / f"curve-{seed}.json"
-    spent = json.loads(record.read_text()).get("seconds", 0.0) if resume and record.is_file() else 0.0
-    started = time.process_time()  # of this process alone: others on the machine do not count
-    with _apart(config.defence):
-        if resume and checkpoint.exists():
-            learner.load(checkpoint)
-        elif teacher is not None:
-            assert isinstance(learner, Teachable)
-            learner.imitate(demonstrate(learner.seat, Spec("attack", teacher).make(), seed, config.demonstrations))
-        learner.learn(config.steps, report, checkpoint, min(config.checkpoint_every, max(config.steps // 10, 1)))
-    facts = {
-        "learner": config.learner, "teacher": teacher, "seed": seed, "steps": learner.steps, "config": as_data(config),
-        "defence_digest": Spec("defence", config.defence).digest, "defence_version": Spec("defence", config.defence).entry.version,
-        "made_with": made_with(config.learner), config.learner: as_data(settings),
-        "environment": learner.seat.card()["hash"], "curve": learner.curve,
-    }  # fmt: skip
-    policy = learner.export(directory / f"policy-{seed}", facts)
-    curve = {"curve": learner.curve, "seconds": spent + time.process_time() - started}
-    write_atomic(record, json.dumps(curve).encode() + b"\n")
-    learner.close()
-    return policy
-
-
-def _apart(defence: str) -> contextlib.AbstractContextManager[None]:
-    """Within it a defence in a sandbox cannot tell training from scoring by the keys that it draws with."""
-    if Spec("defence", defence).sandboxed is None:
-        return contextlib.nullcontext()
-    from tailgate.submission.isolated import veiled
-
-    return veiled()
-
-
-_line: Any = None  # in a process that trains: where it reports to, and the event that stops it
-
-
-class Stopped(Exception):
-    """Training was asked to stop."""
-
-
-def _hold_line(queue: Any, stop: Any) -> None:
-    global _line
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent asks us to stop
-    _line = (queue, stop)
-
-
-def _train_in_child(config: TrainConfig, teacher: str | None, seed: int, resume: bool) -> Path:
-    queue, stop = _line
-
-    def report(progress: Progress) -> None:
-        parent = multiprocessing.parent_process()
-        if stop.is_set() or parent is None or not parent.is_alive():  # killed without a word: nobody waits for this policy
-            raise Stopped(f"seed {seed}")
-        queue.put((seed, progress))
-
-    return _train_seed(config, teacher, seed, resume, report)
-
-
-def _train_apart(
-    config: TrainConfig, teacher: str | None, seeds: Sequence[int], resume: bool, progress: Callable[[int, Progress], None]
-) -> list[Path]:
-    """As many processes as there are workers, one training seed each. An interrupt stops them at their next report."""
-    context = multiprocessing.get_context("spawn")  # a fork would copy the threads of compiled kernels
-    queue, stop = context.Queue(), context.Event()
-    with ProcessPoolExecutor(min(config.workers, len(seeds)), context, _hold_line, (queue, stop)) as pool:
-        futures = [pool.submit(_train_in_child, config, teacher, seed, resume) for seed in seeds]
-        try:
-            while not all(future.done() for future in futures):
-                with contextlib.suppress(Empty):
-                    progress(*queue.get(timeout=0.2))
-                for future in futures:
-                    if future.done():
-                        future.result()  # raises what went wrong
-            while not queue.empty():
-                progress(*queue.get())
-            return [future.result() for future in futures]
-        except BrokenProcessPool:
-            expected = f"memory for {config.workers} of them (or workers=1); then: tailgate train --resume name={config.name}"
-            raise InputError("training", "a process that was killed", expected) from None
-        finally:
-            stop.set()
-            for future in futures:
-                future.cancel()
 
 
 def free_of(teacher: str | None) -> set[str]:
