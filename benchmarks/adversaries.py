@@ -139,7 +139,7 @@ def flags(config: train.TrainConfig, report: dict[str, Any], rows: list[dict[str
     spent = np.mean([row["attack_steps"] for row in rows if not row["crashed"]] or [np.nan])
     if budget is not None and spent < 0.9 * budget:
         out.append(f"unspent budget: {spent:.1f} of {budget} steps in episodes without a collision")
-    for seed in range(config.first_seed, config.first_seed + config.seeds):
+    for seed in train.seeds_of(config):
         curve = [p["reward"] for p in json.loads((config.directory / f"curve-{seed}.json").read_text())["curve"]]
         tenth = max(len(curve) // 10, 1)
         rise, late = np.mean(curve[-tenth:]) - np.mean(curve[:tenth]), np.mean(curve[-tenth:]) - np.mean(curve[-2 * tenth : -tenth])

@@ -232,7 +232,7 @@ def _prepared(config: TrainConfig, resume: bool) -> tuple[dict[int, Path], list[
     done = {seed: path for seed, path in found.items() if path is not None}
     if len(done) == len(found):
         return done, []
-    shared = _settings(config)[1], environment_of(config), teacher_of(config)
+    shared = _settings(config), environment_of(config), teacher_of(config)
     return done, [Training(config, seed, resume, *shared) for seed in found if seed not in done]
 
 
@@ -245,12 +245,12 @@ def _is_held(config: TrainConfig, held: Path) -> bool:
     return isinstance(before, dict) and before | {"workers": config.workers} == as_data(config)
 
 
-def _settings(config: TrainConfig) -> tuple[Any, Any]:
-    """The learner's module, and its checked hyper-parameters."""
+def _settings(config: TrainConfig) -> Any:
+    """The learner's hyper-parameters, checked."""
     module = learner_of(config.learner)
     settings = build(module.Config, dict(getattr(config, config.learner)), f"config.{config.learner}")
     settings.check()
-    return module, settings
+    return settings
 
 
 def free_of(teacher: str | None) -> set[str]:
