@@ -34,6 +34,14 @@ def board(folder: Path) -> None:
 JOBS: dict[str, Callable[[Path], None]] = {"rows": rows, "board": board}
 
 
+def lives(pid: str) -> bool:
+    """Whether a process runs: one that ended and whom nobody asked for its exit code does not."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
 def _die(job: Callable[[Path], None], folder: Path, at: int) -> None:
     signal.alarm(60)
     seen: list[str] = []

@@ -256,17 +256,10 @@ def test_a_run_that_is_killed_at_a_random_time_goes_on(tmp_path: Path) -> None:
     for path in parts.glob("*.jsonl"):
         assert len(read_rows(path)) == 3, f"killed {wait} s after the first cell"
     until = time.monotonic() + 10.0
-    while time.monotonic() < until and any(_runs(worker) for worker in workers):
+    while time.monotonic() < until and any(dying.lives(worker) for worker in workers):
         time.sleep(0.05)
-    assert not any(_runs(worker) for worker in workers)
+    assert not any(dying.lives(worker) for worker in workers)
     suite = Suite("custom", "", ("thesis-ch4-v0",), (None,), defences, attacks, 3)
     rows = run(cells_of(suite), out)
     assert rows == run(cells_of(suite)) and out.read_bytes() == encode(rows)
     assert os.listdir(tmp_path) == ["rows.jsonl"]
-
-
-def _runs(pid: str) -> bool:
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except OSError:
-        return False

@@ -13,11 +13,12 @@ import pytest
 import yaml
 
 from tailgate import cli, files
+from tailgate.assets import embedded
 from tailgate.core import Kind
 from tailgate.errors import InputError
 from tailgate.evaluation import Cell, evaluate, run_cell
 from tailgate.replay.episode import episode_of
-from tailgate.replay.page import context_of, embedded, render, write_page
+from tailgate.replay.page import context_of, render, write_page
 from tailgate.replay.replay import Filter, choose, play
 from tailgate.rows import encode, read_rows
 

@@ -2,6 +2,7 @@
 
 import copy
 import importlib.util
+import json
 import re
 from pathlib import Path
 
@@ -98,8 +99,13 @@ def test_numbers_in_words():
 def test_the_head_in_words_is_the_board_in_figures():
     """A line for each defence, in the order of the page, cut where it is asked; a bar in a name does not end a cell."""
     board = make_board()
-    assert [line[0] for line in head.lines(board)[1:]] == [entry.defence for entry in ordered(read_board(board).entries)]
-    board["entries"][0]["defence"] = "a|b"
+    names = [line[0] for line in head.lines(board)[1:]]
+    assert names == [entry.defence for entry in ordered(read_board(board).entries)]
+    places = [names.index(name) for name in ("kf", "chi2_kf:eta=15", "cusum_kf", "reacquire_kf", "brake_kf", "imm", "none", "oracle")]
+    assert places == sorted(places)  # ranked by class and rank, not attacked, for comparison
+    with pytest.raises(InputError, match=r"board\.entries\[0\]\.status"):
+        head.lines(board | {"entries": [board["entries"][0] | {"status": "first"}]})
+    board = json.loads(json.dumps(board).replace('"kf"', '"a|b"'))
     heading, *body = head.lines(board)
     assert len(body) == len(board["entries"]) and all(len(line) == len(heading) for line in body)
     ranked = [line[2] != "-" for line in body]

@@ -126,13 +126,13 @@ def asked_of(suite: Suite) -> list[Asked]:
     out = []
     for config in configs_of(suite, "none", Path("runs")):
         name, key, where = config.name.removeprefix("none-"), train.plan_key(as_data(config)), fitting(suite, config)
-        out += [Asked(name, key, seed, where) for seed in train.seeds_of(config)]
+        out += [Asked(name, key, seed, where) for seed in train.training_seeds(config)]
     return out
 
 
 def policies_of(config: train.TrainConfig) -> list[Path]:
     """Where a training's policies lie once it is done."""
-    return [config.directory / f"policy-{seed}.json" for seed in train.seeds_of(config)]
+    return [config.directory / f"policy-{seed}.json" for seed in train.training_seeds(config)]
 
 
 def train_against(configs: list[train.TrainConfig], progress: Progress) -> list[Path]:

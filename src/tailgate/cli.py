@@ -12,7 +12,7 @@ from importlib import import_module
 from typing import Any, NoReturn
 
 import tailgate
-from tailgate.errors import InputError
+from tailgate.errors import InputError, Killed
 
 EXIT_INPUT = 2
 COMMANDS = (
@@ -29,6 +29,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return int(chosen.run(chosen))
     except InputError as error:
         print(f"tailgate: error: {error}", file=sys.stderr)
+        if isinstance(error, Killed):
+            print(f"tailgate: {_kept(chosen)}", file=sys.stderr)
         return EXIT_INPUT
     except ImportError as error:
         if "tailgate[" not in str(error):
@@ -36,11 +38,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"tailgate: error: {error}", file=sys.stderr)
         return EXIT_INPUT
     except KeyboardInterrupt:
-        print(f"tailgate: interrupted; {getattr(chosen, 'kept', 'nothing of it is kept')}", file=sys.stderr)
+        print(f"tailgate: interrupted; {_kept(chosen)}", file=sys.stderr)
         return 130
     except BrokenPipeError:  # the reader of our output has gone
         sys.stderr.close()
         return 0
+
+
+def _kept(chosen: argparse.Namespace) -> str:
+    """What is left of a command that ended before its time."""
+    return getattr(chosen, "kept", "nothing of it is kept")
 
 
 class _Parser(argparse.ArgumentParser):

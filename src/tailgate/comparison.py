@@ -23,7 +23,7 @@ from tailgate.rivals import outcomes as outcomes_of
 from tailgate.scenario import load_scenario
 from tailgate.schema import as_data, canonical
 from tailgate.stats import Interval, paired_difference, paired_ratio, proportion
-from tailgate.train import TrainConfig, outcome_of, rivals_of, seeds_of, suite_of
+from tailgate.train import TrainConfig, outcome_of, rivals_of, suite_of, training_seeds
 
 ROWS = "rows.jsonl"
 SHARE = "0/1"  # unit of a metric that is yes or no
@@ -90,7 +90,7 @@ def compare(
     built, uses = Spec("defence", guard).make(), Spec("defence", guard).entry.uses
     keys = draws.keys("report", range(config.first_episode, config.first_episode + config.episodes))
     verdicts = []
-    for path, seed in zip(policies, seeds_of(config), strict=True):
+    for path, seed in zip(policies, training_seeds(config), strict=True):
         policy = PolicyAttack(path)
         place = load_scenario(config.scenario).with_threat(**(threat | {"knowledge": policy.knowledge}))
         own, yoked = timing_advantage(place.loop(built, uses), policy, keys, outcome)
@@ -203,7 +203,7 @@ def make_page(config: TrainConfig, report: dict[str, Any]) -> Path:
     from tailgate.rows import read_rows
 
     curve = [
-        point for seed in seeds_of(config)
+        point for seed in training_seeds(config)
         for point in json.loads((config.directory / f"curve-{seed}.json").read_text())["curve"]
     ]  # fmt: skip
     rows = read_rows(config.directory / ROWS)

@@ -20,6 +20,10 @@ class InputError(ValueError):
         return type(self), (self.field, self.value, self.expected)
 
 
+class Killed(InputError):
+    """A process was killed from outside: what it had kept is there, and the same work can go on from it."""
+
+
 class NotApplicable(InputError):
     """A pairing of components that has no meaning: its rows are skipped, with the reason."""
 

@@ -6,7 +6,9 @@ import multiprocessing
 import os
 import sys
 import threading
+from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
+from typing import Any
 
 
 def abandon(pool: ProcessPoolExecutor) -> None:
@@ -17,16 +19,18 @@ def abandon(pool: ProcessPoolExecutor) -> None:
         process.terminate()
 
 
-def processes(workers: int) -> ProcessPoolExecutor:
-    """A pool of so many workers, which import from where this process does."""
+def processes(workers: int, then: Callable[..., None] | None = None, *given: Any) -> ProcessPoolExecutor:
+    """A pool of so many workers, which import from where this process does; each begins with then(*given), where there is something."""
     context = multiprocessing.get_context("spawn")  # a fork after compiled parallel code can hang
-    return ProcessPoolExecutor(workers, mp_context=context, initializer=_begin, initargs=(list(sys.path),))
+    return ProcessPoolExecutor(workers, mp_context=context, initializer=_begin, initargs=(list(sys.path), then, given))
 
 
-def _begin(path: list[str]) -> None:
+def _begin(path: list[str], then: Callable[..., None] | None, given: tuple[Any, ...]) -> None:
     """What a worker does first."""
     sys.path[:] = path  # a submission's module is found where the parent found it
     threading.Thread(target=_end_with_parent, daemon=True).start()
+    if then is not None:
+        then(*given)
 
 
 def _end_with_parent() -> None:

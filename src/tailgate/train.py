@@ -85,7 +85,7 @@ def load_config(source: str | None, overrides: list[str], resume: bool = False) 
     With `resume` the configuration that the run of this name was started with takes the preset's place.
     """
     config = checked(override(_preset(source or "quickstart"), overrides, TrainConfig))
-    held = config.directory / "config.json"
+    held = _told(config)
     if not resume:
         return config
     if not config.directory.is_dir():
@@ -187,11 +187,15 @@ def rivals_of(config: TrainConfig) -> Suite:
     return Suite(config.name, "", (config.scenario,), (None,), (config.defence,), config.rivals, config.select_episodes)
 
 
-def teacher_of(config: TrainConfig) -> str | None:
-    """The script that the learner is shown; `best` is chosen on tune seeds."""
+def _teacher(config: TrainConfig, chosen: dict[str, str | None]) -> str | None:
+    """The script that the learner is shown; `best` is chosen on tune seeds, once for all learners that are asked the same (chosen)."""
     if config.teacher != "best":
         return config.teacher
-    return best_of(rivals_of(config), dict(config.threat), outcome_of(config), "tune", config.workers)
+    rivals = dataclasses.replace(rivals_of(config), name="rivals")
+    asked = canonical([as_data(rivals), config.threat, outcome_of(config)])
+    if asked not in chosen:
+        chosen[asked] = best_of(rivals, dict(config.threat), outcome_of(config), "tune", config.workers)
+    return chosen[asked]
 
 
 def train(config: TrainConfig, progress: Callable[[int, Any], None], resume: bool = False) -> list[Path]:
@@ -203,37 +207,62 @@ def train(config: TrainConfig, progress: Callable[[int, Any], None], resume: boo
 def train_together(
     runs: Sequence[tuple[TrainConfig, bool]], progress: Callable[[TrainConfig, int, Progress], None], workers: int
 ) -> list[list[Path]]:
-    """The policies of several runs, a list for each; their seeds share the workers. A run comes with whether it is resumed."""
+    """The policies of several runs, a list for each; their seeds share the workers. A run comes with whether it is resumed.
+
+    Nothing is written before all runs are known to make sense, nor of a run before its turn comes.
+    """
     for config, _ in runs:
         check(config)
-    ready = [_prepared(config, resume) for config, resume in runs]
-    new = iter(train_all([training for _, left in ready for training in left], lambda t, now: progress(t.config, t.seed, now), workers))
+    chosen: dict[str, str | None] = {}
+    ready = [_prepared(config, resume, chosen) for config, resume in runs]
+    begun: set[str] = set()
+
+    def begin(training: Training) -> None:
+        if str(training.config.directory) not in begun:
+            begun.add(str(training.config.directory))
+            _begin(training.config, training.resume)
+
+    for (config, resume), (_, left) in zip(runs, ready, strict=True):
+        if not left:  # all is there, and the comparison may be another one
+            _begin(config, resume)
+    trainings = [training for _, left in ready for training in left]
+    new = iter(train_all(trainings, begin, lambda training, now: progress(training.config, training.seed, now), workers))
     found = [done | {training.seed: next(new) for training in left} for done, left in ready]
-    return [[paths[seed] for seed in seeds_of(config)] for (config, _), paths in zip(runs, found, strict=True)]
+    return [[paths[seed] for seed in training_seeds(config)] for (config, _), paths in zip(runs, found, strict=True)]
 
 
-def seeds_of(config: TrainConfig) -> range:
+def training_seeds(config: TrainConfig) -> range:
     """The training seeds of a run."""
     return range(config.first_seed, config.first_seed + config.seeds)
 
 
-def _prepared(config: TrainConfig, resume: bool) -> tuple[dict[int, Path], list[Training]]:
-    """Of a run's seeds the policies that are there, and the trainings that are left; its directory holds its configuration then."""
+def _prepared(config: TrainConfig, resume: bool, chosen: dict[str, str | None]) -> tuple[dict[int, Path], list[Training]]:
+    """Of a run's seeds the policies that are there, and the trainings that are left. Writes nothing."""
+    done: dict[int, Path] = {}
+    if resume and _told(config).is_file():
+        same_run(config)
+    if resume:
+        same = partial(_same_training, as_data(config))
+        found = {seed: finished(config.directory, seed, config.defence, same) for seed in training_seeds(config)}
+        done = {seed: path for seed, path in found.items() if path is not None}
+    left = [seed for seed in training_seeds(config) if seed not in done]
+    if not left:
+        return done, []
+    shared = _settings(config), environment_of(config), _teacher(config, chosen)
+    return done, [Training(config, seed, resume, *shared) for seed in left]
+
+
+def _begin(config: TrainConfig, resume: bool) -> None:
+    """A run's directory holds its configuration; what another run left there is set aside."""
     if not resume and config.directory.is_dir() and any(config.directory.iterdir()):
         set_aside(config.directory)
-    held = writable_directory(config.directory) / "config.json"
-    if resume and held.is_file():
-        same_run(config)
-    same = partial(_same_training, as_data(config))
-    # before anything is written
-    found = {seed: finished(config.directory, seed, config.defence, same) if resume else None for seed in seeds_of(config)}
-    if not _is_held(config, held):
-        write_atomic(held, json.dumps(as_data(config), indent=1).encode() + b"\n")
-    done = {seed: path for seed, path in found.items() if path is not None}
-    if len(done) == len(found):
-        return done, []
-    shared = _settings(config), environment_of(config), teacher_of(config)
-    return done, [Training(config, seed, resume, *shared) for seed in found if seed not in done]
+    writable_directory(config.directory)
+    if not _is_held(config, _told(config)):
+        write_atomic(_told(config), json.dumps(as_data(config), indent=1).encode() + b"\n")
+
+
+def _told(config: TrainConfig) -> Path:
+    return config.directory / "config.json"
 
 
 def _is_held(config: TrainConfig, held: Path) -> bool:
@@ -278,7 +307,7 @@ def plan_key(config: dict[str, Any]) -> str:
 
 def same_run(config: TrainConfig) -> None:
     """Raise InputError when a run would be resumed with another training; more steps, and another comparison, may be asked for."""
-    held = config.directory / "config.json"
+    held = _told(config)
     now, blank, free = as_data(config), as_data(TrainConfig()), free_of(config.teacher) | {"steps"}
     try:
         before = json.loads(held.read_text(encoding="utf-8"))

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import json
 import multiprocessing
 import signal
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
 from functools import partial
 from pathlib import Path
@@ -17,8 +18,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from tailgate.agents.learning import Learner, Progress, Teachable, learner_of, made_with
 from tailgate.agents.teacher import demonstrate
-from tailgate.errors import InputError
+from tailgate.errors import InputError, Killed
 from tailgate.files import write_atomic
+from tailgate.pool import processes
 from tailgate.registry import Spec
 from tailgate.schema import as_data
 
@@ -36,12 +38,36 @@ class Training(NamedTuple):
     environment: dict[str, Any]  # arguments of the environment
     teacher: str | None  # whose decisions the learner is shown first
 
+    def failed(self, error: BaseException) -> BaseException:
+        """The error, which says now in which training it came up."""
+        if isinstance(error, InputError):
+            return type(error)(f"{self}: {error.field}", error.value, error.expected)
+        error.add_note(f"in the training {self}")
+        return error
 
-def train_all(trainings: Sequence[Training], progress: Callable[[Training, Progress], None], workers: int) -> list[Path]:
-    """JSON files of the policies, in the order of the trainings, as many of which run at a time as there are workers."""
-    if min(workers, len(trainings)) <= 1:
-        return [_train(training, partial(progress, training)) for training in trainings]
-    return _train_apart(trainings, progress, min(workers, len(trainings)))
+    def __str__(self) -> str:
+        return f"{self.config.name}, seed {self.seed}"
+
+
+Report = Callable[[Training, Progress], None]
+
+
+def train_all(trainings: Sequence[Training], begin: Callable[[Training], None], progress: Report, workers: int) -> list[Path]:
+    """JSON files of the policies, in the order of the trainings, as many of which run at a time as there are workers.
+
+    begin: called with each, before anything of it is done. Where one fails, those that have begun end, no other begins, and the error
+    names it.
+    """
+    if min(workers, len(trainings)) > 1:
+        return _train_apart(trainings, begin, progress, min(workers, len(trainings)))
+    paths = []
+    for training in trainings:
+        begin(training)
+        try:
+            paths.append(_train(training, partial(progress, training)))
+        except Exception as error:
+            raise training.failed(error) from error.__cause__
+    return paths
 
 
 def _train(training: Training, report: Callable[[Progress], None]) -> Path:
@@ -92,6 +118,7 @@ class Stopped(Exception):
 def _hold_line(queue: Any, stop: Any) -> None:
     global _line
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent asks us to stop
+    queue.cancel_join_thread()  # nor do we wait at our end for somebody to read what we said
     _line = (queue, stop)
 
 
@@ -99,38 +126,57 @@ def _train_in_child(training: Training, place: int) -> Path:
     queue, stop = _line
 
     def report(progress: Progress) -> None:
-        parent = multiprocessing.parent_process()
-        if stop.is_set() or parent is None or not parent.is_alive():  # killed without a word: nobody waits for this policy
-            raise Stopped(f"{training.config.name}, seed {training.seed}")
+        if stop.is_set():
+            raise Stopped(str(training))
         queue.put((place, progress))
 
-    return _train(training, report)
+    try:
+        return _train(training, report)
+    finally:
+        gc.collect()  # learners refer to themselves: their buffers, and a sandbox's processes, would lie about during the next training
 
 
-def _train_apart(trainings: Sequence[Training], progress: Callable[[Training, Progress], None], workers: int) -> list[Path]:
+def _train_apart(trainings: Sequence[Training], begin: Callable[[Training], None], progress: Report, workers: int) -> list[Path]:
     """In processes of their own. An interrupt stops them at their next report."""
-    context = multiprocessing.get_context("spawn")  # a fork would copy the threads of compiled kernels
+    context = multiprocessing.get_context("spawn")
     queue, stop = context.Queue(), context.Event()
+    waiting = list(enumerate(trainings))
+    running: dict[Future[Path], int] = {}
+    paths: dict[int, Path] = {}
+    failed: BaseException | None = None
 
-    def told(place: int, now: Progress) -> None:
-        progress(trainings[place], now)
+    def listen(timeout: float) -> None:
+        with contextlib.suppress(Empty):
+            place, now = queue.get(timeout=timeout)
+            progress(trainings[place], now)
 
-    with ProcessPoolExecutor(workers, context, _hold_line, (queue, stop)) as pool:
-        futures = [pool.submit(_train_in_child, training, place) for place, training in enumerate(trainings)]
+    with processes(workers, _hold_line, queue, stop) as pool:
         try:
-            while not all(future.done() for future in futures):
-                with contextlib.suppress(Empty):
-                    told(*queue.get(timeout=0.2))
-                for future in futures:
-                    if future.done():
-                        future.result()  # raises what went wrong
+            while running or (waiting and failed is None):
+                while waiting and failed is None and len(running) < workers:  # one that lay ready in the pool could not be taken back
+                    place, training = waiting.pop(0)
+                    begin(training)
+                    running[pool.submit(_train_in_child, training, place)] = place
+                listen(0.2)
+                for future in [future for future in running if future.done()]:
+                    place = running.pop(future)
+                    if (error := future.exception()) is None:
+                        paths[place] = future.result()
+                    else:
+                        failed = failed or _said_of(trainings[place], error, workers)
             while not queue.empty():
-                told(*queue.get())
-            return [future.result() for future in futures]
-        except BrokenProcessPool:
-            expected = f"memory for {workers} of them, or workers=1; a run that is resumed goes on where it was"
-            raise InputError("training", "a process that was killed", expected) from None
+                listen(0.2)
+        except BrokenProcessPool as error:  # of a submission
+            raise _said_of(trainings[place], error, workers) from None
         finally:
             stop.set()
-            for future in futures:
-                future.cancel()
+    if failed is not None:
+        raise failed
+    return [paths[place] for place in range(len(trainings))]
+
+
+def _said_of(training: Training, error: BaseException, workers: int) -> BaseException:
+    if isinstance(error, BrokenProcessPool):  # which of them is not told, and none goes on
+        expected = f"memory for {workers} of them, or fewer workers; what was learned up to a checkpoint is kept"
+        return Killed("training", "a process that was killed", expected)
+    return training.failed(error)

@@ -50,7 +50,7 @@ def add(actions: Any) -> None:
     page.set_defaults(run=_page)
     head = actions.add_parser("head", help="print the head of a board as a Markdown table")
     head.add_argument("board", metavar="FILE", help="board.json")
-    head.add_argument("--most", type=int, metavar="N", help="so many defences at most (default: all)")
+    head.add_argument("--most", type=int, metavar="N", help="so many defences at most, the first in the order of the page (default: all)")
     head.set_defaults(run=_head)
 
 
@@ -123,11 +123,10 @@ def _print_board(board: dict[str, Any]) -> None:
 
 
 def _head(options: argparse.Namespace) -> int:
-    from tailgate.leaderboard.board_format import load, read_board
+    from tailgate.leaderboard.board_format import load
     from tailgate.leaderboard.head import markdown
 
     board = load(Path(options.board))
-    read_board(board)
     if options.most is not None and options.most < 1:
         raise InputError("most", options.most, "a whole number not below 1")
     print(markdown(board, options.most), end="")

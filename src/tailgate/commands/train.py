@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from tailgate.errors import Killed
 from tailgate.progress import cells, console, progress
 
 
@@ -77,10 +78,10 @@ def _train(options: argparse.Namespace) -> int:
 
 @contextlib.contextmanager
 def _resumable(config: Any) -> Iterator[None]:
-    """Says how to go on after an interrupt."""
+    """Says how to go on after an interrupt, or when a process was killed."""
     try:
         yield
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, Killed):
         place = f" out={config.out}" if config.out != type(config)().out else ""
         print(f"tailgate: go on with: tailgate train --resume name={config.name}{place}", file=sys.stderr)
         raise

@@ -11,6 +11,7 @@ from typing import Any
 
 from jinja2 import Environment, StrictUndefined
 
+from tailgate.assets import asset, inline
 from tailgate.errors import InputError
 from tailgate.files import writable_directory, write_atomic
 from tailgate.metrics import METRICS
@@ -18,8 +19,7 @@ from tailgate.registry import Entry, entries
 from tailgate.scoring.entry import reference
 from tailgate.summary import summarise
 
-from .assets import asset, inline
-from .words import TITLE, Name, breakable, names_of, percent, shade, spans, steps, ticks
+from .words import HERE, TITLE, Name, breakable, names_of, percent, shade, spans, steps, ticks
 
 Data = dict[str, Any]
 COLUMNS = (  # of the table of every cell, after the crash share: key of the summary, heading
@@ -205,8 +205,8 @@ def build(
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     environment.filters["breakable"] = breakable
     columns = [(key, text, METRICS[key].__doc__ or "") for key, text in COLUMNS]
-    page = environment.from_string(asset("page.html")).render(
-        title=heading, css=inline("page.css"), js=inline("page.js"), columns=columns, facts=facts, headline=_headline(headline),
+    page = environment.from_string(asset(HERE, "page.html")).render(
+        title=heading, css=inline(HERE, "page.css"), js=inline(HERE, "page.js"), columns=columns, facts=facts, headline=_headline(headline),
         curve=_curve(curve), sections=[_section(key, *group, words) for key, group in groups.items()],
         families=[("Defences", _cards(words, "defence")), ("Attacks", _cards(words, "attack"))],
     )  # fmt: skip

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from .board_parts import EntryPart
-from .order import place_of
+from .board_format import read_board
+from .order import ordered
 from .words import at_least
 
 Board = dict[str, Any]
@@ -20,14 +20,19 @@ def title(board: Board) -> str:
 
 
 def lines(board: Board) -> list[tuple[str, ...]]:
-    """Headings, then the defences in the order of the page: rank, critical dose, least share of undamaged episodes at the shown doses."""
+    """Headings, then the defences in the order of the page: rank, critical dose, least share of undamaged episodes at the shown doses.
+
+    Raises InputError for what is no board.
+    """
+    parts = read_board(board).entries
     suite = board["suite"]
     doses = list(suite["shown"]) or [str(dose) for dose in suite["doses"]]
     trusted = any(entry.get("trust") for entry in board["entries"])
     out: list[tuple[str, ...]] = [
         ("defence", "class", "rank", "critical dose", *(f"undamaged at {dose}" for dose in doses), *["trust (safety)"] * trusted, "why not")
     ]  # fmt: skip
-    for entry in sorted(board["entries"], key=lambda e: place_of(EntryPart.model_validate(e))):
+    by_name = {entry["defence"]: entry for entry in board["entries"]}
+    for entry in [by_name[part.defence] for part in ordered(parts)]:
         rank, critical = entry["rank"], entry["critical_dose"]["black"]
         rates = {str(rate["dose"]): rate["undamaged"] for rate in entry["rates"] if rate["knowledge"] == "black"}
         shown = [_share(rates[d]) if d in rates else "-" for d in doses]

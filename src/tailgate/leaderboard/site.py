@@ -15,18 +15,17 @@ from typing import Any
 
 from jinja2 import DictLoader, Environment, StrictUndefined
 
+from tailgate.assets import asset, embedded, inline
 from tailgate.errors import InputError
 from tailgate.files import writable_directory, write_atomic
-from tailgate.replay.page import embedded
 
-from .assets import asset, inline
 from .board_format import read_board
 from .measured import Measured
 from .order import GROUPS, ordered
 from .site_entry import Replayed, entry_page, replay_of
 from .site_index import section
 from .site_suite import Data, Suite
-from .words import TITLE, breakable
+from .words import HERE, TITLE, breakable
 
 SUMMARY = "tailgate-site-1"
 MOST = 60  # characters of a file's name that come from a defence's
@@ -65,7 +64,8 @@ def _encoded(data: Data, where: str) -> bytes:
 def _environment() -> Environment:
     names = ("site_macros.html", "site_index.html", "site_entry.html")
     environment = Environment(
-        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True, loader=DictLoader({n: asset(n) for n in names})
+        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True,
+        loader=DictLoader({name: asset(HERE, name) for name in names}),
     )
     environment.filters |= {"breakable": breakable, "embedded": embedded}
     return environment
@@ -87,7 +87,7 @@ def build_site(
     held = [_encoded(data, "board") for data in boards]
     heading = title or TITLE
     environment = _environment()
-    common = {"css": [inline("page.css"), inline("site.css")], "js": inline("site.js"), "title": heading}
+    common = {"css": [inline(HERE, "page.css"), inline(HERE, "site.css")], "js": inline(HERE, "site.js"), "title": heading}
     folder = writable_directory(Path(out))
     written: dict[str, bytes] = {}
     for suite, content in zip(suites, held, strict=True):

@@ -12,6 +12,7 @@ from markupsafe import Markup, escape
 
 from tailgate.registry import split_text
 
+HERE = "tailgate.leaderboard"  # where the files of its pages lie
 TITLE = "Tailgate leaderboard"
 
 

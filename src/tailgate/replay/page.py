@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import base64
 import dataclasses
-import hashlib
 import inspect
-import json
 import re
 from collections.abc import Callable
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jinja2 import Environment, StrictUndefined
-from markupsafe import Markup
 
+from tailgate.assets import asset, embedded, inline
 from tailgate.files import writable_directory, write_atomic
 from tailgate.leaderboard.words import names_of
 from tailgate.metrics import METRICS, unit_in
@@ -143,29 +139,13 @@ def _measured(value: float | None) -> str:
     return "\N{EN DASH}" if value is None else f"{value:.6g}".replace("-", "\N{MINUS SIGN}")
 
 
-def _asset(*names: str) -> str:
-    return "".join(files("tailgate.replay").joinpath(name).read_text(encoding="utf-8") for name in names)
-
-
-def _inline(text: str) -> Data:
-    """A style sheet or script as it stands in the page, and its hash: the page's policy lets nothing else run."""
-    return {"text": Markup(text), "hash": base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}
-
-
-def embedded(data: Any) -> Markup:
-    """JSON for a script element: nothing in it can end the element or open another."""
-    text = json.dumps(data, allow_nan=False, separators=(",", ":"))
-    for char in "<>&\u2028\u2029":
-        text = text.replace(char, f"\\u{ord(char):04x}")
-    return Markup(text)
-
-
 def render(replay: Replay, source: str = "", agent: int | None = None) -> str:
     """The page as text. agent: the one to look at first, of many."""
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    css, js = _inline(_asset("page.css")), _inline(_asset("pen.js", "road.js", "string.js", "graph.js", "plots.js", "page.js"))
+    here = "tailgate.replay"
+    css, js = inline(here, "page.css"), inline(here, "pen.js", "road.js", "string.js", "graph.js", "plots.js", "page.js")
     data = embedded(episode_of(replay, agent))
-    return environment.from_string(_asset("page.html")).render(css=css, js=js, data=data, **context_of(replay, source))
+    return environment.from_string(asset(here, "page.html")).render(css=css, js=js, data=data, **context_of(replay, source))
 
 
 def write_page(replay: Replay, out: Path, source: str = "", agent: int | None = None) -> Path:
