@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from tailgate import evaluation
+from tailgate import evaluation, sources
 from tailgate.commands import board as command
 from tailgate.leaderboard import run_record
 from tailgate.leaderboard.board_format import load
@@ -88,6 +88,9 @@ def test_interrupted_runs_add_up(suite: Path, tmp_path: Path, monkeypatch: pytes
     for key in ("seconds", "processor_seconds"):
         assert held[key] == pytest.approx(sum(one[key] for one in held["commands"]), abs=0.02)
     assert held["commands"][:2] == seen[1]["commands"]
+    monkeypatch.setattr(sources, "own", lambda: "newer")
+    held = _held(_run(suite, tmp_path / "out"))
+    assert held["rows"] == {"played": 36, "kept": 0, "again": 18}
     suite.write_text(SUITE.replace("fdi:value=5", "fdi:value=6"))
     held = _held(_run(suite, tmp_path / "out"))  # of another suite: a record of its own, in which what was played before is kept
     assert len(held["commands"]) == 1 and held["rows"]["played"] == 6
@@ -120,6 +123,8 @@ def test_a_page_says_what_playing_its_board_took(tmp_path: Path) -> None:
     once, twice = (RunTime.model_validate(_record("mine", "0" * 16, count)) for count in (1, 2))
     assert once.said(30) == "all 30 rows by one command in 104 s, 3 min of processor time (2 workers, A)"
     assert twice.said(90) == "60 of 90 rows by 2 commands in 3.5 min, 6 min of processor time (2 workers, A)"
+    more = RunTime.model_validate(_record("mine", "0" * 16) | {"rows": {"played": 30, "kept": 0, "again": 12}})
+    assert more.said(90) == "18 of 90 rows (12 played twice) by one command in 104 s, 3 min of processor time (2 workers, A)"
     assert [lasting(seconds) for seconds in (0.0, 1.5, 119.0, 120.0, 7199.0, 7200.0, 12_803.0, 720_000.0)] == [
         "0 s", "1.5 s", "119 s", "2 min", "120 min", "2 h", "3.6 h", "200 h",
     ]  # fmt: skip

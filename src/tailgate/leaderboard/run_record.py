@@ -4,7 +4,8 @@
 
 Each command that played rows has its seconds (of the clock), processor_seconds (with those of its workers), played, workers, processor,
 cores, version and commit. Resumed, a run adds up; where no rows are left it begins anew. `kept`: rows of the board that none of them
-played; null while they are being played.
+played; null while they are being played. Where more was played than the board has rows (`again`), newer sources played some of them once
+more.
 """
 
 from __future__ import annotations
@@ -79,6 +80,8 @@ class Record:
             "format": RunTime.model_fields["format"].default, "suite": self.suite.name, "hash": self.suite.hash, **sums,
             "rows": {"played": played, "kept": None if rows is None else max(0, rows - played)}, "commands": commands,
         }  # fmt: skip
+        if rows is not None and played > rows:
+            held["rows"]["again"] = played - rows
         write_atomic(self.path, json.dumps(held, indent=1, allow_nan=False).encode() + b"\n")
         self.written = time.perf_counter()
         return held

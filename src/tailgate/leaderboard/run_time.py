@@ -30,11 +30,15 @@ class Command(BaseModel):
 
 
 class Rows(BaseModel):
-    """Rows that the commands played, and rows of the board that none of them did; null while they are being played."""
+    """Rows that the commands played, and rows of the board that none of them did; null while they are being played.
+
+    again: how many of those that were played stand for nothing, as they were played once more, by newer sources for instance.
+    """
 
     model_config = ConfigDict(strict=True)
     played: Count
     kept: Count | None
+    again: Count = 0
 
 
 class RunTime(BaseModel):
@@ -54,8 +58,9 @@ class RunTime(BaseModel):
         count, machines = len(self.commands), dict.fromkeys((c.workers, c.processor) for c in self.commands)
         how = "one command" if count == 1 else f"{count} commands"
         where = ", ".join(f"{workers} worker{'s' * (workers > 1)}, {name}" for workers, name in machines)
-        share = f"all {rows}" if self.rows.played >= rows else f"{self.rows.played} of {rows}"
-        return f"{share} rows by {how} in {lasting(self.seconds)}, {lasting(self.processor_seconds)} of processor time ({where})"
+        stand, again = self.rows.played - self.rows.again, f" ({self.rows.again} played twice)" * bool(self.rows.again)
+        share = f"all {rows}" if stand >= rows else f"{stand} of {rows}"
+        return f"{share} rows{again} by {how} in {lasting(self.seconds)}, {lasting(self.processor_seconds)} of processor time ({where})"
 
 
 def lasting(seconds: float) -> str:
