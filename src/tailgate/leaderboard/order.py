@@ -6,6 +6,8 @@ import math
 from collections.abc import Iterable
 from typing import Any
 
+from tailgate.scoring.entry import CLAIMED
+
 from .board_parts import LEVELS, Critical, EntryPart
 
 GROUPS = (  # status, title, what it means
@@ -32,4 +34,4 @@ def place_of(entry: EntryPart) -> tuple[Any, ...]:
     status = [name for name, *_ in GROUPS].index(entry.status)
     rank = (entry.rank.best, entry.rank.worst) if entry.rank else (math.inf, math.inf)
     doses = [-sort_dose(entry.critical_dose.get(level)) for level in LEVELS]
-    return (status, not entry.why.startswith("claimed"), entry.class_.count("+"), entry.class_, rank, doses)
+    return (status, not entry.why.startswith(CLAIMED), entry.class_.count("+"), entry.class_, rank, doses)

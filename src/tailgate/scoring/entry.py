@@ -23,6 +23,7 @@ CLEAN_METRICS = (
     "time_gap_inflation", "rms_jerk", "distance_travelled", "max_decel", "min_gap", "rmse_position", "rmse_velocity", "max_error",
     "alarm_rate", "alarm_onsets", "muted_steps",
 )  # fmt: skip
+CLAIMED = "claimed"  # how the reason begins of an entry whose figures nobody but its author has seen come about
 Data = dict[str, Any]
 Levels = dict[str, dict[str, Worst]]  # by defence and knowledge
 
@@ -151,8 +152,8 @@ def _draft(table: Table) -> str:
 def _claimed(rows: list[Row]) -> str:
     """Why rows of somebody else's class stand for nothing yet: who made them could have tuned on the episodes, or have run free."""
     if not all((row.get("submission") or {}).get("sandbox") for row in rows):
-        return "claimed: not played by leaderboard submit in a sandbox"
-    return "" if all(row.get("beacon") for row in rows) else "claimed: played on public seeds"
+        return f"{CLAIMED}: not played by leaderboard submit in a sandbox"
+    return "" if all(row.get("beacon") for row in rows) else f"{CLAIMED}: played on public seeds"
 
 
 def _unmet(table: Table, defence: str, origins: dict[str, Row], asked: list[Asked]) -> str:
