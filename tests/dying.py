@@ -6,6 +6,7 @@ Run as `python dying.py JOB FOLDER`; prints at which call nobody died any more, 
 import os
 import signal
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -40,6 +41,18 @@ def lives(pid: str) -> bool:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except OSError:
         return False
+
+
+def children(pid: int) -> list[str]:
+    return Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+
+
+def left(pids: list[str], seconds: float = 20.0) -> list[str]:
+    """Those of the processes that still run when so much time has passed."""
+    until = time.monotonic() + seconds
+    while time.monotonic() < until and any(lives(pid) for pid in pids):
+        time.sleep(0.05)
+    return [pid for pid in pids if lives(pid)]
 
 
 def _die(job: Callable[[Path], None], folder: Path, at: int) -> None:

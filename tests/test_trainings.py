@@ -102,18 +102,35 @@ def test_processes_that_train_end_with_their_parent(tmp_path: Path) -> None:
     while running.poll() is None and len(list(held.glob("checkpoint-*.safetensors"))) < 2:
         time.sleep(0.05)
     assert running.poll() is None
-    workers = Path(f"/proc/{running.pid}/task/{running.pid}/children").read_text().split()
+    workers = dying.children(running.pid)
     running.send_signal(signal.SIGKILL)
     running.wait()
-    until = time.monotonic() + 20.0
-    while time.monotonic() < until and any(dying.lives(worker) for worker in workers):
-        time.sleep(0.05)
-    left = [worker for worker in workers if dying.lives(worker)]
+    left = dying.left(workers)
     for worker in left:
         with contextlib.suppress(ProcessLookupError):
             os.kill(int(worker), signal.SIGKILL)
     assert len(workers) >= 2 and not left
     assert sorted(path.name for path in held.glob("checkpoint-*.safetensors")) == ["checkpoint-0.safetensors", "checkpoint-1.safetensors"]
+
+
+@pytest.mark.parametrize("gap", [0.0, 0.05])
+def test_two_interrupts_end_a_training_too(tmp_path: Path, gap: float) -> None:
+    """Impatient users press twice: the second one cuts short the pool's end, and still nobody waits for workers that wait for work."""
+    settings = [f"steps={LONG}", "seeds=2", "workers=2", "learner=cem", "cem={population: 3, episodes: 2, hidden: [2]}", "tensorboard=false"]
+    command = [sys.executable, "-m", "tailgate", "train", "name=twice", f"out={tmp_path}", "rivals=[none]", "checkpoint_every=100", *settings]
+    running = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+    while running.poll() is None and len(list(tmp_path.glob("twice/checkpoint-*.safetensors"))) < 2:
+        time.sleep(0.05)
+    workers = dying.children(running.pid)
+    for _ in range(2):
+        running.send_signal(signal.SIGINT)
+        time.sleep(gap)
+    try:
+        _, said = running.communicate(timeout=30.0)
+    finally:
+        running.kill()
+    assert running.returncode == 130 and "go on with: tailgate train --resume name=twice" in said
+    assert len(workers) >= 2 and not dying.left(workers)
 
 
 def test_a_run_is_set_aside_when_its_turn_comes(tmp_path: Path) -> None:

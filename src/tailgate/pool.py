@@ -8,7 +8,20 @@ import sys
 import threading
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
+from multiprocessing.context import SpawnContext, SpawnProcess
 from typing import Any
+
+
+class _Worker(SpawnProcess):
+    def __init__(self, *args: Any, **named: Any) -> None:
+        super().__init__(*args, **named)
+        self.daemon = True  # a second interrupt can cut short a pool's end: the interpreter's would wait for idle workers for ever
+
+
+class _Context(SpawnContext):
+    """Spawned, as a fork after compiled parallel code can hang."""
+
+    Process = _Worker
 
 
 def abandon(pool: ProcessPoolExecutor) -> None:
@@ -21,8 +34,7 @@ def abandon(pool: ProcessPoolExecutor) -> None:
 
 def processes(workers: int, then: Callable[..., None] | None = None, *given: Any) -> ProcessPoolExecutor:
     """A pool of so many workers, which import from where this process does; each begins with then(*given), where there is something."""
-    context = multiprocessing.get_context("spawn")  # a fork after compiled parallel code can hang
-    return ProcessPoolExecutor(workers, mp_context=context, initializer=_begin, initargs=(list(sys.path), then, given))
+    return ProcessPoolExecutor(workers, mp_context=_Context(), initializer=_begin, initargs=(list(sys.path), then, given))
 
 
 def _begin(path: list[str], then: Callable[..., None] | None, given: tuple[Any, ...]) -> None:
