@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -59,6 +59,9 @@ class ObservationCodec:
 
     brief: Brief
     frames: int = 1
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: held for name, held in self.__dict__.items() if name != "columns"}  # functions, which a copy makes again
 
     @property
     def names(self) -> tuple[str, ...]:

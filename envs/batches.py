@@ -16,6 +16,7 @@ from tailgate.loop import LoopState
 from tailgate.tree import leaves, with_leaves
 
 from .seat import Outcome, Seat, Tally
+from .shadow import Begun, Decided, Shadow
 
 ENGINES = ("auto", "fused", "plain")
 
@@ -40,8 +41,11 @@ class Episodes(Protocol):
     def begin(self, keys: Keys) -> None:
         """All rows begin."""
 
-    def again(self, rows: Array, keys: Keys | None = None) -> None:
-        """The next episode in `rows` (B,) bool, or that of the keys, of as many rows."""
+    def again(self, rows: Array, keys: Keys | None = None, reset: bool = False) -> None:
+        """Begin the next episode in `rows` (B,) bool, or that of the keys, of as many rows. reset: the user asked, between two steps."""
+
+    def end(self, rows: Array) -> None:
+        """End the episodes in `rows` (B,) bool, as their horizon would."""
 
     def decide(self, actions: Array, over: Array, restart: bool) -> Outcome:
         """One decision; rows that are `over` (B,) bool count for nothing, and with `restart` begin their next episode instead."""
@@ -60,6 +64,9 @@ class Episodes(Protocol):
     def put(self, held: dict[str, Array]) -> None:
         """What `held` gave, of the same number of rows."""
 
+    def drawn(self, row: int) -> tuple[LoopState, Frame | None, int]:
+        """What a picture of a row shows: a state of the plain loop, its last step (None after a reset), and the row of both."""
+
 
 def framed(now: Array, before: Array | None, frames: int) -> Array:
     """(B, frames d) what is seen now (B, d) on top of what was seen before (B, frames d); none before: the first of an episode."""
@@ -67,7 +74,7 @@ def framed(now: Array, before: Array | None, frames: int) -> Array:
 
 
 def side_by_side(seat: Seat, engine: str = "auto", drawn: bool = False, threads: int = 1) -> Episodes:
-    """In the engine that is asked for; auto: fused where it is possible and nothing is `drawn`, as only the plain loop shows its parts.
+    """Choose the engine; auto: fused where it is possible. `drawn`: pictures may be asked for.
 
     The fused engine plays 2048 episodes and more to each of several `threads`.
     """
@@ -75,15 +82,14 @@ def side_by_side(seat: Seat, engine: str = "auto", drawn: bool = False, threads:
         raise InputError("threads", threads, "a whole number not below 1")
     if engine not in ENGINES:
         raise unknown("engine", engine, ENGINES)
-    if engine == "plain" or (engine == "auto" and drawn):
+    if engine == "plain":
         return PlainEpisodes(seat)
     constants = fuse_seat(seat)
-    if isinstance(constants, Refused) or drawn:
+    if isinstance(constants, Refused):
         if engine == "fused":
-            why = constants.why if isinstance(constants, Refused) else "a picture needs the plain loop's parts"
-            raise InputError("engine", engine, f"plain, or auto: {why}")
+            raise InputError("engine", engine, f"plain, or auto: {constants.why}")
         return PlainEpisodes(seat)
-    return FusedEpisodes(seat, constants, threads)
+    return FusedEpisodes(seat, constants, threads, drawn)
 
 
 class PlainEpisodes:
@@ -106,7 +112,9 @@ class PlainEpisodes:
         self.state = self.seat.loop.start(keys)
         self.tally, self.frame = self.seat.begin(self.state), None
 
-    def again(self, rows: Array, keys: Keys | None = None) -> None:
+    def again(self, rows: Array, keys: Keys | None = None, reset: bool = False) -> None:
+        if reset:
+            self.frame = None
         state, loop = self._state, self.seat.loop
         self.state = loop.restart(state, rows) if keys is None else loop.reseed(state, np.flatnonzero(rows), keys)
         fresh, held = self.seat.begin(self.state), self.tally
@@ -119,6 +127,9 @@ class PlainEpisodes:
         if restart and over.any():
             self.again(over)
         return outcome
+
+    def end(self, rows: Array) -> None:
+        pass  # who is over is said with each decision
 
     def seen(self) -> Array:
         return self.seat.observation.observe(self._view)[:, : len(self.seat.observation.columns)]
@@ -140,6 +151,14 @@ class PlainEpisodes:
         self.state = with_leaves(self._state, {k[5:]: v for k, v in held.items() if k.startswith("loop.")})
         self.tally = Tally(*(held[f"tally.{name}"] for name in self.tally._fields))
 
+    def drawn(self, row: int) -> tuple[LoopState, Frame | None, int]:
+        return self._state, self.frame, row
+
+    def __getstate__(self) -> dict[str, Any]:
+        if why := getattr(self.seat.loop.defence, "opaque", ""):
+            raise InputError("copy", type(self.seat.loop.defence).__name__, f"a defence that can be copied in mid-episode: {why}")
+        return self.__dict__ | {"_looked": None}
+
     @property
     def _state(self) -> LoopState:
         assert self.state is not None
@@ -153,13 +172,14 @@ class PlainEpisodes:
 
 
 class FusedEpisodes:
-    """The fused engine."""
+    """The fused engine. Where pictures may be `drawn` it notes what was decided, so that the plain loop can play a row again."""
 
     engine = "fused"
 
-    def __init__(self, seat: Seat, constants: Any, threads: int) -> None:
-        self.seat, self.constants, self.threads = seat, constants, threads
+    def __init__(self, seat: Seat, constants: Any, threads: int, drawn: bool = False) -> None:
+        self.seat, self.constants, self.threads, self._drawn = seat, constants, threads, drawn
         self.cockpit: Cockpit | None = None
+        self.shadow: Shadow | None = None
 
     @property
     def number(self) -> Array:
@@ -171,13 +191,23 @@ class FusedEpisodes:
         else:
             self.cockpit.take(keys)
         self.cockpit.begin()
+        self.shadow = Shadow(self.seat, keys) if self._drawn else None
 
-    def again(self, rows: Array, keys: Keys | None = None) -> None:
-        self._cockpit.reseed(rows, keys)
+    def again(self, rows: Array, keys: Keys | None = None, reset: bool = False) -> None:
+        self._cockpit.reseed(rows, keys, show=reset)
+        if self.shadow is not None:
+            self.shadow.add(Begun(rows, keys, reset))
+        elif self._drawn and rows.all():
+            self.shadow = Shadow(self.seat, self._cockpit.present_keys)
+
+    def end(self, rows: Array) -> None:
+        self._cockpit.end(rows)
 
     def decide(self, actions: Array, over: Array, restart: bool) -> Outcome:
         cockpit = self._cockpit
         cockpit.decide(actions, restart)
+        if self.shadow is not None:
+            self.shadow.add(Decided(actions.copy(), over, restart))
         flags = cockpit.flags
         return Outcome(cockpit.paid[0], flags[3], flags[4], flags[2], flags[0], flags[1])
 
@@ -196,6 +226,12 @@ class FusedEpisodes:
 
     def put(self, held: dict[str, Array]) -> None:
         self._cockpit.put(held)
+        self.shadow = None  # nobody knows what was decided before
+
+    def drawn(self, row: int) -> tuple[LoopState, Frame | None, int]:
+        if self.shadow is None:
+            raise InputError("render", "episodes that were put back", "reset() first")
+        return *self.shadow.look(row, PlainEpisodes), 0
 
     @property
     def _cockpit(self) -> Cockpit:

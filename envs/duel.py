@@ -202,8 +202,8 @@ class Duel:
 
     def told(self, state: DuelState) -> dict[str, Any]:
         """What a defender is told beside its observation, of the first row: the step, and where its knobs stand."""
-        knobs = {knob.name: float(state.loop.defence.knobs[0, i]) for i, knob in enumerate(self.guard.hand.knobs)}
-        return {"step": int(state.loop.k[0]), **knobs}
+        knobs = {knob.name: state.loop.defence.knobs[0, i] for i, knob in enumerate(self.guard.hand.knobs)}
+        return {"step": state.loop.k[0], **knobs}
 
 
 def checked(space: Any, action: Any, who: str) -> Array:

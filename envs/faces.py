@@ -7,10 +7,12 @@ episode counter.
 
 from __future__ import annotations
 
+import copy
 from typing import Any, ClassVar
 
 import gymnasium
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
@@ -23,10 +25,13 @@ from tailgate.fused.cockpit import Cockpit
 from tailgate.loop import LoopState
 
 from .batches import FusedEpisodes, PlainEpisodes, framed, side_by_side
-from .render_viewer import Viewer
+from .render_viewer import Screen, Viewer
 from .seat import FACES, Seat, Tally
+from .shadow import Begun, Decided
 
 _WHOLE = (int, np.int64)  # an action's usual types
+_BOOL = (np.False_, np.True_)
+_GOES_ON = np.zeros(1, bool)  # of a single row: it is not over
 _AUTORESET = {"next_step": AutoresetMode.NEXT_STEP, "same_step": AutoresetMode.SAME_STEP, "disabled": AutoresetMode.DISABLED}
 
 
@@ -39,22 +44,28 @@ class AdversaryVectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
     purpose: ClassVar[str] = "train"
 
     def __init__(
-        self, num_envs: int = 1, *, render_mode: str | None = None, autoreset: str = "next_step", viewer: str = "auto",
-        size: tuple[int, int] | None = None, engine: str = "auto", threads: int = 1, **arguments: Any,
+        self, num_envs: int = 1, *, render_mode: str | None = None, autoreset: str | AutoresetMode = "next_step", viewer: str = "auto",
+        size: tuple[int, int] | None = None, engine: str = "auto", threads: int = 1, max_episode_steps: int | None = None, **arguments: Any,
     ) -> None:  # fmt: skip
         if not isinstance(num_envs, (int, np.integer)) or num_envs < 1:
             raise InputError("num_envs", num_envs, "a whole number not below 1")
         num_envs = int(num_envs)
+        autoreset = autoreset.name.lower() if isinstance(autoreset, AutoresetMode) else autoreset
         if autoreset not in _AUTORESET:
             raise unknown("autoreset", autoreset, _AUTORESET)
+        limit = limit_of("max_episode_steps", max_episode_steps)
         if render_mode not in (None, "rgb_array"):
             why = "; a window shows one episode: gymnasium.make(..., render_mode='human')" if render_mode == "human" else ""
             raise InputError("render_mode", render_mode, f"None or 'rgb_array'{why}")
         self.seat = Seat.make(**arguments)
         self.num_envs = num_envs
+        self._spec: EnvSpec | None = None
         self.render_mode, self.viewer = render_mode, Viewer(viewer, size)
-        self.autoreset = _AUTORESET[autoreset]
-        self.metadata = self.metadata | {"autoreset_mode": self.autoreset, "render_fps": round(1.0 / self.seat.loop.model.dt)}
+        self.autoreset_mode = _AUTORESET[autoreset]
+        self.horizon = min(self.seat.decisions, limit or self.seat.decisions)  # decisions of an episode that nothing ends early
+        self._limit = limit if limit <= self.seat.decisions else 0
+        self._elapsed = np.zeros(num_envs, np.int64)  # decisions of the present episode, where there is a limit
+        self.metadata = self.metadata | {"autoreset_mode": self.autoreset_mode, "render_fps": round(1.0 / self.seat.loop.model.dt)}
         features = len(self.seat.observation.names)
         self.single_observation_space = gymnasium.spaces.Box(-LIMIT, LIMIT, (features,), np.float32)
         self.single_action_space = action_space(self.seat.action)
@@ -62,17 +73,31 @@ class AdversaryVectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.episodes = side_by_side(self.seat, engine, render_mode is not None, threads)
         self.begun = False
-        self.over, self._everyone = np.zeros(num_envs, bool), np.ones(num_envs, bool)
+        self.over = np.zeros(num_envs, bool)
         self._frames = self.seat.observation.frames
         self._modes = self.seat.action.size if self.seat.action.discrete else 0  # discrete actions, 0 where there are none
         self._facts = ("illegal", "collided", "rear_collided", "allowed", "step", "gap" if self.seat.road else "error")
-        self._present = {f"_{key}": self._everyone for key in (*self._facts, *(("action_mask",) if self._modes else ()))}
+        self._present = self._presence()
         self.observed = np.zeros((num_envs, features if self._frames > 1 else 0), np.float32)  # of several frames
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """What Gymnasium made this of, with the horizon as `max_episode_steps`."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        self._spec = with_horizon(spec, self.horizon)
 
     @property
     def engine(self) -> str:
         """Who plays: fused or plain. What is played is the same."""
         return self.episodes.engine
+
+    @property
+    def direct(self) -> bool:
+        """A fused engine plays, and the environment adds nothing to what it tells."""
+        return isinstance(self.episodes, FusedEpisodes) and self._frames == 1 and not self._limit
 
     @property
     def episode(self) -> Array:
@@ -124,13 +149,12 @@ class AdversaryVectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
         else:
             again = rows & np.array([s is None for s in seeds])
             if again.any():
-                self.episodes.again(again)
+                self.episodes.again(again, reset=True)
             if (named := rows & ~again).any():
                 keys = draws.keys(self.purpose, [s for s in (seeds[i] for i in np.flatnonzero(named)) if s is not None])
-                self.episodes.again(named, keys)
+                self.episodes.again(named, keys, reset=True)
         self.over = self.over & ~rows
-        if isinstance(self.episodes, PlainEpisodes):
-            self.episodes.frame = None
+        self._elapsed[rows] = 0
         self._begin(rows)
         return self._shown(), self._info(*np.zeros((3, self.num_envs), bool))
 
@@ -139,11 +163,13 @@ class AdversaryVectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
         if not self.begun:
             raise InputError("step", "no episode", "reset() first")
         actions = self.checked(actions)
-        over, resets = self.over, self.autoreset == AutoresetMode.NEXT_STEP
-        if self.autoreset == AutoresetMode.DISABLED and over.any():
+        over, resets = self.over, self.autoreset_mode == AutoresetMode.NEXT_STEP
+        if self.autoreset_mode == AutoresetMode.DISABLED and over.any():
             raise InputError("step", np.flatnonzero(over).tolist(), "rows that are over to be reset with options['reset_mask'] first")
         outcome = self.episodes.decide(actions, over, resets)
         terminated, truncated = outcome.terminated, outcome.truncated
+        if self._limit:
+            truncated = self._limited(truncated, over)
         happened = (outcome.illegal, outcome.collided, outcome.rear_collided)
         self.over = terminated | truncated
         if self._frames > 1:
@@ -151,13 +177,15 @@ class AdversaryVectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
             if resets and over.any():  # these rows were over: this step is their reset
                 self._begin(over)
         observation, info = self._shown(), self._info(*happened)
-        if self.autoreset == AutoresetMode.SAME_STEP and self.over.any():
+        if self.autoreset_mode == AutoresetMode.SAME_STEP and self.over.any():
             done, final, final_info = self.over, observation, info
             self.episodes.again(done)
             self._begin(done)
             observation, info = self._shown(), self._info(*happened)
+            final_info |= {key: value.copy() for key, value in zip(self._facts, happened, strict=False)}
             info |= {"final_obs": final, "_final_obs": done.copy(), "final_info": final_info, "_final_info": done.copy()}
             self.over = np.zeros_like(done)
+            self._elapsed[done] = 0
         return observation, outcome.reward, terminated, truncated, info
 
     def action_masks(self) -> Array:
@@ -168,13 +196,30 @@ class AdversaryVectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
 
     def render(self) -> tuple[Array, ...] | None:
         """One (H, W, 3) uint8 picture per row: the road or the graph, what is believed, attack, alarm."""
-        if self.render_mode is None or self.state is None:
+        if self.render_mode is None or not self.begun:
             return None
         from .render import draw
 
-        return tuple(draw(self.seat.loop, self.state, self.frame, row, self.viewer) for row in range(self.num_envs))
+        return tuple(draw(self.seat.loop, *self.episodes.drawn(row), self.viewer) for row in range(self.num_envs))
 
     # -- inside
+
+    def _limited(self, truncated: Array, over: Array) -> Array:
+        """(B,) bool truncated, also at `max_episode_steps`: as Gymnasium's TimeLimit, even in a step that ends in a collision."""
+        self._elapsed = np.where(over, 0, self._elapsed + 1)
+        late = self._elapsed >= self._limit
+        self.episodes.end(late)
+        return truncated | late
+
+    def _presence(self) -> dict[str, Array]:
+        """Which rows have each piece of information: all, in one array that nobody can change."""
+        everyone = np.ones(self.num_envs, bool)
+        everyone.flags.writeable = False
+        return {f"_{key}": everyone for key in (*self._facts, *(("action_mask",) if self._modes else ()))}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__ |= state
+        self._present = self._presence()  # a copied array can be changed
 
     def _begin(self, rows: Array) -> None:
         """What is seen of episodes that have just begun in `rows` (B,) bool: every frame shows their first."""
@@ -205,7 +250,7 @@ class AdversaryVectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
     def _info(self, illegal: Array, collided: Array, rear: Array) -> dict[str, Any]:
         info: dict[str, Any] = dict(zip(self._facts, (illegal, collided, rear, *self.episodes.facts()), strict=True))
         if self._modes:
-            info["action_mask"] = self.episodes.mask().view(np.int8)  # as Space.sample(mask) wants it
+            info["action_mask"] = self.episodes.mask().astype(np.int8)  # as Space.sample(mask) wants it, and the caller's own
         info |= self._present
         return info
 
@@ -224,14 +269,25 @@ class AdversaryEnv(gymnasium.Env[Array, Any]):
         self.batch = AdversaryVectorEnv(1, render_mode=drawn, autoreset="disabled", **arguments)
         self.render_mode = render_mode
         self.metadata = self.metadata | {"render_fps": self.batch.metadata["render_fps"]}
-        self._cockpit: Cockpit | None = None  # where nothing stands between
+        self._cockpit: Cockpit | None = None  # which steps a single row without a batch between
+        self._fused: Any = self.batch.episodes
+        self._spec: EnvSpec | None = None
+        self._direct = self.batch.direct and render_mode != "human"
         self._actions, self._over = self.batch._modes, False  # the second: the episode is over
         self._damage = self.batch._facts[-1]
         self._usual = frozenset(range(self._actions))
-        self._window: Any = None
-        self._shown: LoopState | None = None  # in the window
+        self._screen, self._moves = Screen(), 0  # the second: resets and steps so far
         self.observation_space = self.batch.single_observation_space
         self.action_space = self.batch.single_action_space
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """What Gymnasium made this of, with the horizon as `max_episode_steps`."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        self._spec = with_horizon(spec, self.batch.horizon)
 
     def card(self) -> dict[str, Any]:
         """JSON data that names this environment completely, with a hash."""
@@ -241,16 +297,19 @@ class AdversaryEnv(gymnasium.Env[Array, Any]):
         super().reset(seed=seed)
         if not self.batch.begun and seed is None:
             seed = int(self.np_random.integers(2**31))
-        played, self._over = self.batch.episodes, False
+        played: Any = self.batch.episodes
+        self._over, self._moves = False, self._moves + 1
         if seed is None and self._cockpit is not None:
             _, damage, step, _, _, illegal, collided, rear, allowed, seen, mask = self._cockpit.again_alone()
+            if played.shadow is not None:
+                played.shadow.add(Begun(np.ones(1, bool), None, True))
             return seen, self._told(illegal, collided, rear, allowed, step, damage, mask)
         observation, info = self.batch.reset(seed=seed)
-        if isinstance(played, FusedEpisodes) and self.batch.seat.observation.frames == 1:
+        if self._direct:
             self._cockpit = played.cockpit
         if self.render_mode == "human":
             self.render()
-        return observation[0], self._row(info)
+        return observation[0], self.row(info)
 
     def step(self, action: Any) -> tuple[Array, float, bool, bool, dict[str, Any]]:
         if self._cockpit is None:
@@ -259,13 +318,17 @@ class AdversaryEnv(gymnasium.Env[Array, Any]):
             raise InputError("step", [0], "an episode that is not over: reset() first")
         if not (type(action) in _WHOLE and action in self._usual):
             action = self.batch.checked(np.asarray(action)[None])[0]
+        self._moves += 1
+        if (shadow := self._fused.shadow) is not None:
+            shadow.add(Decided(np.array(action)[None], _GOES_ON, False))
         reward, damage, step, terminated, truncated, illegal, collided, rear, allowed, seen, mask = self._cockpit.decide_alone(action)
         self._over = terminated or truncated
         return seen, reward, terminated, truncated, self._told(illegal, collided, rear, allowed, step, damage, mask)
 
     def _told(self, illegal: bool, collided: bool, rear: bool, allowed: bool, step: int, damage: float, mask: Array) -> dict[str, Any]:
-        info: dict[str, Any] = {
-            "illegal": illegal, "collided": collided, "rear_collided": rear, "allowed": allowed, "step": step, self._damage: damage,
+        info: dict[str, Any] = {  # types of a row of the batch's arrays
+            "illegal": _BOOL[illegal], "collided": _BOOL[collided], "rear_collided": _BOOL[rear], "allowed": _BOOL[allowed],
+            "step": np.int64(step), self._damage: np.float64(damage),
         }  # fmt: skip
         if self._actions:
             info["action_mask"] = mask
@@ -273,9 +336,10 @@ class AdversaryEnv(gymnasium.Env[Array, Any]):
 
     def _step_as_batch(self, action: Any) -> tuple[Array, float, bool, bool, dict[str, Any]]:
         observation, reward, terminated, truncated, info = self.batch.step(np.asarray(action)[None])
+        self._moves += 1
         if self.render_mode == "human":
             self.render()
-        return observation[0], float(reward[0]), bool(terminated[0]), bool(truncated[0]), self._row(info)
+        return observation[0], float(reward[0]), bool(terminated[0]), bool(truncated[0]), self.row(info)
 
     def action_masks(self) -> Array:
         """(actions,) bool: what the channel would accept in a step of the next decision. Discrete action spaces only."""
@@ -283,31 +347,41 @@ class AdversaryEnv(gymnasium.Env[Array, Any]):
 
     def render(self) -> Any:
         """The picture (H, W, 3) uint8; in human mode None: reset() and step() show it in a window by themselves."""
-        if self.render_mode != "human":
-            frames = self.batch.render()
-            return None if frames is None else frames[0]
-        if self.batch.state is None or self.batch.state is self._shown:
+        if self.render_mode is None or not self.batch.begun:
             return None
-        if self._window is None:
-            from .render import Window
+        if self.render_mode == "human":
+            return self._screen.show(self._moves, self.metadata["render_fps"], self._picture)
+        return self._picture()
 
-            self._window = Window(self.metadata["render_fps"])
-        if not self._window.dismissed:
-            frames = self.batch.render()
-            assert frames is not None
-            self._window.show(frames[0])
-        self._shown = self.batch.state
-        return None
+    def _picture(self) -> Array:
+        frames = self.batch.render()
+        assert frames is not None
+        return frames[0]
 
     def close(self) -> None:
-        if self._window is not None:
-            self._window.close()
-            self._window = self._shown = None
+        self._screen.close()
         super().close()
 
     @staticmethod
-    def _row(info: dict[str, Any]) -> dict[str, Any]:
-        return {k: v[0].copy() if v[0].ndim else v[0].item() for k, v in info.items() if not k.startswith("_")}
+    def row(info: dict[str, Any], i: int = 0) -> dict[str, Any]:
+        """The info of row i of a batch's."""
+        return {k: v[i].copy() for k, v in info.items() if not k.startswith("_")}
+
+
+def limit_of(name: str, given: int | None) -> int:
+    """The argument of this name: decisions of an episode at most, 0 where there is no limit. Raises InputError."""
+    if given is not None and (not isinstance(given, (int, np.integer)) or isinstance(given, bool) or given < 1):
+        raise InputError(name, given, "a whole number of decisions not below 1, or None")
+    return int(given or 0)
+
+
+def with_horizon(spec: EnvSpec | None, horizon: int) -> EnvSpec | None:
+    """The spec with `max_episode_steps`, where it says none."""
+    if spec is None or (spec.max_episode_steps or horizon + 1) <= horizon:
+        return spec
+    spec = copy.copy(spec)
+    spec.max_episode_steps = horizon
+    return spec
 
 
 def register_all() -> None:

@@ -49,6 +49,8 @@ class _Undrawn:
     """In place of a scene's random source: whoever draws from it is told that a scene draws nothing."""
 
     def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):  # what Python itself asks for, as when a scene is copied
+            raise AttributeError(name)
         raise RuntimeError(f"a road scene drew {name}: all its randomness comes with its numbers")
 
 

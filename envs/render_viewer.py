@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.util import find_spec
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from tailgate.errors import InputError, NotApplicable, unknown
 from tailgate.loop import Loop
+
+if TYPE_CHECKING:
+    from .render import Window
 
 VIEWERS = ("auto", "plain", "highway")
 SIZE = (960, 240)  # of a picture on HighwayEnv's road [px]
@@ -50,3 +55,32 @@ class Viewer:
                 raise ImportError(f"highway-env is missing, which draws the road: {where}")
             return False
         return True
+
+
+class Screen:
+    """The window of one environment in human mode: shows each picture once, and opens with the first."""
+
+    def __init__(self) -> None:
+        self._window: Window | None = None
+        self._shown = -1
+
+    def show(self, moves: int, fps: int, draw: Callable[[], Any]) -> None:
+        """Show what `draw` gives, a picture (H, W, 3) uint8, unless the one after this number of resets and steps is shown already."""
+        if moves == self._shown:
+            return
+        if self._window is None:
+            from .render import Window
+
+            self._window = Window(fps)
+        if not self._window.dismissed:
+            self._window.show(draw())
+        self._shown = moves
+
+    def close(self) -> None:
+        """Close the window, if it is open; a later picture opens another."""
+        if self._window is not None:
+            self._window.close()
+        self._window, self._shown = None, -1
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {"_window": None, "_shown": -1}  # a copy opens a window for itself

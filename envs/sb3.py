@@ -15,14 +15,14 @@ except ImportError as error:
 from tailgate.core import Array
 from tailgate.errors import unknown
 
-from .faces import AdversaryVectorEnv
+from .faces import AdversaryEnv, AdversaryVectorEnv
 from .seat import CAR_FOLLOWING, FACES
 
 
 class BatchVecEnv(VecEnv):
     """One batch as a VecEnv: same-step autoreset, infos filled at episode ends only (with `episode`, as Monitor writes it).
 
-    id: whose defaults hold for what `arguments` leaves open.
+    An info that is filled has the names that a single environment's info has. id: whose defaults hold for what `arguments` leaves open.
     """
 
     def __init__(self, num_envs: int, id: str = CAR_FOLLOWING, **arguments: Any) -> None:
@@ -32,7 +32,6 @@ class BatchVecEnv(VecEnv):
         super().__init__(num_envs, self.batch.single_observation_space, self.batch.single_action_space)
         self._actions: Array = np.zeros(0)
         self._returns, self._lengths = np.zeros(num_envs), np.zeros(num_envs, np.int64)
-        self._no_infos: list[dict[str, Any]] = [{} for _ in range(num_envs)]
 
     def reset(self) -> Array:
         observation, _ = self.batch.reset(seed=self._seeds[0])  # row i: this seed + i, as `seed` sets them
@@ -48,14 +47,12 @@ class BatchVecEnv(VecEnv):
         done = terminated | truncated
         self._returns += reward
         self._lengths += 1
-        infos = self._no_infos
+        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         if done.any():
-            infos = list(infos)
-            final = info["final_obs"]
+            final, told = info["final_obs"], info["final_info"]
             for i in np.flatnonzero(done):
-                infos[i] = {
-                    "terminal_observation": final[i], "TimeLimit.truncated": bool(truncated[i]),
-                    "crashed": bool(terminated[i]), "rear_collided": bool(info["rear_collided"][i]),
+                infos[i] = AdversaryEnv.row(told, i) | {
+                    "terminal_observation": final[i].copy(), "TimeLimit.truncated": bool(truncated[i] and not terminated[i]),
                     "episode": {"r": float(self._returns[i]), "l": int(self._lengths[i])},
                 }  # fmt: skip
             self._returns[done], self._lengths[done] = 0.0, 0

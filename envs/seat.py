@@ -13,7 +13,7 @@ from tailgate.agents.codec import ActionCodec, ActionSpec
 from tailgate.agents.observation import FRAMES, ObservationCodec
 from tailgate.agents.reward import Reward
 from tailgate.core import Array, Command, Frame, Kind, View
-from tailgate.errors import InputError, unknown
+from tailgate.errors import InputError, UnknownArgument, unknown
 from tailgate.loop import Loop, LoopState
 from tailgate.registry import Spec
 from tailgate.scenario import load_scenario
@@ -82,7 +82,7 @@ class Seat:
         known = fields_of(ActionSpec) | fields_of(Reward)
         for key in options:
             if key not in known:
-                raise unknown("environment argument", key, [*known, "scenario", "defence", "threat", "knowledge", "frames"])
+                raise UnknownArgument(key, [*known, "scenario", "defence", "threat", "knowledge", "frames"])
         for key in threat:
             if key not in fields_of(ThreatModel):
                 raise unknown("threat: unknown field", key, fields_of(ThreatModel))

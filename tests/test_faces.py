@@ -11,7 +11,6 @@ from typing import get_args
 import gymnasium
 import numpy as np
 import pytest
-import yaml
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
@@ -22,48 +21,16 @@ from tailgate.envs.faces import FACES, AdversaryEnv, AdversaryVectorEnv
 from tailgate.errors import InputError
 from tailgate.schema import fields_of
 
+from .tiny import write
+
 ID = "tailgate/CarFollowing-v0"
 ROOT = Path(__file__).parents[1]
 RADAR, PLATOON, NETWORK = "tailgate/RadarFollowing-v0", "tailgate/Platoon-v0", "tailgate/SensorNetwork-v0"
 ACTIONS = get_args(ActionName)
-KINDS = ["dos_jam", "dos_hold", "dropout", "fdi"]
-TINY = {  # scenarios of 40 steps, short enough for many episodes
-    ID: {
-        "plant": {"name": "car_following", "gap": 20.0}, "sensor": "odometry", "controller": "acc", "horizon": 40,
-        "manoeuvre": {"name": "braking", "onset": [0.0, 1.0]}, "threat_model": {"kinds": KINDS, "onset": 3},
-    },
-    RADAR: {
-        "plant": {"name": "radar_following", "gap": 60.0, "rear": True}, "sensor": "fmcw_radar", "controller": "acc_radar", "horizon": 40,
-        "manoeuvre": {"name": "braking", "onset": [0.0, 1.0]},
-        "threat_model": {"kinds": ["noise_jam", "echo_delay", "fdi"], "onset": 3},
-    },
-    PLATOON: {
-        "plant": {"name": "platoon", "followers": 2, "gap": 14.0}, "sensor": "platoon_sensors", "controller": "cacc", "horizon": 40,
-        "manoeuvre": {"name": "braking", "onset": [0.0, 1.0]},
-        "threat_model": {"kinds": KINDS, "targets": ["distance", "velocity"], "agents": [1, 2], "onset": 3},
-    },
-    NETWORK: {
-        "plant": {"name": "sensor_network", "agents": 4, "states": 3, "graph": "ring"}, "sensor": {"name": "linear_sensors", "sensors": 2},
-        "controller": "none", "manoeuvre": {"name": "constant", "value": 0.0}, "horizon": 40,
-        "threat_model": {"kinds": KINDS, "agents": [0, 2], "onset": 3},
-    },
-    "tailgate/Highway-v0": {
-        "plant": {"name": "highway", "lanes": 2, "ahead": 1}, "sensor": "fmcw_radar", "controller": "acc_radar", "horizon": 40,
-        "manoeuvre": {"name": "constant", "value": 0.0}, "threat_model": {"kinds": KINDS, "onset": 3},
-    },
-}  # fmt: skip
-
-
 @pytest.fixture(scope="module")
 def tiny(tmp_path_factory):
     """Arguments of each id with its scenario of 40 steps."""
-    folder = tmp_path_factory.mktemp("scenario")
-    out = {}
-    for name, data in TINY.items():
-        path = folder / f"{name.split('/')[1]}.yaml"
-        path.write_text(yaml.safe_dump(data))
-        out[name] = {"scenario": str(path)}
-    return out
+    return write(tmp_path_factory.mktemp("scenario"))
 
 
 @pytest.fixture(scope="module")

@@ -40,7 +40,7 @@ def made():
     """A vector environment after some quiet steps."""
 
     def make(rows=1, steps=3, **arguments):
-        env = AdversaryVectorEnv(rows, render_mode="rgb_array", **(ROLLS | arguments))
+        env = AdversaryVectorEnv(rows, render_mode="rgb_array", engine="plain", **(ROLLS | arguments))
         env.reset(seed=5)
         for _ in range(steps):
             env.step(np.zeros(rows, np.int64))
@@ -213,7 +213,7 @@ def test_right_after_a_reset(made):
 
 @pytest.mark.parametrize("autoreset", ["next_step", "same_step"])
 def test_autoreset_shows_the_crash_then_the_new_episode(monkeypatch, autoreset):
-    said, env = _signs(monkeypatch), AdversaryVectorEnv(2, render_mode="rgb_array", autoreset=autoreset, **CRASHES)
+    said, env = _signs(monkeypatch), AdversaryVectorEnv(2, render_mode="rgb_array", autoreset=autoreset, engine="plain", **CRASHES)
     env.reset(seed=5)
     attack = next(i for i, mode in enumerate(env.seat.action.modes) if mode[0] == "fdi-")
     for _ in range(env.seat.loop.horizon):

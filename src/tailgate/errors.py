@@ -20,6 +20,25 @@ class InputError(ValueError):
         return type(self), (self.field, self.value, self.expected)
 
 
+class UnknownArgument(InputError, TypeError):
+    """An argument that a constructor does not know: a TypeError too, whose words callers such as TorchRL look for.
+
+    Gymnasium raises it again as `type(error)(text)`, so one text is also taken.
+    """
+
+    def __init__(self, name: str, known: Iterable[str] | None = None) -> None:
+        self.known = None if known is None else sorted(known)
+        if self.known is None:
+            ValueError.__init__(self, name)
+            self.field, self.value, self.expected = "argument", None, ""
+            return
+        expected = f"{_among(name, self.known)} (unexpected keyword argument '{name}')"
+        super().__init__("environment argument", name, expected)
+
+    def __reduce__(self) -> tuple[type, tuple[Any, ...]]:
+        return type(self), (self.args[0],) if self.known is None else (self.value, self.known)
+
+
 class Killed(InputError):
     """A process was killed from outside: what it had kept is there, and the same work can go on from it."""
 
@@ -45,7 +64,10 @@ def wanted(found: Mapping[str, Any]) -> str:
 
 def unknown(field: str, name: object, known: Iterable[str]) -> InputError:
     """An InputError for a name that does not exist: says the nearest that does, then all of them, which may be many."""
-    names = sorted(known)
+    return InputError(field, name, _among(name, sorted(known)))
+
+
+def _among(name: object, names: list[str]) -> str:
     near = difflib.get_close_matches(str(name), names, n=1, cutoff=0.5)
     head = f"one of these (did you mean {near[0]!r}?):" if near else "one of"
-    return InputError(field, name, f"{head} {', '.join(names)}" if names else "no name: there is none to choose from")
+    return f"{head} {', '.join(names)}" if names else "no name: there is none to choose from"

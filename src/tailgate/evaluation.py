@@ -7,6 +7,7 @@ interrupted run resumes, and a component that crashes costs its own rows only.
 from __future__ import annotations
 
 import contextlib
+import copy
 import dataclasses
 import hashlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -102,7 +103,7 @@ def run_cell(cell: Cell, defence: Any = None, attack: Any = None, *, uses: tuple
         for i, seed in enumerate(chunk):
             numbers = {name: None if np.isnan(v[i]) else float(v[i]) for name, v in values.items()}
             hashes = {"trace_hash": trace.trace_hash(i), "decision_hash": trace.decision_hash(i)}
-            rows.append(head | {"seed": seed, "status": "ok", "reason": "", **numbers, **hashes})
+            rows.append(_own(head) | {"seed": seed, "status": "ok", "reason": "", **numbers, **hashes})
     return rows
 
 
@@ -143,7 +144,12 @@ def _digest(family: Any, text: str, identity: str) -> str:
 def _failed(head: dict[str, Any], seeds: Iterable[int], reason: str, status: str = "error") -> list[dict[str, Any]]:
     empty = dict.fromkeys(METRICS) | {"trace_hash": None, "decision_hash": None}
     text = " ".join(reason.split())[:500]
-    return [head | {"seed": seed, "status": status, "reason": text, **empty} for seed in seeds]
+    return [_own(head) | {"seed": seed, "status": status, "reason": text, **empty} for seed in seeds]
+
+
+def _own(head: dict[str, Any]) -> dict[str, Any]:
+    """The head of a row that shares nothing with another's."""
+    return {key: copy.deepcopy(value) if isinstance(value, (dict, list)) else value for key, value in head.items()}
 
 
 def failed_rows(cell: Cell, reason: str) -> list[dict[str, Any]]:

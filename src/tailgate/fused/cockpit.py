@@ -18,8 +18,8 @@ from . import constants as of
 from . import rows as at
 from . import seat as lane
 from .build import Constants, Refused, fuse
-from .lanes import NOTHING, Lanes, not_finite, words_of
-from .memory import AT_COUNT, AT_FLAGS, AT_MASK, AT_PAID, AT_SEEN, FLAGS, MASKED, PAID, SEATED, TICK
+from .lanes import NOTHING, PARTIES, Lanes, not_finite, words_of
+from .memory import AT_COUNT, AT_FLAGS, AT_MASK, AT_PAID, AT_SEEN, FLAGS, MASKED, PAID, SEATED, SHOW, TICK
 
 if TYPE_CHECKING:
     from tailgate.envs.seat import Seat
@@ -105,6 +105,7 @@ class Cockpit(Lanes):
 
     def __init__(self, seat: Seat, constants: Constants, keys: Keys, threads: int = 1) -> None:
         super().__init__(seat.loop, constants, keys, threads=threads)
+        self.seat = seat
         self.interval, batch, features = seat.action.spec.interval, self.batch, int(constants.f[of.FEATURES])
         actions = seat.action.size if seat.action.discrete else 0
         self.memory.order[MASKED] = actions
@@ -172,20 +173,31 @@ class Cockpit(Lanes):
             raise not_finite()
         return *self._told(self._sheet), self._row.copy(), self._allowed.copy()
 
-    def again(self) -> None:
-        """The next episode in every row that is over."""
-        self.run(SEATED, 0, restart=True)
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _copied, (self.seat, self.constants, self.keys, self.threads, self.held())
 
-    def reseed(self, where: Array, keys: Keys | None = None) -> None:
-        """New episodes in the rows `where` (B,) bool: the next of their own, or those of the given keys of as many rows."""
+    @property
+    def present_keys(self) -> Keys:
+        """What the present episodes draw by."""
+        return Keys(np.stack([self.word(name) for name in PARTIES], axis=1), self.word(at.EPISODE).astype(np.uint32))
+
+    def end(self, where: Array) -> None:
+        """End the episodes of the rows `where` (B,) bool: with `restart` their next decision begins another."""
+        self.set_row(at.OVER, np.where(where, 1.0, self.row(at.OVER)))
+
+    def reseed(self, where: Array, keys: Keys | None = None, show: bool = False) -> None:
+        """Begin episodes in the rows `where` (B,) bool: the next of their own, or those of the given keys of as many rows.
+
+        With `show` the sheet is written for all rows; else the others' part is copied from the last sheet, which a caller may hold.
+        """
         if keys is not None:
             for name, value in words_of(keys):
                 held = self.word(name).copy()
-                held[where] = value.astype(np.uint64) - np.uint64(name == at.EPISODE)  # `again` counts one further
+                held[where] = value.astype(np.uint64) - np.uint64(name == at.EPISODE)  # a restart counts one further
                 self.set_word(name, held)
         over = self.row(at.OVER).copy()  # of the others, which begin when they are asked to
         self.set_row(at.OVER, where)
-        self.again()
+        self.run(SEATED, 0, restart=SHOW if show else True)
         self.set_row(at.OVER, np.where(where, 0.0, over))
 
     def held(self) -> dict[str, Array]:
@@ -204,3 +216,10 @@ class Cockpit(Lanes):
         self._sheet[:], self._shared = held["sheet"], True
         self.memory.floats[:], self.memory.order[TICK] = held["floats"], held["tick"][0]
         self.memory.flat_words.view(np.int64)[:] = held["words"]
+
+
+def _copied(seat: Seat, constants: Constants, keys: Keys, threads: int, held: dict[str, Array]) -> Cockpit:
+    """Make what `Cockpit.__reduce__` describes: a copy that goes on from where the original was."""
+    made = Cockpit(seat, constants, keys, threads)
+    made.put(held)
+    return made

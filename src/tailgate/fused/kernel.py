@@ -164,11 +164,11 @@ def play(start, advance, obey, decide, decode, pay, look, places, first_block, l
     spare, spare_window, spare_intent = desk[whole : 2 * whole], desk[2 * whole : room - long], desk[room - long :]
     spare_words = array_at(places[at.AT_DESK_WORDS], (part + 1) * WORDS * LANES, np.uint64)[part * WORDS * LANES :]
     seated, fresh, longest = how == at.SEATED, o[at.FRESH] != 0, 0
-    restart, alone = fresh or o[at.RESTART] != 0, deep == whole
+    restart, alone = fresh or o[at.RESTART] != 0, deep == whole  # `at.SHOW`: and every block is shown
     for b in range(first_block, last_block):
         n, first = np.uint64(min(LANES, batch - b * LANES)), np.uint64(b * LANES)
         held, coming = rows[b * deep : (b + 1) * deep], rows[(b + 1) * deep : (b + 2) * deep]
-        if steps == 0 and not fresh and not ending(held, n):
+        if steps == 0 and not fresh and o[at.RESTART] != at.SHOW and not ending(held, n):
             continue  # nothing is decided and nothing begins
         s = held if alone else desk
         if not alone:

@@ -25,13 +25,13 @@ from .memory import AT_COLUMNS, AT_RECORD, COLUMNS, FRESH, KEPT, OBEY, RESTART, 
 from .rows import LANES, SENSORS, WIRES, wires_of
 
 NOTHING = np.zeros(0, np.uint64)
+PARTIES = at.WORLD_KEY, at.ATTACK_KEY, at.DEFENCE_KEY  # in the order of `Keys.key`
 WORTH = 2048  # episodes that are worth a thread
 
 
 def words_of(keys: Keys) -> tuple[tuple[np.uint64, Array], ...]:
     """What the episodes of these keys draw by, and the row of each."""
-    world, attack, defence = (keys.key[:, i] for i in range(3))
-    return (at.WORLD_KEY, world), (at.ATTACK_KEY, attack), (at.DEFENCE_KEY, defence), (at.EPISODE, keys.episode)
+    return *((name, keys.key[:, i]) for i, name in enumerate(PARTIES)), (at.EPISODE, keys.episode)
 
 
 class _Spent(NamedTuple):

@@ -48,6 +48,7 @@ AT_DESK, AT_DESK_WORDS = _place("desk"), _place("desk words")  # of each thread 
 FEW = 4  # blocks that stay in the cache with all that a step computes on its way
 ASKED = 1 + 2 * WIRES  # rows of a command: kind, targets, values
 OBEY, SCRIPTED, SEATED = range(3)  # who decides
+SHOW = 2  # of the order to restart: all blocks are written to the sheet, also those in which no episode begins
 DESKS = 2  # rooms of ROWS at a desk: for a block that is played, and for episodes that begin
 PAID = 2  # rows of numbers of what a decision brought: reward, gap
 FLAGS = 6  # and of truth values: terminated, truncated, illegal, collided, rear, allowed

@@ -1,0 +1,439 @@
+"""Laws that every face obeys: nothing handed out is used again, copies go on alike, a picture costs no engine, what peers expect of Gymnasium."""
+
+import copy
+import itertools
+import pickle
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode
+
+import tailgate
+from tailgate.envs.faces import FACES, AdversaryEnv, AdversaryVectorEnv
+from tailgate.errors import InputError, UnknownArgument
+from tailgate.evaluation import Cell, run_cell
+
+from .fused import short as shortened
+from .tiny import write
+
+CAR, PLATOON, NETWORK, HIGHWAY = "tailgate/CarFollowing-v0", "tailgate/Platoon-v0", "tailgate/SensorNetwork-v0", "tailgate/Highway-v0"
+CRASHES = {"scenario": "stop-and-go-v0", "defence": "kf", "value": -30.0, "threat": {"onset": 1}, "interval": 5}  # unguarded: it collides
+AUTORESETS = ("next_step", "same_step", "disabled")
+
+
+def spoil(held):
+    """Overwrite everything that can be, as a careless caller may."""
+    if isinstance(held, dict):
+        for value in held.values():
+            spoil(value)
+        held.clear()
+        held["mine"] = 1
+    elif isinstance(held, (list, tuple)):
+        for value in held:
+            spoil(value)
+        if isinstance(held, list):
+            held[:] = [{"mine": 1}] * len(held)
+    elif isinstance(held, np.ndarray) and held.flags.writeable:
+        held[...] = np.zeros((), held.dtype) if held.dtype == bool else 77
+
+
+def arrays(held):
+    """Every array that can be written to, however deep."""
+    if isinstance(held, np.ndarray):
+        return [held] if held.flags.writeable else []
+    parts = held.values() if isinstance(held, dict) else held if isinstance(held, (list, tuple)) else ()
+    return [array for part in parts for array in arrays(part)]
+
+
+def alike(one, other):
+    """The same types, shapes and bits, through dictionaries and lists."""
+    assert type(one) is type(other)
+    if isinstance(one, dict):
+        assert one.keys() == other.keys()
+        for key in one:
+            alike(one[key], other[key])
+    elif isinstance(one, (list, tuple)):
+        assert len(one) == len(other)
+        for parts in zip(one, other, strict=True):
+            alike(*parts)
+    elif isinstance(one, (np.ndarray, np.generic)):
+        assert one.dtype == other.dtype and one.shape == other.shape and one.tobytes() == other.tobytes()
+    else:
+        assert one == other
+
+
+class Driver:
+    """One face, stepped with the actions of a seed; what it hands out at a step, all in one tuple."""
+
+    def __init__(self, name, arguments, face, seed=0):
+        arguments = FACES[name] | arguments
+        self.rng, self.face, self.over = np.random.default_rng(seed), face, False
+        if face == "single":
+            self.env = AdversaryEnv(**arguments)
+        elif face == "sb3":
+            from tailgate.envs.sb3 import BatchVecEnv
+
+            self.env = BatchVecEnv(3, name, **arguments)
+        else:
+            self.env = AdversaryVectorEnv(3, autoreset=face, **arguments)
+        if face == "sb3":
+            self.env.seed(4)
+            self.first = self.env.reset()
+        else:
+            self.first = self.env.reset(seed=4)
+
+    def step(self):
+        env, batch = self.env, getattr(self.env, "batch", self.env)
+        actions, masks = self.rng.integers(0, batch.seat.action.size, 3), env.action_masks()
+        if self.face == "single":
+            out = [env.reset() if self.over else env.step(int(actions[0]))]
+            self.over = not self.over and (out[0][2] or out[0][3])
+        elif self.face == "sb3":
+            out = [env.step(actions)]
+        else:
+            out = [env.step(actions)]
+            if self.face == "disabled" and (done := out[0][2] | out[0][3]).any():
+                out.append(env.reset(options={"reset_mask": done.copy()}))
+        return [masks, *out]
+
+
+@pytest.fixture(scope="module")
+def brief(tmp_path_factory):
+    """Stop-and-go traffic for 60 steps."""
+    path = tmp_path_factory.mktemp("brief") / "brief.yaml"
+    path.write_text(shortened("stop-and-go-v0"))
+    return str(path)
+
+
+@pytest.fixture(scope="module")
+def tiny(tmp_path_factory):
+    """By id and engine: arguments of an environment of ten decisions."""
+    written = write(tmp_path_factory.mktemp("scenario"))
+    return {(name, engine): written[name] | {"interval": 4, "engine": engine} for name, engine in PLAYED}
+
+
+FACE_NAMES = ("single", "sb3", *AUTORESETS)
+PLAYED = [(name, engine) for name in FACES for engine in ("auto", "plain") if (name, engine) != (HIGHWAY, "plain")]
+
+
+@pytest.mark.parametrize("face", FACE_NAMES)
+@pytest.mark.parametrize("name, engine", PLAYED)
+def test_nothing_that_was_handed_out_is_used_again(name, engine, face, tiny):
+    """A caller that overwrites all it got changes nothing of what comes; what it keeps is not changed by what comes."""
+    if face == "sb3":
+        pytest.importorskip("stable_baselines3")
+    kind, rough = (Driver(name, tiny[name, engine], face) for _ in range(2))
+    kept = [(kind.first, copy.deepcopy(kind.first))]
+    spoil(rough.first)
+    for _ in range(25 if name != HIGHWAY else 12):
+        one, other = kind.step(), rough.step()
+        alike(one, other)
+        assert not any(np.may_share_memory(a, b) for a, b in itertools.combinations(arrays(one), 2))
+        kept.append((one, copy.deepcopy(one)))
+        spoil(other)
+    for held, before in kept:
+        alike(held, before)
+
+
+def test_rows_that_are_not_reset_are_shown_as_they_are():
+    """A reset of one row of many, after a caller has overwritten what it was shown of all."""
+    one, other = (AdversaryVectorEnv(150, autoreset="disabled") for _ in range(2))
+    for env in (one, other):
+        env.reset(seed=4)
+    alike(one.step(np.ones(150, np.int64)), held := other.step(np.ones(150, np.int64)))
+    spoil(held)
+    mask = np.arange(150) == 3
+    alike(*(env.reset(options={"reset_mask": mask}) for env in (one, other)))
+
+
+def test_rows_of_a_cell_share_nothing():
+    """Rows are the caller's own, whatever is nested in them."""
+    one, other = run_cell(Cell("", "braking-v0", 5, "kf", "none", 2))
+    for key, value in one.items():
+        if isinstance(value, (dict, list)):
+            assert value is not other[key], key
+
+
+COPIES = {"pickle": lambda env: pickle.loads(pickle.dumps(env)), "deepcopy": copy.deepcopy}
+
+
+@pytest.mark.parametrize("how", COPIES)
+@pytest.mark.parametrize("face", FACE_NAMES)
+@pytest.mark.parametrize("name, engine", PLAYED)
+def test_a_copy_goes_on_as_its_original(name, engine, face, how, tiny):
+    """Copied in mid-episode, both play on to the same observations, rewards, flags, infos and masks, through ends; neither moves the other."""
+    if face == "sb3":
+        pytest.importorskip("stable_baselines3")
+    driver = Driver(name, tiny[name, engine], face)
+    for _ in range(3):
+        driver.step()
+    other = copy.copy(driver)
+    other.env, other.rng = COPIES[how](driver.env), copy.deepcopy(driver.rng)
+    steps = 20 if name != HIGHWAY else 8
+    alike([driver.step() for _ in range(steps)], [other.step() for _ in range(steps)])
+
+
+@pytest.mark.parametrize("action", ["continuous", "increment"])
+def test_a_copy_before_the_first_reset_and_of_vectors(action):
+    """An environment that has not begun, one with frames, and the generator of its spaces and seeds."""
+    env = AdversaryVectorEnv(2, action=action, frames=3, interval=10)
+    early = copy.deepcopy(env)
+    alike(env.reset(seed=1), early.reset(seed=1))
+    late = pickle.loads(pickle.dumps(env))
+    actions = np.full((2, env.seat.action.size), 0.25, np.float32)
+    for _ in range(70):
+        alike(env.step(actions), late.step(actions))
+    alike(env.reset(), late.reset())
+    assert not late._present["_gap"].flags.writeable
+
+
+def test_the_game_is_copied_in_mid_episode():
+    """PettingZoo's environment, the defender's, and both go on alike."""
+    pytest.importorskip("pettingzoo")
+    from tailgate.envs.parallel import parallel_env
+
+    env = parallel_env(interval=20)
+    env.reset(seed=2)
+    for _ in range(3):
+        env.step({"attacker": 1, "defender": 0})
+    others = [copy.deepcopy(env), pickle.loads(pickle.dumps(env))]
+    for _ in range(10):
+        whole = env.step({"attacker": 1, "defender": 1})
+        for other in others:
+            alike(whole, other.step({"attacker": 1, "defender": 1}))
+    defender = gymnasium.make("tailgate/Defender-v0", interval=20, attack=["fdi", "dos_jam"]).unwrapped
+    defender.reset(seed=3)
+    twin, over = pickle.loads(pickle.dumps(defender)), False
+    while not over:
+        result = defender.step(1)
+        alike(result, twin.step(1))
+        over = result[2] or result[3]
+    alike(defender.reset(), twin.reset())
+
+
+def test_the_game_has_what_pettingzoo_expects(monkeypatch):
+    """A window, a limit of cycles, a state of both, and a mask for either."""
+    parallel = pytest.importorskip("tailgate.envs.parallel")
+    env = parallel.parallel_env(interval=5, max_cycles=3)
+    env.reset(seed=1)
+    for cycle in range(3):
+        seen, _, terminated, truncated, infos = env.step({"attacker": 0, "defender": 0})
+        assert np.array_equal(env.state(), np.concatenate([seen["attacker"], seen["defender"]])) and env.state_space.contains(env.state())
+        assert infos["defender"]["action_mask"].tolist() == [1] * env.action_space("defender").n
+        assert truncated == dict.fromkeys(env.possible_agents, cycle == 2) and not any(terminated.values())
+        assert all(np.asarray(value).dtype == value.dtype for info in infos.values() for value in info.values())
+    assert env.agents == []
+    env.reset()
+    assert env.cycles == 0 and env.agents == env.possible_agents
+    with pytest.raises(InputError, match=r"max_cycles.*not below 1"):
+        parallel.parallel_env(max_cycles=0)
+    with pytest.raises(InputError, match=r"state.*reset\(\) first"):
+        parallel.parallel_env().state()
+    assert "action_mask" not in parallel.parallel_env(defender_action="box").reset(seed=1)[1]["defender"]
+
+
+def test_the_game_is_shown_in_a_window(monkeypatch):
+    """Human mode opens a window at reset, shows each step once, and changes no bit."""
+    parallel, pygame = pytest.importorskip("tailgate.envs.parallel"), pytest.importorskip("pygame")
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    env, twin = (parallel.parallel_env(interval=5, render_mode=mode, viewer="plain") for mode in ("human", "rgb_array"))
+    env.metadata["render_fps"] = 10_000
+    for one in (env, twin):
+        one.reset(seed=1)
+    for _ in range(2):
+        alike(*(one.step({"attacker": 1, "defender": 0}) for one in (env, twin)))
+        shown = np.moveaxis(pygame.surfarray.array3d(pygame.display.get_surface()), 0, 1)
+        assert env.render() is None and (shown == twin.render()).all()
+    env.close()
+    assert not pygame.display.get_init()
+
+
+# -- pictures
+
+
+@pytest.mark.parametrize("autoreset", AUTORESETS)
+def test_pictures_of_the_fast_engine_are_those_of_the_plain_loop(autoreset, brief):
+    """Looked at now and then, through collisions, ends and resets by mask: the same pixels, and not one bit of another step."""
+    pytest.importorskip("PIL")
+    config = CRASHES | {"scenario": brief}
+    fast, plain, bare = (
+        AdversaryVectorEnv(2, autoreset=autoreset, viewer="plain", engine=engine, render_mode=mode, **config)
+        for engine, mode in (("auto", "rgb_array"), ("plain", "rgb_array"), ("auto", None))
+    )
+    assert (fast.engine, plain.engine) == ("fused", "plain") and fast.render() is None
+    envs, rng, ends = (fast, plain, bare), np.random.default_rng(1), 0
+    for env in envs:
+        env.reset(seed=5)
+    for t in range(130):
+        if t % 17 in (0, 1, 2) or 60 <= t < 68:
+            assert all((one == other).all() for one, other in zip(fast.render(), plain.render(), strict=True)), t
+        actions = rng.integers(0, fast.seat.action.size, 2)
+        results = [env.step(actions) for env in envs]
+        alike(results[0], results[2])
+        over = results[0][2] | results[0][3]
+        ends += int(over.sum())
+        if autoreset == "disabled" and over.any():
+            for env in envs:
+                env.reset(options={"reset_mask": over})
+        if t == 50:
+            for env in envs:
+                env.reset(seed=[None, 8], options={"reset_mask": np.array([False, True])})
+        if t == 100:
+            for env in envs:
+                env.reset()
+    assert ends >= 6 and fast.engine == "fused"
+
+
+def test_a_single_environment_that_may_be_drawn_stays_fast():
+    """As `make_vec_env` makes it: render_mode is set and nobody looks. The first picture, and each later one, is the plain loop's."""
+    pytest.importorskip("PIL")
+    fast, plain = (gymnasium.make(CAR, render_mode="rgb_array", viewer="plain", engine=engine, **CRASHES).unwrapped for engine in ("auto", "plain"))
+    for env in (fast, plain):
+        env.reset(seed=5)
+    assert fast.batch.engine == "fused"
+    for t in range(150):
+        one, other = fast.step(t % 3), plain.step(t % 3)
+        alike(one, other)
+        if t in (60, 61, 90, 149):
+            assert (fast.render() == plain.render()).all()
+        if one[2] or one[3]:
+            alike(fast.reset(), plain.reset())
+            assert (fast.render() == plain.render()).all()
+    assert fast.batch.engine == "fused" and fast._cockpit is not None
+
+
+def test_decisions_are_kept_for_two_episodes_at_most(brief):
+    """A run of many episodes that nobody looks at stays small; a look then is right, and costs the present episodes alone."""
+    pytest.importorskip("PIL")
+    config = CRASHES | {"scenario": brief, "interval": 12}
+    fast, plain = (AdversaryVectorEnv(3, viewer="plain", engine=engine, render_mode="rgb_array", **config) for engine in ("auto", "plain"))
+    for env in (fast, plain):
+        env.reset(seed=5)
+    for t in range(150):
+        for env in (fast, plain):
+            env.step(np.array([0, 1, t % 4]))
+        assert len(fast.episodes.shadow.events) <= 64 + 4 * 5
+    assert fast.episodes.shadow.dropped >= 70
+    assert all((one == other).all() for one, other in zip(fast.render(), plain.render(), strict=True))
+
+
+def test_a_copy_is_drawn_as_its_original():
+    """Also where its episode began before the copy."""
+    pytest.importorskip("PIL")
+    env = AdversaryEnv(render_mode="rgb_array", viewer="plain", **CRASHES)
+    env.reset(seed=5)
+    for _ in range(9):
+        env.step(1)
+    other = pickle.loads(pickle.dumps(env))
+    assert (env.render() == other.render()).all()
+    kept = other.batch.episodes.held()
+    other.batch.episodes.put(kept)
+    with pytest.raises(InputError, match=r"render.*reset\(\) first"):
+        other.render()
+    other.batch.reset()
+    assert other.batch.render()[0].shape == env.render().shape
+
+
+# -- what peers expect
+
+
+def test_an_unknown_argument_is_both_errors():
+    """TorchRL looks for a TypeError with these words; Gymnasium raises it again from its text alone."""
+    for make in (AdversaryEnv, lambda **a: AdversaryVectorEnv(2, **a), lambda **a: gymnasium.make(CAR, **a), lambda **a: gymnasium.make_vec(CAR, **a)):
+        with pytest.raises(InputError) as caught:
+            make(frameskip=4)
+        assert isinstance(caught.value, TypeError) and isinstance(caught.value, UnknownArgument)
+        assert "unexpected keyword argument 'frameskip'" in str(caught.value) and "scenario" in str(caught.value)
+        again = pickle.loads(pickle.dumps(caught.value))
+        assert str(again) == str(caught.value) and isinstance(again, UnknownArgument)
+
+
+def test_the_autoreset_mode_is_an_attribute_and_an_argument():
+    """By the name, or as Gymnasium's own."""
+    for mode in AutoresetMode:
+        for given in (mode, mode.name.lower()):
+            env = AdversaryVectorEnv(2, autoreset=given)
+            assert env.autoreset_mode is env.metadata["autoreset_mode"] is mode
+
+
+@pytest.mark.parametrize("engine", ["auto", "plain"])
+@pytest.mark.parametrize("autoreset", AUTORESETS)
+def test_a_limit_of_steps_is_that_of_gymnasium(autoreset, engine):
+    """`make_vec(max_episode_steps=n)`: row i equals `make(max_episode_steps=n)`, through ends and collisions; the spec says n."""
+    vec = gymnasium.make_vec(CAR, num_envs=3, max_episode_steps=7, autoreset=autoreset, engine=engine, **CRASHES)
+    assert vec.spec.max_episode_steps == 7
+    vec.reset(seed=20)
+    rng, log = np.random.default_rng(0), []
+    for _ in range(60):
+        actions = rng.integers(0, vec.single_action_space.n, 3)
+        log.append((actions, *vec.step(actions)))
+        over = log[-1][3] | log[-1][4]
+        if autoreset == "disabled" and over.any():
+            log.append((None, vec.reset(options={"reset_mask": over})[0], over))
+    for i in range(3):
+        env = gymnasium.make(CAR, max_episode_steps=7, engine=engine, **CRASHES)
+        env.reset(seed=20 + i)
+        over, ends = False, 0
+        for entry in log:
+            if entry[0] is None:
+                if entry[2][i]:
+                    assert np.array_equal(env.reset()[0], entry[1][i])
+                continue
+            if over and autoreset == "next_step":
+                assert np.array_equal(env.reset()[0], entry[1][i])
+                over = False
+                continue
+            seen, reward, terminated, truncated, _ = env.step(entry[0][i])
+            over = terminated or truncated
+            assert (reward, terminated, truncated) == (entry[2][i], entry[3][i], entry[4][i])
+            if over and autoreset == "same_step":
+                assert np.array_equal(entry[5]["final_obs"][i], seen)
+                seen = env.reset()[0]
+            assert np.array_equal(seen, entry[1][i])
+            ends += over
+        assert ends >= 6
+
+
+@pytest.mark.parametrize("name", FACES)
+def test_the_spec_says_the_horizon(name):
+    """`spec.max_episode_steps` is the number of decisions; a spec that is made again ends at the same one."""
+    env, vec = gymnasium.make(name, interval=20), gymnasium.make_vec(name, num_envs=2, interval=20)
+    decisions = env.unwrapped.batch.seat.decisions
+    assert env.spec.max_episode_steps == env.unwrapped.spec.max_episode_steps == vec.spec.max_episode_steps == decisions
+    assert gymnasium.make(name, interval=20, max_episode_steps=5).spec.max_episode_steps == 5
+    again = gymnasium.make(gymnasium.envs.registration.EnvSpec.from_json(env.spec.to_json()))
+    assert again.spec.max_episode_steps == decisions and again.unwrapped.card() == env.unwrapped.card()
+    if name != HIGHWAY:
+        again.reset(seed=1)
+        ends = [again.step(0)[2:4] for _ in range(decisions)]
+        assert not any(any(end) for end in ends[:-1]) and ends[-1] == (False, True)
+
+
+@pytest.mark.parametrize("bad", [0, -3, 2.5, True, "7"])
+def test_a_bad_limit_is_refused(bad):
+    with pytest.raises(InputError, match=r"max_episode_steps.*not below 1"):
+        AdversaryVectorEnv(2, max_episode_steps=bad)
+
+
+@pytest.mark.parametrize("name", FACES)
+def test_information_has_one_set_of_names_and_types(name):
+    """Single, vector and Stable-Baselines3's face: the same keys, and NumPy's types, so that a reader may ask for a dtype."""
+    pytest.importorskip("stable_baselines3")
+    from tailgate.envs.sb3 import BatchVecEnv
+
+    env, vec, batch = AdversaryEnv(**FACES[name]), AdversaryVectorEnv(2, **FACES[name]), BatchVecEnv(2, name, max_episode_steps=2)
+    _, info = env.reset(seed=0)
+    _, told = vec.reset(seed=0)
+    batch.reset()
+    names = {key for key in told if not key.startswith("_")}
+    infos = [info, env.step(0)[4]]
+    batch.step(np.zeros(2, np.int64))
+    last = batch.step(np.zeros(2, np.int64))[3][0]
+    assert {"terminal_observation", "TimeLimit.truncated", "episode"} == last.keys() - names
+    for one in (*infos, {key: last[key] for key in names}):
+        assert one.keys() == names and {"collided", "rear_collided", "illegal", "allowed", "step"} < names
+        for key, value in one.items():
+            assert value.dtype == told[key].dtype and value.shape == told[key].shape[1:], key
+    assert last["TimeLimit.truncated"] is True and not last["collided"]
+    assert tailgate.envs.faces.AdversaryEnv.row(told)["step"] == 1
