@@ -51,7 +51,7 @@ class BatchVecEnv(VecEnv):
         if done.any():
             final, told = info["final_obs"], info["final_info"]
             for i in np.flatnonzero(done):
-                infos[i] = AdversaryEnv.row(told, i) | {
+                infos[i] = AdversaryEnv.row(told, int(i)) | {
                     "terminal_observation": final[i].copy(), "TimeLimit.truncated": bool(truncated[i] and not terminated[i]),
                     "episode": {"r": float(self._returns[i]), "l": int(self._lengths[i])},
                 }  # fmt: skip
