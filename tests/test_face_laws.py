@@ -188,13 +188,13 @@ def test_a_copy_before_the_first_reset_and_of_vectors(action):
     assert not late._present["_gap"].flags.writeable
 
 
+class Elsewhere(type(tailgate.make_defence("kf"))):
+    opaque = "its state lies in another process"
+
+
 @pytest.mark.parametrize("how", COPIES)
 def test_a_defence_whose_state_lies_elsewhere_is_not_copied(how):
     """As one in a sandbox: one error that says why."""
-
-    class Elsewhere(type(tailgate.make_defence("kf"))):
-        opaque = "its state lies in another process"
-
     env = AdversaryEnv(defence=Elsewhere(), engine="plain")
     env.reset(seed=0)
     with pytest.raises(InputError, match=r"copy: got 'Elsewhere'.*copied in mid-episode: its state lies in another process"):
