@@ -32,23 +32,27 @@ def false_alarms(trace: Trace, every: int) -> Array:
 
 
 class Price(NamedTuple):
-    """Of a defence in a scenario: false alarms and hours of its clean run; `reason` says why detection does not count there."""
+    """Of a defence in a scenario: false alarms and hours of its clean run; `reason` says why detection does not count."""
 
     scenario: str
-    count: int
+    alarms: int
     running_hours: float
     hours: float | None  # mean time between them; None without any
     reason: str
 
 
-def prices(rows: Sequence[Row], limit: float) -> dict[tuple[str, str], Price]:
-    """By defence and scenario, of the first clean row of each that counted them. `limit`: shortest mean time between false alarms [h]."""
+def prices(rows: Sequence[Row], limit: float, nominal: Sequence[str]) -> dict[tuple[str, str], Price]:
+    """By defence and scenario, of the first clean row of each that counted them. `limit`: shortest mean time between false alarms [h].
+
+    `nominal` scenarios are judged: in others the vehicle is not as the defence is told, and what is found there by chance raises no bound,
+    as the worst scenario makes it.
+    """
     out: dict[tuple[str, str], Price] = {}
     for row in rows:
         key = row["defence"], row["scenario"]
         if row["attack"] == CLEAN and row["alarms"] is not None and key not in out:
             count, running = row["alarms"]["count"], row["alarms"]["steps"] * row["dt"] / HOUR
-            often = count * limit > running
+            often = (row["scenario_file"] or row["scenario"]) in nominal and count * limit > running
             every = f"one in {running / count * HOUR:.3g} s without an attack on {row['scenario']}" if often else ""
             reason = f"{DETECTS} does not count: false alarms, {every}, limit {limit * HOUR:g} s" if often else ""
             out[key] = Price(row["scenario"], count, running, running / count if count else None, reason)

@@ -32,7 +32,7 @@ def report(rows: Sequence[Row], suite: Suite, *, alpha: float, settings: Data, c
     names = ("trust",) if formulas else tuple(CONJUNCTIONS)
     fixed = settings["rule"]["name"] == "fixed"
     counted = _counted(rows, _whole(suite))
-    paid = prices([*rows, *clean], settings["demands"]["false_alarms"])
+    paid = prices([*rows, *clean], settings["demands"]["false_alarms"], suite.nominal)
     entries = [_entry(defence, counted, rows, alpha, names, fixed, paid) for defence in suite.defences]
     return {
         "format": FORMAT, "suite": {"name": suite.name, "bound": suite.bound}, "version": tailgate.__version__, "alpha": alpha,
