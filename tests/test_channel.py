@@ -216,6 +216,21 @@ def test_hold_reads_the_sample_before_the_first_attack_and_fresh_the_one_before_
     assert wire.step(Kind.DOS_HOLD_FRESH, [P, V])[0][V] == sent(12)[V]  # the velocity was good until step 12
 
 
+@pytest.mark.parametrize(("granted", "kept"), [({}, 6), ({"hold_from_onset": True}, 3)])
+def test_what_is_held_is_of_before_the_first_hit_or_of_before_the_onset(granted, kept):
+    """(6.18) has one tau, the step before attacks may begin, however late the first of them comes."""
+    wire = Wire(onset=4, targets=MODEL.wires, **granted).idle(6)  # three steps in which an attack would have been accepted
+    for _ in range(2):
+        arrived = wire.step(Kind.DOS_HOLD, [P, ACC])[0]
+        np.testing.assert_array_equal(arrived[[P, ACC]], sent(kept)[[P, ACC]])
+        assert wire.step(Kind.DOS_HOLD_FRESH, [V])[0][V] == sent(wire.k - 1)[V]
+        wire.idle(2)
+
+
+def test_a_hold_from_the_first_step_on_repeats_what_the_prior_expects():
+    np.testing.assert_array_equal(Wire(hold_from_onset=True).idle(1).step(Kind.DOS_HOLD, [P])[0][P], EXPECTED[P])
+
+
 def test_injected_and_refused_samples_are_not_good_samples_or_attacks():
     """A falsified reading is never held; a refused command does not fix the sample that a hold repeats."""
     wire = Wire().idle(2)

@@ -10,10 +10,11 @@ from tailgate.core import Prior, Received
 from tailgate.draws import keys
 from tailgate.envs.cacc import no_gains
 from tailgate.envs.network import LinearSensors, NoControl, SensorNetwork
-from tailgate.envs.platoon import closed_loop, hold
+from tailgate.envs.platoon import Platoon, closed_loop, hold
 from tailgate.errors import InputError
 from tailgate.estimators import DistributedKalman, DistributedKalmanFilter, Kalman
 from tailgate.estimators.distributed import fixed_point, neighbours
+from tailgate.registry import Spec
 from tailgate.scenario import load_scenario
 from tailgate.trace import rollout
 
@@ -314,3 +315,34 @@ def test_a_gate_uses_the_readings_that_are_left(model):
             K = V[i] @ C.T @ np.linalg.inv(C @ V[i] @ C.T + R)
             want = state.x[1, i] + K @ (y[1, i][some] - C @ state.x[1, i])
             np.testing.assert_allclose(refused[1, i], want, rtol=1e-6, atol=1e-7 * np.abs(want).max())
+
+
+@dataclasses.dataclass(frozen=True)
+class Halting(Platoon):
+    """The platoon whose leader is told the input that would have moved a lag as the car moved, its halt included."""
+
+    def step(self, plan, state, u, exo, draws):
+        after, keep = super().step(plan, state, u, exo, draws), plan.A[2, 2]
+        inputs = after.u.copy()
+        inputs[:, 0] = (after.a[:, 0] - keep * state.a[:, 0]) / (1.0 - keep)
+        return after._replace(u=inputs)
+
+    def known(self, plan, u, exo, state):
+        out = np.zeros(u.shape)
+        out[:, 0, 0] = state.u[:, 0]
+        return out
+
+
+@pytest.mark.parametrize(("name", "told", "free"), [("lasso_dkf", 4.73, 0.18), ("norm_resilient", 5.27, 0.15), ("chi2_dkf:gain=steady", 21.8, 0.25)])
+def test_the_clean_error_of_the_braking_platoon_is_its_leaders_halt(name, told, free):
+    """A lag that is told -4 m/s^2 and then 0 rolls backwards; no filter that bounds its corrections is slow where the input fits."""
+    place, worst = load_scenario("platoon-braking-v0"), []
+    halting = Halting(**{f.name: getattr(place.plant, f.name) for f in dataclasses.fields(place.plant)})
+    for plant in (place.plant, halting):
+        guard = Spec("defence", name)
+        trace = rollout(dataclasses.replace(place, plant=plant).loop(guard.make()), tailgate.make_attack("none"), keys("report", range(6)))
+        error = np.where(trace.live[..., None], trace.model.error(trace.estimate, trace.truth), 0.0)[place.threat_model.onset - 1 :]
+        worst.append(np.median(error.max(axis=(0, 2))))
+        own = np.where(trace.live, trace.estimate[:, :, 0, 1] - trace.truth[:, :, 0, 1], 0.0).min(axis=0)
+        assert (np.median(own) < -1.0) == (plant is place.plant)
+    assert worst == [pytest.approx(told, rel=0.1), pytest.approx(free, rel=0.25)]

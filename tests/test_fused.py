@@ -181,6 +181,7 @@ def test_threads_and_blocks_change_no_bit():
 @pytest.mark.parametrize(("scenario", "defence", "threat", "why"), [
     ("platoon-braking-v0", "trust_dkf", {}, "no lane"), ("car-following-lossy-v0", "kf", {}, "lost or late"),
     ("stop-and-go-v0", "kf", {"knowledge": "white"}, "white-box"), ("stop-and-go-v0", "kf", {"kinds": ["delay"]}, "delay"),
+    ("stop-and-go-v0", "kf", {"hold_from_onset": True}, "held from the onset"),
     ("stop-and-go-v0", "steered", {}, "no lane"), ("stop-and-go-v0", "imm:factors=[1,2,3,4,5]", {}, "more than 4 models"),
 ])  # fmt: skip
 def test_what_has_no_lane_is_played_by_the_plain_loop(scenario, defence, threat, why):

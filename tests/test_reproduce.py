@@ -57,6 +57,9 @@ def test_chapter_4(chapter_4):
     assert claims["4.5-lasting-bias"]["holds"] == "no"
     assert claims["4.5.1-complexity"]["measured"]["exponent from 16 to 64"].keys() == {"n (q = 2)", "q (n = 2)", "n = q"}
 
+    (drawn,) = [t for t in json.loads((out / "report.json").read_text())["tables"] if "does not roll back" in t["title"]]
+    assert [row[0] for row in drawn["rows"]] == [r.name for r in READINGS] and {row[1] for row in drawn["rows"][1::2]} == {"0.0 %"}
+
     names = {"figure-4-4", "figure-4-5", "figure-4-6", "figure-eta", "figure-cost"}
     assert {p.stem for p in out.glob("*.png")} == names and all((out / f"{n}.png").read_bytes()[:4] == b"\x89PNG" for n in names)
     page, text, data = (out / "index.html").read_text(), (out / "report.md").read_text(), json.loads((out / "report.json").read_text())
@@ -78,6 +81,20 @@ def test_the_readings_differ_as_they_say():
     k = (1 + 1 / 3) / 1.008
     np.testing.assert_allclose(models["printed, literal plant"].A, np.eye(3) + 0.01 * np.array([[0, 1, 0], [0, 0, 1], [0, -k * 0.9, -k]]))
     assert np.abs(np.linalg.eigvals(models["printed"].A)).max() <= 1.0
+
+
+def test_a_standstill_changes_the_noise_and_no_verdict():
+    """With 18.5 times the noise most cars stand once, and what moves them is no longer the told Q; where they may roll back it is."""
+    from tailgate.reproduce.ch4_cases import THESIS, Played, rolling
+
+    reading, seeds = READINGS[2], 200
+    for case in ("clean", "fdi", "dos"):
+        stands, rolls = (Played.of(reading, case, "ours", seeds, place) for place in (None, rolling(reading.scenario)))
+        assert 0.5 < stands.stood < 0.9 and rolls.stood == 0.0
+        np.testing.assert_allclose(rolls.noise, 1.0, atol=0.05)
+        assert stands.noise[1] < 0.96 and stands.noise[2] > 1.2
+        both = [Spread.of(played.metrics["rmse_position"]) for played in (stands, rolls)]
+        assert all(spread.covers(THESIS[case, "ours"][0]) for spread in both) and both[1].median == pytest.approx(both[0].median, rel=0.03)
 
 
 def test_the_literal_plant_switches_on_the_sign_of_the_acceleration():

@@ -70,10 +70,20 @@ def test_chapter_6_own_distance(case, guard, figure, digits):
     """Largest own-distance error after 20 s: the design's four figures."""
     _, attack, options = ch6_cases.CASES[case]
     seeds = seeds_of(f"test_chapter_6_{case}_{guard}", 300)
-    loop = load_scenario(ch6_cases.SCENARIO).loop(ch6_cases.defence(guard))
+    loop = ch6_cases.platoon().loop(ch6_cases.defence(guard))
     trace = rollout(loop, tailgate.make_attack(attack, **options), draws.keys("report", seeds), terminate=False)
     worst = ch6_cases.Played(trace).worst
     assert holds(worst, figure, digits) and not holds(worst, 1.5 * figure, digits)
+
+
+def test_chapter_6_replays_the_reading_of_20_s():
+    """(6.18): Y_tau with tau = 20, in every hit of every run; in most runs the first hit comes later than at 21 s."""
+    trace = ch6_cases.run(ch6_cases.defence("dkf"), tailgate.make_attack("dos_hold", **ch6_cases.DOS), 50).trace
+    hit, car = trace.kind != 0, ch6_cases.VICTIM
+    assert 0.3 < np.mean(hit.argmax(axis=0) > 20) < 0.8 and not hit[:20].any()
+    read, sent = trace.wires[:, :, car, :2], trace.clean[:, :, car, :2]
+    assert (read[hit] == np.broadcast_to(sent[19], sent.shape)[hit]).all() and (read[~hit] == sent[~hit]).all()
+    assert (sent[19] != sent[20]).all()  # the platoon moves: the test can fail
 
 
 def test_chapter_6_clean():
@@ -163,3 +173,13 @@ def test_verdicts_go_both_ways():
     assert ch6_loop._every_step(few, 100).holds == "yes" and ch6_loop._zero_mean(few, 100).holds == "no" and ch6_loop._zero_mean(none, 100).holds == "yes"
     safe = few | {(label, "DKF"): 0 for label in ch6_loop.ATTACKS}
     assert ch6_loop._collision(safe, 100).holds == "yes"
+
+
+def test_whether_a_known_input_counts_depends_on_the_price(monkeypatch):
+    """Both prices stand in the claim: with a high one nobody need know, with a low one the leader's own prediction has to."""
+    place = dataclasses.replace(load_scenario(ch6_loop.SCENARIO), horizon=450)
+    monkeypatch.setattr(ch6_loop, "_play", lambda place, guard, attack, seeds, play=ch6_loop._play: play(place, guard, attack, 2))
+    safe = {(label, guard): ch6_loop._safe(ch6_loop._play(place, spec, ch6_loop.ATTACKS[label], 2)) for label in ("+60 m, p = 0.5", "+60 m, p = 1") for guard, spec in ch6_loop.GUARDS.items()}
+    rows = ch6_loop._known(place, safe, 2).measured
+    high, low = (rows[f"+60 m, p = 0.5: lasso, lam = {lam:g}"] for lam in (ch6_cases.LOOP_LAM, ch6_cases.LAM))
+    assert set(high.values()) == {1.0} and low["told: nobody"] < low["told: the leader"] == low["told: all"]

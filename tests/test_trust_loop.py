@@ -9,6 +9,7 @@ import shutil
 from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -29,6 +30,7 @@ from tailgate.scoring.ranks import mcnemar
 from tailgate.trace import rollout
 from tailgate.trust import run as trust_run
 from tailgate.trust.cells import Job, check_cell, outcome, runs_of, single
+from tailgate.trust.false_alarms import false_alarms
 from tailgate.trust.logic import Samples, holds
 from tailgate.trust.properties import Demands, built_in, own
 from tailgate.trust.run import check, jobs_of, with_trust
@@ -252,6 +254,67 @@ def test_a_process_that_dies_costs_its_own_cells(short: str, monkeypatch: pytest
     monkeypatch.setattr(trust_run, "processes", lambda workers: _Pool())
     kf, deadly = check(_suite(short, attacks=("none",)), runs=2, workers=2)["defences"]
     assert kf["safety"]["black"]["k"] == 2 and deadly["safety"]["black"] is None and "died" in deadly["why"]
+
+
+AT_RANDOM = "composed:filter=kf,detector=chi2,detector.eta=1.6,mitigation=accept_all"  # exp(-0.8): 45 % of the steps
+SEEN = "fdi:start_step=20,value=-40"
+
+
+def _detects(entry: dict[str, Any]) -> dict[str, Any]:
+    return next(p for p in entry["properties"] if p["name"] == "detects")
+
+
+def test_an_alarm_at_random_earns_no_bound_of_detection(short: str) -> None:
+    """Whoever alarms at everything would be trusted to detect: 45 % of the steps are one in any ten."""
+    found = check(_suite(short, defences=("chi2_kf", AT_RANDOM, "always_alarm"), attacks=("none", SEEN)))
+    good, *bad = found["defences"]
+    (price,) = _detects(good)["false_alarms"]
+    assert good["why"] == "" and _detects(good)["share"]["k"] == N and price["alarms"] == 0 and price["hours"] is None and not price["reason"]
+    assert good["trust"]["black"] is not None
+    for entry, seconds in zip(bad, (0.1 / 0.45, 1.0), strict=True):  # one that stays on counts every ten steps
+        (price,) = _detects(entry)["false_alarms"]
+        assert 0.9 * seconds < price["hours"] * 3600.0 < 2.5 * seconds
+        assert _detects(entry)["share"] is None and set(entry["trust"].values()) == {None}
+        assert entry["why"] == _detects(entry)["reason"] == price["reason"] and "detects does not count" in entry["why"] and "limit 360 s" in entry["why"]
+        assert entry["safety"]["black"]["lower"] > 0.0, "what is safe does not look at alarms"
+    shown = [p for cell in found["cells"] if cell["defence"] == AT_RANDOM for p in cell["properties"] if p["name"] == "detects"]
+    assert [p["share"] and p["share"]["value"] for p in shown] == [None, 1.0] and {p["reason"] for p in shown} == {bad[0]["why"]}, "the cells have what was played"
+    assert not any(duel["of"] == "trust" and AT_RANDOM in (duel["a"], duel["b"]) for duel in found["comparisons"])
+
+
+def test_another_limit_of_false_alarms_can_be_stated(short: str) -> None:
+    """A user's own limit would be ignored, or a board would take it for the default."""
+    found = check(_suite(short, defences=(AT_RANDOM,), attacks=("none", SEEN)), runs=6, asked=Demands(false_alarms=1e-5))
+    assert found["demands"]["false_alarms"] == 1e-5 and _detects(found["defences"][0])["share"]["k"] == 6 and found["defences"][0]["trust"]["black"]
+
+
+def test_who_names_no_clean_run_is_judged_by_one_all_the_same(short: str) -> None:
+    """A random alarm would count where nobody looked at it without an attack."""
+    found = check(_suite(short, defences=("chi2_kf", AT_RANDOM), attacks=(SEEN,)), runs=6)
+    good, bad = found["defences"]
+    assert _detects(bad)["share"] is None and "without an attack" in bad["why"] and _detects(good)["share"]["k"] == 6
+    assert good["trust"]["black"]["cells"] == 1 and [c["attack"] for c in found["cells"]] == [SEEN] * 2, "and is no part of the bound"
+
+
+def test_a_vehicle_that_is_not_as_told_is_not_what_a_detector_is_judged_by(short: str, tmp_path: Path) -> None:
+    """Every detector alarms where the noise is larger than told; where nothing else was played it is judged there."""
+    noisy = tmp_path / "noisy.yaml"
+    noisy.write_text(SHORT + "truth: {sensor: {noise_var: [9.0, 9.0]}}\n", encoding="utf-8")
+    suite = _suite(short, scenarios=(short, str(noisy)), robustness=(str(noisy),), defences=("chi2_kf", AT_RANDOM), attacks=("none", SEEN))
+    good, bad = check(suite, runs=8)["defences"]
+    told, other = _detects(good)["false_alarms"]
+    assert told["hours"] is None and other["hours"] < 0.1 and good["why"] == "" and _detects(good)["share"] and bad["why"]
+    (alone,) = check(dataclasses.replace(suite, scenarios=(str(noisy),), defences=("chi2_kf",)), runs=8)["defences"]
+    assert "does not count" in alone["why"] and _detects(alone)["share"] is None
+
+
+def test_an_alarm_that_stays_on_counts_again() -> None:
+    """It would be a single false alarm, and find everything."""
+    alarm = np.zeros((40, 3, 2), bool)
+    alarm[5:30, 0, 1] = alarm[[3, 4, 6, 20], 1, 0] = alarm[6, 1, 1] = True
+    alarm[:, 2, 0] = True
+    live = np.arange(40)[:, None] < np.array([40, 40, 15])
+    assert false_alarms(SimpleNamespace(alarm=alarm, live=live, batch=3), 10).tolist() == [3, 3, 2]
 
 
 def test_rules_that_stop_early_give_no_bound(short: str) -> None:

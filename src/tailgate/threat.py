@@ -64,6 +64,7 @@ class ThreatModel:
     end: PositiveCount | None = param(None, "last step at which an attack is accepted; none: the horizon")
     knowledge: Knowledge = param("black", "black: the road; grey: + control; white: + defence")
     sees_measurement: bool = param(False, "grants the measurement that the defence receives; of a radar it shows which step is muted")
+    hold_from_onset: bool = param(False, "dos_hold keeps the last good sample before onset (6.18), not before the first hit", if_any=True)
 
     def __post_init__(self) -> None:
         low, high = self.jam_range
@@ -130,7 +131,7 @@ class ChannelPlan(NamedTuple):
 class Memory(NamedTuple):
     """What the channel keeps of some wires: held, fresh (B, N, .); history, tape (B, N, ., recorded), two rings."""
 
-    held: Array  # last good sample before the first attack
+    held: Array  # last good sample before the first attack, or before the onset
     fresh: Array  # last good sample of each wire
     history: Array  # what was sent in the last steps
     tape: Array  # the history as it was when the running replay began
@@ -232,15 +233,15 @@ class Channel:
             hit, value = hit | whole, np.where(whole, strength, value)
         valued = _VALUED[kind][:, None, None]
         last = Command(kind, hit, np.where(hit & valued, value, 0.0))
-        first = charged & (state.used == 0)
+        begins_to_hold = np.asarray(k) == threat.onset if threat.hold_from_onset else charged & (state.used == 0)
         ended = (state.burst > 0) & ~charged
         # the step that ends a burst is itself the first of the pause
         cooldown = np.where(ended, max(threat.cooldown - 1, 0), np.maximum(state.cooldown - 1, 0))
         state = state._replace(
             used=state.used + charged, burst=np.where(charged, state.burst + 1, 0), cooldown=cooldown, last=last,
         )  # fmt: skip
-        if first.any():
-            state = state._replace(links=_hold(state.links, first), drives=_hold(state.drives, first))
+        if begins_to_hold.any():
+            state = state._replace(links=_hold(state.links, begins_to_hold), drives=_hold(state.drives, begins_to_hold))
         begins = np.flatnonzero((kind == REPLAY) & (state.played == 0))
         if len(begins):
             anchor = state.anchor.copy()
@@ -344,9 +345,9 @@ class Channel:
         return memory._replace(fresh=np.where(hit, memory.fresh, sent) if hit.any() else sent, history=history)
 
 
-def _hold(memory: Memory, first: Array) -> Memory:
-    """The memory with its held sample taken where `first` (B,) attack begins."""
-    return memory._replace(held=np.where(first[:, None, None], memory.fresh, memory.held))
+def _hold(memory: Memory, rows: Array) -> Memory:
+    """The memory with its held sample taken in `rows` (B,) bool."""
+    return memory._replace(held=np.where(rows[:, None, None], memory.fresh, memory.held))
 
 
 def _copy_tape(memory: Memory, rows: Array) -> Memory:

@@ -203,10 +203,21 @@ def _print_properties(found: dict[str, Any]) -> None:
                 table.add_row(escape(entry["defence"]), escape(p["name"]), *["-"] * 5, escape(p["reason"]))
                 continue
             often = "-" if when is None else f"in {when['runs']} of {when['of']} runs, {_percent(when['instants'])} of the steps"
+            often += _alarms(p.get("false_alarms", []))
             span = f"{_percent(share['low'])} to {_percent(share['high'])}"
             figures = _percent(share["value"]), f"{share['k']} of {share['n']}", span, _place(share), often
             table.add_row(escape(entry["defence"]), escape(p["name"]), *figures)
     console().print(table)
+
+
+def _alarms(prices: list[dict[str, Any]]) -> str:
+    """How often the alarm goes on without an attack, where it does so most often."""
+    if not prices:
+        return ""
+    worst = min(prices, key=lambda price: float("inf") if price["hours"] is None else price["hours"])
+    if worst["hours"] is None:
+        return f"; no false alarm in {min(price['running_hours'] for price in prices):.3g} h"
+    return f"; a false alarm in {worst['hours']:.3g} h on {escape(worst['scenario'])}"
 
 
 def _print_failures(found: dict[str, Any], folder: str | None) -> None:

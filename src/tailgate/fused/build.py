@@ -69,6 +69,8 @@ def _radar() -> Any:
 
 def fuse(loop: Loop, attack: Attack | None = None) -> Constants | Refused:
     """The constants of a loop, or why the plain loop plays it: under the given attack, or under any that does not hold the defence."""
+    if loop.threat.hold_from_onset:
+        return Refused("what is held from the onset has no lane")
     if loop.model.agents > 1:
         return _several(loop, attack)
     parts = (loop.plant, loop.sensor, loop.controller)

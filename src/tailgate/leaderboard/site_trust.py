@@ -10,8 +10,8 @@ from .words import at_least
 
 SPEED, ACCEL = "m/s", "m/s\N{SUPERSCRIPT TWO}"
 UNITS = {
-    "deadline": "s", "steps": "steps at least", "braking": ACCEL, "stands": SPEED, "detection": "steps", "response": "s", "accel": ACCEL,
-    "brake": ACCEL, "lead_brake": ACCEL,
+    "deadline": "s", "steps": "steps at least", "braking": ACCEL, "stands": SPEED, "detection": "steps", "false_alarms": "h apart",
+    "response": "s", "accel": ACCEL, "brake": ACCEL, "lead_brake": ACCEL,
 }  # fmt: skip
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
@@ -10,11 +11,12 @@ from typing import Any
 import numpy as np
 
 import tailgate
-from tailgate import draws
+from tailgate import draws, num
 from tailgate.core import Array
+from tailgate.envs.following import CarFollowing, FollowingPlan
 from tailgate.metrics import measure
 from tailgate.registry import Spec
-from tailgate.scenario import load_scenario
+from tailgate.scenario import Scenario, load_scenario
 from tailgate.trace import Trace, rollout
 
 from .claims import Claim, Holds, Report, Spread, Table, verdict
@@ -51,8 +53,9 @@ class Reading:
         """The robust filter's penalty [1/m]: tuned on the corrected plant with this noise."""
         return tuned(self.scenario.replace("-literal", ""), self.sd)
 
-    def play(self, guard: Any, attack: Any, seeds: int, purpose: str = "report") -> Trace:
-        return rollout(load_scenario(self.scenario).loop(guard), attack, draws.keys(purpose, range(seeds)), terminate=False)
+    def play(self, guard: Any, attack: Any, seeds: int, place: Scenario | None = None) -> Trace:
+        """On the reading's own scenario where no other is given."""
+        return rollout((place or load_scenario(self.scenario)).loop(guard), attack, draws.keys("report", range(seeds)), terminate=False)
 
     def defence(self, name: str) -> Any:
         if name == "kf":
@@ -76,7 +79,7 @@ def tuned(scenario: str, sd: float) -> float:
 READINGS = (
     Reading("printed", "thesis-ch4-v0", 20.0, 1.0, "Q = R = I and eta = 20 as printed; corrected plant"),
     Reading("printed, literal plant", "thesis-ch4-literal-v0", 20.0, 1.0, "Q = R = I and eta = 20 as printed; the plant as printed"),
-    Reading("fitted", "thesis-ch4-fitted-v0", 40.0, 18.5**0.5, "Q = R = 18.5 I in truth and filter, eta = 40; corrected plant"),
+    Reading("fitted", "thesis-ch4-fitted-v0", 40.0, 18.5**0.5, "Q = R = 18.5 I drawn and told, eta = 40; corrected plant"),
     Reading("fitted, literal plant", "thesis-ch4-literal-fitted-v0", 40.0, 18.5**0.5, "Q = R = 18.5 I, eta = 40; the plant as printed"),
 )
 
@@ -94,8 +97,8 @@ class Played:
     trace: Trace
 
     @classmethod
-    def of(cls, reading: Reading, case: str, name: str, seeds: int) -> Played:
-        trace = reading.play(reading.defence(name), attack_of(case), seeds)
+    def of(cls, reading: Reading, case: str, name: str, seeds: int, place: Scenario | None = None) -> Played:
+        trace = reading.play(reading.defence(name), attack_of(case), seeds, place)
         return cls(measure(trace), trace)
 
     @property
@@ -112,6 +115,33 @@ class Played:
     def error(self) -> Array:
         """(K, B) position error [m]."""
         return np.asarray(self.trace.estimate[:, :, 0, 0] - self.trace.truth[:, :, 0, 0])
+
+    @property
+    def stood(self) -> float:
+        """Share of the runs in which the follower comes to v = 0."""
+        return float((self.trace.truth[:, :, 0, 1] == 0.0).any(axis=0).mean())
+
+    @property
+    def noise(self) -> Array:
+        """(3,) mean square of what the told model does not foresee of the true state, X+ - A X - B u, over the told Q."""
+        model, X, u = self.trace.model, self.trace.truth[:, :, 0], self.trace.control[:, :, 0]
+        w = X[1:] - X[:-1] @ model.A.T - u[:-1] @ model.B.T
+        return np.asarray((w * w).mean(axis=(0, 1)) / np.diag(model.Q))
+
+
+@dataclass(frozen=True)
+class Rolling(CarFollowing):
+    """The corrected plant without a standstill: what is drawn is what it does, and a car may roll back."""
+
+    def move(self, plan: FollowingPlan, ego: Array, u: Array, noise: Array) -> Array:
+        free = num.matvec(plan.A, ego) + num.matvec(plan.B, u)
+        return num.stack([free[..., i] + noise[i][:, None] for i in range(3)])
+
+
+def rolling(scenario: str) -> Scenario:
+    """A scenario of the corrected plant whose car may roll back."""
+    place = load_scenario(scenario)
+    return dataclasses.replace(place, plant=Rolling(**{f.name: getattr(place.plant, f.name) for f in dataclasses.fields(place.plant)}))
 
 
 Runs = dict[tuple[str, str, str], Played]  # by reading, case, filter
@@ -131,6 +161,7 @@ def report(runs: Runs) -> Report:
     """Table, and one claim per printed figure and sentence."""
     out = Report("ch4", "", {})
     out.tables += [_table(runs, quantity, label, unit) for quantity, label, unit in QUANTITIES]
+    out.tables.append(_drawn(runs))
     for (case, name), printed in THESIS.items():
         for (quantity, label, unit), value in zip(QUANTITIES, printed, strict=True):
             out.claims.append(_figure_claim(runs, case, name, quantity, label, unit, value))
@@ -146,6 +177,26 @@ def _table(runs: Runs, quantity: str, label: str, unit: str) -> Table:
             value = f"{printed[0 if quantity == 'rmse_position' else 1]:.2f}" if printed else "-"
             rows.append((title, words, value, *(str(Spread.of(runs[r.name, case, name].metrics[quantity])) for r in READINGS)))
     return Table(f"RMSE of {label} [{unit}], median [quartiles]", ("case", "filter", "thesis", *(r.name for r in READINGS)), tuple(rows))
+
+
+def _drawn(runs: Runs) -> Table:
+    """What becomes of the noise that is drawn where a car does not roll back, and what Algorithm 3 errs where it may."""
+    rows = []
+    for r in READINGS:
+        clean = runs[r.name, "clean", "ours"]
+        cells = [f"{100 * clean.stood:.1f} %", " / ".join(f"{v:.2f}" for v in clean.noise)]
+        if type(load_scenario(r.scenario).plant) is CarFollowing:
+            place, seeds = rolling(r.scenario), clean.trace.batch
+            free = {case: Played.of(r, case, "ours", seeds, place) for case in CASES}
+            cells.append(" / ".join(f"{v:.2f}" for v in free["clean"].noise))
+            cells += [str(Spread.of(free[case].metrics["rmse_position"])) for case in CASES]
+        else:
+            cells += ["rolls back"] + ["-"] * len(CASES)
+        rows.append((r.name, *cells))
+    errs = (f"RMSE of position, {words}" for words in CASES.values())
+    heads = ("reading", "runs that stand", "noise over Q: x / v / a", "if it may roll back", *errs)
+    title = "The corrected plant does not roll back: what its noise comes to [mean square over the told Q], and Algorithm 3 where it may"
+    return Table(title, heads, tuple(rows))
 
 
 def _figure_claim(runs: Runs, case: str, name: str, quantity: str, label: str, unit: str, value: float) -> Claim:

@@ -16,6 +16,7 @@ def reproduce(seeds: int, tick: Tick, figures: bool) -> Report:
     settings = {
         "seeds": seeds,
         "figures": "dt = 1 s, the linear closed loop, w = (1, 1), Sigma = I, lam = 0.1, u_r known; largest |error| after 20 s",
+        "denial of service": "the reading of 20 s at every hit, tau in (6.18); in closed loop the last one before the first hit",
         "closed loop": f"{ch6_loop.SCENARIO}: dt = 0.1 s, 55 s, controllers on the estimates, u_r unknown to the followers, lam = 5",
         "not given in the thesis": "the gains kp = 0.5 and kd = 1, the initial gaps 65 + 5 randn m, the leader's input, the attack's size",
     }

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 import tailgate
-from tailgate import draws
+from tailgate import draws, num
 from tailgate.core import Array
+from tailgate.envs.platoon import Platoon
 from tailgate.metrics import measure
 from tailgate.registry import make
 from tailgate.scenario import Scenario, load_scenario
@@ -18,10 +20,12 @@ from tailgate.string_stability import peak
 from tailgate.trace import Trace, rollout
 
 from .ch4_cases import Tick
+from .ch6_cases import LAM, LOOP_LAM
 from .claims import Claim, Report, Table, verdict
 
 SCENARIO = "platoon-braking-v0"
-GUARDS = {"none": ("none", {}), "DKF": ("dkf", {}), "lasso": ("lasso_dkf", {"lam": 5.0, "unit": "sensor"})}
+GUARDS = {"none": ("none", {}), "DKF": ("dkf", {}), "lasso": ("lasso_dkf", {"lam": LOOP_LAM, "unit": "sensor"})}
+LOW = ("lasso_dkf", {"lam": LAM, "unit": "sensor"})  # at the price of the thesis's figures
 ATTACKS: dict[str, tuple[str, dict[str, Any]]] = {
     "no attack": ("none", {}),
     "+60 m, p = 0.5": ("fdi", {"value": 60.0, "chance": 0.5, "targets": ("distance",)}),
@@ -31,6 +35,7 @@ ATTACKS: dict[str, tuple[str, dict[str, Any]]] = {
     "+8 m/s^2 on car 2's message": ("fdi", {"value": 8.0, "targets": ("predecessor_acceleration",)}),
 }
 SPEC = {"+60 m, p = 0.5": (26, 1, 300), "hold d and v, p = 0.5": (16, 0, 300), "+60 m, p = 1": (0, 0, 0), "no attack": (300, 300, 300)}
+FLIP = 0.25  # change of a share that is one of a verdict
 LAMS = (0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0)
 STRINGS = (
     ("kp = 0.1, kd = 0.5", 0.1, 0.5),
@@ -124,22 +129,40 @@ def _zero_mean(safe: dict[tuple[str, str], int], seeds: int) -> Claim:
     )
 
 
+@dataclass(frozen=True)
+class Untold(Platoon):
+    """The platoon of whose commands no filter is told anything, the leader's own included."""
+
+    def known(self, plan: Any, u: Array, exo: Array, state: Any) -> Array:
+        return num.zeros(u.shape)
+
+
 def _known(place: Scenario, safe: dict[tuple[str, str], int], seeds: int) -> Claim:
-    """Does it change a verdict whether the followers are told the leader's command?"""
-    told = dataclasses.replace(place, plant=dataclasses.replace(place.plant, leader_input_known=True))
-    measured, flips = {}, []
+    """Does it change a verdict who is told the leader's command? At the price of the closed loop, and at that of the thesis's figures."""
+    fields = {f.name: getattr(place.plant, f.name) for f in dataclasses.fields(place.plant)}
+    places = {
+        "all": dataclasses.replace(place, plant=Platoon(**fields | {"leader_input_known": True})),
+        "the leader": place,
+        "nobody": dataclasses.replace(place, plant=Untold(**fields)),
+    }
+    measured: dict[str, dict[str, float]] = {}
     for label in ("+60 m, p = 0.5", "+60 m, p = 1"):
-        for guard in ("DKF", "lasso"):
-            count = _safe(_play(told, GUARDS[guard], ATTACKS[label], seeds))
-            measured[f"{label}: {guard}"] = {"told": count / seeds, "not told": safe[label, guard] / seeds}
-            flips.append(abs(count - safe[label, guard]) > 0.5 * seeds)
+        for words, guard, known in (
+            ("DKF", GUARDS["DKF"], "DKF"), (f"lasso, lam = {LOOP_LAM:g}", GUARDS["lasso"], "lasso"), (f"lasso, lam = {LAM:g}", LOW, ""),
+        ):  # fmt: skip
+            counts = {"the leader": safe[label, known]} if known else {}
+            counts |= {who: _safe(_play(where, guard, ATTACKS[label], seeds)) for who, where in places.items() if who not in counts}
+            measured[f"{label}: {words}"] = {f"told: {who}": counts[who] / seeds for who in places}
+    flips = [max(row.values()) - min(row.values()) > FLIP for row in measured.values()]
     return Claim(
         "6.6-known-input-loop",
         "The same in closed loop",
         "known",
         measured,
-        verdict(not any(flips), any(flips)),
-        "share of runs without a collision; yes means that no share changes by a half",
+        verdict(not any(flips), all(flips)),
+        "share of runs without a collision, by whose filters are told u_r; yes: no share changes by more than a quarter, no: all do. The "
+        "leader's prediction carries its command to all who hear it, so that telling them as well changes nothing. Without it a filter at "
+        "a low price cannot follow its brakes, and one at a high price can",
     )
 
 

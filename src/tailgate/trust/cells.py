@@ -21,8 +21,10 @@ from tailgate.loop import Loop
 from tailgate.registry import Spec
 from tailgate.scenario import Scenario, load_scenario
 from tailgate.schema import canonical
+from tailgate.scoring.damage import CLEAN
 from tailgate.trace import Trace, episodes_at_once, nearest, rollout
 
+from .false_alarms import DETECTS, false_alarms
 from .logic import Eventually, Interval, Samples, along, holds, robustness
 from .properties import CONJUNCTIONS, Demands, Property, built_in, conjunctions, own
 from .signals import SafeDistance, sample
@@ -46,7 +48,7 @@ class Job:
     def identity(self) -> str:
         """Of everything that decides the row."""
         known = [[p.name, str(p.formula), str(p.trigger), p.until] for p in self.properties(load_scenario(self.cell.scenario))]
-        rest = [known, self.safe, self.rule]
+        rest = [known, self.safe, self.rule, *(["false alarms"] if self.cell.attack == CLEAN and not self.formulas else [])]
         return hashlib.blake2b(f"{cell_id(self.cell)}/{canonical(rest)}".encode(), digest_size=12).hexdigest()
 
     def properties(self, place: Scenario) -> tuple[Property, ...]:
@@ -118,9 +120,12 @@ class Found:
     tallies: dict[str, Tally]
     together: dict[str, tuple[str, ...]]  # names of the conjunctions and of what they are made of
     runs: dict[str, list[Array]]
+    alarms: int | None = None  # false ones, of clean runs in which detection is asked for
 
-    def add(self, outcomes: dict[str, Outcome]) -> None:
+    def add(self, outcomes: dict[str, Outcome], alarms: Array | None) -> None:
         """The next runs."""
+        if alarms is not None:
+            self.alarms = (self.alarms or 0) + int(alarms.sum())
         for name, of in outcomes.items():
             self.tallies[name].add(of)
         for name, members in self.together.items():
@@ -157,6 +162,7 @@ def _blank(job: Job, place: Scenario) -> Row:
     return _head(cell, place, guard.entry, rival.entry, cell_id(cell)) | {
         "cell": job.identity, "first_seed": cell.first_seed, "dt": place.brief().model.dt, "horizon": place.horizon,
         "status": "ok", "reason": "", "n": 0, "properties": [], "conjunctions": {}, "verdict": None, "worst": None,
+        "alarms": None,
     }  # fmt: skip
 
 
@@ -167,14 +173,15 @@ def _played(job: Job, loop: Loop, attack: Any, known: Sequence[Property]) -> Fou
     together = {name: members for name, members in conjunctions(known, job.formulas).items() if members}
     found = Found({p.name: Tally() for p in known}, together, {name: [] for name in together})
     for start in range(0, cell.seeds, size):
-        outcomes = _outcomes(job, loop, attack, known, _keys(cell.purpose, tuple(episodes[start : start + size])))
+        outcomes, alarms = _outcomes(job, loop, attack, known, _keys(cell.purpose, tuple(episodes[start : start + size])))
         verdict = None
         if job.rule is not None and together:
             trust = np.all([outcomes[name].holds for name in together["trust"]], axis=0)
             verdict = job.rule.stop(np.concatenate([found.of("trust"), trust]))
         if verdict is not None:
             outcomes = {name: Outcome(*(x[: verdict.runs - start] for x in of)) for name, of in outcomes.items()}
-        found.add(outcomes)
+            alarms = None if alarms is None else alarms[: verdict.runs - start]
+        found.add(outcomes, alarms)
         if verdict is not None:
             break
     return found
@@ -186,12 +193,13 @@ def _keys(purpose: str, seeds: tuple[int, ...]) -> draws.Keys:
     return draws.keys(purpose, seeds)
 
 
-def _outcomes(job: Job, loop: Loop, attack: Any, known: Sequence[Property], keys: draws.Keys) -> dict[str, Outcome]:
-    """Of the runs of these keys. Where the smallest gaps decide everything, no trace is made."""
+def _outcomes(job: Job, loop: Loop, attack: Any, known: Sequence[Property], keys: draws.Keys) -> tuple[dict[str, Outcome], Array | None]:
+    """Of the runs of these keys, and the false alarms of clean ones. Where the smallest gaps decide everything, no trace is made."""
     if all(p.by_gaps for p in known) and (found := nearest(loop, attack, keys)) is not None:
-        return {p.name: outcome_by_gaps(p, *found, loop.model.dt) for p in known}
+        return {p.name: outcome_by_gaps(p, *found, loop.model.dt) for p in known}, None
     trace = rollout(loop, attack, keys)
-    return {p.name: outcome(p, trace, job.safe) for p in known}
+    priced = job.cell.attack == CLEAN and any(p.name == DETECTS for p in known)
+    return {p.name: outcome(p, trace, job.safe) for p in known}, false_alarms(trace, job.asked.detection) if priced else None
 
 
 def _summary(job: Job, known: Sequence[Property], found: Found) -> Row:
@@ -204,6 +212,7 @@ def _summary(job: Job, known: Sequence[Property], found: Found) -> Row:
     return {
         "n": n, "properties": [_property(p, found.tallies.get(p.name), job.cell.episodes) for p in known], "conjunctions": together,
         "verdict": None if verdict is None else verdict.holds, "worst": _worst(known, found, job.cell.episodes),
+        "alarms": None if found.alarms is None else {"count": found.alarms, "steps": found.tallies[DETECTS].steps},
     }  # fmt: skip
 
 

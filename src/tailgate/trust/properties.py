@@ -3,7 +3,7 @@
     no_collision   G (gap > 0 and rear_gap > 0)
     brakes         whenever a gap is unsafe once an attack has begun, that car begins to brake within 0.6 s, strictly later, and
                    brakes on for 0.5 s, or stands, or is safe again
-    detects        an alarm within ten steps of the first step of an attack
+    detects        an alarm within ten steps of the first step of an attack; it counts under a limit of false alarms (false_alarms.py)
     error          G (error <= bound), where nobody drives
 
 A property that has no meaning in a scenario has a reason in place of a formula. One with an antecedent, the trigger, also holds of a run in
@@ -23,6 +23,7 @@ from tailgate.envs.controllers import BRAKE_ACCEL
 from tailgate.errors import InputError, NotApplicable
 from tailgate.metrics import DETECTION_DEADLINE
 from tailgate.scenario import Scenario
+from tailgate.scoring.gates import HOURS
 
 from .formula import parse
 from .logic import Always, And, Atom, Eventually, Formula, Interval, Not, Or, implies, response
@@ -39,6 +40,7 @@ class Demands:
     braking: Positive = param(-BRAKE_ACCEL, "deceleration from which an applied command counts as braking [m/s^2]; that of the mode BRAKE")
     stands: Positive = param(0.1, "speed below which a car counts as standing, and need not brake [m/s]")
     detection: PositiveCount = param(DETECTION_DEADLINE, "steps from the first one attacked to an alarm")
+    false_alarms: Positive = param(HOURS, "shortest mean time between false alarms with which detection counts [h]")
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -14,26 +14,32 @@ from tailgate.scoring.ranks import Harm, class_of, compare
 from tailgate.threat import KNOWLEDGE
 
 from .cells import Row, runs_of
+from .false_alarms import DETECTS, Price, prices, unpaid
 from .properties import CONJUNCTIONS
 from .statistics import interval, lower
 
 FORMAT = "tailgate-trust-1"
 Data = dict[str, Any]
+Paid = Mapping[tuple[str, str], Price]  # by defence and scenario: what its clean run says of its alarms
 
 
-def report(rows: Sequence[Row], suite: Suite, *, alpha: float, settings: Data) -> Data:
-    """What `check` returns. The rows are those of every defence, scenario, dose and attack of the suite, once each."""
+def report(rows: Sequence[Row], suite: Suite, *, alpha: float, settings: Data, clean: Sequence[Row] = ()) -> Data:
+    """What `check` returns. The rows are those of every defence, scenario, dose and attack of the suite, once each.
+
+    clean: runs without an attack that are no part of the suite, by which alarms are judged.
+    """
     formulas = [p["name"] for p in rows[0]["properties"]] if rows and _own(rows) else []
     names = ("trust",) if formulas else tuple(CONJUNCTIONS)
     fixed = settings["rule"]["name"] == "fixed"
     counted = _counted(rows, _whole(suite))
-    entries = [_entry(defence, counted, rows, alpha, names, fixed) for defence in suite.defences]
+    paid = prices([*rows, *clean], settings["demands"]["false_alarms"], suite.nominal)
+    entries = [_entry(defence, counted, rows, alpha, names, fixed, paid) for defence in suite.defences]
     return {
         "format": FORMAT, "suite": {"name": suite.name, "bound": suite.bound}, "version": tailgate.__version__, "alpha": alpha,
         "purpose": rows[0]["purpose"], "beacon": rows[0]["beacon"], **settings,
         "scenarios": list(suite.scenarios), "doses": list(suite.doses),
         "attacks": [{"attack": name, "knowledge": _knowledge(rows, name), "note": _note(rows, counted, name)} for name in suite.attacks],
-        "formulas": formulas, "defences": entries, "cells": [_cell(row, alpha, names) for row in rows],
+        "formulas": formulas, "defences": entries, "cells": [_cell(row, alpha, names, paid) for row in rows],
         "comparisons": [duel for name in names for duel in _compared(entries, counted, name, alpha)] if fixed else [],
     }  # fmt: skip
 
@@ -72,7 +78,9 @@ def _place(row: Row) -> Data:
     return {"scenario": row["scenario"], "dose": row["dose"], "attack": row["attack"]}
 
 
-def _entry(defence: str, counted: Sequence[Row], rows: Sequence[Row], alpha: float, names: Sequence[str], fixed: bool) -> Data:
+def _entry(
+    defence: str, counted: Sequence[Row], rows: Sequence[Row], alpha: float, names: Sequence[str], fixed: bool, paid: Paid
+) -> Data:
     mine = [row for row in counted if row["defence"] == defence]
     uses = next(row["uses"] for row in rows if row["defence"] == defence)
     lost = [row for row in mine if row["status"] != "ok"]
@@ -80,16 +88,23 @@ def _entry(defence: str, counted: Sequence[Row], rows: Sequence[Row], alpha: flo
     out: Data = {"defence": defence, "uses": uses, "class": class_of(uses), "why": why}
     if lost:
         out["why"] = f"incomplete: {lost[0]['attack']} on {lost[0]['scenario']}: {lost[0]['reason']}"
+    free = next(filter(None, (unpaid(row, paid) for row in mine)), "")
+    out["why"] = "; ".join(filter(None, (out["why"], free)))
     for name in names:
         known = {level: [row for row in mine if order(row["knowledge"]) <= order(level)] for level in KNOWLEDGE}
-        out[name] = {level: _bound(known[level], name, alpha, fixed) for level in KNOWLEDGE}
+        out[name] = {level: _bound(known[level], name, alpha, fixed, paid) for level in KNOWLEDGE}
     whole = [row for row in mine if row["status"] == "ok"]
-    return out | {"properties": _properties(whole, alpha), "worst": _failure(whole, names)}
+    return out | {"properties": _properties(whole, alpha, paid), "worst": _failure(whole, names)}
 
 
-def _bound(rows: Sequence[Row], name: str, alpha: float, fixed: bool) -> Data | None:
-    """The least lower limit of a conjunction over cells, each at alpha over their number; None where a cell has no figure."""
+def _bound(rows: Sequence[Row], name: str, alpha: float, fixed: bool, paid: Paid) -> Data | None:
+    """The least lower limit of a conjunction over cells, each at alpha over their number; None where a cell has no figure.
+
+    Nor has one in which detection is asked for and does not count.
+    """
     if not fixed or not rows or any(row["status"] != "ok" or name not in row["conjunctions"] for row in rows):
+        return None
+    if any(DETECTS in row["conjunctions"][name]["of"] and unpaid(row, paid) for row in rows):
         return None
     part = alpha / len(rows)
     worst = min(rows, key=lambda row: lower(row["conjunctions"][name]["k"], row["n"], part))
@@ -106,14 +121,24 @@ def _counts(known: Row) -> tuple[int, int]:
     return (known["answered"], known["asked"]) if known["asked"] is not None else (known["k"], known["n"])
 
 
-def _properties(rows: Sequence[Row], alpha: float) -> list[Data]:
-    """The worst cell of each property, with an interval that holds for all cells together; null where it is defined in none."""
+def _properties(rows: Sequence[Row], alpha: float, paid: Paid) -> list[Data]:
+    """The worst cell of each property, with an interval that holds for all cells together; null where it is defined in none.
+
+    Detection stands there with the alarms of the clean runs, and is null where it does not count in a scenario.
+    """
     out = []
     for name in dict.fromkeys(p["name"] for row in rows for p in row["properties"]):
         held = [(row, p) for row in rows for p in row["properties"] if p["name"] == name]
         asked = [(row, p) for row, p in held if p["formula"] is not None and _counts(p)[1] > 0]
         entry = {"name": name, "about": held[0][1]["about"], "share": None, "antecedent": None, "reason": _why_none(held)}
-        if asked:
+        free = ""
+        if name == DETECTS:
+            free = next(filter(None, (unpaid(row, paid) for row, _ in held)), "")
+            judged = (paid.get((row["defence"], row["scenario"])) for row, _ in held)
+            entry |= {"false_alarms": [price._asdict() for price in dict.fromkeys(judged) if price is not None]}
+        if free:
+            entry["reason"] = free
+        elif asked:
             row, p = min(asked, key=lambda item: (_counts(item[1])[0] / _counts(item[1])[1], -_counts(item[1])[1]))
             k, n = _counts(p)
             share = interval(k, n, 1.0 - alpha / len(asked))._asdict() | {"k": k, "n": n, **_place(row)}
@@ -141,8 +166,8 @@ def _failure(rows: Sequence[Row], names: Sequence[str]) -> Data | None:
     return None
 
 
-def _cell(row: Row, alpha: float, names: Sequence[str]) -> Data:
-    """A cell as the report shows it: intervals hold for each by itself."""
+def _cell(row: Row, alpha: float, names: Sequence[str], paid: Paid) -> Data:
+    """A cell as the report shows it: intervals hold for each by itself. Of detection that does not count the share is what was played."""
     out: Data = {key: row[key] for key in ("scenario", "dose", "defence", "attack", "knowledge", "status", "reason", "n", "verdict")}
     for name in names:
         held = row["conjunctions"].get(name)
@@ -151,7 +176,7 @@ def _cell(row: Row, alpha: float, names: Sequence[str]) -> Data:
     for p in row["properties"]:
         k, n = _counts(p) if p["formula"] is not None else (0, 0)
         share = {"k": k, "n": n, **interval(k, n, 1.0 - alpha)._asdict()} if n else None
-        reason = p["reason"] or ("" if share else "the antecedent never held")
+        reason = p["reason"] or (unpaid(row, paid) if p["name"] == DETECTS else "") or ("" if share else "the antecedent never held")
         kept = {key: p.get(key) for key in ("name", "formula", "least", "seed")}
         found.append({**kept, "share": share, "antecedent": _antecedent(row, p) if p["formula"] is not None else None, "reason": reason})
     return out | {"properties": found, "worst": row["worst"]}

@@ -13,6 +13,7 @@ import shlex
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import as_completed
 from concurrent.futures.process import BrokenProcessPool
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from tailgate.registry import Spec
 from tailgate.rows import encode
 from tailgate.scenario import Suite, load_scenario
 from tailgate.schema import as_data
+from tailgate.scoring.damage import CLEAN
 
 from .cells import Job, Row, check_cell, failed, single
 from .properties import CONJUNCTIONS, Demands, own
@@ -142,12 +144,14 @@ def check(
     if workers < 1:
         raise InputError("workers", workers, "a whole number not below 1")
     most = suite.seeds if runs is None else runs
-    jobs = jobs_of(
-        suite, runs=most, formulas=formulas, purpose=purpose, beacon=beacon, batch=batch, threat=threat, safe=safe, asked=asked, rule=rule
+    of = partial(
+        jobs_of, runs=most, formulas=formulas, purpose=purpose, beacon=beacon, batch=batch, threat=threat, safe=safe, asked=asked, rule=rule
     )
-    rows = play(jobs, folder, workers, progress)
+    jobs, clean = of(suite), dataclasses.replace(suite, attacks=(CLEAN,), doses=suite.doses[:1])
+    judging = [] if CLEAN in suite.attacks or formulas else of(clean)  # runs without an attack say whether detection counts
+    rows = play([*jobs, *judging], folder, workers, progress)
     settings = {"runs": most, "rule": rule_data(rule), "unsafe": _plain(safe or SafeDistance()), "demands": _plain(asked or Demands())}
-    found = report(rows, suite, alpha=alpha, settings=settings)
+    found = report(rows[: len(jobs)], suite, alpha=alpha, settings=settings, clean=rows[len(jobs) :])
     if folder is not None:
         _keep_failures(found, jobs, folder)
         write_atomic(folder / REPORT, json.dumps(found, indent=1, allow_nan=False).encode() + b"\n")

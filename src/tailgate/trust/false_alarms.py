@@ -1,0 +1,67 @@
+"""The price of detection: how often an alarm goes on where nobody attacks, and from when on `detects` does not count.
+
+An alarm that is on at random is on soon after anything. So detection counts in a scenario where the mean time between false alarms of its
+clean run is no shorter than `Demands.false_alarms`. An alarm that stays on counts again each time that the deadline of a detection has
+passed: whoever attacks then would be found by it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from tailgate.core import Array
+from tailgate.scoring.damage import CLEAN
+from tailgate.trace import Trace
+
+HOUR = 3600.0  # [s]
+DETECTS = "detects"  # the property that has this price
+
+Row = dict[str, Any]
+
+
+def false_alarms(trace: Trace, every: int) -> Array:
+    """(B,) times that any agent's alarm goes on in runs without an attack, and once more for every `every` steps that it stays on."""
+    on, stays, out = trace.alarm.any(axis=2) & trace.live, np.zeros(trace.batch, np.int64), np.zeros(trace.batch, np.int64)
+    for now in on:
+        out += now & (stays % every == 0)
+        stays = np.where(now, stays + 1, 0)
+    return out
+
+
+class Price(NamedTuple):
+    """Of a defence in a scenario: false alarms and hours of its clean run; `reason` says why detection does not count."""
+
+    scenario: str
+    alarms: int
+    running_hours: float
+    hours: float | None  # mean time between them; None without any
+    reason: str
+
+
+def prices(rows: Sequence[Row], limit: float, nominal: Sequence[str]) -> dict[tuple[str, str], Price]:
+    """By defence and scenario, of the first clean row of each that counted them. `limit`: shortest mean time between false alarms [h].
+
+    `nominal` scenarios are judged: in others the vehicle is not as the defence is told, and what is found there by chance raises no bound,
+    as the worst scenario makes it.
+    """
+    out: dict[tuple[str, str], Price] = {}
+    for row in rows:
+        key = row["defence"], row["scenario"]
+        if row["attack"] == CLEAN and row["alarms"] is not None and key not in out:
+            count, running = row["alarms"]["count"], row["alarms"]["steps"] * row["dt"] / HOUR
+            often = (row["scenario_file"] or row["scenario"]) in nominal and count * limit > running
+            every = f"one in {running / count * HOUR:.3g} s without an attack on {row['scenario']}" if often else ""
+            reason = f"{DETECTS} does not count: false alarms, {every}, limit {limit * HOUR:g} s" if often else ""
+            out[key] = Price(row["scenario"], count, running, running / count if count else None, reason)
+    return out
+
+
+def unpaid(row: Row, paid: Mapping[tuple[str, str], Price]) -> str:
+    """Why detection does not count in a row; empty where it does, and where it has no meaning."""
+    if not any(p["name"] == DETECTS and p["formula"] is not None for p in row["properties"]):
+        return ""
+    price = paid.get((row["defence"], row["scenario"]))
+    return price.reason if price is not None else f"{DETECTS} does not count: no clean run to judge by on {row['scenario']}"
