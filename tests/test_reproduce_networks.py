@@ -182,4 +182,4 @@ def test_whether_a_known_input_counts_depends_on_the_price(monkeypatch):
     safe = {(label, guard): ch6_loop._safe(ch6_loop._play(place, spec, ch6_loop.ATTACKS[label], 2)) for label in ("+60 m, p = 0.5", "+60 m, p = 1") for guard, spec in ch6_loop.GUARDS.items()}
     rows = ch6_loop._known(place, safe, 2).measured
     high, low = (rows[f"+60 m, p = 0.5: lasso, lam = {lam:g}"] for lam in (ch6_cases.LOOP_LAM, ch6_cases.LAM))
-    assert set(high.values()) == {1.0} and low["told: nobody"] < low["told: the leader"] == low["told: all"]
+    assert set(high.values()) == {1.0} and low["known to nobody"] < low["known to the leader"] == low["known to all"]
