@@ -319,7 +319,7 @@ def test_a_gate_uses_the_readings_that_are_left(model):
 
 @dataclasses.dataclass(frozen=True)
 class Halting(Platoon):
-    """The platoon whose leader is told the input that would have moved a lag as the car moved, its halt included."""
+    """The platoon whose leader knows the input that would have moved a lag as the car moved, its halt included."""
 
     def step(self, plan, state, u, exo, draws):
         after, keep = super().step(plan, state, u, exo, draws), plan.A[2, 2]
@@ -333,9 +333,9 @@ class Halting(Platoon):
         return out
 
 
-@pytest.mark.parametrize(("name", "told", "free"), [("lasso_dkf", 4.73, 0.18), ("norm_resilient", 5.27, 0.15), ("chi2_dkf:gain=steady", 21.8, 0.25)])
-def test_the_clean_error_of_the_braking_platoon_is_its_leaders_halt(name, told, free):
-    """A lag that is told -4 m/s^2 and then 0 rolls backwards; no filter that bounds its corrections is slow where the input fits."""
+@pytest.mark.parametrize(("name", "command", "fits"), [("lasso_dkf", 4.73, 0.18), ("norm_resilient", 5.27, 0.15), ("chi2_dkf:gain=steady", 21.8, 0.25)])
+def test_the_clean_error_of_the_braking_platoon_is_its_leaders_halt(name, command, fits):
+    """A lag under -4 m/s^2 and then 0 rolls backwards; no filter that bounds its corrections is slow where the input fits."""
     place, worst = load_scenario("platoon-braking-v0"), []
     halting = Halting(**{f.name: getattr(place.plant, f.name) for f in dataclasses.fields(place.plant)})
     for plant in (place.plant, halting):
@@ -345,4 +345,4 @@ def test_the_clean_error_of_the_braking_platoon_is_its_leaders_halt(name, told, 
         worst.append(np.median(error.max(axis=(0, 2))))
         own = np.where(trace.live, trace.estimate[:, :, 0, 1] - trace.truth[:, :, 0, 1], 0.0).min(axis=0)
         assert (np.median(own) < -1.0) == (plant is place.plant)
-    assert worst == [pytest.approx(told, rel=0.1), pytest.approx(free, rel=0.25)]
+    assert worst == [pytest.approx(command, rel=0.1), pytest.approx(fits, rel=0.25)]

@@ -84,7 +84,7 @@ def test_the_readings_differ_as_they_say():
 
 
 def test_a_standstill_changes_the_noise_and_no_verdict():
-    """With 18.5 times the noise most cars stand once, and what moves them is no longer the told Q; where they may roll back it is."""
+    """With 18.5 times the noise most cars halt once, and then other noise moves them than Q; where they may roll back it is Q."""
     from tailgate.reproduce.ch4_cases import THESIS, Played, rolling
 
     reading, seeds = READINGS[2], 200

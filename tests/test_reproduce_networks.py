@@ -177,9 +177,10 @@ def test_verdicts_go_both_ways():
 
 def test_whether_a_known_input_counts_depends_on_the_price(monkeypatch):
     """Both prices stand in the claim: with a high one nobody need know, with a low one the leader's own prediction has to."""
-    place = dataclasses.replace(load_scenario(ch6_loop.SCENARIO), horizon=450)
+    place = load_scenario(ch6_loop.SCENARIO)
+    place = dataclasses.replace(place, horizon=240, manoeuvre=dataclasses.replace(place.manoeuvre, onset=(5.0, 5.0)))
     monkeypatch.setattr(ch6_loop, "_play", lambda place, guard, attack, seeds, play=ch6_loop._play: play(place, guard, attack, 2))
     safe = {(label, guard): ch6_loop._safe(ch6_loop._play(place, spec, ch6_loop.ATTACKS[label], 2)) for label in ("+60 m, p = 0.5", "+60 m, p = 1") for guard, spec in ch6_loop.GUARDS.items()}
     rows = ch6_loop._known(place, safe, 2).measured
     high, low = (rows[f"+60 m, p = 0.5: lasso, lam = {lam:g}"] for lam in (ch6_cases.LOOP_LAM, ch6_cases.LAM))
-    assert set(high.values()) == {1.0} and low["told: nobody"] < low["told: the leader"] == low["told: all"]
+    assert set(high.values()) == {1.0} and low["known to nobody"] < low["known to the leader"] == low["known to all"]

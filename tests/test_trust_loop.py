@@ -265,7 +265,7 @@ def _detects(entry: dict[str, Any]) -> dict[str, Any]:
 
 
 def test_an_alarm_at_random_earns_no_bound_of_detection(short: str) -> None:
-    """Whoever alarms at everything would be trusted to detect: 45 % of the steps are one in any ten."""
+    """A class that alarms at everything would be trusted to detect: 45 % of the steps are one in any ten."""
     found = check(_suite(short, defences=("chi2_kf", AT_RANDOM, "always_alarm"), attacks=("none", SEEN)))
     good, *bad = found["defences"]
     (price,) = _detects(good)["false_alarms"]
@@ -296,14 +296,14 @@ def test_who_names_no_clean_run_is_judged_by_one_all_the_same(short: str) -> Non
     assert good["trust"]["black"]["cells"] == 1 and [c["attack"] for c in found["cells"]] == [SEEN] * 2, "and is no part of the bound"
 
 
-def test_a_vehicle_that_is_not_as_told_is_not_what_a_detector_is_judged_by(short: str, tmp_path: Path) -> None:
-    """Every detector alarms where the noise is larger than told; where nothing else was played it is judged there."""
+def test_a_detector_is_judged_by_the_vehicle_that_it_knows(short: str, tmp_path: Path) -> None:
+    """Every detector alarms where the noise is larger than it knows; where nothing else was played it is judged there."""
     noisy = tmp_path / "noisy.yaml"
     noisy.write_text(SHORT + "truth: {sensor: {noise_var: [9.0, 9.0]}}\n", encoding="utf-8")
     suite = _suite(short, scenarios=(short, str(noisy)), robustness=(str(noisy),), defences=("chi2_kf", AT_RANDOM), attacks=("none", SEEN))
     good, bad = check(suite, runs=8)["defences"]
-    told, other = _detects(good)["false_alarms"]
-    assert told["hours"] is None and other["hours"] < 0.1 and good["why"] == "" and _detects(good)["share"] and bad["why"]
+    known, other = _detects(good)["false_alarms"]
+    assert known["hours"] is None and other["hours"] < 0.1 and good["why"] == "" and _detects(good)["share"] and bad["why"]
     (alone,) = check(dataclasses.replace(suite, scenarios=(str(noisy),), defences=("chi2_kf",)), runs=8)["defences"]
     assert "does not count" in alone["why"] and _detects(alone)["share"] is None
 

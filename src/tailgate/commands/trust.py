@@ -211,7 +211,7 @@ def _print_properties(found: dict[str, Any]) -> None:
 
 
 def _alarms(prices: list[dict[str, Any]]) -> str:
-    """How often the alarm goes on without an attack, where it does so most often."""
+    """Say how often the alarm goes on without an attack, where it does so most often."""
     if not prices:
         return ""
     worst = min(prices, key=lambda price: float("inf") if price["hours"] is None else price["hours"])

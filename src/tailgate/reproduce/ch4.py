@@ -16,7 +16,7 @@ def reproduce(seeds: int, tick: Tick, figures: bool) -> Report:
         "seeds": seeds, "steps": 150,
         "attack values": "not given in the thesis: FDI U(0, 77), DoS U(-108, 108), on position and velocity, at the thesis's steps",
         "readings": {r.name: r.about for r in READINGS},
-        "standstill": "a car of the corrected plant that stands neither rolls back nor slows down, so that other noise moves it than is "
+        "standstill": "at v = 0 a car of the corrected plant neither rolls back nor slows down, so that other noise moves it than is "
         "drawn; a table says what it comes to, and what Algorithm 3 errs where a car may roll back",
         "robust KF, lam [1/m] tuned on other attacks and seeds": {r.name: round(r.lam, 4) for r in READINGS},
     }  # fmt: skip

@@ -79,7 +79,7 @@ def tuned(scenario: str, sd: float) -> float:
 READINGS = (
     Reading("printed", "thesis-ch4-v0", 20.0, 1.0, "Q = R = I and eta = 20 as printed; corrected plant"),
     Reading("printed, literal plant", "thesis-ch4-literal-v0", 20.0, 1.0, "Q = R = I and eta = 20 as printed; the plant as printed"),
-    Reading("fitted", "thesis-ch4-fitted-v0", 40.0, 18.5**0.5, "Q = R = 18.5 I drawn and told, eta = 40; corrected plant"),
+    Reading("fitted", "thesis-ch4-fitted-v0", 40.0, 18.5**0.5, "Q = R = 18.5 I drawn, and known to the filter, eta = 40; corrected plant"),
     Reading("fitted, literal plant", "thesis-ch4-literal-fitted-v0", 40.0, 18.5**0.5, "Q = R = 18.5 I, eta = 40; the plant as printed"),
 )
 
@@ -123,7 +123,7 @@ class Played:
 
     @property
     def noise(self) -> Array:
-        """(3,) mean square of what the told model does not foresee of the true state, X+ - A X - B u, over the told Q."""
+        """(3,) mean square of the part of the true state that the model does not foresee, X+ - A X - B u, over the filter's Q."""
         model, X, u = self.trace.model, self.trace.truth[:, :, 0], self.trace.control[:, :, 0]
         w = X[1:] - X[:-1] @ model.A.T - u[:-1] @ model.B.T
         return np.asarray((w * w).mean(axis=(0, 1)) / np.diag(model.Q))
@@ -131,7 +131,7 @@ class Played:
 
 @dataclass(frozen=True)
 class Rolling(CarFollowing):
-    """The corrected plant without a standstill: what is drawn is what it does, and a car may roll back."""
+    """The corrected plant without a standstill: all noise that is drawn moves it, and a car may roll back."""
 
     def move(self, plan: FollowingPlan, ego: Array, u: Array, noise: Array) -> Array:
         free = num.matvec(plan.A, ego) + num.matvec(plan.B, u)
@@ -180,7 +180,7 @@ def _table(runs: Runs, quantity: str, label: str, unit: str) -> Table:
 
 
 def _drawn(runs: Runs) -> Table:
-    """What becomes of the noise that is drawn where a car does not roll back, and what Algorithm 3 errs where it may."""
+    """Say what becomes of the drawn noise where a car does not roll back, and what Algorithm 3 errs where it may."""
     rows = []
     for r in READINGS:
         clean = runs[r.name, "clean", "ours"]
@@ -194,8 +194,8 @@ def _drawn(runs: Runs) -> Table:
             cells += ["rolls back"] + ["-"] * len(CASES)
         rows.append((r.name, *cells))
     errs = (f"RMSE of position, {words}" for words in CASES.values())
-    heads = ("reading", "runs that stand", "noise over Q: x / v / a", "if it may roll back", *errs)
-    title = "The corrected plant does not roll back: what its noise comes to [mean square over the told Q], and Algorithm 3 where it may"
+    heads = ("reading", "runs that reach v = 0", "noise over Q: x / v / a", "if it may roll back", *errs)
+    title = "The corrected plant does not roll back: what its noise comes to [mean square over Q], and Algorithm 3 where it may"
     return Table(title, heads, tuple(rows))
 
 

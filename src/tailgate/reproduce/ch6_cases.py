@@ -224,7 +224,7 @@ def _sensors(seeds: int) -> Claim:
 
 
 def _known(runs: Runs, seeds: int) -> Claim:
-    """The same figures where the followers are not told the leader's input, at the thesis's price and at that of the closed loop."""
+    """Compare the figures with those of followers who do not know the leader's input, at both prices."""
     place = platoon()
     secret = dataclasses.replace(place, plant=dataclasses.replace(place.plant, leader_input_known=False))
     values: dict[str, dict[str, float]] = {}

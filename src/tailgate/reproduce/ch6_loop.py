@@ -131,14 +131,14 @@ def _zero_mean(safe: dict[tuple[str, str], int], seeds: int) -> Claim:
 
 @dataclass(frozen=True)
 class Untold(Platoon):
-    """The platoon of whose commands no filter is told anything, the leader's own included."""
+    """The platoon in which no filter knows any command, the leader's own included."""
 
     def known(self, plan: Any, u: Array, exo: Array, state: Any) -> Array:
         return num.zeros(u.shape)
 
 
 def _known(place: Scenario, safe: dict[tuple[str, str], int], seeds: int) -> Claim:
-    """Does it change a verdict who is told the leader's command? At the price of the closed loop, and at that of the thesis's figures."""
+    """Ask who has to know the leader's command, at the price of the closed loop and at that of the thesis's figures."""
     fields = {f.name: getattr(place.plant, f.name) for f in dataclasses.fields(place.plant)}
     places = {
         "all": dataclasses.replace(place, plant=Platoon(**fields | {"leader_input_known": True})),
@@ -152,7 +152,7 @@ def _known(place: Scenario, safe: dict[tuple[str, str], int], seeds: int) -> Cla
         ):  # fmt: skip
             counts = {"the leader": safe[label, known]} if known else {}
             counts |= {who: _safe(_play(where, guard, ATTACKS[label], seeds)) for who, where in places.items() if who not in counts}
-            measured[f"{label}: {words}"] = {f"told: {who}": counts[who] / seeds for who in places}
+            measured[f"{label}: {words}"] = {f"known to {who}": counts[who] / seeds for who in places}
     flips = [max(row.values()) - min(row.values()) > FLIP for row in measured.values()]
     return Claim(
         "6.6-known-input-loop",
@@ -160,7 +160,7 @@ def _known(place: Scenario, safe: dict[tuple[str, str], int], seeds: int) -> Cla
         "known",
         measured,
         verdict(not any(flips), all(flips)),
-        "share of runs without a collision, by whose filters are told u_r; yes: no share changes by more than a quarter, no: all do. The "
+        "share of runs without a collision, by whose filters know u_r; yes: no share changes by more than a quarter, no: all do. The "
         "leader's prediction carries its command to all who hear it, so that telling them as well changes nothing. Without it a filter at "
         "a low price cannot follow its brakes, and one at a high price can",
     )

@@ -194,7 +194,7 @@ def _keys(purpose: str, seeds: tuple[int, ...]) -> draws.Keys:
 
 
 def _outcomes(job: Job, loop: Loop, attack: Any, known: Sequence[Property], keys: draws.Keys) -> tuple[dict[str, Outcome], Array | None]:
-    """Of the runs of these keys, and the false alarms of clean ones. Where the smallest gaps decide everything, no trace is made."""
+    """Play the runs of these keys: outcomes, and false alarms of clean ones. Where the smallest gaps decide all, no trace is made."""
     if all(p.by_gaps for p in known) and (found := nearest(loop, attack, keys)) is not None:
         return {p.name: outcome_by_gaps(p, *found, loop.model.dt) for p in known}, None
     trace = rollout(loop, attack, keys)

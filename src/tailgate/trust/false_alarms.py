@@ -1,8 +1,8 @@
-"""The price of detection: how often an alarm goes on where nobody attacks, and from when on `detects` does not count.
+"""The price of detection: false alarms where nobody attacks, and from when on `detects` does not count.
 
 An alarm that is on at random is on soon after anything. So detection counts in a scenario where the mean time between false alarms of its
 clean run is no shorter than `Demands.false_alarms`. An alarm that stays on counts again each time that the deadline of a detection has
-passed: whoever attacks then would be found by it.
+passed: an attack at that time would be found by it.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ Row = dict[str, Any]
 
 
 def false_alarms(trace: Trace, every: int) -> Array:
-    """(B,) times that any agent's alarm goes on in runs without an attack, and once more for every `every` steps that it stays on."""
+    """Count, by run (B,), how often any agent's alarm goes on without an attack, and once more for every `every` steps that it stays on."""
     on, stays, out = trace.alarm.any(axis=2) & trace.live, np.zeros(trace.batch, np.int64), np.zeros(trace.batch, np.int64)
     for now in on:
         out += now & (stays % every == 0)
@@ -32,7 +32,7 @@ def false_alarms(trace: Trace, every: int) -> Array:
 
 
 class Price(NamedTuple):
-    """Of a defence in a scenario: false alarms and hours of its clean run; `reason` says why detection does not count."""
+    """False alarms and hours of a defence's clean run in a scenario; `reason` says why detection does not count."""
 
     scenario: str
     alarms: int
@@ -42,10 +42,10 @@ class Price(NamedTuple):
 
 
 def prices(rows: Sequence[Row], limit: float, nominal: Sequence[str]) -> dict[tuple[str, str], Price]:
-    """By defence and scenario, of the first clean row of each that counted them. `limit`: shortest mean time between false alarms [h].
+    """Judge the first clean row of each defence and scenario. `limit`: shortest mean time between false alarms [h].
 
-    `nominal` scenarios are judged: in others the vehicle is not as the defence is told, and what is found there by chance raises no bound,
-    as the worst scenario makes it.
+    `nominal` scenarios are judged. In others the vehicle is not the one that the defence knows, and a lucky detection raises no bound
+    there, as the worst scenario makes it.
     """
     out: dict[tuple[str, str], Price] = {}
     for row in rows:
@@ -60,7 +60,7 @@ def prices(rows: Sequence[Row], limit: float, nominal: Sequence[str]) -> dict[tu
 
 
 def unpaid(row: Row, paid: Mapping[tuple[str, str], Price]) -> str:
-    """Why detection does not count in a row; empty where it does, and where it has no meaning."""
+    """Say why detection does not count in a row; empty where it does, and where it has no meaning."""
     if not any(p["name"] == DETECTS and p["formula"] is not None for p in row["properties"]):
         return ""
     price = paid.get((row["defence"], row["scenario"]))

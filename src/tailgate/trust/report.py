@@ -124,7 +124,7 @@ def _counts(known: Row) -> tuple[int, int]:
 def _properties(rows: Sequence[Row], alpha: float, paid: Paid) -> list[Data]:
     """The worst cell of each property, with an interval that holds for all cells together; null where it is defined in none.
 
-    Detection stands there with the alarms of the clean runs, and is null where it does not count in a scenario.
+    Detection has the alarms of the clean runs with it, and is null where it does not count in a scenario.
     """
     out = []
     for name in dict.fromkeys(p["name"] for row in rows for p in row["properties"]):
@@ -167,7 +167,7 @@ def _failure(rows: Sequence[Row], names: Sequence[str]) -> Data | None:
 
 
 def _cell(row: Row, alpha: float, names: Sequence[str], paid: Paid) -> Data:
-    """A cell as the report shows it: intervals hold for each by itself. Of detection that does not count the share is what was played."""
+    """A cell as the report shows it: intervals hold for each by itself. Detection that does not count keeps the share that was played."""
     out: Data = {key: row[key] for key in ("scenario", "dose", "defence", "attack", "knowledge", "status", "reason", "n", "verdict")}
     for name in names:
         held = row["conjunctions"].get(name)
