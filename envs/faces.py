@@ -25,12 +25,13 @@ from tailgate.loop import LoopState
 from .batches import FusedEpisodes, PlainEpisodes, framed, side_by_side
 from .render_viewer import Viewer
 from .seat import FACES, Seat, Tally
+from .specs import Specified, check_options, in_box
 
 _WHOLE = (int, np.int64)  # an action's usual types
 _AUTORESET = {"next_step": AutoresetMode.NEXT_STEP, "same_step": AutoresetMode.SAME_STEP, "disabled": AutoresetMode.DISABLED}
 
 
-class AdversaryVectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
+class AdversaryVectorEnv(Specified, gymnasium.vector.VectorEnv[Array, Array, Array]):
     """B adversary environments stepped as one batch; arguments as `Seat.make`, viewer, size as `Viewer`, engine as `batches`."""
 
     metadata: dict[str, Any] = {  # noqa: RUF012 - Gymnasium's own annotation
@@ -102,6 +103,7 @@ class AdversaryVectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
 
     def reset(self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None) -> tuple[Array, dict[str, Any]]:
         """seed s or one per row. options["reset_mask"] (B,) bool restarts those rows only."""
+        check_options(options, ("reset_mask",))
         mask = None if options is None else options.get("reset_mask")
         if isinstance(seed, (list, tuple, np.ndarray)):
             if len(seed) != self.num_envs:
@@ -198,7 +200,7 @@ class AdversaryVectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
                 wrong = actions.dtype.kind not in "iu" or actions.min() < 0 or actions.max() >= self._modes
             if wrong:
                 raise InputError("actions", actions.tolist(), f"whole numbers from 0 to {self._modes - 1}")
-        elif not np.isfinite(actions).all():
+        elif not in_box(actions):
             raise InputError("actions", actions.tolist(), "finite numbers in [-1, 1]")
         return actions
 
@@ -210,7 +212,7 @@ class AdversaryVectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
         return info
 
 
-class AdversaryEnv(gymnasium.Env[Array, Any]):
+class AdversaryEnv(Specified, gymnasium.Env[Array, Any]):
     """One adversary environment; see `Seat.make` for the arguments, `Viewer` for viewer and size."""
 
     metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array"], "render_fps": 10}  # noqa: RUF012 - Gymnasium's own annotation
@@ -238,6 +240,7 @@ class AdversaryEnv(gymnasium.Env[Array, Any]):
         return self.batch.card()
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Array, dict[str, Any]]:
+        check_options(options)
         super().reset(seed=seed)
         if not self.batch.begun and seed is None:
             seed = int(self.np_random.integers(2**31))
