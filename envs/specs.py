@@ -46,9 +46,9 @@ def named(family: Family, value: Any, imports: bool = True) -> str:
             why = "its class lies in no module"
         else:
             shown = value
-            if dataclasses.is_dataclass(value) and any(isinstance(getattr(value, f.name), Path) for f in dataclasses.fields(value)):
-                paths = {f.name: str(getattr(value, f.name)) for f in dataclasses.fields(value) if isinstance(getattr(value, f.name), Path)}
-                shown = dataclasses.replace(value, **paths)
+            if dataclasses.is_dataclass(value) and not isinstance(value, type):
+                paths = {f.name: str(held) for f in dataclasses.fields(value) if isinstance(held := getattr(value, f.name), Path)}
+                shown = dataclasses.replace(value, **paths) if paths else value
             spec = Spec(family, text_of(entry_for(family, cls), shown))
             if spec.imports and not imports:
                 why = "its class is no registered one"

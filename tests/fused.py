@@ -1,6 +1,8 @@
 """The fused engine beside the plain loop, for the tests of each of its plants."""
 
 
+import dataclasses
+
 import numpy as np
 
 from tailgate import draws
@@ -11,11 +13,13 @@ from tailgate.scenario import load_scenario
 from tailgate.trace import rollout
 
 
-def loop_of(scenario, defence, attack, horizon=200, **threat):
+def loop_of(scenario, defence, attack, horizon=200, beyond=None, **threat):
+    """`beyond`: changes of the threat model that no file may make."""
     made = Spec("attack", attack)
     changes = {"knowledge": getattr(made.make(), "knowledge", made.entry.knowledge)} | threat
     guard = Spec("defence", defence)
     place = load_scenario(scenario).with_threat(**changes)
+    place = dataclasses.replace(place, threat_model=dataclasses.replace(place.threat_model, **(beyond or {})))
     loop = place.loop(guard.make(), guard.entry.uses)
     object.__setattr__(loop, "horizon", min(horizon, place.horizon))
     return loop, made.make()
