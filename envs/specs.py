@@ -13,7 +13,6 @@ from gymnasium.envs.registration import EnvSpec
 
 from tailgate.core import Array
 from tailgate.errors import InputError, unknown
-from tailgate.estimators.steering import Menu
 from tailgate.registry import Family, Spec, entry_for, text_of
 from tailgate.schema import as_data
 
@@ -80,7 +79,7 @@ def _plain(key: str, value: Any, imports: bool) -> Any:
         if isinstance(value, list | tuple):
             return [held if isinstance(held, str) else named(_FAMILIES[key], held, imports) for held in value]
         return named(_FAMILIES[key], value, imports)
-    if isinstance(value, Menu):
+    if key == "menu" and dataclasses.is_dataclass(value):
         return {name: held for name, held in as_data(value).items() if name != "class"}
     raise InputError(f"spec: {key}", value, "numbers, text, lists and mappings of them: anything else cannot be written as JSON")
 

@@ -68,10 +68,11 @@ def precision(R: Array) -> Array:
 def broad(model: Model) -> Array:
     """(n,) variances so large that the next measurement decides: a million times those after 100 steps of the filter."""
     P = np.array(model.Q)
-    unsure = model.R.diagonal(axis1=1, axis2=2) + num.matmul(num.matmul(model.C, P), num.transpose(model.C)).diagonal(axis1=1, axis2=2)
-    if (unsure < LEAST).any():
-        wanted = f"noise of sensor or process, {LEAST:g} or more in every reading: a filter divides by its variance"
-        raise NotApplicable("model: variance of a reading", unsure.tolist(), wanted)
+    if (model.R.diagonal(axis1=1, axis2=2) < LEAST).any():  # then the process has to be noisy
+        unsure = (num.matmul(num.matmul(model.C, P), num.transpose(model.C)) + model.R).diagonal(axis1=1, axis2=2)
+        if (unsure < LEAST).any():
+            wanted = f"noise of sensor or process, {LEAST:g} or more in every reading: a filter divides by its variance"
+            raise NotApplicable("model: variance of a reading", unsure.tolist(), wanted)
     for _ in range(100):
         C, R = model.C[0], model.R[0]
         S = num.matmul(num.matmul(C, P), num.transpose(C)) + R

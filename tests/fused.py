@@ -77,7 +77,7 @@ def as_plain(arguments, rows, folder):
         if one.seat.action.discrete:
             actions = np.where(rng.random(rows) < 0.6, 0, rng.integers(0, one.seat.action.size, rows))
         else:
-            actions = rng.uniform(-1.2, 1.2, (rows, one.seat.action.size)).astype(np.float32)
+            actions = np.clip(rng.uniform(-1.2, 1.2, (rows, one.seat.action.size)), -1.0, 1.0).astype(np.float32)  # the ends among them
         results = one.step(actions), two.step(actions)
         for first, second in zip(*results, strict=True):
             same(*(value if isinstance(value, dict) else np.asarray(value) for value in (first, second)))

@@ -59,7 +59,7 @@ def cases(cls):
 
 def _plays(place, defence, attack, uses):
     """One short episode of each of two seeds; raises AssertionError where a number is not finite."""
-    place = dataclasses.replace(place, horizon=min(place.horizon, 24)).with_threat(onset=6, end=None)
+    place = dataclasses.replace(place, horizon=min(place.horizon, 12)).with_threat(onset=4, end=None)
     trace = rollout(place.loop(defence, uses), attack, keys("train", (3, 4)))
     for name in ("truth", "estimate", "control", "wires"):
         if name in trace.signals:
