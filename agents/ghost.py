@@ -11,6 +11,7 @@ from tailgate import num
 from tailgate.core import Array, Command, Count, Kind, NonNegative, Positive, View, param
 from tailgate.draws import Draws, constants
 from tailgate.errors import NotApplicable
+from tailgate.quantities import Settling
 from tailgate.registry import register
 from tailgate.threat import Brief
 
@@ -36,7 +37,7 @@ class GhostState(Script):
     size: Positive = param(100.0, "2-norm of g when it is fully grown [unit of the state]")
     grow: NonNegative = param(0.0, "time over which it grows in, linearly [s]; 0: at once")
     mode: Count = param(0, "seed of the direction within the modes that last longest")
-    settle: Count = param(400, "steps of A that leave only these modes of a random direction")
+    settle: Settling = param(400, "steps of A that leave only these modes of a random direction")
 
     def prepare(self, brief: Brief) -> ScriptPlan:
         plan, model, where = super().prepare(brief), brief.model, "attack ghost"

@@ -12,6 +12,7 @@ from tailgate import num
 from tailgate.core import Array, Command, Count, Finite, Kind, Model, NonNegative, Positive, View, param
 from tailgate.draws import Draws
 from tailgate.errors import InputError, NotApplicable
+from tailgate.quantities import Lag
 from tailgate.registry import register
 from tailgate.threat import Brief
 
@@ -75,7 +76,7 @@ class Covert(Script):
     """
 
     displacement: Finite = param(10.0, "by how far the state is displaced, at most; the bounds may allow less [unit of the state]")
-    rise: Positive = param(10.0, "time in which it gets there [s]")
+    rise: Lag = param(10.0, "time in which it gets there [s]")
     state_index: Count = param(0, "which state is displaced; it has to rest where it is put, as a position does")
 
     def prepare(self, brief: Brief) -> ScriptPlan:

@@ -16,8 +16,9 @@ from typing import NamedTuple
 import numpy as np
 
 from tailgate import num
-from tailgate.core import Array, Estimate, Finite, Mode, Model, NonNegative, Positive, Probability, param
+from tailgate.core import Array, Estimate, Mode, Model, Probability, param
 from tailgate.errors import InputError
+from tailgate.quantities import Accel, Gain, Lag, Length, check_order
 from tailgate.registry import register
 
 from .controllers import WIDEN_FACTOR, limited, obeyed
@@ -84,10 +85,13 @@ class LawState(NamedTuple):
 class Law:
     """Base of the CACC laws: a subclass gives its `gains`; running them is the same for all."""
 
-    headway: Positive = param(3.0, "time headway tau_h [s]")
-    standstill: NonNegative = param(5.0, "minimum stopping distance d_r [m]")
-    accel_min: Finite | None = param(-8.0, "lower limit of the command [m/s^2]; none: unlimited")
-    accel_max: Finite | None = param(3.0, "upper limit of the command [m/s^2]; none: unlimited")
+    headway: Lag = param(3.0, "time headway tau_h [s]")
+    standstill: Length = param(5.0, "minimum stopping distance d_r [m]")
+    accel_min: Accel | None = param(-8.0, "lower limit of the command [m/s^2]; none: unlimited")
+    accel_max: Accel | None = param(3.0, "upper limit of the command [m/s^2]; none: unlimited")
+
+    def __post_init__(self) -> None:
+        check_order("controller: accel_min, accel_max", (self.accel_min, self.accel_max))
 
     def gains(self, graph: Array, headway: float, local: bool = False) -> Gains:
         """The law's matrices for a graph (N, N), a time headway [s], and without V2V messages where `local`."""
@@ -156,8 +160,8 @@ class FeedForward(Law):
     Erratum: (6.7) is printed with w1 = w0 = 1, which feeds a steady acceleration forward twice.
     """
 
-    kp: NonNegative = param(0.5, "gain of the spacing error [1/s^2]")
-    kd: NonNegative = param(1.0, "gain of its rate [1/s]")
+    kp: Gain = param(0.5, "gain of the spacing error [1/s^2]")
+    kd: Gain = param(1.0, "gain of its rate [1/s]")
     weights: tuple[Probability, Probability] | None = param(
         None, "w1, w0: weights of the predecessor's and the leader's acceleration; none: (0.5, 0.5), or (1, 0) without the leader's message"
     )

@@ -10,8 +10,9 @@ from typing import Literal
 
 import numpy as np
 
-from tailgate.core import Array, NonNegative, param
+from tailgate.core import Array, param
 from tailgate.errors import InputError
+from tailgate.quantities import Gain
 from tailgate.registry import register
 
 from .cacc import Column, Gains, Law, no_gains
@@ -32,8 +33,8 @@ class Consensus(Law):
     u_i = b (v_{i-1} - v_i) + k (d_i - d_r - tau_h v_i).
     """
 
-    b: NonNegative = param(0.8, "gain of the speed difference to the leader [1/s]")
-    k: NonNegative = param(0.1, "gain of the mean position error among the neighbours [1/s^2]")
+    b: Gain = param(0.8, "gain of the speed difference to the leader [1/s]")
+    k: Gain = param(0.1, "gain of the mean position error among the neighbours [1/s^2]")
     leader: Literal["heard", "estimated"] = param(
         "heard", "the leader's speed is an estimate: heard: only where every car hears the leader's own one; estimated: in any topology"
     )

@@ -6,8 +6,9 @@ from typing import Any
 import numpy as np
 
 from tailgate import num
-from tailgate.core import Array, Estimate, Finite, Mode, Model, NonNegative, Positive, param
+from tailgate.core import Array, Estimate, Mode, Model, param
 from tailgate.errors import InputError
+from tailgate.quantities import Accel, Lag, Length, PositiveGain, PositiveSpeed, check_order
 from tailgate.registry import register
 
 LEADER = ("leader_position", "leader_velocity")  # what the leader sends
@@ -54,12 +55,15 @@ class AdaptiveCruise:
     without the gap term, (v_set - v_f) / h, is taken (speed mode).
     """
 
-    headway: Positive = param(3.0, "time headway h [s]")
-    standstill: NonNegative = param(5.0, "minimum stopping distance d_r [m]")
-    gamma: Positive = param(0.9, "gap gain [1/s]")
-    set_speed: Positive | None = param(29.95, "driver's set speed [m/s]; none: spacing mode only")
-    accel_min: Finite | None = param(-5.0, "lower limit of the command [m/s^2]; none: unlimited")
-    accel_max: Finite | None = param(2.0, "upper limit of the command [m/s^2]; none: unlimited")
+    headway: Lag = param(3.0, "time headway h [s]")
+    standstill: Length = param(5.0, "minimum stopping distance d_r [m]")
+    gamma: PositiveGain = param(0.9, "gap gain [1/s]")
+    set_speed: PositiveSpeed | None = param(29.95, "driver's set speed [m/s]; none: spacing mode only")
+    accel_min: Accel | None = param(-5.0, "lower limit of the command [m/s^2]; none: unlimited")
+    accel_max: Accel | None = param(2.0, "upper limit of the command [m/s^2]; none: unlimited")
+
+    def __post_init__(self) -> None:
+        check_order("controller acc.accel_min, accel_max", (self.accel_min, self.accel_max))
 
     def prepare(self, model: Model) -> Any:
         if model.v2v[:2] != LEADER:

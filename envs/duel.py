@@ -27,6 +27,7 @@ from tailgate.schema import as_data, build, digest, fields_of
 from tailgate.tree import put_rows
 
 from .seat import CAR_FOLLOWING, FACES, Outcome, Seat, Tally
+from .specs import Specified, check_options, in_box
 
 DEFENDER = "tailgate/Defender-v0"
 
@@ -209,9 +210,11 @@ class Duel:
 def checked(space: Any, action: Any, who: str) -> Array:
     """One row's action as a batch of one. Raises InputError for one outside of its space."""
     given = np.asarray(action)
-    fits = given.shape == space.shape and np.isfinite(given).all()
+    fits = given.shape == space.shape
     if fits and isinstance(space, gymnasium.spaces.Discrete):
         fits = given.dtype.kind in "iu" and 0 <= int(given) < space.n
+    elif fits:
+        fits = in_box(given)
     if not fits:
         raise InputError(f"actions.{who}", action, f"an action of {space}")
     return given[None]
@@ -224,7 +227,7 @@ def next_game(duel: Duel, held: DuelState | None, seed: int | None, rng: Any) ->
     return duel.begin(draws.keys("train", [int(rng.integers(2**31)) if seed is None else int(seed)]))
 
 
-class DefenderEnv(gymnasium.Env[Array, Any]):
+class DefenderEnv(Specified, gymnasium.Env[Array, Any]):
     """The defender's seat against given attacks: an action sets the knobs for `interval` steps.
 
     attack: one as on the command line, an object, or a list of them, of which each episode draws one. Other arguments: see `Duel.make`.
@@ -245,6 +248,7 @@ class DefenderEnv(gymnasium.Env[Array, Any]):
         self.attack: Attack = made[0] if len(made) == 1 else Mixture(tuple(made))
         self.attack.prepare(self.duel.seat.loop.brief)  # what does not fit shall fail here
         self.observation_space, self.action_space = self.duel.defender_spaces()
+        self.horizon = self.duel.seat.decisions
         self.state: DuelState | None = None
         self.rival: Rival | None = None
         self.over = np.zeros(1, bool)
@@ -254,6 +258,7 @@ class DefenderEnv(gymnasium.Env[Array, Any]):
         return self.duel.card(attack=self.attack)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Array, dict[str, Any]]:
+        check_options(options)
         super().reset(seed=seed)
         self.state = next_game(self.duel, self.state, seed, self.np_random)
         self.rival, self.over = Rival(self.attack, self.duel.seat, self.state.loop.keys), np.zeros(1, bool)

@@ -7,12 +7,10 @@ episode counter.
 
 from __future__ import annotations
 
-import copy
 from typing import Any, ClassVar
 
 import gymnasium
 import numpy as np
-from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
@@ -28,6 +26,7 @@ from .batches import FusedEpisodes, PlainEpisodes, framed, side_by_side
 from .render_viewer import Screen, Viewer
 from .seat import FACES, Seat, Tally
 from .shadow import Begun, Decided
+from .specs import Specified, check_options, in_box, limit_of
 
 _WHOLE = (int, np.int64)  # an action's usual types
 _BOOL = (np.False_, np.True_)
@@ -35,7 +34,7 @@ _GOES_ON = np.zeros(1, bool)  # of a single row: it is not over
 _AUTORESET = {"next_step": AutoresetMode.NEXT_STEP, "same_step": AutoresetMode.SAME_STEP, "disabled": AutoresetMode.DISABLED}
 
 
-class AdversaryVectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
+class AdversaryVectorEnv(Specified, gymnasium.vector.VectorEnv[Array, Array, Array]):
     """B adversary environments stepped as one batch; arguments as `Seat.make`, viewer, size as `Viewer`, engine as `batches`."""
 
     metadata: dict[str, Any] = {  # noqa: RUF012 - Gymnasium's own annotation
@@ -59,7 +58,6 @@ class AdversaryVectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
             raise InputError("render_mode", render_mode, f"None or 'rgb_array'{why}")
         self.seat = Seat.make(**arguments)
         self.num_envs = num_envs
-        self._spec: EnvSpec | None = None
         self.render_mode, self.viewer = render_mode, Viewer(viewer, size)
         self.autoreset_mode = _AUTORESET[autoreset]
         self.horizon = min(self.seat.decisions, limit or self.seat.decisions)  # decisions of an episode that nothing ends early
@@ -79,15 +77,6 @@ class AdversaryVectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
         self._facts = ("illegal", "collided", "rear_collided", "allowed", "step", "gap" if self.seat.road else "error")
         self._present = self._presence()
         self.observed = np.zeros((num_envs, features if self._frames > 1 else 0), np.float32)  # of several frames
-
-    @property
-    def spec(self) -> EnvSpec | None:
-        """What Gymnasium made this of, with the horizon as `max_episode_steps`."""
-        return self._spec
-
-    @spec.setter
-    def spec(self, spec: EnvSpec | None) -> None:
-        self._spec = with_horizon(spec, self.horizon)
 
     @property
     def engine(self) -> str:
@@ -127,6 +116,7 @@ class AdversaryVectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
 
     def reset(self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None) -> tuple[Array, dict[str, Any]]:
         """seed s or one per row. options["reset_mask"] (B,) bool restarts those rows only."""
+        check_options(options, ("reset_mask",))
         mask = None if options is None else options.get("reset_mask")
         if isinstance(seed, (list, tuple, np.ndarray)):
             if len(seed) != self.num_envs:
@@ -243,7 +233,7 @@ class AdversaryVectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
                 wrong = actions.dtype.kind not in "iu" or actions.min() < 0 or actions.max() >= self._modes
             if wrong:
                 raise InputError("actions", actions.tolist(), f"whole numbers from 0 to {self._modes - 1}")
-        elif not np.isfinite(actions).all():
+        elif not in_box(actions):
             raise InputError("actions", actions.tolist(), "finite numbers in [-1, 1]")
         return actions
 
@@ -255,7 +245,7 @@ class AdversaryVectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
         return info
 
 
-class AdversaryEnv(gymnasium.Env[Array, Any]):
+class AdversaryEnv(Specified, gymnasium.Env[Array, Any]):
     """One adversary environment; see `Seat.make` for the arguments, `Viewer` for viewer and size."""
 
     metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array"], "render_fps": 10}  # noqa: RUF012 - Gymnasium's own annotation
@@ -268,10 +258,10 @@ class AdversaryEnv(gymnasium.Env[Array, Any]):
         drawn = None if render_mode is None else "rgb_array"
         self.batch = AdversaryVectorEnv(1, render_mode=drawn, autoreset="disabled", **arguments)
         self.render_mode = render_mode
+        self.horizon = self.batch.horizon
         self.metadata = self.metadata | {"render_fps": self.batch.metadata["render_fps"]}
         self._cockpit: Cockpit | None = None  # which steps a single row without a batch between
         self._fused: Any = self.batch.episodes
-        self._spec: EnvSpec | None = None
         self._direct = self.batch.direct and render_mode != "human"
         self._actions, self._over = self.batch._modes, False  # the second: the episode is over
         self._damage = self.batch._facts[-1]
@@ -280,20 +270,12 @@ class AdversaryEnv(gymnasium.Env[Array, Any]):
         self.observation_space = self.batch.single_observation_space
         self.action_space = self.batch.single_action_space
 
-    @property
-    def spec(self) -> EnvSpec | None:
-        """What Gymnasium made this of, with the horizon as `max_episode_steps`."""
-        return self._spec
-
-    @spec.setter
-    def spec(self, spec: EnvSpec | None) -> None:
-        self._spec = with_horizon(spec, self.batch.horizon)
-
     def card(self) -> dict[str, Any]:
         """JSON data that names this environment completely, with a hash."""
         return self.batch.card()
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Array, dict[str, Any]]:
+        check_options(options)
         super().reset(seed=seed)
         if not self.batch.begun and seed is None:
             seed = int(self.np_random.integers(2**31))
@@ -366,22 +348,6 @@ class AdversaryEnv(gymnasium.Env[Array, Any]):
     def row(info: dict[str, Any], i: int = 0) -> dict[str, Any]:
         """The info of row i of a batch's."""
         return {k: v[i].copy() for k, v in info.items() if not k.startswith("_")}
-
-
-def limit_of(name: str, given: int | None) -> int:
-    """The argument of this name: decisions of an episode at most, 0 where there is no limit. Raises InputError."""
-    if given is not None and (not isinstance(given, (int, np.integer)) or isinstance(given, bool) or given < 1):
-        raise InputError(name, given, "a whole number of decisions not below 1, or None")
-    return int(given or 0)
-
-
-def with_horizon(spec: EnvSpec | None, horizon: int) -> EnvSpec | None:
-    """The spec with `max_episode_steps`, where it says none."""
-    if spec is None or (spec.max_episode_steps or horizon + 1) <= horizon:
-        return spec
-    spec = copy.copy(spec)
-    spec.max_episode_steps = horizon
-    return spec
 
 
 def register_all() -> None:

@@ -22,8 +22,9 @@ import numpy as np
 from pydantic import Field
 
 from tailgate import num
-from tailgate.core import Array, Finite, Positive, param
+from tailgate.core import Array, Positive, param
 from tailgate.errors import InputError
+from tailgate.quantities import Decibel
 
 LIGHT = 299_792_458.0  # speed of light c [m/s]
 KT0 = 1.380649e-23 * 290.0  # thermal noise density at the reference temperature of a noise figure [W/Hz]
@@ -70,22 +71,22 @@ class Link:
     sweep: Positive = param(150e6, "swept bandwidth Bs of one sweep [Hz]")
     sweep_time: Positive = param(2e-3, "duration Ts of one sweep, up or down [s]")
     power: Positive = param(10e-3, "transmitted power Pt [W]")
-    gain_db: Finite = param(28.0, "gain G of the antenna [dBi]")
-    loss_db: Finite = param(0.10, "losses L of the radar [dB]")
+    gain_db: Decibel = param(28.0, "gain G of the antenna [dBi]")
+    loss_db: Decibel = param(0.10, "losses L of the radar [dB]")
     cross_section: Positive = param(10.0, "radar cross-section s of the car ahead, which does not fluctuate [m^2]")
     bandwidth: Positive = param(256e3, "IF bandwidth B_if, which is the rate of the complex samples [Hz]")
-    noise_figure_db: Finite = param(12.0, "noise figure F of the receiver [dB]")
+    noise_figure_db: Decibel = param(12.0, "noise figure F of the receiver [dB]")
     operating_band: Positive = param(150e6, "operating bandwidth B of the radar, as a jammer sees it [Hz]")
-    jam_gain_db: Finite = param(10.0, "gain GJ of the jammer's antenna [dBi]")
+    jam_gain_db: Decibel = param(10.0, "gain GJ of the jammer's antenna [dBi]")
     jam_band: Positive = param(155e6, "bandwidth BJ of the jammer [Hz]")
-    jam_loss_db: Finite = param(0.10, "losses LJ of the jammer [dB]")
+    jam_loss_db: Decibel = param(0.10, "losses LJ of the jammer [dB]")
     in_band: Share | None = param(
         None, "share of the jammer's received power that the IF filter passes; none: B_if/B, of noise over all B; 1: it follows the chirp"
     )
 
     def __post_init__(self) -> None:
         if self.samples < 64:
-            raise InputError("fmcw_radar.bandwidth", self.bandwidth, f"at least 64 samples a sweep, {64.0 / self.sweep_time:g} Hz")
+            raise InputError("sensor fmcw_radar.bandwidth", self.bandwidth, f"at least 64 samples a sweep, {64.0 / self.sweep_time:g} Hz")
 
     @property
     def slope(self) -> float:

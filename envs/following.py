@@ -15,15 +15,19 @@ import numpy as np
 from pydantic import Field
 
 from tailgate import num
-from tailgate.core import Array, Controller, Finite, Model, NonNegative, Positive, Prior, Scene, Sensor, param
+from tailgate.core import Array, Controller, Model, Prior, Scene, Sensor, param
 from tailgate.draws import Draws
+from tailgate.errors import InputError
+from tailgate.quantities import Accel, Gap, Lag, Position, Speed, Spread, Step, Time, Variance
 from tailgate.registry import register
 
 from .controllers import LEADER
 from .idm import Behind, BehindState
-from .vehicle import drive, lag, roll
+from .vehicle import SIGMAS, check_reaction, drive, lag, roll
 
-Triple = Annotated[tuple[NonNegative, NonNegative, NonNegative], Field(min_length=3, max_length=3)]
+Spreads = Annotated[tuple[Spread, Spread, Spread], Field(min_length=3, max_length=3)]
+Variances = Annotated[tuple[Variance, Variance, Variance], Field(min_length=3, max_length=3)]
+
 
 class FollowingPlan(NamedTuple):
     A: Array
@@ -46,18 +50,25 @@ class FollowingState(NamedTuple):
 class CarFollowing:
     """Leader, ACC follower with actuator lag, and optionally a human-like driver behind."""
 
-    dt: Positive = param(0.1, "step [s]")
-    tau: Positive = param(1.008, "actuator lag [s]")
-    gap: Finite = param(85.5, "initial gap [m]")
-    lead_speed: NonNegative = param(29.05, "leader's initial speed [m/s]")
-    position: Finite = param(2.0, "follower's initial position [m]")
-    speed: NonNegative = param(26.82, "follower's initial speed [m/s]")
-    accel: Finite = param(0.112, "follower's initial acceleration [m/s^2]")
-    process_var: Triple = param((1e-4, 4e-4, 2.5e-3), "process noise variance a step, of x, v and a [m^2, (m/s)^2, (m/s^2)^2]")
-    initial_sd: Triple = param((0.0, 0.0, 0.0), "spread of the true initial state about the prior mean [m, m/s, m/s^2]")
-    prior_var: Triple = param((1.0, 1.0, 0.25), "variance that the defence is told of the prior")
+    dt: Step = param(0.1, "step [s]")
+    tau: Lag = param(1.008, "actuator lag [s]")
+    gap: Gap = param(85.5, "initial gap [m]")
+    lead_speed: Speed = param(29.05, "leader's initial speed [m/s]")
+    position: Position = param(2.0, "follower's initial position [m]")
+    speed: Speed = param(26.82, "follower's initial speed [m/s]")
+    accel: Accel = param(0.112, "follower's initial acceleration [m/s^2]")
+    process_var: Variances = param((1e-4, 4e-4, 2.5e-3), "process noise variance a step, of x, v and a [m^2, (m/s)^2, (m/s^2)^2]")
+    initial_sd: Spreads = param((0.0, 0.0, 0.0), "spread of the true initial state about the prior mean [m, m/s, m/s^2]")
+    prior_var: Variances = param((1.0, 1.0, 0.25), "variance that the defence is told of the prior")
     rear: bool = param(True, "a human-like driver follows behind")
-    rear_reaction: NonNegative = param(1.0, "reaction time of the driver behind [s]")
+    rear_reaction: Time = param(1.0, "reaction time of the driver behind [s]")
+
+    def __post_init__(self) -> None:
+        least = SIGMAS * self.initial_sd[0]
+        if self.gap <= least:
+            wanted = f"more than {SIGMAS:g} times initial_sd of the position ({least:g}): else some begin in a collision"
+            raise InputError("plant car_following.gap", self.gap, wanted)
+        check_reaction("plant car_following.rear_reaction", self.rear_reaction, self.dt)
 
     @property
     def size(self) -> tuple[int, int]:

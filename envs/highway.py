@@ -18,9 +18,10 @@ import numpy as np
 from pydantic import Field
 
 from tailgate import num
-from tailgate.core import Array, Controller, Count, Model, NonNegative, Positive, PositiveCount, Prior, Scene, Sensor, param
+from tailgate.core import Array, Controller, Model, Positive, Prior, Scene, Sensor, param
 from tailgate.draws import Draws
 from tailgate.errors import InputError
+from tailgate.quantities import Gap, Lag, Length, PositiveSpeed, Rate, Step, Variance, check_order
 from tailgate.registry import register
 
 from .radar_car import STATES, radar_model
@@ -29,8 +30,14 @@ from .vehicle import drive, lag
 if TYPE_CHECKING:
     from .highway_scene import Bench, Sight
 
-Quadruple = Annotated[tuple[NonNegative, NonNegative, NonNegative, NonNegative], Field(min_length=4, max_length=4)]
+Quadruple = Annotated[tuple[Variance, Variance, Variance, Variance], Field(min_length=4, max_length=4)]
 Span = Annotated[tuple[Positive, Positive], Field(min_length=2, max_length=2)]
+Lanes = Annotated[int, Field(ge=1, le=20)]
+Lane = Annotated[int, Field(ge=0, le=19)]
+Ahead = Annotated[int, Field(ge=1, le=50)]
+Behind = Annotated[int, Field(ge=0, le=50)]
+Speeds = Annotated[tuple[PositiveSpeed, PositiveSpeed], Field(min_length=2, max_length=2)]
+Gaps = Annotated[tuple[Gap, Gap], Field(min_length=2, max_length=2)]
 START = 1000.0  # where the car begins [m]
 SPEED_LIMIT = 30.0  # of the road [m/s]
 DELTAS = (3.5, 4.5)  # exponents of IDM among the drivers, HighwayEnv's range
@@ -71,24 +78,24 @@ class Highway:
     Ahead is whoever has a part of his car in the lane. Nobody, or nobody nearer than `reach`, is a car at `reach` that keeps the own speed.
     """
 
-    dt: Positive = param(0.1, "step [s]")
-    tau: Positive = param(1.008, "actuator lag [s]")
-    lanes: PositiveCount = param(3, "lanes")
-    lane: Count = param(1, "the car's lane, from 0")
-    ahead: PositiveCount = param(2, "other cars in each lane that begin ahead")
-    behind: Count = param(1, "other cars in each lane that begin behind")
-    spacing: Span = param((40.0, 75.0), "distance from car to car at the beginning, uniform on this span [m]")
-    speed: Positive = param(25.0, "the car's initial speed [m/s]")
-    traffic_speed: Span = param((22.0, 27.0), "speed that a driver wants, uniform on this span [m/s]")
+    dt: Step = param(0.1, "step [s]")
+    tau: Lag = param(1.008, "actuator lag [s]")
+    lanes: Lanes = param(3, "lanes")
+    lane: Lane = param(1, "the car's lane, from 0")
+    ahead: Ahead = param(2, "other cars in each lane that begin ahead")
+    behind: Behind = param(1, "other cars in each lane that begin behind")
+    spacing: Gaps = param((40.0, 75.0), "distance from car to car at the beginning, uniform on this span [m]")
+    speed: PositiveSpeed = param(25.0, "the car's initial speed [m/s]")
+    traffic_speed: Speeds = param((22.0, 27.0), "speed that a driver wants, uniform on this span [m/s]")
     lane_changes: bool = param(True, "drivers change lanes for their own advantage (MOBIL)")
-    bend: NonNegative = param(8.0, "amplitude of the road's winding [m]")
-    period: Positive = param(600.0, "length of one winding [m]")
-    reach: Positive = param(150.0, "distance at which a car is seen [m]")
+    bend: Length = param(8.0, "amplitude of the road's winding [m]")
+    period: Gap = param(600.0, "length of one winding [m]")
+    reach: Gap = param(150.0, "distance at which a car is seen [m]")
     braking: Span | None = param(None, "time between hard brakings of the car ahead, uniform on this span [s]; none: none")
-    decel: Positive = param(6.0, "deceleration of a hard braking [m/s^2]")
+    decel: Rate = param(6.0, "deceleration of a hard braking [m/s^2]")
     lasting: Span = param((1.5, 3.0), "duration of a hard braking, uniform on this span [s]")
     cut_in: Span | None = param(None, "time between cut-ins in front of the car, uniform on this span [s]; none: only MOBIL's")
-    cut_gap: Span = param((12.0, 30.0), "gap at which a car cuts in [m]")
+    cut_gap: Gaps = param((12.0, 30.0), "gap at which a car cuts in [m]")
     process_var: Quadruple = param(
         (3e-3, 1e-1, 3.0, 1e-6), "process noise variance a step that the defence is told, of d, dv, a_L and v_F; the plant has none"
     )
@@ -98,9 +105,7 @@ class Highway:
         if self.lane >= self.lanes:
             raise InputError("plant highway.lane", self.lane, f"a lane from 0 to {self.lanes - 1}")
         for name in ("spacing", "traffic_speed", "braking", "lasting", "cut_in", "cut_gap"):
-            span = getattr(self, name)
-            if span is not None and span[0] > span[1]:
-                raise InputError(f"plant highway.{name}", span, "two numbers, the smaller first")
+            check_order(f"plant highway.{name}", getattr(self, name))
         if self.spacing[0] < 10.0:
             raise InputError("plant highway.spacing", self.spacing, "at least 10 m: cars are 5 m long")
 

@@ -9,7 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tailgate import num
-from tailgate.core import Array, Estimate, Model, NonNegative, Positive, param
+from tailgate.core import Array, Estimate, Model, param
+from tailgate.quantities import Lag, Length, PositiveSpeed, Rate
 from tailgate.registry import register
 
 from .controllers import limited, obeyed, widened
@@ -86,12 +87,12 @@ class IntelligentDriver:
     The thesis speaks of a "modified IDM" (3.5.1) and never writes it down: this is the published model, for comparison with its ACC.
     """
 
-    set_speed: Positive = param(29.95168, "desired speed v0 [m/s]; 67 mph")
-    headway: Positive = param(3.0, "desired time headway T [s]")
-    standstill: NonNegative = param(5.0, "gap at standstill s0 [m]")
-    accel: Positive = param(1.4, "largest acceleration [m/s^2]")
-    decel: Positive = param(2.0, "comfortable deceleration b [m/s^2]")
-    brake: Positive = param(5.0, "largest deceleration [m/s^2]")
+    set_speed: PositiveSpeed = param(29.95168, "desired speed v0 [m/s]; 67 mph")
+    headway: Lag = param(3.0, "desired time headway T [s]")
+    standstill: Length = param(5.0, "gap at standstill s0 [m]")
+    accel: Rate = param(1.4, "largest acceleration [m/s^2]")
+    decel: Rate = param(2.0, "comfortable deceleration b [m/s^2]")
+    brake: Rate = param(5.0, "largest deceleration [m/s^2]")
 
     def prepare(self, model: Model) -> Any:
         check_radar_car(model, "controller idm")

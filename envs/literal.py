@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 
 from tailgate import num
-from tailgate.core import Array, Estimate, Model, NonNegative, Positive, param
+from tailgate.core import Array, Estimate, Model, param
+from tailgate.quantities import Lag, Length, PositiveGain
 from tailgate.registry import register
 
 from .following import CarFollowing, FollowingPlan
@@ -27,8 +28,8 @@ from .following import CarFollowing, FollowingPlan
 class CarFollowingLiteral(CarFollowing):
     """The thesis's matrices as printed. The public model has A_d: the filter is not told when the car accelerates."""
 
-    headway: Positive = param(3.0, "time headway h [s]")
-    gamma: Positive = param(0.9, "gap gain [1/s]")
+    headway: Lag = param(3.0, "time headway h [s]")
+    gamma: PositiveGain = param(0.9, "gap gain [1/s]")
 
     def dynamics(self) -> tuple[Array, Array]:
         dt, tau, h = self.dt, self.tau, self.headway
@@ -50,8 +51,8 @@ class CarFollowingLiteral(CarFollowing):
 class RelativeDistance:
     """Feeds the printed model: u = x_l - x_f [m], the follower's position as estimated."""
 
-    headway: Positive = param(3.0, "time headway h of the spacing policy (4.13) [s]")
-    standstill: NonNegative = param(5.0, "minimum stopping distance d_r [m]")
+    headway: Lag = param(3.0, "time headway h of the spacing policy (4.13) [s]")
+    standstill: Length = param(5.0, "minimum stopping distance d_r [m]")
 
     def prepare(self, model: Model) -> Any:
         return None

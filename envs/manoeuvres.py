@@ -4,27 +4,20 @@ import csv
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from pydantic import Field
 
 from tailgate import num
-from tailgate.core import Array, Finite, NonNegative, Positive, param
+from tailgate.core import Array, param
 from tailgate.draws import Draws
 from tailgate.errors import InputError, said
+from tailgate.quantities import Accel, Gain, Lag, PositiveGain, PositiveSpeed, Rate, Speed, Spread, Time, TimeSpan, check_order
 from tailgate.registry import register
-
-Span = Annotated[tuple[NonNegative, NonNegative], Field(min_length=2, max_length=2)]
 
 
 def _within(span: tuple[float, float], u: Array) -> Array:
     return np.asarray(span[0] + (span[1] - span[0]) * u)
-
-
-def _check_span(where: str, span: tuple[float, float]) -> None:
-    if span[0] > span[1]:
-        raise InputError(where, span, "two times [s], the smaller first")
 
 
 def between(t: Array, begin: float, end: float, value: float, otherwise: float) -> Array:
@@ -66,7 +59,7 @@ def drawn_back(a: Array, speed: Array, mean_speed: float, pull: float, limit: fl
 class Constant:
     """A constant acceleration throughout."""
 
-    value: Finite = param(-0.108, "acceleration [m/s^2]")
+    value: Accel = param(-0.108, "acceleration [m/s^2]")
 
     def prepare(self, dt: float) -> Any:
         return None
@@ -83,12 +76,12 @@ class Constant:
 class Pulse:
     """A constant acceleration for some time, none before and after."""
 
-    value: Finite = param(0.3, "acceleration [m/s^2]")
-    begin: NonNegative = param(18.0, "time at which it begins [s]")
-    end: NonNegative = param(30.0, "time at which it ends [s]")
+    value: Accel = param(0.3, "acceleration [m/s^2]")
+    begin: Time = param(18.0, "time at which it begins [s]")
+    end: Time = param(30.0, "time at which it ends [s]")
 
     def __post_init__(self) -> None:
-        _check_span("manoeuvre pulse.begin, end", (self.begin, self.end))
+        check_order("manoeuvre pulse.begin, end", (self.begin, self.end))
 
     def prepare(self, dt: float) -> float:
         return dt
@@ -105,9 +98,9 @@ class Pulse:
 class Switched:
     """One constant acceleration, and from some time on another."""
 
-    value: Finite = param(-0.1082, "acceleration at first [m/s^2]")
-    then: Finite = param(0.012, "acceleration afterwards [m/s^2]")
-    at: NonNegative = param(100.0, "time of the switch, which the thesis does not give [s]")
+    value: Accel = param(-0.1082, "acceleration at first [m/s^2]")
+    then: Accel = param(0.012, "acceleration afterwards [m/s^2]")
+    at: Time = param(100.0, "time of the switch, which the thesis does not give [s]")
 
     def prepare(self, dt: float) -> float:
         return dt
@@ -134,8 +127,8 @@ class SineState(NamedTuple):
 class Sine:
     """Accelerates and slows down as a cosine of time, so that the mean speed stays: for frequency responses."""
 
-    amplitude: NonNegative = param(0.5, "largest acceleration [m/s^2]")
-    frequency: Positive = param(0.05, "frequency [Hz]")
+    amplitude: Gain = param(0.5, "largest acceleration [m/s^2]")
+    frequency: PositiveGain = param(0.05, "frequency [Hz]")
 
     def prepare(self, dt: float) -> SinePlan:
         angle = 2.0 * math.pi * self.frequency * dt
@@ -161,11 +154,11 @@ class BrakingState(NamedTuple):
 class Braking:
     """Brakes at a random time until it stops."""
 
-    onset: Span = param((25.0, 35.0), "the onset is uniform on this span [s]")
-    decel: Positive = param(4.0, "deceleration [m/s^2]")
+    onset: TimeSpan = param((25.0, 35.0), "the onset is uniform on this span [s]")
+    decel: Rate = param(4.0, "deceleration [m/s^2]")
 
     def __post_init__(self) -> None:
-        _check_span("manoeuvre braking.onset", self.onset)
+        check_order("manoeuvre braking.onset", self.onset)
 
     def prepare(self, dt: float) -> float:
         return dt
@@ -187,16 +180,16 @@ class StopAndGoState(NamedTuple):
 class StopAndGo:
     """Cruises, brakes to a low speed, dwells there and speeds up again, with random times."""
 
-    cruise: Span = param((10.0, 30.0), "length of a cruise, uniform on this span [s]")
-    dwell: Span = param((3.0, 6.0), "length of a dwell at the low speed, uniform on this span [s]")
-    decel: Positive = param(3.0, "deceleration [m/s^2]")
-    accel_rate: Positive = param(1.5, "acceleration back to cruise [m/s^2]")
-    low_speed: NonNegative = param(0.0, "speed of the dwell [m/s]")
-    cruise_speed: Positive = param(29.05, "speed of the cruise [m/s]")
+    cruise: TimeSpan = param((10.0, 30.0), "length of a cruise, uniform on this span [s]")
+    dwell: TimeSpan = param((3.0, 6.0), "length of a dwell at the low speed, uniform on this span [s]")
+    decel: Rate = param(3.0, "deceleration [m/s^2]")
+    accel_rate: Rate = param(1.5, "acceleration back to cruise [m/s^2]")
+    low_speed: Speed = param(0.0, "speed of the dwell [m/s]")
+    cruise_speed: PositiveSpeed = param(29.05, "speed of the cruise [m/s]")
 
     def __post_init__(self) -> None:
-        _check_span("manoeuvre stop_and_go.cruise", self.cruise)
-        _check_span("manoeuvre stop_and_go.dwell", self.dwell)
+        check_order("manoeuvre stop_and_go.cruise", self.cruise)
+        check_order("manoeuvre stop_and_go.dwell", self.dwell)
         if self.low_speed >= self.cruise_speed:
             raise InputError("manoeuvre stop_and_go.low_speed", self.low_speed, f"less than cruise_speed ({self.cruise_speed})")
 
@@ -234,11 +227,11 @@ class OrnsteinUhlenbeckState(NamedTuple):
 class OrnsteinUhlenbeck:
     """Random accelerations with a correlation time, drawn back to a mean speed."""
 
-    sd: NonNegative = param(0.8, "standard deviation of the random acceleration [m/s^2]")
-    correlation: Positive = param(3.0, "correlation time [s]")
-    mean_speed: Positive = param(25.0, "mean speed [m/s]")
-    pull: NonNegative = param(0.1, "return to the mean speed [1/s]")
-    limit: Positive = param(3.0, "largest |acceleration| [m/s^2]")
+    sd: Spread = param(0.8, "standard deviation of the random acceleration [m/s^2]")
+    correlation: Lag = param(3.0, "correlation time [s]")
+    mean_speed: PositiveSpeed = param(25.0, "mean speed [m/s]")
+    pull: Gain = param(0.1, "return to the mean speed [1/s]")
+    limit: Rate = param(3.0, "largest |acceleration| [m/s^2]")
 
     def prepare(self, dt: float) -> OrnsteinUhlenbeckPlan:
         keep = float(num.exp(-dt / self.correlation))

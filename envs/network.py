@@ -20,8 +20,6 @@ from tailgate.core import (
     Count,
     Estimate,
     Model,
-    NonNegative,
-    Positive,
     PositiveCount,
     Prior,
     Probability,
@@ -33,6 +31,7 @@ from tailgate.core import (
 )  # fmt: skip
 from tailgate.draws import Draws, constants
 from tailgate.errors import InputError
+from tailgate.quantities import PositiveVariance, Size, Spread, Step, Variance
 from tailgate.reach import require_detectable
 from tailgate.registry import register
 
@@ -41,6 +40,8 @@ GraphName = Literal["thesis", "ring", "path", "star", "complete", "random"]
 
 # Figure 5.1, counted from 0; the last edge is not determined by the text.
 THESIS_EDGES = ((0, 2), (0, 3), (0, 7), (1, 8), (2, 7), (4, 5), (4, 6), (5, 7), (6, 7), (7, 9), (8, 9), (3, 8))
+Radius = Annotated[float, Field(ge=0, le=1.5)]  # 1000 steps of growth are still a number
+MOST = 10**7  # numbers in the covariances of all agents in one episode
 ANGLE = 0.9  # the widest angle by which a mode turns in a step, in units of pi
 
 
@@ -83,20 +84,24 @@ def blocks(states: int) -> list[slice]:
 class SensorNetwork:
     """One linear system without input, watched by agents that talk to their neighbours in a graph."""
 
-    agents: PositiveCount = param(10, "number of agents")
-    states: PositiveCount = param(20, "number of states")
+    agents: Size = param(10, "number of agents")
+    states: Size = param(20, "number of states")
     graph: GraphName = param("thesis", "who hears whom: thesis (figure 5.1), ring, path, star, complete or random")
     edges: tuple[Edge, ...] | None = param(None, "own edges, pairs of agents from 0, in place of `graph`")
     directed: bool = param(False, "an edge (j, i) lets i hear j, and not the other way round")
     edge_probability: Probability = param(0.3, "graph random: probability of each edge beyond a random tree that connects all [-]")
     system: Literal["gaussian", "modal"] = param("gaussian", "A: gaussian entries, scaled; or modal: rotations that all last equally long")
-    spectral_radius: NonNegative = param(1.0, "largest |eigenvalue| of A [-]")
+    spectral_radius: Radius = param(1.0, "largest |eigenvalue| of A [-]")
     system_seed: Count = param(0, "seed of A and of a random graph")
-    dt: Positive = param(1.0, "step [s]; the thesis has none")
-    noise_var: NonNegative = param(0.0, "process noise variance of the system itself; 0, as in the thesis, is none")
-    process_var: Positive = param(1.0, "process noise variance that the defence is told (Sigma_w)")
-    initial_sd: NonNegative = param(1.0, "spread of the true initial state about 0, which the defence takes it for")
-    prior_var: Positive = param(1.0, "variance that the defence is told of the prior")
+    dt: Step = param(1.0, "step [s]; the thesis has none")
+    noise_var: Variance = param(0.0, "process noise variance of the system itself; 0, as in the thesis, is none")
+    process_var: PositiveVariance = param(1.0, "process noise variance that the defence is told (Sigma_w)")
+    initial_sd: Spread = param(1.0, "spread of the true initial state about 0, which the defence takes it for")
+    prior_var: PositiveVariance = param(1.0, "variance that the defence is told of the prior")
+
+    def __post_init__(self) -> None:
+        if self.agents * self.states * self.states > MOST:
+            raise InputError("plant sensor_network.states", self.states, f"agents x states^2, a covariance each, at most {MOST}")
 
     @property
     def size(self) -> tuple[int, int]:
@@ -199,14 +204,14 @@ class LinearPlan(NamedTuple):
 class LinearSensors:
     """Every agent's readings y_i = C_i x, with random C_i."""
 
-    sensors: PositiveCount = param(14, "readings of each agent")
+    sensors: Size = param(14, "readings of each agent")
     pattern: Literal["gaussian", "modes"] = param(
         "gaussian", "C_i: gaussian: everybody sees something of every state; modes: each agent sees some modes of a modal system only"
     )
     modes_seen: PositiveCount = param(1, "pattern modes: how many of the system's modes each agent sees")
     sensor_seed: Count = param(0, "seed of the C_i")
-    noise_var: NonNegative = param(0.0, "variance of the sensors' noise; 0, as in the thesis, is none")
-    told_var: Positive = param(1.0, "noise variance that the defence is told (Sigma_v)")
+    noise_var: Variance = param(0.0, "variance of the sensors' noise; 0, as in the thesis, is none")
+    told_var: PositiveVariance = param(1.0, "noise variance that the defence is told (Sigma_v)")
 
     def matrices(self, plant: Sized) -> tuple[tuple[str, ...], Array, Array]:
         where = "sensor linear_sensors"

@@ -19,8 +19,8 @@ from tailgate.core import Array, Frame
 from tailgate.errors import InputError
 
 from .duel import Duel, DuelState, checked, next_game
-from .faces import limit_of
 from .render_viewer import Screen, Viewer
+from .specs import check_options, limit_of
 
 ATTACKER, GUARD = "attacker", "defender"
 
@@ -67,6 +67,7 @@ class DuelEnv(ParallelEnv[str, Array, Any]):  # type: ignore[misc]
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Array], dict[str, dict[str, Any]]]:
         """The game of a seed; without one the next of the running row, or a random one at first."""
+        check_options(options, ("options",))  # of no meaning: PettingZoo's own tests give it
         if seed is not None:
             self._rng, _ = seeding.np_random(seed)
         self.game, self.frame, self.agents = next_game(self.duel, self.game, seed, self._rng), None, list(self.possible_agents)

@@ -19,17 +19,20 @@ import numpy as np
 from pydantic import Field
 
 from tailgate import num
-from tailgate.core import Array, Controller, Model, NonNegative, Positive, PositiveCount, Prior, Received, Scene, Sensor, Sized, param
+from tailgate.core import Array, Controller, Model, Prior, Received, Scene, Sensor, Sized, param
 from tailgate.draws import Draws
 from tailgate.errors import InputError
+from tailgate.quantities import Gap, Lag, Length, PositiveSpread, PositiveVariance, Speed, Spread, Step, Variance
 from tailgate.reach import require_detectable
 from tailgate.registry import register
 
 from .cacc import PER_CAR, V2V, Column, Gains, Law
-from .vehicle import drive, lag
+from .vehicle import SIGMAS, drive, lag
 
+Followers = Annotated[int, Field(ge=1, le=80)]
 Topology = Literal["predecessor_leader", "predecessor", "bidirectional", "two_predecessor"]
-Triple = Annotated[tuple[NonNegative, NonNegative, NonNegative], Field(min_length=3, max_length=3)]
+Spreads = Annotated[tuple[Spread, Spread, Spread], Field(min_length=3, max_length=3)]
+Variances = Annotated[tuple[Variance, Variance, Variance], Field(min_length=3, max_length=3)]
 
 
 def hears(topology: Topology, cars: int) -> Array:
@@ -82,19 +85,27 @@ def hold(A: Array, B: Array, c: Array, dt: float) -> tuple[Array, Array, Array]:
 class String:
     """Base of the platoons: who they are, what they hear, and their public model."""
 
-    followers: PositiveCount = param(4, "cars behind the leader")
+    followers: Followers = param(4, "cars behind the leader")
     topology: Topology = param("predecessor_leader", "who hears whom; predecessor_leader is the thesis's")
     leader_input_known: bool = param(False, "the followers are told the leader's command")
-    dt: Positive = param(0.1, "step [s]")
-    tau: Positive = param(1.008, "actuator lag [s]")
-    gap: Positive = param(65.0, "mean initial gap [m]")
-    gap_sd: NonNegative = param(0.0, "Gaussian spread of the initial gaps [m]")
-    gap_range: NonNegative = param(2.0, "uniform spread of the initial gaps, to either side [m]")
-    speed: NonNegative = param(20.0, "initial speed of all cars [m/s]")
-    process_var: Positive = param(1e-3, "process noise variance a step that the defence is told, of all states but the accelerations")
-    accel_sd: Positive = param(0.397, "standard deviation a step that it is told of the accelerations: what it does not know [m/s^2]")
-    initial_sd: NonNegative = param(0.1, "spread of what each car is told of the initial state, about the truth")
-    prior_var: Positive = param(0.01, "variance that it is told of that")
+    dt: Step = param(0.1, "step [s]")
+    tau: Lag = param(1.008, "actuator lag [s]")
+    gap: Gap = param(65.0, "mean initial gap [m]")
+    gap_sd: Length = param(0.0, "Gaussian spread of the initial gaps [m]")
+    gap_range: Length = param(2.0, "uniform spread of the initial gaps, to either side [m]")
+    speed: Speed = param(20.0, "initial speed of all cars [m/s]")
+    process_var: PositiveVariance = param(
+        1e-3, "process noise variance a step that the defence is told, of all states but the accelerations"
+    )
+    accel_sd: PositiveSpread = param(0.397, "standard deviation a step that it is told of the accelerations: what it does not know [m/s^2]")
+    initial_sd: Spread = param(0.1, "spread of what each car is told of the initial state, about the truth")
+    prior_var: PositiveVariance = param(0.01, "variance that it is told of that")
+
+    def __post_init__(self) -> None:
+        least = self.gap_range + SIGMAS * self.gap_sd
+        if self.gap <= least:
+            wanted = f"more than gap_range + {SIGMAS:g} gap_sd ({least:g}): else some begin in a collision"
+            raise InputError("plant platoon.gap", self.gap, wanted)
 
     @property
     def size(self) -> tuple[int, int]:
@@ -176,7 +187,7 @@ class PlatoonState(NamedTuple):
 class Platoon(String):
     """A leader and followers with actuator lag, driven on what they believe of the string."""
 
-    noise_var: Triple = param((0.0, 0.0, 0.0), "process noise variance a step of each car's position, speed and acceleration")
+    noise_var: Variances = param((0.0, 0.0, 0.0), "process noise variance a step of each car's position, speed and acceleration")
 
     def prepare(self, model: Model) -> PlatoonPlan:
         return PlatoonPlan(*lag(self.dt, self.tau), np.sqrt(np.array(self.noise_var)), model.graph[:, 0].astype(np.float64))
@@ -235,8 +246,8 @@ class Platoon(String):
 class PlatoonSensors:
     """Each car's gap to the one ahead (the leader's position), speed and acceleration."""
 
-    noise_sd: Triple = param((0.1, 0.1, 0.05), "standard deviations of the sensors' noise [m, m/s, m/s^2]")
-    told_sd: Triple | None = param(None, "the same as the defence is told (Sigma_v); none: the true ones")
+    noise_sd: Spreads = param((0.1, 0.1, 0.05), "standard deviations of the sensors' noise [m, m/s, m/s^2]")
+    told_sd: Spreads | None = param(None, "the same as the defence is told (Sigma_v); none: the true ones")
 
     def matrices(self, plant: Sized) -> tuple[tuple[str, ...], Array, Array]:
         if not isinstance(plant, String):

@@ -6,7 +6,8 @@ Control Systems Technology 22 (2014) 786-793.
 
 from dataclasses import dataclass
 
-from tailgate.core import Array, NonNegative, param
+from tailgate.core import Array, param
+from tailgate.quantities import Gain
 from tailgate.registry import register
 
 from .cacc import Column, Gains, Law, no_gains, spacing
@@ -24,10 +25,10 @@ class Ploeg(Law):
     of the loop that has the message, cars that fall back amplify, and collide behind a leader that brakes.
     """
 
-    kp: NonNegative = param(0.1, "gain of the spacing error [1/s^2]")
-    kd: NonNegative = param(0.5, "gain of its rate [1/s]")
-    local_kp: NonNegative = param(0.5, "gain of the spacing error without messages; string stable from 2 / tau_h^2 on [1/s^2]")
-    local_kd: NonNegative = param(1.0, "gain of its rate without messages [1/s]")
+    kp: Gain = param(0.1, "gain of the spacing error [1/s^2]")
+    kd: Gain = param(0.5, "gain of its rate [1/s]")
+    local_kp: Gain = param(0.5, "gain of the spacing error without messages; string stable from 2 / tau_h^2 on [1/s^2]")
+    local_kd: Gain = param(1.0, "gain of its rate without messages [1/s]")
 
     def gains(self, graph: Array, headway: float, local: bool = False) -> Gains:
         out = no_gains(len(graph), headway)

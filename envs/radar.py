@@ -7,16 +7,17 @@ import numpy as np
 from pydantic import Field
 
 from tailgate import num
-from tailgate.core import Air, Array, Model, Positive, Received, Sized, param
+from tailgate.core import Air, Array, Model, Received, Sized, param
 from tailgate.draws import Draws
 from tailgate.errors import InputError
+from tailgate.quantities import Gap, PositiveSpread, Step, check_order
 from tailgate.registry import register
 
 from . import fmcw_signal
 from .fmcw import Link, challenge_samples, heard_energy, outlier_probability, tone_sd
 from .radar_car import STATES
 
-Span = Annotated[tuple[Positive, Positive], Field(min_length=2, max_length=2)]
+Span = Annotated[tuple[Gap, Gap], Field(min_length=2, max_length=2)]
 NEAREST = 0.1  # closer than this [m] the radar equation means nothing: powers are those at this distance
 UNIFORM, SAMPLED = 1, 2  # tags of the draws
 
@@ -38,18 +39,17 @@ class FmcwRadar(Link):
     radiated for min(reaction, window)/window of the challenge.
     """
 
-    range_sd: Positive = param(0.25, "standard deviation of the distance, from the target's extent [m]")
-    speed_sd: Positive = param(0.1, "standard deviation of the relative speed, from the target's extent [m/s]")
+    range_sd: PositiveSpread = param(0.25, "standard deviation of the distance, from the target's extent [m]")
+    speed_sd: PositiveSpread = param(0.1, "standard deviation of the relative speed, from the target's extent [m/s]")
     reach: Span = param((2.0, 200.0), "least and largest distance that it reports [m]")
-    window: Positive = param(0.1, "duration of a challenge, in which the energy heard is measured [s]")
+    window: Step = param(0.1, "duration of a challenge, in which the energy heard is measured [s]")
     path: Literal["closed_form", "signal"] = param(
         "closed_form", "closed_form: beats with the errors of root-MUSIC drawn; signal: IF samples simulated and root-MUSIC run on them"
     )
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.reach[0] >= self.reach[1]:
-            raise InputError("fmcw_radar.reach", self.reach, "two distances, the least first")
+        check_order("sensor fmcw_radar.reach", self.reach, strict=True)
 
     @property
     def challenge(self) -> int:

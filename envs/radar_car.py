@@ -6,8 +6,9 @@ from typing import Any
 import numpy as np
 
 from tailgate import num
-from tailgate.core import Array, Estimate, Finite, Model, NonNegative, Plant, Positive, Receiver, Sensor, param
+from tailgate.core import Array, Estimate, Model, Plant, Receiver, Sensor, param
 from tailgate.errors import InputError
+from tailgate.quantities import Accel, Lag, Length, PositiveGain, PositiveSpeed, check_order
 from tailgate.registry import register
 
 from .controllers import limited, obeyed, widened
@@ -62,15 +63,18 @@ class RadarCruise:
     Erratum: the "1/k" of (3.13) is a constant gain g [1/s], not the time index.
     """
 
-    headway: Positive = param(3.0, "time headway tau_h [s]")
-    standstill: NonNegative = param(5.0, "minimum stopping distance d0 [m]")
-    g: Positive = param(0.9, "gap gain [1/s]")
-    tau: Positive = param(1.008, "time constant TL [s]")
-    gain: Positive = param(1.0, "gain KL [-]")
-    sample: Positive = param(1.0, "time T in which the desired speed is to be reached [s]")
-    set_speed: Positive = param(29.95168, "driver's set speed v_set [m/s]; 67 mph")
-    accel_min: Finite = param(-5.0, "lower limit of the command [m/s^2]")
-    accel_max: Finite = param(2.0, "upper limit of the command [m/s^2]")
+    headway: Lag = param(3.0, "time headway tau_h [s]")
+    standstill: Length = param(5.0, "minimum stopping distance d0 [m]")
+    g: PositiveGain = param(0.9, "gap gain [1/s]")
+    tau: Lag = param(1.008, "time constant TL [s]")
+    gain: PositiveGain = param(1.0, "gain KL [-]")
+    sample: Lag = param(1.0, "time T in which the desired speed is to be reached [s]")
+    set_speed: PositiveSpeed = param(29.95168, "driver's set speed v_set [m/s]; 67 mph")
+    accel_min: Accel = param(-5.0, "lower limit of the command [m/s^2]")
+    accel_max: Accel = param(2.0, "upper limit of the command [m/s^2]")
+
+    def __post_init__(self) -> None:
+        check_order("controller acc_radar.accel_min, accel_max", (self.accel_min, self.accel_max))
 
     def prepare(self, model: Model) -> Any:
         check_radar_car(model, "controller acc_radar")

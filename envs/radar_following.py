@@ -17,15 +17,16 @@ import numpy as np
 from pydantic import Field
 
 from tailgate import num
-from tailgate.core import Array, Controller, Model, NonNegative, Positive, Prior, Scene, Sensor, param
+from tailgate.core import Array, Controller, Model, Prior, Scene, Sensor, param
 from tailgate.draws import Draws
+from tailgate.quantities import Gap, Lag, PositiveGain, Speed, Step, Time, Variance
 from tailgate.registry import register
 
 from .idm import Behind, BehindState
 from .radar_car import STATES, radar_model
-from .vehicle import roll
+from .vehicle import check_reaction, roll
 
-Quadruple = Annotated[tuple[NonNegative, NonNegative, NonNegative, NonNegative], Field(min_length=4, max_length=4)]
+Quadruple = Annotated[tuple[Variance, Variance, Variance, Variance], Field(min_length=4, max_length=4)]
 
 
 class RadarPlan(NamedTuple):
@@ -54,18 +55,21 @@ def lagged(a: Array, u: Array, keep: float, gain: float) -> Array:
 class RadarFollowing:
     """A leader, and an ACC follower that sees it by radar and knows its own motion."""
 
-    dt: Positive = param(1.0, "step T [s]")
-    tau: Positive = param(1.008, "time constant TL of the lower-level controller [s]")
-    gain: Positive = param(1.0, "gain KL of the lower-level controller [-]")
-    gap: Positive = param(100.0, "initial gap [m]")
-    lead_speed: NonNegative = param(29.0576, "leader's initial speed [m/s]; 65 mph")
-    speed: NonNegative = param(29.95168, "follower's initial speed [m/s]; 67 mph")
+    dt: Step = param(1.0, "step T [s]")
+    tau: Lag = param(1.008, "time constant TL of the lower-level controller [s]")
+    gain: PositiveGain = param(1.0, "gain KL of the lower-level controller [-]")
+    gap: Gap = param(100.0, "initial gap [m]")
+    lead_speed: Speed = param(29.0576, "leader's initial speed [m/s]; 65 mph")
+    speed: Speed = param(29.95168, "follower's initial speed [m/s]; 67 mph")
     process_var: Quadruple = param(
         (1e-3, 1e-3, 1e-5, 1e-6), "process noise variance a step that the defence is told, of d, dv, a_L and v_F; the plant has none"
     )
     prior_var: Quadruple = param((1.0, 1.0, 0.25, 1e-6), "variance that the defence is told of the prior")
     rear: bool = param(False, "a human-like driver follows behind")
-    rear_reaction: NonNegative = param(1.0, "reaction time of the driver behind [s]")
+    rear_reaction: Time = param(1.0, "reaction time of the driver behind [s]")
+
+    def __post_init__(self) -> None:
+        check_reaction("plant radar_following.rear_reaction", self.rear_reaction, self.dt)
 
     @property
     def size(self) -> tuple[int, int]:

@@ -6,19 +6,17 @@ The reading is exact, so that a defence that believes it knows the state, and an
 """
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
+from pydantic import Field
 
 from tailgate import num
 from tailgate.core import (
     Array,
     Controller,
     Estimate,
-    Finite,
     Model,
-    NonNegative,
-    Positive,
     Prior,
     Received,
     Scene,
@@ -28,8 +26,11 @@ from tailgate.core import (
 )  # fmt: skip
 from tailgate.draws import Draws
 from tailgate.errors import InputError
+from tailgate.quantities import PositiveVariance, Spread, Step
 from tailgate.registry import register
 
+Factor = Annotated[float, Field(ge=-10.0, le=10.0, allow_inf_nan=False)]
+GROWTH = 1.5  # of the state in a step, at most: 1000 steps of it are still a number
 WIRE, ACTUATOR = "y", "u"
 
 
@@ -44,11 +45,11 @@ class ScalarState(NamedTuple):
 class ScalarLoop:
     """x+ = a x + b u + w, one state and one input, which starts near zero."""
 
-    a: Finite = param(1.0, "how much of the state lasts a step [-]")
-    b: Finite = param(1.0, "how much of the input arrives [-]")
-    noise_var: Positive = param(1.0, "variance of w, known to everybody")
-    initial_sd: NonNegative = param(1.0, "spread of the initial state about 0, which the defence takes it for")
-    dt: Positive = param(1.0, "step [s]; nothing depends on it")
+    a: Factor = param(1.0, "how much of the state lasts a step [-]")
+    b: Factor = param(1.0, "how much of the input arrives [-]")
+    noise_var: PositiveVariance = param(1.0, "variance of w, known to everybody")
+    initial_sd: Spread = param(1.0, "spread of the initial state about 0, which the defence takes it for")
+    dt: Step = param(1.0, "step [s]; nothing depends on it")
 
     @property
     def size(self) -> tuple[int, int]:
@@ -101,7 +102,7 @@ class ScalarLoop:
 class ExactReading:
     """y = x, the state of a scalar loop without noise."""
 
-    told_var: Positive = param(1.0, "noise variance that a filter is told")
+    told_var: PositiveVariance = param(1.0, "noise variance that a filter is told")
 
     def matrices(self, plant: Sized) -> tuple[tuple[str, ...], Array, Array]:
         if not isinstance(plant, ScalarLoop):
@@ -120,11 +121,13 @@ class ExactReading:
 class StateFeedback:
     """u = -g x^ on the estimate of the one state."""
 
-    gain: Finite = param(0.25, "feedback gain g [-]")
+    gain: Factor = param(0.25, "feedback gain g [-]")
 
     def prepare(self, model: Model) -> Any:
         if model.states != 1 or model.actuators != (ACTUATOR,):
             raise InputError("controller state_feedback", list(model.actuators), f"the plant scalar_loop, whose actuator is {ACTUATOR}")
+        if abs(model.A[0, 0] - model.B[0, 0] * self.gain) > GROWTH:
+            raise InputError("controller state_feedback.gain", self.gain, f"at most {GROWTH:g} as |a - b gain|, by which the loop grows")
 
     def start(self, plan: Any, batch: int) -> Any:
         return None

@@ -8,12 +8,13 @@ import numpy as np
 from pydantic import Field
 
 from tailgate import num
-from tailgate.core import Array, Model, NonNegative, Received, Sized, param
+from tailgate.core import Array, Model, Received, Sized, param
 from tailgate.draws import Draws
 from tailgate.errors import InputError
+from tailgate.quantities import Variance
 from tailgate.registry import register
 
-Pair = Annotated[tuple[NonNegative, NonNegative], Field(min_length=2, max_length=2)]
+Pair = Annotated[tuple[Variance, Variance], Field(min_length=2, max_length=2)]
 
 
 class OdometryPlan(NamedTuple):

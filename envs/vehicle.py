@@ -13,6 +13,16 @@ import numpy as np
 
 from tailgate import num
 from tailgate.core import Array
+from tailgate.errors import InputError
+
+SIGMAS = 6.0  # initial gaps leave room for that many standard deviations: one car in 10^9 begins in a collision
+REACTION = 10_000  # most steps of the reaction of a driver behind
+
+
+def check_reaction(field: str, reaction: float, dt: float) -> None:
+    """Raise InputError for a reaction time [s] of more steps dt [s] than are remembered."""
+    if reaction > REACTION * dt:
+        raise InputError(field, reaction, f"at most {REACTION} steps ({REACTION * dt:g} s)")
 
 
 def lag(dt: float, tau: float) -> tuple[Array, Array]:

@@ -22,7 +22,7 @@ from .challenge import QUIET, WATCH, Challenger, Response
 from .compose import Filter
 from .predictors import Predictor, PredictorPlan, PredictorState
 
-Factor = Annotated[float, Field(gt=0, lt=1)]
+Factor = Annotated[float, Field(ge=0.01, lt=1)]
 UNIT = 100.0  # of time in h [steps]
 
 

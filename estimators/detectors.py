@@ -22,8 +22,8 @@ from tailgate.registry import register
 
 from .compose import Verdict, blame_all
 
-Allowance = Annotated[float, Field(gt=1, allow_inf_nan=False)]
-Weight = Annotated[float, Field(gt=0, le=1)]
+Allowance = Annotated[float, Field(gt=1, le=1e30, allow_inf_nan=False)]
+Weight = Annotated[float, Field(ge=1e-6, le=1)]
 INSIDE = 1.0 - 1e-12  # of a bound that went through square roots: their rounding shall not raise an alarm
 
 

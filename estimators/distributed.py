@@ -28,7 +28,7 @@ from tailgate.tree import lock
 
 from .chi_square import ChiSquare
 from .compose import AcceptAll, Composed, Detector, Filter, GateOut, Mitigation, Score, Stateless, Verdict, blame_all
-from .kalman import GAIN, Gain, KalmanState, LinearFilter, alone, broad, riccati
+from .kalman import GAIN, Gain, KalmanState, LinearFilter, alone, broad, precision, riccati
 
 SWEEPS = 200
 SETTLED = 1e-13  # relative
@@ -72,7 +72,7 @@ def neighbours(graph: Array) -> tuple[tuple[int, ...], ...]:
 
 def information(model: Model) -> Array:
     """C_i' Sv_i^-1 C_i (N, n, n)."""
-    return np.stack([num.product(num.product(C.T, num.inverse(R)), C) for C, R in zip(model.C, model.R, strict=True)])
+    return np.stack([num.product(num.product(C.T, precision(R)), C) for C, R in zip(model.C, model.R, strict=True)])
 
 
 def _inverse(M: Array) -> Array:

@@ -13,14 +13,16 @@ import numpy as np
 from pydantic import Field
 
 from tailgate import num
-from tailgate.core import Array, Finite, Model, NonNegative, Positive, Prior, param
+from tailgate.core import Array, Finite, Model, NonNegative, Prior, param
 from tailgate.errors import InputError
 from tailgate.registry import register
 
 from .imm import LEAST, Modes
+from .kalman import precision
 from .per_episode import EpisodeByEpisode
 
 Share = Annotated[float, Field(ge=0, lt=1)]
+Alpha = Annotated[float, Field(ge=1e-6, le=1e6)]
 
 
 class KalmanAdapter:
@@ -132,7 +134,7 @@ class HInfinityAdapter(KalmanAdapter):
     def update(self, y: Array, C: Array, R: Array) -> float:
         f = self.filter
         x, P, r = f.x, f.P, y - num.matvec(C, f.x)
-        f.F, f.H, f.V, f.Q = np.eye(len(x)), C, R, num.matmul(num.matmul(C.T, num.inverse(R)), C)
+        f.F, f.H, f.V, f.Q = np.eye(len(x)), C, R, num.matmul(num.matmul(C.T, precision(R)), C)
         f.gamma = self.gamma
         f.update(y)
         after = f.P
@@ -206,7 +208,7 @@ class FilterpyExtended(EpisodeByEpisode):
 class FilterpyUnscented(EpisodeByEpisode):
     """filterpy's unscented Kalman filter, episode by episode; on a linear plant the Kalman filter."""
 
-    alpha: Positive = param(1.0, "spread of the sigma points; a small one loses digits of positions far from 0 [-]")
+    alpha: Alpha = param(1.0, "spread of the sigma points; a small one loses digits of positions far from 0 [-]")
     beta: Finite = param(2.0, "weight of the central point in the covariance; 2 suits a Gaussian [-]")
     kappa: NonNegative = param(0.0, "further spread [-]")
 

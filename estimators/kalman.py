@@ -24,6 +24,7 @@ from tailgate.registry import register
 from .compose import AcceptAll, Composed, Detector, Filter, Mitigation, Score
 
 Gain = Literal["varying", "steady"]
+LEAST = 1e-18  # variance that a filter divides by, at least
 SMALL = 4  # states: matrices up to here are multiplied as they stand, larger ones by kernels of whole passes, to the same bits
 GAIN = "varying: the gain follows the covariance; steady: both are held where they settle when nothing is missed"
 
@@ -56,9 +57,22 @@ def alone(S: Array, keep: Array) -> Array:
     return out
 
 
+def precision(R: Array) -> Array:
+    """R^-1 (q, q). Raises NotApplicable where a reading has no noise: the filter that asks divides by it."""
+    told = R.diagonal()
+    if (told < LEAST).any():
+        raise NotApplicable("sensor: noise variance", told.tolist(), f"{LEAST:g} or more in every reading: this filter divides by it")
+    return num.inverse(R)
+
+
 def broad(model: Model) -> Array:
     """(n,) variances so large that the next measurement decides: a million times those after 100 steps of the filter."""
     P = np.array(model.Q)
+    if (model.R.diagonal(axis1=1, axis2=2) < LEAST).any():  # then the process has to be noisy
+        unsure = (num.matmul(num.matmul(model.C, P), num.transpose(model.C)) + model.R).diagonal(axis1=1, axis2=2)
+        if (unsure < LEAST).any():
+            wanted = f"noise of sensor or process, {LEAST:g} or more in every reading: a filter divides by its variance"
+            raise NotApplicable("model: variance of a reading", unsure.tolist(), wanted)
     for _ in range(100):
         C, R = model.C[0], model.R[0]
         S = num.matmul(num.matmul(C, P), num.transpose(C)) + R
@@ -106,7 +120,7 @@ def steady_state(model: Model) -> Array:
     out = []
     for i in range(0 if lost else model.agents):
         C = model.C[i]
-        P = riccati(model.A, num.matmul(num.matmul(C.T, num.inverse(model.R[i])), C), model.Q)
+        P = riccati(model.A, num.matmul(num.matmul(C.T, precision(model.R[i])), C), model.Q)
         if P is None:
             lost.append(i)
         else:

@@ -31,7 +31,7 @@ from .kalman import KalmanPlan, KalmanState, LinearFilter, alone
 
 LINE = LinearFilter()
 Window = Annotated[int, Field(ge=3, le=1000)]
-Forgetting = Annotated[float, Field(gt=0, le=1)]
+Forgetting = Annotated[float, Field(ge=0.01, le=1)]
 
 
 def require_kinematic(model: Model, where: str) -> None:

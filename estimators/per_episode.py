@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+import importlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol, runtime_checkable
@@ -11,6 +12,7 @@ import numpy as np
 from tailgate import num
 from tailgate.core import Array, Estimate, Mode, Model, Prior, Received
 from tailgate.draws import Draws
+from tailgate.errors import InputError
 
 
 class EpisodeFilter(Protocol):
@@ -125,14 +127,43 @@ def _shared(model: Model) -> dict[int, Any]:
 
 @dataclass(frozen=True)
 class PerEpisode(EpisodeByEpisode):
-    """A defence that keeps one object of `factory` for every episode and agent."""
+    """A defence that keeps one object for every episode and agent: of a class, or of a function without arguments, module:name."""
 
-    factory: Callable[[], EpisodeFilter]
+    factory: str
+
+    def __post_init__(self) -> None:
+        factory_of(self.factory)
 
     def make(self) -> EpisodeFilter:
-        return self.factory()
+        made: EpisodeFilter = factory_of(self.factory)()
+        return made
 
 
-def per_episode(factory: Callable[[], EpisodeFilter]) -> PerEpisode:
-    """A defence from a filter class that knows one episode only."""
-    return PerEpisode(factory)
+def factory_of(name: str) -> Callable[[], Any]:
+    """What module:name names. Raises InputError where that is nothing to call."""
+    module, _, path = name.partition(":")
+    try:
+        found: Any = importlib.import_module(module)
+        for part in path.split("."):
+            found = getattr(found, part)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise InputError("per_episode", name, f"module:name of a class or function that can be imported ({error})") from None
+    if not callable(found):
+        raise InputError("per_episode", name, "a class or a function")
+    return found  # type: ignore[no-any-return]
+
+
+def per_episode(factory: Callable[[], EpisodeFilter] | str) -> PerEpisode:
+    """A defence from a filter that knows one episode only: its class, a function that makes one, or module:name of either.
+
+    Raises InputError for what has no name in a module, such as a lambda: no row or card could say it.
+    """
+    if isinstance(factory, str):
+        return PerEpisode(factory)
+    name = f"{getattr(factory, '__module__', None)}:{getattr(factory, '__qualname__', '')}"
+    try:
+        if factory_of(name) is factory:
+            return PerEpisode(name)
+    except InputError:
+        pass
+    raise InputError("per_episode", factory, "a class or a function with a name in its module, or module:name; no lambda, no partial")

@@ -1,6 +1,8 @@
 """The fused engine beside the plain loop, for the tests of each of its plants."""
 
 
+import dataclasses
+
 import numpy as np
 
 from tailgate import draws
@@ -11,11 +13,13 @@ from tailgate.scenario import load_scenario
 from tailgate.trace import rollout
 
 
-def loop_of(scenario, defence, attack, horizon=200, **threat):
+def loop_of(scenario, defence, attack, horizon=200, beyond=None, **threat):
+    """`beyond`: changes of the threat model that no file may make."""
     made = Spec("attack", attack)
     changes = {"knowledge": getattr(made.make(), "knowledge", made.entry.knowledge)} | threat
     guard = Spec("defence", defence)
     place = load_scenario(scenario).with_threat(**changes)
+    place = dataclasses.replace(place, threat_model=dataclasses.replace(place.threat_model, **(beyond or {})))
     loop = place.loop(guard.make(), guard.entry.uses)
     object.__setattr__(loop, "horizon", min(horizon, place.horizon))
     return loop, made.make()
@@ -73,7 +77,7 @@ def as_plain(arguments, rows, folder):
         if one.seat.action.discrete:
             actions = np.where(rng.random(rows) < 0.6, 0, rng.integers(0, one.seat.action.size, rows))
         else:
-            actions = rng.uniform(-1.2, 1.2, (rows, one.seat.action.size)).astype(np.float32)
+            actions = np.clip(rng.uniform(-1.2, 1.2, (rows, one.seat.action.size)), -1.0, 1.0).astype(np.float32)  # the ends among them
         results = one.step(actions), two.step(actions)
         for first, second in zip(*results, strict=True):
             same(*(value if isinstance(value, dict) else np.asarray(value) for value in (first, second)))

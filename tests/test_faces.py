@@ -272,8 +272,7 @@ def test_the_card_names_everything():
 def test_the_card_of_an_adapted_filter_is_the_same_in_every_process():
     """No memory address of a user's object gets into the card."""
     text = json.dumps(AdversaryEnv(defence=tailgate.per_episode(_OneEpisode)).card())
-    text += json.dumps(AdversaryEnv(defence=tailgate.per_episode(lambda: _OneEpisode())).card())
-    assert "0x" not in text
+    assert "0x" not in text and "_OneEpisode" in text
 
 
 class _OneEpisode:

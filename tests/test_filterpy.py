@@ -1,6 +1,7 @@
 """filterpy's filters as defences, and the adapter for filters of one episode."""
 
 import copy
+import functools
 import subprocess
 import sys
 
@@ -12,6 +13,7 @@ from tailgate.core import Model, Prior, Received
 from tailgate.draws import Role, keys
 from tailgate.errors import InputError
 from tailgate.estimators.filterpy_filters import root
+from tailgate.registry import Spec, entry_for, text_of
 from tailgate.scenario import load_scenario
 from tailgate.tree import leaves
 
@@ -215,3 +217,23 @@ def test_the_package_imports_no_filterpy():
     code = "import sys, tailgate; tailgate.list_defences(); print(sorted({'filterpy', 'matplotlib', 'cvxpy'} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+def _made():
+    return Counter()
+
+
+@pytest.mark.parametrize("factory", [Counter, _made, f"{__name__}:Counter", f"{__name__}:_made"])
+def test_an_adapted_filter_has_a_name_that_makes_it_again(factory):
+    """The text of its rows, which another process reads, gives the same defence."""
+    defence = tailgate.per_episode(factory)
+    text = text_of(entry_for("defence", type(defence)), defence)
+    assert Spec("defence", text).make() == defence and isinstance(defence.make(), Counter)
+    assert defence.factory == f"{__name__}:{getattr(factory, '__name__', str(factory).partition(':')[2])}"
+
+
+@pytest.mark.parametrize("factory", [lambda: Counter(), functools.partial(Counter), Counter().step, "Counter", f"{__name__}:Nobody", f"{__name__}:NO_DRAWS", 3])
+def test_an_adapted_filter_without_a_name_is_refused(factory):
+    """A lambda, a partial and a bound method have no name in a module; a text must name something to call."""
+    with pytest.raises(InputError, match="per_episode: got"):
+        tailgate.per_episode(factory)

@@ -211,7 +211,7 @@ def test_somebody_elses_filter_of_the_same_base_is_not_taken_for_it():
 
 def test_what_is_not_finite_is_refused_as_in_the_plain_loop():
     """A measurement of 1e308 makes the estimate infinite."""
-    loop, _ = loop_of("stop-and-go-v0", "kf", "none", fdi_bound=1.7e308, onset=1)
+    loop, _ = loop_of("stop-and-go-v0", "kf", "none", onset=1, beyond={"fdi_bound": 1.7e308})
     lanes = Lanes(loop, fuse(loop), draws.keys("report", range(3)))
     lanes.start()
     command = loop.brief.command(np.ones(3, bool), 5, np.array([True, True, False, False, False]), 1.7e308)

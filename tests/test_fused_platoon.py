@@ -146,7 +146,7 @@ def test_threads_and_blocks_change_no_bit():
 
 def test_what_is_not_finite_is_refused_as_in_the_plain_loop():
     """A measurement of 1e308 makes the estimate infinite."""
-    loop, _ = loop_of("platoon-gusty-v0", "dkf", "none", fdi_bound=1.7e308, onset=1)
+    loop, _ = loop_of("platoon-gusty-v0", "dkf", "none", onset=1, beyond={"fdi_bound": 1.7e308})
     lanes = Platoon(loop, fuse(loop), draws.keys("report", range(3)))
     lanes.start()
     command = loop.brief.command(np.ones(3, bool), 5, loop.brief.granted, 1.7e308)

@@ -21,7 +21,7 @@ from tailgate import registry
 from tailgate.core import Positive, param
 from tailgate.errors import InputError, NotApplicable, unknown
 from tailgate.estimators import GatedKalman, Kalman
-from tailgate.registry import Entry, Spec, entries, find, make_from, put, register
+from tailgate.registry import Entry, Spec, entries, find, make_from, put, register, said
 from tailgate.schema import as_data, build, canonical, override, read_yaml, scalar
 from tailgate.selfplay import GameConfig
 from tailgate.train import TrainConfig
@@ -281,8 +281,8 @@ def test_every_built_in_component_is_found_in_its_own_module():
         for name, entry in entries(family).items():
             package, _, module = entry.cls.__module__.rpartition(".")
             if package == registry._MODULES[family]:
-                said = [m for m, text in registry._sources(package).items() if re.search(rf'register\(\s*"{family}",\s*"{name}"', text)]
-                assert said == [module], (family, name)
+                homes = [m for m, text in registry._sources(package).items() if re.search(rf'register\(\s*"{family}",\s*"{name}"', text)]
+                assert homes == [module], (family, name)
     for package in map(importlib.import_module, set(registry._MODULES.values())):
         assert all(hasattr(package, name) for name in package.__all__)
         with pytest.raises(AttributeError, match="has no attribute 'nothing'"):
@@ -295,3 +295,49 @@ def test_every_module_that_registers_something_is_named_by_its_package(package):
     held = importlib.import_module(f"tailgate.{package}")
     modules = {path.stem for path in Path(held.__file__).parent.glob("*.py") if "@register(" in path.read_text("utf-8")}
     assert modules and modules <= set(held.HOMES)
+
+
+FOREIGN = """
+import json
+import numpy as np
+from dataclasses import dataclass
+from tailgate.estimators.kalman import Kalman
+
+@dataclass(frozen=True)
+class Seeded(Kalman):
+    def step(self, *arguments):
+        np.random.RandomState(-1)  # raised in compiled code
+
+@dataclass(frozen=True)
+class Library(Kalman):
+    def step(self, *arguments):
+        json.loads("{")
+
+@dataclass(frozen=True)
+class Early(Kalman):
+    def __post_init__(self):
+        {}["x"]
+
+class Plain:
+    def __init__(self):
+        self.x = np.zeros(3).reshape(2)
+"""
+
+
+@pytest.mark.parametrize(("name", "line"), [("Seeded", 10), ("Library", 15)])
+def test_an_error_names_the_last_line_of_its_users_own_file(name, line, tmp_path, monkeypatch):
+    """Neither a library's line nor a compiled one, whose file is not there."""
+    (tmp_path / "foreign_lines.py").write_text(FOREIGN)
+    monkeypatch.syspath_prepend(tmp_path)
+    defence = Spec("defence", f"foreign_lines:{name}").make()
+    with pytest.raises(ValueError) as caught:
+        defence.step(None, None, None, None, None)
+    assert said(caught.value).endswith(f"(foreign_lines.py, line {line})")
+
+
+@pytest.mark.parametrize(("name", "line"), [("Early", 20), ("Plain", 24)])
+def test_a_class_that_cannot_be_made_is_refused_with_its_line(name, line, tmp_path, monkeypatch):
+    (tmp_path / "foreign_lines.py").write_text(FOREIGN)
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(InputError, match=rf"a class that can be made \(\w+Error: .*\(foreign_lines\.py, line {line}\)\)"):
+        Spec("defence", f"foreign_lines:{name}").make()

@@ -13,11 +13,10 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
 from tailgate.draws import Draws
 from tailgate.errors import InputError
@@ -25,18 +24,17 @@ from tailgate.kinds import AIRED as AIRED
 from tailgate.kinds import RADIATED as RADIATED
 from tailgate.kinds import Kind as Kind
 from tailgate.kinds import Mode as Mode
+from tailgate.quantities import Count as Count
+from tailgate.quantities import Finite as Finite
+from tailgate.quantities import NonNegative as NonNegative
+from tailgate.quantities import Positive as Positive
+from tailgate.quantities import PositiveCount as PositiveCount
+from tailgate.quantities import Probability as Probability
 
 if TYPE_CHECKING:
     from tailgate.threat import Brief
 
 Array = NDArray[Any]
-
-Finite = Annotated[float, Field(allow_inf_nan=False)]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-Probability = Annotated[float, Field(ge=0, le=1)]
-Count = Annotated[int, Field(ge=0)]
-PositiveCount = Annotated[int, Field(ge=1)]
 
 
 def param(default: Any, doc: str, if_any: bool = False) -> Any:

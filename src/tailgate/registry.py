@@ -309,7 +309,12 @@ class Spec:
         head, params = self._parts()
         if self.family == "attack" and Path(head).suffix in _FILES:
             params = {"path": head, **params}
-        made: Any = build(self.entry.cls, params, f"{self.family} {head}")
+        try:
+            made: Any = build(self.entry.cls, params, f"{self.family} {head}")
+        except Exception as error:
+            if isinstance(error, InputError) or self.entry.built_in:
+                raise
+            raise InputError(self.family, self.text, f"a class that can be made ({said(error)})") from None
         steps = {"defence": ("prepare", "start", "step"), "attack": ("prepare", "start", "decide")}.get(self.family, ())
         if not all(callable(getattr(made, name, None)) for name in steps):
             raise InputError(self.family, self.text, f"a class with {', '.join(steps)}")
@@ -322,11 +327,14 @@ class Spec:
 
 
 def said(error: Exception) -> str:
-    """An error of somebody's code in a line: its type, its words, and the last line of that code on the way to it."""
+    """An error of somebody's code in a line: its type, its words, and the last line of that code on the way to it.
+
+    Compiled code counts for none: its files are not there to be read.
+    """
     place = ""
     for frame, line in traceback.walk_tb(error.__traceback__):
         file, package = frame.f_code.co_filename, str(frame.f_globals.get("__name__", "")).partition(".")[0]
-        if package != "tailgate" and package not in sys.stdlib_module_names and "site-packages" not in file:
+        if package != "tailgate" and package not in sys.stdlib_module_names and "site-packages" not in file and Path(file).is_file():
             place = f" ({Path(file).name}, line {line})"
     return f"{type(error).__name__}: {error}{place}"
 
@@ -377,7 +385,7 @@ def _split(text: str) -> list[str]:
     """Split at commas outside of brackets."""
     out, depth, start = [], 0, 0
     for i, ch in enumerate(text):
-        depth += (ch in "[(") - (ch in "])")
+        depth += (ch in "[({") - (ch in "])}")
         if ch == "," and depth == 0:
             out.append(text[start:i])
             start = i + 1

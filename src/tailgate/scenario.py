@@ -12,6 +12,7 @@ from tailgate.core import Defence, Positive, PositiveCount, param
 from tailgate.errors import InputError, unknown
 from tailgate.link import Link
 from tailgate.loop import Loop
+from tailgate.quantities import Horizon
 from tailgate.registry import Spec, make_from
 from tailgate.schema import build, digest, fields_of, read_yaml
 from tailgate.threat import Brief, ThreatModel
@@ -34,7 +35,7 @@ class Scenario:
     sensor: Any
     controller: Any
     manoeuvre: Any
-    horizon: PositiveCount
+    horizon: Horizon
     threat_model: ThreatModel
     ends_on_collision: bool = True
     about: str = ""

@@ -19,8 +19,6 @@ from tailgate.core import (
     Count,
     Kind,
     Model,
-    NonNegative,
-    Positive,
     PositiveCount,
     Received,
     no_command,
@@ -28,6 +26,7 @@ from tailgate.core import (
 )  # fmt: skip
 from tailgate.elementwise import select
 from tailgate.errors import InputError, unknown
+from tailgate.quantities import Bound, Bounded, Time, check_order
 
 # Plain numbers: in every comparison with a member of an enumeration numpy looks for array methods of it.
 NONE, DOS_JAM, DOS_HOLD, DOS_HOLD_FRESH, DROPOUT, FDI, DELAY, REPLAY, NOISE_JAM, ECHO_DELAY = map(int, Kind)
@@ -40,7 +39,7 @@ KindName = Literal["dos_jam", "dos_hold", "dos_hold_fresh", "dropout", "fdi", "d
 Knowledge = Literal["black", "grey", "white"]
 KNOWLEDGE: tuple[Knowledge, ...] = get_args(Knowledge)  # each sees what the one before it sees, and more
 Span = Annotated[int, Field(ge=1, le=10_000)]
-Pair = Annotated[tuple[float, float], Field(min_length=2, max_length=2)]
+Pair = Annotated[tuple[Bounded, Bounded], Field(min_length=2, max_length=2)]
 
 
 @dataclass(frozen=True)
@@ -50,12 +49,12 @@ class ThreatModel:
     kinds: tuple[KindName, ...] = param(("dos_hold", "fdi"), "attack kinds that are granted")
     targets: tuple[str, ...] = param((), "wires that may be attacked; empty: every sensor, no V2V field and no actuator")
     agents: tuple[Count, ...] = param((), "agents that may be attacked, by number from 0; empty: all")
-    fdi_bound: Positive = param(50.0, "largest |value| that false data injection may add to a sensor or V2V field [unit of the wire]")
-    actuator_bound: Positive = param(2.0, "largest |value| that may be added to, or jammed onto, an actuator, its limits aside [m/s^2]")
+    fdi_bound: Bound = param(50.0, "largest |value| that false data injection may add to a sensor or V2V field [unit of the wire]")
+    actuator_bound: Bound = param(2.0, "largest |value| that may be added to, or jammed onto, an actuator, its limits aside [m/s^2]")
     jam_range: Pair = param((-108.0, 108.0), "values that a jammer may leave at the receiver [unit of the wire]")
-    jam_power: Positive = param(0.1, "largest power of a jammer's noise, and that with which dos_jam is radiated [W]")
-    delay_bound: Positive = param(20.0, "largest extra range of an echo that is answered too late [m]")
-    reaction: NonNegative | None = param(None, "time until a radiating attacker notices a challenge and falls silent [s]; none: never")
+    jam_power: Bound = param(0.1, "largest power of a jammer's noise, and that with which dos_jam is radiated [W]")
+    delay_bound: Bound = param(20.0, "largest extra range of an echo that is answered too late [m]")
+    reaction: Time | None = param(None, "time until a radiating attacker notices a challenge and falls silent [s]; none: never")
     memory: Span = param(50, "longest delay, and longest window that is replayed, at most 10 000 [steps]")
     budget: Count | None = param(None, "attack steps in an episode (the dose); none: unlimited")
     duration: PositiveCount | None = param(None, "longest burst [steps]; none: unlimited")
@@ -67,9 +66,7 @@ class ThreatModel:
     hold_from_onset: bool = param(False, "dos_hold keeps the last good sample before onset (6.18), not before the first hit", if_any=True)
 
     def __post_init__(self) -> None:
-        low, high = self.jam_range
-        if not (np.isfinite(low) and np.isfinite(high) and low <= high):
-            raise InputError("threat_model.jam_range", self.jam_range, "two finite numbers, low <= high")
+        check_order("threat_model.jam_range", self.jam_range)
         if self.end is not None and self.end < self.onset:
             raise InputError("threat_model.end", self.end, f"a step not before onset ({self.onset})")
 
