@@ -9,9 +9,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import hashlib
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import as_completed
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -25,7 +23,7 @@ from tailgate.errors import InputError, NotApplicable
 from tailgate.files import write_atomic
 from tailgate.metrics import METRICS, measure
 from tailgate.parts import Parts
-from tailgate.pool import abandon, processes
+from tailgate.pool import each
 from tailgate.registry import Entry, Spec, entry_for, said, text_of
 from tailgate.rounds import numbered
 from tailgate.rows import packed
@@ -213,46 +211,31 @@ def run(
         raise InputError("workers", workers, "a whole number not below 1")
     ids = [cell_id(cell) for cell in cells]
     pieces = {i: [(i, seed) for seed in cell.episodes] for i, cell in zip(ids, cells, strict=True)}
-    parts = None if out is None else Parts(out)
-    done = {} if parts is None else parts.finished(pieces)
-    missing = [(i, cell) for i, cell in zip(ids, cells, strict=True) if i not in done]
-    for position, rows in _play([cell for _, cell in missing], workers):
-        done[missing[position][0]] = rows
+    with contextlib.nullcontext() if out is None else Parts(out) as parts:
+        done = {} if parts is None else parts.finished(pieces)
+        missing = [(i, cell) for i, cell in zip(ids, cells, strict=True) if i not in done]
+        with contextlib.closing(_play([cell for _, cell in missing], workers)) as played:
+            for position, rows in played:
+                done[missing[position][0]] = rows
+                if parts is not None:
+                    parts.put(missing[position][0], rows)
+                if progress is not None:
+                    progress(len(done), len(cells))
+        rows = [row for i in ids for row in done[i]]
         if parts is not None:
-            parts.put(missing[position][0], rows)
-        if progress is not None:
-            progress(len(done), len(cells))
-    rows = [row for i in ids for row in done[i]]
-    if parts is not None:
-        parts.finish(rows, pieces)
+            parts.finish(rows, pieces)
     return rows
 
 
-def _play(cells: Sequence[Cell], workers: int) -> Iterator[tuple[int, list[dict[str, Any]]]]:
+def _play(cells: Sequence[Cell], workers: int) -> Generator[tuple[int, list[dict[str, Any]]]]:
     foreign = any(Spec("defence", cell.defence).imports or Spec("attack", cell.attack).imports for cell in cells)
     if not foreign and (workers == 1 or len(cells) < 2):
         for i, cell in enumerate(cells):
             yield i, run_cell(cell)
         return
-    lost = []
-    with processes(workers) as pool:
-        waiting = {pool.submit(run_cell, cell): i for i, cell in enumerate(cells)}
-        try:
-            for future in as_completed(waiting):
-                try:
-                    yield waiting[future], future.result()
-                except BrokenProcessPool:  # one cell killed its process, and the pool with it: which one shows below
-                    lost.append(waiting[future])
-        except BaseException:  # an interrupt shall not wait for what is still to play
-            abandon(pool)
-            raise
-    for i in sorted(lost):
-        with processes(1) as pool:
-            try:
-                rows = pool.submit(run_cell, cells[i]).result()
-            except BrokenProcessPool:
-                rows = failed_rows(cells[i], "the process that played this cell died")
-        yield i, rows
+    yield from each(
+        run_cell, [(cell,) for cell in cells], workers, lambda i: failed_rows(cells[i], "the process that played this cell died")
+    )
 
 
 def evaluate(

@@ -25,6 +25,7 @@ from tailgate.draws import Role
 from tailgate.errors import InputError, NotApplicable
 from tailgate.evaluation import Cell, cell_id, cells_of
 from tailgate.files import replacing, sweep, writable_directory, write_atomic
+from tailgate.locks import alone
 from tailgate.held_out import families
 from tailgate.kinds import Kind, Mode
 from tailgate.log_card import Column, columns_of, readme
@@ -90,7 +91,8 @@ def write_log(
         if held["identity"] != identity:
             raise InputError("out", str(folder), "an empty directory, or one with this log (it holds another one)")
     else:
-        held = _written(base, chosen, cells, identity, writable_directory(folder), writable_directory(parts), progress)
+        with alone(folder):
+            held = _written(base, chosen, cells, identity, writable_directory(folder), writable_directory(parts), progress)
     shutil.rmtree(parts, ignore_errors=True)
     return held
 

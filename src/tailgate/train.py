@@ -23,6 +23,7 @@ from tailgate.envs.seat import Seat
 from tailgate.errors import InputError, said, unknown
 from tailgate.evaluation import cells_of
 from tailgate.files import set_aside, writable_directory, write_atomic
+from tailgate.locks import alone
 from tailgate.metrics import METRICS
 from tailgate.registry import Spec
 from tailgate.rivals import best_of
@@ -213,6 +214,15 @@ def train_together(
     """
     for config, _ in runs:
         check(config)
+    with contextlib.ExitStack() as locks:
+        for directory in sorted({config.directory for config, _ in runs}):
+            locks.enter_context(alone(directory))
+        return _together(runs, progress, workers)
+
+
+def _together(
+    runs: Sequence[tuple[TrainConfig, bool]], progress: Callable[[TrainConfig, int, Progress], None], workers: int
+) -> list[list[Path]]:
     chosen: dict[str, str | None] = {}
     ready = [_prepared(config, resume, chosen) for config, resume in runs]
     begun: set[str] = set()

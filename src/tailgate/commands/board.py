@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import sys
 import time
@@ -14,6 +15,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from tailgate.errors import InputError
+from tailgate.locks import alone
 from tailgate.progress import cells, console, progress
 
 
@@ -75,7 +77,9 @@ def _run(options: argparse.Namespace) -> int:
         measured_of(out / suite.name / BOARD)  # refuses what is no such file before anything is played
     kept = {suite.name: kept_board(out / suite.name / BOARD, suite, options.beacon) for suite in suites if options.keep_entries}
     boards = []
-    with progress(Console(stderr=True)) as update:
+    with contextlib.ExitStack() as locks, progress(Console(stderr=True)) as update:
+        for folder in sorted({out / suite.name for suite in suites}):
+            locks.enter_context(alone(folder))
         for suite in suites:
             folder = out / suite.name
             record = Record(suite, folder, options.workers)

@@ -7,19 +7,19 @@ other: a product of their probabilities would be wrong, and Frechet's bound is a
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import shlex
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import as_completed
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Callable, Generator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from tailgate.errors import InputError
 from tailgate.evaluation import cells_of, run_cell
 from tailgate.files import remove, set_aside, sweep, writable_directory, write_atomic
-from tailgate.pool import abandon, processes
+from tailgate.locks import alone
+from tailgate.pool import each
 from tailgate.registry import Spec
 from tailgate.rows import encode
 from tailgate.scenario import Suite, load_scenario
@@ -71,12 +71,13 @@ def play(jobs: Sequence[Job], folder: Path | None = None, workers: int = 1, prog
     missing = [job for job, i in zip(jobs, ids, strict=True) if i not in done]
     if progress is not None and done:  # of an earlier run
         progress(len(done), len(set(ids)))
-    for row in _played(missing, workers):
-        done[row["cell"]] = row
-        if parts is not None:
-            write_atomic(parts / f"{row['cell']}.json", encode([row]))
-        if progress is not None:
-            progress(len(done), len(set(ids)))
+    with contextlib.closing(_played(missing, workers)) as played:
+        for row in played:
+            done[row["cell"]] = row
+            if parts is not None:
+                write_atomic(parts / f"{row['cell']}.json", encode([row]))
+            if progress is not None:
+                progress(len(done), len(set(ids)))
     rows = [done[i] for i in ids]
     if out is not None and parts is not None:
         if out.is_file() and any(row["cell"] not in ids for row in _read(out)):  # somebody's result
@@ -98,30 +99,14 @@ def _read(path: Path) -> list[Row]:
     return [row for row in rows if isinstance(row, dict) and {"cell", "status", "properties", "conjunctions"} <= set(row)]
 
 
-def _played(jobs: Sequence[Job], workers: int) -> Iterator[Row]:
+def _played(jobs: Sequence[Job], workers: int) -> Generator[Row]:
     """Rows as they are finished. Somebody's own code plays in a process of its own."""
     foreign = any(Spec("defence", job.cell.defence).imports or Spec("attack", job.cell.attack).imports for job in jobs)
     if not foreign and (workers == 1 or len(jobs) < 2):
         yield from map(check_cell, jobs)
         return
-    lost = []
-    with processes(workers) as pool:
-        waiting = {pool.submit(check_cell, job): job for job in jobs}
-        try:
-            for future in as_completed(waiting):
-                try:
-                    yield future.result()
-                except BrokenProcessPool:  # one cell killed its process, and the pool with it: which one shows below
-                    lost.append(waiting[future])
-        except BaseException:  # an interrupt shall not wait for what is still to play
-            abandon(pool)
-            raise
-    for job in lost:
-        with processes(1) as pool:
-            try:
-                row = pool.submit(check_cell, job).result()
-            except BrokenProcessPool:
-                row = failed(job, "the process that played this cell died")
+    died = "the process that played this cell died"
+    for _, row in each(check_cell, [(job,) for job in jobs], workers, lambda i: failed(jobs[i], died)):
         yield row
 
 
@@ -145,12 +130,12 @@ def check(
     jobs = jobs_of(
         suite, runs=most, formulas=formulas, purpose=purpose, beacon=beacon, batch=batch, threat=threat, safe=safe, asked=asked, rule=rule
     )
-    rows = play(jobs, folder, workers, progress)
     settings = {"runs": most, "rule": rule_data(rule), "unsafe": _plain(safe or SafeDistance()), "demands": _plain(asked or Demands())}
-    found = report(rows, suite, alpha=alpha, settings=settings)
-    if folder is not None:
-        _keep_failures(found, jobs, folder)
-        write_atomic(folder / REPORT, json.dumps(found, indent=1, allow_nan=False).encode() + b"\n")
+    with contextlib.nullcontext() if folder is None else alone(folder):
+        found = report(play(jobs, folder, workers, progress), suite, alpha=alpha, settings=settings)
+        if folder is not None:
+            _keep_failures(found, jobs, folder)
+            write_atomic(folder / REPORT, json.dumps(found, indent=1, allow_nan=False).encode() + b"\n")
     return found
 
 
