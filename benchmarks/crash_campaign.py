@@ -81,12 +81,13 @@ JOBS = {
         ("trust/cells.jsonl", "trust/trust.json"),
     ),
     "tune": Job(
-        ("tune", "--trials", "3", "--episodes", "20", "--learner", "cem", "--space", "space.yaml", "--workers", "WORKERS", "name=t", *_LEARN,
-         "steps=1200"), ("runs/t-tune/best.yaml", "runs/t-tune/trials.json"),
+        ("tune", "--trials", "3", "--episodes", "20", "--learner", "cem", "--space", "space.yaml", "--workers", "WORKERS", "name=t",
+         *_LEARN, "steps=1200"), ("runs/t-tune/best.yaml", "runs/t-tune/trials.json"),
     ),
     "selfplay": Job(
         ("selfplay", "name=s", *_LEARN[:1], "steps=600", "environment.interval=40", "rounds=1", "fresh=1", "episodes=20",
-         f"attacker={TINY}", f"defender={TINY}"), ("runs/s/*.safetensors", "runs/s/report.json"), ("--resume",), "runs/s/config.json", False,
+         f"attacker={TINY}", f"defender={TINY}"),
+        ("runs/s/*.safetensors", "runs/s/report.json"), ("--resume",), "runs/s/config.json", parallel=False,
     ),
     "reproduce": Job(("reproduce", "ch7", "--seeds", "10", "--out", "ch7"), ("ch7/report.json",), parallel=False),
 }  # fmt: skip
@@ -162,7 +163,8 @@ def begin(words: list[str], folder: Path) -> subprocess.Popen[bytes]:
     """A command as a user begins it, the leader of a group of its own; what it says goes to a file next to the folder."""
     with open(folder.with_suffix(".said"), "wb") as said:
         command = [sys.executable, "-m", "tailgate", *words]
-        return subprocess.Popen(command, cwd=folder, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=said, start_new_session=True)
+        quiet = {"stdin": subprocess.DEVNULL, "stdout": subprocess.DEVNULL}
+        return subprocess.Popen(command, cwd=folder, stderr=said, start_new_session=True, **quiet)
 
 
 def go_on(words: list[str], folder: Path) -> int:
@@ -256,13 +258,14 @@ def moment(job: Job, folder: Path, way: str, delay: float, workers: int, peace: 
     folder.with_suffix(".played").unlink(missing_ok=True)
     if again := go_on(job.command(workers if job.told else 1, folder), folder):
         wrong.append(f"the next run ends with {again}")
-    elif made(job, folder) != peace:
-        wrong.append("the next run makes something else")
+    elif other := sorted(name for name, _ in made(job, folder).items() ^ peace.items()):
+        wrong.append(f"the next run makes something else: {' '.join(dict.fromkeys(other))}")
     elif lost := replayed(job, folder, before):
         wrong.append(f"done again: {len(lost)}")
     if wrong and not any("traceback" in text for text in wrong):
         said = folder.with_suffix(".again").read_text(errors="replace") if again else said
-    return {"delay": round(delay, 3), "code": code, "seconds": round(took, 2), "kept": len(before), "wrong": wrong, "said": said[-1500:] if wrong else ""}
+    return {"delay": round(delay, 3), "code": code, "seconds": round(took, 2), "kept": len(before), "wrong": wrong,
+            "said": said[-1500:] if wrong else ""}  # fmt: skip
 
 
 def campaign(
@@ -287,11 +290,13 @@ def campaign(
             ]
             wrong = collections.Counter(text.split(":")[0] for one in tried for text in one["wrong"])
             line = {
-                "command": name, "way": way, "moments": moments, "span": round(span, 2), "ended before": sum(not one["code"] for one in tried),
+                "command": name, "way": way, "moments": moments, "span": round(span, 2),
+                "ended before": sum(not one["code"] for one in tried),
                 "kept": sum(one["kept"] > 0 for one in tried), "longest": max(one["seconds"] for one in tried),
                 "failed": sum(bool(one["wrong"]) for one in tried), "wrong": dict(wrong), "failures": [one for one in tried if one["wrong"]],
             }  # fmt: skip
-            told(f"{name:<12} {way:<10} {moments} moments in {span:.1f} s, {line['failed']} failed, longest end {line['longest']} s {dict(wrong) or ''}")
+            figures = f"{moments} moments in {span:.1f} s, {line['failed']} failed, longest end {line['longest']} s"
+            told(f"{name:<12} {way:<10} {figures} {dict(wrong) or ''}")
             yield line
 
 

@@ -18,10 +18,11 @@ import numpy as np
 from pydantic import Field
 
 from tailgate import num
-from tailgate.core import Array, Controller, Count, Model, NonNegative, Positive, PositiveCount, Prior, Scene, Sensor, param
+from tailgate.core import Array, Controller, Count, Model, NonNegative, Positive, Prior, Scene, Sensor, param
 from tailgate.draws import Draws
 from tailgate.errors import InputError
 from tailgate.registry import register
+from tailgate.sizes import Parts
 
 from .radar_car import STATES, radar_model
 from .vehicle import drive, lag
@@ -73,9 +74,9 @@ class Highway:
 
     dt: Positive = param(0.1, "step [s]")
     tau: Positive = param(1.008, "actuator lag [s]")
-    lanes: PositiveCount = param(3, "lanes")
+    lanes: Parts = param(3, "lanes")
     lane: Count = param(1, "the car's lane, from 0")
-    ahead: PositiveCount = param(2, "other cars in each lane that begin ahead")
+    ahead: Parts = param(2, "other cars in each lane that begin ahead")
     behind: Count = param(1, "other cars in each lane that begin behind")
     spacing: Span = param((40.0, 75.0), "distance from car to car at the beginning, uniform on this span [m]")
     speed: Positive = param(25.0, "the car's initial speed [m/s]")

@@ -22,7 +22,6 @@ from tailgate.core import (
     Model,
     NonNegative,
     Positive,
-    PositiveCount,
     Prior,
     Probability,
     Received,
@@ -35,6 +34,7 @@ from tailgate.draws import Draws, constants
 from tailgate.errors import InputError
 from tailgate.reach import require_detectable
 from tailgate.registry import register
+from tailgate.sizes import Parts
 
 Edge = Annotated[tuple[Count, Count], Field(min_length=2, max_length=2)]
 GraphName = Literal["thesis", "ring", "path", "star", "complete", "random"]
@@ -83,8 +83,8 @@ def blocks(states: int) -> list[slice]:
 class SensorNetwork:
     """One linear system without input, watched by agents that talk to their neighbours in a graph."""
 
-    agents: PositiveCount = param(10, "number of agents")
-    states: PositiveCount = param(20, "number of states")
+    agents: Parts = param(10, "number of agents")
+    states: Parts = param(20, "number of states")
     graph: GraphName = param("thesis", "who hears whom: thesis (figure 5.1), ring, path, star, complete or random")
     edges: tuple[Edge, ...] | None = param(None, "own edges, pairs of agents from 0, in place of `graph`")
     directed: bool = param(False, "an edge (j, i) lets i hear j, and not the other way round")
@@ -199,11 +199,11 @@ class LinearPlan(NamedTuple):
 class LinearSensors:
     """Every agent's readings y_i = C_i x, with random C_i."""
 
-    sensors: PositiveCount = param(14, "readings of each agent")
+    sensors: Parts = param(14, "readings of each agent")
     pattern: Literal["gaussian", "modes"] = param(
         "gaussian", "C_i: gaussian: everybody sees something of every state; modes: each agent sees some modes of a modal system only"
     )
-    modes_seen: PositiveCount = param(1, "pattern modes: how many of the system's modes each agent sees")
+    modes_seen: Parts = param(1, "pattern modes: how many of the system's modes each agent sees")
     sensor_seed: Count = param(0, "seed of the C_i")
     noise_var: NonNegative = param(0.0, "variance of the sensors' noise; 0, as in the thesis, is none")
     told_var: Positive = param(1.0, "noise variance that the defence is told (Sigma_v)")

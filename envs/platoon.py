@@ -19,11 +19,12 @@ import numpy as np
 from pydantic import Field
 
 from tailgate import num
-from tailgate.core import Array, Controller, Model, NonNegative, Positive, PositiveCount, Prior, Received, Scene, Sensor, Sized, param
+from tailgate.core import Array, Controller, Model, NonNegative, Positive, Prior, Received, Scene, Sensor, Sized, param
 from tailgate.draws import Draws
 from tailgate.errors import InputError
 from tailgate.reach import require_detectable
 from tailgate.registry import register
+from tailgate.sizes import Parts
 
 from .cacc import PER_CAR, V2V, Column, Gains, Law
 from .vehicle import drive, lag
@@ -82,7 +83,7 @@ def hold(A: Array, B: Array, c: Array, dt: float) -> tuple[Array, Array, Array]:
 class String:
     """Base of the platoons: who they are, what they hear, and their public model."""
 
-    followers: PositiveCount = param(4, "cars behind the leader")
+    followers: Parts = param(4, "cars behind the leader")
     topology: Topology = param("predecessor_leader", "who hears whom; predecessor_leader is the thesis's")
     leader_input_known: bool = param(False, "the followers are told the leader's command")
     dt: Positive = param(0.1, "step [s]")

@@ -12,6 +12,7 @@ from importlib import import_module
 from typing import Any, NoReturn
 
 import tailgate
+from tailgate import sizes
 from tailgate.errors import InputError, Killed
 from tailgate.interrupts import Ending, orderly
 
@@ -25,6 +26,7 @@ COMMANDS = (
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; returns the exit code: 0 done, 1 a component failed, 2 bad input, 130 interrupted, 143 terminated."""
     chosen = argparse.Namespace()
+    sizes.tell = lambda text: print(f"tailgate: {text}", file=sys.stderr)
     with orderly(lambda: _kept(chosen)) as ending:
         return _done(arguments, chosen, ending)
 

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 import tailgate
-from tailgate import draws, sources
+from tailgate import draws, sizes, sources
 from tailgate.core import Model
 from tailgate.errors import InputError, NotApplicable
 from tailgate.files import write_atomic
@@ -30,7 +30,7 @@ from tailgate.rows import packed
 from tailgate.scenario import Scenario, Suite, load_scenario, load_suite
 from tailgate.schema import as_data, canonical
 from tailgate.threat import Brief
-from tailgate.trace import episodes_at_once, rollout
+from tailgate.trace import episode_memory, episodes_at_once, rollout
 
 ENGINE = "plain"
 
@@ -195,7 +195,9 @@ def cells_of(
             with _sparing():
                 place.loop(defence, guard.entry.uses)
         if cell.scenario not in models:
-            models[cell.scenario] = place.brief().model
+            models[cell.scenario] = model = place.brief().model
+            needed = 2 * episode_memory(model, place.horizon)  # with what is measured of them
+            sizes.fits(needed, f"scenario {place.name}: horizon", place.horizon, "the signals of one episode")
         brief = Brief(models[cell.scenario], place.threat_model, place.horizon)
         _ = brief.granted  # names wires and agents that exist
         with _sparing():
@@ -207,8 +209,10 @@ def run(
     cells: Sequence[Cell], out: Path | None = None, workers: int = 1, progress: Callable[[int, int], None] | None = None
 ) -> list[dict[str, Any]]:
     """Rows of all cells in their order. With `out`, cells that an interrupted run finished are not played again."""
-    if workers < 1:
-        raise InputError("workers", workers, "a whole number not below 1")
+    sizes.check("workers", workers)
+    count = sum(sizes.check("seeds", cell.seeds) for cell in cells)
+    sizes.fits(count * sizes.ROW, "seeds", max((cell.seeds for cell in cells), default=0), f"{count:,} rows")
+    sizes.announce(count / sizes.EPISODES_A_SECOND / workers, count * sizes.ROW, f"{count:,} episodes")
     ids = [cell_id(cell) for cell in cells]
     pieces = {i: [(i, seed) for seed in cell.episodes] for i, cell in zip(ids, cells, strict=True)}
     with contextlib.nullcontext() if out is None else Parts(out) as parts:
@@ -262,10 +266,9 @@ def evaluate(
     base = load_suite(suite) if isinstance(suite, str) else suite if suite is not None else Suite(name="custom")
     guards = list(base.defences if defences is None else defences)
     rivals = list(base.attacks if attacks is None else attacks)
-    if batch < 1:
-        raise InputError("batch", batch, "a whole number not below 1")
-    if seeds is not None and seeds < 1:
-        raise InputError("seeds", seeds, "a whole number not below 1")
+    sizes.check("batch", batch)
+    sizes.check("workers", workers)
+    sizes.check("seeds", base.seeds if seeds is None else seeds)
     named = dataclasses.replace(
         base,
         scenarios=tuple(base.scenarios if scenarios is None else scenarios),

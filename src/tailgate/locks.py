@@ -63,7 +63,8 @@ def _taken(place: Path, field: str) -> int | None:
             if error.errno in (errno.EWOULDBLOCK, errno.EACCES):
                 who = "" if path == place else os.pread(handle, 20, 0).decode(errors="replace").strip()
                 os.close(handle)
-                raise InputError(field, str(place), f"a place that no other command writes to now{who and f'; process {who} does'}") from None
+                who = f"; process {who} does" if who else ""
+                raise InputError(field, str(place), f"a place that no other command writes to now{who}") from None
             os.close(handle)
             return None
         with contextlib.suppress(OSError):

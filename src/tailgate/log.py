@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 import tailgate
-from tailgate import draws
+from tailgate import draws, sizes
 from tailgate.core import Array, Frame, Model
 from tailgate.draws import Role
 from tailgate.errors import InputError, NotApplicable
@@ -73,8 +73,7 @@ def write_log(
     pyarrow()
     base = load_suite(suite) if isinstance(suite, str) else suite
     for name, value in (("episodes", episodes), ("dev_episodes", dev_episodes)):
-        if value < 1:
-            raise InputError(name, value, "a whole number not below 1")
+        sizes.check("episodes", value, name)
     chosen = _chosen(base, scenarios, doses, defences, attacks)
     cells = {
         split: cells_of(dataclasses.replace(chosen, seeds=count), purpose=SPLITS[split])

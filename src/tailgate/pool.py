@@ -20,6 +20,7 @@ from collections.abc import Callable, Generator, Sequence
 from multiprocessing import connection, resource_tracker
 from typing import Any, Literal, NamedTuple, TypeVar
 
+from tailgate import sizes
 from tailgate.errors import Killed
 
 R = TypeVar("R")
@@ -70,7 +71,7 @@ class Crew:
     """As many processes as there are jobs at a time, and at most so many; within `with`, after which none is left."""
 
     def __init__(self, most: int) -> None:
-        self.most, self.workers = most, list[_Worker]()
+        self.most, self.workers = sizes.check("workers", most), list[_Worker]()
         _crews.add(self)
 
     def __enter__(self) -> Crew:
@@ -135,8 +136,8 @@ def each(
 ) -> Generator[tuple[int, R]]:
     """(number, function(*job)) of each job, as they are done, by so many workers; an error of one ends all.
 
-    A job whose process dies is done once more, by itself: memory may have been short for several. Where that dies too, died(number), or, without
-    that, Killed is raised.
+    A job whose process dies is done once more, by itself: memory may have been short for several. Where that dies too,
+    died(number), or, without that, Killed is raised.
     """
     lost = []
     with Crew(workers) as crew:

@@ -134,4 +134,5 @@ def _train_apart(trainings: Sequence[Training], begin: Callable[[Training], None
 
 
 def _killed(workers: int) -> Killed:
-    return Killed("training", "a process that was killed", f"memory for {workers} of them, or fewer workers; what was learned up to a checkpoint is kept")
+    expected = f"memory for {workers} of them, or fewer workers; what was learned up to a checkpoint is kept"
+    return Killed("training", "a process that was killed", expected)

@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from tailgate import draws
+from tailgate import draws, sizes
 from tailgate.agents.learning import learner_of
 from tailgate.agents.policy import PolicyAttack
 from tailgate.errors import InputError, unknown
@@ -144,8 +144,8 @@ def make_search(
     seed: int = 0,
 ) -> Search:  # fmt: skip
     """The search of a preset; its files go to the directory `NAME-tune` beside the runs. One training seed per trial."""
-    if trials < 1 or episodes < 1:
-        raise InputError("trials and episodes", (trials, episodes), "whole numbers not below 1")
+    sizes.check("trials", trials)
+    sizes.check("episodes", episodes)
     config = load_config(source, overrides + ([f"learner={learner}"] if learner else []))
     base = dataclasses.replace(config, name=f"{config.name}-tune")
     return Search(base, read_space(space, base.learner), trials, episodes, seed)
@@ -263,8 +263,8 @@ def tune(search: Search, workers: int = 1, progress: Callable[[int, Any], None] 
 
     With several workers that many trials are played at a time; which values they get then depends on who ends first.
     """
-    if workers < 1:
-        raise InputError("workers", workers, "a whole number not below 1")
+    sizes.check("workers", workers)
+    sizes.announce(search.trials * search.base.steps / sizes.DECISIONS_A_SECOND / workers, 0.0, f"{search.trials:,} trainings")
     with alone(search.directory):
         return _tuned(search, workers, progress)
 

@@ -40,6 +40,7 @@ def _train(options: argparse.Namespace) -> int:
     overrides = list(options.overrides) + ([f"first_seed={options.seed}"] if options.seed is not None else [])
     config = train.load_config(options.config, overrides, options.resume)
     train.check(config)  # before a word of what is done
+    train.long(config)
     if options.resume:
         train.same_run(config)
     errors = Console(stderr=True)

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import tailgate
+from tailgate import sizes
 from tailgate.errors import InputError
 from tailgate.locks import alone
 from tailgate.pool import each
@@ -155,8 +156,7 @@ def _play(
     """Figures of each defence, as they are done; of those that are there in part, what is missing."""
     have = there or {}
     guards = [*asked, *have]
-    if workers < 1:
-        raise InputError("workers", workers, "a whole number not below 1")
+    sizes.check("workers", workers)
     update, rest = progress or (lambda *_: None), (attacks, effort, beacon)
     if workers == 1 or len(guards) < 2:
         each = 2 * len(effort.hours)  # of an entry: the stealth attack and the others at each threshold

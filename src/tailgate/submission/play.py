@@ -9,6 +9,7 @@ from collections.abc import Callable, Generator, Sequence
 from pathlib import Path
 from typing import Any
 
+from tailgate import sizes
 from tailgate.errors import InputError
 from tailgate.evaluation import Cell, cells_of
 from tailgate.parts import Parts
@@ -51,8 +52,7 @@ def play_submission(
     guard = sandbox_of(sandbox) if isinstance(sandbox, str) else sandbox
     count = base.seeds if episodes is None else episodes
     for name, value in (("episodes", count), ("workers", workers)):
-        if value < 1:
-            raise InputError(name, value, "a whole number not below 1")
+        sizes.check(name, value)
     places = tuple(base.scenarios if scenarios is None else scenarios)
     named = dataclasses.replace(base, attacks=attacks_of(base), defences=("none",), seeds=count, scenarios=places)
     with staged(text) as source:

@@ -15,6 +15,7 @@ from collections.abc import Callable, Generator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from tailgate import sizes
 from tailgate.errors import InputError
 from tailgate.evaluation import cells_of, run_cell
 from tailgate.files import remove, set_aside, sweep, writable_directory, write_atomic
@@ -43,8 +44,7 @@ def jobs_of(
 ) -> list[Job]:  # fmt: skip
     """Every cell of a suite with what is asked of it. Raises InputError for anything that does not exist or cannot be read."""
     for name, value in (("runs", runs), ("batch", batch)):
-        if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-            raise InputError(name, value, "a whole number not below 1")
+        sizes.check(name, value)
     for name, held in (("scenarios", suite.scenarios), ("defences", suite.defences), ("attacks", suite.attacks)):
         if not held:
             raise InputError(name, list(held), "at least one")
@@ -124,12 +124,12 @@ def check(
     """
     if not 0.0 < alpha < 1.0:
         raise InputError("alpha", alpha, "a number above 0 and below 1")
-    if workers < 1:
-        raise InputError("workers", workers, "a whole number not below 1")
+    sizes.check("workers", workers)
     most = suite.seeds if runs is None else runs
     jobs = jobs_of(
         suite, runs=most, formulas=formulas, purpose=purpose, beacon=beacon, batch=batch, threat=threat, safe=safe, asked=asked, rule=rule
     )
+    sizes.announce(len(jobs) * most / sizes.EPISODES_A_SECOND / workers, 0.0, f"{len(jobs) * most:,} runs")
     settings = {"runs": most, "rule": rule_data(rule), "unsafe": _plain(safe or SafeDistance()), "demands": _plain(asked or Demands())}
     with contextlib.nullcontext() if folder is None else alone(folder):
         found = report(play(jobs, folder, workers, progress), suite, alpha=alpha, settings=settings)
