@@ -52,7 +52,7 @@ class Job:
     resumed_by: tuple[str, ...] = ()  # further words where a run of this name has begun
     begun: str = ""  # the file that says so
     parallel: bool = True  # takes --workers
-    told: bool = False  # its results say how many workers there were
+    told: bool = False  # its results say how many workers there were: it goes on with as many, as a user has it
 
     def command(self, workers: int, folder: Path | None = None) -> list[str]:
         """The words after `tailgate`; those that resume it, where the folder says that it began."""
@@ -159,9 +159,9 @@ def _lives(pid: str) -> bool:
     return False
 
 
-def begin(words: list[str], folder: Path) -> subprocess.Popen[bytes]:
-    """A command as a user begins it, the leader of a group of its own; what it says goes to a file next to the folder."""
-    with open(folder.with_suffix(".said"), "wb") as said:
+def begin(words: list[str], folder: Path, said_in: str = ".said") -> subprocess.Popen[bytes]:
+    """A command as a user begins it, the leader of a process group; what it says goes to a file next to the folder."""
+    with open(folder.with_suffix(said_in), "wb") as said:
         command = [sys.executable, "-m", "tailgate", *words]
         quiet = {"stdin": subprocess.DEVNULL, "stdout": subprocess.DEVNULL}
         return subprocess.Popen(command, cwd=folder, stderr=said, start_new_session=True, **quiet)
@@ -256,7 +256,8 @@ def moment(job: Job, folder: Path, way: str, delay: float, workers: int, peace: 
         wrong.append(f"unreadable: {error}"[:200])
         before = {}
     folder.with_suffix(".played").unlink(missing_ok=True)
-    if again := go_on(job.command(workers if job.told else 1, folder), folder):
+    again = begin(job.command(workers, folder), folder, ".again").wait() if job.told else go_on(job.command(1, folder), folder)
+    if again:
         wrong.append(f"the next run ends with {again}")
     elif other := sorted(name for name, _ in made(job, folder).items() ^ peace.items()):
         wrong.append(f"the next run makes something else: {' '.join(dict.fromkeys(other))}")
@@ -273,9 +274,11 @@ def campaign(
 ) -> Iterator[dict[str, Any]]:
     """A line for each command and way: how many moments, what went wrong how often, the longest end [s]."""
     chance = random.Random(seed)
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as in the background of a shell, which the commands would inherit
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     for name in names:
         job = JOBS[name]
-        go_on(job.command(1), prepared(folder / f"{name}-warm"))  # compiled code is in its cache afterwards
+        begin(job.command(workers), prepared(folder / f"{name}-warm")).wait()  # compiled code is in its cache afterwards
         peace = prepared(folder / f"{name}-peace")
         begun = time.monotonic()
         running = begin(job.command(workers), peace)

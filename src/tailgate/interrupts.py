@@ -48,11 +48,15 @@ def _end(number: int, kept: str, said: bool = False) -> NoReturn:
     os._exit(128 + number)
 
 
+def _heard() -> list[signal.Signals]:
+    """The signals that are not ignored here, as a shell has it for jobs in the background, and that Python can put back."""
+    return [number for number in WORDS if signal.getsignal(number) not in (signal.SIG_IGN, None)]
+
+
 def at_start() -> None:
     """An interrupt during the imports of the command line ends it in one line; elsewhere nothing changes."""
-    if COMMAND and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-        for number in WORDS:
-            signal.signal(number, lambda number, _: _end(number, "it had not begun"))
+    for number in _heard() if COMMAND else ():
+        signal.signal(number, lambda number, _: _end(number, "it had not begun"))
 
 
 class Ending:
@@ -98,23 +102,23 @@ def orderly(kept: Callable[[], str]) -> Iterator[Ending]:
 
     In the process of the command line this holds to its very end; elsewhere what was there before is put back.
     """
-    if threading.current_thread() is not threading.main_thread() or signal.getsignal(signal.SIGINT) in (signal.SIG_IGN, None):
-        yield Ending(kept)  # somebody else's business: a thread, or a background job that no terminal interrupts
-        return
     ending = Ending(kept)
-    before = {number: signal.getsignal(number) for number in WORDS}
+    if threading.current_thread() is not threading.main_thread():  # signals are the main thread's business
+        yield ending
+        return
+    before = {number: signal.getsignal(number) for number in _heard()}
     reads, writes = os.pipe()
     os.set_blocking(writes, False)
     hook, wakeup = sys.unraisablehook, signal.set_wakeup_fd(writes, warn_on_full_buffer=False)
     sys.unraisablehook = ending.unraisable
     threading.Thread(target=ending.watch, args=(reads,), daemon=True).start()
-    for number in WORDS:
+    for number in before:
         signal.signal(number, ending.handle)
     try:
         yield ending
     finally:
         if COMMAND:
-            for number in WORDS:
+            for number in before:
                 signal.signal(number, signal.SIG_IGN)  # all is done and said
         else:
             ending.over.set()
