@@ -184,20 +184,19 @@ def objective(config: TrainConfig, policy: Path, episodes: int) -> float:
     return float(np.concatenate([METRICS[outcome](rollout(loop, attack, draws.keys("tune", part))) for part in parts]).mean())
 
 
-def _journal_lock(path: Path) -> Any:
+class _JournalLock:
     """The kernel's lock on the journal, in place of Optuna's, which outlives a process that is killed and then costs 30 seconds."""
-    handles: list[int] = []
 
-    class Lock(optuna().storages.journal.BaseJournalFileLock):  # type: ignore[misc]
-        def acquire(self) -> bool:
-            handles.append(os.open(path, os.O_RDONLY | os.O_CREAT, 0o644))
-            fcntl.flock(handles[-1], fcntl.LOCK_EX)
-            return True
+    def __init__(self, path: Path) -> None:
+        self.path, self.handles = path, list[int]()
 
-        def release(self) -> None:
-            os.close(handles.pop())
+    def acquire(self) -> bool:
+        self.handles.append(os.open(self.path, os.O_RDONLY | os.O_CREAT, 0o644))
+        fcntl.flock(self.handles[-1], fcntl.LOCK_EX)
+        return True
 
-    return Lock()
+    def release(self) -> None:
+        os.close(self.handles.pop())
 
 
 def _mend(path: Path) -> None:
@@ -212,7 +211,7 @@ def _open(search: Search, ordinal: int | None = None) -> Any:
     """The search's study. The sampler is made anew for each trial, so that one that goes on proposes what an uninterrupted one would."""
     module = optuna()
     path = search.directory / JOURNAL
-    backend = module.storages.journal.JournalFileBackend(str(path), _journal_lock(path))  # JSON lines, never pickles
+    backend = module.storages.journal.JournalFileBackend(str(path), _JournalLock(path))  # JSON lines, never pickles
     sampler = module.samplers.TPESampler(seed=search.seed * SAMPLER_STRIDE + (ordinal or 0), multivariate=False)
     storage = module.storages.JournalStorage(backend)
     return module.create_study(
