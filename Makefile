@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test test-long lint bench clean
+.PHONY: demo test test-long lint bench crash clean
 
 demo: $(VENV)/.ready  ## train an adversary against a gated Kalman filter, compare it with scripted attacks, write the page
 	$(BIN)/python train.py
@@ -20,6 +20,10 @@ lint: $(VENV)/.ready
 
 bench: $(VENV)/.ready  ## speed beside the peers, in one run; writes benchmarks/results/speed.*
 	$(BIN)/python -m tailgate bench --out benchmarks/results
+
+crash: $(VENV)/.ready  ## end the long commands at random moments, and see that the next run makes good: some hours
+	$(BIN)/python benchmarks/crash_campaign.py --ways interrupt,group,twice,terminate --moments 40
+	$(BIN)/python benchmarks/crash_campaign.py --ways kill --moments 100
 
 # torch comes first and pinned: left to the others it would be the largest build that exists
 $(VENV)/.ready: pyproject.toml constraints.txt

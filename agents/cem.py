@@ -36,6 +36,7 @@ from tailgate.envs.seat import Seat
 from tailgate.errors import InputError
 from tailgate.files import write_atomic
 from tailgate.schema import canonical
+from tailgate.sizes import Passes, Rows, Width
 
 from .learning import SEED_STRIDE, Progress, header_of, open_checkpoint
 from .policy import Network, save_policy
@@ -50,16 +51,16 @@ Share = Annotated[float, Field(gt=0, le=1)]
 class Config:
     """Hyper-parameters of the cross-entropy method, tuned on training seeds of the quickstart scenario."""
 
-    population: PositiveCount = param(128, "policies in a generation")
-    episodes: PositiveCount = param(24, "episodes that each policy of a generation plays, the same for all")
+    population: Rows = param(128, "policies in a generation")
+    episodes: Rows = param(24, "episodes that each policy of a generation plays, the same for all")
     elite: Share = param(0.125, "share of a generation that the next one is made of [-]")
     step: Share = param(0.7, "how far the mean moves to that of the elite [-]")
     sd: Positive = param(1.0, "standard deviation of the first generation's weights [-]")
     extra: NonNegative = param(0.1, "extra standard deviation of the first generations [-]")
     extra_until: PositiveCount = param(200, "generations until the extra has fallen to 0")
-    starts: PositiveCount = param(1, "searches that are begun, of which the best goes on")
-    trial: PositiveCount = param(10, "generations that each of several starts is tried for")
-    hidden: tuple[PositiveCount, ...] = param((16,), "widths of the hidden layers")
+    starts: Passes = param(1, "searches that are begun, of which the best goes on")
+    trial: Passes = param(10, "generations that each of several starts is tried for")
+    hidden: tuple[Width, ...] = param((16,), "widths of the hidden layers")
     rest: Probability = param(0.5, "bias of the first mean towards rest: the probability of it that a softmax would give")
 
     @property

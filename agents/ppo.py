@@ -13,8 +13,9 @@ try:
 except ImportError as error:
     raise ImportError("torch or Stable-Baselines3 is missing: pip install 'tailgate[train]'") from error
 
-from tailgate.core import NonNegative, Positive, PositiveCount, Probability, param
+from tailgate.core import NonNegative, Positive, Probability, param
 from tailgate.errors import InputError
+from tailgate.sizes import Passes, Rows, Width
 
 from .policy import Network
 from .stable import StableLearner, perceptron, rest_first
@@ -31,15 +32,15 @@ class Config:
 
     name: ClassVar[str] = "ppo"
 
-    envs: PositiveCount = param(512, "environments in the batch")
-    rollout: PositiveCount = param(64, "steps per environment and update")
-    batch_size: PositiveCount = param(4096, "samples per gradient step")
-    epochs: PositiveCount = param(10, "passes over a rollout")
+    envs: Rows = param(512, "environments in the batch")
+    rollout: Rows = param(64, "steps per environment and update")
+    batch_size: Rows = param(4096, "samples per gradient step")
+    epochs: Passes = param(10, "passes over a rollout")
     learning_rate: Positive = param(1e-3, "step size of Adam")
     gae_lambda: Probability = param(0.95, "bias against variance of the advantages [-]")
     clip: Positive = param(0.2, "largest change of a probability ratio [-]")
     entropy: NonNegative = param(0.0, "weight of the entropy bonus [-]")
-    hidden: tuple[PositiveCount, ...] = param((64, 64), "widths of the hidden layers")
+    hidden: tuple[Width, ...] = param((64, 64), "widths of the hidden layers")
     rest: Probability = param(0.1, "initial probability of attacking in a step: a policy that spends its budget at once learns no timing")
 
     def check(self) -> None:

@@ -18,7 +18,8 @@ try:
 except ImportError as error:
     raise ImportError("torch or sb3-contrib is missing: pip install 'tailgate[train]'") from error
 
-from tailgate.core import Array, Positive, PositiveCount, param
+from tailgate.core import Array, Positive, param
+from tailgate.sizes import Passes, Rows, Width
 
 from . import ppo
 from .policy import Lstm, Network
@@ -30,13 +31,13 @@ class Config(ppo.Config):
 
     name: ClassVar[str] = "recurrent_ppo"
 
-    envs: PositiveCount = param(256, "environments in the batch")
-    rollout: PositiveCount = param(16, "steps per environment and update")
-    batch_size: PositiveCount = param(512, "samples per gradient step")
-    epochs: PositiveCount = param(6, "passes over a rollout")
+    envs: Rows = param(256, "environments in the batch")
+    rollout: Rows = param(16, "steps per environment and update")
+    batch_size: Rows = param(512, "samples per gradient step")
+    epochs: Passes = param(6, "passes over a rollout")
     learning_rate: Positive = param(2e-3, "step size of Adam")
-    hidden: tuple[PositiveCount, ...] = param((32,), "widths of the hidden layers behind the LSTM")
-    memory: PositiveCount = param(32, "width of the LSTM, of the policy and of the critic")
+    hidden: tuple[Width, ...] = param((32,), "widths of the hidden layers behind the LSTM")
+    memory: Width = param(32, "width of the LSTM, of the policy and of the critic")
 
 
 class Learner(ppo.Learner):

@@ -35,6 +35,7 @@ from tailgate.envs.seat import Seat
 from tailgate.errors import InputError
 from tailgate.files import write_atomic
 from tailgate.schema import canonical
+from tailgate.sizes import Episodes, Passes, Rows, Width
 
 from .codec import ActionCodec
 from .learning import SEED_STRIDE, Progress, check_action, header_of, open_checkpoint
@@ -289,15 +290,15 @@ class OffPolicyConfig:
 
     name: ClassVar[str]
 
-    envs: PositiveCount = param(128, "environments in the batch: a step of many costs little more than one of few")
-    train_freq: PositiveCount = param(1, "steps per environment between updates")
-    gradient_steps: PositiveCount = param(16, "gradient steps per update")
-    batch_size: PositiveCount = param(128, "samples per gradient step")
-    buffer_size: PositiveCount = param(300_000, "decisions that the replay buffer holds")
+    envs: Rows = param(128, "environments in the batch: a step of many costs little more than one of few")
+    train_freq: Passes = param(1, "steps per environment between updates")
+    gradient_steps: Passes = param(16, "gradient steps per update")
+    batch_size: Rows = param(128, "samples per gradient step")
+    buffer_size: Episodes = param(300_000, "decisions that the replay buffer holds")
     learning_starts: PositiveCount = param(4_000, "decisions before the first update, taken at random")
     learning_rate: Positive = param(3e-3, "step size of Adam")
-    n_steps: PositiveCount = param(5, "decisions whose rewards a target sums up before it relies on the critic")
-    hidden: tuple[PositiveCount, ...] = param((64, 64), "widths of the hidden layers, of the policy and of the critics")
+    n_steps: Passes = param(5, "decisions whose rewards a target sums up before it relies on the critic")
+    hidden: tuple[Width, ...] = param((64, 64), "widths of the hidden layers, of the policy and of the critics")
     attack: Probability = param(0.2, "probability that a random action attacks: one that spends the budget at once shows no timing")
 
     def check(self) -> None:

@@ -13,8 +13,9 @@ try:
 except ImportError as error:
     raise ImportError("torch or sb3-contrib is missing: pip install 'tailgate[train]'") from error
 
-from tailgate.core import Count, PositiveCount, param
+from tailgate.core import Count, param
 from tailgate.errors import InputError
+from tailgate.sizes import Width
 
 from . import sac
 from .stable import Exploring
@@ -26,7 +27,7 @@ class Config(sac.Config):
 
     name: ClassVar[str] = "tqc"
 
-    quantiles: PositiveCount = param(10, "quantiles that each of the two critics predicts")
+    quantiles: Width = param(10, "quantiles that each of the two critics predicts")
     drop: Count = param(1, "largest quantiles per critic that a target leaves out")
 
     def check(self) -> None:

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from tailgate import sizes
 from tailgate.core import Array, Frame, View
 from tailgate.draws import Keys
 from tailgate.errors import InputError, unknown
@@ -78,8 +79,7 @@ def side_by_side(seat: Seat, engine: str = "auto", drawn: bool = False, threads:
 
     The fused engine plays 2048 episodes and more to each of several `threads`.
     """
-    if not isinstance(threads, int) or isinstance(threads, bool) or threads < 1:
-        raise InputError("threads", threads, "a whole number not below 1")
+    sizes.check("threads", threads)
     if engine not in ENGINES:
         raise unknown("engine", engine, ENGINES)
     if engine == "plain":

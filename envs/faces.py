@@ -14,7 +14,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from tailgate import draws
+from tailgate import draws, sizes
 from tailgate.agents.codec import action_space
 from tailgate.agents.observation import LIMIT
 from tailgate.core import Array, Frame
@@ -46,9 +46,7 @@ class AdversaryVectorEnv(Specified, gymnasium.vector.VectorEnv[Array, Array, Arr
         self, num_envs: int = 1, *, render_mode: str | None = None, autoreset: str | AutoresetMode = "next_step", viewer: str = "auto",
         size: tuple[int, int] | None = None, engine: str = "auto", threads: int = 1, max_episode_steps: int | None = None, **arguments: Any,
     ) -> None:  # fmt: skip
-        if not isinstance(num_envs, (int, np.integer)) or num_envs < 1:
-            raise InputError("num_envs", num_envs, "a whole number not below 1")
-        num_envs = int(num_envs)
+        num_envs = sizes.check("num_envs", num_envs)
         autoreset = autoreset.name.lower() if isinstance(autoreset, AutoresetMode) else autoreset
         if autoreset not in _AUTORESET:
             raise unknown("autoreset", autoreset, _AUTORESET)
@@ -57,6 +55,7 @@ class AdversaryVectorEnv(Specified, gymnasium.vector.VectorEnv[Array, Array, Arr
             why = "; a window shows one episode: gymnasium.make(..., render_mode='human')" if render_mode == "human" else ""
             raise InputError("render_mode", render_mode, f"None or 'rgb_array'{why}")
         self.seat = Seat.make(**arguments)
+        sizes.fits(num_envs * self.seat.memory, "num_envs", num_envs, f"{num_envs:,} environments")
         self.num_envs = num_envs
         self.render_mode, self.viewer = render_mode, Viewer(viewer, size)
         self.autoreset_mode = _AUTORESET[autoreset]

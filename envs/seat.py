@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from tailgate import sizes
 from tailgate.agents.codec import ActionCodec, ActionSpec
 from tailgate.agents.observation import FRAMES, ObservationCodec
 from tailgate.agents.reward import Reward
@@ -59,6 +60,12 @@ class Seat:
     observation: ObservationCodec
     reward: Reward
     config: dict[str, Any]
+
+    @property
+    def memory(self) -> float:
+        """Bytes that an environment of a batch takes, about: the filter's matrices, what it shows, and the rest."""
+        model = self.loop.model
+        return sizes.ENVIRONMENT + 8 * model.agents * model.states**2 * 4 + 8 * len(self.observation.names)
 
     @classmethod
     def make(cls, scenario: Any = None, defence: Any = None, threat: dict[str, Any] | None = None, **options: Any) -> Seat:

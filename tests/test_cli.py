@@ -305,7 +305,7 @@ NOTHING = "nothing of it is kept"
      "nothing is kept: --out DIR would"),
     (["log", "--out", "x"], "log.write_log", "the same command goes on"),
     (["tune", "--trials", "1"], "tuning.tune", "the same command goes on"),
-    (["train", "out=x"], "train.train", "train --resume name=quickstart out=x\ntailgate: interrupted; what was finished is kept"),
+    (["train", "out=x"], "train.train", "what was finished is kept, go on with: tailgate train --resume name=quickstart out=x"),
     (["reproduce", "ch3"], "reproduce.whole.chapter", NOTHING),
     (["reproduce"], "reproduce.whole.reproduce_whole", "the same command goes on after the chapters that are finished"),
 ])  # fmt: skip

@@ -6,11 +6,9 @@ import json
 import re
 import shlex
 import shutil
-from concurrent.futures import Future
-from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, ClassVar, Self
+from typing import Any
 
 import numpy as np
 import pytest
@@ -229,29 +227,15 @@ def test_a_defence_that_was_not_attacked_has_no_bound(short: str) -> None:
     assert gated["safety"]["white"]["k"] == 0 and gated["safety"]["black"]["attacks"] == [JAM]
 
 
-class _Pool:
-    """Stands for processes: one that plays chi2_kf dies, and takes what it had with it."""
-
-    _processes: ClassVar[dict[int, Any]] = {}
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        return None
-
-    def submit(self, function: Any, job: Job) -> Future[Any]:
-        out: Future[Any] = Future()
-        if job.cell.defence == "chi2_kf":
-            out.set_exception(BrokenProcessPool())
-        else:
-            out.set_result(function(copy.deepcopy(job)))  # what crosses to another process is a copy
-        return out
+def _each(function: Any, jobs: Any, workers: int, died: Any) -> Any:
+    """Stands for processes: one that plays chi2_kf dies."""
+    for i, (job,) in enumerate(jobs):
+        yield i, died(i) if job.cell.defence == "chi2_kf" else function(copy.deepcopy(job))  # what crosses to another process is a copy
 
 
 def test_a_process_that_dies_costs_its_own_cells(short: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """A defence that kills its process would take the rows of others with it, or be trusted."""
-    monkeypatch.setattr(trust_run, "processes", lambda workers: _Pool())
+    monkeypatch.setattr(trust_run, "each", _each)
     kf, deadly = check(_suite(short, attacks=("none",)), runs=2, workers=2)["defences"]
     assert kf["safety"]["black"]["k"] == 2 and deadly["safety"]["black"] is None and "died" in deadly["why"]
 

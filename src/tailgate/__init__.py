@@ -7,6 +7,8 @@
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
+from tailgate import interrupts as interrupts  # first: the imports below take half a second, in which a user may change his mind
+
 try:
     __version__ = version("tailgate")
 except PackageNotFoundError:  # a source tree that was never installed

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from tailgate import train
+from tailgate import sizes, train
 from tailgate.agents.codec import ActionCodec, ActionSpec
 from tailgate.agents.learning import LEARNERS, learner_of
 from tailgate.agents.observation import ObservationCodec
@@ -23,6 +23,7 @@ from tailgate.errors import InputError, unknown
 from tailgate.registry import Spec
 from tailgate.scenario import Suite, load_scenario
 from tailgate.schema import as_data, build, fields_of
+from tailgate.sizes import Seeds
 from tailgate.threat import KNOWLEDGE
 
 Progress = Callable[[str, int, int, str], None]  # label, done, total, figures
@@ -38,7 +39,7 @@ class Adaptive:
     changes: tuple[str, ...] = param((), "key=value changes of the preset, for all learners")
     learners: dict[str, tuple[str, ...]] = field(default_factory=dict, metadata={"doc": "learners, each with its own changes"})
     knowledge: tuple[str, ...] = param(("black", "grey"), "what the attackers know, one training each")
-    seeds: PositiveCount = param(5, "training seeds of each")
+    seeds: Seeds = param(5, "training seeds of each")
 
 
 def plan_of(suite: Suite) -> Adaptive:
@@ -64,8 +65,8 @@ def plan_of(suite: Suite) -> Adaptive:
 def configs_of(suite: Suite, defence: str, out: Path, *, seeds: int | None = None, extra: tuple[str, ...] = ()) -> list[train.TrainConfig]:
     """One training for each scenario that is trained on, learner and knowledge."""
     plan = plan_of(suite)
-    if seeds is not None and seeds < 1:
-        raise InputError("seeds", seeds, "a whole number not below 1")
+    if seeds is not None:
+        sizes.check("seeds", seeds)
     Spec("defence", defence).refuse_imports("adaptive attack")
     threat = suite.threat | ({} if plan.dose is None else {"budget": plan.dose})
     settings = [f"defence={json.dumps(defence)}", f"out={json.dumps(str(out))}", "tensorboard=false"]

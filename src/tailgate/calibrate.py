@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from tailgate import sizes
 from tailgate.clean import HOUR, MOST_DIGITS, SILENT, Bench, Count, Crossings, Progress
 from tailgate.errors import InputError
 
@@ -73,8 +74,7 @@ def calibrate(
     if not (isinstance(hours, (int, float)) and math.isfinite(hours) and hours > 0.0):
         raise InputError("hours", hours, "a finite number above 0")
     for name, value in (("onsets", onsets), ("steps", most_steps), ("batch", batch)):
-        if value < 1:
-            raise InputError(name, value, "a whole number not below 1")
+        sizes.check(name, value)
     bench = Bench.of(defence, scenarios, batch, progress)
     longest = bench.hours(most_steps)
     if longest < min(onsets, LEAST) * hours:

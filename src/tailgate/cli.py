@@ -12,7 +12,9 @@ from importlib import import_module
 from typing import Any, NoReturn
 
 import tailgate
+from tailgate import sizes
 from tailgate.errors import InputError, Killed
+from tailgate.interrupts import Ending, orderly
 
 EXIT_INPUT = 2
 COMMANDS = (
@@ -22,10 +24,16 @@ COMMANDS = (
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command; returns the exit code: 0 done, 1 a component failed, 2 bad input, 130 interrupted."""
+    """Run a command; returns the exit code: 0 done, 1 a component failed, 2 bad input, 130 interrupted, 143 terminated."""
     chosen = argparse.Namespace()
+    sizes.tell = lambda text: print(f"tailgate: {text}", file=sys.stderr)
+    with orderly(lambda: _kept(chosen)) as ending:
+        return _done(arguments, chosen, ending)
+
+
+def _done(arguments: Sequence[str] | None, chosen: argparse.Namespace, ending: Ending) -> int:
     try:
-        chosen = _parser().parse_args(arguments)
+        _parser().parse_args(arguments, chosen)
         return int(chosen.run(chosen))
     except InputError as error:
         print(f"tailgate: error: {error}", file=sys.stderr)
@@ -37,9 +45,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             raise
         print(f"tailgate: error: {error}", file=sys.stderr)
         return EXIT_INPUT
-    except KeyboardInterrupt:
-        print(f"tailgate: interrupted; {_kept(chosen)}", file=sys.stderr)
-        return 130
+    except KeyboardInterrupt as error:
+        return ending.last_words(error)
     except BrokenPipeError:  # the reader of our output has gone
         sys.stderr.close()
         return 0

@@ -10,9 +10,7 @@ import contextlib
 import copy
 import dataclasses
 import hashlib
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import as_completed
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -20,20 +18,20 @@ from typing import Any
 import numpy as np
 
 import tailgate
-from tailgate import draws, sources
+from tailgate import draws, sizes, sources
 from tailgate.core import Model
 from tailgate.errors import InputError, NotApplicable
 from tailgate.files import write_atomic
 from tailgate.metrics import METRICS, measure
 from tailgate.parts import Parts
-from tailgate.pool import abandon, processes
+from tailgate.pool import each
 from tailgate.registry import Entry, Spec, entry_for, said, text_of
 from tailgate.rounds import numbered
 from tailgate.rows import packed
 from tailgate.scenario import Scenario, Suite, load_scenario, load_suite
 from tailgate.schema import as_data, canonical
 from tailgate.threat import Brief
-from tailgate.trace import episodes_at_once, rollout
+from tailgate.trace import episode_memory, episodes_at_once, rollout
 
 ENGINE = "plain"
 
@@ -203,7 +201,9 @@ def cells_of(
             with _sparing():
                 place.loop(defence, guard.entry.uses)
         if cell.scenario not in models:
-            models[cell.scenario] = place.brief().model
+            models[cell.scenario] = model = place.brief().model
+            needed = 2 * episode_memory(model, place.horizon)  # with what is measured of them
+            sizes.fits(needed, f"scenario {place.name}: horizon", place.horizon, "the signals of one episode")
         brief = Brief(models[cell.scenario], place.threat_model, place.horizon)
         _ = brief.granted  # names wires and agents that exist
         with _sparing():
@@ -215,50 +215,37 @@ def run(
     cells: Sequence[Cell], out: Path | None = None, workers: int = 1, progress: Callable[[int, int], None] | None = None
 ) -> list[dict[str, Any]]:
     """Rows of all cells in their order. With `out`, cells that an interrupted run finished are not played again."""
-    if workers < 1:
-        raise InputError("workers", workers, "a whole number not below 1")
+    sizes.check("workers", workers)
+    count = sum(sizes.check("seeds", cell.seeds) for cell in cells)
+    sizes.fits(count * sizes.ROW, "seeds", max((cell.seeds for cell in cells), default=0), f"{count:,} rows")
+    sizes.announce(count / sizes.EPISODES_A_SECOND / workers, count * sizes.ROW, f"{count:,} episodes")
     ids = [cell_id(cell) for cell in cells]
     pieces = {i: [(i, seed) for seed in cell.episodes] for i, cell in zip(ids, cells, strict=True)}
-    parts = None if out is None else Parts(out)
-    done = {} if parts is None else parts.finished(pieces)
-    missing = [(i, cell) for i, cell in zip(ids, cells, strict=True) if i not in done]
-    for position, rows in _play([cell for _, cell in missing], workers):
-        done[missing[position][0]] = rows
+    with contextlib.nullcontext() if out is None else Parts(out) as parts:
+        done = {} if parts is None else parts.finished(pieces)
+        missing = [(i, cell) for i, cell in zip(ids, cells, strict=True) if i not in done]
+        with contextlib.closing(_play([cell for _, cell in missing], workers)) as played:
+            for position, rows in played:
+                done[missing[position][0]] = rows
+                if parts is not None:
+                    parts.put(missing[position][0], rows)
+                if progress is not None:
+                    progress(len(done), len(cells))
+        rows = [row for i in ids for row in done[i]]
         if parts is not None:
-            parts.put(missing[position][0], rows)
-        if progress is not None:
-            progress(len(done), len(cells))
-    rows = [row for i in ids for row in done[i]]
-    if parts is not None:
-        parts.finish(rows, pieces)
+            parts.finish(rows, pieces)
     return rows
 
 
-def _play(cells: Sequence[Cell], workers: int) -> Iterator[tuple[int, list[dict[str, Any]]]]:
+def _play(cells: Sequence[Cell], workers: int) -> Generator[tuple[int, list[dict[str, Any]]]]:
     foreign = any(Spec("defence", cell.defence).imports or Spec("attack", cell.attack).imports for cell in cells)
     if not foreign and (workers == 1 or len(cells) < 2):
         for i, cell in enumerate(cells):
             yield i, run_cell(cell)
         return
-    lost = []
-    with processes(workers) as pool:
-        waiting = {pool.submit(run_cell, cell): i for i, cell in enumerate(cells)}
-        try:
-            for future in as_completed(waiting):
-                try:
-                    yield waiting[future], future.result()
-                except BrokenProcessPool:  # one cell killed its process, and the pool with it: which one shows below
-                    lost.append(waiting[future])
-        except BaseException:  # an interrupt shall not wait for what is still to play
-            abandon(pool)
-            raise
-    for i in sorted(lost):
-        with processes(1) as pool:
-            try:
-                rows = pool.submit(run_cell, cells[i]).result()
-            except BrokenProcessPool:
-                rows = failed_rows(cells[i], "the process that played this cell died")
-        yield i, rows
+    yield from each(
+        run_cell, [(cell,) for cell in cells], workers, lambda i: failed_rows(cells[i], "the process that played this cell died")
+    )
 
 
 def evaluate(
@@ -285,10 +272,9 @@ def evaluate(
     base = load_suite(suite) if isinstance(suite, str) else suite if suite is not None else Suite(name="custom")
     guards = list(base.defences if defences is None else defences)
     rivals = list(base.attacks if attacks is None else attacks)
-    if batch < 1:
-        raise InputError("batch", batch, "a whole number not below 1")
-    if seeds is not None and seeds < 1:
-        raise InputError("seeds", seeds, "a whole number not below 1")
+    sizes.check("batch", batch)
+    sizes.check("workers", workers)
+    sizes.check("seeds", base.seeds if seeds is None else seeds)
     named = dataclasses.replace(
         base,
         scenarios=tuple(base.scenarios if scenarios is None else scenarios),

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 import tailgate
-from tailgate import draws
+from tailgate import draws, sizes
 from tailgate.core import Array, Frame, Model
 from tailgate.draws import Role
 from tailgate.errors import InputError, NotApplicable
@@ -27,6 +27,7 @@ from tailgate.evaluation import Cell, cell_id, cells_of
 from tailgate.files import replacing, sweep, writable_directory, write_atomic
 from tailgate.held_out import families
 from tailgate.kinds import Kind, Mode
+from tailgate.locks import alone
 from tailgate.log_card import Column, columns_of, readme
 from tailgate.loop import Loop, LoopState
 from tailgate.registry import Spec
@@ -72,8 +73,7 @@ def write_log(
     pyarrow()
     base = load_suite(suite) if isinstance(suite, str) else suite
     for name, value in (("episodes", episodes), ("dev_episodes", dev_episodes)):
-        if value < 1:
-            raise InputError(name, value, "a whole number not below 1")
+        sizes.check("episodes", value, name)
     chosen = _chosen(base, scenarios, doses, defences, attacks)
     cells = {
         split: cells_of(dataclasses.replace(chosen, seeds=count), purpose=SPLITS[split])
@@ -90,7 +90,8 @@ def write_log(
         if held["identity"] != identity:
             raise InputError("out", str(folder), "an empty directory, or one with this log (it holds another one)")
     else:
-        held = _written(base, chosen, cells, identity, writable_directory(folder), writable_directory(parts), progress)
+        with alone(folder):
+            held = _written(base, chosen, cells, identity, writable_directory(folder), writable_directory(parts), progress)
     shutil.rmtree(parts, ignore_errors=True)
     return held
 

@@ -9,6 +9,7 @@ from typing import Any
 
 from tailgate.errors import InputError
 from tailgate.files import remove, set_aside, sweep, writable_directory, write_atomic
+from tailgate.locks import alone
 from tailgate.rows import encode, packed, read_rows
 
 Rows = list[dict[str, Any]]
@@ -16,14 +17,30 @@ Wanted = Sequence[tuple[str, int]]  # cell and seed of each row of a piece, in o
 
 
 class Parts:
-    """The pieces of a run that writes to `out`. A piece has a name, and is finished when all of its rows are there and none failed."""
+    """The pieces of a run that writes to `out`, within `with`, which nobody else may do meanwhile.
+
+    A piece has a name, and is finished when all of its rows are there and none failed.
+    """
 
     def __init__(self, out: Path) -> None:
         if out.is_dir():
             raise InputError("out", str(out), "a file, not a directory")
-        self.out, self.folder = out, writable_directory(out.with_name(f".{out.name}.parts"), asked=out)
-        for place in (out, self.folder):
-            sweep(place)
+        self.out, self.folder = out, out.with_name(f".{out.name}.parts")
+        self.lock = alone(out)
+
+    def __enter__(self) -> Parts:
+        self.lock.__enter__()
+        try:
+            writable_directory(self.folder, asked=self.out)
+            for place in (self.out, self.folder):
+                sweep(place)
+        except BaseException:
+            self.lock.__exit__(None, None, None)
+            raise
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.lock.__exit__(None, None, None)
 
     def finished(self, pieces: Mapping[str, Wanted]) -> dict[str, Rows]:
         """Rows of the pieces that an earlier run finished, by name: kept as parts, or in the output itself."""

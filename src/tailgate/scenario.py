@@ -8,13 +8,14 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from tailgate.core import Defence, Positive, PositiveCount, param
+from tailgate.core import Defence, Positive, param
 from tailgate.errors import InputError, unknown
 from tailgate.link import Link
 from tailgate.loop import Loop
 from tailgate.quantities import Horizon
 from tailgate.registry import Spec, make_from
 from tailgate.schema import build, digest, fields_of, read_yaml
+from tailgate.sizes import Episodes
 from tailgate.threat import Brief, ThreatModel
 
 LINK = ("loss", "latency")
@@ -103,7 +104,7 @@ class Suite:
     doses: tuple[int | None, ...] = param((None,), "attack budgets [steps]; none: the scenario's own")
     defences: tuple[str, ...] = param((), "defences, as on the command line")
     attacks: tuple[str, ...] = param((), "attacks, as on the command line")
-    seeds: PositiveCount = param(100, "episodes per cell")
+    seeds: Episodes = param(100, "episodes per cell")
     threat: dict[str, Any] = dataclasses.field(default_factory=dict, metadata={"doc": "changes of every scenario's threat model"})
     knowledge: str | None = param(None, "knowledge that every attacker is granted; none: the least that each needs")
     shown: dict[int, str] = dataclasses.field(default_factory=dict, metadata={"doc": "doses that a board shows rates at, and why these"})

@@ -31,7 +31,7 @@ from tailgate.agents.cem import Config
 from tailgate.agents.learning import LEARNERS, learner_of
 from tailgate.agents.policy import PolicyAttack
 from tailgate.agents.selfplay import Learner, Played, constant, export, play
-from tailgate.core import Array, Attack, Count, PositiveCount, param
+from tailgate.core import Array, Attack, Count, param
 from tailgate.envs.duel import Duel, Payoff
 from tailgate.errors import InputError, said
 from tailgate.estimators.steered import Steered
@@ -40,6 +40,7 @@ from tailgate.files import set_aside, writable_directory, write_atomic
 from tailgate.registry import Spec
 from tailgate.scenario import config_path
 from tailgate.schema import as_data, build, digest, override, read_yaml
+from tailgate.sizes import Episodes, Passes, Seeds, Steps
 from tailgate.stats import Interval, paired_difference, proportion
 from tailgate.train import TrainConfig, environment_of
 
@@ -68,11 +69,11 @@ class GameConfig:
     attacker: dict[str, Any] = field(default_factory=dict, metadata={"doc": "hyper-parameters of the attacker's learner"})
     defender: dict[str, Any] = field(default_factory=dict, metadata={"doc": "hyper-parameters of the defender's learner"})
     gamma: Discount = param(0.99, "discount of both [-]")
-    rounds: PositiveCount = param(2, "rounds: an attacker and a defender each")
-    steps: PositiveCount = param(300_000, "decisions of a training, over all environments")
+    rounds: Passes = param(2, "rounds: an attacker and a defender each")
+    steps: Steps = param(300_000, "decisions of a training, over all environments")
     first_seed: Count = param(0, "first training seed")
-    fresh: PositiveCount = param(1, "fresh attackers against the frozen defender, one training seed each")
-    episodes: PositiveCount = param(1000, "report episodes per pair in the final table")
+    fresh: Seeds = param(1, "fresh attackers against the frozen defender, one training seed each")
+    episodes: Episodes = param(1000, "report episodes per pair in the final table")
     rivals: tuple[str, ...] = param((), "scripted attacks in the final table")
 
     @property

@@ -90,9 +90,13 @@ class Trace:
 
 def episodes_at_once(model: Model, horizon: int, most: int) -> int:
     """How many episodes, at most `most`, can be recorded side by side in MEMORY; at least one. A row does not depend on it."""
+    return int(max(1, min(most, MEMORY // episode_memory(model, horizon))))
+
+
+def episode_memory(model: Model, horizon: int) -> int:
+    """Bytes that the signals of an episode take."""
     agents, wires = model.agents, len(model.wires)
-    step = 8 * (agents * (model.states + 3 * wires + 9) + model.states) + agents * (2 * wires + 3)  # bytes of a frame's signals
-    return int(max(1, min(most, MEMORY // (step * horizon))))
+    return horizon * (8 * (agents * (model.states + 3 * wires + 9) + model.states) + agents * (2 * wires + 3))
 
 
 class Recorder:

@@ -14,6 +14,7 @@ from typing import Annotated, Any
 
 from pydantic import Field
 
+from tailgate import sizes
 from tailgate.agents.codec import ActionSpec
 from tailgate.agents.finished import finished
 from tailgate.agents.learning import DISCRETE, LEARNERS, Progress, Teachable, check_action, learner_of
@@ -23,11 +24,13 @@ from tailgate.envs.seat import Seat
 from tailgate.errors import InputError, said, unknown
 from tailgate.evaluation import cells_of
 from tailgate.files import set_aside, writable_directory, write_atomic
+from tailgate.locks import alone
 from tailgate.metrics import METRICS
 from tailgate.registry import Spec
 from tailgate.rivals import best_of
 from tailgate.scenario import Suite, config_path, load_scenario
 from tailgate.schema import as_data, build, canonical, fields_of, override, read_yaml
+from tailgate.sizes import Episodes, Seeds, Steps, Workers
 from tailgate.threat import KNOWLEDGE
 from tailgate.trainings import Training, train_all
 
@@ -58,18 +61,18 @@ class TrainConfig:
     tqc: dict[str, Any] = field(default_factory=dict, metadata={"doc": "hyper-parameters of TQC"})
     cem: dict[str, Any] = field(default_factory=dict, metadata={"doc": "hyper-parameters of the cross-entropy method"})
     teacher: str | None = param(None, "script that PPO imitates before it learns: one by name, or `best` of the rivals; none: from scratch")
-    demonstrations: PositiveCount = param(1024, "episodes of its teacher that a learner is shown")
+    demonstrations: Episodes = param(1024, "episodes of its teacher that a learner is shown")
     gamma: Discount = param(0.995, "discount, of the learner and of the shaping [-]")
-    steps: PositiveCount = param(3_000_000, "decisions per training seed, over all environments")
+    steps: Steps = param(3_000_000, "decisions per training seed, over all environments")
     first_seed: Count = param(0, "first training seed")
-    seeds: PositiveCount = param(1, "training seeds, one policy each")
+    seeds: Seeds = param(1, "training seeds, one policy each")
     checkpoint_every: PositiveCount = param(500_000, "decisions between checkpoints, or a tenth of `steps` where that is less")
     tensorboard: bool = param(True, "write TensorBoard event files")
     outcome: str | None = param(None, "metric that is compared, the larger the worse; none: crashed, or rmse_position without a road")
-    episodes: PositiveCount = param(400, "fresh episodes per attack in the final comparison")
+    episodes: Episodes = param(400, "fresh episodes per attack in the final comparison")
     first_episode: Count = param(0, "number of the first of them: another block has not been seen", if_any=True)
-    select_episodes: PositiveCount = param(1024, "other episodes, that the best rival is chosen on: fewer choose by chance")
-    workers: PositiveCount = param(2, "processes, of the training seeds and of the comparison; change no result")
+    select_episodes: Episodes = param(1024, "other episodes, that the best rival is chosen on: fewer choose by chance")
+    workers: Workers = param(2, "processes, of the training seeds and of the comparison; change no result")
     rivals: tuple[str, ...] = param((), "scripted attacks of equal knowledge and dose to compare with")
     white_box: tuple[str, ...] = param(("stealth:trigger=near,threshold=40",), "attacks that know more, shown beside the others")
     others: tuple[str, ...] = param(("none", "kf", "oracle"), "further defences that the attacks are played on")
@@ -148,15 +151,32 @@ def outcome_of(config: TrainConfig) -> str:
 
 def check(config: TrainConfig) -> None:
     """Everything that a run will need, tried before anything is written: a typing error shall not cost an hour."""
-    _settings(config)
+    settings = _settings(config)
     for name in LEARNERS.keys() - {config.learner}:  # a typing error there as well, where that learner is installed
         with contextlib.suppress(ImportError):
             build(learner_of(name).Config, dict(getattr(config, name)), f"config.{name}")
     seat = Seat.make(**environment_of(config))
     check_action(config.learner, seat)
+    _check_memory(config, settings, seat)
     if config.teacher is not None:
         _check_teacher(config, seat)
     cells_of(suite_of(config, (*config.rivals, *config.white_box)), threat=config.threat)
+
+
+def _check_memory(config: TrainConfig, settings: Any, seat: Seat) -> None:
+    """Raise InputError where the environments side by side, and the decisions that a learner keeps, take more memory than is free."""
+    rows = settings.envs if hasattr(settings, "envs") else settings.population * settings.episodes
+    kept = max(rows * getattr(settings, "rollout", 0), getattr(settings, "buffer_size", 0))
+    side_by_side, seen = min(config.workers, config.seeds), 16 * len(seat.observation.names)  # bytes: before and after, and half for copies
+    needed = side_by_side * (rows * seat.memory + kept * (seen + 64))
+    what = f"{rows:,} environments and {kept:,} kept decisions in each of {side_by_side} trainings"
+    sizes.fits(needed, f"config.{config.learner}: size", rows, what)
+
+
+def long(config: TrainConfig) -> None:
+    """Say before it begins what takes long."""
+    rounds = -(-config.seeds // config.workers)
+    sizes.announce(rounds * config.steps / sizes.DECISIONS_A_SECOND, 0.0, f"{config.seeds} trainings of {config.steps:,} decisions")
 
 
 def _check_teacher(config: TrainConfig, seat: Seat) -> None:
@@ -213,6 +233,15 @@ def train_together(
     """
     for config, _ in runs:
         check(config)
+    with contextlib.ExitStack() as locks:
+        for directory in sorted({config.directory for config, _ in runs}):
+            locks.enter_context(alone(directory))
+        return _together(runs, progress, workers)
+
+
+def _together(
+    runs: Sequence[tuple[TrainConfig, bool]], progress: Callable[[TrainConfig, int, Progress], None], workers: int
+) -> list[list[Path]]:
     chosen: dict[str, str | None] = {}
     ready = [_prepared(config, resume, chosen) for config, resume in runs]
     begun: set[str] = set()

@@ -5,22 +5,17 @@ from __future__ import annotations
 import contextlib
 import gc
 import json
-import multiprocessing
-import signal
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future
-from concurrent.futures.process import BrokenProcessPool
 from functools import partial
 from pathlib import Path
-from queue import Empty
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from tailgate.agents.learning import Learner, Progress, Teachable, learner_of, made_with
 from tailgate.agents.teacher import demonstrate
 from tailgate.errors import InputError, Killed
 from tailgate.files import write_atomic
-from tailgate.pool import processes
+from tailgate.pool import Crew, say
 from tailgate.registry import Spec
 from tailgate.schema import as_data
 
@@ -108,75 +103,36 @@ def _apart(defence: str) -> contextlib.AbstractContextManager[None]:
     return veiled()
 
 
-_line: Any = None  # in a process that trains: where it reports to, and the event that stops it
-
-
-class Stopped(Exception):
-    """Training was asked to stop."""
-
-
-def _hold_line(queue: Any, stop: Any) -> None:
-    global _line
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent asks us to stop
-    queue.cancel_join_thread()  # nor do we wait at our end for somebody to read what we said
-    _line = (queue, stop)
-
-
-def _train_in_child(training: Training, place: int) -> Path:
-    queue, stop = _line
-
-    def report(progress: Progress) -> None:
-        if stop.is_set():
-            raise Stopped(str(training))
-        queue.put((place, progress))
-
+def _train_in_child(training: Training) -> Path:
     try:
-        return _train(training, report)
+        return _train(training, say)
     finally:
         gc.collect()  # learners refer to themselves: their buffers, and a sandbox's processes, would lie about during the next training
 
 
 def _train_apart(trainings: Sequence[Training], begin: Callable[[Training], None], progress: Report, workers: int) -> list[Path]:
-    """In processes of their own. An interrupt stops them at their next report."""
-    context = multiprocessing.get_context("spawn")
-    queue, stop = context.Queue(), context.Event()
+    """In processes of their own, which an interrupt ends."""
     waiting = list(enumerate(trainings))
-    running: dict[Future[Path], int] = {}
     paths: dict[int, Path] = {}
     failed: BaseException | None = None
-
-    def listen(timeout: float) -> None:
-        with contextlib.suppress(Empty):
-            place, now = queue.get(timeout=timeout)
-            progress(trainings[place], now)
-
-    with processes(workers, _hold_line, queue, stop) as pool:
-        try:
-            while running or (waiting and failed is None):
-                while waiting and failed is None and len(running) < workers:  # one that lay ready in the pool could not be taken back
-                    place, training = waiting.pop(0)
-                    begin(training)
-                    running[pool.submit(_train_in_child, training, place)] = place
-                listen(0.2)
-                for future in [future for future in running if future.done()]:
-                    place = running.pop(future)
-                    if (error := future.exception()) is None:
-                        paths[place] = future.result()
-                    else:
-                        failed = failed or _said_of(trainings[place], error, workers)
-            while not queue.empty():
-                listen(0.2)
-        except BrokenProcessPool as error:  # of a submission
-            raise _said_of(trainings[place], error, workers) from None
-        finally:
-            stop.set()
+    with Crew(workers) as crew:
+        while crew.busy or (waiting and failed is None):
+            while waiting and failed is None and crew.free:
+                place, training = waiting.pop(0)
+                begin(training)
+                crew.give(place, _train_in_child, training)
+            for answer in crew.wait():
+                if answer.word == "said":
+                    progress(trainings[answer.job], answer.value)
+                elif answer.word == "done":
+                    paths[answer.job] = answer.value
+                elif failed is None:
+                    failed = _killed(workers) if answer.word == "died" else trainings[answer.job].failed(answer.value)
     if failed is not None:
         raise failed
     return [paths[place] for place in range(len(trainings))]
 
 
-def _said_of(training: Training, error: BaseException, workers: int) -> BaseException:
-    if isinstance(error, BrokenProcessPool):  # which of them is not told, and none goes on
-        expected = f"memory for {workers} of them, or fewer workers; what was learned up to a checkpoint is kept"
-        return Killed("training", "a process that was killed", expected)
-    return training.failed(error)
+def _killed(workers: int) -> Killed:
+    expected = f"memory for {workers} of them, or fewer workers; what was learned up to a checkpoint is kept"
+    return Killed("training", "a process that was killed", expected)

@@ -13,12 +13,13 @@ A space is a mapping of dotted fields of the training's configuration to one of
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import fcntl
 import json
-import multiprocessing
+import os
 import time
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,14 +27,15 @@ from typing import Any
 import numpy as np
 import yaml
 
-from tailgate import draws
+from tailgate import draws, sizes
 from tailgate.agents.learning import learner_of
 from tailgate.agents.policy import PolicyAttack
 from tailgate.errors import InputError, unknown
 from tailgate.evaluation import Cell
 from tailgate.files import writable_directory, write_atomic
+from tailgate.locks import alone
 from tailgate.metrics import METRICS
-from tailgate.pool import abandon
+from tailgate.pool import each
 from tailgate.registry import Spec
 from tailgate.schema import as_data, digest, fields_of, read_yaml
 from tailgate.trace import episodes_at_once, rollout
@@ -63,6 +65,7 @@ SPACES: dict[str, Space] = {
     },
 }
 FORMS = ("range", "log", "choices")
+JOURNAL = "journal.jsonl"
 BATCH = 256  # episodes side by side; changes no result
 SAMPLER_STRIDE = 100_003  # between the sampler's seeds of two searches
 
@@ -141,8 +144,8 @@ def make_search(
     seed: int = 0,
 ) -> Search:  # fmt: skip
     """The search of a preset; its files go to the directory `NAME-tune` beside the runs. One training seed per trial."""
-    if trials < 1 or episodes < 1:
-        raise InputError("trials and episodes", (trials, episodes), "whole numbers not below 1")
+    sizes.check("trials", trials)
+    sizes.check("episodes", episodes)
     config = load_config(source, overrides + ([f"learner={learner}"] if learner else []))
     base = dataclasses.replace(config, name=f"{config.name}-tune")
     return Search(base, read_space(space, base.learner), trials, episodes, seed)
@@ -181,10 +184,34 @@ def objective(config: TrainConfig, policy: Path, episodes: int) -> float:
     return float(np.concatenate([METRICS[outcome](rollout(loop, attack, draws.keys("tune", part))) for part in parts]).mean())
 
 
+class _JournalLock:
+    """The kernel's lock on the journal, in place of Optuna's, which outlives a process that is killed and then costs 30 seconds."""
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.handles = path, list[int]()
+
+    def acquire(self) -> bool:
+        self.handles.append(os.open(self.path, os.O_RDONLY | os.O_CREAT, 0o644))
+        fcntl.flock(self.handles[-1], fcntl.LOCK_EX)
+        return True
+
+    def release(self) -> None:
+        os.close(self.handles.pop())
+
+
+def _mend(path: Path) -> None:
+    """Take back what a killed process had begun to write: the journal ends with a whole line."""
+    if path.is_file():
+        held = path.read_bytes()
+        if not held.endswith(b"\n") and held:
+            os.truncate(path, held.rfind(b"\n") + 1)
+
+
 def _open(search: Search, ordinal: int | None = None) -> Any:
     """The search's study. The sampler is made anew for each trial, so that one that goes on proposes what an uninterrupted one would."""
     module = optuna()
-    backend = module.storages.journal.JournalFileBackend(str(search.directory / "journal.jsonl"))  # JSON lines, never pickles
+    path = search.directory / JOURNAL
+    backend = module.storages.journal.JournalFileBackend(str(path), _JournalLock(path))  # JSON lines, never pickles
     sampler = module.samplers.TPESampler(seed=search.seed * SAMPLER_STRIDE + (ordinal or 0), multivariate=False)
     storage = module.storages.JournalStorage(backend)
     return module.create_study(
@@ -218,6 +245,7 @@ def _begin(search: Search) -> Any:
     """The study, checked to be of this very search, with the trials of an interrupted one marked as failed."""
     module = optuna()
     writable_directory(search.directory)
+    _mend(search.directory / JOURNAL)
     study = _open(search)
     held = study.user_attrs.get("digest")
     if held is None:
@@ -234,8 +262,13 @@ def tune(search: Search, workers: int = 1, progress: Callable[[int, Any], None] 
 
     With several workers that many trials are played at a time; which values they get then depends on who ends first.
     """
-    if workers < 1:
-        raise InputError("workers", workers, "a whole number not below 1")
+    sizes.check("workers", workers)
+    sizes.announce(search.trials * search.base.steps / sizes.DECISIONS_A_SECOND / workers, 0.0, f"{search.trials:,} trainings")
+    with alone(search.directory):
+        return _tuned(search, workers, progress)
+
+
+def _tuned(search: Search, workers: int, progress: Callable[[int, Any], None] | None) -> dict[str, Any]:
     study = _begin(search)
     settled = {entry["ordinal"] for entry in _entries(study) if entry["state"] == "complete" or entry["reason"]}
     missing = [i for i in range(search.trials) if i not in settled]
@@ -243,16 +276,10 @@ def tune(search: Search, workers: int = 1, progress: Callable[[int, Any], None] 
         for ordinal in missing:
             _trial(search, ordinal, progress)
     else:
-        with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:
-            futures = {pool.submit(_trial, search, ordinal): ordinal for ordinal in missing}
-            try:
-                for future in as_completed(futures):
-                    future.result()
-                    if progress is not None:
-                        progress(futures[future], None)
-            except BaseException:  # an interrupt shall not wait for what is still to train
-                abandon(pool)
-                raise
+        with contextlib.closing(each(_trial, [(search, ordinal) for ordinal in missing], workers)) as trials:
+            for i, _ in trials:
+                if progress is not None:
+                    progress(missing[i], None)
     return _report(search, _open(search))
 
 

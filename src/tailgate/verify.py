@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, Literal, cast
 
 import tailgate
-from tailgate import draws
+from tailgate import draws, sizes
 from tailgate.draws import constants
 from tailgate.errors import InputError
 from tailgate.evaluation import ENGINE, Cell, run
@@ -65,9 +65,9 @@ def verify(
     then the report has the counts of each file too.
     """
     apart = {_target(text): text for text in submissions}
-    for name, value in (("sample", sample), ("batch", batch)):
-        if value is not None and value < 1:
-            raise InputError(name, value, "a whole number not below 1")
+    for name, value in (("sample", sample), ("batch", batch), ("workers", workers)):
+        if value is not None:
+            sizes.check(name, value)
     asked = _sampled(len(rows), sample, sample_seed)
     found: dict[int, Finding] = {}
     groups: dict[str, tuple[Cell, list[int]]] = {}

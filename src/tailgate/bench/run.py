@@ -11,6 +11,7 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
 import tailgate
+from tailgate import sizes
 from tailgate.errors import InputError
 from tailgate.machine import commit, cpuinfo, processor
 
@@ -130,8 +131,7 @@ def bench(
     only_these: Iterable[str] | None = None, rounds: int = 7, seconds: float = 0.5, progress: Report | None = None
 ) -> dict[str, Any]:
     """The record of a run: machine, lines, targets, scalings, and what is missing. Raises InputError for a name that does not exist."""
-    if rounds < 1:
-        raise InputError("rounds", rounds, "a whole number not below 1")
+    sizes.check("rounds", rounds)
     if not 0.0 < seconds <= 60.0:
         raise InputError("seconds", seconds, "seconds above 0, at most 60")
     targets, lines, plots = chosen(only_these)

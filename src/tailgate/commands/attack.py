@@ -9,7 +9,7 @@ from typing import Any
 
 from rich.console import Console
 
-from tailgate.errors import InputError
+from tailgate import sizes
 from tailgate.progress import progress
 
 
@@ -36,8 +36,9 @@ def _attack(options: argparse.Namespace) -> int:
 
     sys.path.insert(0, "")  # module:Class is looked for in the working directory, as `leaderboard submit` does
 
-    if options.episodes is not None and options.episodes < 1:  # before anything is trained
-        raise InputError("episodes", options.episodes, "a whole number not below 1")
+    sizes.check("workers", options.workers)
+    if options.episodes is not None:  # before anything is trained
+        sizes.check("episodes", options.episodes)
     with progress(Console(stderr=True)) as update:
         made = attack(
             load_suite(options.suite), options.defence, Path(options.out), seeds=options.seeds, episodes=options.episodes,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import sys
 import time
@@ -13,7 +14,9 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from tailgate import sizes
 from tailgate.errors import InputError
+from tailgate.locks import alone
 from tailgate.progress import cells, console, progress
 
 
@@ -69,13 +72,16 @@ def _run(options: argparse.Namespace) -> int:
     for name in ("unattacked", "score_only") if options.train else ():
         if getattr(options, name):
             raise InputError("--train", True, f"no --{name.replace('_', '-')}: it trains and plays whoever was not attacked")
+    sizes.check("workers", options.workers)
     out, started = Path(options.out), time.perf_counter()
     suites = [load_suite(name) for name in options.suites]
     for suite in suites:
         measured_of(out / suite.name / BOARD)  # refuses what is no such file before anything is played
     kept = {suite.name: kept_board(out / suite.name / BOARD, suite, options.beacon) for suite in suites if options.keep_entries}
     boards = []
-    with progress(Console(stderr=True)) as update:
+    with contextlib.ExitStack() as locks, progress(Console(stderr=True)) as update:
+        for folder in sorted({out / suite.name for suite in suites}):
+            locks.enter_context(alone(folder))
         for suite in suites:
             folder = out / suite.name
             record = Record(suite, folder, options.workers)
@@ -127,8 +133,8 @@ def _head(options: argparse.Namespace) -> int:
     from tailgate.leaderboard.head import markdown
 
     board = load(Path(options.board))
-    if options.most is not None and options.most < 1:
-        raise InputError("most", options.most, "a whole number not below 1")
+    if options.most is not None:
+        sizes.check("most", options.most)
     print(markdown(board, options.most), end="")
     return 0
 

@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from tailgate import sizes
 from tailgate.progress import cells, console, progress
 
 
@@ -33,6 +34,7 @@ def _clock(options: argparse.Namespace) -> int:
     from tailgate.leaderboard.clock import FILE, measure
     from tailgate.scenario import load_suite
 
+    sizes.check("rounds", options.rounds)
     suite = load_suite(options.suite)
     path = None if options.defence else writable_directory(Path(options.out) / suite.name) / FILE  # part of a file would lose the rest
     with progress(Console(stderr=True)) as update:

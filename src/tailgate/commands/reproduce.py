@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from tailgate.locks import alone
 from tailgate.progress import console
 
 
@@ -62,12 +63,14 @@ def _reproduce(options: argparse.Namespace) -> int:
 
 
 def _whole(options: argparse.Namespace, tick: Any) -> int:
-    from tailgate.reproduce.run import as_json, summary
+    from tailgate.reproduce.run import as_json, check_seeds, summary
     from tailgate.reproduce.whole import counts, covered, facts, reproduce_whole, write_whole
 
     out = Path(options.out) if options.out else Path("reproduction")
-    whole = reproduce_whole(options.seeds, out, tick)
-    page = write_whole(whole, out)
+    check_seeds(options.seeds)
+    with alone(out):
+        whole = reproduce_whole(options.seeds, out, tick)
+        page = write_whole(whole, out)
     if options.json:
         print(json.dumps([claim for report in whole.reports for claim in as_json(report)], indent=1, allow_nan=False))
     else:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 from typing import Any
 
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from tailgate.locks import alone
 from tailgate.progress import console, progress
 
 
@@ -40,13 +40,10 @@ def _selfplay(options: argparse.Namespace) -> int:
     config = load_config(options.config, list(options.overrides), options.resume)
     errors = Console(stderr=True)
     errors.print(f"[bold]{config.name}[/]: self-play with [bold]{config.defence}[/] on {config.scenario}, files in {config.directory}")
-    try:
-        with progress(errors) as update:
-            report = Game(config, update, options.resume).run()
-    except KeyboardInterrupt:
-        place = f" out={config.out}" if config.out != type(config)().out else ""
-        print(f"tailgate: go on with: tailgate selfplay --resume name={config.name}{place}", file=sys.stderr)
-        raise
+    place = f" out={config.out}" if config.out != type(config)().out else ""
+    options.kept = f"what was finished is kept, go on with: tailgate selfplay --resume name={config.name}{place}"
+    with alone(config.directory), progress(errors) as update:
+        report = Game(config, update, options.resume).run()
     if options.json:
         print(json.dumps(report, indent=1))
     else:

@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from tailgate import sizes
 from tailgate.files import writable_directory
 from tailgate.progress import console, progress
 
@@ -40,6 +41,7 @@ def _timing(options: argparse.Namespace) -> int:
     from tailgate.strength.policies import changes, write_report
     from tailgate.strength.timing import timing
 
+    sizes.check("episodes", options.episodes)
     if options.out:
         writable_directory(Path(options.out))  # before anything is played
     sys.path.insert(0, "")  # module:Class is looked for in the working directory, as `tailgate evaluate` does

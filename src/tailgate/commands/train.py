@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
 import json
 import sys
-from collections.abc import Iterator
 from typing import Any
 
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from tailgate.errors import Killed
+from tailgate.locks import alone
 from tailgate.progress import cells, console, progress
 
 
@@ -42,11 +40,14 @@ def _train(options: argparse.Namespace) -> int:
     overrides = list(options.overrides) + ([f"first_seed={options.seed}"] if options.seed is not None else [])
     config = train.load_config(options.config, overrides, options.resume)
     train.check(config)  # before a word of what is done
+    train.long(config)
     if options.resume:
         train.same_run(config)
     errors = Console(stderr=True)
     errors.print(f"[bold]{config.name}[/]: training against [bold]{config.defence}[/] on {config.scenario}, files in {config.directory}")
-    with _resumable(config), progress(errors) as update:
+    place = f" out={config.out}" if config.out != type(config)().out else ""
+    options.kept = f"what was finished is kept, go on with: tailgate train --resume name={config.name}{place}"
+    with alone(config.directory), progress(errors) as update:
 
         decisions: dict[int, int] = {}
 
@@ -67,24 +68,13 @@ def _train(options: argparse.Namespace) -> int:
             errors.print("the comparison of these policies is there", highlight=False)
         else:
             report = comparison.compare(config, policies, played)
-    page = comparison.make_page(config, report)
+        page = comparison.make_page(config, report)
     if options.json:
         print(json.dumps(report | {"page": str(page)}, indent=1))
     else:
         _print_report(report)
     errors.print(f"policy: {', '.join(str(p) for p in policies)}\npage:   {page}")
     return 0
-
-
-@contextlib.contextmanager
-def _resumable(config: Any) -> Iterator[None]:
-    """Says how to go on after an interrupt, or when a process was killed."""
-    try:
-        yield
-    except (KeyboardInterrupt, Killed):
-        place = f" out={config.out}" if config.out != type(config)().out else ""
-        print(f"tailgate: go on with: tailgate train --resume name={config.name}{place}", file=sys.stderr)
-        raise
 
 
 def _print_report(report: dict[str, Any]) -> None:

@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from tailgate import sizes
 from tailgate.progress import console, progress
 
 
@@ -38,6 +39,7 @@ def _tune(options: argparse.Namespace) -> int:
     search = tuning.make_search(
         options.config, options.overrides, options.trials, options.space, options.learner, options.episodes, options.seed
     )
+    sizes.check("workers", options.workers)
     errors = Console(stderr=True)
     errors.print(f"[bold]{search.base.name}[/]: {search.trials} trials of {search.base.steps:,} decisions, files in {search.directory}")
     with progress(errors) as update:

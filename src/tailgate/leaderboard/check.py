@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import tailgate
+from tailgate import sizes
 from tailgate.draws import constants
 from tailgate.errors import InputError, unknown
 from tailgate.evaluation import Cell, run
@@ -171,8 +172,8 @@ def known(names: Sequence[str], entries: Sequence[str]) -> None:
 
 def drawn(places: list[int], sample: int | None, seed: int) -> list[int]:
     """So many of the places, ascending; all where no number is asked for, or a larger one. Raises InputError for one below 1."""
-    if sample is not None and sample < 1:
-        raise InputError("sample", sample, "a whole number not below 1")
+    if sample is not None:
+        sizes.check("sample", sample)
     if sample is None or sample >= len(places):
         return places
     order = constants("check", seed).uniform((len(places),))[0].argsort()

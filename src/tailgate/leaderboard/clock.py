@@ -18,7 +18,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 import tailgate
-from tailgate import draws
+from tailgate import draws, sizes
 from tailgate.core import no_command
 from tailgate.errors import InputError, NotApplicable
 from tailgate.loop import Loop
@@ -94,8 +94,7 @@ def measure(suite: Suite, defences: Sequence[str] = (), *, rounds: int = ROUNDS,
     The first round of each loads what the defence needs. Raises InputError for a defence that does not exist, that fails, or is a class of
     somebody's own, for a named one that means nothing there, and where none is left.
     """
-    if rounds < 1:
-        raise InputError("rounds", rounds, "a whole number not below 1")
+    sizes.check("rounds", rounds)
     place = load_scenario(suite.scenarios[0])
     seats: dict[str, tuple[Loop, _Timed]] = {}
     for text in dict.fromkeys(defences or suite.defences):

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 import itertools
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import as_completed
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import tailgate
+from tailgate import sizes
 from tailgate.errors import InputError
-from tailgate.pool import abandon, processes
+from tailgate.locks import alone
+from tailgate.pool import each
 from tailgate.registry import Spec
 from tailgate.scenario import Suite
 from tailgate.scoring.detection import EFFORT, Effort, Progress, detection, plants, stealth_impact
@@ -39,6 +41,11 @@ def detect(
     not `none`, sentinels, or who is told the truth. Attacks are the black-box scripts of the board's list that can be played here. Raises
     InputError for a board of another suite or version, or with figures of another effort, and for a defence that takes no place here.
     """
+    with alone(path.parent):
+        return _detected(path, suite, defences, effort, workers, progress)
+
+
+def _detected(path: Path, suite: Suite, defences: Sequence[str], effort: Effort, workers: int, progress: Progress | None) -> Data:
     board = load(path)
     agree(read_board(board), suite)
     guards = [e["defence"] for e in board["entries"] if e.get("card") and _takes_part(e)]
@@ -60,9 +67,10 @@ def detect(
         raise InputError("detection: plants", told, wanted)
     asked = [guard for guard in defences or guards if not _whole(held, guard, suite, attacks, effort)]
     there = {guard: _of(board, held, guard) for guard in defences or guards if guard not in asked and not _checked(held, guard, suite)}
-    for guard, found in _play(suite, asked, attacks, effort, board["suite"].get("beacon") or "", workers, progress, there):
-        board = _with(load(path), guard, found, effort, suite)  # read again: it may have been marked in the meantime
-        save(board, path)
+    with contextlib.closing(_play(suite, asked, attacks, effort, board["suite"].get("beacon") or "", workers, progress, there)) as played:
+        for guard, found in played:
+            board = _with(load(path), guard, found, effort, suite)  # read again: it may have been marked in the meantime
+            save(board, path)
     return dict(board)
 
 
@@ -144,29 +152,23 @@ def figures(
 def _play(
     suite: Suite, asked: Sequence[str], attacks: Sequence[str], effort: Effort, beacon: str, workers: int, progress: Progress | None,
     there: Mapping[str, Data] | None = None,
-) -> Iterator[tuple[str, Data]]:  # fmt: skip
+) -> Generator[tuple[str, Data]]:  # fmt: skip
     """Figures of each defence, as they are done; of those that are there in part, what is missing."""
     have = there or {}
     guards = [*asked, *have]
-    if workers < 1:
-        raise InputError("workers", workers, "a whole number not below 1")
+    sizes.check("workers", workers)
     update, rest = progress or (lambda *_: None), (attacks, effort, beacon)
     if workers == 1 or len(guards) < 2:
-        each = 2 * len(effort.hours)  # of an entry: the stealth attack and the others at each threshold
+        ticks = 2 * len(effort.hours)  # of an entry: the stealth attack and the others at each threshold
         for i, guard in enumerate(guards):
-            steps = itertools.count(i * each + 1)
-            tick = functools.partial(_tick, update, steps, each * len(guards), guard)
+            steps = itertools.count(i * ticks + 1)
+            tick = functools.partial(_tick, update, steps, ticks * len(guards), guard)
             yield guard, figures(suite, guard, *rest, have.get(guard), tick)
         return
-    with processes(workers) as pool:
-        waiting = {pool.submit(figures, suite, guard, *rest, have.get(guard)): guard for guard in guards}
-        try:
-            for done, future in enumerate(as_completed(waiting), start=1):
-                yield waiting[future], future.result()
-                update("detection", done, len(guards), waiting[future])
-        except BaseException:  # an interrupt shall not wait for what is still to play
-            abandon(pool)
-            raise
+    jobs = [(suite, guard, *rest, have.get(guard)) for guard in guards]
+    for done, (i, found) in enumerate(each(figures, jobs, workers), start=1):
+        yield guards[i], found
+        update("detection", done, len(guards), guards[i])
 
 
 def _tick(update: Progress, steps: Iterator[int], total: int, guard: str, *_: Any) -> None:

@@ -18,7 +18,7 @@ import numpy as np
 from pydantic import Field
 
 import tailgate
-from tailgate import draws
+from tailgate import draws, sizes
 from tailgate.core import Array
 from tailgate.errors import InputError, NotApplicable
 from tailgate.metrics import measure
@@ -157,6 +157,7 @@ def measure_timing(
     agree(read_board(board), suite)
     if episodes is not None and episodes < 2:
         raise InputError("episodes", episodes, "at least 2: the schedule of another episode is needed")
+    sizes.check("episodes", 2 if episodes is None else episodes)
     ranked = [entry["defence"] for entry in board["entries"] if entry["rank"]]
     known(defences, [entry["defence"] for entry in board["entries"]])
     asked, entries, without = list(defences) or ranked, [], []

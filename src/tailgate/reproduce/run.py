@@ -16,6 +16,7 @@ from jinja2 import Environment, FunctionLoader, StrictUndefined
 from markupsafe import Markup, escape
 
 import tailgate
+from tailgate import sizes
 from tailgate.errors import InputError, unknown
 from tailgate.files import writable_directory, write_atomic
 
@@ -44,6 +45,7 @@ def check_chapter(chapter: str) -> None:
 def check_seeds(seeds: int) -> None:
     if seeds < 10:
         raise InputError("seeds", seeds, "a whole number not below 10")
+    sizes.check("seeds", seeds)
 
 
 def as_json(report: Report) -> list[dict[str, Any]]:

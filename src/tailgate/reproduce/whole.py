@@ -15,6 +15,7 @@ from tailgate import sources
 from tailgate.core import param
 from tailgate.errors import InputError
 from tailgate.files import sweep, writable_directory, write_atomic
+from tailgate.locks import alone
 from tailgate.schema import build, read_yaml
 
 from .claims import Claim, Report
@@ -95,6 +96,11 @@ def chapter(
     """A chapter into its folder: the report, the seconds that it took, and whether an earlier run had finished it."""
     check_chapter(name)
     check_seeds(seeds)
+    with alone(place):
+        return _chapter(name, seeds, place, tick, play)
+
+
+def _chapter(name: str, seeds: int, place: Path, tick: Callable[[str], None], play: Play) -> tuple[Report, float, bool]:
     writable_directory(place)
     stamp = {"seeds": seeds, "sources": sources.own()}
     found = read(place)

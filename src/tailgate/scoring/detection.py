@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tailgate import draws
+from tailgate import draws, sizes
 from tailgate.calibrate import Calibration, calibrate
 from tailgate.clean import Bench
 from tailgate.core import Array
@@ -51,9 +51,8 @@ class Effort:
             raise InputError("hours", list(self.hours), "finite numbers above 0")
         if not 1 <= self.episodes <= 4096:
             raise InputError("episodes", self.episodes, "1 to 4096")
-        for name in ("onsets", "most_steps", "checked"):
-            if (value := getattr(self, name)) < 1:
-                raise InputError(name, value, "a whole number not below 1")
+        for name, kind in (("onsets", "onsets"), ("most_steps", "steps"), ("checked", "onsets")):
+            sizes.check(kind, getattr(self, name), name)
 
 
 EFFORT = Effort()

@@ -12,7 +12,7 @@ import numpy as np
 from safetensors.numpy import load as load_tensors
 from safetensors.numpy import save as save_tensors
 
-from tailgate import draws
+from tailgate import draws, sizes
 from tailgate.agents.zoo import FOLDER, zoo_names
 from tailgate.core import Array
 from tailgate.errors import InputError
@@ -71,7 +71,7 @@ def add_policy(policy: Path, name: str, summary: str, *, episodes: int = EPISODE
     blob = packed(policy.with_name(header.tensors))
     if len(blob) > BYTES:
         raise InputError("zoo", f"a tensor file of {len(blob)} bytes", f"at most {BYTES}")
-    keys = draws.keys("report", range(episodes))
+    keys = draws.keys("report", range(sizes.check("episodes", episodes)))
     outcome = outcome_for(who.outcome, scenario)
 
     def measured(attack: Any) -> dict[str, float]:

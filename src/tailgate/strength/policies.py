@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from tailgate import sizes
 from tailgate.agents.policy import Header, PolicyAttack, load_policy
 from tailgate.agents.zoo import ZooAttack
 from tailgate.comparison import SHARE
@@ -178,8 +179,7 @@ def outcome_for(outcome: str | None, scenario: str) -> str:
 
 def check_episodes(episodes: int) -> None:
     """Raise InputError unless there is an episode to play."""
-    if episodes < 1:
-        raise InputError("episodes", episodes, "a whole number not below 1")
+    sizes.check("episodes", episodes)
 
 
 def loop_for(who: Trained, scenario: str, defence: str, threat: dict[str, Any], dose: int | None = None) -> Loop:

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import hashlib
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import as_completed
+from collections.abc import Callable, Generator, Sequence
 from pathlib import Path
 from typing import Any
 
+from tailgate import sizes
 from tailgate.errors import InputError
 from tailgate.evaluation import Cell, cells_of
 from tailgate.parts import Parts
-from tailgate.pool import abandon, processes
+from tailgate.pool import each
 from tailgate.scenario import Suite, load_suite
 from tailgate.scoring.attacks import attacks_of
 from tailgate.submission.limits import Limits, Lost
@@ -51,8 +52,7 @@ def play_submission(
     guard = sandbox_of(sandbox) if isinstance(sandbox, str) else sandbox
     count = base.seeds if episodes is None else episodes
     for name, value in (("episodes", count), ("workers", workers)):
-        if value < 1:
-            raise InputError(name, value, "a whole number not below 1")
+        sizes.check(name, value)
     places = tuple(base.scenarios if scenarios is None else scenarios)
     named = dataclasses.replace(base, attacks=attacks_of(base), defences=("none",), seeds=count, scenarios=places)
     with staged(text) as source:
@@ -72,7 +72,8 @@ def play_submission(
         if lost is not None:
             rows = [row for cell in cells for row in part_of(cell, submission, seeds).failed(seeds, lost)]
             if out is not None:
-                Parts(Path(out)).finish(rows, {"all": [(str(row["cell"]), row["seed"]) for row in rows]})
+                with Parts(Path(out)) as parts:
+                    parts.finish(rows, {"all": [(str(row["cell"]), row["seed"]) for row in rows]})
             return rows
         return _run(jobs, submission, seeds, Path(out) if out is not None else None, workers, progress)
 
@@ -85,32 +86,26 @@ def _run(
     ids = [[str(part_of(cell, submission, seeds).head["cell"]) for cell in job] for job in jobs]
     names = [hashlib.blake2b("".join(each).encode(), digest_size=12).hexdigest() for each in ids]
     pieces = {name: [(cell, seed) for cell in cells for seed in seeds] for name, cells in zip(names, ids, strict=True)}
-    parts = None if out is None else Parts(out)
-    done = {} if parts is None else parts.finished(pieces)
-    missing = [i for i, name in enumerate(names) if name not in done]
-    for position, rows in _play([jobs[i] for i in missing], submission, seeds, workers):
-        name = names[missing[position]]
-        done[name] = rows
+    with contextlib.nullcontext() if out is None else Parts(out) as parts:
+        done = {} if parts is None else parts.finished(pieces)
+        missing = [i for i, name in enumerate(names) if name not in done]
+        with contextlib.closing(_play([jobs[i] for i in missing], submission, seeds, workers)) as played:
+            for position, rows in played:
+                name = names[missing[position]]
+                done[name] = rows
+                if parts is not None:
+                    parts.put(name, rows)
+                if progress is not None:
+                    progress(len(done), len(jobs))
+        rows = [row for name in names for row in done[name]]
         if parts is not None:
-            parts.put(name, rows)
-        if progress is not None:
-            progress(len(done), len(jobs))
-    rows = [row for name in names for row in done[name]]
-    if parts is not None:
-        parts.finish(rows, pieces)
+            parts.finish(rows, pieces)
     return rows
 
 
-def _play(jobs: Sequence[Sequence[Cell]], submission: Submission, seeds: list[int], workers: int) -> Iterator[tuple[int, Rows]]:
+def _play(jobs: Sequence[Sequence[Cell]], submission: Submission, seeds: list[int], workers: int) -> Generator[tuple[int, Rows]]:
     if workers == 1 or len(jobs) < 2:
         for i, job in enumerate(jobs):
             yield i, play_mixed(job, submission, seeds)
         return
-    with processes(workers) as pool:
-        waiting = {pool.submit(play_mixed, job, submission, seeds): i for i, job in enumerate(jobs)}
-        try:
-            for future in as_completed(waiting):
-                yield waiting[future], future.result()
-        except BaseException:  # an interrupt shall not wait for what is still to play; the guards see that we are gone
-            abandon(pool)
-            raise
+    yield from each(play_mixed, [(job, submission, seeds) for job in jobs], workers)  # guards see when a worker is gone

@@ -7,20 +7,21 @@ other: a product of their probabilities would be wrong, and Frechet's bound is a
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import shlex
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import as_completed
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Callable, Generator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+from tailgate import sizes
 from tailgate.errors import InputError
 from tailgate.evaluation import cells_of, run_cell
 from tailgate.files import remove, set_aside, sweep, writable_directory, write_atomic
-from tailgate.pool import abandon, processes
+from tailgate.locks import alone
+from tailgate.pool import each
 from tailgate.registry import Spec
 from tailgate.rows import encode
 from tailgate.scenario import Suite, load_scenario
@@ -45,8 +46,7 @@ def jobs_of(
 ) -> list[Job]:  # fmt: skip
     """Every cell of a suite with what is asked of it. Raises InputError for anything that does not exist or cannot be read."""
     for name, value in (("runs", runs), ("batch", batch)):
-        if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-            raise InputError(name, value, "a whole number not below 1")
+        sizes.check(name, value)
     for name, held in (("scenarios", suite.scenarios), ("defences", suite.defences), ("attacks", suite.attacks)):
         if not held:
             raise InputError(name, list(held), "at least one")
@@ -73,12 +73,13 @@ def play(jobs: Sequence[Job], folder: Path | None = None, workers: int = 1, prog
     missing = [job for job, i in zip(jobs, ids, strict=True) if i not in done]
     if progress is not None and done:  # of an earlier run
         progress(len(done), len(set(ids)))
-    for row in _played(missing, workers):
-        done[row["cell"]] = row
-        if parts is not None:
-            write_atomic(parts / f"{row['cell']}.json", encode([row]))
-        if progress is not None:
-            progress(len(done), len(set(ids)))
+    with contextlib.closing(_played(missing, workers)) as played:
+        for row in played:
+            done[row["cell"]] = row
+            if parts is not None:
+                write_atomic(parts / f"{row['cell']}.json", encode([row]))
+            if progress is not None:
+                progress(len(done), len(set(ids)))
     rows = [done[i] for i in ids]
     if out is not None and parts is not None:
         if out.is_file() and any(row["cell"] not in ids for row in _read(out)):  # somebody's result
@@ -100,30 +101,14 @@ def _read(path: Path) -> list[Row]:
     return [row for row in rows if isinstance(row, dict) and {"cell", "status", "properties", "conjunctions"} <= set(row)]
 
 
-def _played(jobs: Sequence[Job], workers: int) -> Iterator[Row]:
+def _played(jobs: Sequence[Job], workers: int) -> Generator[Row]:
     """Rows as they are finished. Somebody's own code plays in a process of its own."""
     foreign = any(Spec("defence", job.cell.defence).imports or Spec("attack", job.cell.attack).imports for job in jobs)
     if not foreign and (workers == 1 or len(jobs) < 2):
         yield from map(check_cell, jobs)
         return
-    lost = []
-    with processes(workers) as pool:
-        waiting = {pool.submit(check_cell, job): job for job in jobs}
-        try:
-            for future in as_completed(waiting):
-                try:
-                    yield future.result()
-                except BrokenProcessPool:  # one cell killed its process, and the pool with it: which one shows below
-                    lost.append(waiting[future])
-        except BaseException:  # an interrupt shall not wait for what is still to play
-            abandon(pool)
-            raise
-    for job in lost:
-        with processes(1) as pool:
-            try:
-                row = pool.submit(check_cell, job).result()
-            except BrokenProcessPool:
-                row = failed(job, "the process that played this cell died")
+    died = "the process that played this cell died"
+    for _, row in each(check_cell, [(job,) for job in jobs], workers, lambda i: failed(jobs[i], died)):
         yield row
 
 
@@ -141,20 +126,22 @@ def check(
     """
     if not 0.0 < alpha < 1.0:
         raise InputError("alpha", alpha, "a number above 0 and below 1")
-    if workers < 1:
-        raise InputError("workers", workers, "a whole number not below 1")
+    sizes.check("workers", workers)
     most = suite.seeds if runs is None else runs
     of = partial(
         jobs_of, runs=most, formulas=formulas, purpose=purpose, beacon=beacon, batch=batch, threat=threat, safe=safe, asked=asked, rule=rule
     )
     jobs, clean = of(suite), dataclasses.replace(suite, attacks=(CLEAN,), doses=suite.doses[:1])
     judging = [] if CLEAN in suite.attacks or formulas else of(clean)  # runs without an attack say whether detection counts
-    rows = play([*jobs, *judging], folder, workers, progress)
+    count = (len(jobs) + len(judging)) * most
+    sizes.announce(count / sizes.EPISODES_A_SECOND / workers, 0.0, f"{count:,} runs")
     settings = {"runs": most, "rule": rule_data(rule), "unsafe": _plain(safe or SafeDistance()), "demands": _plain(asked or Demands())}
-    found = report(rows[: len(jobs)], suite, alpha=alpha, settings=settings, clean=rows[len(jobs) :])
-    if folder is not None:
-        _keep_failures(found, jobs, folder)
-        write_atomic(folder / REPORT, json.dumps(found, indent=1, allow_nan=False).encode() + b"\n")
+    with contextlib.nullcontext() if folder is None else alone(folder):
+        rows = play([*jobs, *judging], folder, workers, progress)
+        found = report(rows[: len(jobs)], suite, alpha=alpha, settings=settings, clean=rows[len(jobs) :])
+        if folder is not None:
+            _keep_failures(found, jobs, folder)
+            write_atomic(folder / REPORT, json.dumps(found, indent=1, allow_nan=False).encode() + b"\n")
     return found
 
 
