@@ -159,10 +159,10 @@ def _play(
     sizes.check("workers", workers)
     update, rest = progress or (lambda *_: None), (attacks, effort, beacon)
     if workers == 1 or len(guards) < 2:
-        each = 2 * len(effort.hours)  # of an entry: the stealth attack and the others at each threshold
+        ticks = 2 * len(effort.hours)  # of an entry: the stealth attack and the others at each threshold
         for i, guard in enumerate(guards):
-            steps = itertools.count(i * each + 1)
-            tick = functools.partial(_tick, update, steps, each * len(guards), guard)
+            steps = itertools.count(i * ticks + 1)
+            tick = functools.partial(_tick, update, steps, ticks * len(guards), guard)
             yield guard, figures(suite, guard, *rest, have.get(guard), tick)
         return
     jobs = [(suite, guard, *rest, have.get(guard)) for guard in guards]
