@@ -28,6 +28,7 @@ import subprocess
 import sys
 import tempfile
 import time
+import traceback
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -177,6 +178,8 @@ def go_on(words: list[str], folder: Path) -> int:
             code = 0
         except SystemExit as end:
             code = int(end.code or 0)
+        except Exception:
+            traceback.print_exc()
         finally:
             os._exit(code)
     return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
@@ -296,8 +299,8 @@ def campaign(
                 "command": name, "way": way, "moments": moments, "span": round(span, 2),
                 "ended before": sum(not one["code"] for one in tried),
                 "kept": sum(one["kept"] > 0 for one in tried), "longest": max(one["seconds"] for one in tried),
-                "failed": sum(bool(one["wrong"]) for one in tried), "wrong": dict(wrong),
-                "failures": [one for one in tried if one["wrong"]],
+                "failed": sum(bool(one["wrong"]) for one in tried),
+                "wrong": dict(wrong), "failures": [one for one in tried if one["wrong"]],
             }  # fmt: skip
             figures = f"{moments} moments in {span:.1f} s, {line['failed']} failed, longest end {line['longest']} s"
             told(f"{name:<12} {way:<10} {figures} {dict(wrong) or ''}")

@@ -3,7 +3,6 @@
 import dataclasses
 import json
 import os
-import shutil
 import time
 from pathlib import Path
 from typing import Any
@@ -224,12 +223,13 @@ def test_the_command_prints_what_it_found(tmp_path: Path, capsys: pytest.Capture
 
 def test_what_a_killed_search_left_of_its_journal_stops_nobody(tmp_path: Path, straight: tuple[tuning.Search, dict[str, Any]]) -> None:
     """Half a line at the end, and the lock that Optuna itself would wait 30 s for."""
-    search = _search(tmp_path, 4)
-    shutil.copytree(straight[0].directory, search.directory)
+    search = _search(tmp_path, 1)
+    tuning.tune(search)
     journal = search.directory / "journal.jsonl"
     whole = journal.read_bytes()
     journal.write_bytes(whole + b'{"op_code": 4, "worker')
     os.symlink(journal, f"{journal}.lock")
     started = time.monotonic()
-    assert _told(tuning.tune(search)) == _told(straight[1])
-    assert time.monotonic() - started < 20.0 and journal.read_bytes() == whole
+    assert _told(tuning.tune(search)) == _told(straight[1])[:1]
+    assert time.monotonic() - started < 20.0 and journal.read_bytes().startswith(whole)
+    assert all(json.loads(line) for line in journal.read_bytes().splitlines())

@@ -15,6 +15,7 @@ A member is trained for certain opponents: a run that goes on trains anew what w
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import itertools
 import json
@@ -37,6 +38,7 @@ from tailgate.errors import InputError, said
 from tailgate.estimators.steered import Steered
 from tailgate.estimators.steering import nearest
 from tailgate.files import set_aside, writable_directory, write_atomic
+from tailgate.locks import alone
 from tailgate.registry import Spec
 from tailgate.scenario import config_path
 from tailgate.schema import as_data, build, digest, override, read_yaml
@@ -141,10 +143,14 @@ class Game:
             if Spec("attack", name).entry.knowledge != "black":
                 raise InputError("config.rivals", name, "attacks that know no more than the learned one, which sees the road")
             attack.prepare(self.duel.seat.loop.brief)
-        if not resume and config.directory.is_dir() and any(config.directory.iterdir()):
-            set_aside(config.directory)
-        self.directory = writable_directory(config.directory)
-        self._keep(resume)
+        self.directory = config.directory
+        with contextlib.ExitStack() as held:  # from here to the end of `run`
+            held.enter_context(alone(config.directory))
+            if not resume and config.directory.is_dir() and any(config.directory.iterdir()):
+                set_aside(config.directory)
+            writable_directory(config.directory)
+            self._keep(resume)
+            self.held = held.pop_all()
 
     def _keep(self, resume: bool) -> None:
         """Writes the configuration, or raises InputError when the run that is resumed had another one."""
@@ -163,6 +169,10 @@ class Game:
 
         What the run has finished is not trained again, as long as it was trained for the opponents of now.
         """
+        with self.held:
+            return self._run()
+
+    def _run(self) -> dict[str, Any]:
         defenders, attackers = [self._as_it_is()], []
         for r in range(1, self.config.rounds + 1):
             pool = self._guard(policy=tuple(defenders))

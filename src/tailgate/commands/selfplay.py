@@ -10,7 +10,6 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from tailgate.locks import alone
 from tailgate.progress import console, progress
 
 
@@ -42,7 +41,7 @@ def _selfplay(options: argparse.Namespace) -> int:
     errors.print(f"[bold]{config.name}[/]: self-play with [bold]{config.defence}[/] on {config.scenario}, files in {config.directory}")
     place = f" out={config.out}" if config.out != type(config)().out else ""
     options.kept = f"what was finished is kept, go on with: tailgate selfplay --resume name={config.name}{place}"
-    with alone(config.directory), progress(errors) as update:
+    with progress(errors) as update:
         report = Game(config, update, options.resume).run()
     if options.json:
         print(json.dumps(report, indent=1))
