@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test test-long lint bench clean
+.PHONY: demo test test-long lint bench fuzz clean
 
 demo: $(VENV)/.ready  ## train an adversary against a gated Kalman filter, compare it with scripted attacks, write the page
 	$(BIN)/python train.py
@@ -20,6 +20,9 @@ lint: $(VENV)/.ready
 
 bench: $(VENV)/.ready  ## speed beside the peers, in one run; writes benchmarks/results/speed.*
 	$(BIN)/python -m tailgate bench --out benchmarks/results
+
+fuzz: $(VENV)/.ready  ## 10 000 malformed inputs for each reader; `make fuzz FUZZ="--reader rows --inputs 500"` for less
+	$(BIN)/python benchmarks/fuzz.py $(FUZZ)
 
 # torch comes first and pinned: left to the others it would be the largest build that exists
 $(VENV)/.ready: pyproject.toml constraints.txt

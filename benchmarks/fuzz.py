@@ -1,3 +1,4 @@
+# ruff: noqa: E501 - tables
 """Malformed input: every reader meets thousands of inputs that were made of valid files, and has to end each well.
 
     python benchmarks/fuzz.py                                    # 10 000 inputs for each reader
@@ -31,7 +32,8 @@ sys.path.insert(0, str(Path(__file__).parent))
 from fuzz_inputs import mutated
 from fuzz_readers import Reader, readers
 
-SECONDS, MEMORY = 5.0, 1 << 30  # that an input may take
+SECONDS, MEMORY = 5.0, 1 << 30  # of processor time, and bytes, that an input may take
+PATIENCE = 60.0  # [s] of the clock, after which a worker is ended
 LONGEST = 2000  # characters of an error, at most
 COMMANDS = 5  # real command lines for a reader that has one
 
@@ -59,11 +61,11 @@ def met(reader: Reader, folder: Path, content: bytes) -> str:
         return {(entry.name, entry.stat().st_size) for entry in os.scandir(folder) if entry.name not in reader_made}
 
     before, answer = state(), "accepted"
-    signal.setitimer(signal.ITIMER_REAL, SECONDS)
+    signal.setitimer(signal.ITIMER_PROF, SECONDS)
     try:
         reader.read(folder)
     except InputError as error:
-        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.setitimer(signal.ITIMER_PROF, 0)
         said = str(error)
         answer = "refused"
         if "\n" in said or len(said) > LONGEST or not all(ch.isprintable() for ch in said):
@@ -73,10 +75,10 @@ def met(reader: Reader, folder: Path, content: bytes) -> str:
     except MemoryError:
         answer = "memory"
     except Exception as error:
-        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.setitimer(signal.ITIMER_PROF, 0)
         answer = f"{type(error).__name__}{_place(error)}"
     finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.setitimer(signal.ITIMER_PROF, 0)
     return answer if state() == before else "wrote a file"
 
 
@@ -93,7 +95,7 @@ def _late(*_: Any) -> None:
 def _work(line: Any, name: str, seed: int, numbers: range, valid: list[bytes]) -> None:
     """In a process of its own: the inputs of one reader, each announced before it is read."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGALRM, _late)
+    signal.signal(signal.SIGPROF, _late)
     quiet = os.open(os.devnull, os.O_WRONLY)
     os.dup2(quiet, 1)
     os.dup2(quiet, 2)
@@ -157,7 +159,7 @@ def campaign(reader: Reader, inputs: int, seed: int, told: Any = None, valid: li
         at, answer = number, "ended the process"
         try:
             while number < total:
-                if not ours.poll(60.0 if at < 0 or counts.total() == 0 else 3 * SECONDS):
+                if not ours.poll(PATIENCE):
                     answer = "slow, in code that takes no signal"
                     raise EOFError
                 at, found = ours.recv()
@@ -264,7 +266,7 @@ def main() -> int:
 
 
 def _shown(reader: Reader, seed: int, number: int) -> int:
-    signal.signal(signal.SIGALRM, _late)
+    signal.signal(signal.SIGPROF, _late)
     content = input_of(reader, valid_of(reader.name), seed, number)
     print(f"{len(content)} bytes: {content[:3000]!r}")
     with tempfile.TemporaryDirectory() as place:
@@ -272,12 +274,12 @@ def _shown(reader: Reader, seed: int, number: int) -> int:
         reader.beside(Path(place))
         (Path(place) / reader.file).write_bytes(content)
         _fence(True)
-        signal.setitimer(signal.ITIMER_REAL, SECONDS)
+        signal.setitimer(signal.ITIMER_PROF, SECONDS)
         try:
             print(repr(reader.read(Path(place)))[:500])
         except BaseException:
             traceback.print_exc()
-        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.setitimer(signal.ITIMER_PROF, 0)
     return 0
 
 

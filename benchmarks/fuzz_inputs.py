@@ -1,3 +1,4 @@
+# ruff: noqa: E501 - tables
 """Malformed inputs, made of valid ones by a seed: the same seed, reader and number give the same bytes on every machine."""
 
 from __future__ import annotations
@@ -29,7 +30,13 @@ VALUES: tuple[Any, ...] = (
     None, True, False, 0, -1, 1, 2, 10**30, -(10**30), 1e308, -1e308, 1e-320, 0.5, float("nan"), float("inf"), float("-inf"), [], {}, [[]],
     [None], [0], [-1, 1e308], {"": 1}, {"name": None}, {"name": "kf"}, {"a": {"b": {"c": []}}}, ["a", "a"], [[[[[[]]]]]],
 )  # fmt: skip
-BYTES = (b"\x00", b"\xff\xfe", b"\xef\xbb\xbf", b"\xc3\x28", b"\xed\xa0\x80", b"\r", b"\r\n", b"\n\n", b"\t", b'"', b"'", b"{", b"[", b"}", b"]", b":", b",")
+BYTES = (
+    b"\x00", b"\xff\xfe", b"\xef\xbb\xbf", b"\xc3\x28", b"\xed\xa0\x80", b"\r", b"\r\n", b"\n\n", b"\t", b'"', b"'", b"{", b"[", b"}", b"]", b":", b",",
+)  # fmt: skip
+TAGGED = (
+    "!!python/object/apply:os.system [id]", "!!binary aGVsbG8=", "2026-11-27", "!!set {a, b}", "2026-02-30", "!!int x", "!!bool x", "!!float ''",
+    "!!int ''", "!!map x", "!!timestamp x",
+)  # fmt: skip
 _NUMBER = re.compile(r"(?<![\w.\"])-?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?")
 _WORD = re.compile(r"[A-Za-z_][\w-]*")
 Paths = list[tuple[Any, ...]]
@@ -163,20 +170,25 @@ def _bomb(valid: bytes, form: str, rng: random.Random) -> bytes:
     key = (re.findall(rb"^\W*(\w+)\W*:", valid, re.MULTILINE) or [b"a"])[0].decode()
     deep = rng.choice((200, 5000, 100_000))
     wide = "\n".join(f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]" for i in range(1, 12))
+    head, entry, brackets = key + ": ", '{"' + key + '": ', "[" * deep
+    merged = "\n".join(f"m{i}: &m{i} {{<<: [*m{i - 1}, *m{i - 1}]}}" for i in range(1, 25))
     made = {
         "yaml": (
-            f"a0: &a0 [x, x]\n{wide}\n{key}: *a11\n", f"{key}: {'[' * deep}", f"{key}: {'{a: ' * deep}1{'}' * deep}", f"{key}: &b [*b]\n",
-            "".join(f"{' ' * i}a:\n" for i in range(min(deep, 1500))), f"{key}: {':'.join(['1'] * deep)}\n", f"? {key}\n" * 1000,
-            f"{key}: 0x{'f' * deep}\n", f"m0: &m0 {{x: 1}}\n" + "\n".join(f"m{i}: &m{i} {{<<: [*m{i - 1}, *m{i - 1}]}}" for i in range(1, 25)),
-            f"{key}: !!python/object/apply:os.system [id]\n", f"{key}: !!binary aGVsbG8=\n", f"{key}: 2026-11-27\n", f"{key}: !!set {{a, b}}\n",
-            f"{key}: 2026-02-30\n", f"{key}: !!int x\n", f"{key}: !!bool x\n", f"{key}: !!float ''\n", f"{key}: !!int ''\n", f"? [a, b]\n: {key}\n",
+            f"a0: &a0 [x, x]\n{wide}\n{key}: *a11\n", head + brackets, head + "{a: " * deep + "1" + "}" * deep, head + "&b [*b]\n",
+            "".join(" " * i + "a:\n" for i in range(min(deep, 1500))), head + ":".join(["1"] * deep) + "\n", f"? {key}\n" * 1000,
+            head + "0x" + "f" * deep, "m0: &m0 {x: 1}\n" + merged, *(head + value + "\n" for value in TAGGED), f"? [a, b]\n: {key}\n",
         ),
         "json": (
-            "[" * deep, "[" * deep + "]" * deep, '{"a":' * deep + "1" + "}" * deep, f'{{"{key}": {HUGE}}}', f'{{"{key}": 1, "{key}": 2}}',
-            f'{{"{key}": {"[" * deep}{"]" * deep}}}', f'{{"{key}": "\\ud800"}}', f'{{"{key}": 1e999}}', '{"format"', "9" * deep,
+            brackets, brackets + "]" * deep, '{"a":' * deep + "1" + "}" * deep, entry + HUGE + "}", entry + "1, " + entry[1:] + "2}",
+            entry + brackets + "]" * deep + "}", entry + '"\\ud800"}', entry + "1e999}", '{"format"', "9" * deep,
         ),
-        "csv": ('t,v\n0,"' + "x" * 200_000, "t,v\n" + "0,1," * deep, "t,v\n0,1\n1e300,1\n", "t,v\n0,1\n1e12,1\n", "t,v\n0,1\x00\n1,1\n", "t,v\n0,1e308\n1,0\n"),
-        "text": ("[" * deep, "x=" + "[" * deep, "x=&a [*a]", "kf:" + "a=1," * deep, "x=" + "1" * deep, "kf:x=0x" + "f" * deep, "(" * deep, "not " * deep),
+        "csv": (
+            't,v\n0,"' + "x" * 200_000, "t,v\n" + "0,1," * deep, "t,v\n0,1\n1e300,1\n", "t,v\n0,1\n1e12,1\n", "t,v\n0,1\x00\n1,1\n",
+            "t,v\n0,1e308\n1,0\n",
+        ),
+        "text": (
+            brackets, "x=" + brackets, "x=&a [*a]", "kf:" + "a=1," * deep, "x=" + "1" * deep, "kf:x=0x" + "f" * deep, "(" * deep, "not " * deep,
+        ),
     }  # fmt: skip
     return rng.choice(made["json" if form == "jsonl" else form]).encode()
 

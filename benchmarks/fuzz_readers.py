@@ -1,3 +1,4 @@
+# ruff: noqa: E501 - tables
 """Every reader of the package: valid files for it, and the call that reads one that was made of them."""
 
 from __future__ import annotations

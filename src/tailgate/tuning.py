@@ -13,11 +13,12 @@ A space is a mapping of dotted fields of the training's configuration to one of
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import multiprocessing
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,11 +30,12 @@ import yaml
 from tailgate import draws
 from tailgate.agents.learning import learner_of
 from tailgate.agents.policy import PolicyAttack
-from tailgate.errors import InputError, unknown
+from tailgate.errors import InputError, said, unknown
 from tailgate.evaluation import Cell
 from tailgate.files import writable_directory, write_atomic
 from tailgate.metrics import METRICS
 from tailgate.pool import abandon
+from tailgate.reading import lines_of, parse_json
 from tailgate.registry import Spec
 from tailgate.schema import as_data, digest, fields_of, read_yaml
 from tailgate.trace import episodes_at_once, rollout
@@ -186,10 +188,26 @@ def _open(search: Search, ordinal: int | None = None) -> Any:
     module = optuna()
     backend = module.storages.journal.JournalFileBackend(str(search.directory / "journal.jsonl"))  # JSON lines, never pickles
     sampler = module.samplers.TPESampler(seed=search.seed * SAMPLER_STRIDE + (ordinal or 0), multivariate=False)
-    storage = module.storages.JournalStorage(backend)
-    return module.create_study(
-        storage=storage, sampler=sampler, study_name=search.base.name, direction="maximize", load_if_exists=True
-    )  # fmt: skip
+    with _journal_of(search):
+        storage = module.storages.JournalStorage(backend)
+        return module.create_study(
+            storage=storage, sampler=sampler, study_name=search.base.name, direction="maximize", load_if_exists=True
+        )  # fmt: skip
+
+
+@contextlib.contextmanager
+def _journal_of(search: Search) -> Iterator[None]:
+    """Within it whatever Optuna says of a journal is an InputError, which names the file: it checks nothing that it reads."""
+    path = search.directory / "journal.jsonl"
+    try:
+        if path.is_file():
+            for line in lines_of(path):
+                parse_json(line, strict=False)
+        yield
+    except InputError:
+        raise
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, AssertionError, ArithmeticError) as error:
+        raise InputError("tune", str(path), f"a journal of a search ({type(error).__name__}: {said(error)})") from None
 
 
 def _trial(search: Search, ordinal: int, report: Callable[[int, Any], None] | None = None) -> None:
