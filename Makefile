@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test test-long lint bench crash clean
+.PHONY: demo test test-long lint bench crash fuzz clean
 
 demo: $(VENV)/.ready  ## train an adversary against a gated Kalman filter, compare it with scripted attacks, write the page
 	$(BIN)/python train.py
@@ -24,6 +24,9 @@ bench: $(VENV)/.ready  ## speed beside the peers, in one run; writes benchmarks/
 crash: $(VENV)/.ready  ## end the long commands at random moments, and see that the next run makes good: some hours
 	$(BIN)/python benchmarks/crash_campaign.py --ways interrupt,group,twice,terminate --moments 40
 	$(BIN)/python benchmarks/crash_campaign.py --ways kill --moments 100
+
+fuzz: $(VENV)/.ready  ## 10 000 malformed inputs for each reader; `make fuzz FUZZ="--reader rows --inputs 500"` for less
+	$(BIN)/python benchmarks/fuzz.py $(FUZZ)
 
 # torch comes first and pinned: left to the others it would be the largest build that exists
 $(VENV)/.ready: pyproject.toml constraints.txt

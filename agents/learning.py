@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import platform
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -11,9 +10,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
-from safetensors import SafetensorError
-
 from tailgate.errors import InputError, unknown
+from tailgate.reading import TENSORS, parse_json, read_bytes, tensors_of
 
 if TYPE_CHECKING:
     from tailgate.envs.seat import Seat
@@ -107,11 +105,10 @@ def check_action(name: str, seat: Seat) -> None:
 def open_checkpoint(path: Path, wanted: dict[str, Any], load_tensors: Callable[[bytes], Any]) -> tuple[Any, dict[str, Any]]:
     """Tensors and facts of a checkpoint. Raises InputError when it is damaged, or when its facts are not the `wanted` ones."""
     try:
-        blob = path.read_bytes()
-        tensors, length = load_tensors(blob), int.from_bytes(blob[:8], "little")
-        facts = json.loads(json.loads(blob[8 : 8 + length])["__metadata__"]["facts"])
+        tensors, about = tensors_of(read_bytes(path, TENSORS), load_tensors)
+        facts = parse_json(about["facts"], strict=False)
         held = {key: facts.get(key) for key in wanted}
-    except (OSError, SafetensorError, ValueError, KeyError, TypeError, AttributeError) as error:
+    except (OSError, ValueError, KeyError, AttributeError) as error:
         raise InputError("checkpoint", str(path), f"a checkpoint of this program ({type(error).__name__})") from None
     if held != wanted:
         raise InputError("checkpoint", f"{path}: {held}", f"one of this run: {wanted}")

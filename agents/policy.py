@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any, ClassVar, Literal, NamedTuple, TypeVar
 
 import numpy as np
-from safetensors import SafetensorError
 from safetensors.numpy import load as load_tensors
 from safetensors.numpy import save as save_tensors
 
@@ -26,6 +25,7 @@ from tailgate.core import Array, Command, PositiveCount, View, param
 from tailgate.draws import Draws, Keys, Role
 from tailgate.errors import InputError, said
 from tailgate.files import write_atomic
+from tailgate.reading import TENSORS, load_json, read_bytes, tensors_of
 from tailgate.registry import register
 from tailgate.schema import as_data, build
 from tailgate.threat import Brief
@@ -36,7 +36,6 @@ from .observation import FRAMES, ObservationCodec
 FORMAT = "tailgate-policy-1"
 SOME = 8  # names in an error, at most
 LONGEST = 500  # characters of options in an error, at most
-DEPTH = 64  # of lists and mappings in each other in a JSON file, at most
 T = TypeVar("T")
 
 
@@ -187,12 +186,9 @@ def read_trained(kind: type[T], form: str, path: Path, field: str, where: str) -
     Reads data and runs nothing. Raises InputError, which names `where`, the field and its value, for whatever else may stand in the files.
     """
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-        shallow(data)
+        data = load_json(path, strict=False)
     except OSError as error:
         raise InputError(field, str(path), f"a readable file ({error.strerror})") from None
-    except RecursionError:
-        raise InputError(where, str(path), f"JSON whose lists and mappings are nested at most {DEPTH} deep") from None
     except ValueError as error:
         raise InputError(where, str(path), f"valid JSON ({error})") from None
     if not isinstance(data, dict) or data.get("format") != form:
@@ -202,25 +198,15 @@ def read_trained(kind: type[T], form: str, path: Path, field: str, where: str) -
     if not header.tensors or Path(header.tensors).name != header.tensors:
         raise InputError(f"{where}.tensors", header.tensors, "the name of a file beside the JSON file")
     try:
-        blob = path.with_name(header.tensors).read_bytes()
-    except (OSError, ValueError) as error:  # ValueError: what no name of a file can hold
+        blob = read_bytes(path.with_name(header.tensors), TENSORS)
+    except OSError as error:
         raise InputError(f"{where}.tensors", header.tensors, f"a readable file ({said(error)})") from None
     if hashlib.sha256(blob).hexdigest() != header.sha256:
         raise InputError(f"{where}.sha256", header.sha256, f"the digest of {header.tensors}: the file is damaged or another one")
     try:
-        return header, load_tensors(blob)
-    except (SafetensorError, ValueError, KeyError, TypeError) as error:  # the last three: numbers that numpy has no type for
+        return header, tensors_of(blob, load_tensors)[0]
+    except ValueError as error:
         raise InputError(f"{where}.tensors", header.tensors, f"a safetensors file ({error})") from None
-
-
-def shallow(data: Any) -> None:
-    """Raise RecursionError where lists and mappings are nested more than DEPTH deep: what walks through them calls itself."""
-    held = [data]
-    for _ in range(DEPTH + 1):
-        outer = [value.values() if isinstance(value, dict) else value for value in held if isinstance(value, (dict, list))]
-        held = [value for values in outer for value in values]
-    if held:
-        raise RecursionError
 
 
 def perceptron(tensors: dict[str, Array], layers: int, width: int, where: str) -> tuple[tuple[Array, ...], tuple[Array, ...]]:

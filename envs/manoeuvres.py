@@ -13,6 +13,7 @@ from tailgate.core import Array, param
 from tailgate.draws import Draws
 from tailgate.errors import InputError, said
 from tailgate.quantities import Accel, Gain, Lag, PositiveGain, PositiveSpeed, Rate, Speed, Spread, Time, TimeSpan, check_order
+from tailgate.reading import read_bytes
 from tailgate.registry import register
 
 
@@ -247,6 +248,9 @@ class OrnsteinUhlenbeck:
         return OrnsteinUhlenbeckState(a), drawn_back(a, speed, self.mean_speed, self.pull, self.limit)
 
 
+LONGEST = 1e5  # [s] of a profile, at most: its plan has a speed for each step
+
+
 class ProfilePlan(NamedTuple):
     dt: float
     speed: Array  # (K,) at k dt
@@ -256,8 +260,8 @@ def read_profile(path: Path) -> tuple[Array, Array]:
     """Times [s] and speeds [m/s] of a CSV file with the header `t,v`, validated."""
     where = "manoeuvre profile.path"
     try:
-        rows = list(csv.reader(path.read_text(encoding="utf-8-sig").splitlines()))
-    except (OSError, UnicodeDecodeError) as error:
+        rows = list(csv.reader(read_bytes(path).decode("utf-8-sig").splitlines()))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise InputError(where, str(path), f"a readable CSV file ({said(error)})") from None
     if not rows or [c.strip() for c in rows[0]] != ["t", "v"]:
         raise InputError(where, rows[0] if rows else "an empty file", "the header t,v (seconds, metres per second)")
@@ -278,6 +282,8 @@ def read_profile(path: Path) -> tuple[Array, Array]:
         speeds.append(v)
     if len(times) < 2:
         raise InputError(where, len(times), "at least two samples")
+    if times[-1] - times[0] > LONGEST:
+        raise InputError(where, times[-1] - times[0], f"at most {LONGEST:g} s from the first sample to the last")
     return np.array(times), np.array(speeds)
 
 

@@ -17,6 +17,7 @@ from tailgate.core import Array
 from tailgate.evaluation import Cell, cell_id, cells_of, run
 from tailgate.files import write_atomic
 from tailgate.metrics import UNITS, unit_in
+from tailgate.reading import load_json
 from tailgate.registry import Spec
 from tailgate.rivals import BATCH, best_of
 from tailgate.rivals import outcomes as outcomes_of
@@ -151,7 +152,7 @@ def _report(
 def finished(config: TrainConfig, policies: list[Path]) -> dict[str, Any] | None:
     """The report that `compare` wrote of this comparison and of the rows that are there; None where something is another now."""
     try:
-        held: dict[str, Any] = json.loads((config.directory / "report.json").read_text(encoding="utf-8"))
+        held: dict[str, Any] = load_json(config.directory / "report.json")
         return held if held["made_of"] == _made_of(config, policies) else None
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return None
@@ -201,10 +202,11 @@ def make_page(config: TrainConfig, report: dict[str, Any]) -> Path:
     """The page of a finished run."""
     from tailgate.leaderboard.build import build as build_page
     from tailgate.rows import read_rows
+    from tailgate.trainings import curve_of
 
     curve = [
         point for seed in training_seeds(config)
-        for point in json.loads((config.directory / f"curve-{seed}.json").read_text())["curve"]
+        for point in curve_of(config.directory / f"curve-{seed}.json")["curve"]
     ]  # fmt: skip
     rows = read_rows(config.directory / ROWS)
     title = f"{config.name}: {config.defence} under attack"

@@ -12,8 +12,8 @@ class InputError(ValueError):
 
     def __init__(self, field: str, value: object, expected: str) -> None:
         shown = " ".join(repr(value).split())
-        shown = shown if len(shown) <= 120 else shown[:117] + "..."
-        super().__init__(f"{field}: got {shown}; expected {expected}")
+        shown = _cut(shown, 120)
+        super().__init__(_line(f"{_cut(field, 300)}: got {shown}; expected {_cut(expected, 1500)}"))
         self.field, self.value, self.expected = field, value, expected
 
     def __reduce__(self) -> tuple[type, tuple[str, object, str]]:
@@ -37,6 +37,15 @@ class UnknownArgument(InputError, TypeError):
 
     def __reduce__(self) -> tuple[type, tuple[Any, ...]]:
         return type(self), (self.args[0],) if self.known is None else (self.value, self.known)
+
+
+def _cut(text: str, most: int) -> str:
+    return text if len(text) <= most else text[: most - 3] + "..."
+
+
+def _line(text: str) -> str:
+    """The text as a terminal may show it: in one line, and what would steer it written out."""
+    return text if text.isprintable() else "".join(ch if ch.isprintable() else " " if ch.isspace() else repr(ch)[1:-1] for ch in text)
 
 
 class Killed(InputError):
@@ -68,6 +77,6 @@ def unknown(field: str, name: object, known: Iterable[str]) -> InputError:
 
 
 def _among(name: object, names: list[str]) -> str:
-    near = difflib.get_close_matches(str(name), names, n=1, cutoff=0.5)
+    near = difflib.get_close_matches(str(name)[:100], names, n=1, cutoff=0.5)
     head = f"one of these (did you mean {near[0]!r}?):" if near else "one of"
     return f"{head} {', '.join(names)}" if names else "no name: there is none to choose from"

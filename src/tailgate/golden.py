@@ -33,6 +33,7 @@ from tailgate.errors import InputError, NotApplicable, said, unknown
 from tailgate.files import write_atomic
 from tailgate.loop import Loop
 from tailgate.progress import progress
+from tailgate.reading import load_json
 from tailgate.registry import Spec
 from tailgate.scenario import Scenario, Suite, list_suites, load_scenario, load_suite
 from tailgate.trace import Trace, rollout
@@ -151,7 +152,7 @@ def _first(items: Iterator[tuple[str, Loop]], most: int) -> Iterator[tuple[str, 
 def read() -> dict[str, Any]:
     """The recorded fingerprints."""
     try:
-        held: dict[str, Any] = json.loads(FILE.read_text(encoding="utf-8"))
+        held: dict[str, Any] = load_json(FILE)
     except (OSError, ValueError) as error:
         raise InputError("golden", str(FILE), f"a readable JSON file ({said(error)})") from None
     if held.get("format") != FORMAT:

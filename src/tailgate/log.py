@@ -30,6 +30,7 @@ from tailgate.kinds import Kind, Mode
 from tailgate.locks import alone
 from tailgate.log_card import Column, columns_of, readme
 from tailgate.loop import Loop, LoopState
+from tailgate.reading import load_json
 from tailgate.registry import Spec
 from tailgate.scenario import Scenario, Suite, load_suite
 from tailgate.tree import duplicate
@@ -125,7 +126,7 @@ def _hidden(base: Suite, text: str) -> list[str]:
 def _whole(folder: Path) -> dict[str, Any] | None:
     """What schema.json holds, which is written last; None where the log is not whole."""
     try:
-        held: dict[str, Any] = json.loads((folder / "schema.json").read_text(encoding="utf-8"))
+        held: dict[str, Any] = load_json(folder / "schema.json")
         sizes = [(folder / file["path"]).stat().st_size == file["bytes"] for file in held["files"]]
     except (OSError, ValueError, KeyError, TypeError):
         return None

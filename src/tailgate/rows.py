@@ -11,6 +11,7 @@ from pydantic import ConfigDict, Field, ValidationError, create_model
 
 from tailgate.errors import InputError, said, wanted
 from tailgate.metrics import METRICS
+from tailgate.reading import lines_of, parse_json
 
 # What tells one cell from another: rows that differ in one of these are never summed up together.
 KEYS = (
@@ -18,7 +19,6 @@ KEYS = (
 )  # fmt: skip
 
 AGAIN = "the command that wrote it makes it whole, given once more"
-LARGEST = 8_000_000_000  # bytes of rows in a compressed file
 _Text = Annotated[str, Field(strict=True)]
 _Number = Annotated[float, Field(strict=True, allow_inf_nan=False)] | None
 _FIELDS: dict[str, Any] = {
@@ -32,46 +32,42 @@ _Row = create_model("Row", __config__=ConfigDict(extra="allow"), **_FIELDS)
 
 def read_rows(path: Path) -> list[dict[str, Any]]:
     """Rows of a JSON Lines file, checked; raises InputError that names the line."""
+    rows: list[dict[str, Any]] = []
+    lines, number, ahead = lines_of(path), 1, b""
     try:
-        held = path.read_bytes()
-        text = (_unpacked(held) if path.suffix == ".xz" else held).decode("utf-8")
+        line = next(lines, b"")
+        while line:
+            ahead = next(lines, b"")
+            damage = "cut" if not ahead and not line.endswith(b"\n") else "damaged" if rows else ""
+            rows.append(_row(line, f"rows {path}, line {number}", damage))
+            line, number = ahead, number + 1
     except (EOFError, lzma.LZMAError) as error:
         raise InputError("rows", str(path), f"a readable JSON Lines file ({said(error)}): {AGAIN}") from None
-    except (OSError, UnicodeDecodeError) as error:
+    except OSError as error:
         raise InputError("rows", str(path), f"a readable JSON Lines file ({said(error)})") from None
-    rows: list[dict[str, Any]] = []
-    lines = text.splitlines()
-    for number, line in enumerate(lines, start=1):
-        where = f"rows {path}, line {number}"
-        try:
-            row = json.loads(line)
-        except ValueError:
-            what = "cut" if number == len(lines) and not text.endswith("\n") else "damaged" if rows else ""
-            cut = f"; the file was {what} here: {AGAIN}" if what else ""
-            board = ", a row; a board is played again by `tailgate leaderboard check`" if '"format"' in text[:200] else ""
-            raise InputError(where, line[:60], f"a JSON object{board or cut}") from None
-        try:
-            _Row.model_validate(row)
-        except ValidationError as error:
-            first = error.errors()[0]
-            field = ".".join(str(part) for part in first["loc"])
-            shown = first["input"] if isinstance(row, dict) and field in row else None
-            raise InputError(f"{where}: {field}", shown, wanted(first)) from None
-        if row["status"] == "ok" and row["crashed"] not in (0.0, 1.0):
-            raise InputError(f"{where}: crashed", row["crashed"], "0 or 1")
-        rows.append({intern(key): intern(value) if type(value) is str else value for key, value in row.items()})  # half the memory
     return rows
 
 
-def _unpacked(held: bytes) -> bytes:
-    """The text of a compressed file, of at most LARGEST bytes: a small file may hold a great many."""
-    reader = lzma.LZMADecompressor()
-    out = reader.decompress(held, LARGEST + 1)
-    if len(out) > LARGEST:
-        raise OSError(f"more than {LARGEST} bytes")
-    if not reader.eof:
-        raise EOFError("the file was cut")
-    return out
+def _row(line: bytes, where: str, damage: str) -> dict[str, Any]:
+    """A line, checked. damage: what became of its file, if it is no JSON object."""
+    try:
+        row = parse_json(line)
+    except ValueError as error:
+        shown = line[:60].decode("utf-8", "replace").rstrip("\n")
+        cut = f"; the file was {damage} here: {AGAIN}" if damage else ""
+        why = "" if isinstance(error, json.JSONDecodeError) else f" ({error})"
+        board = ", a row; a board is played again by `tailgate leaderboard check`" if b'"format"' in line[:200] or shown == "{" else ""
+        raise InputError(where, shown, f"a JSON object{why}{board or cut}") from None
+    try:
+        _Row.model_validate(row)
+    except ValidationError as error:
+        first = error.errors()[0]
+        field = ".".join(str(part) for part in first["loc"])
+        held = first["input"] if isinstance(row, dict) and field in row else None
+        raise InputError(f"{where}: {field}", held, wanted(first)) from None
+    if row["status"] == "ok" and row["crashed"] not in (0.0, 1.0):
+        raise InputError(f"{where}: crashed", row["crashed"], "0 or 1")
+    return {intern(key): intern(value) if type(value) is str else value for key, value in row.items()}  # half the memory
 
 
 def packed(rows: Sequence[dict[str, Any]], path: Path) -> bytes:

@@ -8,11 +8,11 @@ from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar, get_type_hints
 
-import yaml
 from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 from pydantic.errors import PydanticSchemaGenerationError, PydanticUserError
 
 from tailgate.errors import InputError, said, unknown, wanted
+from tailgate.reading import load_yaml, parse_json, parse_yaml, read_bytes
 
 T = TypeVar("T")
 M = TypeVar("M", bound=BaseModel)
@@ -92,23 +92,12 @@ def digest(value: Any) -> str:
     return hashlib.blake2b(canonical(value).encode(), digest_size=8).hexdigest()
 
 
-class _Once(yaml.SafeLoader):
-    """A safe loader that refuses a key that is there twice: of two values the first would be lost without a word."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        seen = set()
-        for key, _ in node.value:
-            if key.tag != "tag:yaml.org,2002:merge" and key.value in seen and isinstance(key.value, str):
-                raise yaml.constructor.ConstructorError(None, None, f"the key {key.value!r} is there twice", key.start_mark)
-            if isinstance(key.value, str):
-                seen.add(key.value)
-        return super().construct_mapping(node, deep)
-
-
 def read_model(model: type[M], path: Path, what: str, made_by: str) -> M:
     """A JSON file of a model. Raises InputError that names the file, and the field, for anything else than what `made_by` writes."""
     try:
-        return model.model_validate_json(path.read_bytes())
+        content = read_bytes(path)
+        parse_json(content)
+        return model.model_validate_json(content)
     except OSError as error:
         raise InputError(what, str(path), f"a readable report of {made_by} ({said(error)})") from None
     except ValidationError as error:
@@ -117,16 +106,18 @@ def read_model(model: type[M], path: Path, what: str, made_by: str) -> M:
         if not field:
             raise InputError(what, str(path), f"a report of {made_by}, which is a JSON object") from None
         raise InputError(f"{what} {path}: {field}", first["input"] if first["type"] != "missing" else None, wanted(first)) from None
+    except ValueError as error:
+        raise InputError(what, str(path), f"a report of {made_by}, which is a JSON object ({error})") from None
 
 
 def read_yaml(path: Path, where: str) -> dict[str, Any]:
     """A mapping from a YAML file, read safely."""
     try:
-        data = _Once(path.read_text(encoding="utf-8")).get_single_data()
+        data = load_yaml(path)
     except OSError as error:
         raise InputError(where, str(path), f"a readable YAML file ({error.strerror})") from None
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise InputError(where, str(path), f"valid YAML ({' '.join(str(error).split())})") from None
+    except ValueError as error:
+        raise InputError(where, str(path), f"valid YAML ({error})") from None
     if not isinstance(data, dict):
         raise InputError(where, str(path), "a YAML mapping of fields")
     return data
@@ -137,8 +128,8 @@ def scalar(text: str) -> Any:
     if text.lower() in ("none", "null"):
         return None
     try:
-        value = yaml.safe_load(text)
-    except (yaml.YAMLError, ValueError, RecursionError):  # such as the 45th day of a month
+        value = parse_yaml(text)
+    except ValueError:  # no YAML, or a date
         return text
     if isinstance(value, str):
         try:

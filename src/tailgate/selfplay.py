@@ -39,6 +39,7 @@ from tailgate.estimators.steered import Steered
 from tailgate.estimators.steering import nearest
 from tailgate.files import set_aside, writable_directory, write_atomic
 from tailgate.locks import alone
+from tailgate.reading import load_json
 from tailgate.registry import Spec
 from tailgate.scenario import config_path
 from tailgate.schema import as_data, build, digest, override, read_yaml
@@ -95,7 +96,7 @@ def load_config(source: str | None, overrides: list[str], resume: bool = False) 
 def _started(held: Path) -> dict[str, Any]:
     """The configuration that a run was started with."""
     try:
-        started: dict[str, Any] = json.loads(held.read_text(encoding="utf-8"))
+        started: dict[str, Any] = load_json(held, strict=False)
         del started["class"]
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise InputError("resume", str(held), f"the configuration of a run ({said(error)})") from None
@@ -317,7 +318,7 @@ def _finished(path: Path, facts: dict[str, Any]) -> bool:
     if not path.is_file():
         return False
     try:
-        held = json.loads(path.read_text(encoding="utf-8"))["training"]
+        held = load_json(path, strict=False)["training"]
         return all(held.get(key) == value for key, value in facts.items())
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise InputError("resume", str(path), f"a policy of this run ({said(error)})") from None

@@ -26,6 +26,7 @@ from tailgate.evaluation import cells_of
 from tailgate.files import set_aside, writable_directory, write_atomic
 from tailgate.locks import alone
 from tailgate.metrics import METRICS
+from tailgate.reading import load_json
 from tailgate.registry import Spec
 from tailgate.rivals import best_of
 from tailgate.scenario import Suite, config_path, load_scenario
@@ -95,7 +96,7 @@ def load_config(source: str | None, overrides: list[str], resume: bool = False) 
         known = sorted(p.parent.name for p in Path(config.out).glob("*/config.json"))
         raise InputError("resume", config.name, f"the name of a run in {config.out}: {', '.join(known) or 'there is none'}")
     try:
-        started = json.loads(held.read_text(encoding="utf-8"))
+        started = load_json(held, strict=False)
         del started["class"]
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise InputError("resume", str(held), f"the configuration of the run ({said(error)})") from None
@@ -297,7 +298,7 @@ def _told(config: TrainConfig) -> Path:
 def _is_held(config: TrainConfig, held: Path) -> bool:
     """Whether a file has this configuration already, workers apart, which change no result: published files stay as they are."""
     try:
-        before = json.loads(held.read_text(encoding="utf-8"))
+        before = load_json(held, strict=False)
     except (OSError, ValueError):
         return False
     return isinstance(before, dict) and before | {"workers": config.workers} == as_data(config)
@@ -328,6 +329,14 @@ def _same_training(config: dict[str, Any], other: Any) -> bool:
     return isinstance(other, dict) and training_of(other) == training_of(config)
 
 
+def is_training(config: TrainConfig, held: Path) -> bool:
+    """Whether a file holds a configuration of this training; one that cannot be read holds none."""
+    try:
+        return _same_training(as_data(config), load_json(held, strict=False))
+    except (OSError, ValueError):
+        return False
+
+
 def plan_key(config: dict[str, Any]) -> str:
     """The training of a configuration but for the defence that it is against: what a suite's plan asks of everybody."""
     text = training_of({key: value for key, value in config.items() if key != "defence"})
@@ -339,7 +348,7 @@ def same_run(config: TrainConfig) -> None:
     held = _told(config)
     now, blank, free = as_data(config), as_data(TrainConfig()), free_of(config.teacher) | {"steps"}
     try:
-        before = json.loads(held.read_text(encoding="utf-8"))
+        before = load_json(held, strict=False)
         pairs = {key: (before.get(key, blank[key]), now[key]) for key in now if key not in free}
         changed = {key: pair for key, pair in pairs.items() if pair[0] != pair[1]}
     except (OSError, ValueError, AttributeError, RecursionError) as error:

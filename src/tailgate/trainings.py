@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from tailgate.agents.learning import Learner, Progress, Teachable, learner_of, made_with
 from tailgate.agents.teacher import demonstrate
-from tailgate.errors import InputError, Killed
+from tailgate.errors import InputError, Killed, said
 from tailgate.files import write_atomic
 from tailgate.pool import Crew, say
+from tailgate.reading import load_json
 from tailgate.registry import Spec
 from tailgate.schema import as_data
 
@@ -65,6 +66,26 @@ def train_all(trainings: Sequence[Training], begin: Callable[[Training], None], 
     return paths
 
 
+def curve_of(path: Path) -> dict[str, Any]:
+    """What curve-SEED.json of a run holds: `curve`, a list of points, and `seconds`. Raises InputError for anything else."""
+    try:
+        held = load_json(path, strict=False)
+    except (OSError, ValueError) as error:
+        raise InputError("curve", str(path), f"a readable curve of a training ({said(error)})") from None
+    data: dict[str, Any] = held if isinstance(held, dict) else {}
+    points, seconds = data.get("curve"), data.get("seconds", 0.0)
+    if not isinstance(points, list) or not all(isinstance(point, dict) and {"steps", "crash"} <= set(point) for point in points):
+        raise InputError("curve", str(path), "the curve of a training, a list of points")
+    if isinstance(seconds, bool) or not isinstance(seconds, int | float) or not 0 <= seconds < float("inf"):
+        raise InputError(f"curve {path}: seconds", seconds, "a number of seconds")
+    return data
+
+
+def spent(path: Path) -> float:
+    """Processor time that a training took before, by its curve [s]."""
+    return float(curve_of(path).get("seconds", 0.0))
+
+
 def _train(training: Training, report: Callable[[Progress], None]) -> Path:
     config, seed, resume, settings, environment, teacher = training
     module, directory = learner_of(config.learner), config.directory
@@ -72,7 +93,7 @@ def _train(training: Training, report: Callable[[Progress], None]) -> Path:
     learner: Learner = module.Learner(seed, config.gamma, settings, environment, board)
     checkpoint = directory / f"checkpoint-{seed}.safetensors"
     record = directory / f"curve-{seed}.json"
-    spent = json.loads(record.read_text()).get("seconds", 0.0) if resume and record.is_file() else 0.0
+    before = spent(record) if resume and record.is_file() else 0.0
     started = time.process_time()  # of this process alone: others on the machine do not count
     with _apart(config.defence):
         if resume and checkpoint.exists():
@@ -88,7 +109,7 @@ def _train(training: Training, report: Callable[[Progress], None]) -> Path:
         "environment": learner.seat.card()["hash"], "curve": learner.curve,
     }  # fmt: skip
     policy = learner.export(directory / f"policy-{seed}", facts)
-    curve = {"curve": learner.curve, "seconds": spent + time.process_time() - started}
+    curve = {"curve": learner.curve, "seconds": before + time.process_time() - started}
     write_atomic(record, json.dumps(curve).encode() + b"\n")
     learner.close()
     return policy

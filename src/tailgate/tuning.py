@@ -19,7 +19,7 @@ import fcntl
 import json
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -30,12 +30,13 @@ import yaml
 from tailgate import draws, sizes
 from tailgate.agents.learning import learner_of
 from tailgate.agents.policy import PolicyAttack
-from tailgate.errors import InputError, unknown
+from tailgate.errors import InputError, said, unknown
 from tailgate.evaluation import Cell
 from tailgate.files import writable_directory, write_atomic
 from tailgate.locks import alone
 from tailgate.metrics import METRICS
 from tailgate.pool import each
+from tailgate.reading import lines_of, parse_json
 from tailgate.registry import Spec
 from tailgate.schema import as_data, digest, fields_of, read_yaml
 from tailgate.trace import episodes_at_once, rollout
@@ -203,8 +204,12 @@ def _mend(path: Path) -> None:
     """Take back what a killed process had begun to write: the journal ends with a whole line."""
     if path.is_file():
         held = path.read_bytes()
-        if not held.endswith(b"\n") and held:
-            os.truncate(path, held.rfind(b"\n") + 1)
+        whole = held.rfind(b"\n") + 1
+        with contextlib.suppress(ValueError):  # no journal at all: it stays as it is, for its reader to refuse
+            for line in held[:whole].splitlines():
+                parse_json(line, strict=False)
+            if held[whole:].startswith(b"{"):
+                os.truncate(path, whole)
 
 
 def _open(search: Search, ordinal: int | None = None) -> Any:
@@ -213,10 +218,31 @@ def _open(search: Search, ordinal: int | None = None) -> Any:
     path = search.directory / JOURNAL
     backend = module.storages.journal.JournalFileBackend(str(path), _JournalLock(path))  # JSON lines, never pickles
     sampler = module.samplers.TPESampler(seed=search.seed * SAMPLER_STRIDE + (ordinal or 0), multivariate=False)
-    storage = module.storages.JournalStorage(backend)
-    return module.create_study(
-        storage=storage, sampler=sampler, study_name=search.base.name, direction="maximize", load_if_exists=True
-    )  # fmt: skip
+    with _journal_of(search):
+        storage = module.storages.JournalStorage(backend)
+        return module.create_study(
+            storage=storage, sampler=sampler, study_name=search.base.name, direction="maximize", load_if_exists=True
+        )  # fmt: skip
+
+
+@contextlib.contextmanager
+def _journal_of(search: Search) -> Iterator[None]:
+    """Within it whatever Optuna says of a journal is an InputError, which names the file: it checks nothing that it reads."""
+    path = search.directory / JOURNAL
+    try:
+        if path.is_file():
+            lock = _JournalLock(path)
+            lock.acquire()  # another worker may be writing a line
+            try:
+                for line in lines_of(path):
+                    parse_json(line, strict=False)
+            finally:
+                lock.release()
+        yield
+    except InputError:
+        raise
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, AssertionError, ArithmeticError) as error:
+        raise InputError("tune", str(path), f"a journal of a search ({type(error).__name__}: {said(error)})") from None
 
 
 def _trial(search: Search, ordinal: int, report: Callable[[int, Any], None] | None = None) -> None:

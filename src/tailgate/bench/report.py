@@ -12,6 +12,7 @@ from rich.table import Table
 
 from tailgate.errors import InputError
 from tailgate.files import writable_directory, write_atomic
+from tailgate.reading import load_json
 
 from .lines import BYTES, NUMBER, RATE, SECONDS, SHARE
 
@@ -177,7 +178,7 @@ def check_place(directory: Path, wanted: set[str]) -> None:
     """Raise InputError where a record of more lines or plots would be overwritten, or nothing can be written."""
     writable_directory(directory)
     try:
-        held = json.loads((directory / RECORD).read_text(encoding="utf-8"))
+        held = load_json(directory / RECORD)
         more = {*held["lines"], *held["missing"], *(plot["name"] for plot in held["scalings"])} - wanted
     except (OSError, ValueError, KeyError, TypeError):
         return

@@ -38,10 +38,12 @@ def add(commands: Any) -> None:
 
 
 def _timing(options: argparse.Namespace) -> int:
-    from tailgate.strength.policies import changes, write_report
+    from tailgate.strength.policies import changes, trained, write_report
     from tailgate.strength.timing import timing
 
     sizes.check("episodes", options.episodes)
+    for text in options.policies:
+        trained(text)  # a file that is no policy leaves no folder behind
     if options.out:
         writable_directory(Path(options.out))  # before anything is played
     sys.path.insert(0, "")  # module:Class is looked for in the working directory, as `tailgate evaluate` does

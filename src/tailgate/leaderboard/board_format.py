@@ -12,6 +12,7 @@ from pydantic import ValidationError
 
 from tailgate.errors import InputError, said, wanted
 from tailgate.files import sweep, write_atomic
+from tailgate.reading import load_json
 from tailgate.stats import mean_time
 
 from .board_parts import AtThreshold, Board, Detection, EntryTrust
@@ -22,7 +23,7 @@ FORMAT = "tailgate-board-1"
 def load(path: Path) -> Any:
     """The JSON data of a file, to be read by `read_board`; raises InputError for a file that is none."""
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        return load_json(path)
     except (OSError, ValueError) as error:
         rows = "; rows are played again by `tailgate leaderboard verify`" if ".jsonl" in path.suffixes else ""
         raise InputError("board", str(path), f"a readable board.json ({said(error)}){rows}") from None

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 from tailgate.core import param
 from tailgate.errors import InputError, said, unknown
+from tailgate.reading import load_json
 from tailgate.registry import USES
 from tailgate.schema import as_data, build
 
@@ -45,7 +45,7 @@ def read_card(path: Path) -> Card:
     """A card, checked. Raises InputError that names the field."""
     where = f"card {path.name}"
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
+        data = load_json(path)
     except (OSError, ValueError) as error:
         raise InputError(where, str(path), f"a readable JSON file ({said(error)})") from None
     if not isinstance(data, dict):

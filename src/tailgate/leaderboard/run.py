@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import lzma
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -13,6 +12,7 @@ from typing import Any
 import tailgate
 from tailgate.errors import InputError, said
 from tailgate.evaluation import evaluate
+from tailgate.reading import lines_of, load_json, parse_json
 from tailgate.rows import read_rows
 from tailgate.scenario import Suite
 from tailgate.scoring import attacks as admitted
@@ -79,8 +79,7 @@ def _one_round(folder: Path, beacon: str) -> None:
     """Raise InputError where a file holds rows of another round: before anything is played that could not be scored with them."""
     for path in files_of_rows(folder):
         try:
-            with lzma.open(path, "rt", encoding="utf-8") if path.suffix == ".xz" else path.open(encoding="utf-8") as file:
-                held = json.loads(file.readline() or "{}").get("beacon", beacon)
+            held = parse_json(next(lines_of(path), b"{}")).get("beacon", beacon)
         except (OSError, ValueError, AttributeError, EOFError, lzma.LZMAError):
             continue  # what is wrong with it is said where it is read
         if held != beacon:
@@ -130,10 +129,7 @@ def kept_board(path: Path, suite: Suite, beacon: str) -> Any:
 
 
 def _report(path: Path) -> Any:
-    def refuse(constant: str) -> None:
-        raise ValueError(f"{constant} is no number of JSON")
-
     try:
-        return json.loads(path.read_text(encoding="utf-8"), parse_constant=refuse)
+        return load_json(path)
     except (OSError, ValueError) as error:
         raise InputError("trust", str(path), f"a readable JSON file ({said(error)})") from None

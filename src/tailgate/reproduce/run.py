@@ -19,6 +19,7 @@ import tailgate
 from tailgate import sizes
 from tailgate.errors import InputError, unknown
 from tailgate.files import writable_directory, write_atomic
+from tailgate.reading import load_json
 
 from . import whole_theorems
 from .claims import Claim, Figure, Report, Table
@@ -149,7 +150,7 @@ def write(report: Report, directory: Path, **stamp: Any) -> Path:
 def read(directory: Path) -> tuple[Report, dict[str, Any]] | None:
     """The report that stands in a directory, and all fields of its report.json; None where there is none that can be read."""
     try:
-        data = json.loads((directory / "report.json").read_bytes())
+        data = load_json(directory / "report.json")
         tables = [Table(t["title"], tuple(t["columns"]), tuple(tuple(row) for row in t["rows"])) for t in data["tables"]]
         figures = [Figure(f["name"], f["caption"], (directory / f"{f['name']}.png").read_bytes()) for f in data["figures"]]
         claims = [Claim(**claim) for claim in data["claims"]]

@@ -22,9 +22,10 @@ from typing import Any
 
 import numpy as np
 
-from tailgate.errors import InputError, unknown
+from tailgate.errors import InputError, said, unknown
 from tailgate.evaluation import cells_of, run
 from tailgate.files import writable_directory, write_atomic
+from tailgate.reading import parse_json, read_bytes
 from tailgate.registry import Spec
 from tailgate.scenario import Suite, config_path, list_suites, load_suite
 from tailgate.schema import build
@@ -67,18 +68,22 @@ def read(path: Path) -> list[Admitted]:
     if not path.is_file():
         return []
     out: list[Admitted] = []
-    for number, text in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
-        where = f"{path.name}, line {number}"
+    try:
+        lines = read_bytes(path).splitlines()
+    except OSError as error:
+        raise InputError(path.name, str(path), f"a readable JSON Lines file ({said(error)})") from None
+    for number, line in enumerate(lines, start=1):
+        where, shown = f"{path.name}, line {number}", line[:60].decode("utf-8", "replace")
         try:
-            data = json.loads(text)
-        except ValueError:
-            raise InputError(where, text[:60], "a JSON object") from None
+            data = parse_json(line)
+        except ValueError as error:
+            raise InputError(where, shown, f"a JSON object ({error})") from None
         if not isinstance(data, dict):
-            raise InputError(where, text[:60], "a JSON object")
-        line = build(Admitted, data, where)
-        if line.sealed(out[-1].hash if out else "") != line:
-            raise InputError(where, line.attack, "the line as it was written, behind the one that was before it")
-        out.append(line)
+            raise InputError(where, shown, "a JSON object")
+        held = build(Admitted, data, where)
+        if held.sealed(out[-1].hash if out else "") != held:
+            raise InputError(where, held.attack, "the line as it was written, behind the one that was before it")
+        out.append(held)
     return out
 
 

@@ -22,6 +22,7 @@ from tailgate.evaluation import cells_of, run_cell
 from tailgate.files import remove, set_aside, sweep, writable_directory, write_atomic
 from tailgate.locks import alone
 from tailgate.pool import each
+from tailgate.reading import lines_of, parse_json
 from tailgate.registry import Spec
 from tailgate.rows import encode
 from tailgate.scenario import Suite, load_scenario
@@ -95,7 +96,7 @@ def play(jobs: Sequence[Job], folder: Path | None = None, workers: int = 1, prog
 def _read(path: Path) -> list[Row]:
     """The rows of a file that an earlier run wrote; none of a damaged one: its cells are played again."""
     try:
-        rows = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+        rows = [parse_json(line) for line in lines_of(path)]
     except (OSError, ValueError):
         return []
     return [row for row in rows if isinstance(row, dict) and {"cell", "status", "properties", "conjunctions"} <= set(row)]

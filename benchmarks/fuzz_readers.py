@@ -1,0 +1,436 @@
+# ruff: noqa: E501 - tables
+"""Every reader of the package: valid files for it, and the call that reads one that was made of them."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).parents[1]
+CONFIGS, RESULTS = ROOT / "configs", ROOT / "results"
+BOARD = RESULTS / "quick-v0"
+POLICY = ROOT / "agents" / "policies" / "car-following-chi2_kf-0.json"
+_held: dict[str, Any] = {}  # what is made once in a process
+SHORT = 40_000  # bytes of a valid file, at most, where the reader has shorter ones
+
+
+@dataclass(frozen=True)
+class Reader:
+    """A reader: the format and the name of its file, valid contents, the files beside it, and the call that reads it in a folder."""
+
+    name: str
+    form: str
+    file: str
+    valid: Callable[[], Sequence[bytes]]
+    read: Callable[[Path], Any]
+    beside: Callable[[Path], Any] = lambda folder: None
+    command: tuple[str, ...] = ()  # a real command line, {} for the file
+    slow: float = 1.0  # inputs are fewer by this factor: of readers that take long for a valid file
+
+
+def _files(*patterns: str) -> Callable[[], list[bytes]]:
+    def found() -> list[bytes]:
+        held = [path.read_bytes() for pattern in patterns for path in sorted(ROOT.glob(pattern))]
+        return [blob for blob in held if len(blob) < SHORT] or held
+
+    return found
+
+
+# -- valid files that have to be made
+
+
+def _rows() -> list[bytes]:
+    from tailgate.evaluation import evaluate
+    from tailgate.rows import encode
+    from tailgate.scenario import load_suite
+
+    rows = evaluate(load_suite("quick-v0"), defences=["kf"], attacks=["none"], seeds=3)
+    return [encode([*rows, rows[0] | {"status": "error", "reason": "x"}])]
+
+
+def _board() -> list[bytes]:
+    """The published board of quick-v0, with two of its entries."""
+    board = json.loads((BOARD / "board.json").read_text(encoding="utf-8"))
+    names = [entry["defence"] for entry in board["entries"]][:2]
+    for part, keys in (("entries", ("defence",)), ("cells", ("defence",)), ("curves", ("defence",)), ("comparisons", ("a", "b"))):
+        board[part] = [held for held in board[part] if all(held[key] in names for key in keys)][:40]
+    if board.get("detection"):
+        for part in ("entries", "alarms"):
+            board["detection"][part] = [held for held in board["detection"][part] if held["defence"] in names][:5]
+    return [json.dumps(board).encode()]
+
+
+def _sealed(blob: bytes) -> bytes:
+    """The JSON file of a policy whose tensors are these bytes."""
+    return json.dumps(json.loads(POLICY.read_bytes()) | {"sha256": hashlib.sha256(blob).hexdigest(), "tensors": "p.safetensors"}).encode()
+
+
+def _policy(folder: Path) -> Any:
+    from tailgate.agents.policy import load_policy
+
+    return load_policy(folder / "p.json")
+
+
+def _tensors(folder: Path) -> Any:
+    (folder / "p.json").write_bytes(_sealed((folder / "p.safetensors").read_bytes()))
+    return _policy(folder)
+
+
+def _config(folder: Path) -> Any:
+    from tailgate.train import load_config
+
+    return load_config(str(folder / "config.yaml"), [f"out={folder}"])
+
+
+def _resumed(folder: Path) -> Any:
+    from tailgate.train import load_config, same_run
+
+    run = folder / "quickstart"
+    run.mkdir(exist_ok=True)
+    shutil.copyfile(folder / "config.json", run / "config.json")
+    config = load_config(None, [f"out={folder}"], resume=True)
+    same_run(config)
+    return config
+
+
+def _started() -> list[bytes]:
+    from tailgate.schema import as_data
+    from tailgate.train import load_config
+
+    return [json.dumps(as_data(load_config(None, [])), indent=1).encode()]
+
+
+def _game(folder: Path) -> Any:
+    from tailgate.selfplay import load_config
+
+    return load_config(str(folder / "game.yaml"), [f"out={folder}"])
+
+
+def _scenario(folder: Path) -> Any:
+    from tailgate.scenario import load_scenario
+
+    return load_scenario(str(folder / "scenario.yaml"))
+
+
+def _suite(folder: Path) -> Any:
+    from tailgate.scenario import load_suite
+
+    return load_suite(str(folder / "suite.yaml"))
+
+
+def _program(folder: Path) -> Any:
+    from tailgate.registry import Spec
+
+    return Spec("attack", str(folder / "program.yaml")).make()
+
+
+def _automata(folder: Path) -> Any:
+    from tailgate.trust.automata import load_network
+
+    return load_network(str(folder / "automata.yaml"))
+
+
+def _space(folder: Path) -> Any:
+    from tailgate.tuning import read_space
+
+    return read_space(str(folder / "space.yaml"), "ppo")
+
+
+SPACE = b"ppo.learning_rate: {log: [1.0e-4, 1.0e-2]}\nppo.gae_lambda: {range: [0.9, 1.0]}\ngamma: {choices: [0.99, 0.995]}\n"
+PROFILE = b"t,v\n0,20\n1.5,21.25\n10,25\n20.5,0\n"
+
+
+def _profile(folder: Path) -> Any:
+    from tailgate.envs.manoeuvres import Profile
+
+    profile = Profile(folder / "profile.csv")
+    return profile.initial_speed, profile.prepare(0.1)
+
+
+def _read_rows(name: str) -> Callable[[Path], Any]:
+    def read(folder: Path) -> Any:
+        from tailgate.leaderboard import run
+        from tailgate.rows import read_rows
+
+        run._one_round(folder, "")
+        return read_rows(folder / name)
+
+    return read
+
+
+def _attacks(folder: Path) -> Any:
+    from tailgate.scoring.attacks import read
+
+    return read(folder / "attacks.jsonl")
+
+
+def _read_board(folder: Path) -> Any:
+    from tailgate.leaderboard.board_format import load, read_board
+
+    return read_board(load(folder / "board.json"))
+
+
+def _beside(module: str, function: str, *, file: str) -> Callable[[Path], Any]:
+    """A reader of the package that takes the path of the file."""
+
+    def read(folder: Path) -> Any:
+        from importlib import import_module
+
+        return getattr(import_module(f"tailgate.{module}"), function)(folder / file)
+
+    return read
+
+
+def _trust(folder: Path) -> Any:
+    import tailgate
+    from tailgate.leaderboard.run import _report
+    from tailgate.trust.run import with_trust
+
+    if "board" not in _held:
+        _held["board"] = json.loads(_board()[0])
+        _held["board"]["suite"]["version"] = tailgate.__version__
+    return with_trust(_held["board"], _report(folder / "trust.json"))
+
+
+def _trust_files() -> list[bytes]:
+    import dataclasses
+
+    from tailgate.scenario import load_suite
+    from tailgate.trust.run import check
+
+    suite = dataclasses.replace(load_suite("quick-v0"), defences=("kf",), attacks=("none",))
+    return [json.dumps(check(suite, runs=20)).encode()]
+
+
+CARD = {
+    "kind": "defence", "text": "kf", "name": "Kalman", "authors": "A, B", "reference": "doi", "code": "https://example.org", "licence": "MIT",
+    "uses": ["measurements"], "threat_model": "any", "training": "none", "digest": "",
+}  # fmt: skip
+
+
+def _learner(name: str, changes: dict[str, Any]) -> Any:
+    if name not in _held:
+        from tailgate.agents.learning import learner_of
+        from tailgate.schema import build
+
+        module = learner_of(name)
+        _held[name] = module.Learner(0, 0.995, build(module.Config, changes, name), {"scenario": "gusty-stop-and-go-v0", "defence": "kf"})
+    return _held[name]
+
+
+def _checkpoint(name: str, **changes: Any) -> tuple[Callable[[], list[bytes]], Callable[[Path], Any]]:
+    def valid() -> list[bytes]:
+        import tempfile
+
+        with tempfile.TemporaryDirectory() as folder:
+            learner = _learner(name, changes)
+            if name == "ppo":
+                learner.model._setup_learn(1, None)
+            learner.save(Path(folder, "c"))
+            return [Path(folder, "c").read_bytes()]
+
+    return valid, lambda folder: _learner(name, changes).load(folder / "checkpoint.safetensors")
+
+
+def _cem_checkpoint() -> tuple[Callable[[], list[bytes]], Callable[[Path], Any]]:
+    return _checkpoint("cem")
+
+
+def _defender_files() -> list[bytes]:
+    return [path.read_bytes() for path in _defenders()]
+
+
+def _defenders() -> list[Path]:
+    found = [path for path in sorted(RESULTS.glob("selfplay-v0/**/*.json")) if b"tailgate-defender-1" in path.read_bytes()[:2000]]
+    return found[:3]
+
+
+def _defender(folder: Path) -> Any:
+    from tailgate.registry import Spec
+
+    return Spec("defence", f"steered:policy={folder / 'd.json'}").make()
+
+
+def _defender_tensors(folder: Path) -> None:
+    for path in _defenders():
+        for tensors in path.parent.glob("*.safetensors"):
+            shutil.copyfile(tensors, folder / tensors.name)
+
+
+def _log(folder: Path) -> Any:
+    from tailgate.log import _whole
+
+    (folder / "README.md").touch()
+    return _whole(folder)
+
+
+def _parquet() -> list[bytes]:
+    import io
+
+    import pyarrow
+    import pyarrow.parquet
+
+    out = io.BytesIO()
+    pyarrow.parquet.write_table(pyarrow.table({"a": [1, 2, 3]}).replace_schema_metadata({"cell": "x"}), out)
+    return [out.getvalue()]
+
+
+def _part(folder: Path) -> Any:
+    from tailgate.evaluation import Cell
+    from tailgate.log import _good
+
+    return _good(folder / "part.parquet", Cell("quick-v0", "gusty-stop-and-go-v0", None, "kf", "none", 1, "train"))
+
+
+def _journal() -> list[bytes]:
+    import logging
+    import tempfile
+
+    from tailgate.tuning import optuna
+
+    module = optuna()
+    logging.getLogger("optuna").setLevel(logging.ERROR)
+    with tempfile.TemporaryDirectory() as folder:
+        file = str(Path(folder, "journal.jsonl"))
+        study = module.create_study(storage=module.storages.JournalStorage(module.storages.journal.JournalFileBackend(file)), study_name="quickstart-tune", direction="maximize")
+        study.set_user_attr("digest", "x")
+        trial = study.ask()
+        trial.suggest_float("gamma", 0.9, 1.0)
+        study.tell(trial, 0.5)
+        return [Path(file).read_bytes()]
+
+
+def _search(folder: Path) -> Any:
+    from tailgate.tuning import _open, make_search
+
+    run = folder / "quickstart-tune"
+    run.mkdir(exist_ok=True)
+    shutil.copyfile(folder / "journal.jsonl", run / "journal.jsonl")
+    return _open(make_search(None, [f"out={folder}"], 1)).user_attrs
+
+
+def _spent(folder: Path) -> Any:
+    from tailgate.trainings import spent
+
+    return spent(folder / "curve-0.json")
+
+
+# -- texts of the command line
+
+
+def _said(read: Callable[[str], Any]) -> Callable[[Path], Any]:
+    return lambda folder: read((folder / "text").read_bytes().decode("utf-8", "surrogateescape"))
+
+
+def _override(text: str) -> Any:
+    from tailgate.train import load_config
+
+    return load_config(None, text.split("\n"))
+
+
+def _component(text: str) -> Any:
+    from tailgate.registry import Spec
+
+    family: Any = "attack" if text.startswith(("a ", "b")) else "defence"
+    spec = Spec(family, text)
+    spec.refuse_imports("text")
+    return None if spec.sandboxed else spec.make()
+
+
+def _formula(text: str) -> Any:
+    from tailgate.trust.formula import parse
+
+    return parse(text)
+
+
+def _arguments(text: str) -> Any:
+    import contextlib
+    import io
+
+    from tailgate.cli import _parser
+    from tailgate.errors import InputError
+
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(said), contextlib.redirect_stdout(io.StringIO()):
+            return _parser().parse_args(text.split("\n"))
+    except SystemExit as error:
+        if error.code == 2 and said.getvalue().count("\n") == 1:
+            raise InputError("arguments", text, "arguments") from None
+        if error.code != 0:
+            raise ValueError(f"exit code {error.code}: {said.getvalue()[:200]}") from None
+        return None
+
+
+OVERRIDES = (
+    b"defence=kf\nthreat.budget=12\nsteps=2000", b"learner=cem\ncem.population=64\nname=a", b"environment.frames=4\nrivals=[none, jam]",
+    b"defence=chi2_kf:eta=15\nwhite_box=[]\nteacher=best", b"gamma=0.99\ntensorboard=false\nout=runs\noutcome=crashed",
+)  # fmt: skip
+COMPONENTS = (
+    b"chi2_kf:eta=15", b"composed:filter=rkf,detector=cusum,mitigation=reacquire", b"safe_state", b"burst_loss:probability=0.5", b"bias:value=[1, 2]",
+    b"composed:filter=kf,detector=chi2,detector.eta=12", b"steered:defence=kf", b"policy:path=x.json", b"brake_kf",
+)  # fmt: skip
+FORMULAS = (b"G[0,60] gap > 2", b"G (attack -> F[0,0.6] applied <= -2)", b"(gap > 2 and not alarm) U[1,2.5] 2*speed - gap >= 0.5", b"F[0,end] true or false")
+ARGUMENTS = (
+    b"evaluate\n--suite\nquick-v0\n--defence\nkf\n--workers\n2\n--out\nrows.jsonl", b"leaderboard\nrun\nquick-v0\n--out\nboards", b"train\n--config\nquickstart\nsteps=5",
+    b"trust\n--suite\nquick-v0\n--runs\n400\n--alpha\n0.05", b"calibrate\n--defence\ncusum_kf\n--hours\n1", b"replay\nrows.jsonl\n--out\nreplay", b"list",
+    b"dose\njam\n--defence\nkf\n--scenario\nbraking-v0\n--doses\n1,2,3\n--limit\n0.1",
+)  # fmt: skip
+
+
+def readers() -> dict[str, Reader]:
+    """All of them by name."""
+    cem, ppo = _cem_checkpoint(), _checkpoint("ppo", envs=4, rollout=4, batch_size=16)
+    game, programs = "configs/games/*.yaml", "configs/attacks/*.yaml"
+    tensors = [POLICY.with_suffix(".safetensors")]
+    made = [
+        Reader("training preset", "yaml", "config.yaml", _files("configs/*.yaml"), _config, command=("train", "--config", "{}", "out=runs")),
+        Reader("game preset", "yaml", "game.yaml", _files(game), _game, command=("selfplay", "--config", "{}", "out=runs")),
+        Reader("scenario", "yaml", "scenario.yaml", _files("configs/scenarios/*.yaml"), _scenario,
+               command=("evaluate", "--scenario", "{}", "--defence", "kf", "--out", "rows.jsonl")),
+        Reader("suite", "yaml", "suite.yaml", _files("configs/suites/*.yaml"), _suite, command=("evaluate", "--suite", "{}", "--out", "rows.jsonl")),
+        Reader("program", "yaml", "program.yaml", _files(programs), _program,
+               command=("evaluate", "--scenario", "braking-v0", "--defence", "kf", "--attack", "{}", "--out", "rows.jsonl")),
+        Reader("automata", "yaml", "automata.yaml", _files("configs/automata/*.yaml"), _automata),
+        Reader("search space", "yaml", "space.yaml", lambda: [SPACE], _space, command=("tune", "--trials", "1", "--space", "{}", "out=runs")),
+        Reader("speed profile", "csv", "profile.csv", lambda: [PROFILE], _profile),
+        Reader("rows", "jsonl", "rows.jsonl", _rows, _read_rows("rows.jsonl"), command=("leaderboard", "build", "--rows", "{}", "--out", "page")),
+        Reader("compressed rows", "xz", "rows.jsonl.xz", _rows, _read_rows("rows.jsonl.xz"),
+               command=("leaderboard", "build", "--rows", "{}", "--out", "page")),
+        Reader("list of attacks", "jsonl", "attacks.jsonl", _files("configs/suites/*.jsonl"), _attacks),
+        Reader("board", "json", "board.json", _board, _read_board, command=("leaderboard", "page", "{}", "--out", "page"), slow=2.0),
+        Reader("policy", "json", "p.json", lambda: [_sealed(tensors[0].read_bytes())], _policy,
+               lambda folder: shutil.copyfile(tensors[0], folder / "p.safetensors"), ("timing", "{}", "--out", "report")),
+        Reader("policy's tensors", "tensors", "p.safetensors", lambda: [tensors[0].read_bytes()], _tensors, lambda folder: (folder / "p.json").touch()),
+        Reader("defender", "json", "d.json", _defender_files, _defender, _defender_tensors),
+        Reader("checkpoint of cem", "tensors", "checkpoint.safetensors", *cem),
+        Reader("checkpoint of ppo", "tensors", "checkpoint.safetensors", *ppo, slow=2.0),
+        Reader("run's configuration", "json", "config.json", _started, _resumed),
+        Reader("run's curve", "json", "curve-0.json", lambda: [b'{"curve": [], "seconds": 12.5}'], _spent),
+        Reader("card", "json", "card.json", lambda: [json.dumps(CARD).encode()], _beside("leaderboard.card", "read_card", file="card.json")),
+        Reader("step times", "json", "step_time.json", _files("results/quick-v0/step_time.json"),
+               _beside("leaderboard.clock", "read_clock", file="step_time.json")),
+        Reader("timing advantages", "json", "timing.json", _files("results/quick-v0/timing.json"),
+               _beside("leaderboard.timing", "read_timing", file="timing.json")),
+        Reader("verification", "json", "verified.json", _files("results/quick-v0/verified/*.json"),
+               _beside("leaderboard.verified", "read_report", file="verified.json")),
+        Reader("errata", "json", "errata.json", _files("results/quick-v0/errata.json"), _beside("leaderboard.errata", "errata_of", file="board.json")),
+        Reader("record of a run", "json", "run.json", _files("results/quick-v0/run.json"), _beside("leaderboard.run_time", "run_of", file="board.json")),
+        Reader("trust report", "json", "trust.json", _trust_files, _trust),
+        Reader("trust cells", "jsonl", "cells.jsonl", lambda: [b'{"cell": "a", "status": "ok", "properties": [], "conjunctions": {}}\n' * 3],
+               _beside("trust.run", "_read", file="cells.jsonl")),
+        Reader("report of claims", "json", "report.json", _files("results/reproduction/report.json"), _beside("reproduce.run", "read", file="")),
+        Reader("log's schema", "json", "schema.json", lambda: [b'{"format": "tailgate-log-1", "identity": "x", "files": [{"path": "README.md", "bytes": 0}]}'], _log),
+        Reader("log's part", "parquet", "part.parquet", _parquet, _part),
+        Reader("search's journal", "jsonl", "journal.jsonl", _journal, _search, slow=2.0),
+        Reader("overrides", "text", "text", lambda: OVERRIDES, _said(_override), slow=2.0),
+        Reader("component texts", "text", "text", lambda: COMPONENTS, _said(_component)),
+        Reader("formulas", "text", "text", lambda: FORMULAS, _said(_formula)),
+        Reader("arguments", "text", "text", lambda: ARGUMENTS, _said(_arguments), slow=5.0),
+    ]  # fmt: skip
+    return {reader.name: reader for reader in made}

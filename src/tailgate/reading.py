@@ -1,0 +1,238 @@
+"""Files that somebody else wrote: one reader for each format, bounded in size, depth and numbers. Nothing that is read is executed.
+
+They raise OSError where a file cannot be read or is too large, and ValueError, in words, for content that is not of the format.
+"""
+
+from __future__ import annotations
+
+import errno
+import json
+import lzma
+import re
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NoReturn
+
+import yaml
+from safetensors import SafetensorError
+
+LARGEST = 64 << 20  # bytes of a JSON, CSV or JSON Lines file that is read as a whole
+YAML = 256 << 10  # bytes of a YAML file: its reader takes seconds for so many
+NODES = 100_000  # values of a YAML file, those of an alias counted wherever it is used
+TENSORS = 4 << 30  # bytes of a file of tensors: what a checkpoint with a replay buffer may take
+LINE = 4 << 20  # bytes of a line of JSON
+ROWS = 8_000_000_000  # bytes of rows in a compressed file
+FREE, RATIO = 64 << 20, 500  # bytes that a compressed file may hold anyway, and above it so many for each byte: rows hold hashes
+DICTIONARY = 256 << 20  # bytes that unpacking may need
+DEPTH = 64  # of lists and mappings in each other
+DIGITS = 200  # of a number in a YAML file
+_HUGE = re.compile(r"[eE]\+?\d{3}|\d{309}")  # where a number may be one that no float holds
+_PIECE = 1 << 20
+
+
+def read_bytes(path: Path, most: int = LARGEST) -> bytes:
+    """The content of a file of at most so many bytes, also of a pipe or a device."""
+    held = bytearray()
+    for piece in _pieces(path):
+        held += piece
+        if len(held) > most:
+            raise OSError(errno.EFBIG, f"more than {most} bytes")
+    return bytes(held)
+
+
+def _opened(path: Path) -> Any:
+    try:
+        return path.open("rb")
+    except ValueError as error:  # a zero byte in its name
+        raise OSError(errno.EINVAL, str(error)) from None
+
+
+# -- JSON
+
+
+def parse_json(content: bytes | str, strict: bool = True) -> Any:
+    """Read JSON text. Refused are keys that are there twice, deep nesting and whole numbers that no float holds.
+
+    strict: also NaN, infinity and halves of characters, which Python writes where nobody forbids it.
+    """
+    text = content.decode("utf-8") if isinstance(content, bytes) else content
+    rules: dict[str, Any] = {"object_pairs_hook": _once}
+    if strict:
+        rules["parse_constant"] = _no_number
+    if _HUGE.search(text):
+        rules |= {"parse_int": _whole, "parse_float": _finite if strict else None}
+    try:
+        data = json.loads(text, **rules)
+    except RecursionError:
+        raise _deep() from None
+    _shallow(data)
+    if strict and (r"\ud" in text or r"\uD" in text):  # half of a character, which nothing can write
+        json.dumps(data, ensure_ascii=False).encode()
+    return data
+
+
+def load_json(path: Path, strict: bool = True) -> Any:
+    """Read a JSON file, as `parse_json` does."""
+    return parse_json(read_bytes(path), strict)
+
+
+def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    out = dict(pairs)
+    if len(out) != len(pairs):
+        names = [key for key, _ in pairs]
+        raise ValueError(f"the key {next(key for key in names if names.count(key) > 1)[:100]!r} is there twice")
+    return out
+
+
+def _no_number(constant: str) -> NoReturn:
+    raise ValueError(f"{constant} is no number of JSON")
+
+
+def _finite(text: str) -> float:
+    value = float(text)
+    if value in (float("inf"), float("-inf")):
+        raise ValueError(f"a number that is too large, {text[:20]}...")
+    return value
+
+
+def _whole(text: str) -> int:
+    if len(text) > 308:
+        raise ValueError(f"a number of {len(text)} digits")
+    return int(text)
+
+
+def _deep() -> ValueError:
+    return ValueError(f"lists and mappings nested more than {DEPTH} deep")
+
+
+def _shallow(data: Any) -> None:
+    """Raise ValueError where lists and mappings are nested too deep: what walks through them calls itself."""
+    held = [data]
+    for _ in range(DEPTH + 1):
+        outer = [value.values() if isinstance(value, dict) else value for value in held if isinstance(value, (dict, list))]
+        held = [value for values in outer for value in values]
+        if not held:
+            return
+    raise _deep()
+
+
+# -- JSON Lines
+
+
+def lines_of(path: Path) -> Iterator[bytes]:
+    """The lines of a file, of one whose name ends in .xz unpacked, with their ends. Raises EOFError for a compressed file that was cut."""
+    rest = b""
+    for piece in _unpacked(path) if path.suffix == ".xz" else _pieces(path):
+        *whole, rest = (rest + piece).split(b"\n")
+        for line in whole:
+            yield line + b"\n"
+        if len(rest) > LINE:
+            raise OSError(errno.EFBIG, f"a line of more than {LINE} bytes")
+    if rest:
+        yield rest
+
+
+def _pieces(path: Path) -> Iterator[bytes]:
+    with _opened(path) as file:
+        while piece := file.read(_PIECE):
+            yield piece
+
+
+def _unpacked(path: Path) -> Iterator[bytes]:
+    """The content of a compressed file, piece by piece; of several such files one behind the other, of all of them."""
+    read, out, reader, begun = 0, 0, lzma.LZMADecompressor(memlimit=DICTIONARY), False
+    for packed in _pieces(path):
+        read += len(packed)
+        while packed or (begun and not reader.eof and not reader.needs_input):
+            if reader.eof:  # another one follows, or zeros up to a multiple of four
+                packed = packed.lstrip(b"\0")
+                if not packed:
+                    break
+                reader, begun = lzma.LZMADecompressor(memlimit=DICTIONARY), False
+            piece, begun = reader.decompress(packed, _PIECE), True
+            packed = reader.unused_data
+            out += len(piece)
+            if out > ROWS or out > FREE + RATIO * read:
+                raise OSError(errno.EFBIG, f"{out} bytes or more in {read}, which are no rows")
+            yield piece
+    if not reader.eof:
+        raise EOFError("the file was cut")
+
+
+# -- YAML
+
+
+class _Plain(yaml.SafeLoader):
+    """A safe loader of JSON's kinds of values. A key that is there twice is refused: the first value would be lost without a word."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__(text)
+        self.depth = 0
+        self.sizes: dict[int, int] = {}  # values below each node, the node among them
+
+    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
+        event, alias = self.peek_event(), self.check_event(yaml.AliasEvent)  # type: ignore[no-untyped-call]
+        self.depth += 1
+        if self.depth > DEPTH:
+            raise yaml.composer.ComposerError(None, None, str(_deep()), event.start_mark)
+        node = super().compose_node(parent, index)
+        self.depth -= 1
+        if node is not None and not alias:
+            self.sizes[id(node)] = 1 + self._below(node)
+        if node is None or self.sizes.get(id(node), NODES + 1) > NODES:  # an alias within what it names has no size yet
+            what = "an alias that is part of itself" if alias and id(node) not in self.sizes else f"more than {NODES} values"
+            raise yaml.composer.ComposerError(None, None, what, event.start_mark)
+        if isinstance(node, yaml.ScalarNode) and node.tag.endswith((":int", ":float")) and len(node.value) > DIGITS:
+            raise yaml.composer.ComposerError(None, None, f"a number of more than {DIGITS} digits", event.start_mark)
+        return node
+
+    def _below(self, node: yaml.Node) -> int:
+        if isinstance(node, yaml.MappingNode):
+            return sum(self.sizes[id(part)] for pair in node.value for part in pair)
+        return sum(self.sizes[id(part)] for part in node.value) if isinstance(node, yaml.SequenceNode) else 0
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        seen = set()
+        for key, _ in node.value if isinstance(node, yaml.MappingNode) else ():
+            if key.tag != "tag:yaml.org,2002:merge" and key.value in seen and isinstance(key.value, str):
+                raise yaml.constructor.ConstructorError(None, None, f"the key {key.value[:100]!r} is there twice", key.start_mark)
+            if isinstance(key.value, str):
+                seen.add(key.value)
+        return super().construct_mapping(node, deep)
+
+    def no_value(self, node: yaml.Node) -> NoReturn:
+        """Refuse what JSON has no value for, such as a date."""
+        kind = str(node.tag).rpartition(":")[2][:100]
+        raise yaml.constructor.ConstructorError(None, None, f"a {kind} where a text, a number, a list or a mapping may be", node.start_mark)
+
+
+_KINDS = {f"tag:yaml.org,2002:{kind}" for kind in ("null", "bool", "int", "float", "str", "seq", "map")}
+_Plain.yaml_constructors = {tag: made for tag, made in yaml.SafeLoader.yaml_constructors.items() if tag in _KINDS} | {None: _Plain.no_value}
+
+
+def parse_yaml(text: str) -> Any:
+    """Read YAML text. Refused are keys that are there twice, deep nesting, aliases that unfold to much, and kinds that JSON has not."""
+    if len(text) > YAML:
+        raise ValueError(f"more than {YAML} characters")
+    try:
+        return _Plain(text).get_single_data()
+    except (yaml.YAMLError, LookupError, OverflowError, RecursionError) as error:
+        raise ValueError(" ".join(str(error).split())) from None
+
+
+def load_yaml(path: Path) -> Any:
+    """Read a YAML file, as `parse_yaml` does."""
+    return parse_yaml(read_bytes(path, YAML).decode("utf-8"))
+
+
+# -- tensors
+
+
+def tensors_of(blob: bytes, load: Callable[[bytes], dict[str, Any]]) -> tuple[dict[str, Any], dict[str, str]]:
+    """The tensors of a safetensors file, as `load` makes them, and its metadata."""
+    try:
+        tensors = load(blob)
+    except (SafetensorError, KeyError, TypeError, OverflowError, RuntimeError) as error:  # also numbers that there is no type for
+        raise ValueError(str(error)) from None
+    length = int.from_bytes(blob[:8], "little")
+    return tensors, parse_json(blob[8 : 8 + length]).get("__metadata__") or {}
