@@ -55,7 +55,7 @@ def met(reader: Reader, folder: Path, content: bytes) -> str:
     from tailgate.errors import InputError
 
     (folder / reader.file).write_bytes(content)
-    reader_made = {"p.json", "README.md", "quickstart", "quickstart-tune"}  # what the call itself puts there
+    reader_made = {"p.json", "README.md", "runs", "quickstart-tune"}  # what the call itself puts there
 
     def state() -> set[tuple[str, int]]:
         return {(entry.name, entry.stat().st_size) for entry in os.scandir(folder) if entry.name not in reader_made}

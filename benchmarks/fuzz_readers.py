@@ -90,10 +90,10 @@ def _config(folder: Path) -> Any:
 def _resumed(folder: Path) -> Any:
     from tailgate.train import load_config, same_run
 
-    run = folder / "quickstart"
-    run.mkdir(exist_ok=True)
+    run = folder / "runs" / "quickstart"  # the folder is the worker's own
+    run.mkdir(exist_ok=True, parents=True)
     shutil.copyfile(folder / "config.json", run / "config.json")
-    config = load_config(None, [f"out={folder}"], resume=True)
+    config = load_config(None, [], resume=True)
     same_run(config)
     return config
 

@@ -24,7 +24,7 @@ BOMB = "a0: &a0 [x, x, x, x, x, x, x, x, x]\n" + "".join(f"a{i}: &a{i} [{', '.jo
 
 @pytest.mark.parametrize("text", [
     BOMB, "a: &b [*b]", "a: " + "[" * 100 + "]" * 100, "a: 0x" + "f" * 300, "a: 1\na: 2", "a: 2026-11-27", "a: 2026-02-30", "a: !!int x",
-    "a: !!int ''", "a: !!bool x", "a: !!map x", "a: !!binary aGVsbG8=", "a: !!set {b, c}", "a: !!python/object/apply:os.system [id]",
+    "a: !!int ''", "a: !!bool x", "a: !!map x", "a: !!binary aGVsbG8=", "a: !!set {b, c}", "[a]: 1\n{b: 1}: 2", "a: !!python/object/apply:os.system [id]",
     "a: " + "x" * reading.YAML, "m0: &m0 {x: 1}\n" + "".join(f"m{i}: &m{i} {{<<: [*m{i - 1}, *m{i - 1}]}}\n" for i in range(1, 20)),
 ])  # fmt: skip
 def test_yaml_that_unfolds_nests_or_names_other_kinds_is_refused(tmp_path, text):
