@@ -242,7 +242,7 @@ class _Reporter(BaseCallback):
     def _on_step(self) -> bool:
         for info in self.locals["infos"]:
             if info:
-                self.learner.ended.append((info["crashed"], info["episode"]["r"]))
+                self.learner.ended.append((not info["TimeLimit.truncated"], info["episode"]["r"]))
         return True
 
     def _on_rollout_start(self) -> None:  # the update of the last rollout is done

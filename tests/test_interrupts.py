@@ -105,7 +105,15 @@ def test_a_command_ends_in_one_line(code: str, signals: list[signal.Signals], st
 
 def test_an_interrupt_during_the_imports_is_one_line() -> None:
     begin = "import sys; sys.orig_argv = [sys.executable, '-m', 'tailgate']; from tailgate import interrupts"
-    code = begin.replace("from tailgate", "import os, signal, threading\nthreading.Timer(0.05, os.kill, (os.getpid(), signal.SIGINT)).start()\nfrom tailgate")
+    send = """
+import os, signal, threading, time
+def send():
+    while signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        time.sleep(0.001)  # before Tailgate's first line Python answers
+    os.kill(os.getpid(), signal.SIGINT)
+threading.Thread(target=send, daemon=True).start()
+from tailgate"""
+    code = begin.replace("from tailgate", send)
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.stderr.splitlines()[-1:] == ["tailgate: interrupted; it had not begun"] and done.returncode == 130
 

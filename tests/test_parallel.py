@@ -263,7 +263,7 @@ def test_the_box_reaches_the_ends_and_the_middle():
     ({"defence": "steered:defence=composed,defence.detector=os:Mine"}, ["registered names"]), ({"defence": "os:path"}, ["imports nothing"]),
     ({"menu": {"levels": [1]}}, ["menu", "levels"]), ({"menu": {"thresholds": []}}, ["menu.thresholds"]), ({"menu": {"modes": ["fast"]}}, ["menu.modes"]),
     ({"menu": 3}, ["menu"]), ({"mode_cost": -1}, ["mode_cost"]), ({"payoff": "all"}, ["payoff"]), ({"defender_action": "x"}, ["menu"]),
-    ({"scenarioo": "x"}, ["scenarioo"]), ({"interval": 0}, ["interval"]), ({"render_mode": "human"}, ["rgb_array"]),
+    ({"scenarioo": "x"}, ["scenarioo"]), ({"interval": 0}, ["interval"]), ({"render_mode": "ansi"}, ["rgb_array"]),
 ])  # fmt: skip
 def test_bad_arguments(wrong, words):
     """One clear error each."""

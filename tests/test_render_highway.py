@@ -34,7 +34,7 @@ FOLLOWING, RADAR, PLATOON, HIGHWAY = ROADS
 def made(name=FOLLOWING, rows=1, steps=3, action=0, seed=5, **arguments):
     """A vector environment after some steps."""
     defaults = gymnasium.spec(name).kwargs | ({"defence": "dkf"} if name == PLATOON else {})
-    env = AdversaryVectorEnv(rows, render_mode="rgb_array", **(defaults | arguments))
+    env = AdversaryVectorEnv(rows, render_mode="rgb_array", engine="plain", **(defaults | arguments))
     env.reset(seed=seed)
     for _ in range(steps):
         env.step(np.full(rows, action))

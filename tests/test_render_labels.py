@@ -65,7 +65,7 @@ def episode(name):
     """(loop, state, frame) at some steps of an episode that is attacked from early on, right after its reset and at its end among them."""
     face, action, arguments = SCENES[name]
     defaults = gymnasium.spec(f"tailgate/{face}-v0").kwargs
-    env = AdversaryVectorEnv(1, render_mode="rgb_array", autoreset="disabled", threat=EARLY, **(defaults | arguments))
+    env = AdversaryVectorEnv(1, render_mode="rgb_array", engine="plain", autoreset="disabled", threat=EARLY, **(defaults | arguments))
     env.reset(seed=4)
     attack = next(i for i, held in enumerate(env.seat.card()["actions"]) if held == action)
     shots = [(env.seat.loop, env.state, None)]

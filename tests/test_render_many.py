@@ -58,7 +58,7 @@ def made():
     """A vector environment after some quiet steps."""
 
     def make(rows=1, steps=3, **arguments):
-        env = AdversaryVectorEnv(rows, render_mode="rgb_array", **arguments)
+        env = AdversaryVectorEnv(rows, render_mode="rgb_array", engine="plain", **arguments)
         env.reset(seed=5)
         for _ in range(steps):
             env.step(np.zeros(rows, np.int64))

@@ -45,7 +45,7 @@ def env(tiny):
     """An environment after some steps, the attack (0: none) of each."""
 
     def make(actions, defence=GUARD):
-        env = AdversaryVectorEnv(1, render_mode="rgb_array", viewer="plain", scenario=tiny, defence=defence, value=8.0, delay=8.0)
+        env = AdversaryVectorEnv(1, render_mode="rgb_array", engine="plain", viewer="plain", scenario=tiny, defence=defence, value=8.0, delay=8.0)
         env.reset(seed=3)
         for action in actions:
             env.step(np.array([action]))

@@ -7,9 +7,9 @@ job with it and nothing else, and the parent never waits for what a dead one beg
 from __future__ import annotations
 
 import contextlib
+import copy
 import multiprocessing
 import os
-import pickle
 import signal
 import sys
 import threading
@@ -207,7 +207,7 @@ def _portable(error: Exception) -> tuple[Exception, str]:
     """An error as it can cross to another process, and its traceback."""
     text = "".join(traceback.format_exception(error))
     try:
-        pickle.loads(pickle.dumps(error))  # our own: some cannot be made again from what they hold
+        connection._ForkingPickler.dumps(copy.copy(error))  # type: ignore[attr-defined] # some cannot be made again from what they hold
     except Exception:
         error = RuntimeError(f"{type(error).__name__}: {error}")
     return error, text

@@ -1,5 +1,6 @@
 """Rows: one JSON object per episode and line, with everything that is needed to play it again. Files that end in .xz are compressed."""
 
+import contextlib
 import json
 import lzma
 from collections.abc import Sequence
@@ -39,7 +40,7 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
         while line:
             ahead = next(lines, b"")
             damage = "cut" if not ahead and not line.endswith(b"\n") else "damaged" if rows else ""
-            rows.append(_row(line, f"rows {path}, line {number}", damage))
+            rows.append(_row(line, f"rows {path}, line {number}", damage, number == 1))
             line, number = ahead, number + 1
     except (EOFError, lzma.LZMAError) as error:
         raise InputError("rows", str(path), f"a readable JSON Lines file ({said(error)}): {AGAIN}") from None
@@ -48,26 +49,33 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
     return rows
 
 
-def _row(line: bytes, where: str, damage: str) -> dict[str, Any]:
-    """A line, checked. damage: what became of its file, if it is no JSON object."""
+def _row(line: bytes, where: str, damage: str, first: bool) -> dict[str, Any]:
+    """A line, checked. damage: what became of its file, if it is no JSON object. first: it is the first one."""
     try:
         row = parse_json(line)
     except ValueError as error:
+        with contextlib.suppress(ValueError):  # a number that is none is said with its field
+            _check(parse_json(line, strict=False), where)
         shown = line[:60].decode("utf-8", "replace").rstrip("\n")
         cut = f"; the file was {damage} here: {AGAIN}" if damage else ""
         why = "" if isinstance(error, json.JSONDecodeError) else f" ({error})"
-        board = ", a row; a board is played again by `tailgate leaderboard check`" if b'"format"' in line[:200] or shown == "{" else ""
+        board = ", a row; a board is played again by `tailgate leaderboard check`" if first and (b'"format"' in line[:200] or shown == "{") else ""
         raise InputError(where, shown, f"a JSON object{why}{board or cut}") from None
-    try:
-        _Row.model_validate(row)
-    except ValidationError as error:
-        first = error.errors()[0]
-        field = ".".join(str(part) for part in first["loc"])
-        held = first["input"] if isinstance(row, dict) and field in row else None
-        raise InputError(f"{where}: {field}", held, wanted(first)) from None
+    _check(row, where)
     if row["status"] == "ok" and row["crashed"] not in (0.0, 1.0):
         raise InputError(f"{where}: crashed", row["crashed"], "0 or 1")
     return {intern(key): intern(value) if type(value) is str else value for key, value in row.items()}  # half the memory
+
+
+def _check(row: Any, where: str) -> None:
+    """Raise InputError unless the fields of a row are as they should be."""
+    try:
+        _Row.model_validate(row)
+    except ValidationError as error:
+        found = error.errors()[0]
+        field = ".".join(str(part) for part in found["loc"])
+        held = found["input"] if isinstance(row, dict) and field in row else None
+        raise InputError(f"{where}: {field}", held, wanted(found)) from None
 
 
 def packed(rows: Sequence[dict[str, Any]], path: Path) -> bytes:

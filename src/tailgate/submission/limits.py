@@ -1,9 +1,13 @@
 """What a submission may take, and the error of one that took more."""
 
 from dataclasses import dataclass
+from typing import Annotated
+
+from pydantic import Field
 
 from tailgate.core import Positive, PositiveCount, param
 
+Bytes = Annotated[int, Field(ge=1, le=2**50)]
 FEWEST = 256  # rows of a batch, where there are as many
 
 
@@ -20,13 +24,13 @@ class Limits:
     memory, several processes) is looked at five times a second.
     """
 
-    memory: PositiveCount = param(4 * 2**30, "memory of all processes of the submission together [bytes]")
+    memory: Bytes = param(4 * 2**30, "memory of all processes of the submission together [bytes]")
     start_time: Positive = param(60.0, "processor time for importing, prepare and start [s]")
     step_time: Positive = param(1.2e-3, "processor time per step, row and agent, on average: ten times what kf needs at batch 1 [s]")
     cpu: PositiveCount = param(7200, "processor time of any one process, whatever it plays (RLIMIT_CPU) [s]")
     silence: Positive = param(120.0, "longest wait for one answer; waits in all may last this and the processor time granted [s]")
-    output: PositiveCount = param(2**20, "what may be printed to standard output and error together [bytes]")
-    file_size: PositiveCount = param(64 * 2**20, "largest file that may be written (RLIMIT_FSIZE) [bytes]")
+    output: Bytes = param(2**20, "what may be printed to standard output and error together [bytes]")
+    file_size: Bytes = param(64 * 2**20, "largest file that may be written (RLIMIT_FSIZE) [bytes]")
     processes: PositiveCount = param(8, "processes at a time, the submission's own among them")
 
     def steps(self, count: int, rows: int, agents: int) -> float:
