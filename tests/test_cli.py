@@ -298,7 +298,7 @@ NOTHING = "nothing of it is kept"
     (["leaderboard", "clock", "quick-v0", "--out", "x"], "leaderboard.clock.measure", NOTHING),
     (["leaderboard", "admit", "fdi", "--suite", "quick-v0", "--out", "x"], "scoring.attacks.admit", NOTHING),
     (["calibrate", "--defence", "chi2_kf", "--hours", "1"], "calibrate.calibrate", NOTHING),
-    (["timing", "zoo:name=none"], "strength.timing.timing", NOTHING), (["bench"], "bench.run.bench", NOTHING),
+    (["timing", "zoo:name=car-following-chi2_kf-0"], "strength.timing.timing", NOTHING), (["bench"], "bench.run.bench", NOTHING),
     (["transfer", "zoo:name=none"], "strength.transfer.transfer", "nothing is kept: --out DIR would"),
     (["trust", "--out", "x"], "trust.run.check", "the same command goes on"),
     (["dose-response", "fdi", "--defence", "kf", "--scenario", "braking-v0", "--doses", "5"], "strength.dose.dose_response",

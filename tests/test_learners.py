@@ -242,7 +242,7 @@ def test_settings_that_do_not_fit_are_refused(name: str, field: str, value: Any,
 @pytest.mark.parametrize(
     ("name", "action", "rate"),
     [
-        ("ppo", "continuous", 1e30), ("ppo", "mode", 1e30), ("ppo", "mode", 1e38), ("maskable_ppo", "mode", 1e30),
+        ("ppo", "continuous", 1e30), ("ppo", "mode", 1e30), ("maskable_ppo", "mode", 1e30),
         ("sac", "continuous", 1e30),
     ],
 )  # fmt: skip
@@ -252,6 +252,8 @@ def test_a_policy_that_diverges_is_an_error_of_the_step_size(name: str, action: 
     with pytest.raises(InputError, match=rf"config\.{name}\.learning_rate: got {re.escape(str(rate))}; expected .* stays finite"):
         run.learn(4000, lambda progress: None, tmp_path / "c.safetensors")
     assert not (tmp_path / "c.safetensors").exists()
+    with pytest.raises(InputError, match=r"learning_rate: got 1e\+38; expected less"):
+        learner(name, paid | {"action": action}, learning_rate=1e38)
 
 
 def test_a_policy_that_is_not_finite_is_found_where_nothing_fails(paid: dict[str, Any], tmp_path: Path) -> None:

@@ -54,12 +54,16 @@ def _row(line: bytes, where: str, damage: str, first: bool) -> dict[str, Any]:
     try:
         row = parse_json(line)
     except ValueError as error:
-        with contextlib.suppress(ValueError):  # a number that is none is said with its field
-            _check(parse_json(line, strict=False), where)
+        loose: Any = None
+        with contextlib.suppress(ValueError):
+            loose = parse_json(line, strict=False)
+        if loose is not None:
+            _check(loose, where)  # NaN and its like are told with their field
         shown = line[:60].decode("utf-8", "replace").rstrip("\n")
         cut = f"; the file was {damage} here: {AGAIN}" if damage else ""
         why = "" if isinstance(error, json.JSONDecodeError) else f" ({error})"
-        board = ", a row; a board is played again by `tailgate leaderboard check`" if first and (b'"format"' in line[:200] or shown == "{") else ""
+        a_board = first and (b'"format"' in line[:200] or shown == "{")
+        board = ", a row; a board is played again by `tailgate leaderboard check`" if a_board else ""
         raise InputError(where, shown, f"a JSON object{why}{board or cut}") from None
     _check(row, where)
     if row["status"] == "ok" and row["crashed"] not in (0.0, 1.0):
