@@ -103,19 +103,27 @@ def test_a_command_ends_in_one_line(code: str, signals: list[signal.Signals], st
     assert (running.returncode, said) == (status, f"tailgate: {word}; nothing of it is kept\n")
 
 
-def test_an_interrupt_during_the_imports_is_one_line() -> None:
+@pytest.mark.parametrize("times", [1, 2])
+def test_an_interrupt_during_the_imports_is_one_line(times: int) -> None:
     begin = "import sys; sys.orig_argv = [sys.executable, '-m', 'tailgate']; from tailgate import interrupts"
     send = """
 import os, signal, threading, time
 def send():
     while signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         time.sleep(0.001)  # before Tailgate's first line Python answers
+    write = os.write
+    def again(stream, text):  # the next one comes in the midst of the answer
+        done = write(stream, text)
+        if TIMES > 1:
+            signal.raise_signal(signal.SIGINT)
+        return done
+    os.write = again
     os.kill(os.getpid(), signal.SIGINT)
 threading.Thread(target=send, daemon=True).start()
 from tailgate"""
-    code = begin.replace("from tailgate", send)
+    code = begin.replace("from tailgate", send.replace("TIMES", str(times))) + "; time.sleep(5)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert done.stderr.splitlines()[-1:] == ["tailgate: interrupted; it had not begun"] and done.returncode == 130
+    assert done.stderr.splitlines() == ["tailgate: interrupted; it had not begun"] and done.returncode == 130
 
 
 def test_elsewhere_handlers_are_put_back(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

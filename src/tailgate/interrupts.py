@@ -53,10 +53,23 @@ def _heard() -> list[signal.Signals]:
     return [number for number in WORDS if signal.getsignal(number) not in (signal.SIG_IGN, None)]
 
 
+class _Once:
+    """The answer to a signal during the imports: a second one, in the midst of it, adds no line of its own."""
+
+    def __init__(self) -> None:
+        self.called = False
+
+    def __call__(self, number: int, _: Any) -> None:
+        if not self.called:
+            self.called = True
+            _end(number, "it had not begun")
+
+
 def at_start() -> None:
     """An interrupt during the imports of the command line ends it in one line; elsewhere nothing changes."""
+    answer = _Once()
     for number in _heard() if COMMAND else ():
-        signal.signal(number, lambda number, _: _end(number, "it had not begun"))
+        signal.signal(number, answer)
 
 
 class Ending:
