@@ -66,7 +66,7 @@ class Episodes(Protocol):
         """What `held` gave, of the same number of rows."""
 
     def drawn(self, row: int) -> tuple[LoopState, Frame | None, int]:
-        """What a picture of a row shows: a state of the plain loop, its last step (None after a reset), and the row of both."""
+        """Return what a picture of a row shows: a state of the plain loop, its last step (None after a reset), and the row of both."""
 
 
 def framed(now: Array, before: Array | None, frames: int) -> Array:

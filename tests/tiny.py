@@ -2,6 +2,8 @@
 
 import yaml
 
+AUTORESETS = ("next_step", "same_step", "disabled")
+CRASHES = {"scenario": "stop-and-go-v0", "defence": "kf", "value": -30.0, "threat": {"onset": 1}, "interval": 5}  # unguarded: it collides
 KINDS = ["dos_jam", "dos_hold", "dropout", "fdi"]
 TINY = {  # scenarios of 40 steps, short enough for many episodes
     "tailgate/CarFollowing-v0": {
