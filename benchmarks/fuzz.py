@@ -93,7 +93,7 @@ def _late(*_: Any) -> None:
 
 
 def _work(line: Any, name: str, seed: int, numbers: range, valid: list[bytes]) -> None:
-    """In a process of its own: the inputs of one reader, each announced before it is read."""
+    """Read the inputs of one reader, in a separate process that announces each before it reads it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGPROF, _late)
     quiet = os.open(os.devnull, os.O_WRONLY)
