@@ -1,4 +1,4 @@
-"""Walks over states: nested NamedTuples whose leaves are arrays with B first, or None."""
+"""Walks over states: nested NamedTuples and mappings whose leaves are arrays with B first, or None."""
 
 import copy
 from collections.abc import Callable
@@ -13,6 +13,8 @@ def map_leaves(function: Callable[..., Any], tree: Any, *others: Any) -> Any:
     """The tree with `function` applied to its leaves, several trees of one shape side by side."""
     if tree is None:
         return None
+    if isinstance(tree, dict):
+        return {key: map_leaves(function, branch, *(other[key] for other in others)) for key, branch in tree.items()}
     if isinstance(tree, tuple):
         parts = [map_leaves(function, *branches) for branches in zip(tree, *others, strict=True)]
         return type(tree)(*parts) if hasattr(tree, "_fields") else tuple(parts)
@@ -50,10 +52,10 @@ def leaves(tree: Any, prefix: str = "") -> dict[str, np.ndarray]:
     """Every leaf by its dotted name."""
     if tree is None:
         return {}
-    if isinstance(tree, tuple):
-        names = getattr(tree, "_fields", range(len(tree)))
+    if isinstance(tree, (tuple, dict)):
+        names = tree if isinstance(tree, dict) else getattr(tree, "_fields", range(len(tree)))
         out: dict[str, np.ndarray] = {}
-        for name, branch in zip(names, tree, strict=True):
+        for name, branch in zip(names, tree.values() if isinstance(tree, dict) else tree, strict=True):
             out |= leaves(branch, f"{prefix}{name}.")
         return out
     return {prefix[:-1]: tree}

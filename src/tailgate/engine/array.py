@@ -1,0 +1,391 @@
+"""Traced arrays: numpy's surface over the nodes of a graph.
+
+The axis of the episodes has length one. Whatever code does along the other axes happens once, while it is traced: a matrix product becomes
+products and sums of numbers. Arrays that are the same for all episodes (`fixed`) may be asked for their values, as in a Python branch;
+of the others only the code's elementwise results are known.
+
+Types follow numpy's own rules: a Python number takes the type of the array that it meets.
+"""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import numpy as np
+
+from tailgate.engine.graph import BOOL, FLOAT, Array, Graph, Node
+from tailgate.engine.untraceable import Untraceable
+
+_ZERO = np.zeros((), np.int8)
+
+
+class Flags:
+    """Whether an array may be written to, as numpy's `flags` say it."""
+
+    def __init__(self, writeable: bool = True) -> None:
+        self.writeable = writeable
+
+
+class Traced:
+    """An array of nodes. `batch`: its axis of the episodes, None where it has none or nobody knows it; `weak`: it is a Python number."""
+
+    __slots__ = ("batch", "dtype", "flags", "graph", "nodes", "weak")
+    __hash__ = None  # type: ignore[assignment]
+    __array_priority__ = 1000.0
+
+    def __init__(
+        self, graph: Graph, nodes: Array, dtype: np.dtype[Any], batch: int | None = None, weak: type | None = None, writeable: bool = True
+    ) -> None:
+        self.graph, self.nodes, self.dtype, self.batch, self.weak = graph, nodes, dtype, batch, weak
+        self.flags = Flags(writeable)
+
+    # -- what it is
+
+    shape = property(lambda self: self.nodes.shape)
+    ndim = property(lambda self: self.nodes.ndim)
+    size = property(lambda self: self.nodes.size)
+    T = property(lambda self: self.transpose())
+
+    @property
+    def strides(self) -> tuple[int, ...]:
+        """As if the numbers stood there."""
+        return tuple(s // self.nodes.itemsize * self.dtype.itemsize for s in self.nodes.strides)
+
+    @property
+    def fixed(self) -> bool:
+        """Is it the same for all episodes?"""
+        return all(node.fixed for node in self.nodes.flat)
+
+    def values(self) -> Array:
+        """The numbers of a fixed array."""
+        out = np.empty(self.shape, self.dtype)
+        for i, node in enumerate(self.nodes.flat):
+            out.flat[i] = self.graph.value(node)
+        return out
+
+    def known(self, what: str, instead: str) -> Array:
+        """The numbers of a fixed array, which code asks for in a way that no episode's own can answer."""
+        if not self.fixed:
+            raise Untraceable(f"{what} of what each episode has its own of", instead)
+        return self.values()
+
+    def __repr__(self) -> str:
+        return f"Traced{self.shape} {self.dtype}{' fixed' if self.fixed else ''}"
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> Array:
+        return self.known("an array of numbers", "use numpy's elementwise functions, num.* or np.where").astype(dtype or self.dtype)
+
+    def __len__(self) -> int:
+        return len(self.nodes)
+
+    def __bool__(self) -> bool:
+        return bool(self.known("a Python branch", "write np.where, or `if num.some(mask):` around what only those rows need"))
+
+    def __float__(self) -> float:
+        return float(self.known("float()", "keep the array"))
+
+    def __int__(self) -> int:
+        return int(self.known("int()", "write x.astype(int)"))
+
+    def __index__(self) -> int:
+        return operator.index(self.known("an index", "write num.take(x, index)")[()])
+
+    def __round__(self, digits: int = 0) -> Any:
+        return round(float(self), digits)
+
+    def item(self) -> Any:
+        """The only number."""
+        return self.known("item()", "keep the array").item()
+
+    def tolist(self) -> Any:
+        """Nested lists of the numbers."""
+        return self.known("tolist()", "write a loop over what there can be, and np.where").tolist()
+
+    def __iter__(self) -> Iterator[Any]:
+        return (self[i] for i in range(len(self)))
+
+    # -- the same nodes in another shape
+
+    def _moved(self, move: Callable[[Any], Any], copied: bool = False) -> Traced:
+        """A view after a change of shape; a copy of the axis of the episodes goes the same way and shows where it comes to lie."""
+        nodes, batch = move(self.nodes), None
+        if not isinstance(nodes, np.ndarray):
+            nodes = boxed(nodes)
+        if self.batch is not None:
+            shape = (*self.shape[: self.batch], 2, *self.shape[self.batch + 1 :])
+            there = [i for i, (m, n) in enumerate(zip(move(np.broadcast_to(_ZERO, shape)).shape, nodes.shape, strict=True)) if m != n]
+            if not there and not all(node.fixed for node in nodes.flat):
+                raise Untraceable("one row out of the batch", "write it for all rows")
+            batch = there[0] if there else None
+        return Traced(self.graph, nodes, self.dtype, batch, self.weak, copied or self.flags.writeable)
+
+    def transpose(self, *axes: Any) -> Traced:
+        """Axes in another order."""
+        return self._moved(lambda a: a.transpose(*axes))
+
+    def swapaxes(self, first: int, second: int) -> Traced:
+        """Two axes exchanged."""
+        return self._moved(lambda a: a.swapaxes(first, second))
+
+    def squeeze(self, axis: int | tuple[int, ...]) -> Traced:
+        """Without axes of length one."""
+        return self._moved(lambda a: a.squeeze(axis))
+
+    def diagonal(self, offset: int = 0, axis1: int = 0, axis2: int = 1) -> Traced:
+        """The diagonal of two axes, as the last axis."""
+        return self._moved(lambda a: a.diagonal(offset, axis1, axis2))
+
+    def reshape(self, *shape: Any, order: Any = "C") -> Traced:
+        """Another shape, of which the axis of the episodes is the first or the last as it was."""
+        new = tuple(shape[0]) if len(shape) == 1 and isinstance(shape[0], (tuple, list)) else shape
+        nodes = self.nodes.reshape(new)
+        if self.batch is None:
+            return Traced(self.graph, nodes, self.dtype, None, self.weak, self.flags.writeable)
+        for here, there in ((0, 0), (self.ndim - 1, nodes.ndim - 1)):
+            if self.batch == here and nodes.ndim and nodes.shape[there] == 1:
+                return Traced(self.graph, nodes, self.dtype, there, self.weak, self.flags.writeable)
+        raise Untraceable("a shape that puts episodes and other axes together", "keep the episodes as the first axis")
+
+    def ravel(self) -> Traced:
+        """One axis."""
+        return self.reshape(-1)
+
+    def copy(self, order: Any = None) -> Traced:
+        """Nodes of its own."""
+        return Traced(self.graph, self.nodes.copy(), self.dtype, self.batch, self.weak)
+
+    def view(self, dtype: Any = None) -> Traced:
+        """The same nodes; with another type of the same size, their bits."""
+        if dtype is None or np.dtype(dtype) == self.dtype:
+            return Traced(self.graph, self.nodes, self.dtype, self.batch, self.weak, self.flags.writeable)
+        to = np.dtype(dtype)
+        return self.mapped(lambda node: self.graph.bits(node, to), to)
+
+    def astype(self, dtype: Any, order: Any = "K", casting: Any = "unsafe", copy: bool = True) -> Traced:
+        """Of another type."""
+        to = np.dtype(dtype)
+        return self.mapped(lambda node: self.graph.cast(node, to), to)
+
+    def mapped(self, function: Callable[[Node], Node], dtype: Any = None) -> Traced:
+        """A function of each node."""
+        return Traced(self.graph, each(function, self.nodes), np.dtype(dtype or self.dtype), self.batch)
+
+    # -- places
+
+    def _key(self, key: Any) -> tuple[Any, ...]:
+        """A key of numpy's, without traced arrays."""
+        parts = key if isinstance(key, tuple) else (key,)
+        masks = "write np.where(mask, x, y) for all rows"
+        return tuple(
+            part.known("rows of a mask" if part.dtype == BOOL else "an index", masks if part.dtype == BOOL else "write num.take(x, index)")
+            if isinstance(part, Traced) else part
+            for part in parts
+        )  # fmt: skip
+
+    def __getitem__(self, key: Any) -> Traced:
+        plain = self._key(key)
+        return self._moved(lambda a: a[plain])
+
+    def __setitem__(self, key: Any, value: Any) -> None:
+        if not self.flags.writeable:
+            raise ValueError("assignment destination is read-only")
+        graph = self.graph
+        if isinstance(key, Traced) and key.dtype == BOOL and not key.fixed:  # x[mask] = a number
+            mask = key.reshape(*key.shape, *(1,) * (self.ndim - key.ndim))
+            if np.ndim(value):
+                raise Untraceable("an assignment of several numbers to the rows of a mask", "write np.where(mask, x, y) for all rows")
+            self.nodes[...] = chosen(mask, value, self, self.dtype).nodes
+            self.batch = self.batch if self.batch is not None else mask.batch
+            return
+        plain, new = self._key(key), lifted(graph, value, self.dtype)
+        cast = each(lambda node: graph.cast(node, self.dtype), new.nodes)
+        self.nodes[plain] = cast if cast.ndim else cast[()]
+        if new.batch is not None and self.batch is None and self.shape[:1] == (1,):
+            self.batch = 0
+
+    # -- numpy
+
+    def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **options: Any) -> Any:
+        from tailgate.engine import ufuncs
+
+        return ufuncs.called(self.graph, ufunc, method, inputs, options)
+
+    def __array_function__(self, function: Any, types: Any, args: Any, options: Any) -> Any:
+        from tailgate.engine import functions
+
+        return functions.called(self.graph, function, args, options)
+
+    def any(self, axis: Any = None, out: Any = None, keepdims: bool = False) -> Any:
+        """True where any is, along axes that are not the episodes'."""
+        return reduced(self.astype(bool), "or", axis, keepdims, "write `if num.some(mask):`, or name the axis")
+
+    def all(self, axis: Any = None, out: Any = None, keepdims: bool = False) -> Any:
+        """True where all are, along axes that are not the episodes'."""
+        return reduced(self.astype(bool), "and", axis, keepdims, "write `if num.every(mask):`, or name the axis")
+
+    def max(self, axis: Any = None, out: Any = None, keepdims: bool = False) -> Any:
+        """The largest along axes that are not the episodes'."""
+        return reduced(self, "or" if self.dtype == BOOL else "max", axis, keepdims)
+
+    def min(self, axis: Any = None, out: Any = None, keepdims: bool = False) -> Any:
+        """The smallest along axes that are not the episodes'."""
+        return reduced(self, "and" if self.dtype == BOOL else "min", axis, keepdims)
+
+    def sum(self, axis: Any = None, dtype: Any = None, out: Any = None, keepdims: bool = False) -> Any:
+        """The sum of up to seven along an axis: numpy's order of more than that depends on their place in memory."""
+        return reduced(summands(self, axis, dtype), "add", axis, keepdims)
+
+    def clip(self, low: Any, high: Any) -> Any:
+        """Within limits."""
+        return np.minimum(np.maximum(self, low), high)
+
+    def __pow__(self, exponent: Any) -> Any:
+        """Of the exponents that numpy has no library function for."""
+        known = float(exponent)
+        if known not in (0.5, 1.0, 2.0):
+            raise Untraceable(f"the power {known}", "write products, or num.exp(p * num.log(x))")
+        return {0.5: np.sqrt, 1.0: np.positive, 2.0: np.square}[known](self)
+
+
+def _operators() -> None:
+    """Python's operators, each numpy's function: reflected and in place too."""
+    pairs = {
+        "add": np.add, "sub": np.subtract, "mul": np.multiply, "truediv": np.true_divide, "floordiv": np.floor_divide, "mod": np.remainder,
+        "and": np.bitwise_and, "or": np.bitwise_or, "xor": np.bitwise_xor, "lshift": np.left_shift, "rshift": np.right_shift,
+        "matmul": np.matmul,
+    }  # fmt: skip
+
+    def plain(ufunc: Any) -> Callable[[Any, Any], Any]:
+        return lambda self, other: ufunc(self, other)
+
+    def reflected(ufunc: Any) -> Callable[[Any, Any], Any]:
+        return lambda self, other: ufunc(other, self)
+
+    def in_place(ufunc: Any) -> Callable[[Any, Any], Any]:
+        return lambda self, other: ufunc(self, other, out=(self,))
+
+    for name, ufunc in pairs.items():
+        setattr(Traced, f"__{name}__", plain(ufunc))
+        setattr(Traced, f"__r{name}__", reflected(ufunc))
+        setattr(Traced, f"__i{name}__", in_place(ufunc))
+    comparisons = {"lt": np.less, "le": np.less_equal, "gt": np.greater, "ge": np.greater_equal, "eq": np.equal, "ne": np.not_equal}
+    for name, ufunc in comparisons.items():
+        setattr(Traced, f"__{name}__", plain(ufunc))
+    for name, single in {"neg": np.negative, "abs": np.absolute, "invert": np.invert, "pos": np.positive}.items():
+        setattr(Traced, f"__{name}__", (lambda ufunc: lambda self: ufunc(self))(single))
+
+
+# -- of nodes
+
+
+def boxed(node: Any) -> Array:
+    """An array without axes that holds one node."""
+    out = np.empty((), object)
+    out[()] = node
+    return out
+
+
+def each(function: Callable[..., Node], *arrays: Array) -> Array:
+    """A function of nodes for each place of arrays of them."""
+    shape = np.broadcast_shapes(*(a.shape for a in arrays))
+    out = np.empty(shape, object)
+    out[...] = np.frompyfunc(function, len(arrays), 1)(*arrays)
+    return out
+
+
+def lifted(graph: Graph, x: Any, like: np.dtype[Any] | None = None) -> Traced:
+    """A traced array, or numbers as one: constants. A Python number gets the type `like`."""
+    if isinstance(x, Traced):
+        return x
+    weak = type(x) if type(x) in (bool, int, float) else None
+    held = np.asarray(x, like if weak and like is not None else None)
+    if held.dtype == object:
+        raise Untraceable(f"an array of {type(held.flat[0]).__name__ if held.size else 'objects'}", "use numbers")
+    nodes = np.empty(held.shape, object)
+    for i, value in enumerate(held.flat):
+        nodes.flat[i] = graph.const(value, held.dtype)
+    return Traced(graph, nodes, held.dtype, None, weak)
+
+
+def shared_batch(arrays: Sequence[Traced]) -> int | None:
+    """The episodes' axis of what several arrays give together, counted from the last: -1 is the last."""
+    found = {a.batch - a.ndim for a in arrays if a.batch is not None}
+    if len(found) > 1:
+        raise Untraceable("episodes against another axis", "give each array the episodes as its first axis, with None where one is missing")
+    return found.pop() if found else None
+
+
+def elementwise(graph: Graph, function: Callable[..., Node], arrays: Sequence[Traced], dtype: np.dtype[Any]) -> Traced:
+    """A function of nodes for each place of several arrays."""
+    back = shared_batch(arrays)
+    nodes = each(function, *(a.nodes for a in arrays))
+    if back is not None and nodes.shape[back] != 1:
+        raise Untraceable("the axis of the episodes against a longer one", "give each array the episodes as its first axis")
+    weak = next(iter({a.weak for a in arrays}), None) if all(a.weak for a in arrays) else None
+    return Traced(graph, nodes, dtype, None if back is None else nodes.ndim + back, weak)
+
+
+def typed(graph: Graph, x: Traced, dtype: np.dtype[Any]) -> Traced:
+    """x of a type."""
+    return x if x.dtype == dtype else Traced(graph, each(lambda node: graph.cast(node, dtype), x.nodes), dtype, x.batch)
+
+
+def result_type(arrays: Sequence[Traced]) -> np.dtype[Any]:
+    """The type of what may be any of several arrays."""
+    return np.result_type(*(a.weak(0) if a.weak else a.dtype for a in arrays))
+
+
+def chosen(where: Any, x: Any, y: Any, dtype: np.dtype[Any] | None = None) -> Traced:
+    """x where `where` holds, else y: np.where."""
+    graph = next(a.graph for a in (where, x, y) if isinstance(a, Traced))
+    mask, one, other = lifted(graph, where), lifted(graph, x), lifted(graph, y)
+    to = dtype or result_type([one, other])
+    return elementwise(graph, graph.select, [typed(graph, mask, BOOL), typed(graph, one, to), typed(graph, other, to)], to)
+
+
+def axes_of(x: Traced, axis: Any, instead: str) -> list[int]:
+    """The axes that a reduction names, which are none of the episodes'."""
+    if axis is None:
+        if x.fixed or (x.batch is None and x.ndim == 0):
+            return list(range(x.ndim))
+        raise Untraceable("one number of all episodes", instead)
+    axes = sorted(a % x.ndim for a in ((axis,) if isinstance(axis, (int, np.integer)) else axis))
+    if x.batch in axes and not x.fixed:
+        raise Untraceable("a sum, a product or a choice over the episodes", instead)
+    return axes
+
+
+def summands(x: Traced, axis: Any, dtype: Any = None) -> Traced:
+    """x of the type that a sum has, where it is of few enough."""
+    long = max((x.shape[a] for a in axes_of(x, axis, "name the axis")), default=0)
+    if x.dtype.kind == "f" and long > 7:
+        raise Untraceable(f"a sum of {long} numbers", "write num.dot, or a loop: numpy's order of them depends on their place in memory")
+    return typed(x.graph, x, np.dtype(dtype or (np.int64 if x.dtype.kind in "bi" else x.dtype)))
+
+
+def reduced(x: Traced, op: str, axis: Any, keepdims: bool, instead: str = "name an axis that is not the episodes'") -> Any:
+    """x with axes put together by an operation, in ascending order."""
+    out = x
+    for a in reversed(axes_of(x, axis, instead)):
+        parts = [out._moved(lambda n, a=a, i=i: n.take(i, a)) for i in range(out.shape[a])]  # type: ignore[misc]
+        if not parts and op not in ("and", "or", "add"):
+            raise ValueError(f"zero-size array to reduction operation {op} which has no identity")
+        if parts:
+            held = parts[0]
+            for part in parts[1:]:
+                held = elementwise(x.graph, lambda p, q: x.graph.binary(op, p, q), [held, part], x.dtype)
+        else:
+            shape = tuple(n for i, n in enumerate(out.shape) if i != a)
+            held = lifted(x.graph, np.full(shape, op == "and", x.dtype))
+        out = held
+    if keepdims:
+        for a in axes_of(x, axis, instead):
+            out = out._moved(lambda n, a=a: np.expand_dims(n, a))  # type: ignore[misc]
+    return out[()] if out.ndim else out
+
+
+_operators()
+
+__all__ = ["FLOAT", "Flags", "Traced", "chosen", "each", "elementwise", "lifted", "reduced", "result_type", "typed"]

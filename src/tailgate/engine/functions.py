@@ -1,0 +1,239 @@
+"""numpy's other functions on traced arrays, and its makers of arrays while something is traced."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import numpy as np
+
+from tailgate.engine.array import Traced, boxed, chosen, each, lifted, result_type, shared_batch, typed
+from tailgate.engine.graph import Graph, Node
+from tailgate.engine.untraceable import Untraceable
+
+
+def called(graph: Graph, function: Any, args: Any, options: dict[str, Any]) -> Any:
+    """What numpy would give. Of arrays that are the same for all episodes everything is known."""
+    if function in _FUNCTIONS:
+        return _FUNCTIONS[function](*args, **options)
+    held = [x for x in _inside((args, tuple(options.values()))) if isinstance(x, Traced)]
+    if all(x.fixed for x in held):
+        return function(*_known(args), **{name: _known(x) for name, x in options.items()})
+    raise Untraceable(f"np.{function.__name__}", "write it with elementwise functions, num.* or np.where")
+
+
+def _inside(x: Any) -> Iterator[Any]:
+    if isinstance(x, (tuple, list)):
+        for part in x:
+            yield from _inside(part)
+    else:
+        yield x
+
+
+def _known(x: Any) -> Any:
+    if isinstance(x, (tuple, list)):
+        return type(x)(_known(part) for part in x)
+    return x.values() if isinstance(x, Traced) else x
+
+
+# -- several arrays in one
+
+
+def _joined(arrays: Sequence[Any], join: Callable[[list[Any]], Any]) -> Traced:
+    graph = next(a.graph for a in arrays if isinstance(a, Traced))
+    parts = [lifted(graph, a) for a in arrays]
+    dtype = result_type(parts)
+    parts = [typed(graph, part, dtype) for part in parts]
+    back = shared_batch(parts)
+    nodes = join([part.nodes for part in parts])
+    batch = None
+    if back is not None:  # where the episodes' axis went: the same with two of them
+        shadows = [np.zeros([2 if i - p.ndim == back else n for i, n in enumerate(p.shape)], np.int8) for p in parts]
+        moved = [i for i, (m, n) in enumerate(zip(join(shadows).shape, nodes.shape, strict=True)) if m != n]
+        batch = moved[0] if moved else None
+    return Traced(graph, nodes, dtype, batch)
+
+
+def _stack(arrays: Sequence[Any], axis: int = 0) -> Traced:
+    return _joined(arrays, lambda parts: np.stack(parts, axis))
+
+
+def _concatenate(arrays: Sequence[Any], axis: int = 0) -> Traced:
+    return _joined(arrays, lambda parts: np.concatenate(parts, axis))
+
+
+def _column_stack(arrays: Sequence[Any]) -> Traced:
+    return _concatenate([a[:, None] if np.ndim(a) == 1 else a for a in arrays], 1)
+
+
+# -- one array
+
+
+def _broadcast_to(x: Traced, shape: Any, subok: bool = False) -> Traced:
+    nodes = np.broadcast_to(x.nodes, shape)
+    return Traced(x.graph, nodes, x.dtype, None if x.batch is None else nodes.ndim - x.ndim + x.batch, writeable=False)
+
+
+def _full_like(x: Traced, value: Any, dtype: Any = None, order: Any = "K", subok: bool = True, shape: Any = None) -> Traced:
+    out = made(x.graph, x.shape if shape is None else shape, value, np.dtype(dtype or x.dtype))
+    out.batch = x.batch if shape is None else None
+    return out
+
+
+def _likes(value: Any) -> Callable[..., Traced]:
+    return lambda x, dtype=None, order="K", subok=True, shape=None: _full_like(x, value, dtype, shape=shape)
+
+
+def _least(x: Traced, axis: int, op: str) -> Traced:
+    """The place of the least or the largest along an axis, the first of several."""
+    if axis is None or (x.batch is not None and axis % x.ndim == x.batch):
+        raise Untraceable("the place of one number of all episodes", "name another axis")
+    parts = [np.take(x.nodes, i, axis) for i in range(x.shape[axis])]
+    graph = x.graph
+    best, place = parts[0], each(lambda node: graph.const(0, np.dtype(np.int64)), parts[0])
+    for i, part in enumerate(parts[1:], 1):
+        better = each(lambda p, b: graph.binary(op, p, b), part, best)
+        best = each(graph.select, better, part, best)
+        place = each(lambda c, k, i=i: graph.select(c, graph.const(i, np.dtype(np.int64)), k), better, place)
+    shadow = x._moved(lambda n: n.take(0, axis))
+    return Traced(graph, place, np.dtype(np.int64), shadow.batch)
+
+
+def _count_nonzero(x: Traced, axis: Any = None, keepdims: bool = False) -> Any:
+    return x.astype(bool).astype(np.int64).sum(axis=axis, keepdims=keepdims)
+
+
+def _copyto(target: Traced, source: Any, casting: Any = "same_kind", where: Any = True) -> None:
+    target[...] = source if where is True else chosen(where, source, target)
+
+
+def _choose(conditions: Sequence[Any], choices: Sequence[Any], default: Any = 0) -> Any:
+    out = default
+    for condition, choice in zip(reversed(conditions), reversed(choices), strict=True):
+        out = np.where(condition, choice, out)
+    return out
+
+
+_FUNCTIONS: dict[Any, Callable[..., Any]] = {
+    np.where: chosen,
+    np.select: _choose,
+    np.stack: _stack,
+    np.concatenate: _concatenate,
+    np.column_stack: _column_stack,
+    np.broadcast_to: _broadcast_to,
+    np.full_like: _full_like,
+    np.zeros_like: _likes(0),
+    np.ones_like: _likes(1),
+    np.empty_like: _likes(0),
+    np.swapaxes: lambda x, i, j: x.swapaxes(i, j),
+    np.transpose: lambda x, axes=None: x.transpose(axes) if axes is not None else x.transpose(),
+    np.moveaxis: lambda x, source, to: x._moved(lambda a: np.moveaxis(a, source, to)),
+    np.expand_dims: lambda x, axis: x._moved(lambda a: np.expand_dims(a, axis)),
+    np.squeeze: lambda x, axis: x.squeeze(axis),
+    np.reshape: lambda x, shape, order="C": x.reshape(shape),
+    np.ravel: lambda x, order="C": x.ravel(),
+    np.diagonal: lambda x, offset=0, axis1=0, axis2=1: x.diagonal(offset, axis1, axis2),
+    np.repeat: lambda x, repeats, axis: x._moved(lambda a: np.repeat(a, repeats, axis), copied=True),
+    np.roll: lambda x, shift, axis: x._moved(lambda a: np.roll(a, shift, axis), copied=True),
+    np.flip: lambda x, axis: x._moved(lambda a: np.flip(a, axis)),
+    np.clip: lambda x, low, high: np.minimum(np.maximum(x, low), high),
+    np.any: lambda x, axis=None, keepdims=False: x.any(axis, keepdims=keepdims),
+    np.all: lambda x, axis=None, keepdims=False: x.all(axis, keepdims=keepdims),
+    np.max: lambda x, axis=None, keepdims=False: x.max(axis, keepdims=keepdims),
+    np.min: lambda x, axis=None, keepdims=False: x.min(axis, keepdims=keepdims),
+    np.amax: lambda x, axis=None, keepdims=False: x.max(axis, keepdims=keepdims),
+    np.amin: lambda x, axis=None, keepdims=False: x.min(axis, keepdims=keepdims),
+    np.sum: lambda x, axis=None, dtype=None, keepdims=False: x.sum(axis, dtype, keepdims=keepdims),
+    np.count_nonzero: _count_nonzero,
+    np.argmin: lambda x, axis=None: _least(x, axis, "lt"),
+    np.argmax: lambda x, axis=None: _least(x, axis, "gt"),
+    np.cumsum: lambda x, axis: np.add.accumulate(x, axis),
+    np.copyto: _copyto,
+    np.copy: lambda x, order="K", subok=False: x.copy(),
+    np.shape: lambda x: x.shape,
+    np.ndim: lambda x: x.ndim,
+    np.size: lambda x: x.size,
+    np.iscomplexobj: lambda x: False,
+    np.isrealobj: lambda x: True,
+}
+
+
+# -- makers
+
+
+def made(graph: Graph, shape: Any, value: Any, dtype: np.dtype[Any]) -> Traced:
+    """A new array that holds a value."""
+    size = (int(shape),) if isinstance(shape, (int, np.integer)) else tuple(shape)
+    nodes = np.empty(size, object)
+    if isinstance(value, Traced) or np.ndim(value):
+        out = Traced(graph, nodes, dtype)
+        out[...] = value
+        return out
+    nodes.fill(graph.const(value, dtype))
+    return Traced(graph, nodes, dtype)
+
+
+_LIBRARIES = ("numpy", "scipy", "torch", "filterpy", "cvxpy", "gymnasium", "llvmlite")
+_here = threading.local()
+_lock = threading.RLock()
+
+
+def _makers(graph: Graph) -> dict[str, Callable[..., Any]]:
+    def filled(value: Any) -> Callable[..., Traced]:
+        return lambda shape, dtype=float, order="C": made(graph, shape, value, np.dtype(dtype))
+
+    def full(shape: Any, value: Any, dtype: Any = None, order: Any = "C") -> Traced:
+        held = lifted(graph, value)
+        return made(graph, shape, value, np.dtype(dtype) if dtype is not None else held.dtype)
+
+    def as_array(x: Any, dtype: Any = None, order: Any = None, copy: Any = None) -> Any:
+        if isinstance(x, (list, tuple)) and any(isinstance(part, Traced) for part in _inside(x)):
+            x = _stack([as_array(part) for part in x])
+        return x if not isinstance(x, Traced) or dtype is None else x.astype(dtype)
+
+    def array(x: Any, dtype: Any = None, order: Any = None, copy: Any = True, ndmin: int = 0) -> Any:
+        held = as_array(x, dtype)
+        return held.copy() if isinstance(held, Traced) and copy else held
+
+    return {
+        "zeros": filled(0), "ones": filled(1), "empty": filled(0), "full": full, "asarray": as_array, "ascontiguousarray": as_array,
+        "asanyarray": as_array, "array": array,
+    }  # fmt: skip
+
+
+_CONVERT = ("asarray", "ascontiguousarray", "asanyarray", "array")
+
+
+@contextlib.contextmanager
+def makers(graph: Graph) -> Iterator[None]:
+    """Within it, numpy's makers of arrays give traced ones to whoever is traced in this thread."""
+
+    def wrapped(original: Any, mine: Callable[..., Any], converts: bool) -> Any:
+        def maker(*args: Any, **options: Any) -> Any:
+            if getattr(_here, "graph", None) is not graph:
+                return original(*args, **options)
+            caller = str(sys._getframe(1).f_globals.get("__name__", ""))
+            if caller.split(".")[0] in _LIBRARIES or caller.startswith("tailgate.engine."):
+                return original(*args, **options)
+            if converts and not any(isinstance(part, Traced) for part in _inside(args[:1])):
+                return original(*args, **options)
+            return mine(*args, **options)
+
+        return maker
+
+    with _lock:
+        before, _here.graph = {name: getattr(np, name) for name in _makers(graph)}, graph
+        try:
+            for name, mine in _makers(graph).items():
+                setattr(np, name, wrapped(before[name], mine, name in _CONVERT))
+            yield
+        finally:
+            _here.graph = None
+            for name, original in before.items():
+                setattr(np, name, original)
+
+
+__all__ = ["Node", "boxed", "called", "made", "makers"]

@@ -1,0 +1,221 @@
+"""The graph of a computation: numbers of one episode, each computed once.
+
+Two nodes of one operation on the same arguments are one node. Operations on constants are folded by the same numpy functions that define
+every operation, so that a folded value has the bits of a computed one. No rewriting changes a bit, NaN's sign and payload apart.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+import numpy as np
+
+Array = np.ndarray[Any, Any]
+BOOL, FLOAT, INT, WORD = np.dtype(bool), np.dtype(np.float64), np.dtype(np.int64), np.dtype(np.uint64)
+DTYPES = [np.dtype(name) for name in ("?", "f8", "f4", "i8", "u8", "i4", "u4", "i2", "u2", "i1", "u1")]
+
+
+def minimum(x: Any, y: Any) -> Any:
+    """The smaller one; y where neither is, and NaN where either is: of numbers that are equal, -0.0 and 0.0 too, the second."""
+    return np.where((x < y) | (x != x), x, y)
+
+
+def maximum(x: Any, y: Any) -> Any:
+    """The larger one, as `minimum` takes the smaller."""
+    return np.where((x > y) | (x != x), x, y)
+
+
+def converted(x: Any, dtype: np.dtype[Any]) -> Any:
+    """x as another type. What no 64-bit integer holds, NaN too, becomes the least one; a narrower type keeps the low bits."""
+    if x.dtype.kind == "f" and dtype.kind in "iu":
+        holds = (x >= -(2.0**63)) & (x < 2.0**63)
+        return np.where(holds, np.where(holds, x, 0.0).astype(np.int64), np.iinfo(np.int64).min).astype(dtype)
+    return x.astype(dtype)
+
+
+COMPARISONS = {"lt": np.less, "le": np.less_equal, "gt": np.greater, "ge": np.greater_equal, "eq": np.equal, "ne": np.not_equal}
+BINARY: dict[str, Callable[..., Any]] = {
+    "add": np.add, "sub": np.subtract, "mul": np.multiply, "div": np.true_divide, "min": minimum, "max": maximum,
+    "and": np.bitwise_and, "or": np.bitwise_or, "xor": np.bitwise_xor, "shl": np.left_shift, "shr": np.right_shift, "rem": np.remainder,
+}  # fmt: skip
+UNARY: dict[str, Callable[..., Any]] = {
+    "neg": np.negative, "abs": np.absolute, "not": np.invert, "sqrt": np.sqrt, "floor": np.floor, "ceil": np.ceil, "trunc": np.trunc,
+    "rint": np.rint,
+}  # fmt: skip
+COMMUTATIVE = {"add", "mul", "and", "or", "xor", "eq", "ne"}
+
+
+class Node:
+    """A number: an operation `op` on other nodes. `fixed`: it is the same for all episodes."""
+
+    __slots__ = ("args", "attr", "dtype", "fixed", "id", "op")
+
+    def __init__(self, id: int, op: str, dtype: np.dtype[Any], args: tuple[Node, ...], attr: Any, fixed: bool) -> None:
+        self.id, self.op, self.dtype, self.args, self.attr, self.fixed = id, op, dtype, args, attr, fixed
+
+    def __repr__(self) -> str:
+        args = ", ".join(f"%{a.id}" for a in self.args)
+        return f"%{self.id} = {self.op} {self.dtype} ({args}){'' if self.attr is None else f' {self.attr}'}"
+
+
+class Graph:
+    """Nodes in an order in which each one follows its arguments."""
+
+    def __init__(self) -> None:
+        self.nodes: list[Node] = []
+        self._known: dict[Any, Node] = {}
+        self._values: dict[int, Any] = {}  # of fixed nodes
+
+    # -- leaves
+
+    def const(self, value: Any, dtype: np.dtype[Any]) -> Node:
+        """A constant. Its sign counts, where it is zero."""
+        with np.errstate(all="ignore"):
+            held = converted(np.asarray(value), dtype)[()]
+        return self._node("const", dtype, (), held, held.tobytes(), True)
+
+    def input(self, name: Any, dtype: np.dtype[Any]) -> Node:
+        """A number that each episode brings."""
+        return self._node("input", dtype, (), name, name, False)
+
+    def uniform(self, name: Any, value: Any) -> Node:
+        """A number that is the same for all episodes and may be another one the next time: the code does not hold its value."""
+        node = self._node("uniform", np.asarray(value).dtype, (), name, name, True)
+        self._values[node.id] = np.asarray(value)[()]
+        return node
+
+    def _node(self, op: str, dtype: np.dtype[Any], args: tuple[Node, ...], attr: Any, key: Any, fixed: bool) -> Node:
+        known = (op, dtype, key, *(a.id for a in args))
+        node = self._known.get(known)
+        if node is None:
+            node = self._known[known] = Node(len(self.nodes), op, dtype, args, attr, fixed)
+            self.nodes.append(node)
+        return node
+
+    def value(self, node: Node) -> Any:
+        """The number that a fixed node is now."""
+        if node.op == "const":
+            return node.attr
+        if node.id not in self._values:
+            for part in ordered([node]):
+                if part.id not in self._values:
+                    self._values[part.id] = part.attr if part.op == "const" else computed(part, [self._values[a.id] for a in part.args])
+        return self._values[node.id]
+
+    # -- operations: each takes nodes of the types that it asks for
+
+    def binary(self, op: str, x: Node, y: Node) -> Node:
+        """x op y of one type."""
+        if x.dtype != y.dtype:
+            raise TypeError(f"{op} of {x.dtype} and {y.dtype}")
+        dtype = BOOL if op in COMPARISONS else x.dtype
+        if same := _identity(op, x, y):
+            return same
+        if op in COMMUTATIVE and x.id > y.id:
+            x, y = y, x
+        return self._folded(op, dtype, (x, y))
+
+    def unary(self, op: str, x: Node) -> Node:
+        """op x."""
+        if op == "not" and x.op == "not":
+            return x.args[0]
+        return self._folded(op, x.dtype, (x,))
+
+    def select(self, where: Node, x: Node, y: Node) -> Node:
+        """x where `where` holds, else y."""
+        if x.dtype != y.dtype or where.dtype != BOOL:
+            raise TypeError(f"a choice by {where.dtype} of {x.dtype} and {y.dtype}")
+        if where.op == "const":
+            return x if where.attr else y
+        if x is y:
+            return x
+        if where.op == "not":
+            where, x, y = where.args[0], y, x
+        if x.dtype == BOOL and x.op == y.op == "const":
+            return where if x.attr else self.unary("not", where)
+        return self._folded("select", x.dtype, (where, x, y))
+
+    def cast(self, x: Node, dtype: np.dtype[Any]) -> Node:
+        """x as another type."""
+        return x if x.dtype == dtype else self._folded("cast", dtype, (x,))
+
+    def bits(self, x: Node, dtype: np.dtype[Any]) -> Node:
+        """The bits of x as those of another type of the same size."""
+        if x.dtype.itemsize != dtype.itemsize or BOOL in (x.dtype, dtype):
+            raise TypeError(f"bits of {x.dtype} as {dtype}")
+        if x.dtype == dtype:
+            return x
+        return x.args[0] if x.op == "bits" and x.args[0].dtype == dtype else self._folded("bits", dtype, (x,))
+
+    def _folded(self, op: str, dtype: np.dtype[Any], args: tuple[Node, ...]) -> Node:
+        if all(a.op == "const" for a in args):
+            with np.errstate(all="ignore"):
+                return self.const(apply(op, dtype, [a.attr for a in args]), dtype)
+        return self._node(op, dtype, args, None, None, all(a.fixed for a in args))
+
+
+def _is(node: Node, value: float) -> bool:
+    """Is the node this constant? Zeros count by their sign."""
+    return node.op == "const" and node.attr == value and bool(np.signbit(node.attr)) == (str(value)[0] == "-")
+
+
+def _identity(op: str, x: Node, y: Node) -> Node | None:
+    """What x op y is without a computation, to the bit."""
+    kind = x.dtype.kind
+    if kind == "f":
+        if (op in ("mul", "div") and _is(y, 1.0)) or (op == "sub" and _is(y, 0.0)) or (op == "add" and _is(y, -0.0)):
+            return x
+        return y if (op == "mul" and _is(x, 1.0)) or (op == "add" and _is(x, -0.0)) else None
+    if kind == "b" and op in ("and", "or"):
+        for this, other in ((x, y), (y, x)):
+            if this.op == "const":
+                return other if bool(this.attr) == (op == "and") else this
+    elif kind in "iu" and op in ("add", "or", "xor", "shl", "shr"):
+        if y.op == "const" and y.attr == 0:
+            return x
+        if x.op == "const" and x.attr == 0 and op in ("add", "or", "xor"):
+            return y
+    return x if x is y and op in ("and", "or", "min", "max") else None
+
+
+def apply(op: str, dtype: np.dtype[Any], args: Sequence[Any]) -> Any:
+    """The operation on numpy's arrays or numbers: what every backend has to give."""
+    if op == "select":
+        return np.where(*args)
+    if op == "cast":
+        return converted(args[0], dtype)
+    if op == "bits":
+        return args[0].view(dtype)
+    return (UNARY.get(op) or BINARY.get(op) or COMPARISONS[op])(*args)
+
+
+def computed(node: Node, args: Sequence[Any]) -> Any:
+    """The value of a node whose arguments have these."""
+    with np.errstate(all="ignore"):
+        return np.asarray(apply(node.op, node.dtype, args))[()]
+
+
+def ordered(roots: Iterable[Node]) -> list[Node]:
+    """The roots and all that they need, arguments first."""
+    seen: dict[int, Node] = {}
+    left = list(roots)
+    while left:
+        node = left.pop()
+        if node.id not in seen:
+            seen[node.id] = node
+            left.extend(node.args)
+    return [seen[i] for i in sorted(seen)]
+
+
+def evaluate(graph: Graph, roots: Sequence[Node], inputs: dict[Any, Array]) -> list[Array]:
+    """The roots by numpy, of inputs (B,) by name."""
+    values: dict[int, Any] = {}
+    for node in ordered(roots):
+        if node.fixed:
+            values[node.id] = graph.value(node)
+        elif node.op == "input":
+            values[node.id] = inputs[node.attr]
+        else:
+            values[node.id] = computed(node, [values[a.id] for a in node.args])
+    return [values[root.id] for root in roots]

@@ -1,0 +1,232 @@
+"""What is computed in which order, and what is skipped where no episode of a block asks for it.
+
+A number that is needed only on one side of choices by one mask goes into a branch: it is computed where the mask holds in any lane of the
+block. The branches are found here; no code says where they are.
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass, field
+
+from tailgate.engine.graph import Node, ordered
+
+_COST = {"const": 0, "uniform": 0, "div": 8, "sqrt": 10, "rem": 20}
+LEAST = 12  # cost of what is worth a branch, in additions
+
+
+@dataclass(eq=False)
+class Branch:
+    """What is needed only where `mask` holds, or only where it does not (`side` 2), and the choices that ask for it."""
+
+    mask: Node
+    side: int
+    choices: list[Node]
+    inside: set[int]
+    cost: int
+    body: list[Item] = field(default_factory=list)
+    decides: list[Node] = field(default_factory=list)  # choices whose result is known after this branch; of the others, one side
+
+
+Item = Node | Branch
+
+
+def schedule(roots: Iterable[Node], least: int = LEAST) -> list[Item]:
+    """All that the roots need but constants and what is the same for all episodes, in the order of its computation."""
+    wanted = list(roots)
+    nodes = [node for node in ordered(wanted) if not node.fixed]
+    return _scope(nodes, {node.id for node in wanted}, least)
+
+
+def _scope(nodes: Sequence[Node], kept: Collection[int], least: int) -> list[Item]:
+    """The nodes of one scope, of which those in `kept` are needed outside of it, with its branches."""
+    branches = _branches(nodes, kept, least)
+    while True:
+        try:
+            items = _in_order(nodes, branches)
+            break
+        except _Circle as circle:
+            branches.remove(min(circle.branches, key=lambda branch: branch.cost))
+    by_id = {node.id: node for node in nodes}
+    for branch in branches:
+        results = {choice.args[branch.side].id for choice in branch.choices}
+        branch.body = _scope([by_id[i] for i in sorted(branch.inside)], results, least)
+    return items
+
+
+# -- which branches there are
+
+
+def _branches(nodes: Sequence[Node], kept: Collection[int], least: int) -> list[Branch]:
+    users: dict[int, list[tuple[Node, int]]] = {node.id: [] for node in nodes}
+    groups: dict[tuple[int, int], list[Node]] = {}
+    for node in nodes:
+        for place, arg in enumerate(node.args):
+            if arg.id in users:
+                users[arg.id].append((node, place))
+        if node.op == "select" and not node.args[0].fixed:
+            for side in (1, 2):
+                groups.setdefault((node.args[0].id, side), []).append(node)
+    by_id = {node.id: node for node in nodes}
+    taken: set[int] = set()  # nodes in branches
+    pinned = set(kept)  # nodes that stay in this scope
+    found: list[Branch] = []
+
+    def of(side: int, choices: list[Node]) -> Branch:
+        inside = _only(choices, side, users, by_id, pinned | taken)
+        held = [choice for choice in choices if choice.args[side].id in inside]
+        return Branch(choices[0].args[0], side, held, inside, sum(_COST.get(by_id[i].op, 1) for i in inside))
+
+    waiting: list[tuple[int, int, int, list[Node], Branch]] = []
+    for (_, side), choices in groups.items():
+        for level in _levels(nodes, choices) if of(side, choices).cost >= least else ():
+            branch = of(side, level)
+            if branch.cost >= least:
+                heapq.heappush(waiting, (-branch.cost, len(waiting), side, level, branch))
+    while waiting:
+        _, turn, side, level, branch = heapq.heappop(waiting)
+        left = [choice for choice in level if choice.id not in taken]
+        if branch.inside & (taken | pinned) or len(left) < len(level):  # a larger branch has taken some of it
+            if left and (branch := of(side, left)).cost >= least:
+                heapq.heappush(waiting, (-branch.cost, turn, side, left, branch))
+            continue
+        taken |= branch.inside
+        pinned |= {choice.id for choice in branch.choices}
+        found.append(branch)
+    return found
+
+
+def _levels(nodes: Sequence[Node], choices: list[Node]) -> list[list[Node]]:
+    """The choices by how many others of them each one follows from."""
+    mine = {choice.id for choice in choices}
+    depth: dict[int, int] = {}
+    levels: dict[int, list[Node]] = {}
+    for node in nodes:
+        if node.id < choices[0].id:
+            continue
+        deep = max((depth.get(arg.id, 0) for arg in node.args), default=0)
+        if node.id in mine:
+            levels.setdefault(deep, []).append(node)
+            deep += 1
+        if deep:
+            depth[node.id] = deep
+    return [levels[deep] for deep in sorted(levels)]
+
+
+def _only(
+    choices: Sequence[Node], side: int, users: dict[int, list[tuple[Node, int]]], by_id: dict[int, Node], others: Collection[int]
+) -> set[int]:
+    """Nodes that nothing needs but the choices, on that side of them, none of `others`."""
+    mine = {choice.id for choice in choices}
+    inside: set[int] = set()
+    seen: set[int] = set()
+    heap: list[int] = []
+
+    def look(node: Node) -> None:
+        if node.id in by_id and node.id not in seen:
+            seen.add(node.id)
+            heapq.heappush(heap, -node.id)
+
+    for choice in choices:
+        look(choice.args[side])
+    while heap:
+        i = -heapq.heappop(heap)
+        if i in others or i in mine:
+            continue
+        if all(user.id in inside or (user.id in mine and place == side) for user, place in users[i]):
+            inside.add(i)
+            for arg in by_id[i].args:
+                look(arg)
+    return inside
+
+
+# -- in which order
+
+
+class _Circle(Exception):
+    """Branches that wait for one another."""
+
+    def __init__(self, branches: list[Branch]) -> None:
+        super().__init__()
+        self.branches = branches
+
+
+def _in_order(nodes: Sequence[Node], branches: Sequence[Branch]) -> list[Item]:
+    """The scope's nodes outside of its branches, each after its arguments, and the branches where they are first asked for."""
+    home = {i: branch for branch in branches for i in branch.inside}
+    by_id = {node.id: node for node in nodes}
+    gives: dict[int, list[Branch]] = {}
+    for branch in sorted(branches, key=lambda branch: branch.side):
+        branch.decides = []
+        for choice in branch.choices:
+            gives.setdefault(choice.id, []).append(branch)
+    for i, several in gives.items():
+        several[-1].decides.append(by_id[i])
+    needs: dict[int, list[Node]] = {}  # of a branch: what has to be there before it
+    for branch in branches:
+        found = [branch.mask]
+        found += [arg for i in branch.inside for arg in by_id[i].args if arg.id not in branch.inside]
+        found += [choice.args[3 - branch.side] for choice in branch.decides if len(gives[choice.id]) == 1]
+        needs[id(branch)] = sorted({arg.id: arg for arg in found}.values(), key=lambda node: node.id)
+    partner = {
+        id(branch): [b for choice in branch.decides for b in gives[choice.id] if b is not branch] for branch in branches
+    }  # fmt: skip
+    done: set[int] = set()
+    items: list[Item] = []
+    busy: list[Branch] = []
+
+    def enter(branch: Branch) -> None:
+        if id(branch) in done:
+            return
+        if branch in busy:
+            raise _Circle(busy[busy.index(branch) :])
+        busy.append(branch)
+        for arg in needs[id(branch)]:
+            visit(arg)
+        for other in partner[id(branch)]:
+            enter(other)
+        busy.pop()
+        done.add(id(branch))
+        items.append(branch)
+        done.update(choice.id for choice in branch.decides)
+
+    def visit(node: Node) -> None:
+        left: list[tuple[Node, bool]] = [(node, False)]
+        while left:
+            this, ready = left.pop()
+            if this.id in done or this.id not in by_id:
+                continue
+            if this.id in home:
+                raise AssertionError(f"{this} is asked for outside of its branch")
+            if this.id in gives:
+                for branch in gives[this.id]:
+                    enter(branch)
+            elif ready or not this.args:
+                done.add(this.id)
+                items.append(this)
+            else:
+                left.append((this, True))
+                left.extend((arg, False) for arg in reversed(this.args))
+
+    for node in nodes:
+        if node.id not in home and (node.args or node.op != "input"):
+            visit(node)
+    for node in nodes:
+        if node.id not in home:
+            visit(node)
+    return items
+
+
+def counted(items: Sequence[Item]) -> dict[str, int]:
+    """How many nodes and branches there are, and how many nodes in branches."""
+    out = {"nodes": 0, "branches": 0, "in branches": 0}
+    for item in items:
+        if isinstance(item, Branch):
+            inner = counted(item.body)
+            out["nodes"] += inner["nodes"] + len(item.decides)
+            out["branches"] += inner["branches"] + 1
+            out["in branches"] += inner["nodes"]
+        else:
+            out["nodes"] += 1
+    return out

@@ -1,0 +1,161 @@
+"""numpy's universal functions on traced arrays: types by numpy's own rules, one node for each place."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from tailgate.engine.array import Traced, each, elementwise, lifted, reduced, summands, typed
+from tailgate.engine.graph import BOOL, COMPARISONS, Graph, Node
+from tailgate.engine.untraceable import Untraceable
+
+_PAIRS: dict[Any, str] = {
+    np.add: "add", np.subtract: "sub", np.multiply: "mul", np.true_divide: "div", np.minimum: "min", np.maximum: "max",
+    np.remainder: "rem", np.bitwise_and: "and", np.bitwise_or: "or", np.bitwise_xor: "xor", np.left_shift: "shl", np.right_shift: "shr",
+    np.less: "lt", np.less_equal: "le", np.greater: "gt", np.greater_equal: "ge", np.equal: "eq", np.not_equal: "ne",
+    np.logical_and: "and", np.logical_or: "or", np.logical_xor: "ne",
+}  # fmt: skip
+_SINGLES: dict[Any, str] = {
+    np.negative: "neg", np.absolute: "abs", np.fabs: "abs", np.sqrt: "sqrt", np.floor: "floor", np.ceil: "ceil", np.trunc: "trunc",
+    np.rint: "rint", np.invert: "not", np.logical_not: "not",
+}  # fmt: skip
+_LOGICAL = {np.logical_and, np.logical_or, np.logical_xor, np.logical_not}
+_ON_BOOLS = {"add": "or", "mul": "and", "min": "and", "max": "or"}
+_LIBRARY = {
+    np.exp: "num.exp",
+    np.log: "num.log",
+    np.tanh: "num.tanh",
+    np.matmul: "num.matmul",
+    np.power: "products, or num.exp(p * num.log(x))",
+}
+
+
+def called(graph: Graph, ufunc: Any, method: str, inputs: Sequence[Any], options: dict[str, Any]) -> Any:
+    """What numpy would give."""
+    out = options.pop("out", None)
+    if any(isinstance(target, np.ndarray) for target in out or ()):
+        raise Untraceable("writing a traced array into one of numpy's", "make it with np.zeros or np.empty in the same function")
+    arrays = [lifted(graph, x) for x in inputs]
+    if all(a.fixed for a in arrays) and method == "__call__" and not (ufunc in _PAIRS or ufunc in _SINGLES):
+        result: Any = lifted(graph, ufunc(*(a.values() for a in arrays), **options))
+    elif method == "reduce":
+        result = _reduced(ufunc, arrays[0], options)
+    elif method == "accumulate":
+        result = _accumulated(ufunc, arrays[0], **options)
+    elif method == "__call__" and set(options) <= {"dtype", "casting", "where"}:
+        result = _elementwise(graph, ufunc, arrays, options.get("dtype"))
+        if options.get("where", True) is not True:
+            result = _partly(result, options["where"], out)
+    else:
+        raise Untraceable(f"np.{ufunc.__name__}.{method} with {', '.join(options) or 'this'}", "write a loop over the axis")
+    if out:
+        out[0][...] = result
+        return out[0]
+    return result
+
+
+def _elementwise(graph: Graph, ufunc: Any, arrays: list[Traced], dtype: Any) -> Any:
+    if ufunc in _DERIVED:
+        return _DERIVED[ufunc](*arrays)
+    op = _PAIRS.get(ufunc) or _SINGLES.get(ufunc)
+    if op is None:
+        raise Untraceable(f"np.{ufunc.__name__}", f"write {_LIBRARY.get(ufunc, 'it with +, -, *, /, np.sqrt, np.where')}")
+    kinds = [BOOL] * len(arrays) if ufunc in _LOGICAL else loop_types(ufunc, arrays)
+    if dtype is not None:
+        kinds = [np.dtype(dtype)] * len(arrays)
+    if any(kind.kind not in "fiub" for kind in kinds):
+        raise Untraceable(f"np.{ufunc.__name__} of {', '.join(map(str, kinds))}", "use real numbers")
+    arrays = [typed(graph, a, kind) for a, kind in zip(arrays, kinds, strict=True)]
+    if kinds[0] == BOOL:
+        op = _ON_BOOLS.get(op, op)
+    if op in ("rem", "shl", "shr"):
+        return _by_a_constant(graph, op, arrays, kinds[0])
+    if len(arrays) == 1:
+        return elementwise(graph, lambda x: graph.unary(op, x), arrays, kinds[0])
+    return elementwise(graph, lambda x, y: graph.binary(op, x, y), arrays, BOOL if op in COMPARISONS else kinds[0])
+
+
+def loop_types(ufunc: Any, arrays: Sequence[Traced]) -> list[np.dtype[Any]]:
+    """The types in which numpy computes it."""
+    given = [a.weak if a.weak in (int, float) else a.dtype for a in arrays]
+    kinds = ufunc.resolve_dtypes((*given, *(None,) * ufunc.nout))[: len(arrays)]
+    if len(set(kinds)) > 1:
+        raise Untraceable(f"np.{ufunc.__name__} of {' and '.join(map(str, kinds))}", "give both one type")
+    return list(kinds)
+
+
+def _by_a_constant(graph: Graph, op: str, arrays: list[Traced], dtype: np.dtype[Any]) -> Traced:
+    """A remainder or a shift, by numbers that are known: no processor agrees with another about the rest."""
+    if dtype.kind == "f":
+        raise Untraceable("a remainder of floats", "write x - y * np.floor(x / y)")
+    by = arrays[1].known("a remainder or a shift", "use constants on the right")
+    least, most = (1, np.iinfo(dtype).max) if op == "rem" else (0, 8 * dtype.itemsize - 1)
+    if by.size and not (least <= by.min() and by.max() <= most):
+        raise Untraceable(f"a remainder or a shift by {by.min()}", f"use constants from {least} to {most}")
+    return elementwise(graph, lambda x, y: _divided(graph, op, x, y), [arrays[0], lifted(graph, by)], dtype)
+
+
+def _divided(graph: Graph, op: str, x: Node, y: Node) -> Node:
+    if op == "rem" and y.op == "const" and int(y.attr) & (int(y.attr) - 1) == 0:
+        return graph.binary("and", x, graph.const(int(y.attr) - 1, x.dtype))
+    return graph.binary(op, x, y)
+
+
+def _partly(result: Traced, where: Any, out: Any) -> Traced:
+    from tailgate.engine.array import chosen
+
+    if not out:
+        raise Untraceable("a function with where= and without out=", "write np.where")
+    return chosen(where, result, out[0])
+
+
+def _reduced(ufunc: Any, x: Traced, options: dict[str, Any]) -> Any:
+    op, axis = _PAIRS.get(ufunc), options.get("axis", 0)
+    if op not in ("add", "mul", "min", "max", "and", "or") or set(options) - {"axis", "keepdims", "dtype"}:
+        raise Untraceable(f"np.{ufunc.__name__}.reduce", "write a loop over the axis")
+    if ufunc in _LOGICAL:
+        x = typed(x.graph, x, BOOL)
+    elif op in ("add", "mul"):
+        x = summands(x, axis, options.get("dtype"))
+    return reduced(x, _ON_BOOLS.get(op, op) if x.dtype == BOOL else op, axis, options.get("keepdims", False))
+
+
+def _accumulated(ufunc: Any, x: Traced, axis: int = 0) -> Traced:
+    op = _PAIRS.get(ufunc)
+    if op not in ("add", "mul", "min", "max", "and", "or"):
+        raise Untraceable(f"np.{ufunc.__name__}.accumulate", "write a loop over the axis")
+    if op in ("add", "mul") and x.dtype.kind in "bi":
+        x = typed(x.graph, x, np.dtype(np.int64))
+    if x.batch == axis % x.ndim:
+        raise Untraceable("an accumulation over the episodes", "name another axis")
+    nodes = np.empty(x.shape, object)
+    there, source = np.moveaxis(nodes, axis, 0), np.moveaxis(x.nodes, axis, 0)
+    for i in range(len(source)):
+        there[i] = source[i] if i == 0 else each(lambda p, q: x.graph.binary(op, p, q), there[i - 1], source[i])
+    return Traced(x.graph, nodes, x.dtype, x.batch)
+
+
+def _sign(x: Any) -> Any:
+    return np.where(x > 0, 1.0, np.where(x < 0, -1.0, np.where(x == 0, 0.0, x)))
+
+
+def _copied_sign(x: Any, y: Any) -> Any:
+    graph, word = x.graph, np.dtype(np.uint64)
+    x, y = typed(graph, x, np.dtype(float)), typed(graph, y, np.dtype(float))
+    sign = np.uint64(1 << 63)
+    return ((x.view(word) & ~sign) | (y.view(word) & sign)).view(float)
+
+
+_DERIVED: dict[Any, Callable[..., Any]] = {
+    np.square: lambda x: x * x,
+    np.positive: lambda x: x.copy(),
+    np.reciprocal: lambda x: 1.0 / x,
+    np.isfinite: lambda x: np.absolute(x) < np.inf,
+    np.isnan: lambda x: x != x,
+    np.isinf: lambda x: np.absolute(x) == np.inf,
+    np.sign: _sign,
+    np.copysign: _copied_sign,
+    np.signbit: lambda x: np.less(typed(x.graph, x, np.dtype(float)).view(np.int64), 0),
+}

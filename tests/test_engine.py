@@ -1,0 +1,146 @@
+"""The traced engine: random graphs and array code give the same bits in numpy and in machine code."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tailgate.engine.graph import BOOL, COMPARISONS, DTYPES, FLOAT, Graph, Node, evaluate
+from tailgate.engine.program import Memory, Program, Trace
+
+SPECIAL = np.array([0.0, -0.0, 1.0, -1.0, 0.5, 1e-310, -5e-324, 1e308, -1e308, np.inf, -np.inf, np.nan, 2.0**63, -(2.0**63), 3.7, 255.5])
+FLOATS, INTS = [d for d in DTYPES if d.kind == "f"], [d for d in DTYPES if d.kind in "iu"]
+
+
+def numbers(chance: np.random.Generator, dtype: np.dtype[Any], size: int) -> np.ndarray:
+    """Numbers of a type, the odd ones among them."""
+    if dtype == BOOL:
+        return chance.random(size) < 0.5
+    if dtype.kind == "f":
+        plain = np.where(
+            chance.random(size) < 0.3, chance.choice(SPECIAL, size), chance.normal(scale=10.0 ** chance.integers(-3, 4), size=size)
+        )
+        with np.errstate(over="ignore"):
+            return plain.astype(dtype)
+    held = np.iinfo(dtype)
+    small = chance.integers(max(held.min, -20), 20, size, dtype=dtype)
+    return np.where(chance.random(size) < 0.7, small, chance.integers(held.min, held.max, size, dtype=dtype, endpoint=True))
+
+
+def grown(graph: Graph, pool: list[Node], chance: np.random.Generator, count: int) -> None:
+    """More nodes, of random operations on those that there are."""
+
+    def one(dtypes: list[np.dtype[Any]]) -> Node:
+        fit = [node for node in pool if node.dtype in dtypes]
+        late = fit[-12:] if chance.random() < 0.7 else fit
+        return late[int(chance.integers(len(late)))]
+
+    for _ in range(count):
+        x = one(DTYPES)
+        alike = one([x.dtype])
+        kind = x.dtype.kind
+        ops = ["compare", "select", "select", "cast", "not" if kind in "biu" else "round", "and" if kind in "biu" else "div"]
+        op = str(chance.choice([*ops, *(["arithmetic"] * 6 if kind != "b" else []), *(["shift", "rem", "bits"] if kind in "iu" else [])]))
+        if op == "compare":
+            new = graph.binary(str(chance.choice(list(COMPARISONS))), x, alike)
+        elif op == "select":
+            new = graph.select(one([BOOL]), x, alike)
+        elif op == "cast":
+            new = graph.cast(x, DTYPES[int(chance.integers(len(DTYPES)))])
+        elif op == "round":
+            new = graph.unary(str(chance.choice(["sqrt", "floor", "ceil", "trunc", "rint", "abs", "neg"])), x)
+        elif op == "arithmetic":
+            new = graph.binary(str(chance.choice(["add", "sub", "mul", "min", "max"])), x, alike)
+        elif op == "and":
+            new = graph.binary(str(chance.choice(["and", "or", "xor"])), x, alike)
+        elif op == "div":
+            new = graph.binary("div", x, alike)
+        elif op == "not":
+            new = graph.unary(str(chance.choice(["not", "neg", "abs"])) if kind != "b" else "not", x)
+        elif op == "shift":
+            by = graph.const(int(chance.integers(8 * x.dtype.itemsize)), x.dtype)
+            new = graph.binary(str(chance.choice(["shl", "shr"])), x, by)
+        elif op == "rem":
+            new = graph.binary("rem", x, graph.const(int(chance.integers(1, 100)), x.dtype))
+        else:
+            whole = {8: FLOAT, 4: np.dtype(np.float32)}.get(x.dtype.itemsize, x.dtype)
+            new = graph.bits(x, whole)
+            new = (
+                graph.select(graph.binary("eq", new, new), new, graph.const(0.0, new.dtype)) if new.dtype.kind == "f" else new
+            )  # no NaN's bits
+        pool.append(new)
+
+
+def random_trace(seed: int) -> tuple[Trace, list[Node], dict[Any, np.dtype[Any]]]:
+    """A trace of random nodes: a state, arguments, and results of all types."""
+    chance, graph = np.random.default_rng(seed), Graph()
+    shapes = {f"s{i}": DTYPES[int(chance.integers(len(DTYPES)))] for i in range(8)} | {"s8": BOOL, "s9": FLOAT}
+    arguments = {f"a{i}": DTYPES[int(chance.integers(len(DTYPES)))] for i in range(4)} | {"a4": FLOAT}
+
+    def inputs(kind: str, named: dict[str, np.dtype[Any]], size: int) -> dict[str, np.ndarray]:
+        out = {}
+        for name, dtype in named.items():
+            out[name] = np.array([[graph.input((kind, name, i), dtype) for i in range(size)]], object)
+        return out
+
+    here, args = inputs("state", shapes, 2), inputs("arguments", arguments, 3)
+    pool = [node for held in (*here.values(), *args.values()) for node in held.flat]
+    uniforms = [graph.uniform(f"u{i}", numbers(chance, dtype, 1)[0]) for i, dtype in enumerate([*DTYPES, FLOAT, FLOAT])]
+    pool += uniforms + [graph.const(numbers(chance, dtype, 1)[0], dtype) for dtype in DTYPES]
+    grown(graph, pool, chance, int(chance.integers(40, 240)))
+
+    def picked(dtype: np.dtype[Any]) -> Node:
+        fit = [node for node in pool[-60:] if node.dtype == dtype] or [node for node in pool if node.dtype == dtype]
+        return fit[int(chance.integers(len(fit)))]
+
+    state = {name: (nodes, np.array([[picked(shapes[name]) for _ in nodes[0]]], object)) for name, nodes in here.items()}
+    results = {}
+    for i in range(6):
+        dtype = DTYPES[int(chance.integers(len(DTYPES)))] if i else FLOAT
+        results[f"r{i}"] = np.array([[picked(dtype) for _ in range(int(chance.integers(1, 12)))]], object)
+    return Trace(graph, state, args, results, None, None), uniforms, shapes
+
+
+def same(got: np.ndarray, wanted: np.ndarray) -> bool:
+    """Equal to the bit; of NaN the sign and the payload are nobody's."""
+    got, wanted = np.broadcast_arrays(got, wanted)
+    if got.dtype != wanted.dtype:
+        return False
+    if got.dtype.kind != "f":
+        return bool((got == wanted).all())
+    return bool((((got == wanted) & (np.signbit(got) == np.signbit(wanted))) | (np.isnan(got) & np.isnan(wanted))).all())
+
+
+@pytest.mark.parametrize("seed", range(24))
+def test_random_graphs(seed: int) -> None:
+    trace, uniforms, shapes = random_trace(seed)
+    chance = np.random.default_rng(seed + 1000)
+    batches = [1, 65, *(int(n) for n in chance.integers(2, 65, 2))]
+    others = {node.attr: numbers(chance, node.dtype, 1)[0] for node in uniforms}
+    for lanes in (2, 4, 8):
+        program = Program(trace, lanes, least=int(chance.integers(1, 20)))
+        for batch, values in zip(batches, (None, others, None, others), strict=True):
+            graph = trace.graph
+            if values:  # what the reference goes by
+                graph._values = {node.id: values[node.attr] for node in uniforms}
+            memory = Memory(program, batch)
+            memory.uniforms[:] = program.uniforms(values)
+            state = {name: numbers(chance, dtype, 2 * batch).reshape(batch, 2) for name, dtype in shapes.items()}
+            memory.put(state)
+            for _ in range(3):
+                given: dict[Any, np.ndarray] = {}
+                for name, nodes in trace.arguments.items():
+                    held = memory.argument(name)[0]
+                    held[...] = numbers(chance, held.dtype, held.size).reshape(held.shape)
+                    given |= {node.attr: held[:, i] for i, node in enumerate(nodes.flat)}
+                given |= {node.attr: state[name][:, i] for name, (nodes, _) in trace.state.items() for i, node in enumerate(nodes.flat)}
+                memory.step()
+                after = {name: evaluate(graph, list(new.flat), given) for name, (_, new) in trace.state.items()}
+                held_state = memory.get(state)
+                for name, columns in after.items():
+                    wanted = np.stack([np.broadcast_to(column, batch) for column in columns], 1).astype(shapes[name])
+                    assert same(held_state[name], wanted), (lanes, batch, name)
+                for name, nodes in trace.results.items():
+                    for i, column in enumerate(evaluate(graph, list(nodes.flat), given)):
+                        assert same(memory.result(name)[0][:, i], np.asarray(column)), (lanes, batch, name, i, nodes.flat[i])
+                state = held_state
