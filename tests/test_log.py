@@ -298,3 +298,16 @@ def test_the_command_writes_a_log(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert options.run(options) == 0
     held = json.loads(capsys.readouterr().out)
     assert held["doses"] == [5] and held["attacks"] == ["none", "fdi"] and sum(file["rows"] for file in held["files"]) == 600
+
+
+def test_a_part_whose_names_are_no_text_is_played_again(tmp_path):
+    import pyarrow as pa
+    from tailgate.evaluation import Cell
+    from tailgate.log import _good
+
+    cell = Cell("quick-v0", "gusty-stop-and-go-v0", None, "kf", "none", 1, "train")
+    pq.write_table(pa.table({"somename": [1.0]}), tmp_path / "part", store_schema=False)
+    (tmp_path / "part").write_bytes((tmp_path / "part").read_bytes().replace(b"somename", b"\xfdomename"))
+    with pytest.raises(UnicodeDecodeError):
+        pq.ParquetFile(tmp_path / "part")
+    assert not _good(tmp_path / "part", cell)

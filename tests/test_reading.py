@@ -50,7 +50,7 @@ def test_a_value_of_the_command_line_that_is_no_plain_data_is_its_text():
 
 @pytest.mark.parametrize(("text", "words"), [
     ('{"a": 1, "a": 2}', "twice"), ("[" * 100_000, "nested"), ("[" * 70 + "]" * 70, "nested"), ("[NaN]", "NaN"), ("[1e999]", "too large"),
-    ("[" + "9" * 400 + "]", "digits"), ('["\\ud800"]', "surrogate"), ("", "Expecting"), ("\ufeff{}", "BOM"),
+    ("[" + "9" * 400 + "]", "too large"), ('["\\ud800"]', "surrogate"), ("", "Expecting"), ("\ufeff{}", "BOM"),
 ])  # fmt: skip
 def test_json_is_bounded(text, words):
     with pytest.raises(ValueError, match=words):

@@ -198,7 +198,7 @@ def _good(part: Path, cell: Cell) -> bool:
     pa, pq = pyarrow()
     try:
         held = pq.ParquetFile(part).schema_arrow.metadata or {}
-    except (OSError, pa.ArrowException):
+    except (OSError, ValueError, pa.ArrowException):  # names that are no text, among others
         return False
     return bool(held.get(b"cell") == cell_id(cell).encode())
 

@@ -8,8 +8,9 @@ from __future__ import annotations
 import errno
 import json
 import lzma
-import re
+import sys
 from collections.abc import Callable, Iterator
+from math import isfinite
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -22,11 +23,11 @@ NODES = 100_000  # values of a YAML file, those of an alias counted wherever it 
 TENSORS = 4 << 30  # bytes of a file of tensors: what a checkpoint with a replay buffer may take
 LINE = 4 << 20  # bytes of a line of JSON
 ROWS = 8_000_000_000  # bytes of rows in a compressed file
-FREE, RATIO = 64 << 20, 500  # bytes that a compressed file may hold anyway, and above it so many for each byte: rows hold hashes
+FREE, RATIO = 16 << 20, 200  # bytes that a compressed file may hold anyway, and above it so many for each byte: rows hold hashes
 DICTIONARY = 256 << 20  # bytes that unpacking may need
 DEPTH = 64  # of lists and mappings in each other
 DIGITS = 200  # of a number in a YAML file
-_HUGE = re.compile(r"[eE]\+?\d{3}|\d{309}")  # where a number may be one that no float holds
+LARGEST_FLOAT = int(sys.float_info.max)
 _PIECE = 1 << 20
 
 
@@ -59,13 +60,11 @@ def parse_json(content: bytes | str, strict: bool = True) -> Any:
     rules: dict[str, Any] = {"object_pairs_hook": _once}
     if strict:
         rules["parse_constant"] = _no_number
-    if _HUGE.search(text):
-        rules |= {"parse_int": _whole, "parse_float": _finite if strict else None}
     try:
         data = json.loads(text, **rules)
     except RecursionError:
         raise _deep() from None
-    _shallow(data)
+    _checked(data, strict)
     if strict and (r"\ud" in text or r"\uD" in text):  # half of a character, which nothing can write
         json.dumps(data, ensure_ascii=False).encode()
     return data
@@ -88,27 +87,18 @@ def _no_number(constant: str) -> NoReturn:
     raise ValueError(f"{constant} is no number of JSON")
 
 
-def _finite(text: str) -> float:
-    value = float(text)
-    if value in (float("inf"), float("-inf")):
-        raise ValueError(f"a number that is too large, {text[:20]}...")
-    return value
-
-
-def _whole(text: str) -> int:
-    if len(text) > 308:
-        raise ValueError(f"a number of {len(text)} digits")
-    return int(text)
-
-
 def _deep() -> ValueError:
     return ValueError(f"lists and mappings nested more than {DEPTH} deep")
 
 
-def _shallow(data: Any) -> None:
-    """Raise ValueError where lists and mappings are nested too deep: what walks through them calls itself."""
+def _checked(data: Any, strict: bool) -> None:
+    """Raise ValueError where lists and mappings are nested too deep, or a number is one that no float holds."""
     held = [data]
     for _ in range(DEPTH + 1):
+        for value in held:
+            kind = type(value)
+            if (kind is float and strict and not isfinite(value)) or (kind is int and abs(value) > LARGEST_FLOAT):
+                raise ValueError("a number that is too large")
         outer = [value.values() if isinstance(value, dict) else value for value in held if isinstance(value, (dict, list))]
         held = [value for values in outer for value in values]
         if not held:
