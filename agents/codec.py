@@ -183,11 +183,11 @@ class ActionCodec:
         brief = self.brief
         if self.discrete:
             index = np.asarray(action).reshape(-1)
-            kinds = np.array([mode.kind for mode in self.modes], np.int8)[index]
-            target = np.array([mode.target for mode in self.modes])[index]
-            value = np.array([mode.value for mode in self.modes])[index][:, None, :]
+            kinds = num.take(np.array([mode.kind for mode in self.modes], np.int8), index)
+            target = num.take(np.array([mode.target for mode in self.modes]), index)
+            value = num.take(np.array([mode.value for mode in self.modes]), index)[:, None, :]
             if self.spec.action == "ramp":
-                sign = np.array([mode.sign for mode in self.modes])[index][:, None, None]
+                sign = num.take(np.array([mode.sign for mode in self.modes]), index)[:, None, None]
                 for kind in set(VECTOR) & {mode.kind for mode in self.modes} - {Kind.NOISE_JAM}:
                     ramping = ((view.last.kind == kind) & (kinds == kind))[:, None, None]
                     value = np.where(ramping, self._changed(kind, view.last.value, sign), value)
@@ -195,7 +195,7 @@ class ActionCodec:
         action = np.clip(np.asarray(action, np.float64), -1.0, 1.0)
         on, count = action[:, 0] > 0.0, len(self.carried)
         index = np.clip(np.ceil(action[:, 0] * count).astype(np.int64) - 1, 0, count - 1)
-        kinds, value, target = np.array(self.carried, np.int8)[index], num.zeros((len(action), *brief.granted.shape)), brief.granted
+        kinds, value, target = num.take(np.array(self.carried, np.int8), index), num.zeros((len(action), *brief.granted.shape)), brief.granted
         for kind in self.carried:
             mine = (kinds == kind)[:, None, None]
             value = np.where(mine, self._sent(kind, action[:, 1:], view), value)

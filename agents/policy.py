@@ -306,12 +306,12 @@ class PolicyAttack:
     def consider(self, plan: PolicyPlan, state: PolicyState, view: View, draws: Draws, always: bool = False) -> PolicyState:
         """A new decision in the rows where one is due; the others hold theirs."""
         due = (view.k - 1) % plan.action.spec.interval == 0
-        if not due.any():
+        if not num.some(due):
             return state
         chance = policy_draws(draws) if self.stochastic else None
         first = (view.k == 1)[:, None]
         seen = plan.observation.observe(view, state.seen)
-        if plan.observation.frames > 1 and first.any():
+        if plan.observation.frames > 1 and num.some(first):
             seen = np.where(first, plan.observation.observe(view), seen)
         read, memory = seen, state.memory
         if plan.network.lstm is not None and memory is not None:

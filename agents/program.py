@@ -10,6 +10,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from tailgate import num
 from tailgate.core import AIRED, Array, Command, Count, Kind, PositiveCount, Probability, View, no_command, param
 from tailgate.draws import Draws
 from tailgate.errors import InputError, NotApplicable, unknown
@@ -151,7 +152,7 @@ class Program:
         attacked, over = state.attacked, np.zeros(batch, bool)
         for i, ready in enumerate(plan.phases):
             here = state.phase == i
-            if not here.any():
+            if not num.some(here):
                 continue
             now, on, count = ready.trigger.step(ready.timing, state.trigger, view, draws)
             hit = draws.uniform(ready.target.shape, HIT) < ready.probability

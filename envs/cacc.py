@@ -118,7 +118,7 @@ class Law:
         mode = estimate.mode
         u, f = self._act(plan.normal, estimate.x, state.f, v2v)
         for other, tuned in ((Mode.WIDEN, plan.wide), (Mode.ACC, plan.local)):
-            if (mode == other).any():
+            if num.some(mode == other):
                 v, g = self._act(tuned, estimate.x, state.f, v2v)
                 u, f = np.where(mode == other, v, u), np.where(mode == other, g, f)
         u = limited(obeyed(u, mode), self.accel_min, self.accel_max)

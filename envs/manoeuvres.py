@@ -205,7 +205,7 @@ class StopAndGo:
         dt = plan
         phase, clock = state.phase, state.clock - dt
         done = phase_over(phase, clock, speed, self.low_speed, self.cruise_speed)
-        if done.any():
+        if num.some(done):
             u = draws.uniform()
             phase = np.where(done, (phase + 1) % 4, phase).astype(np.int8)
             fresh = np.where(phase == CRUISE, _within(self.cruise, u), _within(self.dwell, u))

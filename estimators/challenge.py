@@ -76,7 +76,7 @@ class ChallengeState(NamedTuple):
 
 def pick(mask: Array, chosen: Any, other: Any) -> Any:
     """The state `chosen` in the rows of `mask` (B, 1), else `other`."""
-    if not mask.any():
+    if not num.some(mask):
         return other
     return map_leaves(lambda a, b: np.where(mask.reshape(-1, *[1] * (a.ndim - 1)), a, b), chosen, other)
 

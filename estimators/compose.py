@@ -152,7 +152,7 @@ class Composed:
         innovation = plan.filter.innovation(plan.filter_plan, belief, received)
         detector, verdict = plan.detector.step(plan.detector_plan, state.detector, innovation)
         mitigation, decision = plan.mitigation.step(plan.mitigation_plan, state.mitigation, verdict, received)
-        if decision.forget is not None and decision.forget.any():
+        if decision.forget is not None and num.some(decision.forget):
             belief = plan.filter.forget(plan.filter_plan, belief, decision.forget)
         if decision.instead is not None or decision.forget is not None:
             y = received.y if decision.instead is None else decision.instead

@@ -49,7 +49,7 @@ class KalmanState(NamedTuple):
 
 def alone(S: Array, keep: Array) -> Array:
     """S with the covariances of the sensors that `keep` (B, N, q) leaves out set to zero: those that stay see their own marginal."""
-    if keep.all():
+    if num.every(keep):
         return S
     out = S * (keep[..., :, None] & keep[..., None, :])
     for i in range(S.shape[-1]):
@@ -166,7 +166,7 @@ class LinearFilter:
         if len(plan.A) > SMALL and state.P is not None and plan.held is None:
             return KalmanState(*num.corrected(plan.C, num.inverse(alone(S, accept)), state.x, state.P, r, accept))
         cross = self._cross(plan, state)
-        if not accept.all():  # multiplying by one would change no bit of the other rows
+        if not num.every(accept):  # multiplying by one would change no bit of the other rows
             keep = accept.astype(np.float64)
             cross = cross * keep[..., None]
             S = alone(S, accept)

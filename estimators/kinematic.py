@@ -125,7 +125,7 @@ class JointRegression:
         if self.threshold is None:
             return state
         changed = np.asarray((sums > self.threshold).any(axis=-1))
-        return self._restart(plan, state, changed) if changed.any() else state
+        return self._restart(plan, state, changed) if num.some(changed) else state
 
     def forget(self, plan: RegressionPlan, state: RegressionState, where: Array) -> RegressionState:
         return state._replace(fit=LINE.forget(plan.line, state.fit, where))

@@ -19,6 +19,7 @@ noise of 1, has 0.1. With 0.1 the braking platoon cannot follow its brakes: half
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from tailgate import num
 from tailgate.core import Array, Innovation, Positive, param
 from tailgate.registry import register
 
@@ -47,7 +48,7 @@ class LassoFilter(Lasso, DistributedFilter):
 
     def update(self, plan: Any, state: Any, innovation: Innovation, accept: Array) -> Any:
         r, S = innovation
-        if not accept.all():
+        if not num.every(accept):
             r, S = r * accept, alone(S, accept)
         solve = believed if self.solver == "exact" else believed_by_cvxpy
         return super().update(plan, state, Innovation(solve(r, S, self.price(S)), S), accept)

@@ -73,10 +73,10 @@ class Reacquire(GateOut):
         left, shut = self.shut(state.shut, verdict)
         rejected = np.where(received.valid, np.where(shut, state.rejected + 1, 0), state.rejected)
         due = received.valid & (rejected > self.after)
-        if due.any():
+        if num.some(due):
             rejected = np.where(due, 0, rejected)
             left = None if left is None else np.where(due, 0, left)
-        forget = np.asarray(due.any(axis=-1)) if due.any() else None
+        forget = np.asarray(due.any(axis=-1)) if num.some(due) else None
         return ReacquireState(left, rejected), Decision(received.valid & (~shut | due), quiet(verdict), forget=forget)
 
 

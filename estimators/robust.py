@@ -149,7 +149,7 @@ class RobustKalmanFilter(Solved, LinearFilter):
 
     def update(self, plan: KalmanPlan, state: KalmanState, innovation: Innovation, accept: Array) -> KalmanState:
         r, S = innovation
-        if not accept.all():
+        if not num.every(accept):
             r, S = r * accept, alone(S, accept)
         solve = believed if self.solver == "exact" else believed_by_cvxpy
         return super().update(plan, state, Innovation(solve(r, S, self.price(S)), S), accept)

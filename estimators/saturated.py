@@ -46,7 +46,7 @@ class SaturatedFilter(DistributedFilter):
 
     def update(self, plan: FusionPlan, state: Any, innovation: Innovation, accept: Array) -> Any:
         r, S = innovation
-        if not accept.all():
+        if not num.every(accept):
             r, S = r * accept, alone(S, accept)
         length = np.sqrt(num.quadratic(r, num.inverse(S)) / np.maximum(np.count_nonzero(accept, axis=-1), 1))
         keep = self.gamma / np.maximum(length, self.gamma)

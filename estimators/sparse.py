@@ -44,7 +44,7 @@ class SparseChiSquare(Stateless):
         score = num.quadratic(innovation.r, num.inverse(innovation.S))
         alarm = score > self.eta
         suspect = np.zeros(innovation.r.shape, bool)
-        if alarm.any():
+        if num.some(alarm):
             suspect[alarm] = ~self.trusted(plan, innovation.r[alarm], innovation.S[alarm])
         return None, Verdict(score, alarm, suspect)
 

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
 import numpy as np
 from safetensors.numpy import save as save_tensors
 
+from tailgate import num
 from tailgate.core import Array, Count, Estimate, Model, PositiveCount, Prior, Received, param
 from tailgate.draws import Draws
 from tailgate.errors import InputError, NotApplicable, unknown
@@ -217,7 +218,7 @@ class Steered:
 
     def _consider(self, plan: SteeredPlan, state: SteeredState, draws: Draws) -> SteeredState:
         new = state.member < 0
-        if new.any():
+        if num.some(new):
             some = len(plan.networks)
             drawn = (draws.uniform((), TAG) * some).astype(np.int64) if some > 1 else np.zeros(len(new), np.int64)
             state = state._replace(member=np.where(new, np.minimum(drawn, some - 1), state.member))
@@ -226,7 +227,7 @@ class Steered:
     def _chosen(self, plan: SteeredPlan, state: SteeredState) -> SteeredState:
         """The knobs after a decision, in the rows where one is due."""
         due = state.k % self.menu_used.interval == 0
-        if not due.any():
+        if not num.some(due):
             return state
         chosen = np.zeros(len(due), np.int64)
         for i, network in enumerate(plan.networks):

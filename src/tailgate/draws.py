@@ -15,6 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tailgate import kernels, num
+from tailgate.engine import elementary
+from tailgate.engine.array import Traced
 from tailgate.errors import InputError
 
 Array = NDArray[Any]
@@ -75,9 +77,17 @@ class Draws(NamedTuple):
 
     def _fill(self, fill: Any, shape: tuple[int, ...], tag: int) -> Array:
         size = math.prod(shape)
+        if isinstance(self.key, Traced):
+            return self._traced(fill is kernels.fill_normal, size, tag).reshape(len(self.key), *shape)
         out = np.empty((size, len(self.key)))
         fill(np.ascontiguousarray(self.key), self.episode, self.step, self.stream << 16 | tag, out)
         return num.last_to_first(out.reshape(*shape, len(self.key)))
+
+    def _traced(self, normal: bool, size: int, tag: int) -> Any:
+        pair = elementary.normal_pair if normal else elementary.uniform_pair
+        counters = (self.key, self.episode.astype(np.uint64), self.step.astype(np.uint64), np.uint64(self.stream << 16 | tag))
+        out = [number for block in range((size + 1) // 2) for number in pair(*counters, np.uint64(block))][:size]
+        return np.stack(out, axis=-1) if out else np.zeros((len(self.key), 0))
 
     def normal(self, shape: tuple[int, ...] = (), tag: int = 0) -> Array:
         """Standard normals (B, *shape)."""

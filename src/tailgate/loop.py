@@ -39,6 +39,7 @@ from tailgate.core import (
     pair_of,
 )  # fmt: skip
 from tailgate.draws import Keys, Role
+from tailgate.engine.array import Traced
 from tailgate.errors import InputError, NotApplicable
 from tailgate.link import Link, LinkState
 from tailgate.threat import Brief, Channel, ChannelPlan, ChannelState, ThreatModel
@@ -57,22 +58,18 @@ def check_estimate(estimate: Estimate, model: Model, batch: int, k: Array) -> No
     }  # fmt: skip
     for name, (size, kinds) in wanted.items():
         value = getattr(estimate, name, None)
-        if not isinstance(value, np.ndarray) or value.shape != size or value.dtype.kind not in kinds:
-            got = f"{value.dtype} {value.shape}" if isinstance(value, np.ndarray) else type(value).__name__
+        if not isinstance(value, (np.ndarray, Traced)) or value.shape != size or value.dtype.kind not in kinds:
+            got = f"{value.dtype} {value.shape}" if isinstance(value, (np.ndarray, Traced)) else type(value).__name__
             raise InputError(f"defence output {name}", got, f"an array of shape {size}, kind {kinds!r}")
-        if kinds == "f" and not (finite := np.isfinite(value)).all():
-            rows = np.flatnonzero(~finite.all(axis=tuple(range(1, finite.ndim))))
-            found = f"NaN or infinity in step {k[rows[0]]}, in {len(rows)} of {batch} rows, the first of them row {rows[0]}"
-            error = InputError(f"defence output {name}", found, "finite numbers")
-            error.row = int(rows[0])
-            raise error
+        if kinds == "f":
+            num.demand(np.isfinite(value), f"defence output {name}", "NaN or infinity", "finite numbers", k)
     if estimate.limits is not None:
         size = (*shape, len(model.actuators), 2)
-        if estimate.limits.shape != size or not (estimate.limits[..., 0] <= estimate.limits[..., 1]).all():
+        if estimate.limits.shape != size:
             raise InputError("defence output limits", estimate.limits.shape, f"an array of shape {size}, the lower limits first")
-    if ((estimate.mode < 0) | (estimate.mode >= len(Mode))).any():
-        known = ", ".join(f"{m.value} ({m.name})" for m in Mode)
-        raise InputError("defence output mode", np.unique(estimate.mode).tolist(), f"one of {known}")
+        num.demand(estimate.limits[..., 0] <= estimate.limits[..., 1], "defence output limits", "limits", "the lower limits first", k)
+    known = ", ".join(f"{m.value} ({m.name})" for m in Mode)
+    num.demand((estimate.mode >= 0) & (estimate.mode < len(Mode)), "defence output mode", "another number", f"one of {known}", k)
 
 
 class LoopPlan(NamedTuple):

@@ -9,10 +9,10 @@ runs along the batch.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import cache
 from importlib import import_module
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,12 +20,100 @@ from numpy.typing import NDArray
 from tailgate import kernels, linear
 from tailgate.elementwise import clip as clip
 from tailgate.elementwise import select as select
+from tailgate.engine import elementary, matrices
+from tailgate.engine.array import Traced
+from tailgate.errors import InputError
 
 Array = NDArray[Any]
 
-exp = kernels.exp
-log = kernels.log
-tanh = kernels.tanh
+
+def exp(x: Any) -> Any:
+    """e to the power x."""
+    return elementary.exp(x) if isinstance(x, Traced) else kernels.exp(x)
+
+
+def log(x: Any) -> Any:
+    """The natural logarithm."""
+    return elementary.log(x) if isinstance(x, Traced) else kernels.log(x)
+
+
+def tanh(x: Any) -> Any:
+    """The hyperbolic tangent."""
+    return elementary.tanh(x) if isinstance(x, Traced) else kernels.tanh(x)
+
+
+# -- what plain code asks of a batch, and traced code answers for every episode
+
+
+def some(mask: Any) -> bool:
+    """Is any of it true? A hint: what follows may be done for all rows, and is where they are traced. So the others keep their bits."""
+    return bool(mask.values().any()) if isinstance(mask, Traced) and mask.fixed else isinstance(mask, Traced) or bool(mask.any())
+
+
+def every(mask: Any) -> bool:
+    """Is all of it true? A hint, as `some`: what follows spares work that would change no bit."""
+    return bool(mask.values().all()) if isinstance(mask, Traced) and mask.fixed else not isinstance(mask, Traced) and bool(mask.all())
+
+
+def present(values: Any, candidates: Iterable[int]) -> list[int]:
+    """The candidates that are among some whole numbers: all of them where these are traced."""
+    if isinstance(values, Traced) and not values.fixed:
+        return list(candidates)
+    held = set((values.values() if isinstance(values, Traced) else values).ravel().tolist())
+    return [one for one in candidates if one in held]
+
+
+def ring_get(ring: Array, place: Any) -> Any:
+    """ring[..., place] of a ring (B, ..., L) and whole numbers that broadcast to (B, ...)."""
+    if not isinstance(ring, Traced):
+        return np.take_along_axis(ring, np.broadcast_to(place, ring.shape[:-1])[..., None], axis=-1)[..., 0]
+    out = ring[..., 0]
+    for i in range(1, ring.shape[-1]):
+        out = np.where(place == i, ring[..., i], out)
+    return out
+
+
+def ring_put(ring: Array, place: Any, value: Any) -> Any:
+    """A ring (B, ..., L) with `value` (B, ...) at `place`, which broadcasts to (B, ...)."""
+    if isinstance(ring, Traced):
+        return np.stack([np.where(place == i, value, ring[..., i]) for i in range(ring.shape[-1])], axis=-1)
+    out = ring.copy(order="K")
+    np.put_along_axis(out, np.broadcast_to(place, ring.shape[:-1])[..., None], np.asarray(value)[..., None], axis=-1)
+    return out
+
+
+def ring_next(place: Any, size: int) -> Any:
+    """The place behind one in a ring of a size."""
+    return np.where(place + 1 == size, 0, place + 1)
+
+
+def demand(condition: Any, field: str, found: str, wanted: str, k: Any) -> None:
+    """Raise InputError unless a condition (B, ...) holds in all rows, which are at steps k (B,). Traced code asks after its step."""
+    if isinstance(condition, Traced):
+        rows = condition.reshape(len(condition), -1).all(axis=1)
+        condition.graph.demands.append((field, found, wanted, rows.nodes[0]))
+    elif not condition.all():
+        raise broken(~condition.reshape(len(condition), -1).all(axis=1), field, found, wanted, k)
+
+
+def broken(rows: Array, field: str, found: str, wanted: str, k: Array) -> InputError:
+    """The error of rows (B,) bool at steps k (B,) in which a demand does not hold."""
+    first = int(np.flatnonzero(rows)[0])
+    where = f"{found} in step {k[first]}, in {np.count_nonzero(rows)} of {len(rows)} rows, the first of them row {first}"
+    error = InputError(field, where, wanted)
+    error.row = first
+    return error
+
+
+def take(table: Array, index: Any) -> Any:
+    """table[index] of a table (K, ...) and whole numbers from 0 to K - 1."""
+    if not isinstance(index, Traced):
+        return table[index]
+    wide = index[(..., *(None,) * (table.ndim - 1))]
+    out: Any = np.broadcast_to(table[0], (*index.shape, *table.shape[1:]))
+    for k in range(1, len(table)):
+        out = np.where(wide == k, table[k], out)
+    return out
 
 
 @cache
@@ -86,6 +174,11 @@ def matmul(x: Array, y: Array) -> Array:
 
     One matrix x for a whole batch, or one (N, i, k) for each agent of it: its structural zeros count for nothing, whatever y holds there.
     """
+    if isinstance(x, Traced) or isinstance(y, Traced):
+        alike = not isinstance(x, Traced) or x.fixed
+        if alike and y.ndim > 3 and (x.ndim == 2 or (x.ndim == 3 and x.shape[0] in (1, *y.shape[1:-2]))):
+            return cast(Array, matrices.constant_times(x, y))
+        return cast(Array, matrices.product(x, y))
     fixed = _constant(x)
     if y.ndim > 3 and (fixed is not None or (x.ndim == 3 and x.shape[:1] == y.shape[1:-2])):
         flat = _last(y)
@@ -153,6 +246,8 @@ def inverse(s: Array) -> Array:
         out[..., 1, 1] = a * scale
         out[..., 0, 1] = out[..., 1, 0] = -b * scale
         return out
+    if isinstance(s, Traced):
+        return cast(Array, matrices.inverse(s))
     flat = _last(s if s.ndim > 2 else s[None])
     out = np.empty_like(flat)
     _lanes().invert_each(flat, out)

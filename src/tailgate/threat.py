@@ -217,18 +217,18 @@ class Channel:
         """
         threat, kind, aimed = plan.threat, command.kind, command.target.any(axis=(1, 2))
         charged = (kind != NONE) & aimed
-        if charged.any():
+        if num.some(charged):
             charged = charged & self._legal(plan, command) & self.allowed(plan, state, k)
         refused = ((kind != NONE) | aimed) & ~charged
 
         hit = command.target & charged[:, None, None]
         kind = np.where(charged, kind, 0).astype(np.int8)
         q, value = plan.sensors, command.value
-        if plan.air and (aired := _ON_AIR[kind]).any():  # who reaches a receiver over the air reaches all that it reads
+        if plan.air and num.some(aired := num.take(_ON_AIR, kind)):  # who reaches a receiver over the air reaches all that it reads
             strength = np.max(np.where(hit, value, 0.0), axis=2, keepdims=True)
             whole = aired[:, None, None] & hit.any(axis=2, keepdims=True) & (np.arange(hit.shape[2]) < q)
             hit, value = hit | whole, np.where(whole, strength, value)
-        valued = _VALUED[kind][:, None, None]
+        valued = num.take(_VALUED, kind)[:, None, None]
         last = Command(kind, hit, np.where(hit & valued, value, 0.0))
         begins_to_hold = np.asarray(k) == threat.onset if threat.hold_from_onset else charged & (state.used == 0)
         ended = (state.burst > 0) & ~charged
@@ -237,15 +237,14 @@ class Channel:
         state = state._replace(
             used=state.used + charged, burst=np.where(charged, state.burst + 1, 0), cooldown=cooldown, last=last,
         )  # fmt: skip
-        if begins_to_hold.any():
+        if num.some(begins_to_hold):
             state = state._replace(links=_hold(state.links, begins_to_hold), drives=_hold(state.drives, begins_to_hold))
-        begins = np.flatnonzero((kind == REPLAY) & (state.played == 0))
-        if len(begins):
-            anchor = state.anchor.copy()
-            anchor[begins] = state.taped[begins]
+        begins = (kind == REPLAY) & (state.played == 0)
+        if plan.kinds[REPLAY] and num.some(begins):
+            anchor = np.where(begins, state.taped, state.anchor)
             state = state._replace(anchor=anchor, links=_copy_tape(state.links, begins), drives=_copy_tape(state.drives, begins))
         heard, under = sent, received
-        if again is not None and _RADIATED[kind].any():
+        if again is not None and num.some(num.take(_RADIATED, kind)):
             under, left = again(self._radiated(plan, last)), (kind == DOS_JAM)[:, None, None]
             under = under._replace(valid=np.where(left, received.valid, under.valid))  # what a jammer leaves is read where anything is
             heard = num.stack([under.y[..., i] for i in range(q)] + [sent[..., i] for i in range(q, sent.shape[-1])])
@@ -255,7 +254,7 @@ class Channel:
             y=links[..., :q], valid=under.valid & ~lost[..., :q], v2v=links[..., q:], attacked=hit[..., :q]
         )
         good = sent
-        if not received.valid.all():  # a muted sensor's nothing is no sample: the last one stands for it
+        if not num.every(received.valid):  # a muted sensor's nothing is no sample: the last one stands for it
             good = sent.copy(order="K")
             good[..., :q] = np.where(received.valid, sent[..., :q], state.links.fresh[..., :q])
         return state._replace(links=self._keep(plan, state, state.links, good, hit[..., : sent.shape[-1]])), out, links, refused
@@ -274,10 +273,10 @@ class Channel:
         """(B,) bool: kind, targets and values are granted."""
         kind, value = command.kind, command.value
         known = (kind >= 0) & (kind < len(plan.kinds))
-        legal = known & plan.kinds[np.where(known, kind, 0)]
+        legal = known & num.take(plan.kinds, np.where(known, kind, 0))
         ok = plan.granted
         with np.errstate(invalid="ignore"):
-            for one in set(kind.tolist()):
+            for one in num.present(kind, np.flatnonzero(plan.kinds).tolist()):
                 fits = self._fits(plan, one, value)
                 ok = ok if fits is None else ok & ((kind != one)[:, None, None] | fits)
         return np.asarray(legal & ~(command.target & ~ok).any(axis=(1, 2)))
@@ -309,7 +308,8 @@ class Channel:
         """What arrives of `sent` (B, N, .), the part `wires` of all wires, under the command in force."""
         command, out = state.last, sent
         target, value = command.target[..., wires], command.value[..., wires]
-        for kind in sorted(set(command.kind[target.any(axis=(1, 2))].tolist()) - set(AIRED)):
+        known = [kind for kind in np.flatnonzero(plan.kinds).tolist() if kind not in AIRED]
+        for kind in num.present(np.where(target.any(axis=(1, 2)), command.kind, NONE), known):
             hit = target & (command.kind == kind)[:, None, None]
             if kind == DOS_JAM:
                 changed = value
@@ -330,16 +330,14 @@ class Channel:
             ring, last = memory.tape, state.anchor[:, None, None] + state.played[:, None, None] % span
         else:
             ring, last = memory.history, state.taped[:, None, None]
-        return np.asarray(np.take_along_axis(ring, ((last - span) % plan.recorded)[..., None], axis=-1)[..., 0])
+        return num.ring_get(ring, (last - span) % plan.recorded)
 
     def _keep(self, plan: ChannelPlan, state: ChannelState, memory: Memory, sent: Array, hit: Array) -> Memory:
         """The memory after this step's `sent` (B, N, .), of which `hit` was attacked."""
         history = memory.history
         if plan.recorded:
-            rows = np.arange(len(sent))
-            history = history.copy(order="K")
-            history[rows, :, :, state.taped % plan.recorded] = sent
-        return memory._replace(fresh=np.where(hit, memory.fresh, sent) if hit.any() else sent, history=history)
+            history = num.ring_put(history, (state.taped % plan.recorded)[:, None, None], sent)
+        return memory._replace(fresh=np.where(hit, memory.fresh, sent) if num.some(hit) else sent, history=history)
 
 
 def _hold(memory: Memory, rows: Array) -> Memory:
@@ -348,7 +346,5 @@ def _hold(memory: Memory, rows: Array) -> Memory:
 
 
 def _copy_tape(memory: Memory, rows: Array) -> Memory:
-    """The memory with the recording of `rows` (R,) copied for a replay: the recorder itself runs on."""
-    tape = memory.tape.copy(order="K")
-    tape[rows] = memory.history[rows]
-    return memory._replace(tape=tape)
+    """The memory with the recording of `rows` (B,) bool copied for a replay: the recorder itself runs on."""
+    return memory._replace(tape=np.where(rows[:, None, None, None], memory.history, memory.tape))

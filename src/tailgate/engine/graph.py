@@ -64,6 +64,7 @@ class Graph:
 
     def __init__(self) -> None:
         self.nodes: list[Node] = []
+        self.demands: list[tuple[str, str, str, Node]] = []  # what has to hold: field, what else is found, what is wanted
         self._known: dict[Any, Node] = {}
         self._values: dict[int, Any] = {}  # of fixed nodes
 
