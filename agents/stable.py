@@ -189,8 +189,10 @@ class StableLearner:
             self._restore_model(tensors, facts)
             self._restore_batch(tensors)
             self.restore({name[5:]: tensor.numpy().copy() for name, tensor in tensors.items() if name.startswith("held.")})
-            words = tensors["numpy"].numpy().view(np.uint32)
-            np.random.set_state(("MT19937", words, facts["numpy_position"], 0, 0.0))  # noqa: NPY002 - see save
+            words, position = tensors["numpy"].numpy().view(np.uint32).reshape(624), int(facts["numpy_position"])
+            if not 0 <= position <= len(words):  # numpy takes any, and reads behind its words
+                raise ValueError(f"numpy_position {position}")
+            np.random.set_state(("MT19937", words, position, 0, 0.0))  # noqa: NPY002 - see save
             torch.set_rng_state(tensors["torch"])
             self.curve = facts["curve"]
             self.ended.extend((bool(crashed), float(reward)) for crashed, reward in facts["ended"])

@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from safetensors import safe_open
+from safetensors.numpy import save_file
 
 from tailgate import cli, comparison, train
 from tailgate.agents.cem import Config as CemConfig
@@ -71,7 +73,7 @@ def test_a_checkpoint_is_written_on_the_way(tmp_path: Path) -> None:
     assert seen == [False, False, True, True]  # after two updates, when the third rollout starts
 
 
-@pytest.mark.parametrize("damage", ["empty", "cut", "foreign", "other seed", "other environment"])
+@pytest.mark.parametrize("damage", ["empty", "cut", "foreign", "other seed", "other environment", "few words", "far position"])
 def test_a_checkpoint_that_does_not_fit_is_refused(tmp_path: Path, damage: str) -> None:
     path = tmp_path / "c.safetensors"
     learner = _learner()
@@ -86,8 +88,17 @@ def test_a_checkpoint_that_does_not_fit_is_refused(tmp_path: Path, damage: str) 
         path.write_bytes(learner.export(tmp_path / "p", {}).with_suffix(".safetensors").read_bytes())
     elif damage == "other seed":
         other = _learner(4)
-    else:
+    elif damage == "other environment":
         other = _learner(value=-3.0)
+    else:  # of numpy's generator
+        with safe_open(path, "np") as file:
+            facts = json.loads(file.metadata()["facts"])
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
+        if damage == "few words":
+            tensors["numpy"] = tensors["numpy"][:1]
+        else:
+            facts["numpy_position"] = 10**6
+        save_file(tensors, path, {"facts": json.dumps(facts)})
     with pytest.raises(InputError, match="checkpoint"):
         other.load(path)
 
@@ -193,7 +204,9 @@ def test_the_final_comparison_begins_at_the_episode_that_is_named(here: Path, sm
     assert len(hashes) == 1 and not set(wanted[0]) & set(wanted[1000])
 
 
-def test_decisions_beyond_those_that_were_asked_for_are_said(here: Path, capsys: pytest.CaptureFixture[str], small_run: tuple[str, ...]) -> None:
+def test_decisions_beyond_those_that_were_asked_for_are_said(
+    here: Path, capsys: pytest.CaptureFixture[str], small_run: tuple[str, ...]
+) -> None:
     """Rollouts are 640 decisions here; what was asked for exactly is not worth a word."""
     assert cli.main(["train", *small_run, "steps=1300"]) == 0
     assert "1,920 decisions a seed (1,300 asked for)" in " ".join(capsys.readouterr().err.split())
@@ -243,7 +256,16 @@ def test_a_preset_may_change_another(tmp_path: Path) -> None:
 def test_the_command_trains_on_every_system(here: Path, tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]) -> None:
     """Policy, comparison by the system's own outcome, yoked twin and page; the policy plays in an evaluation of its scenario."""
     config = train.load_config(name, [])
-    small = ["steps=560", "ppo.envs=16", "ppo.rollout=35", "ppo.batch_size=140", "ppo.epochs=1", "episodes=6", f"rivals=['{config.rivals[0]}']", "others=[]"]
+    small = [
+        "steps=560",
+        "ppo.envs=16",
+        "ppo.rollout=35",
+        "ppo.batch_size=140",
+        "ppo.epochs=1",
+        "episodes=6",
+        f"rivals=['{config.rivals[0]}']",
+        "others=[]",
+    ]
     assert cli.main(["train", "--config", name, *small, "tensorboard=false", "workers=1", "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
     assert report["outcome"] == SYSTEMS[name] and report["attacks"][0]["label"] == "no attack"
