@@ -195,7 +195,8 @@ class ActionCodec:
         action = np.clip(np.asarray(action, np.float64), -1.0, 1.0)
         on, count = action[:, 0] > 0.0, len(self.carried)
         index = np.clip(np.ceil(action[:, 0] * count).astype(np.int64) - 1, 0, count - 1)
-        kinds, value, target = num.take(np.array(self.carried, np.int8), index), num.zeros((len(action), *brief.granted.shape)), brief.granted
+        kinds = num.take(np.array(self.carried, np.int8), index)
+        value, target = num.zeros((len(action), *brief.granted.shape)), brief.granted
         for kind in self.carried:
             mine = (kinds == kind)[:, None, None]
             value = np.where(mine, self._sent(kind, action[:, 1:], view), value)

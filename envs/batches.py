@@ -1,4 +1,4 @@
-"""Episodes that an environment plays side by side, in either engine: the same decisions, rewards and observations to the last bit."""
+"""Episodes that an environment plays side by side, in any engine: the same decisions, rewards and observations to the last bit."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 from tailgate import sizes
 from tailgate.core import Array, Frame, View
 from tailgate.draws import Keys
+from tailgate.engine.seats import Rows, SeatPrograms, Untraced, programs_of
 from tailgate.errors import InputError, unknown
 from tailgate.fused import Refused
 from tailgate.fused.cockpit import Cockpit, fuse_seat
@@ -19,7 +20,8 @@ from tailgate.tree import leaves, with_leaves
 from .seat import Outcome, Seat, Tally
 from .shadow import Begun, Decided, Shadow
 
-ENGINES = ("auto", "fused", "plain")
+ENGINES = ("auto", "fused", "traced", "plain")
+WORTH = 16  # rows for which auto traces what the fused engine does not play
 
 
 class Facts(NamedTuple):
@@ -74,22 +76,28 @@ def framed(now: Array, before: Array | None, frames: int) -> Array:
     return np.tile(now, frames) if before is None else np.concatenate([now, before[:, : -now.shape[1]]], axis=1)
 
 
-def side_by_side(seat: Seat, engine: str = "auto", drawn: bool = False, threads: int = 1) -> Episodes:
-    """Choose the engine; auto: fused where it is possible. `drawn`: pictures may be asked for.
+def side_by_side(seat: Seat, engine: str = "auto", drawn: bool = False, threads: int = 1, rows: int = WORTH) -> Episodes:
+    """Choose the engine; auto: fused where it is possible, else traced, else plain. `drawn`: pictures may be asked for.
 
-    The fused engine plays 2048 episodes and more to each of several `threads`.
+    The fused engine plays 2048 episodes and more to each of several `threads`. Tracing takes some tenths of a second: auto traces for
+    environments of at least `WORTH` rows.
     """
     sizes.check("threads", threads)
     if engine not in ENGINES:
         raise unknown("engine", engine, ENGINES)
-    if engine == "plain":
-        return PlainEpisodes(seat)
-    constants = fuse_seat(seat)
-    if isinstance(constants, Refused):
+    if engine in ("auto", "fused"):
+        constants = fuse_seat(seat)
+        if not isinstance(constants, Refused):
+            return FusedEpisodes(seat, constants, threads, drawn)
         if engine == "fused":
-            raise InputError("engine", engine, f"plain, or auto: {constants.why}")
-        return PlainEpisodes(seat)
-    return FusedEpisodes(seat, constants, threads, drawn)
+            raise InputError("engine", engine, f"traced, plain or auto: {constants.why}")
+    if engine == "traced" or (engine == "auto" and rows >= WORTH):
+        programs = programs_of(seat)
+        if not isinstance(programs, Untraced):
+            return TracedEpisodes(programs, drawn)
+        if engine == "traced":
+            raise InputError("engine", engine, f"plain or auto: {programs.why}")
+    return PlainEpisodes(seat)
 
 
 class PlainEpisodes:
@@ -169,6 +177,83 @@ class PlainEpisodes:
         if self._looked is None or self._looked[0] is not self._state:  # observation, information and mask are of one look
             self._looked = self._state, self.seat.loop.sense(self._state)
         return self._looked[1]
+
+
+class TracedEpisodes:
+    """The traced engine, on the plain loop's own state. Where pictures may be `drawn` it notes decisions, as the fused engine does."""
+
+    engine = "traced"
+
+    def __init__(self, programs: SeatPrograms, drawn: bool = False) -> None:
+        self.programs, self._drawn = programs, drawn
+        self.rows: Rows | None = None
+        self.shadow: Shadow | None = None
+
+    @property
+    def number(self) -> Array:
+        return self._rows.state.get_leaf("loop.keys.episode")
+
+    def begin(self, keys: Keys) -> None:
+        self.rows = Rows(self.programs, len(keys.key))
+        self.rows.begin(np.ones(len(keys.key), bool), keys)
+        self.shadow = Shadow(self.programs.seat, keys) if self._drawn else None
+
+    def again(self, rows: Array, keys: Keys | None = None, reset: bool = False) -> None:
+        self._rows.begin(rows, keys)
+        if self.shadow is not None:
+            self.shadow.add(Begun(rows, keys, reset))
+        elif self._drawn and rows.all():
+            held = self._rows.state.get_leaf
+            self.shadow = Shadow(self.programs.seat, Keys(held("loop.keys.key"), held("loop.keys.episode")))
+
+    def decide(self, actions: Array, over: Array, restart: bool) -> Outcome:
+        self._rows.decide(actions, over, over & restart)
+        if self.shadow is not None:
+            self.shadow.add(Decided(actions.copy(), over, restart))
+        return self._rows.outcome()
+
+    def end(self, rows: Array) -> None:
+        pass  # who is over is said with each decision
+
+    def seen(self) -> Array:
+        return self._rows.brought["seen"]
+
+    def facts(self) -> Facts:
+        brought = self._rows.brought
+        return Facts(brought["allowed"], brought["k"], brought["damage"])
+
+    def mask(self) -> Array:
+        return self._rows.brought["mask"]
+
+    def held(self) -> dict[str, Array]:
+        return self._rows.held()
+
+    def put(self, held: dict[str, Array]) -> None:
+        self._rows.put(held)
+        self.shadow = None  # nobody knows what was decided before
+
+    def drawn(self, row: int) -> tuple[LoopState, Frame | None, int]:
+        if self.shadow is None:
+            raise InputError("render", "episodes that were put back", "reset() first")
+        return *self.shadow.look(row, PlainEpisodes), 0
+
+    def __getstate__(self) -> dict[str, Any]:
+        held = None if self.rows is None else (self.rows.batch, self.rows.held(), self.rows.brought)
+        return {"seat": self.programs.seat, "drawn": self._drawn, "held": held, "shadow": self.shadow}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__init__(SeatPrograms(state["seat"]), state["drawn"])  # type: ignore[misc]
+        if state["held"] is not None:
+            batch, held, brought = state["held"]
+            self.rows = Rows(self.programs, batch)
+            self.rows.put(held)
+            self.rows.brought = brought
+        self.shadow = state["shadow"]
+
+    @property
+    def _rows(self) -> Rows:
+        assert self.rows is not None
+        return self.rows
 
 
 class FusedEpisodes:

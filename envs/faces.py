@@ -68,7 +68,7 @@ class AdversaryVectorEnv(Specified, gymnasium.vector.VectorEnv[Array, Array, Arr
         self.single_action_space = action_space(self.seat.action)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self.episodes = side_by_side(self.seat, engine, render_mode is not None, threads)
+        self.episodes = side_by_side(self.seat, engine, render_mode is not None, threads, num_envs)
         self.begun = False
         self.over = np.zeros(num_envs, bool)
         self._frames = self.seat.observation.frames
@@ -79,7 +79,7 @@ class AdversaryVectorEnv(Specified, gymnasium.vector.VectorEnv[Array, Array, Arr
 
     @property
     def engine(self) -> str:
-        """Who plays: fused or plain. What is played is the same."""
+        """Who plays: fused, traced or plain. What is played is the same."""
         return self.episodes.engine
 
     @property

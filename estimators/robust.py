@@ -55,12 +55,35 @@ def _single(r: Array, S: Array, half: Array) -> Array:
 
 
 def _pair(r: Array, S: Array, W: Array, half: Array) -> Array:
-    """Two sensors, compiled: r and lam/2 (B, N, 2), S and W (B, N, 2, 2)."""
-    one = slice(None, 1) if S.strides[0] == 0 else slice(None)  # the same for the whole batch
-    given = (np.ascontiguousarray(num.first_to_last(x)) for x in (r, S[one], W[one], half))
-    y = num.zeros(r.shape)
-    linear.pair_each(*given, num.first_to_last(y))
-    return y
+    """Two sensors in closed form: r and lam/2 (B, N, 2), S and W (B, N, 2, 2).
+
+    Nothing is an outlier, or both are, with one of four pairs of signs s and y = S (s lam) / 2, or one is.
+    """
+    (r0, r1), (half0, half1) = (r[..., 0], r[..., 1]), (half[..., 0], half[..., 1])
+    (S00, S01), (S10, S11) = ((S[..., i, 0], S[..., i, 1]) for i in (0, 1))
+    (W00, W01), (W10, W11) = ((W[..., i, 0], W[..., i, 1]) for i in (0, 1))
+    out0, out1, best = r0, r1, np.full(r0.shape, -np.inf)
+    for s0, s1 in ((1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0)):
+        price0, price1 = s0 * half0, s1 * half1
+        y0, y1 = S00 * price0 + S01 * price1, S10 * price0 + S11 * price1
+        left0, left1 = price0 - (W00 * y0 + W01 * y1), price1 - (W10 * y0 + W11 * y1)
+        y0, y1 = y0 + (S00 * left0 + S01 * left1), y1 + (S10 * left0 + S11 * left1)  # mends the rounding
+        least = np.minimum(s0 * (r0 - y0), s1 * (r1 - y1))  # negative where a sign is wrong
+        out0, out1 = np.where(least > best, y0, out0), np.where(least > best, y1, out1)
+        best = np.maximum(least, best)
+    one = _within(r0, (-half0 - W01 * r1) / W00, (half0 - W01 * r1) / W00)
+    alone0 = np.abs(W10 * one + W11 * r1) <= half1
+    out0, out1 = np.where(alone0, one, out0), np.where(alone0, r1, out1)
+    one = _within(r1, (-half1 - W10 * r0) / W11, (half1 - W10 * r0) / W11)
+    alone1 = np.abs(W00 * r0 + W01 * one) <= half0
+    out0, out1 = np.where(alone1, r0, out0), np.where(alone1, one, out1)
+    found = (np.abs(W00 * r0 + W01 * r1) > half0) | (np.abs(W10 * r0 + W11 * r1) > half1)
+    return np.where(found[..., None], num.stack([out0, out1]), r)
+
+
+def _within(x: Array, low: Array, high: Array) -> Array:
+    x = np.where(x <= low, low, x)
+    return np.where(x >= high, high, x)
 
 
 def _pivot(r: Array, S: Array, W: Array, half: Array, rows: tuple[Array, ...]) -> Array:

@@ -45,19 +45,19 @@ class SparseChiSquare(Stateless):
         alarm = score > self.eta
         suspect = np.zeros(innovation.r.shape, bool)
         if num.some(alarm):
-            suspect[alarm] = ~self.trusted(plan, innovation.r[alarm], innovation.S[alarm])
+            suspect = alarm[..., None] & ~self.trusted(plan, innovation.r, innovation.S)
         return None, Verdict(score, alarm, suspect)
 
     def trusted(self, plan: Array, r: Array, S: Array) -> Array:
-        """(M, q) bool: who is left of M alarms with r (M, q) and S (M, q, q). A reading that is missing has r = 0 and goes last."""
+        """(B, N, q) bool: who is left after alarms of r (B, N, q) and S (B, N, q, q). A reading that is missing has r = 0 and goes last."""
         keep, sensors = np.ones(r.shape, bool), np.arange(r.shape[-1])
         for _ in sensors:
             W = num.inverse(alone(S, keep))
             pull = num.matvec(W, r * keep)
             g = num.dot(r * keep, pull)
-            guilty = g > plan[np.count_nonzero(keep, axis=-1)]
+            guilty = g > num.take(plan, np.count_nonzero(keep, axis=-1))
             fall = np.where(keep, pull * pull / W.diagonal(axis1=-2, axis2=-1), -1.0)
-            keep = keep & ~(guilty[:, None] & (sensors == np.argmax(fall, axis=-1)[:, None]))
+            keep = keep & ~(guilty[..., None] & (sensors == np.argmax(fall, axis=-1)[..., None]))
         return keep
 
     def gate(self, plan: Array, state: Any) -> float:

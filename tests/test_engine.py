@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tailgate.engine.graph import BOOL, COMPARISONS, DTYPES, FLOAT, Graph, Node, evaluate
-from tailgate.engine.program import Memory, Program, Trace
+from tailgate.engine.program import Call, Program, State, Trace
 
 SPECIAL = np.array([0.0, -0.0, 1.0, -1.0, 0.5, 1e-310, -5e-324, 1e308, -1e308, np.inf, -np.inf, np.nan, 2.0**63, -(2.0**63), 3.7, 255.5])
 FLOATS, INTS = [d for d in DTYPES if d.kind == "f"], [d for d in DTYPES if d.kind in "iu"]
@@ -123,18 +123,19 @@ def test_random_graphs(seed: int) -> None:
             graph = trace.graph
             if values:  # what the reference goes by
                 graph._values = {node.id: values[node.attr] for node in uniforms}
-            memory = Memory(program, batch)
-            memory.uniforms[:] = program.uniforms(values)
+            memory = State(program, batch)
+            call = Call(program, memory)
+            call.uniforms[:] = program.uniforms(values)
             state = {name: numbers(chance, dtype, 2 * batch).reshape(batch, 2) for name, dtype in shapes.items()}
             memory.put(state)
             for _ in range(3):
                 given: dict[Any, np.ndarray] = {}
                 for name, nodes in trace.arguments.items():
-                    held = memory.argument(name)[0]
+                    held = call.arguments[name]
                     held[...] = numbers(chance, held.dtype, held.size).reshape(held.shape)
                     given |= {node.attr: held[:, i] for i, node in enumerate(nodes.flat)}
                 given |= {node.attr: state[name][:, i] for name, (nodes, _) in trace.state.items() for i, node in enumerate(nodes.flat)}
-                memory.step()
+                results = call()
                 after = {name: evaluate(graph, list(new.flat), given) for name, (_, new) in trace.state.items()}
                 held_state = memory.get(state)
                 for name, columns in after.items():
@@ -142,5 +143,5 @@ def test_random_graphs(seed: int) -> None:
                     assert same(held_state[name], wanted), (lanes, batch, name)
                 for name, nodes in trace.results.items():
                     for i, column in enumerate(evaluate(graph, list(nodes.flat), given)):
-                        assert same(memory.result(name)[0][:, i], np.asarray(column)), (lanes, batch, name, i, nodes.flat[i])
+                        assert same(results[name][:, i], np.asarray(column)), (lanes, batch, name, i, nodes.flat[i])
                 state = held_state

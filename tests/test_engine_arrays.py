@@ -11,7 +11,7 @@ import pytest
 from tailgate.engine import functions
 from tailgate.engine.array import Traced
 from tailgate.engine.graph import FLOAT, Graph
-from tailgate.engine.program import Memory, Program, traced
+from tailgate.engine.program import Call, Program, State, traced
 from tailgate.engine.untraceable import Untraceable
 
 FIXED = np.array([[0.5, -0.0, 2.0], [1.0, 3.0, -1.0]])
@@ -59,6 +59,7 @@ CASES: dict[str, Callable[..., Any]] = {
     "weak": lambda x, y, m, n: x.astype(np.float32) * 3 + n.astype(np.float32)[:, None] * 0.1,
     "unsigned": lambda x, y, m, n: (n.astype(np.uint32) * np.uint32(2654435761)) >> np.uint32(7) ^ np.uint32(5),
     "shifts": lambda x, y, m, n: (n << 3) % 7 + (n >> 1) - n % 8,
+    "remainders by data": lambda x, y, m, n: n % (np.floor(x[:, 0] * 3).astype(np.int64)) + n.astype(np.uint8) % (n.astype(np.uint8) >> 2),
     "bits": lambda x, y, m, n: (x.view(np.int64) & np.int64(0x7FFFFFFFFFFFFFFF)).view(np.float64),
     "where": lambda x, y, m, n: np.where(m, x, np.where(x > 0, 1, n[:, None])),
     "select": lambda x, y, m, n: np.select([m, x > 0], [x, -x], 4.0),
@@ -106,11 +107,10 @@ def test_numpys_functions(name: str) -> None:
         lambda state, held: ((), {"out": function(**{k: held[k].copy() for k in held})}), (), {k: v[:1] for k, v in given.items()}
     )
     program = Program(trace)
-    memory = Memory(program, 13)
+    call = Call(program, State(program, 13))
     for key, value in given.items():
-        memory.argument(key)[0] = value
-    memory.step()
-    got = memory.result("out")[0]
+        call.arguments[key][...] = value
+    got = call()["out"]
     assert got.dtype == wanted.dtype and got.shape == wanted.shape
     bits = np.dtype(f"u{got.dtype.itemsize}")
     np.testing.assert_array_equal(np.ascontiguousarray(got).view(bits), np.ascontiguousarray(wanted).view(bits))
@@ -194,7 +194,6 @@ def test_parameters_are_no_part_of_the_code() -> None:
     assert one.text == other.text and not other.function.fresh
     assert trace(-0.3).text != one.text  # another side of a Python branch
     for program, gain in ((one, 0.3), (other, 0.7)):
-        memory = Memory(program, 5)
-        memory.argument("x")[0, :, 0] = np.arange(5.0)
-        memory.step()
-        assert (memory.result("out")[0, :, 0] == np.arange(5.0) * (gain * 2 + 1) + 1.0).all()
+        call = Call(program, State(program, 5))
+        call.arguments["x"][:, 0] = np.arange(5.0)
+        assert (call()["out"][:, 0] == np.arange(5.0) * (gain * 2 + 1) + 1.0).all()

@@ -302,6 +302,7 @@ def test_the_command_writes_a_log(tmp_path: Path, capsys: pytest.CaptureFixture[
 
 def test_a_part_whose_names_are_no_text_is_played_again(tmp_path):
     import pyarrow as pa
+
     from tailgate.evaluation import Cell
     from tailgate.log import _good
 

@@ -182,18 +182,6 @@ def ball_each(w: np.ndarray, c: np.ndarray, u: np.ndarray) -> None:
 
 
 @_jit
-def pair_each(r, S, W, half, y):
-    """`pair` of r (N, 2, B) into y, with S and W = S^-1 (N, 2, 2, B or 1) and half (N, 2, B)."""
-    for n in range(r.shape[0]):
-        for b in range(r.shape[2]):
-            at = b if S.shape[3] > 1 else 0
-            y[n, 0, b], y[n, 1, b] = pair(
-                r[n, 0, b], r[n, 1, b], half[n, 0, b], half[n, 1, b], S[n, 0, 0, at], S[n, 0, 1, at], S[n, 1, 0, at], S[n, 1, 1, at],
-                W[n, 0, 0, at], W[n, 0, 1, at], W[n, 1, 0, at], W[n, 1, 1, at],
-            )  # fmt: skip
-
-
-@_jit
 def pair(r0, r1, half0, half1, S00, S01, S10, S11, W00, W01, W10, W11):
     """The part of two readings that is believed (robust.py), in closed form; S and W = S^-1, and half of lam.
 

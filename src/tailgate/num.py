@@ -22,6 +22,7 @@ from tailgate.elementwise import clip as clip
 from tailgate.elementwise import select as select
 from tailgate.engine import elementary, matrices
 from tailgate.engine.array import Traced
+from tailgate.engine.functions import tracing
 from tailgate.errors import InputError
 
 Array = NDArray[Any]
@@ -109,7 +110,7 @@ def take(table: Array, index: Any) -> Any:
     """table[index] of a table (K, ...) and whole numbers from 0 to K - 1."""
     if not isinstance(index, Traced):
         return table[index]
-    wide = index[(..., *(None,) * (table.ndim - 1))]
+    wide: Any = index[(..., *(None,) * (table.ndim - 1))]
     out: Any = np.broadcast_to(table[0], (*index.shape, *table.shape[1:]))
     for k in range(1, len(table)):
         out = np.where(wide == k, table[k], out)
@@ -174,7 +175,7 @@ def matmul(x: Array, y: Array) -> Array:
 
     One matrix x for a whole batch, or one (N, i, k) for each agent of it: its structural zeros count for nothing, whatever y holds there.
     """
-    if isinstance(x, Traced) or isinstance(y, Traced):
+    if tracing():
         alike = not isinstance(x, Traced) or x.fixed
         if alike and y.ndim > 3 and (x.ndim == 2 or (x.ndim == 3 and x.shape[0] in (1, *y.shape[1:-2]))):
             return cast(Array, matrices.constant_times(x, y))
@@ -246,7 +247,7 @@ def inverse(s: Array) -> Array:
         out[..., 1, 1] = a * scale
         out[..., 0, 1] = out[..., 1, 0] = -b * scale
         return out
-    if isinstance(s, Traced):
+    if tracing():
         return cast(Array, matrices.inverse(s))
     flat = _last(s if s.ndim > 2 else s[None])
     out = np.empty_like(flat)

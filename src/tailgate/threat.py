@@ -330,7 +330,7 @@ class Channel:
             ring, last = memory.tape, state.anchor[:, None, None] + state.played[:, None, None] % span
         else:
             ring, last = memory.history, state.taped[:, None, None]
-        return num.ring_get(ring, (last - span) % plan.recorded)
+        return np.asarray(num.ring_get(ring, (last - span) % plan.recorded))
 
     def _keep(self, plan: ChannelPlan, state: ChannelState, memory: Memory, sent: Array, hit: Array) -> Memory:
         """The memory after this step's `sent` (B, N, .), of which `hit` was attacked."""

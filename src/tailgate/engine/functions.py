@@ -207,6 +207,11 @@ def _makers(graph: Graph) -> dict[str, Callable[..., Any]]:
 _CONVERT = ("asarray", "ascontiguousarray", "asanyarray", "array")
 
 
+def tracing() -> bool:
+    """Is something traced in this thread?"""
+    return getattr(_here, "graph", None) is not None
+
+
 @contextlib.contextmanager
 def makers(graph: Graph) -> Iterator[None]:
     """Within it, numpy's makers of arrays give traced ones to whoever is traced in this thread."""

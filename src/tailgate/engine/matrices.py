@@ -19,7 +19,8 @@ def structure(x: Any) -> Any:
 
 def constant_times(x: Any, y: Any) -> Any:
     """x (..., i, k) times y (B, ..., k, j), of an x that is the same for all: sums run from 0, and its zeros count for nothing."""
-    there, out = structure(x), 0.0
+    out: Any = 0.0
+    there = structure(x)
     for k in range(x.shape[-1]):
         out = np.where(there[..., k, None], out + x[..., k, None] * y[..., k, None, :], out)
     return out

@@ -11,6 +11,7 @@ import ctypes
 import hashlib
 import os
 import threading
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -95,6 +96,17 @@ def _compiled(text: str) -> bytes:
     return bytes(machine.emit_object(module))
 
 
+def proved(names: Sequence[str]) -> bool:
+    """Has code of these objects once been compared with plain code on this machine, and been found equal?"""
+    return all(_kept(f"{name}.equal") is not None for name in names)
+
+
+def prove(names: Sequence[str]) -> None:
+    """Remember that it has."""
+    for name in names:
+        _keep(f"{name}.equal", b"")
+
+
 class Function:
     """`step` of a text. Calls release Python's lock."""
 
@@ -104,7 +116,7 @@ class Function:
             key = "\0".join((text, *processor(), binding.llvm_version_info and str(binding.llvm_version_info))).encode()
             name = hashlib.sha256(VERSION + key).hexdigest() + ".o"
             content = _kept(name)
-            self.fresh = content is None
+            self.name, self.fresh = name, content is None
             if content is None:
                 content = _compiled(text)
                 _keep(name, content)

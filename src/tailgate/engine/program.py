@@ -22,12 +22,12 @@ from tailgate.engine.passes import LEAST
 from tailgate.tree import leaves, map_leaves
 
 ALIGNED = 64  # bytes: a line of the processor's cache
-Step = Callable[[Any, Any], tuple[Any, Any]]
+Step = Callable[[Any, Any], tuple[Any, dict[str, Any]]]
 
 
 @dataclass(eq=False)
 class Trace:
-    """What a function computes. Nodes are by leaf, in the order of its places."""
+    """What a function computes. Nodes are by leaf, in the order of its places. The result `demands` (B, .) is what code asks to hold."""
 
     graph: Graph
     state: dict[str, tuple[Array, Array]]  # leaf -> its nodes, and those of the next state
@@ -44,14 +44,16 @@ def traced(function: Step, state: Any, arguments: Any) -> Trace:
     with makers(graph):
         following, results = function(inside, taken)
         following = map_leaves(lambda leaf, like: lifted(graph, leaf, like.dtype).astype(like.dtype), following, inside)
-        results = map_leaves(lambda leaf: lifted(graph, leaf), results)
+        results = {name: lifted(graph, leaf) for name, leaf in results.items()}
     before: dict[str, Any] = leaves(inside)
     after: dict[str, Any] = leaves(following)
     for name, leaf in before.items():
         if after[name].shape != leaf.shape:
             raise ValueError(f"state {name}: {after[name].shape} after a step, {leaf.shape} before it")
     held = {name: (leaf.nodes, after[name].nodes) for name, leaf in before.items()}
-    args, given = _nodes(taken), map_leaves(_of_each, results)
+    if graph.demands:
+        results = results | {"demands": Traced(graph, np.array([[node for *_, node in graph.demands]], object), np.dtype(bool), 0)}
+    args, given = _nodes(taken), {name: _of_each(leaf) for name, leaf in results.items()}
     return Trace(graph, held, args, _nodes(given), following, results)
 
 
@@ -127,69 +129,92 @@ class Program:
         return out
 
 
-class Memory:
-    """Episodes of a program: their state in blocks, and the arrays of its arguments and results (episodes, columns)."""
+class State:
+    """The state of episodes in blocks of one vector each: of all programs whose states have the same leaves."""
 
-    def __init__(self, program: Program, episodes: int, steps: int = 1) -> None:
-        self.program, self.episodes, self.steps = program, episodes, steps
-        lanes = program.lanes
-        self.blocks = -(-episodes // lanes)
-        self.state = _aligned((self.blocks, program.stride))
-        self.uniforms = program.uniforms()
-        self.arrays: dict[tuple[str, str], Array] = {}
-        trace = program.trace
-        for kind, name in program.arrays:
-            nodes = (trace.arguments if kind == "arguments" else trace.results)[name]
-            dtype = nodes.flat[0].dtype if nodes.size else np.dtype(float)
-            shape = (steps, self.blocks * lanes, nodes.size)
-            self.arrays[kind, name] = _aligned(shape, dtype)
-        self._table = np.zeros((len(program.arrays), 2), np.int64)
-        for i, held in enumerate(self.arrays.values()):
-            self._table[i] = held.ctypes.data, held.nbytes // steps if steps > 1 else 0
-        self._state, self._shared, self._arrays = (ctypes.c_void_p(a.ctypes.data) for a in (self.state, self.uniforms, self._table))
-
-    def argument(self, name: str) -> Array:
-        """(steps, episodes, *shape), to be written to."""
-        return self._shaped("arguments", name)
-
-    def result(self, name: str) -> Array:
-        """(steps, episodes, *shape)."""
-        return self._shaped("results", name)
-
-    def _shaped(self, kind: str, name: str) -> Array:
-        held, trace = self.arrays[kind, name], self.program.trace
-        shape = (trace.arguments if kind == "arguments" else trace.results)[name].shape[1:]
-        return held[:, : self.episodes].reshape(self.steps, self.episodes, *shape)
+    def __init__(self, program: Program, episodes: int) -> None:
+        self.program, self.episodes = program, episodes
+        self.blocks = -(-episodes // program.lanes)
+        self.memory = _aligned((self.blocks, program.stride))
 
     def _leaf(self, name: str) -> Array:
-        """A leaf of the state, (blocks, places, lanes)."""
+        """A leaf (blocks, places, lanes), to be read and written."""
         program = self.program
         nodes = program.trace.state[name][0]
-        dtype, at = nodes.flat[0].dtype if nodes.size else np.dtype(bool), program.places[name]
-        raw = self.state[:, at : at + nodes.size * program.lanes * dtype.itemsize]
+        dtype, at = nodes.flat[0].dtype if nodes.size else leaves(program.trace.next_state)[name].dtype, program.places[name]
+        raw = self.memory[:, at : at + nodes.size * program.lanes * dtype.itemsize]
         return raw.view(dtype).reshape(self.blocks, nodes.size, program.lanes)
 
-    def put(self, state: Any) -> None:
-        """Take over a state, a tree of arrays (episodes, ...). Lanes that no episode has repeat the last one."""
-        index = np.minimum(np.arange(self.blocks * self.program.lanes), self.episodes - 1)
-        for name, leaf in leaves(state).items():
-            rows = np.asarray(leaf).reshape(self.episodes, -1)[index]
-            self._leaf(name)[...] = rows.reshape(self.blocks, self.program.lanes, -1).swapaxes(1, 2)
+    def put(self, tree: Any, rows: Array | None = None) -> None:
+        """Take over the leaves of a tree, arrays (episodes, ...), or of `rows` (R,) alone. Idle lanes repeat the last row."""
+        for name, leaf in leaves(tree).items():
+            self.put_leaf(name, leaf, rows)
+
+    def put_leaf(self, name: str, leaf: Array, rows: Array | None = None) -> None:
+        """Take over one leaf, as `put` does."""
+        lanes, place = self.program.lanes, self._leaf(name)
+        if rows is not None:
+            place[rows // lanes, :, rows % lanes] = leaf.reshape(len(rows), place.shape[1])
+            return
+        index = np.minimum(np.arange(self.blocks * lanes), self.episodes - 1)
+        held = np.asarray(leaf).reshape(self.episodes, place.shape[1])[index]
+        place[...] = held.reshape(self.blocks, lanes, place.shape[1]).swapaxes(1, 2)
 
     def get(self, like: Any) -> Any:
-        """The state as a tree of arrays (episodes, ...)."""
+        """A tree of arrays (episodes, ...): a copy."""
         names = iter(leaves(like))
+        return map_leaves(lambda old: self.get_leaf(next(names)), like)
 
-        def leaf(old: Array) -> Array:
-            held = self._leaf(next(names)).swapaxes(0, 1).reshape(-1, self.blocks * self.program.lanes)[:, : self.episodes]
-            return np.moveaxis(np.array(held, order="C").reshape(*old.shape[1:], self.episodes), -1, 0)
+    def get_leaf(self, name: str) -> Array:
+        """One leaf (episodes, ...), the episodes together in memory: a copy."""
+        shape = self.program.trace.state[name][0].shape[1:]
+        held = np.array(self._leaf(name).swapaxes(0, 1), order="C").reshape(-1, self.blocks * self.program.lanes)[:, : self.episodes]
+        return np.moveaxis(held.reshape(*shape, self.episodes), -1, 0)
 
-        return map_leaves(leaf, like)
 
-    def step(self, steps: int | None = None, first: int = 0, last: int | None = None) -> None:
-        """Play steps of the blocks of a range, by default all."""
-        end = self.blocks if last is None else last
-        self.program.function.call(self._state, self._shared, self._arrays, first, end, self.steps if steps is None else steps)
+class Call:
+    """Calls of a program on a state: arguments that stay what they are until they are written to, and results that are new each time.
+
+    Arguments are (episodes, ...), or (steps, episodes, ...) with more `steps` than one; so are results.
+    """
+
+    def __init__(self, program: Program, state: State, steps: int = 1) -> None:
+        self.program, self.state, self.steps = program, state, steps
+        self.uniforms = program.uniforms()
+        self._table = np.zeros((len(program.arrays), 2), np.int64)
+        self.arguments: dict[str, Array] = {}
+        self._results: list[tuple[str, tuple[int, ...], np.dtype[Any], int]] = []
+        rows, trace, size = state.blocks * program.lanes, program.trace, 0
+        for i, (kind, name) in enumerate(program.arrays):
+            nodes = (trace.arguments if kind == "arguments" else trace.results)[name]
+            dtype = nodes.flat[0].dtype if nodes.size else np.dtype(float)
+            shape = (steps, rows, *nodes.shape[1:])
+            count = int(np.prod(shape)) * dtype.itemsize
+            self._table[i, 1] = count // steps
+            if kind == "arguments":
+                held = _aligned(shape, dtype)
+                self._table[i, 0] = held.ctypes.data
+                self.arguments[name] = held[:, : state.episodes] if steps > 1 else held[0, : state.episodes]
+            else:
+                self._results.append((name, shape, dtype, size))
+                size += -(-count // ALIGNED) * ALIGNED
+        self._first, self._size = len(program.arrays) - len(self._results), size
+        self._offsets = np.array([at for *_, at in self._results], np.int64)
+        self._pointers = tuple(ctypes.c_void_p(a.ctypes.data) for a in (state.memory, self.uniforms, self._table))
+
+    def __call__(self, steps: int | None = None, first: int = 0, last: int | None = None) -> dict[str, Array]:
+        """Play the steps of the blocks of a range, by default all; -> the results by name."""
+        sheet = np.empty(self._size + ALIGNED, np.uint8)
+        base = sheet.ctypes.data
+        begin = -base % ALIGNED
+        self._table[self._first :, 0] = base + begin + self._offsets
+        end, played = self.state.blocks if last is None else last, self.steps if steps is None else steps
+        self.program.function.call(*self._pointers, first, end, played)
+        out, episodes = {}, self.state.episodes
+        for name, shape, dtype, at in self._results:
+            held: Array = np.ndarray(shape, dtype, sheet, begin + at)
+            out[name] = held[:played, :episodes] if self.steps > 1 else held[0, :episodes]
+        return out
 
 
 def _aligned(shape: tuple[int, ...], dtype: Any = np.uint8) -> Array:
@@ -201,4 +226,4 @@ def _aligned(shape: tuple[int, ...], dtype: Any = np.uint8) -> Array:
     return out
 
 
-__all__ = ["Memory", "Node", "Program", "Trace", "traced"]
+__all__ = ["Call", "Node", "Program", "State", "Trace", "traced"]

@@ -86,15 +86,27 @@ def loop_types(ufunc: Any, arrays: Sequence[Traced]) -> list[np.dtype[Any]]:
     return list(kinds)
 
 
-def _by_a_constant(graph: Graph, op: str, arrays: list[Traced], dtype: np.dtype[Any]) -> Traced:
+def _by_a_constant(graph: Graph, op: str, arrays: list[Traced], dtype: np.dtype[Any]) -> Any:
     """A remainder or a shift, by numbers that are known: no processor agrees with another about the rest."""
     if dtype.kind == "f":
         raise Untraceable("a remainder of floats", "write x - y * np.floor(x / y)")
+    if op == "rem" and not arrays[1].fixed:
+        return _remainder(*arrays)
     by = arrays[1].known("a remainder or a shift", "use constants on the right")
     least, most = (1, np.iinfo(dtype).max) if op == "rem" else (0, 8 * dtype.itemsize - 1)
     if by.size and not (least <= by.min() and by.max() <= most):
         raise Untraceable(f"a remainder or a shift by {by.min()}", f"use constants from {least} to {most}")
     return elementwise(graph, lambda x, y: _divided(graph, op, x, y), [arrays[0], lifted(graph, by)], dtype)
+
+
+def _remainder(x: Any, y: Any) -> Any:
+    """Of whole numbers by others: with the sign of y, and 0 where y is 0."""
+    graph: Graph = x.graph
+    back: Any = y < 0
+    size = np.where(back, -y, y) if y.dtype.kind == "i" else y
+    parts: list[Any] = [np.where(back, -x, x), np.where(size == 0, 1, size)]
+    rest: Any = elementwise(graph, lambda p, q: graph.binary("rem", p, q), parts, x.dtype)
+    return np.where(y == 0, 0, np.where(back, -rest, rest) if y.dtype.kind == "i" else rest)
 
 
 def _divided(graph: Graph, op: str, x: Node, y: Node) -> Node:

@@ -1,0 +1,184 @@
+"""The attacker's seat as a program: what `tailgate.envs.seat.Seat` plays, traced as it stands.
+
+    decide   a decision of every row; rows `again` begin their next episode instead
+    begin    the next episode of the rows `again`, or their first
+
+Both leave what is to be seen, and what may be decided next.
+"""
+
+from __future__ import annotations
+
+import traceback
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from tailgate import draws, num
+from tailgate.agents.observation import ObservationCodec
+from tailgate.draws import Keys
+from tailgate.engine import objects
+from tailgate.engine.graph import Array
+from tailgate.engine.program import Call, Program, State, traced
+from tailgate.engine.untraceable import Untraceable
+from tailgate.errors import InputError
+from tailgate.tree import leaves, map_leaves
+
+if TYPE_CHECKING:
+    from tailgate.envs.seat import Outcome, Seat
+
+
+class SeatPrograms:
+    """The programs of a seat. Raises whatever its parts raise while they are traced."""
+
+    def __init__(self, seat: Seat) -> None:
+        self.seat, self.loop = seat, seat.loop
+        self.observation = ObservationCodec(seat.loop.brief)
+        start = seat.loop.start(draws.keys("tune", [0]))
+        self.example = {"loop": start, "tally": seat.begin(start)}
+        for name, leaf in leaves(self.example).items():
+            if leaf.dtype == object:
+                raise TypeError(f"state {name} holds objects")
+        flags = np.zeros(1, bool)
+        action = np.zeros(1, np.int64) if seat.action.discrete else np.zeros((1, seat.action.size))
+        self.decide = Program(traced(self._decide, self.example, {"action": action, "over": flags, "again": flags}))
+
+    @cached_property
+    def begin(self) -> Program:
+        """The program of rows that begin."""
+        return Program(traced(self._begin, self.example, {"again": np.zeros(1, bool)}))
+
+    def _decide(self, held: Any, given: Any) -> tuple[Any, Any]:
+        loop, tally, outcome, _ = self.seat.step(held["loop"], held["tally"], given["action"], given["over"])
+        state = self._renewed({"loop": loop, "tally": tally}, held["loop"].keys, given["again"])
+        return state, outcome._asdict() | self._shown(state)
+
+    def _begin(self, held: Any, given: Any) -> tuple[Any, Any]:
+        state = self._renewed(held, held["loop"].keys, given["again"])
+        return state, self._shown(state)
+
+    def _renewed(self, state: Any, keys: Keys, again: Any) -> Any:
+        """The state with the next episode in the rows `again`."""
+        loop = self.loop.start(Keys(keys.key, keys.episode + np.uint32(1)))
+        fresh = {"loop": loop, "tally": self.seat.begin(loop)}
+        return map_leaves(lambda old, new: np.where(again.reshape(len(again), *(1,) * (old.ndim - 1)), new, old), state, fresh)
+
+    def _shown(self, state: Any) -> dict[str, Any]:
+        seat, view = self.seat, self.loop.sense(state["loop"])
+        damage = np.min(view.scene.gap, axis=1) if seat.road else state["tally"].error
+        shown = {"seen": self.observation.observe(view), "allowed": view.allowed, "k": view.k, "damage": damage}
+        return shown | ({"mask": seat.action.mask(view)} if seat.action.discrete else {})
+
+
+class Untraced(NamedTuple):
+    """Why the plain loop plays what somebody asked the engine for."""
+
+    why: str
+
+
+def programs_of(seat: Seat) -> SeatPrograms | Untraced:
+    """The programs of a seat, once they have been found equal to the plain loop on this machine; or why there are none."""
+    try:
+        programs = SeatPrograms(seat)
+    except Exception as error:  # whatever somebody's code raises where arrays are not numpy's
+        return Untraced(explained(error))
+    names = [program.function.name for program in (programs.decide, programs.begin)]
+    if not objects.proved(names):
+        if found := difference(programs):
+            return Untraced(f"traced code and the plain loop differ in {found}")
+        objects.prove(names)
+    return programs
+
+
+def explained(error: Exception) -> str:
+    """What a failure says, and where: the line of the code that is traced."""
+    if isinstance(error, Untraceable):
+        return str(error)
+    steps = traceback.extract_tb(error.__traceback__)
+    own = [step for step in steps if not step.filename.startswith(str(Path(__file__).parent)) and "/numpy/" not in step.filename]
+    place = f"{own[-1].filename}:{own[-1].lineno}: " if own else ""
+    return f"{place}{type(error).__name__}: {' '.join(str(error).split())[:300]}"
+
+
+def difference(programs: SeatPrograms, batch: int = 64, decisions: int = 24) -> str:
+    """Play some decisions in both engines, resets among them; -> what differs first, or nothing."""
+    from tailgate.envs.batches import PlainEpisodes
+
+    chance, size = np.random.default_rng(0), programs.seat.action.size
+    keys, everyone = draws.keys("tune", range(batch)), np.ones(batch, bool)
+    rows, plain = Rows(programs, batch), PlainEpisodes(programs.seat)
+    rows.begin(everyone, keys)
+    plain.begin(keys)
+    for decision in range(decisions):
+        over = chance.random(batch) < (0.5 if decision == decisions // 2 else 0.02)
+        actions = chance.integers(0, size, batch) if programs.seat.action.discrete else chance.uniform(-1.0, 1.0, (batch, size))
+        rows.decide(actions, over, over)
+        outcome = plain.decide(actions, over, True)
+        here, there = rows.held() | rows.outcome()._asdict(), plain.held() | outcome._asdict()
+        here, there = here | {"seen": rows.brought["seen"]}, there | {"seen": plain.seen()}
+        for name, wanted in there.items():
+            if not _same(here[name], wanted):
+                return f"{name}, decision {decision}"
+    return ""
+
+
+def _same(got: Array, wanted: Array) -> bool:
+    """Equal to the bit, NaN's sign and payload apart."""
+    if got.dtype != wanted.dtype or got.shape != wanted.shape or not np.array_equal(got, wanted, equal_nan=got.dtype.kind == "f"):
+        return False
+    return got.dtype.kind != "f" or bool(((np.signbit(got) == np.signbit(wanted)) | (got != got)).all())
+
+
+class Rows:
+    """B rows of a seat's episodes, and what the last call brought (see `SeatPrograms`)."""
+
+    def __init__(self, programs: SeatPrograms, batch: int) -> None:
+        self.programs, self.batch = programs, batch
+        self.state = State(programs.decide, batch)
+        self._decide = Call(programs.decide, self.state)
+        self.brought: dict[str, Array] = {}
+
+    @cached_property
+    def _begin(self) -> Call:
+        return Call(self.programs.begin, self.state)
+
+    def decide(self, actions: Array, over: Array, again: Array) -> None:
+        """One decision of each row: actions (B,) or (B, size), over and again (B,) bool."""
+        given = self._decide.arguments
+        given["action"][...], given["over"][...], given["again"][...] = actions, over, again
+        k, self.brought = self.brought["k"], self._decide()
+        if not self.brought["demands"].all():
+            raise self.broken(self.brought["demands"], k)
+
+    def broken(self, demands: Array, k: Array) -> InputError:
+        """The error of a decision from steps k (B,) on that broke some of its demands (B, .)."""
+        known = self.programs.decide.trace.graph.demands
+        first = int(np.flatnonzero(~demands.all(axis=0))[0])
+        field, found, wanted, _ = known[first]
+        return num.broken(~demands[:, first], field, found, wanted, k + first // (len(known) // self.programs.seat.action.spec.interval))
+
+    def begin(self, rows: Array, keys: Keys | None = None) -> None:
+        """Begin episodes in the rows (B,) bool: the next of their own, or those of keys, of as many rows."""
+        if keys is not None:
+            where, state = np.flatnonzero(rows), self.state
+            state.put_leaf("loop.keys.key", keys.key, where)
+            state.put_leaf("loop.keys.episode", keys.episode - np.uint32(1), where)
+        self._begin.arguments["again"][...] = rows
+        self.brought = self._begin()
+
+    def outcome(self) -> Outcome:
+        """What the last decision brought."""
+        from tailgate.envs.seat import Outcome
+
+        return Outcome(*(self.brought[name] for name in Outcome._fields))
+
+    def held(self) -> dict[str, Array]:
+        """All that changes from step to step, by name: copies."""
+        return {name: self.state.get_leaf(name) for name in leaves(self.programs.example)}
+
+    def put(self, held: dict[str, Array]) -> None:
+        """What `held` gave, of the same number of rows."""
+        for name in leaves(self.programs.example):
+            self.state.put_leaf(name, held[name])
+        self.begin(np.zeros(self.batch, bool))
