@@ -9,7 +9,8 @@ import numpy as np
 from tailgate import sizes
 from tailgate.core import Array, Frame, View
 from tailgate.draws import Keys
-from tailgate.engine.seats import Rows, SeatPrograms, Untraced, programs_of
+from tailgate.engine.agreement import Untraced
+from tailgate.engine.seats import Rows, SeatPrograms, programs_of
 from tailgate.errors import InputError, unknown
 from tailgate.fused import Refused
 from tailgate.fused.cockpit import Cockpit, fuse_seat

@@ -18,11 +18,13 @@ from tailgate.fused.play import play
 from tailgate.loop import Loop, LoopState
 from tailgate.watch import Watched
 
+WORTH = 20_000  # steps for which a loop without lanes is traced: that takes some tenths of a second
 MEMORY = 1e9  # [bytes] that a trace may take: who plays many episodes plays so many at a time
 _DECISIONS = ("kind", "target", "alarm", "mode", "refused", "collided", "rear_collided")
 
 
-def _signals(frame: Frame) -> dict[str, Array]:
+def signals_of(frame: Frame) -> dict[str, Array]:
+    """What a trace keeps of a step, (B, ...) each."""
     scene, command, estimate = frame.scene, frame.command, frame.estimate
     return {
         "gap": scene.gap, "speed": scene.speed, "accel": scene.accel, "lead_speed": scene.lead_speed, "rear_gap": scene.rear_gap,
@@ -111,7 +113,7 @@ class Recorder:
 
     def add(self, frame: Frame, live: Array) -> None:
         """`live` (B,): the episodes that this step belongs to."""
-        for name, value in _signals(frame).items():
+        for name, value in signals_of(frame).items():
             held = self.signals.get(name)
             if name == "truth" and value.strides[1] == 0 and (held is None or held.shape[2] == 1):
                 value = value[:, :1]
@@ -133,13 +135,19 @@ class Recorder:
 def rollout(loop: Loop, attack: Attack, keys: Keys, *, terminate: bool = True, plain: bool = False) -> Trace:
     """Play one episode per key. With `terminate` an episode ends at its first collision, else it runs to the horizon.
 
-    A loop whose parts have lanes is played by the fused engine, to the same bits; with `plain` it is not.
+    A loop whose parts have lanes is played by the fused engine, to the same bits. One of at least `WORTH` steps that has none is traced,
+    where it can be. With `plain` the plain loop plays.
     """
     if not plain and isinstance(guard := loop.defence, Watched):
         seen = rollout(loop.bare, attack, keys, terminate=terminate)
         return dataclasses.replace(seen, signals=seen.signals | {"alarm": guard.alarms(seen.score)})
     if not plain and isinstance(fused := fuse(loop, attack), Constants):
         return Trace(loop.model, loop.horizon, *play(loop, fused, attack, keys, terminate), loop.controller.desired_gap)
+    if not plain and len(keys.key) * loop.horizon >= WORTH:
+        from tailgate.engine.rollouts import Rollout, rollout_of
+
+        if isinstance(program := rollout_of(loop, attack), Rollout):
+            return Trace(loop.model, loop.horizon, *program.play(keys, terminate), loop.controller.desired_gap)
     state = loop.start(keys)
     plan = attack.prepare(loop.brief)
     memory: Any = attack.start(plan, len(keys.key), keys.at(Role.ATTACK, np.zeros(len(keys.key), np.int64)))

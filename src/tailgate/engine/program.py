@@ -202,19 +202,29 @@ class Call:
         self._offsets = np.array([at for *_, at in self._results], np.int64)
         self._pointers = tuple(ctypes.c_void_p(a.ctypes.data) for a in (state.memory, self.uniforms, self._table))
 
-    def __call__(self, steps: int | None = None, first: int = 0, last: int | None = None) -> dict[str, Array]:
-        """Play the steps of the blocks of a range, by default all; -> the results by name."""
+    def __call__(self) -> dict[str, Array]:
+        """Play all steps; -> the results by name."""
+        out = self.sheet()
+        self.play(self.steps)
+        return out
+
+    def sheet(self) -> dict[str, Array]:
+        """New results, which `play` fills."""
         sheet = np.empty(self._size + ALIGNED, np.uint8)
         base = sheet.ctypes.data
         begin = -base % ALIGNED
         self._table[self._first :, 0] = base + begin + self._offsets
-        end, played = self.state.blocks if last is None else last, self.steps if steps is None else steps
-        self.program.function.call(*self._pointers, first, end, played)
         out, episodes = {}, self.state.episodes
         for name, shape, dtype, at in self._results:
             held: Array = np.ndarray(shape, dtype, sheet, begin + at)
-            out[name] = held[:played, :episodes] if self.steps > 1 else held[0, :episodes]
+            out[name] = held[:, :episodes] if self.steps > 1 else held[0, :episodes]
         return out
+
+    def play(self, steps: int) -> None:
+        """Play steps into the last sheet; the next ones go on from there."""
+        self.program.function.call(*self._pointers, 0, self.state.blocks, steps)
+        if self.steps > 1:
+            self._table[:, 0] += steps * self._table[:, 1]
 
 
 def _aligned(shape: tuple[int, ...], dtype: Any = np.uint8) -> Array:

@@ -8,10 +8,8 @@ Both leave what is to be seen, and what may be decided next.
 
 from __future__ import annotations
 
-import traceback
 from functools import cached_property
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -19,9 +17,9 @@ from tailgate import draws, num
 from tailgate.agents.observation import ObservationCodec
 from tailgate.draws import Keys
 from tailgate.engine import objects
+from tailgate.engine.agreement import Untraced, explained, same
 from tailgate.engine.graph import Array
 from tailgate.engine.program import Call, Program, State, traced
-from tailgate.engine.untraceable import Untraceable
 from tailgate.errors import InputError
 from tailgate.tree import leaves, map_leaves
 
@@ -71,12 +69,6 @@ class SeatPrograms:
         return shown | ({"mask": seat.action.mask(view)} if seat.action.discrete else {})
 
 
-class Untraced(NamedTuple):
-    """Why the plain loop plays what somebody asked the engine for."""
-
-    why: str
-
-
 def programs_of(seat: Seat) -> SeatPrograms | Untraced:
     """The programs of a seat, once they have been found equal to the plain loop on this machine; or why there are none."""
     try:
@@ -89,16 +81,6 @@ def programs_of(seat: Seat) -> SeatPrograms | Untraced:
             return Untraced(f"traced code and the plain loop differ in {found}")
         objects.prove(names)
     return programs
-
-
-def explained(error: Exception) -> str:
-    """What a failure says, and where: the line of the code that is traced."""
-    if isinstance(error, Untraceable):
-        return str(error)
-    steps = traceback.extract_tb(error.__traceback__)
-    own = [step for step in steps if not step.filename.startswith(str(Path(__file__).parent)) and "/numpy/" not in step.filename]
-    place = f"{own[-1].filename}:{own[-1].lineno}: " if own else ""
-    return f"{place}{type(error).__name__}: {' '.join(str(error).split())[:300]}"
 
 
 def difference(programs: SeatPrograms, batch: int = 64, decisions: int = 24) -> str:
@@ -118,16 +100,9 @@ def difference(programs: SeatPrograms, batch: int = 64, decisions: int = 24) -> 
         here, there = rows.held() | rows.outcome()._asdict(), plain.held() | outcome._asdict()
         here, there = here | {"seen": rows.brought["seen"]}, there | {"seen": plain.seen()}
         for name, wanted in there.items():
-            if not _same(here[name], wanted):
+            if not same(here[name], wanted):
                 return f"{name}, decision {decision}"
     return ""
-
-
-def _same(got: Array, wanted: Array) -> bool:
-    """Equal to the bit, NaN's sign and payload apart."""
-    if got.dtype != wanted.dtype or got.shape != wanted.shape or not np.array_equal(got, wanted, equal_nan=got.dtype.kind == "f"):
-        return False
-    return got.dtype.kind != "f" or bool(((np.signbit(got) == np.signbit(wanted)) | (got != got)).all())
 
 
 class Rows:

@@ -1,0 +1,114 @@
+"""Whole episodes of a loop under an attack as a program: what `tailgate.trace.rollout` records, with the attack traced as well."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from tailgate import num
+from tailgate.core import Attack
+from tailgate.draws import Keys, Role
+from tailgate.engine import objects
+from tailgate.engine.agreement import Untraced, explained, same
+from tailgate.engine.graph import Array
+from tailgate.engine.program import Call, Program, State, traced
+from tailgate.loop import Loop
+from tailgate.tree import leaves
+
+STEPS = 32  # between two looks whether an episode is left
+TRIED = 24  # steps in which fresh code is compared with the plain loop
+
+
+class Rollout:
+    """The program of a loop under an attack. Raises whatever their parts raise while they are traced."""
+
+    def __init__(self, loop: Loop, attack: Attack) -> None:
+        self.loop, self.attack, self.plan = loop, attack, attack.prepare(loop.brief)
+        self.program = Program(traced(self._step, self.begun(_ONE), {}))
+
+    def begun(self, keys: Keys) -> dict[str, Any]:
+        """The state of episodes that begin."""
+        batch = len(keys.key)
+        memory = self.attack.start(self.plan, batch, keys.at(Role.ATTACK, np.zeros(batch, np.int64)))
+        return {"loop": self.loop.start(keys), "memory": memory}
+
+    def _step(self, held: Any, given: Any) -> tuple[Any, Any]:
+        from tailgate.trace import signals_of
+
+        ended = held["loop"].ended
+        state, memory, frame = self.loop.step(held["loop"], self.attack, self.plan, held["memory"])
+        return {"loop": state, "memory": memory}, signals_of(frame) | {"ended": ended}
+
+    def play(self, keys: Keys, terminate: bool) -> tuple[Array, dict[str, Array], dict[str, Array]]:
+        """Lengths (B,), signals (K, B, ...) and the road before the first step, as `tailgate.trace.Trace` holds them."""
+        loop, batch, begun = self.loop, len(keys.key), self.begun(keys)
+        first = loop.plant.scene(loop.plan.plant, begun["loop"].plant)._asdict()
+        state = State(self.program, batch)
+        state.put(begun)
+        call = Call(self.program, state, max(2, loop.horizon))
+        signals, done = call.sheet(), 0
+        demands, ended = signals.pop("demands"), signals.pop("ended")
+        while done < loop.horizon and not (terminate and done and ended[done - 1].all() and state.get_leaf("loop.ended").all()):
+            steps = min(STEPS, loop.horizon - done)
+            call.play(steps)
+            self._demand(demands[done : done + steps], ended[done : done + steps], done, terminate)
+            done += steps
+        length = np.count_nonzero(~ended[:done], axis=0) if terminate else np.full(batch, done)
+        steps = int(length.max(initial=0))
+        return length.astype(np.int64), {name: value[:steps] for name, value in signals.items()}, first
+
+    def _demand(self, held: Array, ended: Array, first: int, terminate: bool) -> None:
+        """Raise what the plain loop would have raised in these steps (K, B, .), of which it plays none when all have ended."""
+        for step in np.flatnonzero(~held.all(axis=(1, 2))):
+            if terminate and ended[step].all():
+                return
+            which = int(np.flatnonzero(~held[step].all(axis=0))[0])
+            field, found, wanted, _ = self.program.trace.graph.demands[which]
+            raise num.broken(~held[step, :, which], field, found, wanted, np.full(held.shape[1], first + step + 1))
+
+
+_ONE = Keys(np.zeros((1, 3), np.uint64), np.zeros(1, np.uint32))
+
+
+_held: list[tuple[Loop, Attack, Rollout | Untraced]] = []  # the last ones: who plays many episodes plays so many at a time
+
+
+def rollout_of(loop: Loop, attack: Attack) -> Rollout | Untraced:
+    """The program of a loop under an attack, once it has been found equal to the plain loop on this machine; or why there is none."""
+    for known, also, found in _held:
+        if known is loop and also is attack:
+            return found
+    found = _made(loop, attack)
+    _held[:] = [*_held[-3:], (loop, attack, found)]
+    return found
+
+
+def _made(loop: Loop, attack: Attack) -> Rollout | Untraced:
+    try:
+        rollout = Rollout(loop, attack)
+    except Exception as error:  # whatever somebody's code raises where arrays are not numpy's
+        return Untraced(explained(error))
+    if not objects.proved([rollout.program.function.name]):
+        if found := _difference(rollout):
+            return Untraced(f"traced code and the plain loop differ in {found}")
+        objects.prove([rollout.program.function.name])
+    return rollout
+
+
+def _difference(rollout: Rollout, batch: int = 64) -> str:
+    """Play some steps in both engines; -> what differs first, or nothing."""
+    from tailgate import draws
+
+    plain = rollout.begun(draws.keys("tune", range(batch)))
+    state = State(rollout.program, batch)
+    state.put(plain)
+    call = Call(rollout.program, state)
+    for step in range(min(TRIED, rollout.loop.horizon)):
+        results = call()
+        plain, wanted = rollout._step(plain, {})
+        for name, leaf in (leaves(plain) | wanted).items():
+            got = results[name] if name in wanted else state.get_leaf(name)
+            if not same(got, leaf):
+                return f"{name}, step {step + 1}"
+    return ""
