@@ -92,13 +92,14 @@ def side_by_side(seat: Seat, engine: str = "auto", drawn: bool = False, threads:
             return FusedEpisodes(seat, constants, threads, drawn)
         if engine == "fused":
             raise InputError("engine", engine, f"traced, plain or auto: {constants.why}")
-    if engine == "traced" or (engine == "auto" and rows >= WORTH):
-        programs = programs_of(seat)
-        if not isinstance(programs, Untraced):
-            return TracedEpisodes(programs, drawn)
-        if engine == "traced":
-            raise InputError("engine", engine, f"plain or auto: {programs.why}")
-    return PlainEpisodes(seat)
+    if engine == "plain" or (engine == "auto" and rows < WORTH):
+        return PlainEpisodes(seat)
+    programs = programs_of(seat)
+    if not isinstance(programs, Untraced):
+        return TracedEpisodes(programs, drawn)
+    if engine == "traced":
+        raise InputError("engine", engine, f"plain or auto: {programs.why}")
+    return PlainEpisodes(seat, programs.why)
 
 
 class PlainEpisodes:
@@ -106,8 +107,8 @@ class PlainEpisodes:
 
     engine = "plain"
 
-    def __init__(self, seat: Seat) -> None:
-        self.seat = seat
+    def __init__(self, seat: Seat, why: str = "") -> None:
+        self.seat, self.why = seat, why  # the second: why no other engine plays, where somebody asked
         self.state: LoopState | None = None
         self.tally: Tally | None = None
         self.frame: Frame | None = None  # the last step

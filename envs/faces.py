@@ -83,6 +83,11 @@ class AdversaryVectorEnv(Specified, gymnasium.vector.VectorEnv[Array, Array, Arr
         return self.episodes.engine
 
     @property
+    def engine_why(self) -> str:
+        """Why the plain loop plays unasked: the line that cannot be traced, and what to write. Empty where it does not."""
+        return self.episodes.why if isinstance(self.episodes, PlainEpisodes) else ""
+
+    @property
     def direct(self) -> bool:
         """A fused engine plays, and the environment adds nothing to what it tells."""
         return isinstance(self.episodes, FusedEpisodes) and self._frames == 1 and not self._limit

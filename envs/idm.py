@@ -69,8 +69,8 @@ class Behind:
         decided = idm_accel(x - state.x, state.v, v)
         intent, slot = state.intent, state.slot
         if self.reaction:
-            made = num.ring_get(intent, slot)
-            intent, slot = num.ring_put(intent, slot, decided), num.ring_next(slot, self.reaction)
+            made = num.pick(intent, slot)
+            intent, slot = num.put(intent, slot, decided), num.ring_next(slot, self.reaction)
         else:
             made = decided
         return BehindState(*roll(state.x, state.v, made, self.dt), intent, slot)

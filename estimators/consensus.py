@@ -77,7 +77,7 @@ class ConsensusFilter(DistributedFilter):
     def _shared(self, plan: FusionPlan, state: KalmanState, innovation: Innovation, accept: Array) -> KalmanState:
         """The Kalman update with the accepted sensors of N(i), one neighbour after the other: their noises are independent."""
         assert state.P is not None
-        known = one_row(state.P) if accept.all() else state.P
+        known = one_row(state.P) if num.every(accept) else state.P
         x, P = state.x.copy(order="K"), num.zeros(known.shape)
         for i, near in enumerate(plan.heard):
             P_i = known[:, i]

@@ -204,7 +204,7 @@ class DistributedFilter(LinearFilter):
             out = KalmanState(num.apply(plan.merge, gather(plan.heard, z)), None)
             return out if weight is None else self._reweigh(plan, out, z, weight)
         alike = None if weight is None else even(plan.heard, weight)
-        if len(M) < len(x) and (alike is None or alike.all()):  # one covariance for all rows
+        if len(M) < len(x) and (alike is None or num.every(alike)):  # one covariance for all rows
             L = num.inverse(M)
             Qinv, z = num.zeros(L.shape), gather(plan.heard, num.matvec(L, x))
             for i, near in enumerate(plan.heard):
@@ -224,19 +224,21 @@ class DistributedFilter(LinearFilter):
         assert plan.L is not None
         x, P, alike = out.x, None, even(plan.heard, weight)
         for i, near in enumerate(plan.heard):
-            rows = np.flatnonzero(~alike[:, i])
-            if not len(rows):
+            rows = ~alike[:, i]
+            if not num.some(rows):
                 continue
-            w = weight[rows, i]
-            total, Q, y = np.zeros(len(rows)), np.zeros((len(rows), *plan.Q.shape)), np.zeros((len(rows), z.shape[2]))
+            w = weight[:, i]
+            total, Q, y = np.zeros(len(w)), np.zeros((len(w), *plan.Q.shape)), np.zeros((len(w), z.shape[2]))
             for j in near:
                 total += w[:, j]
                 Q += w[:, j, None, None] * plan.L[j]
-                y += w[:, j, None] * z[rows, j]
+                y += w[:, j, None] * z[:, j]
+            total = np.where(rows, total, 1.0)
             Qinv = num.inverse(Q / total[:, None, None])
             if P is None:
                 P = num.full((*x.shape, x.shape[2]), plan.held)
-            P[rows, i], x[rows, i] = Qinv, num.matvec(Qinv, y / total[:, None])
+            P[:, i] = np.where(rows[:, None, None], Qinv, P[:, i])
+            x[:, i] = np.where(rows[:, None], num.matvec(Qinv, y / total[:, None]), x[:, i])
         return out if P is None else KalmanState(x, P)
 
     def innovation(self, plan: FusionPlan, state: Any, received: Received) -> Innovation:
@@ -252,13 +254,12 @@ class DistributedFilter(LinearFilter):
         if plan.held is not None and state.P is None:
             assert plan.K is not None and plan.cross is not None
             x = num.apply(plan.K, r, state.x)
-            b, i = np.nonzero(~accept.all(axis=-1))
-            if len(b):
-                keep = accept[b, i]
-                K = gain_of(alone(S[b, i], keep), plan.cross[i] * keep[..., None])
-                x[b, i] = state.x[b, i] + num.matvec(K, r[b, i] * keep)
+            whole = np.asarray(accept.all(axis=-1))
+            if not num.every(whole):
+                K = gain_of(alone(S, accept), plan.cross * accept[..., None])
+                x = np.where(whole[..., None], x, state.x + num.matvec(K, r * accept))
             return KalmanState(x, None)
-        if len(one_row(state.P)) < len(r) and accept.all() and len(one_row(S)) == 1:
+        if len(one_row(state.P)) < len(r) and num.every(accept) and len(one_row(S)) == 1:
             cross = num.matmul(plan.C, state.P[:1])
             K = gain_of(S[:1], cross)
             P = state.P[:1] - num.matmul(K, cross)
@@ -273,12 +274,12 @@ class DistributedFilter(LinearFilter):
 
 def one_row(P: Array) -> Array:
     """The first row of a covariance that all rows of a batch share in memory, else all: what is computed of it is the same for all."""
-    return P[:1] if P.ndim == 4 and P.strides[0] == 0 else P
+    return P[:1] if P.ndim == 4 and len(P) > 1 and P.strides[0] == 0 else P
 
 
 def shared(P: Array) -> Array:
     """P (B, ...) with its rows shared in memory where they are all equal."""
-    return np.broadcast_to(P[:1], P.shape) if (P[:1] == P).all() else P
+    return np.broadcast_to(P[:1], P.shape) if len(P) > 1 and (P[:1] == P).all() else P
 
 
 def gain_of(S: Array, cross: Array) -> Array:

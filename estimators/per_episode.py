@@ -54,6 +54,8 @@ class EpisodeState(NamedTuple):
 class EpisodeByEpisode:
     """A defence that plays one episode and agent after the other. A subclass makes the filter."""
 
+    untraced = "it plays one episode after the other"  # why the engine leaves it to the plain loop
+
     def make(self) -> EpisodeFilter:
         """A filter, before its first reset."""
         raise TypeError(f"{type(self).__name__} must define make()")

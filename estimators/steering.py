@@ -254,10 +254,10 @@ class Sight:
                 closing.append(-_row(model.C[i, model.sensors.index("relative_speed")], x))
             gaps.append(gap)
             speeds.append(speed)
-        rows, near = np.arange(len(estimate.x)), np.argmin(np.stack(gaps, axis=1), axis=1)
-        gap, speed = (np.stack(part, axis=1)[rows, near] for part in (gaps, speeds))
+        near = np.argmin(np.stack(gaps, axis=1), axis=1)
+        gap, speed = (num.pick(np.stack(part, axis=1), near) for part in (gaps, speeds))
         out = [gap / 50.0, speed / 15.0, gap / np.maximum(speed, 1.0) / 3.0]
-        return [*out, np.stack(closing, axis=1)[rows, near] / 5.0] if closing else out
+        return [*out, num.pick(np.stack(closing, axis=1), near) / 5.0] if closing else out
 
     def _places(self, values: Array) -> Array:
         """(B, K) where the knobs stand, in [-1, 1] between the ends of the menu."""

@@ -1,6 +1,25 @@
 """The traced engine plays environments as the plain loop does, to the last bit, restarts, resets and what was held included."""
 
+import importlib
+import json
+from pathlib import Path
+
+import numpy as np
 import pytest
+
+from tailgate import draws, num
+from tailgate.agents.scripted import NoAttack
+from tailgate.cli import main
+from tailgate.engine import objects
+from tailgate.engine.graph import evaluate
+from tailgate.engine.program import Call, Program, State, traced
+from tailgate.engine.rollouts import Rollout, rollout_of
+from tailgate.envs.faces import AdversaryVectorEnv
+from tailgate.errors import InputError
+from tailgate.estimators import Kalman
+from tailgate.registry import Spec
+from tailgate.scenario import load_scenario
+from tailgate.trace import Trace, rollout
 
 from .fused import as_plain
 from .test_fused import ENVIRONMENTS
@@ -18,3 +37,165 @@ MORE = [  # what the fused engine does not play
 @pytest.mark.parametrize("arguments", [*ENVIRONMENTS, *MORE], ids=lambda a: f"{a['scenario']}-{a['defence']}")
 def test_an_environment_is_the_plain_one_to_the_last_bit(arguments, tmp_path):
     as_plain(arguments, 5, tmp_path, "traced")
+
+
+def plugin(tmp_path, monkeypatch, name="saturated_plugin"):
+    """The class of docs/new-defence.md, word for word."""
+    text = (Path(__file__).parent.parent / "docs/new-defence.md").read_text()
+    code = text.split("```python\n")[1].split("```")[0]
+    (tmp_path / f"{name}.py").write_text(code)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    return importlib.import_module(name)
+
+
+def test_a_strangers_defence_is_traced_as_it_stands(tmp_path, monkeypatch):
+    made = plugin(tmp_path, monkeypatch).Saturated(gain=0.1)
+    for rows, engine in ((16, "traced"), (1, "plain")):
+        env = AdversaryVectorEnv(rows, defence=made)
+        assert (env.engine, env.engine_why) == (engine, "")
+    as_plain({"scenario": "stop-and-go-v0", "defence": made}, 5, tmp_path, "traced")
+
+
+@pytest.mark.parametrize("terminate", [True, False])
+@pytest.mark.parametrize(("scenario", "defence", "rival"), [
+    ("stop-and-go-v0", "mine", "fdi:value=5"), ("car-following-lossy-v0", "chi2_kf", "dos_hold"), ("gusty-stop-and-go-v0", "chi2_kf_sparse", "none"),
+    ("radar-following-v0", "cra", "noise_jam"), ("stop-and-go-v0", "steered", "fdi_then_jam"),
+])  # fmt: skip
+def test_a_rollout_has_the_plain_ones_hashes(scenario, defence, rival, terminate, tmp_path, monkeypatch):
+    if defence == "mine":
+        loop = load_scenario(scenario).loop(plugin(tmp_path, monkeypatch).Saturated())
+    else:
+        spec = Spec("defence", defence)
+        loop = load_scenario(scenario).loop(spec.make(), spec.entry.uses)
+    attack, keys = Spec("attack", rival).make(), draws.keys("report", range(11))
+    program = rollout_of(loop, attack)
+    assert isinstance(program, Rollout), program
+    fast = Trace(loop.model, loop.horizon, *program.play(keys, terminate), loop.controller.desired_gap)
+    plain = rollout(loop, attack, keys, terminate=terminate, plain=True)
+    assert np.array_equal(fast.length, plain.length)
+    assert {name: (held.shape, held.dtype) for name, held in fast.signals.items()} == {
+        n: (x.shape, x.dtype) for n, x in plain.signals.items()
+    }
+    assert [fast.trace_hash(i) for i in range(11)] == [plain.trace_hash(i) for i in range(11)]
+    assert all(np.array_equal(fast.first[name], held) for name, held in plain.first.items())
+
+
+def test_large_rollouts_without_lanes_are_traced(monkeypatch, tmp_path):
+    """And small ones are not: tracing takes longer than they do."""
+    loop, played = load_scenario("stop-and-go-v0").loop(plugin(tmp_path, monkeypatch).Saturated()), []
+    monkeypatch.setattr(Rollout, "play", lambda self, keys, terminate, play=Rollout.play: played.append(1) or play(self, keys, terminate))
+    hashes = [rollout(loop, NoAttack(), draws.keys("report", range(n))).trace_hash(3) for n in (10, 50)]
+    assert hashes[0] == hashes[1] and len(played) == 1
+
+
+class Branching(Kalman):
+    """A filter that decides by the first row."""
+
+    def step(self, plan, state, received, known_u, draws):
+        state, estimate = super().step(plan, state, received, known_u, draws)
+        if estimate.score[0, 0] > 3.0:
+            estimate = estimate._replace(alarm=~estimate.alarm)
+        return state, estimate
+
+
+class Deceiving(Kalman):
+    """A filter that is another one when it is traced."""
+
+    def step(self, plan, state, received, known_u, draws):
+        state, estimate = super().step(plan, state, received, known_u, draws)
+        return state, estimate._replace(score=estimate.score + (0.0 if isinstance(estimate.score, np.ndarray) else 1e-9))
+
+
+def test_what_cannot_be_traced_is_played_plain_and_says_why():
+    env = AdversaryVectorEnv(16, defence=Branching())
+    line = Branching.step.__code__.co_firstlineno + 2
+    assert env.engine == "plain" and f"test_traced.py:{line}: " in env.engine_why and "write it for all rows" in env.engine_why
+    with pytest.raises(InputError, match=rf"engine: got 'traced'; expected plain or auto: .*test_traced.py:{line}"):
+        AdversaryVectorEnv(16, defence=Branching(), engine="traced")
+    assert AdversaryVectorEnv(1, defence=Branching(), engine="auto").engine_why == ""  # nobody tried
+    for name, why in (("filterpy_kf", "one episode after the other"),):
+        assert why in AdversaryVectorEnv(16, defence=name).engine_why
+
+
+def test_code_that_differs_from_the_plain_loop_is_not_used():
+    env = AdversaryVectorEnv(16, defence=Deceiving())
+    assert env.engine == "plain" and "differ in loop.estimate.score, decision 0" in env.engine_why
+
+
+class Growing(Kalman):
+    """A filter that overflows where its reading is far off."""
+
+    def step(self, plan, state, received, known_u, draws):
+        state, estimate = super().step(plan, state, received, known_u, draws)
+        return state, estimate._replace(score=estimate.score * 1e295)
+
+
+def test_what_is_not_finite_is_refused_as_in_the_plain_loop(tmp_path):
+    """The same error, which names step and row."""
+    said = []
+    for engine in ("traced", "plain"):
+        env = AdversaryVectorEnv(5, engine=engine, defence=Growing(), action="timing", value=1e9, threat={"fdi_bound": 1e9, "onset": 1})
+        env.reset(seed=0)
+        with pytest.raises(InputError, match="defence output score: got 'NaN or infinity in step") as caught:
+            for t in range(9):
+                env.step(np.arange(5) == min(t, 3))
+        said.append(str(caught.value))
+    assert said[0] == said[1]
+
+
+def test_objects_that_are_damaged_or_cannot_be_kept_are_made_again(tmp_path, monkeypatch):
+    monkeypatch.setenv("TAILGATE_CACHE", str(tmp_path / "cache"))
+    text = "define void @step(ptr %a, ptr %b, ptr %c, i64 %d, i64 %e, i64 %f) {\n  store i64 %d, ptr %a\n  ret void\n}\n"
+
+    def call():
+        made, out = objects.Function(text), np.zeros(1, np.int64)
+        made.call(out.ctypes.data, None, None, 7, 0, 0)
+        assert out[0] == 7
+        return made
+
+    assert call().fresh and not call().fresh
+    (kept,) = (tmp_path / "cache/objects").iterdir()
+    kept.write_bytes(kept.read_bytes()[:-3] + b"abc")
+    assert call().fresh and not call().fresh
+    objects.prove([kept.name])
+    assert objects.proved([kept.name]) and not objects.proved([kept.name, "other"])
+    (tmp_path / "cache/objects").chmod(0o777)  # somebody else could write here
+    assert call().fresh and not objects.proved([kept.name])
+    monkeypatch.setenv("TAILGATE_CACHE", "/proc/nowhere")
+    assert call().fresh and call().fresh
+
+
+def test_explain_names_the_engine_and_the_line(capsys):
+    assert main(["explain", "engine", "--json", "--scenario", "car-following-lossy-v0", "--attack", "dos_hold"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert "lost or late" in found["environments"]["fused"]["why"] and "operations" in found["environments"]["traced"]["size"]
+    assert "operations" in found["episodes"]["traced"]["size"]
+    assert main(["explain", "engine", "--defence", "filterpy_kf"]) == 0
+    assert "one episode after the other" in " ".join(capsys.readouterr().out.split())
+    assert main(["explain", "engine", "--defence", "nobody"]) == 2
+
+
+def test_until_goes_on_for_each_row():
+    """Newton's square roots: every row stops where it would by itself."""
+
+    def roots(x, a):
+        def step(m, n):
+            y = 0.5 * m + a / m * 0.5
+            return np.abs(y - m) > 1e-12, (y, n + 1)
+
+        return num.until(step, (x, np.zeros(x.shape, np.int64)), a > 20.0, 50)
+
+    chance = np.random.default_rng(0)
+    x, a = chance.uniform(1.0, 9.0, (37, 2)), chance.uniform(0.1, 90.0, (37, 2))
+    wanted = roots(x, a)
+    assert len(set(wanted[1].ravel().tolist())) > 3 and 0 in wanted[1]
+    for lanes in (2, 4, 8):
+        trace = traced(lambda state, held: ((), dict(zip("mn", roots(held["x"], held["a"]), strict=True))), (), {"x": x[:1], "a": a[:1]})
+        program = Program(trace, lanes)
+        call = Call(program, State(program, 37))
+        call.arguments["x"][...], call.arguments["a"][...] = x, a
+        results = call()
+        assert np.array_equal(results["m"], wanted[0]) and np.array_equal(results["n"], wanted[1])
+        given = {("arguments", key, (i,)): value[:, i] for key, value in (("x", x), ("a", a)) for i in range(2)}
+        for name, held in zip("mn", wanted, strict=True):
+            assert np.array_equal(np.stack(evaluate(trace.graph, list(trace.results[name].flat), given), 1), held)

@@ -19,7 +19,7 @@ from tailgate.interrupts import Ending, orderly
 EXIT_INPUT = 2
 COMMANDS = (
     "train", "tune", "selfplay", "evaluate", "timing", "dose", "transfer", "zoo", "calibrate", "leaderboard", "log", "replay",
-    "reproduce", "trust", "bench", "list",
+    "reproduce", "trust", "bench", "list", "explain",
 )  # fmt: skip
 
 

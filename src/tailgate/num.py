@@ -23,6 +23,7 @@ from tailgate.elementwise import select as select
 from tailgate.engine import elementary, matrices
 from tailgate.engine.array import Traced
 from tailgate.engine.functions import tracing
+from tailgate.engine.loops import until as until
 from tailgate.errors import InputError
 
 Array = NDArray[Any]
@@ -64,7 +65,7 @@ def present(values: Any, candidates: Iterable[int]) -> list[int]:
     return [one for one in candidates if one in held]
 
 
-def ring_get(ring: Array, place: Any) -> Any:
+def pick(ring: Array, place: Any) -> Any:
     """ring[..., place] of a ring (B, ..., L) and whole numbers that broadcast to (B, ...)."""
     if not isinstance(ring, Traced):
         return np.take_along_axis(ring, np.broadcast_to(place, ring.shape[:-1])[..., None], axis=-1)[..., 0]
@@ -74,7 +75,7 @@ def ring_get(ring: Array, place: Any) -> Any:
     return out
 
 
-def ring_put(ring: Array, place: Any, value: Any) -> Any:
+def put(ring: Array, place: Any, value: Any) -> Any:
     """A ring (B, ..., L) with `value` (B, ...) at `place`, which broadcasts to (B, ...)."""
     if isinstance(ring, Traced):
         return np.stack([np.where(place == i, value, ring[..., i]) for i in range(ring.shape[-1])], axis=-1)
@@ -256,13 +257,16 @@ def inverse(s: Array) -> Array:
     return full_out if s.ndim > 2 else full_out[0]
 
 
-def apply(matrices: Array, x: Array, base: Array | None = None) -> Array:
+def apply(matrix: Array, x: Array, base: Array | None = None) -> Array:
     """Each agent's own matrix (N, i, k), or one (1, i, k) for all, times its vector in x (B, N, k), and base (B, N, i) with it: (B, N, i).
 
     Sums run over k in ascending order, and structural zeros of the matrices count for nothing.
     """
+    if tracing():
+        moved = matrices.constant_on(matrix, x)
+        return cast(Array, moved if base is None else base + moved)
     under = _NOTHING if base is None else np.ascontiguousarray(first_to_last(base), np.float64)
-    return last_to_first(_applied(matrices, np.ascontiguousarray(first_to_last(x), np.float64), under))
+    return last_to_first(_applied(matrix, np.ascontiguousarray(first_to_last(x), np.float64), under))
 
 
 _NOTHING = np.empty((0, 0, 0))
@@ -276,6 +280,8 @@ def _applied(matrices: Array, x: Array, base: Array = _NOTHING) -> Array:
 
 def predicted(A: Array, B: Array, c: Array, L: Array, merge: Array, heard: Array, x: Array, u: Array) -> Array:
     """merge_i sum_j L_j (A x_j + B u_j + c) (B, N, n) over the j in heard (N, N) bool, for x (B, N, n) and u (B, N, m)."""
+    if tracing():
+        return cast(Array, matrices.predicted(A, B, c, L, merge, heard, x, u))
     flat = np.ascontiguousarray(first_to_last(x), np.float64)
     out = np.empty_like(flat)
     _lanes().predict_each(A, B, c, L, merge, heard, flat, np.ascontiguousarray(first_to_last(u), np.float64), out)
@@ -284,6 +290,8 @@ def predicted(A: Array, B: Array, c: Array, L: Array, merge: Array, heard: Array
 
 def congruent(A: Array, P: Array, Q: Array) -> Array:
     """A P A' + Q for one A and Q (n, n) and P (B, N, n, n), in the order of `matmul`."""
+    if tracing():
+        return cast(Array, matrices.congruent(A, P, Q))
     flat = _last(P)
     out = np.empty_like(flat)
     _lanes().spread_each(A, flat, Q, out)
@@ -292,6 +300,8 @@ def congruent(A: Array, P: Array, Q: Array) -> Array:
 
 def moment(weights: Sequence[Array], covariances: Sequence[Array], offsets: Sequence[Array]) -> Array:
     """sum_i w_i (P_i + d_i d_i') (B, N, n, n) in that order, of w_i (B, N), P_i (B, N, n, n) and d_i (B, N, n)."""
+    if tracing():
+        return cast(Array, matrices.moment(weights, covariances, offsets))
     out = np.empty(first_to_last(covariances[0]).shape)
     if any(len(part) != len(covariances[0]) for part in (*weights, *covariances, *offsets)):
         raise ValueError("weights, covariances and offsets have the same rows")
@@ -309,6 +319,8 @@ def fused(heard: Array, x: Array, M: Array, shares: Shares | None = None, step: 
     shares: its weight, total and begin, (B or 1, ...); none: all weigh the same. step: its A and Q.
     """
     shares = shares or (np.ones((1, *heard.shape)), np.count_nonzero(heard, axis=1)[None], np.full((1, len(heard)), -0.0))
+    if tracing():
+        return cast(tuple[Array, Array], matrices.fused(heard, x, M, *shares, step))
     flat, spread, weight, total, begin = (np.ascontiguousarray(first_to_last(part), np.float64) for part in (x, M, *shares))
     mean, P = np.empty_like(flat), np.empty((*spread.shape[:-1], flat.shape[-1]))
     A, Q = step or (np.empty((0, 0)), np.empty((0, 0)))
@@ -318,6 +330,8 @@ def fused(heard: Array, x: Array, M: Array, shares: Shares | None = None, step: 
 
 def corrected(C: Array, W: Array, x: Array, P: Array, r: Array, keep: Array) -> tuple[Array, Array]:
     """x (B, N, n) and P (B, N, n, n) after an update by r (B, N, q), whose covariance has the inverse W: `lanes.correct_each`."""
+    if tracing():
+        return cast(tuple[Array, Array], matrices.corrected(C, W, x, P, r, keep))
     inverse, flat, known, off, mask = (np.ascontiguousarray(first_to_last(part), np.float64) for part in (W, x, P, r, keep))
     mean, covariance = np.empty_like(flat), np.empty((*known.shape[:-1], len(x)))
     _lanes().correct_each(C, inverse, flat, known, off, mask, mean, covariance)
@@ -354,10 +368,34 @@ def root(s: Array) -> tuple[Array, Array]:
 
 def in_ball(w: Array, c: Array) -> Array:
     """u_k = w_k / (c_k + mu) with the least mu >= 0 at which |u| <= 1, for w (B, P, q) and c (P, q) >= 0: (B, P, q). 0/0 counts as 0."""
-    flat = np.ascontiguousarray(first_to_last(w))
-    out = np.empty_like(flat)
-    linear.ball_each(flat, np.ascontiguousarray(c), out)
-    return last_to_first(out)
+    size = np.abs(w)
+    some_w, least, length, most, weighed = w != 0.0, zeros(w.shape[:-1]), zeros(w.shape[:-1]), zeros(w.shape[:-1]), zeros(w.shape[:-1])
+    for k in range(w.shape[-1]):
+        over = size[..., k] - c[..., k]
+        least = np.where(over > least, over, least)
+        length, most = length + w[..., k] * w[..., k], np.where(c[..., k] > most, c[..., k], most)
+        share = _divided(w[..., k], c[..., k], some_w[..., k])
+        weighed = weighed + share * share
+    outside, bound = weighed > 1.0, np.sqrt(length) - most
+    mu = np.where(outside, np.where(bound > least, bound, least), 0.0)
+
+    def closer(mu: Any, _: Any) -> tuple[Any, tuple[Any, Any]]:  # Newton on 1 / |u|, monotone from below
+        s, t = zeros(mu.shape), zeros(mu.shape)
+        for k in range(w.shape[-1]):
+            z = _divided(w[..., k], c[..., k] + mu, some_w[..., k])
+            s, t = s + z * z, t + _divided(z * z, c[..., k] + mu, z != 0.0)
+        length = np.sqrt(s)
+        step = _divided(s * (length - 1.0), t, t != 0.0)
+        further = step > 1e-15 * mu
+        return further, (np.where(further, mu + step, mu), length)
+
+    mu, length = until(closer, (mu, np.ones_like(mu)), outside, 100)
+    return stack([_divided(_divided(w[..., k], c[..., k] + mu, some_w[..., k]), length, some_w[..., k]) for k in range(w.shape[-1])])
+
+
+def _divided(x: Array, y: Array, where: Array) -> Array:
+    """x / y in some places, 0 elsewhere."""
+    return np.where(where, x, 0.0) / np.where(where, y, 1.0)
 
 
 def expm(m: Array) -> Array:
@@ -389,4 +427,7 @@ def spectral_radius(m: Array) -> float:
 
 def dense(x: Array, weight: Array, bias: Array, squash: bool) -> Array:
     """One network layer (B, i) -> (B, o) in float64 and fixed order, with tanh if `squash`."""
+    if tracing():
+        out = matrices.dense(x, weight, bias)
+        return cast(Array, elementary.tanh(out) if squash else out)
     return np.asarray(kernels.dense(np.ascontiguousarray(x, np.float64), weight, bias, squash))

@@ -330,13 +330,13 @@ class Channel:
             ring, last = memory.tape, state.anchor[:, None, None] + state.played[:, None, None] % span
         else:
             ring, last = memory.history, state.taped[:, None, None]
-        return np.asarray(num.ring_get(ring, (last - span) % plan.recorded))
+        return np.asarray(num.pick(ring, (last - span) % plan.recorded))
 
     def _keep(self, plan: ChannelPlan, state: ChannelState, memory: Memory, sent: Array, hit: Array) -> Memory:
         """The memory after this step's `sent` (B, N, .), of which `hit` was attacked."""
         history = memory.history
         if plan.recorded:
-            history = num.ring_put(history, (state.taped % plan.recorded)[:, None, None], sent)
+            history = num.put(history, (state.taped % plan.recorded)[:, None, None], sent)
         return memory._replace(fresh=np.where(hit, memory.fresh, sent) if num.some(hit) else sent, history=history)
 
 

@@ -28,6 +28,11 @@ class Watched:
         """Why no white box looks into the defence; of the watch it sees nothing."""
         return str(getattr(self.defence, "opaque", ""))
 
+    @property
+    def untraced(self) -> str:
+        """Why the defence cannot be traced."""
+        return str(getattr(self.defence, "untraced", ""))
+
     def prepare(self, model: Model) -> Any:
         return self.defence.prepare(model)
 

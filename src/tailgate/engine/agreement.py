@@ -3,19 +3,27 @@
 from __future__ import annotations
 
 import traceback
+from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from tailgate.engine.graph import Array
 from tailgate.engine.untraceable import Untraceable
+from tailgate.errors import InputError
 
 
 class Untraced(NamedTuple):
     """Why the plain loop plays what somebody asked the engine for."""
 
     why: str
+
+
+def check_open(defence: Any) -> None:
+    """Raise TypeError for a defence that runs elsewhere, or says itself why it cannot be traced."""
+    if why := getattr(defence, "opaque", "") or getattr(defence, "untraced", ""):
+        raise TypeError(f"the defence {type(defence).__name__} is not traced: {why}")
 
 
 def explained(error: Exception) -> str:
@@ -26,6 +34,14 @@ def explained(error: Exception) -> str:
     own = [step for step in steps if not step.filename.startswith(str(Path(__file__).parent)) and "/numpy/" not in step.filename]
     place = f"{own[-1].filename}:{own[-1].lineno}: " if own else ""
     return f"{place}{type(error).__name__}: {' '.join(str(error).split())[:300]}"
+
+
+def raised(play: Callable[[], Any]) -> Any:
+    """What a call gives, or the text of its InputError."""
+    try:
+        return play()
+    except InputError as error:
+        return str(error)
 
 
 def same(got: Array, wanted: Array) -> bool:

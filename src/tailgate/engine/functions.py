@@ -106,6 +106,14 @@ def _count_nonzero(x: Traced, axis: Any = None, keepdims: bool = False) -> Any:
     return x.astype(bool).astype(np.int64).sum(axis=axis, keepdims=keepdims)
 
 
+def _is_in(x: Traced, values: Any, invert: bool = False) -> Any:
+    """Is each number one of a few? (Whole numbers: enumerations are.)"""
+    found: Any = lifted(x.graph, np.zeros(x.shape, bool))
+    for value in np.asarray(values).ravel().tolist():
+        found = found | (x == value)
+    return ~found if invert else found
+
+
 def _copyto(target: Traced, source: Any, casting: Any = "same_kind", where: Any = True) -> None:
     target[...] = source if where is True else chosen(where, source, target)
 
@@ -150,6 +158,7 @@ _FUNCTIONS: dict[Any, Callable[..., Any]] = {
     np.count_nonzero: _count_nonzero,
     np.argmin: lambda x, axis=None: _least(x, axis, "lt"),
     np.argmax: lambda x, axis=None: _least(x, axis, "gt"),
+    np.isin: _is_in,
     np.cumsum: lambda x, axis: np.add.accumulate(x, axis),
     np.copyto: _copyto,
     np.copy: lambda x, order="K", subok=False: x.copy(),

@@ -7,6 +7,7 @@ every operation, so that a folded value has the bits of a computed one. No rewri
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -57,6 +58,26 @@ class Node:
     def __repr__(self) -> str:
         args = ", ".join(f"%{a.id}" for a in self.args)
         return f"%{self.id} = {self.op} {self.dtype} ({args}){'' if self.attr is None else f' {self.attr}'}"
+
+
+@dataclass(eq=False)
+class Body:
+    """A round of a loop: `nodes` are those that depend on what is carried. The first that are carried say who goes on."""
+
+    carried: list[Node]
+    after: list[Node]
+    going: list[Node]
+    most: int
+    nodes: list[Node]
+
+
+def dependent(roots: Sequence[Node], sources: Sequence[Node]) -> set[Node]:
+    """The roots and what they need, as far as it depends on the sources; without these."""
+    found = set(sources)
+    for node in ordered(roots):
+        if any(a in found for a in node.args):
+            found.add(node)
+    return found - set(sources)
 
 
 class Graph:
@@ -149,6 +170,25 @@ class Graph:
             return x
         return x.args[0] if x.op == "bits" and x.args[0].dtype == dtype else self._folded("bits", dtype, (x,))
 
+    # -- loops
+
+    def carried(self, begin: Array) -> Array:
+        """What a loop carries from round to round, of the types of what it begins with."""
+        out = np.empty(begin.shape, object)
+        for i, node in enumerate(begin.flat):
+            out.flat[i] = self._node("carried", node.dtype, (), None, len(self.nodes), False)
+        return out
+
+    def loop(self, begin: list[Node], carried: list[Node], after: list[Node], going: list[Node], most: int) -> list[Node]:
+        """What `carried` nodes are at last, of those that they become `after` a round, while any of `going` holds."""
+        inside = dependent(after, carried)
+        captured = {a.id: a for node in (*inside, *after) for a in node.args if a not in inside and a.op != "carried" and not a.fixed}
+        outer = [node for node in after if node not in inside and node.op != "carried" and not node.fixed]
+        args = (*begin, *(captured | {node.id: node for node in outer}).values())
+        body = Body(carried, after, going, most, sorted(inside, key=lambda node: node.id))
+        node = self._node("loop", BOOL, args, body, len(self.nodes), False)
+        return [self._node("pick", one.dtype, (node,), i, i, False) for i, one in enumerate(begin)]
+
     def _folded(self, op: str, dtype: np.dtype[Any], args: tuple[Node, ...]) -> Node:
         if all(a.op == "const" for a in args):
             with np.errstate(all="ignore"):
@@ -212,11 +252,33 @@ def ordered(roots: Iterable[Node]) -> list[Node]:
 def evaluate(graph: Graph, roots: Sequence[Node], inputs: dict[Any, Array]) -> list[Array]:
     """The roots by numpy, of inputs (B,) by name."""
     values: dict[int, Any] = {}
-    for node in ordered(roots):
+    _evaluate(graph, ordered(roots), inputs, values)
+    return [values[root.id] for root in roots]
+
+
+def _evaluate(graph: Graph, nodes: Iterable[Node], inputs: dict[Any, Array], values: dict[int, Any]) -> None:
+    for node in nodes:
+        args = [graph.value(a) if a.fixed else values[a.id] for a in node.args]
         if node.fixed:
             values[node.id] = graph.value(node)
         elif node.op == "input":
             values[node.id] = inputs[node.attr]
+        elif node.op == "pick":
+            values[node.id] = args[0][node.attr]
+        elif node.op == "loop":
+            values[node.id] = _looped(graph, node.attr, args, values)
         else:
-            values[node.id] = computed(node, [values[a.id] for a in node.args])
-    return [values[root.id] for root in roots]
+            values[node.id] = computed(node, args)
+
+
+def _looped(graph: Graph, body: Body, args: Sequence[Any], values: dict[int, Any]) -> list[Any]:
+    held = list(args[: len(body.carried)])
+    going = held[: len(body.going)]
+    for _ in range(body.most):
+        if not any(np.any(one) for one in going):
+            break
+        inner = values | {node.id: value for node, value in zip(body.carried, held, strict=True)}
+        _evaluate(graph, body.nodes, {}, inner)
+        held = [graph.value(node) if node.fixed else inner[node.id] for node in body.after]
+        going = held[: len(body.going)]
+    return held

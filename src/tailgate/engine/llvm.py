@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from tailgate.engine.graph import BOOL, Node
-from tailgate.engine.passes import Branch, Item, schedule
+from tailgate.engine.graph import BOOL, Body, Node
+from tailgate.engine.passes import Branch, Item, counted, rounds, schedule
 
 _TYPES = {"f8": "double", "f4": "float", "b1": "i1"} | {f"{kind}{size}": f"i{8 * size}" for kind in "iu" for size in (1, 2, 4, 8)}
 _FLOAT_ORDER = {"lt": "olt", "le": "ole", "gt": "ogt", "ge": "oge", "eq": "oeq", "ne": "une"}
@@ -168,7 +168,50 @@ class Emitter:
         return self.address(f"%array{place.array}", self.set(f"add i64 {step}, {row}"))
 
     def compute(self, node: Node) -> None:
-        self.names[node.id] = self.input(node) if node.op == "input" else operation(self, node)
+        if node.op == "loop":
+            self.loop(node)
+        elif node.op == "pick":
+            self.names[node.id] = self.names[node.args[0].id, str(node.attr)]
+        else:
+            self.names[node.id] = self.input(node) if node.op == "input" else operation(self, node)
+
+    def loop(self, node: Node) -> None:
+        """Rounds until no lane goes on."""
+        body: Body = node.attr
+        begin = [self.value(a) for a in node.args[: len(body.carried)]]
+        for captured in {a.id: a for inner in (*body.nodes, *body.after) for a in (*inner.args, inner) if a.fixed}.values():
+            self.value(captured)
+        again, out = self.label("again"), self.label("out")
+        before, outer, count = self.block, dict(self.names), f"%count{node.id}"
+        self.line(f"br label %{again}")
+        self.begin(again)
+        heads = []
+        for one, first in zip(body.carried, begin, strict=True):
+            self.count += 1
+            self.names[one.id] = f"%v{self.count}"
+            heads.append((len(self.lines), one, first))
+            self.lines.append("")
+        self.lines.append("")
+        going = [self.names[one.id] for one in body.carried[: len(body.going)]]
+        mask = going[0]
+        for other in going[1:]:
+            mask = self.set(f"or <{self.lanes} x i1> {mask}, {other}")
+        more = self.set(f"icmp slt i64 {count}, {body.most}")
+        go, inside = self.set(f"and i1 {self.any_lane(mask)}, {more}"), self.label("round")
+        self.line(f"br i1 {go}, label %{inside}, label %{out}")
+        self.begin(inside)
+        self.emit(rounds(body), {})
+        for at, one, first in heads:
+            new = self.value(body.after[body.carried.index(one)])
+            self.lines[at] = f"  {self.names[one.id]} = phi {self.vector(one.dtype)} [{first}, %{before}], [{new}, %{self.block}]"
+        self.lines[heads[-1][0] + 1] = f"  {count} = phi i64 [0, %{before}], [{count}n, %{self.block}]"
+        self.line(f"{count}n = add i64 {count}, 1")
+        self.line(f"br label %{again}")
+        carried = {one.id: self.names[one.id] for one in body.carried}
+        self.names = outer
+        for i, one in enumerate(body.carried):
+            self.names[node.id, str(i)] = carried[one.id]
+        self.begin(out)
 
     # -- order
 
@@ -345,8 +388,8 @@ def cast(e: Emitter, x: str, of: np.dtype[Any], to: np.dtype[Any]) -> str:
     return e.set(f"{how} {kind} {x} to {result}")
 
 
-def text_of(layout: Layout, arrays: int, lanes: int, least: int) -> str:
-    """LLVM's text of `step(state, uniforms, table, first, last, steps)`."""
+def text_of(layout: Layout, arrays: int, lanes: int, least: int) -> tuple[str, dict[str, int]]:
+    """LLVM's text of `step(state, uniforms, table, first, last, steps)`, and how many nodes and branches it has."""
     e = Emitter(layout, lanes)
     e.begin("entry")
     for i in range(arrays):
@@ -358,13 +401,14 @@ def text_of(layout: Layout, arrays: int, lanes: int, least: int) -> str:
         e.line(f"%at = mul i64 %block, {layout.stride}")
         e.line("%state = getelementptr i8, ptr %memory, i64 %at")
         with _loop(e, "time", "0", "%steps"):
-            _step(e, least)
+            items = _step(e, least)
     e.line("ret void")
     wide = 64 * lanes
     attributes = f'nounwind "prefer-vector-width"="{max(128, min(512, wide))}" "min-legal-vector-width"="{max(128, min(512, wide))}"'
     head = ("define void @step(ptr noalias nocapture %memory, ptr noalias nocapture readonly %uniforms, "
             "ptr noalias nocapture readonly %table, i64 %first, i64 %last, i64 %steps) #0 {")  # fmt: skip
-    return "\n".join([*sorted(e.declared), head, *e.lines, "}", f"attributes #0 = {{ {attributes} }}", ""])
+    text = "\n".join([*sorted(e.declared), head, *e.lines, "}", f"attributes #0 = {{ {attributes} }}", ""])
+    return text, counted(items)
 
 
 @contextlib.contextmanager
@@ -384,7 +428,7 @@ def _loop(e: Emitter, name: str, first: str, last: str) -> Iterator[None]:
     e.begin(f"{name}_end")
 
 
-def _step(e: Emitter, least: int) -> None:
+def _step(e: Emitter, least: int) -> list[Item]:
     """One step of one block."""
     layout = e.layout
     items = schedule([node for node, _ in layout.outputs], least)
@@ -408,6 +452,7 @@ def _step(e: Emitter, least: int) -> None:
     for several in rows.values():
         several.sort(key=lambda pair: pair[0].column)
         e.store_columns([node for _, node in several], several[0][0])
+    return items
 
 
 def _last_read(items: Sequence[Item], layout: Layout) -> dict[int, int]:

@@ -48,3 +48,80 @@ def inverse(s: Any) -> Any:
                 a[i][p] = np.zeros_like(f)
                 a[i] = [v - f * w for v, w in zip(a[i], a[p], strict=True)]
     return np.stack([np.stack(row, axis=-1) for row in a], axis=-2)
+
+
+def transposed(x: Any) -> Any:
+    """The last two axes exchanged."""
+    return np.swapaxes(x, -1, -2)
+
+
+def times(x: Any, v: Any) -> Any:
+    """x (..., i, k) times v (..., k), by `product`."""
+    return product(x, v[..., None])[..., 0]
+
+
+def constant_on(x: Any, v: Any) -> Any:
+    """x (..., i, k), the same for all, times v (B, ..., k), by `constant_times`."""
+    return constant_times(x, v[..., None])[..., 0]
+
+
+def congruent(A: Any, P: Any, Q: Any) -> Any:
+    """A P A' + Q for one A and Q (n, n) and P (B, N, n, n)."""
+    return constant_times(A, transposed(constant_times(A, P))) + Q
+
+
+def predicted(A: Any, B: Any, c: Any, L: Any, merge: Any, heard: Any, x: Any, u: Any) -> Any:
+    """merge_i sum_j L_j (A x_j + B u_j + c) (B, N, n) over the j in heard (N, N) bool, for x (B, N, n) and u (B, N, m)."""
+    sent = constant_on(L, constant_on(A, x) + constant_on(B, u) + c)
+    return constant_on(merge, np.stack([_heard(sent, 0.0, who) for who in structure(heard)], axis=1))
+
+
+def _heard(sent: Any, begin: Any, who: Any) -> Any:
+    """The sum of what agents send (B, N, ...), in their order, over those that are heard (N,) bool."""
+    out = begin
+    for j in np.flatnonzero(who):
+        out = out + sent[:, j]
+    return out
+
+
+def moment(weights: Any, covariances: Any, offsets: Any) -> Any:
+    """sum_i w_i (P_i + d_i d_i') (B, N, n, n) in that order, of w_i (B, N), P_i (B, N, n, n) and d_i (B, N, n)."""
+    out: Any = None
+    for w, P, d in zip(weights, covariances, offsets, strict=True):
+        term = w[..., None, None] * (P + d[..., :, None] * d[..., None, :])
+        out = term if out is None else out + term
+    return out
+
+
+def fused(heard: Any, x: Any, M: Any, weight: Any, total: Any, begin: Any, step: Any) -> tuple[Any, Any]:
+    """xb (B, N, n) and Q^-1 (B, N, n, n) of what is sent: x (B, N, n) and its covariances M (B or 1, N, n, n), after a step (A, Q) if any.
+
+    Q_i = (begin_i + sum_j w_ij M_j^-1) / t_i and xb_i = Q_i^-1 (sum_j w_ij M_j^-1 x_j) / t_i over the j in heard (N, N) bool.
+    """
+    L = inverse(M if step is None else congruent(step[0], M, step[1]))
+    y, means, spreads = times(L, x), [], []
+    for i, who in enumerate(structure(heard)):
+        information, mean = begin[:, i, None, None], 0.0
+        for j in np.flatnonzero(who):
+            information = information + weight[:, i, j, None, None] * L[:, j]
+            mean = mean + weight[:, i, j, None] * y[:, j]
+        spreads.append(inverse(information / total[:, i, None, None]))
+        means.append(times(spreads[-1], mean / total[:, i, None]))
+    return np.stack(means, axis=1), np.stack(spreads, axis=1)
+
+
+def corrected(C: Any, W: Any, x: Any, P: Any, r: Any, keep: Any) -> tuple[Any, Any]:
+    """x (B, N, n) and P (B, N, n, n) after an update by r (B, N, q), whose covariance has the inverse W; keep (B, N, q) are the sensors."""
+    there = keep.astype(np.float64)
+    cross = constant_times(C, P) * there[..., None]
+    gain = transposed(product(W, cross))
+    left = P - product(gain, cross)
+    return x + times(gain, r * there), 0.5 * (left + transposed(left))
+
+
+def dense(x: Any, weight: Any, bias: Any) -> Any:
+    """x (B, i) times weight (i, o), on top of bias (o,): sums run over i in ascending order."""
+    out = bias
+    for i in range(x.shape[1]):
+        out = out + x[:, i, None] * weight[i]
+    return out

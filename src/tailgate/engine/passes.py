@@ -10,9 +10,9 @@ import heapq
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field
 
-from tailgate.engine.graph import Node, ordered
+from tailgate.engine.graph import Body, Node, ordered
 
-_COST = {"const": 0, "uniform": 0, "div": 8, "sqrt": 10, "rem": 20}
+_COST = {"const": 0, "uniform": 0, "pick": 0, "loop": 300, "div": 8, "sqrt": 10, "rem": 20}
 LEAST = 12  # cost of what is worth a branch, in additions
 
 
@@ -37,6 +37,11 @@ def schedule(roots: Iterable[Node], least: int = LEAST) -> list[Item]:
     wanted = list(roots)
     nodes = [node for node in ordered(wanted) if not node.fixed]
     return _scope(nodes, {node.id for node in wanted}, least)
+
+
+def rounds(body: Body, least: int = LEAST) -> list[Item]:
+    """A round of a loop, in the order of its computation."""
+    return _scope(body.nodes, {node.id for node in body.after}, least)
 
 
 def _scope(nodes: Sequence[Node], kept: Collection[int], least: int) -> list[Item]:

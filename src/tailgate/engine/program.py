@@ -101,7 +101,7 @@ class Program:
                     layout.inputs[node.id] = Column(number, column, len(nodes))
                 else:
                     layout.outputs.append((node, Column(number, column, len(nodes))))
-        self.text = text_of(layout, len(self.arrays), self.lanes, least)
+        self.text, self.size = text_of(layout, len(self.arrays), self.lanes, least)
         self.function = objects.Function(self.text)
         self._slots = [trace.graph.nodes[i] for i in layout.uniforms]
 
@@ -210,7 +210,7 @@ class Call:
 
     def sheet(self) -> dict[str, Array]:
         """New results, which `play` fills."""
-        sheet = np.empty(self._size + ALIGNED, np.uint8)
+        self._sheet = sheet = np.empty(self._size + ALIGNED, np.uint8)  # kept: code writes to it as long as it is called
         base = sheet.ctypes.data
         begin = -base % ALIGNED
         self._table[self._first :, 0] = base + begin + self._offsets

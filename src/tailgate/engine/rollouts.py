@@ -10,7 +10,7 @@ from tailgate import num
 from tailgate.core import Attack
 from tailgate.draws import Keys, Role
 from tailgate.engine import objects
-from tailgate.engine.agreement import Untraced, explained, same
+from tailgate.engine.agreement import Untraced, check_open, explained, raised, same
 from tailgate.engine.graph import Array
 from tailgate.engine.program import Call, Program, State, traced
 from tailgate.loop import Loop
@@ -24,6 +24,7 @@ class Rollout:
     """The program of a loop under an attack. Raises whatever their parts raise while they are traced."""
 
     def __init__(self, loop: Loop, attack: Attack) -> None:
+        check_open(loop.defence)
         self.loop, self.attack, self.plan = loop, attack, attack.prepare(loop.brief)
         self.program = Program(traced(self._step, self.begun(_ONE), {}))
 
@@ -105,8 +106,10 @@ def _difference(rollout: Rollout, batch: int = 64) -> str:
     state.put(plain)
     call = Call(rollout.program, state)
     for step in range(min(TRIED, rollout.loop.horizon)):
-        results = call()
-        plain, wanted = rollout._step(plain, {})
+        results, found = call(), raised(lambda: rollout._step(plain, {}))  # noqa: B023
+        if isinstance(found, str):
+            return "" if not results["demands"].all() else f"step {step + 1}: {found}"
+        plain, wanted = found
         for name, leaf in (leaves(plain) | wanted).items():
             got = results[name] if name in wanted else state.get_leaf(name)
             if not same(got, leaf):

@@ -17,7 +17,7 @@ from tailgate import draws, num
 from tailgate.agents.observation import ObservationCodec
 from tailgate.draws import Keys
 from tailgate.engine import objects
-from tailgate.engine.agreement import Untraced, explained, same
+from tailgate.engine.agreement import Untraced, check_open, explained, raised, same
 from tailgate.engine.graph import Array
 from tailgate.engine.program import Call, Program, State, traced
 from tailgate.errors import InputError
@@ -31,6 +31,7 @@ class SeatPrograms:
     """The programs of a seat. Raises whatever its parts raise while they are traced."""
 
     def __init__(self, seat: Seat) -> None:
+        check_open(seat.loop.defence)
         self.seat, self.loop = seat, seat.loop
         self.observation = ObservationCodec(seat.loop.brief)
         start = seat.loop.start(draws.keys("tune", [0]))
@@ -95,8 +96,11 @@ def difference(programs: SeatPrograms, batch: int = 64, decisions: int = 24) -> 
     for decision in range(decisions):
         over = chance.random(batch) < (0.5 if decision == decisions // 2 else 0.02)
         actions = chance.integers(0, size, batch) if programs.seat.action.discrete else chance.uniform(-1.0, 1.0, (batch, size))
-        rows.decide(actions, over, over)
-        outcome = plain.decide(actions, over, True)
+        broken, outcome = raised(lambda: rows.decide(actions, over, over)), raised(lambda: plain.decide(actions, over, True))  # noqa: B023
+        if isinstance(outcome, str):
+            return "" if broken == outcome else f"decision {decision}: {outcome}"
+        if isinstance(broken, str):
+            return f"decision {decision}: {broken}"
         here, there = rows.held() | rows.outcome()._asdict(), plain.held() | outcome._asdict()
         here, there = here | {"seen": rows.brought["seen"]}, there | {"seen": plain.seen()}
         for name, wanted in there.items():
