@@ -138,7 +138,7 @@ def test_what_is_not_finite_is_refused_as_in_the_plain_loop(tmp_path):
         env.reset(seed=0)
         with pytest.raises(InputError, match="defence output score: got 'NaN or infinity in step") as caught:
             for t in range(9):
-                env.step(np.arange(5) == min(t, 3))
+                env.step((np.arange(5) == min(t, 3)).astype(int))
         said.append(str(caught.value))
     assert said[0] == said[1]
 
