@@ -12,6 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from tailgate.engine.routines import routine
+
 LN2_HI = 6.93147180369123816490e-01  # ln 2, its last bits zero: n * LN2_HI is exact for |n| < 2**20
 LN2_LO = 1.90821492927058770002e-10
 LOG2_E = 1.44269504088896338700e00
@@ -29,6 +31,7 @@ def _polynomial(z: Any, *coefficients: float) -> Any:
     return out
 
 
+@routine
 def exp(x: Any) -> Any:
     """e to the power x; below the normal range it is 0."""
     z = np.where(x == x, x, 0.0)
@@ -54,6 +57,7 @@ def log_normal(x: Any, e: Any) -> Any:
     return e * LN2_HI + (2.0 * s * p + e * LN2_LO)
 
 
+@routine
 def log(x: Any) -> Any:
     """The natural logarithm: -inf of 0, NaN of less."""
     x = np.where(x == x, x, -1.0)
@@ -65,6 +69,7 @@ def log(x: Any) -> Any:
     return np.where(plain, log_normal(x, np.where(small, -54.0, 0.0)), other)
 
 
+@routine
 def tanh(x: Any) -> Any:
     """The hyperbolic tangent, to an absolute error below 4e-16."""
     out = 1.0 - 2.0 / (exp(2.0 * x) + 1.0)
@@ -94,6 +99,7 @@ def philox(c0: Any, c1: Any, c2: Any, c3: Any, k0: Any, k1: Any) -> tuple[Any, A
     return c0 & LOW, c1 & LOW, c2 & LOW, c3 & LOW
 
 
+@routine
 def uniform_pair(key: Any, episode: Any, step: Any, stream: Any, block: Any) -> tuple[Any, Any]:
     """Two uniforms in (0, 1) of 52 bits each, never 0 nor 1; all arguments are uint64."""
     w0, w1, w2, w3 = philox(episode, block, step, stream, key & LOW, key >> SHIFT)
@@ -106,6 +112,7 @@ def uniform_pair(key: Any, episode: Any, step: Any, stream: Any, block: Any) -> 
     return number(w0, w1), number(w2, w3)
 
 
+@routine
 def normal_pair(key: Any, episode: Any, step: Any, stream: Any, block: Any) -> tuple[Any, Any]:
     """Two standard normals, by Box and Muller."""
     u, v = uniform_pair(key, episode, step, stream, block)

@@ -170,6 +170,16 @@ class Graph:
             return x
         return x.args[0] if x.op == "bits" and x.args[0].dtype == dtype else self._folded("bits", dtype, (x,))
 
+    # -- routines
+
+    def call(self, routine: Any, args: Sequence[Node]) -> Node:
+        """A call of a routine (engine/routines.py), whose results are picked."""
+        return self._node("call", BOOL, tuple(args), routine, id(routine), all(a.fixed for a in args))
+
+    def pick(self, node: Node, number: int, dtype: np.dtype[Any]) -> Node:
+        """One of several results."""
+        return self._node("pick", dtype, (node,), number, number, node.fixed)
+
     # -- loops
 
     def carried(self, begin: Array) -> Array:
@@ -187,7 +197,7 @@ class Graph:
         args = (*begin, *(captured | {node.id: node for node in outer}).values())
         body = Body(carried, after, going, most, sorted(inside, key=lambda node: node.id))
         node = self._node("loop", BOOL, args, body, len(self.nodes), False)
-        return [self._node("pick", one.dtype, (node,), i, i, False) for i, one in enumerate(begin)]
+        return [self.pick(node, i, one.dtype) for i, one in enumerate(begin)]
 
     def _folded(self, op: str, dtype: np.dtype[Any], args: tuple[Node, ...]) -> Node:
         if all(a.op == "const" for a in args):
@@ -233,6 +243,10 @@ def apply(op: str, dtype: np.dtype[Any], args: Sequence[Any]) -> Any:
 
 def computed(node: Node, args: Sequence[Any]) -> Any:
     """The value of a node whose arguments have these."""
+    if node.op == "call":
+        return node.attr.values(list(args))
+    if node.op == "pick":
+        return args[0][node.attr]
     with np.errstate(all="ignore"):
         return np.asarray(apply(node.op, node.dtype, args))[()]
 
@@ -263,8 +277,6 @@ def _evaluate(graph: Graph, nodes: Iterable[Node], inputs: dict[Any, Array], val
             values[node.id] = graph.value(node)
         elif node.op == "input":
             values[node.id] = inputs[node.attr]
-        elif node.op == "pick":
-            values[node.id] = args[0][node.attr]
         elif node.op == "loop":
             values[node.id] = _looped(graph, node.attr, args, values)
         else:

@@ -66,6 +66,8 @@ class Emitter:
         self.layout, self.lanes = layout, lanes
         self.lines: list[str] = []
         self.declared: set[str] = set()
+        self.routines: dict[Any, str] = {}  # their names
+        self.texts: list[str] = []  # and texts
         self.names: dict[int | tuple[int, str], str] = {}
         self.count = 0
         self.block = "entry"
@@ -170,10 +172,35 @@ class Emitter:
     def compute(self, node: Node) -> None:
         if node.op == "loop":
             self.loop(node)
+        elif node.op == "call":
+            self.call(node)
         elif node.op == "pick":
             self.names[node.id] = self.names[node.args[0].id, str(node.attr)]
         else:
             self.names[node.id] = self.input(node) if node.op == "input" else operation(self, node)
+
+    def call(self, node: Node) -> None:
+        """A routine, whose text is written when it is met first."""
+        routine = node.attr
+        kinds = [self.vector(one.dtype) for one in routine.outputs]
+        result = f"{{ {', '.join(kinds)} }}"
+        if routine not in self.routines:
+            self.routines[routine] = name = f"@{routine.name}{len(self.routines)}"
+            inner = Emitter(Layout({}, [], 0), self.lanes)
+            inner.routines, inner.texts, inner.declared = self.routines, self.texts, self.declared
+            inner.names = {one.id: f"%a{i}" for i, one in enumerate(routine.inputs)}
+            inner.begin("entry")
+            inner.emit([item for item in schedule(routine.outputs) if not isinstance(item, Node) or item.op != "input"], {})
+            whole = "poison"
+            for i, (one, kind) in enumerate(zip(routine.outputs, kinds, strict=True)):
+                whole = inner.set(f"insertvalue {result} {whole}, {kind} {inner.value(one)}, {i}")
+            inner.line(f"ret {result} {whole}")
+            given = ", ".join(f"{inner.vector(one.dtype)} %a{i}" for i, one in enumerate(routine.inputs))
+            self.texts.append("\n".join([f"define internal fastcc {result} {name}({given}) noinline #0 {{", *inner.lines, "}"]))
+        given = ", ".join(f"{self.vector(a.dtype)} {self.value(a)}" for a in node.args)
+        held = self.set(f"call fastcc {result} {self.routines[routine]}({given})")
+        for i in range(len(kinds)):
+            self.names[node.id, str(i)] = self.set(f"extractvalue {result} {held}, {i}")
 
     def loop(self, node: Node) -> None:
         """Rounds until no lane goes on."""
@@ -407,7 +434,7 @@ def text_of(layout: Layout, arrays: int, lanes: int, least: int) -> tuple[str, d
     attributes = f'nounwind "prefer-vector-width"="{max(128, min(512, wide))}" "min-legal-vector-width"="{max(128, min(512, wide))}"'
     head = ("define void @step(ptr noalias nocapture %memory, ptr noalias nocapture readonly %uniforms, "
             "ptr noalias nocapture readonly %table, i64 %first, i64 %last, i64 %steps) #0 {")  # fmt: skip
-    text = "\n".join([*sorted(e.declared), head, *e.lines, "}", f"attributes #0 = {{ {attributes} }}", ""])
+    text = "\n".join([*sorted(e.declared), *e.texts, head, *e.lines, "}", f"attributes #0 = {{ {attributes} }}", ""])
     return text, counted(items)
 
 

@@ -81,7 +81,7 @@ def _branches(nodes: Sequence[Node], kept: Collection[int], least: int) -> list[
     def of(side: int, choices: list[Node]) -> Branch:
         inside = _only(choices, side, users, by_id, pinned | taken)
         held = [choice for choice in choices if choice.args[side].id in inside]
-        return Branch(choices[0].args[0], side, held, inside, sum(_COST.get(by_id[i].op, 1) for i in inside))
+        return Branch(choices[0].args[0], side, held, inside, sum(_cost(by_id[i]) for i in inside))
 
     waiting: list[tuple[int, int, int, list[Node], Branch]] = []
     for (_, side), choices in groups.items():
@@ -100,6 +100,10 @@ def _branches(nodes: Sequence[Node], kept: Collection[int], least: int) -> list[
         pinned |= {choice.id for choice in branch.choices}
         found.append(branch)
     return found
+
+
+def _cost(node: Node) -> int:
+    return int(node.attr.cost) if node.op == "call" else _COST.get(node.op, 1)
 
 
 def _levels(nodes: Sequence[Node], choices: list[Node]) -> list[list[Node]]:

@@ -8,6 +8,7 @@ Both leave what is to be seen, and what may be decided next.
 
 from __future__ import annotations
 
+import dataclasses
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -19,6 +20,7 @@ from tailgate.draws import Keys
 from tailgate.engine import objects
 from tailgate.engine.agreement import Untraced, check_open, explained, raised, same
 from tailgate.engine.graph import Array
+from tailgate.engine.parameters import lifted
 from tailgate.engine.program import Call, Program, State, traced
 from tailgate.errors import InputError
 from tailgate.tree import leaves, map_leaves
@@ -49,25 +51,35 @@ class SeatPrograms:
         return Program(traced(self._begin, self.example, {"again": np.zeros(1, bool)}))
 
     def _decide(self, held: Any, given: Any) -> tuple[Any, Any]:
-        loop, tally, outcome, _ = self.seat.step(held["loop"], held["tally"], given["action"], given["over"])
-        state = self._renewed({"loop": loop, "tally": tally}, held["loop"].keys, given["again"])
-        return state, outcome._asdict() | self._shown(state)
+        seat = self._lifted(held)
+        loop, tally, outcome, _ = seat.step(held["loop"], held["tally"], given["action"], given["over"])
+        state = _renewed(seat, {"loop": loop, "tally": tally}, held["loop"].keys, given["again"])
+        return state, outcome._asdict() | _shown(seat, state)
 
     def _begin(self, held: Any, given: Any) -> tuple[Any, Any]:
-        state = self._renewed(held, held["loop"].keys, given["again"])
-        return state, self._shown(state)
+        seat = self._lifted(held)
+        state = _renewed(seat, held, held["loop"].keys, given["again"])
+        return state, _shown(seat, state)
 
-    def _renewed(self, state: Any, keys: Keys, again: Any) -> Any:
-        """The state with the next episode in the rows `again`."""
-        loop = self.loop.start(Keys(keys.key, keys.episode + np.uint32(1)))
-        fresh = {"loop": loop, "tally": self.seat.begin(loop)}
-        return map_leaves(lambda old, new: np.where(again.reshape(len(again), *(1,) * (old.ndim - 1)), new, old), state, fresh)
+    def _lifted(self, held: Any) -> Seat:
+        """The seat with its parameters traced, which shows one frame."""
+        seat: Seat = lifted(held["loop"].k.graph, dataclasses.replace(self.seat, observation=self.observation, config={}), "seat")
+        return seat
 
-    def _shown(self, state: Any) -> dict[str, Any]:
-        seat, view = self.seat, self.loop.sense(state["loop"])
-        damage = np.min(view.scene.gap, axis=1) if seat.road else state["tally"].error
-        shown = {"seen": self.observation.observe(view), "allowed": view.allowed, "k": view.k, "damage": damage}
-        return shown | ({"mask": seat.action.mask(view)} if seat.action.discrete else {})
+
+def _renewed(seat: Seat, state: Any, keys: Keys, again: Any) -> Any:
+    """The state with the next episode in the rows `again`."""
+    loop = seat.loop.start(Keys(keys.key, keys.episode + np.uint32(1)))
+    fresh = {"loop": loop, "tally": seat.begin(loop)}
+    return map_leaves(lambda old, new: np.where(again.reshape(len(again), *(1,) * (old.ndim - 1)), new, old), state, fresh)
+
+
+def _shown(seat: Seat, state: Any) -> dict[str, Any]:
+    """What is to be seen of a state, and what may be decided next."""
+    view = seat.loop.sense(state["loop"])
+    damage = np.min(view.scene.gap, axis=1) if seat.road else state["tally"].error
+    shown = {"seen": seat.observation.observe(view), "allowed": view.allowed, "k": view.k, "damage": damage}
+    return shown | ({"mask": seat.action.mask(view)} if seat.action.discrete else {})
 
 
 def programs_of(seat: Seat) -> SeatPrograms | Untraced:

@@ -1,0 +1,68 @@
+"""Routines: elementwise functions that machine code calls, in place of a copy of theirs wherever they are used."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import update_wrapper
+from typing import Any
+
+import numpy as np
+
+from tailgate.engine.array import Traced, boxed, each, lifted, shared_batch
+from tailgate.engine.graph import Graph, Node, evaluate
+
+
+@dataclass(eq=False)
+class Routine:
+    """A function of numbers of given types, traced by itself."""
+
+    name: str
+    graph: Graph
+    inputs: list[Node]
+    outputs: list[Node]
+    cost: int = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.cost = len(self.graph.nodes)
+
+    def values(self, args: list[Any]) -> list[Any]:
+        """What numpy gives."""
+        return evaluate(self.graph, self.outputs, dict(zip((node.attr for node in self.inputs), args, strict=True)))
+
+
+class _Called:
+    """A function that becomes a routine where its arguments are traced."""
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self.function = function
+        self._made: dict[tuple[Any, ...], tuple[Routine, bool]] = {}
+        update_wrapper(self, function)
+
+    def __call__(self, *args: Any) -> Any:
+        found = next((x for x in args if isinstance(x, Traced)), None)
+        if found is None:
+            return self.function(*args)
+        graph = found.graph
+        arrays = [lifted(graph, x, found.dtype) for x in args]
+        routine, several = self._routine(tuple(x.dtype for x in arrays))
+        calls = each(lambda *nodes: graph.call(routine, nodes), *(x.nodes for x in arrays))
+        back = shared_batch(arrays)
+        batch = None if back is None else calls.ndim + back
+        out = [Traced(graph, each(lambda n, i=i: graph.pick(n, i, o.dtype), calls), o.dtype, batch) for i, o in enumerate(routine.outputs)]  # noqa: B023
+        return tuple(out) if several else out[0]
+
+    def _routine(self, dtypes: tuple[Any, ...]) -> tuple[Routine, bool]:
+        if dtypes not in self._made:
+            graph = Graph()
+            inputs = [graph.input(i, dtype) for i, dtype in enumerate(dtypes)]
+            made = self.function(*(Traced(graph, boxed(node), node.dtype) for node in inputs))
+            several = isinstance(made, tuple)
+            outputs = [np.asarray(part.nodes)[()] for part in (made if several else (made,))]
+            self._made[dtypes] = Routine(self.function.__name__, graph, inputs, outputs), several
+        return self._made[dtypes]
+
+
+def routine(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Decorator of an elementwise function of arrays, which gives an array or a tuple of them."""
+    return _Called(function)
