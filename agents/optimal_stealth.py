@@ -79,7 +79,7 @@ class OptimalStealth(Script):
         gate = self.gate if self.gate is not None else look.gate
         if gate is None:
             raise NotApplicable("attack optimal_stealth", type(box.defence).__name__, "a defence with a gate, or the attack's own")
-        row = aim.row[np.minimum(view.k, aim.last)][:, None]  # (B, 1, n)
+        row = num.take(aim.row, np.minimum(view.k, aim.last))[:, None]  # (B, 1, n)
         predicted = num.matvec(model.A, view.estimate.x) + num.matvec(model.B, box.known_u) + model.c
         heading = num.dot(row, predicted - view.truth)
         gain = num.stack([num.dot(row, look.gain[..., j]) for j in range(len(model.sensors))])

@@ -9,12 +9,15 @@ import pytest
 
 from tailgate import draws, num
 from tailgate.agents.scripted import NoAttack
+from tailgate.agents.zoo import zoo_card
 from tailgate.cli import main
 from tailgate.engine import objects
 from tailgate.engine.graph import evaluate
 from tailgate.engine.program import Call, Program, State, traced
 from tailgate.engine.rollouts import Rollout, rollout_of
+from tailgate.engine.seats import SeatPrograms
 from tailgate.envs.faces import AdversaryVectorEnv
+from tailgate.envs.seat import Seat
 from tailgate.errors import InputError
 from tailgate.estimators import Kalman
 from tailgate.registry import Spec
@@ -59,14 +62,15 @@ def test_a_strangers_defence_is_traced_as_it_stands(tmp_path, monkeypatch):
 @pytest.mark.parametrize("terminate", [True, False])
 @pytest.mark.parametrize(("scenario", "defence", "rival"), [
     ("stop-and-go-v0", "mine", "fdi:value=5"), ("car-following-lossy-v0", "chi2_kf", "dos_hold"), ("gusty-stop-and-go-v0", "chi2_kf_sparse", "none"),
-    ("radar-following-v0", "cra", "noise_jam"), ("stop-and-go-v0", "steered", "fdi_then_jam"),
+    ("radar-following-v0", "cra", "noise_jam"), ("stop-and-go-v0", "steered", "fdi_then_jam"), ("gusty-stop-and-go-v0", "chi2_kf_sparse", "zoo:name=car-following-chi2_kf-0"),
 ])  # fmt: skip
 def test_a_rollout_has_the_plain_ones_hashes(scenario, defence, rival, terminate, tmp_path, monkeypatch):
     if defence == "mine":
         loop = load_scenario(scenario).loop(plugin(tmp_path, monkeypatch).Saturated())
     else:
-        spec = Spec("defence", defence)
-        loop = load_scenario(scenario).loop(spec.make(), spec.entry.uses)
+        spec, threat = Spec("defence", defence), dict(zoo_card(rival[9:])["threat"]) if rival.startswith("zoo") else {}
+        threat.pop("class", None)
+        loop = load_scenario(scenario).with_threat(**threat).loop(spec.make(), spec.entry.uses)
     attack, keys = Spec("attack", rival).make(), draws.keys("report", range(11))
     program = rollout_of(loop, attack)
     assert isinstance(program, Rollout), program
@@ -115,6 +119,18 @@ def test_what_cannot_be_traced_is_played_plain_and_says_why():
     assert AdversaryVectorEnv(1, defence=Branching(), engine="auto").engine_why == ""  # nobody tried
     for name, why in (("filterpy_kf", "one episode after the other"),):
         assert why in AdversaryVectorEnv(16, defence=name).engine_why
+
+
+def test_other_parameters_need_no_other_code():
+    """Thresholds, noises, gains and rewards are numbers that all episodes share."""
+
+    def made(defence, **options):
+        return SeatPrograms(Seat.make("gusty-stop-and-go-v0", defence, **options)).decide
+
+    one, other = made("chi2_kf:eta=20"), made("chi2_kf:eta=7.5", gap_shaping=0.1, threat={"jam_range": [-50.0, 70.0]})
+    assert one.text == other.text and not other.function.fresh
+    assert sorted(one.uniforms().tolist()) != sorted(other.uniforms().tolist())
+    assert made("kf").text != one.text
 
 
 def test_code_that_differs_from_the_plain_loop_is_not_used():

@@ -21,7 +21,7 @@ from tailgate import kernels, linear
 from tailgate.elementwise import clip as clip
 from tailgate.elementwise import select as select
 from tailgate.engine import elementary, matrices
-from tailgate.engine.array import Traced
+from tailgate.engine.array import Traced, gathered
 from tailgate.engine.functions import tracing
 from tailgate.engine.loops import until as until
 from tailgate.errors import InputError
@@ -107,10 +107,15 @@ def broken(rows: Array, field: str, found: str, wanted: str, k: Array) -> InputE
     return error
 
 
+LISTED = 8  # entries of a table that are compared one by one where code is traced
+
+
 def take(table: Array, index: Any) -> Any:
     """table[index] of a table (K, ...) and whole numbers from 0 to K - 1."""
     if not isinstance(index, Traced):
         return table[index]
+    if len(table) > LISTED and not index.fixed:
+        return gathered(table, index)
     wide: Any = index[(..., *(None,) * (table.ndim - 1))]
     out: Any = np.broadcast_to(table[0], (*index.shape, *table.shape[1:]))
     for k in range(1, len(table)):

@@ -327,6 +327,17 @@ def elementwise(graph: Graph, function: Callable[..., Node], arrays: Sequence[Tr
     return Traced(graph, nodes, dtype, None if back is None else nodes.ndim + back, weak)
 
 
+def gathered(table: Any, index: Traced) -> Traced:
+    """table[index] of a table (K, ...) that is the same for all episodes."""
+    graph, held = index.graph, lifted(index.graph, table)
+    columns = held.nodes.reshape(len(held.nodes), -1).T
+    nodes = np.empty((*index.shape, len(columns)), object)
+    for place in np.ndindex(*index.shape):
+        one: Node = index.nodes[place]  # type: ignore[assignment]
+        nodes[place] = [graph.gather(list(column), one) for column in columns]
+    return Traced(graph, nodes.reshape(*index.shape, *held.shape[1:]), held.dtype, index.batch)
+
+
 def typed(graph: Graph, x: Traced, dtype: np.dtype[Any]) -> Traced:
     """x of a type."""
     return x if x.dtype == dtype else Traced(graph, each(lambda node: graph.cast(node, dtype), x.nodes), dtype, x.batch)

@@ -114,6 +114,10 @@ def _is_in(x: Traced, values: Any, invert: bool = False) -> Any:
     return ~found if invert else found
 
 
+def _untold(what: str, instead: str) -> Any:
+    raise Untraceable(what, f"write {instead}")
+
+
 def _copyto(target: Traced, source: Any, casting: Any = "same_kind", where: Any = True) -> None:
     target[...] = source if where is True else chosen(where, source, target)
 
@@ -144,6 +148,7 @@ _FUNCTIONS: dict[Any, Callable[..., Any]] = {
     np.reshape: lambda x, shape, order="C": x.reshape(shape),
     np.ravel: lambda x, order="C": x.ravel(),
     np.diagonal: lambda x, offset=0, axis1=0, axis2=1: x.diagonal(offset, axis1, axis2),
+    np.tile: lambda x, reps: _concatenate([x] * reps, -1) if isinstance(reps, int) else _untold("np.tile", "np.concatenate"),
     np.repeat: lambda x, repeats, axis: x._moved(lambda a: np.repeat(a, repeats, axis), copied=True),
     np.roll: lambda x, shift, axis: x._moved(lambda a: np.roll(a, shift, axis), copied=True),
     np.flip: lambda x, axis: x._moved(lambda a: np.flip(a, axis)),

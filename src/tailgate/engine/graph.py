@@ -12,6 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from tailgate.engine.untraceable import Untraceable
+
 Array = np.ndarray[Any, Any]
 BOOL, FLOAT, INT, WORD = np.dtype(bool), np.dtype(np.float64), np.dtype(np.int64), np.dtype(np.uint64)
 DTYPES = [np.dtype(name) for name in ("?", "f8", "f4", "i8", "u8", "i4", "u4", "i2", "u2", "i1", "u1")]
@@ -35,6 +37,7 @@ def converted(x: Any, dtype: np.dtype[Any]) -> Any:
     return x.astype(dtype)
 
 
+MOST = 60_000  # nodes of a graph: what has more takes minutes to compile
 COMPARISONS = {"lt": np.less, "le": np.less_equal, "gt": np.greater, "ge": np.greater_equal, "eq": np.equal, "ne": np.not_equal}
 BINARY: dict[str, Callable[..., Any]] = {
     "add": np.add, "sub": np.subtract, "mul": np.multiply, "div": np.true_divide, "min": minimum, "max": maximum,
@@ -111,6 +114,8 @@ class Graph:
         known = (op, dtype, key, *(a.id for a in args))
         node = self._known.get(known)
         if node is None:
+            if len(self.nodes) >= MOST:
+                raise Untraceable(f"more than {MOST:,} operations", "use num.until, num.take and matrix products of num for what is large")
             node = self._known[known] = Node(len(self.nodes), op, dtype, args, attr, fixed)
             self.nodes.append(node)
         return node
@@ -180,6 +185,22 @@ class Graph:
         """One of several results."""
         return self._node("pick", dtype, (node,), number, number, node.fixed)
 
+    # -- tables
+
+    def gather(self, table: Sequence[Node], index: Node) -> Node:
+        """table[index] of fixed nodes of one type; an index beyond its ends takes the number there."""
+        last = self.const(len(table) - 1, INT)
+        within = self.binary("min", self.binary("max", self.cast(index, INT), self.const(0, INT)), last)
+        return self._node("gather", table[0].dtype, (within,), tuple(table), tuple(node.id for node in table), False)
+
+    # -- matrices
+
+    def matvec(self, matrix: Array, x: Sequence[Node], base: Sequence[Node]) -> list[Node]:
+        """base + matrix x, of a matrix (p, q) of fixed nodes: sums begin with the base and run over q in ascending order."""
+        key = tuple(node.id for node in matrix.flat)
+        node = self._node("matvec", FLOAT, (*x, *base), matrix, key, False)
+        return [self.pick(node, i, FLOAT) for i in range(len(base))]
+
     # -- loops
 
     def carried(self, begin: Array) -> Array:
@@ -247,6 +268,8 @@ def computed(node: Node, args: Sequence[Any]) -> Any:
         return node.attr.values(list(args))
     if node.op == "pick":
         return args[0][node.attr]
+    if node.op == "matvec":
+        raise AssertionError("a matrix product is evaluated with its graph")
     with np.errstate(all="ignore"):
         return np.asarray(apply(node.op, node.dtype, args))[()]
 
@@ -277,10 +300,21 @@ def _evaluate(graph: Graph, nodes: Iterable[Node], inputs: dict[Any, Array], val
             values[node.id] = graph.value(node)
         elif node.op == "input":
             values[node.id] = inputs[node.attr]
+        elif node.op == "gather":
+            values[node.id] = np.array([graph.value(entry) for entry in node.attr], node.dtype)[args[0]]
+        elif node.op == "matvec":
+            values[node.id] = _multiplied(graph, node.attr, args)
         elif node.op == "loop":
             values[node.id] = _looped(graph, node.attr, args, values)
         else:
             values[node.id] = computed(node, args)
+
+
+def _multiplied(graph: Graph, matrix: Array, args: Sequence[Any]) -> list[Any]:
+    x, out = args[: matrix.shape[1]], list(args[matrix.shape[1] :])
+    for k in range(matrix.shape[1]):
+        out = [total + graph.value(matrix[i, k]) * x[k] for i, total in enumerate(out)]
+    return out
 
 
 def _looped(graph: Graph, body: Body, args: Sequence[Any], values: dict[int, Any]) -> list[Any]:

@@ -15,9 +15,10 @@ from typing import Any
 
 import numpy as np
 
-from tailgate.engine.graph import BOOL, Body, Node
+from tailgate.engine.graph import BOOL, FLOAT, Body, Node
 from tailgate.engine.passes import Branch, Item, counted, rounds, schedule
 
+ROWS = 10  # of a matrix that are summed at once
 _TYPES = {"f8": "double", "f4": "float", "b1": "i1"} | {f"{kind}{size}": f"i{8 * size}" for kind in "iu" for size in (1, 2, 4, 8)}
 _FLOAT_ORDER = {"lt": "olt", "le": "ole", "gt": "ogt", "ge": "oge", "eq": "oeq", "ne": "une"}
 _ROUNDED = {"sqrt": "sqrt", "floor": "floor", "ceil": "ceil", "trunc": "trunc", "rint": "rint"}
@@ -56,7 +57,8 @@ class Layout:
     inputs: dict[int, Held | Column]  # by node
     outputs: list[tuple[Node, Held | Column]]
     stride: int  # bytes of a block's state
-    uniforms: dict[int, int] = field(default_factory=dict)  # node -> place in the table of float64
+    uniforms: dict[int, int] = field(default_factory=dict)  # node -> its slot
+    slots: list[Node] = field(default_factory=list)  # what the table of numbers that all episodes share holds
 
 
 class Emitter:
@@ -68,6 +70,7 @@ class Emitter:
         self.declared: set[str] = set()
         self.routines: dict[Any, str] = {}  # their names
         self.texts: list[str] = []  # and texts
+        self.rooms: list[str] = []  # on the stack
         self.names: dict[int | tuple[int, str], str] = {}
         self.count = 0
         self.block = "entry"
@@ -118,8 +121,10 @@ class Emitter:
         if node.id not in self.names:
             if not node.fixed:
                 raise AssertionError(f"{node} is not computed yet")
-            place = self.layout.uniforms.setdefault(node.id, len(self.layout.uniforms))
-            self.names[node.id] = self.uniform(place, node.dtype)
+            if node.id not in self.layout.uniforms:
+                self.layout.uniforms[node.id] = len(self.layout.slots)
+                self.layout.slots.append(node)
+            self.names[node.id] = self.uniform(self.layout.uniforms[node.id], node.dtype)
         return self.names[node.id]
 
     def uniform(self, place: int, dtype: np.dtype[Any]) -> str:
@@ -174,6 +179,10 @@ class Emitter:
             self.loop(node)
         elif node.op == "call":
             self.call(node)
+        elif node.op == "matvec":
+            self.matvec(node)
+        elif node.op == "gather":
+            self.names[node.id] = self.gather(node)
         elif node.op == "pick":
             self.names[node.id] = self.names[node.args[0].id, str(node.attr)]
         else:
@@ -201,6 +210,72 @@ class Emitter:
         held = self.set(f"call fastcc {result} {self.routines[routine]}({given})")
         for i in range(len(kinds)):
             self.names[node.id, str(i)] = self.set(f"extractvalue {result} {held}, {i}")
+
+    def gather(self, node: Node) -> str:
+        """A number of a table for each lane."""
+        table = self.address("%uniforms", 8 * len(self.layout.slots))
+        self.layout.slots.extend(node.attr)
+        index, out, name = self.value(node.args[0]), "poison", "i8" if node.dtype == BOOL else scalar(node.dtype)
+        for lane in range(self.lanes):
+            at = self.set(f"shl i64 {self.set(f'extractelement <{self.lanes} x i64> {index}, i32 {lane}')}, 3")
+            held = self.set(f"load {name}, ptr {self.address(table, at)}, align 8")
+            if node.dtype == BOOL:
+                held = self.set(f"icmp ne i8 {held}, 0")
+            out = self.set(f"insertelement {self.vector(node.dtype)} {out}, {scalar(node.dtype)} {held}, i32 {lane}")
+        return out
+
+    def buffer(self, names: Sequence[str]) -> str:
+        """Room for vectors one behind the other, which hold these."""
+        kind, size = self.vector(FLOAT), 8 * self.lanes
+        self.count += 1
+        room = f"%room{self.count}"
+        self.rooms.append(f"  {room} = alloca [{len(names)} x {kind}], align {size}")
+        for i, name in enumerate(names):
+            self.line(f"store {kind} {name}, ptr {self.address(room, size * i)}, align {size}")
+        return room
+
+    def matvec(self, node: Node) -> None:
+        """A matrix that all episodes share times a vector of each: a loop over its columns, by a function for each shape."""
+        (p, q), kind, size = node.attr.shape, self.vector(FLOAT), 8 * self.lanes
+        if (p, q) not in self.routines:
+            self.routines[p, q] = f"@matvec_{p}_{q}"
+            self.texts.append(self._matvec_text(p, q))
+        table = self.address("%uniforms", 8 * len(self.layout.slots))
+        self.layout.slots.extend(node.attr.T.flat)
+        names = [self.value(a) for a in node.args]
+        x, out = self.buffer(names[:q]), self.buffer(names[q:])
+        self.line(f"call fastcc void {self.routines[p, q]}(ptr {table}, ptr {x}, ptr {out})")
+        for i in range(p):
+            self.names[node.id, str(i)] = self.set(f"load {kind}, ptr {self.address(out, size * i)}, align {size}")
+
+    def _matvec_text(self, p: int, q: int) -> str:
+        e, kind, size = Emitter(Layout({}, [], 0), self.lanes), self.vector(FLOAT), 8 * self.lanes
+        e.begin("entry")
+        for first in range(0, p, ROWS):
+            rows = range(first, min(first + ROWS, p))
+            begin = [e.set(f"load {kind}, ptr {e.address('%out', size * i)}, align {size}") for i in rows]
+            before, again, done = e.block, e.label("again"), e.label("done")
+            e.line(f"br label %{again}")
+            e.begin(again)
+            k, totals = f"%k{first}", [f"%total{i}" for i in rows]
+            e.line(f"{k} = phi i64 [0, %{before}], [{k}n, %{again}]")
+            for name, at_first in zip(totals, begin, strict=True):
+                e.line(f"{name} = phi {kind} [{at_first}, %{before}], [{name}n, %{again}]")
+            held = e.set(f"load {kind}, ptr {e.address('%x', e.set(f'mul i64 {k}, {size}'))}, align {size}")
+            column = e.address("%table", e.set(f"mul i64 {k}, {8 * p}"))
+            for i, name in zip(rows, totals, strict=True):
+                one = e.set(f"load double, ptr {e.address(column, 8 * i)}, align 8")
+                first_lane = e.set(f"insertelement {kind} poison, double {one}, i32 0")
+                all_lanes = e.set(f"shufflevector {kind} {first_lane}, {kind} poison, <{self.lanes} x i32> zeroinitializer")
+                e.line(f"{name}n = fadd {kind} {name}, {e.set(f'fmul {kind} {all_lanes}, {held}')}")
+            e.line(f"{k}n = add i64 {k}, 1")
+            e.line(f"br i1 {e.set(f'icmp slt i64 {k}n, {q}')}, label %{again}, label %{done}")
+            e.begin(done)
+            for i, name in zip(rows, totals, strict=True):
+                e.line(f"store {kind} {name}n, ptr {e.address('%out', size * i)}, align {size}")
+        e.line("ret void")
+        head = f"define internal fastcc void @matvec_{p}_{q}(ptr noalias %table, ptr noalias %x, ptr noalias %out) noinline #0 {{"
+        return "\n".join([head, *e.lines, "}"])
 
     def loop(self, node: Node) -> None:
         """Rounds until no lane goes on."""
@@ -419,6 +494,7 @@ def text_of(layout: Layout, arrays: int, lanes: int, least: int) -> tuple[str, d
     """LLVM's text of `step(state, uniforms, table, first, last, steps)`, and how many nodes and branches it has."""
     e = Emitter(layout, lanes)
     e.begin("entry")
+    e.lines.append("")
     for i in range(arrays):
         e.line(f"%at{i} = getelementptr i64, ptr %table, i64 {2 * i}")
         e.line(f"%array{i} = load ptr, ptr %at{i}, align 8")
@@ -430,6 +506,7 @@ def text_of(layout: Layout, arrays: int, lanes: int, least: int) -> tuple[str, d
         with _loop(e, "time", "0", "%steps"):
             items = _step(e, least)
     e.line("ret void")
+    e.lines[1] = "\n".join(e.rooms)
     wide = 64 * lanes
     attributes = f'nounwind "prefer-vector-width"="{max(128, min(512, wide))}" "min-legal-vector-width"="{max(128, min(512, wide))}"'
     head = ("define void @step(ptr noalias nocapture %memory, ptr noalias nocapture readonly %uniforms, "

@@ -9,7 +9,26 @@ from typing import Any
 
 import numpy as np
 
-from tailgate.engine.array import Traced
+from tailgate.engine.array import Traced, lifted
+from tailgate.engine.graph import FLOAT
+
+LOOPED = 64  # numbers in a matrix without zeros that is multiplied in a loop: straight code of more takes long to compile
+
+
+def _looped(x: Any, y: Traced, base: Any) -> Traced:
+    """base + x y, of an x that is the same for all episodes: in the order of `constant_times` and `dense`."""
+    graph = y.graph
+    matrix, begin = lifted(graph, x), lifted(graph, base)
+    shape, lead = begin.shape, begin.shape[:-2]
+    matrices = np.broadcast_to(matrix.nodes, (*lead, *matrix.shape[-2:]))
+    vectors = np.broadcast_to(y.nodes, (*lead, *y.shape[-2:]))
+    out = np.empty(shape, object)
+    for place in np.ndindex(*lead):
+        for j in range(shape[-1]):
+            out[(*place, slice(None), j)] = graph.matvec(
+                matrices[place], list(vectors[place][:, j]), list(begin.nodes[(*place, slice(None), j)])
+            )
+    return Traced(graph, out, FLOAT, None if y.batch is None else y.batch - y.ndim + len(shape))
 
 
 def structure(x: Any) -> Any:
@@ -19,8 +38,11 @@ def structure(x: Any) -> Any:
 
 def constant_times(x: Any, y: Any) -> Any:
     """x (..., i, k) times y (B, ..., k, j), of an x that is the same for all: sums run from 0, and its zeros count for nothing."""
-    out: Any = 0.0
     there = structure(x)
+    if isinstance(y, Traced) and there.all() and there.shape[-2] * there.shape[-1] >= LOOPED:
+        zero = np.zeros((*np.broadcast_shapes(x.shape[:-2], y.shape[:-2]), x.shape[-2], y.shape[-1]))
+        return _looped(x, y, zero)
+    out: Any = 0.0
     for k in range(x.shape[-1]):
         out = np.where(there[..., k, None], out + x[..., k, None] * y[..., k, None, :], out)
     return out
@@ -121,6 +143,8 @@ def corrected(C: Any, W: Any, x: Any, P: Any, r: Any, keep: Any) -> tuple[Any, A
 
 def dense(x: Any, weight: Any, bias: Any) -> Any:
     """x (B, i) times weight (i, o), on top of bias (o,): sums run over i in ascending order."""
+    if isinstance(x, Traced) and not x.fixed and weight.size >= LOOPED:
+        return _looped(np.swapaxes(weight, 0, 1), x[..., None], np.broadcast_to(bias, (len(x), len(bias)))[..., None])[..., 0]
     out = bias
     for i in range(x.shape[1]):
         out = out + x[:, i, None] * weight[i]

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 from tailgate.engine.graph import Body, Node, ordered
 
-_COST = {"const": 0, "uniform": 0, "pick": 0, "loop": 300, "div": 8, "sqrt": 10, "rem": 20}
+_COST = {"const": 0, "uniform": 0, "pick": 0, "loop": 300, "gather": 12, "div": 8, "sqrt": 10, "rem": 20}
 LEAST = 12  # cost of what is worth a branch, in additions
 
 
@@ -103,7 +103,7 @@ def _branches(nodes: Sequence[Node], kept: Collection[int], least: int) -> list[
 
 
 def _cost(node: Node) -> int:
-    return int(node.attr.cost) if node.op == "call" else _COST.get(node.op, 1)
+    return int(node.attr.cost) if node.op == "call" else 2 * node.attr.size if node.op == "matvec" else _COST.get(node.op, 1)
 
 
 def _levels(nodes: Sequence[Node], choices: list[Node]) -> list[list[Node]]:

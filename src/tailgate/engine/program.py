@@ -103,7 +103,7 @@ class Program:
                     layout.outputs.append((node, Column(number, column, len(nodes))))
         self.text, self.size = text_of(layout, len(self.arrays), self.lanes, least)
         self.function = objects.Function(self.text)
-        self._slots = [trace.graph.nodes[i] for i in layout.uniforms]
+        self._slots = layout.slots
 
     def _places(self) -> tuple[dict[str, int], int]:
         """Where each leaf of the state begins in a block, and the bytes of a block: the widest numbers first."""

@@ -7,8 +7,6 @@ from dataclasses import dataclass, field
 from functools import update_wrapper
 from typing import Any
 
-import numpy as np
-
 from tailgate.engine.array import Traced, boxed, each, lifted, shared_batch
 from tailgate.engine.graph import Graph, Node, evaluate
 
@@ -58,7 +56,7 @@ class _Called:
             inputs = [graph.input(i, dtype) for i, dtype in enumerate(dtypes)]
             made = self.function(*(Traced(graph, boxed(node), node.dtype) for node in inputs))
             several = isinstance(made, tuple)
-            outputs = [np.asarray(part.nodes)[()] for part in (made if several else (made,))]
+            outputs = [part.nodes.item() for part in (made if several else (made,))]
             self._made[dtypes] = Routine(self.function.__name__, graph, inputs, outputs), several
         return self._made[dtypes]
 
