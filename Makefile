@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test test-long lint bench crash fuzz clean
+.PHONY: demo test test-long nightly lint bench crash fuzz clean
 
 demo: $(VENV)/.ready  ## train an adversary against a gated Kalman filter, compare it with scripted attacks, write the page
 	$(BIN)/python train.py
@@ -13,6 +13,8 @@ test: $(VENV)/.ready lint  ## lint, types, tests
 
 test-long: $(VENV)/.ready lint  ## and the tests that take a minute each, as before a release
 	$(BIN)/python -m pytest -n 2 --dist worksteal --long
+
+nightly: test-long fuzz crash  ## everything: the long tests and both campaigns, five hours or so
 
 lint: $(VENV)/.ready
 	$(BIN)/ruff check .
