@@ -39,19 +39,15 @@ def believed(r: Array, S: Array, lam: Array) -> Array:
     W = num.inverse(S)
     if r.shape[-1] == 2:
         return _pair(r, S, W, 0.5 * lam)
-    rows = np.nonzero((2.0 * np.abs(num.matvec(W, r)) > lam).any(axis=-1))
+    half, found = 0.5 * lam, np.asarray((2.0 * np.abs(num.matvec(W, r)) > lam).any(axis=-1))
+    if r.shape[-1] == 1:
+        return np.where(found[..., None], np.clip(r, -half * S[..., 0], half * S[..., 0]), r)
+    rows = np.nonzero(found)
     if not len(rows[0]):
         return r
-    y, half = r.copy(order="K"), 0.5 * lam
-    if r.shape[-1] > 2:
-        y[rows] = _pivot(r, S, W, half, rows)
-    else:
-        y[rows] = _single(r[rows], S[rows], half[rows])
+    y = r.copy(order="K")
+    y[rows] = _pivot(r, S, W, half, rows)
     return y
-
-
-def _single(r: Array, S: Array, half: Array) -> Array:
-    return np.clip(r, -half * S[..., 0], half * S[..., 0])
 
 
 def _pair(r: Array, S: Array, W: Array, half: Array) -> Array:

@@ -37,7 +37,7 @@ def converted(x: Any, dtype: np.dtype[Any]) -> Any:
     return x.astype(dtype)
 
 
-MOST = 60_000  # nodes of a graph: what has more takes minutes to compile
+MOST = 20_000  # nodes of a graph: what has more takes long to compile, as straight code
 COMPARISONS = {"lt": np.less, "le": np.less_equal, "gt": np.greater, "ge": np.greater_equal, "eq": np.equal, "ne": np.not_equal}
 BINARY: dict[str, Callable[..., Any]] = {
     "add": np.add, "sub": np.subtract, "mul": np.multiply, "div": np.true_divide, "min": minimum, "max": maximum,

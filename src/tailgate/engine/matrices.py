@@ -42,7 +42,7 @@ def constant_times(x: Any, y: Any) -> Any:
     if isinstance(y, Traced) and there.all() and there.shape[-2] * there.shape[-1] >= LOOPED:
         zero = np.zeros((*np.broadcast_shapes(x.shape[:-2], y.shape[:-2]), x.shape[-2], y.shape[-1]))
         return _looped(x, y, zero)
-    out: Any = 0.0
+    out: Any = np.zeros((*np.broadcast_shapes(x.shape[:-2], y.shape[:-2]), x.shape[-2], y.shape[-1]))
     for k in range(x.shape[-1]):
         out = np.where(there[..., k, None], out + x[..., k, None] * y[..., k, None, :], out)
     return out

@@ -24,7 +24,7 @@ class Rollout:
     """The program of a loop under an attack. Raises whatever their parts raise while they are traced."""
 
     def __init__(self, loop: Loop, attack: Attack) -> None:
-        check_open(loop.defence)
+        check_open(loop)
         self.loop, self.attack, self.plan = loop, attack, attack.prepare(loop.brief)
         self.program = Program(traced(self._step, self.begun(_ONE), {}))
 

@@ -33,7 +33,7 @@ class SeatPrograms:
     """The programs of a seat. Raises whatever its parts raise while they are traced."""
 
     def __init__(self, seat: Seat) -> None:
-        check_open(seat.loop.defence)
+        check_open(seat.loop)
         self.seat, self.loop = seat, seat.loop
         self.observation = ObservationCodec(seat.loop.brief)
         start = seat.loop.start(draws.keys("tune", [0]))
