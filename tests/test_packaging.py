@@ -16,7 +16,8 @@ SOURCES = sorted({p.resolve() for folder in FOLDERS.values() for p in (ROOT / fo
 SCORED = [
     *(ROOT / "envs").glob("*.py"), *(ROOT / "estimators").glob("*.py"), *(ROOT / "agents").glob("*.py"),
     *(ROOT / "src/tailgate/fused").glob("*.py"),
-    *(ROOT / "src/tailgate" / f"{n}.py" for n in ("loop", "threat", "trace", "metrics", "draws", "num", "tree", "linear", "lanes", "kernels", "elementwise", "watch")),
+    *(ROOT / "src/tailgate" / f"{n}.py" for n in ("loop", "threat", "trace", "metrics", "draws", "num", "tree", "linear", "lanes", "kernels", "elementwise", "hints", "watch")),
+    *(ROOT / "src/tailgate/engine" / f"{n}.py" for n in ("elementary", "matrices", "loops")),
 ]  # fmt: skip
 UNSCORED = {"render.py", "sb3.py", "ppo.py", "cem.py", "stable.py", "teacher.py"}
 FORBIDDEN = {

@@ -9,7 +9,7 @@ runs along the batch.
 """
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from functools import cache
 from importlib import import_module
 from typing import Any, cast
@@ -21,10 +21,18 @@ from tailgate import kernels, linear
 from tailgate.elementwise import clip as clip
 from tailgate.elementwise import select as select
 from tailgate.engine import elementary, matrices
-from tailgate.engine.array import Traced, gathered
+from tailgate.engine.array import Traced
 from tailgate.engine.functions import tracing
 from tailgate.engine.loops import until as until
-from tailgate.errors import InputError
+from tailgate.hints import broken as broken
+from tailgate.hints import demand as demand
+from tailgate.hints import every as every
+from tailgate.hints import pick as pick
+from tailgate.hints import present as present
+from tailgate.hints import put as put
+from tailgate.hints import ring_next as ring_next
+from tailgate.hints import some as some
+from tailgate.hints import take as take
 
 Array = NDArray[Any]
 
@@ -42,85 +50,6 @@ def log(x: Any) -> Any:
 def tanh(x: Any) -> Any:
     """The hyperbolic tangent."""
     return elementary.tanh(x) if isinstance(x, Traced) else kernels.tanh(x)
-
-
-# -- what plain code asks of a batch, and traced code answers for every episode
-
-
-def some(mask: Any) -> bool:
-    """Is any of it true? A hint: what follows may be done for all rows, and is where they are traced. So the others keep their bits."""
-    return bool(mask.values().any()) if isinstance(mask, Traced) and mask.fixed else isinstance(mask, Traced) or bool(mask.any())
-
-
-def every(mask: Any) -> bool:
-    """Is all of it true? A hint, as `some`: what follows spares work that would change no bit."""
-    return bool(mask.values().all()) if isinstance(mask, Traced) and mask.fixed else not isinstance(mask, Traced) and bool(mask.all())
-
-
-def present(values: Any, candidates: Iterable[int]) -> list[int]:
-    """The candidates that are among some whole numbers: all of them where these are traced."""
-    if isinstance(values, Traced) and not values.fixed:
-        return list(candidates)
-    held = set((values.values() if isinstance(values, Traced) else values).ravel().tolist())
-    return [one for one in candidates if one in held]
-
-
-def pick(ring: Array, place: Any) -> Any:
-    """ring[..., place] of a ring (B, ..., L) and whole numbers that broadcast to (B, ...)."""
-    if not isinstance(ring, Traced):
-        return np.take_along_axis(ring, np.broadcast_to(place, ring.shape[:-1])[..., None], axis=-1)[..., 0]
-    out = ring[..., 0]
-    for i in range(1, ring.shape[-1]):
-        out = np.where(place == i, ring[..., i], out)
-    return out
-
-
-def put(ring: Array, place: Any, value: Any) -> Any:
-    """A ring (B, ..., L) with `value` (B, ...) at `place`, which broadcasts to (B, ...)."""
-    if isinstance(ring, Traced):
-        return np.stack([np.where(place == i, value, ring[..., i]) for i in range(ring.shape[-1])], axis=-1)
-    out = ring.copy(order="K")
-    np.put_along_axis(out, np.broadcast_to(place, ring.shape[:-1])[..., None], np.asarray(value)[..., None], axis=-1)
-    return out
-
-
-def ring_next(place: Any, size: int) -> Any:
-    """The place behind one in a ring of a size."""
-    return np.where(place + 1 == size, 0, place + 1)
-
-
-def demand(condition: Any, field: str, found: str, wanted: str, k: Any) -> None:
-    """Raise InputError unless a condition (B, ...) holds in all rows, which are at steps k (B,). Traced code asks after its step."""
-    if isinstance(condition, Traced):
-        rows = condition.reshape(len(condition), -1).all(axis=1)
-        condition.graph.demands.append((field, found, wanted, rows.nodes[0]))
-    elif not condition.all():
-        raise broken(~condition.reshape(len(condition), -1).all(axis=1), field, found, wanted, k)
-
-
-def broken(rows: Array, field: str, found: str, wanted: str, k: Array) -> InputError:
-    """The error of rows (B,) bool at steps k (B,) in which a demand does not hold."""
-    first = int(np.flatnonzero(rows)[0])
-    where = f"{found} in step {k[first]}, in {np.count_nonzero(rows)} of {len(rows)} rows, the first of them row {first}"
-    error = InputError(field, where, wanted)
-    error.row = first
-    return error
-
-
-LISTED = 8  # entries of a table that are compared one by one where code is traced
-
-
-def take(table: Array, index: Any) -> Any:
-    """table[index] of a table (K, ...) and whole numbers from 0 to K - 1."""
-    if not isinstance(index, Traced):
-        return table[index]
-    if len(table) > LISTED and not index.fixed:
-        return gathered(table, index)
-    wide: Any = index[(..., *(None,) * (table.ndim - 1))]
-    out: Any = np.broadcast_to(table[0], (*index.shape, *table.shape[1:]))
-    for k in range(1, len(table)):
-        out = np.where(wide == k, table[k], out)
-    return out
 
 
 @cache
@@ -373,29 +302,30 @@ def root(s: Array) -> tuple[Array, Array]:
 
 def in_ball(w: Array, c: Array) -> Array:
     """u_k = w_k / (c_k + mu) with the least mu >= 0 at which |u| <= 1, for w (B, P, q) and c (P, q) >= 0: (B, P, q). 0/0 counts as 0."""
-    size = np.abs(w)
-    some_w, least, length, most, weighed = w != 0.0, zeros(w.shape[:-1]), zeros(w.shape[:-1]), zeros(w.shape[:-1]), zeros(w.shape[:-1])
-    for k in range(w.shape[-1]):
-        over = size[..., k] - c[..., k]
-        least = np.where(over > least, over, least)
-        length, most = length + w[..., k] * w[..., k], np.where(c[..., k] > most, c[..., k], most)
-        share = _divided(w[..., k], c[..., k], some_w[..., k])
-        weighed = weighed + share * share
-    outside, bound = weighed > 1.0, np.sqrt(length) - most
-    mu = np.where(outside, np.where(bound > least, bound, least), 0.0)
-
-    def closer(mu: Any, _: Any) -> tuple[Any, tuple[Any, Any]]:  # Newton on 1 / |u|, monotone from below
-        s, t = zeros(mu.shape), zeros(mu.shape)
+    with np.errstate(over="ignore"):
+        size = np.abs(w)
+        some_w, least, length, most, weighed = w != 0.0, zeros(w.shape[:-1]), zeros(w.shape[:-1]), zeros(w.shape[:-1]), zeros(w.shape[:-1])
         for k in range(w.shape[-1]):
-            z = _divided(w[..., k], c[..., k] + mu, some_w[..., k])
-            s, t = s + z * z, t + _divided(z * z, c[..., k] + mu, z != 0.0)
-        length = np.sqrt(s)
-        step = _divided(s * (length - 1.0), t, t != 0.0)
-        further = step > 1e-15 * mu
-        return further, (np.where(further, mu + step, mu), length)
+            over = size[..., k] - c[..., k]
+            least = np.where(over > least, over, least)
+            length, most = length + w[..., k] * w[..., k], np.where(c[..., k] > most, c[..., k], most)
+            share = _divided(w[..., k], c[..., k], some_w[..., k])
+            weighed = weighed + share * share
+        outside, bound = weighed > 1.0, np.sqrt(length) - most
+        mu = np.where(outside, np.where(bound > least, bound, least), 0.0)
 
-    mu, length = until(closer, (mu, np.ones_like(mu)), outside, 100)
-    return stack([_divided(_divided(w[..., k], c[..., k] + mu, some_w[..., k]), length, some_w[..., k]) for k in range(w.shape[-1])])
+        def closer(mu: Any, _: Any) -> tuple[Any, tuple[Any, Any]]:  # Newton on 1 / |u|, monotone from below
+            s, t = zeros(mu.shape), zeros(mu.shape)
+            for k in range(w.shape[-1]):
+                z = _divided(w[..., k], c[..., k] + mu, some_w[..., k])
+                s, t = s + z * z, t + _divided(z * z, c[..., k] + mu, z != 0.0)
+            length = np.sqrt(s)
+            step = _divided(s * (length - 1.0), t, t != 0.0)
+            further = step > 1e-15 * mu
+            return further, (np.where(further, mu + step, mu), length)
+
+        mu, length = until(closer, (mu, np.ones_like(mu)), outside, 100)
+        return stack([_divided(_divided(w[..., k], c[..., k] + mu, some_w[..., k]), length, some_w[..., k]) for k in range(w.shape[-1])])
 
 
 def _divided(x: Array, y: Array, where: Array) -> Array:

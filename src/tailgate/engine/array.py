@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from tailgate.engine.graph import BOOL, FLOAT, Array, Graph, Node
+from tailgate.engine.graph import BOOL, Array, Graph, Node
 from tailgate.engine.untraceable import Untraceable
 
 _ZERO = np.zeros((), np.int8)
@@ -398,5 +398,3 @@ def reduced(x: Traced, op: str, axis: Any, keepdims: bool, instead: str = "name 
 
 
 _operators()
-
-__all__ = ["FLOAT", "Flags", "Traced", "chosen", "each", "elementwise", "lifted", "reduced", "result_type", "typed"]

@@ -15,23 +15,10 @@ from typing import Any
 
 import numpy as np
 
-from tailgate.engine.graph import BOOL, FLOAT, Body, Node
-from tailgate.engine.passes import Branch, Item, counted, rounds, schedule
-
-ROWS = 10  # of a matrix that are summed at once
-_TYPES = {"f8": "double", "f4": "float", "b1": "i1"} | {f"{kind}{size}": f"i{8 * size}" for kind in "iu" for size in (1, 2, 4, 8)}
-_FLOAT_ORDER = {"lt": "olt", "le": "ole", "gt": "ogt", "ge": "oge", "eq": "oeq", "ne": "une"}
-_ROUNDED = {"sqrt": "sqrt", "floor": "floor", "ceil": "ceil", "trunc": "trunc", "rint": "rint"}
-
-
-def code(dtype: np.dtype[Any]) -> str:
-    """A type's kind and size."""
-    return f"{dtype.kind}{dtype.itemsize}"
-
-
-def scalar(dtype: np.dtype[Any]) -> str:
-    """LLVM's name of a type."""
-    return _TYPES[code(dtype)]
+from tailgate.engine import blocks
+from tailgate.engine.graph import BOOL, FLOAT, Node
+from tailgate.engine.instructions import operation, scalar
+from tailgate.engine.passes import Branch, Item, counted, schedule
 
 
 @dataclass(frozen=True)
@@ -74,6 +61,12 @@ class Emitter:
         self.names: dict[int | tuple[int, str], str] = {}
         self.count = 0
         self.block = "entry"
+
+    def fresh(self) -> Emitter:
+        """Of another function of the same module."""
+        out = Emitter(Layout({}, [], 0), self.lanes)
+        out.routines, out.texts, out.declared = self.routines, self.texts, self.declared
+        return out
 
     # -- text
 
@@ -175,54 +168,14 @@ class Emitter:
         return self.address(f"%array{place.array}", self.set(f"add i64 {step}, {row}"))
 
     def compute(self, node: Node) -> None:
-        if node.op == "loop":
-            self.loop(node)
-        elif node.op == "call":
-            self.call(node)
-        elif node.op == "matvec":
-            self.matvec(node)
+        if node.op in ("loop", "call", "matvec"):
+            getattr(blocks, node.op)(self, node)
         elif node.op == "gather":
-            self.names[node.id] = self.gather(node)
+            self.names[node.id] = blocks.gather(self, node)
         elif node.op == "pick":
             self.names[node.id] = self.names[node.args[0].id, str(node.attr)]
         else:
             self.names[node.id] = self.input(node) if node.op == "input" else operation(self, node)
-
-    def call(self, node: Node) -> None:
-        """A routine, whose text is written when it is met first."""
-        routine = node.attr
-        kinds = [self.vector(one.dtype) for one in routine.outputs]
-        result = f"{{ {', '.join(kinds)} }}"
-        if routine not in self.routines:
-            self.routines[routine] = name = f"@{routine.name}{len(self.routines)}"
-            inner = Emitter(Layout({}, [], 0), self.lanes)
-            inner.routines, inner.texts, inner.declared = self.routines, self.texts, self.declared
-            inner.names = {one.id: f"%a{i}" for i, one in enumerate(routine.inputs)}
-            inner.begin("entry")
-            inner.emit([item for item in schedule(routine.outputs) if not isinstance(item, Node) or item.op != "input"], {})
-            whole = "poison"
-            for i, (one, kind) in enumerate(zip(routine.outputs, kinds, strict=True)):
-                whole = inner.set(f"insertvalue {result} {whole}, {kind} {inner.value(one)}, {i}")
-            inner.line(f"ret {result} {whole}")
-            given = ", ".join(f"{inner.vector(one.dtype)} %a{i}" for i, one in enumerate(routine.inputs))
-            self.texts.append("\n".join([f"define internal fastcc {result} {name}({given}) noinline #0 {{", *inner.lines, "}"]))
-        given = ", ".join(f"{self.vector(a.dtype)} {self.value(a)}" for a in node.args)
-        held = self.set(f"call fastcc {result} {self.routines[routine]}({given})")
-        for i in range(len(kinds)):
-            self.names[node.id, str(i)] = self.set(f"extractvalue {result} {held}, {i}")
-
-    def gather(self, node: Node) -> str:
-        """A number of a table for each lane."""
-        table = self.address("%uniforms", 8 * len(self.layout.slots))
-        self.layout.slots.extend(node.attr)
-        index, out, name = self.value(node.args[0]), "poison", "i8" if node.dtype == BOOL else scalar(node.dtype)
-        for lane in range(self.lanes):
-            at = self.set(f"shl i64 {self.set(f'extractelement <{self.lanes} x i64> {index}, i32 {lane}')}, 3")
-            held = self.set(f"load {name}, ptr {self.address(table, at)}, align 8")
-            if node.dtype == BOOL:
-                held = self.set(f"icmp ne i8 {held}, 0")
-            out = self.set(f"insertelement {self.vector(node.dtype)} {out}, {scalar(node.dtype)} {held}, i32 {lane}")
-        return out
 
     def buffer(self, names: Sequence[str]) -> str:
         """Room for vectors one behind the other, which hold these."""
@@ -233,87 +186,6 @@ class Emitter:
         for i, name in enumerate(names):
             self.line(f"store {kind} {name}, ptr {self.address(room, size * i)}, align {size}")
         return room
-
-    def matvec(self, node: Node) -> None:
-        """A matrix that all episodes share times a vector of each: a loop over its columns, by a function for each shape."""
-        (p, q), kind, size = node.attr.shape, self.vector(FLOAT), 8 * self.lanes
-        if (p, q) not in self.routines:
-            self.routines[p, q] = f"@matvec_{p}_{q}"
-            self.texts.append(self._matvec_text(p, q))
-        table = self.address("%uniforms", 8 * len(self.layout.slots))
-        self.layout.slots.extend(node.attr.T.flat)
-        names = [self.value(a) for a in node.args]
-        x, out = self.buffer(names[:q]), self.buffer(names[q:])
-        self.line(f"call fastcc void {self.routines[p, q]}(ptr {table}, ptr {x}, ptr {out})")
-        for i in range(p):
-            self.names[node.id, str(i)] = self.set(f"load {kind}, ptr {self.address(out, size * i)}, align {size}")
-
-    def _matvec_text(self, p: int, q: int) -> str:
-        e, kind, size = Emitter(Layout({}, [], 0), self.lanes), self.vector(FLOAT), 8 * self.lanes
-        e.begin("entry")
-        for first in range(0, p, ROWS):
-            rows = range(first, min(first + ROWS, p))
-            begin = [e.set(f"load {kind}, ptr {e.address('%out', size * i)}, align {size}") for i in rows]
-            before, again, done = e.block, e.label("again"), e.label("done")
-            e.line(f"br label %{again}")
-            e.begin(again)
-            k, totals = f"%k{first}", [f"%total{i}" for i in rows]
-            e.line(f"{k} = phi i64 [0, %{before}], [{k}n, %{again}]")
-            for name, at_first in zip(totals, begin, strict=True):
-                e.line(f"{name} = phi {kind} [{at_first}, %{before}], [{name}n, %{again}]")
-            held = e.set(f"load {kind}, ptr {e.address('%x', e.set(f'mul i64 {k}, {size}'))}, align {size}")
-            column = e.address("%table", e.set(f"mul i64 {k}, {8 * p}"))
-            for i, name in zip(rows, totals, strict=True):
-                one = e.set(f"load double, ptr {e.address(column, 8 * i)}, align 8")
-                first_lane = e.set(f"insertelement {kind} poison, double {one}, i32 0")
-                all_lanes = e.set(f"shufflevector {kind} {first_lane}, {kind} poison, <{self.lanes} x i32> zeroinitializer")
-                e.line(f"{name}n = fadd {kind} {name}, {e.set(f'fmul {kind} {all_lanes}, {held}')}")
-            e.line(f"{k}n = add i64 {k}, 1")
-            e.line(f"br i1 {e.set(f'icmp slt i64 {k}n, {q}')}, label %{again}, label %{done}")
-            e.begin(done)
-            for i, name in zip(rows, totals, strict=True):
-                e.line(f"store {kind} {name}n, ptr {e.address('%out', size * i)}, align {size}")
-        e.line("ret void")
-        head = f"define internal fastcc void @matvec_{p}_{q}(ptr noalias %table, ptr noalias %x, ptr noalias %out) noinline #0 {{"
-        return "\n".join([head, *e.lines, "}"])
-
-    def loop(self, node: Node) -> None:
-        """Rounds until no lane goes on."""
-        body: Body = node.attr
-        begin = [self.value(a) for a in node.args[: len(body.carried)]]
-        for captured in {a.id: a for inner in (*body.nodes, *body.after) for a in (*inner.args, inner) if a.fixed}.values():
-            self.value(captured)
-        again, out = self.label("again"), self.label("out")
-        before, outer, count = self.block, dict(self.names), f"%count{node.id}"
-        self.line(f"br label %{again}")
-        self.begin(again)
-        heads = []
-        for one, first in zip(body.carried, begin, strict=True):
-            self.count += 1
-            self.names[one.id] = f"%v{self.count}"
-            heads.append((len(self.lines), one, first))
-            self.lines.append("")
-        self.lines.append("")
-        going = [self.names[one.id] for one in body.carried[: len(body.going)]]
-        mask = going[0]
-        for other in going[1:]:
-            mask = self.set(f"or <{self.lanes} x i1> {mask}, {other}")
-        more = self.set(f"icmp slt i64 {count}, {body.most}")
-        go, inside = self.set(f"and i1 {self.any_lane(mask)}, {more}"), self.label("round")
-        self.line(f"br i1 {go}, label %{inside}, label %{out}")
-        self.begin(inside)
-        self.emit(rounds(body), {})
-        for at, one, first in heads:
-            new = self.value(body.after[body.carried.index(one)])
-            self.lines[at] = f"  {self.names[one.id]} = phi {self.vector(one.dtype)} [{first}, %{before}], [{new}, %{self.block}]"
-        self.lines[heads[-1][0] + 1] = f"  {count} = phi i64 [0, %{before}], [{count}n, %{self.block}]"
-        self.line(f"{count}n = add i64 {count}, 1")
-        self.line(f"br label %{again}")
-        carried = {one.id: self.names[one.id] for one in body.carried}
-        self.names = outer
-        for i, one in enumerate(body.carried):
-            self.names[node.id, str(i)] = carried[one.id]
-        self.begin(out)
 
     # -- order
 
@@ -392,102 +264,6 @@ class Emitter:
                 self.set(f"shufflevector {kind} {a}, {kind} {b}, <{n} x i32> <{mask}>") for a, b in pairs for mask in (low, high)
             ]  # fmt: skip
         return rows
-
-
-def operation(e: Emitter, node: Node) -> str:
-    """An operation of two or fewer arguments, a choice, or a change of type."""
-    op, dtype, lanes = node.op, node.dtype, e.lanes
-    args = [e.value(a) for a in node.args]
-    of = node.args[0].dtype
-    kind, result = e.vector(of), e.vector(dtype)
-    floats = of.kind == "f"
-    if op == "select":
-        return e.set(f"select {kind} {args[0]}, {result} {args[1]}, {result} {args[2]}")
-    if op == "bits":
-        return args[0] if scalar(of) == scalar(dtype) else e.set(f"bitcast {kind} {args[0]} to {result}")
-    if op == "cast":
-        return cast(e, args[0], of, dtype)
-    if op in _FLOAT_ORDER:
-        if floats:
-            return e.set(f"fcmp {_FLOAT_ORDER[op]} {kind} {args[0]}, {args[1]}")
-        order = op if op in ("eq", "ne") else ("s" if of.kind == "i" else "u") + op
-        return e.set(f"icmp {order} {kind} {args[0]}, {args[1]}")
-    if op in ("min", "max"):
-        return smaller(e, node, args, "lt" if op == "min" else "gt")
-    if op in ("add", "sub", "mul"):
-        return e.set(f"{'f' if floats else ''}{op} {kind} {args[0]}, {args[1]}")
-    if op in ("and", "or", "xor", "shl"):
-        return e.set(f"{op} {kind} {args[0]}, {args[1]}")
-    if op == "div":
-        return e.set(f"fdiv {kind} {args[0]}, {args[1]}")
-    if op == "shr":
-        return e.set(f"{'ashr' if of.kind == 'i' else 'lshr'} {kind} {args[0]}, {args[1]}")
-    if op == "rem":
-        return remainder(e, kind, args, of.kind == "i")
-    if op == "neg":
-        return e.set(f"fneg {kind} {args[0]}" if floats else f"sub {kind} zeroinitializer, {args[0]}")
-    if op == "not":
-        return e.set(f"xor {kind} {args[0]}, splat ({scalar(of)} {'true' if of == BOOL else -1})")
-    if op == "abs" and not floats:
-        return e.set(f"select <{lanes} x i1> {e.set(f'icmp slt {kind} {args[0]}, zeroinitializer')}, {kind} "
-                     f"{e.set(f'sub {kind} zeroinitializer, {args[0]}')}, {kind} {args[0]}") if of.kind == "i" else args[0]  # fmt: skip
-    name = f"@llvm.{_ROUNDED.get(op, 'fabs')}.v{lanes}f{8 * of.itemsize}"
-    e.declared.add(f"declare {kind} {name}({kind})")
-    return e.set(f"call {kind} {name}({kind} {args[0]})")
-
-
-def smaller(e: Emitter, node: Node, args: Sequence[str], order: str) -> str:
-    """min and max, as `graph.minimum` defines them."""
-    x, y = node.args
-    kind, lanes = e.vector(x.dtype), e.lanes
-    if x.dtype.kind == "f":
-        if y.op == "const" and y.attr == y.attr:
-            first = e.set(f"fcmp u{order} {kind} {args[0]}, {args[1]}")
-        else:
-            first = e.set(f"fcmp o{order} {kind} {args[0]}, {args[1]}")
-            if not (x.op == "const" and x.attr == x.attr):
-                first = e.set(f"or <{lanes} x i1> {first}, {e.set(f'fcmp uno {kind} {args[0]}, {args[0]}')}")
-    else:
-        first = e.set(f"icmp {'s' if x.dtype.kind == 'i' else 'u'}{order} {kind} {args[0]}, {args[1]}")
-    return e.set(f"select <{lanes} x i1> {first}, {kind} {args[0]}, {kind} {args[1]}")
-
-
-def remainder(e: Emitter, kind: str, args: Sequence[str], signed: bool) -> str:
-    """The remainder by a positive constant, which is never negative."""
-    if not signed:
-        return e.set(f"urem {kind} {args[0]}, {args[1]}")
-    rest = e.set(f"srem {kind} {args[0]}, {args[1]}")
-    below = e.set(f"icmp slt {kind} {rest}, zeroinitializer")
-    return e.set(f"select <{e.lanes} x i1> {below}, {kind} {e.set(f'add {kind} {rest}, {args[1]}')}, {kind} {rest}")
-
-
-def cast(e: Emitter, x: str, of: np.dtype[Any], to: np.dtype[Any]) -> str:
-    """x as another type, as `graph.converted` defines it."""
-    kind, result, lanes = e.vector(of), e.vector(to), e.lanes
-    if of == BOOL:
-        if to.kind == "f":
-            return e.set(f"select {kind} {x}, {result} {e.splat(np.ones((), to)[()])}, {result} zeroinitializer")
-        return e.set(f"zext {kind} {x} to {result}")
-    if to == BOOL:
-        return e.set(f"{'fcmp une' if of.kind == 'f' else 'icmp ne'} {kind} {x}, zeroinitializer")
-    if of.kind == to.kind == "f":
-        return e.set(f"{'fptrunc' if to.itemsize < of.itemsize else 'fpext'} {kind} {x} to {result}")
-    if of.kind == "f":
-        if of.itemsize < 8:
-            x, kind = e.set(f"fpext {kind} {x} to <{lanes} x double>"), f"<{lanes} x double>"
-        lower = e.set(f"fcmp oge {kind} {x}, splat (double 0xC3E0000000000000)")
-        upper = e.set(f"fcmp olt {kind} {x}, splat (double 0x43E0000000000000)")
-        holds = e.set(f"and <{lanes} x i1> {lower}, {upper}")
-        inside = e.set(f"select <{lanes} x i1> {holds}, {kind} {x}, {kind} zeroinitializer")
-        whole = e.set(f"fptosi {kind} {inside} to <{lanes} x i64>")
-        held = e.set(f"select <{lanes} x i1> {holds}, <{lanes} x i64> {whole}, <{lanes} x i64> splat (i64 -9223372036854775808)")
-        return held if to.itemsize == 8 else e.set(f"trunc <{lanes} x i64> {held} to {result}")
-    if to.kind == "f":
-        return e.set(f"{'si' if of.kind == 'i' else 'ui'}tofp {kind} {x} to {result}")
-    if of.itemsize == to.itemsize:
-        return x
-    how = "trunc" if of.itemsize > to.itemsize else "sext" if of.kind == "i" else "zext"
-    return e.set(f"{how} {kind} {x} to {result}")
 
 
 def text_of(layout: Layout, arrays: int, lanes: int, least: int) -> tuple[str, dict[str, int]]:

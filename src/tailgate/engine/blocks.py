@@ -1,0 +1,135 @@
+"""Code of more than an instruction: loops, routines, tables, and matrices that all episodes share."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from tailgate.engine.graph import BOOL, FLOAT, Body, Node
+from tailgate.engine.instructions import scalar
+from tailgate.engine.passes import rounds, schedule
+
+if TYPE_CHECKING:
+    from tailgate.engine.llvm import Emitter
+
+ROWS = 10  # of a matrix that are summed at once
+
+
+def loop(e: Emitter, node: Node) -> None:
+    """Rounds until no lane goes on."""
+    body: Body = node.attr
+    begin = [e.value(a) for a in node.args[: len(body.carried)]]
+    for captured in {a.id: a for inner in (*body.nodes, *body.after) for a in (*inner.args, inner) if a.fixed}.values():
+        e.value(captured)
+    again, out = e.label("again"), e.label("out")
+    before, outer, count = e.block, dict(e.names), f"%count{node.id}"
+    e.line(f"br label %{again}")
+    e.begin(again)
+    heads = []
+    for one, first in zip(body.carried, begin, strict=True):
+        e.count += 1
+        e.names[one.id] = f"%v{e.count}"
+        heads.append((len(e.lines), one, first))
+        e.lines.append("")
+    e.lines.append("")
+    going = [e.names[one.id] for one in body.carried[: len(body.going)]]
+    mask = going[0]
+    for other in going[1:]:
+        mask = e.set(f"or <{e.lanes} x i1> {mask}, {other}")
+    more = e.set(f"icmp slt i64 {count}, {body.most}")
+    go, inside = e.set(f"and i1 {e.any_lane(mask)}, {more}"), e.label("round")
+    e.line(f"br i1 {go}, label %{inside}, label %{out}")
+    e.begin(inside)
+    e.emit(rounds(body), {})
+    for at, one, first in heads:
+        new = e.value(body.after[body.carried.index(one)])
+        e.lines[at] = f"  {e.names[one.id]} = phi {e.vector(one.dtype)} [{first}, %{before}], [{new}, %{e.block}]"
+    e.lines[heads[-1][0] + 1] = f"  {count} = phi i64 [0, %{before}], [{count}n, %{e.block}]"
+    e.line(f"{count}n = add i64 {count}, 1")
+    e.line(f"br label %{again}")
+    carried = {one.id: e.names[one.id] for one in body.carried}
+    e.names = outer
+    for i, one in enumerate(body.carried):
+        e.names[node.id, str(i)] = carried[one.id]
+    e.begin(out)
+
+
+def call(e: Emitter, node: Node) -> None:
+    """A routine, whose text is written when it is met first."""
+    routine = node.attr
+    kinds = [e.vector(one.dtype) for one in routine.outputs]
+    result = f"{{ {', '.join(kinds)} }}"
+    if routine not in e.routines:
+        e.routines[routine] = name = f"@{routine.name}{len(e.routines)}"
+        inner = e.fresh()
+        inner.names = {one.id: f"%a{i}" for i, one in enumerate(routine.inputs)}
+        inner.begin("entry")
+        inner.emit([item for item in schedule(routine.outputs) if not isinstance(item, Node) or item.op != "input"], {})
+        whole = "poison"
+        for i, (one, kind) in enumerate(zip(routine.outputs, kinds, strict=True)):
+            whole = inner.set(f"insertvalue {result} {whole}, {kind} {inner.value(one)}, {i}")
+        inner.line(f"ret {result} {whole}")
+        given = ", ".join(f"{inner.vector(one.dtype)} %a{i}" for i, one in enumerate(routine.inputs))
+        e.texts.append("\n".join([f"define internal fastcc {result} {name}({given}) noinline #0 {{", *inner.lines, "}"]))
+    given = ", ".join(f"{e.vector(a.dtype)} {e.value(a)}" for a in node.args)
+    held = e.set(f"call fastcc {result} {e.routines[routine]}({given})")
+    for i in range(len(kinds)):
+        e.names[node.id, str(i)] = e.set(f"extractvalue {result} {held}, {i}")
+
+
+def gather(e: Emitter, node: Node) -> str:
+    """A number of a table for each lane."""
+    table = e.address("%uniforms", 8 * len(e.layout.slots))
+    e.layout.slots.extend(node.attr)
+    index, out, name = e.value(node.args[0]), "poison", "i8" if node.dtype == BOOL else scalar(node.dtype)
+    for lane in range(e.lanes):
+        at = e.set(f"shl i64 {e.set(f'extractelement <{e.lanes} x i64> {index}, i32 {lane}')}, 3")
+        held = e.set(f"load {name}, ptr {e.address(table, at)}, align 8")
+        if node.dtype == BOOL:
+            held = e.set(f"icmp ne i8 {held}, 0")
+        out = e.set(f"insertelement {e.vector(node.dtype)} {out}, {scalar(node.dtype)} {held}, i32 {lane}")
+    return out
+
+
+def matvec(e: Emitter, node: Node) -> None:
+    """A matrix that all episodes share times a vector of each: a loop over its columns, by a function for each shape."""
+    (p, q), kind, size = node.attr.shape, e.vector(FLOAT), 8 * e.lanes
+    if (p, q) not in e.routines:
+        e.routines[p, q] = f"@matvec_{p}_{q}"
+        e.texts.append(_matvec_text(e, p, q))
+    table = e.address("%uniforms", 8 * len(e.layout.slots))
+    e.layout.slots.extend(node.attr.T.flat)
+    names = [e.value(a) for a in node.args]
+    x, out = e.buffer(names[:q]), e.buffer(names[q:])
+    e.line(f"call fastcc void {e.routines[p, q]}(ptr {table}, ptr {x}, ptr {out})")
+    for i in range(p):
+        e.names[node.id, str(i)] = e.set(f"load {kind}, ptr {e.address(out, size * i)}, align {size}")
+
+
+def _matvec_text(outer: Emitter, p: int, q: int) -> str:
+    e, kind, size = outer.fresh(), outer.vector(FLOAT), 8 * outer.lanes
+    e.begin("entry")
+    for first in range(0, p, ROWS):
+        rows = range(first, min(first + ROWS, p))
+        begin = [e.set(f"load {kind}, ptr {e.address('%out', size * i)}, align {size}") for i in rows]
+        before, again, done = e.block, e.label("again"), e.label("done")
+        e.line(f"br label %{again}")
+        e.begin(again)
+        k, totals = f"%k{first}", [f"%total{i}" for i in rows]
+        e.line(f"{k} = phi i64 [0, %{before}], [{k}n, %{again}]")
+        for name, at_first in zip(totals, begin, strict=True):
+            e.line(f"{name} = phi {kind} [{at_first}, %{before}], [{name}n, %{again}]")
+        held = e.set(f"load {kind}, ptr {e.address('%x', e.set(f'mul i64 {k}, {size}'))}, align {size}")
+        column = e.address("%table", e.set(f"mul i64 {k}, {8 * p}"))
+        for i, name in zip(rows, totals, strict=True):
+            one = e.set(f"load double, ptr {e.address(column, 8 * i)}, align 8")
+            first_lane = e.set(f"insertelement {kind} poison, double {one}, i32 0")
+            all_lanes = e.set(f"shufflevector {kind} {first_lane}, {kind} poison, <{e.lanes} x i32> zeroinitializer")
+            e.line(f"{name}n = fadd {kind} {name}, {e.set(f'fmul {kind} {all_lanes}, {held}')}")
+        e.line(f"{k}n = add i64 {k}, 1")
+        e.line(f"br i1 {e.set(f'icmp slt i64 {k}n, {q}')}, label %{again}, label %{done}")
+        e.begin(done)
+        for i, name in zip(rows, totals, strict=True):
+            e.line(f"store {kind} {name}n, ptr {e.address('%out', size * i)}, align {size}")
+    e.line("ret void")
+    head = f"define internal fastcc void @matvec_{p}_{q}(ptr noalias %table, ptr noalias %x, ptr noalias %out) noinline #0 {{"
+    return "\n".join([head, *e.lines, "}"])
