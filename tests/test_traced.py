@@ -175,6 +175,9 @@ def test_objects_that_are_damaged_or_cannot_be_kept_are_made_again(tmp_path, mon
     assert call().fresh and not call().fresh
     objects.prove([kept.name])
     assert objects.proved([kept.name]) and not objects.proved([kept.name, "other"])
+    monkeypatch.setattr(objects, "KEPT", 2)
+    objects.prove(["another"])
+    assert len(list((tmp_path / "cache/objects").iterdir())) == 2 and objects.proved([kept.name, "another"])
     (tmp_path / "cache/objects").chmod(0o777)  # somebody else could write here
     assert call().fresh and not objects.proved([kept.name])
     monkeypatch.setenv("TAILGATE_CACHE", "/proc/nowhere")

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 VERSION = b"1"  # of what this module makes of a text
+KEPT = 4000  # files in the folder, those that were used last
 _lock = threading.RLock()
 
 
@@ -67,6 +68,7 @@ def _kept(name: str) -> bytes | None:
         return None
     with contextlib.suppress(OSError):
         held = (place / name).read_bytes()
+        os.utime(place / name)
         if hashlib.sha256(held[32:]).digest() == held[:32]:
             return held[32:]
     return None
@@ -80,6 +82,8 @@ def _keep(name: str, content: bytes) -> None:
     try:
         partial.write_bytes(hashlib.sha256(content).digest() + content)
         os.replace(partial, place / name)
+        for old in sorted(place.iterdir(), key=lambda path: path.stat().st_mtime)[:-KEPT]:
+            old.unlink()
     except OSError:
         with contextlib.suppress(OSError):
             partial.unlink()
