@@ -35,6 +35,8 @@ def present(values: Any, candidates: Iterable[int]) -> list[int]:
 def pick(ring: Array, place: Any) -> Any:
     """ring[..., place] of a ring (B, ..., L) and whole numbers that broadcast to (B, ...)."""
     if not isinstance(ring, Traced):
+        if ring.ndim == 2 and np.ndim(place) == 1:
+            return ring[np.arange(len(ring)), place]
         return np.take_along_axis(ring, np.broadcast_to(place, ring.shape[:-1])[..., None], axis=-1)[..., 0]
     out = ring[..., 0]
     for i in range(1, ring.shape[-1]):
@@ -47,6 +49,9 @@ def put(ring: Array, place: Any, value: Any) -> Any:
     if isinstance(ring, Traced):
         return np.stack([np.where(place == i, value, ring[..., i]) for i in range(ring.shape[-1])], axis=-1)
     out = ring.copy(order="K")
+    if ring.ndim == 2 and np.ndim(place) == 1:
+        out[np.arange(len(ring)), place] = value
+        return out
     np.put_along_axis(out, np.broadcast_to(place, ring.shape[:-1])[..., None], np.asarray(value)[..., None], axis=-1)
     return out
 

@@ -171,6 +171,17 @@ def ball(q, x, c, u):
 
 
 @_jit
+def ball_each(w: np.ndarray, c: np.ndarray, u: np.ndarray) -> None:
+    """`ball` of w (P, q, B) and c (P, q) into u (P, q, B), each by itself."""
+    x, y = np.empty(w.shape[1]), np.empty(w.shape[1])
+    for p in range(w.shape[0]):
+        for b in range(w.shape[2]):
+            x[:] = w[p, :, b]
+            ball(len(x), x, c[p], y)
+            u[p, :, b] = y
+
+
+@_jit
 def pair(r0, r1, half0, half1, S00, S01, S10, S11, W00, W01, W10, W11):
     """The part of two readings that is believed (robust.py), in closed form; S and W = S^-1, and half of lam.
 

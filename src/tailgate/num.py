@@ -302,35 +302,10 @@ def root(s: Array) -> tuple[Array, Array]:
 
 def in_ball(w: Array, c: Array) -> Array:
     """u_k = w_k / (c_k + mu) with the least mu >= 0 at which |u| <= 1, for w (B, P, q) and c (P, q) >= 0: (B, P, q). 0/0 counts as 0."""
-    with np.errstate(over="ignore"):
-        size = np.abs(w)
-        some_w, least, length, most, weighed = w != 0.0, zeros(w.shape[:-1]), zeros(w.shape[:-1]), zeros(w.shape[:-1]), zeros(w.shape[:-1])
-        for k in range(w.shape[-1]):
-            over = size[..., k] - c[..., k]
-            least = np.where(over > least, over, least)
-            length, most = length + w[..., k] * w[..., k], np.where(c[..., k] > most, c[..., k], most)
-            share = _divided(w[..., k], c[..., k], some_w[..., k])
-            weighed = weighed + share * share
-        outside, bound = weighed > 1.0, np.sqrt(length) - most
-        mu = np.where(outside, np.where(bound > least, bound, least), 0.0)
-
-        def closer(mu: Any, _: Any) -> tuple[Any, tuple[Any, Any]]:  # Newton on 1 / |u|, monotone from below
-            s, t = zeros(mu.shape), zeros(mu.shape)
-            for k in range(w.shape[-1]):
-                z = _divided(w[..., k], c[..., k] + mu, some_w[..., k])
-                s, t = s + z * z, t + _divided(z * z, c[..., k] + mu, z != 0.0)
-            length = np.sqrt(s)
-            step = _divided(s * (length - 1.0), t, t != 0.0)
-            further = step > 1e-15 * mu
-            return further, (np.where(further, mu + step, mu), length)
-
-        mu, length = until(closer, (mu, np.ones_like(mu)), outside, 100)
-        return stack([_divided(_divided(w[..., k], c[..., k] + mu, some_w[..., k]), length, some_w[..., k]) for k in range(w.shape[-1])])
-
-
-def _divided(x: Array, y: Array, where: Array) -> Array:
-    """x / y in some places, 0 elsewhere."""
-    return np.where(where, x, 0.0) / np.where(where, y, 1.0)
+    flat = np.ascontiguousarray(first_to_last(w))
+    out = np.empty_like(flat)
+    linear.ball_each(flat, np.ascontiguousarray(c), out)
+    return last_to_first(out)
 
 
 def expm(m: Array) -> Array:
