@@ -9,7 +9,6 @@ from tailgate.engine.graph import BOOL, COMPARISONS, DTYPES, FLOAT, Graph, Node,
 from tailgate.engine.program import Call, Program, State, Trace
 
 SPECIAL = np.array([0.0, -0.0, 1.0, -1.0, 0.5, 1e-310, -5e-324, 1e308, -1e308, np.inf, -np.inf, np.nan, 2.0**63, -(2.0**63), 3.7, 255.5])
-FLOATS, INTS = [d for d in DTYPES if d.kind == "f"], [d for d in DTYPES if d.kind in "iu"]
 
 
 def numbers(chance: np.random.Generator, dtype: np.dtype[Any], size: int) -> np.ndarray:

@@ -1,7 +1,9 @@
 """The traced engine plays environments as the plain loop does, to the last bit, restarts, resets and what was held included."""
 
+import dataclasses
 import importlib
 import json
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -90,6 +92,32 @@ def test_large_rollouts_without_lanes_are_traced(monkeypatch, tmp_path):
     monkeypatch.setattr(Rollout, "play", lambda self, keys, terminate, play=Rollout.play: played.append(1) or play(self, keys, terminate))
     hashes = [rollout(loop, NoAttack(), draws.keys("report", range(n))).trace_hash(3) for n in (10, 50)]
     assert hashes[0] == hashes[1] and len(played) == 1
+
+
+@dataclass
+class Turning:
+    """A defence whose gain somebody changes between two rollouts."""
+
+    made: object
+    gain: float = 0.1
+
+    def prepare(self, model):
+        return model
+
+    def start(self, plan, prior):
+        return self.made.start(plan, prior)
+
+    def step(self, plan, state, received, known_u, draws):
+        return dataclasses.replace(self.made, gain=self.gain).step(plan, state, received, known_u, draws)
+
+
+def test_an_object_that_is_changed_is_traced_again(tmp_path, monkeypatch):
+    turning, hashes = Turning(plugin(tmp_path, monkeypatch).Saturated()), []
+    loop, keys = load_scenario("stop-and-go-v0").loop(turning), draws.keys("report", range(40))
+    for gain in (0.1, 0.3):
+        turning.gain = gain
+        hashes.append([rollout(loop, NoAttack(), keys, plain=plain).trace_hash(3) for plain in (False, True)])
+    assert hashes[0][0] == hashes[0][1] != hashes[1][0] == hashes[1][1]
 
 
 class Branching(Kalman):

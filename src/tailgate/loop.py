@@ -241,7 +241,9 @@ class Loop:
             odometry=odometry if "odometry" in self.uses else None,
             attacked=received.attacked if "truth" in self.uses else None,
         )
-        answer = self.defence.step(plan.defence, state.defence, frozen(heard), frozen(state.known_u), state.keys.at(Role.DEFENCE, state.k))
+        answer = self.defence.step(
+            plan.defence, state.defence, frozen(heard), frozen(state.known_u), state.keys.at(Role.DEFENCE, state.k)
+        )
         defence, estimate = pair_of(answer)
         check_estimate(estimate, self.model, len(state.k), state.k)
         if "probe" not in self.uses:  # who does not say that it switches the probe off cannot
@@ -257,18 +259,7 @@ class Loop:
         collided = np.any(scene.gap <= 0.0, axis=1)
         rear_collided = np.any(scene.rear_gap <= 0.0, axis=1)
         frame = Frame(
-            state.k,
-            truth,
-            state.sent,
-            arrived,
-            channel.last,
-            refused,
-            estimate,
-            u,
-            applied,
-            scene,
-            received,
-            collided,
+            state.k, truth, state.sent, arrived, channel.last, refused, estimate, u, applied, scene, received, collided,
             rear_collided,
         )
         sent, fresh = self._measure(state.keys, state.k + 1, plant, controller, estimate)
@@ -309,7 +300,9 @@ class Loop:
     def _move(self, keys: Keys, k: Array, manoeuvre: Any, plant: Any, applied: Array, u: Array | None = None) -> tuple[Any, Any, Array]:
         """-> manoeuvre, plant, and what is known of the input; u is what was commanded, where that is not what is applied."""
         plan = self.plan
-        manoeuvre, exo = self.manoeuvre.accel(plan.manoeuvre, manoeuvre, k, self.plant.lead_speed_of(plant), keys.at(Role.MANOEUVRE, k))
+        manoeuvre, exo = self.manoeuvre.accel(
+            plan.manoeuvre, manoeuvre, k, self.plant.lead_speed_of(plant), keys.at(Role.MANOEUVRE, k)
+        )
         driven = applied if self.load == 1.0 else applied / self.load
         plant = self.plant.step(plan.plant, plant, driven, exo, keys.at(Role.PROCESS, k))
         return manoeuvre, plant, self.plant.known(plan.plant, applied if u is None else u, exo, plant)

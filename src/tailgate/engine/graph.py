@@ -15,7 +15,7 @@ import numpy as np
 from tailgate.engine.untraceable import Untraceable
 
 Array = np.ndarray[Any, Any]
-BOOL, FLOAT, INT, WORD = np.dtype(bool), np.dtype(np.float64), np.dtype(np.int64), np.dtype(np.uint64)
+BOOL, FLOAT, INT = np.dtype(bool), np.dtype(np.float64), np.dtype(np.int64)
 DTYPES = [np.dtype(name) for name in ("?", "f8", "f4", "i8", "u8", "i4", "u4", "i2", "u2", "i1", "u1")]
 
 

@@ -81,8 +81,14 @@ def rollout_of(loop: Loop, attack: Attack) -> Rollout | Untraced:
         if known is loop and also is attack:
             return found
     found = _made(loop, attack)
-    _held[:] = [*_held[-3:], (loop, attack, found)]
+    if _frozen(loop.defence) and _frozen(attack):  # another object may be a different one the next time
+        _held[:] = [*_held[-3:], (loop, attack, found)]
     return found
+
+
+def _frozen(held: Any) -> bool:
+    parameters = getattr(type(held), "__dataclass_params__", None)
+    return parameters is not None and bool(parameters.frozen)
 
 
 def _made(loop: Loop, attack: Attack) -> Rollout | Untraced:
