@@ -113,10 +113,10 @@ class Turning:
 
 def test_an_object_that_is_changed_is_traced_again(tmp_path, monkeypatch):
     turning, hashes = Turning(plugin(tmp_path, monkeypatch).Saturated()), []
-    loop, keys = load_scenario("stop-and-go-v0").loop(turning), draws.keys("report", range(40))
+    attack, (loop, keys) = NoAttack(), (load_scenario("stop-and-go-v0").loop(turning), draws.keys("report", range(40)))
     for gain in (0.1, 0.3):
         turning.gain = gain
-        hashes.append([rollout(loop, NoAttack(), keys, plain=plain).trace_hash(3) for plain in (False, True)])
+        hashes.append([rollout(loop, attack, keys, plain=plain).trace_hash(3) for plain in (False, True)])
     assert hashes[0][0] == hashes[0][1] != hashes[1][0] == hashes[1][1]
 
 

@@ -1,4 +1,4 @@
-"""What is not traced, and why; and when two engines agree."""
+"""Reasons why code is not traced, and the comparison of two engines."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def check_open(loop: Loop) -> None:
 
 
 def explained(error: Exception) -> str:
-    """What a failure says, and where: the line of the code that is traced."""
+    """Give the text of a failure, with the line of the code that was traced."""
     if isinstance(error, Untraceable):
         return str(error)
     steps = traceback.extract_tb(error.__traceback__)
@@ -44,7 +44,7 @@ def explained(error: Exception) -> str:
 
 
 def raised(play: Callable[[], Any]) -> Any:
-    """What a call gives, or the text of its InputError."""
+    """Call, and return the result or the text of its InputError."""
     try:
         return play()
     except InputError as error:

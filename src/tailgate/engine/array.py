@@ -22,7 +22,7 @@ _ZERO = np.zeros((), np.int8)
 
 
 class Flags:
-    """Whether an array may be written to, as numpy's `flags` say it."""
+    """Says if an array may be written to, as numpy's `flags` do."""
 
     def __init__(self, writeable: bool = True) -> None:
         self.writeable = writeable
@@ -153,7 +153,7 @@ class Traced:
         return self.reshape(-1)
 
     def copy(self, order: Any = None) -> Traced:
-        """Nodes of its own."""
+        """Copy the array."""
         return Traced(self.graph, self.nodes.copy(), self.dtype, self.batch, self.weak)
 
     def view(self, dtype: Any = None) -> Traced:
@@ -164,7 +164,7 @@ class Traced:
         return self.mapped(lambda node: self.graph.bits(node, to), to)
 
     def astype(self, dtype: Any, order: Any = "K", casting: Any = "unsafe", copy: bool = True) -> Traced:
-        """Of another type."""
+        """Convert to another type."""
         to = np.dtype(dtype)
         return self.mapped(lambda node: self.graph.cast(node, to), to)
 
@@ -242,7 +242,7 @@ class Traced:
         return np.minimum(np.maximum(self, low), high)
 
     def __pow__(self, exponent: Any) -> Any:
-        """Of the exponents that numpy has no library function for."""
+        """Raise to 0.5, 1 or 2: for other exponents numpy calls a library, whose bits differ between machines."""
         known = float(exponent)
         if known not in (0.5, 1.0, 2.0):
             raise Untraceable(f"the power {known}", "write products, or num.exp(p * num.log(x))")

@@ -16,7 +16,7 @@ from tailgate.engine.untraceable import Untraceable
 
 
 def called(graph: Graph, function: Any, args: Any, options: dict[str, Any]) -> Any:
-    """What numpy would give. Of arrays that are the same for all episodes everything is known."""
+    """Return what numpy would. Arrays that are the same for all episodes are handed to numpy itself."""
     if function in _FUNCTIONS:
         return _FUNCTIONS[function](*args, **options)
     held = [x for x in _inside((args, tuple(options.values()))) if isinstance(x, Traced)]
@@ -228,7 +228,7 @@ def tracing() -> bool:
 
 @contextlib.contextmanager
 def makers(graph: Graph) -> Iterator[None]:
-    """Within it, numpy's makers of arrays give traced ones to whoever is traced in this thread."""
+    """While this context is open, `np.zeros` and its like return traced arrays to code that is traced in this thread."""
 
     def wrapped(original: Any, mine: Callable[..., Any], converts: bool) -> Any:
         def maker(*args: Any, **options: Any) -> Any:
