@@ -21,16 +21,11 @@ class Untraced(NamedTuple):
     why: str
 
 
-LARGE = 400  # numbers in the matrices of all agents: straight code of more takes long to trace and to compile
-
-
 def check_open(loop: Loop) -> None:
-    """Raise TypeError for a loop whose matrices are large, and for a defence that runs elsewhere or says itself why it cannot be traced."""
-    defence, model = loop.defence, loop.model
+    """Raise TypeError for a defence that runs elsewhere or says itself why it cannot be traced."""
+    defence = loop.defence
     if why := getattr(defence, "opaque", "") or getattr(defence, "untraced", ""):
         raise TypeError(f"the defence {type(defence).__name__} is not traced: {why}")
-    if model.agents * model.states**2 > LARGE:
-        raise TypeError(f"matrices of {model.agents} agents and {model.states} states are too large for straight code")
 
 
 def explained(error: Exception) -> str:

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from tailgate.engine.buffers import blended, swept, wide
 from tailgate.engine.graph import BOOL, Array, Graph, Node
 from tailgate.engine.untraceable import Untraceable
 
@@ -166,11 +167,11 @@ class Traced:
     def astype(self, dtype: Any, order: Any = "K", casting: Any = "unsafe", copy: bool = True) -> Traced:
         """Convert to another type."""
         to = np.dtype(dtype)
-        return self.mapped(lambda node: self.graph.cast(node, to), to)
+        return self.copy() if to == self.dtype else self.mapped(lambda node: self.graph.cast(node, to), to)
 
     def mapped(self, function: Callable[[Node], Node], dtype: Any = None) -> Traced:
         """A function of each node."""
-        return Traced(self.graph, each(function, self.nodes), np.dtype(dtype or self.dtype), self.batch)
+        return Traced(self.graph, each(self.graph, function, self.nodes), np.dtype(dtype or self.dtype), self.batch)
 
     # -- places
 
@@ -200,7 +201,7 @@ class Traced:
             self.batch = self.batch if self.batch is not None else mask.batch
             return
         plain, new = self._key(key), lifted(graph, value, self.dtype)
-        cast = each(lambda node: graph.cast(node, self.dtype), new.nodes)
+        cast = typed(graph, new, self.dtype).nodes
         self.nodes[plain] = cast if cast.ndim else cast[()]
         if new.batch is not None and self.batch is None and self.shape[:1] == (1,):
             self.batch = 0
@@ -287,9 +288,11 @@ def boxed(node: Any) -> Array:
     return out
 
 
-def each(function: Callable[..., Node], *arrays: Array) -> Array:
+def each(graph: Graph, function: Callable[..., Node], *arrays: Array) -> Array:
     """A function of nodes for each place of arrays of them."""
     shape = np.broadcast_shapes(*(a.shape for a in arrays))
+    if wide(graph, *arrays):
+        return swept(graph, function, shape, arrays)
     out = np.empty(shape, object)
     out[...] = np.frompyfunc(function, len(arrays), 1)(*arrays)
     return out
@@ -319,8 +322,14 @@ def shared_batch(arrays: Sequence[Traced]) -> int | None:
 
 def elementwise(graph: Graph, function: Callable[..., Node], arrays: Sequence[Traced], dtype: np.dtype[Any]) -> Traced:
     """A function of nodes for each place of several arrays."""
+    shared_batch(arrays)
+    nodes = each(graph, function, *(a.nodes for a in arrays))
+    return _of_all(graph, nodes, arrays, dtype)
+
+
+def _of_all(graph: Graph, nodes: Array, arrays: Sequence[Traced], dtype: np.dtype[Any]) -> Traced:
+    """The array of what was computed of several ones."""
     back = shared_batch(arrays)
-    nodes = each(function, *(a.nodes for a in arrays))
     if back is not None and nodes.shape[back] != 1:
         raise Untraceable("the axis of the episodes against a longer one", "give each array the episodes as its first axis")
     weak = next(iter({a.weak for a in arrays}), None) if all(a.weak for a in arrays) else None
@@ -340,7 +349,7 @@ def gathered(table: Any, index: Traced) -> Traced:
 
 def typed(graph: Graph, x: Traced, dtype: np.dtype[Any]) -> Traced:
     """x of a type."""
-    return x if x.dtype == dtype else Traced(graph, each(lambda node: graph.cast(node, dtype), x.nodes), dtype, x.batch)
+    return x if x.dtype == dtype else x.mapped(lambda node: graph.cast(node, dtype), dtype)
 
 
 def result_type(arrays: Sequence[Traced]) -> np.dtype[Any]:
@@ -353,7 +362,12 @@ def chosen(where: Any, x: Any, y: Any, dtype: np.dtype[Any] | None = None) -> Tr
     graph = next(a.graph for a in (where, x, y) if isinstance(a, Traced))
     mask, one, other = lifted(graph, where), lifted(graph, x), lifted(graph, y)
     to = dtype or result_type([one, other])
-    return elementwise(graph, graph.select, [typed(graph, mask, BOOL), typed(graph, one, to), typed(graph, other, to)], to)
+    arrays = [typed(graph, mask, BOOL), typed(graph, one, to), typed(graph, other, to)]
+    if mask.size == 1 and wide(graph, *(a.nodes for a in arrays)):
+        shape = np.broadcast_shapes(*(a.shape for a in arrays))
+        sides = [np.broadcast_to(a.nodes, shape) for a in arrays[1:]]
+        return _of_all(graph, blended(graph, arrays[0].nodes.item(), *sides), arrays, to)
+    return elementwise(graph, graph.select, arrays, to)
 
 
 def axes_of(x: Traced, axis: Any, instead: str) -> list[int]:

@@ -78,8 +78,7 @@ def call(e: Emitter, node: Node) -> None:
 
 def gather(e: Emitter, node: Node) -> str:
     """A number of a table for each lane."""
-    table = e.address("%uniforms", 8 * len(e.layout.slots))
-    e.layout.slots.extend(node.attr)
+    table = e.table(node.attr)
     index, out, name = e.value(node.args[0]), "poison", "i8" if node.dtype == BOOL else scalar(node.dtype)
     for lane in range(e.lanes):
         at = e.set(f"shl i64 {e.set(f'extractelement <{e.lanes} x i64> {index}, i32 {lane}')}, 3")
@@ -96,8 +95,7 @@ def matvec(e: Emitter, node: Node) -> None:
     if (p, q) not in e.routines:
         e.routines[p, q] = f"@matvec_{p}_{q}"
         e.texts.append(_matvec_text(e, p, q))
-    table = e.address("%uniforms", 8 * len(e.layout.slots))
-    e.layout.slots.extend(node.attr.T.flat)
+    table = e.table(tuple(node.attr.T.flat))
     names = [e.value(a) for a in node.args]
     x, out = e.buffer(names[:q]), e.buffer(names[q:])
     e.line(f"call fastcc void {e.routines[p, q]}(ptr {table}, ptr {x}, ptr {out})")

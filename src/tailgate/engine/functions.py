@@ -91,13 +91,12 @@ def _least(x: Traced, axis: int, op: str) -> Traced:
     """The place of the least or the largest along an axis, the first of several."""
     if axis is None or (x.batch is not None and axis % x.ndim == x.batch):
         raise Untraceable("the place of one number of all episodes", "name another axis")
-    parts = [np.take(x.nodes, i, axis) for i in range(x.shape[axis])]
-    graph = x.graph
-    best, place = parts[0], each(lambda node: graph.const(0, np.dtype(np.int64)), parts[0])
+    graph, parts = x.graph, [np.take(x.nodes, i, axis) for i in range(x.shape[axis])]
+    best, place = parts[0], each(graph, lambda node: graph.const(0, np.dtype(np.int64)), parts[0])
     for i, part in enumerate(parts[1:], 1):
-        better = each(lambda p, b: graph.binary(op, p, b), part, best)
-        best = each(graph.select, better, part, best)
-        place = each(lambda c, k, i=i: graph.select(c, graph.const(i, np.dtype(np.int64)), k), better, place)
+        better = each(graph, lambda p, b: graph.binary(op, p, b), part, best)
+        best = each(graph, graph.select, better, part, best)
+        place = each(graph, lambda c, k, i=i: graph.select(c, graph.const(i, np.dtype(np.int64)), k), better, place)
     shadow = x._moved(lambda n: n.take(0, axis))
     return Traced(graph, place, np.dtype(np.int64), shadow.batch)
 

@@ -37,7 +37,8 @@ def converted(x: Any, dtype: np.dtype[Any]) -> Any:
     return x.astype(dtype)
 
 
-MOST = 20_000  # nodes of a graph: what has more takes long to compile, as straight code
+MOST = 20_000  # operations of a graph: what has more takes long to compile, as straight code
+_FREE = {"const", "uniform", "input", "carried", "pick"}  # which are none
 COMPARISONS = {"lt": np.less, "le": np.less_equal, "gt": np.greater, "ge": np.greater_equal, "eq": np.equal, "ne": np.not_equal}
 BINARY: dict[str, Callable[..., Any]] = {
     "add": np.add, "sub": np.subtract, "mul": np.multiply, "div": np.true_divide, "min": minimum, "max": maximum,
@@ -51,12 +52,15 @@ COMMUTATIVE = {"add", "mul", "and", "or", "xor", "eq", "ne"}
 
 
 class Node:
-    """A number: an operation `op` on other nodes. `fixed`: it is the same for all episodes."""
+    """A number: an operation `op` on other nodes. `fixed`: it is the same for all episodes.
 
-    __slots__ = ("args", "attr", "dtype", "fixed", "id", "op")
+    With a `size` it is a buffer of so many numbers, which are picked.
+    """
 
-    def __init__(self, id: int, op: str, dtype: np.dtype[Any], args: tuple[Node, ...], attr: Any, fixed: bool) -> None:
-        self.id, self.op, self.dtype, self.args, self.attr, self.fixed = id, op, dtype, args, attr, fixed
+    __slots__ = ("args", "attr", "dtype", "fixed", "id", "op", "size")
+
+    def __init__(self, id: int, op: str, dtype: np.dtype[Any], args: tuple[Node, ...], attr: Any, fixed: bool, size: int = 0) -> None:
+        self.id, self.op, self.dtype, self.args, self.attr, self.fixed, self.size = id, op, dtype, args, attr, fixed, size
 
     def __repr__(self) -> str:
         args = ", ".join(f"%{a.id}" for a in self.args)
@@ -74,10 +78,30 @@ class Body:
     nodes: list[Node]
 
 
+@dataclass(frozen=True)
+class Source:
+    """Where a number stands in each round of a sweep: in a buffer, or in a table of fixed nodes."""
+
+    held: Node | tuple[Node, ...]
+    offset: int
+    strides: tuple[int, ...]
+
+
+@dataclass(eq=False)
+class Sweep:
+    """A body that is computed for each index of a shape: `carried` numbers, from their sources, become those of `after`, one by one."""
+
+    shape: tuple[int, ...]
+    carried: list[Node]
+    sources: list[Source]
+    after: list[Node]
+    nodes: list[Node]
+
+
 def dependent(roots: Sequence[Node], sources: Sequence[Node]) -> set[Node]:
     """The roots and what they need, as far as it depends on the sources; without these."""
     found = set(sources)
-    for node in ordered(roots):
+    for node in ordered(roots, min((node.id for node in sources), default=0)):
         if any(a in found for a in node.args):
             found.add(node)
     return found - set(sources)
@@ -89,8 +113,10 @@ class Graph:
     def __init__(self) -> None:
         self.nodes: list[Node] = []
         self.demands: list[tuple[str, str, str, Node]] = []  # what has to hold: field, what else is found, what is wanted
+        self.operations = 0
         self._known: dict[Any, Node] = {}
         self._values: dict[int, Any] = {}  # of fixed nodes
+        self._picks: dict[int, Array] = {}  # of buffers
 
     # -- leaves
 
@@ -110,13 +136,14 @@ class Graph:
         self._values[node.id] = np.asarray(value)[()]
         return node
 
-    def _node(self, op: str, dtype: np.dtype[Any], args: tuple[Node, ...], attr: Any, key: Any, fixed: bool) -> Node:
+    def _node(self, op: str, dtype: np.dtype[Any], args: tuple[Node, ...], attr: Any, key: Any, fixed: bool, size: int = 0) -> Node:
         known = (op, dtype, key, *(a.id for a in args))
         node = self._known.get(known)
         if node is None:
-            if len(self.nodes) >= MOST:
+            self.operations += op not in _FREE
+            if self.operations > MOST:
                 raise Untraceable(f"more than {MOST:,} operations", "use num.until, num.take and matrix products of num for what is large")
-            node = self._known[known] = Node(len(self.nodes), op, dtype, args, attr, fixed)
+            node = self._known[known] = Node(len(self.nodes), op, dtype, args, attr, fixed, size)
             self.nodes.append(node)
         return node
 
@@ -201,6 +228,49 @@ class Graph:
         node = self._node("matvec", FLOAT, (*x, *base), matrix, key, False)
         return [self.pick(node, i, FLOAT) for i in range(len(base))]
 
+    # -- buffers
+
+    def picks(self, buffer: Node) -> Array:
+        """The numbers of a buffer, by their places."""
+        if buffer.id not in self._picks:
+            out = np.empty(buffer.size, object)
+            for i in range(buffer.size):
+                out[i] = node = Node(len(self.nodes), "pick", buffer.dtype, (buffer,), i, False)
+                self.nodes.append(node)
+            self._picks[buffer.id] = out
+        return self._picks[buffer.id]
+
+    def held(self, name: Any, size: int, dtype: np.dtype[Any]) -> Node:
+        """A buffer that each episode brings."""
+        return self._node("held", dtype, (), name, name, False, size)
+
+    def packed(self, nodes: Sequence[Node]) -> Node:
+        """A buffer of these."""
+        return self._node("pack", nodes[0].dtype, tuple(nodes), None, None, False, len(nodes))
+
+    def blend(self, where: Node, x: Node, y: Node) -> Node:
+        """The buffer x where `where` holds, else the buffer y."""
+        if where.op == "const" or x is y:
+            return x if x is y or where.attr else y
+        return self._node("blend", x.dtype, (where, x, y), None, None, False, x.size)
+
+    def inverses(self, matrices: Node, q: int) -> Node:
+        """The inverses of symmetric positive definite matrices (., q, q)."""
+        return self._node("invert", FLOAT, (matrices,), q, q, False, matrices.size)
+
+    def sweep(self, shape: tuple[int, ...], carried: list[Node], sources: list[Source], after: list[Node]) -> Node:
+        """A buffer (*shape, len(after)) of what the carried numbers become in each round."""
+        inside = dependent(after, carried)
+        used = {a.id for node in inside for a in node.args} | {node.id for node in after}
+        kept = [(one, source) for one, source in zip(carried, sources, strict=True) if one.id in used]
+        outer = {a.id: a for node in inside for a in node.args} | {node.id: node for node in after}
+        mine = {node.id for node in (*inside, *carried)}
+        captured = [node for i, node in outer.items() if i not in mine and not node.fixed]
+        buffers = {s.held.id: s.held for _, s in kept if isinstance(s.held, Node)}
+        body = Sweep(shape, [one for one, _ in kept], [s for _, s in kept], after, sorted(inside, key=lambda node: node.id))
+        size = len(after) * int(np.prod(shape, dtype=int))
+        return self._node("sweep", after[0].dtype, (*buffers.values(), *captured), body, len(self.nodes), False, size)
+
     # -- loops
 
     def carried(self, begin: Array) -> Array:
@@ -268,19 +338,23 @@ def computed(node: Node, args: Sequence[Any]) -> Any:
         return node.attr.values(list(args))
     if node.op == "pick":
         return args[0][node.attr]
-    if node.op == "matvec":
-        raise AssertionError("a matrix product is evaluated with its graph")
+    if node.op in ("matvec", "sweep"):
+        raise AssertionError("what has fixed nodes of its own is evaluated with its graph")
+    if node.op == "pack":
+        return list(args)
+    if node.op == "blend":
+        return [np.where(args[0], x, y) for x, y in zip(args[1], args[2], strict=True)]
     with np.errstate(all="ignore"):
         return np.asarray(apply(node.op, node.dtype, args))[()]
 
 
-def ordered(roots: Iterable[Node]) -> list[Node]:
-    """The roots and all that they need, arguments first."""
+def ordered(roots: Iterable[Node], first: int = 0) -> list[Node]:
+    """The roots and all that they need, from the node `first` on, arguments first."""
     seen: dict[int, Node] = {}
     left = list(roots)
     while left:
         node = left.pop()
-        if node.id not in seen:
+        if node.id >= first and node.id not in seen:
             seen[node.id] = node
             left.extend(node.args)
     return [seen[i] for i in sorted(seen)]
@@ -298,7 +372,7 @@ def _evaluate(graph: Graph, nodes: Iterable[Node], inputs: dict[Any, Array], val
         args = [graph.value(a) if a.fixed else values[a.id] for a in node.args]
         if node.fixed:
             values[node.id] = graph.value(node)
-        elif node.op == "input":
+        elif node.op in ("input", "held"):
             values[node.id] = inputs[node.attr]
         elif node.op == "gather":
             values[node.id] = np.array([graph.value(entry) for entry in node.attr], node.dtype)[args[0]]
@@ -306,6 +380,10 @@ def _evaluate(graph: Graph, nodes: Iterable[Node], inputs: dict[Any, Array], val
             values[node.id] = _multiplied(graph, node.attr, args)
         elif node.op == "loop":
             values[node.id] = _looped(graph, node.attr, args, values)
+        elif node.op == "sweep":
+            values[node.id] = _swept(graph, node.attr, values)
+        elif node.op == "invert":
+            values[node.id] = _inverted(args[0], node.attr)
         else:
             values[node.id] = computed(node, args)
 
@@ -328,3 +406,22 @@ def _looped(graph: Graph, body: Body, args: Sequence[Any], values: dict[int, Any
         held = [graph.value(node) if node.fixed else inner[node.id] for node in body.after]
         going = held[: len(body.going)]
     return held
+
+
+def _swept(graph: Graph, sweep: Sweep, values: dict[int, Any]) -> list[Any]:
+    out = []
+    for index in np.ndindex(*sweep.shape):
+        inner = dict(values)
+        for one, source in zip(sweep.carried, sweep.sources, strict=True):
+            place = source.offset + sum(i * n for i, n in zip(index, source.strides, strict=True))
+            inner[one.id] = values[source.held.id][place] if isinstance(source.held, Node) else graph.value(source.held[place])
+        _evaluate(graph, sweep.nodes, {}, inner)
+        out += [graph.value(node) if node.fixed else inner[node.id] for node in sweep.after]
+    return out
+
+
+def _inverted(numbers: Sequence[Any], q: int) -> list[Any]:
+    from tailgate.engine.matrices import inverse
+
+    stack = np.stack(numbers, axis=-1)
+    return list(np.moveaxis(inverse(stack.reshape(*stack.shape[:-1], -1, q, q)).reshape(stack.shape), -1, 0))

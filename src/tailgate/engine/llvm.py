@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from tailgate.engine import blocks
+from tailgate.engine import blocks, sweeps
 from tailgate.engine.graph import BOOL, FLOAT, Node
 from tailgate.engine.instructions import operation, scalar
 from tailgate.engine.passes import Branch, Item, counted, schedule
@@ -58,6 +58,7 @@ class Emitter:
         self.routines: dict[Any, str] = {}  # their names
         self.texts: list[str] = []  # and texts
         self.rooms: list[str] = []  # on the stack
+        self.places: dict[int, int] = {}  # of buffers in the large one of them
         self.names: dict[int | tuple[int, str], str] = {}
         self.count = 0
         self.block = "entry"
@@ -111,20 +112,37 @@ class Emitter:
         """The name of a node's vector."""
         if node.op == "const":
             return self.splat(node.attr)
+        if node.op == "pick" and node.args[0].size:
+            size = node.dtype.itemsize * self.lanes
+            return self.from_memory(sweeps.element(self, self.value(node.args[0]), "0", size, node.attr), node.dtype, size)
         if node.id not in self.names:
             if not node.fixed:
                 raise AssertionError(f"{node} is not computed yet")
             if node.id not in self.layout.uniforms:
                 self.layout.uniforms[node.id] = len(self.layout.slots)
                 self.layout.slots.append(node)
-            self.names[node.id] = self.uniform(self.layout.uniforms[node.id], node.dtype)
+            self.names[node.id] = self.uniform(self.address("%uniforms", 8 * self.layout.uniforms[node.id]), node.dtype)
         return self.names[node.id]
 
-    def uniform(self, place: int, dtype: np.dtype[Any]) -> str:
-        """One of the numbers that all episodes share, in all lanes."""
+    def table(self, nodes: Sequence[Node]) -> str:
+        """The address of numbers that all episodes share, one behind the other."""
+        out = self.address("%uniforms", 8 * len(self.layout.slots))
+        self.layout.slots.extend(nodes)
+        return out
+
+    def room(self, node: Node) -> str:
+        """The address of a buffer."""
+        return self.address("%large", self.places[node.id])
+
+    def kind(self, node: Node) -> str:
+        """The type of what a name of a node is."""
+        return "ptr" if node.size else self.vector(node.dtype)
+
+    def uniform(self, place: str, dtype: np.dtype[Any]) -> str:
+        """A number that all episodes share, at an address, in all lanes."""
         name = scalar(BOOL) if dtype == BOOL else scalar(dtype)
         stored = "i8" if dtype == BOOL else name
-        held = self.set(f"load {stored}, ptr {self.address('%uniforms', 8 * place)}, align 8")
+        held = self.set(f"load {stored}, ptr {place}, align 8")
         if dtype == BOOL:
             held = self.set(f"icmp ne i8 {held}, 0")
         first = self.set(f"insertelement {self.vector(dtype)} poison, {name} {held}, i32 0")
@@ -170,10 +188,19 @@ class Emitter:
     def compute(self, node: Node) -> None:
         if node.op in ("loop", "call", "matvec"):
             getattr(blocks, node.op)(self, node)
+        elif node.op in ("sweep", "pack", "invert"):
+            getattr(sweeps, node.op)(self, node)
+        elif node.op == "blend":
+            self.names[node.id] = sweeps.blend(self, node, *(self.value(a) for a in node.args))
+        elif node.op == "held":
+            place = self.layout.inputs[node.id]
+            assert isinstance(place, Held)
+            self.names[node.id] = self.address("%state", place.offset)
         elif node.op == "gather":
             self.names[node.id] = blocks.gather(self, node)
         elif node.op == "pick":
-            self.names[node.id] = self.names[node.args[0].id, str(node.attr)]
+            if not node.args[0].size:
+                self.names[node.id] = self.names[node.args[0].id, str(node.attr)]
         else:
             self.names[node.id] = self.input(node) if node.op == "input" else operation(self, node)
 
@@ -214,8 +241,10 @@ class Emitter:
         self.emit(branch.body, {})
         found = {}
         for choice in branch.choices:
-            held, kind = self.value(choice.args[branch.side]), self.vector(choice.dtype)
-            if choice.id in others:
+            held, kind = self.value(choice.args[branch.side]), self.kind(choice)
+            if choice.id in others and choice.size:
+                held = sweeps.blend(self, choice, mask, held, others[choice.id])
+            elif choice.id in others:
                 held = self.set(f"select <{self.lanes} x i1> {mask}, {kind} {held}, {kind} {others[choice.id]}")
             found[choice.id] = held
         self.line(f"br label %{after}")
@@ -223,7 +252,7 @@ class Emitter:
         self.begin(after)
         for choice in branch.choices:
             skipped = others.get(choice.id, "poison")
-            held = self.set(f"phi {self.vector(choice.dtype)} [{found[choice.id]}, %{end}], [{skipped}, %{before}]")
+            held = self.set(f"phi {self.kind(choice)} [{found[choice.id]}, %{end}], [{skipped}, %{before}]")
             self.names[choice.id if choice.id in others else (choice.id, "one side")] = held
 
     def _other(self, choice: Node, side: int) -> str:
@@ -311,16 +340,23 @@ def _loop(e: Emitter, name: str, first: str, last: str) -> Iterator[None]:
 def _step(e: Emitter, least: int) -> list[Item]:
     """One step of one block."""
     layout = e.layout
-    items = schedule([node for node, _ in layout.outputs], least)
+    outputs = [node for node, _ in layout.outputs]
+    items = schedule(outputs, least)
+    e.places, room = sweeps.rooms(items, outputs, e.lanes)
+    if room:
+        e.rooms.append(f"  %large = alloca [{room} x i8], align 64")
     here = {item.id: turn for turn, item in enumerate(items) if not isinstance(item, Branch)}
     here |= {node.id: turn for turn, item in enumerate(items) if isinstance(item, Branch) for node in item.decides}
     late = {place.offset for i, place in layout.inputs.items() if isinstance(place, Held) and i not in here}  # read in a branch, or never
     waiting: dict[int, list[Held | Column]] = {}
     rest: list[tuple[Node, Held | Column]] = []
     rows: dict[int, list[tuple[Column, Node]]] = {}
+    large: list[tuple[Node, Held | Column]] = []
     read = _last_read(items, layout)
     for node, place in layout.outputs:
-        if isinstance(place, Column) and place.columns > 1:
+        if node.size:
+            large.append((node, place))
+        elif isinstance(place, Column) and place.columns > 1:
             rows.setdefault(place.array, []).append((place, node))
         elif node.id in here and isinstance(place, Held) and place.offset not in late and read.get(place.offset, -1) <= here[node.id]:
             waiting.setdefault(node.id, []).append(place)
@@ -332,6 +368,9 @@ def _step(e: Emitter, least: int) -> list[Item]:
     for several in rows.values():
         several.sort(key=lambda pair: pair[0].column)
         e.store_columns([node for _, node in several], several[0][0])
+    for node, place in large:
+        assert isinstance(place, Held)
+        sweeps.copy(e, e.value(node), e.address("%state", place.offset), node, node.size)
     return items
 
 

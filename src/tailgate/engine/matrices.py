@@ -5,14 +5,29 @@ Arrays are (B, ..., rows, columns). What is the same for all episodes has no B, 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from tailgate.engine.array import Traced, lifted
+from tailgate.engine.buffers import buffer_of, swept, wide
 from tailgate.engine.graph import FLOAT
 
 LOOPED = 64  # numbers in a matrix without zeros that is multiplied in a loop: straight code of more takes long to compile
+STRAIGHT = 600  # products of numbers in straight code
+
+
+def _large(*arrays: Any) -> bool:
+    """Is one of them a buffer?"""
+    return any(isinstance(a, Traced) and wide(a.graph, a.nodes) for a in arrays)
+
+
+def _over(function: Any, lead: Sequence[int], *arrays: Any) -> Traced:
+    """function(*arrays without their first axes), for each index of these: of arrays (B, ...) that broadcast to `lead`."""
+    graph = next(a.graph for a in arrays if isinstance(a, Traced))
+    given = [lifted(graph, a).nodes for a in arrays]
+    return Traced(graph, swept(graph, lambda *parts: function(*(Traced(graph, part, FLOAT) for part in parts)).nodes, lead, given), FLOAT, 0)
 
 
 def _looped(x: Any, y: Traced, base: Any) -> Traced:
@@ -38,6 +53,11 @@ def structure(x: Any) -> Any:
 
 def constant_times(x: Any, y: Any) -> Any:
     """x (..., i, k) times y (B, ..., k, j), of an x that is the same for all: sums run from 0, and its zeros count for nothing."""
+    if _large(y) or (isinstance(y, Traced) and y.shape[-1] > 1 and _large(y[..., :1, :] * np.ones((x.shape[-2], 1)))):
+        if x.ndim > 2 and len(x) > 1:
+            return np.stack([constant_times(x[i], y[:, i]) for i in range(len(x))], axis=1)
+        one, turned = x.reshape(x.shape[-2:]), np.swapaxes(y, -1, -2)
+        return np.swapaxes(_over(lambda column: constant_times(one, column[:, None])[:, 0], turned.shape[:-1], turned), -1, -2)
     there = structure(x)
     if isinstance(y, Traced) and there.all() and there.shape[-2] * there.shape[-1] >= LOOPED:
         zero = np.zeros((*np.broadcast_shapes(x.shape[:-2], y.shape[:-2]), x.shape[-2], y.shape[-1]))
@@ -50,6 +70,11 @@ def constant_times(x: Any, y: Any) -> Any:
 
 def product(x: Any, y: Any) -> Any:
     """x (..., i, k) times y (..., k, j): sums begin with their first product."""
+    if _large(x, y):
+        lead = np.broadcast_shapes(x.shape[:-2], y.shape[:-2])
+        if x.shape[-2] * y.shape[-2] * y.shape[-1] <= STRAIGHT:
+            return _over(product, lead, x, y)
+        return _over(lambda row, y: product(row[None], y)[0], (*lead, x.shape[-2]), x, y[..., None, :, :])
     out = x[..., :1] * y[..., :1, :]
     for k in range(1, x.shape[-1]):
         out = out + x[..., k : k + 1] * y[..., k : k + 1, :]
@@ -59,6 +84,8 @@ def product(x: Any, y: Any) -> Any:
 def inverse(s: Any) -> Any:
     """The inverse of symmetric positive definite (..., q, q) by Gauss and Jordan, without pivots."""
     q = s.shape[-1]
+    if _large(s):
+        return Traced(s.graph, s.graph.picks(s.graph.inverses(buffer_of(s.graph, s.nodes), q)).reshape(s.shape), FLOAT, s.batch)
     a = [[s[..., i, j] for j in range(q)] for i in range(q)]
     for p in range(q):
         scale = 1.0 / a[p][p]

@@ -10,7 +10,7 @@ import heapq
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field
 
-from tailgate.engine.graph import Body, Node, ordered
+from tailgate.engine.graph import Body, Node, Sweep, ordered
 
 _COST = {"const": 0, "uniform": 0, "pick": 0, "loop": 300, "gather": 12, "div": 8, "sqrt": 10, "rem": 20}
 LEAST = 12  # cost of what is worth a branch, in additions
@@ -39,8 +39,8 @@ def schedule(roots: Iterable[Node], least: int = LEAST) -> list[Item]:
     return _scope(nodes, {node.id for node in wanted}, least)
 
 
-def rounds(body: Body, least: int = LEAST) -> list[Item]:
-    """A round of a loop, in the order of its computation."""
+def rounds(body: Body | Sweep, least: int = LEAST) -> list[Item]:
+    """A round of a loop or a sweep, in the order of its computation."""
     return _scope(body.nodes, {node.id for node in body.after}, least)
 
 
@@ -70,7 +70,7 @@ def _branches(nodes: Sequence[Node], kept: Collection[int], least: int) -> list[
         for place, arg in enumerate(node.args):
             if arg.id in users:
                 users[arg.id].append((node, place))
-        if node.op == "select" and not node.args[0].fixed:
+        if node.op in ("select", "blend") and not node.args[0].fixed:
             for side in (1, 2):
                 groups.setdefault((node.args[0].id, side), []).append(node)
     by_id = {node.id: node for node in nodes}
@@ -103,6 +103,10 @@ def _branches(nodes: Sequence[Node], kept: Collection[int], least: int) -> list[
 
 
 def _cost(node: Node) -> int:
+    if node.op == "sweep":
+        return node.size // max(1, len(node.attr.after)) * (2 + len(node.attr.nodes))
+    if node.size:
+        return node.size * (node.attr if node.op == "invert" else 1)
     return int(node.attr.cost) if node.op == "call" else 2 * node.attr.size if node.op == "matvec" else _COST.get(node.op, 1)
 
 

@@ -15,6 +15,7 @@ import numpy as np
 
 from tailgate.engine import objects
 from tailgate.engine.array import Traced, lifted
+from tailgate.engine.buffers import WIDE, buffer_of, copied
 from tailgate.engine.functions import makers
 from tailgate.engine.graph import Array, Graph, Node, computed, ordered
 from tailgate.engine.llvm import Column, Held, Layout, text_of
@@ -31,6 +32,7 @@ class Trace:
 
     graph: Graph
     state: dict[str, tuple[Array, Array]]  # leaf -> its nodes, and those of the next state
+    large: dict[str, tuple[Node, Node]]  # of leaves that are buffers: now and next
     arguments: dict[str, Array]
     results: dict[str, Array]
     next_state: Any  # the trees, with traced leaves
@@ -51,10 +53,20 @@ def traced(function: Step, state: Any, arguments: Any) -> Trace:
         if after[name].shape != leaf.shape:
             raise ValueError(f"state {name}: {after[name].shape} after a step, {leaf.shape} before it")
     held = {name: (leaf.nodes, after[name].nodes) for name, leaf in before.items()}
+    large = {name: (here.flat[0].args[0], _own(graph, here.flat[0].args[0], buffer_of(graph, there))) for name, (here, there) in held.items() if here.size >= WIDE}
     if graph.demands:
         results = results | {"demands": Traced(graph, np.array([[node for *_, node in graph.demands]], object), np.dtype(bool), 0)}
     args, given = _nodes(taken), {name: _of_each(leaf) for name, leaf in results.items()}
-    return Trace(graph, held, args, _nodes(given), following, results)
+    return Trace(graph, held, large, args, _nodes(given), following, results)
+
+
+def _own(graph: Graph, place: Node, new: Node) -> Node:
+    """The next numbers of a place in the state, copied if another place may hold them: that one is written to as well."""
+
+    def borrowed(node: Node) -> bool:
+        return (node.op == "held" and node is not place) or (node.op == "blend" and any(borrowed(a) for a in node.args[1:]))
+
+    return copied(graph, new) if borrowed(new) else new
 
 
 def _inputs(graph: Graph, tree: Any, kind: str) -> Any:
@@ -63,6 +75,9 @@ def _inputs(graph: Graph, tree: Any, kind: str) -> Any:
 
     def leaf(x: Array) -> Traced:
         name, nodes = next(names), np.empty((1, *x.shape[1:]), object)
+        if kind == "state" and nodes.size >= WIDE:
+            held = graph.picks(graph.held((kind, name), nodes.size, x.dtype)).reshape(nodes.shape)
+            return Traced(graph, held, x.dtype, 0, writeable=False)
         for place in np.ndindex(*x.shape[1:]):
             nodes[(0, *place)] = graph.input((kind, name, place), x.dtype)
         return Traced(graph, nodes, x.dtype, 0, writeable=False)
@@ -90,6 +105,11 @@ class Program:
         layout = Layout({}, [], self.stride)
         for name, (here, there) in trace.state.items():
             at, size = self.places[name], here.flat[0].dtype.itemsize * self.lanes if here.size else 0
+            if name in trace.large:
+                layout.inputs[trace.large[name][0].id] = Held(at)
+                if trace.large[name][0] is not trace.large[name][1]:
+                    layout.outputs.append((trace.large[name][1], Held(at)))
+                continue
             for i, (node, new) in enumerate(zip(here.flat, there.flat, strict=True)):
                 layout.inputs[node.id] = Held(at + i * size)
                 if new is not node:

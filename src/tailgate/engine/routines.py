@@ -44,10 +44,10 @@ class _Called:
         graph = found.graph
         arrays = [lifted(graph, x, found.dtype) for x in args]
         routine, several = self._routine(tuple(x.dtype for x in arrays))
-        calls = each(lambda *nodes: graph.call(routine, nodes), *(x.nodes for x in arrays))
-        back = shared_batch(arrays)
-        batch = None if back is None else calls.ndim + back
-        out = [Traced(graph, each(lambda n, i=i: graph.pick(n, i, o.dtype), calls), o.dtype, batch) for i, o in enumerate(routine.outputs)]  # noqa: B023
+        back, out = shared_batch(arrays), []
+        for i, result in enumerate(routine.outputs):
+            nodes = each(graph, lambda *nodes: graph.pick(graph.call(routine, nodes), i, result.dtype), *(x.nodes for x in arrays))  # noqa: B023
+            out.append(Traced(graph, nodes, result.dtype, None if back is None else nodes.ndim + back))
         return tuple(out) if several else out[0]
 
     def _routine(self, dtypes: tuple[Any, ...]) -> tuple[Routine, bool]:

@@ -145,7 +145,7 @@ def _accumulated(ufunc: Any, x: Traced, axis: int = 0) -> Traced:
     nodes = np.empty(x.shape, object)
     there, source = np.moveaxis(nodes, axis, 0), np.moveaxis(x.nodes, axis, 0)
     for i in range(len(source)):
-        there[i] = source[i] if i == 0 else each(lambda p, q: x.graph.binary(op, p, q), there[i - 1], source[i])
+        there[i] = source[i] if i == 0 else each(x.graph, lambda p, q: x.graph.binary(op, p, q), there[i - 1], source[i])
     return Traced(x.graph, nodes, x.dtype, x.batch)
 
 

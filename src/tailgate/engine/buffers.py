@@ -1,0 +1,140 @@
+"""Large arrays as buffers: what is done for each of their numbers, rows or matrices is a sweep, which machine code plays in loops.
+
+Straight code of a few thousand numbers takes long to compile. The nodes of a large array are the picks of a buffer; whoever takes single
+ones of them reads them where it needs them.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import numpy as np
+
+from tailgate.engine.graph import Array, Graph, Node, Source
+
+WIDE = 128  # numbers of an array that is a buffer
+_inside: list[Graph] = []  # graphs in which the body of a sweep is traced: its arrays are no buffers
+
+
+def wide(graph: Graph, *arrays: Array) -> bool:
+    """Does an elementwise function of these make a buffer?"""
+    shape = np.broadcast_shapes(*(a.shape for a in arrays))
+    return int(np.prod(shape, dtype=int)) >= WIDE and graph not in _inside and not all(_fixed(a) for a in arrays)
+
+
+def _fixed(nodes: Array) -> bool:
+    return all(node.fixed for node in nodes.flat)
+
+
+@contextlib.contextmanager
+def _body(graph: Graph) -> Iterator[None]:
+    _inside.append(graph)
+    try:
+        yield
+    finally:
+        _inside.remove(graph)
+
+
+def swept(graph: Graph, function: Callable[..., Any], lead: Sequence[int], arrays: Sequence[Array]) -> Array:
+    """A function of the trailing axes of arrays of nodes, for each index of their first axes, which broadcast to `lead`.
+
+    It gets arrays of nodes, or a node where no axis is left, and gives such; -> (*lead, ...).
+    """
+    n = len(lead)
+    held = [a[(None,) * (n - a.ndim)] if a.ndim < n else a for a in arrays]
+    held = [a[tuple(slice(1) if a.strides[i] == 0 or a.shape[i] == 1 else slice(None) for i in range(n))] for a in held]
+    found = [a if a.size == 1 or a.shape[:n] == (1,) * n or _alike(a) else _source(graph, a) for a in held]
+    kept = [i for i in range(n) if lead[i] > 1]
+    carried: list[Node] = []
+    sources: list[Source] = []
+    given = []
+    for nodes, source in zip(held, found, strict=True):
+        rest = nodes.shape[n:]
+        if not isinstance(source, Source):
+            given.append(_of_one(nodes[(0,) * n] if nodes.shape[:n] == (1,) * n else nodes.ravel()[0], rest))
+            continue
+        those = np.empty(rest, object)
+        for place in np.ndindex(*rest):
+            at = source.offset + sum(i * s for i, s in zip(place, source.strides[n:], strict=True))
+            one = nodes[(*(0,) * n, *place)]
+            those[place] = new = graph.carried(_boxed(one)).item()
+            carried.append(new)
+            sources.append(Source(source.held, at, tuple(source.strides[i] if nodes.shape[i] > 1 else 0 for i in kept)))
+        given.append(those if rest else those.item())
+    with _body(graph):
+        result = function(*given)
+    made = result if isinstance(result, np.ndarray) else _boxed(result)
+    shape, sources = _fewer([lead[i] for i in kept], sources)
+    buffer = graph.sweep(shape, carried, sources, list(made.flat))
+    return graph.picks(buffer).reshape(*lead, *made.shape)
+
+
+def _boxed(node: Any) -> Array:
+    out = np.empty((), object)
+    out[()] = node
+    return out
+
+
+def _of_one(nodes: Any, rest: tuple[int, ...]) -> Any:
+    """What is the same in all rounds."""
+    return np.broadcast_to(_boxed(nodes), rest) if rest and isinstance(nodes, Node) else nodes
+
+
+def _alike(nodes: Array) -> bool:
+    first = nodes.flat[0]
+    return all(node is first for node in nodes.flat)
+
+
+def _source(graph: Graph, nodes: Array) -> Source:
+    """Where the numbers of an array stand: strides for each of its axes. They are put together where they do not."""
+    first = nodes.flat[0]
+    if _is_pick(first) and all(_is_pick(node) and node.args[0] is first.args[0] for node in nodes.flat):
+        places = np.array([node.attr for node in nodes.flat]).reshape(nodes.shape)
+        strides = [int(places.take(1, i).flat[0]) - first.attr if n > 1 else 0 for i, n in enumerate(nodes.shape)]
+        straight = first.attr + sum(np.arange(n).reshape(-1, *(1,) * (nodes.ndim - i - 1)) * strides[i] for i, n in enumerate(nodes.shape))
+        if np.array_equal(straight, places):
+            return Source(first.args[0], first.attr, tuple(strides))
+    strides = [int(np.prod(nodes.shape[i + 1 :], dtype=int)) for i in range(nodes.ndim)]
+    return Source(tuple(nodes.flat) if _fixed(nodes) else graph.packed(list(nodes.flat)), 0, tuple(strides))
+
+
+def _is_pick(node: Node) -> bool:
+    return node.op == "pick" and node.args[0].size > 0
+
+
+def _fewer(shape: list[int], sources: list[Source]) -> tuple[tuple[int, ...], list[Source]]:
+    """Neighbouring axes as one, where all sources have them so."""
+    strides = [list(source.strides) for source in sources]
+    for i in reversed(range(len(shape) - 1)):
+        if all(s[i] == s[i + 1] * shape[i + 1] for s in strides):
+            shape[i : i + 2] = [shape[i] * shape[i + 1]]
+            for s in strides:
+                del s[i]
+    return tuple(shape), [Source(source.held, source.offset, tuple(s)) for source, s in zip(sources, strides, strict=True)]
+
+
+def buffer_of(graph: Graph, nodes: Array) -> Node:
+    """The buffer that holds the numbers of an array one behind the other."""
+    source = _source(graph, nodes.ravel())
+    if isinstance(source.held, Node) and source.held.size == nodes.size and source.offset == 0 and source.strides[0] == 1:
+        return source.held
+    if isinstance(source.held, Node) and source.held.op == "pack":
+        return source.held
+    return _copied(graph, nodes.ravel())
+
+
+def copied(graph: Graph, buffer: Node) -> Node:
+    """A buffer of the same numbers."""
+    return _copied(graph, graph.picks(buffer))
+
+
+def _copied(graph: Graph, nodes: Array) -> Node:
+    made: Node = swept(graph, lambda node: node, nodes.shape, [nodes]).flat[0].args[0]
+    return made
+
+
+def blended(graph: Graph, where: Node, x: Array, y: Array) -> Array:
+    """The array x where `where` holds, else y."""
+    return graph.picks(graph.blend(where, buffer_of(graph, x), buffer_of(graph, y))).reshape(x.shape)

@@ -1,0 +1,230 @@
+"""Code of what is done on buffers, and the room that each of them has on the stack."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterable, Iterator, Sequence
+from typing import TYPE_CHECKING, Any
+
+from tailgate.engine.graph import FLOAT, Node, Sweep
+from tailgate.engine.passes import Branch, Item, rounds
+from tailgate.engine.untraceable import Untraceable
+
+if TYPE_CHECKING:
+    from tailgate.engine.llvm import Emitter
+
+ROOM = 3_000_000  # bytes on the stack
+CHUNK = 16  # numbers of a row that are kept in registers
+
+
+@contextlib.contextmanager
+def counted(e: Emitter, count: int) -> Iterator[str]:
+    """Code for each number below a count."""
+    if count == 1:
+        yield "0"
+        return
+    before, head, again, out = e.block, e.label("each"), e.label("next"), e.label("end")
+    index = f"%{head}i"
+    e.line(f"br label %{head}")
+    e.begin(head)
+    e.line(f"{index} = phi i64 [0, %{before}], [{index}n, %{again}]")
+    yield index
+    e.line(f"br label %{again}")
+    e.begin(again)
+    e.line(f"{index}n = add i64 {index}, 1")
+    e.line(f"br i1 {e.set(f'icmp ult i64 {index}n, {count}')}, label %{head}, label %{out}")
+    e.begin(out)
+
+
+def element(e: Emitter, base: str, index: str, size: int, offset: int = 0) -> str:
+    """The address of a number of a buffer."""
+    at = index if index == "0" else e.set(f"mul i64 {index}, {size}")
+    there = base if at == "0" else e.address(base, at)
+    return e.address(there, offset * size) if offset else there
+
+
+def _index(e: Emitter, numbers: Sequence[str], strides: Sequence[int]) -> str:
+    """The sum of indices times their strides."""
+    out = "0"
+    for number, stride in zip(numbers, strides, strict=True):
+        if stride and number != "0":
+            part = number if stride == 1 else e.set(f"mul i64 {number}, {stride}")
+            out = part if out == "0" else e.set(f"add i64 {out}, {part}")
+    return out
+
+
+def sweep(e: Emitter, node: Node) -> None:
+    """Its body, in a loop for each axis."""
+    body: Sweep = node.attr
+    size = node.dtype.itemsize * e.lanes
+    for fixed in {a.id: a for inner in (*body.nodes, *body.after) for a in (*inner.args, inner) if a.fixed}.values():
+        e.value(fixed)
+    tables = {id(s.held): e.table(s.held) for s in body.sources if isinstance(s.held, tuple)}
+    room, outer = e.room(node), dict(e.names)
+    with contextlib.ExitStack() as loops:
+        numbers = [loops.enter_context(counted(e, n)) for n in body.shape]
+        at: dict[Any, str] = {}
+        for one, source in zip(body.carried, body.sources, strict=True):
+            if source.strides not in at:
+                at[source.strides] = _index(e, numbers, source.strides)
+            if isinstance(source.held, Node):
+                width = one.dtype.itemsize * e.lanes
+                there = element(e, e.value(source.held), at[source.strides], width, source.offset)
+                e.names[one.id] = e.from_memory(there, one.dtype, width)
+            else:
+                e.names[one.id] = e.uniform(element(e, tables[id(source.held)], at[source.strides], 8, source.offset), one.dtype)
+        e.emit(rounds(body), {})
+        strides = [len(body.after)] * len(body.shape)
+        for i in reversed(range(len(body.shape) - 1)):
+            strides[i] = strides[i + 1] * body.shape[i + 1]
+        base = element(e, room, _index(e, numbers, strides), size)
+        for i, result in enumerate(body.after):
+            e.to_memory(e.address(base, i * size) if i else base, node.dtype, e.value(result), size)
+    e.names = outer
+    e.names[node.id] = room
+
+
+def pack(e: Emitter, node: Node) -> None:
+    """Numbers one behind the other: runs of another buffer's in a loop."""
+    room, size, i = e.room(node), node.dtype.itemsize * e.lanes, 0
+    while i < node.size:
+        one, n = node.args[i], 1
+        if one.op == "pick" and one.args[0].size:
+            while i + n < node.size and _follows(one, node.args[i + n], n):
+                n += 1
+        if n > 4:
+            copy(e, element(e, e.value(one.args[0]), "0", size, one.attr), element(e, room, "0", size, i), node, n)
+        else:
+            for k in range(i, i + n):
+                e.to_memory(element(e, room, "0", size, k), node.dtype, e.value(node.args[k]), size)
+        i += n
+    e.names[node.id] = room
+
+
+def _follows(one: Node, other: Node, n: int) -> bool:
+    return other.op == "pick" and other.args[0] is one.args[0] and other.attr == one.attr + n
+
+
+def copy(e: Emitter, source: str, target: str, node: Node, count: int) -> None:
+    """Some numbers of a buffer's type, from one place to another."""
+    size = node.dtype.itemsize * e.lanes
+    with counted(e, count) as i:
+        held = e.from_memory(element(e, source, i, size), node.dtype, size)
+        e.to_memory(element(e, target, i, size), node.dtype, held, size)
+
+
+def blend(e: Emitter, node: Node, mask: str, x: str, y: str) -> str:
+    """The buffer x in the lanes of a mask, and y in the others."""
+    room, kind, size = e.room(node), e.vector(node.dtype), node.dtype.itemsize * e.lanes
+    with counted(e, node.size) as i:
+        one, other = (e.from_memory(element(e, place, i, size), node.dtype, size) for place in (x, y))
+        held = e.set(f"select <{e.lanes} x i1> {mask}, {kind} {one}, {kind} {other}")
+        e.to_memory(element(e, room, i, size), node.dtype, held, size)
+    return room
+
+
+def invert(e: Emitter, node: Node) -> None:
+    """The inverses of matrices, in their new place."""
+    q, room = node.attr, e.room(node)
+    copy(e, e.value(node.args[0]), room, node, node.size)
+    if ("invert", q) not in e.routines:
+        e.routines["invert", q] = f"@invert_{q}"
+        e.texts.append(_invert_text(e, q))
+    with counted(e, node.size // (q * q)) as i:
+        e.line(f"call fastcc void @invert_{q}(ptr {element(e, room, i, 8 * e.lanes * q * q)})")
+    e.names[node.id] = room
+
+
+def _invert_text(outer: Emitter, q: int) -> str:
+    """As `matrices.inverse`, element by element."""
+    e, kind, size = outer.fresh(), outer.vector(FLOAT), 8 * outer.lanes
+    e.begin("entry")
+
+    def read(there: str) -> str:
+        return e.set(f"load {kind}, ptr {there}, align {size}")
+
+    def write(name: str, there: str) -> None:
+        e.line(f"store {kind} {name}, ptr {there}, align {size}")
+
+    with counted(e, q) as p:
+        row = element(e, "%a", p, size * q)
+        pivot = element(e, row, p, size)
+        scale = e.set(f"fdiv {kind} splat (double 1.0), {read(pivot)}")
+        write("splat (double 1.0)", pivot)
+        with counted(e, q) as j:
+            there = element(e, row, j, size)
+            write(e.set(f"fmul {kind} {read(there)}, {scale}"), there)
+        for first in range(0, q, CHUNK):
+            columns = range(first, min(first + CHUNK, q))
+            held = [read(element(e, row, "0", size, j)) for j in columns]
+            with counted(e, q) as i:
+                before, other, after = e.block, e.label("other"), e.label("after")
+                e.line(f"br i1 {e.set(f'icmp eq i64 {i}, {p}')}, label %{after}, label %{other}")
+                e.begin(other)
+                line = element(e, "%a", i, size * q)
+                factor = element(e, "%f", i, size)
+                if first == 0:
+                    there = element(e, line, p, size)
+                    write(read(there), factor)
+                    write("zeroinitializer", there)
+                f = read(factor)
+                for j, name in zip(columns, held, strict=True):
+                    there = element(e, line, "0", size, j)
+                    write(e.set(f"fsub {kind} {read(there)}, {e.set(f'fmul {kind} {f}, {name}')}"), there)
+                e.line(f"br label %{after}")
+                e.begin(after)
+                del before
+    e.line("ret void")
+    room = f"  %f = alloca [{q} x {kind}], align {size}"
+    head = f"define internal fastcc void @invert_{q}(ptr noalias %a) noinline #0 {{"
+    return "\n".join([head, e.lines[0], room, *e.lines[1:], "}"])
+
+
+# -- rooms
+
+
+def rooms(items: Sequence[Item], kept: Iterable[Node], lanes: int) -> tuple[dict[int, int], int]:
+    """Where each buffer stands in the room of a function [bytes], and its size: a place is free again behind the last that reads it."""
+    turn: dict[int, int] = {}
+    nodes: dict[int, Node] = {}
+    for i, item in enumerate(items):
+        for node in _of(item):
+            nodes[node.id], turn[node.id] = node, i
+    last = {i: turn[i] for i in nodes}
+    for node in kept:
+        if node.id in last:
+            last[node.id] = len(items)
+    for node in sorted(nodes.values(), key=lambda node: -node.id):
+        through = node.op in ("pick", "blend")  # what reads a buffer later on
+        until = last[node.id] if through else turn[node.id]
+        for a in node.args:
+            if a.id in last:
+                last[a.id] = max(last[a.id], until)
+    out: dict[int, int] = {}
+    busy: list[tuple[int, int, int]] = []  # begin, end, last
+    total = 0
+    for node in sorted((n for n in nodes.values() if n.size and n.op != "held"), key=lambda node: turn[node.id]):
+        size, at = node.size * node.dtype.itemsize * lanes, 0
+        busy = [one for one in busy if one[2] >= turn[node.id]]
+        for begin, end, _ in sorted(busy):
+            if at + size <= begin:
+                break
+            at = max(at, end)
+        out[node.id] = at
+        busy.append((at, at + size, last[node.id]))
+        total = max(total, at + size)
+    if total > ROOM:
+        raise Untraceable(f"arrays of {total / 1e6:.1f} MB in a step", "use smaller ones")
+    return out, total
+
+
+def _of(item: Item) -> Iterator[Node]:
+    """The nodes of an item, and of what is in it."""
+    if isinstance(item, Branch):
+        yield from item.decides
+        for inner in item.body:
+            yield from _of(inner)
+    else:
+        yield item
+        if item.op == "loop":
+            yield from item.attr.nodes
