@@ -12,9 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from tailgate.engine.graph import Array, Graph, Node, Source
+from tailgate.engine.graph import Array, Graph, Node, Piece, Source
 
 WIDE = 128  # numbers of an array that is a buffer
+SHORT = 3  # numbers that are put in their place one by one
 _inside: list[Graph] = []  # graphs in which the body of a sweep is traced: its arrays are no buffers
 
 
@@ -88,16 +89,53 @@ def _alike(nodes: Array) -> bool:
 
 
 def _source(graph: Graph, nodes: Array) -> Source:
-    """Where the numbers of an array stand: strides for each of its axes. They are put together where they do not."""
+    """Where the numbers of an array stand: strides for each of its axes. They are put together where they have none."""
+    if found := _strided(nodes):
+        return found
+    return Source(graph.packed(tuple(_pieces(nodes)), nodes.flat[0].dtype), 0, steps(nodes.shape))
+
+
+def steps(shape: tuple[int, ...]) -> tuple[int, ...]:
+    """The strides of numbers that stand one behind the other."""
+    return tuple(int(np.prod(shape[i + 1 :], dtype=int)) for i in range(len(shape)))
+
+
+def _strided(nodes: Array) -> Source | None:
+    """Where the numbers of an array stand, if they are of one buffer and have strides, or are all fixed."""
     first = nodes.flat[0]
-    if _is_pick(first) and all(_is_pick(node) and node.args[0] is first.args[0] for node in nodes.flat):
-        places = np.array([node.attr for node in nodes.flat]).reshape(nodes.shape)
-        strides = [int(places.take(1, i).flat[0]) - first.attr if n > 1 else 0 for i, n in enumerate(nodes.shape)]
-        straight = first.attr + sum(np.arange(n).reshape(-1, *(1,) * (nodes.ndim - i - 1)) * strides[i] for i, n in enumerate(nodes.shape))
-        if np.array_equal(straight, places):
-            return Source(first.args[0], first.attr, tuple(strides))
-    strides = [int(np.prod(nodes.shape[i + 1 :], dtype=int)) for i in range(nodes.ndim)]
-    return Source(tuple(nodes.flat) if _fixed(nodes) else graph.packed(list(nodes.flat)), 0, tuple(strides))
+    if _fixed(nodes):
+        return Source(tuple(nodes.flat), 0, steps(nodes.shape))
+    if not (_is_pick(first) and all(_is_pick(node) and node.args[0] is first.args[0] for node in nodes.flat)):
+        return None
+    places = np.array([node.attr for node in nodes.flat]).reshape(nodes.shape)
+    strides = [int(places.take(1, i).flat[0]) - first.attr if n > 1 else 0 for i, n in enumerate(nodes.shape)]
+    straight = first.attr + sum(np.arange(n).reshape(-1, *(1,) * (nodes.ndim - i - 1)) * strides[i] for i, n in enumerate(nodes.shape))
+    return Source(first.args[0], first.attr, tuple(strides)) if np.array_equal(straight, places) else None
+
+
+def _pieces(nodes: Array) -> Iterator[Piece]:
+    """An array as few parts that have strides."""
+    if found := _strided(nodes):
+        yield Piece(found, nodes.shape)
+    elif nodes.ndim > 1:
+        for part in nodes:
+            yield from _pieces(part)
+    else:
+        for part in _runs(nodes):
+            found = _strided(part) if len(part) > SHORT else None
+            yield from [Piece(found, part.shape)] if found else [Piece(node) for node in part]
+
+
+def _runs(nodes: Array) -> list[Array]:
+    """An array in one axis, cut where its numbers come from elsewhere or their stride changes."""
+    origin = np.array([node.args[0].id if _is_pick(node) else -1 - i for i, node in enumerate(nodes)])
+    place = np.array([node.attr if _is_pick(node) else 0 for node in nodes])
+    cuts, begin = [], 0
+    for i in range(1, len(nodes)):
+        if origin[i] != origin[i - 1] or (i - begin > 1 and place[i] - place[i - 1] != place[i - 1] - place[i - 2]):
+            cuts.append(i)
+            begin = i
+    return np.split(nodes, cuts)
 
 
 def _is_pick(node: Node) -> bool:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -85,6 +85,13 @@ class Source:
     held: Node | tuple[Node, ...]
     offset: int
     strides: tuple[int, ...]
+
+
+class Piece(NamedTuple):
+    """Numbers of a source, by an index of a shape; or one number."""
+
+    source: Source | Node
+    shape: tuple[int, ...] = ()
 
 
 @dataclass(eq=False)
@@ -244,9 +251,11 @@ class Graph:
         """A buffer that each episode brings."""
         return self._node("held", dtype, (), name, name, False, size)
 
-    def packed(self, nodes: Sequence[Node]) -> Node:
-        """A buffer of these."""
-        return self._node("pack", nodes[0].dtype, tuple(nodes), None, None, False, len(nodes))
+    def packed(self, pieces: tuple[Piece, ...], dtype: np.dtype[Any]) -> Node:
+        """A buffer of these, one behind the other."""
+        args = [source if isinstance(source, Node) else source.held for source, _ in pieces]
+        size = sum(int(np.prod(shape, dtype=int)) for _, shape in pieces)
+        return self._node("pack", dtype, tuple({a.id: a for a in args if isinstance(a, Node)}.values()), pieces, pieces, False, size)
 
     def blend(self, where: Node, x: Node, y: Node) -> Node:
         """The buffer x where `where` holds, else the buffer y."""
@@ -338,10 +347,8 @@ def computed(node: Node, args: Sequence[Any]) -> Any:
         return node.attr.values(list(args))
     if node.op == "pick":
         return args[0][node.attr]
-    if node.op in ("matvec", "sweep"):
+    if node.op in ("matvec", "sweep", "pack"):
         raise AssertionError("what has fixed nodes of its own is evaluated with its graph")
-    if node.op == "pack":
-        return list(args)
     if node.op == "blend":
         return [np.where(args[0], x, y) for x, y in zip(args[1], args[2], strict=True)]
     with np.errstate(all="ignore"):
@@ -382,6 +389,8 @@ def _evaluate(graph: Graph, nodes: Iterable[Node], inputs: dict[Any, Array], val
             values[node.id] = _looped(graph, node.attr, args, values)
         elif node.op == "sweep":
             values[node.id] = _swept(graph, node.attr, values)
+        elif node.op == "pack":
+            values[node.id] = [x for piece in node.attr for x in _packed(graph, piece, values)]
         elif node.op == "invert":
             values[node.id] = _inverted(args[0], node.attr)
         else:
@@ -408,13 +417,24 @@ def _looped(graph: Graph, body: Body, args: Sequence[Any], values: dict[int, Any
     return held
 
 
+def _packed(graph: Graph, piece: Piece, values: dict[int, Any]) -> list[Any]:
+    source, shape = piece
+    if isinstance(source, Node):
+        return [graph.value(source) if source.fixed else values[source.id]]
+    return [_read(graph, source, index, values) for index in np.ndindex(*shape)]
+
+
+def _read(graph: Graph, source: Source, index: Sequence[int], values: dict[int, Any]) -> Any:
+    place = source.offset + sum(i * n for i, n in zip(index, source.strides, strict=True))
+    return values[source.held.id][place] if isinstance(source.held, Node) else graph.value(source.held[place])
+
+
 def _swept(graph: Graph, sweep: Sweep, values: dict[int, Any]) -> list[Any]:
     out = []
     for index in np.ndindex(*sweep.shape):
         inner = dict(values)
         for one, source in zip(sweep.carried, sweep.sources, strict=True):
-            place = source.offset + sum(i * n for i, n in zip(index, source.strides, strict=True))
-            inner[one.id] = values[source.held.id][place] if isinstance(source.held, Node) else graph.value(source.held[place])
+            inner[one.id] = _read(graph, source, index, values)
         _evaluate(graph, sweep.nodes, {}, inner)
         out += [graph.value(node) if node.fixed else inner[node.id] for node in sweep.after]
     return out

@@ -234,6 +234,7 @@ class Emitter:
         if branch.side == 2:
             mask = self.set(f"xor <{self.lanes} x i1> {mask}, splat (i1 true)")
         others = {c.id: self._other(c, branch.side) for c in branch.decides}
+        instead = {c.id: self.room(c) if c.size else "poison" for c in branch.choices if c.id not in others}  # never read, but an address
         inside, after = self.label("in"), self.label("after")
         self.line(f"br i1 {self.any_lane(mask)}, label %{inside}, label %{after}")
         before, outer = self.block, dict(self.names)
@@ -251,7 +252,7 @@ class Emitter:
         end, self.names = self.block, outer
         self.begin(after)
         for choice in branch.choices:
-            skipped = others.get(choice.id, "poison")
+            skipped = others.get(choice.id) or instead[choice.id]
             held = self.set(f"phi {self.kind(choice)} [{found[choice.id]}, %{end}], [{skipped}, %{before}]")
             self.names[choice.id if choice.id in others else (choice.id, "one side")] = held
 

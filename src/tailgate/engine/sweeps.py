@@ -6,7 +6,10 @@ import contextlib
 from collections.abc import Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
-from tailgate.engine.graph import FLOAT, Node, Sweep
+import numpy as np
+
+from tailgate.engine.buffers import steps
+from tailgate.engine.graph import FLOAT, Node, Source, Sweep
 from tailgate.engine.passes import Branch, Item, rounds
 from tailgate.engine.untraceable import Untraceable
 
@@ -67,17 +70,9 @@ def sweep(e: Emitter, node: Node) -> None:
         for one, source in zip(body.carried, body.sources, strict=True):
             if source.strides not in at:
                 at[source.strides] = _index(e, numbers, source.strides)
-            if isinstance(source.held, Node):
-                width = one.dtype.itemsize * e.lanes
-                there = element(e, e.value(source.held), at[source.strides], width, source.offset)
-                e.names[one.id] = e.from_memory(there, one.dtype, width)
-            else:
-                e.names[one.id] = e.uniform(element(e, tables[id(source.held)], at[source.strides], 8, source.offset), one.dtype)
+            e.names[one.id] = _read(e, source, at[source.strides], one, tables.get(id(source.held), ""))
         e.emit(rounds(body), {})
-        strides = [len(body.after)] * len(body.shape)
-        for i in reversed(range(len(body.shape) - 1)):
-            strides[i] = strides[i + 1] * body.shape[i + 1]
-        base = element(e, room, _index(e, numbers, strides), size)
+        base = element(e, room, _index(e, numbers, steps((*body.shape, len(body.after)))[:-1]), size)
         for i, result in enumerate(body.after):
             e.to_memory(e.address(base, i * size) if i else base, node.dtype, e.value(result), size)
     e.names = outer
@@ -85,24 +80,29 @@ def sweep(e: Emitter, node: Node) -> None:
 
 
 def pack(e: Emitter, node: Node) -> None:
-    """Numbers one behind the other: runs of another buffer's in a loop."""
-    room, size, i = e.room(node), node.dtype.itemsize * e.lanes, 0
-    while i < node.size:
-        one, n = node.args[i], 1
-        if one.op == "pick" and one.args[0].size:
-            while i + n < node.size and _follows(one, node.args[i + n], n):
-                n += 1
-        if n > 4:
-            copy(e, element(e, e.value(one.args[0]), "0", size, one.attr), element(e, room, "0", size, i), node, n)
-        else:
-            for k in range(i, i + n):
-                e.to_memory(element(e, room, "0", size, k), node.dtype, e.value(node.args[k]), size)
-        i += n
+    """Pieces one behind the other."""
+    room, size, at = e.room(node), node.dtype.itemsize * e.lanes, 0
+    for source, shape in node.attr:
+        if isinstance(source, Node):
+            e.to_memory(element(e, room, "0", size, at), node.dtype, e.value(source), size)
+            at += 1
+            continue
+        table = e.table(source.held) if isinstance(source.held, tuple) else ""
+        with contextlib.ExitStack() as loops:
+            numbers = [loops.enter_context(counted(e, n)) for n in shape]
+            held = _read(e, source, _index(e, numbers, source.strides), node, table)
+            to = element(e, room, _index(e, numbers, steps(shape)), size, at)
+            e.to_memory(to, node.dtype, held, size)
+        at += int(np.prod(shape))
     e.names[node.id] = room
 
 
-def _follows(one: Node, other: Node, n: int) -> bool:
-    return other.op == "pick" and other.args[0] is one.args[0] and other.attr == one.attr + n
+def _read(e: Emitter, source: Source, index: str, like: Node, table: str) -> str:
+    """A number of a source, whose table stands there."""
+    if isinstance(source.held, Node):
+        size = like.dtype.itemsize * e.lanes
+        return e.from_memory(element(e, e.value(source.held), index, size, source.offset), like.dtype, size)
+    return e.uniform(element(e, table, index, 8, source.offset), like.dtype)
 
 
 def copy(e: Emitter, source: str, target: str, node: Node, count: int) -> None:
@@ -204,7 +204,7 @@ def rooms(items: Sequence[Item], kept: Iterable[Node], lanes: int) -> tuple[dict
     busy: list[tuple[int, int, int]] = []  # begin, end, last
     total = 0
     for node in sorted((n for n in nodes.values() if n.size and n.op != "held"), key=lambda node: turn[node.id]):
-        size, at = node.size * node.dtype.itemsize * lanes, 0
+        size, at = -(-node.size * node.dtype.itemsize * lanes // 64) * 64, 0
         busy = [one for one in busy if one[2] >= turn[node.id]]
         for begin, end, _ in sorted(busy):
             if at + size <= begin:
