@@ -254,11 +254,7 @@ class DistributedFilter(LinearFilter):
         if plan.held is not None and state.P is None:
             assert plan.K is not None and plan.cross is not None
             x = num.apply(plan.K, r, state.x)
-            whole = np.asarray(accept.all(axis=-1))
-            if not num.every(whole):
-                K = gain_of(alone(S, accept), plan.cross * accept[..., None])
-                x = np.where(whole[..., None], x, state.x + num.matvec(K, r * accept))
-            return KalmanState(x, None)
+            return KalmanState(num.elsewhere(accept.all(axis=-1), x, _corrected, state.x, r, S, plan.cross[None], accept), None)
         if len(one_row(state.P)) < len(r) and num.every(accept) and len(one_row(S)) == 1:
             cross = num.matmul(plan.C, state.P[:1])
             K = gain_of(S[:1], cross)
@@ -285,6 +281,10 @@ def shared(P: Array) -> Array:
 def gain_of(S: Array, cross: Array) -> Array:
     """P- C' S^-1 (..., n, q) from C P- (..., q, n), in the order of the Kalman filter's update, to the last bit."""
     return num.transpose(num.matmul(num.inverse(S), cross))
+
+
+def _corrected(x: Array, r: Array, S: Array, cross: Array, accept: Array) -> Array:
+    return np.asarray(x + num.matvec(gain_of(alone(S, accept), cross * accept[..., None]), r * accept))
 
 
 def even(heard: tuple[tuple[int, ...], ...], weight: Array) -> Array:

@@ -11,7 +11,7 @@ left out, the others correct with the gain that they have alone at the same P-. 
 """
 
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, cast
 
 import numpy as np
 
@@ -49,8 +49,10 @@ class KalmanState(NamedTuple):
 
 def alone(S: Array, keep: Array) -> Array:
     """S with the covariances of the sensors that `keep` (B, N, q) leaves out set to zero: those that stay see their own marginal."""
-    if num.every(keep):
-        return S
+    return cast(Array, num.elsewhere(keep.all(axis=-1), S, _marginal, S, keep))
+
+
+def _marginal(S: Array, keep: Array) -> Array:
     out = S * (keep[..., :, None] & keep[..., None, :])
     for i in range(S.shape[-1]):
         out[..., i, i] = S[..., i, i]

@@ -97,7 +97,7 @@ def random_trace(seed: int) -> tuple[Trace, list[Node], dict[Any, np.dtype[Any]]
     for i in range(6):
         dtype = DTYPES[int(chance.integers(len(DTYPES)))] if i else FLOAT
         results[f"r{i}"] = np.array([[picked(dtype) for _ in range(int(chance.integers(1, 12)))]], object)
-    return Trace(graph, state, args, results, None, None), uniforms, shapes
+    return Trace(graph, state, args, results, None), uniforms, shapes
 
 
 def same(got: np.ndarray, wanted: np.ndarray) -> bool:

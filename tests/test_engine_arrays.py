@@ -199,7 +199,7 @@ def test_parameters_are_no_part_of_the_code() -> None:
             out = x * (k * 2 + 1) + (1.0 if k > 0 else -1.0) if k < 5 else x
         from tailgate.engine.program import Trace
 
-        return Program(Trace(graph, {}, {"x": nodes}, {"out": out.nodes}, None, None))
+        return Program(Trace(graph, {}, {"x": nodes}, {"out": out.nodes}, None))
 
     one, other = trace(0.3), trace(0.7)
     assert one.text == other.text and not other.function.fresh

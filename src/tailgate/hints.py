@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
@@ -22,6 +22,24 @@ def some(mask: Any) -> bool:
 def every(mask: Any) -> bool:
     """Is all of it true? A hint, as `some`: what follows spares work that would change no bit."""
     return bool(mask.values().all()) if isinstance(mask, Traced) and mask.fixed else not isinstance(mask, Traced) and bool(mask.all())
+
+
+def elsewhere(mask: Any, x: Any, function: Callable[..., Any], *arrays: Any) -> Any:
+    """x (B, N, ...) where a mask (B, N) holds, and function(*arrays) elsewhere: of arrays (B, N, ...), or (1, N, ...).
+
+    Plain code asks for the function only if some row needs it, traced code agent by agent.
+    """
+    if isinstance(mask, Traced) and not mask.fixed:
+        parts = []
+        for i in range(mask.shape[1]):
+            one = slice(i, i + 1)
+            parts.append(np.where(_wide(mask[:, one], x), x[:, one], function(*(array[:, one] for array in arrays))))
+        return np.concatenate(parts, axis=1)
+    return x if every(mask) else np.where(_wide(mask, x), x, function(*arrays))
+
+
+def _wide(mask: Any, like: Any) -> Any:
+    return mask[(..., *(None,) * (like.ndim - mask.ndim))]
 
 
 def present(values: Any, candidates: Iterable[int]) -> list[int]:

@@ -26,6 +26,7 @@ from tailgate.engine.functions import tracing
 from tailgate.engine.loops import until as until
 from tailgate.hints import broken as broken
 from tailgate.hints import demand as demand
+from tailgate.hints import elsewhere as elsewhere
 from tailgate.hints import every as every
 from tailgate.hints import pick as pick
 from tailgate.hints import present as present

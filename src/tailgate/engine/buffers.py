@@ -19,10 +19,10 @@ SHORT = 3  # numbers that are put in their place one by one
 _inside: list[Graph] = []  # graphs in which the body of a sweep is traced: its arrays are no buffers
 
 
-def wide(graph: Graph, *arrays: Array) -> bool:
-    """Does an elementwise function of these make a buffer?"""
-    shape = np.broadcast_shapes(*(a.shape for a in arrays))
-    return int(np.prod(shape, dtype=int)) >= WIDE and graph not in _inside and not all(_fixed(a) for a in arrays)
+def wide(graph: Graph, *arrays: Array, size: int = 0) -> bool:
+    """Does an elementwise function of these make a buffer, or what has a size and is made of them?"""
+    made = int(np.prod(np.broadcast_shapes(*(a.shape for a in arrays)), dtype=int))
+    return max(size, made) >= WIDE and graph not in _inside and not all(_fixed(a) for a in arrays)
 
 
 def _fixed(nodes: Array) -> bool:
@@ -176,3 +176,22 @@ def _copied(graph: Graph, nodes: Array) -> Node:
 def blended(graph: Graph, where: Node, x: Array, y: Array) -> Array:
     """The array x where `where` holds, else y."""
     return graph.picks(graph.blend(where, buffer_of(graph, x), buffer_of(graph, y))).reshape(x.shape)
+
+
+def sides(graph: Graph, nodes: Array) -> tuple[Node, Array, Array] | None:
+    """Who chooses all of these numbers, and between which ones, if one side is the same for all episodes."""
+    first = nodes.flat[0]
+    if first.op == "select" and all(node.op == "select" and node.args[0] is first.args[0] for node in nodes.flat):
+        held = [_map(lambda node, i=i: node.args[i], nodes) for i in (1, 2)]  # type: ignore[misc]
+    elif _is_pick(first) and first.args[0].op == "blend" and _strided(nodes) == Source(first.args[0], 0, steps(nodes.shape)):
+        held = [graph.picks(side).reshape(nodes.shape) for side in first.args[0].args[1:]] if first.args[0].size == nodes.size else []
+        first = first.args[0]
+    else:
+        return None
+    return (first.args[0], *held) if any(_fixed(side) for side in held) else None
+
+
+def _map(function: Callable[[Node], Node], nodes: Array) -> Array:
+    out = np.empty(nodes.shape, object)
+    out[...] = np.frompyfunc(function, 1, 1)(nodes)
+    return out

@@ -147,7 +147,7 @@ class Graph:
         known = (op, dtype, key, *(a.id for a in args))
         node = self._known.get(known)
         if node is None:
-            self.operations += op not in _FREE
+            self.operations += op not in _FREE and not fixed
             if self.operations > MOST:
                 raise Untraceable(f"more than {MOST:,} operations", "use num.until, num.take and matrix products of num for what is large")
             node = self._known[known] = Node(len(self.nodes), op, dtype, args, attr, fixed, size)
@@ -161,8 +161,14 @@ class Graph:
         if node.id not in self._values:
             for part in ordered([node]):
                 if part.id not in self._values:
-                    self._values[part.id] = part.attr if part.op == "const" else computed(part, [self._values[a.id] for a in part.args])
+                    self._values[part.id] = self.recomputed(part, self._values)
         return self._values[node.id]
+
+    def recomputed(self, node: Node, values: dict[int, Any]) -> Any:
+        """The number that a fixed node is where its arguments have these values."""
+        if node.op == "pack":
+            return [x for piece in node.attr for x in _packed(self, piece, values)]
+        return node.attr if node.op == "const" else computed(node, [values[a.id] for a in node.args])
 
     # -- operations: each takes nodes of the types that it asks for
 
@@ -242,7 +248,7 @@ class Graph:
         if buffer.id not in self._picks:
             out = np.empty(buffer.size, object)
             for i in range(buffer.size):
-                out[i] = node = Node(len(self.nodes), "pick", buffer.dtype, (buffer,), i, False)
+                out[i] = node = Node(len(self.nodes), "pick", buffer.dtype, (buffer,), i, buffer.fixed)
                 self.nodes.append(node)
             self._picks[buffer.id] = out
         return self._picks[buffer.id]
@@ -255,7 +261,8 @@ class Graph:
         """A buffer of these, one behind the other."""
         args = [source if isinstance(source, Node) else source.held for source, _ in pieces]
         size = sum(int(np.prod(shape, dtype=int)) for _, shape in pieces)
-        return self._node("pack", dtype, tuple({a.id: a for a in args if isinstance(a, Node)}.values()), pieces, pieces, False, size)
+        nodes = tuple({a.id: a for a in args if isinstance(a, Node)}.values())
+        return self._node("pack", dtype, nodes, pieces, pieces, all(a.fixed for a in nodes), size)
 
     def blend(self, where: Node, x: Node, y: Node) -> Node:
         """The buffer x where `where` holds, else the buffer y."""
@@ -265,7 +272,7 @@ class Graph:
 
     def inverses(self, matrices: Node, q: int) -> Node:
         """The inverses of symmetric positive definite matrices (., q, q)."""
-        return self._node("invert", FLOAT, (matrices,), q, q, False, matrices.size)
+        return self._node("invert", FLOAT, (matrices,), q, q, matrices.fixed, matrices.size)
 
     def sweep(self, shape: tuple[int, ...], carried: list[Node], sources: list[Source], after: list[Node]) -> Node:
         """A buffer (*shape, len(after)) of what the carried numbers become in each round."""
@@ -349,6 +356,8 @@ def computed(node: Node, args: Sequence[Any]) -> Any:
         return args[0][node.attr]
     if node.op in ("matvec", "sweep", "pack"):
         raise AssertionError("what has fixed nodes of its own is evaluated with its graph")
+    if node.op == "invert":
+        return _inverted(args[0], node.attr)
     if node.op == "blend":
         return [np.where(args[0], x, y) for x, y in zip(args[1], args[2], strict=True)]
     with np.errstate(all="ignore"):
@@ -391,8 +400,6 @@ def _evaluate(graph: Graph, nodes: Iterable[Node], inputs: dict[Any, Array], val
             values[node.id] = _swept(graph, node.attr, values)
         elif node.op == "pack":
             values[node.id] = [x for piece in node.attr for x in _packed(graph, piece, values)]
-        elif node.op == "invert":
-            values[node.id] = _inverted(args[0], node.attr)
         else:
             values[node.id] = computed(node, args)
 
@@ -420,13 +427,15 @@ def _looped(graph: Graph, body: Body, args: Sequence[Any], values: dict[int, Any
 def _packed(graph: Graph, piece: Piece, values: dict[int, Any]) -> list[Any]:
     source, shape = piece
     if isinstance(source, Node):
-        return [graph.value(source) if source.fixed else values[source.id]]
+        return [values[source.id] if source.id in values else graph.value(source)]
     return [_read(graph, source, index, values) for index in np.ndindex(*shape)]
 
 
 def _read(graph: Graph, source: Source, index: Sequence[int], values: dict[int, Any]) -> Any:
     place = source.offset + sum(i * n for i, n in zip(index, source.strides, strict=True))
-    return values[source.held.id][place] if isinstance(source.held, Node) else graph.value(source.held[place])
+    node = source.held[place] if isinstance(source.held, tuple) else source.held
+    found = values[node.id] if node.id in values else graph.value(node)
+    return found[place] if node is source.held else found
 
 
 def _swept(graph: Graph, sweep: Sweep, values: dict[int, Any]) -> list[Any]:

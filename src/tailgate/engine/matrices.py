@@ -10,24 +10,28 @@ from typing import Any
 
 import numpy as np
 
-from tailgate.engine.array import Traced, lifted
-from tailgate.engine.buffers import buffer_of, swept, wide
-from tailgate.engine.graph import FLOAT
+from tailgate.engine.array import Traced, boxed, lifted
+from tailgate.engine.buffers import buffer_of, sides, swept, wide
+from tailgate.engine.graph import BOOL, FLOAT
 
 LOOPED = 64  # numbers in a matrix without zeros that is multiplied in a loop: straight code of more takes long to compile
 STRAIGHT = 600  # products of numbers in straight code
 
 
-def _large(*arrays: Any) -> bool:
-    """Is one of them a buffer?"""
-    return any(isinstance(a, Traced) and wide(a.graph, a.nodes) for a in arrays)
+def _large(size: int, *arrays: Any) -> bool:
+    """Is one of these a buffer, or what has a size and is made of them?"""
+    return any(isinstance(a, Traced) and wide(a.graph, a.nodes, size=size) for a in arrays)
 
 
 def _over(function: Any, lead: Sequence[int], *arrays: Any) -> Traced:
     """function(*arrays without their first axes), for each index of these: of arrays (B, ...) that broadcast to `lead`."""
     graph = next(a.graph for a in arrays if isinstance(a, Traced))
     given = [lifted(graph, a).nodes for a in arrays]
-    return Traced(graph, swept(graph, lambda *parts: function(*(Traced(graph, part, FLOAT) for part in parts)).nodes, lead, given), FLOAT, 0)
+
+    def body(*parts: Any) -> Any:
+        return function(*(Traced(graph, part, FLOAT) for part in parts)).nodes
+
+    return Traced(graph, swept(graph, body, lead, given), FLOAT, 0)
 
 
 def _looped(x: Any, y: Traced, base: Any) -> Traced:
@@ -53,7 +57,7 @@ def structure(x: Any) -> Any:
 
 def constant_times(x: Any, y: Any) -> Any:
     """x (..., i, k) times y (B, ..., k, j), of an x that is the same for all: sums run from 0, and its zeros count for nothing."""
-    if _large(y) or (isinstance(y, Traced) and y.shape[-1] > 1 and _large(y[..., :1, :] * np.ones((x.shape[-2], 1)))):
+    if _large(y.size // y.shape[-2] * x.shape[-2], y):
         if x.ndim > 2 and len(x) > 1:
             return np.stack([constant_times(x[i], y[:, i]) for i in range(len(x))], axis=1)
         one, turned = x.reshape(x.shape[-2:]), np.swapaxes(y, -1, -2)
@@ -70,7 +74,7 @@ def constant_times(x: Any, y: Any) -> Any:
 
 def product(x: Any, y: Any) -> Any:
     """x (..., i, k) times y (..., k, j): sums begin with their first product."""
-    if _large(x, y):
+    if _large(x.size // x.shape[-1] * y.shape[-1], x, y):
         lead = np.broadcast_shapes(x.shape[:-2], y.shape[:-2])
         if x.shape[-2] * y.shape[-2] * y.shape[-1] <= STRAIGHT:
             return _over(product, lead, x, y)
@@ -84,7 +88,10 @@ def product(x: Any, y: Any) -> Any:
 def inverse(s: Any) -> Any:
     """The inverse of symmetric positive definite (..., q, q) by Gauss and Jordan, without pivots."""
     q = s.shape[-1]
-    if _large(s):
+    if isinstance(s, Traced) and any(sides(s.graph, one) for one in s.nodes.reshape(-1, q, q)):
+        parts = [_inverse_by_side(Traced(s.graph, one, FLOAT)) for one in s.nodes.reshape(-1, q, q)]
+        return Traced(s.graph, np.stack([part.nodes for part in parts]).reshape(s.shape), FLOAT, s.batch)
+    if _large(s.size, s):
         return Traced(s.graph, s.graph.picks(s.graph.inverses(buffer_of(s.graph, s.nodes), q)).reshape(s.shape), FLOAT, s.batch)
     a = [[s[..., i, j] for j in range(q)] for i in range(q)]
     for p in range(q):
@@ -97,6 +104,15 @@ def inverse(s: Any) -> Any:
                 a[i][p] = np.zeros_like(f)
                 a[i] = [v - f * w for v, w in zip(a[i], a[p], strict=True)]
     return np.stack([np.stack(row, axis=-1) for row in a], axis=-2)
+
+
+def _inverse_by_side(s: Traced) -> Any:
+    """The inverse of one matrix: of what episodes choose from, where one of both is the same for all."""
+    found = sides(s.graph, s.nodes)
+    if found is None:
+        return inverse(s)
+    where, *both = found
+    return np.where(Traced(s.graph, boxed(where), BOOL), *(inverse(Traced(s.graph, side, FLOAT)) for side in both))
 
 
 def transposed(x: Any) -> Any:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,7 @@ from tailgate.engine import objects
 from tailgate.engine.array import Traced, lifted
 from tailgate.engine.buffers import WIDE, buffer_of, copied
 from tailgate.engine.functions import makers
-from tailgate.engine.graph import Array, Graph, Node, computed, ordered
+from tailgate.engine.graph import Array, Graph, Node, ordered
 from tailgate.engine.llvm import Column, Held, Layout, text_of
 from tailgate.engine.passes import LEAST
 from tailgate.tree import leaves, map_leaves
@@ -32,11 +32,10 @@ class Trace:
 
     graph: Graph
     state: dict[str, tuple[Array, Array]]  # leaf -> its nodes, and those of the next state
-    large: dict[str, tuple[Node, Node]]  # of leaves that are buffers: now and next
     arguments: dict[str, Array]
     results: dict[str, Array]
-    next_state: Any  # the trees, with traced leaves
-    result_tree: Any
+    next_state: Any  # the tree, with traced leaves
+    large: dict[str, tuple[Node, Node]] = field(default_factory=dict)  # of leaves that are buffers: now and next
 
 
 def traced(function: Step, state: Any, arguments: Any) -> Trace:
@@ -53,11 +52,15 @@ def traced(function: Step, state: Any, arguments: Any) -> Trace:
         if after[name].shape != leaf.shape:
             raise ValueError(f"state {name}: {after[name].shape} after a step, {leaf.shape} before it")
     held = {name: (leaf.nodes, after[name].nodes) for name, leaf in before.items()}
-    large = {name: (here.flat[0].args[0], _own(graph, here.flat[0].args[0], buffer_of(graph, there))) for name, (here, there) in held.items() if here.size >= WIDE}
+    large = {}
+    for name, (here, there) in held.items():
+        if here.size >= WIDE:
+            place: Node = here.flat[0].args[0]
+            large[name] = place, _own(graph, place, buffer_of(graph, there))
     if graph.demands:
         results = results | {"demands": Traced(graph, np.array([[node for *_, node in graph.demands]], object), np.dtype(bool), 0)}
     args, given = _nodes(taken), {name: _of_each(leaf) for name, leaf in results.items()}
-    return Trace(graph, held, large, args, _nodes(given), following, results)
+    return Trace(graph, held, args, _nodes(given), following, large)
 
 
 def _own(graph: Graph, place: Node, new: Node) -> Node:
@@ -142,7 +145,7 @@ class Program:
                 if node.op == "uniform":
                     known[node.id] = np.asarray(values.get(node.attr, graph.value(node)), node.dtype)[()]
                 else:
-                    known[node.id] = node.attr if node.op == "const" else computed(node, [known[a.id] for a in node.args])
+                    known[node.id] = graph.recomputed(node, known)
         out = np.zeros(max(1, len(self._slots)), np.uint64)
         for i, node in enumerate(self._slots):
             out[i : i + 1].view(node.dtype)[:1] = known[node.id] if values else graph.value(node)

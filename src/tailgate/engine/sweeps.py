@@ -158,7 +158,7 @@ def _invert_text(outer: Emitter, q: int) -> str:
             columns = range(first, min(first + CHUNK, q))
             held = [read(element(e, row, "0", size, j)) for j in columns]
             with counted(e, q) as i:
-                before, other, after = e.block, e.label("other"), e.label("after")
+                other, after = e.label("other"), e.label("after")
                 e.line(f"br i1 {e.set(f'icmp eq i64 {i}, {p}')}, label %{after}, label %{other}")
                 e.begin(other)
                 line = element(e, "%a", i, size * q)
@@ -168,12 +168,11 @@ def _invert_text(outer: Emitter, q: int) -> str:
                     write(read(there), factor)
                     write("zeroinitializer", there)
                 f = read(factor)
-                for j, name in zip(columns, held, strict=True):
-                    there = element(e, line, "0", size, j)
+                for column, name in zip(columns, held, strict=True):
+                    there = element(e, line, "0", size, column)
                     write(e.set(f"fsub {kind} {read(there)}, {e.set(f'fmul {kind} {f}, {name}')}"), there)
                 e.line(f"br label %{after}")
                 e.begin(after)
-                del before
     e.line("ret void")
     room = f"  %f = alloca [{q} x {kind}], align {size}"
     head = f"define internal fastcc void @invert_{q}(ptr noalias %a) noinline #0 {{"
