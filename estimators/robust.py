@@ -14,11 +14,11 @@ and satisfies |2 W y|_i <= lam_i, however large r is. Where |2 W r|_i <= lam_i f
 from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, cast
 
 import numpy as np
 
-from tailgate import linear, num
+from tailgate import num
 from tailgate.core import Array, Innovation, Model, Positive, param
 from tailgate.registry import register
 
@@ -42,12 +42,7 @@ def believed(r: Array, S: Array, lam: Array) -> Array:
     half, found = 0.5 * lam, np.asarray((2.0 * np.abs(num.matvec(W, r)) > lam).any(axis=-1))
     if r.shape[-1] == 1:
         return np.where(found[..., None], np.clip(r, -half * S[..., 0], half * S[..., 0]), r)
-    rows = np.nonzero(found)
-    if not len(rows[0]):
-        return r
-    y = r.copy(order="K")
-    y[rows] = _pivot(r, S, W, half, rows)
-    return y
+    return cast(Array, num.elsewhere(~found, r, _pivot, r, W, half, S.diagonal(axis1=-2, axis2=-1)))
 
 
 def _pair(r: Array, S: Array, W: Array, half: Array) -> Array:
@@ -82,22 +77,74 @@ def _within(x: Array, low: Array, high: Array) -> Array:
     return np.where(x >= high, high, x)
 
 
-def _pivot(r: Array, S: Array, W: Array, half: Array, rows: tuple[Array, ...]) -> Array:
+def _pivot(r: Array, W: Array, half: Array, size: Array) -> Array:
     """Any number of sensors: block principal pivoting (Judice and Pires 1992), which ends in a finite number of rounds.
 
     A round solves for the outliers of presumed signs, and changes the presumptions that its solution contradicts: all of them while they
     grow fewer, else the last one alone. (Coordinate descent is simpler, and takes thousands of sweeps where sensors are correlated.)
+    r, half and size (B, N, q), W (B, N, q, q).
     """
-    r, half = np.ascontiguousarray(r[rows]), np.ascontiguousarray(half[rows])
-    size = np.ascontiguousarray(S.diagonal(axis1=-2, axis2=-1)[rows])
-    shared = W.ndim == 4 and W.strides[0] == 0  # the same for the whole batch
-    blocks, which = (W[0], rows[1]) if shared else (W[rows], np.arange(len(r)))
-    y = np.empty_like(r)
-    flat = np.ascontiguousarray(blocks).reshape(len(blocks), -1)
-    left = linear.pivot_each(r, flat, which, half, size, LIMITS, y)
-    if left:
-        raise ArithmeticError(f"believed: {left} problems of {r.shape[1]} sensors are not solved after {ROUNDS} rounds of pivoting")
+    q = r.shape[-1]
+    sensors = range(q)
+
+    def step(sign: Array, y: Array, fewest: Array, left: Array) -> tuple[Array, list[Array]]:
+        y = _solved(sign, r, W, half)
+        wrong, toward = [], []
+        for i in sensors:
+            g, largest = np.zeros(y.shape[:-1]), np.zeros(y.shape[:-1])
+            for j in sensors:
+                part = W[..., i, j] * y[..., j]
+                g, largest = g + part, np.maximum(largest, np.abs(part))
+            beyond = np.abs(g) > half[..., i] + (TOLERANCE * half[..., i] + ROUNDING * largest)
+            slack = TOLERANCE * half[..., i] * size[..., i] + ROUNDING * (np.abs(r[..., i]) + np.abs(y[..., i]))
+            wrong.append(np.where(sign[..., i] == 0.0, beyond, sign[..., i] * (r[..., i] - y[..., i]) < -slack))
+            toward.append(np.where(sign[..., i] == 0.0, np.copysign(1.0, g), 0.0))
+        count, last = np.zeros(left.shape, np.int64), np.zeros(left.shape, np.int64)
+        for i in sensors:
+            count, last = count + wrong[i], np.where(wrong[i], i, last)
+        left, fewest = np.where(count < fewest, PATIENCE, left - 1), np.minimum(count, fewest)
+        changed = [np.where(wrong[i] & ((left >= 0) | (last == i)), toward[i], sign[..., i]) for i in sensors]
+        return count > 0, [num.stack(changed), y, fewest, left]
+
+    alone = np.where(np.abs(r) > half * size, np.copysign(1.0, r), 0.0)  # what each sensor alone would say
+    whole = np.zeros(r.shape[:-1], np.int64)
+    begin = [alone, r, whole + (q + 1), whole + PATIENCE]
+    _, y, fewest, _ = num.until(step, begin, whole == 0, ROUNDS)
+    unsolved = np.asarray(fewest > 0)
+    if not num.tracing() and unsolved.any():
+        raise ArithmeticError(f"believed: {np.count_nonzero(unsolved)} problems of {q} sensors are not solved after {ROUNDS} rounds of pivoting")
     return y
+
+
+def _solved(sign: Array, r: Array, W: Array, half: Array) -> Array:
+    """y (B, N, q) for presumed signs: an outlier is where its price is met, any other sensor is believed."""
+    q = r.shape[-1]
+    out = [sign[..., i] != 0.0 for i in range(q)]
+    y = [np.where(out[i], 0.0, r[..., i]) for i in range(q)]
+    L: list[list[Array]] = []  # L L' = W of the outliers, 1 for the others
+    for i in range(q):
+        L.append([])
+        for j in range(i + 1):
+            both = out[i] & out[j]
+            held = W[..., i, j]
+            for k in range(j):
+                held = held - L[i][k] * L[j][k]
+            held = np.where(both, held, 1.0 if i == j else 0.0)
+            L[i].append(np.sqrt(held) if i == j else held / L[j][j])
+    for _ in range(2):  # the second time mends the rounding of the first
+        z: list[Array] = []
+        for i in range(q):
+            held = sign[..., i] * half[..., i]
+            for j in range(q):
+                part = W[..., i, j] * y[j] + (L[i][j] * z[j] if j < i else 0.0)
+                held = np.where(out[i], held - part, held)
+            z.append(held / L[i][i])
+        for i in reversed(range(q)):
+            for k in range(i + 1, q):
+                z[i] = z[i] - L[k][i] * z[k]
+            z[i] = z[i] / L[i][i]
+        y = [y[i] + z[i] for i in range(q)]
+    return num.stack(y)
 
 
 @cache

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tailgate import num
-from tailgate.engine import matrices
+from tailgate.engine import matrices, sweeps
 from tailgate.engine.buffers import WIDE
 from tailgate.engine.graph import evaluate
 from tailgate.engine.program import Call, Program, State, traced
@@ -171,7 +171,8 @@ def test_inverses_know_what_is_the_same_for_all() -> None:
     assert matrices.LOOPED <= WIDE
 
 
-def test_what_is_too_large_for_the_stack_is_refused() -> None:
-    huge = {"x": np.zeros((1, 300_000))}
+def test_what_is_too_large_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sweeps, "ROOM", 1e5)
+    large = {"x": np.zeros((1, 10_000))}
     with pytest.raises(Untraceable, match="use smaller ones"):
-        Program(traced(lambda held, _: ({"x": held["x"] * 2.0 + 1.0}, {}), huge, {}), 8)
+        Program(traced(lambda held, _: ({"x": held["x"] * 2.0 + 1.0}, {}), large, {}), 8)

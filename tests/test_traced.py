@@ -193,7 +193,7 @@ def test_objects_that_are_damaged_or_cannot_be_kept_are_made_again(tmp_path, mon
 
     def call():
         made, out = objects.Function(text), np.zeros(1, np.int64)
-        made.call(out.ctypes.data, None, None, 7, 0, 0)
+        made.call(out.ctypes.data, None, None, None, 7, 0, 0)
         assert out[0] == 7
         return made
 

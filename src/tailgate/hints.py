@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tailgate.engine.array import Traced, gathered
+from tailgate.engine.loops import chosen_apart
 from tailgate.errors import InputError
 
 Array = NDArray[Any]
@@ -25,21 +26,22 @@ def every(mask: Any) -> bool:
 
 
 def elsewhere(mask: Any, x: Any, function: Callable[..., Any], *arrays: Any) -> Any:
-    """x (B, N, ...) where a mask (B, N) holds, and function(*arrays) elsewhere: of arrays (B, N, ...), or (1, N, ...).
+    """x (B, N, ...) where a mask (B, N) holds, and function(*arrays) elsewhere: of arrays (B, N, ...), or (1, N, ...). N may be missing.
 
-    Plain code asks for the function only if some row needs it, traced code agent by agent.
+    Plain code calls the function with the places where it is needed, (M, 1, ...), if there are any; traced code for each agent, (1, 1, ...).
     """
+    if mask.ndim == 1:
+        return elsewhere(mask[:, None], x[:, None], function, *(array[:, None] for array in arrays))[:, 0]
     if isinstance(mask, Traced) and not mask.fixed:
-        parts = []
-        for i in range(mask.shape[1]):
-            one = slice(i, i + 1)
-            parts.append(np.where(_wide(mask[:, one], x), x[:, one], function(*(array[:, one] for array in arrays))))
-        return np.concatenate(parts, axis=1)
-    return x if every(mask) else np.where(_wide(mask, x), x, function(*arrays))
-
-
-def _wide(mask: Any, like: Any) -> Any:
-    return mask[(..., *(None,) * (like.ndim - mask.ndim))]
+        return chosen_apart(mask, x, function, arrays)
+    held = mask.values() if isinstance(mask, Traced) else mask
+    if held.all():
+        return x
+    b, i = np.nonzero(~held)
+    given = [array[b if len(array) > 1 else 0, i][:, None] for array in arrays]
+    out = np.array(x, order="K")
+    out[b, i] = function(*given)[:, 0]
+    return out
 
 
 def present(values: Any, candidates: Iterable[int]) -> list[int]:

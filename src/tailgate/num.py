@@ -22,7 +22,7 @@ from tailgate.elementwise import clip as clip
 from tailgate.elementwise import select as select
 from tailgate.engine import elementary, matrices
 from tailgate.engine.array import Traced
-from tailgate.engine.functions import tracing
+from tailgate.engine.functions import tracing as tracing
 from tailgate.engine.loops import until as until
 from tailgate.hints import broken as broken
 from tailgate.hints import demand as demand

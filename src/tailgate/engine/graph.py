@@ -37,7 +37,7 @@ def converted(x: Any, dtype: np.dtype[Any]) -> Any:
     return x.astype(dtype)
 
 
-MOST = 20_000  # operations of a graph: what has more takes long to compile, as straight code
+MOST = 60_000  # operations of a graph: what has more takes long to compile, as straight code
 _FREE = {"const", "uniform", "input", "carried", "pick"}  # which are none
 COMPARISONS = {"lt": np.less, "le": np.less_equal, "gt": np.greater, "ge": np.greater_equal, "eq": np.equal, "ne": np.not_equal}
 BINARY: dict[str, Callable[..., Any]] = {
@@ -299,8 +299,9 @@ class Graph:
     def loop(self, begin: list[Node], carried: list[Node], after: list[Node], going: list[Node], most: int) -> list[Node]:
         """What `carried` nodes are at last, of those that they become `after` a round, while any of `going` holds."""
         inside = dependent(after, carried)
-        captured = {a.id: a for node in (*inside, *after) for a in node.args if a not in inside and a.op != "carried" and not a.fixed}
-        outer = [node for node in after if node not in inside and node.op != "carried" and not node.fixed]
+        mine = {*inside, *carried}
+        captured = {a.id: a for node in inside for a in node.args if a not in mine and not a.fixed}
+        outer = [node for node in after if node not in mine and not node.fixed]
         args = (*begin, *(captured | {node.id: node for node in outer}).values())
         body = Body(carried, after, going, most, sorted(inside, key=lambda node: node.id))
         node = self._node("loop", BOOL, args, body, len(self.nodes), False)

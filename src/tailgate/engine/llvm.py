@@ -1,8 +1,8 @@
 """Machine code of this processor: LLVM's text of a scheduled graph, in vectors of `lanes` episodes.
 
 Episodes stand in blocks of one vector each. A block's state lies together in memory, so that a step reads and writes a few KiB at fixed
-places. Operations are neither reordered nor contracted. A function has five arguments: the state, the numbers that are the same for all
-episodes, a table of arrays (address, bytes a step), the first block and the one behind the last, and the steps to play.
+places. Operations are neither reordered nor contracted. A function has seven arguments: the state, the numbers that are the same for all
+episodes, a table of arrays (address, bytes a step), room for buffers, the first block and the one behind the last, and the steps to play.
 """
 
 from __future__ import annotations
@@ -296,8 +296,8 @@ class Emitter:
         return rows
 
 
-def text_of(layout: Layout, arrays: int, lanes: int, least: int) -> tuple[str, dict[str, int]]:
-    """LLVM's text of `step(state, uniforms, table, first, last, steps)`, and how many nodes and branches it has."""
+def text_of(layout: Layout, arrays: int, lanes: int, least: int) -> tuple[str, dict[str, int], int]:
+    """LLVM's text of `step(state, uniforms, table, room, first, last, steps)`, how many nodes and branches it has, and the room's bytes."""
     e = Emitter(layout, lanes)
     e.begin("entry")
     e.lines.append("")
@@ -310,15 +310,15 @@ def text_of(layout: Layout, arrays: int, lanes: int, least: int) -> tuple[str, d
         e.line(f"%at = mul i64 %block, {layout.stride}")
         e.line("%state = getelementptr i8, ptr %memory, i64 %at")
         with _loop(e, "time", "0", "%steps"):
-            items = _step(e, least)
+            items, room = _step(e, least)
     e.line("ret void")
     e.lines[1] = "\n".join(e.rooms)
     wide = 64 * lanes
     attributes = f'nounwind "prefer-vector-width"="{max(128, min(512, wide))}" "min-legal-vector-width"="{max(128, min(512, wide))}"'
     head = ("define void @step(ptr noalias nocapture %memory, ptr noalias nocapture readonly %uniforms, "
-            "ptr noalias nocapture readonly %table, i64 %first, i64 %last, i64 %steps) #0 {")  # fmt: skip
+            "ptr noalias nocapture readonly %table, ptr noalias nocapture %large, i64 %first, i64 %last, i64 %steps) #0 {")  # fmt: skip
     text = "\n".join([*sorted(e.declared), *e.texts, head, *e.lines, "}", f"attributes #0 = {{ {attributes} }}", ""])
-    return text, counted(items)
+    return text, counted(items), room
 
 
 @contextlib.contextmanager
@@ -338,14 +338,12 @@ def _loop(e: Emitter, name: str, first: str, last: str) -> Iterator[None]:
     e.begin(f"{name}_end")
 
 
-def _step(e: Emitter, least: int) -> list[Item]:
-    """One step of one block."""
+def _step(e: Emitter, least: int) -> tuple[list[Item], int]:
+    """One step of one block; -> its items, and the bytes of its buffers."""
     layout = e.layout
     outputs = [node for node, _ in layout.outputs]
     items = schedule(outputs, least)
     e.places, room = sweeps.rooms(items, outputs, e.lanes)
-    if room:
-        e.rooms.append(f"  %large = alloca [{room} x i8], align 64")
     here = {item.id: turn for turn, item in enumerate(items) if not isinstance(item, Branch)}
     here |= {node.id: turn for turn, item in enumerate(items) if isinstance(item, Branch) for node in item.decides}
     late = {place.offset for i, place in layout.inputs.items() if isinstance(place, Held) and i not in here}  # read in a branch, or never
@@ -372,7 +370,7 @@ def _step(e: Emitter, least: int) -> list[Item]:
     for node, place in large:
         assert isinstance(place, Held)
         sweeps.copy(e, e.value(node), e.address("%state", place.offset), node, node.size)
-    return items
+    return items, room
 
 
 def _last_read(items: Sequence[Item], layout: Layout) -> dict[int, int]:

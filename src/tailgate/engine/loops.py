@@ -8,8 +8,10 @@ from typing import Any
 import numpy as np
 
 from tailgate.engine.array import Traced, lifted
+from tailgate.engine.buffers import swept
 
 Step = Callable[..., tuple[Any, Sequence[Any]]]
+LONG = 400  # operations of a function that is written once for all agents
 
 
 def until(step: Step, state: Sequence[Any], active: Any, most: int) -> list[Any]:
@@ -49,6 +51,30 @@ def _round(step: Step, state: Sequence[Any], going: Any) -> tuple[Any, list[Any]
     further, new = step(*state)
     held = [np.where(_wide(going, old), x, old) for x, old in zip(new, state, strict=True)]
     return going & further, held
+
+
+def chosen_apart(mask: Any, x: Any, function: Callable[..., Any], arrays: Sequence[Any]) -> Any:
+    """x (B, N, ...) where a mask (B, N) holds, else function(*arrays), agent by agent: a long function in a loop."""
+    graph, agents = mask.graph, mask.shape[1]
+    held = [lifted(graph, a) for a in (mask, x, *arrays)]
+
+    def one(mask: Any, x: Any, *arrays: Any) -> Any:
+        return np.where(_wide(mask, x), x, function(*arrays))
+
+    before, parts = graph.operations, []
+    for i in range(agents):
+        parts.append(one(*(a[:, i : i + 1] for a in held)))
+        if i == 0 and agents > 1 and graph.operations - before > LONG:
+            break
+    else:
+        return np.concatenate(parts, axis=1)
+    graph.operations = before  # what was made for the first agent is not used
+
+    def body(*nodes: Any) -> Any:
+        given = [Traced(graph, np.reshape(part, (1, 1, *np.shape(part))), a.dtype, 0) for part, a in zip(nodes, held, strict=True)]
+        return one(*given).nodes[0, 0]
+
+    return Traced(graph, swept(graph, body, (1, agents), [a.nodes for a in held]), held[1].dtype, 0)
 
 
 def _wide(mask: Any, like: Any) -> Any:

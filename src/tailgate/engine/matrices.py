@@ -23,6 +23,11 @@ def _large(size: int, *arrays: Any) -> bool:
     return any(isinstance(a, Traced) and wide(a.graph, a.nodes, size=size) for a in arrays)
 
 
+def _size(x: Any, y: Any) -> int:
+    """Of a product."""
+    return int(np.prod((*np.broadcast_shapes(x.shape[:-2], y.shape[:-2]), x.shape[-2], y.shape[-1]), dtype=int)) if x.shape[-1] else 0
+
+
 def _over(function: Any, lead: Sequence[int], *arrays: Any) -> Traced:
     """function(*arrays without their first axes), for each index of these: of arrays (B, ...) that broadcast to `lead`."""
     graph = next(a.graph for a in arrays if isinstance(a, Traced))
@@ -57,7 +62,7 @@ def structure(x: Any) -> Any:
 
 def constant_times(x: Any, y: Any) -> Any:
     """x (..., i, k) times y (B, ..., k, j), of an x that is the same for all: sums run from 0, and its zeros count for nothing."""
-    if _large(y.size // y.shape[-2] * x.shape[-2], y):
+    if _large(_size(x, y), y):
         if x.ndim > 2 and len(x) > 1:
             return np.stack([constant_times(x[i], y[:, i]) for i in range(len(x))], axis=1)
         one, turned = x.reshape(x.shape[-2:]), np.swapaxes(y, -1, -2)
@@ -74,7 +79,7 @@ def constant_times(x: Any, y: Any) -> Any:
 
 def product(x: Any, y: Any) -> Any:
     """x (..., i, k) times y (..., k, j): sums begin with their first product."""
-    if _large(x.size // x.shape[-1] * y.shape[-1], x, y):
+    if _large(_size(x, y), x, y):
         lead = np.broadcast_shapes(x.shape[:-2], y.shape[:-2])
         if x.shape[-2] * y.shape[-2] * y.shape[-1] <= STRAIGHT:
             return _over(product, lead, x, y)

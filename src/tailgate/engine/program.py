@@ -124,7 +124,7 @@ class Program:
                     layout.inputs[node.id] = Column(number, column, len(nodes))
                 else:
                     layout.outputs.append((node, Column(number, column, len(nodes))))
-        self.text, self.size = text_of(layout, len(self.arrays), self.lanes, least)
+        self.text, self.size, self.room = text_of(layout, len(self.arrays), self.lanes, least)
         self.function = objects.Function(self.text)
         self._slots = layout.slots
 
@@ -223,7 +223,8 @@ class Call:
                 size += -(-count // ALIGNED) * ALIGNED
         self._first, self._size = len(program.arrays) - len(self._results), size
         self._offsets = np.array([at for *_, at in self._results], np.int64)
-        self._pointers = tuple(ctypes.c_void_p(a.ctypes.data) for a in (state.memory, self.uniforms, self._table))
+        self._room = _aligned((program.room,))
+        self._pointers = tuple(ctypes.c_void_p(a.ctypes.data) for a in (state.memory, self.uniforms, self._table, self._room))
 
     def __call__(self) -> dict[str, Array]:
         """Play all steps; -> the results by name."""

@@ -1,4 +1,4 @@
-"""Code of what is done on buffers, and the room that each of them has on the stack."""
+"""Code of what is done on buffers, and the room that each of them has."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tailgate.engine.untraceable import Untraceable
 if TYPE_CHECKING:
     from tailgate.engine.llvm import Emitter
 
-ROOM = 3_000_000  # bytes on the stack
+ROOM = 64_000_000  # bytes
 CHUNK = 16  # numbers of a row that are kept in registers
 
 
