@@ -110,10 +110,10 @@ def _pivot(r: Array, W: Array, half: Array, size: Array) -> Array:
     whole = np.zeros(r.shape[:-1], np.int64)
     begin = [alone, r, whole + (q + 1), whole + PATIENCE]
     _, y, fewest, _ = num.until(step, begin, whole == 0, ROUNDS)
-    unsolved = np.asarray(fewest > 0)
-    if not num.tracing() and unsolved.any():
-        raise ArithmeticError(f"believed: {np.count_nonzero(unsolved)} problems of {q} sensors are not solved after {ROUNDS} rounds of pivoting")
-    return y
+    if not num.tracing() and (fewest > 0).any():
+        left = np.count_nonzero(fewest > 0)
+        raise ArithmeticError(f"believed: {left} problems of {q} sensors are not solved after {ROUNDS} rounds of pivoting")
+    return np.asarray(y)
 
 
 def _solved(sign: Array, r: Array, W: Array, half: Array) -> Array:

@@ -189,7 +189,7 @@ def test_what_is_not_finite_is_refused_as_in_the_plain_loop(tmp_path):
 
 def test_objects_that_are_damaged_or_cannot_be_kept_are_made_again(tmp_path, monkeypatch):
     monkeypatch.setenv("TAILGATE_CACHE", str(tmp_path / "cache"))
-    text = "define void @step(ptr %a, ptr %b, ptr %c, i64 %d, i64 %e, i64 %f) {\n  store i64 %d, ptr %a\n  ret void\n}\n"
+    text = "define void @step(ptr %a, ptr %b, ptr %c, ptr %r, i64 %d, i64 %e, i64 %f) {\n  store i64 %d, ptr %a\n  ret void\n}\n"
 
     def call():
         made, out = objects.Function(text), np.zeros(1, np.int64)

@@ -26,9 +26,9 @@ def every(mask: Any) -> bool:
 
 
 def elsewhere(mask: Any, x: Any, function: Callable[..., Any], *arrays: Any) -> Any:
-    """x (B, N, ...) where a mask (B, N) holds, and function(*arrays) elsewhere: of arrays (B, N, ...), or (1, N, ...). N may be missing.
+    """x (B, N, ...) where a mask (B, N) holds, else function(*arrays) of arrays (B or 1, N, ...). N may be missing.
 
-    Plain code calls the function with the places where it is needed, (M, 1, ...), if there are any; traced code for each agent, (1, 1, ...).
+    Plain code calls it with the places that need it, (M, 1, ...), if there are any; traced code for each agent, (1, 1, ...).
     """
     if mask.ndim == 1:
         return elsewhere(mask[:, None], x[:, None], function, *(array[:, None] for array in arrays))[:, 0]
