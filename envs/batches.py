@@ -244,7 +244,9 @@ class TracedEpisodes:
         return {"seat": self.programs.seat, "drawn": self._drawn, "held": held, "shadow": self.shadow}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__init__(SeatPrograms(state["seat"]), state["drawn"])  # type: ignore[misc]
+        programs = programs_of(state["seat"])
+        assert isinstance(programs, SeatPrograms), "it was traced before"
+        self.__init__(programs, state["drawn"])  # type: ignore[misc]
         if state["held"] is not None:
             batch, held, brought = state["held"]
             self.rows = Rows(self.programs, batch)

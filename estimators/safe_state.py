@@ -275,7 +275,7 @@ class SafeSet:
             back = self._looked_back(plan, old, back, way)
             fast = _told_by_gaps(plan, box[GAP], back, box[LEAD])
             lost = fast.lo > fast.hi  # no car moves like this
-            if lost.any():
+            if num.some(lost):
                 sure = box[LEAD]
                 fast, back = Span(np.where(lost, sure.lo, fast.lo), np.where(lost, sure.hi, fast.hi)), _reset(back, lost)
                 box[GAP] = Span(np.where(lost, gap.lo, box[GAP].lo), np.where(lost, gap.hi, box[GAP].hi))

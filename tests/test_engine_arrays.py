@@ -12,6 +12,7 @@ from tailgate import num
 from tailgate.engine import functions
 from tailgate.engine.array import Traced
 from tailgate.engine.graph import FLOAT, Graph
+from tailgate.engine.parameters import lifted
 from tailgate.engine.program import Call, Program, State, traced
 from tailgate.engine.untraceable import Untraceable
 
@@ -194,7 +195,7 @@ def test_parameters_are_no_part_of_the_code() -> None:
         graph = Graph()
         nodes = np.array([[graph.input(("arguments", "x", (0,)), FLOAT)]], object)
         x = Traced(graph, nodes, FLOAT, 0)
-        k = Traced(graph, functions.boxed(graph.uniform("gain", gain)), FLOAT, None, float)
+        (k,) = lifted(graph, (gain,))
         with functions.makers(graph):
             out = x * (k * 2 + 1) + (1.0 if k > 0 else -1.0) if k < 5 else x
         from tailgate.engine.program import Trace

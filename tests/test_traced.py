@@ -1,8 +1,10 @@
 """The traced engine plays environments as the plain loop does, to the last bit, restarts, resets and what was held included."""
 
+import copy
 import dataclasses
 import importlib
 import json
+import pickle
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,15 +15,16 @@ from tailgate import draws, num
 from tailgate.agents.scripted import NoAttack
 from tailgate.agents.zoo import zoo_card
 from tailgate.cli import main
-from tailgate.engine import objects
+from tailgate.engine import objects, rollouts, seats
 from tailgate.engine.graph import evaluate
+from tailgate.engine.parameters import Remembered
 from tailgate.engine.program import Call, Program, State, traced
 from tailgate.engine.rollouts import Rollout, rollout_of
 from tailgate.engine.seats import SeatPrograms
 from tailgate.envs.faces import AdversaryVectorEnv
 from tailgate.envs.seat import Seat
 from tailgate.errors import InputError
-from tailgate.estimators import Kalman
+from tailgate.estimators import ChiSquare, Kalman
 from tailgate.registry import Spec
 from tailgate.scenario import load_scenario
 from tailgate.trace import Trace, rollout
@@ -36,6 +39,9 @@ MORE = [  # what the fused engine does not play
     {"scenario": "stop-and-go-v0", "defence": "kf", "threat": {"hold_from_onset": True, "kinds": ["dos_hold"]}},
     {"scenario": "stop-and-go-v0", "defence": "chi2_kf_sparse"},
     {"scenario": "stop-and-go-v0", "defence": "chi2_kf", "knowledge": "white", "reward": "error"},
+    {"scenario": "platoon-gusty-v0", "defence": "chi2_dkf"},
+    {"scenario": "platoon-v2v-v0", "defence": "lasso_dkf"},
+    {"scenario": "network-noisy-v0", "defence": "rkf", "reward": "error"},
 ]  # fmt: skip
 
 
@@ -159,6 +165,45 @@ def test_other_parameters_need_no_other_code():
     assert one.text == other.text and not other.function.fresh
     assert sorted(one.uniforms().tolist()) != sorted(other.uniforms().tolist())
     assert made("kf").text != one.text
+
+
+def test_parameters_of_other_values_are_traced_once(monkeypatch):
+    """Budgets, thresholds and times of attacks are no part of the code; an answer that Python code asked for is."""
+    made = []
+    monkeypatch.setattr(rollouts, "traced", lambda *arguments: made.append(1) or traced(*arguments))
+    keys = draws.keys("report", range(5))
+
+    def play(defence, rival, budget, method=None):
+        place = load_scenario("gusty-stop-and-go-v0").with_threat(budget=budget)
+        loop, attack = place.loop(Spec("defence", defence).make()), Spec("attack", rival).make()
+        found, wanted = rollout_of(loop, attack), rollout(loop, attack, keys, plain=True)
+        got = Trace(loop.model, loop.horizon, *found.play(keys, True), loop.controller.desired_gap)
+        assert [got.trace_hash(i) for i in range(5)] == [wanted.trace_hash(i) for i in range(5)]
+        return len(made)
+
+    monkeypatch.setattr(rollouts, "_made", Remembered())
+    assert play("chi2_kf", "fdi:trigger=near,threshold=50,value=3", 20) == 1
+    assert play("chi2_kf:eta=9", "fdi:trigger=near,threshold=41.5,value=-2", 7) == 1
+    assert play("chi2_kf", "fdi:trigger=near,threshold=50,value=3", 0) in (1, 2)
+    before = len(made)
+    assert play("kf", "fdi:trigger=near,threshold=50,value=3", 20) == before + 1  # another class
+    assert play("kf", "fdi:trigger=near,threshold=50,value=3,targets=[position]", 20) == before + 2  # an answer to a question of Python's
+    shifted = ChiSquare.step
+    monkeypatch.setattr(ChiSquare, "step", lambda *arguments: shifted(*arguments))
+    assert play("chi2_kf", "fdi:trigger=near,threshold=50,value=3", 20) == before + 3  # other functions
+
+
+def test_copies_of_a_traced_environment_are_not_traced_again(monkeypatch):
+    env = AdversaryVectorEnv(16, scenario="gusty-stop-and-go-v0", defence="chi2_kf", engine="traced")
+    env.reset(seed=3)
+    env.step(np.zeros(16, np.int64))
+    monkeypatch.setattr(seats, "traced", None)
+    copies = [copy.deepcopy(env), pickle.loads(pickle.dumps(env))]
+    actions = np.arange(16) % env.seat.action.size
+    wanted = env.step(actions)
+    for other in copies:
+        got = other.step(actions)
+        assert other.engine == "traced" and all(np.array_equal(x, y) for x, y in zip(got[:4], wanted[:4], strict=True))
 
 
 def test_code_that_differs_from_the_plain_loop_is_not_used():

@@ -205,7 +205,7 @@ class Loop:
         plan, channel = self.plan, state.channel
         threat = self.threat
         budget_left = Channel().budget_left(plan.channel, channel)
-        budget = np.full(len(state.k), np.inf if threat.budget is None else float(threat.budget))
+        budget = np.full(len(state.k), np.inf if threat.budget is None else threat.budget, np.float64)
         view = View(
             k=state.k,
             progress=state.k / self.horizon,

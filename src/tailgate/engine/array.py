@@ -61,10 +61,11 @@ class Traced:
 
     def values(self) -> Array:
         """The numbers of a fixed array."""
-        out = np.empty(self.shape, self.dtype)
-        for i, node in enumerate(self.nodes.flat):
-            out.flat[i] = self.graph.value(node)
-        return out
+        return self.graph.ask(list(self.nodes.flat), self.dtype).reshape(self.shape)
+
+    def nonzero_places(self) -> Array:
+        """Where the numbers of a fixed array are not zero."""
+        return self.graph.ask(list(self.nodes.flat), self.dtype, nonzero=True).reshape(self.shape)
 
     def known(self, what: str, instead: str) -> Array:
         """The numbers of a fixed array, which code asks for in a way that no episode's own can answer."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import operator
 import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
@@ -113,6 +114,10 @@ def _is_in(x: Traced, values: Any, invert: bool = False) -> Any:
     return ~found if invert else found
 
 
+def _tiled(x: Traced, times: int) -> Traced:
+    return _concatenate([x] * times, -1)
+
+
 def _untold(what: str, instead: str) -> Any:
     raise Untraceable(what, f"write {instead}")
 
@@ -147,7 +152,7 @@ _FUNCTIONS: dict[Any, Callable[..., Any]] = {
     np.reshape: lambda x, shape, order="C": x.reshape(shape),
     np.ravel: lambda x, order="C": x.ravel(),
     np.diagonal: lambda x, offset=0, axis1=0, axis2=1: x.diagonal(offset, axis1, axis2),
-    np.tile: lambda x, reps: _concatenate([x] * reps, -1) if isinstance(reps, int) else _untold("np.tile", "np.concatenate"),
+    np.tile: lambda x, reps: _untold("np.tile", "np.concatenate") if isinstance(reps, tuple) else _tiled(x, operator.index(reps)),
     np.repeat: lambda x, repeats, axis: x._moved(lambda a: np.repeat(a, repeats, axis), copied=True),
     np.roll: lambda x, shift, axis: x._moved(lambda a: np.roll(a, shift, axis), copied=True),
     np.flip: lambda x, axis: x._moved(lambda a: np.flip(a, axis)),

@@ -121,6 +121,8 @@ class Graph:
         self.nodes: list[Node] = []
         self.demands: list[tuple[str, str, str, Node]] = []  # what has to hold: field, what else is found, what is wanted
         self.operations = 0
+        self.parameters: list[Array] = []  # by the first number of a uniform's name: see engine/parameters.py
+        self.asked: tuple[dict[int, Node], dict[int, Node]] = {}, {}  # whose values code asked for, and if they are zero
         self._known: dict[Any, Node] = {}
         self._values: dict[int, Any] = {}  # of fixed nodes
         self._picks: dict[int, Array] = {}  # of buffers
@@ -169,6 +171,14 @@ class Graph:
         if node.op == "pack":
             return [x for piece in node.attr for x in _packed(self, piece, values)]
         return node.attr if node.op == "const" else computed(node, [values[a.id] for a in node.args])
+
+    def ask(self, nodes: Sequence[Node], dtype: np.dtype[Any], nonzero: bool = False) -> Array:
+        """The numbers of fixed nodes, or where they are not zero: code that asks depends on the answer."""
+        out = np.empty(len(nodes), dtype)
+        for i, node in enumerate(nodes):
+            out[i] = self.value(node)
+        self.asked[nonzero].update((node.id, node) for node in nodes if node.op != "const")
+        return out != 0 if nonzero else out
 
     # -- operations: each takes nodes of the types that it asks for
 

@@ -57,7 +57,7 @@ def _looped(x: Any, y: Traced, base: Any) -> Traced:
 
 def structure(x: Any) -> Any:
     """Where a matrix that is the same for all episodes is not zero."""
-    return (x.values() if isinstance(x, Traced) else np.asarray(x)) != 0.0
+    return x.nonzero_places() if isinstance(x, Traced) else np.asarray(x) != 0.0
 
 
 def constant_times(x: Any, y: Any) -> Any:

@@ -1,53 +1,217 @@
 """Parameters as numbers that all episodes share: other values need no other code.
 
 Plans, components and models are copied with their floats traced. What asks for a value, as a Python branch does, gets it; then the code
-depends on it, and on no more.
+depends on it, and on no more. Things that differ in such numbers alone have the same `key`.
 """
 
 from __future__ import annotations
 
 import copy
 import dataclasses
-from typing import Any
+import enum
+import threading
+import types
+from collections.abc import Sequence
+from pathlib import PurePath
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 
 from tailgate.engine.array import Traced, boxed
-from tailgate.engine.graph import FLOAT, Graph
+from tailgate.engine.graph import FLOAT, Graph, Node, ordered
+
+KEPT, EACH = 64, 8  # keys that are remembered, and things of each
+T = TypeVar("T")
+_MINUS = np.array([-0.0]).view(np.uint64)[0]
+_PLAIN = (type(None), str, bytes, int, complex, enum.Enum, np.generic, np.dtype, type, types.BuiltinFunctionType, np.ufunc, PurePath)
 
 
-def lifted(graph: Graph, held: Any, name: str) -> Any:
-    """A copy of dataclasses, tuples, lists and mappings in which floats and arrays of floats are traced."""
-    return _lifted(graph, held, name, {})
+def lifted(graph: Graph, held: Any, whole: bool = True) -> Any:
+    """A copy of dataclasses, tuples, lists, mappings and closures in which floats and arrays of floats are traced, and `whole` numbers."""
+    return _Reader(graph, whole).visit(held)
 
 
-def _lifted(graph: Graph, held: Any, name: str, known: dict[int, Any]) -> Any:
-    if type(held) is float:
-        return Traced(graph, boxed(graph.uniform(name, held)), FLOAT, None, float)
-    if type(held) not in (np.ndarray, tuple, list, dict) and not hasattr(held, "_fields") and not dataclasses.is_dataclass(held):
-        return held
-    if isinstance(held, type):
-        return held
-    if id(held) not in known:
-        known[id(held)] = held, _copied(graph, held, name, known)  # the first lives on: its number is not given to another
-    return known[id(held)][1]
+class Parameters:
+    """What code for some things depends on: `key`, None where nobody knows, and the `values` of its parameters."""
+
+    def __init__(self, held: Any, whole: bool = True) -> None:
+        reader = _Reader(None, whole)
+        reader.visit(held)
+        self.values = reader.values
+        self.kept = reader.kept  # what is known by its number lives as long as the key
+        self.key = None if reader.changeable else tuple(reader.key)
 
 
-def _copied(graph: Graph, held: Any, name: str, known: dict[int, Any]) -> Any:
-    if isinstance(held, np.ndarray):
+class Reading:
+    """The numbers of fixed nodes, which parameters of other values change."""
+
+    def __init__(self, graph: Graph, nodes: Sequence[Node]) -> None:
+        self.graph, self.size = graph, len(nodes)
+        direct: dict[int, list[tuple[int, int]]] = {}
+        self._rest: list[tuple[int, Node]] = []
+        for i, node in enumerate(nodes):
+            if node.op == "uniform" and type(node.attr) is tuple:
+                direct.setdefault(node.attr[0], []).append((i, node.attr[1]))
+            else:
+                self._rest.append((i, node))
+        self._direct = {leaf: np.array(places).T for leaf, places in direct.items()}
+        self._order = ordered(node for _, node in self._rest)
+
+    def bits(self, values: Sequence[np.ndarray[Any, Any]] | None = None) -> np.ndarray[Any, Any]:
+        """Each number in 64 bits, of parameters with other values or with their own."""
+        values = self.graph.parameters if values is None else values
+        out = np.zeros(max(1, self.size), np.uint64)
+        for leaf, (where, places) in self._direct.items():
+            out[where] = values[leaf].view(np.uint64)[places]
+        known: dict[int, Any] = {}
+        for node in self._order:
+            if node.op == "uniform" and type(node.attr) is tuple:
+                known[node.id] = values[node.attr[0]][node.attr[1]]
+            else:
+                known[node.id] = self.graph.value(node) if node.op == "uniform" else self.graph.recomputed(node, known)
+        for i, node in self._rest:
+            out[i : i + 1].view(node.dtype)[:1] = known[node.id]
+        return out
+
+
+class Answers:
+    """What code asked while it was traced: it fits parameters that give the same answers."""
+
+    def __init__(self, graphs: Sequence[Graph]) -> None:
+        self._asked = [(Reading(graph, list(graph.asked[zero].values())), zero) for graph in graphs for zero in (False, True)]
+        self._answers = [self._read(reading, zero) for reading, zero in self._asked]
+
+    def fit(self, values: Sequence[np.ndarray[Any, Any]]) -> bool:
+        """Do these parameters give the same answers?"""
+        return all(self._read(*asked, values) == answer for asked, answer in zip(self._asked, self._answers, strict=True))
+
+    @staticmethod
+    def _read(reading: Reading, nonzero: bool, values: Any = None) -> bytes:
+        bits = reading.bits(values)
+        return ((bits != 0) & (bits != _MINUS) if nonzero else bits).tobytes()
+
+
+class Remembered(Generic[T]):
+    """What was made of things, by the key of their parameters: the last ones, of each key as many as gave other answers."""
+
+    def __init__(self) -> None:
+        self._held: dict[Any, list[tuple[Parameters, Answers, T]]] = {}
+        self._lock = threading.Lock()
+
+    def find(self, parameters: Parameters) -> T | None:
+        """What fits these parameters."""
+        with self._lock:
+            several = self._held.pop(parameters.key, None) if parameters.key is not None else None
+            if several is None:
+                return None
+            self._held[parameters.key] = several  # the last one that was asked for
+        return next((made for _, answers, made in several if answers.fit(parameters.values)), None)
+
+    def keep(self, parameters: Parameters, graphs: Sequence[Graph], made: T) -> None:
+        """Remember what was made of these parameters, and what was asked in its graphs."""
+        if parameters.key is None:
+            return
+        answers = Answers(graphs)
+        with self._lock:
+            several = self._held.pop(parameters.key, [])
+            self._held[parameters.key] = [*several[1 - EACH :], (parameters, answers, made)]
+            while len(self._held) > KEPT:
+                del self._held[next(iter(self._held))]
+
+
+class _Reader:
+    """Goes through things in a fixed order; with a graph it makes a copy of them."""
+
+    def __init__(self, graph: Graph | None, whole: bool) -> None:
+        self.graph, self.whole = graph, whole
+        self.key: list[Any] = []
+        self.values: list[np.ndarray[Any, Any]] = [] if graph is None else graph.parameters
+        self.kept: list[Any] = []
+        self.changeable = False
+        self._known: dict[int, tuple[int, Any, Any]] = {}
+
+    def visit(self, held: Any) -> Any:
+        if type(held) is float or (type(held) is int and self.whole and abs(held) < 2**62):
+            leaf = np.array([held])
+            (node,) = self._leaf(leaf)
+            return held if self.graph is None else Traced(self.graph, boxed(node), leaf.dtype, None, type(held))
+        if isinstance(held, _PLAIN):
+            self.key += [type(held), id(held) if isinstance(held, (type, types.BuiltinFunctionType, np.ufunc)) else held]
+            return held
+        if id(held) in self._known:
+            number, _, out = self._known[id(held)]
+            self.key.append(("again", number))
+            return out
+        number = len(self._known)
+        self.key += [type(held), _code_of(type(held))]
+        self._known[id(held)] = number, held, held
+        out = self._copied(held, number)
+        self._known[id(held)] = number, held, out  # the original lives on: its number is not given to another
+        return out
+
+    def _leaf(self, values: np.ndarray[Any, Any]) -> Any:
+        """The nodes of some numbers."""
+        leaf = len(self.values)
+        self.values.append(values.ravel())
+        self.key += [values.shape, values.dtype.kind]
+        if self.graph is None:
+            return [None] * values.size
+        return [self.graph.uniform((leaf, i), value) for i, value in enumerate(values.flat)]
+
+    def _copied(self, held: Any, number: int) -> Any:
+        if isinstance(held, np.ndarray):
+            return self._array(held)
+        if isinstance(held, (tuple, list)):
+            self.key.append(len(held))
+            parts = [self.visit(part) for part in held]
+            return type(held)(*parts) if hasattr(held, "_fields") else type(held)(parts)
+        if isinstance(held, dict):
+            self.key.append(tuple(held))
+            return {key: self.visit(part) for key, part in held.items()}
+        if isinstance(held, types.FunctionType):
+            return self._function(held)
+        if not dataclasses.is_dataclass(held):
+            self.kept.append(held)
+            self.key.append(id(held))
+            self.changeable = self.changeable or not isinstance(held, frozenset)
+            return held
+        self.changeable = self.changeable or not _frozen(type(held))
+        out = copy.copy(held)
+        self._known[id(held)] = number, held, out  # before its parts: one of them may lead back
+        self.key.append(tuple(vars(held)))
+        for key, part in vars(held).items():
+            object.__setattr__(out, key, self.visit(part))
+        return out
+
+    def _array(self, held: np.ndarray[Any, Any]) -> Any:
         if held.dtype != FLOAT:
+            self.key += [held.shape, held.dtype.str, held.tobytes()]
+            self.changeable = self.changeable or held.dtype == object
+            return held
+        made = self._leaf(held)
+        if self.graph is None:
             return held
         nodes = np.empty(held.shape, object)
-        for place in np.ndindex(*held.shape):
-            nodes[place] = graph.uniform((name, place), held[place])
-        return Traced(graph, nodes, FLOAT, writeable=False)
-    if isinstance(held, (tuple, list)):
-        parts = [_lifted(graph, part, f"{name}.{i}", known) for i, part in enumerate(held)]
-        return type(held)(*parts) if hasattr(held, "_fields") else type(held)(parts)
-    if isinstance(held, dict):
-        return {key: _lifted(graph, part, f"{name}.{key}", known) for key, part in held.items()}
-    out = copy.copy(held)
-    known[id(held)] = held, out  # before its parts: one of them may lead back
-    for key, part in vars(held).items():
-        object.__setattr__(out, key, _lifted(graph, part, f"{name}.{key}", known))
-    return out
+        nodes.ravel()[:] = made
+        return Traced(self.graph, nodes, FLOAT, writeable=False)
+
+    def _function(self, held: types.FunctionType) -> Any:
+        self.kept.append(held)
+        self.key += [held.__code__, id(held.__globals__)]
+        defaults = self.visit(held.__defaults__)
+        parts = [self.visit(cell.cell_contents) for cell in held.__closure__ or ()]
+        if self.graph is None or not parts:
+            return held
+        cells = tuple(types.CellType(part) for part in parts)
+        out = types.FunctionType(held.__code__, held.__globals__, held.__name__, defaults, cells)
+        out.__kwdefaults__ = held.__kwdefaults__
+        return out
+
+
+def _frozen(kind: Any) -> bool:
+    return bool(kind.__dataclass_params__.frozen)
+
+
+def _code_of(kind: type) -> tuple[Any, ...]:
+    """The functions of a class and its bases: somebody may put others in their place."""
+    return tuple(part for base in kind.__mro__ for part in vars(base).values() if isinstance(part, types.FunctionType))

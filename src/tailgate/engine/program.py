@@ -7,7 +7,7 @@ Parameters are the same for all episodes. Their values are no part of the code: 
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -17,8 +17,9 @@ from tailgate.engine import objects
 from tailgate.engine.array import Traced, lifted
 from tailgate.engine.buffers import WIDE, buffer_of, copied
 from tailgate.engine.functions import makers
-from tailgate.engine.graph import Array, Graph, Node, ordered
+from tailgate.engine.graph import Array, Graph, Node
 from tailgate.engine.llvm import Column, Held, Layout, text_of
+from tailgate.engine.parameters import Reading
 from tailgate.engine.passes import LEAST
 from tailgate.tree import leaves, map_leaves
 
@@ -126,7 +127,7 @@ class Program:
                     layout.outputs.append((node, Column(number, column, len(nodes))))
         self.text, self.size, self.room = text_of(layout, len(self.arrays), self.lanes, least)
         self.function = objects.Function(self.text)
-        self._slots = layout.slots
+        self._reading = Reading(trace.graph, layout.slots)
 
     def _places(self) -> tuple[dict[str, int], int]:
         """Where each leaf of the state begins in a block, and the bytes of a block: the widest numbers first."""
@@ -137,19 +138,9 @@ class Program:
             at += sizes[name][0] * sizes[name][1] * self.lanes
         return places, -(-max(at, 1) // ALIGNED) * ALIGNED
 
-    def uniforms(self, values: dict[Any, Any] | None = None) -> Array:
-        """The numbers that all episodes share, as the code reads them; of parameters with other values by name."""
-        graph, known = self.trace.graph, {}
-        if values:
-            for node in ordered(self._slots):
-                if node.op == "uniform":
-                    known[node.id] = np.asarray(values.get(node.attr, graph.value(node)), node.dtype)[()]
-                else:
-                    known[node.id] = graph.recomputed(node, known)
-        out = np.zeros(max(1, len(self._slots)), np.uint64)
-        for i, node in enumerate(self._slots):
-            out[i : i + 1].view(node.dtype)[:1] = known[node.id] if values else graph.value(node)
-        return out
+    def uniforms(self, values: Sequence[Array] | None = None) -> Array:
+        """The numbers that all episodes share, as the code reads them; of parameters with other `values` (see engine/parameters.py)."""
+        return self._reading.bits(values)
 
 
 class State:
@@ -201,9 +192,9 @@ class Call:
     Arguments are (episodes, ...), or (steps, episodes, ...) with more `steps` than one; so are results.
     """
 
-    def __init__(self, program: Program, state: State, steps: int = 1) -> None:
+    def __init__(self, program: Program, state: State, steps: int = 1, values: Sequence[Array] | None = None) -> None:
         self.program, self.state, self.steps = program, state, steps
-        self.uniforms = program.uniforms()
+        self.uniforms = program.uniforms(values)
         self._table = np.zeros((len(program.arrays), 2), np.int64)
         self.arguments: dict[str, Array] = {}
         self._results: list[tuple[str, tuple[int, ...], np.dtype[Any], int]] = []

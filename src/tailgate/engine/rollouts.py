@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from tailgate.draws import Keys, Role
 from tailgate.engine import objects
 from tailgate.engine.agreement import Untraced, check_open, explained, raised, same
 from tailgate.engine.graph import Array
+from tailgate.engine.parameters import Parameters, Remembered, lifted
 from tailgate.engine.program import Call, Program, State, traced
 from tailgate.loop import Loop
 from tailgate.tree import leaves
@@ -26,7 +28,14 @@ class Rollout:
     def __init__(self, loop: Loop, attack: Attack) -> None:
         check_open(loop)
         self.loop, self.attack, self.plan = loop, attack, attack.prepare(loop.brief)
-        self.program = Program(traced(self._step, self.begun(_ONE), {}))
+        self.values: list[Array] | None = None  # of the parameters, if others than those it was traced with
+        self.program = Program(traced(self._traced, self.begun(_ONE), {}))
+
+    def of(self, loop: Loop, attack: Attack, plan: Any, values: list[Array]) -> Rollout:
+        """The same program for a loop and an attack of other parameters."""
+        out = copy.copy(self)
+        out.loop, out.attack, out.plan, out.values = loop, attack, plan, values
+        return out
 
     def begun(self, keys: Keys) -> dict[str, Any]:
         """The state of episodes that begin."""
@@ -34,12 +43,13 @@ class Rollout:
         memory = self.attack.start(self.plan, batch, keys.at(Role.ATTACK, np.zeros(batch, np.int64)))
         return {"loop": self.loop.start(keys), "memory": memory}
 
-    def _step(self, held: Any, given: Any) -> tuple[Any, Any]:
-        from tailgate.trace import signals_of
+    def _traced(self, held: Any, given: Any) -> tuple[Any, Any]:
+        loop, attack, plan = lifted(held["loop"].k.graph, (self.loop, self.attack, self.plan))
+        return _step(loop, attack, plan, held)
 
-        ended = held["loop"].ended
-        state, memory, frame = self.loop.step(held["loop"], self.attack, self.plan, held["memory"])
-        return {"loop": state, "memory": memory}, signals_of(frame) | {"ended": ended}
+    def plain(self, held: Any) -> tuple[Any, Any]:
+        """A step of the plain loop: what follows a state, and its signals."""
+        return _step(self.loop, self.attack, self.plan, held)
 
     def play(self, keys: Keys, terminate: bool) -> tuple[Array, dict[str, Array], dict[str, Array]]:
         """Lengths (B,), signals (K, B, ...) and the road before the first step, as `tailgate.trace.Trace` holds them."""
@@ -47,7 +57,7 @@ class Rollout:
         first = loop.plant.scene(loop.plan.plant, begun["loop"].plant)._asdict()
         state = State(self.program, batch)
         state.put(begun)
-        call = Call(self.program, state, max(2, loop.horizon))
+        call = Call(self.program, state, max(2, loop.horizon), self.values)
         signals, done = call.sheet(), 0
         demands, ended = signals.pop("demands"), signals.pop("ended")
         while done < loop.horizon and not (terminate and done and ended[done - 1].all() and state.get_leaf("loop.ended").all()):
@@ -69,37 +79,35 @@ class Rollout:
             raise num.broken(~held[step, :, which], field, found, wanted, np.full(held.shape[1], first + step + 1))
 
 
+def _step(loop: Loop, attack: Attack, plan: Any, held: Any) -> tuple[Any, Any]:
+    from tailgate.trace import signals_of
+
+    ended = held["loop"].ended
+    state, memory, frame = loop.step(held["loop"], attack, plan, held["memory"])
+    return {"loop": state, "memory": memory}, signals_of(frame) | {"ended": ended}
+
+
 _ONE = Keys(np.zeros((1, 3), np.uint64), np.zeros(1, np.uint32))
 
 
-_held: list[tuple[Loop, Attack, Rollout | Untraced]] = []  # the last ones: who plays many episodes plays so many at a time
+_made: Remembered[Rollout] = Remembered()
 
 
 def rollout_of(loop: Loop, attack: Attack) -> Rollout | Untraced:
     """The program of a loop under an attack, once it has been found equal to the plain loop on this machine; or why there is none."""
-    for known, also, found in _held:
-        if known is loop and also is attack:
-            return found
-    found = _made(loop, attack)
-    if _frozen(loop.defence) and _frozen(attack):  # another object may be a different one the next time
-        _held[:] = [*_held[-3:], (loop, attack, found)]
-    return found
-
-
-def _frozen(held: Any) -> bool:
-    parameters = getattr(type(held), "__dataclass_params__", None)
-    return parameters is not None and bool(parameters.frozen)
-
-
-def _made(loop: Loop, attack: Attack) -> Rollout | Untraced:
+    plan = attack.prepare(loop.brief)
+    parameters = Parameters((loop, attack, plan))
+    if found := _made.find(parameters):
+        return found.of(loop, attack, plan, parameters.values)
     try:
         rollout = Rollout(loop, attack)
     except Exception as error:  # whatever somebody's code raises where arrays are not numpy's
         return Untraced(explained(error))
     if not objects.proved([rollout.program.function.name]):
-        if found := _difference(rollout):
-            return Untraced(f"traced code and the plain loop differ in {found}")
+        if differs := _difference(rollout):
+            return Untraced(f"traced code and the plain loop differ in {differs}")
         objects.prove([rollout.program.function.name])
+    _made.keep(parameters, [rollout.program.trace.graph], rollout)
     return rollout
 
 
@@ -112,7 +120,7 @@ def _difference(rollout: Rollout, batch: int = 64) -> str:
     state.put(plain)
     call = Call(rollout.program, state)
     for step in range(min(TRIED, rollout.loop.horizon)):
-        results, found = call(), raised(lambda: rollout._step(plain, {}))  # noqa: B023
+        results, found = call(), raised(lambda: rollout.plain(plain))  # noqa: B023
         if isinstance(found, str):
             return "" if not results["demands"].all() else f"step {step + 1}: {found}"
         plain, wanted = found

@@ -8,6 +8,7 @@ Both leave what is to be seen, and what may be decided next.
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -20,7 +21,7 @@ from tailgate.draws import Keys
 from tailgate.engine import objects
 from tailgate.engine.agreement import Untraced, check_open, explained, raised, same
 from tailgate.engine.graph import Array
-from tailgate.engine.parameters import lifted
+from tailgate.engine.parameters import Parameters, Remembered, lifted
 from tailgate.engine.program import Call, Program, State, traced
 from tailgate.errors import InputError
 from tailgate.tree import leaves, map_leaves
@@ -34,8 +35,8 @@ class SeatPrograms:
 
     def __init__(self, seat: Seat) -> None:
         check_open(seat.loop)
-        self.seat, self.loop = seat, seat.loop
-        self.observation = ObservationCodec(seat.loop.brief)
+        self.seat, self.loop, self.shown = seat, seat.loop, _shown_once(seat)
+        self.values: list[Array] | None = None  # of the parameters, if others than those it was traced with
         start = seat.loop.start(draws.keys("tune", [0]))
         self.example = {"loop": start, "tally": seat.begin(start)}
         for name, leaf in leaves(self.example).items():
@@ -44,6 +45,12 @@ class SeatPrograms:
         flags = np.zeros(1, bool)
         action = np.zeros(1, np.int64) if seat.action.discrete else np.zeros((1, seat.action.size))
         self.decide = Program(traced(self._decide, self.example, {"action": action, "over": flags, "again": flags}))
+
+    def of(self, seat: Seat, values: list[Array]) -> SeatPrograms:
+        """The same programs for a seat of other parameters."""
+        out = copy.copy(self)
+        out.seat, out.loop, out.values = seat, seat.loop, values
+        return out
 
     @cached_property
     def begin(self) -> Program:
@@ -62,9 +69,13 @@ class SeatPrograms:
         return state, _shown(seat, state)
 
     def _lifted(self, held: Any) -> Seat:
-        """The seat with its parameters traced, which shows one frame."""
-        seat: Seat = lifted(held["loop"].k.graph, dataclasses.replace(self.seat, observation=self.observation, config={}), "seat")
+        seat: Seat = lifted(held["loop"].k.graph, self.shown)
         return seat
+
+
+def _shown_once(seat: Seat) -> Seat:
+    """The seat as it is traced: it shows one frame."""
+    return dataclasses.replace(seat, observation=ObservationCodec(seat.loop.brief), config={})
 
 
 def _renewed(seat: Seat, state: Any, keys: Keys, again: Any) -> Any:
@@ -82,17 +93,25 @@ def _shown(seat: Seat, state: Any) -> dict[str, Any]:
     return shown | ({"mask": seat.action.mask(view)} if seat.action.discrete else {})
 
 
+_made: Remembered[SeatPrograms] = Remembered()
+
+
 def programs_of(seat: Seat) -> SeatPrograms | Untraced:
     """The programs of a seat, once they have been found equal to the plain loop on this machine; or why there are none."""
+    parameters = Parameters(_shown_once(seat))
+    if found := _made.find(parameters):
+        return found.of(seat, parameters.values)
     try:
         programs = SeatPrograms(seat)
     except Exception as error:  # whatever somebody's code raises where arrays are not numpy's
         return Untraced(explained(error))
-    names = [program.function.name for program in (programs.decide, programs.begin)]
+    both = (programs.decide, programs.begin)
+    names = [program.function.name for program in both]
     if not objects.proved(names):
-        if found := difference(programs):
-            return Untraced(f"traced code and the plain loop differ in {found}")
+        if differs := difference(programs):
+            return Untraced(f"traced code and the plain loop differ in {differs}")
         objects.prove(names)
+    _made.keep(parameters, [program.trace.graph for program in both], programs)
     return programs
 
 
@@ -127,12 +146,12 @@ class Rows:
     def __init__(self, programs: SeatPrograms, batch: int) -> None:
         self.programs, self.batch = programs, batch
         self.state = State(programs.decide, batch)
-        self._decide = Call(programs.decide, self.state)
+        self._decide = Call(programs.decide, self.state, values=programs.values)
         self.brought: dict[str, Array] = {}
 
     @cached_property
     def _begin(self) -> Call:
-        return Call(self.programs.begin, self.state)
+        return Call(self.programs.begin, self.state, values=self.programs.values)
 
     def decide(self, actions: Array, over: Array, again: Array) -> None:
         """One decision of each row: actions (B,) or (B, size), over and again (B,) bool."""

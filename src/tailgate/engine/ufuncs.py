@@ -79,7 +79,8 @@ def _elementwise(graph: Graph, ufunc: Any, arrays: list[Traced], dtype: Any) -> 
 
 def loop_types(ufunc: Any, arrays: Sequence[Traced]) -> list[np.dtype[Any]]:
     """The types in which numpy computes it."""
-    given = [a.weak if a.weak in (int, float) else a.dtype for a in arrays]
+    known = all(a.weak for a in arrays)
+    given = [a.weak if a.weak in (int, float) and not known else a.dtype for a in arrays]
     kinds = ufunc.resolve_dtypes((*given, *(None,) * ufunc.nout))[: len(arrays)]
     if len(set(kinds)) > 1:
         raise Untraceable(f"np.{ufunc.__name__} of {' and '.join(map(str, kinds))}", "give both one type")
