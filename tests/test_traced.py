@@ -5,6 +5,7 @@ import dataclasses
 import importlib
 import json
 import pickle
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -217,6 +218,25 @@ class Growing(Kalman):
     def step(self, plan, state, received, known_u, draws):
         state, estimate = super().step(plan, state, received, known_u, draws)
         return state, estimate._replace(score=estimate.score * 1e295)
+
+
+def test_a_class_that_was_changed_is_compared_again(tmp_path, monkeypatch):
+    """Its machine code is the same, its plain course is another one."""
+    code = (
+        "import numpy as np\nfrom tailgate.estimators import Kalman\n\n\nclass Mine(Kalman):\n"
+        "    def step(self, plan, state, received, known_u, draws):\n"
+        "        state, estimate = super().step(plan, state, received, known_u, draws)\n"
+        "        return state, estimate._replace(score=estimate.score + (OFF if isinstance(estimate.score, np.ndarray) else 0.25))\n"
+    )
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    file = tmp_path / "changed_defence.py"
+    file.write_text(code.replace("OFF", "0.25"))
+    made = importlib.import_module("changed_defence")
+    assert AdversaryVectorEnv(16, defence=made.Mine()).engine == "traced"
+    file.write_text(code.replace("OFF", "0.75"))
+    env = AdversaryVectorEnv(16, defence=importlib.reload(made).Mine())
+    assert env.engine == "plain" and "differ in" in env.engine_why
 
 
 def test_what_is_not_finite_is_refused_as_in_the_plain_loop(tmp_path):

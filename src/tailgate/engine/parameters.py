@@ -9,16 +9,19 @@ from __future__ import annotations
 import copy
 import dataclasses
 import enum
+import hashlib
+import sys
 import threading
 import types
 from collections.abc import Sequence
-from pathlib import PurePath
+from pathlib import Path, PurePath
 from typing import Any, Generic, TypeVar
 
 import numpy as np
 
 from tailgate.engine.array import Traced, boxed
 from tailgate.engine.graph import FLOAT, Graph, Node, ordered
+from tailgate.sources import own
 
 KEPT, EACH = 64, 8  # keys that are remembered, and things of each
 T = TypeVar("T")
@@ -38,8 +41,20 @@ class Parameters:
         reader = _Reader(None, whole)
         reader.visit(held)
         self.values = reader.values
+        self._modules = reader.modules
         self.kept = reader.kept  # what is known by its number lives as long as the key
         self.key = None if reader.changeable else tuple(reader.key)
+
+
+    @property
+    def sources(self) -> str:
+        """Of the files that hold the classes and functions in it: Tailgate's, and somebody else's."""
+        digest = hashlib.sha256(own().encode())
+        for name in sorted(self._modules):
+            file = getattr(sys.modules.get(name), "__file__", None)
+            if name.partition(".")[0] != "tailgate" and file and Path(file).is_file():
+                digest.update(Path(file).read_bytes())
+        return digest.hexdigest()
 
 
 class Reading:
@@ -127,6 +142,7 @@ class _Reader:
         self.key: list[Any] = []
         self.values: list[np.ndarray[Any, Any]] = [] if graph is None else graph.parameters
         self.kept: list[Any] = []
+        self.modules: set[str] = set()
         self.changeable = False
         self._known: dict[int, tuple[int, Any, Any]] = {}
 
@@ -144,6 +160,7 @@ class _Reader:
             return out
         number = len(self._known)
         self.key += [type(held), _code_of(type(held))]
+        self.modules.update(base.__module__ for base in type(held).__mro__)
         self._known[id(held)] = number, held, held
         out = self._copied(held, number)
         self._known[id(held)] = number, held, out  # the original lives on: its number is not given to another
@@ -198,6 +215,7 @@ class _Reader:
     def _function(self, held: types.FunctionType) -> Any:
         self.kept.append(held)
         self.key += [held.__code__, id(held.__globals__)]
+        self.modules.add(str(held.__module__))
         defaults = self.visit(held.__defaults__)
         parts = [self.visit(cell.cell_contents) for cell in held.__closure__ or ()]
         if self.graph is None or not parts:

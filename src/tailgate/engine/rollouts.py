@@ -103,10 +103,11 @@ def rollout_of(loop: Loop, attack: Attack) -> Rollout | Untraced:
         rollout = Rollout(loop, attack)
     except Exception as error:  # whatever somebody's code raises where arrays are not numpy's
         return Untraced(explained(error))
-    if not objects.proved([rollout.program.function.name]):
+    names = [f"{rollout.program.function.name}.{parameters.sources}"]
+    if not objects.proved(names):
         if differs := _difference(rollout):
             return Untraced(f"traced code and the plain loop differ in {differs}")
-        objects.prove([rollout.program.function.name])
+        objects.prove(names)
     _made.keep(parameters, [rollout.program.trace.graph], rollout)
     return rollout
 

@@ -106,7 +106,7 @@ def programs_of(seat: Seat) -> SeatPrograms | Untraced:
     except Exception as error:  # whatever somebody's code raises where arrays are not numpy's
         return Untraced(explained(error))
     both = (programs.decide, programs.begin)
-    names = [program.function.name for program in both]
+    names = [f"{program.function.name}.{parameters.sources}" for program in both]
     if not objects.proved(names):
         if differs := difference(programs):
             return Untraced(f"traced code and the plain loop differ in {differs}")
