@@ -212,7 +212,14 @@ class TracedEpisodes:
         self._rows.decide(actions, over, over & restart)
         if self.shadow is not None:
             self.shadow.add(Decided(actions.copy(), over, restart))
-        return self._rows.outcome()
+        brought = self._rows.brought
+        return Outcome(*(brought[name] for name in Outcome._fields))
+
+    def decide_alone(self, action: Any) -> tuple[Any, ...]:
+        return self._rows.decide_alone(action)
+
+    def again_alone(self) -> tuple[Any, ...]:
+        return self._rows.again_alone()
 
     def end(self, rows: Array) -> None:
         pass  # who is over is said with each decision

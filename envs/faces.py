@@ -22,7 +22,7 @@ from tailgate.errors import InputError, unknown
 from tailgate.fused.cockpit import Cockpit
 from tailgate.loop import LoopState
 
-from .batches import FusedEpisodes, PlainEpisodes, framed, side_by_side
+from .batches import FusedEpisodes, PlainEpisodes, TracedEpisodes, framed, side_by_side
 from .render_viewer import Screen, Viewer
 from .seat import FACES, Seat, Tally
 from .shadow import Begun, Decided
@@ -89,8 +89,8 @@ class AdversaryVectorEnv(Specified, gymnasium.vector.VectorEnv[Array, Array, Arr
 
     @property
     def direct(self) -> bool:
-        """A fused engine plays, and the environment adds nothing to what it tells."""
-        return isinstance(self.episodes, FusedEpisodes) and self._frames == 1 and not self._limit
+        """No plain loop plays, and the environment adds nothing to what the engine tells."""
+        return not isinstance(self.episodes, PlainEpisodes) and self._frames == 1 and not self._limit
 
     @property
     def episode(self) -> Array:
@@ -264,7 +264,7 @@ class AdversaryEnv(Specified, gymnasium.Env[Array, Any]):
         self.render_mode = render_mode
         self.horizon = self.batch.horizon
         self.metadata = self.metadata | {"render_fps": self.batch.metadata["render_fps"]}
-        self._cockpit: Cockpit | None = None  # which steps a single row without a batch between
+        self._cockpit: Cockpit | TracedEpisodes | None = None  # which steps a single row without a batch between
         self._fused: Any = self.batch.episodes
         self._direct = self.batch.direct and render_mode != "human"
         self._actions, self._over = self.batch._modes, False  # the second: the episode is over
@@ -292,7 +292,7 @@ class AdversaryEnv(Specified, gymnasium.Env[Array, Any]):
             return seen, self._told(illegal, collided, rear, allowed, step, damage, mask)
         observation, info = self.batch.reset(seed=seed)
         if self._direct:
-            self._cockpit = played.cockpit
+            self._cockpit = played.cockpit if isinstance(played, FusedEpisodes) else played
         if self.render_mode == "human":
             self.render()
         return observation[0], self.row(info)

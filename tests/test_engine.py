@@ -5,7 +5,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tailgate.engine.graph import BOOL, COMPARISONS, DTYPES, FLOAT, Graph, Node, evaluate
+from tailgate.engine.evaluation import evaluate
+from tailgate.engine.graph import Graph, Node
+from tailgate.engine.operations import BOOL, COMPARISONS, DTYPES, FLOAT
 from tailgate.engine.program import Call, Program, State, Trace
 
 SPECIAL = np.array([0.0, -0.0, 1.0, -1.0, 0.5, 1e-310, -5e-324, 1e308, -1e308, np.inf, -np.inf, np.nan, 2.0**63, -(2.0**63), 3.7, 255.5])

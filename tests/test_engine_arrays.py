@@ -11,7 +11,8 @@ import pytest
 from tailgate import num
 from tailgate.engine import functions
 from tailgate.engine.array import Traced
-from tailgate.engine.graph import FLOAT, Graph
+from tailgate.engine.graph import Graph
+from tailgate.engine.operations import FLOAT
 from tailgate.engine.parameters import lifted
 from tailgate.engine.program import Call, Program, State, traced
 from tailgate.engine.untraceable import Untraceable

@@ -10,7 +10,7 @@ import pytest
 from tailgate import num
 from tailgate.engine import matrices, sweeps
 from tailgate.engine.buffers import WIDE
-from tailgate.engine.graph import evaluate
+from tailgate.engine.evaluation import evaluate
 from tailgate.engine.program import Call, Program, State, traced
 from tailgate.engine.untraceable import Untraceable
 from tailgate.tree import leaves

@@ -17,12 +17,12 @@ from tailgate.agents.scripted import NoAttack
 from tailgate.agents.zoo import zoo_card
 from tailgate.cli import main
 from tailgate.engine import objects, rollouts, seats
-from tailgate.engine.graph import evaluate
+from tailgate.engine.evaluation import evaluate
 from tailgate.engine.parameters import Remembered
 from tailgate.engine.program import Call, Program, State, traced
 from tailgate.engine.rollouts import Rollout, rollout_of
 from tailgate.engine.seats import SeatPrograms
-from tailgate.envs.faces import AdversaryVectorEnv
+from tailgate.envs.faces import AdversaryEnv, AdversaryVectorEnv
 from tailgate.envs.seat import Seat
 from tailgate.errors import InputError
 from tailgate.estimators import ChiSquare, Kalman
@@ -207,6 +207,37 @@ def test_copies_of_a_traced_environment_are_not_traced_again(monkeypatch):
         assert other.engine == "traced" and all(np.array_equal(x, y) for x, y in zip(got[:4], wanted[:4], strict=True))
 
 
+@pytest.mark.parametrize("arguments", [
+    {"scenario": "gusty-stop-and-go-v0", "defence": "chi2_kf"},
+    {"scenario": "platoon-gusty-v0", "defence": "chi2_dkf", "action": "continuous"},
+    {"scenario": "radar-following-v0", "defence": "cra", "frames": 2},
+])  # fmt: skip
+def test_a_single_environment(arguments):
+    """Its short way to the code gives what a batch of one gives, types included."""
+    one, other = (AdversaryEnv(engine=engine, **arguments) for engine in ("traced", "plain"))
+    chance = np.random.default_rng(0)
+    for seed in (4, None, 9):
+        moves = [(env.reset(seed=seed)) for env in (one, other)]
+        over = False
+        while not over:
+            for mine, theirs in zip(*moves, strict=True):
+                assert type(mine) is type(theirs)
+                if isinstance(mine, dict):
+                    assert {k: (type(v), np.asarray(v).tolist()) for k, v in mine.items()} == {
+                        k: (type(v), np.asarray(v).tolist()) for k, v in theirs.items()
+                    }
+                else:
+                    assert np.array_equal(mine, theirs)
+            space = one.action_space
+            action = int(chance.integers(space.n)) if hasattr(space, "n") else chance.uniform(-1, 1, space.shape)
+            if len(moves[0]) == 5 and moves[0][4]["step"] % 40 == 0:
+                one = pickle.loads(pickle.dumps(one))
+            moves = [env.step(action) for env in (one, other)]
+            over = moves[0][2] or moves[0][3]
+        with pytest.raises(InputError, match="reset"):
+            one.step(action)
+
+
 def test_code_that_differs_from_the_plain_loop_is_not_used():
     env = AdversaryVectorEnv(16, defence=Deceiving())
     assert env.engine == "plain" and "differ in loop.estimate.score, decision 0" in env.engine_why
@@ -254,12 +285,11 @@ def test_what_is_not_finite_is_refused_as_in_the_plain_loop(tmp_path):
 
 def test_objects_that_are_damaged_or_cannot_be_kept_are_made_again(tmp_path, monkeypatch):
     monkeypatch.setenv("TAILGATE_CACHE", str(tmp_path / "cache"))
-    text = "define void @step(ptr %a, ptr %b, ptr %c, ptr %r, i64 %d, i64 %e, i64 %f) {\n  store i64 %d, ptr %a\n  ret void\n}\n"
+    text = "define i64 @step(ptr %a, ptr %b, ptr %c, ptr %r, ptr %s, i64 %d, i64 %e, i64 %f) {\n  ret i64 %d\n}\n"
 
     def call():
-        made, out = objects.Function(text), np.zeros(1, np.int64)
-        made.call(out.ctypes.data, None, None, None, 7, 0, 0)
-        assert out[0] == 7
+        made = objects.Function(text)
+        assert made.call(None, None, None, None, None, 7, 0, 0) == 7
         return made
 
     assert call().fresh and not call().fresh

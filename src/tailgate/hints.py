@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tailgate.engine.array import Traced, gathered
+from tailgate.engine.array import Traced
+from tailgate.engine.functions import gathered
 from tailgate.engine.loops import chosen_apart
 from tailgate.errors import InputError
 

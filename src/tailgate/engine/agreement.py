@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tailgate.engine.graph import Array
+from tailgate.engine.operations import Array
 from tailgate.engine.untraceable import Untraceable
 from tailgate.errors import InputError
 from tailgate.loop import Loop

@@ -11,22 +11,17 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Callable, Iterator, Sequence
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 
 from tailgate.engine.buffers import blended, swept, wide
-from tailgate.engine.graph import BOOL, Array, Graph, Node
+from tailgate.engine.graph import Graph, Node
+from tailgate.engine.operations import BOOL, Array
 from tailgate.engine.untraceable import Untraceable
 
 _ZERO = np.zeros((), np.int8)
-
-
-class Flags:
-    """Says if an array may be written to, as numpy's `flags` do."""
-
-    def __init__(self, writeable: bool = True) -> None:
-        self.writeable = writeable
 
 
 class Traced:
@@ -40,7 +35,7 @@ class Traced:
         self, graph: Graph, nodes: Array, dtype: np.dtype[Any], batch: int | None = None, weak: type | None = None, writeable: bool = True
     ) -> None:
         self.graph, self.nodes, self.dtype, self.batch, self.weak = graph, nodes, dtype, batch, weak
-        self.flags = Flags(writeable)
+        self.flags = SimpleNamespace(writeable=writeable)  # as numpy's say it
 
     # -- what it is
 
@@ -335,17 +330,6 @@ def _of_all(graph: Graph, nodes: Array, arrays: Sequence[Traced], dtype: np.dtyp
         raise Untraceable("the axis of the episodes against a longer one", "give each array the episodes as its first axis")
     weak = next(iter({a.weak for a in arrays}), None) if all(a.weak for a in arrays) else None
     return Traced(graph, nodes, dtype, None if back is None else nodes.ndim + back, weak)
-
-
-def gathered(table: Any, index: Traced) -> Traced:
-    """table[index] of a table (K, ...) that is the same for all episodes."""
-    graph, held = index.graph, lifted(index.graph, table)
-    columns = held.nodes.reshape(len(held.nodes), -1).T
-    nodes = np.empty((*index.shape, len(columns)), object)
-    for place in np.ndindex(*index.shape):
-        one: Node = index.nodes[place]  # type: ignore[assignment]
-        nodes[place] = [graph.gather(list(column), one) for column in columns]
-    return Traced(graph, nodes.reshape(*index.shape, *held.shape[1:]), held.dtype, index.batch)
 
 
 def typed(graph: Graph, x: Traced, dtype: np.dtype[Any]) -> Traced:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from tailgate.engine.graph import BOOL, FLOAT, Body, Node
+from tailgate.engine.graph import Body, Node
 from tailgate.engine.instructions import scalar
+from tailgate.engine.operations import BOOL, FLOAT
 from tailgate.engine.passes import rounds, schedule
 
 if TYPE_CHECKING:
@@ -131,3 +133,13 @@ def _matvec_text(outer: Emitter, p: int, q: int) -> str:
     e.line("ret void")
     head = f"define internal fastcc void @matvec_{p}_{q}(ptr noalias %table, ptr noalias %x, ptr noalias %out) noinline #0 {{"
     return "\n".join([head, *e.lines, "}"])
+
+
+def demand(e: Emitter, names: Sequence[str]) -> None:
+    """Remember if one of these does not hold in some lane."""
+    held = names[0]
+    for name in names[1:]:
+        held = e.set(f"and <{e.lanes} x i1> {held}, {name}")
+    bad = e.any_lane(e.set(f"xor <{e.lanes} x i1> {held}, splat (i1 true)"))
+    before, now = e.set("load i64, ptr %broken, align 8"), e.set(f"zext i1 {bad} to i64")
+    e.line(f"store i64 {e.set(f'or i64 {before}, {now}')}, ptr %broken, align 8")

@@ -12,7 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from tailgate.engine.graph import Array, Graph, Node, Piece, Source
+from tailgate.engine.graph import Graph, Node, Piece, Source
+from tailgate.engine.operations import Array
 
 WIDE = 128  # numbers of an array that is a buffer
 SHORT = 3  # numbers that are put in their place one by one

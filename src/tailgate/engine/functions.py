@@ -179,6 +179,20 @@ _FUNCTIONS: dict[Any, Callable[..., Any]] = {
 }
 
 
+# -- tables
+
+
+def gathered(table: Any, index: Traced) -> Traced:
+    """table[index] of a table (K, ...) that is the same for all episodes."""
+    graph, held = index.graph, lifted(index.graph, table)
+    columns = held.nodes.reshape(len(held.nodes), -1).T
+    nodes = np.empty((*index.shape, len(columns)), object)
+    for place in np.ndindex(*index.shape):
+        one: Node = index.nodes[place]  # type: ignore[assignment]
+        nodes[place] = [graph.gather(list(column), one) for column in columns]
+    return Traced(graph, nodes.reshape(*index.shape, *held.shape[1:]), held.dtype, index.batch)
+
+
 # -- makers
 
 

@@ -6,49 +6,17 @@ every operation, so that a folded value has the bits of a computed one. No rewri
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from tailgate.engine.operations import BOOL, COMMUTATIVE, COMPARISONS, FLOAT, INT, Array, apply, converted
 from tailgate.engine.untraceable import Untraceable
-
-Array = np.ndarray[Any, Any]
-BOOL, FLOAT, INT = np.dtype(bool), np.dtype(np.float64), np.dtype(np.int64)
-DTYPES = [np.dtype(name) for name in ("?", "f8", "f4", "i8", "u8", "i4", "u4", "i2", "u2", "i1", "u1")]
-
-
-def minimum(x: Any, y: Any) -> Any:
-    """The smaller one; y where neither is, and NaN where either is: of numbers that are equal, -0.0 and 0.0 too, the second."""
-    return np.where((x < y) | (x != x), x, y)
-
-
-def maximum(x: Any, y: Any) -> Any:
-    """The larger one, as `minimum` takes the smaller."""
-    return np.where((x > y) | (x != x), x, y)
-
-
-def converted(x: Any, dtype: np.dtype[Any]) -> Any:
-    """x as another type. What no 64-bit integer holds, NaN too, becomes the least one; a narrower type keeps the low bits."""
-    if x.dtype.kind == "f" and dtype.kind in "iu":
-        holds = (x >= -(2.0**63)) & (x < 2.0**63)
-        return np.where(holds, np.where(holds, x, 0.0).astype(np.int64), np.iinfo(np.int64).min).astype(dtype)
-    return x.astype(dtype)
-
 
 MOST = 60_000  # operations of a graph: what has more takes long to compile, as straight code
 _FREE = {"const", "uniform", "input", "carried", "pick"}  # which are none
-COMPARISONS = {"lt": np.less, "le": np.less_equal, "gt": np.greater, "ge": np.greater_equal, "eq": np.equal, "ne": np.not_equal}
-BINARY: dict[str, Callable[..., Any]] = {
-    "add": np.add, "sub": np.subtract, "mul": np.multiply, "div": np.true_divide, "min": minimum, "max": maximum,
-    "and": np.bitwise_and, "or": np.bitwise_or, "xor": np.bitwise_xor, "shl": np.left_shift, "shr": np.right_shift, "rem": np.remainder,
-}  # fmt: skip
-UNARY: dict[str, Callable[..., Any]] = {
-    "neg": np.negative, "abs": np.absolute, "not": np.invert, "sqrt": np.sqrt, "floor": np.floor, "ceil": np.ceil, "trunc": np.trunc,
-    "rint": np.rint,
-}  # fmt: skip
-COMMUTATIVE = {"add", "mul", "and", "or", "xor", "eq", "ne"}
 
 
 class Node:
@@ -169,7 +137,7 @@ class Graph:
     def recomputed(self, node: Node, values: dict[int, Any]) -> Any:
         """The number that a fixed node is where its arguments have these values."""
         if node.op == "pack":
-            return [x for piece in node.attr for x in _packed(self, piece, values)]
+            return [x for piece in node.attr for x in packed_values(self, piece, values)]
         return node.attr if node.op == "const" else computed(node, [values[a.id] for a in node.args])
 
     def ask(self, nodes: Sequence[Node], dtype: np.dtype[Any], nonzero: bool = False) -> Array:
@@ -348,17 +316,6 @@ def _identity(op: str, x: Node, y: Node) -> Node | None:
     return x if x is y and op in ("and", "or", "min", "max") else None
 
 
-def apply(op: str, dtype: np.dtype[Any], args: Sequence[Any]) -> Any:
-    """The operation on numpy's arrays or numbers: what every backend has to give."""
-    if op == "select":
-        return np.where(*args)
-    if op == "cast":
-        return converted(args[0], dtype)
-    if op == "bits":
-        return args[0].view(dtype)
-    return (UNARY.get(op) or BINARY.get(op) or COMPARISONS[op])(*args)
-
-
 def computed(node: Node, args: Sequence[Any]) -> Any:
     """The value of a node whose arguments have these."""
     if node.op == "call":
@@ -387,77 +344,18 @@ def ordered(roots: Iterable[Node], first: int = 0) -> list[Node]:
     return [seen[i] for i in sorted(seen)]
 
 
-def evaluate(graph: Graph, roots: Sequence[Node], inputs: dict[Any, Array]) -> list[Array]:
-    """The roots by numpy, of inputs (B,) by name."""
-    values: dict[int, Any] = {}
-    _evaluate(graph, ordered(roots), inputs, values)
-    return [values[root.id] for root in roots]
-
-
-def _evaluate(graph: Graph, nodes: Iterable[Node], inputs: dict[Any, Array], values: dict[int, Any]) -> None:
-    for node in nodes:
-        args = [graph.value(a) if a.fixed else values[a.id] for a in node.args]
-        if node.fixed:
-            values[node.id] = graph.value(node)
-        elif node.op in ("input", "held"):
-            values[node.id] = inputs[node.attr]
-        elif node.op == "gather":
-            values[node.id] = np.array([graph.value(entry) for entry in node.attr], node.dtype)[args[0]]
-        elif node.op == "matvec":
-            values[node.id] = _multiplied(graph, node.attr, args)
-        elif node.op == "loop":
-            values[node.id] = _looped(graph, node.attr, args, values)
-        elif node.op == "sweep":
-            values[node.id] = _swept(graph, node.attr, values)
-        elif node.op == "pack":
-            values[node.id] = [x for piece in node.attr for x in _packed(graph, piece, values)]
-        else:
-            values[node.id] = computed(node, args)
-
-
-def _multiplied(graph: Graph, matrix: Array, args: Sequence[Any]) -> list[Any]:
-    x, out = args[: matrix.shape[1]], list(args[matrix.shape[1] :])
-    for k in range(matrix.shape[1]):
-        out = [total + graph.value(matrix[i, k]) * x[k] for i, total in enumerate(out)]
-    return out
-
-
-def _looped(graph: Graph, body: Body, args: Sequence[Any], values: dict[int, Any]) -> list[Any]:
-    held = list(args[: len(body.carried)])
-    going = held[: len(body.going)]
-    for _ in range(body.most):
-        if not any(np.any(one) for one in going):
-            break
-        inner = values | {node.id: value for node, value in zip(body.carried, held, strict=True)}
-        _evaluate(graph, body.nodes, {}, inner)
-        held = [graph.value(node) if node.fixed else inner[node.id] for node in body.after]
-        going = held[: len(body.going)]
-    return held
-
-
-def _packed(graph: Graph, piece: Piece, values: dict[int, Any]) -> list[Any]:
+def packed_values(graph: Graph, piece: Piece, values: dict[int, Any]) -> list[Any]:
     source, shape = piece
     if isinstance(source, Node):
         return [values[source.id] if source.id in values else graph.value(source)]
-    return [_read(graph, source, index, values) for index in np.ndindex(*shape)]
+    return [read(graph, source, index, values) for index in np.ndindex(*shape)]
 
 
-def _read(graph: Graph, source: Source, index: Sequence[int], values: dict[int, Any]) -> Any:
+def read(graph: Graph, source: Source, index: Sequence[int], values: dict[int, Any]) -> Any:
     place = source.offset + sum(i * n for i, n in zip(index, source.strides, strict=True))
     node = source.held[place] if isinstance(source.held, tuple) else source.held
     found = values[node.id] if node.id in values else graph.value(node)
     return found[place] if node is source.held else found
-
-
-def _swept(graph: Graph, sweep: Sweep, values: dict[int, Any]) -> list[Any]:
-    out = []
-    for index in np.ndindex(*sweep.shape):
-        inner = dict(values)
-        for one, source in zip(sweep.carried, sweep.sources, strict=True):
-            inner[one.id] = _read(graph, source, index, values)
-        _evaluate(graph, sweep.nodes, {}, inner)
-        out += [graph.value(node) if node.fixed else inner[node.id] for node in sweep.after]
-    return out
 
 
 def _inverted(numbers: Sequence[Any], q: int) -> list[Any]:

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tailgate.engine.graph import BOOL, Node
+from tailgate.engine.graph import Node
+from tailgate.engine.operations import BOOL
 
 if TYPE_CHECKING:
     from tailgate.engine.llvm import Emitter

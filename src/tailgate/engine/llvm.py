@@ -1,8 +1,9 @@
 """Machine code of this processor: LLVM's text of a scheduled graph, in vectors of `lanes` episodes.
 
 Episodes stand in blocks of one vector each. A block's state lies together in memory, so that a step reads and writes a few KiB at fixed
-places. Operations are neither reordered nor contracted. A function has seven arguments: the state, the numbers that are the same for all
-episodes, a table of arrays (address, bytes a step), room for buffers, the first block and the one behind the last, and the steps to play.
+places. Operations are neither reordered nor contracted. A function's arguments are the state, the numbers that are the same for all
+episodes, a table of arrays (address, or place on the sheet; bytes a step), room for buffers, the sheet of results, the first block and the
+one behind the last, and the steps to play. It tells if in any lane, an idle one too, something did not hold that code demands.
 """
 
 from __future__ import annotations
@@ -16,8 +17,9 @@ from typing import Any
 import numpy as np
 
 from tailgate.engine import blocks, sweeps
-from tailgate.engine.graph import BOOL, FLOAT, Node
+from tailgate.engine.graph import Node
 from tailgate.engine.instructions import operation, scalar
+from tailgate.engine.operations import BOOL, FLOAT
 from tailgate.engine.passes import Branch, Item, counted, schedule
 
 
@@ -44,6 +46,8 @@ class Layout:
     inputs: dict[int, Held | Column]  # by node
     outputs: list[tuple[Node, Held | Column]]
     stride: int  # bytes of a block's state
+    given: int = 0  # arrays of arguments: those behind them are of results, and stand on the sheet
+    demands: list[Node] = field(default_factory=list)  # what has to hold
     uniforms: dict[int, int] = field(default_factory=dict)  # node -> its slot
     slots: list[Node] = field(default_factory=list)  # what the table of numbers that all episodes share holds
 
@@ -297,13 +301,17 @@ class Emitter:
 
 
 def text_of(layout: Layout, arrays: int, lanes: int, least: int) -> tuple[str, dict[str, int], int]:
-    """LLVM's text of `step(state, uniforms, table, room, first, last, steps)`, how many nodes and branches it has, and the room's bytes."""
+    """LLVM's text of `step`, how many nodes and branches it has, and the bytes of its room."""
     e = Emitter(layout, lanes)
     e.begin("entry")
     e.lines.append("")
     for i in range(arrays):
         e.line(f"%at{i} = getelementptr i64, ptr %table, i64 {2 * i}")
-        e.line(f"%array{i} = load ptr, ptr %at{i}, align 8")
+        if i < layout.given:
+            e.line(f"%array{i} = load ptr, ptr %at{i}, align 8")
+        else:
+            e.line(f"%offset{i} = load i64, ptr %at{i}, align 8")
+            e.line(f"%array{i} = getelementptr i8, ptr %sheet, i64 %offset{i}")
         e.line(f"%by{i} = getelementptr i64, ptr %table, i64 {2 * i + 1}")
         e.line(f"%bytes{i} = load i64, ptr %by{i}, align 8")
     with _loop(e, "block", "%first", "%last"):
@@ -311,12 +319,14 @@ def text_of(layout: Layout, arrays: int, lanes: int, least: int) -> tuple[str, d
         e.line("%state = getelementptr i8, ptr %memory, i64 %at")
         with _loop(e, "time", "0", "%steps"):
             items, room = _step(e, least)
-    e.line("ret void")
+    e.line(f"ret i64 {e.set('load i64, ptr %broken, align 8')}")
+    e.rooms += ["  %broken = alloca i64, align 8", "  store i64 0, ptr %broken, align 8"]
     e.lines[1] = "\n".join(e.rooms)
     wide = 64 * lanes
     attributes = f'nounwind "prefer-vector-width"="{max(128, min(512, wide))}" "min-legal-vector-width"="{max(128, min(512, wide))}"'
-    head = ("define void @step(ptr noalias nocapture %memory, ptr noalias nocapture readonly %uniforms, "
-            "ptr noalias nocapture readonly %table, ptr noalias nocapture %large, i64 %first, i64 %last, i64 %steps) #0 {")  # fmt: skip
+    head = ("define i64 @step(ptr noalias nocapture %memory, ptr noalias nocapture readonly %uniforms, "
+            "ptr noalias nocapture readonly %table, ptr noalias nocapture %large, ptr noalias nocapture %sheet, "
+            "i64 %first, i64 %last, i64 %steps) #0 {")  # fmt: skip
     text = "\n".join([*sorted(e.declared), *e.texts, head, *e.lines, "}", f"attributes #0 = {{ {attributes} }}", ""])
     return text, counted(items), room
 
@@ -367,6 +377,8 @@ def _step(e: Emitter, least: int) -> tuple[list[Item], int]:
     for several in rows.values():
         several.sort(key=lambda pair: pair[0].column)
         e.store_columns([node for _, node in several], several[0][0])
+    if layout.demands:
+        blocks.demand(e, [e.value(node) for node in layout.demands])
     for node, place in large:
         assert isinstance(place, Held)
         sweeps.copy(e, e.value(node), e.address("%state", place.offset), node, node.size)

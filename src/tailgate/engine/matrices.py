@@ -5,6 +5,7 @@ Arrays are (B, ..., rows, columns). What is the same for all episodes has no B, 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -12,7 +13,7 @@ import numpy as np
 
 from tailgate.engine.array import Traced, boxed, lifted
 from tailgate.engine.buffers import buffer_of, sides, swept, wide
-from tailgate.engine.graph import BOOL, FLOAT
+from tailgate.engine.operations import BOOL, FLOAT
 
 LOOPED = 64  # numbers in a matrix without zeros that is multiplied in a loop: straight code of more takes long to compile
 STRAIGHT = 600  # products of numbers in straight code
@@ -25,7 +26,7 @@ def _large(size: int, *arrays: Any) -> bool:
 
 def _size(x: Any, y: Any) -> int:
     """Of a product."""
-    return int(np.prod((*np.broadcast_shapes(x.shape[:-2], y.shape[:-2]), x.shape[-2], y.shape[-1]), dtype=int)) if x.shape[-1] else 0
+    return math.prod((*np.broadcast_shapes(x.shape[:-2], y.shape[:-2]), x.shape[-2], y.shape[-1])) if x.shape[-1] else 0
 
 
 def _over(function: Any, lead: Sequence[int], *arrays: Any) -> Traced:

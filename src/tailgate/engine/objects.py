@@ -124,5 +124,5 @@ class Function:
             self._engine.add_object_file(binding.ObjectFileRef.from_data(content))
             self._engine.finalize_object()
             address = self._engine.get_function_address("step")
-        kind = ctypes.CFUNCTYPE(None, *(ctypes.c_void_p,) * 4, *(ctypes.c_int64,) * 3)
+        kind = ctypes.CFUNCTYPE(ctypes.c_int64, *(ctypes.c_void_p,) * 5, *(ctypes.c_int64,) * 3)
         self.call = kind(address)

@@ -20,7 +20,8 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 
 from tailgate.engine.array import Traced, boxed
-from tailgate.engine.graph import FLOAT, Graph, Node, ordered
+from tailgate.engine.graph import Graph, Node, ordered
+from tailgate.engine.operations import FLOAT
 from tailgate.sources import own
 
 KEPT, EACH = 64, 8  # keys that are remembered, and things of each

@@ -7,9 +7,11 @@ Parameters are the same for all episodes. Their values are no part of the code: 
 from __future__ import annotations
 
 import ctypes
+import operator
+import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -17,12 +19,14 @@ from tailgate.engine import objects
 from tailgate.engine.array import Traced, lifted
 from tailgate.engine.buffers import WIDE, buffer_of, copied
 from tailgate.engine.functions import makers
-from tailgate.engine.graph import Array, Graph, Node
+from tailgate.engine.graph import Graph, Node
 from tailgate.engine.llvm import Column, Held, Layout, text_of
+from tailgate.engine.operations import Array
 from tailgate.engine.parameters import Reading
 from tailgate.engine.passes import LEAST
 from tailgate.tree import leaves, map_leaves
 
+_PYTHON = {"f": "d", "b": "?", "i": "q"}  # how Python reads 64-bit numbers and truth values
 ALIGNED = 64  # bytes: a line of the processor's cache
 Step = Callable[[Any, Any], tuple[Any, dict[str, Any]]]
 
@@ -106,7 +110,8 @@ class Program:
         self.trace, self.lanes = trace, lanes or objects.lanes()
         self.places, self.stride = self._places()
         self.arrays = [("arguments", name) for name in trace.arguments] + [("results", name) for name in trace.results]
-        layout = Layout({}, [], self.stride)
+        demanded = list(trace.results["demands"].flat) if "demands" in trace.results else []
+        layout = Layout({}, [], self.stride, len(trace.arguments), demanded)
         for name, (here, there) in trace.state.items():
             at, size = self.places[name], here.flat[0].dtype.itemsize * self.lanes if here.size else 0
             if name in trace.large:
@@ -186,60 +191,105 @@ class State:
         return np.moveaxis(held.reshape(*shape, self.episodes), -1, 0)
 
 
+class _Place(NamedTuple):
+    """Where an array stands on a sheet."""
+
+    shape: tuple[int, ...]
+    dtype: np.dtype[Any]
+    at: int
+    strides: tuple[int, ...]
+
+
 class Call:
     """Calls of a program on a state: arguments that stay what they are until they are written to, and results that are new each time.
 
-    Arguments are (episodes, ...), or (steps, episodes, ...) with more `steps` than one; so are results.
+    Arguments are (episodes, ...), or (steps, episodes, ...) with more `steps` than one; so are results. `broken`: a demand did not hold.
     """
 
     def __init__(self, program: Program, state: State, steps: int = 1, values: Sequence[Array] | None = None) -> None:
-        self.program, self.state, self.steps = program, state, steps
+        self.program, self.state, self.steps, self.broken = program, state, steps, False
         self.uniforms = program.uniforms(values)
         self._table = np.zeros((len(program.arrays), 2), np.int64)
         self.arguments: dict[str, Array] = {}
-        self._results: list[tuple[str, tuple[int, ...], np.dtype[Any], int]] = []
-        rows, trace, size = state.blocks * program.lanes, program.trace, 0
+        self._views: list[tuple[str, _Place]] = []
+        self._singles: list[tuple[list[str], _Place]] = []  # results of a number each, together
+        self._size = 0  # of the sheet
+        rows, trace = state.blocks * program.lanes, program.trace
+        singles: dict[np.dtype[Any], list[str]] = {}
         for i, (kind, name) in enumerate(program.arrays):
             nodes = (trace.arguments if kind == "arguments" else trace.results)[name]
             dtype = nodes.flat[0].dtype if nodes.size else np.dtype(float)
-            shape = (steps, rows, *nodes.shape[1:])
-            count = int(np.prod(shape)) * dtype.itemsize
-            self._table[i, 1] = count // steps
+            shape = (rows, *nodes.shape[1:])
+            self._table[i, 1] = int(np.prod(shape)) * dtype.itemsize
             if kind == "arguments":
-                held = _aligned(shape, dtype)
+                held = _aligned((steps, *shape), dtype)
                 self._table[i, 0] = held.ctypes.data
                 self.arguments[name] = held[:, : state.episodes] if steps > 1 else held[0, : state.episodes]
+            elif nodes.ndim == 1 and steps == 1:
+                singles.setdefault(dtype, []).append(name)
             else:
-                self._results.append((name, shape, dtype, size))
-                size += -(-count // ALIGNED) * ALIGNED
-        self._first, self._size = len(program.arrays) - len(self._results), size
-        self._offsets = np.array([at for *_, at in self._results], np.int64)
+                self._views.append((name, self._place((state.episodes, *nodes.shape[1:]), shape, dtype)))
+                self._table[i, 0] = self._views[-1][1].at
+        for dtype, names in singles.items():
+            self._singles.append((names, self._place((len(names), state.episodes), (len(names), rows), dtype)))
+            for i, name in enumerate(names):
+                self._table[program.arrays.index(("results", name)), 0] = self._singles[-1][1].at + i * rows * dtype.itemsize
         self._room = _aligned((program.room,))
         self._pointers = tuple(ctypes.c_void_p(a.ctypes.data) for a in (state.memory, self.uniforms, self._table, self._room))
+        self.sheet = np.empty(0, np.uint8)  # what the last call wrote
+
+    def _place(self, shown: tuple[int, ...], shape: tuple[int, ...], dtype: np.dtype[Any]) -> _Place:
+        """Room on the sheet for each step's array of a shape, of which `shown` is shown."""
+        at, size = self._size, int(np.prod(shape)) * dtype.itemsize
+        strides = tuple(int(np.prod(shape[i + 1 :])) * dtype.itemsize for i in range(len(shape)))
+        self._size += -(-size * self.steps // ALIGNED) * ALIGNED
+        return _Place(shown, dtype, at, strides) if self.steps == 1 else _Place((self.steps, *shown), dtype, at, (size, *strides))
 
     def __call__(self) -> dict[str, Array]:
         """Play all steps; -> the results by name."""
-        out = self.sheet()
+        self.begin()
         self.play(self.steps)
-        return out
+        return self.results()
 
-    def sheet(self) -> dict[str, Array]:
-        """New results, which `play` fills."""
-        self._sheet = sheet = np.empty(self._size + ALIGNED, np.uint8)  # kept: code writes to it as long as it is called
-        base = sheet.ctypes.data
-        begin = -base % ALIGNED
-        self._table[self._first :, 0] = base + begin + self._offsets
-        out, episodes = {}, self.state.episodes
-        for name, shape, dtype, at in self._results:
-            held: Array = np.ndarray(shape, dtype, sheet, begin + at)
-            out[name] = held[:, :episodes] if self.steps > 1 else held[0, :episodes]
-        return out
+    def begin(self) -> None:
+        """Begin a new sheet, which `play` fills."""
+        self.sheet = np.empty(self._size, np.uint8)
 
     def play(self, steps: int) -> None:
         """Play steps into the last sheet; the next ones go on from there."""
-        self.program.function.call(*self._pointers, 0, self.state.blocks, steps)
+        there = ctypes.addressof(ctypes.c_char.from_buffer(self.sheet)) if self._size else None  # type: ignore[arg-type]
+        self.broken = bool(self.program.function.call(*self._pointers, there, 0, self.state.blocks, steps))
         if self.steps > 1:
             self._table[:, 0] += steps * self._table[:, 1]
+
+    def numbers(self, names: Sequence[str]) -> Callable[[], tuple[Any, ...]]:
+        """What reads results of a number each off the sheet of a single episode, as Python's own numbers."""
+        places: dict[str, tuple[int, str, int]] = {}
+        for several, (shape, dtype, at, strides) in self._singles:
+            assert shape[1] == 1, "a single episode"
+            places |= {name: (at + i * strides[0], _PYTHON[dtype.kind], dtype.itemsize) for i, name in enumerate(several)}
+        layout, end = "<", 0
+        wanted = sorted(names, key=lambda name: places[name][0])
+        for name in wanted:
+            at, code, size = places[name]
+            layout, end = f"{layout}{at - end}x{code}", at + size
+        read, order = struct.Struct(layout).unpack_from, operator.itemgetter(*(wanted.index(name) for name in names))
+        return lambda: order(read(self.sheet))  # type: ignore[arg-type]
+
+    def reader(self, name: str, row: int, dtype: Any = None) -> Callable[[], Array]:
+        """What reads a row of a result off the sheet, as another type of the same size."""
+        shape, kept, at, strides = dict(self._views)[name]
+        return lambda: np.ndarray(shape[1:], dtype or kept, self.sheet, at + row * strides[0], strides[1:])
+
+    def results(self, sheet: Array | None = None) -> dict[str, Array]:
+        """What stands on the sheet, or on an earlier one, by name."""
+        out: dict[str, Array] = {}
+        sheet = self.sheet if sheet is None else sheet
+        for names, (shape, dtype, at, strides) in self._singles:
+            out.update(zip(names, np.ndarray(shape, dtype, sheet, at, strides), strict=True))
+        for name, (shape, dtype, at, strides) in self._views:
+            out[name] = np.ndarray(shape, dtype, sheet, at, strides)
+        return out
 
 
 def _aligned(shape: tuple[int, ...], dtype: Any = np.uint8) -> Array:

@@ -12,7 +12,7 @@ from tailgate.core import Attack
 from tailgate.draws import Keys, Role
 from tailgate.engine import objects
 from tailgate.engine.agreement import Untraced, check_open, explained, raised, same
-from tailgate.engine.graph import Array
+from tailgate.engine.operations import Array
 from tailgate.engine.parameters import Parameters, Remembered, lifted
 from tailgate.engine.program import Call, Program, State, traced
 from tailgate.loop import Loop
@@ -58,12 +58,14 @@ class Rollout:
         state = State(self.program, batch)
         state.put(begun)
         call = Call(self.program, state, max(2, loop.horizon), self.values)
-        signals, done = call.sheet(), 0
+        call.begin()
+        signals, done = call.results(), 0
         demands, ended = signals.pop("demands"), signals.pop("ended")
         while done < loop.horizon and not (terminate and done and ended[done - 1].all() and state.get_leaf("loop.ended").all()):
             steps = min(STEPS, loop.horizon - done)
             call.play(steps)
-            self._demand(demands[done : done + steps], ended[done : done + steps], done, terminate)
+            if call.broken:
+                self._demand(demands[done : done + steps], ended[done : done + steps], done, terminate)
             done += steps
         length = np.count_nonzero(~ended[:done], axis=0) if terminate else np.full(batch, done)
         steps = int(length.max(initial=0))

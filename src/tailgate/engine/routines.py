@@ -8,7 +8,8 @@ from functools import update_wrapper
 from typing import Any
 
 from tailgate.engine.array import Traced, boxed, each, lifted, shared_batch
-from tailgate.engine.graph import Graph, Node, evaluate
+from tailgate.engine.evaluation import evaluate
+from tailgate.engine.graph import Graph, Node
 
 
 @dataclass(eq=False)

@@ -20,14 +20,18 @@ from tailgate.agents.observation import ObservationCodec
 from tailgate.draws import Keys
 from tailgate.engine import objects
 from tailgate.engine.agreement import Untraced, check_open, explained, raised, same
-from tailgate.engine.graph import Array
+from tailgate.engine.operations import Array
 from tailgate.engine.parameters import Parameters, Remembered, lifted
 from tailgate.engine.program import Call, Program, State, traced
 from tailgate.errors import InputError
 from tailgate.tree import leaves, map_leaves
 
 if TYPE_CHECKING:
-    from tailgate.envs.seat import Outcome, Seat
+    from tailgate.envs.seat import Seat
+
+
+# what a step of a single row tells, in the order of the fused engine
+ALONE = ("reward", "damage", "k", "terminated", "truncated", "illegal", "collided", "rear_collided", "allowed")
 
 
 class SeatPrograms:
@@ -132,8 +136,7 @@ def difference(programs: SeatPrograms, batch: int = 64, decisions: int = 24) -> 
             return "" if broken == outcome else f"decision {decision}: {outcome}"
         if isinstance(broken, str):
             return f"decision {decision}: {broken}"
-        here, there = rows.held() | rows.outcome()._asdict(), plain.held() | outcome._asdict()
-        here, there = here | {"seen": rows.brought["seen"]}, there | {"seen": plain.seen()}
+        here, there = rows.held() | rows.brought, plain.held() | outcome._asdict() | {"seen": plain.seen()}
         for name, wanted in there.items():
             if not same(here[name], wanted):
                 return f"{name}, decision {decision}"
@@ -146,20 +149,58 @@ class Rows:
     def __init__(self, programs: SeatPrograms, batch: int) -> None:
         self.programs, self.batch = programs, batch
         self.state = State(programs.decide, batch)
-        self._decide = Call(programs.decide, self.state, values=programs.values)
-        self.brought: dict[str, Array] = {}
+        self._decide = self._last = Call(programs.decide, self.state, values=programs.values)
+        self._brought: dict[str, Array] | None = {}
 
     @cached_property
     def _begin(self) -> Call:
         return Call(self.programs.begin, self.state, values=self.programs.values)
 
+    @cached_property
+    def _alone(self) -> tuple[Any, ...]:
+        """What reads the sheet of a single row."""
+        call, discrete = self._decide, self.programs.seat.action.discrete
+        return call.numbers(ALONE), call.reader("seen", 0), call.reader("mask", 0, np.int8) if discrete else lambda: None
+
+    @property
+    def brought(self) -> dict[str, Array]:
+        """The results of the last call."""
+        if self._brought is None:
+            self._brought = self._last.results()
+        return self._brought
+
+    @brought.setter
+    def brought(self, results: dict[str, Array]) -> None:
+        self._brought = results
+
     def decide(self, actions: Array, over: Array, again: Array) -> None:
         """One decision of each row: actions (B,) or (B, size), over and again (B,) bool."""
         given = self._decide.arguments
         given["action"][...], given["over"][...], given["again"][...] = actions, over, again
-        k, self.brought = self.brought["k"], self._decide()
-        if not self.brought["demands"].all():
-            raise self.broken(self.brought["demands"], k)
+        self._play(self._decide)
+
+    def decide_alone(self, action: Any) -> tuple[Any, ...]:
+        """The decision of a single row; -> what ALONE names, as Python's numbers, its observation and its mask."""
+        given = self._decide.arguments
+        given["action"][0], given["over"][0], given["again"][0] = action, False, False
+        self._play(self._decide)
+        numbers, seen, mask = self._alone
+        return *numbers(), seen(), mask()
+
+    def again_alone(self) -> tuple[Any, ...]:
+        """The next episode of a single row; -> as `decide_alone`, of a decision that brought nothing."""
+        self.begin(np.ones(1, bool))
+        new = self.brought
+        mask = new["mask"][0].view(np.int8) if "mask" in new else None
+        return 0.0, float(new["damage"][0]), int(new["k"][0]), *(False,) * 5, bool(new["allowed"][0]), new["seen"][0], mask
+
+    def _play(self, call: Call) -> None:
+        before, sheet = self._last, self._last.sheet
+        call.begin()
+        call.play(1)
+        self._last, self._brought = call, None
+        if call.broken and not self.brought["demands"].all():  # idle lanes may hold anything
+            raise self.broken(self.brought["demands"], before.results(sheet)["k"])
 
     def broken(self, demands: Array, k: Array) -> InputError:
         """The error of a decision from steps k (B,) on that broke some of its demands (B, .)."""
@@ -175,13 +216,7 @@ class Rows:
             state.put_leaf("loop.keys.key", keys.key, where)
             state.put_leaf("loop.keys.episode", keys.episode - np.uint32(1), where)
         self._begin.arguments["again"][...] = rows
-        self.brought = self._begin()
-
-    def outcome(self) -> Outcome:
-        """What the last decision brought."""
-        from tailgate.envs.seat import Outcome
-
-        return Outcome(*(self.brought[name] for name in Outcome._fields))
+        self._play(self._begin)
 
     def held(self) -> dict[str, Array]:
         """All that changes from step to step, by name: copies."""

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tailgate.engine.buffers import steps
-from tailgate.engine.graph import FLOAT, Node, Source, Sweep
+from tailgate.engine.graph import Node, Source, Sweep
+from tailgate.engine.operations import FLOAT
 from tailgate.engine.passes import Branch, Item, rounds
 from tailgate.engine.untraceable import Untraceable
 

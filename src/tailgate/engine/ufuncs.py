@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from tailgate.engine.array import Traced, each, elementwise, lifted, reduced, summands, typed
-from tailgate.engine.graph import BOOL, COMPARISONS, Graph, Node
+from tailgate.engine.graph import Graph, Node
+from tailgate.engine.operations import BOOL, COMPARISONS
 from tailgate.engine.untraceable import Untraceable
 
 _PAIRS: dict[Any, str] = {
