@@ -62,7 +62,7 @@ def _share_of_bounds(brief: Brief, value: Array) -> float:
 def _play(plan: ScriptPlan, on: Array, count: Array) -> Command:
     """The step of a schedule that is due."""
     schedule: Schedule = plan.extra
-    value = schedule.value[np.minimum(count, len(schedule.value) - 1)]
+    value = num.take(schedule.value, np.minimum(count, len(schedule.value) - 1))
     return plan.brief.command(on, Kind.FDI, plan.target, np.clip(value, -plan.brief.bounds, plan.brief.bounds))
 
 
