@@ -9,7 +9,7 @@ from __future__ import annotations
 import ctypes
 import operator
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -106,8 +106,9 @@ def _of_each(leaf: Traced) -> Traced:
 class Program:
     """Machine code of a trace."""
 
-    def __init__(self, trace: Trace, lanes: int | None = None, least: int = LEAST) -> None:
-        self.trace, self.lanes = trace, lanes or objects.lanes()
+    def __init__(self, trace: Trace, lanes: int | None = None, least: int = LEAST, twins: Mapping[str, str] | None = None) -> None:
+        """twins: leaves of the state that always equal others, in whose place they stand."""
+        self.trace, self.lanes, self._twins = trace, lanes or objects.lanes(), dict(twins or {})
         self.places, self.stride = self._places()
         self.arrays = [("arguments", name) for name in trace.arguments] + [("results", name) for name in trace.results]
         demanded = list(trace.results["demands"].flat) if "demands" in trace.results else []
@@ -116,12 +117,12 @@ class Program:
             at, size = self.places[name], here.flat[0].dtype.itemsize * self.lanes if here.size else 0
             if name in trace.large:
                 layout.inputs[trace.large[name][0].id] = Held(at)
-                if trace.large[name][0] is not trace.large[name][1]:
+                if trace.large[name][0] is not trace.large[name][1] and name not in self._twins:
                     layout.outputs.append((trace.large[name][1], Held(at)))
                 continue
             for i, (node, new) in enumerate(zip(here.flat, there.flat, strict=True)):
                 layout.inputs[node.id] = Held(at + i * size)
-                if new is not node:
+                if new is not node and name not in self._twins:
                     layout.outputs.append((new, Held(at + i * size)))
         for number, (kind, name) in enumerate(self.arrays):
             nodes = (trace.arguments if kind == "arguments" else trace.results)[name].ravel()
@@ -138,9 +139,10 @@ class Program:
         """Where each leaf of the state begins in a block, and the bytes of a block: the widest numbers first."""
         sizes = {name: (here.flat[0].dtype.itemsize if here.size else 1, here.size) for name, (here, _) in self.trace.state.items()}
         places, at = {}, 0
-        for name in sorted(sizes, key=lambda name: -sizes[name][0]):
+        for name in sorted(sizes.keys() - self._twins.keys(), key=lambda name: (-sizes[name][0], list(sizes).index(name))):
             places[name] = at
             at += sizes[name][0] * sizes[name][1] * self.lanes
+        places |= {name: places[other] for name, other in self._twins.items()}
         return places, -(-max(at, 1) // ALIGNED) * ALIGNED
 
     def uniforms(self, values: Sequence[Array] | None = None) -> Array:

@@ -22,7 +22,7 @@ from tailgate.engine import objects
 from tailgate.engine.agreement import Untraced, check_open, explained, raised, same
 from tailgate.engine.operations import Array
 from tailgate.engine.parameters import Parameters, Remembered, lifted
-from tailgate.engine.program import Call, Program, State, traced
+from tailgate.engine.program import Call, Program, State, Trace, traced
 from tailgate.errors import InputError
 from tailgate.tree import leaves, map_leaves
 
@@ -48,18 +48,16 @@ class SeatPrograms:
                 raise TypeError(f"state {name} holds objects")
         flags = np.zeros(1, bool)
         action = np.zeros(1, np.int64) if seat.action.discrete else np.zeros((1, seat.action.size))
-        self.decide = Program(traced(self._decide, self.example, {"action": action, "over": flags, "again": flags}))
+        decide = traced(self._decide, self.example, {"action": action, "over": flags, "again": flags})
+        begin = traced(self._begin, self.example, {"again": flags})
+        twins = _twins(decide, begin)
+        self.decide, self.begin = Program(decide, twins=twins), Program(begin, twins=twins)
 
     def of(self, seat: Seat, values: list[Array]) -> SeatPrograms:
         """The same programs for a seat of other parameters."""
         out = copy.copy(self)
         out.seat, out.loop, out.values = seat, seat.loop, values
         return out
-
-    @cached_property
-    def begin(self) -> Program:
-        """The program of rows that begin."""
-        return Program(traced(self._begin, self.example, {"again": np.zeros(1, bool)}))
 
     def _decide(self, held: Any, given: Any) -> tuple[Any, Any]:
         seat = self._lifted(held)
@@ -80,6 +78,20 @@ class SeatPrograms:
 def _shown_once(seat: Seat) -> Seat:
     """The seat as it is traced: it shows one frame."""
     return dataclasses.replace(seat, observation=ObservationCodec(seat.loop.brief), config={})
+
+
+def _twins(decide: Trace, begin: Trace) -> dict[str, str]:
+    """Leaves of the state that equal others after each decision and each beginning, and these."""
+    first: dict[Any, str] = {}
+    out = {}
+    for name, (here, there) in decide.state.items():
+        after = list(decide.large[name][1:]) if name in decide.large else list(there.flat)
+        pairs = [begin.large[name]] if name in begin.large else list(zip(*(nodes.flat for nodes in begin.state[name]), strict=True))
+        if after and all(new.op in ("select", "blend") and new.args[2] is old for old, new in pairs):
+            key = here.shape, tuple(node.id for node in after), tuple((new.args[0].id, new.args[1].id) for _, new in pairs)
+            if first.setdefault(key, name) != name:
+                out[name] = first[key]
+    return out
 
 
 def _renewed(seat: Seat, state: Any, keys: Keys, again: Any) -> Any:
