@@ -317,6 +317,7 @@ def text_of(layout: Layout, arrays: int, lanes: int, least: int) -> tuple[str, d
     with _loop(e, "block", "%first", "%last"):
         e.line(f"%at = mul i64 %block, {layout.stride}")
         e.line("%state = getelementptr i8, ptr %memory, i64 %at")
+        sweeps.fetch(e, layout.stride)
         with _loop(e, "time", "0", "%steps"):
             items, room = _step(e, least)
     e.line(f"ret i64 {e.set('load i64, ptr %broken, align 8')}")

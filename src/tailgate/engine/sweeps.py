@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from tailgate.engine.llvm import Emitter
 
 ROOM = 64_000_000  # bytes
+LINE = 64  # bytes of a line of the cache
 CHUNK = 16  # numbers of a row that are kept in registers
 
 
@@ -178,6 +179,14 @@ def _invert_text(outer: Emitter, q: int) -> str:
     room = f"  %f = alloca [{q} x {kind}], align {size}"
     head = f"define internal fastcc void @invert_{q}(ptr noalias %a) noinline #0 {{"
     return "\n".join([head, e.lines[0], room, *e.lines[1:], "}"])
+
+
+def fetch(e: Emitter, stride: int) -> None:
+    """Ask for the next block's state while this one is played."""
+    e.declared.add("declare void @llvm.prefetch.p0(ptr, i32, i32, i32)")
+    following = e.address("%state", stride)
+    with counted(e, stride // LINE) as i:
+        e.line(f"call void @llvm.prefetch.p0(ptr {element(e, following, i, LINE)}, i32 1, i32 3, i32 1)")
 
 
 # -- rooms
