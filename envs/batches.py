@@ -80,7 +80,7 @@ def framed(now: Array, before: Array | None, frames: int) -> Array:
 def side_by_side(seat: Seat, engine: str = "auto", drawn: bool = False, threads: int = 1, rows: int = WORTH) -> Episodes:
     """Choose the engine; auto: fused where it is possible, else traced, else plain. `drawn`: pictures may be asked for.
 
-    The fused engine plays 2048 episodes and more to each of several `threads`. Tracing takes some tenths of a second: auto traces for
+    Of several `threads` each plays 2048 episodes and more. Tracing takes some tenths of a second: auto traces for
     environments of at least `WORTH` rows.
     """
     sizes.check("threads", threads)
@@ -96,7 +96,7 @@ def side_by_side(seat: Seat, engine: str = "auto", drawn: bool = False, threads:
         return PlainEpisodes(seat)
     programs = programs_of(seat)
     if not isinstance(programs, Untraced):
-        return TracedEpisodes(programs, drawn)
+        return TracedEpisodes(programs, drawn, threads)
     if engine == "traced":
         raise InputError("engine", engine, f"plain or auto: {programs.why}")
     return PlainEpisodes(seat, programs.why)
@@ -186,8 +186,8 @@ class TracedEpisodes:
 
     engine = "traced"
 
-    def __init__(self, programs: SeatPrograms, drawn: bool = False) -> None:
-        self.programs, self._drawn = programs, drawn
+    def __init__(self, programs: SeatPrograms, drawn: bool = False, threads: int = 1) -> None:
+        self.programs, self._drawn, self._threads = programs, drawn, threads
         self.rows: Rows | None = None
         self.shadow: Shadow | None = None
 
@@ -196,7 +196,7 @@ class TracedEpisodes:
         return self._rows.state.get_leaf("loop.keys.episode")
 
     def begin(self, keys: Keys) -> None:
-        self.rows = Rows(self.programs, len(keys.key))
+        self.rows = Rows(self.programs, len(keys.key), self._threads)
         self.rows.begin(np.ones(len(keys.key), bool), keys)
         self.shadow = Shadow(self.programs.seat, keys) if self._drawn else None
 
@@ -248,15 +248,15 @@ class TracedEpisodes:
 
     def __getstate__(self) -> dict[str, Any]:
         held = None if self.rows is None else (self.rows.batch, self.rows.held(), self.rows.brought)
-        return {"seat": self.programs.seat, "drawn": self._drawn, "held": held, "shadow": self.shadow}
+        return {"seat": self.programs.seat, "drawn": self._drawn, "threads": self._threads, "held": held, "shadow": self.shadow}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         programs = programs_of(state["seat"])
         assert isinstance(programs, SeatPrograms), "it was traced before"
-        self.__init__(programs, state["drawn"])  # type: ignore[misc]
+        self.__init__(programs, state["drawn"], state["threads"])  # type: ignore[misc]
         if state["held"] is not None:
             batch, held, brought = state["held"]
-            self.rows = Rows(self.programs, batch)
+            self.rows = Rows(self.programs, batch, self._threads)
             self.rows.put(held)
             self.rows.brought = brought
         self.shadow = state["shadow"]

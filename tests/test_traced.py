@@ -207,6 +207,19 @@ def test_copies_of_a_traced_environment_are_not_traced_again(monkeypatch):
         assert other.engine == "traced" and all(np.array_equal(x, y) for x, y in zip(got[:4], wanted[:4], strict=True))
 
 
+def test_threads_change_no_bit():
+    several = [AdversaryVectorEnv(4200, scenario="gusty-stop-and-go-v0", defence="chi2_kf", engine="traced", threads=n) for n in (1, 2)]
+    chance = np.random.default_rng(0)
+    seen = [env.reset(seed=2)[0] for env in several]
+    assert [len(env.episodes.rows._decide._parts) for env in several] == [1, 2]
+    for _ in range(30):
+        assert np.array_equal(*seen)
+        actions = chance.integers(0, several[0].seat.action.size, 4200)
+        told = [env.step(actions) for env in several]
+        assert all(np.array_equal(x, y) for x, y in zip(*(one[1:4] for one in told), strict=True))
+        seen = [one[0] for one in told]
+
+
 @pytest.mark.parametrize("arguments", [
     {"scenario": "gusty-stop-and-go-v0", "defence": "chi2_kf"},
     {"scenario": "platoon-gusty-v0", "defence": "chi2_dkf", "action": "continuous"},

@@ -46,7 +46,6 @@ class Parameters:
         self.kept = reader.kept  # what is known by its number lives as long as the key
         self.key = None if reader.changeable else tuple(reader.key)
 
-
     @property
     def sources(self) -> str:
         """Of the files that hold the classes and functions in it: Tailgate's, and somebody else's."""

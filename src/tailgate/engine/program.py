@@ -10,7 +10,9 @@ import ctypes
 import operator
 import struct
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -27,6 +29,7 @@ from tailgate.engine.passes import LEAST
 from tailgate.tree import leaves, map_leaves
 
 _PYTHON = {"f": "d", "b": "?", "i": "q"}  # how Python reads 64-bit numbers and truth values
+WORTH = 2048  # episodes that are worth a thread
 ALIGNED = 64  # bytes: a line of the processor's cache
 Step = Callable[[Any, Any], tuple[Any, dict[str, Any]]]
 
@@ -206,10 +209,13 @@ class Call:
     """Calls of a program on a state: arguments that stay what they are until they are written to, and results that are new each time.
 
     Arguments are (episodes, ...), or (steps, episodes, ...) with more `steps` than one; so are results. `broken`: a demand did not hold.
+    Many episodes may share several `threads`: a block depends on no other.
     """
 
-    def __init__(self, program: Program, state: State, steps: int = 1, values: Sequence[Array] | None = None) -> None:
+    def __init__(self, program: Program, state: State, steps: int = 1, values: Sequence[Array] | None = None, threads: int = 1) -> None:
         self.program, self.state, self.steps, self.broken = program, state, steps, False
+        threads = max(1, min(threads, state.episodes // WORTH))
+        self._parts = [(state.blocks * i // threads, state.blocks * (i + 1) // threads) for i in range(threads)]
         self.uniforms = program.uniforms(values)
         self._table = np.zeros((len(program.arrays), 2), np.int64)
         self.arguments: dict[str, Array] = {}
@@ -236,8 +242,9 @@ class Call:
             self._singles.append((names, self._place((len(names), state.episodes), (len(names), rows), dtype)))
             for i, name in enumerate(names):
                 self._table[program.arrays.index(("results", name)), 0] = self._singles[-1][1].at + i * rows * dtype.itemsize
-        self._room = _aligned((program.room,))
-        self._pointers = tuple(ctypes.c_void_p(a.ctypes.data) for a in (state.memory, self.uniforms, self._table, self._room))
+        self._rooms = [_aligned((program.room,)) for _ in self._parts]
+        self._pointers = tuple(ctypes.c_void_p(a.ctypes.data) for a in (state.memory, self.uniforms, self._table))
+        self._places = [ctypes.c_void_p(room.ctypes.data) for room in self._rooms]
         self.sheet = np.empty(0, np.uint8)  # what the last call wrote
 
     def _place(self, shown: tuple[int, ...], shape: tuple[int, ...], dtype: np.dtype[Any]) -> _Place:
@@ -260,9 +267,16 @@ class Call:
     def play(self, steps: int) -> None:
         """Play steps into the last sheet; the next ones go on from there."""
         there = ctypes.addressof(ctypes.c_char.from_buffer(self.sheet)) if self._size else None  # type: ignore[arg-type]
-        self.broken = bool(self.program.function.call(*self._pointers, there, 0, self.state.blocks, steps))
+        if len(self._parts) == 1:
+            self.broken = self._part(0, there, steps)
+        else:
+            others = [_pool(len(self._parts) - 1).submit(self._part, i, there, steps) for i in range(1, len(self._parts))]
+            self.broken = any([self._part(0, there, steps), *(other.result() for other in others)])
         if self.steps > 1:
             self._table[:, 0] += steps * self._table[:, 1]
+
+    def _part(self, part: int, there: int | None, steps: int) -> bool:
+        return bool(self.program.function.call(*self._pointers, self._places[part], there, *self._parts[part], steps))
 
     def numbers(self, names: Sequence[str]) -> Callable[[], tuple[Any, ...]]:
         """What reads results of a number each off the sheet of a single episode, as Python's own numbers."""
@@ -292,6 +306,11 @@ class Call:
         for name, (shape, dtype, at, strides) in self._views:
             out[name] = np.ndarray(shape, dtype, sheet, at, strides)
         return out
+
+
+@cache
+def _pool(threads: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(threads)
 
 
 def _aligned(shape: tuple[int, ...], dtype: Any = np.uint8) -> Array:

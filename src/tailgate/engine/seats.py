@@ -158,15 +158,15 @@ def difference(programs: SeatPrograms, batch: int = 64, decisions: int = 24) -> 
 class Rows:
     """B rows of a seat's episodes, and what the last call brought (see `SeatPrograms`)."""
 
-    def __init__(self, programs: SeatPrograms, batch: int) -> None:
-        self.programs, self.batch = programs, batch
+    def __init__(self, programs: SeatPrograms, batch: int, threads: int = 1) -> None:
+        self.programs, self.batch, self.threads = programs, batch, threads
         self.state = State(programs.decide, batch)
-        self._decide = self._last = Call(programs.decide, self.state, values=programs.values)
+        self._decide = self._last = Call(programs.decide, self.state, values=programs.values, threads=threads)
         self._brought: dict[str, Array] | None = {}
 
     @cached_property
     def _begin(self) -> Call:
-        return Call(self.programs.begin, self.state, values=self.programs.values)
+        return Call(self.programs.begin, self.state, values=self.programs.values, threads=self.threads)
 
     @cached_property
     def _alone(self) -> tuple[Any, ...]:
