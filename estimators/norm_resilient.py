@@ -17,7 +17,7 @@ factors in an order that does not multiply; the bound is in tailgate.resilience.
 
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, Literal, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 
@@ -179,6 +179,7 @@ class NormResilientFilter(Norm, DistributedFilter):
 class NormResilient(Norm, Composed):
     """Resilient distributed estimator: however many sensors are attacked, a step's correction stays bounded."""
 
+    untraced: ClassVar[str] = "each set of sensors has a decomposition of its own, by Jacobi's rotations"  # a loop that numba compiles
     gain: Gain = param("steady", GAIN)
 
     def parts(self) -> tuple[Filter, Detector, Mitigation]:

@@ -15,7 +15,7 @@ import numpy as np
 from tailgate.engine.operations import BOOL, COMMUTATIVE, COMPARISONS, FLOAT, INT, Array, apply, converted
 from tailgate.engine.untraceable import Untraceable
 
-MOST = 60_000  # operations of a graph: what has more takes long to compile, as straight code
+MOST = 30_000  # operations of a graph: what has more takes long to compile, as straight code
 _FREE = {"const", "uniform", "input", "carried", "pick"}  # which are none
 
 
