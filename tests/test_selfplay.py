@@ -247,6 +247,9 @@ def test_a_run_that_goes_on_trains_for_the_opponents_of_now(tiny):
     assert against("attacker-2")["policy"] == [digest("defender-0.json"), digest("defender-1.json")]
     assert [one["path"] for one in against("defender-2")] == [digest("attacker-1.json"), digest("attacker-2.json")]
 
+    made = {path.name: path.stat().st_mtime_ns for path in home.glob("*-*.json")}
+    assert command("--resume", "name=tiny")[0] == 0
+    assert made == {path.name: path.stat().st_mtime_ns for path in home.glob("*-*.json")}  # what is finished is not written again
     first = (home / "attacker-1.json").read_text()
     data = json.loads(first)
     data["training"]["against"]["policy"] = ["defender-0.json#0123456789abcdef"]

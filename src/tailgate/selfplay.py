@@ -191,8 +191,11 @@ class Game:
         return dataclasses.replace(self.duel.guard, **who)
 
     def _as_it_is(self) -> Path:
-        setting = nearest(self.duel.guard.hand.knobs)
-        return export(self.directory / "defender-0", self.duel, constant(self.duel, setting), {"learner": "none", "setting": setting})
+        path, setting = self.directory / "defender-0", nearest(self.duel.guard.hand.knobs)
+        facts = {"learner": "none", "setting": setting}
+        if _finished(path.with_suffix(".json"), facts):
+            return path.with_suffix(".json")
+        return export(path, self.duel, constant(self.duel, setting), facts)
 
     def _fresh(self, name: str, i: int, guard: Steered) -> Path:
         return self._attacker(name, self.config.first_seed + FRESH + i, guard)
