@@ -6,6 +6,7 @@ block. The branches are found here; no code says where they are.
 
 from __future__ import annotations
 
+import bisect
 import heapq
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field
@@ -85,8 +86,9 @@ def _branches(nodes: Sequence[Node], kept: Collection[int], least: int) -> list[
 
     waiting: list[tuple[int, int, int, list[Node], Branch]] = []
     for (_, side), choices in groups.items():
-        for level in _levels(nodes, choices) if of(side, choices).cost >= least else ():
-            branch = of(side, level)
+        whole = of(side, choices)
+        for level in _levels(nodes, choices) if whole.cost >= least else ():
+            branch = whole if len(level) == len(choices) else of(side, level)
             if branch.cost >= least:
                 heapq.heappush(waiting, (-branch.cost, len(waiting), side, level, branch))
     while waiting:
@@ -111,13 +113,15 @@ def _cost(node: Node) -> int:
 
 
 def _levels(nodes: Sequence[Node], choices: list[Node]) -> list[list[Node]]:
-    """The choices by how many others of them each one follows from."""
+    """The choices by how many others of them each one follows from. The nodes are in the order of their numbers."""
     mine = {choice.id for choice in choices}
+    if len(mine) == 1:
+        return [choices]
+    begin = bisect.bisect_left(nodes, min(mine), key=lambda node: node.id)
+    end = bisect.bisect_right(nodes, max(mine), key=lambda node: node.id)
     depth: dict[int, int] = {}
     levels: dict[int, list[Node]] = {}
-    for node in nodes:
-        if node.id < choices[0].id:
-            continue
+    for node in nodes[begin:end]:
         deep = max((depth.get(arg.id, 0) for arg in node.args), default=0)
         if node.id in mine:
             levels.setdefault(deep, []).append(node)
