@@ -92,7 +92,7 @@ def _keep(name: str, content: bytes) -> None:
 def _compiled(text: str) -> bytes:
     binding, machine = _binding(), _machine()
     module = binding.parse_assembly(text)
-    module.verify()  # no passes: they take most of the time and make nothing faster, since nodes are unique and ordered already
+    module.verify()  # no passes: they take most of the time and gain little, since nodes are unique and ordered already
     return bytes(machine.emit_object(module))
 
 
