@@ -38,7 +38,7 @@ WITHIN = 5.0  # [s] from the signal to the command's end
 HANGS = 30.0  # [s] after which a command that goes on is killed
 EARLIEST = 0.15  # [s] before that the interpreter itself begins, and nothing of Tailgate runs
 MARKS = ("Traceback", "Exception ignored", "Process Spawn", "Error:", "leaked")
-CLOCKED = "second|time grows|times slower"  # in the names of figures that another run measures anew
+CLOCKED = "second|time grows|times slower"  # names of figures that each run measures with a clock
 WAYS = ("interrupt", "twice", "group", "terminate", "kill")
 SUITE = "about: s\nscenarios: [thesis-ch4-v0]\ndoses: [5]\ndefences: [none, kf]\nattacks: [none, 'fdi:value=5']\nseeds: 3\n"
 SPACE = "cem.step: {range: [0.4, 1.0]}\n"

@@ -179,7 +179,7 @@ class NormResilientFilter(Norm, DistributedFilter):
 class NormResilient(Norm, Composed):
     """Resilient distributed estimator: however many sensors are attacked, a step's correction stays bounded."""
 
-    untraced: ClassVar[str] = "each set of sensors has a decomposition of its own, by Jacobi's rotations"  # a loop that numba compiles
+    untraced: ClassVar[str] = "numba compiles the loop of Jacobi's rotations"
     gain: Gain = param("steady", GAIN)
 
     def parts(self) -> tuple[Filter, Detector, Mitigation]:

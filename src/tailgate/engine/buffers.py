@@ -1,7 +1,7 @@
 """Large arrays as buffers: what is done for each of their numbers, rows or matrices is a sweep, which machine code plays in loops.
 
-Straight code of a few thousand numbers takes long to compile. The nodes of a large array are the picks of a buffer; whoever takes single
-ones of them reads them where it needs them.
+Straight code of a few thousand numbers takes long to compile. The nodes of a large array are picks, each of one place of the buffer.
+Code that needs a single number reads it there.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ def _boxed(node: Any) -> Array:
 
 
 def _of_one(nodes: Any, rest: tuple[int, ...]) -> Any:
-    """What is the same in all rounds."""
+    """An array for the trailing axes, of nodes that no round changes."""
     return np.broadcast_to(_boxed(nodes), rest) if rest and isinstance(nodes, Node) else nodes
 
 
@@ -180,7 +180,7 @@ def blended(graph: Graph, where: Node, x: Array, y: Array) -> Array:
 
 
 def sides(graph: Graph, nodes: Array) -> tuple[Node, Array, Array] | None:
-    """Who chooses all of these numbers, and between which ones, if one side is the same for all episodes."""
+    """The mask by which all numbers of an array are chosen, and both sides, if one side is the same for all episodes."""
     first = nodes.flat[0]
     if first.op == "select" and all(node.op == "select" and node.args[0] is first.args[0] for node in nodes.flat):
         held = [_map(lambda node, i=i: node.args[i], nodes) for i in (1, 2)]  # type: ignore[misc]

@@ -22,7 +22,7 @@ _FREE = {"const", "uniform", "input", "carried", "pick"}  # which are none
 class Node:
     """A number: an operation `op` on other nodes. `fixed`: it is the same for all episodes.
 
-    With a `size` it is a buffer of so many numbers, which are picked.
+    A node with a `size` is a buffer of that many numbers. A `pick` is one of them.
     """
 
     __slots__ = ("args", "attr", "dtype", "fixed", "id", "op", "size")
@@ -323,7 +323,7 @@ def computed(node: Node, args: Sequence[Any]) -> Any:
     if node.op == "pick":
         return args[0][node.attr]
     if node.op in ("matvec", "sweep", "pack"):
-        raise AssertionError("what has fixed nodes of its own is evaluated with its graph")
+        raise AssertionError("this operation needs its graph: use evaluate()")
     if node.op == "invert":
         return _inverted(args[0], node.attr)
     if node.op == "blend":

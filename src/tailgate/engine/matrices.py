@@ -25,7 +25,7 @@ def _large(size: int, *arrays: Any) -> bool:
 
 
 def _size(x: Any, y: Any) -> int:
-    """Of a product."""
+    """How many numbers a product of two arrays has."""
     return math.prod((*np.broadcast_shapes(x.shape[:-2], y.shape[:-2]), x.shape[-2], y.shape[-1])) if x.shape[-1] else 0
 
 

@@ -30,16 +30,16 @@ _MINUS = np.array([-0.0]).view(np.uint64)[0]
 _PLAIN = (type(None), str, bytes, int, complex, enum.Enum, np.generic, np.dtype, type, types.BuiltinFunctionType, np.ufunc, PurePath)
 
 
-def lifted(graph: Graph, held: Any, whole: bool = True) -> Any:
-    """A copy of dataclasses, tuples, lists, mappings and closures in which floats and arrays of floats are traced, and `whole` numbers."""
-    return _Reader(graph, whole).visit(held)
+def lifted(graph: Graph, held: Any) -> Any:
+    """A copy of dataclasses, tuples, lists, mappings and closures in which floats, arrays of floats and whole numbers are traced."""
+    return _Reader(graph).visit(held)
 
 
 class Parameters:
-    """What code for some things depends on: `key`, None where nobody knows, and the `values` of its parameters."""
+    """The parameters of some things. Equal `key`s have the same code but for their `values`; it is None for things that can change."""
 
-    def __init__(self, held: Any, whole: bool = True) -> None:
-        reader = _Reader(None, whole)
+    def __init__(self, held: Any) -> None:
+        reader = _Reader(None)
         reader.visit(held)
         self.values = reader.values
         self._modules = reader.modules
@@ -48,7 +48,7 @@ class Parameters:
 
     @property
     def sources(self) -> str:
-        """Of the files that hold the classes and functions in it: Tailgate's, and somebody else's."""
+        """A hash of the files that hold the classes and functions: Tailgate's, and somebody else's."""
         digest = hashlib.sha256(own().encode())
         for name in sorted(self._modules):
             file = getattr(sys.modules.get(name), "__file__", None)
@@ -137,8 +137,8 @@ class Remembered(Generic[T]):
 class _Reader:
     """Goes through things in a fixed order; with a graph it makes a copy of them."""
 
-    def __init__(self, graph: Graph | None, whole: bool) -> None:
-        self.graph, self.whole = graph, whole
+    def __init__(self, graph: Graph | None) -> None:
+        self.graph = graph
         self.key: list[Any] = []
         self.values: list[np.ndarray[Any, Any]] = [] if graph is None else graph.parameters
         self.kept: list[Any] = []
@@ -147,7 +147,7 @@ class _Reader:
         self._known: dict[int, tuple[int, Any, Any]] = {}
 
     def visit(self, held: Any) -> Any:
-        if type(held) is float or (type(held) is int and self.whole and abs(held) < 2**62):
+        if type(held) is float or (type(held) is int and abs(held) < 2**62):
             leaf = np.array([held])
             (node,) = self._leaf(leaf)
             return held if self.graph is None else Traced(self.graph, boxed(node), leaf.dtype, None, type(held))
