@@ -298,20 +298,26 @@ def campaign(
         for way in ways:
             if way == "group" and not job.parallel:
                 continue
-            tried = [
-                moment(job, folder / f"{name}-{way}-{i}", way, chance.uniform(EARLIEST, span), workers, held) for i in range(moments)
-            ]
+            tried: list[dict[str, Any]] = []
+            with contextlib.suppress(KeyboardInterrupt):  # what was tried until then is told
+                for i in range(moments):
+                    tried.append(moment(job, folder / f"{name}-{way}-{i}", way, chance.uniform(EARLIEST, span), workers, held))
+                    print(f"{name} {way} {i + 1}/{moments} {tried[-1]['wrong'] or ''}", file=sys.stderr, flush=True)
+            if not tried:
+                return
             wrong = collections.Counter(text.split(":")[0] for one in tried for text in one["wrong"])
             line = {
-                "command": name, "way": way, "moments": moments, "span": round(span, 2),
+                "command": name, "way": way, "moments": len(tried), "span": round(span, 2),
                 "ended before": sum(not one["code"] for one in tried),
                 "kept": sum(one["kept"] > 0 for one in tried), "longest": max(one["seconds"] for one in tried),
                 "failed": sum(bool(one["wrong"]) for one in tried),
                 "wrong": dict(wrong), "failures": [one for one in tried if one["wrong"]],
             }  # fmt: skip
-            figures = f"{moments} moments in {span:.1f} s, {line['failed']} failed, longest end {line['longest']} s"
+            figures = f"{len(tried)} moments in {span:.1f} s, {line['failed']} failed, longest end {line['longest']} s"
             told(f"{name:<12} {way:<10} {figures} {dict(wrong) or ''}")
             yield line
+            if len(tried) < moments:
+                return
 
 
 def main() -> None:
