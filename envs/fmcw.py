@@ -22,7 +22,7 @@ import numpy as np
 from pydantic import Field
 
 from tailgate import num
-from tailgate.core import Array, Positive, param
+from tailgate.core import Array, param
 from tailgate.errors import InputError
 from tailgate.quantities import Decibel
 
@@ -31,6 +31,7 @@ KT0 = 1.380649e-23 * 290.0  # thermal noise density at the reference temperature
 _LN10 = 2.302585092994046
 
 Share = Annotated[float, Field(gt=0, le=1)]
+Radio = Annotated[float, Field(ge=1e-9, le=1e15, allow_inf_nan=False)]  # of a radar or a jammer [its unit]
 
 
 def from_db(value: float) -> float:
@@ -43,7 +44,7 @@ def to_db(ratio: Array | float) -> Array:
     return np.asarray(num.log(np.asarray(ratio, np.float64)) * (10.0 / _LN10))
 
 
-# The closed forms, elementwise: the sensor uses them on arrays, the fused engine on single numbers.
+# The closed forms, elementwise.
 
 
 def beats(d: Array, dv: Array, per_metre: float, per_speed: float) -> tuple[Array, Array]:
@@ -67,18 +68,18 @@ def passes(up: Array, down: Array, low: float, high: float) -> Array:
 class Link:
     """A triangular FMCW radar, its target, and a jammer that the target carries (self-screening)."""
 
-    wavelength: Positive = param(3.89e-3, "wavelength lam of the 77 GHz carrier [m]")
-    sweep: Positive = param(150e6, "swept bandwidth Bs of one sweep [Hz]")
-    sweep_time: Positive = param(2e-3, "duration Ts of one sweep, up or down [s]")
-    power: Positive = param(10e-3, "transmitted power Pt [W]")
+    wavelength: Radio = param(3.89e-3, "wavelength lam of the 77 GHz carrier [m]")
+    sweep: Radio = param(150e6, "swept bandwidth Bs of one sweep [Hz]")
+    sweep_time: Radio = param(2e-3, "duration Ts of one sweep, up or down [s]")
+    power: Radio = param(10e-3, "transmitted power Pt [W]")
     gain_db: Decibel = param(28.0, "gain G of the antenna [dBi]")
     loss_db: Decibel = param(0.10, "losses L of the radar [dB]")
-    cross_section: Positive = param(10.0, "radar cross-section s of the car ahead, which does not fluctuate [m^2]")
-    bandwidth: Positive = param(256e3, "IF bandwidth B_if, which is the rate of the complex samples [Hz]")
+    cross_section: Radio = param(10.0, "radar cross-section s of the car ahead, which does not fluctuate [m^2]")
+    bandwidth: Radio = param(256e3, "IF bandwidth B_if, which is the rate of the complex samples [Hz]")
     noise_figure_db: Decibel = param(12.0, "noise figure F of the receiver [dB]")
-    operating_band: Positive = param(150e6, "operating bandwidth B of the radar, as a jammer sees it [Hz]")
+    operating_band: Radio = param(150e6, "operating bandwidth B of the radar, as a jammer sees it [Hz]")
     jam_gain_db: Decibel = param(10.0, "gain GJ of the jammer's antenna [dBi]")
-    jam_band: Positive = param(155e6, "bandwidth BJ of the jammer [Hz]")
+    jam_band: Radio = param(155e6, "bandwidth BJ of the jammer [Hz]")
     jam_loss_db: Decibel = param(0.10, "losses LJ of the jammer [dB]")
     in_band: Share | None = param(
         None, "share of the jammer's received power that the IF filter passes; none: B_if/B, of noise over all B; 1: it follows the chirp"
@@ -183,6 +184,7 @@ def tone_of(link: Link) -> Tone:
     return Tone(6.0 / (4.0 * math.pi * math.pi * (link.samples * link.samples - 1)), cell * cell / 3.0)
 
 
+@np.errstate(over="ignore", divide="ignore")  # at no SNR it is the widest
 def tone_variance(x: Array, bound: float, widest: float) -> Array:
     """Variance over B_if^2 of a beat that is no outlier, at the SNR x after integration, elementwise: a multiple of the bound."""
     inverse, (e0, e1, e2) = 1.0 / x, _EFFICIENCY
@@ -251,7 +253,7 @@ def mean_power(samples: int, heard: Array, jam: Array, tone: Array, z0: Array, z
     noise, rest = 1.0 + jam, samples - heard
     in_phase = np.sqrt(0.5) * z0 + np.sqrt(heard * tone / noise)
     loud = noise * (gamma(heard - 0.5, z1) + in_phase * in_phase)
-    quiet = num.select(rest > 0.0, gamma(np.maximum(rest, 1.0), z2), 0.0)
+    quiet = np.where(rest > 0.0, gamma(np.maximum(rest, 1.0), z2), 0.0)
     out: Array = (loud + quiet) / samples
     return out
 

@@ -27,13 +27,14 @@ from tailgate.envs.cacc import V2V
 from tailgate.envs.controllers import LEADER
 from tailgate.envs.radar_car import kinematic
 from tailgate.errors import InputError, NotApplicable
+from tailgate.quantities import Accel
 
 GAP, LEAD, SPEED, ACCEL = range(4)  # columns of the box
 FAR = 1e4  # limit of a gap that nothing limits [m]
 EXACT = 1e-6  # accuracy of what is told without noise [m/s]
 ROUNDING = 1e-9
 BACK = 1.0  # how far back gaps tell the speed of the car ahead [s]
-Limits = Annotated[tuple[float, float], Field(min_length=2, max_length=2)]
+Limits = Annotated[tuple[Accel, Accel], Field(min_length=2, max_length=2)]
 
 
 class Told(NamedTuple):
