@@ -8,8 +8,8 @@ from typing import Literal
 import numpy as np
 
 from tailgate.core import Array, Frame, Kind, Model, NonNegative, Positive, param
-from tailgate.elementwise import clip
 from tailgate.errors import InputError
+from tailgate.num import clip
 
 RewardName = Literal["collision", "min_gap", "error", "peak", "stealth", "final"]
 NEAR = 20.0  # min_gap: a smaller gap than this counts [m]

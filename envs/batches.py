@@ -12,17 +12,13 @@ from tailgate.draws import Keys
 from tailgate.engine.agreement import Untraced
 from tailgate.engine.seats import Rows, SeatPrograms, programs_of
 from tailgate.errors import InputError, unknown
-from tailgate.fused import Refused
-from tailgate.fused.cockpit import Cockpit, fuse_seat
-from tailgate.fused.rows import EPISODE
 from tailgate.loop import LoopState
 from tailgate.tree import leaves, with_leaves
 
 from .seat import Outcome, Seat, Tally
 from .shadow import Begun, Decided, Shadow
 
-ENGINES = ("auto", "fused", "traced", "plain")
-WORTH = 16  # rows for which auto traces what the fused engine does not play
+ENGINES = ("auto", "traced", "plain")
 
 
 class Facts(NamedTuple):
@@ -47,9 +43,6 @@ class Episodes(Protocol):
 
     def again(self, rows: Array, keys: Keys | None = None, reset: bool = False) -> None:
         """Begin the next episode in `rows` (B,) bool, or that of the keys, of as many rows. reset: the user asked, between two steps."""
-
-    def end(self, rows: Array) -> None:
-        """End the episodes in `rows` (B,) bool, as their horizon would."""
 
     def decide(self, actions: Array, over: Array, restart: bool) -> Outcome:
         """One decision; rows that are `over` (B,) bool count for nothing, and with `restart` begin their next episode instead."""
@@ -77,22 +70,15 @@ def framed(now: Array, before: Array | None, frames: int) -> Array:
     return np.tile(now, frames) if before is None else np.concatenate([now, before[:, : -now.shape[1]]], axis=1)
 
 
-def side_by_side(seat: Seat, engine: str = "auto", drawn: bool = False, threads: int = 1, rows: int = WORTH) -> Episodes:
-    """Choose the engine; auto: fused where it is possible, else traced, else plain. `drawn`: pictures may be asked for.
+def side_by_side(seat: Seat, engine: str = "auto", drawn: bool = False, threads: int = 1) -> Episodes:
+    """Choose the engine; auto: traced where it is possible, else plain. `drawn`: pictures may be asked for.
 
-    Of several `threads` each plays 2048 episodes and more. Tracing takes some tenths of a second: auto traces for
-    environments of at least `WORTH` rows.
+    Of several `threads` each plays 2048 episodes and more.
     """
     sizes.check("threads", threads)
     if engine not in ENGINES:
         raise unknown("engine", engine, ENGINES)
-    if engine in ("auto", "fused"):
-        constants = fuse_seat(seat)
-        if not isinstance(constants, Refused):
-            return FusedEpisodes(seat, constants, threads, drawn)
-        if engine == "fused":
-            raise InputError("engine", engine, f"traced, plain or auto: {constants.why}")
-    if engine == "plain" or (engine == "auto" and rows < WORTH):
+    if engine == "plain":
         return PlainEpisodes(seat)
     programs = programs_of(seat)
     if not isinstance(programs, Untraced):
@@ -138,9 +124,6 @@ class PlainEpisodes:
             self.again(over)
         return outcome
 
-    def end(self, rows: Array) -> None:
-        pass  # who is over is said with each decision
-
     def seen(self) -> Array:
         return self.seat.observation.observe(self._view)[:, : len(self.seat.observation.columns)]
 
@@ -182,7 +165,10 @@ class PlainEpisodes:
 
 
 class TracedEpisodes:
-    """The traced engine, on the plain loop's own state. Where pictures may be `drawn` it notes decisions, as the fused engine does."""
+    """The traced engine, on the plain loop's own state.
+
+    Where pictures may be `drawn` it notes what was decided, so that the plain loop can play a row again.
+    """
 
     engine = "traced"
 
@@ -220,9 +206,6 @@ class TracedEpisodes:
 
     def again_alone(self) -> tuple[Any, ...]:
         return self._rows.again_alone()
-
-    def end(self, rows: Array) -> None:
-        pass  # who is over is said with each decision
 
     def seen(self) -> Array:
         return self._rows.brought["seen"]
@@ -265,71 +248,3 @@ class TracedEpisodes:
     def _rows(self) -> Rows:
         assert self.rows is not None
         return self.rows
-
-
-class FusedEpisodes:
-    """The fused engine. Where pictures may be `drawn` it notes what was decided, so that the plain loop can play a row again."""
-
-    engine = "fused"
-
-    def __init__(self, seat: Seat, constants: Any, threads: int, drawn: bool = False) -> None:
-        self.seat, self.constants, self.threads, self._drawn = seat, constants, threads, drawn
-        self.cockpit: Cockpit | None = None
-        self.shadow: Shadow | None = None
-
-    @property
-    def number(self) -> Array:
-        return self._cockpit.word(EPISODE).astype(np.uint32)
-
-    def begin(self, keys: Keys) -> None:
-        if self.cockpit is None or self.cockpit.batch != len(keys.key):
-            self.cockpit = Cockpit(self.seat, self.constants, keys, self.threads)
-        else:
-            self.cockpit.take(keys)
-        self.cockpit.begin()
-        self.shadow = Shadow(self.seat, keys) if self._drawn else None
-
-    def again(self, rows: Array, keys: Keys | None = None, reset: bool = False) -> None:
-        self._cockpit.reseed(rows, keys, show=reset)
-        if self.shadow is not None:
-            self.shadow.add(Begun(rows, keys, reset))
-        elif self._drawn and rows.all():
-            self.shadow = Shadow(self.seat, self._cockpit.present_keys)
-
-    def end(self, rows: Array) -> None:
-        self._cockpit.end(rows)
-
-    def decide(self, actions: Array, over: Array, restart: bool) -> Outcome:
-        cockpit = self._cockpit
-        cockpit.decide(actions, restart)
-        if self.shadow is not None:
-            self.shadow.add(Decided(actions.copy(), over, restart))
-        flags = cockpit.flags
-        return Outcome(cockpit.paid[0], flags[3], flags[4], flags[2], flags[0], flags[1])
-
-    def seen(self) -> Array:
-        return self._cockpit.seen
-
-    def facts(self) -> Facts:
-        cockpit = self._cockpit
-        return Facts(cockpit.flags[5], cockpit.count, cockpit.paid[1])
-
-    def mask(self) -> Array:
-        return self._cockpit.mask.view(bool)
-
-    def held(self) -> dict[str, Array]:
-        return self._cockpit.held()
-
-    def put(self, held: dict[str, Array]) -> None:
-        self._cockpit.put(held)
-        self.shadow = None  # nobody knows what was decided before
-
-    def drawn(self, row: int) -> tuple[LoopState, Frame | None, int]:
-        if self.shadow is None:
-            raise InputError("render", "episodes that were put back", "reset() first")
-        return *self.shadow.look(row, PlainEpisodes), 0
-
-    @property
-    def _cockpit(self) -> Cockpit:
-        assert self.cockpit is not None
-        return self.cockpit

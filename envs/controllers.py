@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 
-from tailgate import num
 from tailgate.core import Array, Estimate, Mode, Model, param
 from tailgate.errors import InputError
 from tailgate.quantities import Accel, Lag, Length, PositiveGain, PositiveSpeed, check_order
@@ -14,20 +13,19 @@ from tailgate.registry import register
 LEADER = ("leader_position", "leader_velocity")  # what the leader sends
 WIDEN_FACTOR = 1.5  # Mode.WIDEN: time headway times this
 BRAKE_ACCEL = -2.0  # Mode.BRAKE: at most this acceleration [m/s^2]
-WIDEN, BRAKE, STOP = (int(mode) for mode in (Mode.WIDEN, Mode.BRAKE, Mode.STOP))  # a compiled lane knows numbers only
 STOP_ACCEL = -5.0  # Mode.STOP [m/s^2], the braking limit of the thesis's follower (section 3.5)
 
 
 def widened(headway: float, mode: Array) -> Array:
     """The time headway [s] under a mode that the defence asks for."""
-    out: Array = num.select(mode == WIDEN, WIDEN_FACTOR * headway, headway)
+    out: Array = np.where(mode == Mode.WIDEN, WIDEN_FACTOR * headway, headway)
     return out
 
 
 def obeyed(a: Array, mode: Array) -> Array:
     """The command [m/s^2] under a mode that the defence asks for."""
-    a = num.select(mode == BRAKE, np.minimum(a, BRAKE_ACCEL), a)
-    out: Array = num.select(mode == STOP, STOP_ACCEL, a)
+    a = np.where(mode == Mode.BRAKE, np.minimum(a, BRAKE_ACCEL), a)
+    out: Array = np.where(mode == Mode.STOP, STOP_ACCEL, a)
     return out
 
 

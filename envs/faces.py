@@ -19,10 +19,9 @@ from tailgate.agents.codec import action_space
 from tailgate.agents.observation import LIMIT
 from tailgate.core import Array, Frame
 from tailgate.errors import InputError, unknown
-from tailgate.fused.cockpit import Cockpit
 from tailgate.loop import LoopState
 
-from .batches import FusedEpisodes, PlainEpisodes, TracedEpisodes, framed, side_by_side
+from .batches import PlainEpisodes, TracedEpisodes, framed, side_by_side
 from .render_viewer import Screen, Viewer
 from .seat import FACES, Seat, Tally
 from .shadow import Begun, Decided
@@ -68,7 +67,7 @@ class AdversaryVectorEnv(Specified, gymnasium.vector.VectorEnv[Array, Array, Arr
         self.single_action_space = action_space(self.seat.action)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self.episodes = side_by_side(self.seat, engine, render_mode is not None, threads, num_envs)
+        self.episodes = side_by_side(self.seat, engine, render_mode is not None, threads)
         self.begun = False
         self.over = np.zeros(num_envs, bool)
         self._frames = self.seat.observation.frames
@@ -79,7 +78,7 @@ class AdversaryVectorEnv(Specified, gymnasium.vector.VectorEnv[Array, Array, Arr
 
     @property
     def engine(self) -> str:
-        """Who plays: fused, traced or plain. What is played is the same."""
+        """Who plays: traced or plain. What is played is the same."""
         return self.episodes.engine
 
     @property
@@ -99,17 +98,17 @@ class AdversaryVectorEnv(Specified, gymnasium.vector.VectorEnv[Array, Array, Arr
 
     @property
     def state(self) -> LoopState | None:
-        """The plain loop's state, for rendering and curious readers; None before the first episode, and in the fused engine."""
+        """The plain loop's state, for rendering and curious readers; None before the first episode, and where a traced loop plays."""
         return self.episodes.state if isinstance(self.episodes, PlainEpisodes) else None
 
     @property
     def tally(self) -> Tally | None:
-        """What the plain loop's reward remembers; None before the first episode, and in the fused engine."""
+        """What the plain loop's reward remembers; None before the first episode, and where a traced loop plays."""
         return self.episodes.tally if isinstance(self.episodes, PlainEpisodes) else None
 
     @property
     def frame(self) -> Frame | None:
-        """The plain loop's last step; None before it, and in the fused engine."""
+        """The plain loop's last step; None before it, and where a traced loop plays."""
         return self.episodes.frame if isinstance(self.episodes, PlainEpisodes) else None
 
     def card(self) -> dict[str, Any]:
@@ -202,7 +201,6 @@ class AdversaryVectorEnv(Specified, gymnasium.vector.VectorEnv[Array, Array, Arr
         """(B,) bool truncated, also at `max_episode_steps`: as Gymnasium's TimeLimit, even in a step that ends in a collision."""
         self._elapsed = np.where(over, 0, self._elapsed + 1)
         late = self._elapsed >= self._limit
-        self.episodes.end(late)
         return truncated | late
 
     def _presence(self) -> dict[str, Array]:
@@ -264,8 +262,7 @@ class AdversaryEnv(Specified, gymnasium.Env[Array, Any]):
         self.render_mode = render_mode
         self.horizon = self.batch.horizon
         self.metadata = self.metadata | {"render_fps": self.batch.metadata["render_fps"]}
-        self._cockpit: Cockpit | TracedEpisodes | None = None  # which steps a single row without a batch between
-        self._fused: Any = self.batch.episodes
+        self._alone: TracedEpisodes | None = None  # which steps a single row without a batch between
         self._direct = self.batch.direct and render_mode != "human"
         self._actions, self._over = self.batch._modes, False  # the second: the episode is over
         self._damage = self.batch._facts[-1]
@@ -285,29 +282,29 @@ class AdversaryEnv(Specified, gymnasium.Env[Array, Any]):
             seed = int(self.np_random.integers(2**31))
         played: Any = self.batch.episodes
         self._over, self._moves = False, self._moves + 1
-        if seed is None and self._cockpit is not None:
-            _, damage, step, _, _, illegal, collided, rear, allowed, seen, mask = self._cockpit.again_alone()
+        if seed is None and self._alone is not None:
+            _, damage, step, _, _, illegal, collided, rear, allowed, seen, mask = self._alone.again_alone()
             if played.shadow is not None:
                 played.shadow.add(Begun(np.ones(1, bool), None, True))
             return seen, self._told(illegal, collided, rear, allowed, step, damage, mask)
         observation, info = self.batch.reset(seed=seed)
         if self._direct:
-            self._cockpit = played.cockpit if isinstance(played, FusedEpisodes) else played
+            self._alone = played
         if self.render_mode == "human":
             self.render()
         return observation[0], self.row(info)
 
     def step(self, action: Any) -> tuple[Array, float, bool, bool, dict[str, Any]]:
-        if self._cockpit is None:
+        if self._alone is None:
             return self._step_as_batch(action)
         if self._over:
             raise InputError("step", [0], "an episode that is not over: reset() first")
         if not (type(action) in _WHOLE and action in self._usual):
             action = self.batch.checked(np.asarray(action)[None])[0]
         self._moves += 1
-        if (shadow := self._fused.shadow) is not None:
+        if (shadow := self._alone.shadow) is not None:
             shadow.add(Decided(np.array(action)[None], _GOES_ON, False))
-        reward, damage, step, terminated, truncated, illegal, collided, rear, allowed, seen, mask = self._cockpit.decide_alone(action)
+        reward, damage, step, terminated, truncated, illegal, collided, rear, allowed, seen, mask = self._alone.decide_alone(action)
         self._over = terminated or truncated
         return seen, reward, terminated, truncated, self._told(illegal, collided, rear, allowed, step, damage, mask)
 

@@ -23,13 +23,13 @@ def _within(span: tuple[float, float], u: Array) -> Array:
 
 def between(t: Array, begin: float, end: float, value: float, otherwise: float) -> Array:
     """`value` [m/s^2] from the time `begin` until `end` [s], `otherwise` before and after, elementwise."""
-    out: Array = num.select((t >= begin) & (t < end), value, otherwise)
+    out: Array = np.where((t >= begin) & (t < end), value, otherwise)
     return out
 
 
 def halt(t: Array, onset: Array, decel: float, speed: Array, dt: float) -> Array:
     """Braking with `decel` from the time `onset` [s] until the vehicle stands, elementwise [m/s^2]."""
-    out: Array = num.select(t >= onset, np.maximum(-decel, -speed / dt), 0.0)
+    out: Array = np.where(t >= onset, np.maximum(-decel, -speed / dt), 0.0)
     return out
 
 
@@ -38,14 +38,14 @@ CRUISE, BRAKE, DWELL, SPEED_UP = 0, 1, 2, 3  # phases of stop and go, in this or
 
 def phase_over(phase: Array, clock: Array, speed: Array, low: float, high: float) -> Array:
     """Whether a phase of stop and go ends, elementwise: braking and speeding up at a speed [m/s], the others by the clock."""
-    out: Array = num.select(phase == BRAKE, speed <= low, num.select(phase == SPEED_UP, speed >= high, clock <= 0.0))
+    out: Array = np.where(phase == BRAKE, speed <= low, np.where(phase == SPEED_UP, speed >= high, clock <= 0.0))
     return out
 
 
 def stop_and_go(phase: Array, speed: Array, low: float, high: float, decel: float, rate: float, dt: float) -> Array:
     """Acceleration in a phase of stop and go [m/s^2], elementwise; no more than it takes to the speed at which the phase ends."""
     slow, fast = np.maximum(-decel, (low - speed) / dt), np.minimum(rate, (high - speed) / dt)
-    out: Array = num.select(phase == BRAKE, slow, num.select(phase == SPEED_UP, fast, 0.0))
+    out: Array = np.where(phase == BRAKE, slow, np.where(phase == SPEED_UP, fast, 0.0))
     return out
 
 
@@ -308,5 +308,5 @@ class Profile:
         return None
 
     def accel(self, plan: ProfilePlan, state: Any, k: Array, speed: Array, draws: Draws) -> tuple[Any, Array]:
-        wanted = plan.speed[np.minimum(k + 1, len(plan.speed) - 1)]
+        wanted = num.take(plan.speed, np.minimum(k + 1, len(plan.speed) - 1))
         return None, (wanted - speed) / plan.dt

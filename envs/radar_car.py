@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 
-from tailgate import num
 from tailgate.core import Array, Estimate, Model, Plant, Receiver, Sensor, param
 from tailgate.errors import InputError
 from tailgate.quantities import Accel, Lag, Length, PositiveGain, PositiveSpeed, check_order
@@ -46,7 +45,7 @@ def wanted(
     off = d - (standstill + headway * v)
     spacing = v / gain + tau / (headway * gain) * (dv + g * off)
     free = d > standstill + headway * set_speed
-    out: Array = num.select(free, set_speed, np.minimum(spacing, set_speed))
+    out: Array = np.where(free, set_speed, np.minimum(spacing, set_speed))
     return out
 
 

@@ -40,6 +40,17 @@ class Tally(NamedTuple):
     peak: Array  # the largest of the episode so far, where the reward is for that
 
 
+class Sums(NamedTuple):
+    """What is added up over the steps of a decision, (B,) each."""
+
+    raw: Array  # reward of the steps
+    begun: Array  # the potential before the decision
+    collided: Array
+    rear_collided: Array
+    refused: Array  # a command was, in a step that counts
+    accepted: Array
+
+
 class Outcome(NamedTuple):
     """What a decision of the attacker brought, (B,) each; of rows that were over before it nothing."""
 
@@ -143,26 +154,43 @@ class Seat:
 
         action: as `ActionCodec.decode` takes it, or somebody who decides in every step.
         """
-        loop, reward = self.loop, self.reward
-        raw, (potential, least, largest, peak) = np.zeros(len(over)), tally
-        collided, rear, refused, accepted = (np.zeros(len(over), bool) for _ in range(4))
+        sums = self.opened(tally)
         for _ in range(self.action.spec.interval):
-            live = ~over & ~state.ended & (state.k <= loop.horizon)
-            view = loop.sense(state)
-            state, frame = loop.advance(state, action(view) if callable(action) else self.action.decode(action, view))
-            before, least, lower = least, reward.least(frame.scene.gap, least), peak
-            if reward.reward == "peak":
-                peak = np.maximum(np.max(loop.model.error(frame.estimate.x, frame.truth), axis=1), peak)
-            raw += np.where(live, reward(loop.model, frame, before - least, frame.k == loop.horizon, peak - lower), 0.0)
-            gap_error = loop.model.gap_error(frame.estimate.x, frame.truth)
-            potential = np.where(live, reward.potential(frame.scene.gap, gap_error), potential)
-            if not self.road:
-                largest = np.where(live, np.max(loop.model.error(frame.estimate.x, frame.truth), axis=1), largest)
-            collided, rear = collided | (frame.collided & live), rear | (frame.rear_collided & live)
-            refused = refused | (frame.refused & live)
-            accepted = accepted | (frame.command.kind != Kind.NONE)  # also behind a collision, which no mask foresees
-        illegal = refused & ~accepted
+            state, tally, sums, frame = self.advanced(state, tally, sums, action, over)
+        return state, tally, self.closed(state, tally, sums, over), frame
+
+    def opened(self, tally: Tally) -> Sums:
+        """What is added up over the steps of a decision, before them."""
+        no = np.zeros(len(tally.potential), bool)
+        return Sums(np.zeros(len(no)), tally.potential, no, no, no, no)
+
+    def advanced(
+        self, state: LoopState, tally: Tally, sums: Sums, action: Array | Callable[[View], Command], over: Array
+    ) -> tuple[LoopState, Tally, Sums, Frame]:
+        """One step of a decision."""
+        loop, reward = self.loop, self.reward
+        live = ~over & ~state.ended & (state.k <= loop.horizon)
+        view = loop.sense(state)
+        state, frame = loop.advance(state, action(view) if callable(action) else self.action.decode(action, view))
+        least, peak, largest = reward.least(frame.scene.gap, tally.least), tally.peak, tally.error
+        if reward.reward == "peak":
+            peak = np.maximum(np.max(loop.model.error(frame.estimate.x, frame.truth), axis=1), peak)
+        gained = reward(loop.model, frame, tally.least - least, frame.k == loop.horizon, peak - tally.peak)
+        gap_error = loop.model.gap_error(frame.estimate.x, frame.truth)
+        potential = np.where(live, reward.potential(frame.scene.gap, gap_error), tally.potential)
+        if not self.road:
+            largest = np.where(live, np.max(loop.model.error(frame.estimate.x, frame.truth), axis=1), largest)
+        sums = Sums(
+            sums.raw + np.where(live, gained, 0.0), sums.begun, sums.collided | (frame.collided & live),
+            sums.rear_collided | (frame.rear_collided & live), sums.refused | (frame.refused & live),
+            sums.accepted | (frame.command.kind != Kind.NONE),  # also behind a collision, which no mask foresees
+        )  # fmt: skip
+        return state, Tally(potential, least, largest, peak), sums, frame
+
+    def closed(self, state: LoopState, tally: Tally, sums: Sums, over: Array) -> Outcome:
+        """What a decision brought, after its last step."""
+        illegal = sums.refused & ~sums.accepted
         terminated = state.ended & ~over
-        truncated = ~terminated & ~over & (state.k > loop.horizon)
-        gained = np.where(over, 0.0, reward.decided(raw, illegal, tally.potential, potential, terminated))
-        return state, Tally(potential, least, largest, peak), Outcome(gained, collided, rear, illegal, terminated, truncated), frame
+        truncated = ~terminated & ~over & (state.k > self.loop.horizon)
+        gained = np.where(over, 0.0, self.reward.decided(sums.raw, illegal, sums.begun, tally.potential, terminated))
+        return Outcome(gained, sums.collided, sums.rear_collided, illegal, terminated, truncated)

@@ -40,8 +40,8 @@ def drive(A: Array, B: Array, x: Array, v: Array, a: Array, u: Array, noise: Arr
     a_next = A[2][2] * a + B[2][0] * u + noise[2]
     halted = v_next <= 0.0  # a car that stands neither rolls back nor decelerates
     v_next = np.maximum(v_next, 0.0)
-    a_next = num.select(halted, np.maximum(a_next, 0.0), a_next)
-    x_next = num.select(halted, np.maximum(x_next, x), x_next)
+    a_next = np.where(halted, np.maximum(a_next, 0.0), a_next)
+    x_next = np.where(halted, np.maximum(x_next, x), x_next)
     return x_next, v_next, a_next
 
 

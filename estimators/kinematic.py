@@ -164,7 +164,7 @@ class JointRegression:
 def stop_time(speed: Array, a: Array, age: Array) -> Array:
     """Time [s] to the instant at which a leader's fitted speed [m/s] passed zero, elementwise; `_stop` says of which ones."""
     slowing = (speed < 0.0) & (a < 0.0)
-    out: Array = num.select(slowing, np.maximum(-speed / num.select(slowing, a, -1.0), -age), 0.0)
+    out: Array = np.where(slowing, np.maximum(-speed / np.where(slowing, a, -1.0), -age), 0.0)
     return out
 
 

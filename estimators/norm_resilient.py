@@ -17,7 +17,7 @@ factors in an order that does not multiply; the bound is in tailgate.resilience.
 
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -29,6 +29,8 @@ from .compose import AcceptAll, Composed, Detector, Filter, Mitigation, Score
 from .distributed import DistributedFilter, FusionPlan, one_row
 from .kalman import GAIN, Gain, KalmanState, alone
 from .robust import ACCURACY, load_cvxpy
+
+ROUNDS = 100  # of Newton's iteration; some five are enough
 
 
 class Axes(NamedTuple):
@@ -46,12 +48,45 @@ def axes(C: Array, R: Array, spread: Array) -> Axes:
     """
     _, white = num.root(R)
     rows, turn = num.orthogonal(num.matmul(num.matmul(white, C), num.transpose(spread)), white)
-    return Axes(np.ascontiguousarray(turn), 0.5 * num.dot(rows, rows), 0.5 * np.ascontiguousarray(num.transpose(num.matmul(rows, spread))))
+    return Axes(turn, 0.5 * num.dot(rows, rows), 0.5 * num.transpose(num.matmul(rows, spread)))
+
+
+@np.errstate(all="ignore")  # rows that have stopped, and prices beyond all measure
+def in_ball(w: Array, c: Array) -> Array:
+    """u_k = w_k / (c_k + mu) with the least mu >= 0 at which |u| <= 1, for w (B, P, q) and c (B or 1, P, q) >= 0. 0/0 counts as 0."""
+    there, q = w != 0.0, range(w.shape[-1])
+
+    def parts(mu: Array) -> Array:
+        return np.where(there, w / np.where(there, c + mu[..., None], 1.0), 0.0)
+
+    exact = _summed(parts(np.zeros(w.shape[:-1])), 2)
+    outside = exact > 1.0
+    short = np.maximum(0.0, np.abs(w[..., 0]) - c[..., 0])
+    for k in q[1:]:
+        short = np.maximum(short, np.abs(w[..., k]) - c[..., k])
+    least = np.maximum(short, np.sqrt(num.dot(w, w)) - np.max(c, axis=-1))
+
+    def newton(mu: Array, size: Array) -> tuple[Array, list[Array]]:
+        z = parts(mu)
+        s = _summed(z, 2)
+        t = z * z / np.where(there, c + mu[..., None], 1.0)
+        size = np.sqrt(s)
+        step = s * (size - 1.0) / _summed(t, 1)
+        further = step > 1e-15 * mu
+        return further, [np.where(further, mu + step, mu), size]
+
+    mu, size = num.until(newton, [np.where(outside, least, 0.0), np.ones(outside.shape)], outside, ROUNDS)
+    return np.asarray(parts(mu) / size[..., None])
+
+
+def _summed(x: Array, power: int) -> Array:
+    """Sums of x (..., q) or its squares, in ascending order."""
+    return num.dot(x, x if power == 2 else np.ones_like(x))
 
 
 def moved(problem: Axes, r: Array, lam: float) -> tuple[Array, Array]:
     """xh - xb (B, P, n) and u (B, P, q), in the axes of V, for the innovations r = y - C xb (B, P, q)."""
-    u = num.in_ball(num.apply(problem.turn, r), lam * problem.half)
+    u = in_ball(num.apply(problem.turn, r), lam * problem.half[None])
     return lam * num.apply(problem.push, u), u
 
 
@@ -76,6 +111,14 @@ def moved_by_cvxpy(C: Array, R: Array, Qinv: Array, r: Array, lam: float) -> Arr
     parameter.value, offset.value = H / size, solve_triangular(white, r, lower=True) * (2.0 / (lam * size * size))
     problem.solve(solver="CLARABEL", warm_start=False, **dict.fromkeys(("tol_gap_abs", "tol_gap_rel", "tol_feas"), ACCURACY))
     return np.asarray(num.matvec(root, z.value) * (0.5 * lam * size))
+
+
+def _times(m: Array, v: Array) -> Array:
+    """m (M, i, k) times v (M, k), as `num.apply`: sums run from 0, and zeros of m count for nothing."""
+    out = np.zeros(m.shape[:2])
+    for k in range(m.shape[2]):
+        out = np.where(m[..., k] != 0.0, out + m[..., k] * v[:, k, None], out)
+    return out
 
 
 class NormPlan(NamedTuple):
@@ -152,19 +195,16 @@ class NormResilientFilter(Norm, DistributedFilter):
             spread = num.root(held.reshape(-1, *held.shape[2:]))[0].reshape(held.shape)
             whole = axes(linear.C, linear.R, spread[0])
         if len(held) == 1:
-            out, left = moved(whole, r, self.lam)[0], np.asarray(~accept.all(axis=-1))
+            out, known = moved(whole, r, self.lam)[0], accept.all(axis=-1)
         else:
-            out, left = num.zeros((*r.shape[:2], held.shape[-1])), np.full(r.shape[:2], True)
-        b, i = np.nonzero(left)
-        if len(b):
-            some = which = np.arange(len(b))
-            if len(held) == 1:  # one decomposition for each agent and set of sensors
-                kinds = np.concatenate([i[:, None], accept[b, i]], axis=1)
-                _, some, which = np.unique(kinds, axis=0, return_index=True, return_inverse=True)
-            agent, keep = i[some], accept[b, i][some]
-            each = axes(linear.C[agent] * keep[..., None], alone(linear.R[agent], keep), spread[b[some] % len(held), agent])
-            out[b, i] = moved(Axes(*(part[which.reshape(-1)] for part in each)), r[b, i][None], self.lam)[0][0]
-        return out
+            out, known = num.zeros((*r.shape[:2], held.shape[-1])), np.zeros(r.shape[:2], bool)
+        return np.asarray(num.elsewhere(known, out, self._apart, r, accept, linear.C[None], linear.R[None], spread))
+
+    def _apart(self, r: Array, accept: Array, C: Array, R: Array, spread: Array) -> Array:
+        """xh - xb (M, 1, n) of problems with a decomposition of their own: r and accept (M, 1, q), C, R and spread (M, 1, ...)."""
+        each = axes(C[:, 0] * accept[:, 0, :, None], alone(R, accept)[:, 0], spread[:, 0])
+        u = in_ball(_times(each.turn, r[:, 0])[:, None], self.lam * each.half[:, None])
+        return self.lam * _times(each.push, u[:, 0])[:, None]
 
     def _by_cvxpy(self, linear: FusionPlan, held: Array, r: Array, accept: Array) -> Array:
         out = num.zeros((*r.shape[:2], held.shape[-1]))
@@ -179,7 +219,6 @@ class NormResilientFilter(Norm, DistributedFilter):
 class NormResilient(Norm, Composed):
     """Resilient distributed estimator: however many sensors are attacked, a step's correction stays bounded."""
 
-    untraced: ClassVar[str] = "numba compiles the loop of Jacobi's rotations"
     gain: Gain = param("steady", GAIN)
 
     def parts(self) -> tuple[Filter, Detector, Mitigation]:

@@ -31,7 +31,6 @@ ACCURACY = 1e-9  # asked of the interior-point solver
 PATIENCE = 3  # rounds of block changes without progress
 TOLERANCE = 1e-12  # of the optimality conditions, relative to lam
 ROUNDING = 8 * float(np.finfo(np.float64).eps)  # of a sum, relative to its largest term
-LIMITS = (TOLERANCE, ROUNDING, PATIENCE, ROUNDS)
 
 
 def believed(r: Array, S: Array, lam: Array) -> Array:

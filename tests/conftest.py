@@ -21,6 +21,8 @@ from tailgate.threat import KindName
 from tailgate.trace import rollout
 from tailgate.tree import leaves
 
+os.environ.setdefault("TAILGATE_LLVM", "0")  # code is compiled for a few steps only; no bit depends on it
+
 settings.register_profile("steady", deadline=None, derandomize=True)  # machines differ in speed, and a suite shall repeat
 settings.load_profile("steady")
 

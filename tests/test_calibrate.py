@@ -12,9 +12,9 @@ import pytest
 from scipy import stats
 
 import tailgate
-from tailgate import cli
+from tailgate import cli, trace
 from tailgate.calibrate import MIXTURE, calibrate
-from tailgate.clean import Bench, Count, Crossings, _fused, count_onsets
+from tailgate.clean import Bench, Count, Crossings, count_onsets
 from tailgate.draws import keys
 from tailgate.errors import InputError
 from tailgate.estimators import ChiSquare, Cusum, GateOut, KalmanFilter, Mewma, WindowedChiSquare, compose
@@ -75,17 +75,13 @@ def test_onsets_are_those_of_the_metric(short):
 
 
 @pytest.mark.parametrize(("defence", "scenario"), [("chi2_kf", "braking-v0"), ("imm", "stop-and-go-v0"), ("cusum_kf", "radar-braking-v0")])
-def test_the_fused_engine_finds_the_same_threshold(monkeypatch, defence, scenario):
+def test_the_plain_loop_finds_the_same_threshold(monkeypatch, defence, scenario):
     """To the last digit, with the same alarms in as many steps."""
-    found = {}
-    for engine in (True, False):
-        if not engine:
-            monkeypatch.setattr("tailgate.clean._fused", lambda loop: False)
-        else:
-            bench = Bench.of(defence, [scenario], 4096, None)
-            assert _fused(bench.places[0].loop(bench.at(9.0), bench.uses))
-        found[engine] = calibrate(defence, 0.02, scenarios=[scenario], onsets=40, most_steps=200_000).as_data()
-    assert found[True] == found[False] and found[True]["measured"]["onsets"] > 0
+    found = []
+    for worth in (trace.WORTH, np.inf):
+        monkeypatch.setattr(trace, "WORTH", worth)
+        found.append(calibrate(defence, 0.02, scenarios=[scenario], onsets=40, most_steps=200_000).as_data())
+    assert found[0] == found[1] and found[0]["measured"]["onsets"] > 0
 
 
 def test_the_interval_is_exact_poisson():

@@ -145,7 +145,7 @@ def test_before_onset_an_attacked_episode_is_the_clean_one(attack, short, play):
 @pytest.mark.parametrize("defence", DEFENCES)
 def test_swapping_the_defence_leaves_the_world_draws(defence, short, play, monkeypatch):
     """Clean runs of two defences draw the same numbers for the world: comparisons are paired."""
-    log, fill = [], Draws._fill
+    log, fill = [], Draws._numbers
 
     def spy(self, fill_, shape, tag):
         out = fill(self, fill_, shape, tag)
@@ -153,7 +153,7 @@ def test_swapping_the_defence_leaves_the_world_draws(defence, short, play, monke
             log.append((self.stream, tag, self.step.tobytes(), out.tobytes()))
         return out
 
-    monkeypatch.setattr(Draws, "_fill", spy)
+    monkeypatch.setattr(Draws, "_numbers", spy)
     traces, logs = [], []
     for name in (defence, "none"):
         log.clear()

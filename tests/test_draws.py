@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 import tailgate
-from tailgate import draws, kernels
+from tailgate import draws
 from tailgate.draws import Draws, Role, keys
+from tailgate.engine import elementary
 from tailgate.errors import InputError
 
 ANSWERS = [  # Random123 known answers of philox4x32-10: counter, key, words
@@ -53,20 +54,21 @@ def _draws(seeds, role=Role.SENSOR, step=3, purpose="train", episode=0):
 @pytest.mark.parametrize("counter, key, words", ANSWERS)
 def test_philox_known_answers(counter, key, words):
     """The generator is the published one."""
-    np.testing.assert_array_equal(kernels.philox_words(_words(counter), _words(key)), _words(words))
+    given = [np.array([word], np.uint64) for word in (*_words(counter)[0], *_words(key)[0])]
+    np.testing.assert_array_equal(np.stack(elementary.philox(*given), axis=1), _words(words))
     np.testing.assert_array_equal(_philox(_words(counter).astype(np.uint64), _words(key).astype(np.uint64)), _words(words))
 
 
 @pytest.mark.parametrize("size", [1, 2, 5])
 def test_uniforms_equal_a_numpy_transcription(size):
-    """fill_uniform is the counter-based generator, bit for bit."""
+    """uniform() is the counter-based generator, bit for bit."""
     source = _draws(range(50), episode=4)
     np.testing.assert_array_equal(source.uniform((size,)), _oracle(source, size)[:size].T)
 
 
 @pytest.mark.parametrize("size", [1, 2, 5])
 def test_normals_are_box_muller_of_the_same_uniforms(size):
-    """fill_normal against the library's logarithm, sine and cosine."""
+    """normal() against the library's logarithm, sine and cosine."""
     source = _draws(range(50))
     u = _oracle(source, size)
     want = np.empty((size, 50))
@@ -76,14 +78,13 @@ def test_normals_are_box_muller_of_the_same_uniforms(size):
     np.testing.assert_allclose(source.normal((size,)), want.T, atol=2e-15 * 10)
 
 
-def test_compiled_fill_equals_its_python_source(same_bits):
+@pytest.mark.parametrize(("kind", "pair"), [("normal", elementary.normal_pair), ("uniform", elementary.uniform_pair)])
+def test_compiled_draws_equal_their_source(kind, pair, same_bits):
     """Compilation changes no bit of a draw."""
     source = _draws(range(6))
-    for fill in (kernels.fill_normal, kernels.fill_uniform):
-        a, b = np.empty((3, 6)), np.empty((3, 6))
-        fill(np.ascontiguousarray(source.key), source.episode, source.step, source.stream, a)
-        fill.py_func(np.ascontiguousarray(source.key), source.episode, source.step, source.stream, b)
-        assert same_bits(a, b)
+    counters = source.key, source.episode.astype(np.uint64), source.step.astype(np.uint64), np.uint64(source.stream << 16)
+    want = [number for block in range(2) for number in pair(*counters, np.uint64(block))][:3]
+    assert same_bits(getattr(source, kind)((3,)), np.stack(want, axis=1))
 
 
 @pytest.mark.parametrize("kind", ["normal", "uniform"])
@@ -169,14 +170,14 @@ def test_successive_steps_are_uncorrelated():
 def test_swapping_the_defence_or_the_attack_leaves_every_world_draw(short, play, monkeypatch):
     """Comparisons are paired: what the world draws is the same, address by address and bit for bit."""
     log = []
-    fill = Draws._fill
+    fill = Draws._numbers
 
     def spy(self, fill_, shape, tag):
         out = fill(self, fill_, shape, tag)
         log.append((self.stream, tag, shape, self.step.tobytes(), self.key.tobytes(), out.tobytes()))
         return out
 
-    monkeypatch.setattr(Draws, "_fill", spy)
+    monkeypatch.setattr(Draws, "_numbers", spy)
     seen = []
     for defence, attack in (("kf", "none"), ("stand_still", "none"), ("chi2_kf", "dos_jam")):
         log.clear()

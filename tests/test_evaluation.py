@@ -277,7 +277,7 @@ def _recorded(loop: Any) -> dict[str, Any]:
     state = loop.start(draws.keys("train", [0]))
     recorder = trace.Recorder(loop, state)
     _, frame = loop.advance(state, no_command(1, loop.model.agents, len(loop.model.wires)))
-    recorder.add(frame, np.ones(1, bool))
+    recorder.put(trace.signals_of(frame), np.ones(1, bool))
     return recorder.signals
 
 

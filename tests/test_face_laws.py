@@ -13,7 +13,7 @@ from tailgate.envs.faces import FACES, AdversaryEnv, AdversaryVectorEnv
 from tailgate.errors import InputError
 from tailgate.evaluation import Cell, run_cell
 
-from .fused import short as shortened
+from .engines import short as shortened
 from .tiny import AUTORESETS, CRASHES, write
 
 CAR, PLATOON, NETWORK, HIGHWAY = "tailgate/CarFollowing-v0", "tailgate/Platoon-v0", "tailgate/SensorNetwork-v0", "tailgate/Highway-v0"
@@ -271,7 +271,7 @@ def test_pictures_of_the_fast_engine_are_those_of_the_plain_loop(autoreset, brie
         AdversaryVectorEnv(2, autoreset=autoreset, viewer="plain", engine=engine, render_mode=mode, **config)
         for engine, mode in (("auto", "rgb_array"), ("plain", "rgb_array"), ("auto", None))
     )
-    assert (fast.engine, plain.engine) == ("fused", "plain") and fast.render() is None
+    assert (fast.engine, plain.engine) == ("traced", "plain") and fast.render() is None
     envs, rng, ends = (fast, plain, bare), np.random.default_rng(1), 0
     for env in envs:
         env.reset(seed=5)
@@ -292,7 +292,7 @@ def test_pictures_of_the_fast_engine_are_those_of_the_plain_loop(autoreset, brie
         if t == 100:
             for env in envs:
                 env.reset()
-    assert ends >= 6 and fast.engine == "fused"
+    assert ends >= 6 and fast.engine == "traced"
 
 
 def test_a_single_environment_that_may_be_drawn_stays_fast():
@@ -301,7 +301,7 @@ def test_a_single_environment_that_may_be_drawn_stays_fast():
     fast, plain = (gymnasium.make(CAR, render_mode="rgb_array", viewer="plain", engine=engine, **CRASHES).unwrapped for engine in ("auto", "plain"))
     for env in (fast, plain):
         env.reset(seed=5)
-    assert fast.batch.engine == "fused"
+    assert fast.batch.engine == "traced"
     for t in range(150):
         one, other = fast.step(t % 3), plain.step(t % 3)
         alike(one, other)
@@ -310,7 +310,7 @@ def test_a_single_environment_that_may_be_drawn_stays_fast():
         if one[2] or one[3]:
             alike(fast.reset(), plain.reset())
             assert (fast.render() == plain.render()).all()
-    assert fast.batch.engine == "fused" and fast._cockpit is not None
+    assert fast.batch.engine == "traced" and fast._alone is not None
 
 
 def test_decisions_are_kept_for_two_episodes_at_most(brief):

@@ -169,7 +169,7 @@ def test_row_i_is_the_single_environment_of_seed_s_plus_i(name, action, interval
                 assert np.array_equal(value, info[key][i]), key
             over = alone[2] or alone[3]
         assert episodes >= 2
-        assert vec.unwrapped.state.keys.episode[i] == episodes - 1 == env.unwrapped.batch.state.keys.episode[0]
+        assert vec.unwrapped.episode[i] == episodes - 1 == env.unwrapped.batch.episode[0]
 
 
 @pytest.mark.parametrize("name", FACES)

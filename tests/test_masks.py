@@ -11,7 +11,7 @@ from tailgate.envs.faces import AdversaryVectorEnv
 from tailgate.scenario import load_scenario
 from tailgate.threat import Brief, Channel, ThreatModel
 
-from .fused import same
+from .engines import same
 
 LIMITS = [
     {"budget": 9, "duration": 3, "cooldown": 2, "onset": 1, "end": 75},
@@ -61,17 +61,17 @@ def test_one_of_the_next_steps_is_open_where_the_channel_accepts_in_one(onset, m
 def test_an_action_is_illegal_exactly_where_its_mask_is_closed(seat, interval, limits):
     """In random play, in both engines alike; an open one costs budget and a closed one none."""
     arguments = SEATS[seat] | {"interval": interval, "threat": limits, "illegal_penalty": 0.3}
-    fused, plain = (AdversaryVectorEnv(12, engine=engine, **arguments) for engine in ("fused", "plain"))
-    same(fused.reset(seed=2)[1], plain.reset(seed=2)[1])
+    fast, plain = (AdversaryVectorEnv(12, engine=engine, **arguments) for engine in ("traced", "plain"))
+    same(fast.reset(seed=2)[1], plain.reset(seed=2)[1])
     rng, opened, closed = np.random.default_rng(1), 0, 0
     for _ in range(min(180, 400 // interval)):
-        mask, fused_mask, over, used = plain.action_masks(), fused.action_masks(), plain.over.copy(), plain.state.channel.used
+        mask, fast_mask, over, used = plain.action_masks(), fast.action_masks(), plain.over.copy(), plain.state.channel.used
         actions = rng.integers(0, mask.shape[1], 12)
         *results, info = plain.step(actions)
-        for one, two in zip(fused.step(actions), (*results, info), strict=True):
+        for one, two in zip(fast.step(actions), (*results, info), strict=True):
             same(one, two)
         here = mask[np.arange(12), actions]
-        assert mask[:, 0].all() and np.array_equal(mask, fused_mask) and np.array_equal(info["illegal"], ~here & ~over)
+        assert mask[:, 0].all() and np.array_equal(mask, fast_mask) and np.array_equal(info["illegal"], ~here & ~over)
         cost = (plain.state.channel.used > used)[~over]
         assert np.array_equal(cost, (here & (actions != 0))[~over])
         opened, closed = opened + np.count_nonzero(cost), closed + np.count_nonzero(info["illegal"])

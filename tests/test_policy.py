@@ -21,7 +21,7 @@ from tailgate.errors import InputError
 from tailgate.metrics import METRICS, crashed
 from tailgate.registry import Spec
 from tailgate.scenario import Scenario, load_scenario
-from tailgate.trace import Recorder, rollout
+from tailgate.trace import Recorder, rollout, signals_of
 
 THREAT = {"budget": 20, "kinds": ["dos_jam", "fdi"], "fdi_bound": 5.0}
 SEEDS = list(range(12))
@@ -89,7 +89,7 @@ def _same_trace(tmp_path: Path, spec: dict[str, Any], knowledge: str, scenario: 
         live = ~state.ended & (state.k <= loop.horizon)
         state, frame = advance(state, command)
         if live.any() and recorder.steps < loop.horizon:
-            recorder.add(frame, live)
+            recorder.put(signals_of(frame), live)
         return state, frame
 
     object.__setattr__(loop, "advance", recorded)

@@ -12,14 +12,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tailgate import draws, num
+from tailgate import draws, num, trace
 from tailgate.agents.scripted import NoAttack
 from tailgate.agents.zoo import zoo_card
 from tailgate.cli import main
 from tailgate.engine import objects, rollouts, seats
+from tailgate.engine.commanded import Commanded
 from tailgate.engine.evaluation import evaluate
-from tailgate.engine.parameters import Remembered
 from tailgate.engine.program import Call, Program, State, traced
+from tailgate.engine.remembered import Remembered
 from tailgate.engine.rollouts import Rollout, rollout_of
 from tailgate.engine.seats import SeatPrograms
 from tailgate.envs.faces import AdversaryEnv, AdversaryVectorEnv
@@ -30,10 +31,9 @@ from tailgate.registry import Spec
 from tailgate.scenario import load_scenario
 from tailgate.trace import Trace, rollout
 
-from .fused import as_plain
-from .test_fused import ENVIRONMENTS
+from .engines import as_plain
 
-MORE = [  # what the fused engine does not play
+ENVIRONMENTS = [  # beyond those of test_traced_cars.py and test_traced_many.py
     {"scenario": "gusty-stop-and-go-v0", "defence": "chi2_kf", "action": "mode", "interval": 3,
      "threat": {"kinds": ["delay", "replay", "dropout", "dos_hold_fresh"], "memory": 12}},
     {"scenario": "car-following-lossy-v0", "defence": "kf"},
@@ -46,9 +46,9 @@ MORE = [  # what the fused engine does not play
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize("arguments", [*ENVIRONMENTS, *MORE], ids=lambda a: f"{a['scenario']}-{a['defence']}")
+@pytest.mark.parametrize("arguments", ENVIRONMENTS, ids=lambda a: f"{a['scenario']}-{a['defence']}")
 def test_an_environment_is_the_plain_one_to_the_last_bit(arguments, tmp_path):
-    as_plain(arguments, 5, tmp_path, "traced")
+    as_plain(arguments, 5, tmp_path)
 
 
 def plugin(tmp_path, monkeypatch, name="saturated_plugin"):
@@ -62,10 +62,9 @@ def plugin(tmp_path, monkeypatch, name="saturated_plugin"):
 
 def test_a_strangers_defence_is_traced_as_it_stands(tmp_path, monkeypatch):
     made = plugin(tmp_path, monkeypatch).Saturated(gain=0.1)
-    for rows, engine in ((16, "traced"), (1, "plain")):
-        env = AdversaryVectorEnv(rows, defence=made)
-        assert (env.engine, env.engine_why) == (engine, "")
-    as_plain({"scenario": "stop-and-go-v0", "defence": made}, 5, tmp_path, "traced")
+    env = AdversaryVectorEnv(1, defence=made)
+    assert (env.engine, env.engine_why) == ("traced", "")
+    as_plain({"scenario": "stop-and-go-v0", "defence": made}, 5, tmp_path)
 
 
 @pytest.mark.parametrize("terminate", [True, False])
@@ -93,12 +92,15 @@ def test_a_rollout_has_the_plain_ones_hashes(scenario, defence, rival, terminate
     assert all(np.array_equal(fast.first[name], held) for name, held in plain.first.items())
 
 
-def test_large_rollouts_without_lanes_are_traced(monkeypatch, tmp_path):
-    """And small ones are not: tracing takes longer than they do."""
+def test_who_plays_a_rollout_depends_on_its_size(monkeypatch, tmp_path):
+    """Tracing takes longer than small ones do; an attack is traced for many steps alone."""
     loop, played = load_scenario("stop-and-go-v0").loop(plugin(tmp_path, monkeypatch).Saturated()), []
-    monkeypatch.setattr(Rollout, "play", lambda self, keys, terminate, play=Rollout.play: played.append(1) or play(self, keys, terminate))
-    hashes = [rollout(loop, NoAttack(), draws.keys("report", range(n))).trace_hash(3) for n in (10, 50)]
-    assert hashes[0] == hashes[1] and len(played) == 1
+    for kind in (Rollout, Commanded):
+        monkeypatch.setattr(kind, "play", lambda self, *rest, kind=kind, play=kind.play: played.append(kind) or play(self, *rest))
+    hashes = [rollout(loop, NoAttack(), draws.keys("report", range(4))).trace_hash(3)]  # of 600 steps
+    monkeypatch.setattr(trace, "LONG", 601)
+    hashes += [rollout(loop, NoAttack(), draws.keys("report", range(n))).trace_hash(3) for n in (10, 50, 1700)]
+    assert len(set(hashes)) == 1 and played == [Commanded, Commanded, Rollout]
 
 
 @dataclass
@@ -151,7 +153,6 @@ def test_what_cannot_be_traced_is_played_plain_and_says_why():
     assert env.engine == "plain" and f"test_traced.py:{line}: " in env.engine_why and "write it for all rows" in env.engine_why
     with pytest.raises(InputError, match=rf"engine: got 'traced'; expected plain or auto: .*test_traced.py:{line}"):
         AdversaryVectorEnv(16, defence=Branching(), engine="traced")
-    assert AdversaryVectorEnv(1, defence=Branching(), engine="auto").engine_why == ""  # nobody tried
     for name, why in (("filterpy_kf", "one episode after the other"),):
         assert why in AdversaryVectorEnv(16, defence=name).engine_why
 
@@ -192,6 +193,17 @@ def test_parameters_of_other_values_are_traced_once(monkeypatch):
     shifted = ChiSquare.step
     monkeypatch.setattr(ChiSquare, "step", lambda *arguments: shifted(*arguments))
     assert play("chi2_kf", "fdi:trigger=near,threshold=50,value=3", 20) == before + 3  # other functions
+
+
+def test_intervals_share_code_and_not_their_length():
+    """Decisions of 12 and 5 steps have one program, and each plays its own number of them."""
+    for interval in (12, 5, 1, 5):
+        one, other = (AdversaryVectorEnv(3, engine=engine, interval=interval) for engine in ("traced", "plain"))
+        for env in (one, other):
+            env.reset(seed=4)
+        for t in range(12):
+            (*got, info), (*wanted, _) = (env.step(np.array([0, 1, t % 3])) for env in (one, other))
+            assert all(np.array_equal(x, y) for x, y in zip(got, wanted, strict=True)) and info["step"][0] == 1 + interval * (t + 1)
 
 
 def test_copies_of_a_traced_environment_are_not_traced_again(monkeypatch):
@@ -323,8 +335,7 @@ def test_objects_that_are_damaged_or_cannot_be_kept_are_made_again(tmp_path, mon
 def test_explain_names_the_engine_and_the_line(capsys):
     assert main(["explain", "engine", "--json", "--scenario", "car-following-lossy-v0", "--attack", "dos_hold"]) == 0
     found = json.loads(capsys.readouterr().out)
-    assert "lost or late" in found["environments"]["fused"]["why"] and "operations" in found["environments"]["traced"]["size"]
-    assert "operations" in found["episodes"]["traced"]["size"]
+    assert all("operations" in held["size"] for held in found.values()) and len(found) == 3
     assert main(["explain", "engine", "--defence", "filterpy_kf"]) == 0
     assert "one episode after the other" in " ".join(capsys.readouterr().out.split())
     assert main(["explain", "engine", "--defence", "nobody"]) == 2

@@ -148,7 +148,7 @@ def test_a_dose_that_is_changed_everywhere_is_found(rows: list[dict[str, Any]]) 
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"version": "9.9"}, "tailgate 9.9"), ({"engine": "fused"}, "engine 'fused'"), ({"purpose": "mine"}, "'mine'"),
+        ({"version": "9.9"}, "tailgate 9.9"), ({"engine": "quick"}, "engine 'quick'"), ({"purpose": "mine"}, "'mine'"),
         ({"defence": "os:system"}, "code to import"), ({"attack": "os:system:command=ls"}, "code to import"),
         ({"defence": "composed:detector=os:system"}, "code to import"), ({"defence": "composed:detector={name: 'os:system'}"}, "code to import"),
         ({"attack": "/nowhere/policy.json"}, "not here"), ({"attack": "policy:path=/nowhere/policy.json"}, "not here"),

@@ -18,10 +18,9 @@ import numpy as np
 
 from tailgate import draws
 from tailgate.agents.scripted import NoAttack
-from tailgate.core import Array, Model, no_command
+from tailgate.core import Array, Model
 from tailgate.errors import InputError, NotApplicable
 from tailgate.estimators.watched import watched
-from tailgate.fused import Constants, fuse
 from tailgate.loop import Loop
 from tailgate.registry import Spec, entry_for, text_of
 from tailgate.scenario import Scenario, load_scenario
@@ -30,7 +29,7 @@ from tailgate.trace import MEMORY, episodes_at_once, rollout
 
 SILENT = 1e12  # a threshold that nothing reaches
 MOST_DIGITS = 7  # of a threshold
-RECORDED = 512  # episodes of the fused engine at a time
+RECORDED = 512  # episodes that are recorded side by side
 NOTHING = NoAttack()
 HOUR = 3600.0
 
@@ -107,31 +106,13 @@ def most_at_once(model: Model, most: int) -> int:
 
 def side_by_side(loop: Loop, most: int) -> int:
     """How many clean episodes of a loop, at most `most`, are played at once; it changes no bit of them."""
-    size = most_at_once(loop.model, most)
-    return episodes_at_once(loop.model, loop.horizon, min(size, RECORDED)) if _fused(loop) else size
+    return episodes_at_once(loop.model, loop.horizon, most_at_once(loop.model, min(most, RECORDED)))
 
 
 def play_clean(loop: Loop, keys: draws.Keys) -> Iterator[tuple[Array, Array, Array]]:
-    """(alarm (B, agents), score (B, agents), live (B,)) of each step without an attack; an episode ends with a collision.
-
-    A loop that has lanes is played by the fused engine, whose record is to the same bits.
-    """
-    if _fused(loop):
-        trace = rollout(loop, NOTHING, keys)
-        yield from zip(trace.alarm, trace.score, trace.live, strict=True)
-        return
-    state = loop.start(keys)
-    nothing = no_command(len(keys.key), loop.model.agents, len(loop.model.wires))
-    for _ in range(loop.horizon):
-        live = ~state.ended
-        if not live.any():
-            return
-        state, frame = loop.advance(state, nothing)
-        yield frame.estimate.alarm, frame.estimate.score, live
-
-
-def _fused(loop: Loop) -> bool:
-    return isinstance(fuse(loop.bare, NOTHING), Constants)
+    """(alarm (B, agents), score (B, agents), live (B,)) of each step without an attack; an episode ends with a collision."""
+    trace = rollout(loop, NOTHING, keys)
+    yield from zip(trace.alarm, trace.score, trace.live, strict=True)
 
 
 @dataclass(frozen=True)

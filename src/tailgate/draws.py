@@ -9,14 +9,16 @@ import hashlib
 import math
 from collections.abc import Sequence
 from enum import IntEnum
-from typing import Any, NamedTuple
+from functools import cache
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tailgate import kernels, num
+from tailgate import num
 from tailgate.engine import elementary
 from tailgate.engine.array import Traced
+from tailgate.engine.compiled import Code
 from tailgate.errors import InputError
 
 Array = NDArray[Any]
@@ -67,6 +69,11 @@ def keys(purpose: str, seeds: Sequence[int]) -> Keys:
     return Keys(out.T, np.zeros(len(seeds), np.uint32))
 
 
+@cache
+def _code(pair: Any) -> Code:
+    return Code(pair, np.uint64, 5)
+
+
 class Draws(NamedTuple):
     """One role's random numbers at one step. A second independent draw in the same step needs another `tag`."""
 
@@ -75,27 +82,28 @@ class Draws(NamedTuple):
     step: Array
     stream: int
 
-    def _fill(self, fill: Any, shape: tuple[int, ...], tag: int) -> Array:
-        size = math.prod(shape)
+    def _numbers(self, pair: Any, shape: tuple[int, ...], tag: int) -> Array:
+        """(B, *shape) numbers of a function that gives two for each block."""
+        size, batch = math.prod(shape), len(self.key)
+        blocks, stream = (size + 1) // 2, np.uint64(self.stream << 16 | tag)
         if isinstance(self.key, Traced):
-            return self._traced(fill is kernels.fill_normal, size, tag).reshape(len(self.key), *shape)
-        out = np.empty((size, len(self.key)))
-        fill(np.ascontiguousarray(self.key), self.episode, self.step, self.stream << 16 | tag, out)
-        return num.last_to_first(out.reshape(*shape, len(self.key)))
-
-    def _traced(self, normal: bool, size: int, tag: int) -> Any:
-        pair = elementary.normal_pair if normal else elementary.uniform_pair
-        counters = (self.key, self.episode.astype(np.uint64), self.step.astype(np.uint64), np.uint64(self.stream << 16 | tag))
-        out = [number for block in range((size + 1) // 2) for number in pair(*counters, np.uint64(block))][:size]
-        return np.stack(out, axis=-1) if out else np.zeros((len(self.key), 0))
+            counters = self.key, self.episode.astype(np.uint64), self.step.astype(np.uint64), stream
+            out: Any = [number for block in range(blocks) for number in pair(*counters, np.uint64(block))][:size]
+            held: Any = np.stack(out, axis=-1) if out else np.zeros((batch, 0))
+            return cast(Array, held.reshape(batch, *shape))
+        given = np.empty((5, blocks, batch), np.uint64)
+        given[0], given[1], given[2], given[3], given[4] = self.key, self.episode, self.step, stream, np.arange(blocks)[:, None]
+        held = _code(pair)(given.reshape(5, -1)) if given.size else np.empty((2, 0))
+        both = held.reshape(2, blocks, batch).swapaxes(0, 1).reshape(2 * blocks, batch)
+        return num.last_to_first(both[:size].reshape(*shape, batch))
 
     def normal(self, shape: tuple[int, ...] = (), tag: int = 0) -> Array:
         """Standard normals (B, *shape)."""
-        return self._fill(kernels.fill_normal, shape, tag)
+        return self._numbers(elementary.normal_pair, shape, tag)
 
     def uniform(self, shape: tuple[int, ...] = (), tag: int = 0) -> Array:
         """Uniforms on (0, 1), ends excluded, (B, *shape)."""
-        return self._fill(kernels.fill_uniform, shape, tag)
+        return self._numbers(elementary.uniform_pair, shape, tag)
 
 
 def constants(name: str, seed: int) -> Draws:

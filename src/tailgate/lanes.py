@@ -2,7 +2,7 @@
 
 To vectorise a loop over a batch is otherwise left to the compiler, which does it along the wrong index, or not at all, where matrices are
 small. What a row of a batch gets does not depend on the others; where eight does not divide a batch, the last lanes repeat its last row. As
-in `tailgate.kernels`, every sum has a fixed order and nothing is contracted.
+in `tailgate.linear`, every sum has a fixed order and nothing is contracted.
 """
 
 import numba

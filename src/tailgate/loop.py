@@ -154,7 +154,7 @@ class Loop:
         )
 
     @cached_property
-    def _shown(self) -> Any:
+    def shown(self) -> Any:
         """The defence's plan as a white-box attacker holds it: a copy, so that nothing it writes reaches the defence."""
         return lock(copy.deepcopy(self.plan.defence))
 
@@ -222,7 +222,7 @@ class Loop:
         if threat.knowledge in ("grey", "white"):
             view = view._replace(control=state.control)
         if threat.knowledge == "white":
-            box = WhiteBox(self.defence, self._shown, duplicate(state.defence), frozen(state.known_u))
+            box = WhiteBox(self.defence, self.shown, duplicate(state.defence), frozen(state.known_u))
             view = view._replace(defence=box, estimate=state.estimate, truth=self._truth(state.plant, state.controller))
         if threat.sees_measurement or threat.knowledge == "white":
             view = view._replace(received=state.received)

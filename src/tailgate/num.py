@@ -17,13 +17,14 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from tailgate import kernels, linear
-from tailgate.elementwise import clip as clip
-from tailgate.elementwise import select as select
+from tailgate import linear
 from tailgate.engine import elementary, matrices
 from tailgate.engine.array import Traced
+from tailgate.engine.compiled import elementwise
 from tailgate.engine.functions import tracing as tracing
 from tailgate.engine.loops import until as until
+from tailgate.engine.matrices import orthogonal as orthogonal
+from tailgate.engine.matrices import root as root
 from tailgate.hints import broken as broken
 from tailgate.hints import demand as demand
 from tailgate.hints import elsewhere as elsewhere
@@ -38,19 +39,17 @@ from tailgate.hints import take as take
 Array = NDArray[Any]
 
 
-def exp(x: Any) -> Any:
-    """e to the power x."""
-    return elementary.exp(x) if isinstance(x, Traced) else kernels.exp(x)
+SMALL = 500  # products of numbers that numpy makes sooner than compiled code is loaded
+WORTH = 16  # numbers for which machine code takes less time than numpy's many passes
+
+exp = elementwise(WORTH)(elementary.exp)
+log = elementwise(WORTH)(elementary.log)
+tanh = elementwise(WORTH)(elementary.tanh)
 
 
-def log(x: Any) -> Any:
-    """The natural logarithm."""
-    return elementary.log(x) if isinstance(x, Traced) else kernels.log(x)
-
-
-def tanh(x: Any) -> Any:
-    """The hyperbolic tangent."""
-    return elementary.tanh(x) if isinstance(x, Traced) else kernels.tanh(x)
+def clip(x: Any, low: Any, high: Any) -> Any:
+    """x within [low, high], elementwise."""
+    return np.minimum(np.maximum(x, low), high)
 
 
 @cache
@@ -106,12 +105,17 @@ def _last(x: Array) -> Array:
     return moved.reshape(math.prod(moved.shape[:-3]), *moved.shape[-3:])
 
 
+def _products(x: Array, y: Array) -> int:
+    """How many products of numbers x y takes."""
+    return math.prod((*np.broadcast_shapes(x.shape[:-2], y.shape[:-2]), *x.shape[-2:], y.shape[-1]))
+
+
 def matmul(x: Array, y: Array) -> Array:
     """(..., i, k) times (..., k, j), summed over k in ascending order; (B, ..., i, j) has B contiguous in memory.
 
     One matrix x for a whole batch, or one (N, i, k) for each agent of it: its structural zeros count for nothing, whatever y holds there.
     """
-    if tracing():
+    if tracing() or x.ndim == y.ndim == 2 or _products(x, y) <= SMALL:
         alike = not isinstance(x, Traced) or x.fixed
         if alike and y.ndim > 3 and (x.ndim == 2 or (x.ndim == 3 and x.shape[0] in (1, *y.shape[1:-2]))):
             return cast(Array, matrices.constant_times(x, y))
@@ -126,11 +130,6 @@ def matmul(x: Array, y: Array) -> Array:
             held = np.empty((m, len(fixed), j * b))
             linear.constant_times(np.ascontiguousarray(fixed, np.float64), flat.reshape(m, k, j * b), held)
         return last_to_first(held.reshape(*y.shape[1:-2], x.shape[-2], j, b))
-    if x.ndim == y.ndim == 2:  # of what is computed once: numba is not worth its import
-        out = x[:, :1] * y[:1]
-        for k in range(1, len(y)):
-            out = out + x[:, k : k + 1] * y[k : k + 1]
-        return np.asarray(out, np.float64)
     batch = np.broadcast_shapes(x.shape[:-2], y.shape[:-2])
     first, *middle = batch
     out = np.zeros((math.prod(middle), x.shape[-2], y.shape[-1], first))
@@ -169,21 +168,11 @@ def quadratic(x: Array, weight: Array) -> Array:
 
 
 def inverse(s: Array) -> Array:
-    """Inverse of symmetric positive definite (..., q, q): closed form for q <= 2, else Gauss-Jordan in fixed order."""
+    """Inverse of symmetric positive definite (..., q, q), see `matrices.inverse`."""
     q = s.shape[-1]
     if s.ndim > 2 and len(s) > 1 and s.strides[0] == 0:  # the same for the whole batch
         return np.broadcast_to(inverse(s[:1]), s.shape)
-    if q == 1:
-        return np.asarray(1.0 / s)
-    if q == 2:
-        a, b, d = s[..., 0, 0], s[..., 0, 1], s[..., 1, 1]
-        scale = 1.0 / (a * d - b * b)
-        out = np.empty_like(s)
-        out[..., 0, 0] = d * scale
-        out[..., 1, 1] = a * scale
-        out[..., 0, 1] = out[..., 1, 0] = -b * scale
-        return out
-    if tracing():
+    if tracing() or q <= 2 or s.size <= SMALL:
         return cast(Array, matrices.inverse(s))
     flat = _last(s if s.ndim > 2 else s[None])
     out = np.empty_like(flat)
@@ -197,7 +186,7 @@ def apply(matrix: Array, x: Array, base: Array | None = None) -> Array:
 
     Sums run over k in ascending order, and structural zeros of the matrices count for nothing.
     """
-    if tracing():
+    if tracing() or math.prod(x.shape) * matrix.shape[1] <= SMALL:
         moved = matrices.constant_on(matrix, x)
         return cast(Array, moved if base is None else base + moved)
     under = _NOTHING if base is None else np.ascontiguousarray(first_to_last(base), np.float64)
@@ -215,7 +204,7 @@ def _applied(matrices: Array, x: Array, base: Array = _NOTHING) -> Array:
 
 def predicted(A: Array, B: Array, c: Array, L: Array, merge: Array, heard: Array, x: Array, u: Array) -> Array:
     """merge_i sum_j L_j (A x_j + B u_j + c) (B, N, n) over the j in heard (N, N) bool, for x (B, N, n) and u (B, N, m)."""
-    if tracing():
+    if tracing() or x.size * len(A) <= SMALL:
         return cast(Array, matrices.predicted(A, B, c, L, merge, heard, x, u))
     flat = np.ascontiguousarray(first_to_last(x), np.float64)
     out = np.empty_like(flat)
@@ -225,7 +214,7 @@ def predicted(A: Array, B: Array, c: Array, L: Array, merge: Array, heard: Array
 
 def congruent(A: Array, P: Array, Q: Array) -> Array:
     """A P A' + Q for one A and Q (n, n) and P (B, N, n, n), in the order of `matmul`."""
-    if tracing():
+    if tracing() or P.size * len(A) <= SMALL:
         return cast(Array, matrices.congruent(A, P, Q))
     flat = _last(P)
     out = np.empty_like(flat)
@@ -235,7 +224,7 @@ def congruent(A: Array, P: Array, Q: Array) -> Array:
 
 def moment(weights: Sequence[Array], covariances: Sequence[Array], offsets: Sequence[Array]) -> Array:
     """sum_i w_i (P_i + d_i d_i') (B, N, n, n) in that order, of w_i (B, N), P_i (B, N, n, n) and d_i (B, N, n)."""
-    if tracing():
+    if tracing() or covariances[0].size <= SMALL:
         return cast(Array, matrices.moment(weights, covariances, offsets))
     out = np.empty(first_to_last(covariances[0]).shape)
     if any(len(part) != len(covariances[0]) for part in (*weights, *covariances, *offsets)):
@@ -254,7 +243,7 @@ def fused(heard: Array, x: Array, M: Array, shares: Shares | None = None, step: 
     shares: its weight, total and begin, (B or 1, ...); none: all weigh the same. step: its A and Q.
     """
     shares = shares or (np.ones((1, *heard.shape)), np.count_nonzero(heard, axis=1)[None], np.full((1, len(heard)), -0.0))
-    if tracing():
+    if tracing() or x.size * x.shape[-1] ** 2 <= SMALL:
         return cast(tuple[Array, Array], matrices.fused(heard, x, M, *shares, step))
     flat, spread, weight, total, begin = (np.ascontiguousarray(first_to_last(part), np.float64) for part in (x, M, *shares))
     mean, P = np.empty_like(flat), np.empty((*spread.shape[:-1], flat.shape[-1]))
@@ -265,7 +254,7 @@ def fused(heard: Array, x: Array, M: Array, shares: Shares | None = None, step: 
 
 def corrected(C: Array, W: Array, x: Array, P: Array, r: Array, keep: Array) -> tuple[Array, Array]:
     """x (B, N, n) and P (B, N, n, n) after an update by r (B, N, q), whose covariance has the inverse W: `lanes.correct_each`."""
-    if tracing():
+    if tracing() or x.size * x.shape[-1] * C.shape[1] <= SMALL:
         return cast(tuple[Array, Array], matrices.corrected(C, W, x, P, r, keep))
     inverse, flat, known, off, mask = (np.ascontiguousarray(first_to_last(part), np.float64) for part in (W, x, P, r, keep))
     mean, covariance = np.empty_like(flat), np.empty((*known.shape[:-1], len(x)))
@@ -274,39 +263,13 @@ def corrected(C: Array, W: Array, x: Array, P: Array, r: Array, keep: Array) -> 
 
 
 def product(x: Array, y: Array) -> Array:
-    """One (i, k) times one (k, j) of any size, compiled; summed over k in ascending order."""
-    return np.asarray(linear.product(np.ascontiguousarray(x, np.float64), np.ascontiguousarray(y, np.float64)))
+    """One (i, k) times one (k, j): summed over k in ascending order, without the zeros of x."""
+    return cast(Array, matrices.constant_times(x, y))
 
 
 def solve(m: Array, y: Array) -> Array:
     """M^-1 Y for one (n, n) and one (n, k), by elimination with row pivots in fixed order."""
-    return np.asarray(linear.solve(np.array(m, np.float64, order="C"), np.array(y, np.float64, order="C")))
-
-
-def orthogonal(x: Array, y: Array) -> tuple[Array, Array]:
-    """V'X, whose rows are orthogonal, and V'Y for X (M, q, n) and Y (M, q, p): each row of V'X to its own relative accuracy.
-
-    Jacobi's rotations in fixed order; V is orthogonal. The squared lengths of the rows are the eigenvalues of X X', in no order.
-    """
-    n = x.shape[-1]
-    both = np.ascontiguousarray(np.concatenate([x, y], axis=-1), np.float64)
-    linear.turn_rows(both, n)
-    return both[..., :n], both[..., n:]
-
-
-def root(s: Array) -> tuple[Array, Array]:
-    """D^1/2 V' and D^-1/2 V' for symmetric positive definite V D V' (M, q, q): Y with Y'Y = S, and with Y'Y = S^-1."""
-    rows, turn = orthogonal(s, np.broadcast_to(np.eye(s.shape[-1]), s.shape))
-    half = np.sqrt(dot(rows, turn))[..., None]  # V'S = D V'
-    return turn * half, turn / half
-
-
-def in_ball(w: Array, c: Array) -> Array:
-    """u_k = w_k / (c_k + mu) with the least mu >= 0 at which |u| <= 1, for w (B, P, q) and c (P, q) >= 0: (B, P, q). 0/0 counts as 0."""
-    flat = np.ascontiguousarray(first_to_last(w))
-    out = np.empty_like(flat)
-    linear.ball_each(flat, np.ascontiguousarray(c), out)
-    return last_to_first(out)
+    return cast(Array, matrices.solve(m, y))
 
 
 def expm(m: Array) -> Array:
@@ -338,7 +301,5 @@ def spectral_radius(m: Array) -> float:
 
 def dense(x: Array, weight: Array, bias: Array, squash: bool) -> Array:
     """One network layer (B, i) -> (B, o) in float64 and fixed order, with tanh if `squash`."""
-    if tracing():
-        out = matrices.dense(x, weight, bias)
-        return cast(Array, elementary.tanh(out) if squash else out)
-    return np.asarray(kernels.dense(np.ascontiguousarray(x, np.float64), weight, bias, squash))
+    out = matrices.dense(x, weight, bias)
+    return cast(Array, tanh(out) if squash else out)

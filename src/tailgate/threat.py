@@ -24,7 +24,6 @@ from tailgate.core import (
     no_command,
     param,
 )  # fmt: skip
-from tailgate.elementwise import select
 from tailgate.errors import InputError, unknown
 from tailgate.quantities import Bound, Bounded, Time, check_order
 
@@ -155,7 +154,7 @@ def accepts(k: Any, steps: Any, left: Any, burst: Any, cooldown: Any, onset: Any
     Until the first step that is accepted nothing is charged: a cooldown counts down, a burst that is full ends and is followed by its
     pause, of which the step that ends it is the first. So it is one moment that decides.
     """
-    first = np.maximum(k + select(burst < longest, cooldown, np.maximum(pause, 1)), onset)
+    first = np.maximum(k + np.where(burst < longest, cooldown, np.maximum(pause, 1)), onset)
     return (left > 0) & (first <= last) & (first < k + steps)
 
 
@@ -249,7 +248,7 @@ class Channel:
             under = under._replace(valid=np.where(left, received.valid, under.valid))  # what a jammer leaves is read where anything is
             heard = num.stack([under.y[..., i] for i in range(q)] + [sent[..., i] for i in range(q, sent.shape[-1])])
         links = self._arrive(plan, state, state.links, heard, slice(0, sent.shape[-1]))
-        lost = hit & (kind == DROPOUT)[:, None, None]
+        lost = hit & (kind == DROPOUT)[:, None, None] if plan.kinds[DROPOUT] else np.zeros_like(hit)
         out = under._replace(
             y=links[..., :q], valid=under.valid & ~lost[..., :q], v2v=links[..., q:], attacked=hit[..., :q]
         )

@@ -6,20 +6,20 @@ import dataclasses
 import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from tailgate.core import Array, Attack, Frame, Model
 from tailgate.draws import Keys, Role
-from tailgate.fused import Constants, fuse
-from tailgate.fused.play import nearest as _nearest
-from tailgate.fused.play import play
 from tailgate.loop import Loop, LoopState
 from tailgate.watch import Watched
 
-WORTH = 20_000  # steps for which a loop without lanes is traced: that takes some tenths of a second
+WORTH, MANY = 20_000, 1_000_000  # steps for which a loop is traced, and the attack with it: each takes some tenths of a second
+LONG = 300  # steps of an episode for which a loop is traced: the plain loop takes a millisecond for each, however few rows there are
 MEMORY = 1e9  # [bytes] that a trace may take: who plays many episodes plays so many at a time
+Player = Callable[[Keys, bool], tuple[Array, dict[str, Array], dict[str, Array]]]  # keys, terminate: lengths, signals, the road before
 _DECISIONS = ("kind", "target", "alarm", "mode", "refused", "collided", "rear_collided")
 
 
@@ -111,9 +111,9 @@ class Recorder:
         self.length = np.zeros(len(state.k), np.int64)
         self.steps = 0
 
-    def add(self, frame: Frame, live: Array) -> None:
-        """`live` (B,): the episodes that this step belongs to."""
-        for name, value in signals_of(frame).items():
+    def put(self, signals: dict[str, Array], live: Array) -> None:
+        """What `signals_of` gives of a step. `live` (B,): the episodes that this step belongs to."""
+        for name, value in signals.items():
             held = self.signals.get(name)
             if name == "truth" and value.strides[1] == 0 and (held is None or held.shape[2] == 1):
                 value = value[:, :1]
@@ -135,19 +135,14 @@ class Recorder:
 def rollout(loop: Loop, attack: Attack, keys: Keys, *, terminate: bool = True, plain: bool = False) -> Trace:
     """Play one episode per key. With `terminate` an episode ends at its first collision, else it runs to the horizon.
 
-    A loop whose parts have lanes is played by the fused engine, to the same bits. One of at least `WORTH` steps that has none is traced,
-    where it can be. With `plain` the plain loop plays.
+    Steps that are worth it are played by a traced loop, where it can be traced; many of them under a traced attack. With `plain` the
+    plain loop plays, to the same bits.
     """
     if not plain and isinstance(guard := loop.defence, Watched):
         seen = rollout(loop.bare, attack, keys, terminate=terminate)
         return dataclasses.replace(seen, signals=seen.signals | {"alarm": guard.alarms(seen.score)})
-    if not plain and isinstance(fused := fuse(loop, attack), Constants):
-        return Trace(loop.model, loop.horizon, *play(loop, fused, attack, keys, terminate), loop.controller.desired_gap)
-    if not plain and len(keys.key) * loop.horizon >= WORTH:
-        from tailgate.engine.rollouts import Rollout, rollout_of
-
-        if isinstance(program := rollout_of(loop, attack), Rollout):
-            return Trace(loop.model, loop.horizon, *program.play(keys, terminate), loop.controller.desired_gap)
+    if not plain and (play := _player(loop, attack, len(keys.key) * loop.horizon)) is not None:
+        return Trace(loop.model, loop.horizon, *play(keys, terminate), loop.controller.desired_gap)
     state = loop.start(keys)
     plan = attack.prepare(loop.brief)
     memory: Any = attack.start(plan, len(keys.key), keys.at(Role.ATTACK, np.zeros(len(keys.key), np.int64)))
@@ -157,15 +152,18 @@ def rollout(loop: Loop, attack: Attack, keys: Keys, *, terminate: bool = True, p
         if not live.any():
             break
         state, memory, frame = loop.step(state, attack, plan, memory)
-        recorder.add(frame, live)
+        recorder.put(signals_of(frame), live)
     return recorder.trace()
 
 
-def nearest(loop: Loop, attack: Attack, keys: Keys) -> tuple[Array, dict[str, Array]] | None:
-    """Lengths (B,), and the smallest `gap` and `rear_gap` (B,) [m], of the episodes that `rollout` would record.
+def _player(loop: Loop, attack: Attack, steps: int) -> Player | None:
+    """What plays so many steps faster than the plain loop does."""
+    from tailgate.engine.agreement import Untraced
+    from tailgate.engine.commanded import commanded
+    from tailgate.engine.rollouts import rollout_of
 
-    In a memory that the horizon does not add to. None of a loop or an attack without lanes: their gaps are in the trace.
-    """
-    fused = fuse(loop, attack)
-    found = _nearest(loop, fused, attack, keys) if isinstance(fused, Constants) else None
-    return None if found is None else (found[0], dict(zip(("gap", "rear_gap"), found[1], strict=True)))
+    if steps >= MANY and not isinstance(whole := rollout_of(loop, attack), Untraced):
+        return whole.play
+    if (steps >= WORTH or loop.horizon >= LONG) and not isinstance(told := commanded(loop), Untraced):
+        return partial(told.play, attack)
+    return None

@@ -21,10 +21,10 @@ from tailgate.agents.observation import ObservationCodec
 from tailgate.agents.reward import Reward, RewardName
 from tailgate.core import Array, Command, Estimate, Mode, View
 from tailgate.draws import Role
+from tailgate.engine.agreement import Untraced
+from tailgate.engine.seats import Rows, programs_of
 from tailgate.envs.batches import side_by_side
 from tailgate.envs.seat import Seat
-from tailgate.fused import Constants
-from tailgate.fused.cockpit import Cockpit, fuse_seat
 from tailgate.registry import Spec
 from tailgate.scenario import Scenario, load_scenario
 from tailgate.tree import put_rows
@@ -102,26 +102,28 @@ def played(held: Playing, episodes: int) -> Go:
 HELD = 16  # steps of one call: rewards in each, an observation and restarts after the last
 
 
-def flown(episodes: int, threads: int = 1) -> Cockpit:
-    """Car following in the fused engine, with injection by the learner's action; begun."""
+def flown(episodes: int, threads: int = 1) -> Rows:
+    """Car following with injection by the learner's action; begun."""
     options: dict[str, Any] = {"action": "timing", "kind": "fdi", "value": -4.0, "interval": HELD, "reward": "min_gap"}
-    seat = Seat.make(scenario=SCENARIO, defence="chi2_kf", **options)
-    constants = fuse_seat(seat)
-    assert isinstance(constants, Constants)
-    cockpit = Cockpit(seat, constants, draws.keys("tune", range(episodes)), threads)
-    cockpit.begin()
-    return cockpit
+    programs = programs_of(Seat.make(scenario=SCENARIO, defence="chi2_kf", **options))
+    assert not isinstance(programs, Untraced)
+    rows = Rows(programs, episodes, threads)
+    rows.begin(np.ones(episodes, bool), draws.keys("tune", range(episodes)))
+    return rows
+
+
+def decided(rows: Rows) -> int:
+    """A decision of all rows, which begin again where they are over; -> the steps of it."""
+    brought, attack = rows.brought, np.ones(rows.batch, np.int64)
+    over = brought["terminated"] | brought["truncated"] if "terminated" in brought else np.zeros(rows.batch, bool)
+    rows.decide(attack, over, over)
+    return HELD * rows.batch
 
 
 def batch(episodes: int, threads: int = 1) -> Go:
     """Whole steps of car following under a learner's action: rewards included, an observation and restarts every HELD steps."""
-    cockpit, attack = flown(episodes, threads), np.ones(episodes, np.int64)
-
-    def chunk() -> int:
-        cockpit.decide(attack, restart=True)
-        return HELD * episodes
-
-    return repeated(chunk)
+    rows = flown(episodes, threads)
+    return repeated(lambda: decided(rows))
 
 
 def several(place: Scenario, defence: str, value: float, reward: RewardName, episodes: int) -> Go:
@@ -196,13 +198,12 @@ def on_cores(episodes: int, cores: int) -> Go:
     """Whole steps on so many cores at once, by the wall clock: one thread for each, which plays its share of the blocks."""
     if (os.cpu_count() or 1) < cores:
         raise Missing(f"this machine has {os.cpu_count()} cores, not {cores}")
-    cockpit, attack = flown(episodes, cores), np.ones(episodes, np.int64)
+    rows = flown(episodes, cores)
 
     def go(seconds: float) -> Sample:
         done, started = 0, time.perf_counter()
         while done == 0 or time.perf_counter() - started < seconds:
-            cockpit.decide(attack, restart=True)
-            done += HELD * episodes
+            done += decided(rows)
         return Sample(done, time.perf_counter() - started)
 
     return go
@@ -213,13 +214,17 @@ def unequal(episodes: int = 4096, threads: int = 2) -> Go:
 
     def go(seconds: float) -> Sample:
         one, several = flown(episodes), flown(episodes, threads)
-        for cockpit in (one, several):
+        for rows in (one, several):
             for _ in range(4):
-                cockpit.decide(np.ones(episodes, np.int64), restart=True)
+                decided(rows)
         alike = several.held()
-        return Sample(sum(int(np.count_nonzero(x.view(np.uint8) != alike[name].view(np.uint8))) for name, x in one.held().items()), 1.0)
+        return Sample(sum(int(np.count_nonzero(_bytes(x) != _bytes(alike[name]))) for name, x in one.held().items()), 1.0)
 
     return go
+
+
+def _bytes(x: Array) -> Array:
+    return np.ascontiguousarray(x).reshape(-1).view(np.uint8)
 
 
 # -- what is not a rate
@@ -240,7 +245,7 @@ def _first_step(cache: str, bytecode: bool = False) -> float:
 
     With `bytecode`, that of Python as well, as everybody has it whose environment does not forbid it.
     """
-    environment = os.environ | {"NUMBA_CACHE_DIR": cache}
+    environment = os.environ | {"TAILGATE_CACHE": cache}
     if bytecode:
         environment = {k: v for k, v in environment.items() if k != "PYTHONDONTWRITEBYTECODE"} | {"PYTHONPYCACHEPREFIX": cache}
     done = subprocess.run([sys.executable, "-c", _FIRST], capture_output=True, text=True, check=True, env=environment)

@@ -1,4 +1,4 @@
-"""tailgate explain: which engine plays something, and why no faster one does."""
+"""tailgate explain: what the engine can trace, and where not, why."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from tailgate.progress import console
 
 def add(commands: Any) -> None:
     command = commands.add_parser(
-        "explain", help="which engine plays a scenario, a defence and an attack, and why no faster one does",
-        description="Say which engines can play environments of a scenario and a defence, and, with an attack, whole episodes. "
-        "Where code cannot be traced, the line and what to write in its place are named (docs/engine.md).",
+        "explain", help="whether a scenario, a defence and an attack are traced, and if not, why",
+        description="Say whether the engine can trace environments of a scenario and a defence, and, with an attack, whole episodes. "
+        "Where it cannot, the line and what to write in its place are named (docs/engine.md).",
     )  # fmt: skip
     command.add_argument("what", choices=["engine"], help="what is explained")
     command.add_argument("--scenario", metavar="NAME", help="name or YAML file (default: stop-and-go-v0)")
@@ -33,40 +33,29 @@ def _explain(options: argparse.Namespace) -> int:
     if options.json:
         print(json.dumps(found, indent=1))
         return 0
-    table = Table("what", "engine", "can it", "why not, or how large")
-    for what, engines in found.items():
-        for engine, said in engines.items():
-            table.add_row(what, engine, "no" if said.get("why") else "yes", escape(said.get("why") or said.get("size", "")))
+    table = Table("what", "traced", "why not, or how large")
+    for what, said in found.items():
+        table.add_row(what, "no" if "why" in said else "yes", escape(said.get("why") or said["size"]))
     console().print(table)
     return 0
 
 
-def explanation(scenario: str | None, defence: str | None, attack: str | None) -> dict[str, dict[str, dict[str, str]]]:
-    """By what is played and by engine: `why` it cannot play, or the `size` of its code."""
+def explanation(scenario: str | None, defence: str | None, attack: str | None) -> dict[str, dict[str, str]]:
+    """By what is played: `why` it cannot be traced, or the `size` of its code."""
     from tailgate.engine.agreement import Untraced
+    from tailgate.engine.commanded import commanded
     from tailgate.engine.rollouts import rollout_of
     from tailgate.engine.seats import programs_of
     from tailgate.envs.seat import Seat
-    from tailgate.fused import Refused, fuse
-    from tailgate.fused.cockpit import fuse_seat
     from tailgate.registry import Spec
 
     seat = Seat.make(scenario, defence)
-    lanes, programs = fuse_seat(seat), programs_of(seat)
-    found = {"environments": {"fused": _why(lanes, Refused), "traced": _why(programs, Untraced)}}
-    if not isinstance(programs, Untraced):
-        found["environments"]["traced"] = _size(programs.decide)
+    made: dict[str, Any] = {"environments": programs_of(seat)}
     if attack is not None:
         rival = Spec("attack", attack).make()
         rival.prepare(seat.loop.brief)  # what does not fit says so
-        rollout = rollout_of(seat.loop, rival)
-        traced = {"why": rollout.why} if isinstance(rollout, Untraced) else _size(rollout.program)
-        found["episodes"] = {"fused": _why(fuse(seat.loop, rival), Refused), "traced": traced}
-    return found
-
-
-def _why(held: Any, refused: Any) -> dict[str, str]:
-    return {"why": held.why} if isinstance(held, refused) else {}
+        made |= {"episodes": commanded(seat.loop), "episodes, attack included": rollout_of(seat.loop, rival)}
+    return {what: {"why": held.why} if isinstance(held, Untraced) else _size(held.programs[0]) for what, held in made.items()}
 
 
 def _size(program: Any) -> dict[str, str]:

@@ -5,14 +5,16 @@ from __future__ import annotations
 import traceback
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from tailgate.engine.operations import Array
 from tailgate.engine.untraceable import Untraceable
 from tailgate.errors import InputError
-from tailgate.loop import Loop
+
+if TYPE_CHECKING:
+    from tailgate.loop import Loop
 
 
 class Untraced(NamedTuple):

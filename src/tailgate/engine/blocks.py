@@ -92,15 +92,21 @@ def gather(e: Emitter, node: Node) -> str:
 
 
 def matvec(e: Emitter, node: Node) -> None:
-    """A matrix that all episodes share times a vector of each: a loop over its columns, by a function for each shape."""
-    (p, q), kind, size = node.attr.shape, e.vector(FLOAT), 8 * e.lanes
-    if (p, q) not in e.routines:
-        e.routines[p, q] = f"@matvec_{p}_{q}"
-        e.texts.append(_matvec_text(e, p, q))
-    table = e.table(tuple(node.attr.T.flat))
-    names = [e.value(a) for a in node.args]
+    """A matrix that all episodes share times a vector of each, by a function: a loop over columns, or of a sparse one over its numbers."""
+    (matrix, there, tables), kind, size = node.attr, e.vector(FLOAT), 8 * e.lanes
+    (p, q), names = matrix.shape, [e.value(a) for a in node.args]
     x, out = e.buffer(names[:q]), e.buffer(names[q:])
-    e.line(f"call fastcc void {e.routines[p, q]}(ptr {table}, ptr {x}, ptr {out})")
+    if there is None:
+        if (p, q) not in e.routines:
+            e.routines[p, q] = f"@matvec_{p}_{q}"
+            e.texts.append(_matvec_text(e, p, q))
+        e.line(f"call fastcc void {e.routines[p, q]}(ptr {e.table(tuple(matrix.T.flat))}, ptr {x}, ptr {out})")
+    else:
+        if "sparse" not in e.routines:
+            e.routines["sparse"] = "@sparse"
+            e.texts.append(_sparse_text(e))
+        held, columns, last = (e.table(part) for part in (list(matrix[there]), *tables))
+        e.line(f"call fastcc void @sparse(ptr {held}, ptr {columns}, ptr {last}, i64 {8 * p}, ptr {x}, ptr {out})")
     for i in range(p):
         e.names[node.id, str(i)] = e.set(f"load {kind}, ptr {e.address(out, size * i)}, align {size}")
 
@@ -133,6 +139,42 @@ def _matvec_text(outer: Emitter, p: int, q: int) -> str:
     e.line("ret void")
     head = f"define internal fastcc void @matvec_{p}_{q}(ptr noalias %table, ptr noalias %x, ptr noalias %out) noinline #0 {{"
     return "\n".join([head, *e.lines, "}"])
+
+
+def _sparse_text(outer: Emitter) -> str:
+    """Rows one after the other: the places in `columns` and `last` are in bytes."""
+    e, kind, size = outer.fresh(), outer.vector(FLOAT), 8 * outer.lanes
+    e.begin("entry")
+    e.line("br label %row")
+    e.begin("row")
+    e.line("%i = phi i64 [0, %entry], [%next, %done]")
+    e.line("%first = phi i64 [0, %entry], [%end, %done]")
+    e.line(f"%place = mul i64 %i, {outer.lanes}")
+    target = e.address("%out", "%place")
+    e.line(f"%begin = load {kind}, ptr {target}, align {size}")
+    e.line(f"%end = load i64, ptr {e.address('%last', '%i')}, align 8")
+    e.line("br label %test")
+    e.begin("test")
+    e.line("%at = phi i64 [%first, %row], [%following, %entry_of_row]")
+    e.line(f"%total = phi {kind} [%begin, %row], [%sum, %entry_of_row]")
+    e.line(f"br i1 {e.set('icmp slt i64 %at, %end')}, label %entry_of_row, label %done")
+    e.begin("entry_of_row")
+    one = e.set(f"load double, ptr {e.address('%table', '%at')}, align 8")
+    column = e.set(f"load i64, ptr {e.address('%columns', '%at')}, align 8")
+    held = e.set(f"load {kind}, ptr {e.address('%x', e.set(f'mul i64 {column}, {outer.lanes}'))}, align {size}")
+    first_lane = e.set(f"insertelement {kind} poison, double {one}, i32 0")
+    all_lanes = e.set(f"shufflevector {kind} {first_lane}, {kind} poison, <{e.lanes} x i32> zeroinitializer")
+    e.line(f"%sum = fadd {kind} %total, {e.set(f'fmul {kind} {all_lanes}, {held}')}")
+    e.line("%following = add i64 %at, 8")
+    e.line("br label %test")
+    e.begin("done")
+    e.line(f"store {kind} %total, ptr {target}, align {size}")
+    e.line("%next = add i64 %i, 8")
+    e.line(f"br i1 {e.set('icmp slt i64 %next, %rows')}, label %row, label %left")
+    e.begin("left")
+    e.line("ret void")
+    given = "ptr noalias %table, ptr noalias %columns, ptr noalias %last, i64 %rows, ptr noalias %x, ptr noalias %out"
+    return "\n".join([f"define internal fastcc void @sparse({given}) noinline #0 {{", *e.lines, "}"])
 
 
 def demand(e: Emitter, names: Sequence[str]) -> None:

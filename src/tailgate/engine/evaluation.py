@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from tailgate.engine.graph import Body, Graph, Node, Sweep, computed, ordered, packed_values, read
+from tailgate.engine.graph import Body, Graph, Matrix, Node, Sweep, computed, ordered, packed_values, read
 from tailgate.engine.operations import Array
 
 
@@ -39,10 +39,12 @@ def _evaluate(graph: Graph, nodes: Iterable[Node], inputs: dict[Any, Array], val
             values[node.id] = computed(node, args)
 
 
-def _multiplied(graph: Graph, matrix: Array, args: Sequence[Any]) -> list[Any]:
+def _multiplied(graph: Graph, held: Matrix, args: Sequence[Any]) -> list[Any]:
+    matrix, there, _ = held
     x, out = args[: matrix.shape[1]], list(args[matrix.shape[1] :])
-    for k in range(matrix.shape[1]):
-        out = [total + graph.value(matrix[i, k]) * x[k] for i, total in enumerate(out)]
+    for i, k in np.ndindex(*matrix.shape):
+        if there is None or there[i, k]:
+            out[i] = out[i] + graph.value(matrix[i, k]) * x[k]
     return out
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from tailgate.engine.operations import BOOL, COMMUTATIVE, COMPARISONS, FLOAT, INT, Array, apply, converted
 from tailgate.engine.untraceable import Untraceable
 
-MOST = 30_000  # operations of a graph: what has more takes long to compile, as straight code
+MOST = 45_000  # operations of a graph: what has more takes long to compile, as straight code
 _FREE = {"const", "uniform", "input", "carried", "pick"}  # which are none
 
 
@@ -80,6 +80,14 @@ def dependent(roots: Sequence[Node], sources: Sequence[Node]) -> set[Node]:
         if any(a in found for a in node.args):
             found.add(node)
     return found - set(sources)
+
+
+class Matrix(NamedTuple):
+    """A matrix (p, q) of fixed nodes, what of it counts, and of a sparse one the places of its numbers."""
+
+    nodes: Any
+    there: Array | None
+    tables: list[list[Node]]
 
 
 class Graph:
@@ -213,10 +221,16 @@ class Graph:
 
     # -- matrices
 
-    def matvec(self, matrix: Array, x: Sequence[Node], base: Sequence[Node]) -> list[Node]:
-        """base + matrix x, of a matrix (p, q) of fixed nodes: sums begin with the base and run over q in ascending order."""
-        key = tuple(node.id for node in matrix.flat)
-        node = self._node("matvec", FLOAT, (*x, *base), matrix, key, False)
+    def matvec(self, matrix: Array, x: Sequence[Node], base: Sequence[Node], there: Array | None = None) -> list[Node]:
+        """base + matrix x, of a matrix (p, q) of fixed nodes: sums begin with the base and run over q in ascending order.
+
+        What is not `there` (p, q) bool counts for nothing.
+        """
+        key = tuple(node.id for node in matrix.flat), None if there is None else there.tobytes()
+        tables: list[list[Node]] = []
+        if there is not None:  # bytes to the column of each number, and to the end of each row
+            tables = [[self.const(8 * k, INT) for k in part] for part in (np.nonzero(there)[1], np.cumsum(there.sum(axis=1)))]
+        node = self._node("matvec", FLOAT, (*x, *base), Matrix(matrix, there, tables), key, False)
         return [self.pick(node, i, FLOAT) for i in range(len(base))]
 
     # -- buffers

@@ -13,9 +13,13 @@ import numpy as np
 
 from tailgate.engine.array import Traced, boxed, lifted
 from tailgate.engine.buffers import buffer_of, sides, swept, wide
+from tailgate.engine.compiled import shaped
+from tailgate.engine.functions import gathered
+from tailgate.engine.loops import until
 from tailgate.engine.operations import BOOL, FLOAT
 
 LOOPED = 64  # numbers in a matrix without zeros that is multiplied in a loop: straight code of more takes long to compile
+SPARSE = 100  # numbers of a matrix with zeros that is multiplied in a loop
 STRAIGHT = 600  # products of numbers in straight code
 
 
@@ -40,19 +44,20 @@ def _over(function: Any, lead: Sequence[int], *arrays: Any) -> Traced:
     return Traced(graph, swept(graph, body, lead, given), FLOAT, 0)
 
 
-def _looped(x: Any, y: Traced, base: Any) -> Traced:
+def _looped(x: Any, y: Traced, base: Any, there: Any = None) -> Traced:
     """base + x y, of an x that is the same for all episodes: in the order of `constant_times` and `dense`."""
     graph = y.graph
     matrix, begin = lifted(graph, x), lifted(graph, base)
     shape, lead = begin.shape, begin.shape[:-2]
     matrices = np.broadcast_to(matrix.nodes, (*lead, *matrix.shape[-2:]))
+    places = None if there is None else np.broadcast_to(there, matrices.shape)
     vectors = np.broadcast_to(y.nodes, (*lead, *y.shape[-2:]))
     out = np.empty(shape, object)
     for place in np.ndindex(*lead):
         for j in range(shape[-1]):
-            out[(*place, slice(None), j)] = graph.matvec(
-                matrices[place], list(vectors[place][:, j]), list(begin.nodes[(*place, slice(None), j)])
-            )
+            under = begin.nodes[(*place, slice(None), j)]
+            kept = None if places is None else places[place]
+            out[(*place, slice(None), j)] = graph.matvec(matrices[place], list(vectors[place][:, j]), list(under), kept)
     return Traced(graph, out, FLOAT, None if y.batch is None else y.batch - y.ndim + len(shape))
 
 
@@ -69,12 +74,14 @@ def constant_times(x: Any, y: Any) -> Any:
         one, turned = x.reshape(x.shape[-2:]), np.swapaxes(y, -1, -2)
         return np.swapaxes(_over(lambda column: constant_times(one, column[:, None])[:, 0], turned.shape[:-1], turned), -1, -2)
     there = structure(x)
-    if isinstance(y, Traced) and there.all() and there.shape[-2] * there.shape[-1] >= LOOPED:
+    dense = there.all() and there.shape[-2] * there.shape[-1] >= LOOPED
+    if isinstance(y, Traced) and (dense or np.count_nonzero(there) > SPARSE):
         zero = np.zeros((*np.broadcast_shapes(x.shape[:-2], y.shape[:-2]), x.shape[-2], y.shape[-1]))
-        return _looped(x, y, zero)
+        return _looped(x, y, zero, None if dense else there)
     out: Any = np.zeros((*np.broadcast_shapes(x.shape[:-2], y.shape[:-2]), x.shape[-2], y.shape[-1]))
-    for k in range(x.shape[-1]):
-        out = np.where(there[..., k, None], out + x[..., k, None] * y[..., k, None, :], out)
+    with np.errstate(all="ignore"):  # whatever stands where x is zero
+        for k in range(x.shape[-1]):
+            out = np.where(there[..., k, None], out + x[..., k, None] * y[..., k, None, :], out)
     return out
 
 
@@ -92,24 +99,26 @@ def product(x: Any, y: Any) -> Any:
 
 
 def inverse(s: Any) -> Any:
-    """The inverse of symmetric positive definite (..., q, q) by Gauss and Jordan, without pivots."""
+    """The inverse of symmetric positive definite (..., q, q): in closed form for q <= 2, else by Gauss and Jordan, without pivots."""
     q = s.shape[-1]
+    if q == 1:
+        return 1.0 / s
+    if q == 2:
+        a, b, d = s[..., 0, 0], s[..., 0, 1], s[..., 1, 1]
+        scale = 1.0 / (a * d - b * b)
+        off = -b * scale
+        return np.stack([np.stack([d * scale, off], axis=-1), np.stack([off, a * scale], axis=-1)], axis=-2)
     if isinstance(s, Traced) and any(sides(s.graph, one) for one in s.nodes.reshape(-1, q, q)):
         parts = [_inverse_by_side(Traced(s.graph, one, FLOAT)) for one in s.nodes.reshape(-1, q, q)]
         return Traced(s.graph, np.stack([part.nodes for part in parts]).reshape(s.shape), FLOAT, s.batch)
     if _large(s.size, s):
         return Traced(s.graph, s.graph.picks(s.graph.inverses(buffer_of(s.graph, s.nodes), q)).reshape(s.shape), FLOAT, s.batch)
-    a = [[s[..., i, j] for j in range(q)] for i in range(q)]
+    out, index = s, np.arange(q)
     for p in range(q):
-        scale = 1.0 / a[p][p]
-        a[p][p] = np.ones_like(scale)
-        a[p] = [v * scale for v in a[p]]
-        for i in range(q):
-            if i != p:
-                f = a[i][p]
-                a[i][p] = np.zeros_like(f)
-                a[i] = [v - f * w for v, w in zip(a[i], a[p], strict=True)]
-    return np.stack([np.stack(row, axis=-1) for row in a], axis=-2)
+        row = np.where(index == p, 1.0, out[..., p, :]) * (1.0 / out[..., p, p])[..., None]
+        left = np.where(index == p, 0.0, out) - out[..., :, p, None] * row[..., None, :]
+        out = np.where((index == p)[:, None], row[..., None, :], left)
+    return out
 
 
 def _inverse_by_side(s: Traced) -> Any:
@@ -188,6 +197,101 @@ def corrected(C: Any, W: Any, x: Any, P: Any, r: Any, keep: Any) -> tuple[Any, A
     gain = transposed(product(W, cross))
     left = P - product(gain, cross)
     return x + times(gain, r * there), 0.5 * (left + transposed(left))
+
+
+def solve(m: Any, y: Any) -> Any:
+    """m^-1 y for one m (n, n) and y (n, k), by Gauss-Jordan elimination with row pivots."""
+    n = len(m)
+    both = np.concatenate([m, y], axis=1)
+    columns = np.arange(both.shape[1])
+    for p in range(n):
+        best = p + int(np.argmax(np.abs(both[p:, p])))
+        both[[p, best]] = both[[best, p]]
+        factor = both[:, p] / both[p, p]
+        there = (factor != 0.0) & (np.arange(n) != p)
+        both = np.where(there[:, None] & (columns >= p), both - factor[:, None] * both[p], both)
+    return both[:, n:] / np.diagonal(both)[:, None]
+
+
+PAIRS = 15  # of rows that are turned in straight code
+SWEEPS = 60  # of Jacobi's rotations; some ten are enough
+ROUNDING = 1e-15
+
+
+@shaped(lambda x, y: x.shape[1] > 5)
+@np.errstate(all="ignore")
+def orthogonal(x: Any, y: Any) -> tuple[Any, Any]:
+    """V'X, whose rows are orthogonal, and V'Y for X (M, q, n) and Y (M, q, p): each row of V'X to its own relative accuracy.
+
+    Jacobi's rotations from one side in fixed order, pair by pair; V is orthogonal. The squared lengths of the rows are the eigenvalues
+    of X X', in no order.
+    """
+    n, both = x.shape[-1], np.concatenate([x, y], axis=-1)
+    count = both.shape[1]
+    pairs = [(i, j) for i in range(count) for j in range(i + 1, count)]
+    rows, everyone = [both[:, i] for i in range(count)], np.ones(len(both), bool)
+    if isinstance(both, Traced) and len(pairs) > PAIRS:
+        rows = _one_by_one(rows, pairs, n, everyone)
+    else:
+
+        def sweep(*rows: Any) -> tuple[Any, list[Any]]:
+            held, turned = list(rows), np.zeros(len(both), bool)
+            for i, j in pairs:
+                turn, held[i], held[j] = _rotated(held[i], held[j], n)
+                turned = turned | turn
+            return turned, held
+
+        rows = until(sweep, rows, everyone, SWEEPS)
+    both = np.stack(rows, axis=1)
+    return both[..., :n], both[..., n:]
+
+
+def _rotated(v: Any, w: Any, n: int) -> tuple[Any, Any, Any]:
+    """Do two rows (M, k) turn, and what they are when the first n numbers of both are orthogonal."""
+    a, b, g = _dot(v[:, :n], v[:, :n]), _dot(w[:, :n], w[:, :n]), _dot(v[:, :n], w[:, :n])
+    turn = ~(np.abs(g) <= ROUNDING * np.sqrt(a * b))
+    half = (b - a) / (2.0 * np.where(turn, g, 1.0))
+    t = np.where(half >= 0.0, 1.0, -1.0) / (np.abs(half) + np.sqrt(half * half + 1.0))
+    c = 1.0 / np.sqrt(t * t + 1.0)
+    there, t, c = turn[:, None], t[:, None], c[:, None]
+    return turn, np.where(there, c * (v - t * w), v), np.where(there, c * (w + t * v), w)
+
+
+def _one_by_one(rows: list[Any], pairs: list[tuple[int, int]], n: int, everyone: Any) -> list[Any]:
+    """The same rotations, a pair in each round of a loop: straight code of all pairs takes long to compile."""
+    places = np.array(pairs)
+
+    def row(rows: Sequence[Any], which: Any) -> Any:
+        out = rows[0]
+        for k in range(1, len(rows)):
+            out = np.where(which == k, rows[k], out)
+        return out
+
+    def round_of(turned: Any, pair: Any, *rows: Any) -> tuple[Any, list[Any]]:
+        which: list[Any] = [gathered(places[:, side], pair)[:, None] for side in (0, 1)]
+        i, j = which
+        turn, v, w = _rotated(row(rows, i), row(rows, j), n)
+        held = [np.where(i == k, v, np.where(j == k, w, one)) for k, one in enumerate(rows)]
+        turned, last = turned | turn, pair == len(pairs) - 1
+        return ~last | turned, [turned & ~last, np.where(last, 0, pair + 1), *held]
+
+    state = [~everyone, np.zeros(len(everyone), np.int64), *rows]
+    return until(round_of, state, everyone, SWEEPS * len(pairs))[2:]
+
+
+def root(s: Any) -> tuple[Any, Any]:
+    """D^1/2 V' and D^-1/2 V' for symmetric positive definite V D V' (M, q, q): Y with Y'Y = S, and with Y'Y = S^-1."""
+    rows, turn = orthogonal(s, np.broadcast_to(np.eye(s.shape[-1]), s.shape))
+    half = np.sqrt(_dot(rows, turn))[..., None]  # V'S = D V'
+    return turn * half, turn / half
+
+
+def _dot(x: Any, y: Any) -> Any:
+    """Products (..., k), summed in ascending order."""
+    out = x[..., 0] * y[..., 0]
+    for k in range(1, x.shape[-1]):
+        out = out + x[..., k] * y[..., k]
+    return out
 
 
 def dense(x: Any, weight: Any, bias: Any) -> Any:

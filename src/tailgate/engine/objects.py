@@ -16,6 +16,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from tailgate.errors import InputError
+
 VERSION = b"2"  # of what this module makes of a text
 KEPT = 4000  # files in the folder, those that were used last
 _lock = threading.RLock()
@@ -44,10 +46,19 @@ def lanes() -> int:
     return 8 if "+avx512f" in features and "+avx512dq" in features else 4 if "+avx2" in features else 2
 
 
+def level() -> int:
+    """LLVM's level of optimisation: TAILGATE_LLVM, or 1; 2 and 3 take twice the time to compile, for code as fast. No bit depends on it."""
+    asked = os.environ.get("TAILGATE_LLVM", "1")
+    if asked not in ("0", "1", "2", "3"):
+        raise InputError("TAILGATE_LLVM", asked, "0, 1, 2 or 3")
+    return int(asked)
+
+
 def _machine() -> Any:
     binding = _binding()
     name, features = processor()
-    return binding.Target.from_default_triple().create_target_machine(cpu=name, features=features, opt=3)
+    target = binding.Target.from_default_triple()
+    return target.create_target_machine(cpu=name, features=features, opt=level())
 
 
 def folder() -> Path | None:
@@ -113,7 +124,7 @@ class Function:
     def __init__(self, text: str) -> None:
         with _lock:
             binding = _binding()
-            key = "\0".join((text, *processor(), binding.llvm_version_info and str(binding.llvm_version_info))).encode()
+            key = "\0".join((text, str(level()), *processor(), binding.llvm_version_info and str(binding.llvm_version_info))).encode()
             name = hashlib.sha256(VERSION + key).hexdigest() + ".o"
             content = _kept(name)
             self.name, self.fresh = name, content is None

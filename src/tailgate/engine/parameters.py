@@ -11,11 +11,10 @@ import dataclasses
 import enum
 import hashlib
 import sys
-import threading
 import types
 from collections.abc import Sequence
 from pathlib import Path, PurePath
-from typing import Any, Generic, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -24,9 +23,7 @@ from tailgate.engine.graph import Graph, Node, ordered
 from tailgate.engine.operations import FLOAT
 from tailgate.sources import own
 
-KEPT, EACH = 64, 8  # keys that are remembered, and things of each
-T = TypeVar("T")
-_MINUS = np.array([-0.0]).view(np.uint64)[0]
+LARGE = 20_000  # numbers of an array that is taken as it is: mostly, code reads few of them
 _PLAIN = (type(None), str, bytes, int, complex, enum.Enum, np.generic, np.dtype, type, types.BuiltinFunctionType, np.ufunc, PurePath)
 
 
@@ -87,51 +84,6 @@ class Reading:
         for i, node in self._rest:
             out[i : i + 1].view(node.dtype)[:1] = known[node.id]
         return out
-
-
-class Answers:
-    """What code asked while it was traced: it fits parameters that give the same answers."""
-
-    def __init__(self, graphs: Sequence[Graph]) -> None:
-        self._asked = [(Reading(graph, list(graph.asked[zero].values())), zero) for graph in graphs for zero in (False, True)]
-        self._answers = [self._read(reading, zero) for reading, zero in self._asked]
-
-    def fit(self, values: Sequence[np.ndarray[Any, Any]]) -> bool:
-        """Do these parameters give the same answers?"""
-        return all(self._read(*asked, values) == answer for asked, answer in zip(self._asked, self._answers, strict=True))
-
-    @staticmethod
-    def _read(reading: Reading, nonzero: bool, values: Any = None) -> bytes:
-        bits = reading.bits(values)
-        return ((bits != 0) & (bits != _MINUS) if nonzero else bits).tobytes()
-
-
-class Remembered(Generic[T]):
-    """What was made of things, by the key of their parameters: the last ones, of each key as many as gave other answers."""
-
-    def __init__(self) -> None:
-        self._held: dict[Any, list[tuple[Parameters, Answers, T]]] = {}
-        self._lock = threading.Lock()
-
-    def find(self, parameters: Parameters) -> T | None:
-        """What fits these parameters."""
-        with self._lock:
-            several = self._held.pop(parameters.key, None) if parameters.key is not None else None
-            if several is None:
-                return None
-            self._held[parameters.key] = several  # the last one that was asked for
-        return next((made for _, answers, made in several if answers.fit(parameters.values)), None)
-
-    def keep(self, parameters: Parameters, graphs: Sequence[Graph], made: T) -> None:
-        """Remember what was made of these parameters, and what was asked in its graphs."""
-        if parameters.key is None:
-            return
-        answers = Answers(graphs)
-        with self._lock:
-            several = self._held.pop(parameters.key, [])
-            self._held[parameters.key] = [*several[1 - EACH :], (parameters, answers, made)]
-            while len(self._held) > KEPT:
-                del self._held[next(iter(self._held))]
 
 
 class _Reader:
@@ -201,7 +153,7 @@ class _Reader:
         return out
 
     def _array(self, held: np.ndarray[Any, Any]) -> Any:
-        if held.dtype != FLOAT:
+        if held.dtype != FLOAT or held.size > LARGE:
             self.key += [held.shape, held.dtype.str, held.tobytes()]
             self.changeable = self.changeable or held.dtype == object
             return held

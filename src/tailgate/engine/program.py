@@ -26,6 +26,8 @@ from tailgate.engine.llvm import Column, Held, Layout, text_of
 from tailgate.engine.operations import Array
 from tailgate.engine.parameters import Reading
 from tailgate.engine.passes import LEAST
+from tailgate.errors import InputError
+from tailgate.hints import broken
 from tailgate.tree import leaves, map_leaves
 
 _PYTHON = {"f": "d", "b": "?", "i": "q"}  # how Python reads 64-bit numbers and truth values
@@ -148,6 +150,12 @@ class Program:
         places |= {name: places[other] for name, other in self._twins.items()}
         return places, -(-max(at, 1) // ALIGNED) * ALIGNED
 
+    def broken(self, demands: Array, k: Array) -> InputError:
+        """The error of a step k (B,) that broke some demands (B, .)."""
+        first = int(np.flatnonzero(~demands.all(axis=0))[0])
+        field, found, wanted, _ = self.trace.graph.demands[first]
+        return broken(~demands[:, first], field, found, wanted, k)
+
     def uniforms(self, values: Sequence[Array] | None = None) -> Array:
         """The numbers that all episodes share, as the code reads them; of parameters with other `values` (see engine/parameters.py)."""
         return self._reading.bits(values)
@@ -159,7 +167,7 @@ class State:
     def __init__(self, program: Program, episodes: int) -> None:
         self.program, self.episodes = program, episodes
         self.blocks = -(-episodes // program.lanes)
-        self.memory = _aligned((self.blocks, program.stride))
+        self.memory = aligned((self.blocks, program.stride))
 
     def _leaf(self, name: str) -> Array:
         """A leaf (blocks, places, lanes), to be read and written."""
@@ -209,10 +217,13 @@ class Call:
     """Calls of a program on a state: arguments that stay what they are until they are written to, and results that are new each time.
 
     Arguments are (episodes, ...), or (steps, episodes, ...) with more `steps` than one; so are results. `broken`: a demand did not hold.
-    Many episodes may share several `threads`: a block depends on no other.
+    Many episodes may share several `threads`: a block depends on no other. `like`: the call whose arguments all steps have.
     """
 
-    def __init__(self, program: Program, state: State, steps: int = 1, values: Sequence[Array] | None = None, threads: int = 1) -> None:
+    def __init__(
+        self, program: Program, state: State, steps: int = 1, values: Sequence[Array] | None = None, threads: int = 1,
+        like: Call | None = None,
+    ) -> None:  # fmt: skip
         self.program, self.state, self.steps, self.broken = program, state, steps, False
         threads = max(1, min(threads, state.episodes // WORTH))
         self._parts = [(state.blocks * i // threads, state.blocks * (i + 1) // threads) for i in range(threads)]
@@ -230,7 +241,11 @@ class Call:
             shape = (rows, *nodes.shape[1:])
             self._table[i, 1] = int(np.prod(shape)) * dtype.itemsize
             if kind == "arguments":
-                held = _aligned((steps, *shape), dtype)
+                if like is not None:
+                    self.arguments[name] = like.arguments[name]
+                    self._table[i] = self.arguments[name].ctypes.data, 0
+                    continue
+                held = aligned((steps, *shape), dtype)
                 self._table[i, 0] = held.ctypes.data
                 self.arguments[name] = held[:, : state.episodes] if steps > 1 else held[0, : state.episodes]
             elif nodes.ndim == 1 and steps == 1:
@@ -242,7 +257,8 @@ class Call:
             self._singles.append((names, self._place((len(names), state.episodes), (len(names), rows), dtype)))
             for i, name in enumerate(names):
                 self._table[program.arrays.index(("results", name)), 0] = self._singles[-1][1].at + i * rows * dtype.itemsize
-        self._rooms = [_aligned((program.room,)) for _ in self._parts]
+        self._first = self._table[:, 0].copy()  # where the first step reads and writes
+        self._rooms = [aligned((program.room,)) for _ in self._parts]
         self._pointers = tuple(ctypes.c_void_p(a.ctypes.data) for a in (state.memory, self.uniforms, self._table))
         self._places = [ctypes.c_void_p(room.ctypes.data) for room in self._rooms]
         self.sheet = np.empty(0, np.uint8)  # what the last call wrote
@@ -263,6 +279,8 @@ class Call:
     def begin(self) -> None:
         """Begin a new sheet, which `play` fills."""
         self.sheet = np.empty(self._size, np.uint8)
+        if self.steps > 1:
+            self._table[:, 0] = self._first
 
     def play(self, steps: int) -> None:
         """Play steps into the last sheet; the next ones go on from there."""
@@ -313,7 +331,7 @@ def _pool(threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(threads)
 
 
-def _aligned(shape: tuple[int, ...], dtype: Any = np.uint8) -> Array:
+def aligned(shape: tuple[int, ...], dtype: Any = np.uint8) -> Array:
     """Zeros, beginning at a cache line."""
     size = int(np.prod(shape)) * np.dtype(dtype).itemsize
     raw = np.zeros(size + ALIGNED, np.uint8)

@@ -7,14 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from tailgate import num
 from tailgate.core import Attack
 from tailgate.draws import Keys, Role
-from tailgate.engine import objects
-from tailgate.engine.agreement import Untraced, check_open, explained, raised, same
+from tailgate.engine.agreement import Untraced, check_open, raised, same
 from tailgate.engine.operations import Array
-from tailgate.engine.parameters import Parameters, Remembered, lifted
+from tailgate.engine.parameters import lifted
 from tailgate.engine.program import Call, Program, State, traced
+from tailgate.engine.remembered import Remembered
 from tailgate.loop import Loop
 from tailgate.tree import leaves
 
@@ -25,11 +24,15 @@ TRIED = 24  # steps in which fresh code is compared with the plain loop
 class Rollout:
     """The program of a loop under an attack. Raises whatever their parts raise while they are traced."""
 
-    def __init__(self, loop: Loop, attack: Attack) -> None:
+    def __init__(self, loop: Loop, attack: Attack, plan: Any) -> None:
         check_open(loop)
-        self.loop, self.attack, self.plan = loop, attack, attack.prepare(loop.brief)
+        self.loop, self.attack, self.plan = loop, attack, plan
         self.values: list[Array] | None = None  # of the parameters, if others than those it was traced with
         self.program = Program(traced(self._traced, self.begun(_ONE), {}))
+
+    @property
+    def programs(self) -> tuple[Program, ...]:
+        return (self.program,)
 
     def of(self, loop: Loop, attack: Attack, plan: Any, values: list[Array]) -> Rollout:
         """The same program for a loop and an attack of other parameters."""
@@ -39,9 +42,7 @@ class Rollout:
 
     def begun(self, keys: Keys) -> dict[str, Any]:
         """The state of episodes that begin."""
-        batch = len(keys.key)
-        memory = self.attack.start(self.plan, batch, keys.at(Role.ATTACK, np.zeros(batch, np.int64)))
-        return {"loop": self.loop.start(keys), "memory": memory}
+        return _begun(self.loop, self.attack, self.plan, keys)
 
     def _traced(self, held: Any, given: Any) -> tuple[Any, Any]:
         loop, attack, plan = lifted(held["loop"].k.graph, (self.loop, self.attack, self.plan))
@@ -76,9 +77,13 @@ class Rollout:
         for step in np.flatnonzero(~held.all(axis=(1, 2))):
             if terminate and ended[step].all():
                 return
-            which = int(np.flatnonzero(~held[step].all(axis=0))[0])
-            field, found, wanted, _ = self.program.trace.graph.demands[which]
-            raise num.broken(~held[step, :, which], field, found, wanted, np.full(held.shape[1], first + step + 1))
+            raise self.program.broken(held[step], np.full(held.shape[1], first + step + 1))
+
+
+def _begun(loop: Loop, attack: Attack, plan: Any, keys: Keys) -> dict[str, Any]:
+    batch = len(keys.key)
+    memory = attack.start(plan, batch, keys.at(Role.ATTACK, np.zeros(batch, np.int64)))
+    return {"loop": loop.start(keys), "memory": memory}
 
 
 def _step(loop: Loop, attack: Attack, plan: Any, held: Any) -> tuple[Any, Any]:
@@ -98,20 +103,13 @@ _made: Remembered[Rollout] = Remembered()
 def rollout_of(loop: Loop, attack: Attack) -> Rollout | Untraced:
     """The program of a loop under an attack, once it has been found equal to the plain loop on this machine; or why there is none."""
     plan = attack.prepare(loop.brief)
-    parameters = Parameters((loop, attack, plan))
-    if found := _made.find(parameters):
-        return found.of(loop, attack, plan, parameters.values)
-    try:
-        rollout = Rollout(loop, attack)
-    except Exception as error:  # whatever somebody's code raises where arrays are not numpy's
-        return Untraced(explained(error))
-    names = [f"{rollout.program.function.name}.{parameters.sources}"]
-    if not objects.proved(names):
-        if differs := _difference(rollout):
-            return Untraced(f"traced code and the plain loop differ in {differs}")
-        objects.prove(names)
-    _made.keep(parameters, [rollout.program.trace.graph], rollout)
-    return rollout
+    return _made.proved(
+        (loop, attack, plan),
+        lambda: loop.sense(_begun(loop, attack, plan, _ONE)["loop"]),
+        lambda: Rollout(loop, attack, plan),
+        lambda found, values: found.of(loop, attack, plan, values),
+        _difference,
+    )
 
 
 def _difference(rollout: Rollout, batch: int = 64) -> str:

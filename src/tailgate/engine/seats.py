@@ -1,57 +1,68 @@
 """The attacker's seat as a program: what `tailgate.envs.seat.Seat` plays, traced as it stands.
 
-    decide   a decision of every row; rows `again` begin their next episode instead
+    advance  a step of a decision of several, but the last
+    decide   a decision of every row, or its last step; rows `again` begin their next episode instead
     begin    the next episode of the rows `again`, or their first
 
-Both leave what is to be seen, and what may be decided next.
+The last two leave what is to be seen, and what may be decided next.
 """
 
 from __future__ import annotations
 
 import copy
 import dataclasses
+from collections.abc import Callable
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tailgate import draws, num
+from tailgate import draws
 from tailgate.agents.observation import ObservationCodec
 from tailgate.draws import Keys
-from tailgate.engine import objects
-from tailgate.engine.agreement import Untraced, check_open, explained, raised, same
+from tailgate.engine.agreement import Untraced, check_open, raised, same
 from tailgate.engine.operations import Array
-from tailgate.engine.parameters import Parameters, Remembered, lifted
+from tailgate.engine.parameters import lifted
 from tailgate.engine.program import Call, Program, State, Trace, traced
-from tailgate.errors import InputError
+from tailgate.engine.remembered import Remembered
 from tailgate.tree import leaves, map_leaves
 
 if TYPE_CHECKING:
     from tailgate.envs.seat import Seat
 
 
-# what a step of a single row tells, in the order of the fused engine
+# what a step of a single row tells
 ALONE = ("reward", "damage", "k", "terminated", "truncated", "illegal", "collided", "rear_collided", "allowed")
 
 
 class SeatPrograms:
     """The programs of a seat. Raises whatever its parts raise while they are traced."""
 
-    def __init__(self, seat: Seat) -> None:
+    def __init__(self, seat: Seat, shown: Seat | None = None) -> None:
         check_open(seat.loop)
-        self.seat, self.loop, self.shown = seat, seat.loop, _shown_once(seat)
+        self.seat, self.loop, self.shown = seat, seat.loop, shown or _shown_once(seat)
         self.values: list[Array] | None = None  # of the parameters, if others than those it was traced with
-        start = seat.loop.start(draws.keys("tune", [0]))
-        self.example = {"loop": start, "tally": seat.begin(start)}
+        self.example = _example(seat)
         for name, leaf in leaves(self.example).items():
             if leaf.dtype == object:
                 raise TypeError(f"state {name} holds objects")
+        state = self.example | ({"sums": seat.opened(self.example["tally"])} if _several(seat) else {})
         flags = np.zeros(1, bool)
         action = np.zeros(1, np.int64) if seat.action.discrete else np.zeros((1, seat.action.size))
-        decide = traced(self._decide, self.example, {"action": action, "over": flags, "again": flags})
-        begin = traced(self._begin, self.example, {"again": flags})
-        twins = _twins(decide, begin)
-        self.decide, self.begin = Program(decide, twins=twins), Program(begin, twins=twins)
+        decide = traced(self._decide, state, {"action": action, "over": flags, "again": flags})
+        begin = traced(self._begin, state, {"again": flags})
+        traces = [decide, begin]
+        if _several(seat):
+            traces.append(traced(self._advance, state, {"action": action, "over": flags}))
+        twins = _twins(*traces)
+        self.programs = tuple(Program(trace, twins=twins) for trace in traces)
+        self.decide, self.begin, *advance = self.programs
+        self.advance = advance[0] if advance else None
+
+    @property
+    def between(self) -> int:
+        """Steps of a decision before its last."""
+        return self.seat.action.spec.interval - 1
 
     def of(self, seat: Seat, values: list[Array]) -> SeatPrograms:
         """The same programs for a seat of other parameters."""
@@ -60,19 +71,41 @@ class SeatPrograms:
         return out
 
     def _decide(self, held: Any, given: Any) -> tuple[Any, Any]:
-        seat = self._lifted(held)
-        loop, tally, outcome, _ = seat.step(held["loop"], held["tally"], given["action"], given["over"])
+        seat, over = self._lifted(held), given["over"]
+        loop, tally, sums = held["loop"], held["tally"], held["sums"] if _several(seat) else seat.opened(held["tally"])
+        loop, tally, sums, _ = seat.advanced(loop, tally, sums, given["action"], over)
+        outcome = seat.closed(loop, tally, sums, over)
         state = _renewed(seat, {"loop": loop, "tally": tally}, held["loop"].keys, given["again"])
-        return state, outcome._asdict() | _shown(seat, state)
+        return self._opened(seat, state), outcome._asdict() | _shown(seat, state)
+
+    def _advance(self, held: Any, given: Any) -> tuple[Any, Any]:
+        seat = self._lifted(held)
+        *state, _ = seat.advanced(held["loop"], held["tally"], held["sums"], given["action"], given["over"])
+        return dict(zip(("loop", "tally", "sums"), state, strict=True)), {}
 
     def _begin(self, held: Any, given: Any) -> tuple[Any, Any]:
         seat = self._lifted(held)
-        state = _renewed(seat, held, held["loop"].keys, given["again"])
-        return state, _shown(seat, state)
+        state = _renewed(seat, {"loop": held["loop"], "tally": held["tally"]}, held["loop"].keys, given["again"])
+        return self._opened(seat, state), _shown(seat, state)
+
+    def _opened(self, seat: Seat, state: Any) -> Any:
+        """With the sums of the next decision, where a decision has several steps."""
+        return state | {"sums": seat.opened(state["tally"])} if _several(seat) else state
 
     def _lifted(self, held: Any) -> Seat:
         seat: Seat = lifted(held["loop"].k.graph, self.shown)
         return seat
+
+
+def _example(seat: Seat) -> dict[str, Any]:
+    """The state of an episode that begins."""
+    start = seat.loop.start(draws.keys("tune", [0]))
+    return {"loop": start, "tally": seat.begin(start)}
+
+
+def _several(seat: Seat) -> bool:
+    """Has a decision several steps? Traced code asks, so that a program is found again for both kinds apart."""
+    return bool(seat.action.spec.interval > 1)
 
 
 def _shown_once(seat: Seat) -> Seat:
@@ -80,18 +113,26 @@ def _shown_once(seat: Seat) -> Seat:
     return dataclasses.replace(seat, observation=ObservationCodec(seat.loop.brief), config={})
 
 
-def _twins(decide: Trace, begin: Trace) -> dict[str, str]:
+def _twins(decide: Trace, begin: Trace, *others: Trace) -> dict[str, str]:
     """Leaves of the state that equal others after each decision and each beginning, and these."""
     first: dict[Any, str] = {}
     out = {}
-    for name, (here, there) in decide.state.items():
-        after = list(decide.large[name][1:]) if name in decide.large else list(there.flat)
+    for name, (here, _) in decide.state.items():
         pairs = [begin.large[name]] if name in begin.large else list(zip(*(nodes.flat for nodes in begin.state[name]), strict=True))
-        if after and all(new.op in ("select", "blend") and new.args[2] is old for old, new in pairs):
-            key = here.shape, tuple(node.id for node in after), tuple((new.args[0].id, new.args[1].id) for _, new in pairs)
+        if here.size and all(new.op in ("select", "blend") and new.args[2] is old for old, new in pairs):
+            key = (
+                here.shape,
+                *(_after(trace, name) for trace in (decide, *others)),
+                tuple((new.args[0].id, new.args[1].id) for _, new in pairs),
+            )
             if first.setdefault(key, name) != name:
                 out[name] = first[key]
     return out
+
+
+def _after(trace: Trace, name: str) -> tuple[int, ...]:
+    """Numbers of what a leaf is in the next state."""
+    return (trace.large[name][1].id,) if name in trace.large else tuple(node.id for node in trace.state[name][1].flat)
 
 
 def _renewed(seat: Seat, state: Any, keys: Keys, again: Any) -> Any:
@@ -114,21 +155,14 @@ _made: Remembered[SeatPrograms] = Remembered()
 
 def programs_of(seat: Seat) -> SeatPrograms | Untraced:
     """The programs of a seat, once they have been found equal to the plain loop on this machine; or why there are none."""
-    parameters = Parameters(_shown_once(seat))
-    if found := _made.find(parameters):
-        return found.of(seat, parameters.values)
-    try:
-        programs = SeatPrograms(seat)
-    except Exception as error:  # whatever somebody's code raises where arrays are not numpy's
-        return Untraced(explained(error))
-    both = (programs.decide, programs.begin)
-    names = [f"{program.function.name}.{parameters.sources}" for program in both]
-    if not objects.proved(names):
-        if differs := difference(programs):
-            return Untraced(f"traced code and the plain loop differ in {differs}")
-        objects.prove(names)
-    _made.keep(parameters, [program.trace.graph for program in both], programs)
-    return programs
+    shown = _shown_once(seat)
+    return _made.proved(
+        shown,
+        lambda: _shown(shown, _example(shown)),
+        lambda: SeatPrograms(seat, shown),
+        lambda found, values: found.of(seat, values),
+        difference,
+    )
 
 
 def difference(programs: SeatPrograms, batch: int = 64, decisions: int = 24) -> str:
@@ -169,10 +203,16 @@ class Rows:
         return Call(self.programs.begin, self.state, values=self.programs.values, threads=self.threads)
 
     @cached_property
+    def _advance(self) -> Call:
+        assert self.programs.advance is not None
+        return Call(self.programs.advance, self.state, self.programs.between, self.programs.values, self.threads, self._decide)
+
+    @cached_property
     def _alone(self) -> tuple[Any, ...]:
         """What reads the sheet of a single row."""
         call, discrete = self._decide, self.programs.seat.action.discrete
-        return call.numbers(ALONE), call.reader("seen", 0), call.reader("mask", 0, np.int8) if discrete else lambda: None
+        mask = call.reader("mask", 0, np.int8) if discrete else None
+        return call.numbers(ALONE), call.reader("seen", 0), (lambda: mask().copy()) if mask else lambda: None
 
     @property
     def brought(self) -> dict[str, Array]:
@@ -203,23 +243,24 @@ class Rows:
         """The next episode of a single row; -> as `decide_alone`, of a decision that brought nothing."""
         self.begin(np.ones(1, bool))
         new = self.brought
-        mask = new["mask"][0].view(np.int8) if "mask" in new else None
+        mask = new["mask"][0].view(np.int8).copy() if "mask" in new else None  # the caller may write to it
         return 0.0, float(new["damage"][0]), int(new["k"][0]), *(False,) * 5, bool(new["allowed"][0]), new["seen"][0], mask
 
     def _play(self, call: Call) -> None:
         before, sheet = self._last, self._last.sheet
-        call.begin()
-        call.play(1)
+        steps = [self._advance, call] if self.programs.between and call is self._decide else [call]
+        for part in steps:
+            part.begin()
+            part.play(part.steps)
+            if part.broken:
+                self._check(part, lambda: before.results(sheet)["k"])
         self._last, self._brought = call, None
-        if call.broken and not self.brought["demands"].all():  # idle lanes may hold anything
-            raise self.broken(self.brought["demands"], before.results(sheet)["k"])
 
-    def broken(self, demands: Array, k: Array) -> InputError:
-        """The error of a decision from steps k (B,) on that broke some of its demands (B, .)."""
-        known = self.programs.decide.trace.graph.demands
-        first = int(np.flatnonzero(~demands.all(axis=0))[0])
-        field, found, wanted, _ = known[first]
-        return num.broken(~demands[:, first], field, found, wanted, k + first // (len(known) // self.programs.seat.action.spec.interval))
+    def _check(self, call: Call, k: Callable[[], Array]) -> None:
+        """Raise the error of a demand that did not hold, in a decision from steps k (B,) on; idle lanes may hold anything."""
+        demands = call.results()["demands"].reshape(call.steps, self.batch, -1)
+        for step in np.flatnonzero(~demands.all(axis=(1, 2))):
+            raise call.program.broken(demands[step], k() + step + (self.programs.between if call is self._decide else 0))
 
     def begin(self, rows: Array, keys: Keys | None = None) -> None:
         """Begin episodes in the rows (B,) bool: the next of their own, or those of keys, of as many rows."""

@@ -27,7 +27,7 @@ from tailgate.registry import Spec
 from tailgate.scenario import Scenario, list_scenarios, load_scenario
 from tailgate.schema import build
 from tailgate.threat import ThreatModel
-from tailgate.trace import Recorder, Trace
+from tailgate.trace import Recorder, Trace, signals_of
 from tailgate.tree import duplicate
 
 YAML = (".yaml", ".yml")
@@ -202,7 +202,7 @@ def play(row: Row, allowed: Filter | None = None) -> Replay:
     recorder, gate = Recorder(loop, start), [_gate(loop, start)]
     for state, frame in states:
         assert frame is not None
-        recorder.add(frame, np.ones(1, bool))
+        recorder.put(signals_of(frame), np.ones(1, bool))
         gate.append(_gate(loop, state))
     trace = recorder.trace()
     metrics = {name: None if np.isnan(value[0]) else float(value[0]) for name, value in measure(trace).items()}

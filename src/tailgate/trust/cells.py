@@ -22,10 +22,10 @@ from tailgate.registry import Spec
 from tailgate.scenario import Scenario, load_scenario
 from tailgate.schema import canonical
 from tailgate.scoring.damage import CLEAN
-from tailgate.trace import Trace, episodes_at_once, nearest, rollout
+from tailgate.trace import Trace, episodes_at_once, rollout
 
 from .false_alarms import DETECTS, false_alarms
-from .logic import Eventually, Interval, Samples, along, holds, robustness
+from .logic import Eventually, Interval, along, holds, robustness
 from .properties import CONJUNCTIONS, Demands, Property, built_in, conjunctions, own
 from .signals import SafeDistance, sample
 from .statistics import Sequential, Sprt
@@ -74,15 +74,6 @@ def outcome(known: Property, trace: Trace, safe: SafeDistance) -> Outcome:
         asked = holds(Eventually(known.trigger, Interval(0.0, known.until)), samples)
         instants = np.count_nonzero(along(known.trigger, samples) & samples.live, axis=0)
     return Outcome(holds(known.formula, samples), robustness(known.formula, samples), asked, instants, trace.length)
-
-
-def outcome_by_gaps(known: Property, length: Array, least: dict[str, Array], dt: float) -> Outcome:
-    """A property that the smallest gaps decide (`Property.by_gaps`), in runs of which only these are known."""
-    assert known.formula is not None
-    values = {name: least[name.partition("@")[0]][None, :] for name in known.signals}
-    samples = Samples(dt, np.ones_like(length), values)
-    asked, instants = np.ones(len(length), bool), np.zeros(len(length), np.int64)
-    return Outcome(holds(known.formula, samples), robustness(known.formula, samples), asked, instants, length)
 
 
 @dataclass
@@ -194,9 +185,7 @@ def _keys(purpose: str, seeds: tuple[int, ...]) -> draws.Keys:
 
 
 def _outcomes(job: Job, loop: Loop, attack: Any, known: Sequence[Property], keys: draws.Keys) -> tuple[dict[str, Outcome], Array | None]:
-    """Play the runs of these keys: outcomes, and false alarms of clean ones. Where the smallest gaps decide all, no trace is made."""
-    if all(p.by_gaps for p in known) and (found := nearest(loop, attack, keys)) is not None:
-        return {p.name: outcome_by_gaps(p, *found, loop.model.dt) for p in known}, None
+    """Play the runs of these keys: outcomes, and false alarms of clean ones."""
     trace = rollout(loop, attack, keys)
     priced = job.cell.attack == CLEAN and any(p.name == DETECTS for p in known)
     return {p.name: outcome(p, trace, job.safe) for p in known}, false_alarms(trace, job.asked.detection) if priced else None

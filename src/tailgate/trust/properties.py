@@ -59,26 +59,11 @@ class Property:
         """Names of the signals that are needed to decide it."""
         return set().union(*(f.signals for f in (self.formula, self.trigger) if f is not None))
 
-    @property
-    def by_gaps(self) -> bool:
-        """Whether the smallest gaps of a run decide it, and say how far it is from being otherwise.
-
-        So it is of G of lower bounds on gaps: a bound is exceeded, and by how much, where the signal is least, rounding included.
-        """
-        if self.trigger is not None or not isinstance(self.formula, Always) or self.formula.within != Interval():
-            return False
-        parts = self.formula.of.of if isinstance(self.formula.of, And) else (self.formula.of,)
-        return all(isinstance(part, Atom) and len(part.terms) == 1 and _least_counts(*part.terms[0]) for part in parts)
-
 
 CONJUNCTIONS: dict[str, tuple[str, ...]] = {  # of what is defined among these one boolean a run is made
     "trust": ("no_collision", "brakes", "detects", "error"),
     "safety": ("no_collision", "brakes", "error"),
 }
-
-
-def _least_counts(signal: str, factor: float) -> bool:
-    return signal.partition("@")[0] in ("gap", "rear_gap") and factor > 0.0
 
 
 def _over(signal: str, factor: float, bound: float, strict: bool = True) -> Atom:

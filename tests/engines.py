@@ -1,16 +1,16 @@
-"""The fused engine beside the plain loop, for the tests of each of its plants."""
-
+"""The traced engine beside the plain loop, for the tests of each plant."""
 
 import dataclasses
 
 import numpy as np
+import pytest
 
 from tailgate import draws
+from tailgate.engine.commanded import Commanded, commanded
 from tailgate.envs.faces import AdversaryVectorEnv
-from tailgate.fused import Constants, fuse
 from tailgate.registry import Spec
 from tailgate.scenario import load_scenario
-from tailgate.trace import rollout
+from tailgate.trace import Trace, rollout
 
 
 def loop_of(scenario, defence, attack, horizon=200, beyond=None, **threat):
@@ -25,6 +25,12 @@ def loop_of(scenario, defence, attack, horizon=200, beyond=None, **threat):
     return loop, made.make()
 
 
+def some(cells, every):
+    """All of these; but for every so many they are played with --long only: a program for each takes long to compile."""
+    held = (cell if isinstance(cell, tuple) else (cell,) for cell in cells)
+    return [pytest.param(*cell, marks=[pytest.mark.long] if i % every else []) for i, cell in enumerate(held)]
+
+
 def same(one, two):
     if isinstance(one, dict):
         assert one.keys() == two.keys()
@@ -34,37 +40,25 @@ def same(one, two):
         assert one.dtype == two.dtype and np.array_equal(one, two, equal_nan=True)
 
 
+def told(loop, rival, keys, terminate=True):
+    """Episodes of a traced loop under an attack in plain code."""
+    program = commanded(loop)
+    assert isinstance(program, Commanded), program
+    return Trace(loop.model, loop.horizon, *program.play(rival, keys, terminate), loop.controller.desired_gap)
+
+
 def trace_as_plain(loop, rival):
-    """Episodes in two blocks, one of them not full: every signal's hash, and the lengths. -> the plain loop's trace."""
-    assert isinstance(fuse(loop, rival), Constants)
+    """67 episodes, no whole number of vectors: every signal's hash, and the lengths. -> the plain loop's trace."""
     keys = draws.keys("report", range(67))
-    fused, plain = rollout(loop, rival, keys), rollout(loop, rival, keys, plain=True)
-    assert np.array_equal(fused.length, plain.length)
-    assert [fused.trace_hash(b) for b in range(67)] == [plain.trace_hash(b) for b in range(67)]
-    assert {name: column.dtype for name, column in fused.signals.items()} == {name: column.dtype for name, column in plain.signals.items()}
-    assert all(np.array_equal(fused.first[name], plain.first[name]) for name in plain.first)
+    fast, plain = told(loop, rival, keys), rollout(loop, rival, keys, plain=True)
+    assert np.array_equal(fast.length, plain.length)
+    assert [fast.trace_hash(b) for b in range(67)] == [plain.trace_hash(b) for b in range(67)]
+    assert {name: column.dtype for name, column in fast.signals.items()} == {name: column.dtype for name, column in plain.signals.items()}
+    assert all(np.array_equal(fast.first[name], plain.first[name]) for name in plain.first)
     return plain
 
 
-def in_any_thread(kind, loop):
-    """4200 episodes of a kind of lanes in one thread and in two, and one of them apart."""
-    constants, keys = fuse(loop), draws.keys("report", range(4200))
-    held = []
-    for threads, mine in ((1, keys), (2, keys), (1, draws.keys("report", [4111]))):
-        rows = len(mine.key)
-        command = loop.brief.command(np.ones(rows, bool), 5, loop.brief.granted, 2.0)
-        lanes = kind(loop, constants, mine, threads=threads)
-        assert lanes.threads == threads
-        lanes.start()
-        for _ in range(3):
-            lanes.advance(command)
-        held.append(lanes.memory.window.copy())
-    assert np.array_equal(*held[:2])
-    block, lane = divmod(4111, 64)
-    assert np.array_equal(held[0][block].reshape(-1, 64)[:, lane], held[2][0].reshape(-1, 64)[:, 0])
-
-
-def as_plain(arguments, rows, folder, engine="fused"):
+def as_plain(arguments, rows, folder, engine="traced"):
     """So many rows of both engines, in a scenario so short that all begin again; some are reset by a mask, one in two of them with a seed."""
     text = folder / "short.yaml"
     text.write_text(short(arguments["scenario"]))
@@ -91,7 +85,7 @@ def as_plain(arguments, rows, folder, engine="fused"):
             kept = one.episodes.held()
             one.step(actions)
             one.episodes.put(kept)
-            one.observed = two.observed.copy()
+            one.observed, one.over = two.observed.copy(), two.over.copy()
     assert ended >= rows and np.array_equal(one.episode, two.episode)
 
 

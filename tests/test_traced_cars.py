@@ -1,29 +1,25 @@
-"""The fused engine against the plain loop: the same bits, lane by lane and over a covering set of pairs, over whole episodes."""
+"""One car that follows another, by wheel sensors or radar: the traced engine plays it as the plain loop does, to the last bit."""
 
 import dataclasses
-import hashlib
-import os
 import subprocess
 import sys
+import time
 
 import numpy as np
 import pytest
 
 from tailgate import draws
+from tailgate.engine.commanded import Steps, commanded
 from tailgate.envs.faces import AdversaryEnv, AdversaryVectorEnv
 from tailgate.errors import InputError
-from tailgate.fused import Constants, Refused, compiled, fuse, script
-from tailgate.fused.lanes import Lanes
-from tailgate.fused.memory import SCRIPTED
-from tailgate.fused.rows import ROWS, STATE
 from tailgate.registry import Spec
 from tailgate.scenario import load_scenario
 from tailgate.trace import rollout
 
-from .fused import as_plain, loop_of, same, short
+from .engines import as_plain, loop_of, same, short, some, told, trace_as_plain
 
 # Every filter, detector, mitigation, manoeuvre, kind, law and trigger at least once.
-CELLS = [
+CARS = [
     ("stop-and-go-v0", "chi2_kf", "none"),
     ("gusty-stop-and-go-v0", "kf", "fdi:trigger=near,threshold=30,value=-4"),
     ("gusty-stop-and-go-v0", "windowed_chi2_kf", "fdi_gaussian:trigger=near,threshold=40,sd=4"),
@@ -68,28 +64,69 @@ STEALTH = [
     ("thesis-ch4-v0", "chi2_kf:gain=steady", "stealth"),
     ("car-following-noisy-v0", "always_alarm", "stealth:start_step=70"),
 ]
+# Every filter, detector, mitigation and kind at least once, over the air and on the wires, and a jammer that leaves nothing to read.
+ANY = {
+    "kinds": ("noise_jam", "echo_delay", "fdi", "dos_jam", "dos_hold", "dos_hold_fresh", "dropout"), "delay_bound": 60.0,
+    "jam_power": 100.0, "budget": None, "onset": 5,
+}  # fmt: skip
+DRIVEN = ANY | {"targets": ("distance", "relative_speed", "acceleration")}
+ONE = ANY | {"targets": ("distance",)}
+RADARS = [
+    ("radar-following-v0", "kf", "none", {}),
+    ("radar-following-v0", "none", "noise_jam:start_step=30,power=50", ANY),
+    ("radar-braking-v0", "chi2_kf:gain=steady", "echo_delay:trigger=leader_braking,threshold=2,delay=15", {}),
+    ("radar-heavy-v0", "rkf", "echo_pull_off:trigger=leader_braking,threshold=0.3,rate=6,hop=true", ANY),
+    ("radar-heavy-v0", "windowed_chi2_kf", "dos_jam:start_step=40,low=10,high=100,burst=3,pause=4", ANY),
+    ("thesis-ch3-v0", "cusum_kf", "echo_delay:start_step=60,delay=6", {}),
+    ("thesis-ch3-switched-v0", "mewma_kf", "noise_jam:start_step=60", {}),
+    ("thesis-ch3-v0", "kf", "radar_jam:start_step=51", {}),
+    ("radar-following-v0", "reacquire_kf:after=3", "noise_jam:start_step=30,power=100,chance=0.7", ANY),
+    ("radar-following-v0", "reacquire_kf:after=2", "echo_delay:trigger=near,threshold=60,delay=60,burst=5,pause=5", ANY),
+    ("radar-following-v0", "cusum_reacquire_kf", "dos_hold:start_step=50,length=40", ANY),
+    ("radar-following-v0", "cusum_reacquire_kf", "dos_hold:start_step=50,fresh=true,targets=[distance]", ANY),
+    ("radar-following-v0", "widen_kf", "dropout:start_step=20,probability=0.6", ANY),
+    ("radar-following-v0", "brake_kf", "fdi_ramp:start_step=30,rate=0.5,targets=[distance]", ANY),
+    ("radar-following-v0", "chi2_kf_sparse", "fdi_gaussian:start_step=20,sd=8,chance=0.5", DRIVEN),
+    ("radar-following-v0", "oracle", "fdi_bernoulli:start_step=20,value=9", ANY),
+    ("radar-following-v0", "coast", "none", {}),
+    ("radar-following-v0", "always_brake", "fdi_uniform:start_step=20", ANY),
+    ("radar-following-v0", "always_alarm", "fdi_then_jam:start_step=20,inject=5,value=8", ANY),
+    ("radar-following-v0", "rkf:unit=sensor", "actuator_fdi:start_step=20,value=1.0", DRIVEN),
+    ("radar-following-v0", "composed:detector=chi2,mitigation=latch", "noise_jam:start_step=20,targets=[distance],power=60", ONE),
+    ("radar-following-v0", "chi2_kf", "dos_jam:start_step=20,low=0,high=100", ONE),
+    ("radar-following-v0", "cra", "noise_jam:start_step=60", {}),
+    ("radar-following-v0", "cra", "dos_jam:start_step=20,low=5,high=100,burst=9,pause=9", ANY),
+    ("radar-following-v0", "cra:challenge=fixed,times=[15,50,175]", "echo_delay:trigger=near,threshold=60,delay=60", ANY),
+    ("radar-heavy-v0", "cra:probability=0.3,quiet=5,mode=brake", "echo_delay:trigger=near,threshold=60,delay=60,hop=true", ANY),
+    ("thesis-ch3-v0", "cra:suspicion=20,watch=none", "noise_jam:start_step=60", {}),
+    ("thesis-ch3-switched-v0", "cra:margin=1", "radar_jam:start_step=51", {}),
+    ("radar-fast-attacker-v0", "cra", "noise_jam:start_step=60,power=0.1", {}),
+    ("radar-braking-v0", "cra:rollback=false,freeze=false", "dropout:start_step=20,probability=0.6", ANY),
+    ("radar-braking-v0", "cra:passes=false", "fdi_gaussian:start_step=20,sd=8,chance=0.5", DRIVEN),
+    ("radar-following-v0", "cra:filter.window=5,filter.forgetting=0.9,filter.threshold=4", "echo_pull_off:start_step=40,rate=2", ANY),
+    ("radar-following-v0", "pycra", "echo_delay:trigger=near,threshold=60,delay=60", ANY),
+    ("radar-following-v0", "pycra:challenge=fixed,filter.threshold=none", "dos_hold:start_step=30", ANY),
+    ("radar-following-v0", "imm", "noise_jam:start_step=30,power=50", ANY),
+    ("radar-braking-v0", "imm:factors=[1,30,10000],threshold=1", "echo_delay:trigger=near,threshold=60,delay=60", ANY),
+    ("radar-following-v0", "algorithm2:times=[20,40,60,80,100]", "noise_jam:start_step=30,power=50", ANY),
+    ("thesis-ch3-v0", "algorithm2:delta=100", "radar_jam:start_step=51", {}),
+    ("radar-braking-v0", "algorithm2:challenge=random,probability=0.3,quiet=3,mode=widen,suspicion=15", "dropout:probability=0.6", ANY),
+]
 
 
-@pytest.mark.parametrize(("scenario", "defence", "attack"), CELLS + STEALTH)
-def test_a_trace_is_the_plain_loops_to_the_last_bit(scenario, defence, attack):
-    """Episodes in two blocks, one of them not full: every signal's hash, and the lengths."""
-    loop, rival = loop_of(scenario, defence, attack)
-    assert isinstance(fuse(loop, rival), Constants)
-    keys = draws.keys("report", range(67))
-    fused, plain = rollout(loop, rival, keys), rollout(loop, rival, keys, plain=True)
-    assert np.array_equal(fused.length, plain.length)
-    assert [fused.trace_hash(b) for b in range(67)] == [plain.trace_hash(b) for b in range(67)]
-    assert {name: column.dtype for name, column in fused.signals.items()} == {name: column.dtype for name, column in plain.signals.items()}
+@pytest.mark.parametrize(("scenario", "defence", "attack", "threat"), some([(*cell, {}) for cell in CARS + STEALTH] + RADARS, 2))
+def test_a_trace_is_the_plain_loops_to_the_last_bit(scenario, defence, attack, threat):
+    trace_as_plain(*loop_of(scenario, defence, attack, **threat))
 
 
 def test_a_run_to_the_horizon_goes_on_after_a_collision():
     """Without an end at a collision the attack goes on as well, to the last bit."""
     loop, rival = loop_of("gusty-stop-and-go-v0", "chi2_kf", "fdi:trigger=near,threshold=30,value=-4", horizon=600)
     keys = draws.keys("report", range(20))
-    fused, plain = (rollout(loop, rival, keys, terminate=False, plain=engine) for engine in (False, True))
+    fast, plain = told(loop, rival, keys, terminate=False), rollout(loop, rival, keys, terminate=False, plain=True)
     crashed = (plain.collided | plain.rear_collided)[:450].any(axis=0)
     assert (plain.kind[450:500, crashed] != 0).any()
-    assert [fused.trace_hash(b) for b in range(20)] == [plain.trace_hash(b) for b in range(20)]
+    assert [fast.trace_hash(b) for b in range(20)] == [plain.trace_hash(b) for b in range(20)]
 
 
 ENVIRONMENTS = [
@@ -104,13 +141,26 @@ ENVIRONMENTS = [
     {"scenario": "stop-and-go-v0", "defence": "imm", "autoreset": "same_step", "reward": "peak"},
     {"scenario": "gusty-stop-and-go-v0", "defence": "safe_state_brake", "autoreset": "next_step", "action": "continuous",
      "threat": {"targets": ["position", "leader_position", "leader_velocity"]}},
+    {"scenario": "radar-following-v0", "defence": "chi2_kf", "autoreset": "next_step", "delay": 60.0},
+    {"scenario": "radar-braking-v0", "defence": "reacquire_kf", "autoreset": "same_step", "action": "ramp", "reward": "stealth", "frames": 3,
+     "threat": {"budget": 50, "cooldown": 3, "duration": 9, "jam_power": 60.0}, "power": 60.0},
+    {"scenario": "thesis-ch3-v0", "defence": "rkf", "action": "mode", "reward": "final", "interval": 3, "knowledge": "grey", "value": 100.0,
+     "threat": {"sees_measurement": True, "targets": ["distance", "acceleration"]}},
+    {"scenario": "radar-heavy-v0", "defence": "cusum_kf", "autoreset": "same_step", "action": "ramp", "reward": "error", "value": 5.0,
+     "threat": {"kinds": ["fdi", "echo_delay", "dropout"]}, "attack_cost": 0.1, "illegal_penalty": 0.2, "per_sensor": True},
+    {"scenario": "radar-following-v0", "defence": "none", "action": "increment", "reward": "collision", "autoreset": "next_step",
+     "threat": {"kinds": ["fdi"], "targets": ["distance", "acceleration"]}},
+    {"scenario": "radar-following-v0", "defence": "cra", "autoreset": "same_step", "delay": 60.0, "shares": [0.04, 0.14, 1.0], "knowledge": "grey",
+     "threat": {"budget": None, "sees_measurement": True}},
+    {"scenario": "radar-braking-v0", "defence": "pycra:suspicion=20", "autoreset": "next_step", "action": "ramp", "interval": 2},
+    {"scenario": "radar-following-v0", "defence": "kf", "action": "timing", "kind": "echo_delay", "autoreset": "same_step"},
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize("arguments", ENVIRONMENTS, ids=lambda a: f"{a['scenario']}-{a['defence']}")
+@pytest.mark.parametrize("arguments", some(ENVIRONMENTS, 2), ids=lambda a: f"{a['scenario']}-{a['defence']}")
 def test_an_environment_is_the_plain_one_to_the_last_bit(arguments, tmp_path):
     """Observations, rewards, flags and information, over restarts, a masked reset and what was held."""
-    as_plain(arguments, 5, tmp_path)
+    as_plain(arguments, 9, tmp_path)
 
 
 def test_a_masked_reset_leaves_rows_that_wait_for_their_next_episode_alone(tmp_path):
@@ -118,7 +168,7 @@ def test_a_masked_reset_leaves_rows_that_wait_for_their_next_episode_alone(tmp_p
     text = tmp_path / "short.yaml"
     text.write_text(short("stop-and-go-v0"))
     seen = []
-    for engine in ("fused", "plain"):
+    for engine in ("traced", "plain"):
         env = AdversaryVectorEnv(6, engine=engine, scenario=str(text), defence="kf", autoreset="next_step")
         env.reset(seed=3)
         for _ in range(60):
@@ -134,8 +184,8 @@ def test_a_masked_reset_leaves_rows_that_wait_for_their_next_episode_alone(tmp_p
 @pytest.mark.parametrize("action", ["mode", "continuous"])
 def test_a_single_environment_is_a_batch_of_one(action):
     """The short way through a single environment gives the results, types and errors of the long one."""
-    one, two = (AdversaryEnv(engine=engine, action=action, threat={"budget": 30}) for engine in ("fused", "plain"))
-    assert [env.batch.engine for env in (one, two)] == ["fused", "plain"]
+    one, two = (AdversaryEnv(engine=engine, action=action, threat={"budget": 30}) for engine in ("traced", "plain"))
+    assert [env.batch.engine for env in (one, two)] == ["traced", "plain"]
     rng, over, chosen = np.random.default_rng(3), False, None
     same(*(env.reset(seed=5)[0] for env in (one, two)))
     for _ in range(700):
@@ -157,185 +207,37 @@ def test_a_single_environment_is_a_batch_of_one(action):
         one.step(99 if action == "mode" else np.full(3, np.nan, np.float32))
 
 
-def test_threads_and_blocks_change_no_bit():
-    """4200 episodes in one thread, in two, and apart."""
-    loop, _ = loop_of("stop-and-go-v0", "chi2_kf", "none", horizon=3)
-    constants, keys = fuse(loop), draws.keys("report", range(4200))
-    held = []
-    for threads in (1, 2):
-        lanes = Lanes(loop, constants, keys, threads=threads)
-        assert lanes.threads == threads
-        lanes.start()
-        for _ in range(3):
-            lanes.advance(loop.brief.command(np.zeros(4200, bool), 0, np.zeros(5, bool), 0.0))
-        held.append(lanes.rows.copy())
-    assert np.array_equal(*held)
-    alone = Lanes(loop, constants, draws.keys("report", [4111]))
-    alone.start()
-    for _ in range(3):
-        alone.advance(loop.brief.command(np.zeros(1, bool), 0, np.zeros(5, bool), 0.0))
-    block, lane = divmod(4111, 64)
-    assert np.array_equal(held[0][block].reshape(STATE, 64)[:, lane], alone.rows[0].reshape(ROWS, 64)[:STATE, 0])
-
-
-@pytest.mark.parametrize(("scenario", "defence", "threat", "why"), [
-    ("platoon-braking-v0", "trust_dkf", {}, "no lane"), ("car-following-lossy-v0", "kf", {}, "lost or late"),
-    ("stop-and-go-v0", "kf", {"knowledge": "white"}, "white-box"), ("stop-and-go-v0", "kf", {"kinds": ["delay"]}, "delay"),
-    ("stop-and-go-v0", "kf", {"hold_from_onset": True}, "held from the onset"),
-    ("stop-and-go-v0", "steered", {}, "no lane"), ("stop-and-go-v0", "imm:factors=[1,2,3,4,5]", {}, "more than 4 models"),
-])  # fmt: skip
-def test_what_has_no_lane_is_played_by_the_plain_loop(scenario, defence, threat, why):
-    """And says why."""
-    guard = Spec("defence", defence)
-    found = fuse(load_scenario(scenario).with_threat(**threat).loop(guard.make(), guard.entry.uses))
-    assert isinstance(found, Refused) and why in found.why
-    with pytest.raises(InputError, match="engine: got 'fused'"):
-        AdversaryVectorEnv(1, scenario=scenario, defence=defence, threat=threat, engine="fused")
-    with pytest.raises(InputError, match="engine"):
-        AdversaryVectorEnv(1, engine="quick")
-
-
-def test_somebody_elses_filter_of_the_same_base_is_not_taken_for_it():
-    """A subclass may mean something else: only the exact types have lanes."""
-    from tailgate.estimators.chi_square import ChiSquare
-    from tailgate.estimators.compose import AcceptAll, compose
-    from tailgate.estimators.kalman import KalmanFilter
-
-    class Mine(KalmanFilter):
-        pass
-
-    loop = load_scenario("stop-and-go-v0").loop(compose(Mine(), ChiSquare(), AcceptAll()))
-    assert isinstance(fuse(loop), Refused)
-    assert isinstance(fuse(load_scenario("stop-and-go-v0").loop(compose(KalmanFilter(), ChiSquare(), AcceptAll()))), Constants)
-
-
 def test_what_is_not_finite_is_refused_as_in_the_plain_loop():
-    """A measurement of 1e308 makes the estimate infinite."""
+    """A measurement of 1e308 makes the score infinite."""
     loop, _ = loop_of("stop-and-go-v0", "kf", "none", onset=1, beyond={"fdi_bound": 1.7e308})
-    lanes = Lanes(loop, fuse(loop), draws.keys("report", range(3)))
-    lanes.start()
     command = loop.brief.command(np.ones(3, bool), 5, np.array([True, True, False, False, False]), 1.7e308)
-    with pytest.raises(InputError, match="defence output x: got 'NaN or infinity'"):
-        for _ in range(5):
-            lanes.advance(command)
-
-
-def test_kept_code_is_of_these_sources(monkeypatch, tmp_path):
-    """The key on disk changes with a formula in another file."""
-    before = compiled.digest()
-    for package in compiled._SOURCES:
-        (tmp_path / package).mkdir()
-        for path in compiled.files(package).iterdir():
-            if path.name.endswith(".py"):
-                (tmp_path / package / path.name).write_bytes(path.read_bytes())
-    monkeypatch.setattr(compiled, "files", lambda package: tmp_path / package)
-    compiled.digest.cache_clear()
-    assert compiled.digest() == before
-    (tmp_path / "tailgate.envs" / "vehicle.py").write_text("x = 1\n")
-    compiled.digest.cache_clear()
-    assert compiled.digest() != before
-    compiled.digest.cache_clear()
-
-
-def test_a_part_is_called_by_compiled_code_alone():
-    """It has no machine code of its own; Python is told so."""
-    from tailgate.fused import kernel
-
-    with pytest.raises(TypeError, match="bad argument"):
-        kernel.living(np.zeros(ROWS * 64), np.uint64(64))
-
-
-@pytest.mark.long
-def test_another_version_of_numba_compiles_it_in_its_own_way(tmp_path):
-    """Without what is known of this version's inner workings the code is made anew, and plays the same."""
-    code = """
-import numba
-numba.__version__ = "99.0"
-from tailgate import draws, make_attack, make_defence
-from tailgate.scenario import load_scenario
-from tailgate.trace import rollout
-loop = load_scenario("stop-and-go-v0").loop(make_defence("chi2_kf"))
-one, two = (rollout(loop, make_attack("none"), draws.keys("train", [3]), plain=plain).trace_hash(0) for plain in (False, True))
-from tailgate.fused import compiled
-assert one == two and not compiled._inside()
-"""
-    done = subprocess.run([sys.executable, "-c", code], env=os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-
-
-def test_code_is_linked_into_a_process_with_gigabytes_in_it():
-    """Small holes in the address space, and nothing else near them: code and data have to be placed together all the same."""
-    code = """
-import mmap
-import numba
-from tailgate import draws, make_attack, make_defence
-from tailgate.scenario import load_scenario
-from tailgate.trace import rollout
-holes = [mmap.mmap(-1, 2 * mmap.PAGESIZE) for _ in range(400)]
-far = mmap.mmap(-1, 3 << 30)
-for hole in holes[::2]:
-    hole.close()
-loop = load_scenario("stop-and-go-v0").loop(make_defence("chi2_kf"))
-one, two = (rollout(loop, make_attack("none"), draws.keys("train", [3]), plain=plain).trace_hash(0) for plain in (False, True))
-assert one == two
-"""
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-
-
-def test_the_phases_are_vectorised():
-    """Packed against single multiplications in what is compiled of the filter's update and of the vehicle's move: a guard, and not a time."""
-    import re
-
-    import numba
-
-    from tailgate.fused import kalman, road
-
-    @numba.njit(error_model="numpy")
-    def both(s, g, intent, c, f, n):
-        kalman.update(s, f, n)
-        road.move(s, g, intent, c, f, np.uint64(0), 0, n)
-
-    floats, words = np.zeros(ROWS * 64), np.zeros(4 * 64, np.uint64)
-    constants = fuse(load_scenario("stop-and-go-v0").loop(Spec("defence", "kf").make()))
-    both(floats, words, np.zeros(640), constants.c, constants.f, np.uint64(64))
-    (code,) = both.inspect_asm().values()
-    packed, single = len(re.findall(r"\bv?f?n?m?[a-z]*mul[a-z0-9]*pd\b", code)), len(re.findall(r"\bv?mulsd\b", code))
-    if not re.search(r"\bv?mul[sp]d\b", code):
-        pytest.skip("not an x86 processor")
-    assert packed > 0.7 * single and packed > 60
+    state, said = loop.start(draws.keys("report", range(3))), []
+    steps = Steps(commanded(loop), state)
+    for play in (lambda: steps.play(command), lambda: loop.advance(state, command)):
+        with pytest.raises(InputError, match="defence output score: got 'NaN or infinity in step 1") as caught:
+            play()
+        said.append(str(caught.value))
+    assert said[0] == said[1]
 
 
 def test_a_calm_road_does_not_slow_down():
     """Without noise, and after the filter has settled, no number is so small that the processor takes its slow path."""
-    import time
-
     place = load_scenario("thesis-ch4-v0")
     data = {"process_var": (0.0, 0.0, 0.0)}
     plant, sensor = dataclasses.replace(place.plant, **data), dataclasses.replace(place.sensor, noise_var=(1e-6, 1e-6))
     loop = dataclasses.replace(place, plant=plant, sensor=sensor, horizon=30_000).loop(Spec("defence", "mewma_kf").make())
-    lanes = Lanes(loop, fuse(loop), draws.keys("report", range(64)))
-    lanes.memory.script[:] = script.numbers(Spec("attack", "none").make(), None)
-    lanes.start()
+    steps, nothing = Steps(commanded(loop), loop.start(draws.keys("report", range(64)))), loop.brief.command(np.zeros(64, bool), 0, np.zeros(5, bool), 0.0)
     took = []
     for _ in range(10):
         started = time.process_time()
-        lanes.run(SCRIPTED, 1000)
+        for _ in range(400):
+            steps.play(nothing)
         took.append(time.process_time() - started)
     assert min(took[5:]) < 3.0 * min(took[:5])
 
 
-def _kernel_is_kept():
-    from tailgate.fused import kernel
-
-    assert kernel.run.entry
-    return any((folder / kernel.run._file).is_file() for folder in compiled._folders())
-
-
-def test_an_environment_starts_without_numba_and_scipy_where_the_code_is_kept():
+def test_an_environment_starts_without_scipy_and_torch():
     """Their import takes longer than all the rest; nor are modules of estimators imported that nobody asked for."""
-    if not _kernel_is_kept():
-        pytest.skip("no folder to keep machine code in")
     code = """
 import sys
 import gymnasium
@@ -346,26 +248,6 @@ print([name for name in ("numba", "scipy", "torch", "tailgate.estimators.lasso",
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.stdout.strip() == "[]", done.stdout + done.stderr
-
-
-def test_broken_machine_code_counts_as_none(monkeypatch, tmp_path):
-    """Half a file, somebody else's, and code that calls what this process does not have: compiled anew, and no crash."""
-    from tailgate.fused import kernel
-
-    held = compiled.Kernel(kernel.run.py_func)
-    monkeypatch.setattr(compiled, "_folders", lambda: iter([tmp_path]))
-    assert held._loaded is None
-    for content in (b"", b"junk", b"symbol\njunk", b"symbol digest\njunk", f"symbol {hashlib.blake2b(b'junk').hexdigest()}\njunk".encode()):
-        (tmp_path / held._file).write_bytes(content)
-        assert held._loaded is None
-    if _kernel_is_kept():
-        monkeypatch.undo()
-        (path, *_) = [path for folder in compiled._folders() if (path := folder / held._file).is_file()]
-        head, _, code = path.read_bytes().partition(b"\n")
-        monkeypatch.setattr(compiled, "_folders", lambda: iter([tmp_path]))
-        for content in (head + b"\n" + code[:-1], b"another_" + head + b"\n" + code):
-            (tmp_path / held._file).write_bytes(content)
-            assert held._loaded is None
 
 
 def test_what_an_environment_returned_stays_as_it_is():
