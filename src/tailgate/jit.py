@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cached_property, update_wrapper
+from functools import cache, cached_property, update_wrapper
 from typing import Any
 
 
@@ -16,9 +16,7 @@ class Jitted:
 
     @cached_property
     def dispatcher(self) -> Any:
-        import numba
-
-        return numba.njit(**self._options)(self.py_func)
+        return _numba().njit(**self._options)(self.py_func)
 
     def __call__(self, *arguments: Any) -> Any:
         return self.dispatcher(*arguments)
@@ -27,3 +25,13 @@ class Jitted:
 def jit(**options: Any) -> Callable[[Callable[..., Any]], Jitted]:
     """Decorator: `numba.njit` with these options. Neither fast-math nor another division than numpy's, unless they say so."""
     return lambda function: Jitted(function, {"error_model": "numpy"} | options)
+
+
+@cache
+def _numba() -> Any:
+    """The package, which from now on knows what a `Jitted` is where another one calls it."""
+    import numba
+    from numba.extending import typeof_impl
+
+    typeof_impl.register(Jitted)(lambda value, context: typeof_impl(value.dispatcher, context))
+    return numba
