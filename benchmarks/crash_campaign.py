@@ -299,7 +299,7 @@ def campaign(
             if way == "group" and not job.parallel:
                 continue
             tried: list[dict[str, Any]] = []
-            with contextlib.suppress(KeyboardInterrupt):  # what was tried until then is told
+            with contextlib.suppress(KeyboardInterrupt):  # the figures of what was tried follow
                 for i in range(moments):
                     tried.append(moment(job, folder / f"{name}-{way}-{i}", way, chance.uniform(EARLIEST, span), workers, held))
                     print(f"{name} {way} {i + 1}/{moments} {tried[-1]['wrong'] or ''}", file=sys.stderr, flush=True)

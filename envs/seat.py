@@ -41,7 +41,7 @@ class Tally(NamedTuple):
 
 
 class Sums(NamedTuple):
-    """What is added up over the steps of a decision, (B,) each."""
+    """Sums over the steps of a decision, (B,) each."""
 
     raw: Array  # reward of the steps
     begun: Array  # the potential before the decision
@@ -160,7 +160,7 @@ class Seat:
         return state, tally, self.closed(state, tally, sums, over), frame
 
     def opened(self, tally: Tally) -> Sums:
-        """What is added up over the steps of a decision, before them."""
+        """The sums before the first step of a decision."""
         no = np.zeros(len(tally.potential), bool)
         return Sums(np.zeros(len(no)), tally.potential, no, no, no, no)
 
@@ -188,7 +188,7 @@ class Seat:
         return state, Tally(potential, least, largest, peak), sums, frame
 
     def closed(self, state: LoopState, tally: Tally, sums: Sums, over: Array) -> Outcome:
-        """What a decision brought, after its last step."""
+        """The outcome of a decision, after its last step."""
         illegal = sums.refused & ~sums.accepted
         terminated = state.ended & ~over
         truncated = ~terminated & ~over & (state.k > self.loop.horizon)

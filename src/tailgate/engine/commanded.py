@@ -1,4 +1,4 @@
-"""A loop as a program that is told each step's command: an attack in plain code, on a traced loop.
+"""A traced loop that takes the command of each step: the attack is plain code.
 
 One program serves all attacks on a defence in a scenario. `tailgate.engine.rollouts` has the attack in the program as well.
 """
@@ -25,7 +25,7 @@ TRIED = 24  # steps in which fresh code is compared with the plain loop
 
 
 class Commanded:
-    """The program of a loop that is told the commands. Raises whatever its parts raise while they are traced."""
+    """The program of a loop that takes commands. Raises whatever its parts raise while they are traced."""
 
     def __init__(self, loop: Loop) -> None:
         check_open(loop)
@@ -125,7 +125,7 @@ _made: Remembered[Commanded] = Remembered()
 
 
 def commanded(loop: Loop) -> Commanded | Untraced:
-    """The program of a loop that is told the commands, once it has been found equal to the plain loop; or why there is none."""
+    """The program of a loop that takes commands, once it has been found equal to the plain loop; or why there is none."""
     return _made.proved(
         loop, lambda: _seen(loop, _first(loop)), lambda: Commanded(loop), lambda found, values: found.of(loop, values), _difference
     )
