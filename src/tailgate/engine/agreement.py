@@ -17,6 +17,9 @@ if TYPE_CHECKING:
     from tailgate.loop import Loop
 
 
+TRIED, ROWS = 24, 64  # steps and episodes in which fresh code is compared with the plain loop
+
+
 class Untraced(NamedTuple):
     """Why the plain loop plays what somebody asked the engine for."""
 

@@ -13,15 +13,13 @@ import numpy as np
 from tailgate import draws
 from tailgate.core import Array, Attack, Command, Kind, View, WhiteBox, no_command
 from tailgate.draws import Keys, Role
-from tailgate.engine.agreement import Untraced, check_open, raised, same
+from tailgate.engine.agreement import ROWS, TRIED, Untraced, check_open, raised, same
 from tailgate.engine.parameters import lifted
 from tailgate.engine.program import Call, Program, State, traced
 from tailgate.engine.remembered import Remembered
 from tailgate.loop import Loop, LoopState
 from tailgate.trace import Recorder, signals_of
 from tailgate.tree import duplicate, frozen, leaves, map_leaves
-
-TRIED = 24  # steps in which fresh code is compared with the plain loop
 
 
 class Commanded:
@@ -131,7 +129,7 @@ def commanded(loop: Loop) -> Commanded | Untraced:
     )
 
 
-def _difference(made: Commanded, batch: int = 64) -> str:
+def _difference(made: Commanded, batch: int = ROWS) -> str:
     """Play some steps in both engines, under commands at random; -> what differs first, or nothing."""
     loop, chance = made.loop, np.random.default_rng(0)
     kinds = [Kind[name.upper()] for name in loop.threat.kinds] or [Kind.NONE]

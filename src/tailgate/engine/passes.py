@@ -7,9 +7,9 @@ block. The branches are found here; no code says where they are.
 from __future__ import annotations
 
 import bisect
-import heapq
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 from tailgate.engine.graph import Body, Node, Sweep, ordered
 
@@ -65,43 +65,75 @@ def _scope(nodes: Sequence[Node], kept: Collection[int], least: int) -> list[Ite
 
 
 def _branches(nodes: Sequence[Node], kept: Collection[int], least: int) -> list[Branch]:
-    users: dict[int, list[tuple[Node, int]]] = {node.id: [] for node in nodes}
-    groups: dict[tuple[int, int], list[Node]] = {}
-    for node in nodes:
-        for place, arg in enumerate(node.args):
-            if arg.id in users:
-                users[arg.id].append((node, place))
-        if node.op in ("select", "blend") and not node.args[0].fixed:
-            for side in (1, 2):
-                groups.setdefault((node.args[0].id, side), []).append(node)
+    """The branches of a scope, whatever is in branches of theirs. The nodes are in the order of their numbers."""
+    turns: dict[int, int] = {}  # of a choice that follows from others by the same mask: how many
+    found = _asked(nodes, kept, turns)
+    for several in found.values():
+        if len(several.choices) > 1 and several.cost >= least:
+            turns |= {choice.id: turn for turn, level in enumerate(_levels(nodes, several.choices)) for choice in level if turn}
+    if turns:
+        found = _asked(nodes, kept, turns)
+    return sorted((branch for branch in found.values() if branch.cost >= least), key=lambda branch: -branch.cost)
+
+
+def _asked(nodes: Sequence[Node], kept: Collection[int], turns: Mapping[int, int]) -> dict[Any, Branch]:
+    """What is needed only on one side of choices that are in no branch, by their mask, side and turn.
+
+    Each node belongs where all that need it meet: paths of (mask, side) lead there, from the scope itself on.
+    """
+    nowhere = _Path(None, None, 0)
     by_id = {node.id: node for node in nodes}
-    taken: set[int] = set()  # nodes in branches
-    pinned = set(kept)  # nodes that stay in this scope
-    found: list[Branch] = []
+    home: dict[int, _Path] = dict.fromkeys(kept, nowhere)
+    out: dict[Any, Branch] = {}
 
-    def of(side: int, choices: list[Node]) -> Branch:
-        inside = _only(choices, side, users, by_id, pinned | taken)
-        held = [choice for choice in choices if choice.args[side].id in inside]
-        return Branch(choices[0].args[0], side, held, inside, sum(_cost(by_id[i]) for i in inside))
+    def needed(node: Node, path: _Path) -> None:
+        if node.id in by_id:
+            held = home.get(node.id)
+            home[node.id] = path if held is None else held.meeting(path)
 
-    waiting: list[tuple[int, int, int, list[Node], Branch]] = []
-    for (_, side), choices in groups.items():
-        whole = of(side, choices)
-        for level in _levels(nodes, choices) if whole.cost >= least else ():
-            branch = whole if len(level) == len(choices) else of(side, level)
-            if branch.cost >= least:
-                heapq.heappush(waiting, (-branch.cost, len(waiting), side, level, branch))
-    while waiting:
-        _, turn, side, level, branch = heapq.heappop(waiting)
-        left = [choice for choice in level if choice.id not in taken]
-        if branch.inside & (taken | pinned) or len(left) < len(level):  # a larger branch has taken some of it
-            if left and (branch := of(side, left)).cost >= least:
-                heapq.heappush(waiting, (-branch.cost, turn, side, left, branch))
+    for node in reversed(nodes):  # what needs a node has a higher number
+        path = home.setdefault(node.id, nowhere)
+        if path.depth:
+            branch = out[path.first]
+            branch.inside.add(node.id)
+            branch.cost += _cost(node)
+        if node.op not in ("select", "blend") or node.args[0].fixed:
+            for arg in node.args:
+                needed(arg, path)
             continue
-        taken |= branch.inside
-        pinned |= {choice.id for choice in branch.choices}
-        found.append(branch)
-    return found
+        needed(node.args[0], path)
+        for side in (1, 2):
+            key = (node.args[0].id, side, turns.get(node.id, 0))
+            if not path.depth:
+                out.setdefault(key, Branch(node.args[0], side, [], set(), 0)).choices.append(node)
+            needed(node.args[side], path.to(key))
+    for branch in out.values():
+        branch.choices = [choice for choice in reversed(branch.choices) if choice.args[branch.side].id in branch.inside]
+    return out
+
+
+class _Path:
+    """The sides of choices that lead to what is needed there alone."""
+
+    def __init__(self, before: _Path | None, key: Any, depth: int) -> None:
+        self.before, self.depth = before, depth
+        self.first: Any = key if depth == 1 else before and before.first
+        self._ways: dict[Any, _Path] = {}
+
+    def to(self, key: Any) -> _Path:
+        """One side more."""
+        if key not in self._ways:
+            self._ways[key] = _Path(self, key, self.depth + 1)
+        return self._ways[key]
+
+    def meeting(self, other: _Path) -> _Path:
+        """As far as both are the same."""
+        one: Any = self
+        two: Any = other
+        while one is not two:
+            deep = one.depth - two.depth
+            one, two = one.before if deep >= 0 else one, two.before if deep <= 0 else two
+        return one  # type: ignore[no-any-return]
 
 
 def _cost(node: Node) -> int:
@@ -129,33 +161,6 @@ def _levels(nodes: Sequence[Node], choices: list[Node]) -> list[list[Node]]:
         if deep:
             depth[node.id] = deep
     return [levels[deep] for deep in sorted(levels)]
-
-
-def _only(
-    choices: Sequence[Node], side: int, users: dict[int, list[tuple[Node, int]]], by_id: dict[int, Node], others: Collection[int]
-) -> set[int]:
-    """Nodes that nothing needs but the choices, on that side of them, none of `others`."""
-    mine = {choice.id for choice in choices}
-    inside: set[int] = set()
-    seen: set[int] = set()
-    heap: list[int] = []
-
-    def look(node: Node) -> None:
-        if node.id in by_id and node.id not in seen:
-            seen.add(node.id)
-            heapq.heappush(heap, -node.id)
-
-    for choice in choices:
-        look(choice.args[side])
-    while heap:
-        i = -heapq.heappop(heap)
-        if i in others or i in mine:
-            continue
-        if all(user.id in inside or (user.id in mine and place == side) for user, place in users[i]):
-            inside.add(i)
-            for arg in by_id[i].args:
-                look(arg)
-    return inside
 
 
 # -- in which order

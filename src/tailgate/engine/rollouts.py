@@ -9,7 +9,7 @@ import numpy as np
 
 from tailgate.core import Attack
 from tailgate.draws import Keys, Role
-from tailgate.engine.agreement import Untraced, check_open, raised, same
+from tailgate.engine.agreement import ROWS, TRIED, Untraced, check_open, raised, same
 from tailgate.engine.operations import Array
 from tailgate.engine.parameters import lifted
 from tailgate.engine.program import Call, Program, State, traced
@@ -18,7 +18,6 @@ from tailgate.loop import Loop
 from tailgate.tree import leaves
 
 STEPS = 32  # between two looks whether an episode is left
-TRIED = 24  # steps in which fresh code is compared with the plain loop
 
 
 class Rollout:
@@ -112,7 +111,7 @@ def rollout_of(loop: Loop, attack: Attack) -> Rollout | Untraced:
     )
 
 
-def _difference(rollout: Rollout, batch: int = 64) -> str:
+def _difference(rollout: Rollout, batch: int = ROWS) -> str:
     """Play some steps in both engines; -> what differs first, or nothing."""
     from tailgate import draws
 

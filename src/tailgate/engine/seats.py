@@ -20,7 +20,7 @@ import numpy as np
 from tailgate import draws
 from tailgate.agents.observation import ObservationCodec
 from tailgate.draws import Keys
-from tailgate.engine.agreement import Untraced, check_open, raised, same
+from tailgate.engine.agreement import ROWS, TRIED, Untraced, check_open, raised, same
 from tailgate.engine.operations import Array
 from tailgate.engine.parameters import lifted
 from tailgate.engine.program import Call, Program, State, Trace, traced
@@ -165,10 +165,11 @@ def programs_of(seat: Seat) -> SeatPrograms | Untraced:
     )
 
 
-def difference(programs: SeatPrograms, batch: int = 64, decisions: int = 24) -> str:
+def difference(programs: SeatPrograms, batch: int = ROWS, steps: int = TRIED) -> str:
     """Play some decisions in both engines, resets among them; -> what differs first, or nothing."""
     from tailgate.envs.batches import PlainEpisodes
 
+    decisions = max(4, steps // (programs.between + 1))
     chance, size = np.random.default_rng(0), programs.seat.action.size
     keys, everyone = draws.keys("tune", range(batch)), np.ones(batch, bool)
     rows, plain = Rows(programs, batch), PlainEpisodes(programs.seat)
