@@ -21,6 +21,7 @@ from tailgate.engine.operations import BOOL, FLOAT
 LOOPED = 64  # numbers in a matrix without zeros that is multiplied in a loop: straight code of more takes long to compile
 SPARSE = 100  # numbers of a matrix with zeros that is multiplied in a loop
 STRAIGHT = 600  # products of numbers in straight code
+AT_ONCE = 20_000  # products of numbers that numpy makes before it adds them
 
 
 def _large(size: int, *arrays: Any) -> bool:
@@ -68,6 +69,8 @@ def structure(x: Any) -> Any:
 
 def constant_times(x: Any, y: Any) -> Any:
     """x (..., i, k) times y (B, ..., k, j), of an x that is the same for all: sums run from 0, and its zeros count for nothing."""
+    if not (isinstance(x, Traced) or isinstance(y, Traced)) and x.shape[-1] and np.isfinite(y).all():
+        return _summed(x, y) + 0.0  # zeros of x add nothing; a sum from 0 is never -0
     if _large(_size(x, y), y):
         if x.ndim > 2 and len(x) > 1:
             return np.stack([constant_times(x[i], y[:, i]) for i in range(len(x))], axis=1)
@@ -85,6 +88,16 @@ def constant_times(x: Any, y: Any) -> Any:
     return out
 
 
+def _summed(x: Any, y: Any) -> Any:
+    """The sums over k of x (..., i, k) times y (..., k, j), which begin with their first product."""
+    if not (isinstance(x, Traced) or isinstance(y, Traced)) and _size(x, y) * x.shape[-1] <= AT_ONCE:
+        return np.add.accumulate(x[..., None] * y[..., None, :, :], axis=-2)[..., -1, :]  # in ascending order, unlike a sum
+    out = x[..., :1] * y[..., :1, :]
+    for k in range(1, x.shape[-1]):
+        out = out + x[..., k : k + 1] * y[..., k : k + 1, :]
+    return out
+
+
 def product(x: Any, y: Any) -> Any:
     """x (..., i, k) times y (..., k, j): sums begin with their first product."""
     if _large(_size(x, y), x, y):
@@ -92,10 +105,7 @@ def product(x: Any, y: Any) -> Any:
         if x.shape[-2] * y.shape[-2] * y.shape[-1] <= STRAIGHT:
             return _over(product, lead, x, y)
         return _over(lambda row, y: product(row[None], y)[0], (*lead, x.shape[-2]), x, y[..., None, :, :])
-    out = x[..., :1] * y[..., :1, :]
-    for k in range(1, x.shape[-1]):
-        out = out + x[..., k : k + 1] * y[..., k : k + 1, :]
-    return out
+    return _summed(x, y)
 
 
 def inverse(s: Any) -> Any:
@@ -113,11 +123,14 @@ def inverse(s: Any) -> Any:
         return Traced(s.graph, np.stack([part.nodes for part in parts]).reshape(s.shape), FLOAT, s.batch)
     if _large(s.size, s):
         return Traced(s.graph, s.graph.picks(s.graph.inverses(buffer_of(s.graph, s.nodes), q)).reshape(s.shape), FLOAT, s.batch)
-    out, index = s, np.arange(q)
+    out = s.copy()
     for p in range(q):
-        row = np.where(index == p, 1.0, out[..., p, :]) * (1.0 / out[..., p, p])[..., None]
-        left = np.where(index == p, 0.0, out) - out[..., :, p, None] * row[..., None, :]
-        out = np.where((index == p)[:, None], row[..., None, :], left)
+        scale = 1.0 / out[..., p, p]
+        out[..., p, p] = 1.0
+        row, column = out[..., p, :] * scale[..., None], out[..., :, p].copy()
+        out[..., :, p] = 0.0
+        out = out - column[..., None] * row[..., None, :]
+        out[..., p, :] = row
     return out
 
 
@@ -203,13 +216,14 @@ def solve(m: Any, y: Any) -> Any:
     """m^-1 y for one m (n, n) and y (n, k), by Gauss-Jordan elimination with row pivots."""
     n = len(m)
     both = np.concatenate([m, y], axis=1)
-    columns = np.arange(both.shape[1])
     for p in range(n):
         best = p + int(np.argmax(np.abs(both[p:, p])))
-        both[[p, best]] = both[[best, p]]
+        if best != p:
+            both[[p, best]] = both[[best, p]]
         factor = both[:, p] / both[p, p]
-        there = (factor != 0.0) & (np.arange(n) != p)
-        both = np.where(there[:, None] & (columns >= p), both - factor[:, None] * both[p], both)
+        factor[p] = 0.0
+        rest = both[:, p:]
+        np.subtract(rest, factor[:, None] * rest[p], out=rest, where=(factor != 0.0)[:, None])
     return both[:, n:] / np.diagonal(both)[:, None]
 
 
