@@ -144,6 +144,12 @@ def _load(family: Family) -> dict[str, Entry]:
     return _entries[family]
 
 
+@cache
+def _plugged(points: Callable[..., Any], group: str) -> frozenset[str]:
+    """Names of the plug-ins of a group: all installed packages are read for them."""
+    return frozenset(point.name for point in points(group=group))
+
+
 def entry_of(family: Family, name: str, cls: type) -> Entry:
     """An entry for somebody else's class, which may carry `uses`, `reference` and `version` as class attributes."""
     uses = tuple(getattr(cls, "uses", ("measurements",)))
@@ -273,7 +279,7 @@ class Spec:
     @property
     def foreign(self) -> bool:
         """Whether playing this runs somebody else's code outside of any sandbox: a class to import, or a plug-in."""
-        plugged = {point.name for point in entry_points(group=_GROUPS[self.family])} if self.family in _GROUPS else set()
+        plugged = _plugged(entry_points, _GROUPS[self.family]) if self.family in _GROUPS else frozenset()
         return self.imports or (not self.sandboxed and self._parts()[0] in plugged)
 
     @property

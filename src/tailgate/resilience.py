@@ -7,7 +7,6 @@ larger the spectral radius of A.
 """
 
 import numpy as np
-from scipy.linalg import cholesky, solve_triangular
 
 from tailgate.core import Array, Model
 from tailgate.errors import InputError
@@ -18,6 +17,8 @@ MOST = 22  # sensors of which all combinations of signs are tried
 
 def _white(model: Model) -> Array:
     """Sv_i^-1/2 C_i (N, q, n); any root gives the same norms."""
+    from scipy.linalg import cholesky, solve_triangular
+
     pairs = zip(model.C, model.R, strict=True)
     return np.stack([solve_triangular(cholesky(R, lower=True), C, lower=True) for C, R in pairs])
 
@@ -39,6 +40,8 @@ def norm_bound(model: Model, lam: float, fusion: Fusion | None = None) -> Array:
 
 def norm_direction(model: Model, fusion: Fusion | None = None) -> Array:
     """(N, q) injections, of length 1 after whitening, that reach `norm_bound` in the limit of a large factor of either sign."""
+    from scipy.linalg import cholesky
+
     fusion = fusion or fixed_point(model)
     _, _, right = np.linalg.svd(fusion.Qinv @ np.swapaxes(_white(model), 1, 2))
     return np.stack([cholesky(R, lower=True) @ v[0] for R, v in zip(model.R, right, strict=True)])

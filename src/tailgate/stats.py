@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy import stats
 
 from tailgate.core import Array
 
@@ -19,6 +18,8 @@ class Interval(NamedTuple):
 
 def proportion(successes: int, n: int, level: float = 0.95) -> Interval:
     """Share of successes with the exact (Clopper-Pearson) interval."""
+    from scipy import stats  # its import takes half a second
+
     ci = stats.binomtest(successes, n).proportion_ci(confidence_level=level, method="exact")
     return Interval(successes / n, float(ci.low), float(ci.high))
 
@@ -29,6 +30,8 @@ def mean_time(events: int, time: float, dispersion: float = 1.0, level: float = 
     Events that come in clusters tell less than their number says: it and the time are divided by the dispersion (variance over mean of
     their number in a run) where that is above 1. The upper end is None without any event.
     """
+    from scipy import stats
+
     clusters = max(dispersion, 1.0)
     if events:  # and one at least
         clusters = min(clusters, float(events))
@@ -43,6 +46,8 @@ def median_limits(values: Array, level: float = 0.95) -> tuple[float, float] | N
     It covers with a chance of at least `level` whatever the distribution is. None where so few values cannot. Source: scipy's
     `quantile_test`; Conover, Practical Nonparametric Statistics, 1999, section 3.2.
     """
+    from scipy import stats
+
     ends = stats.quantile_test(values, q=0.0, p=0.5).confidence_interval(confidence_level=level)
     return None if np.isnan(ends.low) or np.isnan(ends.high) else (float(ends.low), float(ends.high))
 
@@ -57,6 +62,8 @@ def paired_difference(a: Array, b: Array, level: float = 0.95, resamples: int = 
     share: a and b are 0 or 1. An interval is then never narrower than what differences of -1 and of 1 could make of it that happened not to
     be among so many episodes: where all differences are equal the bootstrap has no width.
     """
+    from scipy import stats
+
     delta = np.atleast_2d(np.asarray(a, np.float64) - np.asarray(b, np.float64))
     runs, episodes = delta.shape
     value, of_episode = float(delta.mean()), delta.mean(axis=0)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from scipy import stats
-
 from tailgate.stats import mean_time
 
 from .board_parts import AlarmPart
@@ -79,6 +77,8 @@ def drifts_of(suite: Suite, defence: str) -> list[str]:
 
 def _aside(line: AlarmPart, level: float) -> str:
     """Of drives, which are independent: onsets of one drive come in clusters."""
+    from scipy import stats
+
     drives, most = line.early + line.late, max(line.early, line.late)
     if not drives or stats.binomtest(most, drives, APART, alternative="greater").pvalue > level / 2.0:
         return ""

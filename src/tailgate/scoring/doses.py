@@ -12,7 +12,6 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from scipy import stats
 
 from tailgate.core import Array
 from tailgate.errors import InputError
@@ -26,6 +25,8 @@ Data = dict[str, Any]
 
 def limits(successes: Array, n: Array, alpha: float) -> tuple[Array, Array]:
     """One-sided Clopper-Pearson limits of shares, lower and upper, each missed with a chance of at most alpha."""
+    from scipy import stats
+
     low = np.where(successes > 0, stats.beta.ppf(alpha, np.maximum(successes, 1), n - successes + 1), 0.0)
     high = np.where(successes < n, stats.beta.isf(alpha, successes + 1, np.maximum(n - successes, 1)), 1.0)
     return low, high

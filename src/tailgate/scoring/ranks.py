@@ -7,7 +7,6 @@ from itertools import combinations
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.stats import binom, binomtest
 
 from tailgate.core import Array
 from tailgate.errors import InputError
@@ -40,6 +39,8 @@ def class_of(uses: Sequence[str]) -> str:
 
 def mcnemar(only_a: int, only_b: int) -> float:
     """Exact two-sided p of McNemar's test: of the pairs that differ, each side has half under the null hypothesis."""
+    from scipy.stats import binomtest
+
     n = only_a + only_b
     return float(binomtest(only_a, n).pvalue) if n else 1.0
 
@@ -51,6 +52,8 @@ def outdone(a: Harm, b: Harm, least: bool = False) -> float:
     correction). That a's worst was chosen on these very episodes costs the factor of its attacks (Bonferroni). Where nobody knows which
     episodes came to damage, p is the largest that their numbers allow, or the least, and 1 where b came to damage as often.
     """
+    from scipy.stats import binom
+
     vague = a.vague[a.worst] | b.vague
     only_a, only_b = apart(a.of_worst, b.damage, vague, least)
     blank = (only_a + only_b == 0) | (vague & (only_a <= only_b))
@@ -85,6 +88,8 @@ def duel(group: str, a: str, b: str, x: Harm, y: Harm) -> Data:
 
 def credible(told: Data, here: Data, x: Harm, y: Harm) -> bool:
     """Whether a pair can have been found like that when more episodes were known, of which cells tell no more than the bound `here`."""
+    from scipy.stats import binom
+
     if told.get("weaker") not in (told["a"], told["b"]):
         return False
     only = told["only_a"], told["only_b"]

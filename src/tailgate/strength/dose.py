@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.optimize import isotonic_regression
 
 from tailgate.core import Array
 from tailgate.errors import InputError
@@ -32,6 +31,8 @@ LEVEL = 0.95
 
 def fitted(values: Array) -> Array:
     """The monotone regression of means (doses,), all measured on as many episodes."""
+    from scipy.optimize import isotonic_regression
+
     return np.asarray(isotonic_regression(values, increasing=True).x)
 
 

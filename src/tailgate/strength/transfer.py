@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy import stats
 
 from tailgate.core import Array
 from tailgate.errors import InputError
@@ -36,6 +35,8 @@ def difference(a: Array, b: Array, share: bool = False) -> Interval:
 
     Episodes are paired, training seeds are not: their part is Welch's t over the runs' means, and missing where each side has one.
     """
+    from scipy import stats
+
     paired = paired_difference(a.mean(axis=0), b.mean(axis=0), LEVEL, share=share)
     parts = [(float(x.mean(axis=1).var(ddof=1)) / len(x), len(x) - 1) for x in (a, b) if len(x) > 1]
     variance, spread = sum(v for v, _ in parts), 0.0
