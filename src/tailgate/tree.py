@@ -1,7 +1,7 @@
 """Walks over states: nested NamedTuples and mappings whose leaves are arrays with B first, or None."""
 
 import copy
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,19 @@ def map_leaves(function: Callable[..., Any], tree: Any, *others: Any) -> Any:
         parts = [map_leaves(function, *branches) for branches in zip(tree, *others, strict=True)]
         return type(tree)(*parts) if hasattr(tree, "_fields") else tuple(parts)
     return function(tree, *others)
+
+
+def rebuilt(like: Any) -> Callable[[Iterator[Any]], Any]:
+    """What makes a tree as `like` of leaves in their order: faster than `map_leaves`, for whoever makes many."""
+    if like is None:
+        return lambda leaves: None
+    if isinstance(like, dict):
+        branches = [(key, rebuilt(branch)) for key, branch in like.items()]
+        return lambda leaves: {key: make(leaves) for key, make in branches}
+    if isinstance(like, tuple):
+        parts, kind = [rebuilt(branch) for branch in like], getattr(type(like), "_make", tuple)
+        return lambda leaves: kind([make(leaves) for make in parts])
+    return next
 
 
 def put_rows(tree: Any, rows: Array, fresh: Any) -> Any:

@@ -19,7 +19,7 @@ from tailgate.engine.program import Call, Program, State, traced
 from tailgate.engine.remembered import Remembered
 from tailgate.loop import Loop, LoopState
 from tailgate.trace import Recorder, signals_of
-from tailgate.tree import duplicate, frozen, leaves, map_leaves
+from tailgate.tree import duplicate, leaves, rebuilt
 
 
 class Commanded:
@@ -30,11 +30,11 @@ class Commanded:
         self.loop = loop
         self.values: list[Array] | None = None  # of the parameters, if others than those it was traced with
         begun = _first(loop)
-        self.seen = _seen(loop, begun)
+        self.rebuilt = rebuilt(_seen(loop, begun))
         self.program = Program(traced(self._traced, {"loop": begun}, _nothing(loop, 1)._asdict()))
         results = list(self.program.trace.results)
         self.names = [name for name in results if name.startswith("seen.")]  # in the order of the leaves
-        self.signals = [name.partition(".")[2] for name in results if name.startswith("signals.")]
+        self.signals = [(name.partition(".")[2], name) for name in results if name.startswith("signals.")]
 
     @property
     def programs(self) -> tuple[Program, ...]:
@@ -82,14 +82,15 @@ class Steps:
         """A step under a command: its signals; who has ended (B,) and what an attacker sees, after it."""
         for name, leaf in zip(Command._fields, command, strict=True):
             self._call.arguments[name][...] = leaf
-        told = self._call()
+        self._call.begin()
+        self._call.play(1)
+        self._call.sheet.flags.writeable = False  # attacks look at it
+        told = self._call.results()
         if self._call.broken and not told["demands"].all():
             raise self.of.program.broken(told["demands"], self.k)
         self.k = told["seen.view.k"]
-        names = iter(self.of.names)
-        held = frozen(map_leaves(lambda _: told[next(names)], self.of.seen))
-        signals = {name: told[f"signals.{name}"] for name in self.of.signals}
-        return signals, told["ended"], _view(self.of.loop, held)
+        signals = {name: told[full] for name, full in self.of.signals}
+        return signals, told["ended"], _view(self.of.loop, self.of.rebuilt(told[name] for name in self.of.names))
 
 
 def _first(loop: Loop) -> LoopState:

@@ -90,7 +90,7 @@ def constant_times(x: Any, y: Any) -> Any:
 
 def _summed(x: Any, y: Any) -> Any:
     """The sums over k of x (..., i, k) times y (..., k, j), which begin with their first product."""
-    if not (isinstance(x, Traced) or isinstance(y, Traced)) and _size(x, y) * x.shape[-1] <= AT_ONCE:
+    if not (isinstance(x, Traced) or isinstance(y, Traced)) and max(x.size * y.shape[-1], x.shape[-2] * y.size) <= AT_ONCE:
         return np.add.accumulate(x[..., None] * y[..., None, :, :], axis=-2)[..., -1, :]  # in ascending order, unlike a sum
     out = x[..., :1] * y[..., :1, :]
     for k in range(1, x.shape[-1]):
