@@ -4,6 +4,7 @@ import dataclasses
 import json
 import os
 import shutil
+from collections import Counter
 from itertools import combinations
 from typing import get_args
 
@@ -32,10 +33,14 @@ def pytest_addoption(parser):
 
 
 def pytest_collection_modifyitems(config, items):
-    if not config.getoption("--long"):
-        for item in items:
-            if item.get_closest_marker("long"):
-                item.add_marker(pytest.mark.skip(reason="long: make test-long"))
+    if config.getoption("--long"):
+        return
+    turns: Counter[str] = Counter()
+    for item in items:
+        thin, name = item.get_closest_marker("thin"), item.nodeid.partition("[")[0]
+        turns[name] += 1
+        if item.get_closest_marker("long") or (thin and (turns[name] - 1) % thin.args[0]):
+            item.add_marker(pytest.mark.skip(reason="long: make test-long"))
 
 
 def _same_bits(a, b):

@@ -70,9 +70,11 @@ def _die(job: Callable[[Path], None], folder: Path, at: int) -> None:
 
 
 def main(name: str, folder: Path) -> None:
+    (folder / "whole").mkdir()
+    JOBS[name](folder / "whole")  # what is traced and compiled, children have from their parent
     for at in range(1, 500):
         (folder / str(at)).mkdir()
-        if not (child := os.fork()):  # of one parent that has done the imports and nothing else
+        if not (child := os.fork()):  # of one parent that has no thread
             _die(JOBS[name], folder / str(at), at)
         if (code := os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])) != 9:
             print(at, code)

@@ -3,7 +3,6 @@
 import dataclasses
 
 import numpy as np
-import pytest
 
 from tailgate import draws
 from tailgate.engine.commanded import Commanded, commanded
@@ -23,12 +22,6 @@ def loop_of(scenario, defence, attack, horizon=200, beyond=None, **threat):
     loop = place.loop(guard.make(), guard.entry.uses)
     object.__setattr__(loop, "horizon", min(horizon, place.horizon))
     return loop, made.make()
-
-
-def some(cells, every):
-    """All of these; but for every so many they are played with --long only: a program for each takes long to compile."""
-    held = (cell if isinstance(cell, tuple) else (cell,) for cell in cells)
-    return [pytest.param(*cell, marks=[pytest.mark.long] if i % every else []) for i, cell in enumerate(held)]
 
 
 def same(one, two):

@@ -76,10 +76,11 @@ def test_a_limit_of_steps_is_that_of_gymnasium(autoreset, engine):
 @pytest.mark.parametrize("name", FACES)
 def test_the_spec_says_the_horizon(name):
     """`spec.max_episode_steps` is the number of decisions; a spec that is made again ends at the same one."""
-    env, vec = gymnasium.make(name, interval=20), gymnasium.make_vec(name, num_envs=2, interval=20)
+    few = {"defence": "dkf"} if name == "tailgate/SensorNetwork-v0" else {}  # its default takes long to compile
+    env, vec = gymnasium.make(name, interval=20, **few), gymnasium.make_vec(name, num_envs=2, interval=20, **few)
     decisions = env.unwrapped.batch.seat.decisions
     assert env.spec.max_episode_steps == env.unwrapped.spec.max_episode_steps == vec.spec.max_episode_steps == decisions
-    assert gymnasium.make(name, interval=20, max_episode_steps=5).spec.max_episode_steps == 5
+    assert gymnasium.make(name, interval=20, max_episode_steps=5, **few).spec.max_episode_steps == 5
     again = gymnasium.make(gymnasium.envs.registration.EnvSpec.from_json(env.spec.to_json()))
     assert again.spec.max_episode_steps == decisions and again.unwrapped.card() == env.unwrapped.card()
     if name != HIGHWAY:

@@ -95,7 +95,9 @@ def _fits(text, brief):
     return True
 
 
-@pytest.mark.parametrize("name", ["quick-v0", "car-following-v0", "platoon-v0", "radar-v0", "network-v0", "thesis-v0", "highway-v0"])
+@pytest.mark.parametrize(
+    "name", ["quick-v0", "car-following-v0", "platoon-v0", "radar-v0", "network-v0", "thesis-v0", pytest.param("highway-v0", marks=pytest.mark.long)]
+)
 def test_the_entries_of_a_published_board_met_every_built_in_attack_that_its_suite_grants(name) -> None:
     """Scripts, programs and all of the zoo: what they did not meet is refused, does nothing in any scenario, or is a ceiling. Nobody was spared."""
     suite, board = load_suite(name), json.loads((ROOT / f"results/{name}/board.json").read_text())

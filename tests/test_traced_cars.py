@@ -16,7 +16,7 @@ from tailgate.registry import Spec
 from tailgate.scenario import load_scenario
 from tailgate.trace import rollout
 
-from .engines import as_plain, loop_of, same, short, some, told, trace_as_plain
+from .engines import as_plain, loop_of, same, short, told, trace_as_plain
 
 # Every filter, detector, mitigation, manoeuvre, kind, law and trigger at least once.
 CARS = [
@@ -114,7 +114,8 @@ RADARS = [
 ]
 
 
-@pytest.mark.parametrize(("scenario", "defence", "attack", "threat"), some([(*cell, {}) for cell in CARS + STEALTH] + RADARS, 2))
+@pytest.mark.thin(2)
+@pytest.mark.parametrize(("scenario", "defence", "attack", "threat"), [(*cell, {}) for cell in CARS + STEALTH] + RADARS)
 def test_a_trace_is_the_plain_loops_to_the_last_bit(scenario, defence, attack, threat):
     trace_as_plain(*loop_of(scenario, defence, attack, **threat))
 
@@ -157,7 +158,8 @@ ENVIRONMENTS = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize("arguments", some(ENVIRONMENTS, 2), ids=lambda a: f"{a['scenario']}-{a['defence']}")
+@pytest.mark.thin(2)
+@pytest.mark.parametrize("arguments", ENVIRONMENTS, ids=lambda a: f"{a['scenario']}-{a['defence']}")
 def test_an_environment_is_the_plain_one_to_the_last_bit(arguments, tmp_path):
     """Observations, rewards, flags and information, over restarts, a masked reset and what was held."""
     as_plain(arguments, 9, tmp_path)

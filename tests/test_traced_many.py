@@ -15,7 +15,7 @@ from tailgate.scenario import load_scenario
 from tailgate.trace import rollout
 from tailgate.tree import leaves
 
-from .engines import as_plain, loop_of, same, some, told, trace_as_plain
+from .engines import as_plain, loop_of, same, told, trace_as_plain
 
 # Every topology and law, manoeuvre of a scenario, kind, law of values and trigger at least once; wires of several cars, and all of a car's.
 WIRES = ("distance", "velocity", "acceleration", "predecessor_acceleration", "leader_acceleration", "predecessor_command", "command")
@@ -111,7 +111,8 @@ NETWORKS = [
 ]
 
 
-@pytest.mark.parametrize(("scenario", "defence", "attack", "threat"), some(PLATOONS + NETWORKS, 4))
+@pytest.mark.thin(7)
+@pytest.mark.parametrize(("scenario", "defence", "attack", "threat"), PLATOONS + NETWORKS)
 def test_a_trace_is_the_plain_loops_to_the_last_bit(scenario, defence, attack, threat):
     many = {"onset": 10, "end": 80} if scenario in (RESTLESS, WEAK, NOISY, LARGE, THESIS, "network-weak-v0") else {}
     loop, rival = loop_of(scenario, defence, attack, horizon=90 if many else 120, **(many | threat))
@@ -146,7 +147,8 @@ def test_whole_episodes_with_collisions_and_beyond_them():
         assert [fast.trace_hash(b) for b in range(20)] == [plain.trace_hash(b) for b in range(20)]
 
 
-@pytest.mark.parametrize(("agents", "states", "sensors", "graph"), some([(2, 2, 2, "path"), (7, 5, 3, "star"), (4, 9, 20, "complete")], 3))
+@pytest.mark.thin(3)
+@pytest.mark.parametrize(("agents", "states", "sensors", "graph"), [(2, 2, 2, "path"), (7, 5, 3, "star"), (4, 9, 20, "complete")])
 @pytest.mark.parametrize("defence", ["dkf", "norm_resilient", "lasso_dkf", "consensus_kf"])
 def test_networks_of_any_size(agents, states, sensors, graph, defence):
     """A single row, in a graph with directions; a system that grows, with noise of its own, and readings with noise."""
@@ -203,7 +205,8 @@ ENVIRONMENTS = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize("arguments", some(ENVIRONMENTS, 4), ids=lambda a: f"{a['scenario']}-{a['defence']}")
+@pytest.mark.thin(7)
+@pytest.mark.parametrize("arguments", ENVIRONMENTS, ids=lambda a: f"{a['scenario']}-{a['defence']}")
 def test_an_environment_is_the_plain_one_to_the_last_bit(arguments, tmp_path):
     """Observations, rewards, flags and information, over restarts, a masked reset and what was held."""
     as_plain(arguments, 9, tmp_path)
