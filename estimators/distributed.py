@@ -204,14 +204,7 @@ class DistributedFilter(LinearFilter):
             out = KalmanState(num.apply(plan.merge, gather(plan.heard, z)), None)
             return out if weight is None else self._reweigh(plan, out, z, weight)
         alike = None if weight is None else even(plan.heard, weight)
-        if len(M) < len(x) and (alike is None or num.every(alike)):  # one covariance for all rows
-            L = num.inverse(M)
-            Qinv, z = num.zeros(L.shape), gather(plan.heard, num.matvec(L, x))
-            for i, near in enumerate(plan.heard):
-                Qinv[:, i] = num.inverse(_sum(L, near) / len(near))
-                z[:, i] = z[:, i] / len(near)
-            return KalmanState(num.matvec(Qinv, z), np.broadcast_to(Qinv, (len(x), *Qinv.shape[1:])))
-        if weight is None or alike is None:
+        if weight is None or alike is None or (len(M) < len(x) and num.every(alike)):  # the last: one covariance for all rows
             return KalmanState(*num.fused(plan.hears, x, M))
         share, total = np.where(alike[..., None], 1.0, weight), num.zeros(alike.shape)
         for i, near in enumerate(plan.heard):
@@ -290,13 +283,6 @@ def _corrected(x: Array, r: Array, S: Array, cross: Array, accept: Array) -> Arr
 def even(heard: tuple[tuple[int, ...], ...], weight: Array) -> Array:
     """(B, N) bool: whether agent i weighs all j in N(i) alike, by weight (B, N, N)."""
     return np.stack([(weight[:, i, near] == weight[:, i, near[:1]]).all(axis=1) for i, near in enumerate(heard)], axis=1)
-
-
-def _sum(L: Array, near: tuple[int, ...]) -> Array:
-    out = L[:, near[0]]
-    for j in near[1:]:
-        out = out + L[:, j]
-    return np.asarray(out)
 
 
 def gather(heard: tuple[tuple[int, ...], ...], z: Array) -> Array:

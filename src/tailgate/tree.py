@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from tailgate.core import Array
+from tailgate.engine.operations import Array
 
 
 def map_leaves(function: Callable[..., Any], tree: Any, *others: Any) -> Any:

@@ -25,13 +25,6 @@ class Sample(NamedTuple):
         return self.amount / self.per
 
 
-def only(cores: int) -> None:
-    """Compiled parallel loops use so many cores from now on, where the machine has them."""
-    import numba
-
-    numba.set_num_threads(min(cores, int(numba.config.NUMBA_NUM_THREADS)))  # type: ignore[attr-defined]
-
-
 Go = Callable[[float], Sample]  # runs for about so many seconds
 
 

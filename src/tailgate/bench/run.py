@@ -15,7 +15,7 @@ from tailgate import sizes
 from tailgate.errors import InputError
 from tailgate.machine import commit, cpuinfo, processor
 
-from .lines import RATE, Line, Missing, only
+from .lines import RATE, Line, Missing
 from .targets import Scaling, Target, chosen, groups
 from .yardstick import compiler
 
@@ -87,7 +87,6 @@ class Measured:
         for line in lines:
             said(line)
             try:
-                only(line.cores)
                 go = line.make()
                 if line.unit == RATE:
                     go(0.0)  # compiles, fills caches
@@ -102,7 +101,6 @@ class Measured:
             for line, go in ready:
                 if line.most is None or i < line.most:
                     said(line)
-                    only(line.cores)
                     self.values.setdefault(line.name, []).append(go(self.seconds).value)
 
 

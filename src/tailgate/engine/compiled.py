@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import math
+import inspect
 from collections.abc import Callable, Sequence
 from functools import update_wrapper
 from typing import Any
@@ -10,9 +10,12 @@ from typing import Any
 import numpy as np
 
 from tailgate.engine.array import Traced
+from tailgate.engine.functions import tracing
 from tailgate.engine.operations import Array
+from tailgate.tree import leaves, map_leaves
 
 ALIGNED = 64  # bytes: a line of the processor's cache
+KEPT = 256  # constants whose code is known at once
 
 
 class Code:
@@ -79,41 +82,73 @@ def elementwise(worth: int) -> Callable[[Callable[..., Any]], Elementwise]:
 
 
 class Shaped:
-    """A function of arrays (M, ...) of floats, which computes each of M by itself and gives a tuple of such; see `Elementwise`."""
+    """A function of arrays (B, ...) and of constants, which computes each of B by itself; see `Elementwise`.
 
-    def __init__(self, function: Callable[..., Any], worth: Callable[..., bool]) -> None:
+    Arrays of one row stand for all of B. Arguments may be sequences of arrays. Other constants that give the same answers to what the
+    function asks, as where they are zero, share its code.
+    """
+
+    def __init__(self, function: Callable[..., Any], worth: Callable[..., bool], constants: Sequence[str]) -> None:
         self.function, self.worth = function, worth
-        self._made: dict[Any, tuple[Code, list[tuple[int, ...]]]] = {}
+        names = list(inspect.signature(function).parameters)
+        self._fixed = [names.index(name) for name in constants]
+        self._found: dict[Any, tuple[Any, Array]] = {}  # program and uniforms, by shapes and constants
+        self._made: dict[Any, list[tuple[Any, Any]]] = {}  # answers and programs, by shapes and what is said of constants
         update_wrapper(self, function)
 
-    def __call__(self, *arrays: Any) -> Any:
-        if any(isinstance(x, Traced) for x in arrays) or not self.worth(*arrays):
-            return self.function(*arrays)
-        shapes = tuple(x.shape[1:] for x in arrays)
-        if shapes not in self._made:
-            self._made[shapes] = self._code(shapes)
-        code, results = self._made[shapes]
-        held = code(np.concatenate([np.moveaxis(x, 0, -1).reshape(-1, len(x)) for x in arrays]))
-        return tuple(np.moveaxis(part.reshape(*shape, -1), -1, 0) for part, shape in zip(_parts(held, results), results, strict=True))
+    def __call__(self, *arguments: Any) -> Any:
+        if tracing() or not self.worth(*arguments):
+            return self.function(*arguments)
+        from tailgate.engine.program import State
 
-    def _code(self, shapes: Sequence[tuple[int, ...]]) -> tuple[Code, list[tuple[int, ...]]]:
-        results: list[tuple[int, ...]] = []
+        constants = tuple(arguments[i] for i in self._fixed)
+        given = tuple(tuple(x) if isinstance(x, list) else x for i, x in enumerate(arguments) if i not in self._fixed)
+        arrays: dict[str, Array] = leaves(given)
+        rows = max(map(len, arrays.values()))
+        key = (tuple((name, x.shape[1:], x.dtype) for name, x in arrays.items()), *map(_bits, leaves(constants).values()))
+        if key not in self._found:
+            while len(self._found) >= KEPT:
+                self._found.pop(next(iter(self._found)))
+            self._found[key] = self._code(given, constants, key[0])
+        program, uniforms = self._found[key]
+        state = State(program, rows)
+        for name, x in arrays.items():
+            state.put_leaf(f"given.{name}", x if len(x) == rows else np.broadcast_to(x, (rows, *x.shape[1:])))
+        program.alone(state, uniforms)
+        names = (name for name in program.places if name.partition(".")[0] == "made")
+        return map_leaves(lambda _: state.get_leaf(next(names)), program.trace.next_state["made"])
 
-        def flat(*numbers: Any) -> list[Any]:
-            given = [np.stack(part, axis=-1).reshape(1, *shape) for part, shape in zip(_parts(numbers, shapes), shapes, strict=True)]
-            made = self.function(*given)
-            results[:] = [x.shape[1:] for x in made]
-            return [x[(slice(None), *place)] for x in made for place in np.ndindex(*x.shape[1:])]
+    def _code(self, given: Any, constants: Any, shapes: Any) -> tuple[Any, Array]:
+        from tailgate.engine.parameters import Parameters, lifted
+        from tailgate.engine.program import Program, traced
+        from tailgate.engine.remembered import Answers
 
-        return Code(flat, np.float64, sum(map(math.prod, shapes))), results
+        parameters = Parameters(constants)
+        several = self._made.setdefault((shapes, parameters.key), [])
+        for answers, program in several:
+            if answers.fit(parameters.values):
+                return program, program.uniforms(parameters.values)
+
+        def arranged(given: Any, constants: Any) -> Any:
+            one, other = iter(given), iter(constants)
+            return self.function(*(next(other if i in self._fixed else one) for i in range(len(given) + len(constants))))
+
+        def step(state: Any, nothing: Any) -> tuple[Any, Any]:
+            first: Any = next(iter(leaves(state).values()))
+            return {"given": state["given"], "made": arranged(state["given"], lifted(first.graph, constants))}, {}
+
+        example = map_leaves(lambda x: np.array(x[:1]), given)
+        with np.errstate(all="ignore"):
+            made = map_leaves(np.zeros_like, arranged(example, constants))
+        program = Program(traced(step, {"given": example, "made": made}, {}))
+        several.append((Answers([program.trace.graph]), program))
+        return program, program.uniforms(parameters.values)
 
 
-def _parts(held: Any, shapes: Sequence[tuple[int, ...]]) -> list[Any]:
-    """What belongs to each shape of numbers one behind the other."""
-    ends = np.cumsum([math.prod(shape) for shape in shapes]).tolist()
-    return [held[first:last] for first, last in zip([0, *ends[:-1]], ends, strict=True)]
+def _bits(x: Array) -> tuple[Any, bytes]:
+    return x.shape, x.tobytes()
 
 
-def shaped(worth: Callable[..., bool]) -> Callable[[Callable[..., Any]], Any]:
-    """Decorator of a function of arrays (M, ...) that gives a tuple of them; worth: for which arrays machine code is."""
-    return lambda function: Shaped(function, worth)
+def shaped(worth: Callable[..., bool], *constants: str) -> Callable[[Callable[..., Any]], Any]:
+    """Decorator of a function of arrays (B, ...); worth: for which arguments machine code is; constants: names of those without B."""
+    return lambda function: Shaped(function, worth, constants)

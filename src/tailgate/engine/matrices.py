@@ -18,6 +18,7 @@ from tailgate.engine.functions import gathered
 from tailgate.engine.loops import until
 from tailgate.engine.operations import BOOL, FLOAT
 
+SMALL = 500  # products of numbers that numpy makes sooner than machine code is called
 LOOPED = 64  # numbers in a matrix without zeros that is multiplied in a loop: straight code of more takes long to compile
 SPARSE = 100  # numbers of a matrix with zeros that is multiplied in a loop
 STRAIGHT = 600  # products of numbers in straight code
@@ -32,6 +33,11 @@ def _large(size: int, *arrays: Any) -> bool:
 def _size(x: Any, y: Any) -> int:
     """How many numbers a product of two arrays has."""
     return math.prod((*np.broadcast_shapes(x.shape[:-2], y.shape[:-2]), x.shape[-2], y.shape[-1])) if x.shape[-1] else 0
+
+
+def _products(x: Any, y: Any) -> int:
+    """How many products of numbers x y takes, about."""
+    return int(max(x.size * y.shape[-1], x.shape[-2] * y.size))
 
 
 def _over(function: Any, lead: Sequence[int], *arrays: Any) -> Traced:
@@ -67,6 +73,7 @@ def structure(x: Any) -> Any:
     return x.nonzero_places() if isinstance(x, Traced) else np.asarray(x) != 0.0
 
 
+@shaped(lambda x, y: y.ndim > 2 and _products(x, y) > SMALL, "x")
 def constant_times(x: Any, y: Any) -> Any:
     """x (..., i, k) times y (B, ..., k, j), of an x that is the same for all: sums run from 0, and its zeros count for nothing."""
     if not (isinstance(x, Traced) or isinstance(y, Traced)) and x.shape[-1] and np.isfinite(y).all():
@@ -90,7 +97,7 @@ def constant_times(x: Any, y: Any) -> Any:
 
 def _summed(x: Any, y: Any) -> Any:
     """The sums over k of x (..., i, k) times y (..., k, j), which begin with their first product."""
-    if not (isinstance(x, Traced) or isinstance(y, Traced)) and max(x.size * y.shape[-1], x.shape[-2] * y.size) <= AT_ONCE:
+    if not (isinstance(x, Traced) or isinstance(y, Traced)) and _products(x, y) <= AT_ONCE:
         return np.add.accumulate(x[..., None] * y[..., None, :, :], axis=-2)[..., -1, :]  # in ascending order, unlike a sum
     out = x[..., :1] * y[..., :1, :]
     for k in range(1, x.shape[-1]):
@@ -98,6 +105,7 @@ def _summed(x: Any, y: Any) -> Any:
     return out
 
 
+@shaped(lambda x, y: x.ndim == y.ndim > 2 and _products(x, y) > SMALL)
 def product(x: Any, y: Any) -> Any:
     """x (..., i, k) times y (..., k, j): sums begin with their first product."""
     if _large(_size(x, y), x, y):
@@ -108,6 +116,7 @@ def product(x: Any, y: Any) -> Any:
     return _summed(x, y)
 
 
+@shaped(lambda s: s.ndim > 2 < s.shape[-1] and s.size > SMALL)
 def inverse(s: Any) -> Any:
     """The inverse of symmetric positive definite (..., q, q): in closed form for q <= 2, else by Gauss and Jordan, without pivots."""
     q = s.shape[-1]
@@ -158,11 +167,19 @@ def constant_on(x: Any, v: Any) -> Any:
     return constant_times(x, v[..., None])[..., 0]
 
 
+@shaped(lambda A, P, Q: P.size * len(A) > SMALL, "A", "Q")
 def congruent(A: Any, P: Any, Q: Any) -> Any:
     """A P A' + Q for one A and Q (n, n) and P (B, N, n, n)."""
     return constant_times(A, transposed(constant_times(A, P))) + Q
 
 
+def applied(matrix: Any, x: Any, base: Any) -> Any:
+    """Each agent's own matrix (N, i, k), or one (1, i, k) for all, times its vector in x (B, N, k), on top of base (B, N, i) if any."""
+    moved = constant_on(matrix, x)
+    return moved if base is None else base + moved
+
+
+@shaped(lambda A, B, c, L, merge, heard, x, u: x.size * len(A) > SMALL, "A", "B", "c", "L", "merge", "heard")
 def predicted(A: Any, B: Any, c: Any, L: Any, merge: Any, heard: Any, x: Any, u: Any) -> Any:
     """merge_i sum_j L_j (A x_j + B u_j + c) (B, N, n) over the j in heard (N, N) bool, for x (B, N, n) and u (B, N, m)."""
     sent = constant_on(L, constant_on(A, x) + constant_on(B, u) + c)
@@ -177,6 +194,7 @@ def _heard(sent: Any, begin: Any, who: Any) -> Any:
     return out
 
 
+@shaped(lambda weights, covariances, offsets: covariances[0].size > SMALL)
 def moment(weights: Any, covariances: Any, offsets: Any) -> Any:
     """sum_i w_i (P_i + d_i d_i') (B, N, n, n) in that order, of w_i (B, N), P_i (B, N, n, n) and d_i (B, N, n)."""
     out: Any = None
@@ -186,23 +204,38 @@ def moment(weights: Any, covariances: Any, offsets: Any) -> Any:
     return out
 
 
-def fused(heard: Any, x: Any, M: Any, weight: Any, total: Any, begin: Any, step: Any) -> tuple[Any, Any]:
-    """xb (B, N, n) and Q^-1 (B, N, n, n) of what is sent: x (B, N, n) and its covariances M (B or 1, N, n, n), after a step (A, Q) if any.
+def _each(M: Any) -> bool:
+    return bool(M.size * M.shape[-1] > SMALL)
 
-    Q_i = (begin_i + sum_j w_ij M_j^-1) / t_i and xb_i = Q_i^-1 (sum_j w_ij M_j^-1 x_j) / t_i over the j in heard (N, N) bool.
+
+@shaped(lambda heard, M, *others: _each(M), "heard", "step")
+def spreads(heard: Any, M: Any, weight: Any, total: Any, begin: Any, step: Any) -> tuple[Any, Any]:
+    """L_j = M_j^-1 and Q_i^-1 (B, N, n, n) of covariances M (B, N, n, n) that are sent, after a step (A, Q) if any.
+
+    Q_i = (begin_i + sum_j w_ij L_j) / t_i over the j in heard (N, N) bool, of w (B, N, N), t and begin (B, N).
     """
-    L = inverse(M if step is None else congruent(step[0], M, step[1]))
-    y, means, spreads = times(L, x), [], []
+    L, out = inverse(M if step is None else congruent(step[0], M, step[1])), []
     for i, who in enumerate(structure(heard)):
-        information, mean = begin[:, i, None, None], 0.0
+        information = begin[:, i, None, None]
         for j in np.flatnonzero(who):
             information = information + weight[:, i, j, None, None] * L[:, j]
+        out.append(inverse(information / total[:, i, None, None]))
+    return L, np.stack(out, axis=1)
+
+
+@shaped(lambda heard, x, L, *others: x.size * x.shape[-1] > SMALL, "heard")
+def means(heard: Any, x: Any, L: Any, spread: Any, weight: Any, total: Any) -> Any:
+    """xb_i = Q_i^-1 (sum_j w_ij L_j x_j) / t_i (B, N, n) over the j in heard (N, N) bool, of x (B, N, n), and `spreads`."""
+    y, out = times(L, x), []
+    for i, who in enumerate(structure(heard)):
+        mean = 0.0
+        for j in np.flatnonzero(who):
             mean = mean + weight[:, i, j, None] * y[:, j]
-        spreads.append(inverse(information / total[:, i, None, None]))
-        means.append(times(spreads[-1], mean / total[:, i, None]))
-    return np.stack(means, axis=1), np.stack(spreads, axis=1)
+        out.append(times(spread[:, i], mean / total[:, i, None]))
+    return np.stack(out, axis=1)
 
 
+@shaped(lambda C, W, x, P, r, keep: x.size * x.shape[-1] * C.shape[1] > SMALL, "C")
 def corrected(C: Any, W: Any, x: Any, P: Any, r: Any, keep: Any) -> tuple[Any, Any]:
     """x (B, N, n) and P (B, N, n, n) after an update by r (B, N, q), whose covariance has the inverse W; keep (B, N, q) are the sensors."""
     there = keep.astype(np.float64)

@@ -156,6 +156,11 @@ class Program:
         field, found, wanted, _ = self.trace.graph.demands[first]
         return broken(~demands[:, first], field, found, wanted, k)
 
+    def alone(self, state: State, uniforms: Array) -> None:
+        """A step of code without arguments and results: from the state to the state."""
+        room = aligned((self.room,))
+        self.function.call(state.memory.ctypes.data, uniforms.ctypes.data, None, room.ctypes.data, None, 0, state.blocks, 1)
+
     def uniforms(self, values: Sequence[Array] | None = None) -> Array:
         """The numbers that all episodes share, as the code reads them; of parameters with other `values` (see engine/parameters.py)."""
         return self._reading.bits(values)
@@ -188,9 +193,12 @@ class State:
         if rows is not None:
             place[rows // lanes, :, rows % lanes] = leaf.reshape(len(rows), place.shape[1])
             return
-        index = np.minimum(np.arange(self.blocks * lanes), self.episodes - 1)
-        held = np.asarray(leaf).reshape(self.episodes, place.shape[1])[index]
-        place[...] = held.reshape(self.blocks, lanes, place.shape[1]).swapaxes(1, 2)
+        numbers = np.asarray(leaf).reshape(self.episodes, place.shape[1]).T
+        whole = self.episodes // lanes
+        place[:whole] = numbers[:, : whole * lanes].reshape(len(numbers), whole, lanes).swapaxes(0, 1)
+        if whole < self.blocks:
+            place[whole, :, : self.episodes - whole * lanes] = numbers[:, whole * lanes :]
+            place[whole, :, self.episodes - whole * lanes :] = numbers[:, -1:]
 
     def get(self, like: Any) -> Any:
         """A tree of arrays (episodes, ...): a copy."""

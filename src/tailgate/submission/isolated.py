@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -72,6 +72,7 @@ class Isolated:
     State stays in that process, so that the loop's state holds tickets only. Close it, or use it in a `with`, to end the processes.
     """
 
+    untraced: ClassVar[str] = "it plays in a process of its own"  # why the engine leaves it to the plain loop
     text: str
     source: Path | None = None  # directory that the class is imported from, beside what is installed
     limits: Limits = field(default_factory=Limits)

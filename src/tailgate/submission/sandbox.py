@@ -13,6 +13,7 @@ from typing import Literal, get_args
 
 import tailgate
 from tailgate.core import param
+from tailgate.engine.objects import folder as kept_objects
 from tailgate.errors import InputError
 from tailgate.submission.limits import Limits
 
@@ -78,10 +79,8 @@ def bwrap(folder: Path, source: Path | None, limits: Limits) -> list[str]:
     for prefix in prefixes:
         if not any(prefix == path or prefix.startswith(f"{path}/") for path in _SYSTEM):
             out += ["--ro-bind", prefix, prefix]
-    if (cache := package / "__pycache__").is_dir():  # compiled kernels are looked for where they could be written
-        copy = folder / "cache"
-        shutil.copytree(cache, copy, ignore=lambda _, names: [name for name in names if not name.endswith((".nbi", ".nbc"))])
-        out += ["--bind", str(copy), str(cache)]
+    if objects := kept_objects():  # machine code of products and inverses, to be read
+        out += ["--ro-bind", str(objects), f"{HOME}/.cache/tailgate/objects"]
     out += ["--ro-bind", str(folder / "in"), str(folder / "in"), "--bind", str(folder / "out"), str(folder / "out")]
     if source is not None:
         out += ["--ro-bind", str(source), str(source)]

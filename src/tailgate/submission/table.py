@@ -38,6 +38,8 @@ class _Hand(NamedTuple):
 class Seat:
     """The defence as one rollout sees it."""
 
+    untraced = "its steps wait for other rollouts"  # which would wait for the end of the tracing
+
     def __init__(self, model: Model, work: Callable[[Seat], Any]) -> None:
         self.model, self.work = model, work
         self.prior: Prior | None = None

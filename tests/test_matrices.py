@@ -1,9 +1,4 @@
-"""The kernels of eight episodes at a time: the bits of plain loops, in every batch, and vector instructions for certain."""
-
-import os
-import re
-import subprocess
-import sys
+"""Matrices of the plain loop as machine code: the bits of loops over single numbers, in every batch."""
 
 import numpy as np
 import pytest
@@ -142,32 +137,9 @@ def test_a_correction_is_that_of_matrices(q, batch, same_bits):
         assert same_bits(got[0], x + num.matvec(K, r * keep)) and same_bits(got[1], 0.5 * (after + num.transpose(after)))
 
 
-SHOWN = """
-import numpy as np
-from tailgate import lanes, num
-num.inverse(np.broadcast_to(np.eye(3), (9, 2, 3, 3)).copy())
-num.apply(np.ones((1, 3, 3)), np.ones((9, 2, 3)))
-num.congruent(np.eye(3), np.ones((9, 2, 3, 3)), np.eye(3))
-for kernel in (lanes.invert_each, lanes.apply_each, lanes.spread_each):
-    print(*kernel.inspect_asm().values())
-    print("NEXT")
-"""
-
-
-def test_no_kernel_has_lost_its_vectors(tmp_path):
-    """What was compiled multiplies whole vectors, and hardly ever a single number: a lost vector would cost a factor of four to eight."""
-    env = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}  # code from the cache cannot be shown
-    out = subprocess.run([sys.executable, "-c", SHOWN], env=env, capture_output=True, text=True, check=True).stdout
-    for code in out.split("NEXT")[:-1]:
-        packed, single = len(re.findall(r"\bv?f?n?m?[a-z]*mul[a-z0-9]*pd\b", code)), len(re.findall(r"\bv?mulsd\b", code))
-        if "pd" not in code and "xmm" not in code:
-            pytest.skip("not the instructions of an x86 processor")
-        assert packed >= 4 and single == 0
-
-
 @pytest.mark.parametrize("defence", ["kf", "chi2_kf", "chi2_kf_sparse", "imm"])
 def test_filters_of_many_states_are_the_textbook_recursion(defence, monkeypatch, short, play, same_bits):
-    """Kernels of whole passes are products one after the other: five cars, each with 19 states, some of whose readings go missing."""
+    """Functions of whole passes are products one after the other: five cars, each with 19 states, some of whose readings go missing."""
     place = short("platoon-lossy-v0", horizon=50)
 
     def played():
