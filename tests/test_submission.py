@@ -11,14 +11,17 @@ from typing import Any
 import pytest
 
 from tailgate.commands import submit
+from tailgate.engine.agreement import Untraced
+from tailgate.engine.commanded import commanded
 from tailgate.errors import InputError
 from tailgate.evaluation import Cell, cells_of, run_cell
 from tailgate.registry import Spec
 from tailgate.rounds import seeds_of
 from tailgate.rows import read_rows
-from tailgate.scenario import Suite
+from tailgate.scenario import Suite, load_scenario
 from tailgate.submission import Isolated, digest_of, mixed, play, play_submission
 from tailgate.submission.source import staged
+from tailgate.submission.table import Seat
 
 KALMAN = "tailgate.estimators:Kalman"
 SCENARIO = """
@@ -217,3 +220,14 @@ def test_the_command_writes_rows_and_prints_a_summary(
     named = Spec("defence", "other_sub:Own").digest  # the class lies elsewhere: its file decides, as rows of an older one shall not be kept
     (tmp_path / "own_sub.py").write_text((tmp_path / "own_sub.py").read_text() + "# changed\n", encoding="utf-8")
     assert Spec("defence", "other_sub:Own").digest != named and Spec("defence", "own_sub:Own").digest != digest
+
+
+def test_the_engine_leaves_seats_at_a_table_to_the_plain_loop() -> None:
+    """Their steps wait for other rollouts, which would wait for the end of the tracing."""
+    place = load_scenario("gusty-stop-and-go-v0")
+    seat = Seat(place.brief().model, lambda seat: None)
+    seat.play_on(None)
+    for defence, why in ((seat, "its steps wait for other rollouts"), (Isolated(KALMAN), "it plays in a process of its own")):
+        found = commanded(place.loop(defence, ("measurements",)))
+        assert isinstance(found, Untraced) and why in found.why
+    assert seat.done
