@@ -1,6 +1,6 @@
 """A job that is done again and again, in processes of its own that each die at a later call of the hook, until one comes to the end.
 
-Run as `python dying.py JOB FOLDER`; prints at which call nobody died any more, and that one's exit code.
+Run as `python dying.py JOB FOLDER EVERY`: every is how many calls lie between two deaths; prints at which call nobody died any more, and that one's exit code.
 """
 
 import os
@@ -69,10 +69,10 @@ def _die(job: Callable[[Path], None], folder: Path, at: int) -> None:
     os._exit(0)
 
 
-def main(name: str, folder: Path) -> None:
+def main(name: str, folder: Path, every: int) -> None:
     (folder / "whole").mkdir()
     JOBS[name](folder / "whole")  # what is traced and compiled, children have from their parent
-    for at in range(1, 500):
+    for at in range(1, 500, every):
         (folder / str(at)).mkdir()
         if not (child := os.fork()):  # of one parent that has no thread
             _die(JOBS[name], folder / str(at), at)
@@ -82,4 +82,4 @@ def main(name: str, folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1], Path(sys.argv[2]))
+    main(sys.argv[1], Path(sys.argv[2]), int(sys.argv[3]))

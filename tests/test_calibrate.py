@@ -94,7 +94,7 @@ def test_the_interval_is_exact_poisson():
     assert Count(0, 3600.0, 1, 1.0).hours is None and Count(0, 3600.0, 1, 1.0).interval() == (pytest.approx(1 / 3.6889, rel=1e-4), None)
 
 
-@pytest.mark.parametrize("defence", ["chi2_kf", "windowed_chi2_kf", "cusum_kf", "mewma_kf"])
+@pytest.mark.parametrize("defence", ["chi2_kf", pytest.param("windowed_chi2_kf", marks=pytest.mark.long), "cusum_kf", pytest.param("mewma_kf", marks=pytest.mark.long)])
 def test_a_calibrated_threshold_holds_on_fresh_runs(defence, roads):
     """For 0.1 h: the mean time between onsets is within 20 % on fresh seeds; for chi2 the threshold is that of theory."""
     done = calibrate(defence, 0.1, scenarios=roads[:1], onsets=200, check=True)

@@ -182,22 +182,23 @@ def test_only_what_a_killed_writer_left_is_swept(tmp_path: Path) -> None:
     assert sorted(os.listdir(tmp_path)) == sorted(names[1:])
 
 
-def _all_die(job: str, folder: Path) -> int:
-    """Processes that do a job die at every call of the hook, in a folder each; -> the number of the one that came to its end."""
-    done = subprocess.run([sys.executable, dying.__file__ or "", job, str(folder)], capture_output=True, text=True, check=False)
+def _all_die(job: str, folder: Path, every: int = 1) -> int:
+    """Processes that do a job die at calls of the hook, in a folder each; -> the number of the one that came to its end."""
+    done = subprocess.run([sys.executable, dying.__file__ or "", job, str(folder), str(every)], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     last, code = map(int, done.stdout.split())
     assert code == 0, done.stderr
     return last
 
 
-def test_a_board_that_is_killed_at_any_step_is_made_whole_by_the_same_command(tmp_path: Path) -> None:
+@pytest.mark.parametrize("every", [pytest.param(1, marks=pytest.mark.long), 4])
+def test_a_board_that_is_killed_at_any_step_is_made_whole_by_the_same_command(tmp_path: Path, every: int) -> None:
     """Packed rows, board.json and run.json: dead at a call of the hook, nothing broken lies there, and a rerun gives the same rows and board."""
     (tmp_path / dying.NAME).write_text(dying.FILE)
-    last = _all_die("board", tmp_path)
+    last = _all_die("board", tmp_path, every)
     whole = tmp_path / str(last)
     assert last > 30 and sorted(os.listdir(whole)) == ["board.json", "rows.jsonl.xz", "run.json"]
-    for folder in (tmp_path / str(at) for at in range(1, last)):
+    for folder in (tmp_path / str(at) for at in range(1, last, every)):
         for path in folder.glob("*.json"):
             json.loads(path.read_text())
         for path in folder.glob("**/rows*.jsonl*"):

@@ -144,6 +144,7 @@ def _campaign(tmp_path: Path, names: list[str], ways: list[str], moments: int) -
     assert len(lines) == len(names) * len(ways)
 
 
+@pytest.mark.long
 def test_a_command_that_is_ended_at_a_random_moment_goes_on(tmp_path: Path) -> None:
     _campaign(tmp_path, ["evaluate"], ["group"], 1)
 

@@ -174,8 +174,9 @@ class Killed(BaseException):
     """Not an Exception: nothing on the way may catch it."""
 
 
-def test_a_log_that_is_killed_anywhere_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """At every write, fsync and rename in turn: parts that were finished are kept, and the bytes are those of a log in peace."""
+@pytest.mark.parametrize("every", [pytest.param(1, marks=pytest.mark.long), 4])
+def test_a_log_that_is_killed_anywhere_goes_on(every: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """At writes, fsyncs and renames in turn: parts that were finished are kept, and the bytes are those of a log in peace."""
     options = {"episodes": 1, "dev_episodes": 1, "defences": ["chi2_kf"], "attacks": ["dropout"]}
     tables: dict[str, Any] = {}
     table = log._table
@@ -190,7 +191,7 @@ def test_a_log_that_is_killed_anywhere_goes_on(tmp_path: Path, monkeypatch: pyte
     whole, calls = _bytes(tmp_path / "whole"), 0
     real, played = log._play_part, []
     monkeypatch.setattr(log, "_play_part", lambda part, *rest: (played.append(part.name), real(part, *rest)))
-    for at in range(1, 100):
+    for at in range(1, 100, every):
         calls = 0
 
         def step(what: str, path: Path, at: int = at) -> None:

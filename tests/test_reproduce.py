@@ -19,7 +19,7 @@ FIELDS = {"id", "claim", "thesis", "measured", "holds", "why"}
 
 @pytest.fixture(scope="module")
 def chapter_4(tmp_path_factory):
-    """The command on 20 seeds, with three values of eta: exit code, claims by id, directory."""
+    """The command on 10 seeds, with three values of eta: exit code, claims by id, directory."""
     import contextlib
     import io
 
@@ -29,7 +29,7 @@ def chapter_4(tmp_path_factory):
     with contextlib.redirect_stdout(text), pytest.MonkeyPatch.context() as patch:
         for module in (ch4_theory, ch4_figures):
             patch.setattr(module, "ETAS", etas)
-        code = cli.main(["reproduce", "ch4", "--seeds", "20", "--out", str(out), "--json"])
+        code = cli.main(["reproduce", "ch4", "--seeds", "10", "--out", str(out), "--json"])
     return code, {claim["id"]: claim for claim in json.loads(text.getvalue())}, out
 
 
@@ -63,7 +63,7 @@ def test_chapter_4(chapter_4):
     names = {"figure-4-4", "figure-4-5", "figure-4-6", "figure-eta", "figure-cost"}
     assert {p.stem for p in out.glob("*.png")} == names and all((out / f"{n}.png").read_bytes()[:4] == b"\x89PNG" for n in names)
     page, text, data = (out / "index.html").read_text(), (out / "report.md").read_text(), json.loads((out / "report.json").read_text())
-    assert [c["id"] for c in data["claims"]] == list(claims) and len(data["tables"]) >= 3 and data["settings"]["seeds"] == 20
+    assert [c["id"] for c in data["claims"]] == list(claims) and len(data["tables"]) >= 3 and data["settings"]["seeds"] == 10
     for claim in claims.values():
         assert f'id="{claim["id"]}"' in page and claim["id"] in text
     assert "http://" not in page and "https://" not in page and "<script" not in page

@@ -50,6 +50,7 @@ def systems():
     return out | {"size": np.concatenate([ch5_cases.sizes(ch5_cases.fresh(s), s) for s in seeds], axis=1)}
 
 
+@pytest.mark.long
 def test_chapter_5_worst_errors(systems):
     """The design has 2.3 with resilience (thesis below 3) and about 1450 without (thesis about 1400)."""
     assert holds(ch5_cases.worst(systems["norm"]), 2.3, 1)
@@ -57,6 +58,7 @@ def test_chapter_5_worst_errors(systems):
     assert not holds(ch5_cases.worst(systems["norm"]), 3.0, 1)  # the test can fail
 
 
+@pytest.mark.long
 def test_chapter_5_clean_convergence(systems):
     """The design has convergence to 1 % in about 7 steps (thesis about 10)."""
     low, high = median_interval(ch5_cases.steps_to(systems["norm"], systems["size"]))

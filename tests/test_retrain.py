@@ -70,6 +70,7 @@ def _changed(path: Path, folder: Path, **training: Any) -> Path:
     return copy
 
 
+@pytest.mark.long
 def test_weights_of_another_training_are_found(policies: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     other = _changed(policies[0], tmp_path, seed=7)
     again = retrain(str(other))

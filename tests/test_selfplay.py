@@ -225,6 +225,7 @@ def test_a_weak_search_is_said_to_be_one(select, report, worst, weak, brief, tmp
     assert several["fresh"]["attack"] == max(("fresh-0", "fresh-fixed-0"), key=lambda name: select[NAMES.index(name)])  # of several the best
 
 
+@pytest.mark.long
 def test_a_run_that_goes_on_trains_for_the_opponents_of_now(tiny):
     """With a round more the pools are kept, and the fresh attackers are trained for the new defender; one trained for others is trained anew."""
     home, _, command = tiny

@@ -252,6 +252,7 @@ def test_a_preset_may_change_another(tmp_path: Path) -> None:
             train.load_config(str(mine), [])
 
 
+@pytest.mark.thin(2)
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_the_command_trains_on_every_system(here: Path, tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]) -> None:
     """Policy, comparison by the system's own outcome, yoked twin and page; the policy plays in an evaluation of its scenario."""
@@ -399,6 +400,7 @@ def test_a_fresh_start_forgets_the_run_before_and_resume_wants_the_same_learner(
     assert "steps: got 10; expected at least" in capsys.readouterr().err and all(path.read_bytes() == text for path, text in held.items())
 
 
+@pytest.mark.long
 def test_trainings_that_share_processes_give_the_same_policies(tmp_path: Path) -> None:
     """Two seeds of two learners side by side, and one after the other: the same files, whatever ran beside or before them."""
     learners = {

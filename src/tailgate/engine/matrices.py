@@ -179,7 +179,6 @@ def applied(matrix: Any, x: Any, base: Any) -> Any:
     return moved if base is None else base + moved
 
 
-@shaped(lambda A, B, c, L, merge, heard, x, u: x.size * len(A) > SMALL, "A", "B", "c", "L", "merge", "heard")
 def predicted(A: Any, B: Any, c: Any, L: Any, merge: Any, heard: Any, x: Any, u: Any) -> Any:
     """merge_i sum_j L_j (A x_j + B u_j + c) (B, N, n) over the j in heard (N, N) bool, for x (B, N, n) and u (B, N, m)."""
     sent = constant_on(L, constant_on(A, x) + constant_on(B, u) + c)
@@ -194,7 +193,6 @@ def _heard(sent: Any, begin: Any, who: Any) -> Any:
     return out
 
 
-@shaped(lambda weights, covariances, offsets: covariances[0].size > SMALL)
 def moment(weights: Any, covariances: Any, offsets: Any) -> Any:
     """sum_i w_i (P_i + d_i d_i') (B, N, n, n) in that order, of w_i (B, N), P_i (B, N, n, n) and d_i (B, N, n)."""
     out: Any = None
@@ -204,11 +202,6 @@ def moment(weights: Any, covariances: Any, offsets: Any) -> Any:
     return out
 
 
-def _each(M: Any) -> bool:
-    return bool(M.size * M.shape[-1] > SMALL)
-
-
-@shaped(lambda heard, M, *others: _each(M), "heard", "step")
 def spreads(heard: Any, M: Any, weight: Any, total: Any, begin: Any, step: Any) -> tuple[Any, Any]:
     """L_j = M_j^-1 and Q_i^-1 (B, N, n, n) of covariances M (B, N, n, n) that are sent, after a step (A, Q) if any.
 
@@ -219,11 +212,10 @@ def spreads(heard: Any, M: Any, weight: Any, total: Any, begin: Any, step: Any) 
         information = begin[:, i, None, None]
         for j in np.flatnonzero(who):
             information = information + weight[:, i, j, None, None] * L[:, j]
-        out.append(inverse(information / total[:, i, None, None]))
-    return L, np.stack(out, axis=1)
+        out.append(information / total[:, i, None, None])
+    return L, inverse(np.stack(out, axis=1))
 
 
-@shaped(lambda heard, x, L, *others: x.size * x.shape[-1] > SMALL, "heard")
 def means(heard: Any, x: Any, L: Any, spread: Any, weight: Any, total: Any) -> Any:
     """xb_i = Q_i^-1 (sum_j w_ij L_j x_j) / t_i (B, N, n) over the j in heard (N, N) bool, of x (B, N, n), and `spreads`."""
     y, out = times(L, x), []
@@ -231,11 +223,10 @@ def means(heard: Any, x: Any, L: Any, spread: Any, weight: Any, total: Any) -> A
         mean = 0.0
         for j in np.flatnonzero(who):
             mean = mean + weight[:, i, j, None] * y[:, j]
-        out.append(times(spread[:, i], mean / total[:, i, None]))
-    return np.stack(out, axis=1)
+        out.append(mean / total[:, i, None])
+    return times(spread, np.stack(out, axis=1))
 
 
-@shaped(lambda C, W, x, P, r, keep: x.size * x.shape[-1] * C.shape[1] > SMALL, "C")
 def corrected(C: Any, W: Any, x: Any, P: Any, r: Any, keep: Any) -> tuple[Any, Any]:
     """x (B, N, n) and P (B, N, n, n) after an update by r (B, N, q), whose covariance has the inverse W; keep (B, N, q) are the sensors."""
     there = keep.astype(np.float64)

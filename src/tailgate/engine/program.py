@@ -7,6 +7,7 @@ Parameters are the same for all episodes. Their values are no part of the code: 
 from __future__ import annotations
 
 import ctypes
+import math
 import operator
 import struct
 from collections.abc import Callable, Mapping, Sequence
@@ -159,7 +160,7 @@ class Program:
     def alone(self, state: State, uniforms: Array) -> None:
         """A step of code without arguments and results: from the state to the state."""
         room = aligned((self.room,))
-        self.function.call(state.memory.ctypes.data, uniforms.ctypes.data, None, room.ctypes.data, None, 0, state.blocks, 1)
+        self.function.call(address(state.memory), address(uniforms), None, address(room), None, 0, state.blocks, 1)
 
     def uniforms(self, values: Sequence[Array] | None = None) -> Array:
         """The numbers that all episodes share, as the code reads them; of parameters with other `values` (see engine/parameters.py)."""
@@ -339,11 +340,16 @@ def _pool(threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(threads)
 
 
+def address(array: Array) -> int:
+    """Of its first number."""
+    return int(array.__array_interface__["data"][0])
+
+
 def aligned(shape: tuple[int, ...], dtype: Any = np.uint8) -> Array:
     """Zeros, beginning at a cache line."""
-    size = int(np.prod(shape)) * np.dtype(dtype).itemsize
+    size = math.prod(shape) * np.dtype(dtype).itemsize
     raw = np.zeros(size + ALIGNED, np.uint8)
-    begin = -raw.ctypes.data % ALIGNED
+    begin = -address(raw) % ALIGNED
     out: Array = raw[begin : begin + size].view(dtype).reshape(shape)
     return out
 
