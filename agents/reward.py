@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from tailgate.core import Array, Frame, Kind, Model, NonNegative, Positive, param
+from tailgate.core import Array, Discount, Frame, Kind, Model, NonNegative, Positive, param
 from tailgate.errors import InputError
 from tailgate.num import clip
 
@@ -50,7 +50,7 @@ class Reward:
     error_scale: Positive = param(10.0, "error, peak, stealth, final: the error that earns 1: of the gap [m], or of the state [its unit]")
     gap_shaping: NonNegative = param(0.5, "weight of the closeness of the car ahead as a potential [-]")
     error_shaping: NonNegative = param(1.0, "weight of the believed extra gap, per 10 m and capped at 20 m, as a potential [-]")
-    gamma: Positive = param(0.995, "discount in the potential's difference [-]")
+    gamma: Discount = param(0.995, "discount in the potential's difference [-]")
     illegal_penalty: NonNegative = param(0.0, "cost of a decision whose command is refused in every step [-]")
     attack_cost: NonNegative = param(0.0, "cost of a step under attack: what makes waiting for the right moment pay [-]")
 

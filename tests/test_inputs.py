@@ -10,6 +10,7 @@ import pytest
 
 from tailgate.agents.scripted import Inject, Script
 from tailgate.draws import keys
+from tailgate.envs.seat import Seat
 from tailgate.errors import InputError, NotApplicable
 from tailgate.registry import PARTS, Spec, entries, make
 from tailgate.scenario import load_scenario
@@ -167,3 +168,9 @@ def test_no_reading_may_be_certain_altogether():
     place = dataclasses.replace(place, plant=plant, sensor=make("sensor", "odometry", noise_var=[0.0, 0.0]))
     with pytest.raises(NotApplicable, match="variance of a reading"):
         place.loop(make("defence", "kf"))
+
+
+@pytest.mark.parametrize("gamma", [1.5, 0.0, -0.1, float("nan")])
+def test_a_discount_is_within_its_range(gamma):
+    with pytest.raises(InputError, match=r"reward\.gamma"):
+        Seat.make(gamma=gamma)

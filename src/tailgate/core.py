@@ -25,6 +25,7 @@ from tailgate.kinds import RADIATED as RADIATED
 from tailgate.kinds import Kind as Kind
 from tailgate.kinds import Mode as Mode
 from tailgate.quantities import Count as Count
+from tailgate.quantities import Discount as Discount
 from tailgate.quantities import Finite as Finite
 from tailgate.quantities import NonNegative as NonNegative
 from tailgate.quantities import Positive as Positive

@@ -22,17 +22,16 @@ import json
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-from pydantic import Field
 
 from tailgate import draws
 from tailgate.agents.cem import Config
 from tailgate.agents.learning import LEARNERS, learner_of
 from tailgate.agents.policy import PolicyAttack
 from tailgate.agents.selfplay import Learner, Played, constant, export, play
-from tailgate.core import Array, Attack, Count, param
+from tailgate.core import Array, Attack, Count, Discount, param
 from tailgate.envs.duel import Duel, Payoff
 from tailgate.errors import InputError, said
 from tailgate.estimators.steered import Steered
@@ -51,7 +50,6 @@ FRESH, DEFENDERS = 1000, 500  # added to the first seed: seeds of best responses
 SELECT_EPISODES = 512  # that the best fixed setting and the worst attack are chosen on
 BATCH = 4096  # games side by side
 AS_IS, FIXED, TRAINED = "as it is", "best fixed setting", "trained"
-Discount = Annotated[float, Field(gt=0, le=1)]
 Update = Callable[[str, int, int, str], None]
 Crashed = dict[tuple[str, str], Array]  # by defender and attack: (episodes,) 0 or 1
 

@@ -10,16 +10,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
-
-from pydantic import Field
+from typing import Any
 
 from tailgate import sizes
 from tailgate.agents.codec import ActionSpec
 from tailgate.agents.finished import finished
 from tailgate.agents.learning import DISCRETE, LEARNERS, Progress, Teachable, check_action, learner_of
 from tailgate.agents.reward import Reward
-from tailgate.core import Count, PositiveCount, param
+from tailgate.core import Count, Discount, PositiveCount, param
 from tailgate.envs.seat import Seat
 from tailgate.errors import InputError, said, unknown
 from tailgate.evaluation import cells_of
@@ -40,7 +38,6 @@ ENVIRONMENT = (fields_of(ActionSpec) | fields_of(Reward) | {"frames": None}).key
 COMPARED = {"episodes", "first_episode", "white_box", "others", "workers"}
 CHOSEN = {"rivals", "select_episodes", "outcome"}
 LATER = {"demonstrations"}  # fields that joined when policies had been published: at its default such a field leaves no mark
-Discount = Annotated[float, Field(gt=0, le=1)]
 
 
 @dataclass(frozen=True)
