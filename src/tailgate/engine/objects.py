@@ -120,7 +120,7 @@ def prove(names: Sequence[str]) -> None:
 
 
 class Function:
-    """`step` of a text. Calls release Python's lock."""
+    """`step` of a text, and `bound`, which has the address of its arguments. Calls release Python's lock."""
 
     def __init__(self, text: str) -> None:
         with _lock:
@@ -138,3 +138,4 @@ class Function:
             address = self._engine.get_function_address("step")
         kind = ctypes.CFUNCTYPE(ctypes.c_int64, *(ctypes.c_void_p,) * 5, *(ctypes.c_int64,) * 3)
         self.call = kind(address)
+        self.bound = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_void_p)(self._engine.get_function_address("bound"))

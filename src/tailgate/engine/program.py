@@ -7,6 +7,7 @@ Parameters are the same for all episodes. Their values are no part of the code: 
 from __future__ import annotations
 
 import ctypes
+import functools
 import math
 import operator
 import struct
@@ -271,6 +272,7 @@ class Call:
         self._pointers = tuple(ctypes.c_void_p(a.ctypes.data) for a in (state.memory, self.uniforms, self._table))
         self._places = [ctypes.c_void_p(room.ctypes.data) for room in self._rooms]
         self.sheet = np.empty(0, np.uint8)  # what the last call wrote
+        self._bound = np.empty(0, np.int64)  # arguments of `fixed`
 
     def _place(self, shown: tuple[int, ...], shape: tuple[int, ...], dtype: np.dtype[Any]) -> _Place:
         """Room on the sheet for each step's array of a shape, of which `shown` is shown."""
@@ -304,6 +306,13 @@ class Call:
 
     def _part(self, part: int, there: int | None, steps: int) -> bool:
         return bool(self.program.function.call(*self._pointers, self._places[part], there, *self._parts[part], steps))
+
+    def fixed(self) -> Callable[[], int]:
+        """What plays a step into one sheet again and again: whoever keeps what stands there copies it."""
+        self.begin()
+        pointers = [pointer.value for pointer in (*self._pointers, self._places[0])]
+        self._bound = np.array([*pointers, address(self.sheet), *self._parts[0], 1], np.int64)
+        return functools.partial(self.program.function.bound, address(self._bound))
 
     def numbers(self, names: Sequence[str]) -> Callable[[], tuple[Any, ...]]:
         """What reads results of a number each off the sheet of a single episode, as Python's own numbers."""

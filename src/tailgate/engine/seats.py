@@ -13,7 +13,7 @@ import copy
 import dataclasses
 from collections.abc import Callable
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -190,6 +190,18 @@ def difference(programs: SeatPrograms, batch: int = ROWS, steps: int = TRIED) ->
     return ""
 
 
+class _Alone(NamedTuple):
+    """What plays a single row into one sheet again and again, and reads it."""
+
+    call: Call
+    advance: Call | None
+    play: Callable[[], int]
+    action: Array
+    numbers: Callable[[], tuple[Any, ...]]
+    seen: Array
+    mask: Array | None
+
+
 class Rows:
     """B rows of a seat's episodes, and what the last call brought (see `SeatPrograms`)."""
 
@@ -198,6 +210,7 @@ class Rows:
         self.state = State(programs.decide, batch)
         self._decide = self._last = Call(programs.decide, self.state, values=programs.values, threads=threads)
         self._brought: dict[str, Array] | None = {}
+        self._k = 0  # of a single row, after its last decision
 
     @cached_property
     def _begin(self) -> Call:
@@ -209,11 +222,13 @@ class Rows:
         return Call(self.programs.advance, self.state, self.programs.between, self.programs.values, self.threads, self._decide)
 
     @cached_property
-    def _alone(self) -> tuple[Any, ...]:
-        """What reads the sheet of a single row."""
-        call, discrete = self._decide, self.programs.seat.action.discrete
-        mask = call.reader("mask", 0, np.int8) if discrete else None
-        return call.numbers(ALONE), call.reader("seen", 0), (lambda: mask().copy()) if mask else lambda: None
+    def _alone(self) -> _Alone:
+        programs = self.programs
+        call = Call(programs.decide, self.state, values=programs.values)
+        advance = Call(programs.advance, self.state, programs.between, programs.values, like=call) if programs.advance else None
+        play = call.fixed()
+        mask = call.reader("mask", 0, np.int8)() if programs.seat.action.discrete else None
+        return _Alone(call, advance, play, call.arguments["action"], call.numbers(ALONE), call.reader("seen", 0)(), mask)
 
     @property
     def brought(self) -> dict[str, Array]:
@@ -234,11 +249,22 @@ class Rows:
 
     def decide_alone(self, action: Any) -> tuple[Any, ...]:
         """The decision of a single row; -> what ALONE names, as Python's numbers, its observation and its mask."""
-        given = self._decide.arguments
-        given["action"][0], given["over"][0], given["again"][0] = action, False, False
-        self._play(self._decide)
-        numbers, seen, mask = self._alone
-        return *numbers(), seen(), mask()
+        call, advance, play, given, numbers, seen, mask = self._alone
+        given[0] = action
+        if advance is not None:
+            advance.begin()
+            advance.play(advance.steps)
+            if advance.broken:
+                self._check(advance, self._step)
+        if play():
+            self._check(call, self._step)
+        self._last, self._brought, told = call, None, numbers()
+        self._k = told[2]
+        return *told, seen.copy(), None if mask is None else mask.copy()
+
+    def _step(self) -> Array:
+        """The step before the decision of a single row."""
+        return np.array([self._k]) if self._last is self._alone.call else self._last.results()["k"]
 
     def again_alone(self) -> tuple[Any, ...]:
         """The next episode of a single row; -> as `decide_alone`, of a decision that brought nothing."""
@@ -261,7 +287,7 @@ class Rows:
         """Raise the error of a demand that did not hold, in a decision from steps k (B,) on; idle lanes may hold anything."""
         demands = call.results()["demands"].reshape(call.steps, self.batch, -1)
         for step in np.flatnonzero(~demands.all(axis=(1, 2))):
-            raise call.program.broken(demands[step], k() + step + (self.programs.between if call is self._decide else 0))
+            raise call.program.broken(demands[step], k() + step + (self.programs.between if call.program is self.programs.decide else 0))
 
     def begin(self, rows: Array, keys: Keys | None = None) -> None:
         """Begin episodes in the rows (B,) bool: the next of their own, or those of keys, of as many rows."""
