@@ -15,7 +15,7 @@ from tailgate.engine.operations import Array
 from tailgate.tree import leaves, map_leaves
 
 ALIGNED = 64  # bytes: a line of the processor's cache
-KEPT = 256  # constants whose code is known at once
+KEPT, EACH = 256, 8  # constants whose code is known at once, and code of the same shapes for other answers
 
 
 class Code:
@@ -107,8 +107,7 @@ class Shaped:
         rows = max(map(len, arrays.values()))
         key = (tuple((name, x.shape[1:], x.dtype) for name, x in arrays.items()), *map(_bits, leaves(constants).values()))
         if key not in self._found:
-            while len(self._found) >= KEPT:
-                self._found.pop(next(iter(self._found)))
+            _shortened(self._found)
             self._found[key] = self._code(given, constants, key[0])
         program, uniforms = self._found[key]
         state = State(program, rows)
@@ -124,6 +123,7 @@ class Shaped:
         from tailgate.engine.remembered import Answers
 
         parameters = Parameters(constants)
+        _shortened(self._made)
         several = self._made.setdefault((shapes, parameters.key), [])
         for answers, program in several:
             if answers.fit(parameters.values):
@@ -141,8 +141,14 @@ class Shaped:
         with np.errstate(all="ignore"):
             made = map_leaves(np.zeros_like, arranged(example, constants))
         program = Program(traced(step, {"given": example, "made": made}, {}))
-        several.append((Answers([program.trace.graph]), program))
+        several[:] = [*several[1 - EACH :], (Answers([program.trace.graph]), program)]
         return program, program.uniforms(parameters.values)
+
+
+def _shortened(held: dict[Any, Any]) -> None:
+    """Makes room for one more: what came first goes."""
+    while len(held) >= KEPT:
+        held.pop(next(iter(held)), None)
 
 
 def _bits(x: Array) -> tuple[Any, bytes]:
