@@ -21,6 +21,7 @@ from tailgate.engine.graph import Node
 from tailgate.engine.instructions import operation, scalar
 from tailgate.engine.operations import BOOL, FLOAT
 from tailgate.engine.passes import Branch, Item, counted, schedule
+from tailgate.engine.routines import bound
 
 
 @dataclass(frozen=True)
@@ -328,18 +329,8 @@ def text_of(layout: Layout, arrays: int, lanes: int, least: int) -> tuple[str, d
     head = ("define i64 @step(ptr noalias nocapture %memory, ptr noalias nocapture readonly %uniforms, "
             "ptr noalias nocapture readonly %table, ptr noalias nocapture %large, ptr noalias nocapture %sheet, "
             "i64 %first, i64 %last, i64 %steps) #0 {")  # fmt: skip
-    text = "\n".join([*sorted(e.declared), *e.texts, head, *e.lines, "}", _bound(), f"attributes #0 = {{ {attributes} }}", ""])
+    text = "\n".join([*sorted(e.declared), *e.texts, head, *e.lines, "}", bound(), f"attributes #0 = {{ {attributes} }}", ""])
     return text, counted(items), room
-
-
-def _bound() -> str:
-    """`step` by the address of its arguments: a call with one of them takes Python less time than with eight."""
-    kinds = ["ptr"] * 5 + ["i64"] * 3
-    lines = ["define i64 @bound(ptr %arguments) #0 {"]
-    for i, kind in enumerate(kinds):
-        lines += [f"  %at{i} = getelementptr i64, ptr %arguments, i64 {i}", f"  %a{i} = load {kind}, ptr %at{i}, align 8"]
-    given = ", ".join(f"{kind} %a{i}" for i, kind in enumerate(kinds))
-    return "\n".join([*lines, f"  %broken = call i64 @step({given})", "  ret i64 %broken", "}"])
 
 
 @contextlib.contextmanager
