@@ -274,7 +274,7 @@ def moment(job: Job, folder: Path, way: str, delay: float, workers: int, peace: 
     elif lost := replayed(job, folder, before):
         wrong.append(f"done again: {len(lost)}")
     if wrong and not any("traceback" in text for text in wrong):
-        said = folder.with_suffix(".again").read_text(errors="replace") if again else said
+        said = folder.with_suffix(".again").read_text(errors="replace") if again and job.told else said
     return {"delay": round(delay, 3), "code": code, "seconds": round(took, 2), "kept": len(before), "wrong": wrong,
             "said": said[-1500:] if wrong else ""}  # fmt: skip
 
