@@ -12,6 +12,7 @@ import numpy as np
 from tailgate.engine.array import Traced
 from tailgate.engine.functions import tracing
 from tailgate.engine.operations import Array
+from tailgate.engine.untraceable import Untraceable
 from tailgate.tree import leaves, map_leaves
 
 ALIGNED = 64  # bytes: a line of the processor's cache
@@ -110,6 +111,8 @@ class Shaped:
             _shortened(self._found)
             self._found[key] = self._code(given, constants, key[0])
         program, uniforms = self._found[key]
+        if program is None:
+            return self.function(*arguments)
         state = State(program, rows)
         for name, x in arrays.items():
             state.put_leaf(f"given.{name}", x if len(x) == rows else np.broadcast_to(x, (rows, *x.shape[1:])))
@@ -140,7 +143,10 @@ class Shaped:
         example = map_leaves(lambda x: np.array(x[:1]), given)
         with np.errstate(all="ignore"):
             made = map_leaves(np.zeros_like, arranged(example, constants))
-        program = Program(traced(step, {"given": example, "made": made}, {}))
+        try:
+            program = Program(traced(step, {"given": example, "made": made}, {}))
+        except Untraceable:  # too large: numpy computes it
+            return None, np.empty(0)
         several[:] = [*several[1 - EACH :], (Answers([program.trace.graph]), program)]
         return program, program.uniforms(parameters.values)
 
