@@ -1,6 +1,6 @@
 """A job that is done again and again, in processes of its own that each die at a later call of the hook, until one comes to the end.
 
-Run as `python dying.py JOB FOLDER EVERY`: every is how many calls lie between two deaths; prints at which call nobody died any more, and that one's exit code.
+Run as `python dying.py JOB FOLDER EVERY`: a process dies at every EVERY-th call. Prints the first call at which none died, and the exit code.
 """
 
 import os

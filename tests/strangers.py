@@ -1,4 +1,4 @@
-"""What somebody else wrote, without a word about engines: a plant with its sensor and controller, a defence and an attack."""
+"""Plain classes of a user: a plant with its sensor and controller, a defence and an attack. None mentions the engine."""
 
 from dataclasses import dataclass
 from typing import NamedTuple

@@ -227,7 +227,7 @@ def test_the_engine_leaves_seats_at_a_table_to_the_plain_loop() -> None:
     place = load_scenario("gusty-stop-and-go-v0")
     seat = Seat(place.brief().model, lambda seat: None)
     seat.play_on(None)
-    for defence, why in ((seat, "its steps wait for other rollouts"), (Isolated(KALMAN), "it plays in a process of its own")):
+    for defence, why in ((seat, "its steps wait for other rollouts"), (Isolated(KALMAN), "another process plays it")):
         found = commanded(place.loop(defence, ("measurements",)))
         assert isinstance(found, Untraced) and why in found.why
     assert seat.done

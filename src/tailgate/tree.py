@@ -22,7 +22,7 @@ def map_leaves(function: Callable[..., Any], tree: Any, *others: Any) -> Any:
 
 
 def rebuilt(like: Any) -> Callable[[Iterator[Any]], Any]:
-    """What makes a tree as `like` of leaves in their order: faster than `map_leaves`, for whoever makes many."""
+    """Return a function that builds a tree shaped as `like` from an iterator of leaves. Faster than `map_leaves` when it is called often."""
     if like is None:
         return lambda leaves: None
     if isinstance(like, dict):

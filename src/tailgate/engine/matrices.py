@@ -36,7 +36,7 @@ def _size(x: Any, y: Any) -> int:
 
 
 def _products(x: Any, y: Any) -> int:
-    """How many products of numbers x y takes, about."""
+    """Estimate how many scalar multiplications x y needs."""
     return int(max(x.size * y.shape[-1], x.shape[-2] * y.size))
 
 

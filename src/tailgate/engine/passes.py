@@ -77,9 +77,9 @@ def _branches(nodes: Sequence[Node], kept: Collection[int], least: int) -> list[
 
 
 def _asked(nodes: Sequence[Node], kept: Collection[int], turns: Mapping[int, int]) -> dict[Any, Branch]:
-    """What is needed only on one side of choices that are in no branch, by their mask, side and turn.
+    """Find the outermost branches, by mask, side and turn.
 
-    Each node belongs where all that need it meet: paths of (mask, side) lead there, from the scope itself on.
+    A path lists the choices (mask, side) around a node, the outermost first. A node gets the path that all its users share.
     """
     nowhere = _Path(None, None, 0)
     by_id = {node.id: node for node in nodes}
@@ -113,7 +113,7 @@ def _asked(nodes: Sequence[Node], kept: Collection[int], turns: Mapping[int, int
 
 
 class _Path:
-    """The sides of choices that lead to what is needed there alone."""
+    """The choices around a node, the outermost first."""
 
     def __init__(self, before: _Path | None, key: Any, depth: int) -> None:
         self.before, self.depth = before, depth
@@ -121,13 +121,13 @@ class _Path:
         self._ways: dict[Any, _Path] = {}
 
     def to(self, key: Any) -> _Path:
-        """One side more."""
+        """Append a choice."""
         if key not in self._ways:
             self._ways[key] = _Path(self, key, self.depth + 1)
         return self._ways[key]
 
     def meeting(self, other: _Path) -> _Path:
-        """As far as both are the same."""
+        """Return what both paths share."""
         one: Any = self
         two: Any = other
         while one is not two:

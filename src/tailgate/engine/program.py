@@ -308,7 +308,7 @@ class Call:
         return bool(self.program.function.call(*self._pointers, self._places[part], there, *self._parts[part], steps))
 
     def fixed(self) -> Callable[[], int]:
-        """What plays a step into one sheet again and again: whoever keeps what stands there copies it."""
+        """Return a call that plays one step and writes to the same sheet each time. Copy what is to be kept."""
         self.begin()
         pointers = [pointer.value for pointer in (*self._pointers, self._places[0])]
         self._bound = np.array([*pointers, address(self.sheet), *self._parts[0], 1], np.int64)
@@ -350,7 +350,7 @@ def _pool(threads: int) -> ThreadPoolExecutor:
 
 
 def address(array: Array) -> int:
-    """Of its first number."""
+    """Return the address of an array's first number."""
     return int(array.__array_interface__["data"][0])
 
 

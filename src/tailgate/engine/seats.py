@@ -191,7 +191,7 @@ def difference(programs: SeatPrograms, batch: int = ROWS, steps: int = TRIED) ->
 
 
 class _Alone(NamedTuple):
-    """What plays a single row into one sheet again and again, and reads it."""
+    """A single row: the calls that play it, its action, and readers of its sheet."""
 
     call: Call
     advance: Call | None

@@ -72,7 +72,7 @@ class Isolated:
     State stays in that process, so that the loop's state holds tickets only. Close it, or use it in a `with`, to end the processes.
     """
 
-    untraced: ClassVar[str] = "it plays in a process of its own"  # why the engine leaves it to the plain loop
+    untraced: ClassVar[str] = "another process plays it"  # why the engine leaves it to the plain loop
     text: str
     source: Path | None = None  # directory that the class is imported from, beside what is installed
     limits: Limits = field(default_factory=Limits)
