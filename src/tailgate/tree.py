@@ -22,7 +22,7 @@ def map_leaves(function: Callable[..., Any], tree: Any, *others: Any) -> Any:
 
 
 def rebuilt(like: Any) -> Callable[[Iterator[Any]], Any]:
-    """Return a function that builds a tree shaped as `like` from an iterator of leaves. Faster than `map_leaves` when it is called often."""
+    """Return a function that builds a tree shaped as `like` from an iterator of leaves, in less time than `map_leaves` takes."""
     if like is None:
         return lambda leaves: None
     if isinstance(like, dict):
