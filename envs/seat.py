@@ -62,6 +62,16 @@ class Outcome(NamedTuple):
     truncated: Array  # the horizon did
 
 
+def _reward(options: dict[str, Any]) -> Reward:
+    """The reward from its options, or the object that stands for it."""
+    own = options.get("reward")
+    if not isinstance(own, Reward):
+        return build(Reward, options, "reward")
+    for key in options.keys() - {"reward"}:
+        raise InputError(key, options[key], f"no such option: {type(own).__name__}, the reward given as an object, holds it")
+    return own
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class Seat:
     """Everything that an adversary environment is, apart from its episodes: loop, codecs and reward, from checked arguments."""
@@ -83,7 +93,7 @@ class Seat:
         """scenario: name or YAML file. defence: name (`chi2_kf:eta=15`) or object. threat: changes of the scenario's threat model.
 
         options: the fields of ActionSpec and Reward, `knowledge`, and `frames`: how many decisions the observation shows at once. Scenario
-        and defence are those of car following where they are None.
+        and defence are those of car following where they are None. `reward` may be an object of a subclass of Reward.
         """
         scenario = FACES[CAR_FOLLOWING]["scenario"] if scenario is None else scenario
         defence = FACES[CAR_FOLLOWING]["defence"] if defence is None else defence
@@ -105,7 +115,7 @@ class Seat:
             if key not in fields_of(ThreatModel):
                 raise unknown("threat: unknown field", key, fields_of(ThreatModel))
         action = build(ActionSpec, {k: v for k, v in options.items() if k in fields_of(ActionSpec)}, "action")
-        reward = build(Reward, {k: v for k, v in options.items() if k in fields_of(Reward)}, "reward")
+        reward = _reward({k: v for k, v in options.items() if k in fields_of(Reward)})
         place = load_scenario(scenario).with_threat(**threat)
         if isinstance(defence, str):
             spec = Spec("defence", defence)

@@ -1,4 +1,4 @@
-"""Plain classes of a user: a plant with its sensor and controller, a defence and an attack. None mentions the engine."""
+"""Plain classes of a user: a plant with its sensor and controller, a defence, an attack, a reward, a metric. None mentions the engine."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -6,9 +6,11 @@ from typing import NamedTuple
 import numpy as np
 
 from tailgate import num
+from tailgate.agents.reward import Reward
 from tailgate.core import Kind, Model, Prior, Received, Scene
 from tailgate.estimators import ChiSquare, GateOut, compose
 from tailgate.estimators.kalman import KalmanFilter
+from tailgate.metrics import metric
 
 
 class Swing(NamedTuple):
@@ -138,3 +140,20 @@ class Nudge:
         on = (view.k % 3 != 0) & (draws.uniform() < 0.9)
         value = self.gain * seen * np.where(angle > 0.0, 1.0, -1.0)
         return Nudging(seen), plan.command(on, Kind.FDI, plan.granted, np.where(seen > 0.1, 2.0 * value, value)[:, None, None])
+
+
+@dataclass(frozen=True)
+class Scare(Reward):
+    """Pays for braking harder than is comfortable, twice as much while nothing alarms."""
+
+    comfort: float = 1.0
+
+    def __call__(self, model, frame, fall, last, rise=0.0):
+        hard = np.maximum(-frame.scene.accel[:, 0] - self.comfort, 0.0)
+        return hard * np.where(frame.estimate.alarm.any(axis=1), 1.0, 2.0) + super().__call__(model, frame, fall, last, rise)
+
+
+@metric("rad")
+def largest_lean(trace):
+    """Farthest that the rod leant."""
+    return np.max(np.where(trace.live, np.abs(trace.truth[:, :, 0, 0]), 0.0), axis=0)

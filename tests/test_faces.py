@@ -336,7 +336,7 @@ def test_the_documentation_runs_as_written(tmp_path):
     pytest.importorskip("stable_baselines3")
     text = (ROOT / "docs/environment.md").read_text(encoding="utf-8")
     blocks = re.findall(r"```python\n(.*?)```", text, flags=re.S)
-    assert len(blocks) == 3 and "learn(150_000)" in blocks[1]
+    assert len(blocks) == 5 and "learn(150_000)" in blocks[1]
     code = "\n".join(blocks).replace("learn(150_000)", "learn(7_000)")
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300, cwd=tmp_path)
     assert done.returncode == 0, done.stderr

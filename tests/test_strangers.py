@@ -8,13 +8,19 @@ import pytest
 from tailgate import draws
 from tailgate.agents.scripted import NoAttack
 from tailgate.engine.rollouts import Rollout, rollout_of
+from tailgate.envs.faces import AdversaryVectorEnv
+from tailgate.errors import InputError
+from tailgate.metrics import METRICS, UNITS, measure
 from tailgate.scenario import load_scenario
 from tailgate.threat import ThreatModel
 from tailgate.trace import Trace, rollout
 
-from .engines import trace_as_plain
-from .strangers import Gyroscope, Nudge, Pendulum, Upright, stubborn
+from . import strangers
+from .engines import as_plain, trace_as_plain
+from .strangers import Gyroscope, Nudge, Pendulum, Scare, Upright, stubborn
 
+for _columns in (METRICS, UNITS):
+    _columns.pop("largest_lean", None)  # other tests know the built-in ones only
 THREAT = ThreatModel(kinds=("fdi",), fdi_bound=1.0, onset=20, sees_measurement=True)
 
 
@@ -53,3 +59,32 @@ def test_other_numbers_of_a_strangers_classes_are_not_traced_again(monkeypatch):
     fast = Trace(loop.model, loop.horizon, *program.play(keys, True), loop.controller.desired_gap)
     plain = rollout(loop, Nudge(gain=0.9), keys, plain=True)
     assert [fast.trace_hash(row) for row in range(5)] == [plain.trace_hash(row) for row in range(5)]
+
+
+def test_a_reward(tmp_path):
+    """It is part of the program of the environment, and its numbers are the plain loop's."""
+    arguments = {"scenario": "stop-and-go-v0", "defence": "chi2_kf", "reward": Scare(comfort=0.0)}
+    as_plain(arguments, 7, tmp_path)
+    env, usual = (AdversaryVectorEnv(4, **(arguments | {"reward": reward})) for reward in (Scare(comfort=0.0), "min_gap"))
+    assert env.engine == "traced" and env.seat.card()["reward"]["comfort"] == 0.0
+    paid = []
+    for one in (env, usual):
+        one.reset(seed=0)
+        paid.append(sum(one.step(np.full(4, 1))[1] for _ in range(60)))
+    assert (paid[0] > paid[1]).any() and (paid[0] >= paid[1]).all()
+
+
+def test_a_reward_takes_its_options_with_it():
+    with pytest.raises(InputError, match=r"error_scale: got 3\.0; expected no such option: Scare"):
+        AdversaryVectorEnv(1, reward=Scare(), error_scale=3.0)
+
+
+def test_a_metric(monkeypatch):
+    """It is a column of every trace, also of one that machine code made."""
+    monkeypatch.setitem(METRICS, "largest_lean", strangers.largest_lean)
+    loop, keys = _loop(), draws.keys("report", range(67))
+    program = rollout_of(loop, Nudge())
+    fast = Trace(loop.model, loop.horizon, *program.play(keys, True), loop.controller.desired_gap)
+    plain = rollout(loop, Nudge(), keys, plain=True)
+    assert np.array_equal(measure(fast)["largest_lean"], measure(plain)["largest_lean"])
+    assert measure(fast)["largest_lean"].max() == 1.5
