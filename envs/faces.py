@@ -271,6 +271,16 @@ class AdversaryEnv(Specified, gymnasium.Env[Array, Any]):
         self.observation_space = self.batch.single_observation_space
         self.action_space = self.batch.single_action_space
 
+    @property
+    def engine(self) -> str:
+        """Who plays: traced or plain."""
+        return self.batch.engine
+
+    @property
+    def engine_why(self) -> str:
+        """Why the plain loop plays unasked; empty where it does not."""
+        return self.batch.engine_why
+
     def card(self) -> dict[str, Any]:
         """JSON data that names this environment completely, with a hash."""
         return self.batch.card()

@@ -8,7 +8,7 @@ import pytest
 from tailgate import draws
 from tailgate.agents.scripted import NoAttack
 from tailgate.engine.rollouts import Rollout, rollout_of
-from tailgate.envs.faces import AdversaryVectorEnv
+from tailgate.envs.faces import AdversaryEnv, AdversaryVectorEnv
 from tailgate.errors import InputError
 from tailgate.metrics import METRICS, UNITS, measure
 from tailgate.scenario import load_scenario
@@ -66,7 +66,7 @@ def test_a_reward(tmp_path):
     arguments = {"scenario": "stop-and-go-v0", "defence": "chi2_kf", "reward": Scare(comfort=0.0)}
     as_plain(arguments, 7, tmp_path)
     env, usual = (AdversaryVectorEnv(4, **(arguments | {"reward": reward})) for reward in (Scare(comfort=0.0), "min_gap"))
-    assert env.engine == "traced" and env.seat.card()["reward"]["comfort"] == 0.0
+    assert env.engine == AdversaryEnv(**arguments).engine == "traced" and env.seat.card()["reward"]["comfort"] == 0.0
     paid = []
     for one in (env, usual):
         one.reset(seed=0)
