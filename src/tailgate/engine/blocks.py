@@ -93,55 +93,59 @@ def gather(e: Emitter, node: Node) -> str:
 
 def matvec(e: Emitter, node: Node) -> None:
     """A matrix that all episodes share times a vector of each, by a function: a loop over columns, or of a sparse one over its numbers."""
-    (matrix, there, tables), kind, size = node.attr, e.vector(FLOAT), 8 * e.lanes
-    (p, q), names = matrix.shape, [e.value(a) for a in node.args]
-    x, out = e.buffer(names[:q]), e.buffer(names[q:])
+    (matrix, there, tables), (p, q), room = node.attr, node.attr.nodes.shape, e.room(node)
+    x, base = e.together(node.args[:q]), node.args[q:]
+    begin = e.splat(base[0].attr) if base[0].op == "const" and all(one is base[0] for one in base) else ""
+    under = "" if begin else f", ptr {e.together(base)}"
+    key = (begin, p, q) if there is None else (begin, "sparse")
+    if key not in e.routines:
+        e.routines[key] = f"@matvec{len(e.routines)}"
+        e.texts.append((_sparse_text if there is not None else _dense_text)(e, e.routines[key], begin, p, q))
     if there is None:
-        if (p, q) not in e.routines:
-            e.routines[p, q] = f"@matvec_{p}_{q}"
-            e.texts.append(_matvec_text(e, p, q))
-        e.line(f"call fastcc void {e.routines[p, q]}(ptr {e.table(tuple(matrix.T.flat))}, ptr {x}, ptr {out})")
+        e.line(f"call fastcc void {e.routines[key]}(ptr {e.table(tuple(matrix.T.flat))}, ptr {x}, ptr {room}{under})")
     else:
-        if "sparse" not in e.routines:
-            e.routines["sparse"] = "@sparse"
-            e.texts.append(_sparse_text(e))
         held, columns, last = (e.table(part) for part in (list(matrix[there]), *tables))
-        e.line(f"call fastcc void @sparse(ptr {held}, ptr {columns}, ptr {last}, i64 {8 * p}, ptr {x}, ptr {out})")
-    for i in range(p):
-        e.names[node.id, str(i)] = e.set(f"load {kind}, ptr {e.address(out, size * i)}, align {size}")
+        e.line(f"call fastcc void {e.routines[key]}(ptr {held}, ptr {columns}, ptr {last}, i64 {8 * p}, ptr {x}, ptr {room}{under})")
+    e.names[node.id] = room
 
 
-def _matvec_text(outer: Emitter, p: int, q: int) -> str:
+def _dense_text(outer: Emitter, name: str, begin: str, p: int, q: int) -> str:
     e, kind, size = outer.fresh(), outer.vector(FLOAT), 8 * outer.lanes
     e.begin("entry")
     for first in range(0, p, ROWS):
         rows = range(first, min(first + ROWS, p))
-        begin = [e.set(f"load {kind}, ptr {e.address('%out', size * i)}, align {size}") for i in rows]
+        under = [begin or e.set(f"load {kind}, ptr {e.address('%base', size * i)}, align {size}") for i in rows]
         before, again, done = e.block, e.label("again"), e.label("done")
         e.line(f"br label %{again}")
         e.begin(again)
         k, totals = f"%k{first}", [f"%total{i}" for i in rows]
         e.line(f"{k} = phi i64 [0, %{before}], [{k}n, %{again}]")
-        for name, at_first in zip(totals, begin, strict=True):
-            e.line(f"{name} = phi {kind} [{at_first}, %{before}], [{name}n, %{again}]")
+        for total, at_first in zip(totals, under, strict=True):
+            e.line(f"{total} = phi {kind} [{at_first}, %{before}], [{total}n, %{again}]")
         held = e.set(f"load {kind}, ptr {e.address('%x', e.set(f'mul i64 {k}, {size}'))}, align {size}")
         column = e.address("%table", e.set(f"mul i64 {k}, {8 * p}"))
-        for i, name in zip(rows, totals, strict=True):
-            one = e.set(f"load double, ptr {e.address(column, 8 * i)}, align 8")
-            first_lane = e.set(f"insertelement {kind} poison, double {one}, i32 0")
-            all_lanes = e.set(f"shufflevector {kind} {first_lane}, {kind} poison, <{e.lanes} x i32> zeroinitializer")
-            e.line(f"{name}n = fadd {kind} {name}, {e.set(f'fmul {kind} {all_lanes}, {held}')}")
+        for i, total in zip(rows, totals, strict=True):
+            product = e.set(f"fmul {kind} {_shared(e, e.address(column, 8 * i))}, {held}")
+            e.line(f"{total}n = fadd {kind} {total}, {product}")
         e.line(f"{k}n = add i64 {k}, 1")
         e.line(f"br i1 {e.set(f'icmp slt i64 {k}n, {q}')}, label %{again}, label %{done}")
         e.begin(done)
-        for i, name in zip(rows, totals, strict=True):
-            e.line(f"store {kind} {name}n, ptr {e.address('%out', size * i)}, align {size}")
+        for i, total in zip(rows, totals, strict=True):
+            e.line(f"store {kind} {total}n, ptr {e.address('%out', size * i)}, align {size}")
     e.line("ret void")
-    head = f"define internal fastcc void @matvec_{p}_{q}(ptr noalias %table, ptr noalias %x, ptr noalias %out) noinline #0 {{"
-    return "\n".join([head, *e.lines, "}"])
+    given = "ptr noalias %table, ptr noalias %x, ptr noalias %out" + ("" if begin else ", ptr noalias %base")
+    return "\n".join([f"define internal fastcc void {name}({given}) noinline #0 {{", *e.lines, "}"])
 
 
-def _sparse_text(outer: Emitter) -> str:
+def _shared(e: Emitter, place: str) -> str:
+    """A number of a table, in all lanes."""
+    kind = e.vector(FLOAT)
+    one = e.set(f"load double, ptr {place}, align 8")
+    first = e.set(f"insertelement {kind} poison, double {one}, i32 0")
+    return e.set(f"shufflevector {kind} {first}, {kind} poison, <{e.lanes} x i32> zeroinitializer")
+
+
+def _sparse_text(outer: Emitter, name: str, begin: str, *_: int) -> str:
     """Rows one after the other: the places in `columns` and `last` are in bytes."""
     e, kind, size = outer.fresh(), outer.vector(FLOAT), 8 * outer.lanes
     e.begin("entry")
@@ -150,31 +154,29 @@ def _sparse_text(outer: Emitter) -> str:
     e.line("%i = phi i64 [0, %entry], [%next, %done]")
     e.line("%first = phi i64 [0, %entry], [%end, %done]")
     e.line(f"%place = mul i64 %i, {outer.lanes}")
-    target = e.address("%out", "%place")
-    e.line(f"%begin = load {kind}, ptr {target}, align {size}")
+    under = begin or e.set(f"load {kind}, ptr {e.address('%base', '%place')}, align {size}")
     e.line(f"%end = load i64, ptr {e.address('%last', '%i')}, align 8")
     e.line("br label %test")
     e.begin("test")
     e.line("%at = phi i64 [%first, %row], [%following, %entry_of_row]")
-    e.line(f"%total = phi {kind} [%begin, %row], [%sum, %entry_of_row]")
+    e.line(f"%total = phi {kind} [{under}, %row], [%sum, %entry_of_row]")
     e.line(f"br i1 {e.set('icmp slt i64 %at, %end')}, label %entry_of_row, label %done")
     e.begin("entry_of_row")
-    one = e.set(f"load double, ptr {e.address('%table', '%at')}, align 8")
     column = e.set(f"load i64, ptr {e.address('%columns', '%at')}, align 8")
     held = e.set(f"load {kind}, ptr {e.address('%x', e.set(f'mul i64 {column}, {outer.lanes}'))}, align {size}")
-    first_lane = e.set(f"insertelement {kind} poison, double {one}, i32 0")
-    all_lanes = e.set(f"shufflevector {kind} {first_lane}, {kind} poison, <{e.lanes} x i32> zeroinitializer")
-    e.line(f"%sum = fadd {kind} %total, {e.set(f'fmul {kind} {all_lanes}, {held}')}")
+    product = e.set(f"fmul {kind} {_shared(e, e.address('%table', '%at'))}, {held}")
+    e.line(f"%sum = fadd {kind} %total, {product}")
     e.line("%following = add i64 %at, 8")
     e.line("br label %test")
     e.begin("done")
-    e.line(f"store {kind} %total, ptr {target}, align {size}")
+    e.line(f"store {kind} %total, ptr {e.address('%out', '%place')}, align {size}")
     e.line("%next = add i64 %i, 8")
     e.line(f"br i1 {e.set('icmp slt i64 %next, %rows')}, label %row, label %left")
     e.begin("left")
     e.line("ret void")
     given = "ptr noalias %table, ptr noalias %columns, ptr noalias %last, i64 %rows, ptr noalias %x, ptr noalias %out"
-    return "\n".join([f"define internal fastcc void @sparse({given}) noinline #0 {{", *e.lines, "}"])
+    given += "" if begin else ", ptr noalias %base"
+    return "\n".join([f"define internal fastcc void {name}({given}) noinline #0 {{", *e.lines, "}"])
 
 
 def demand(e: Emitter, names: Sequence[str]) -> None:

@@ -106,7 +106,7 @@ def _strided(nodes: Array) -> Source | None:
     first = nodes.flat[0]
     if _fixed(nodes):
         return Source(tuple(nodes.flat), 0, steps(nodes.shape))
-    if not (_is_pick(first) and all(_is_pick(node) and node.args[0] is first.args[0] for node in nodes.flat)):
+    if not (is_pick(first) and all(is_pick(node) and node.args[0] is first.args[0] for node in nodes.flat)):
         return None
     places = np.array([node.attr for node in nodes.flat]).reshape(nodes.shape)
     strides = [int(places.take(1, i).flat[0]) - first.attr if n > 1 else 0 for i, n in enumerate(nodes.shape)]
@@ -129,8 +129,8 @@ def _pieces(nodes: Array) -> Iterator[Piece]:
 
 def _runs(nodes: Array) -> list[Array]:
     """An array in one axis, cut where its numbers come from elsewhere or their stride changes."""
-    origin = np.array([node.args[0].id if _is_pick(node) else -1 - i for i, node in enumerate(nodes)])
-    place = np.array([node.attr if _is_pick(node) else 0 for node in nodes])
+    origin = np.array([node.args[0].id if is_pick(node) else -1 - i for i, node in enumerate(nodes)])
+    place = np.array([node.attr if is_pick(node) else 0 for node in nodes])
     cuts, begin = [], 0
     for i in range(1, len(nodes)):
         if origin[i] != origin[i - 1] or (i - begin > 1 and place[i] - place[i - 1] != place[i - 1] - place[i - 2]):
@@ -139,8 +139,9 @@ def _runs(nodes: Array) -> list[Array]:
     return np.split(nodes, cuts)
 
 
-def _is_pick(node: Node) -> bool:
-    return node.op == "pick" and node.args[0].size > 0
+def is_pick(node: Node) -> bool:
+    """Is it a number of a buffer that machine code holds?"""
+    return node.op == "pick" and node.args[0].size > 0 and not node.fixed
 
 
 def _fewer(shape: list[int], sources: list[Source]) -> tuple[tuple[int, ...], list[Source]]:
@@ -164,6 +165,11 @@ def buffer_of(graph: Graph, nodes: Array) -> Node:
     return _copied(graph, nodes.ravel())
 
 
+def table_of(graph: Graph, nodes: Array) -> Node:
+    """The buffer of fixed nodes, which is fixed itself and in no machine code."""
+    return graph.packed((Piece(Source(tuple(nodes.flat), 0, (1,)), (nodes.size,)),), nodes.flat[0].dtype)
+
+
 def copied(graph: Graph, buffer: Node) -> Node:
     """A buffer of the same numbers."""
     return _copied(graph, graph.picks(buffer))
@@ -171,6 +177,8 @@ def copied(graph: Graph, buffer: Node) -> Node:
 
 def _copied(graph: Graph, nodes: Array) -> Node:
     made: Node = swept(graph, lambda node: node, nodes.shape, [nodes]).flat[0].args[0]
+    if _fixed(nodes):
+        graph.copies[made.id] = nodes
     return made
 
 
@@ -184,9 +192,11 @@ def sides(graph: Graph, nodes: Array) -> tuple[Node, Array, Array] | None:
     first = nodes.flat[0]
     if first.op == "select" and all(node.op == "select" and node.args[0] is first.args[0] for node in nodes.flat):
         held = [_map(lambda node, i=i: node.args[i], nodes) for i in (1, 2)]  # type: ignore[misc]
-    elif _is_pick(first) and first.args[0].op == "blend" and _strided(nodes) == Source(first.args[0], 0, steps(nodes.shape)):
-        held = [graph.picks(side).reshape(nodes.shape) for side in first.args[0].args[1:]] if first.args[0].size == nodes.size else []
+    elif is_pick(first) and first.args[0].op == "blend" and _strided(nodes) == Source(first.args[0], 0, steps(nodes.shape)):
         first = first.args[0]
+        held = []
+        if first.size == nodes.size:
+            held = [graph.copies.get(side.id, graph.picks(side)).reshape(nodes.shape) for side in first.args[1:]]
     else:
         return None
     return (first.args[0], *held) if any(_fixed(side) for side in held) else None

@@ -99,6 +99,7 @@ class Graph:
         self.operations = 0
         self.parameters: list[Array] = []  # by the first number of a uniform's name: see engine/parameters.py
         self.asked: tuple[dict[int, Node], dict[int, Node]] = {}, {}  # whose values code asked for, and if they are zero
+        self.copies: dict[int, Array] = {}  # of buffers that hold fixed nodes: these
         self._known: dict[Any, Node] = {}
         self._values: dict[int, Any] = {}  # of fixed nodes
         self._picks: dict[int, Array] = {}  # of buffers
@@ -230,8 +231,7 @@ class Graph:
         tables: list[list[Node]] = []
         if there is not None:  # bytes to the column of each number, and to the end of each row
             tables = [[self.const(8 * k, INT) for k in part] for part in (np.nonzero(there)[1], np.cumsum(there.sum(axis=1)))]
-        node = self._node("matvec", FLOAT, (*x, *base), Matrix(matrix, there, tables), key, False)
-        return [self.pick(node, i, FLOAT) for i in range(len(base))]
+        return list(self.picks(self._node("matvec", FLOAT, (*x, *base), Matrix(matrix, there, tables), key, False, len(base))))
 
     # -- buffers
 

@@ -64,6 +64,7 @@ class Emitter:
         self.texts: list[str] = []  # and texts
         self.rooms: list[str] = []  # on the stack
         self.places: dict[int, int] = {}  # of buffers in the large one of them
+        self.merged: set[int] = set()  # sweeps that are computed where they are read
         self.names: dict[int | tuple[int, str], str] = {}
         self.count = 0
         self.block = "entry"
@@ -117,7 +118,7 @@ class Emitter:
         """The name of a node's vector."""
         if node.op == "const":
             return self.splat(node.attr)
-        if node.op == "pick" and node.args[0].size:
+        if sweeps.is_pick(node):
             size = node.dtype.itemsize * self.lanes
             return self.from_memory(sweeps.element(self, self.value(node.args[0]), "0", size, node.attr), node.dtype, size)
         if node.id not in self.names:
@@ -191,6 +192,8 @@ class Emitter:
         return self.address(f"%array{place.array}", self.set(f"add i64 {step}, {row}"))
 
     def compute(self, node: Node) -> None:
+        if node.id in self.merged:
+            return
         if node.op in ("loop", "call", "matvec"):
             getattr(blocks, node.op)(self, node)
         elif node.op in ("sweep", "pack", "invert"):
@@ -209,14 +212,16 @@ class Emitter:
         else:
             self.names[node.id] = self.input(node) if node.op == "input" else operation(self, node)
 
-    def buffer(self, names: Sequence[str]) -> str:
-        """Room for vectors one behind the other, which hold these."""
-        kind, size = self.vector(FLOAT), 8 * self.lanes
+    def together(self, nodes: Sequence[Node]) -> str:
+        """The address of vectors one behind the other: where they stand, or room on the stack that they are written to."""
+        kind, size, first = self.vector(FLOAT), 8 * self.lanes, nodes[0]
+        if all(sweeps.is_pick(node) and node.args == first.args and node.attr == first.attr + i for i, node in enumerate(nodes)):
+            return sweeps.element(self, self.value(first.args[0]), "0", size, first.attr)
         self.count += 1
         room = f"%room{self.count}"
-        self.rooms.append(f"  {room} = alloca [{len(names)} x {kind}], align {size}")
-        for i, name in enumerate(names):
-            self.line(f"store {kind} {name}, ptr {self.address(room, size * i)}, align {size}")
+        self.rooms.append(f"  {room} = alloca [{len(nodes)} x {kind}], align {size}")
+        for i, node in enumerate(nodes):
+            self.line(f"store {kind} {self.value(node)}, ptr {self.address(room, size * i)}, align {size}")
         return room
 
     # -- order
@@ -355,7 +360,8 @@ def _step(e: Emitter, least: int) -> tuple[list[Item], int]:
     layout = e.layout
     outputs = [node for node, _ in layout.outputs]
     items = schedule(outputs, least)
-    e.places, room = sweeps.rooms(items, outputs, e.lanes)
+    e.merged = sweeps.merged(items, outputs)
+    e.places, room = sweeps.rooms(items, outputs, e.lanes, e.merged)
     here = {item.id: turn for turn, item in enumerate(items) if not isinstance(item, Branch)}
     here |= {node.id: turn for turn, item in enumerate(items) if isinstance(item, Branch) for node in item.decides}
     late = {place.offset for i, place in layout.inputs.items() if isinstance(place, Held) and i not in here}  # read in a branch, or never

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from tailgate.engine.array import Traced, boxed, lifted
-from tailgate.engine.buffers import buffer_of, sides, swept, wide
+from tailgate.engine.buffers import buffer_of, sides, swept, table_of, wide
 from tailgate.engine.compiled import shaped
 from tailgate.engine.functions import gathered
 from tailgate.engine.loops import until
@@ -110,6 +110,9 @@ def product(x: Any, y: Any) -> Any:
     """x (..., i, k) times y (..., k, j): sums begin with their first product."""
     if _large(_size(x, y), x, y):
         lead = np.broadcast_shapes(x.shape[:-2], y.shape[:-2])
+        if math.prod(lead) == 1:  # in one place of the code among many: a loop over its numbers is the shortest
+            turned = np.swapaxes(y, -1, -2)[..., None, :, :]
+            return _over(lambda row, column: _dot(row, column), (*lead, x.shape[-2], y.shape[-1]), x[..., None, :], turned)
         if x.shape[-2] * y.shape[-2] * y.shape[-1] <= STRAIGHT:
             return _over(product, lead, x, y)
         return _over(lambda row, y: product(row[None], y)[0], (*lead, x.shape[-2]), x, y[..., None, :, :])
@@ -130,8 +133,9 @@ def inverse(s: Any) -> Any:
     if isinstance(s, Traced) and any(sides(s.graph, one) for one in s.nodes.reshape(-1, q, q)):
         parts = [_inverse_by_side(Traced(s.graph, one, FLOAT)) for one in s.nodes.reshape(-1, q, q)]
         return Traced(s.graph, np.stack([part.nodes for part in parts]).reshape(s.shape), FLOAT, s.batch)
-    if _large(s.size, s):
-        return Traced(s.graph, s.graph.picks(s.graph.inverses(buffer_of(s.graph, s.nodes), q)).reshape(s.shape), FLOAT, s.batch)
+    if isinstance(s, Traced) and (s.fixed or _large(s.size, s)):
+        held = table_of(s.graph, s.nodes) if s.fixed else buffer_of(s.graph, s.nodes)
+        return Traced(s.graph, s.graph.picks(s.graph.inverses(held, q)).reshape(s.shape), FLOAT, s.batch)
     out = s.copy()
     for p in range(q):
         scale = 1.0 / out[..., p, p]

@@ -139,9 +139,11 @@ class _Path:
 def _cost(node: Node) -> int:
     if node.op == "sweep":
         return node.size // max(1, len(node.attr.after)) * (2 + len(node.attr.nodes))
+    if node.op == "matvec":
+        return 2 * int(node.attr.nodes.size)
     if node.size:
         return node.size * (node.attr if node.op == "invert" else 1)
-    return int(node.attr.cost) if node.op == "call" else 2 * node.attr.nodes.size if node.op == "matvec" else _COST.get(node.op, 1)
+    return int(node.attr.cost) if node.op == "call" else _COST.get(node.op, 1)
 
 
 def _levels(nodes: Sequence[Node], choices: list[Node]) -> list[list[Node]]:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from tailgate.engine.buffers import is_pick as is_pick
 from tailgate.engine.buffers import steps
 from tailgate.engine.graph import Node, Source, Sweep
 from tailgate.engine.operations import FLOAT
@@ -20,6 +21,8 @@ if TYPE_CHECKING:
 ROOM = 64_000_000  # bytes
 LINE = 64  # bytes of a line of the cache
 CHUNK = 16  # numbers of a row that are kept in registers
+MERGED = 3  # readers of a buffer that had rather be no buffer
+LIGHT, HEAVY = 4, 100  # operations of a sweep that is merged into several, or into one
 
 
 @contextlib.contextmanager
@@ -62,23 +65,92 @@ def sweep(e: Emitter, node: Node) -> None:
     """Its body, in a loop for each axis."""
     body: Sweep = node.attr
     size = node.dtype.itemsize * e.lanes
-    for fixed in {a.id: a for inner in (*body.nodes, *body.after) for a in (*inner.args, inner) if a.fixed}.values():
-        e.value(fixed)
-    tables = {id(s.held): e.table(s.held) for s in body.sources if isinstance(s.held, tuple)}
+    tables: dict[int, str] = {}
+    _prepare(e, body, tables)
     room, outer = e.room(node), dict(e.names)
     with contextlib.ExitStack() as loops:
         numbers = [loops.enter_context(counted(e, n)) for n in body.shape]
-        at: dict[Any, str] = {}
-        for one, source in zip(body.carried, body.sources, strict=True):
-            if source.strides not in at:
-                at[source.strides] = _index(e, numbers, source.strides)
-            e.names[one.id] = _read(e, source, at[source.strides], one, tables.get(id(source.held), ""))
-        e.emit(rounds(body), {})
+        _round(e, body, numbers, tables, {})
         base = element(e, room, _index(e, numbers, steps((*body.shape, len(body.after)))[:-1]), size)
         for i, result in enumerate(body.after):
             e.to_memory(e.address(base, i * size) if i else base, node.dtype, e.value(result), size)
     e.names = outer
     e.names[node.id] = room
+
+
+def _prepare(e: Emitter, body: Sweep, tables: dict[int, str]) -> None:
+    """Names for what no round changes."""
+    for fixed in {a.id: a for inner in (*body.nodes, *body.after) for a in (*inner.args, inner) if a.fixed}.values():
+        e.value(fixed)
+    for source in body.sources:
+        if isinstance(source.held, tuple):
+            tables[id(source.held)] = e.table(source.held)
+        elif source.held.id in e.merged:
+            _prepare(e, source.held.attr, tables)
+
+
+def _round(e: Emitter, body: Sweep, numbers: Sequence[str], tables: dict[int, str], made: dict[Any, str]) -> None:
+    """One round of a sweep, with what is merged into it."""
+    at: dict[Any, str] = {}
+    found: dict[int, str] = {}
+    for one, source in zip(body.carried, body.sources, strict=True):
+        if source.strides not in at:
+            at[source.strides] = _index(e, numbers, source.strides)
+        index = at[source.strides]
+        if isinstance(source.held, tuple) or source.held.id not in e.merged:
+            found[one.id] = _read(e, source, index, one, tables.get(id(source.held), ""))
+            continue
+        inner: Sweep = source.held.attr
+        key = source.held.id, index, source.offset
+        if key not in made:
+            place = numbers
+            if not _alike(inner, body, source):
+                place = [index if not source.offset else e.set(f"add i64 {index}, {source.offset}")]
+            _round(e, inner, place, tables, made)
+            made[key] = e.value(inner.after[0])
+        found[one.id] = made[key]
+    e.names.update(found)
+    e.emit(rounds(body), {})
+
+
+def _alike(inner: Sweep, outer: Sweep, source: Source) -> bool:
+    """Does each round of a sweep read what the same round of the other made?"""
+    return inner.shape == outer.shape and source.offset == 0 and source.strides == steps(inner.shape)
+
+
+def merged(items: Sequence[Item], kept: Iterable[Node]) -> set[int]:
+    """Sweeps that need no buffer: those that read them compute their numbers where they need them."""
+    uses: dict[int, int] = {}
+    sizes: dict[int, int] = {}
+
+    def used(node: Node, times: int) -> None:
+        uses[node.id] = uses.get(node.id, 0) + times
+
+    nodes = {node.id: node for item in items for node in _of(item)}
+    for node in (*kept, *(after for node in nodes.values() if node.op in ("loop", "sweep") for after in node.attr.after)):
+        used(node.args[0] if is_pick(node) else node, MERGED + 1)
+    for node in nodes.values():
+        for a in node.args:
+            if a.size and node.op not in ("sweep", "pick"):
+                used(a, MERGED + 1)
+            elif is_pick(a):
+                used(a.args[0], MERGED + 1)
+        if node.op == "sweep":
+            for source in node.attr.sources:
+                if isinstance(source.held, Node) and source.held.op == "sweep":
+                    inner: Sweep = source.held.attr
+                    once = all(stride or n == 1 for stride, n in zip(source.strides, node.attr.shape, strict=True))
+                    fits = len(inner.after) == 1 and (len(inner.shape) == 1 or _alike(inner, node.attr, source))
+                    used(source.held, 1 if once and fits else MERGED + 1)
+    out = set()
+    for i, node in sorted(nodes.items()):
+        if node.op == "sweep" and 0 < uses.get(i, 0) <= MERGED:
+            sizes[i] = len(node.attr.nodes) + sum(sizes.get(a.id, 0) for a in node.args)
+            if sizes[i] <= (LIGHT if uses[i] > 1 else HEAVY):
+                out.add(i)
+            else:
+                sizes[i] = 0
+    return out
 
 
 def pack(e: Emitter, node: Node) -> None:
@@ -192,8 +264,11 @@ def fetch(e: Emitter, stride: int) -> None:
 # -- rooms
 
 
-def rooms(items: Sequence[Item], kept: Iterable[Node], lanes: int) -> tuple[dict[int, int], int]:
-    """Where each buffer stands in the room of a function [bytes], and its size: a place is free again behind the last that reads it."""
+def rooms(items: Sequence[Item], kept: Iterable[Node], lanes: int, none: Collection[int] = ()) -> tuple[dict[int, int], int]:
+    """Where each buffer stands in the room of a function [bytes], and its size: a place is free again behind the last that reads it.
+
+    Those in `none` have no room.
+    """
     turn: dict[int, int] = {}
     nodes: dict[int, Node] = {}
     for i, item in enumerate(items):
@@ -204,7 +279,7 @@ def rooms(items: Sequence[Item], kept: Iterable[Node], lanes: int) -> tuple[dict
         if node.id in last:
             last[node.id] = len(items)
     for node in sorted(nodes.values(), key=lambda node: -node.id):
-        through = node.op in ("pick", "blend")  # what reads a buffer later on
+        through = node.op in ("pick", "blend") or node.id in none  # what reads a buffer later on
         until = last[node.id] if through else turn[node.id]
         for a in node.args:
             if a.id in last:
@@ -212,7 +287,7 @@ def rooms(items: Sequence[Item], kept: Iterable[Node], lanes: int) -> tuple[dict
     out: dict[int, int] = {}
     busy: list[tuple[int, int, int]] = []  # begin, end, last
     total = 0
-    for node in sorted((n for n in nodes.values() if n.size and n.op != "held"), key=lambda node: turn[node.id]):
+    for node in sorted((n for n in nodes.values() if n.size and n.op != "held" and n.id not in none), key=lambda node: turn[node.id]):
         size, at = -(-node.size * node.dtype.itemsize * lanes // 64) * 64, 0
         busy = [one for one in busy if one[2] >= turn[node.id]]
         for begin, end, _ in sorted(busy):
@@ -235,5 +310,5 @@ def _of(item: Item) -> Iterator[Node]:
             yield from _of(inner)
     else:
         yield item
-        if item.op == "loop":
+        if item.op in ("loop", "sweep"):
             yield from item.attr.nodes
