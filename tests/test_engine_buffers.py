@@ -79,6 +79,15 @@ def fused(s: Row) -> Any:
     return spread + mean[..., None]
 
 
+def turned(x: Any) -> Any:
+    """Numbers that are read at other places than they are made."""
+    return np.swapaxes(x, -1, -2) + x[..., ::-1] * x[:, ::-1]
+
+
+def many(x: Any) -> Any:
+    return (x + 1.0) * (x - 1.0) * (x + 2.0) * (x - 2.0) * (x + 3.0)
+
+
 CASES: dict[str, Callable[[Row], Any]] = {
     "elementwise": lambda s: (s["P"] * 2 - s["Z"]) / (1.0 + s["Z"] * s["Z"]) + np.sqrt(np.abs(s["P"])),
     "broadcast": lambda s: s["P"] * s["w"][..., None, None] + s["x"][..., None] * s["x"][..., None, :],
@@ -105,6 +114,8 @@ CASES: dict[str, Callable[[Row], Any]] = {
     "rare": rare,
     "both sides": both,
     "steady": steady,
+    "read in other places": lambda s: turned(s["P"] * 2.0 - s["Z"]),
+    "read by many": lambda s: many(s["P"] * 2.0),
 }  # fmt: skip
 
 
@@ -176,3 +187,12 @@ def test_what_is_too_large_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     large = {"x": np.zeros((1, 10_000))}
     with pytest.raises(Untraceable, match="use smaller ones"):
         Program(traced(lambda held, _: ({"x": held["x"] * 2.0 + 1.0}, {}), large, {}), 8)
+
+
+def test_a_number_that_is_read_once_is_never_in_memory() -> None:
+    """Of a chain of elementwise operations only the result has room."""
+    given = state(1)
+    trace = traced(lambda held, _: (held, {"out": np.sqrt(np.abs((held["P"] + 1.0) * 2.0 - held["Z"])) + 3.0}), given, {})
+    assert sum(node.op == "sweep" for node in trace.graph.nodes) > 4
+    program = Program(trace, 4)
+    assert program.room == -(-given["P"].size * 8 * 4 // 64) * 64

@@ -302,9 +302,10 @@ def lifted(graph: Graph, x: Any, like: np.dtype[Any] | None = None) -> Traced:
     held = np.asarray(x, like if weak and like is not None else None)
     if held.dtype == object:
         raise Untraceable(f"an array of {type(held.flat[0]).__name__ if held.size else 'objects'}", "use numbers")
-    nodes = np.empty(held.shape, object)
+    nodes, made = np.empty(held.shape, object), dict[bytes, Node]()
     for i, value in enumerate(held.flat):
-        nodes.flat[i] = graph.const(value, held.dtype)
+        key = value.tobytes()
+        nodes.flat[i] = made[key] = made.get(key) or graph.const(value, held.dtype)
     return Traced(graph, nodes, held.dtype, None, weak)
 
 

@@ -11,7 +11,7 @@ from tailgate.engine.operations import BOOL, FLOAT
 from tailgate.engine.passes import rounds, schedule
 
 if TYPE_CHECKING:
-    from tailgate.engine.llvm import Emitter
+    from tailgate.engine.llvm import Column, Emitter
 
 ROWS = 10  # of a matrix that are summed at once
 
@@ -187,3 +187,33 @@ def demand(e: Emitter, names: Sequence[str]) -> None:
     bad = e.any_lane(e.set(f"xor <{e.lanes} x i1> {held}, splat (i1 true)"))
     before, now = e.set("load i64, ptr %broken, align 8"), e.set(f"zext i1 {bad} to i64")
     e.line(f"store i64 {e.set(f'or i64 {before}, {now}')}, ptr %broken, align 8")
+
+
+def store_columns(e: Emitter, nodes: Sequence[Node], place: Column) -> None:
+    """Several columns of one array, as whole rows."""
+    dtype, lanes, stored = nodes[0].dtype, e.lanes, e.stored(nodes[0].dtype)
+    base = e.row(place, dtype)
+    for begin in range(0, len(nodes), lanes):
+        names = [e.value(node) for node in nodes[begin : begin + lanes]]
+        if dtype == BOOL:
+            names = [e.set(f"zext <{lanes} x i1> {name} to {stored}") for name in names]
+        for lane, name in enumerate(turned(e, names + ["poison"] * (lanes - len(names)), stored)):
+            there = e.address(base, (lane * place.columns + place.column + begin) * dtype.itemsize)
+            kind = f"<{len(names)} x {stored.split(' x ')[1]}"
+            if len(names) < lanes:
+                chosen = ", ".join(f"i32 {i}" for i in range(len(names)))
+                name = e.set(f"shufflevector {stored} {name}, {stored} poison, <{len(names)} x i32> <{chosen}>")
+            e.line(f"store {kind} {name}, ptr {there}, align {dtype.itemsize}")
+
+
+def turned(e: Emitter, rows: list[str], kind: str) -> list[str]:
+    """As many vectors as there are lanes, transposed."""
+    n, half = e.lanes, e.lanes // 2
+    low = ", ".join(f"i32 {i + side * n}" for i in range(half) for side in (0, 1))
+    high = ", ".join(f"i32 {half + i + side * n}" for i in range(half) for side in (0, 1))
+    for _ in range(n.bit_length() - 1):
+        pairs = [(rows[i], rows[i + half]) for i in range(half)]
+        rows = [
+            e.set(f"shufflevector {kind} {a}, {kind} {b}, <{n} x i32> <{mask}>") for a, b in pairs for mask in (low, high)
+        ]  # fmt: skip
+    return rows

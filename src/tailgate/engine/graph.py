@@ -108,8 +108,10 @@ class Graph:
 
     def const(self, value: Any, dtype: np.dtype[Any]) -> Node:
         """A constant. Its sign counts, where it is zero."""
-        with np.errstate(all="ignore"):
-            held = converted(np.asarray(value), dtype)[()]
+        held = value
+        if not (isinstance(value, np.generic) and value.dtype == dtype):
+            with np.errstate(all="ignore"):
+                held = converted(np.asarray(value), dtype)[()]
         return self._node("const", dtype, (), held, held.tobytes(), True)
 
     def input(self, name: Any, dtype: np.dtype[Any]) -> Node:

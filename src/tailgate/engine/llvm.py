@@ -51,6 +51,7 @@ class Layout:
     demands: list[Node] = field(default_factory=list)  # what has to hold
     uniforms: dict[int, int] = field(default_factory=dict)  # node -> its slot
     slots: list[Node] = field(default_factory=list)  # what the table of numbers that all episodes share holds
+    tables: dict[tuple[int, ...], int] = field(default_factory=dict)  # several nodes one behind the other -> the slot of the first
 
 
 class Emitter:
@@ -132,9 +133,11 @@ class Emitter:
 
     def table(self, nodes: Sequence[Node]) -> str:
         """The address of numbers that all episodes share, one behind the other."""
-        out = self.address("%uniforms", 8 * len(self.layout.slots))
-        self.layout.slots.extend(nodes)
-        return out
+        key = tuple(node.id for node in nodes)
+        if key not in self.layout.tables:
+            self.layout.tables[key] = len(self.layout.slots)
+            self.layout.slots.extend(nodes)
+        return self.address("%uniforms", 8 * self.layout.tables[key])
 
     def room(self, node: Node) -> str:
         """The address of a buffer."""
@@ -277,34 +280,6 @@ class Emitter:
         else:
             self.to_memory(self.row(place, node.dtype), node.dtype, self.value(node), node.dtype.itemsize)
 
-    def store_columns(self, nodes: Sequence[Node], place: Column) -> None:
-        """Several columns of one array, as whole rows."""
-        dtype, lanes, stored = nodes[0].dtype, self.lanes, self.stored(nodes[0].dtype)
-        base = self.row(place, dtype)
-        for begin in range(0, len(nodes), lanes):
-            names = [self.value(node) for node in nodes[begin : begin + lanes]]
-            if dtype == BOOL:
-                names = [self.set(f"zext <{lanes} x i1> {name} to {stored}") for name in names]
-            for lane, name in enumerate(self.turned(names + ["poison"] * (lanes - len(names)), stored)):
-                there = self.address(base, (lane * place.columns + place.column + begin) * dtype.itemsize)
-                kind = f"<{len(names)} x {stored.split(' x ')[1]}"
-                if len(names) < lanes:
-                    chosen = ", ".join(f"i32 {i}" for i in range(len(names)))
-                    name = self.set(f"shufflevector {stored} {name}, {stored} poison, <{len(names)} x i32> <{chosen}>")
-                self.line(f"store {kind} {name}, ptr {there}, align {dtype.itemsize}")
-
-    def turned(self, rows: list[str], kind: str) -> list[str]:
-        """As many vectors as there are lanes, transposed."""
-        n, half = self.lanes, self.lanes // 2
-        low = ", ".join(f"i32 {i + side * n}" for i in range(half) for side in (0, 1))
-        high = ", ".join(f"i32 {half + i + side * n}" for i in range(half) for side in (0, 1))
-        for _ in range(n.bit_length() - 1):
-            pairs = [(rows[i], rows[i + half]) for i in range(half)]
-            rows = [
-                self.set(f"shufflevector {kind} {a}, {kind} {b}, <{n} x i32> <{mask}>") for a, b in pairs for mask in (low, high)
-            ]  # fmt: skip
-        return rows
-
 
 def text_of(layout: Layout, arrays: int, lanes: int, least: int) -> tuple[str, dict[str, int], int]:
     """LLVM's text of `step`, how many nodes and branches it has, and the bytes of its room."""
@@ -384,7 +359,7 @@ def _step(e: Emitter, least: int) -> tuple[list[Item], int]:
         e.store(node, place)
     for several in rows.values():
         several.sort(key=lambda pair: pair[0].column)
-        e.store_columns([node for _, node in several], several[0][0])
+        blocks.store_columns(e, [node for _, node in several], several[0][0])
     if layout.demands:
         blocks.demand(e, [e.value(node) for node in layout.demands])
     for node, place in large:

@@ -92,7 +92,7 @@ def _prepare(e: Emitter, body: Sweep, tables: dict[int, str]) -> None:
 def _round(e: Emitter, body: Sweep, numbers: Sequence[str], tables: dict[int, str], made: dict[Any, str]) -> None:
     """One round of a sweep, with what is merged into it."""
     at: dict[Any, str] = {}
-    found: dict[int, str] = {}
+    found: dict[int | tuple[int, str], str] = {}
     for one, source in zip(body.carried, body.sources, strict=True):
         if source.strides not in at:
             at[source.strides] = _index(e, numbers, source.strides)
@@ -127,7 +127,8 @@ def merged(items: Sequence[Item], kept: Iterable[Node]) -> set[int]:
         uses[node.id] = uses.get(node.id, 0) + times
 
     nodes = {node.id: node for item in items for node in _of(item)}
-    for node in (*kept, *(after for node in nodes.values() if node.op in ("loop", "sweep") for after in node.attr.after)):
+    results = [after for node in nodes.values() if node.op in ("loop", "sweep") for after in node.attr.after]
+    for node in (*kept, *results):
         used(node.args[0] if is_pick(node) else node, MERGED + 1)
     for node in nodes.values():
         for a in node.args:
