@@ -22,14 +22,13 @@ SUITES = [load_suite(name) for name in NAMES]
 SCENARIOS = sorted({name for suite in SUITES for name in suite.scenarios})
 REASONS = {  # of what is played plain
     "filterpy": "it plays one episode after the other",
-    "norm_resilient": "Jacobi's rotations",
     "highway": "highway.py",  # somebody else's simulator, episode by episode
 }
 KEYS = draws.keys("report", range(6))
 
 
 def reason(scenario: str, defence: str) -> str:
-    if defence == "centralised_lasso" and ("network" in scenario or scenario == "thesis-ch5-v0"):
+    if defence == "centralised_lasso" and scenario in ("network-restless-v0", "thesis-ch5-v0"):
         return "operations"  # pivoting of 30 and 140 sensors
     return next((why for name, why in REASONS.items() if scenario.startswith(name) or defence.startswith(name)), "")
 
