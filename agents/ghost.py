@@ -74,5 +74,5 @@ class GhostState(Script):
     def command(self, plan: ScriptPlan, on: Array, count: Array, view: View, draws: Draws) -> Command:
         ghost: Ghost = plan.extra
         on = on & (count < len(ghost.value))
-        value = ghost.value[np.minimum(count, len(ghost.value) - 1)]
+        value = num.take(ghost.value, np.minimum(count, len(ghost.value) - 1))
         return plan.brief.command(on, Kind.FDI, plan.target, value)

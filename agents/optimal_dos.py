@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from tailgate import num
 from tailgate.core import Array, Command, Kind, Model, Positive, View, param
 from tailgate.draws import Draws
 from tailgate.errors import NotApplicable
@@ -57,4 +58,4 @@ class OptimalDos(Script):
         return np.asarray(system.updated(steady_state(model), np.ones_like(system.lost))[0])
 
     def command(self, plan: ScriptPlan, on: Array, count: Array, view: View, draws: Draws) -> Command:
-        return plan.brief.command(on & plan.extra[view.k - 1], Kind.DROPOUT, plan.target, 0.0)
+        return plan.brief.command(on & num.take(plan.extra, view.k - 1), Kind.DROPOUT, plan.target, 0.0)

@@ -34,12 +34,13 @@ def reason(scenario: str, defence: str) -> str:
 
 
 def seated(scenario: str, defence: str, threat: dict[str, Any]) -> Seat:
+    value = -min(4.0, load_scenario(scenario).with_threat(**threat).threat_model.fdi_bound)
     try:
-        return Seat.make(scenario, defence, threat)
+        return Seat.make(scenario, defence, threat, value=value)
     except InputError as error:
         if "nobody drives" not in str(error):
             raise
-        return Seat.make(scenario, defence, threat, reward="error")
+        return Seat.make(scenario, defence, threat, value=value, reward="error")
 
 
 @pytest.mark.long

@@ -39,10 +39,10 @@ def _body(graph: Graph) -> Iterator[None]:
         _inside.remove(graph)
 
 
-def swept(graph: Graph, function: Callable[..., Any], lead: Sequence[int], arrays: Sequence[Array]) -> Array:
+def swept(graph: Graph, function: Callable[..., Any], lead: Sequence[int], arrays: Sequence[Array], nested: bool = False) -> Array:
     """A function of the trailing axes of arrays of nodes, for each index of their first axes, which broadcast to `lead`.
 
-    It gets arrays of nodes, or a node where no axis is left, and gives such; -> (*lead, ...).
+    It gets arrays of nodes, or a node where no axis is left, and gives such; -> (*lead, ...). `nested`: it may make buffers of its own.
     """
     n = len(lead)
     held = [a[(None,) * (n - a.ndim)] if a.ndim < n else a for a in arrays]
@@ -65,7 +65,7 @@ def swept(graph: Graph, function: Callable[..., Any], lead: Sequence[int], array
             carried.append(new)
             sources.append(Source(source.held, at, tuple(source.strides[i] if nodes.shape[i] > 1 else 0 for i in kept)))
         given.append(those if rest else those.item())
-    with _body(graph):
+    with contextlib.nullcontext() if nested else _body(graph):
         result = function(*given)
     made = result if isinstance(result, np.ndarray) else _boxed(result)
     shape, sources = _fewer([lead[i] for i in kept], sources)

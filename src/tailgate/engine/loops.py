@@ -74,7 +74,7 @@ def chosen_apart(mask: Any, x: Any, function: Callable[..., Any], arrays: Sequen
         given = [Traced(graph, np.reshape(part, (1, 1, *np.shape(part))), a.dtype, 0) for part, a in zip(nodes, held, strict=True)]
         return one(*given).nodes[0, 0]
 
-    return Traced(graph, swept(graph, body, (1, agents), [a.nodes for a in held]), held[1].dtype, 0)
+    return Traced(graph, swept(graph, body, (1, agents), [a.nodes for a in held], nested=True), held[1].dtype, 0)
 
 
 def _wide(mask: Any, like: Any) -> Any:

@@ -127,6 +127,7 @@ def merged(items: Sequence[Item], kept: Iterable[Node]) -> set[int]:
         uses[node.id] = uses.get(node.id, 0) + times
 
     nodes = {node.id: node for item in items for node in _of(item)}
+    within = {inner.id: node.id for node in nodes.values() if node.op in ("loop", "sweep") for inner in node.attr.nodes}
     results = [after for node in nodes.values() if node.op in ("loop", "sweep") for after in node.attr.after]
     for node in (*kept, *results):
         used(node.args[0] if is_pick(node) else node, MERGED + 1)
@@ -141,6 +142,7 @@ def merged(items: Sequence[Item], kept: Iterable[Node]) -> set[int]:
                 if isinstance(source.held, Node) and source.held.op == "sweep":
                     inner: Sweep = source.held.attr
                     once = all(stride or n == 1 for stride, n in zip(source.strides, node.attr.shape, strict=True))
+                    once = once and within.get(source.held.id) == within.get(node.id)
                     fits = len(inner.after) == 1 and (len(inner.shape) == 1 or _alike(inner, node.attr, source))
                     used(source.held, 1 if once and fits else MERGED + 1)
     out = set()
@@ -312,4 +314,5 @@ def _of(item: Item) -> Iterator[Node]:
     else:
         yield item
         if item.op in ("loop", "sweep"):
-            yield from item.attr.nodes
+            for inner in item.attr.nodes:
+                yield from _of(inner)
