@@ -35,7 +35,7 @@ from .fmcw import LIGHT, Link
 
 _SPLIT = 4  # a window of root-MUSIC is the fourth part of the samples: of 1/16 to 1/4 the one with the least variance and threshold
 _ROWS = 16  # sweeps at once, so that a large batch takes no more memory than a small one
-_POWERS, _ROOT_STEPS = 500, 50  # at most
+_STEPS, _ROOT_STEPS = 500, 50  # at most, of the power iteration and of Cauchy's method
 _STILL = 1e-13  # a row whose step is shorter has arrived, and changes no more
 _TURN = 2.0 * math.pi
 
@@ -95,7 +95,7 @@ def _chirp(link: Link, d: Array, dv: Array, late: Array, side: Array) -> Array:
 
 @np.errstate(all="ignore")
 def _frequency(x: Array) -> Array:
-    """(R,) root-MUSIC's frequency of the tone in x (R, 2, M), in cycles per sample. Large tables are of one row, as a cache holds."""
+    """(R,) root-MUSIC's frequency of the tone in x (R, 2, M), in cycles per sample; large tables are made row by row, for the cache."""
     m = 2 * (x.shape[-1] // (2 * _SPLIT))  # an even number
     u = _first_eigenvector(np.stack([_covariance(row, m) for row in x]))
     start = np.array([_deepest(row) for row in u])
@@ -166,7 +166,7 @@ def _powers(c: Array, level: Array, u: Array) -> Any:
         new = np.where(length > 0.0, w / length, u)
         return ~(np.max(np.abs(new - u), axis=1) < _STILL), [new]
 
-    return num.until(step, [u], np.ones(len(c), bool), _POWERS)[0]
+    return num.until(step, [u], np.ones(len(c), bool), _STEPS)[0]
 
 
 def _deepest(u: Array) -> float:
