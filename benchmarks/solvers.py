@@ -85,7 +85,7 @@ def main() -> None:
         record = {
             "figures": figures, "repeats": options.repeats, "version": tailgate.__version__, "machine": platform.machine(),
             "cores": os.cpu_count(), "load": [round(x, 2) for x in os.getloadavg()], "python": platform.python_version(),
-            "packages": {p: version(p) for p in ("numpy", "numba", "cvxpy", "clarabel")},
+            "packages": {p: version(p) for p in ("numpy", "llvmlite", "cvxpy", "clarabel")},
         }  # fmt: skip
         options.out.parent.mkdir(parents=True, exist_ok=True)
         options.out.write_text(json.dumps(record, indent=1) + "\n")

@@ -13,22 +13,31 @@ and the frequency is the angle of the root of D next to the unit circle. R is ce
 real one (Pesavento, Gershman and Haardt 2000): s is found there by power iteration. The root is found from the deepest point of D on the
 circle by Cauchy's method, which solves a quadratic in each step and so meets the pair of roots z, 1/z^c of a strong tone.
 
-Compiled, one row after the other in fixed order: a row's result does not depend on its companions. Sines are the mathematical library's,
-so that other machines may differ in the last bits.
+Sums run in an order that the number of rows does not change, and sines are the engine's. So a row's result depends neither on its
+companions nor on the machine's mathematical library.
 """
 
 import math
+from collections.abc import Iterator
+from functools import lru_cache
+from itertools import pairwise
+from typing import Any
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
+from tailgate import num
 from tailgate.core import Array
-from tailgate.jit import jit
+from tailgate.engine.compiled import shaped
+from tailgate.engine.elementary import sincos_turn
 
 from .fmcw import LIGHT, Link
 
 _SPLIT = 4  # a window of root-MUSIC is the fourth part of the samples: of 1/16 to 1/4 the one with the least variance and threshold
+_ROWS = 16  # sweeps at once, so that a large batch takes no more memory than a small one
+_STEPS, _ROOT_STEPS = 500, 50  # at most, of the power iteration and of Cauchy's method
+_STILL = 1e-13  # a row whose step is shorter has arrived, and changes no more
 _TURN = 2.0 * math.pi
-_jit = jit(cache=True)
 
 
 def read(link: Link, d: Array, dv: Array, late: Array, snr: Array, noise: Array, normals: Array) -> tuple[Array, Array]:
@@ -39,10 +48,15 @@ def read(link: Link, d: Array, dv: Array, late: Array, snr: Array, noise: Array,
     From the middle of one sweep to that of the other the target moves by dv Ts, which (3.8) reads as a speed of -dv Bs lam/(2 c): the
     receiver takes that out.
     """
-    half = 0.5 * link.sweep_time
-    up = _beats(link, d - half * dv, dv, late, snr, noise, normals[:, :, 0], 1.0)
-    down = _beats(link, d + half * dv, dv, late, snr, noise, normals[:, :, 1], -1.0)
-    distance, speed = link.range_speed(up, down)
+    beats, low, sides = np.empty((*d.shape, 2)), link.lowest / link.bandwidth, np.array([1.0, -1.0])
+    for part in _parts(beats.size):
+        *row, sweep = np.unravel_index(part, beats.shape)
+        at, side = tuple(row), sides[sweep]
+        echo = _chirp(link, d[at] - 0.5 * side * link.sweep_time * dv[at], dv[at], late[at], side)
+        x = np.sqrt(snr[at])[:, None, None] * echo + np.sqrt(0.5 * noise[at])[:, None, None] * np.swapaxes(normals[(*at, sweep)], 1, 2)
+        f = _frequency(x)
+        beats[(*at, sweep)] = link.bandwidth * (f - np.floor(f - low))  # within the receiver's band
+    distance, speed = link.range_speed(beats[..., 0], beats[..., 1])
     return distance, speed / (1.0 - link.sweep * link.wavelength / (2.0 * LIGHT))
 
 
@@ -51,147 +65,173 @@ def samples(link: Link, d: float, dv: float, late: float = 0.0, side: float = 1.
 
     d [m] is the distance in the middle of the sweep, dv [m/s] its rate, `late` [m] the attacker's extra time of flight as range.
     """
-    out = np.empty((link.samples, 2))
-    _chirp(d, dv, late, side, LIGHT / link.wavelength, link.slope, link.bandwidth, out)
-    return np.asarray(out[:, 0] + 1j * out[:, 1])
+    re, im = _chirp(link, *(np.array([v]) for v in (d, dv, late, side)))[0]
+    return _complex(re, im)
 
 
 def root_music(x: Array) -> Array:
     """(...) frequency of the tone in x (..., M) complex, in cycles per sample, in [-1/2, 1/2)."""
-    pairs = np.stack([x.real, x.imag], axis=-1).reshape(-1, x.shape[-1], 2)
-    return np.asarray(np.array([_frequency(row, _window(x.shape[-1])) for row in pairs]).reshape(x.shape[:-1]))
+    rows = x.reshape(-1, x.shape[-1])
+    out = np.empty(len(rows))
+    for part in _parts(len(rows)):
+        out[part] = _frequency(np.stack([rows[part].real, rows[part].imag], axis=1))
+    return out.reshape(x.shape[:-1])
 
 
-def _window(count: int) -> int:
-    """An even number of samples."""
-    return 2 * (count // (2 * _SPLIT))
+def _parts(rows: int) -> Iterator[Array]:
+    """Indices of so many rows, a few at a time."""
+    return (np.arange(first, min(first + _ROWS, rows)) for first in range(0, rows, _ROWS))
 
 
-def _beats(link: Link, d: Array, dv: Array, late: Array, snr: Array, noise: Array, normals: Array, side: float) -> Array:
-    """(B, N) [Hz] one sweep's beats, within the receiver's band."""
-    out, x = np.empty(d.shape), np.empty((link.samples, 2))
-    low = link.lowest / link.bandwidth
-    for row in np.ndindex(d.shape):
-        _chirp(d[row], dv[row], late[row], side, LIGHT / link.wavelength, link.slope, link.bandwidth, x)
-        x *= math.sqrt(snr[row])
-        x += math.sqrt(0.5 * noise[row]) * normals[row]
-        f = _frequency(x, _window(link.samples))
-        out[row] = link.bandwidth * (f - math.floor(f - low))
-    return out
+def _chirp(link: Link, d: Array, dv: Array, late: Array, side: Array) -> Array:
+    """(R, 2, M) real and imaginary part of transmit x conj(delayed echo); the sweep's middle is t = 0, phases are counted in turns."""
+    d, dv, late, side = (v[:, None] for v in (d, dv, late, side))
+    sent = (np.arange(link.samples) + 0.5 - 0.5 * link.samples) / link.bandwidth
+    t = np.stack([np.broadcast_to(sent, (len(d), link.samples)), sent - 2.0 * (d + dv * sent + late) / LIGHT])
+    phase = LIGHT / link.wavelength * t + 0.5 * side * link.slope * t * t
+    (b, s), (a, c) = sincos_turn(phase - np.floor(phase))
+    return np.stack([a * c + b * s, side * (b * c - a * s)], axis=1)
 
 
-@_jit
-def _chirp(d: float, dv: float, late: float, side: float, carrier: float, slope: float, rate: float, out: Array) -> None:
-    """Transmit x conj(delayed echo) into out (M, 2); the sweep's middle is t = 0 and the phase is counted in turns."""
-    count = out.shape[0]
-    for n in range(count):
-        t = (n + 0.5 - 0.5 * count) / rate
-        back = t - 2.0 * (d + dv * t + late) / LIGHT
-        sent = carrier * t + 0.5 * side * slope * t * t
-        echo = carrier * back + 0.5 * side * slope * back * back
-        sent, echo = _TURN * (sent - math.floor(sent)), _TURN * (echo - math.floor(echo))
-        a, b, c, s = math.cos(sent), math.sin(sent), math.cos(echo), math.sin(echo)
-        out[n, 0] = a * c + b * s
-        out[n, 1] = side * (b * c - a * s)
+@np.errstate(all="ignore")
+def _frequency(x: Array) -> Array:
+    """(R,) root-MUSIC's frequency of the tone in x (R, 2, M), in cycles per sample; large tables are made row by row, for the cache."""
+    m = 2 * (x.shape[-1] // (2 * _SPLIT))  # an even number
+    u = _first_eigenvector(np.stack([_covariance(row, m) for row in x]))
+    start = np.array([_deepest(row) for row in u])
+    half, sign = u.reshape(len(u), 2, m // 2), np.array([[1.0], [-1.0]])
+    s = np.concatenate([half, sign * half[..., ::-1]], axis=-1)  # conjugate symmetric
+    return _root(np.stack([_in_order(_lagged(row, m)) for row in s]), start)
 
 
-@_jit
+def _lagged(x: Array, m: int) -> Array:
+    """(2, M, m): x_k conj(x_{k+l}) of x (2, M) and lags l < m, with zeros behind the last sample."""
+    re, im = x[..., None]
+    later_re, later_im = sliding_window_view(np.concatenate([x, np.zeros((2, m - 1))], axis=1), m, axis=1)
+    out_re, out_im, other = out = np.empty((3, *later_re.shape))  # one piece of memory: several would be handed back and fetched again
+    np.multiply(re, later_re, out=out_re)
+    np.multiply(im, later_re, out=out_im)
+    out_re += np.multiply(im, later_im, out=other)
+    out_im -= np.multiply(re, later_im, out=other)
+    return out[:2]
+
+
+def _in_order(x: Array) -> Array:
+    """(..., k, n) summed over k in ascending order: over an axis that is not the last, numpy adds one row after the other."""
+    return np.asarray(np.add.reduce(x, axis=-2, initial=-0.0))
+
+
 def _covariance(x: Array, m: int) -> Array:
-    """The real (m, m) matrix that the forward-backward covariance of the windows of x (M, 2) is unitarily similar to."""
-    span, half = x.shape[0] - m + 1, m // 2
-    re, im = np.empty((m, m)), np.empty((m, m))
-    for j in range(m):  # sum over the windows of x_i conj(x_j): the first row, then along the diagonals
-        a = b = 0.0
-        for k in range(span):
-            a += x[k, 0] * x[k + j, 0] + x[k, 1] * x[k + j, 1]
-            b += x[k, 1] * x[k + j, 0] - x[k, 0] * x[k + j, 1]
-        re[0, j], im[0, j], re[j, 0], im[j, 0] = a, b, a, -b
-    for i in range(m - 1):
-        for j in range(i, m - 1):
-            p, q, r, s = x[i], x[j], x[span + i], x[span + j]
-            a = re[i, j] + (r[0] * s[0] + r[1] * s[1]) - (p[0] * q[0] + p[1] * q[1])
-            b = im[i, j] + (r[1] * s[0] - r[0] * s[1]) - (p[1] * q[0] - p[0] * q[1])
-            re[i + 1, j + 1], im[i + 1, j + 1], re[j + 1, i + 1], im[j + 1, i + 1] = a, b, a, -b
-    out = np.empty((m, m))
-    for i in range(half):
-        for j in range(half):
-            a, b = re[i, j] + re[m - 1 - i, m - 1 - j], im[i, j] - im[m - 1 - i, m - 1 - j]
-            c, d = re[i, m - 1 - j] + re[m - 1 - i, j], im[i, m - 1 - j] - im[m - 1 - i, j]
-            out[i, j], out[half + i, half + j] = a + c, a - c
-            out[i, half + j] = out[half + j, i] = d - b
+    """The real (m, m) matrix that the forward-backward covariance of the windows of x (2, M) is unitarily similar to."""
+    span, half = x.shape[-1] - m + 1, m // 2
+    products = _lagged(x, m)
+    sums = np.empty((m, 2, m))  # by i and l: x_{k+i} conj(x_{k+i+l}) over the windows k; from i to i + 1 one product comes and one goes
+    sums[0] = _in_order(products[:, :span])
+    sums[1:] = np.swapaxes(products[:, span:] - products[:, : m - 1], 0, 1)
+    for before, now in pairwise(sums):
+        now += before
+    here, opposite, sign = _places(m)
+    flat = np.swapaxes(sums, 0, 1).reshape(2, m * m)
+    re, im = flat.take(here, axis=1) + flat.take(opposite, axis=1)  # R's upper half, but for the sign
+    im *= sign
+    a, b, c, d = re[:, :half], im[:, :half], re[:, : half - 1 : -1], im[:, : half - 1 : -1]
+    return np.block([[a + c, d - b], [(d - b).T, a - c]])
+
+
+@lru_cache(maxsize=4)
+def _places(m: int) -> tuple[Array, Array, Array]:
+    """Where the sums (m, m) by i and l have R's i, j and m-1-i, m-1-j, for i < m/2; the sign of the imaginary part below the diagonal."""
+    i, j = np.indices((m // 2, m))
+    lag = np.abs(i - j)
+    return np.minimum(i, j) * m + lag, (m - 1 - np.maximum(i, j)) * m + lag, np.where(i > j, -1.0, 1.0)
+
+
+def _first_eigenvector(c: Array) -> Array:
+    """(R, m) of real symmetric, positive semidefinite (R, m, m)."""
+    diagonal = np.diagonal(c, axis1=1, axis2=2)
+    level = np.cumsum(diagonal / c.shape[1], axis=1)[:, -1:]  # the mean of the eigenvalues
+    return np.asarray(_powers(c, level, c[np.arange(len(c)), np.argmax(diagonal, axis=1)]))
+
+
+@shaped(lambda c, level, u: len(c) > 1)  # the engine makes machine code of it
+def _powers(c: Array, level: Array, u: Array) -> Any:
+    """Power iteration from u (R, m), as far as 500 steps lead where two eigenvalues nearly tie.
+
+    `level` (R, 1) is taken off the eigenvalues: most are then small.
+    """
+
+    def step(u: Array) -> tuple[Array, list[Array]]:
+        w = (num.matvec(c, u) if num.tracing() else _in_order(u[..., None] * c)) - level * u
+        length = np.sqrt(np.cumsum(w * w, axis=1)[:, -1:])
+        new = np.where(length > 0.0, w / length, u)
+        return ~(np.max(np.abs(new - u), axis=1) < _STILL), [new]
+
+    return num.until(step, [u], np.ones(len(c), bool), _STEPS)[0]
+
+
+def _deepest(u: Array) -> float:
+    """Turns at which D is least, of 8 m points of the circle: s* a(z) is largest there."""
+    circle = _circle(len(u))
+    place = int(np.argmax(np.square(_in_order(u[:, None] * circle))))
+    return place / int(circle.shape[1])
+
+
+@lru_cache(maxsize=4)
+def _circle(m: int) -> Array:
+    """(m, 8 m): its rows times u, added up, are s* a(z) at 8 m points but for a phase. They are real, for s is conjugate symmetric."""
+    grid = 8 * m
+    halves = (2 * np.arange(m // 2) - (m - 1))[:, None] * np.arange(grid) % (2 * grid)
+    sine, cosine = sincos_turn(halves / (2 * grid))
+    return np.concatenate([cosine, sine])
+
+
+def _root(lags: Array, start: Array) -> Array:
+    """(R,) turns of the root of D, by Cauchy's method from `start` (R,) on the circle; r_l = sum_k s_k conj(s_{k+l}) are `lags` (R, 2, m).
+
+    g(nu) = D(z) = (m - 1) r_0 - sum_l (r_l z^l + (r_l)^c z^-l) with z = exp(2 pi i nu), and g1 and g2 are its derivatives.
+    """
+    m = lags.shape[-1]
+    l, re, im = np.arange(1.0, m), lags[:, 0, 1:], lags[:, 1, 1:]
+
+    def step(nu: Array) -> tuple[Array, list[Array]]:
+        turns = nu.real[:, None] * l
+        sine, cosine = sincos_turn(turns - np.floor(turns))
+        out = num.exp(-_TURN * nu.imag[:, None] * l)
+        plus, minus = out + 1.0 / out, out - 1.0 / out
+        x, y = re * cosine - im * sine, re * sine + im * cosine
+        even, odd = _complex(plus * x, minus * y), _complex(minus * x, plus * y)  # r_l z^l plus and minus (r_l)^c z^-l
+        sums = np.cumsum(np.stack([even, l * odd, l * l * even]), axis=-1)[..., -1]
+        g, g1, g2 = (m - 1) * lags[:, 0, 0] - sums[0], -1j * _TURN * sums[1], _TURN * _TURN * sums[2]
+        root = _sqrt(_times(g1, g1) - 2.0 * _times(g, g2))
+        below = np.where(_square(g1 + root) > _square(g1 - root), g1 + root, g1 - root)
+        size = _square(below)
+        shift = -2.0 * _times(g, below.conj()) / np.where(size > 0.0, size, 1.0)
+        return ~(_square(shift) < _STILL * _STILL), [nu + shift]
+
+    nu = num.until(step, [start + 0j], np.ones(len(start), bool), _ROOT_STEPS)[0].real
+    return np.asarray(nu - np.floor(nu + 0.5))
+
+
+def _complex(re: Array, im: Array) -> Array:
+    """re + i im."""
+    out = np.empty(re.shape, np.complex128)
+    out.real, out.imag = re, im
     return out
 
 
-@_jit
-def _first_eigenvector(c: Array) -> Array:
-    """Of a real symmetric, positive semidefinite (m, m); as far as 500 steps lead, where two eigenvalues nearly tie."""
-    m, best, level = c.shape[0], 0, 0.0
-    for i in range(m):
-        level += c[i, i] / m
-        best = i if c[i, i] > c[best, best] else best
-    u, w = np.empty(m), np.empty(m)
-    u[:] = c[best]
-    for _ in range(500):
-        for i in range(m):
-            w[i] = -level * u[i]  # the mean of the eigenvalues taken off: the others' are then small
-        for j in range(m):
-            v = u[j]
-            for i in range(m):
-                w[i] += c[j, i] * v
-        length = change = 0.0
-        for i in range(m):
-            length += w[i] * w[i]
-        length = math.sqrt(length)
-        if length == 0.0:
-            break
-        for i in range(m):
-            v = w[i] / length
-            change, u[i] = max(change, abs(v - u[i])), v
-        if change < 1e-13:
-            break
-    return u
+def _times(x: Array, y: Array) -> Array:
+    """x y, without the fused products that numpy's own has on some processors."""
+    return _complex(x.real * y.real - x.imag * y.imag, x.real * y.imag + x.imag * y.real)
 
 
-@_jit
-def _frequency(x: Array, m: int) -> float:
-    """Root-MUSIC's frequency of the tone in x (M, 2), in cycles per sample, with windows of m samples."""
-    u, half, grid = _first_eigenvector(_covariance(x, m)), m // 2, 8 * m
-    cosine, sine = np.empty(2 * grid), np.empty(2 * grid)
-    for k in range(2 * grid):
-        cosine[k], sine[k] = math.cos(math.pi * k / grid), math.sin(math.pi * k / grid)
-    peak, place = -1.0, 0
-    for k in range(grid):  # s* a(z) on the circle: real up to a phase, for s is conjugate symmetric
-        v = 0.0
-        for i in range(half):
-            turn = ((2 * i - (m - 1)) * k) % (2 * grid)
-            v += u[i] * cosine[turn] + u[half + i] * sine[turn]
-        if v * v > peak:
-            peak, place = v * v, k
-    s = np.empty(m, np.complex128)
-    for i in range(half):
-        s[i], s[m - 1 - i] = complex(u[i], u[half + i]), complex(u[i], -u[half + i])
-    lags = np.zeros(m, np.complex128)
-    for lag in range(m):
-        for j in range(m - lag):
-            lags[lag] += s[j + lag].conjugate() * s[j]
-    size = m * lags[0].real
-    nu = complex(place / grid, 0.0)  # z = exp(2 pi i nu)
-    for _ in range(50):
-        big = math.exp(-_TURN * nu.imag)
-        z = complex(big * math.cos(_TURN * nu.real), big * math.sin(_TURN * nu.real))
-        back, left, right = 1.0 / z, complex(1.0, 0.0), complex(1.0, 0.0)
-        g, g1, g2 = complex(size, 0.0) - lags[0], complex(0.0, 0.0), complex(0.0, 0.0)
-        for lag in range(1, m):
-            right, left = right * z, left * back
-            a, b = lags[lag] * right, lags[lag].conjugate() * left
-            g, g1, g2 = g - (a + b), g1 - lag * (a - b), g2 + (lag * lag) * (a + b)
-        g1, g2 = g1 * complex(0.0, _TURN), g2 * (_TURN * _TURN)
-        root = np.sqrt(g1 * g1 - 2.0 * g * g2)
-        below = g1 + root if abs(g1 + root) > abs(g1 - root) else g1 - root
-        if abs(below) == 0.0:
-            break
-        step = -2.0 * g / below
-        nu = nu + step
-        if abs(step) < 1e-13:
-            break
-    return nu.real - math.floor(nu.real + 0.5)
+def _square(x: Array) -> Array:
+    """|x|^2."""
+    return np.asarray(x.real * x.real + x.imag * x.imag)
+
+
+def _sqrt(x: Array) -> Array:
+    """The root of x with a real part that is not negative."""
+    part = np.sqrt(0.5 * (np.abs(x.real) + np.sqrt(_square(x))))
+    other = 0.5 * np.abs(x.imag) / np.where(part > 0.0, part, 1.0)
+    right = x.real >= 0.0
+    return _complex(np.where(right, part, other), np.copysign(np.where(right, other, part), x.imag))

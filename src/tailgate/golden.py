@@ -2,8 +2,8 @@
 
 A published suite never changes under its name. `check` plays 16 episodes (fewer of a slow plant, or of a suite with fewer) x two defences
 x three attacks of each scenario again and says what moved; `write` records them anew, which is for a new version and never for an old one.
-A decision's hash is the same on every platform; a trace's is exact for one machine type with one numpy and numba, and is compared where
-those are the recorded ones.
+A decision's hash is the same on every platform. A trace's is exact for one machine type with one numpy and one llvmlite, whose LLVM
+compiles random numbers and traced loops. It is compared where those are the recorded ones.
 
     python -m tailgate.golden --check [--scenario NAME ...]
     python -m tailgate.golden --write [--suite NAME ...]
@@ -58,7 +58,7 @@ class _Blocks(Mixture):
 
 def this_platform() -> str:
     """What a trace's last bits may depend on."""
-    return f"{platform.machine()}, numpy {np.__version__}, numba {version('numba')}"
+    return f"{platform.machine()}, numpy {np.__version__}, llvmlite {version('llvmlite')}"
 
 
 def instructions() -> str:

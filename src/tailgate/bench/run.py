@@ -20,7 +20,7 @@ from .targets import Scaling, Target, chosen, groups
 from .yardstick import compiler
 
 PACKAGES = (
-    "numpy", "numba", "llvmlite", "scipy", "gymnasium", "filterpy", "highway-env", "cvxpy", "clarabel", "stable-baselines3", "torch",
+    "numpy", "llvmlite", "scipy", "gymnasium", "filterpy", "highway-env", "cvxpy", "clarabel", "stable-baselines3", "torch",
     "libsumo",
 )  # fmt: skip
 LEVEL = 0.95
