@@ -24,7 +24,7 @@ from tailgate.core import Array, Innovation, Model, Positive, Prior, Probability
 from tailgate.errors import InputError
 from tailgate.reach import require_detectable
 from tailgate.registry import register
-from tailgate.tree import lock
+from tailgate.tree import remembered
 
 from .chi_square import ChiSquare
 from .compose import AcceptAll, Composed, Detector, Filter, GateOut, Mitigation, Score, Stateless, Verdict, blame_all
@@ -32,8 +32,6 @@ from .kalman import GAIN, Gain, KalmanState, LinearFilter, alone, broad, precisi
 
 SWEEPS = 200
 SETTLED = 1e-13  # relative
-KEPT = 4  # fixed points that are remembered
-_known: dict[bytes, Fusion] = {}
 
 
 class Fusion(NamedTuple):
@@ -85,18 +83,10 @@ def _predicted(model: Model, P: Array) -> Array:
     return np.asarray(0.5 * (M + M.T))
 
 
+@remembered("A", "C", "Q", "R", "graph")  # every cell of an evaluation asks again, and a long string takes minutes
 def fixed_point(model: Model) -> Fusion:
     """P_i (N, n, n) of (5.5), with L_j and Q_i^-1. Raises InputError, naming the agents, where there is none."""
     require_detectable(model, "model")
-    key = b"".join(part.tobytes() for part in (model.A, model.C, model.Q, model.R, model.graph))
-    if key not in _known:  # every cell of an evaluation asks again, and a long string takes minutes
-        while len(_known) >= KEPT:
-            _known.pop(next(iter(_known)))
-        _known[key] = lock(_settle(model))
-    return _known[key]
-
-
-def _settle(model: Model) -> Fusion:
     heard, G = neighbours(model.graph), information(model)
     L = np.stack([_inverse(model.Q)] * model.agents)  # of P = 0
     P = np.zeros_like(L)

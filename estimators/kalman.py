@@ -20,6 +20,7 @@ from tailgate.core import Array, Innovation, Model, Prior, Received, param
 from tailgate.errors import NotApplicable
 from tailgate.reach import blind
 from tailgate.registry import register
+from tailgate.tree import remembered
 
 from .compose import AcceptAll, Composed, Detector, Filter, Mitigation, Score
 
@@ -67,6 +68,7 @@ def precision(R: Array) -> Array:
     return num.inverse(R)
 
 
+@remembered("A", "C", "Q", "R")
 def broad(model: Model) -> Array:
     """(n,) variances so large that the next measurement decides: a million times those after 100 steps of the filter."""
     P = np.array(model.Q)
@@ -116,6 +118,7 @@ def _settle(A: Array, C: Array, Q: Array, R: Array, P: Array) -> Array:
     return P
 
 
+@remembered("A", "C", "Q", "R")
 def steady_state(model: Model) -> Array:
     """P- (N, n, n) at which the predicted covariances settle. Raises NotApplicable, naming the agents, where they do not."""
     lost = blind(model, np.eye(model.agents, dtype=bool))  # the doubling may take a mode that nobody sees for one that settles

@@ -4,6 +4,7 @@ import dataclasses
 import json
 import os
 import shutil
+import sys
 from collections import Counter
 from itertools import combinations
 from typing import get_args
@@ -22,6 +23,8 @@ from tailgate.threat import KindName
 from tailgate.trace import rollout
 from tailgate.tree import leaves
 
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # hundreds of commands are started: each would compile the package
+sys.dont_write_bytecode = False
 os.environ.setdefault("TAILGATE_LLVM", "0")  # code is compiled for a few steps only; no bit depends on it
 
 settings.register_profile("steady", deadline=None, derandomize=True)  # machines differ in speed, and a suite shall repeat

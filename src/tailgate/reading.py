@@ -5,11 +5,13 @@ They raise OSError where a file cannot be read or is too large, and ValueError, 
 
 from __future__ import annotations
 
+import copy
 import errno
 import json
 import lzma
 import sys
 from collections.abc import Callable, Iterator
+from functools import lru_cache
 from math import isfinite
 from pathlib import Path
 from typing import Any, NoReturn
@@ -204,6 +206,11 @@ def parse_yaml(text: str) -> Any:
     """Read YAML text. Refused are keys that are there twice, deep nesting, aliases that unfold to much, and kinds that JSON has not."""
     if len(text) > YAML:
         raise ValueError(f"more than {YAML} characters")
+    return copy.deepcopy(_parsed(text))
+
+
+@lru_cache(maxsize=128)
+def _parsed(text: str) -> Any:
     try:
         return _Plain(text).get_single_data()
     except (yaml.YAMLError, LookupError, OverflowError, RecursionError) as error:
