@@ -57,6 +57,7 @@ def test_every_defence_applies_somewhere():
         load_scenario(PLACE[name]).loop(tailgate.make_defence(name), entries("defence")[name].uses)
 
 
+@pytest.mark.thin(2)
 @pytest.mark.parametrize("defence", DEFENCES)
 def test_rows_of_a_defence_do_not_depend_on_their_batch(defence, short, play):
     """trace_hash of each seed is the same in batches of 1, 7 and 64, in which some readings are falsified and others jammed."""
@@ -72,6 +73,7 @@ def test_rows_of_an_attack_do_not_depend_on_their_batch(attack, short, play):
     _batches(lambda seeds: _play(play, short(budget=20, duration=7, cooldown=2), "chi2_kf", attack, seeds, terminate=False))
 
 
+@pytest.mark.thin(3)
 @pytest.mark.parametrize("name", SCENARIOS)
 def test_rows_of_a_scenario_do_not_depend_on_their_batch(name, short, play):
     """trace_hash of each seed is the same in batches of 1, 7 and 64, collisions included; of many agents in 1, 2 and 6, for fewer steps."""

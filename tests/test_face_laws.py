@@ -114,6 +114,7 @@ FACE_NAMES = ("single", "sb3", *AUTORESETS)
 PLAYED = [(name, engine) for name in FACES for engine in ("auto", "plain") if (name, engine) != (HIGHWAY, "plain")]
 
 
+@pytest.mark.thin(4)
 @pytest.mark.parametrize("face", FACE_NAMES)
 @pytest.mark.parametrize("name, engine", PLAYED)
 def test_nothing_that_was_handed_out_is_used_again(name, engine, face, tiny):
@@ -155,6 +156,7 @@ def test_rows_of_a_cell_share_nothing():
 COPIES = {"pickle": lambda env: pickle.loads(pickle.dumps(env)), "deepcopy": copy.deepcopy}
 
 
+@pytest.mark.thin(7)
 @pytest.mark.parametrize("how", COPIES)
 @pytest.mark.parametrize("face", FACE_NAMES)
 @pytest.mark.parametrize("name, engine", PLAYED)

@@ -52,6 +52,7 @@ def strict(monkeypatch):
         yield
 
 
+@pytest.mark.thin(4)
 @pytest.mark.parametrize("turn, knowledge", [(0, "black"), (1, "grey"), (2, "white")])
 @pytest.mark.parametrize("action", ACTIONS)
 def test_both_checkers_pass_without_a_warning(action, turn, knowledge, strict, brief_scenario):
@@ -87,6 +88,7 @@ def test_the_checker_passes_with_its_render_check(name, strict, monkeypatch):
     check_env(gymnasium.make(name).unwrapped)
 
 
+@pytest.mark.thin(2)
 @pytest.mark.parametrize("name", FACES)
 def test_the_id_works_in_a_fresh_interpreter(name):
     """Gymnasium alone imports the module that the id names."""

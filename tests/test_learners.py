@@ -100,6 +100,7 @@ def test_it_learns_what_to_inject(name: str, least: float, paid: dict[str, Any],
     assert earned(run.export(tmp_path / "policy", {}), environment, action) > least
 
 
+@pytest.mark.thin(2)
 @pytest.mark.parametrize("name", SMALL)
 def test_a_resumed_run_gives_the_policy_of_an_uninterrupted_one(name: str, paid: dict[str, Any], tmp_path: Path, same_bits: Any) -> None:
     """To the last bit, in networks, buffer, environments and curve: the interruption falls into the middle of episodes."""

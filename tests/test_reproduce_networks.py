@@ -177,6 +177,7 @@ def test_verdicts_go_both_ways():
     assert ch6_loop._collision(safe, 100).holds == "yes"
 
 
+@pytest.mark.long
 def test_whether_a_known_input_counts_depends_on_the_price(monkeypatch):
     """Both prices stand in the claim: with a high one nobody need know, with a low one the leader's own prediction has to."""
     place = load_scenario(ch6_loop.SCENARIO)

@@ -26,6 +26,7 @@ def test_a_template_is_filled_within_its_ranges() -> None:
     assert all(-2.5 <= float(item["value"]) <= 0.0 for item in fields) and len({item["value"] for item in fields}) > 100
 
 
+@pytest.mark.long
 def test_the_search_finds_the_moment_that_a_table_of_all_shows(monkeypatch: pytest.MonkeyPatch) -> None:
     """Against a plain filter a bias is worth something only within a range of gaps."""
     config = train.load_config("car-following", [*CONFIG, "threat.fdi_bound=5.0", "threat.budget=18"])

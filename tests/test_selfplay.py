@@ -298,7 +298,8 @@ def test_the_preset():
     assert isinstance(Duel.make(config.scenario, config.defence, config.menu).guard, Steered)
 
 
-@pytest.mark.parametrize("name", [pytest.param("ppo", marks=pytest.mark.long), "maskable_ppo"])
+@pytest.mark.long
+@pytest.mark.parametrize("name", ["ppo", "maskable_ppo"])
 def test_the_attacker_learns_by_other_learners_too(name, brief, tmp_path, monkeypatch, capsys):
     """A round and its report; what is exported chooses as it was trained to, and the run goes on."""
     monkeypatch.chdir(tmp_path)

@@ -46,6 +46,7 @@ ENVIRONMENTS = [  # beyond those of test_traced_cars.py and test_traced_many.py
 ]  # fmt: skip
 
 
+@pytest.mark.thin(2)
 @pytest.mark.parametrize("arguments", ENVIRONMENTS, ids=lambda a: f"{a['scenario']}-{a['defence']}")
 def test_an_environment_is_the_plain_one_to_the_last_bit(arguments, tmp_path):
     as_plain(arguments, 5, tmp_path)
@@ -67,6 +68,7 @@ def test_a_strangers_defence_is_traced_as_it_stands(tmp_path, monkeypatch):
     as_plain({"scenario": "stop-and-go-v0", "defence": made}, 5, tmp_path)
 
 
+@pytest.mark.thin(5)
 @pytest.mark.parametrize("terminate", [True, False])
 @pytest.mark.parametrize(("scenario", "defence", "rival"), [
     ("stop-and-go-v0", "mine", "fdi:value=5"), ("car-following-lossy-v0", "chi2_kf", "dos_hold"), ("gusty-stop-and-go-v0", "chi2_kf_sparse", "none"),
@@ -232,6 +234,7 @@ def test_threads_change_no_bit():
         seen = [one[0] for one in told]
 
 
+@pytest.mark.thin(3)
 @pytest.mark.parametrize("arguments", [
     {"scenario": "gusty-stop-and-go-v0", "defence": "chi2_kf"},
     {"scenario": "platoon-gusty-v0", "defence": "chi2_dkf", "action": "continuous"},

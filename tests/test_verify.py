@@ -73,6 +73,7 @@ def test_a_row_is_the_same_in_a_batch_of_4096() -> None:
     assert verify(run([cell]), batch=4096)["counts"] == {"verified": 4100, "differs": 0, "unchecked": 0}
 
 
+@pytest.mark.thin(2)
 @pytest.mark.parametrize(("suite", "scenario", "dose", "defence", "attack", "seeds"), [
     ("car-following-v0", "car-following-noisy-v0", 10, "chi2_kf", "stealth:trigger=near,threshold=40", 300),
     ("car-following-v0", "car-following-lossy-v0", 10, "imm", "zoo:name=car-following-chi2_kf-0", 40),
