@@ -1,6 +1,6 @@
 """python train.py [--config FILE] [key=value ...]: train an adversary."""
 
-from tailgate.train import main
+from tailgate.training.train import main
 
 if __name__ == "__main__":
     raise SystemExit(main())

@@ -1,6 +1,6 @@
 """Attacks: scripted ones, learned policies, and the learners."""
 
-from tailgate.lazy import exported
+from tailgate.base.lazy import exported
 
 HOMES = {  # modules, and what they give to the package
     "burst_loss": "BurstLoss",

@@ -4,9 +4,9 @@ from collections.abc import Iterable
 
 import numpy as np
 
+from tailgate.base.errors import NotApplicable, unknown
 from tailgate.core import Array
-from tailgate.errors import NotApplicable, unknown
-from tailgate.threat import Brief
+from tailgate.core.threat import Brief
 
 
 def chosen(brief: Brief, names: tuple[str, ...], default: Array, agents: tuple[int, ...] = (), where: str = "attack ") -> Array:

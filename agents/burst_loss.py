@@ -11,11 +11,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from tailgate.base.errors import InputError
 from tailgate.core import Array, Command, Kind, Probability, View, param
-from tailgate.draws import Draws
-from tailgate.errors import InputError
-from tailgate.registry import register
-from tailgate.threat import Brief
+from tailgate.core.draws import Draws
+from tailgate.core.registry import register
+from tailgate.core.threat import Brief
 
 from .aim import chosen, require
 from .scripted import Script, ScriptPlan

@@ -29,14 +29,13 @@ from pydantic import Field
 from safetensors.numpy import load as load_tensors
 from safetensors.numpy import save as save_tensors
 
-from tailgate import draws
-from tailgate.core import Array, NonNegative, Positive, PositiveCount, Probability, param
+from tailgate.base.errors import InputError
+from tailgate.base.files import write_atomic
+from tailgate.base.sizes import Passes, Rows, Width
+from tailgate.core import Array, NonNegative, Positive, PositiveCount, Probability, draws, param
+from tailgate.core.schema import canonical
 from tailgate.envs.batches import framed, side_by_side
 from tailgate.envs.seat import Seat
-from tailgate.errors import InputError
-from tailgate.files import write_atomic
-from tailgate.schema import canonical
-from tailgate.sizes import Passes, Rows, Width
 
 from .learning import SEED_STRIDE, Progress, header_of, open_checkpoint
 from .policy import Network, save_policy

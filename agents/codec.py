@@ -9,9 +9,9 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from tailgate import num
+from tailgate.base.errors import InputError
 from tailgate.core import AIRED, Array, Command, Finite, Kind, Positive, PositiveCount, View, param
-from tailgate.errors import InputError
-from tailgate.threat import Brief, Channel, ChannelPlan, KindName
+from tailgate.core.threat import Brief, Channel, ChannelPlan, KindName
 
 from .values import fit, receivers
 

@@ -6,8 +6,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from tailgate.errors import InputError
-from tailgate.registry import Spec
+from tailgate.base.errors import InputError
+from tailgate.core.registry import Spec
 
 from .policy import load_policy
 

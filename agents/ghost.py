@@ -8,12 +8,12 @@ from typing import NamedTuple
 import numpy as np
 
 from tailgate import num
+from tailgate.base.errors import NotApplicable
 from tailgate.core import Array, Command, Count, Kind, NonNegative, Positive, View, param
-from tailgate.draws import Draws, constants
-from tailgate.errors import NotApplicable
-from tailgate.quantities import Settling
-from tailgate.registry import register
-from tailgate.threat import Brief
+from tailgate.core.draws import Draws, constants
+from tailgate.core.quantities import Settling
+from tailgate.core.registry import register
+from tailgate.core.threat import Brief
 
 from .aim import require
 from .scripted import Script, ScriptPlan

@@ -10,8 +10,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
-from tailgate.errors import InputError, unknown
-from tailgate.reading import TENSORS, parse_json, read_bytes, tensors_of
+from tailgate.base.errors import InputError, unknown
+from tailgate.base.reading import TENSORS, parse_json, read_bytes, tensors_of
 
 if TYPE_CHECKING:
     from tailgate.envs.seat import Seat

@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tailgate.core import Array, Attack, Command, View
-from tailgate.draws import Draws
-from tailgate.threat import Brief
+from tailgate.core.draws import Draws
+from tailgate.core.threat import Brief
 
 TAG = 255  # of the draw that picks the attacker: the attacks draw with others
 

@@ -9,12 +9,12 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from tailgate import num
+from tailgate.base.errors import InputError, NotApplicable
 from tailgate.core import Array, Command, Count, Finite, Kind, Model, NonNegative, Positive, View, param
-from tailgate.draws import Draws
-from tailgate.errors import InputError, NotApplicable
-from tailgate.quantities import Lag
-from tailgate.registry import register
-from tailgate.threat import Brief
+from tailgate.core.draws import Draws
+from tailgate.core.quantities import Lag
+from tailgate.core.registry import register
+from tailgate.core.threat import Brief
 
 from .aim import chosen, require
 from .scripted import Script, ScriptPlan

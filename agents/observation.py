@@ -12,7 +12,7 @@ import numpy as np
 
 from tailgate import num
 from tailgate.core import AIRED, Array, Kind, Model, View
-from tailgate.threat import Brief
+from tailgate.core.threat import Brief
 
 from .values import receivers
 

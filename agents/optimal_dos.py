@@ -7,13 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from tailgate import num
+from tailgate.base.errors import NotApplicable
 from tailgate.core import Array, Command, Kind, Model, Positive, View, param
-from tailgate.draws import Draws
-from tailgate.errors import NotApplicable
+from tailgate.core.draws import Draws
+from tailgate.core.optimal import Filtering, Objective, Rules, best_losses
+from tailgate.core.registry import register
+from tailgate.core.threat import Brief
 from tailgate.estimators.kalman import steady_state
-from tailgate.optimal import Filtering, Objective, Rules, best_losses
-from tailgate.registry import register
-from tailgate.threat import Brief
 
 from .aim import chosen, require
 from .scripted import Script, ScriptPlan

@@ -7,13 +7,13 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 
+from tailgate.base.errors import InputError, NotApplicable
 from tailgate.core import Array, Command, Finite, Kind, Positive, PositiveCount, View, param
-from tailgate.draws import Draws
+from tailgate.core.draws import Draws
+from tailgate.core.optimal import Grid, Holding, HoldTable, Objective, Rules, best_holds
+from tailgate.core.registry import register
+from tailgate.core.threat import Brief
 from tailgate.envs.scalar_loop import WIRE, StateFeedback
-from tailgate.errors import InputError, NotApplicable
-from tailgate.optimal import Grid, Holding, HoldTable, Objective, Rules, best_holds
-from tailgate.registry import register
-from tailgate.threat import Brief
 
 from .aim import chosen, require
 

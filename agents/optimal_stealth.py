@@ -9,13 +9,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tailgate import num
+from tailgate.base.errors import InputError, NotApplicable
 from tailgate.core import Array, Command, Finite, Kind, Positive, View, param
-from tailgate.draws import Draws
-from tailgate.errors import InputError, NotApplicable
+from tailgate.core.draws import Draws
+from tailgate.core.optimal import farthest
+from tailgate.core.registry import register
+from tailgate.core.threat import Brief
 from tailgate.estimators.kalman import steady_state
-from tailgate.optimal import farthest
-from tailgate.registry import register
-from tailgate.threat import Brief
 
 from .aim import chosen, require
 from .scripted import Script, ScriptPlan

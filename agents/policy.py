@@ -21,14 +21,14 @@ from safetensors.numpy import load as load_tensors
 from safetensors.numpy import save as save_tensors
 
 from tailgate import num
+from tailgate.base.errors import InputError, said
+from tailgate.base.files import write_atomic
+from tailgate.base.reading import TENSORS, load_json, read_bytes, tensors_of
 from tailgate.core import Array, Command, PositiveCount, View, param
-from tailgate.draws import Draws, Keys, Role
-from tailgate.errors import InputError, said
-from tailgate.files import write_atomic
-from tailgate.reading import TENSORS, load_json, read_bytes, tensors_of
-from tailgate.registry import register
-from tailgate.schema import as_data, build
-from tailgate.threat import Brief
+from tailgate.core.draws import Draws, Keys, Role
+from tailgate.core.registry import register
+from tailgate.core.schema import as_data, build
+from tailgate.core.threat import Brief
 
 from .codec import ActionCodec, ActionSpec
 from .observation import FRAMES, ObservationCodec
@@ -375,8 +375,8 @@ class Yoked:
 
 def timing_advantage(loop: Any, policy: PolicyAttack, keys: Keys, outcome: str = "crashed") -> tuple[Array, Array]:
     """(own, yoked) outcomes (B,) of a policy, a metric: yoked plays the on and off runs of another episode of the same policy."""
-    from tailgate.metrics import METRICS
-    from tailgate.strength.timing import played, recorded, yoked_to
+    from tailgate.play.metrics import METRICS
+    from tailgate.studies.timing import played, recorded, yoked_to
 
     schedules = (None, yoked_to(recorded(loop, policy, keys)))
     own, yoked = (played(loop, policy, keys, schedule, [METRICS[outcome]])[0] for schedule in schedules)

@@ -13,9 +13,9 @@ try:
 except ImportError as error:
     raise ImportError("torch or Stable-Baselines3 is missing: pip install 'tailgate[train]'") from error
 
+from tailgate.base.errors import InputError
+from tailgate.base.sizes import Passes, Rows, Width
 from tailgate.core import NonNegative, Positive, Probability, param
-from tailgate.errors import InputError
-from tailgate.sizes import Passes, Rows, Width
 
 from .policy import Network
 from .stable import StableLearner, perceptron, rest_first

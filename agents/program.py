@@ -11,14 +11,14 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from tailgate import num
+from tailgate.base.errors import InputError, NotApplicable, unknown
+from tailgate.base.pytree import map_leaves
 from tailgate.core import AIRED, Array, Command, Count, Kind, PositiveCount, Probability, View, no_command, param
-from tailgate.draws import Draws
-from tailgate.errors import InputError, NotApplicable, unknown
-from tailgate.registry import register
-from tailgate.scenario import config_path
-from tailgate.schema import build, read_yaml
-from tailgate.threat import Brief, KindName
-from tailgate.tree import map_leaves
+from tailgate.core.draws import Draws
+from tailgate.core.registry import register
+from tailgate.core.scenario import config_path
+from tailgate.core.schema import build, read_yaml
+from tailgate.core.threat import Brief, KindName
 
 from .aim import chosen, require
 from .radio import on_receivers

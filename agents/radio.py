@@ -6,11 +6,11 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field
 
+from tailgate.base.errors import InputError, NotApplicable
 from tailgate.core import Array, Command, Finite, Kind, Positive, View, param
-from tailgate.draws import Draws
-from tailgate.errors import InputError, NotApplicable
-from tailgate.registry import register
-from tailgate.threat import Brief
+from tailgate.core.draws import Draws
+from tailgate.core.registry import register
+from tailgate.core.threat import Brief
 
 from .aim import chosen, require
 from .scripted import Script, ScriptPlan

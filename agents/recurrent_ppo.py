@@ -18,8 +18,8 @@ try:
 except ImportError as error:
     raise ImportError("torch or sb3-contrib is missing: pip install 'tailgate[train]'") from error
 
+from tailgate.base.sizes import Passes, Rows, Width
 from tailgate.core import Array, Positive, param
-from tailgate.sizes import Passes, Rows, Width
 
 from . import ppo
 from .policy import Lstm, Network

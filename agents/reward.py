@@ -7,8 +7,8 @@ from typing import Literal
 
 import numpy as np
 
+from tailgate.base.errors import InputError
 from tailgate.core import Array, Discount, Frame, Kind, Model, NonNegative, Positive, param
-from tailgate.errors import InputError
 from tailgate.num import clip
 
 RewardName = Literal["collision", "min_gap", "error", "peak", "stealth", "final"]

@@ -6,11 +6,11 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from tailgate.base.errors import InputError, NotApplicable
 from tailgate.core import Array, Command, Count, Finite, Kind, NonNegative, PositiveCount, Probability, View, no_command, param
-from tailgate.draws import Draws, constants
-from tailgate.errors import InputError, NotApplicable
-from tailgate.registry import register
-from tailgate.threat import Brief
+from tailgate.core.draws import Draws, constants
+from tailgate.core.registry import register
+from tailgate.core.threat import Brief
 
 from .aim import chosen, require
 from .triggers import TAG, Closing, Fast, LeaderBraking, Near, Reading, Slow, Trigger, TriggerState, idle

@@ -9,11 +9,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tailgate.core import Array, Attack
-from tailgate.draws import Keys
+from tailgate.core.draws import Keys
+from tailgate.core.schema import digest
 from tailgate.envs.duel import Duel, Rival
 from tailgate.estimators.steered import save_defender
 from tailgate.estimators.steering import nearest
-from tailgate.schema import digest
 
 from .cem import Config, Search, lean, outputs
 from .mixture import Mixture

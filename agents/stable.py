@@ -29,13 +29,13 @@ from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
 from scipy.stats import norm
 
+from tailgate.base.errors import InputError
+from tailgate.base.files import write_atomic
+from tailgate.base.sizes import Episodes, Passes, Rows, Width
 from tailgate.core import Array, Positive, PositiveCount, Probability, param
+from tailgate.core.schema import canonical
 from tailgate.envs.sb3 import BatchVecEnv
 from tailgate.envs.seat import Seat
-from tailgate.errors import InputError
-from tailgate.files import write_atomic
-from tailgate.schema import canonical
-from tailgate.sizes import Episodes, Passes, Rows, Width
 
 from .codec import ActionCodec
 from .learning import SEED_STRIDE, Progress, check_action, header_of, open_checkpoint

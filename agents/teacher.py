@@ -6,11 +6,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tailgate import draws
-from tailgate.core import Array, Attack, Command
-from tailgate.draws import Role
+from tailgate.base.errors import InputError
+from tailgate.core import Array, Attack, Command, draws
+from tailgate.core.draws import Role
 from tailgate.envs.seat import Seat
-from tailgate.errors import InputError
 
 from .codec import ActionCodec
 from .learning import SEED_STRIDE

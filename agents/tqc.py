@@ -13,9 +13,9 @@ try:
 except ImportError as error:
     raise ImportError("torch or sb3-contrib is missing: pip install 'tailgate[train]'") from error
 
+from tailgate.base.errors import InputError
+from tailgate.base.sizes import Width
 from tailgate.core import Count, param
-from tailgate.errors import InputError
-from tailgate.sizes import Width
 
 from . import sac
 from .stable import Exploring

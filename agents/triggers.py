@@ -14,11 +14,11 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 from pydantic import Field
 
+from tailgate.base.errors import InputError, NotApplicable, unknown
 from tailgate.core import Array, Count, NonNegative, Positive, PositiveCount, Probability, View, param
-from tailgate.draws import Draws
-from tailgate.errors import InputError, NotApplicable, unknown
-from tailgate.schema import build
-from tailgate.threat import Brief
+from tailgate.core.draws import Draws
+from tailgate.core.schema import build
+from tailgate.core.threat import Brief
 
 TAG = 0x4000  # of the draws of triggers; what is injected draws below it
 

@@ -9,10 +9,10 @@ import numpy as np
 from pydantic import Field
 
 from tailgate import num
+from tailgate.base.errors import InputError, unknown
 from tailgate.core import AIRED, Array, Finite, Kind, NonNegative, Positive, param
-from tailgate.draws import Draws
-from tailgate.errors import InputError, unknown
-from tailgate.threat import Brief
+from tailgate.core.draws import Draws
+from tailgate.core.threat import Brief
 
 from .triggers import part
 

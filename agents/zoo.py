@@ -8,11 +8,11 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any, ClassVar
 
+from tailgate.base.errors import InputError, NotApplicable, unknown
 from tailgate.core import Command, View, param
-from tailgate.draws import Draws
-from tailgate.errors import InputError, NotApplicable, unknown
-from tailgate.registry import register
-from tailgate.threat import Brief
+from tailgate.core.draws import Draws
+from tailgate.core.registry import register
+from tailgate.core.threat import Brief
 
 from .policy import PolicyAttack, PolicyPlan, PolicyState, load_policy
 

@@ -20,15 +20,16 @@ from adversaries_page import learners_of, line, lines, markdown, picture
 from rich.console import Console
 from script_search import found
 
-from tailgate import comparison, stats, train
-from tailgate.adaptive import train_against
-from tailgate.errors import unknown
-from tailgate.evaluation import cells_of, run
-from tailgate.files import write_atomic
-from tailgate.progress import progress
-from tailgate.rivals import BATCH, outcomes
-from tailgate.rows import read_rows
-from tailgate.schema import as_data, read_yaml
+from tailgate.base.errors import unknown
+from tailgate.base.files import write_atomic
+from tailgate.base.progress import progress
+from tailgate.core.schema import as_data, read_yaml
+from tailgate.evaluation import stats
+from tailgate.evaluation.baselines import BATCH, outcomes
+from tailgate.evaluation.cells import cells_of, run
+from tailgate.evaluation.rows import read_rows
+from tailgate.training import comparison, train
+from tailgate.training.adaptive import train_against
 
 HERE = Path(__file__).parent
 FIRST_EPISODE = 20261124  # of the report: a block that no setting was ever played on
@@ -183,7 +184,7 @@ def main() -> None:
         best = record[name]["best"]
         console.print(f"{name}, {best}: {line(record[name]['learners'][best])}", highlight=False)
         if options.zoo:
-            from tailgate.strength.collect import add_run
+            from tailgate.studies.collect import add_run
 
             add_run(Path(options.runs) / f"{name}-{best}", name, episodes=options.episodes, replace=True)
     out = Path(options.out)

@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from tailgate import comparison, stats
-from tailgate.plots import canvas, png
+from tailgate.base.plots import canvas, png
+from tailgate.evaluation import stats
+from tailgate.training import comparison
 
 PARTS = ("a moment to choose", "none to choose", "linear")  # of the record; where there is none, values alone are learned
 QUESTIONS = ("no attack", "own yoked schedule", "best scripted attack")

@@ -12,12 +12,12 @@ from pathlib import Path
 from rich.console import Console
 
 import tailgate
-from tailgate.evaluation import evaluate
-from tailgate.files import write_atomic
-from tailgate.plots import write_overview
-from tailgate.progress import cells, progress
-from tailgate.scenario import load_suite
-from tailgate.summary import summarise
+from tailgate.base.files import write_atomic
+from tailgate.base.plots import write_overview
+from tailgate.base.progress import cells, progress
+from tailgate.core.scenario import load_suite
+from tailgate.evaluation.cells import evaluate
+from tailgate.evaluation.summary import summarise
 
 SUITES = ("ch4-long-v0", "ch4-actuator-v0")
 FILTERPY = ("filterpy_kf", "filterpy_ekf", "filterpy_ukf", "filterpy_hinfinity", "filterpy_imm")

@@ -119,7 +119,7 @@ def _timeless(held: Any) -> Any:
 
 def finished(folder: Path) -> dict[str, Any]:
     """Pieces that are done, by name, each with what changes when it is done again. Raises where something there cannot be read."""
-    from tailgate.rows import read_rows
+    from tailgate.evaluation.rows import read_rows
 
     done: dict[str, Any] = {}
     for path in folder.rglob("*"):
@@ -193,7 +193,8 @@ def go_on(words: list[str], folder: Path) -> int:
 
 
 def _play(words: list[str], folder: Path) -> None:
-    from tailgate import cli, evaluation
+    from tailgate import cli
+    from tailgate.evaluation import cells as evaluation
     from tailgate.trust import run as trust
 
     os.setsid()
@@ -329,7 +330,7 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=2, help="of the commands that are ended (default 2)")
     parser.add_argument("--out", help="write the table here as JSON")
     options = parser.parse_args()
-    from tailgate import cli, evaluation, train, tuning  # noqa: F401 - before the forks
+    from tailgate.training import tuning  # noqa: F401 - before the forks
 
     names, ways = options.commands.split(","), options.ways.split(",")
     for given, known in ((names, [*JOBS]), (ways, [*WAYS])):

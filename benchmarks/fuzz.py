@@ -52,7 +52,7 @@ def input_of(reader: Reader, valid: list[bytes], seed: int, number: int) -> byte
 
 def met(reader: Reader, folder: Path, content: bytes) -> str:
     """`accepted`, `refused`, or what is wrong."""
-    from tailgate.errors import InputError
+    from tailgate.base.errors import InputError
 
     (folder / reader.file).write_bytes(content)
     reader_made = {"p.json", "README.md", "runs", "quickstart-tune"}  # what the call itself puts there

@@ -45,9 +45,9 @@ def _files(*patterns: str) -> Callable[[], list[bytes]]:
 
 
 def _rows() -> list[bytes]:
-    from tailgate.evaluation import evaluate
-    from tailgate.rows import encode
-    from tailgate.scenario import load_suite
+    from tailgate.core.scenario import load_suite
+    from tailgate.evaluation.cells import evaluate
+    from tailgate.evaluation.rows import encode
 
     rows = evaluate(load_suite("quick-v0"), defences=["kf"], attacks=["none"], seeds=3)
     return [encode([*rows, rows[0] | {"status": "error", "reason": "x"}])]
@@ -82,13 +82,13 @@ def _tensors(folder: Path) -> Any:
 
 
 def _config(folder: Path) -> Any:
-    from tailgate.train import load_config
+    from tailgate.training.train import load_config
 
     return load_config(str(folder / "config.yaml"), [f"out={folder}"])
 
 
 def _resumed(folder: Path) -> Any:
-    from tailgate.train import load_config, same_run
+    from tailgate.training.train import load_config, same_run
 
     run = folder / "runs" / "quickstart"  # the folder is the worker's own
     run.mkdir(exist_ok=True, parents=True)
@@ -99,32 +99,32 @@ def _resumed(folder: Path) -> Any:
 
 
 def _started() -> list[bytes]:
-    from tailgate.schema import as_data
-    from tailgate.train import load_config
+    from tailgate.core.schema import as_data
+    from tailgate.training.train import load_config
 
     return [json.dumps(as_data(load_config(None, [])), indent=1).encode()]
 
 
 def _game(folder: Path) -> Any:
-    from tailgate.selfplay import load_config
+    from tailgate.training.selfplay import load_config
 
     return load_config(str(folder / "game.yaml"), [f"out={folder}"])
 
 
 def _scenario(folder: Path) -> Any:
-    from tailgate.scenario import load_scenario
+    from tailgate.core.scenario import load_scenario
 
     return load_scenario(str(folder / "scenario.yaml"))
 
 
 def _suite(folder: Path) -> Any:
-    from tailgate.scenario import load_suite
+    from tailgate.core.scenario import load_suite
 
     return load_suite(str(folder / "suite.yaml"))
 
 
 def _program(folder: Path) -> Any:
-    from tailgate.registry import Spec
+    from tailgate.core.registry import Spec
 
     return Spec("attack", str(folder / "program.yaml")).make()
 
@@ -136,7 +136,7 @@ def _automata(folder: Path) -> Any:
 
 
 def _space(folder: Path) -> Any:
-    from tailgate.tuning import read_space
+    from tailgate.training.tuning import read_space
 
     return read_space(str(folder / "space.yaml"), "ppo")
 
@@ -154,8 +154,8 @@ def _profile(folder: Path) -> Any:
 
 def _read_rows(name: str) -> Callable[[Path], Any]:
     def read(folder: Path) -> Any:
+        from tailgate.evaluation.rows import read_rows
         from tailgate.leaderboard import run
-        from tailgate.rows import read_rows
 
         run._one_round(folder, "")
         return read_rows(folder / name)
@@ -200,7 +200,7 @@ def _trust(folder: Path) -> Any:
 def _trust_files() -> list[bytes]:
     import dataclasses
 
-    from tailgate.scenario import load_suite
+    from tailgate.core.scenario import load_suite
     from tailgate.trust.run import check
 
     suite = dataclasses.replace(load_suite("quick-v0"), defences=("kf",), attacks=("none",))
@@ -216,7 +216,7 @@ CARD = {
 def _learner(name: str, changes: dict[str, Any]) -> Any:
     if name not in _held:
         from tailgate.agents.learning import learner_of
-        from tailgate.schema import build
+        from tailgate.core.schema import build
 
         module = learner_of(name)
         _held[name] = module.Learner(0, 0.995, build(module.Config, changes, name), {"scenario": "gusty-stop-and-go-v0", "defence": "kf"})
@@ -251,7 +251,7 @@ def _defenders() -> list[Path]:
 
 
 def _defender(folder: Path) -> Any:
-    from tailgate.registry import Spec
+    from tailgate.core.registry import Spec
 
     return Spec("defence", f"steered:policy={folder / 'd.json'}").make()
 
@@ -263,7 +263,7 @@ def _defender_tensors(folder: Path) -> None:
 
 
 def _log(folder: Path) -> Any:
-    from tailgate.log import _whole
+    from tailgate.studies.log import _whole
 
     (folder / "README.md").touch()
     return _whole(folder)
@@ -281,8 +281,8 @@ def _parquet() -> list[bytes]:
 
 
 def _part(folder: Path) -> Any:
-    from tailgate.evaluation import Cell
-    from tailgate.log import _good
+    from tailgate.evaluation.cells import Cell
+    from tailgate.studies.log import _good
 
     return _good(folder / "part.parquet", Cell("quick-v0", "gusty-stop-and-go-v0", None, "kf", "none", 1, "train"))
 
@@ -291,7 +291,7 @@ def _journal() -> list[bytes]:
     import logging
     import tempfile
 
-    from tailgate.tuning import optuna
+    from tailgate.training.tuning import optuna
 
     module = optuna()
     logging.getLogger("optuna").setLevel(logging.ERROR)
@@ -306,7 +306,7 @@ def _journal() -> list[bytes]:
 
 
 def _search(folder: Path) -> Any:
-    from tailgate.tuning import _open, make_search
+    from tailgate.training.tuning import _open, make_search
 
     run = folder / "quickstart-tune"
     run.mkdir(exist_ok=True)
@@ -315,7 +315,7 @@ def _search(folder: Path) -> Any:
 
 
 def _spent(folder: Path) -> Any:
-    from tailgate.trainings import spent
+    from tailgate.training.trainings import spent
 
     return spent(folder / "curve-0.json")
 
@@ -328,13 +328,13 @@ def _said(read: Callable[[str], Any]) -> Callable[[Path], Any]:
 
 
 def _override(text: str) -> Any:
-    from tailgate.train import load_config
+    from tailgate.training.train import load_config
 
     return load_config(None, text.split("\n"))
 
 
 def _component(text: str) -> Any:
-    from tailgate.registry import Spec
+    from tailgate.core.registry import Spec
 
     family: Any = "attack" if text.startswith(("a ", "b")) else "defence"
     spec = Spec(family, text)
@@ -352,8 +352,8 @@ def _arguments(text: str) -> Any:
     import contextlib
     import io
 
-    from tailgate.cli import _parser
-    from tailgate.errors import InputError
+    from tailgate.base.errors import InputError
+    from tailgate.cli.command_line import _parser
 
     said = io.StringIO()
     try:
@@ -424,7 +424,7 @@ def readers() -> dict[str, Reader]:
         Reader("trust report", "json", "trust.json", _trust_files, _trust),
         Reader("trust cells", "jsonl", "cells.jsonl", lambda: [b'{"cell": "a", "status": "ok", "properties": [], "conjunctions": {}}\n' * 3],
                _beside("trust.run", "_read", file="cells.jsonl")),
-        Reader("report of claims", "json", "report.json", _files("results/reproduction/report.json"), _beside("reproduce.run", "read", file="")),
+        Reader("report of claims", "json", "report.json", _files("results/reproduction/report.json"), _beside("thesis.run", "read", file="")),
         Reader("log's schema", "json", "schema.json", lambda: [b'{"format": "tailgate-log-1", "identity": "x", "files": [{"path": "README.md", "bytes": 0}]}'], _log),
         Reader("log's part", "parquet", "part.parquet", _parquet, _part),
         Reader("search's journal", "jsonl", "journal.jsonl", _journal, _search, slow=2.0),

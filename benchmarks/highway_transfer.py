@@ -26,17 +26,17 @@ from rich.console import Console
 from scipy.stats import kendalltau
 
 import tailgate
-from tailgate.adaptive import train_against
+from tailgate.base.files import write_atomic
+from tailgate.base.plots import MARKERS, canvas, png
+from tailgate.base.progress import cells as words
+from tailgate.base.progress import progress
 from tailgate.core import Array
-from tailgate.evaluation import cells_of, run
-from tailgate.files import write_atomic
-from tailgate.plots import MARKERS, canvas, png
-from tailgate.progress import cells as words
-from tailgate.progress import progress
-from tailgate.rivals import outcomes
-from tailgate.scenario import Suite
-from tailgate.stats import proportion
-from tailgate.train import TrainConfig, load_config
+from tailgate.core.scenario import Suite
+from tailgate.evaluation.baselines import outcomes
+from tailgate.evaluation.cells import cells_of, run
+from tailgate.evaluation.stats import proportion
+from tailgate.training.adaptive import train_against
+from tailgate.training.train import TrainConfig, load_config
 
 DEFENCES = ("none", "kf", "rkf", "imm", "chi2_kf", "reacquire_kf", "brake_kf", "cra")
 AGAINST = {"radar": ("chi2_kf", "cra"), "tuned": ("kf", "chi2_kf", "cra"), "highway": ("chi2_kf",)}  # what attackers are trained against

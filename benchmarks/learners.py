@@ -13,15 +13,15 @@ from pathlib import Path
 
 import numpy as np
 
-from tailgate import draws
 from tailgate.agents.learning import LEARNERS, check_action, learner_of
 from tailgate.agents.policy import PolicyAttack
 from tailgate.agents.reward import NEAR, small
+from tailgate.base.errors import InputError
+from tailgate.core import draws
+from tailgate.core.registry import Spec
 from tailgate.envs.seat import Seat
-from tailgate.errors import InputError
-from tailgate.metrics import METRICS
-from tailgate.registry import Spec
-from tailgate.strength.timing import played
+from tailgate.play.metrics import METRICS
+from tailgate.studies.timing import played
 
 TASK = {
     "scenario": "gusty-stop-and-go-v0", "defence": "kf", "threat": {"kinds": ["fdi"], "budget": 30, "fdi_bound": 6.0}, "interval": 30,

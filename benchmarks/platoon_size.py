@@ -21,14 +21,14 @@ from pathlib import Path
 from matplotlib.ticker import NullLocator
 
 import tailgate
-from tailgate import draws
-from tailgate.draws import Role
+from tailgate.base.files import write_atomic
+from tailgate.base.plots import canvas, png
+from tailgate.core import draws
+from tailgate.core.draws import Role
+from tailgate.core.loop import Loop
+from tailgate.core.registry import Spec
+from tailgate.core.scenario import load_scenario
 from tailgate.estimators import distributed
-from tailgate.files import write_atomic
-from tailgate.loop import Loop
-from tailgate.plots import canvas, png
-from tailgate.registry import Spec
-from tailgate.scenario import load_scenario
 
 EPISODES, STEPS, WARM = 4, 20, 3
 GROUPS = (("none",), ("dkf", "lasso_dkf"))

@@ -9,10 +9,10 @@ import re
 
 import numpy as np
 
-from tailgate import train
-from tailgate.errors import InputError
-from tailgate.evaluation import cells_of, run
-from tailgate.rivals import BATCH, outcomes
+from tailgate.base.errors import InputError
+from tailgate.evaluation.baselines import BATCH, outcomes
+from tailgate.evaluation.cells import cells_of, run
+from tailgate.training import train
 
 TRIES, TRIED_ON, KEPT, KEPT_ON, JOIN = 48, 64, 8, 512, 2  # scripts of a template; episodes of each; of these; episodes; and of these
 _HOLE = re.compile(r"\{([^{}]*)\}")

@@ -23,9 +23,9 @@ import numpy as np
 from rich.console import Console
 
 import tailgate
-from tailgate.files import write_atomic
-from tailgate.progress import cells, progress
-from tailgate.scenario import load_suite
+from tailgate.base.files import write_atomic
+from tailgate.base.progress import cells, progress
+from tailgate.core.scenario import load_suite
 from tailgate.trust.run import check
 from tailgate.trust.statistics import Sequential, Sprt, interval, okamoto, runs_for
 

@@ -17,13 +17,13 @@ from typing import Any
 import numpy as np
 
 import tailgate
-from tailgate import draws
+from tailgate.core import draws
+from tailgate.core.registry import Spec
+from tailgate.core.scenario import Scenario, load_scenario
 from tailgate.estimators import RobustKalman
 from tailgate.estimators.kalman import steady_state
-from tailgate.metrics import rmse_position
-from tailgate.registry import Spec
-from tailgate.scenario import Scenario, load_scenario
-from tailgate.trace import rollout
+from tailgate.play.metrics import rmse_position
+from tailgate.play.trace import rollout
 
 GRID = tuple(float(f"{x:.4g}") for x in np.geomspace(0.5, 16.0, 16))  # in 1/sqrt(R_11)
 NOISY = 18.5  # variance of both noises, of which the thesis's figures speak

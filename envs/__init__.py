@@ -1,6 +1,6 @@
 """Plants, sensors, controllers and manoeuvres, and the Gymnasium faces over the loop."""
 
-from tailgate.lazy import exported
+from tailgate.base.lazy import exported
 
 HOMES = {  # modules, and what they give to the package
     "cacc": "FeedForward",

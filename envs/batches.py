@@ -6,14 +6,14 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from tailgate import sizes
+from tailgate.base import sizes
+from tailgate.base.errors import InputError, unknown
+from tailgate.base.pytree import leaves, with_leaves
 from tailgate.core import Array, Frame, View
-from tailgate.draws import Keys
-from tailgate.engine.agreement import Untraced
-from tailgate.engine.seats import Rows, SeatPrograms, programs_of
-from tailgate.errors import InputError, unknown
-from tailgate.loop import LoopState
-from tailgate.tree import leaves, with_leaves
+from tailgate.core.draws import Keys
+from tailgate.core.loop import LoopState
+from tailgate.play.agreement import Untraced
+from tailgate.play.seats import Rows, SeatPrograms, programs_of
 
 from .seat import Outcome, Seat, Tally
 from .shadow import Begun, Decided, Shadow

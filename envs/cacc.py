@@ -16,10 +16,10 @@ from typing import NamedTuple
 import numpy as np
 
 from tailgate import num
+from tailgate.base.errors import InputError
 from tailgate.core import Array, Estimate, Mode, Model, Probability, param
-from tailgate.errors import InputError
-from tailgate.quantities import Accel, Gain, Lag, Length, check_order
-from tailgate.registry import register
+from tailgate.core.quantities import Accel, Gain, Lag, Length, check_order
+from tailgate.core.registry import register
 
 from .controllers import WIDEN_FACTOR, limited, obeyed
 

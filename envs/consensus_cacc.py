@@ -10,10 +10,10 @@ from typing import Literal
 
 import numpy as np
 
+from tailgate.base.errors import InputError
 from tailgate.core import Array, param
-from tailgate.errors import InputError
-from tailgate.quantities import Gain
-from tailgate.registry import register
+from tailgate.core.quantities import Gain
+from tailgate.core.registry import register
 
 from .cacc import Column, Gains, Law, no_gains
 

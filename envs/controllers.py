@@ -5,10 +5,10 @@ from typing import Any
 
 import numpy as np
 
+from tailgate.base.errors import InputError
 from tailgate.core import Array, Estimate, Mode, Model, param
-from tailgate.errors import InputError
-from tailgate.quantities import Accel, Lag, Length, PositiveGain, PositiveSpeed, check_order
-from tailgate.registry import register
+from tailgate.core.quantities import Accel, Lag, Length, PositiveGain, PositiveSpeed, check_order
+from tailgate.core.registry import register
 
 LEADER = ("leader_position", "leader_velocity")  # what the leader sends
 WIDEN_FACTOR = 1.5  # Mode.WIDEN: time headway times this

@@ -13,18 +13,17 @@ from typing import Any, Literal, NamedTuple
 import gymnasium
 import numpy as np
 
-from tailgate import draws
 from tailgate.agents.codec import ActionSpec
 from tailgate.agents.mixture import Mixture
-from tailgate.core import Array, Attack, Command, Frame, NonNegative, View, param
-from tailgate.draws import Keys, Role
-from tailgate.errors import InputError, unknown
+from tailgate.base.errors import InputError, unknown
+from tailgate.base.pytree import put_rows
+from tailgate.core import Array, Attack, Command, Frame, NonNegative, View, draws, param
+from tailgate.core.draws import Keys, Role
+from tailgate.core.loop import LoopState
+from tailgate.core.registry import Spec, entry_for
+from tailgate.core.schema import as_data, build, digest, fields_of
 from tailgate.estimators.steered import Steered, SteeredChallenge, SteeredPlan, SteeredState
 from tailgate.estimators.steering import LIMIT, Menu
-from tailgate.loop import LoopState
-from tailgate.registry import Spec, entry_for
-from tailgate.schema import as_data, build, digest, fields_of
-from tailgate.tree import put_rows
 
 from .seat import CAR_FOLLOWING, FACES, Outcome, Seat, Tally
 from .specs import Specified, check_options, in_box

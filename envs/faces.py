@@ -14,12 +14,12 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from tailgate import draws, sizes
 from tailgate.agents.codec import action_space
 from tailgate.agents.observation import LIMIT
-from tailgate.core import Array, Frame
-from tailgate.errors import InputError, unknown
-from tailgate.loop import LoopState
+from tailgate.base import sizes
+from tailgate.base.errors import InputError, unknown
+from tailgate.core import Array, Frame, draws
+from tailgate.core.loop import LoopState
 
 from .batches import PlainEpisodes, TracedEpisodes, framed, side_by_side
 from .render_viewer import Screen, Viewer

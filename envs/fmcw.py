@@ -22,9 +22,9 @@ import numpy as np
 from pydantic import Field
 
 from tailgate import num
+from tailgate.base.errors import InputError
 from tailgate.core import Array, param
-from tailgate.errors import InputError
-from tailgate.quantities import Decibel
+from tailgate.core.quantities import Decibel
 
 LIGHT = 299_792_458.0  # speed of light c [m/s]
 KT0 = 1.380649e-23 * 290.0  # thermal noise density at the reference temperature of a noise figure [W/Hz]

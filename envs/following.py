@@ -15,11 +15,11 @@ import numpy as np
 from pydantic import Field
 
 from tailgate import num
+from tailgate.base.errors import InputError
 from tailgate.core import Array, Controller, Model, Prior, Scene, Sensor, param
-from tailgate.draws import Draws
-from tailgate.errors import InputError
-from tailgate.quantities import Accel, Gap, Lag, Position, Speed, Spread, Step, Time, Variance
-from tailgate.registry import register
+from tailgate.core.draws import Draws
+from tailgate.core.quantities import Accel, Gap, Lag, Position, Speed, Spread, Step, Time, Variance
+from tailgate.core.registry import register
 
 from .controllers import LEADER
 from .idm import Behind, BehindState

@@ -18,11 +18,11 @@ import numpy as np
 from pydantic import Field
 
 from tailgate import num
+from tailgate.base.errors import InputError
 from tailgate.core import Array, Controller, Model, Positive, Prior, Scene, Sensor, param
-from tailgate.draws import Draws
-from tailgate.errors import InputError
-from tailgate.quantities import Gap, Lag, Length, PositiveSpeed, Rate, Step, Variance, check_order
-from tailgate.registry import register
+from tailgate.core.draws import Draws
+from tailgate.core.quantities import Gap, Lag, Length, PositiveSpeed, Rate, Step, Variance, check_order
+from tailgate.core.registry import register
 
 from .radar_car import STATES, radar_model
 from .vehicle import drive, lag

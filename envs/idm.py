@@ -10,8 +10,8 @@ import numpy as np
 
 from tailgate import num
 from tailgate.core import Array, Estimate, Model, param
-from tailgate.quantities import Lag, Length, PositiveSpeed, Rate
-from tailgate.registry import register
+from tailgate.core.quantities import Lag, Length, PositiveSpeed, Rate
+from tailgate.core.registry import register
 
 from .controllers import limited, obeyed, widened
 from .radar_car import GAP, RELATIVE_SPEED, check_radar_car

@@ -7,8 +7,8 @@ import numpy as np
 
 from tailgate import num
 from tailgate.core import Array, Model, Prior, Scene
-from tailgate.draws import Draws
-from tailgate.registry import register
+from tailgate.core.draws import Draws
+from tailgate.core.registry import register
 
 from .cacc import PER_CAR, Column
 from .platoon import String

@@ -17,8 +17,8 @@ import numpy as np
 
 from tailgate import num
 from tailgate.core import Array, Estimate, Model, param
-from tailgate.quantities import Lag, Length, PositiveGain
-from tailgate.registry import register
+from tailgate.core.quantities import Lag, Length, PositiveGain
+from tailgate.core.registry import register
 
 from .following import CarFollowing, FollowingPlan
 

@@ -9,12 +9,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tailgate import num
+from tailgate.base.errors import InputError, said
+from tailgate.base.reading import read_bytes
 from tailgate.core import Array, param
-from tailgate.draws import Draws
-from tailgate.errors import InputError, said
-from tailgate.quantities import Accel, Gain, Lag, PositiveGain, PositiveSpeed, Rate, Speed, Spread, Time, TimeSpan, check_order
-from tailgate.reading import read_bytes
-from tailgate.registry import register
+from tailgate.core.draws import Draws
+from tailgate.core.quantities import Accel, Gain, Lag, PositiveGain, PositiveSpeed, Rate, Speed, Spread, Time, TimeSpan, check_order
+from tailgate.core.registry import register
 
 
 def _within(span: tuple[float, float], u: Array) -> Array:

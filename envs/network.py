@@ -14,6 +14,7 @@ import numpy as np
 from pydantic import Field
 
 from tailgate import num
+from tailgate.base.errors import InputError
 from tailgate.core import (
     Array,
     Controller,
@@ -29,11 +30,10 @@ from tailgate.core import (
     Sized,
     param,
 )  # fmt: skip
-from tailgate.draws import Draws, constants
-from tailgate.errors import InputError
-from tailgate.quantities import PositiveVariance, Size, Spread, Step, Variance
-from tailgate.reach import require_detectable
-from tailgate.registry import register
+from tailgate.core.draws import Draws, constants
+from tailgate.core.quantities import PositiveVariance, Size, Spread, Step, Variance
+from tailgate.core.reach import require_detectable
+from tailgate.core.registry import register
 
 Edge = Annotated[tuple[Count, Count], Field(min_length=2, max_length=2)]
 GraphName = Literal["thesis", "ring", "path", "star", "complete", "random"]

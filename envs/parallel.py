@@ -15,8 +15,8 @@ except ImportError as error:
 
 from tailgate.agents.codec import action_space
 from tailgate.agents.observation import LIMIT
+from tailgate.base.errors import InputError
 from tailgate.core import Array, Frame
-from tailgate.errors import InputError
 
 from .duel import Duel, DuelState, checked, next_game
 from .render_viewer import Screen, Viewer

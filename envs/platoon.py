@@ -19,12 +19,12 @@ import numpy as np
 from pydantic import Field
 
 from tailgate import num
+from tailgate.base.errors import InputError
 from tailgate.core import Array, Controller, Model, Prior, Received, Scene, Sensor, Sized, param
-from tailgate.draws import Draws
-from tailgate.errors import InputError
-from tailgate.quantities import Gap, Lag, Length, PositiveSpread, PositiveVariance, Speed, Spread, Step, Variance
-from tailgate.reach import require_detectable
-from tailgate.registry import register
+from tailgate.core.draws import Draws
+from tailgate.core.quantities import Gap, Lag, Length, PositiveSpread, PositiveVariance, Speed, Spread, Step, Variance
+from tailgate.core.reach import require_detectable
+from tailgate.core.registry import register
 
 from .cacc import PER_CAR, V2V, Column, Gains, Law
 from .vehicle import SIGMAS, drive, lag

@@ -7,8 +7,8 @@ Control Systems Technology 22 (2014) 786-793.
 from dataclasses import dataclass
 
 from tailgate.core import Array, param
-from tailgate.quantities import Gain
-from tailgate.registry import register
+from tailgate.core.quantities import Gain
+from tailgate.core.registry import register
 
 from .cacc import Column, Gains, Law, no_gains, spacing
 

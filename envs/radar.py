@@ -7,11 +7,11 @@ import numpy as np
 from pydantic import Field
 
 from tailgate import num
+from tailgate.base.errors import InputError
 from tailgate.core import Air, Array, Model, Received, Sized, param
-from tailgate.draws import Draws
-from tailgate.errors import InputError
-from tailgate.quantities import Gap, PositiveSpread, Step, check_order
-from tailgate.registry import register
+from tailgate.core.draws import Draws
+from tailgate.core.quantities import Gap, PositiveSpread, Step, check_order
+from tailgate.core.registry import register
 
 from . import fmcw_signal
 from .fmcw import Link, challenge_samples, heard_energy, outlier_probability, tone_sd

@@ -5,10 +5,10 @@ from typing import Any
 
 import numpy as np
 
+from tailgate.base.errors import InputError
 from tailgate.core import Array, Estimate, Model, Plant, Receiver, Sensor, param
-from tailgate.errors import InputError
-from tailgate.quantities import Accel, Lag, Length, PositiveGain, PositiveSpeed, check_order
-from tailgate.registry import register
+from tailgate.core.quantities import Accel, Lag, Length, PositiveGain, PositiveSpeed, check_order
+from tailgate.core.registry import register
 
 from .controllers import limited, obeyed, widened
 

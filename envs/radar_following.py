@@ -18,9 +18,9 @@ from pydantic import Field
 
 from tailgate import num
 from tailgate.core import Array, Controller, Model, Prior, Scene, Sensor, param
-from tailgate.draws import Draws
-from tailgate.quantities import Gap, Lag, PositiveGain, Speed, Step, Time, Variance
-from tailgate.registry import register
+from tailgate.core.draws import Draws
+from tailgate.core.quantities import Gap, Lag, PositiveGain, Speed, Step, Time, Variance
+from tailgate.core.registry import register
 
 from .idm import Behind, BehindState
 from .radar_car import STATES, radar_model

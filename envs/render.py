@@ -9,10 +9,10 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from tailgate.base.errors import InputError
 from tailgate.core import Array, Frame
-from tailgate.errors import InputError
-from tailgate.loop import Loop, LoopState
-from tailgate.registry import entry_for
+from tailgate.core.loop import Loop, LoopState
+from tailgate.core.registry import entry_for
 
 from . import render_following, render_network, render_platoon, render_radar
 from .render_canvas import HEIGHT as HEIGHT

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from tailgate.core import Frame, Kind
-from tailgate.loop import Loop, LoopState
+from tailgate.core.loop import Loop, LoopState
 
 from .render_canvas import ATTACK, COMMANDS, EGO, GREY, INK, PALE, WARNING, WHITE, aimed, alarmed, metres
 from .render_sheet import Sheet

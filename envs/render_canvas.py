@@ -13,7 +13,7 @@ except ImportError as error:
     raise ImportError("Pillow is missing, which draws the pictures: pip install 'tailgate[viz]'") from error
 
 from tailgate.core import Array, Command, Frame, Kind, Mode
-from tailgate.loop import Loop, LoopState
+from tailgate.core.loop import Loop, LoopState
 
 HEIGHT, WIDTH = 320, 960  # multiples of 16, which video encoders ask for
 ZOOM = 2  # drawn larger and shrunk: Pillow's lines are not smooth

@@ -11,7 +11,7 @@ import math
 import numpy as np
 
 from tailgate.core import Array, Frame
-from tailgate.loop import Loop, LoopState
+from tailgate.core.loop import Loop, LoopState
 
 from .render_canvas import (
     BELIEF,

@@ -11,7 +11,7 @@ from itertools import pairwise
 from typing import NamedTuple
 
 from tailgate.core import Array, Frame
-from tailgate.loop import Loop, LoopState
+from tailgate.core.loop import Loop, LoopState
 
 from .render_bars import lower, upper
 from .render_canvas import ATTACK, BELIEF, BELIEF_PALE, EGO, INK, TINY, WARNING, WHITE, ZOOM, ended, metres

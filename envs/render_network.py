@@ -7,9 +7,9 @@ from functools import lru_cache
 
 import numpy as np
 
+from tailgate.base.drawing import edges, layout
 from tailgate.core import Array, Frame
-from tailgate.drawing import edges, layout
-from tailgate.loop import Loop, LoopState
+from tailgate.core.loop import Loop, LoopState
 
 from .render_canvas import (
     ATTACK,

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from tailgate.core import Array, Frame
-from tailgate.loop import Loop, LoopState
+from tailgate.core.loop import Loop, LoopState
 
 from .render_canvas import (
     ATTACK,

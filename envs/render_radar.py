@@ -10,7 +10,7 @@ import math
 from itertools import pairwise
 
 from tailgate.core import Array, Frame
-from tailgate.loop import Loop, LoopState
+from tailgate.core.loop import Loop, LoopState
 
 from .radar_car import GAP
 from .render_canvas import EGO, HEIGHT, INK, MARGIN, SMALL, WARNING, WHITE, WIDTH, Canvas, ended_line, header, metres

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tailgate.errors import InputError, NotApplicable, unknown
-from tailgate.loop import Loop
+from tailgate.base.errors import InputError, NotApplicable, unknown
+from tailgate.core.loop import Loop
 
 if TYPE_CHECKING:
     from .render import Window

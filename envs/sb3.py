@@ -12,8 +12,8 @@ try:
 except ImportError as error:
     raise ImportError("Stable-Baselines3 is missing: pip install 'tailgate[train]'") from error
 
+from tailgate.base.errors import unknown
 from tailgate.core import Array
-from tailgate.errors import unknown
 
 from .faces import AdversaryEnv, AdversaryVectorEnv
 from .seat import CAR_FOLLOWING, FACES

@@ -12,6 +12,7 @@ import numpy as np
 from pydantic import Field
 
 from tailgate import num
+from tailgate.base.errors import InputError
 from tailgate.core import (
     Array,
     Controller,
@@ -24,10 +25,9 @@ from tailgate.core import (
     Sized,
     param,
 )  # fmt: skip
-from tailgate.draws import Draws
-from tailgate.errors import InputError
-from tailgate.quantities import PositiveVariance, Spread, Step
-from tailgate.registry import register
+from tailgate.core.draws import Draws
+from tailgate.core.quantities import PositiveVariance, Spread, Step
+from tailgate.core.registry import register
 
 Factor = Annotated[float, Field(ge=-10.0, le=10.0, allow_inf_nan=False)]
 GROWTH = 1.5  # of the state in a step, at most: 1000 steps of it are still a number

@@ -9,17 +9,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tailgate import sizes
 from tailgate.agents.codec import ActionCodec, ActionSpec
 from tailgate.agents.observation import FRAMES, ObservationCodec
 from tailgate.agents.reward import Reward
+from tailgate.base import sizes
+from tailgate.base.errors import InputError, UnknownArgument, unknown
 from tailgate.core import Array, Command, Frame, Kind, View
-from tailgate.errors import InputError, UnknownArgument, unknown
-from tailgate.loop import Loop, LoopState
-from tailgate.registry import Spec
-from tailgate.scenario import load_scenario
-from tailgate.schema import as_data, build, digest, fields_of
-from tailgate.threat import ThreatModel
+from tailgate.core.loop import Loop, LoopState
+from tailgate.core.registry import Spec
+from tailgate.core.scenario import load_scenario
+from tailgate.core.schema import as_data, build, digest, fields_of
+from tailgate.core.threat import ThreatModel
 
 CAR_FOLLOWING = "tailgate/CarFollowing-v0"
 FACES: dict[str, dict[str, Any]] = {  # what each id is where nothing else is said: the one place of these defaults

@@ -8,11 +8,11 @@ import numpy as np
 from pydantic import Field
 
 from tailgate import num
+from tailgate.base.errors import InputError
 from tailgate.core import Array, Model, Received, Sized, param
-from tailgate.draws import Draws
-from tailgate.errors import InputError
-from tailgate.quantities import Variance
-from tailgate.registry import register
+from tailgate.core.draws import Draws
+from tailgate.core.quantities import Variance
+from tailgate.core.registry import register
 
 Pair = Annotated[tuple[Variance, Variance], Field(min_length=2, max_length=2)]
 

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from tailgate.core import Array, Frame
-from tailgate.draws import Keys
-from tailgate.loop import LoopState
+from tailgate.core.draws import Keys
+from tailgate.core.loop import LoopState
 
 from .seat import Seat
 

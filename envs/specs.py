@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 from gymnasium.envs.registration import EnvSpec
 
+from tailgate.base.errors import InputError, unknown
 from tailgate.core import Array
-from tailgate.errors import InputError, unknown
-from tailgate.registry import Family, Spec, entry_for, text_of
-from tailgate.schema import as_data
+from tailgate.core.registry import Family, Spec, entry_for, text_of
+from tailgate.core.schema import as_data
 
 ROUNDING = 1e-6  # by which a vector may leave [-1, 1]: float32 that was scaled is off by as much
 _FAMILIES: dict[str, Family] = {"defence": "defence", "attack": "attack"}  # arguments that may be objects

@@ -12,8 +12,8 @@ discretised exactly (zero-order hold of u) with E = exp(-dt/tau) and s1 = tau (1
 import numpy as np
 
 from tailgate import num
+from tailgate.base.errors import InputError
 from tailgate.core import Array
-from tailgate.errors import InputError
 
 SIGMAS = 6.0  # initial gaps leave room for that many standard deviations: one car in 10^9 begins in a collision
 REACTION = 10_000  # most steps of the reaction of a driver behind

@@ -1,6 +1,6 @@
 """Defences: one method per file, its reference in the docstring."""
 
-from tailgate.lazy import exported
+from tailgate.base.lazy import exported
 
 from .compose import compose as compose  # which stands here in place of the module of its name
 from .per_episode import per_episode as per_episode  # likewise

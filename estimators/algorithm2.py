@@ -16,7 +16,7 @@ from pydantic import Field
 
 from tailgate import num
 from tailgate.core import Array, Innovation, Positive, PositiveCount, Probability, param
-from tailgate.registry import register
+from tailgate.core.registry import register
 
 from .challenge import QUIET, WATCH, Challenger, Response
 from .compose import Filter

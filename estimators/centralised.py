@@ -12,8 +12,8 @@ import numpy as np
 
 from tailgate import num
 from tailgate.core import Array, Estimate, Model, Prior, Received
-from tailgate.draws import Draws
-from tailgate.registry import register
+from tailgate.core.draws import Draws
+from tailgate.core.registry import register
 
 from .compose import AcceptAll, Composed, Filter, Score, compose
 from .distributed import DistributedKalmanFilter

@@ -21,13 +21,13 @@ import numpy as np
 from pydantic import Field
 
 from tailgate import num
+from tailgate.base.errors import InputError, NotApplicable
+from tailgate.base.pytree import map_leaves
 from tailgate.core import Array, Estimate, Model, NonNegative, Positive, PositiveCount, Prior, Probability, Received, param
-from tailgate.draws import Draws
+from tailgate.core.draws import Draws
+from tailgate.core.registry import imported, make_from, register
+from tailgate.core.schema import build
 from tailgate.envs.fmcw import false_alarm_threshold, from_db
-from tailgate.errors import InputError, NotApplicable
-from tailgate.registry import imported, make_from, register
-from tailgate.schema import build
-from tailgate.tree import map_leaves
 
 from .compose import AcceptAll, Filter, Look, ModeName, Verdict
 from .predictors import read_states

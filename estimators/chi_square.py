@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 
 from tailgate import num
 from tailgate.core import Innovation, Positive, param
-from tailgate.registry import register
+from tailgate.core.registry import register
 
 from .compose import Composed, Detector, Filter, GateOut, Mitigation, Stateless, Verdict, blame_all
 from .kalman import GAIN, Gain, KalmanFilter

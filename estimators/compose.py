@@ -13,11 +13,11 @@ from typing import Any, Literal, NamedTuple, Protocol
 import numpy as np
 
 from tailgate import num
+from tailgate.base.errors import NotApplicable
 from tailgate.core import Array, Count, Estimate, Innovation, Mode, Model, NonNegative, Prior, Received, param
-from tailgate.draws import Draws
-from tailgate.errors import NotApplicable
-from tailgate.registry import imported, make_from, register
-from tailgate.schema import build, fields_of
+from tailgate.core.draws import Draws
+from tailgate.core.registry import imported, make_from, register
+from tailgate.core.schema import build, fields_of
 
 
 class Verdict(NamedTuple):

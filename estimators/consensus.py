@@ -22,10 +22,10 @@ from typing import ClassVar
 import numpy as np
 
 from tailgate import num
+from tailgate.base.errors import NotApplicable
 from tailgate.core import Array, Innovation, Model, Positive, Probability, param
-from tailgate.errors import NotApplicable
-from tailgate.reach import MARGIN, blind
-from tailgate.registry import register
+from tailgate.core.reach import MARGIN, blind
+from tailgate.core.registry import register
 
 from .compose import AcceptAll, Composed, Detector, Filter, Mitigation
 from .distributed import ALARM, DistributedFilter, FusionPlan, gate_of, neighbours, one_row

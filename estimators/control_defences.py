@@ -14,9 +14,9 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from tailgate import num
+from tailgate.base.errors import InputError, NotApplicable
 from tailgate.core import Array, Finite, Model, NonNegative, Positive, Received, param
-from tailgate.errors import InputError, NotApplicable
-from tailgate.registry import register
+from tailgate.core.registry import register
 
 from .compose import Decision, GateOut, ModeName, Verdict, quiet
 

@@ -18,7 +18,7 @@ from pydantic import Field
 
 from tailgate import num
 from tailgate.core import Array, Innovation, Model, Positive, PositiveCount, param
-from tailgate.registry import register
+from tailgate.core.registry import register
 
 from .compose import Verdict, blame_all
 

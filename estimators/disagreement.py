@@ -19,7 +19,7 @@ import numpy as np
 
 from tailgate import num
 from tailgate.core import Array, Positive, param
-from tailgate.registry import register
+from tailgate.core.registry import register
 
 from .compose import Composed, Detector, Filter, GateOut, Mitigation
 from .distributed import ETA, DistributedFilter, FusionPlan, gate_of

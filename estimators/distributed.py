@@ -20,11 +20,11 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from tailgate import num
+from tailgate.base.errors import InputError
+from tailgate.base.pytree import remembered
 from tailgate.core import Array, Innovation, Model, Positive, Prior, Probability, Received, param
-from tailgate.errors import InputError
-from tailgate.reach import require_detectable
-from tailgate.registry import register
-from tailgate.tree import remembered
+from tailgate.core.reach import require_detectable
+from tailgate.core.registry import register
 
 from .chi_square import ChiSquare
 from .compose import AcceptAll, Composed, Detector, Filter, GateOut, Mitigation, Score, Stateless, Verdict, blame_all

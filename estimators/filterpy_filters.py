@@ -13,9 +13,9 @@ import numpy as np
 from pydantic import Field
 
 from tailgate import num
+from tailgate.base.errors import InputError
 from tailgate.core import Array, Finite, Model, NonNegative, Prior, param
-from tailgate.errors import InputError
-from tailgate.registry import register
+from tailgate.core.registry import register
 
 from .imm import LEAST, Modes
 from .kalman import precision

@@ -19,8 +19,8 @@ from pydantic import Field
 
 from tailgate import num
 from tailgate.core import Array, Estimate, Finite, Innovation, Mode, Model, Positive, Prior, Received, param
-from tailgate.draws import Draws
-from tailgate.registry import register
+from tailgate.core.draws import Draws
+from tailgate.core.registry import register
 
 from .kalman import SMALL, KalmanFilter, KalmanPlan, KalmanState
 

@@ -16,11 +16,11 @@ from typing import Any, Literal, NamedTuple, cast
 import numpy as np
 
 from tailgate import num
+from tailgate.base.errors import NotApplicable
+from tailgate.base.pytree import remembered
 from tailgate.core import Array, Innovation, Model, Prior, Received, param
-from tailgate.errors import NotApplicable
-from tailgate.reach import blind
-from tailgate.registry import register
-from tailgate.tree import remembered
+from tailgate.core.reach import blind
+from tailgate.core.registry import register
 
 from .compose import AcceptAll, Composed, Detector, Filter, Mitigation, Score
 

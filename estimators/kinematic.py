@@ -22,10 +22,10 @@ import numpy as np
 from pydantic import Field
 
 from tailgate import num
+from tailgate.base.errors import NotApplicable
 from tailgate.core import Array, Innovation, Model, NonNegative, Positive, Prior, Received, param
+from tailgate.core.registry import register
 from tailgate.envs.radar_car import GAP, LEAD_ACCEL, OWN_SPEED, RELATIVE_SPEED, STATES, kinematic
-from tailgate.errors import NotApplicable
-from tailgate.registry import register
 
 from .kalman import KalmanPlan, KalmanState, LinearFilter, alone
 

@@ -21,7 +21,7 @@ from typing import Any, Literal
 
 from tailgate import num
 from tailgate.core import Array, Innovation, Positive, param
-from tailgate.registry import register
+from tailgate.core.registry import register
 
 from .compose import AcceptAll, Composed, Detector, Filter, Mitigation, Score
 from .distributed import DistributedFilter

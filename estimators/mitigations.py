@@ -11,7 +11,7 @@ import numpy as np
 
 from tailgate import num
 from tailgate.core import Array, Count, PositiveCount, Received, param
-from tailgate.registry import register
+from tailgate.core.registry import register
 
 from .compose import Decision, GateOut, ModeName, ReactionPlan, Verdict, quiet
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from tailgate.core import Count, NonNegative, Positive, PositiveCount, param
-from tailgate.registry import register
+from tailgate.core.registry import register
 
 from .chi_square import ChiSquare
 from .compose import Composed, Detector, Filter, GateOut, Mitigation

@@ -12,7 +12,7 @@ y = C xh. Else Newton's iteration on 1/|u| = 1, concave in mu, from the lower bo
 to the solution and needs no safeguard. An axis that the prediction cannot move along, g_k = 0, has u_k = w_k / mu, and 0 where w_k = 0.
 
 Sensors that are not accepted leave the problem: each set of sensors of an agent has its own V and g. Erratum: (5.11) of the thesis has the
-factors in an order that does not multiply; the bound is in tailgate.resilience.
+factors in an order that does not multiply; the bound is in tailgate.thesis.resilience.
 """
 
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ import numpy as np
 
 from tailgate import num
 from tailgate.core import Array, Innovation, Model, Positive, Prior, Received, param
-from tailgate.registry import register
+from tailgate.core.registry import register
 
 from .compose import AcceptAll, Composed, Detector, Filter, Mitigation, Score
 from .distributed import DistributedFilter, FusionPlan, one_row

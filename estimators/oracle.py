@@ -5,9 +5,9 @@ from typing import Any
 
 import numpy as np
 
+from tailgate.base.errors import InputError
 from tailgate.core import Mode, Received, param
-from tailgate.errors import InputError
-from tailgate.registry import register
+from tailgate.core.registry import register
 
 from .compose import Composed, Decision, Detector, Filter, Mitigation, Score, Stateless, Verdict
 from .distributed import DistributedKalmanFilter

@@ -10,9 +10,9 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 import numpy as np
 
 from tailgate import num
+from tailgate.base.errors import InputError
 from tailgate.core import Array, Estimate, Mode, Model, Prior, Received
-from tailgate.draws import Draws
-from tailgate.errors import InputError
+from tailgate.core.draws import Draws
 
 
 class EpisodeFilter(Protocol):

@@ -18,9 +18,9 @@ import numpy as np
 from pydantic import Field
 
 from tailgate import num
+from tailgate.base.errors import InputError, NotApplicable
 from tailgate.core import Array, Innovation, Model, Positive, Prior, Received, param
-from tailgate.errors import InputError, NotApplicable
-from tailgate.registry import register
+from tailgate.core.registry import register
 
 LARGEST = 1e6  # an extrapolation does not pass this [unit of the sensor]: an unstable one would leave the numbers
 RIDGE = 1e-6  # on the coefficients of a polynomial, which its samples may leave open [-]

@@ -6,10 +6,10 @@ from typing import NamedTuple
 import numpy as np
 
 from tailgate import num
+from tailgate.base.errors import NotApplicable
 from tailgate.core import Array, Estimate, Mode, Model, Prior, Received
-from tailgate.draws import Draws
-from tailgate.errors import NotApplicable
-from tailgate.registry import register
+from tailgate.core.draws import Draws
+from tailgate.core.registry import register
 
 
 class Reading(NamedTuple):

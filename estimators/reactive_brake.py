@@ -20,10 +20,10 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from tailgate import num
+from tailgate.base.errors import NotApplicable
 from tailgate.core import Array, Estimate, Mode, Model, NonNegative, Positive, Prior, Received, param
-from tailgate.draws import Draws
-from tailgate.errors import NotApplicable
-from tailgate.registry import make_from, register
+from tailgate.core.draws import Draws
+from tailgate.core.registry import make_from, register
 
 from .safe_state import ACCEL, GAP, LEAD, SPEED, Finding, OwnCommand, SafeSet, SetPlan, SetState
 

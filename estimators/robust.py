@@ -20,7 +20,7 @@ import numpy as np
 
 from tailgate import num
 from tailgate.core import Array, Innovation, Model, Positive, param
-from tailgate.registry import register
+from tailgate.core.registry import register
 
 from .chi_square import ChiSquare
 from .compose import AcceptAll, Composed, Detector, Filter, Mitigation, Stateless, Verdict

@@ -22,12 +22,12 @@ import numpy as np
 from pydantic import Field
 
 from tailgate import num
+from tailgate.base.errors import InputError, NotApplicable
 from tailgate.core import Array, Model, NonNegative, Positive, Received, param
+from tailgate.core.quantities import Accel
 from tailgate.envs.cacc import V2V
 from tailgate.envs.controllers import LEADER
 from tailgate.envs.radar_car import kinematic
-from tailgate.errors import InputError, NotApplicable
-from tailgate.quantities import Accel
 
 GAP, LEAD, SPEED, ACCEL = range(4)  # columns of the box
 FAR = 1e4  # limit of a gap that nothing limits [m]

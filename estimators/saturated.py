@@ -26,7 +26,7 @@ import numpy as np
 
 from tailgate import num
 from tailgate.core import Array, Innovation, Positive, param
-from tailgate.registry import register
+from tailgate.core.registry import register
 
 from .compose import AcceptAll, Composed, Detector, Filter, Mitigation
 from .distributed import ALARM, DistributedFilter, FusionPlan, gate_of

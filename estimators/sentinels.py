@@ -7,7 +7,7 @@ import numpy as np
 
 from tailgate import num
 from tailgate.core import Array, Innovation, Mode, Model, PositiveCount, Received, param
-from tailgate.registry import register
+from tailgate.core.registry import register
 
 from .compose import AcceptAll, Composed, Decision, Detector, Filter, Mitigation, Score, Stateless, Verdict, blame_all
 from .kalman import KalmanFilter

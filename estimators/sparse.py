@@ -17,7 +17,7 @@ import numpy as np
 
 from tailgate import num
 from tailgate.core import Array, Innovation, Model, Positive, param
-from tailgate.registry import register
+from tailgate.core.registry import register
 
 from .compose import Composed, Detector, Filter, GateOut, Mitigation, Stateless, Verdict
 from .kalman import KalmanFilter, alone

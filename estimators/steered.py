@@ -20,12 +20,12 @@ import numpy as np
 from safetensors.numpy import save as save_tensors
 
 from tailgate import num
+from tailgate.base.errors import InputError, NotApplicable, unknown
+from tailgate.base.files import write_atomic
 from tailgate.core import Array, Count, Estimate, Model, PositiveCount, Prior, Received, param
-from tailgate.draws import Draws
-from tailgate.errors import InputError, NotApplicable, unknown
-from tailgate.files import write_atomic
-from tailgate.registry import entries, entry_for, register
-from tailgate.schema import as_data, build
+from tailgate.core.draws import Draws
+from tailgate.core.registry import entries, entry_for, register
+from tailgate.core.schema import as_data, build
 
 from .compose import Look
 from .steering import Hand, Memory, Menu, Sight, settings

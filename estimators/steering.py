@@ -18,8 +18,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tailgate import num
+from tailgate.base.errors import InputError, NotApplicable
 from tailgate.core import Array, Defence, Estimate, Mode, Model, Positive, PositiveCount, Probability, Received, param
-from tailgate.errors import InputError, NotApplicable
 
 from .challenge import CHANCE, Challenger, ChallengeState
 from .chi_square import ChiSquare

@@ -21,10 +21,10 @@ from typing import NamedTuple
 import numpy as np
 
 from tailgate import num
+from tailgate.base.errors import NotApplicable
 from tailgate.core import Array, Count, Model, param
-from tailgate.errors import NotApplicable
-from tailgate.reach import MARGIN
-from tailgate.registry import register
+from tailgate.core.reach import MARGIN
+from tailgate.core.registry import register
 
 from .compose import AcceptAll, Composed, Detector, Filter, Mitigation, Score
 from .distributed import neighbours

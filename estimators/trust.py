@@ -22,7 +22,7 @@ import numpy as np
 
 from tailgate import num
 from tailgate.core import Array, Innovation, Positive, Prior, Probability, param
-from tailgate.registry import register
+from tailgate.core.registry import register
 
 from .compose import AcceptAll, Composed, Detector, Filter, Mitigation
 from .disagreement import THRESHOLD, disagreement

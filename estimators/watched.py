@@ -1,7 +1,7 @@
-"""A defence with a watch on its score (tailgate.watch)."""
+"""A defence with a watch on its score (tailgate.core.score_threshold)."""
 
 from tailgate.core import Defence
-from tailgate.watch import Watched
+from tailgate.core.score_threshold import Watched
 
 from .chi_square import ChiSquare
 from .compose import AcceptAll, Composed, Score, compose

@@ -4,9 +4,9 @@ import math
 import re
 from html.parser import HTMLParser
 
-from tailgate.evaluation import evaluate
+from tailgate.evaluation.cells import evaluate
+from tailgate.evaluation.stats import mean_time
 from tailgate.leaderboard.site import build_site, slug
-from tailgate.stats import mean_time
 
 LEVELS = ("black", "grey", "white")
 DOSES = [5, 10, 20, 40, 200]

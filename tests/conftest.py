@@ -14,14 +14,14 @@ import pytest
 from hypothesis import settings
 
 import tailgate
+from tailgate.base.errors import NotApplicable
+from tailgate.base.pytree import leaves
 from tailgate.core import Model
-from tailgate.draws import keys
-from tailgate.errors import NotApplicable
-from tailgate.registry import entries
-from tailgate.scenario import load_scenario
-from tailgate.threat import KindName
-from tailgate.trace import rollout
-from tailgate.tree import leaves
+from tailgate.core.draws import keys
+from tailgate.core.registry import entries
+from tailgate.core.scenario import load_scenario
+from tailgate.core.threat import KindName
+from tailgate.play.trace import rollout
 
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # hundreds of commands are started: each would compile the package
 sys.dont_write_bytecode = False

@@ -7,10 +7,10 @@ import numpy as np
 
 import tailgate
 from tailgate.core import Prior, Received
-from tailgate.draws import keys
-from tailgate.registry import Spec
-from tailgate.scenario import load_scenario
-from tailgate.trace import rollout
+from tailgate.core.draws import keys
+from tailgate.core.registry import Spec
+from tailgate.core.scenario import load_scenario
+from tailgate.play.trace import rollout
 
 RNG = np.random.default_rng(23)
 

@@ -4,12 +4,12 @@ import dataclasses
 
 import numpy as np
 
-from tailgate import draws
-from tailgate.engine.commanded import Commanded, commanded
+from tailgate.core import draws
+from tailgate.core.registry import Spec
+from tailgate.core.scenario import load_scenario
 from tailgate.envs.faces import AdversaryVectorEnv
-from tailgate.registry import Spec
-from tailgate.scenario import load_scenario
-from tailgate.trace import Trace, rollout
+from tailgate.play.commanded import Commanded, commanded
+from tailgate.play.trace import Trace, rollout
 
 
 def loop_of(scenario, defence, attack, horizon=200, beyond=None, **threat):

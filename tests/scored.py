@@ -2,9 +2,9 @@
 
 import functools
 
-from tailgate.metrics import METRICS
-from tailgate.rounds import seeds_of
-from tailgate.scenario import Suite, load_scenario
+from tailgate.core.scenario import Suite, load_scenario
+from tailgate.evaluation.rounds import seeds_of
+from tailgate.play.metrics import METRICS
 from tailgate.scoring import score
 from tailgate.scoring.damage import hashes_of
 

@@ -10,7 +10,7 @@ from tailgate.agents.reward import Reward
 from tailgate.core import Kind, Model, Prior, Received, Scene
 from tailgate.estimators import ChiSquare, GateOut, compose
 from tailgate.estimators.kalman import KalmanFilter
-from tailgate.metrics import metric
+from tailgate.play.metrics import metric
 
 
 class Swing(NamedTuple):

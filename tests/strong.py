@@ -12,7 +12,7 @@ from tailgate.agents.codec import ActionCodec, ActionSpec
 from tailgate.agents.observation import ObservationCodec
 from tailgate.agents.policy import Network, save_policy
 from tailgate.agents.zoo import ZooAttack
-from tailgate.scenario import load_scenario
+from tailgate.core.scenario import load_scenario
 
 PLACE = "gusty-stop-and-go-v0"
 THREAT: dict[str, Any] = {"kinds": ["dos_jam", "fdi"], "budget": 20, "fdi_bound": 3.0}

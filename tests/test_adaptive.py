@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from tailgate.adaptive import asked_of, configs_of, fitting, plan_of, train_against
-from tailgate.errors import InputError
-from tailgate.evaluation import evaluate
-from tailgate.scenario import Suite, config_path, load_suite
-from tailgate.train import train
+from tailgate.base.errors import InputError
+from tailgate.core.scenario import Suite, config_path, load_suite
+from tailgate.evaluation.cells import evaluate
+from tailgate.training.adaptive import asked_of, configs_of, fitting, plan_of, train_against
+from tailgate.training.train import train
 
 PLAN = {
     "config": "car-following", "dose": 12, "changes": ["environment.interval=20", "environment.frames=1"],
@@ -136,7 +136,7 @@ def test_a_typing_error_in_the_file_of_a_suite_is_told_when_it_is_read(there: st
 
 def test_a_file_of_a_suite_is_looked_through_without_torch() -> None:
     path = config_path("suites", "radar-v0", "suite")
-    done = f"import sys; from tailgate.scenario import load_suite; load_suite({str(path)!r}); assert 'torch' not in sys.modules"
+    done = f"import sys; from tailgate.core.scenario import load_suite; load_suite({str(path)!r}); assert 'torch' not in sys.modules"
     assert subprocess.run([sys.executable, "-c", done], check=False).returncode == 0
 
 

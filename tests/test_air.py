@@ -9,10 +9,10 @@ import pytest
 import tailgate
 from tailgate.agents.codec import ActionCodec, ActionSpec
 from tailgate.agents.observation import ObservationCodec
+from tailgate.base.errors import InputError
 from tailgate.core import Array, Kind
-from tailgate.draws import keys
-from tailgate.errors import InputError
-from tailgate.scenario import load_scenario
+from tailgate.core.draws import keys
+from tailgate.core.scenario import load_scenario
 
 SILENT = (5, 6, 9)  # steps of the challenges of `Mute`
 DISTANCE, SPEED, ACTUATOR = range(3)  # the wires of the radar's plant

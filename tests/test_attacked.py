@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from tailgate.commands import board as command
-from tailgate.errors import InputError
+from tailgate.base.errors import InputError
+from tailgate.cli import board as command
 
 TEXT = """about: s
 scenarios: [gusty-stop-and-go-v0]

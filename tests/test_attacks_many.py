@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 import tailgate
+from tailgate.base.errors import InputError, NotApplicable
 from tailgate.core import Kind
-from tailgate.errors import InputError, NotApplicable
-from tailgate.registry import Spec
-from tailgate.scenario import load_scenario
-from tailgate.threat import KindName
+from tailgate.core.registry import Spec
+from tailgate.core.scenario import load_scenario
+from tailgate.core.threat import KindName
 
 K = 40
 OLD = {"kinds": get_args(KindName)}

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from tailgate.errors import InputError
-from tailgate.reproduce.ch7_automata import as_guards, closed_form
-from tailgate.stats import proportion
+from tailgate.base.errors import InputError
+from tailgate.evaluation.stats import proportion
+from tailgate.thesis.ch7_automata import as_guards, closed_form
 from tailgate.trust.automata import Atom, Query, load_network, network_of
 from tailgate.trust.simulate import simulate
 

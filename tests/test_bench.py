@@ -8,14 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tailgate import cli, draws
+from tailgate import cli
+from tailgate.base.errors import InputError
 from tailgate.bench import ours, peers, report, run, targets, yardstick
 from tailgate.bench.lines import Line, Missing, Sample, repeated
-from tailgate.draws import Role
+from tailgate.core import draws
+from tailgate.core.draws import Role
+from tailgate.core.registry import Spec
+from tailgate.core.scenario import load_scenario
 from tailgate.envs.seat import Seat
-from tailgate.errors import InputError
-from tailgate.registry import Spec
-from tailgate.scenario import load_scenario
 
 
 def _compiled() -> bool:

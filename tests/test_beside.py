@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tailgate.commands import board as command
-from tailgate.errors import InputError
-from tailgate.evaluation import cells_of, run
+from tailgate.base.errors import InputError
+from tailgate.cli import board as command
+from tailgate.core.scenario import load_suite
+from tailgate.evaluation.cells import cells_of, run
+from tailgate.evaluation.rows import encode
 from tailgate.leaderboard.board_format import read_board
 from tailgate.leaderboard.check import _scored
-from tailgate.rows import encode
-from tailgate.scenario import load_suite
 from tailgate.scoring.attacks import Admitted
 from tailgate.scoring.cells import digits, hits_of, shared_of
 from tailgate.scoring.follow import sharpened, strays, untold

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tailgate.errors import InputError
+from tailgate.base.errors import InputError
 from tailgate.leaderboard.board_format import read_board
 from tailgate.scoring.attacks import Admitted
 from tailgate.scoring.follow import strays

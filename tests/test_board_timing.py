@@ -11,17 +11,17 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from tailgate import draws
 from tailgate.agents.policy import Yoked
+from tailgate.base.errors import InputError
 from tailgate.cli import main
-from tailgate.errors import InputError
+from tailgate.core import draws
+from tailgate.core.registry import Spec
+from tailgate.core.scenario import load_scenario, load_suite
 from tailgate.leaderboard.measured import Measured
 from tailgate.leaderboard.site import build_site
 from tailgate.leaderboard.timing import Gain, Shown, Timed, Timing, measure_timing, read_timing, telling
-from tailgate.registry import Spec
-from tailgate.scenario import load_scenario, load_suite
+from tailgate.play.trace import Trace, rollout
 from tailgate.scoring.cells import hits_of
-from tailgate.trace import Trace, rollout
 
 Data = dict[str, Any]
 ROOT = Path(__file__).parents[1]

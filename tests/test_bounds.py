@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from tailgate import bounds
+from tailgate.core.scenario import load_scenario
 from tailgate.estimators import AcceptAll, ChiSquare, GatedKalman, KalmanFilter, compose
-from tailgate.reproduce import probe
-from tailgate.scenario import load_scenario
+from tailgate.thesis import bounds, probe
 
 ETA = 20.0
 MODELS = {

@@ -7,12 +7,12 @@ import pytest
 
 import tailgate
 from tailgate.agents.burst_loss import BurstLoss, groups
+from tailgate.base.errors import InputError, NotApplicable
 from tailgate.core import Kind
-from tailgate.draws import keys
+from tailgate.core.draws import keys
+from tailgate.core.scenario import load_scenario
 from tailgate.envs.cacc import V2V
-from tailgate.errors import InputError, NotApplicable
-from tailgate.scenario import load_scenario
-from tailgate.trace import rollout
+from tailgate.play.trace import rollout
 
 SENDERS = ("predecessor", "leader")
 

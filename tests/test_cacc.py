@@ -7,16 +7,16 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import tailgate
+from tailgate.base.errors import InputError
 from tailgate.core import Estimate, Mode
-from tailgate.draws import keys
+from tailgate.core.draws import keys
+from tailgate.core.registry import make
+from tailgate.core.scenario import load_scenario
 from tailgate.envs.cacc import PER_CAR, V2V, Column, FeedForward
 from tailgate.envs.controllers import BRAKE_ACCEL, STOP_ACCEL, WIDEN_FACTOR
 from tailgate.envs.platoon import Platoon, PlatoonSensors, hears
-from tailgate.errors import InputError
-from tailgate.registry import make
-from tailgate.scenario import load_scenario
-from tailgate.string_stability import growth, transfer
-from tailgate.trace import rollout
+from tailgate.play.trace import rollout
+from tailgate.thesis.string_stability import growth, transfer
 
 TOPOLOGIES = ("predecessor_leader", "predecessor", "bidirectional", "two_predecessor")
 LAWS = {"cacc": {}, "ploeg_cacc": {}, "consensus_cacc": {"leader": "estimated"}}

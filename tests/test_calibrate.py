@@ -12,17 +12,18 @@ import pytest
 from scipy import stats
 
 import tailgate
-from tailgate import cli, trace
-from tailgate.calibrate import MIXTURE, calibrate
-from tailgate.clean import Bench, Count, Crossings, count_onsets
-from tailgate.draws import keys
-from tailgate.errors import InputError
+from tailgate import cli
+from tailgate.base.errors import InputError
+from tailgate.core.draws import keys
+from tailgate.core.scenario import config_path
+from tailgate.core.schema import fields_of
+from tailgate.core.score_threshold import Watched
 from tailgate.estimators import ChiSquare, Cusum, GateOut, KalmanFilter, Mewma, WindowedChiSquare, compose
-from tailgate.metrics import METRICS
-from tailgate.scenario import config_path
-from tailgate.schema import fields_of
-from tailgate.trace import rollout
-from tailgate.watch import Watched
+from tailgate.evaluation.attack_free import Bench, Count, Crossings, count_onsets
+from tailgate.evaluation.calibrate import MIXTURE, calibrate
+from tailgate.play import trace
+from tailgate.play.metrics import METRICS
+from tailgate.play.trace import rollout
 
 RECORDS = json.loads((Path(__file__).parents[1] / "benchmarks/results/calibration.json").read_text(encoding="utf-8"))
 ENTRIES = [entry | {"command": record["command"]} for record in RECORDS for entry in record["results"]]

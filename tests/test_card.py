@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from tailgate.errors import InputError
+from tailgate.base.errors import InputError
 from tailgate.leaderboard.card import read_card, with_cards
 
 ROOT = Path(__file__).parent.parent

@@ -6,13 +6,13 @@ import json
 import numpy as np
 import pytest
 
-from tailgate import draws
 from tailgate.agents.cem import Config, Learner, Shape
 from tailgate.agents.policy import PolicyAttack
-from tailgate.errors import InputError
-from tailgate.metrics import measure
-from tailgate.scenario import config_path
-from tailgate.trace import rollout
+from tailgate.base.errors import InputError
+from tailgate.core import draws
+from tailgate.core.scenario import config_path
+from tailgate.play.metrics import measure
+from tailgate.play.trace import rollout
 
 ROAD = {
     "scenario": "gusty-stop-and-go-v0", "defence": "kf", "threat": {"kinds": ["fdi"], "budget": 30, "fdi_bound": 6.0}, "value": -6.0, "interval": 30,

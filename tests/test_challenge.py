@@ -7,14 +7,14 @@ import pytest
 from scipy import stats
 
 import tailgate
+from tailgate.base.errors import InputError, NotApplicable
+from tailgate.base.pytree import leaves
 from tailgate.core import Mode, Prior, Received
-from tailgate.draws import Keys, Role, keys
+from tailgate.core.draws import Keys, Role, keys
+from tailgate.core.registry import Spec, make
+from tailgate.core.scenario import load_scenario
 from tailgate.envs.fmcw import false_alarm_threshold
-from tailgate.errors import InputError, NotApplicable
-from tailgate.registry import Spec, make
-from tailgate.scenario import load_scenario
-from tailgate.trace import rollout
-from tailgate.tree import leaves
+from tailgate.play.trace import rollout
 
 FIXED = "cra:challenge=fixed"
 JAM, LATE = "radar_jam:start_step=182", "echo_delay:start_step=180,delay=6"

@@ -5,10 +5,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tailgate.base.errors import InputError
 from tailgate.core import AIRED, Command, Kind, Received
-from tailgate.errors import InputError
-from tailgate.scenario import load_scenario
-from tailgate.threat import Brief, Channel, ThreatModel
+from tailgate.core.scenario import load_scenario
+from tailgate.core.threat import Brief, Channel, ThreatModel
 
 ALL = ("dos_jam", "dos_hold", "dos_hold_fresh", "dropout", "fdi", "delay", "replay")
 P, V, LP, LV, ACC = range(5)  # wires: position, velocity, leader's position and velocity, the acceleration command

@@ -12,13 +12,13 @@ from typing import Any
 import pytest
 
 import tailgate
-from tailgate.commands import check as command
-from tailgate.errors import InputError
-from tailgate.evaluation import cells_of, run
+from tailgate.base.errors import InputError
+from tailgate.cli import check as command
+from tailgate.core.scenario import load_suite
+from tailgate.evaluation.cells import cells_of, run
+from tailgate.evaluation.rows import encode
 from tailgate.leaderboard.check import check, with_check
 from tailgate.leaderboard.site import build_site
-from tailgate.rows import encode
-from tailgate.scenario import load_suite
 from tailgate.scoring.board import score
 from tailgate.scoring.follow import strays
 

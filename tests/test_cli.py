@@ -265,7 +265,7 @@ def test_a_module_that_cannot_be_loaded_is_one_line(run: Run, tmp_path: Path, mo
 
 def test_a_place_for_pictures_is_looked_at_before_anything_is_played(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "taken").write_text("")
-    monkeypatch.setattr("tailgate.evaluation.evaluate", lambda *_, **__: pytest.fail("episodes were played"))
+    monkeypatch.setattr("tailgate.evaluation.cells.evaluate", lambda *_, **__: pytest.fail("episodes were played"))
     code, _, said = run("evaluate", "--suite", "quick-v0", "--plot", "taken")
     assert code == 2 and "plot" in said and "taken" in said
 
@@ -288,26 +288,26 @@ NOTHING = "nothing of it is kept"
 
 
 @pytest.mark.parametrize(("arguments", "stopped", "told"), [
-    (["evaluate"], "evaluation.evaluate", "nothing is kept: --out FILE would"),
-    (["evaluate", "--out", "rows.jsonl"], "evaluation.evaluate", "the same command goes on with the rows of rows.jsonl"),
+    (["evaluate"], "evaluation.cells.evaluate", "nothing is kept: --out FILE would"),
+    (["evaluate", "--out", "rows.jsonl"], "evaluation.cells.evaluate", "the same command goes on with the rows of rows.jsonl"),
     (["leaderboard", "run", "quick-v0", "--out", "boards"], "leaderboard.run.play", "the same command goes on"),
     (["leaderboard", "attack", "kf", "--suite", "quick-v0", "--out", "x"], "leaderboard.attacked.attack", "the same command goes on"),
-    (["leaderboard", "submit", "mine:Mine"], "submission.play_submission", "nothing is kept: --out FILE would"),
-    (["leaderboard", "submit", "mine:Mine", "--out", "rows.jsonl"], "submission.play_submission",
+    (["leaderboard", "submit", "mine:Mine"], "sandbox.play_submission", "nothing is kept: --out FILE would"),
+    (["leaderboard", "submit", "mine:Mine", "--out", "rows.jsonl"], "sandbox.play_submission",
      "the same command goes on after the scenarios that are finished"),
     (["leaderboard", "clock", "quick-v0", "--out", "x"], "leaderboard.clock.measure", NOTHING),
     (["leaderboard", "admit", "fdi", "--suite", "quick-v0", "--out", "x"], "scoring.attacks.admit", NOTHING),
-    (["calibrate", "--defence", "chi2_kf", "--hours", "1"], "calibrate.calibrate", NOTHING),
-    (["timing", "zoo:name=car-following-chi2_kf-0"], "strength.timing.timing", NOTHING), (["bench"], "bench.run.bench", NOTHING),
-    (["transfer", "zoo:name=none"], "strength.transfer.transfer", "nothing is kept: --out DIR would"),
+    (["calibrate", "--defence", "chi2_kf", "--hours", "1"], "evaluation.calibrate.calibrate", NOTHING),
+    (["timing", "zoo:name=car-following-chi2_kf-0"], "studies.timing.timing", NOTHING), (["bench"], "bench.run.bench", NOTHING),
+    (["transfer", "zoo:name=none"], "studies.transfer.transfer", "nothing is kept: --out DIR would"),
     (["trust", "--out", "x"], "trust.run.check", "the same command goes on"),
-    (["dose-response", "fdi", "--defence", "kf", "--scenario", "braking-v0", "--doses", "5"], "strength.dose.dose_response",
+    (["dose-response", "fdi", "--defence", "kf", "--scenario", "braking-v0", "--doses", "5"], "studies.dose.dose_response",
      "nothing is kept: --out DIR would"),
-    (["log", "--out", "x"], "log.write_log", "the same command goes on"),
-    (["tune", "--trials", "1"], "tuning.tune", "the same command goes on"),
-    (["train", "out=x"], "train.train", "what was finished is kept, go on with: tailgate train --resume name=quickstart out=x"),
-    (["reproduce", "ch3"], "reproduce.whole.chapter", NOTHING),
-    (["reproduce"], "reproduce.whole.reproduce_whole", "the same command goes on after the chapters that are finished"),
+    (["log", "--out", "x"], "studies.log.write_log", "the same command goes on"),
+    (["tune", "--trials", "1"], "training.tuning.tune", "the same command goes on"),
+    (["train", "out=x"], "training.train.train", "what was finished is kept, go on with: tailgate train --resume name=quickstart out=x"),
+    (["reproduce", "ch3"], "thesis.whole.chapter", NOTHING),
+    (["reproduce"], "thesis.whole.reproduce_whole", "the same command goes on after the chapters that are finished"),
 ])  # fmt: skip
 def test_an_interrupted_command_says_what_is_kept_and_how_to_go_on(
     arguments: list[str], stopped: str, told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

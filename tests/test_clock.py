@@ -8,15 +8,15 @@ from pathlib import Path
 
 import pytest
 
+from tailgate.base.errors import InputError
 from tailgate.cli import main
-from tailgate.errors import InputError
-from tailgate.evaluation import cells_of, run
+from tailgate.core.registry import Spec
+from tailgate.core.scenario import Suite, load_scenario
+from tailgate.evaluation.cells import cells_of, run
+from tailgate.evaluation.rows import encode
 from tailgate.leaderboard.clock import Clock, StepTime, _round, _Timed, clock_of, measure, read_clock
 from tailgate.leaderboard.run import board_of
 from tailgate.leaderboard.site import build_site
-from tailgate.registry import Spec
-from tailgate.rows import encode
-from tailgate.scenario import Suite, load_scenario
 
 SUITE = Suite("small", "", ("thesis-ch4-v0",), (5,), ("none", "kf"), ("none",), 4)
 
@@ -121,7 +121,7 @@ def test_anything_else_than_step_times_is_refused(tmp_path: Path, change: dict, 
 
 def test_the_command_writes_a_table_and_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     """The fastest first; --json prints the file. Of some defences alone it prints the figures, and leaves the file as it is."""
-    monkeypatch.setattr("tailgate.scenario.load_suite", lambda name: SUITE)
+    monkeypatch.setattr("tailgate.core.scenario.load_suite", lambda name: SUITE)
     words = ["leaderboard", "clock", "small", "--out", str(tmp_path), "--rounds", "1"]
     assert main(words) == 0
     lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("\N{BOX DRAWINGS LIGHT VERTICAL}")]

@@ -11,18 +11,18 @@ from tailgate.agents.codec import ActionCodec, ActionSpec
 from tailgate.agents.observation import LIMIT, ObservationCodec
 from tailgate.agents.policy import load_policy
 from tailgate.agents.reward import NEAR, Reward
+from tailgate.base.errors import InputError
 from tailgate.core import Kind
-from tailgate.draws import Role, keys
+from tailgate.core.draws import Role, keys
+from tailgate.core.registry import Spec
+from tailgate.core.scenario import load_scenario
+from tailgate.core.schema import as_data
 from tailgate.envs.faces import AdversaryVectorEnv
 from tailgate.envs.network import LinearSensors, NoControl, SensorNetwork
 from tailgate.envs.platoon import Platoon, PlatoonSensors
 from tailgate.envs.seat import Seat
-from tailgate.errors import InputError
-from tailgate.metrics import METRICS
-from tailgate.registry import Spec
-from tailgate.scenario import load_scenario
-from tailgate.schema import as_data
-from tailgate.trace import rollout
+from tailgate.play.metrics import METRICS
+from tailgate.play.trace import rollout
 
 ROOT = Path(__file__).parents[1]
 DKF = Spec("defence", "dkf")

@@ -8,15 +8,15 @@ import pytest
 
 import tailgate
 from tailgate.agents.mixture import Mixture
+from tailgate.base.errors import InputError, NotApplicable
+from tailgate.base.pytree import leaves
 from tailgate.core import Command, Kind, Mode
-from tailgate.draws import Draws, Keys, Role, keys
-from tailgate.errors import InputError, NotApplicable
-from tailgate.registry import entries, make
-from tailgate.scenario import list_scenarios, list_suites, load_scenario, load_suite
-from tailgate.schema import fields_of
-from tailgate.threat import KindName
-from tailgate.trace import rollout
-from tailgate.tree import leaves
+from tailgate.core.draws import Draws, Keys, Role, keys
+from tailgate.core.registry import entries, make
+from tailgate.core.scenario import list_scenarios, list_suites, load_scenario, load_suite
+from tailgate.core.schema import fields_of
+from tailgate.core.threat import KindName
+from tailgate.play.trace import rollout
 
 DEFENCES = tailgate.list_defences()
 ATTACKS = [name for name in tailgate.list_attacks() if name != "policy"]  # a policy needs a file

@@ -9,15 +9,15 @@ import pytest
 
 import tailgate
 from tailgate.agents.mixture import Mixture
+from tailgate.base.errors import NotApplicable
+from tailgate.base.pytree import leaves
 from tailgate.core import Kind, Mode
-from tailgate.draws import Keys, Role, keys
-from tailgate.errors import NotApplicable
+from tailgate.core.draws import Keys, Role, keys
+from tailgate.core.registry import entries
+from tailgate.core.scenario import load_scenario
+from tailgate.core.threat import KindName
 from tailgate.estimators import EpisodeByEpisode
-from tailgate.registry import entries
-from tailgate.scenario import load_scenario
-from tailgate.threat import KindName
-from tailgate.trace import rollout
-from tailgate.tree import leaves
+from tailgate.play.trace import rollout
 
 MANY = ("network-weak-v0", "platoon-braking-v0")
 PLACES = (*MANY, "radar-following-v0")

@@ -8,17 +8,17 @@ from scipy.linalg import solve_discrete_lyapunov
 from scipy.signal import cont2discrete
 
 import tailgate
+from tailgate.base.errors import InputError, NotApplicable
 from tailgate.core import Mode, Received
-from tailgate.draws import keys
+from tailgate.core.draws import keys
+from tailgate.core.registry import make
+from tailgate.core.scenario import load_scenario
 from tailgate.envs.cacc import Column
-from tailgate.errors import InputError, NotApplicable
 from tailgate.estimators import compose
 from tailgate.estimators.compose import Score, Verdict
 from tailgate.estimators.control_defences import OWN, AccFallback, InputClip, SlidingMode, peak, reachable, response
 from tailgate.estimators.distributed import DistributedKalmanFilter
-from tailgate.registry import make
-from tailgate.scenario import load_scenario
-from tailgate.trace import rollout
+from tailgate.play.trace import rollout
 
 DT, MODEL = 0.1, load_scenario("platoon-v2v-v0").brief().model
 LIE = "fdi:targets=[predecessor_acceleration],value=10"
@@ -32,7 +32,7 @@ def guarded(mitigation, detector=None, filter=None):
 def play(defence, attack="none", place="platoon-v2v-v0", seeds=range(8), changes=None, **threat):
     here = load_scenario(place).with_threat(**threat)
     here = dataclasses.replace(here, **(changes or {}))
-    spec = tailgate.registry.Spec("attack", attack)
+    spec = tailgate.core.registry.Spec("attack", attack)
     return rollout(here.loop(defence), spec.make(), keys("train", list(seeds)))
 
 

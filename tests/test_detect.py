@@ -11,13 +11,13 @@ from typing import Any
 
 import pytest
 
+from tailgate.base.errors import InputError
 from tailgate.cli import main
-from tailgate.errors import InputError
-from tailgate.evaluation import cells_of, run
+from tailgate.core.scenario import load_scenario, load_suite
+from tailgate.evaluation.cells import cells_of, run
 from tailgate.leaderboard import detect as module
 from tailgate.leaderboard.board_format import read_board
 from tailgate.leaderboard.detect import check_detection, detect
-from tailgate.scenario import load_scenario, load_suite
 from tailgate.scoring.board import score
 from tailgate.scoring.detection import Effort
 

@@ -7,13 +7,13 @@ import pytest
 from scipy import stats
 
 import tailgate
+from tailgate.base.errors import InputError, NotApplicable
 from tailgate.core import Innovation
-from tailgate.errors import InputError, NotApplicable
+from tailgate.core.registry import Spec
+from tailgate.core.scenario import load_scenario
 from tailgate.estimators import ChiSquare, Cusum, GateOut, KalmanFilter, Mewma, NamedParts, WindowedChiSquare, compose
 from tailgate.estimators.compose import Score
 from tailgate.estimators.detectors import whiten
-from tailgate.registry import Spec
-from tailgate.scenario import load_scenario
 
 RNG = np.random.default_rng(5)
 MODEL = load_scenario("stop-and-go-v0").brief().model  # one agent, two sensors

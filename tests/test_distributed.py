@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 
 import tailgate
+from tailgate.base.errors import InputError
 from tailgate.core import Prior, Received
-from tailgate.draws import keys
+from tailgate.core.draws import keys
+from tailgate.core.registry import Spec
+from tailgate.core.scenario import load_scenario
 from tailgate.envs.cacc import no_gains
 from tailgate.envs.network import LinearSensors, NoControl, SensorNetwork
 from tailgate.envs.platoon import Platoon, closed_loop, hold
-from tailgate.errors import InputError
 from tailgate.estimators import DistributedKalman, DistributedKalmanFilter, Kalman
 from tailgate.estimators.distributed import fixed_point, neighbours
-from tailgate.registry import Spec
-from tailgate.scenario import load_scenario
-from tailgate.trace import rollout
+from tailgate.play.trace import rollout
 
 RNG = np.random.default_rng(11)
 MODAL = {"system": "modal", "graph": "ring"}

@@ -7,9 +7,11 @@ import pytest
 from scipy import stats
 
 import tailgate
+from tailgate.base.errors import InputError, NotApplicable
 from tailgate.core import Innovation, Prior
+from tailgate.core.registry import Spec
+from tailgate.core.scenario import load_scenario
 from tailgate.envs.network import LinearSensors, NoControl, SensorNetwork
-from tailgate.errors import InputError, NotApplicable
 from tailgate.estimators import (
     AcceptAll,
     ChiSquare,
@@ -25,8 +27,6 @@ from tailgate.estimators import (
 )
 from tailgate.estimators.disagreement import disagreement
 from tailgate.estimators.distributed import neighbours
-from tailgate.registry import Spec
-from tailgate.scenario import load_scenario
 
 from .distributed import RNG, error, model_of, place_of, play, random_state
 
@@ -84,7 +84,7 @@ def test_the_oracle_asks_for_the_truth():
     """A loop that grants no truth is refused, and the card says that it is used."""
     with pytest.raises(InputError, match="grants `truth`"):
         play("thesis-ch5-v0", "dkf_oracle", uses=("measurements",))
-    assert tailgate.registry.entries("defence")["dkf_oracle"].uses == ("measurements", "truth")
+    assert tailgate.core.registry.entries("defence")["dkf_oracle"].uses == ("measurements", "truth")
 
 
 @pytest.mark.parametrize("q", [1, 2, 3, 14])

@@ -123,9 +123,10 @@ def test_names_of_the_package_are_there(name: str) -> None:
 
 
 def test_the_scenario_of_the_documentation_plays(tmp_path: Path) -> None:
-    from tailgate import draws, make_attack, make_defence
-    from tailgate.scenario import load_scenario
-    from tailgate.trace import rollout
+    from tailgate import make_attack, make_defence
+    from tailgate.core import draws
+    from tailgate.core.scenario import load_scenario
+    from tailgate.play.trace import rollout
 
     (tmp_path / "mine.yaml").write_text(_blocks("docs/scenarios.md", "yaml")[0], encoding="utf-8")
     (tmp_path / "leader.csv").write_text(_blocks("docs/scenarios.md", "csv")[0], encoding="utf-8")
@@ -159,9 +160,10 @@ def test_the_adapted_filter_of_the_documentation_plays(tmp_path: Path) -> None:
 
 def test_the_kalman_filter_of_the_documentation_is_the_built_in_one(package: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Trace for trace, while every reading arrives."""
-    from tailgate import draws, make_attack, make_defence
-    from tailgate.scenario import load_scenario
-    from tailgate.trace import rollout
+    from tailgate import make_attack, make_defence
+    from tailgate.core import draws
+    from tailgate.core.scenario import load_scenario
+    from tailgate.play.trace import rollout
 
     code = _blocks("docs/new-defence.md", "python")[4]
     assert len([line for line in code.splitlines() if line.strip()]) <= 31
@@ -191,7 +193,7 @@ def test_the_published_head_is_that_of_the_published_board() -> None:
 
 def test_the_tables_of_robustness_are_those_of_the_files() -> None:
     """Scenarios whose vehicle is not as told, and which suite plays which."""
-    from tailgate.scenario import list_scenarios, list_suites, load_scenario, load_suite
+    from tailgate.core.scenario import list_scenarios, list_suites, load_scenario, load_suite
 
     told = (ROOT / "docs/scenarios.md").read_text(encoding="utf-8").split("| scenario | differs from")[1].split("\n\n")[0].split("|---|---|")[1]
     differs = {name: load_scenario(name).truth for name in list_scenarios() if load_scenario(name).truth}

@@ -10,11 +10,11 @@ pytest.importorskip("matplotlib")
 from matplotlib.patches import Circle, FancyArrowPatch
 
 from tailgate import cli
-from tailgate.drawing import draw_graph, edges, graph_figure, hops, layout
+from tailgate.base.drawing import draw_graph, edges, graph_figure, hops, layout
+from tailgate.base.errors import InputError
+from tailgate.core.scenario import load_scenario
 from tailgate.envs import CarFollowing, Platoon, SensorNetwork
 from tailgate.envs.network import THESIS_EDGES
-from tailgate.errors import InputError
-from tailgate.scenario import load_scenario
 
 
 def _ring(n, directed=False):

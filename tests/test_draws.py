@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 import tailgate
-from tailgate import draws
-from tailgate.draws import Draws, Role, keys
+from tailgate.base.errors import InputError
+from tailgate.core import draws
+from tailgate.core.draws import Draws, Role, keys
 from tailgate.engine import elementary
-from tailgate.errors import InputError
 
 ANSWERS = [  # Random123 known answers of philox4x32-10: counter, key, words
     ("00000000 00000000 00000000 00000000", "00000000 00000000", "6627e8d5 e169c58d bc57ac4c 9b00dbd8"),

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from tailgate import num
+from tailgate.base.pytree import leaves
 from tailgate.engine import matrices, sweeps
 from tailgate.engine.buffers import WIDE
 from tailgate.engine.evaluation import evaluate
 from tailgate.engine.program import Call, Program, State, traced
 from tailgate.engine.untraceable import Untraceable
-from tailgate.tree import leaves
 
 CHANCE = np.random.default_rng(5)
 AGENTS, N, Q = 3, 9, 5

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tailgate.errors import InputError
+from tailgate.base.errors import InputError
 from tailgate.leaderboard.errata import Errata, errata_of
 from tailgate.leaderboard.measured import Measured, measured_of
 from tailgate.leaderboard.site import build_site

@@ -12,19 +12,20 @@ import pytest
 import yaml
 
 import tailgate
-from tailgate import draws, evaluation, trace
-from tailgate import rows as rows_module
-from tailgate.core import no_command
+from tailgate.base.errors import InputError
+from tailgate.core import draws, no_command
+from tailgate.core.reach import blind
+from tailgate.core.scenario import Scenario, Suite, load_scenario
 from tailgate.envs import SensorNetwork
-from tailgate.errors import InputError
 from tailgate.estimators import Kalman, Oracle
-from tailgate.evaluation import Cell, cells_of, run, run_cell
-from tailgate.metrics import METRICS
-from tailgate.reach import blind
-from tailgate.rows import read_rows
-from tailgate.scenario import Scenario, Suite, load_scenario
-from tailgate.summary import summarise
-from tailgate.trace import Trace, episodes_at_once, rollout
+from tailgate.evaluation import cells as evaluation
+from tailgate.evaluation import rows as rows_module
+from tailgate.evaluation.cells import Cell, cells_of, run, run_cell
+from tailgate.evaluation.rows import read_rows
+from tailgate.evaluation.summary import summarise
+from tailgate.play import trace
+from tailgate.play.metrics import METRICS
+from tailgate.play.trace import Trace, episodes_at_once, rollout
 
 PLACE = "thesis-ch4-v0"  # a short one
 SUITE = Suite("small", "", (PLACE,), (12,), ("kf", "chi2_kf"), ("none", "fdi:start_step=60,value=-4"), 9)

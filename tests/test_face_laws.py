@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 import tailgate
+from tailgate.base.errors import InputError
 from tailgate.envs.faces import FACES, AdversaryEnv, AdversaryVectorEnv
-from tailgate.errors import InputError
-from tailgate.evaluation import Cell, run_cell
+from tailgate.evaluation.cells import Cell, run_cell
 
 from .engines import short as shortened
 from .tiny import AUTORESETS, CRASHES, write

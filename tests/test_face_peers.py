@@ -8,8 +8,8 @@ import pytest
 from gymnasium.vector import AutoresetMode
 
 import tailgate
+from tailgate.base.errors import InputError, UnknownArgument
 from tailgate.envs.faces import FACES, AdversaryEnv, AdversaryVectorEnv
-from tailgate.errors import InputError, UnknownArgument
 
 from .tiny import AUTORESETS, CRASHES
 

@@ -17,9 +17,9 @@ from gymnasium.vector import AutoresetMode
 import tailgate
 from tailgate.agents.codec import ActionName, ActionSpec
 from tailgate.agents.reward import Reward, RewardName
+from tailgate.base.errors import InputError
+from tailgate.core.schema import fields_of
 from tailgate.envs.faces import FACES, AdversaryEnv, AdversaryVectorEnv
-from tailgate.errors import InputError
-from tailgate.schema import fields_of
 
 from .tiny import write
 

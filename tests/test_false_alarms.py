@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tailgate.clean import Bench
-from tailgate.errors import InputError
-from tailgate.evaluation import Cell, run_cell
+from tailgate.base.errors import InputError
+from tailgate.core.scenario import load_scenario, load_suite
+from tailgate.evaluation.attack_free import Bench
+from tailgate.evaluation.cells import Cell, run_cell
 from tailgate.leaderboard.board_format import read_board
 from tailgate.leaderboard.site_alarms import drifts_of, table_of, time_text, together_of
 from tailgate.leaderboard.site_suite import Suite
-from tailgate.scenario import load_scenario, load_suite
 from tailgate.scoring import false_alarms as module
 from tailgate.scoring.false_alarms import FIRST, Drives, dispersion, false_alarms
 

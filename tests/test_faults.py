@@ -15,10 +15,11 @@ from typing import Any
 
 import pytest
 
-from tailgate import evaluation, files
-from tailgate.evaluation import Cell, cells_of, run, run_cell
-from tailgate.rows import encode, read_rows
-from tailgate.scenario import Suite
+from tailgate.base import files
+from tailgate.core.scenario import Suite
+from tailgate.evaluation import cells as evaluation
+from tailgate.evaluation.cells import Cell, cells_of, run, run_cell
+from tailgate.evaluation.rows import encode, read_rows
 from tailgate.scoring import read_attacks
 from tailgate.scoring.attacks import Admitted, append
 

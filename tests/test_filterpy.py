@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 import tailgate
+from tailgate.base.errors import InputError
+from tailgate.base.pytree import leaves
 from tailgate.core import Model, Prior, Received
-from tailgate.draws import Role, keys
-from tailgate.errors import InputError
+from tailgate.core.draws import Role, keys
+from tailgate.core.registry import Spec, entry_for, text_of
+from tailgate.core.scenario import load_scenario
 from tailgate.estimators.filterpy_filters import root
-from tailgate.registry import Spec, entry_for, text_of
-from tailgate.scenario import load_scenario
-from tailgate.tree import leaves
 
 NAMES = ("filterpy_kf", "filterpy_ekf", "filterpy_ukf", "filterpy_hinfinity", "filterpy_imm")
 NO_DRAWS = keys("train", [0]).at(Role.DEFENCE, np.zeros(1))

@@ -10,11 +10,11 @@ import pytest
 
 import tailgate
 from tailgate.core import Air
-from tailgate.draws import Role, keys
+from tailgate.core.draws import Role, keys
+from tailgate.core.scenario import load_scenario
 from tailgate.envs import FmcwRadar, RadarCruise, RadarFollowing, fmcw, fmcw_signal
 from tailgate.envs.fmcw_signal import read, root_music, samples
-from tailgate.scenario import load_scenario
-from tailgate.trace import rollout
+from tailgate.play.trace import rollout
 
 LINK = fmcw.Link()
 SHARP = FmcwRadar(range_sd=1e-9, speed_sd=1e-9, reach=(1e-3, 1e6))  # the target is a point: what is left is the estimation's error

@@ -10,16 +10,16 @@ from scipy.signal import cont2discrete
 
 import tailgate
 from tailgate.agents import Inject
-from tailgate.draws import Role, keys
+from tailgate.base.errors import InputError
+from tailgate.core.draws import Role, keys
+from tailgate.core.loop import Loop
+from tailgate.core.scenario import list_scenarios, load_scenario
+from tailgate.core.threat import ThreatModel
 from tailgate.envs import AdaptiveCruise, Braking, CarFollowing, Constant, Odometry, OrnsteinUhlenbeck, Profile, StopAndGo
 from tailgate.envs.idm import idm_accel
-from tailgate.errors import InputError
 from tailgate.estimators import Raw
-from tailgate.loop import Loop
-from tailgate.metrics import measure
-from tailgate.scenario import list_scenarios, load_scenario
-from tailgate.threat import ThreatModel
-from tailgate.trace import rollout
+from tailgate.play.metrics import measure
+from tailgate.play.trace import rollout
 
 LONG = [(n, d) for n in list_scenarios() for d in ("kf", "chi2_kf") if load_scenario(n).horizon == 600]
 LONG += [(n, "chi2_kf") for n in list_scenarios() if load_scenario(n).horizon > 600]

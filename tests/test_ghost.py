@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 import tailgate
-from tailgate import draws
-from tailgate.errors import NotApplicable
-from tailgate.scenario import load_scenario
-from tailgate.trace import rollout
+from tailgate.base.errors import NotApplicable
+from tailgate.core import draws
+from tailgate.core.scenario import load_scenario
+from tailgate.play.trace import rollout
 
 
 def _run(attack, defence="dkf", seeds=2, **threat):

@@ -9,10 +9,10 @@ from typing import Any
 
 import pytest
 
-from tailgate import golden
 from tailgate.core import Kind
-from tailgate.evaluation import Cell, run_cell
-from tailgate.scenario import Suite, list_suites, load_suite
+from tailgate.core.scenario import Suite, list_suites, load_suite
+from tailgate.evaluation import golden
+from tailgate.evaluation.cells import Cell, run_cell
 
 HELD = golden.read()
 

@@ -10,17 +10,16 @@ import pytest
 import yaml
 
 import tailgate
-from tailgate import draws
 from tailgate.agents.codec import ActionCodec, ActionSpec
 from tailgate.agents.observation import ObservationCodec
-from tailgate.core import Kind, no_command
-from tailgate.draws import Role
+from tailgate.base.errors import InputError
+from tailgate.core import Kind, draws, no_command
+from tailgate.core.draws import Role
+from tailgate.core.scenario import load_scenario, load_suite
 from tailgate.envs import FmcwRadar, Highway, RadarCruise
-from tailgate.errors import InputError
-from tailgate.evaluation import Cell, evaluate
-from tailgate.scenario import load_scenario, load_suite
-from tailgate.strength.policies import misfit
-from tailgate.trace import rollout
+from tailgate.evaluation.cells import Cell, evaluate
+from tailgate.play.trace import rollout
+from tailgate.studies.policies import misfit
 
 pytest.importorskip("highway_env")
 from tailgate.envs import highway_scene as hs
@@ -79,12 +78,12 @@ def test_nothing_heavy_is_imported_and_a_missing_library_is_named():
     """`import tailgate`, a scenario and its public model do without HighwayEnv and pygame; playing without them names the extra, rows too."""
     code = (
         "import sys; sys.modules['highway_env'] = None\n"
-        "import tailgate\nfrom tailgate.scenario import load_scenario\n"
+        "import tailgate\nfrom tailgate.core.scenario import load_scenario\n"
         "place = load_scenario('highway-v0'); place.brief()\n"
         "print([m for m in sys.modules if m.split('.')[0] in ('pygame', 'highway_env') and sys.modules[m]])\n"
         "try: place.plant.prepare(place.brief().model)\n"
         "except ImportError as error: print(error)\n"
-        "from tailgate.evaluation import evaluate\n"
+        "from tailgate.evaluation.cells import evaluate\n"
         "print(*evaluate('highway-v0', scenarios=['highway-v0'], defences=['kf'], attacks=['none'], seeds=1)[0]['reason'].split('\\n'))\n"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)

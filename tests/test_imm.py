@@ -10,13 +10,13 @@ from filterpy.kalman import KalmanFilter as Reference
 from scipy import stats
 
 import tailgate
+from tailgate.base.errors import InputError
 from tailgate.core import Innovation, Prior, Received
-from tailgate.draws import Role, keys
-from tailgate.errors import InputError
+from tailgate.core.draws import Role, keys
+from tailgate.core.scenario import load_scenario
 from tailgate.estimators import InteractingModels, Kalman
 from tailgate.estimators.imm import ImmState, Modes, log_likelihood, mix, weigh
 from tailgate.estimators.kalman import KalmanState
-from tailgate.scenario import load_scenario
 
 NO_DRAWS = keys("train", [0]).at(Role.DEFENCE, np.zeros(1))
 

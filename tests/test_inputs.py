@@ -9,14 +9,14 @@ import warnings
 import pytest
 
 from tailgate.agents.scripted import Inject, Script
-from tailgate.draws import keys
+from tailgate.base.errors import InputError, NotApplicable
+from tailgate.core.draws import keys
+from tailgate.core.registry import PARTS, Spec, entries, make
+from tailgate.core.scenario import load_scenario
+from tailgate.core.schema import build, fields_of
+from tailgate.core.threat import ThreatModel
 from tailgate.envs.seat import Seat
-from tailgate.errors import InputError, NotApplicable
-from tailgate.registry import PARTS, Spec, entries, make
-from tailgate.scenario import load_scenario
-from tailgate.schema import build, fields_of
-from tailgate.threat import ThreatModel
-from tailgate.trace import rollout
+from tailgate.play.trace import rollout
 
 FLOATS = (-1.0, 0.0, math.nan, math.inf, -math.inf, 1e300, -1e300, 1e-300)
 WHOLE = (-1, 0, 10**30, 1.5)

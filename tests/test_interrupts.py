@@ -12,9 +12,9 @@ from typing import Any
 
 import pytest
 
-from tailgate import interrupts
+from tailgate.base import interrupts
+from tailgate.base.pool import Crew, each
 from tailgate.cli import main
-from tailgate.pool import Crew, each
 
 spec = importlib.util.spec_from_file_location("crash_campaign", Path(__file__).parents[1] / "benchmarks" / "crash_campaign.py")
 assert spec is not None and spec.loader is not None
@@ -68,7 +68,7 @@ def _command(code: str) -> subprocess.Popen[str]:
     """The command line with a command that does something else; it says when it has begun."""
     lines = [
         "import sys; sys.orig_argv = [sys.executable, '-m', 'tailgate']", "import ctypes, signal, time, threading", "from tailgate import cli",
-        "from tailgate.commands import list as module", f"def run(options):\n    print('begun', flush=True)\n    {code}", "module._list = run",
+        "from tailgate.cli import list as module", f"def run(options):\n    print('begun', flush=True)\n    {code}", "module._list = run",
         "sys.exit(cli.main(['list']))",
     ]  # fmt: skip
     return subprocess.Popen([sys.executable, "-c", "\n".join(lines)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)

@@ -11,13 +11,13 @@ from scipy import stats
 from scipy.linalg import solve_discrete_are
 
 import tailgate
+from tailgate.base.errors import InputError
 from tailgate.core import Innovation, Model, Prior, Received
-from tailgate.draws import Role, keys
-from tailgate.errors import InputError
+from tailgate.core.draws import Role, keys
+from tailgate.core.registry import Spec
+from tailgate.core.scenario import list_scenarios, load_scenario
 from tailgate.estimators import AcceptAll, ChiSquare, GatedKalman, Kalman, KalmanFilter, compose
 from tailgate.estimators.kalman import KalmanState, steady_state
-from tailgate.registry import Spec
-from tailgate.scenario import list_scenarios, load_scenario
 
 RNG = np.random.default_rng(11)
 NO_DRAWS = keys("train", [0]).at(Role.DEFENCE, np.zeros(1))

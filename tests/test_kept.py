@@ -8,11 +8,11 @@ from typing import Any
 
 import pytest
 
-from tailgate.commands import board as command
-from tailgate.errors import InputError
-from tailgate.evaluation import cells_of, run
-from tailgate.rows import encode
-from tailgate.scenario import load_suite
+from tailgate.base.errors import InputError
+from tailgate.cli import board as command
+from tailgate.core.scenario import load_suite
+from tailgate.evaluation.cells import cells_of, run
+from tailgate.evaluation.rows import encode
 
 Data = dict[str, Any]
 TEXT = "about: s\nscenarios: [thesis-ch4-v0]\ndoses: [5]\ndefences: [none, kf, chi2_kf]\nattacks: [none, 'fdi:value=5']\nseeds: 4\n"

@@ -7,17 +7,18 @@ import pytest
 from scipy.optimize import minimize
 
 import tailgate
-from tailgate import num, resilience
+from tailgate import num
+from tailgate.base.errors import InputError
 from tailgate.core import Prior, Received
-from tailgate.draws import Role, keys
-from tailgate.errors import InputError
+from tailgate.core.draws import Role, keys
+from tailgate.core.registry import Spec, entries
+from tailgate.core.scenario import load_scenario
 from tailgate.estimators import DistributedKalmanFilter, LassoFilter, LassoKalman
 from tailgate.estimators.centralised import stacked
 from tailgate.estimators.distributed import fixed_point
 from tailgate.estimators.robust import believed, believed_by_cvxpy
-from tailgate.registry import Spec, entries
-from tailgate.scenario import load_scenario
-from tailgate.trace import rollout
+from tailgate.play.trace import rollout
+from tailgate.thesis import resilience
 
 FAMILIES = (
     "ordinary", "tiny", "huge", "dependent sensors", "blind", "no attack", "boundary", "one sensor", "more sensors than states",

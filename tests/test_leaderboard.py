@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from tailgate.errors import InputError
+from tailgate.base.errors import InputError
 from tailgate.leaderboard.build import build
 from tailgate.leaderboard.words import at_least, breakable, names_of, percent, shade, spans, steps, ticks
-from tailgate.metrics import METRICS
+from tailgate.play.metrics import METRICS
 
 spec = importlib.util.spec_from_file_location("boards", Path(__file__).with_name("boards.py"))
 boards = importlib.util.module_from_spec(spec)

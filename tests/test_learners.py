@@ -11,14 +11,15 @@ import numpy as np
 import pytest
 import torch
 
-from tailgate import draws, train
 from tailgate.agents.learning import ACTIONS, LEARNERS, check_action, learner_of
 from tailgate.agents.policy import PolicyAttack, load_policy
+from tailgate.base.errors import InputError
+from tailgate.core import draws
+from tailgate.core.schema import build
 from tailgate.envs.faces import AdversaryVectorEnv
 from tailgate.envs.seat import Seat
-from tailgate.errors import InputError
-from tailgate.schema import build
-from tailgate.trace import rollout
+from tailgate.play.trace import rollout
+from tailgate.training import train
 
 TASK = """
 plant: car_following

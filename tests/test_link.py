@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 import tailgate
-from tailgate import draws
-from tailgate.errors import InputError
-from tailgate.scenario import load_scenario
-from tailgate.trace import rollout
+from tailgate.base.errors import InputError
+from tailgate.core import draws
+from tailgate.core.scenario import load_scenario
+from tailgate.play.trace import rollout
 
 PLACE = dataclasses.replace(load_scenario("gusty-stop-and-go-v0"), horizon=80)
 

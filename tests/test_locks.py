@@ -11,9 +11,10 @@ from pathlib import Path
 
 import pytest
 
-from tailgate import cli, train
-from tailgate.errors import InputError
-from tailgate.locks import alone, lock_of
+from tailgate import cli
+from tailgate.base.errors import InputError
+from tailgate.base.locks import alone, lock_of
+from tailgate.training import train
 
 TINY = ["learner=cem", "steps=600", "seeds=1", "cem={population: 3, episodes: 2, hidden: [2]}", "environment.interval=40", "tensorboard=false", "rivals=[none]"]
 SOME = ["--scenario", "thesis-ch4-v0", "--defence", "kf", "--attack", "none"]
@@ -90,7 +91,7 @@ def test_a_command_may_consist_of_others_and_leaves_no_file(tmp_path: Path) -> N
 
 def test_one_that_was_killed_blocks_nobody(tmp_path: Path) -> None:
     place = tmp_path / "place"
-    code = f"import time; from pathlib import Path; from tailgate.locks import alone\nwith alone(Path({str(place)!r})): print(flush=True); time.sleep(60)"
+    code = f"import time; from pathlib import Path; from tailgate.base.locks import alone\nwith alone(Path({str(place)!r})): print(flush=True); time.sleep(60)"
     running = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE)
     assert running.stdout is not None and running.stdout.readline()
     with pytest.raises(InputError, match=f"process {running.pid} does"), alone(place):

@@ -12,16 +12,18 @@ import pyarrow.parquet as pq
 import pytest
 
 import tailgate
-from tailgate import draws, files, log
 from tailgate.agents.zoo import zoo_path
-from tailgate.commands import log as command
-from tailgate.evaluation import Cell
-from tailgate.held_out import families
-from tailgate.kinds import Kind, Mode
-from tailgate.log import write_log
-from tailgate.registry import Spec
-from tailgate.scenario import Suite, load_suite
-from tailgate.trace import rollout
+from tailgate.base import files
+from tailgate.cli import log as command
+from tailgate.core import draws
+from tailgate.core.kinds import Kind, Mode
+from tailgate.core.registry import Spec
+from tailgate.core.scenario import Suite, load_suite
+from tailgate.evaluation.cells import Cell
+from tailgate.evaluation.excluded_attacks import families
+from tailgate.play.trace import rollout
+from tailgate.studies import log
+from tailgate.studies.log import write_log
 
 ATTACKS = ("none", "fdi:start_step=40,value=9,targets=[position]", "dropout:start_step=100", "fdi_ramp:start_step=20")
 SUITE = Suite("small", "Small.", ("thesis-ch4-v0",), (12, 30, 50), ("none", "chi2_kf"), ATTACKS, 9, held_out=("fdi_ramp",))
@@ -304,8 +306,8 @@ def test_the_command_writes_a_log(tmp_path: Path, capsys: pytest.CaptureFixture[
 def test_a_part_whose_names_are_no_text_is_played_again(tmp_path):
     import pyarrow as pa
 
-    from tailgate.evaluation import Cell
-    from tailgate.log import _good
+    from tailgate.evaluation.cells import Cell
+    from tailgate.studies.log import _good
 
     cell = Cell("quick-v0", "gusty-stop-and-go-v0", None, "kf", "none", 1, "train")
     pq.write_table(pa.table({"somename": [1.0]}), tmp_path / "part", store_schema=False)

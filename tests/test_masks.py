@@ -7,9 +7,9 @@ from hypothesis import strategies as st
 
 import tailgate
 from tailgate.core import Kind, Received
+from tailgate.core.scenario import load_scenario
+from tailgate.core.threat import Brief, Channel, ThreatModel
 from tailgate.envs.faces import AdversaryVectorEnv
-from tailgate.scenario import load_scenario
-from tailgate.threat import Brief, Channel, ThreatModel
 
 from .engines import same
 

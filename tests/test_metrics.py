@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 import tailgate
-from tailgate.metrics import METRICS, UNITS, measure, metric, unit_in
-from tailgate.scenario import load_scenario
-from tailgate.trace import Trace
+from tailgate.core.scenario import load_scenario
+from tailgate.play.metrics import METRICS, UNITS, measure, metric, unit_in
+from tailgate.play.trace import Trace
 
 DT = 0.5
 MODEL = replace(load_scenario("stop-and-go-v0").brief().model, dt=DT)

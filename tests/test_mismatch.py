@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import yaml
 
-from tailgate import draws
-from tailgate.errors import InputError
-from tailgate.metrics import measure
-from tailgate.registry import Spec
-from tailgate.scenario import list_scenarios, load_scenario
-from tailgate.trace import rollout
+from tailgate.base.errors import InputError
+from tailgate.core import draws
+from tailgate.core.registry import Spec
+from tailgate.core.scenario import list_scenarios, load_scenario
+from tailgate.play.metrics import measure
+from tailgate.play.trace import rollout
 
 ROAD = "gusty-stop-and-go-v0"
 
@@ -27,7 +27,7 @@ def played(scenario, defence="kf", episodes=20):
 
 def changed(tmp_path: Path, truth: object, base: str = ROAD) -> str:
     """A scenario file with this truth."""
-    from tailgate.scenario import config_path
+    from tailgate.core.scenario import config_path
 
     data = yaml.safe_load(config_path("scenarios", base, "scenario").read_text()) | {"truth": truth}
     path = tmp_path / "changed.yaml"
@@ -63,8 +63,8 @@ def test_a_loaded_car_brakes_less_than_it_is_told_to() -> None:
     """With 1.25 times the mass the acceleration settles at 0.8 of a constant command."""
     import dataclasses
 
+    from tailgate.core.loop import Loop
     from tailgate.envs.controllers import AdaptiveCruise
-    from tailgate.loop import Loop
 
     class Steady(AdaptiveCruise):
         def step(self, plan, state, estimate, v2v, odometry):

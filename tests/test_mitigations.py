@@ -8,9 +8,9 @@ import pytest
 
 import tailgate
 from tailgate.core import Mode, Received
+from tailgate.core.registry import Spec, entries
+from tailgate.core.scenario import load_scenario
 from tailgate.estimators import AcceptAll, Brake, GateOut, Hold, Latch, Reacquire, Verdict, Widen
-from tailgate.registry import Spec, entries
-from tailgate.scenario import load_scenario
 
 MODEL = load_scenario("stop-and-go-v0").brief().model  # one agent, two sensors, 0.1 s
 POLICIES = [AcceptAll(), GateOut(), GateOut(latch=2), Latch(3), Hold(), Reacquire()]
@@ -137,7 +137,7 @@ def test_no_mitigation_uses_what_did_not_arrive(name):
     suspect, valid = rng.uniform(size=(60, 2)) < 0.1, rng.uniform(size=(60, 2)) < 0.5
     valid[:, 1] = False
     y = np.where(valid, 1.0, np.nan)
-    out = judge(tailgate.registry.make("mitigation", name), suspect, valid, y)
+    out = judge(tailgate.core.registry.make("mitigation", name), suspect, valid, y)
     assert out["accept"][:, 0].any() and not out["accept"][:, 1].any()
     used = y if out["instead"][0] is None else out["instead"]
     assert np.isfinite(used[out["accept"]]).all()

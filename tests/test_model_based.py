@@ -7,12 +7,12 @@ import pytest
 
 import tailgate
 from tailgate.agents.model_based import invariant_zeros
+from tailgate.base.errors import InputError, NotApplicable
 from tailgate.core import Kind
-from tailgate.draws import keys
-from tailgate.errors import InputError, NotApplicable
-from tailgate.evaluation import Cell, run_cell
-from tailgate.scenario import load_scenario
-from tailgate.trace import rollout
+from tailgate.core.draws import keys
+from tailgate.core.scenario import load_scenario
+from tailgate.evaluation.cells import Cell, run_cell
+from tailgate.play.trace import rollout
 
 EVERYTHING = ("position", "velocity", "acceleration")
 

@@ -8,20 +8,20 @@ import pytest
 
 import tailgate
 from tailgate import cli
-from tailgate.clean import Bench, count_onsets, most_at_once
+from tailgate.base.errors import InputError
+from tailgate.base.plots import write_overview
 from tailgate.core import Model
-from tailgate.draws import keys
+from tailgate.core.draws import keys
+from tailgate.core.reach import blind, eigenvalues, lasting, reach, require_detectable
+from tailgate.core.registry import make
+from tailgate.core.scenario import Scenario, list_scenarios, load_scenario
+from tailgate.core.threat import ThreatModel
 from tailgate.envs import LinearSensors, SensorNetwork
-from tailgate.errors import InputError
-from tailgate.metrics import measure
-from tailgate.plots import write_overview
-from tailgate.reach import blind, eigenvalues, lasting, reach, require_detectable
-from tailgate.registry import make
-from tailgate.rows import read_rows
-from tailgate.scenario import Scenario, list_scenarios, load_scenario
-from tailgate.summary import summarise
-from tailgate.threat import ThreatModel
-from tailgate.trace import rollout
+from tailgate.evaluation.attack_free import Bench, count_onsets, most_at_once
+from tailgate.evaluation.rows import read_rows
+from tailgate.evaluation.summary import summarise
+from tailgate.play.metrics import measure
+from tailgate.play.trace import rollout
 
 NETWORKS = [name for name in list_scenarios() if isinstance(load_scenario(name).plant, SensorNetwork) and load_scenario(name).plant.agents > 1]
 NONE, STILL = make("controller", "none"), make("manoeuvre", "constant", value=0.0)

@@ -8,15 +8,16 @@ import pytest
 from scipy.optimize import brentq
 
 import tailgate
-from tailgate import num, resilience
+from tailgate import num
 from tailgate.core import Innovation, Prior, Received
-from tailgate.draws import Role, keys
+from tailgate.core.draws import Role, keys
+from tailgate.core.registry import Spec
+from tailgate.core.scenario import load_scenario
 from tailgate.estimators import DistributedKalmanFilter, NormResilient, NormResilientFilter
 from tailgate.estimators.distributed import fixed_point
 from tailgate.estimators.norm_resilient import axes, moved, moved_by_cvxpy
-from tailgate.registry import Spec
-from tailgate.scenario import load_scenario
-from tailgate.trace import rollout
+from tailgate.play.trace import rollout
+from tailgate.thesis import resilience
 
 FAMILIES = (
     "ordinary", "tiny", "huge", "dependent sensors", "blind", "exact fit", "boundary", "one sensor", "more sensors than states",

@@ -9,18 +9,18 @@ import pytest
 
 import tailgate
 from tailgate.agents.optimal_stealth import farthest_inside
-from tailgate.bounds import stealth_bound, updated
+from tailgate.base.errors import InputError, NotApplicable
 from tailgate.core import Kind
-from tailgate.draws import keys
+from tailgate.core.draws import keys
+from tailgate.core.optimal import Filtering, Grid, Holding, Rules, best_holds, best_losses, farthest, reach, stealth_programme
+from tailgate.core.registry import entries
+from tailgate.core.scenario import load_scenario
+from tailgate.core.threat import ThreatModel
 from tailgate.envs.network import LinearSensors, NoControl, SensorNetwork
-from tailgate.errors import InputError, NotApplicable
-from tailgate.evaluation import Cell, run_cell
-from tailgate.metrics import METRICS
-from tailgate.optimal import Filtering, Grid, Holding, Rules, best_holds, best_losses, farthest, reach, stealth_programme
-from tailgate.registry import entries
-from tailgate.scenario import load_scenario
-from tailgate.threat import ThreatModel
-from tailgate.trace import rollout
+from tailgate.evaluation.cells import Cell, run_cell
+from tailgate.play.metrics import METRICS
+from tailgate.play.trace import rollout
+from tailgate.thesis.bounds import stealth_bound, updated
 
 OPTIMAL = ("optimal_dos", "optimal_hold", "optimal_stealth")
 BIG = 3.29  # standard errors of a 99.9 % interval

@@ -15,7 +15,8 @@ SOURCES = sorted({p.resolve() for folder in FOLDERS.values() for p in (ROOT / fo
 # What a trace is made of. Their results must not depend on the batch, so no BLAS, no einsum, no sums by shape, no library transcendentals.
 SCORED = [
     *(ROOT / "envs").glob("*.py"), *(ROOT / "estimators").glob("*.py"), *(ROOT / "agents").glob("*.py"),
-    *(ROOT / "src/tailgate" / f"{n}.py" for n in ("loop", "threat", "trace", "metrics", "draws", "num", "tree", "hints", "watch")),
+    *(ROOT / "src/tailgate/core" / f"{n}.py" for n in ("draws", "loop", "score_threshold", "threat")),
+    *(ROOT / "src/tailgate" / f"{n}.py" for n in ("num", "base/pytree", "engine/hints", "play/metrics", "play/trace")),
     *(ROOT / "src/tailgate/engine" / f"{n}.py" for n in ("elementary", "matrices", "loops")),
 ]  # fmt: skip
 UNSCORED = {"render.py", "sb3.py", "ppo.py", "cem.py", "stable.py", "teacher.py"}

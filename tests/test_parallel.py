@@ -13,19 +13,19 @@ from pettingzoo.test import parallel_api_test, parallel_seed_test
 
 import tailgate
 from tailgate.agents.selfplay import constant, export
+from tailgate.base.errors import InputError, NotApplicable
 from tailgate.core import Kind, Mode
-from tailgate.draws import keys
+from tailgate.core.draws import keys
+from tailgate.core.registry import Spec
+from tailgate.core.scenario import load_scenario
 from tailgate.envs.duel import DefenderEnv, Duel, Rival
-from tailgate.errors import InputError, NotApplicable
 from tailgate.estimators import Steered, SteeredChallenge, compose
 from tailgate.estimators.distributed import TailChiSquare
 from tailgate.estimators.kalman import KalmanFilter
 from tailgate.estimators.mitigations import Widen
 from tailgate.estimators.steered import load_defender
 from tailgate.estimators.steering import Hand, Knob, Menu, nearest, settings
-from tailgate.registry import Spec
-from tailgate.scenario import load_scenario
-from tailgate.trace import rollout
+from tailgate.play.trace import rollout
 
 GUSTY = {"scenario": "gusty-stop-and-go-v0", "interval": 20}
 

@@ -9,14 +9,14 @@ from scipy.linalg import expm
 from scipy.signal import cont2discrete
 
 import tailgate
-from tailgate.draws import Role, keys
+from tailgate.base.errors import InputError
+from tailgate.core.draws import Role, keys
+from tailgate.core.registry import make
+from tailgate.core.scenario import list_scenarios, load_scenario
 from tailgate.envs.cacc import PER_CAR, Column
 from tailgate.envs.platoon import Platoon, PlatoonSensors, closed_loop, hold
 from tailgate.envs.vehicle import lag
-from tailgate.errors import InputError
-from tailgate.registry import make
-from tailgate.scenario import list_scenarios, load_scenario
-from tailgate.trace import rollout
+from tailgate.play.trace import rollout
 
 TOPOLOGIES = ("predecessor_leader", "predecessor", "bidirectional", "two_predecessor")
 LAWS = {"cacc": {}, "ploeg_cacc": {}, "consensus_cacc": {"leader": "estimated"}}

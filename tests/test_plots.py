@@ -10,7 +10,7 @@ pytest.importorskip("matplotlib")
 from PIL import Image
 
 from tailgate import cli
-from tailgate.plots import matrices, scatter, write_overview
+from tailgate.base.plots import matrices, scatter, write_overview
 
 
 def entry(defence, attack, rmse, gap, crash, scenario="s", dose=5):

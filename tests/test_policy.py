@@ -11,17 +11,17 @@ import pytest
 from safetensors.numpy import load as load_tensors
 from safetensors.numpy import save as save_tensors
 
-from tailgate import draws
 from tailgate.agents.codec import ActionCodec, ActionSpec
 from tailgate.agents.observation import ObservationCodec
 from tailgate.agents.policy import Lstm, Memory, Network, PolicyAttack, Yoked, choose, load_policy, save_policy, timing_advantage
+from tailgate.base.errors import InputError
+from tailgate.core import draws
+from tailgate.core.registry import Spec
+from tailgate.core.scenario import Scenario, load_scenario
 from tailgate.envs.faces import AdversaryVectorEnv
 from tailgate.envs.network import SensorNetwork
-from tailgate.errors import InputError
-from tailgate.metrics import METRICS, crashed
-from tailgate.registry import Spec
-from tailgate.scenario import Scenario, load_scenario
-from tailgate.trace import Recorder, rollout, signals_of
+from tailgate.play.metrics import METRICS, crashed
+from tailgate.play.trace import Recorder, rollout, signals_of
 
 THREAT = {"budget": 20, "kinds": ["dos_jam", "fdi"], "fdi_bound": 5.0}
 SEEDS = list(range(12))

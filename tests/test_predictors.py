@@ -7,12 +7,12 @@ import pytest
 from scipy import stats
 
 from tailgate import num
+from tailgate.base.errors import InputError, NotApplicable
 from tailgate.core import Mode, Prior, Received
-from tailgate.draws import keys
-from tailgate.errors import InputError, NotApplicable
-from tailgate.registry import Spec, make
-from tailgate.scenario import load_scenario
-from tailgate.trace import rollout
+from tailgate.core.draws import keys
+from tailgate.core.registry import Spec, make
+from tailgate.core.scenario import load_scenario
+from tailgate.play.trace import rollout
 
 SD = np.array([0.25, 0.1])
 LEAD = (100.0, 29.0576, -0.1082)  # position [m], speed [m/s], acceleration [m/s^2] at t = 0

@@ -11,12 +11,12 @@ import tailgate
 from tailgate.agents.program import Phase, Program, Sheet
 from tailgate.agents.triggers import TRIGGERS
 from tailgate.agents.values import LAWS
+from tailgate.base.errors import InputError, NotApplicable
 from tailgate.core import Kind
-from tailgate.draws import keys
-from tailgate.errors import InputError, NotApplicable
-from tailgate.registry import Spec
-from tailgate.schema import as_data, canonical, fields_of
-from tailgate.trace import rollout
+from tailgate.core.draws import keys
+from tailgate.core.registry import Spec
+from tailgate.core.schema import as_data, canonical, fields_of
+from tailgate.play.trace import rollout
 
 ROOT = Path(__file__).parents[1]
 ALL = ("dos_jam", "dos_hold", "dos_hold_fresh", "dropout", "fdi", "delay", "replay")

@@ -10,13 +10,13 @@ from hypothesis import strategies as st
 from scipy import stats
 
 import tailgate
+from tailgate.base.errors import InputError
 from tailgate.core import Air, Kind
-from tailgate.draws import Role, keys
+from tailgate.core.draws import Role, keys
+from tailgate.core.registry import make
+from tailgate.core.scenario import load_scenario
 from tailgate.envs import FmcwRadar, RadarCruise, RadarFollowing, fmcw
-from tailgate.errors import InputError
-from tailgate.registry import make
-from tailgate.scenario import load_scenario
-from tailgate.trace import rollout
+from tailgate.play.trace import rollout
 
 LINK = fmcw.Link()
 SAMPLES = 25_600  # of a challenge: 0.1 s at 256 kHz

@@ -6,14 +6,13 @@ import numpy as np
 import pytest
 
 import tailgate
-from tailgate import draws
-from tailgate.core import Command, Estimate, Kind, Mode
-from tailgate.draws import Role
+from tailgate.base.errors import InputError
+from tailgate.core import Command, Estimate, Kind, Mode, draws
+from tailgate.core.draws import Role
+from tailgate.core.registry import make
+from tailgate.core.scenario import load_scenario
 from tailgate.envs import FmcwRadar, IntelligentDriver, RadarCruise, RadarFollowing
-from tailgate.errors import InputError
-from tailgate.registry import make
-from tailgate.scenario import load_scenario
-from tailgate.trace import rollout
+from tailgate.play.trace import rollout
 
 PLANT, SENSOR = RadarFollowing(), FmcwRadar()
 MODEL = PLANT.model(SENSOR, RadarCruise())

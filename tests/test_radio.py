@@ -5,12 +5,12 @@ import pytest
 
 import tailgate
 from tailgate.agents.program import Program
+from tailgate.base.errors import InputError, NotApplicable
 from tailgate.core import Kind
-from tailgate.draws import keys
-from tailgate.errors import InputError, NotApplicable
-from tailgate.registry import Spec
-from tailgate.scenario import load_scenario
-from tailgate.trace import rollout
+from tailgate.core.draws import keys
+from tailgate.core.registry import Spec
+from tailgate.core.scenario import load_scenario
+from tailgate.play.trace import rollout
 
 SCRIPTS = {"noise_jam": "noise_jam", "echo_delay": "echo_delay", "echo_pull_off": "echo_delay", "radar_jam": "dos_jam"}
 

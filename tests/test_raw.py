@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 import tailgate
+from tailgate.base.errors import NotApplicable
 from tailgate.core import Model, Prior, Received
-from tailgate.draws import keys
+from tailgate.core.draws import keys
+from tailgate.core.scenario import load_scenario
 from tailgate.envs.cacc import Column
-from tailgate.errors import NotApplicable
-from tailgate.scenario import load_scenario
-from tailgate.trace import rollout
+from tailgate.play.trace import rollout
 
 NONE = tailgate.make_defence("none")
 

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from safetensors.numpy import load, save
 
-from tailgate import reading
-from tailgate.errors import InputError
-from tailgate.rows import read_rows
-from tailgate.schema import read_yaml, scalar
+from tailgate.base import reading
+from tailgate.base.errors import InputError
+from tailgate.core.schema import read_yaml, scalar
+from tailgate.evaluation.rows import read_rows
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 from fuzz import campaign, input_of, valid_of, with_commands
@@ -148,7 +148,7 @@ def test_a_list_of_attacks_that_is_no_text_is_refused(tmp_path):
 
 @pytest.mark.parametrize("text", ["", "[]", "{}", '{"curve": [1]}', '{"curve": [], "seconds": "x"}', "[" * 100_000])
 def test_a_damaged_curve_is_refused(tmp_path, text):
-    from tailgate.trainings import spent
+    from tailgate.training.trainings import spent
 
     (tmp_path / "curve-0.json").write_text(text)
     with pytest.raises(InputError, match="curve"):

@@ -17,14 +17,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import tailgate
-from tailgate import registry
-from tailgate.core import Positive, param
-from tailgate.errors import InputError, NotApplicable, unknown
+from tailgate.base.errors import InputError, NotApplicable, unknown
+from tailgate.core import Positive, param, registry
+from tailgate.core.registry import Entry, Spec, entries, find, make_from, put, register, said
+from tailgate.core.schema import as_data, build, canonical, override, read_yaml, scalar
 from tailgate.estimators import GatedKalman, Kalman
-from tailgate.registry import Entry, Spec, entries, find, make_from, put, register, said
-from tailgate.schema import as_data, build, canonical, override, read_yaml, scalar
-from tailgate.selfplay import GameConfig
-from tailgate.train import TrainConfig
+from tailgate.training.selfplay import GameConfig
+from tailgate.training.train import TrainConfig
 
 PLUGIN = """
     from dataclasses import dataclass

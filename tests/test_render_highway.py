@@ -13,18 +13,17 @@ pytest.importorskip("highway_env")
 from highway_env.vehicle.graphics import VehicleGraphics
 
 import tailgate
-from tailgate import draws
-from tailgate.core import Kind
+from tailgate.base.errors import InputError, NotApplicable
+from tailgate.base.pytree import duplicate
+from tailgate.core import Kind, draws
+from tailgate.core.scenario import load_scenario
 from tailgate.envs import render, render_canvas, render_highway, render_viewer
 from tailgate.envs.faces import AdversaryVectorEnv
 from tailgate.envs.render_stage import LENGTH, stage_of
 from tailgate.envs.render_viewer import Viewer
-from tailgate.errors import InputError, NotApplicable
-from tailgate.evaluation import Cell, run_cell
+from tailgate.evaluation.cells import Cell, run_cell
 from tailgate.replay.replay import play
 from tailgate.replay.video import frames, write_video
-from tailgate.scenario import load_scenario
-from tailgate.tree import duplicate
 
 ROADS = ["tailgate/CarFollowing-v0", "tailgate/RadarFollowing-v0", "tailgate/Platoon-v0", "tailgate/Highway-v0"]
 SIZES = [(480, 160), (960, 240), (1280, 360)]

@@ -6,10 +6,10 @@ import pytest
 
 pytest.importorskip("PIL")
 
+from tailgate.base.pytree import duplicate
 from tailgate.core import Kind
 from tailgate.envs import render, render_canvas, render_network, render_platoon
 from tailgate.envs.faces import AdversaryVectorEnv
-from tailgate.tree import duplicate
 
 PLATOON = {"scenario": "platoon-braking-v0", "defence": "dkf", "viewer": "plain", "threat": {"onset": 1, "targets": ["distance", "velocity"]}}
 NETWORK = {"scenario": "thesis-ch5-v0", "defence": "dkf", "reward": "error", "threat": {"onset": 1}}

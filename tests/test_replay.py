@@ -12,15 +12,16 @@ import numpy as np
 import pytest
 import yaml
 
-from tailgate import cli, files
-from tailgate.assets import embedded
+from tailgate import cli
+from tailgate.base import files
+from tailgate.base.assets import embedded
+from tailgate.base.errors import InputError
 from tailgate.core import Kind
-from tailgate.errors import InputError
-from tailgate.evaluation import Cell, evaluate, run_cell
+from tailgate.evaluation.cells import Cell, evaluate, run_cell
+from tailgate.evaluation.rows import encode, read_rows
 from tailgate.replay.episode import episode_of
 from tailgate.replay.page import context_of, render, write_page
 from tailgate.replay.replay import Filter, choose, play
-from tailgate.rows import encode, read_rows
 
 ROOT = Path(__file__).parents[1]
 HOSTILE = "</script><script>document.title='owned'</script><img src=x onerror=alert(1)>&\"'\u2028"

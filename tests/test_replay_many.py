@@ -7,13 +7,13 @@ import pytest
 import yaml
 
 from tailgate import cli
-from tailgate.errors import InputError
-from tailgate.evaluation import Cell, run_cell
+from tailgate.base.errors import InputError
+from tailgate.evaluation.cells import Cell, run_cell
+from tailgate.evaluation.rows import encode
 from tailgate.replay import episode
 from tailgate.replay.episode import episode_of, shown, watched
 from tailgate.replay.page import context_of, outcome, render, write_page
 from tailgate.replay.replay import Filter, choose, play
-from tailgate.rows import encode
 
 THREAT = {"kinds": ["dos_jam", "dos_hold", "fdi"], "onset": 3}
 PLATOON = {

@@ -5,7 +5,7 @@ import pytest
 import yaml
 
 from tailgate.core import Kind
-from tailgate.evaluation import Cell, run_cell
+from tailgate.evaluation.cells import Cell, run_cell
 from tailgate.replay.page import write_page
 from tailgate.replay.replay import play
 

@@ -9,7 +9,7 @@ pytest.importorskip("PIL")
 from tailgate.core import Kind
 from tailgate.envs import render, render_canvas, render_following
 from tailgate.envs.faces import AdversaryVectorEnv
-from tailgate.evaluation import Cell, run_cell
+from tailgate.evaluation.cells import Cell, run_cell
 from tailgate.replay.episode import episode_of
 from tailgate.replay.page import write_page
 from tailgate.replay.replay import play

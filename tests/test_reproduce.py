@@ -8,11 +8,11 @@ import pytest
 
 import tailgate
 from tailgate import cli
-from tailgate.errors import InputError
-from tailgate.reproduce import Claim, Report, reproduce, write
-from tailgate.reproduce.ch4_cases import READINGS
-from tailgate.reproduce.claims import Spread, Table, verdict
-from tailgate.reproduce.run import flat, markdown
+from tailgate.base.errors import InputError
+from tailgate.thesis import Claim, Report, reproduce, write
+from tailgate.thesis.ch4_cases import READINGS
+from tailgate.thesis.claims import Spread, Table, verdict
+from tailgate.thesis.run import flat, markdown
 
 FIELDS = {"id", "claim", "thesis", "measured", "holds", "why"}
 
@@ -23,7 +23,7 @@ def chapter_4(tmp_path_factory):
     import contextlib
     import io
 
-    from tailgate.reproduce import ch4_figures, ch4_theory
+    from tailgate.thesis import ch4_figures, ch4_theory
 
     out, text, etas = tmp_path_factory.mktemp("ch4"), io.StringIO(), ch4_theory.ETAS[::3]
     with contextlib.redirect_stdout(text), pytest.MonkeyPatch.context() as patch:
@@ -71,7 +71,7 @@ def test_chapter_4(chapter_4):
 
 def test_the_readings_differ_as_they_say():
     """Four readings: printed and fitted noise, on the corrected plant and on the one as printed."""
-    from tailgate.scenario import load_scenario
+    from tailgate.core.scenario import load_scenario
 
     models = {r.name: load_scenario(r.scenario).brief().model for r in READINGS}
     for r in READINGS:
@@ -85,7 +85,7 @@ def test_the_readings_differ_as_they_say():
 
 def test_a_standstill_changes_the_noise_and_no_verdict():
     """With 18.5 times the noise most cars halt once, and then other noise moves them than Q; where they may roll back it is Q."""
-    from tailgate.reproduce.ch4_cases import THESIS, Played, rolling
+    from tailgate.thesis.ch4_cases import THESIS, Played, rolling
 
     reading, seeds = READINGS[2], 200
     for case in ("clean", "fdi", "dos"):
@@ -111,7 +111,7 @@ def test_the_literal_plant_switches_on_the_sign_of_the_acceleration():
 
 def test_the_same_seeds_give_the_same_figures():
     """Two runs of the cases agree in every digit."""
-    from tailgate.reproduce.ch4_cases import Played
+    from tailgate.thesis.ch4_cases import Played
 
     one, two = (Played.of(READINGS[2], "fdi", "ours", 10).metrics for _ in range(2))
     assert all(np.array_equal(one[name], two[name], equal_nan=True) for name in one)
@@ -136,7 +136,7 @@ def test_a_verdict_has_three_values(yes, no, word):
 def test_verdicts_follow_what_is_measured(monkeypatch):
     """On a plant, attack or gate for which a claim is true, the same code says so; on another that it is false."""
     from tailgate.estimators import GatedKalman
-    from tailgate.reproduce import ch4_safety, ch4_theory
+    from tailgate.thesis import ch4_safety, ch4_theory
 
     calm = ch4_theory.case_study()
     rng = np.random.default_rng(0)

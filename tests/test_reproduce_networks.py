@@ -9,11 +9,12 @@ import pytest
 from scipy import stats
 
 import tailgate
-from tailgate import cli, draws
-from tailgate.metrics import measure
-from tailgate.reproduce import ch5_cases, ch5_theory, ch6_cases, ch6_loop, write
-from tailgate.scenario import load_scenario
-from tailgate.trace import rollout
+from tailgate import cli
+from tailgate.core import draws
+from tailgate.core.scenario import load_scenario
+from tailgate.play.metrics import measure
+from tailgate.play.trace import rollout
+from tailgate.thesis import ch5_cases, ch5_theory, ch6_cases, ch6_loop, write
 
 LEVEL = 0.999
 
@@ -140,7 +141,7 @@ def brief_chapters(monkeypatch):
 @pytest.mark.parametrize(("chapter", "claims", "figures"), [("ch5", 10, 4), ("ch6", 18, 5)])
 def test_a_report(chapter, claims, figures, tmp_path, brief_chapters):
     """Four seeds give every claim with a verdict and a reason, tables and figures."""
-    report = import_module(f"tailgate.reproduce.{chapter}").reproduce(4, lambda _: None, True)  # ten are the least from outside
+    report = import_module(f"tailgate.thesis.{chapter}").reproduce(4, lambda _: None, True)  # ten are the least from outside
     page = write(report, tmp_path)
     data = json.loads((tmp_path / "report.json").read_text())
     assert len(report.claims) >= claims and len({c.id for c in report.claims}) == len(report.claims)

@@ -8,12 +8,12 @@ import pytest
 from PIL import Image
 from scipy import stats
 
-from tailgate import draws
-from tailgate.registry import Spec, make
-from tailgate.reproduce import CHAPTERS, ch3_cases, ch3_figures, ch3_limits, ch3_radar
-from tailgate.reproduce.ch3_cases import ATTACKS, DETECTED, OURS, PLACES, Run
-from tailgate.scenario import load_scenario
-from tailgate.trace import rollout
+from tailgate.core import draws
+from tailgate.core.registry import Spec, make
+from tailgate.core.scenario import load_scenario
+from tailgate.play.trace import rollout
+from tailgate.thesis import CHAPTERS, ch3_cases, ch3_figures, ch3_limits, ch3_radar
+from tailgate.thesis.ch3_cases import ATTACKS, DETECTED, OURS, PLACES, Run
 
 LEVEL, SEEDS = 0.999, 60
 

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from tailgate import cli
-from tailgate.errors import InputError
-from tailgate.reproduce import ch7_automata, ch7_cost, ch7_loop, ch7_ratings, ch7_signals, ch7_trust, ch7_width, whole, whole_theorems
-from tailgate.reproduce.claims import Claim, Figure, Report, Table
-from tailgate.reproduce.run import CHAPTERS, flat, read, write
-from tailgate.reproduce.whole import Item, check_coverage, load_coverage, reproduce_whole, write_whole
-from tailgate.scenario import load_scenario
-from tailgate.sources import fingerprint
-from tailgate.stats import proportion
+from tailgate.base.errors import InputError
+from tailgate.base.sources import fingerprint
+from tailgate.core.scenario import load_scenario
+from tailgate.evaluation.stats import proportion
+from tailgate.thesis import ch7_automata, ch7_cost, ch7_loop, ch7_ratings, ch7_signals, ch7_trust, ch7_width, whole, whole_theorems
+from tailgate.thesis.claims import Claim, Figure, Report, Table
+from tailgate.thesis.run import CHAPTERS, flat, read, write
+from tailgate.thesis.whole import Item, check_coverage, load_coverage, reproduce_whole, write_whole
 from tailgate.trust.cells import Outcome
 
 ROOT = Path(__file__).parents[1]

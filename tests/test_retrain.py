@@ -8,10 +8,11 @@ from typing import Any
 
 import pytest
 
-from tailgate import cli, train
+from tailgate import cli
 from tailgate.agents.learning import made_with
-from tailgate.strength.collect import add_policy
-from tailgate.strength.retrain import retrain
+from tailgate.studies.collect import add_policy
+from tailgate.studies.retrain import retrain
+from tailgate.training import train
 
 SETTINGS = ["scenario=gusty-stop-and-go-v0", "defence=kf", "seeds=2", "workers=1", "tensorboard=false", "environment.interval=5"]
 SMALL = {

@@ -11,11 +11,11 @@ from filterpy.kalman import KalmanFilter as Reference
 import tailgate
 from tailgate import num
 from tailgate.core import Innovation, Prior, Received
-from tailgate.draws import Role, keys
+from tailgate.core.draws import Role, keys
+from tailgate.core.registry import Spec
+from tailgate.core.scenario import load_scenario
 from tailgate.estimators import Kalman, Outlier, RobustKalman, RobustKalmanFilter
 from tailgate.estimators.robust import believed, believed_by_cvxpy
-from tailgate.registry import Spec
-from tailgate.scenario import load_scenario
 
 FAMILIES = ("plain", "tiny", "huge", "units", "correlated", "far", "boundary", "none", "one silent")
 NO_DRAWS = keys("train", [0]).at(Role.DEFENCE, np.zeros(1))

@@ -9,16 +9,17 @@ from typing import Any
 
 import pytest
 
-from tailgate import evaluation, sources
-from tailgate.commands import board as command
+from tailgate.base import sources
+from tailgate.base.provenance import cores, processor
+from tailgate.cli import board as command
+from tailgate.core.scenario import load_suite
+from tailgate.evaluation import cells as evaluation
 from tailgate.leaderboard import run_record
 from tailgate.leaderboard.board_format import load
 from tailgate.leaderboard.measured import measured_of
 from tailgate.leaderboard.run_record import Record, processor_time
 from tailgate.leaderboard.run_time import FILE, RunTime, lasting, run_of
 from tailgate.leaderboard.site import build_site
-from tailgate.machine import cores, processor
-from tailgate.scenario import load_suite
 from tailgate.scoring.attacks import attacks_of
 
 SUITE = "name: mine\nscenarios: [gusty-stop-and-go-v0]\ndoses: [12]\ndefences: [none, kf]\nattacks: [none, dropout, 'fdi:value=5']\nseeds: 3\n"

@@ -7,17 +7,18 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from tailgate import make_defence, metrics, num
+from tailgate import make_defence, num
+from tailgate.base.errors import InputError, NotApplicable
 from tailgate.core import Received
-from tailgate.draws import keys
+from tailgate.core.draws import keys
+from tailgate.core.registry import Spec
+from tailgate.core.scenario import load_scenario
 from tailgate.envs.vehicle import drive, lag
-from tailgate.errors import InputError, NotApplicable
 from tailgate.estimators import SafeSet, SafeState, SafeStateBrake
 from tailgate.estimators.reactive_brake import stopping_distance
 from tailgate.estimators.safe_state import ACCEL, GAP, LEAD, SPEED, OwnOdometry
-from tailgate.registry import Spec
-from tailgate.scenario import load_scenario
-from tailgate.trace import rollout
+from tailgate.play import metrics
+from tailgate.play.trace import rollout
 
 ROOT3 = 3.0**0.5  # standard deviations in the half-width of uniform noise
 USES = ("measurements", "v2v")

@@ -7,17 +7,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tailgate.adaptive import configs_of, train_against
-from tailgate.draws import Draws
-from tailgate.errors import InputError
-from tailgate.evaluation import evaluate
-from tailgate.registry import Spec
-from tailgate.rounds import seeds_of
-from tailgate.scenario import Suite, load_suite
+from tailgate.base.errors import InputError
+from tailgate.core.draws import Draws
+from tailgate.core.registry import Spec
+from tailgate.core.scenario import Suite, load_suite
+from tailgate.evaluation.cells import evaluate
+from tailgate.evaluation.rounds import seeds_of
+from tailgate.evaluation.verify import verify
+from tailgate.sandbox import play_submission
+from tailgate.sandbox.isolated import IsolatedPlan, _shown, veiled
 from tailgate.scoring import score
-from tailgate.submission import play_submission
-from tailgate.submission.isolated import IsolatedPlan, _shown, veiled
-from tailgate.verify import verify
+from tailgate.training.adaptive import configs_of, train_against
 
 pytestmark = pytest.mark.skipif(shutil.which("bwrap") is None, reason="bubblewrap is not installed")
 BEACON, MINE = "0123456789abcdef", "bwrap/mine:Mine"

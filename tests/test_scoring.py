@@ -13,12 +13,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from tailgate.errors import InputError
+from tailgate.base.errors import InputError
 from tailgate.leaderboard.board_format import read_board
 from tailgate.scoring import score
 from tailgate.scoring.doses import limits
 from tailgate.scoring.ranks import mcnemar
-from tailgate.strength.policies import rising
+from tailgate.studies.policies import rising
 
 spec = importlib.util.spec_from_file_location("scored", Path(__file__).with_name("scored.py"))
 scored = importlib.util.module_from_spec(spec)
@@ -215,8 +215,8 @@ def test_an_attack_beyond_the_list_counts_where_it_was_played_and_is_asked_of_no
 
 def test_a_rank_asks_for_an_attack_that_was_trained_against_that_very_defence() -> None:
     """A policy of the zoo that was trained against chi2_kf speaks for chi2_kf alone, and only for the files that it was trained against."""
-    from tailgate.registry import Spec
-    from tailgate.strength.policies import origin_of
+    from tailgate.core.registry import Spec
+    from tailgate.studies.policies import origin_of
 
     text = "zoo:name=car-following-chi2_kf-0"
     mine = {"learned": True, "attack_digest": Spec("attack", text).digest, "trained": origin_of(text)}

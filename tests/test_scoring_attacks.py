@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
+from tailgate.base.errors import InputError
 from tailgate.cli import main
-from tailgate.errors import InputError
-from tailgate.rows import read_rows
-from tailgate.scenario import load_suite
+from tailgate.core.scenario import load_suite
+from tailgate.evaluation.rows import read_rows
 from tailgate.scoring import admit, read_attacks, score, withdraw
 from tailgate.scoring.attacks import Admitted, append, attacks_of, next_level, published, standing
 
@@ -134,7 +134,7 @@ def test_an_attack_is_admitted_by_what_it_does_on_select_seeds_and_else_not(part
 
 def test_the_command_says_whom_an_attack_beats(part, tmp_path, capsys, monkeypatch) -> None:
     """Admitted, refused and taken back; each a line of the list."""
-    monkeypatch.setattr("tailgate.scenario.load_suite", lambda name: part)
+    monkeypatch.setattr("tailgate.core.scenario.load_suite", lambda name: part)
     words = ["leaderboard", "admit", "--suite", "quick-v0", "--out", str(tmp_path), "--defence", "chi2_kf", "--workers", "1"]
     assert main([*words, "fdi_ramp:trigger=near,threshold=40,rate=-0.5"]) == 0
     said = capsys.readouterr().out
@@ -153,7 +153,7 @@ def test_the_command_says_whom_an_attack_beats(part, tmp_path, capsys, monkeypat
 
 def test_a_board_asks_every_defence_for_what_was_admitted_and_forgets_what_was_taken_back(part) -> None:
     """Without rows of an admitted attack a defence is incomplete; after an erratum its rows count no more."""
-    from tailgate.evaluation import evaluate
+    from tailgate.evaluation.cells import evaluate
 
     rows = evaluate(dataclasses.replace(part, seeds=10))
     assert {e["defence"]: e["status"] for e in score(rows, part, require_adaptive=False)["entries"]} == {"none": "unranked", "chi2_kf": "ranked"}

@@ -8,19 +8,19 @@ import numpy as np
 import pytest
 import yaml
 
-from tailgate import registry
-from tailgate.adaptive import configs_of, train_against
+from tailgate.base.errors import InputError
 from tailgate.cli import main
-from tailgate.errors import InputError
+from tailgate.core import registry
+from tailgate.core.scenario import Suite, load_suite
 from tailgate.estimators import Kalman
-from tailgate.evaluation import evaluate
+from tailgate.evaluation.cells import evaluate
+from tailgate.evaluation.rows import packed, read_rows
 from tailgate.leaderboard.head import lines, title
 from tailgate.leaderboard.run import OWN, board_of, play
-from tailgate.rows import packed, read_rows
-from tailgate.scenario import Suite, load_suite
 from tailgate.scoring import Admitted, score
 from tailgate.scoring.attacks import admit
 from tailgate.scoring.follow import strays
+from tailgate.training.adaptive import configs_of, train_against
 
 spec = importlib.util.spec_from_file_location("scored", Path(__file__).with_name("scored.py"))
 scored = importlib.util.module_from_spec(spec)

@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 
 from tailgate import make_attack, make_defence
-from tailgate.adaptive import asked_of
 from tailgate.agents.zoo import zoo_names
-from tailgate.draws import keys
-from tailgate.errors import InputError, NotApplicable
-from tailgate.evaluation import evaluate
+from tailgate.base.errors import InputError, NotApplicable
+from tailgate.core.draws import keys
+from tailgate.core.registry import Spec, entries
+from tailgate.core.scenario import Suite, list_suites, load_scenario, load_suite
+from tailgate.evaluation.cells import evaluate
 from tailgate.leaderboard.board_format import read_board
-from tailgate.metrics import max_error
-from tailgate.registry import Spec, entries
-from tailgate.scenario import Suite, list_suites, load_scenario, load_suite
+from tailgate.play.metrics import max_error
+from tailgate.play.trace import rollout
 from tailgate.scoring import score
 from tailgate.scoring.detection import Effort, detection, deviation, plants, stealth_impact, threshold
-from tailgate.trace import rollout
+from tailgate.training.adaptive import asked_of
 
 ROOT = Path(__file__).parents[1]
 SENTINELS = {name: e.sentinel for name, e in entries("defence").items() if e.sentinel}

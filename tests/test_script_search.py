@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tailgate import train
-from tailgate.errors import InputError
+from tailgate.base.errors import InputError
+from tailgate.training import train
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 import script_search

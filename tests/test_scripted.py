@@ -10,12 +10,12 @@ from scipy import stats
 import tailgate
 from tailgate.agents import scripted
 from tailgate.agents.values import Gamma
+from tailgate.base.errors import InputError, NotApplicable
 from tailgate.core import Kind
-from tailgate.draws import Role, keys
+from tailgate.core.draws import Role, keys
+from tailgate.core.scenario import load_scenario
 from tailgate.envs.faces import AdversaryVectorEnv
-from tailgate.errors import InputError, NotApplicable
-from tailgate.scenario import load_scenario
-from tailgate.trace import rollout
+from tailgate.play.trace import rollout
 
 K = 60
 
@@ -195,7 +195,7 @@ def test_sparse_injection(sends):
 
 def test_sparse_injection_as_text(sends):
     """The law and its parameters, per sensor too, can be written as a command line writes them."""
-    spec = tailgate.registry.Spec("attack", "fdi_sparse:probability=1,value=gamma,value.shape=1.5,value.sign=1")
+    spec = tailgate.core.registry.Spec("attack", "fdi_sparse:probability=1,value=gamma,value.shape=1.5,value.sign=1")
     assert spec.make().law == Gamma(shape=1.5, sign=1)
     per = sends("fdi_sparse", probability=1.0, value={"position": 2.0, "velocity": {"name": "ramp", "rate": 0.5}})
     np.testing.assert_array_equal(per.value[:, 0, 0, 0], 2.0)
@@ -236,7 +236,7 @@ def test_replay(sends):
 
 def test_a_replayed_speed_passes_the_gate_in_a_steady_cruise_and_a_replayed_position_does_not(short, play):
     """Thesis 4.7: a replay without a change of level escapes the chi-square detector."""
-    place = dataclasses.replace(short("stop-and-go-v0", horizon=300, onset=1, **OLD), manoeuvre=tailgate.registry.make("manoeuvre", "constant", value=0.0))
+    place = dataclasses.replace(short("stop-and-go-v0", horizon=300, onset=1, **OLD), manoeuvre=tailgate.core.registry.make("manoeuvre", "constant", value=0.0))
     rate = {}
     for name in ("velocity", "position"):
         trace = play(place, "chi2_kf", tailgate.make_attack("replay", start_step=200, targets=(name,)), range(40), terminate=False)
@@ -393,7 +393,7 @@ def test_rollout_stops_when_all_have_crashed(short, loop_of):
     """With termination the trace ends with the last collision; without, at the horizon."""
     attack = tailgate.make_attack("fdi", value=-50.0)
     loop = loop_of(short("braking-v0", horizon=600), "none")
-    held = tailgate.draws.keys("train", range(4))
+    held = tailgate.core.draws.keys("train", range(4))
     ended, full = rollout(loop, attack, held), rollout(loop, attack, held, terminate=False)
     assert len(ended.kind) == ended.length.max() < 600 == len(full.kind)
     last = ended.length - 1

@@ -12,20 +12,21 @@ import numpy as np
 import pytest
 
 import tailgate
-from tailgate import cli, draws, selfplay
+from tailgate import cli
 from tailgate.agents.cem import Config
 from tailgate.agents.mixture import Mixture
 from tailgate.agents.policy import PolicyAttack
 from tailgate.agents.selfplay import Learner, Played, constant, play
-from tailgate.commands.selfplay import _print_report
-from tailgate.core import Kind
+from tailgate.base.errors import InputError
+from tailgate.cli.selfplay import _print_report
+from tailgate.core import Kind, draws
+from tailgate.core.registry import Spec
+from tailgate.core.scenario import config_path, load_scenario
 from tailgate.envs.duel import Duel
-from tailgate.errors import InputError
 from tailgate.estimators import Steered
-from tailgate.registry import Spec
-from tailgate.scenario import config_path, load_scenario
-from tailgate.selfplay import Game, GameConfig, load_config
-from tailgate.trace import rollout
+from tailgate.play.trace import rollout
+from tailgate.training import selfplay
+from tailgate.training.selfplay import Game, GameConfig, load_config
 
 ROAD = {"scenario": "gusty-stop-and-go-v0", "interval": 60, "menu": {"thresholds": [6.0, 1e9], "modes": ["normal", "brake"]}, "knowledge": "black"}
 FDI = "fdi:trigger=near,threshold=40,value=-4"

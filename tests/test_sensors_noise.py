@@ -5,12 +5,12 @@ import dataclasses
 import numpy as np
 import pytest
 
-from tailgate.draws import Role, keys
+from tailgate.base.errors import InputError
+from tailgate.core.draws import Role, keys
+from tailgate.core.registry import make
+from tailgate.core.scenario import load_scenario
+from tailgate.core.schema import as_data
 from tailgate.envs.sensors import Odometry
-from tailgate.errors import InputError
-from tailgate.registry import make
-from tailgate.scenario import load_scenario
-from tailgate.schema import as_data
 
 STEPS = np.zeros(20_000, np.int64)
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tailgate.errors import InputError
+from tailgate.base.errors import InputError
 from tailgate.leaderboard import head
 from tailgate.leaderboard.board_format import read_board
 from tailgate.leaderboard.charts import Axis, Dot, Line, chart, nice, spread, ticks_at

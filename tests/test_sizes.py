@@ -6,10 +6,12 @@ from typing import Any
 
 import pytest
 
-from tailgate import cli, evaluate, sizes, train
+from tailgate import cli, evaluate
+from tailgate.base import sizes
+from tailgate.base.errors import InputError
+from tailgate.base.pool import Crew
 from tailgate.envs.faces import AdversaryVectorEnv
-from tailgate.errors import InputError
-from tailgate.pool import Crew
+from tailgate.training import train
 
 SOME = ["--scenario", "thesis-ch4-v0", "--defence", "kf", "--attack", "none"]
 HUGE = "1000000000000"

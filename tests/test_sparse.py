@@ -10,9 +10,9 @@ from scipy import stats
 import tailgate
 from tailgate import num
 from tailgate.core import Innovation, Prior, Received
-from tailgate.draws import Role, keys
+from tailgate.core.draws import Role, keys
+from tailgate.core.scenario import load_scenario
 from tailgate.estimators import GatedKalman, KalmanFilter, SparseChiSquare, SparseGatedKalman
-from tailgate.scenario import load_scenario
 
 RNG = np.random.default_rng(23)
 NO_DRAWS = keys("train", [0]).at(Role.DEFENCE, np.zeros(1))

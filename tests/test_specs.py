@@ -9,11 +9,11 @@ import pytest
 from gymnasium.envs.registration import EnvSpec
 
 import tailgate
+from tailgate.base.errors import InputError
 from tailgate.envs.duel import DefenderEnv
 from tailgate.envs.faces import AdversaryEnv, AdversaryVectorEnv
 from tailgate.envs.parallel import DuelEnv
 from tailgate.envs.specs import in_box
-from tailgate.errors import InputError
 from tailgate.estimators.compose import compose
 from tailgate.estimators.kalman import Kalman
 from tailgate.estimators.steering import Menu

@@ -5,10 +5,9 @@ import time
 
 import numpy as np
 
-from tailgate import draws
-from tailgate.core import Kind
-from tailgate.registry import Spec
-from tailgate.scenario import load_scenario
+from tailgate.core import Kind, draws
+from tailgate.core.registry import Spec
+from tailgate.core.scenario import load_scenario
 
 
 def _rate(episodes: int, steps: int) -> float:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tailgate.stats import holm, mean_time, median_limits, paired_difference, paired_ratio, proportion
+from tailgate.evaluation.stats import holm, mean_time, median_limits, paired_difference, paired_ratio, proportion
 
 
 def test_clopper_pearson_known_values() -> None:

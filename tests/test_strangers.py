@@ -5,15 +5,15 @@ import dataclasses
 import numpy as np
 import pytest
 
-from tailgate import draws
 from tailgate.agents.scripted import NoAttack
-from tailgate.engine.rollouts import Rollout, rollout_of
+from tailgate.base.errors import InputError
+from tailgate.core import draws
+from tailgate.core.scenario import load_scenario
+from tailgate.core.threat import ThreatModel
 from tailgate.envs.faces import AdversaryEnv, AdversaryVectorEnv
-from tailgate.errors import InputError
-from tailgate.metrics import METRICS, UNITS, measure
-from tailgate.scenario import load_scenario
-from tailgate.threat import ThreatModel
-from tailgate.trace import Trace, rollout
+from tailgate.play.metrics import METRICS, UNITS, measure
+from tailgate.play.rollouts import Rollout, rollout_of
+from tailgate.play.trace import Trace, rollout
 
 from . import strangers
 from .engines import as_plain, trace_as_plain
@@ -52,7 +52,7 @@ def test_an_attack_is_in_the_program():
 def test_other_numbers_of_a_strangers_classes_are_not_traced_again(monkeypatch):
     rollout_of(_loop(), Nudge())
     monkeypatch.setattr("tailgate.engine.program.traced", lambda *_: pytest.fail("traced again"))
-    monkeypatch.setattr("tailgate.engine.rollouts.traced", lambda *_: pytest.fail("traced again"))
+    monkeypatch.setattr("tailgate.play.rollouts.traced", lambda *_: pytest.fail("traced again"))
     loop, keys = _loop(stubborn(eta=5.0), plant=Pendulum(pull=0.5), sensor=Gyroscope((0.02, 0.03))), draws.keys("report", range(5))
     program = rollout_of(loop, Nudge(gain=0.9))
     assert isinstance(program, Rollout), program

@@ -10,19 +10,20 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tailgate import cli, draws
+from tailgate import cli
 from tailgate.agents.policy import Yoked, timing_advantage
-from tailgate.draws import Role
-from tailgate.errors import InputError
-from tailgate.metrics import METRICS
-from tailgate.registry import Spec
-from tailgate.strength.collect import add_run
-from tailgate.strength.dose import critical_dose, critical_interval, dose_response, fitted
-from tailgate.strength.figures import dose_figure, timing_figure
-from tailgate.strength.policies import label, loop_for, trained
-from tailgate.strength.timing import periodic, play, shuffled, timing
-from tailgate.strength.transfer import transfer
-from tailgate.trace import MEMORY, Trace, episodes_at_once, rollout
+from tailgate.base.errors import InputError
+from tailgate.core import draws
+from tailgate.core.draws import Role
+from tailgate.core.registry import Spec
+from tailgate.play.metrics import METRICS
+from tailgate.play.trace import MEMORY, Trace, episodes_at_once, rollout
+from tailgate.studies.collect import add_run
+from tailgate.studies.dose import critical_dose, critical_interval, dose_response, fitted
+from tailgate.studies.figures import dose_figure, timing_figure
+from tailgate.studies.policies import label, loop_for, trained
+from tailgate.studies.timing import periodic, play, shuffled, timing
+from tailgate.studies.transfer import transfer
 
 spec = importlib.util.spec_from_file_location("strong", Path(__file__).with_name("strong.py"))
 assert spec is not None and spec.loader is not None
@@ -128,8 +129,8 @@ def test_many_episodes_are_played_as_memory_allows(monkeypatch: pytest.MonkeyPat
         sizes.append(len(keys.key))
         return rollout(loop, attack, keys, **options)
 
-    monkeypatch.setattr("tailgate.strength.timing.rollout", counted)
-    monkeypatch.setattr("tailgate.trace.MEMORY", 7.5 * MEMORY / episodes_at_once(loop.model, loop.horizon, 10**9))
+    monkeypatch.setattr("tailgate.studies.timing.rollout", counted)
+    monkeypatch.setattr("tailgate.play.trace.MEMORY", 7.5 * MEMORY / episodes_at_once(loop.model, loop.horizon, 10**9))
     apart = timing_advantage(loop, who.policy, keys, "min_gap")
     assert sizes == [7, 7, 3] * 3
     assert np.array_equal(apart, together) and not np.array_equal(*apart)
@@ -161,7 +162,7 @@ def test_a_record_that_names_code_runs_nothing(
     tmp_path: Path, module: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, field: str, value: Any
 ) -> None:
     """One line that names the file and the field, from every command that reads records, even where another defence is asked for."""
-    monkeypatch.setattr("tailgate.strength.collect.FOLDER", tmp_path / "zoo")
+    monkeypatch.setattr("tailgate.studies.collect.FOLDER", tmp_path / "zoo")
     policy = str(_recorded(_always(tmp_path, "policy-0"), **{field: value}))
     for words in (
         ["timing", policy], ["timing", policy, "--defence", "kf"], ["transfer", policy], ["transfer", policy, "--defence", "kf"],
@@ -218,7 +219,7 @@ def test_the_bootstrap_interval_covers_the_critical_dose() -> None:
     doses, shares = np.array([0.0, 10.0, 20.0]), np.array([0.0, 0.05, 0.25])
     rng = np.random.default_rng(1)
     hits = 0
-    import tailgate.strength.dose as module
+    import tailgate.studies.dose as module
 
     before, module.RESAMPLES = module.RESAMPLES, 200
     try:

@@ -5,13 +5,13 @@ import dataclasses
 import numpy as np
 import pytest
 
-from tailgate.draws import keys
+from tailgate.base.errors import InputError
+from tailgate.core.draws import keys
+from tailgate.core.registry import make
+from tailgate.core.scenario import load_scenario
 from tailgate.envs.manoeuvres import Sine
 from tailgate.envs.platoon import Platoon, PlatoonSensors
-from tailgate.errors import InputError
-from tailgate.registry import make
-from tailgate.scenario import load_scenario
-from tailgate.string_stability import Peak, growth, peak, sweep, transfer
+from tailgate.thesis.string_stability import Peak, growth, peak, sweep, transfer
 
 WEIGHTS = ((1.0, 1.0), (0.5, 0.5), (1.0, 0.0))
 

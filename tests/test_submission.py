@@ -10,18 +10,18 @@ from typing import Any
 
 import pytest
 
-from tailgate.commands import submit
-from tailgate.engine.agreement import Untraced
-from tailgate.engine.commanded import commanded
-from tailgate.errors import InputError
-from tailgate.evaluation import Cell, cells_of, run_cell
-from tailgate.registry import Spec
-from tailgate.rounds import seeds_of
-from tailgate.rows import read_rows
-from tailgate.scenario import Suite, load_scenario
-from tailgate.submission import Isolated, digest_of, mixed, play, play_submission
-from tailgate.submission.source import staged
-from tailgate.submission.table import Seat
+from tailgate.base.errors import InputError
+from tailgate.cli import submit
+from tailgate.core.registry import Spec
+from tailgate.core.scenario import Suite, load_scenario
+from tailgate.evaluation.cells import Cell, cells_of, run_cell
+from tailgate.evaluation.rounds import seeds_of
+from tailgate.evaluation.rows import read_rows
+from tailgate.play.agreement import Untraced
+from tailgate.play.commanded import commanded
+from tailgate.sandbox import Isolated, digest_of, mixed, play, play_submission
+from tailgate.sandbox.source import staged
+from tailgate.sandbox.table import Seat
 
 KALMAN = "tailgate.estimators:Kalman"
 SCENARIO = """

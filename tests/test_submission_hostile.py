@@ -12,14 +12,14 @@ from typing import Any
 
 import pytest
 
-from tailgate.evaluation import Cell
-from tailgate.rounds import seeds_of
-from tailgate.rows import read_rows
-from tailgate.scenario import Suite
-from tailgate.submission import Limits, play_mixed, play_submission
-from tailgate.submission.mixed import Submission
-from tailgate.submission.sandbox import sandbox_of
-from tailgate.submission.source import staged
+from tailgate.core.scenario import Suite
+from tailgate.evaluation.cells import Cell
+from tailgate.evaluation.rounds import seeds_of
+from tailgate.evaluation.rows import read_rows
+from tailgate.sandbox import Limits, play_mixed, play_submission
+from tailgate.sandbox.mixed import Submission
+from tailgate.sandbox.sandbox import sandbox_of
+from tailgate.sandbox.source import staged
 
 LIMITS = Limits(memory=2 * 2**30, start_time=30.0, silence=3.0, output=2**16, file_size=2**20, processes=4)
 BOUND = 60.0  # [s] for everything of one test, on a machine that does other things beside
@@ -36,7 +36,7 @@ import ctypes, os, signal, subprocess, sys, time
 from dataclasses import dataclass
 import numpy as np
 from tailgate.core import Estimate, Mode
-from tailgate.draws import Draws, Role, keys
+from tailgate.core.draws import Draws, Role, keys
 from tailgate.estimators import Kalman
 
 class Big(int):

@@ -15,18 +15,18 @@ import numpy as np
 import pytest
 
 import tailgate
+from tailgate.base.errors import InputError
 from tailgate.core import Prior
-from tailgate.draws import keys
-from tailgate.errors import InputError
-from tailgate.rounds import seeds_of
-from tailgate.scenario import Scenario, load_scenario
-from tailgate.submission import Isolated, Limits, digest_of, mixed
-from tailgate.submission.limits import Lost
-from tailgate.submission.sandbox import Sandbox, bwrap, docker, sandbox_of
-from tailgate.submission.source import staged
-from tailgate.submission.table import order_of
-from tailgate.submission.wire import pack, unpack
-from tailgate.trace import rollout
+from tailgate.core.draws import keys
+from tailgate.core.scenario import Scenario, load_scenario
+from tailgate.evaluation.rounds import seeds_of
+from tailgate.play.trace import rollout
+from tailgate.sandbox import Isolated, Limits, digest_of, mixed
+from tailgate.sandbox.limits import Lost
+from tailgate.sandbox.sandbox import Sandbox, bwrap, docker, sandbox_of
+from tailgate.sandbox.source import staged
+from tailgate.sandbox.table import order_of
+from tailgate.sandbox.wire import pack, unpack
 
 KALMAN = "tailgate.estimators:Kalman"
 
@@ -127,8 +127,8 @@ def test_a_killed_run_leaves_no_process_of_the_submission(tmp_path: Path) -> Non
     """Whoever played it is killed without warning: the guard sees it, ends everything and removes the scratch directory."""
     code = f"""
 import os, signal, time
-from tailgate.submission import Isolated
-from tailgate.scenario import load_scenario
+from tailgate.sandbox import Isolated
+from tailgate.core.scenario import load_scenario
 plan = Isolated({KALMAN!r}).prepare(load_scenario("stop-and-go-v0").brief().model)
 print(plan.process.guard.pid, plan.process.scratch, plan.process.folder, flush=True)
 time.sleep(1000)

@@ -59,7 +59,7 @@ def test_the_automata_drawn(net):
     pytest.importorskip("matplotlib")
     from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
 
-    from tailgate.plots import png
+    from tailgate.base.plots import png
     from tailgate.trust.automata_figures import automata_figure
 
     figure = automata_figure(net, one_hop(net))

@@ -6,19 +6,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tailgate import draws, train
 from tailgate.agents import cem
 from tailgate.agents.learning import Teachable, learner_of
 from tailgate.agents.policy import PolicyAttack
 from tailgate.agents.ppo import Config, Learner
 from tailgate.agents.teacher import demonstrate, nearest
-from tailgate.core import Kind
+from tailgate.base.errors import InputError
+from tailgate.core import Kind, draws
+from tailgate.core.registry import Spec
+from tailgate.core.scenario import config_path
 from tailgate.envs.seat import Seat
-from tailgate.errors import InputError
-from tailgate.metrics import crashed
-from tailgate.registry import Spec
-from tailgate.scenario import config_path
-from tailgate.trace import rollout
+from tailgate.play.metrics import crashed
+from tailgate.play.trace import rollout
+from tailgate.training import train
 
 SCRIPT = "fdi_then_jam:trigger=near,threshold=40,inject=10"
 ENVIRONMENT: dict[str, Any] = {

@@ -12,24 +12,26 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tailgate import draws, num, trace
+from tailgate import num
 from tailgate.agents.scripted import NoAttack
 from tailgate.agents.zoo import zoo_card
+from tailgate.base.errors import InputError
 from tailgate.cli import main
-from tailgate.engine import objects, rollouts, seats
-from tailgate.engine.commanded import Commanded
+from tailgate.core import draws
+from tailgate.core.registry import Spec
+from tailgate.core.scenario import load_scenario
+from tailgate.engine import objects
 from tailgate.engine.evaluation import evaluate
 from tailgate.engine.program import Call, Program, State, traced
-from tailgate.engine.remembered import Remembered
-from tailgate.engine.rollouts import Rollout, rollout_of
-from tailgate.engine.seats import SeatPrograms
 from tailgate.envs.faces import AdversaryEnv, AdversaryVectorEnv
 from tailgate.envs.seat import Seat
-from tailgate.errors import InputError
 from tailgate.estimators import ChiSquare, Kalman
-from tailgate.registry import Spec
-from tailgate.scenario import load_scenario
-from tailgate.trace import Trace, rollout
+from tailgate.play import rollouts, seats, trace
+from tailgate.play.commanded import Commanded
+from tailgate.play.remembered import Remembered
+from tailgate.play.rollouts import Rollout, rollout_of
+from tailgate.play.seats import SeatPrograms
+from tailgate.play.trace import Trace, rollout
 
 from .engines import as_plain
 

@@ -8,13 +8,13 @@ import time
 import numpy as np
 import pytest
 
-from tailgate import draws
-from tailgate.engine.commanded import Steps, commanded
+from tailgate.base.errors import InputError
+from tailgate.core import draws
+from tailgate.core.registry import Spec
+from tailgate.core.scenario import load_scenario
 from tailgate.envs.faces import AdversaryEnv, AdversaryVectorEnv
-from tailgate.errors import InputError
-from tailgate.registry import Spec
-from tailgate.scenario import load_scenario
-from tailgate.trace import rollout
+from tailgate.play.commanded import Steps, commanded
+from tailgate.play.trace import rollout
 
 from .engines import as_plain, loop_of, same, short, told, trace_as_plain
 

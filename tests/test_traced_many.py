@@ -5,15 +5,15 @@ import dataclasses
 import numpy as np
 import pytest
 
-from tailgate import draws
-from tailgate.engine.commanded import Steps, commanded
+from tailgate.base.errors import InputError
+from tailgate.base.pytree import leaves
+from tailgate.core import draws
+from tailgate.core.registry import Spec
+from tailgate.core.scenario import load_scenario
 from tailgate.envs.faces import AdversaryEnv
 from tailgate.envs.manoeuvres import Profile
-from tailgate.errors import InputError
-from tailgate.registry import Spec
-from tailgate.scenario import load_scenario
-from tailgate.trace import rollout
-from tailgate.tree import leaves
+from tailgate.play.commanded import Steps, commanded
+from tailgate.play.trace import rollout
 
 from .engines import as_plain, loop_of, same, told, trace_as_plain
 

@@ -5,16 +5,16 @@ from typing import Any
 
 import pytest
 
-from tailgate import draws
-from tailgate.engine.agreement import Untraced
-from tailgate.engine.rollouts import Rollout, rollout_of
-from tailgate.engine.seats import SeatPrograms, programs_of
+from tailgate.base.errors import InputError
+from tailgate.core import draws
+from tailgate.core.loop import Loop
+from tailgate.core.registry import Spec, entries
+from tailgate.core.scenario import Suite, load_scenario, load_suite
 from tailgate.envs.seat import Seat
-from tailgate.errors import InputError
-from tailgate.loop import Loop
-from tailgate.registry import Spec, entries
-from tailgate.scenario import Suite, load_scenario, load_suite
-from tailgate.trace import Trace, rollout
+from tailgate.play.agreement import Untraced
+from tailgate.play.rollouts import Rollout, rollout_of
+from tailgate.play.seats import SeatPrograms, programs_of
+from tailgate.play.trace import Trace, rollout
 
 ROOT = Path(__file__).parent.parent
 NAMES = sorted(path.stem for path in (ROOT / "configs/suites").glob("*.yaml") if "." not in path.stem)

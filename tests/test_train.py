@@ -15,13 +15,14 @@ import yaml
 from safetensors import safe_open
 from safetensors.numpy import save_file
 
-from tailgate import cli, comparison, train
+from tailgate import cli
 from tailgate.agents.cem import Config as CemConfig
 from tailgate.agents.ppo import Config, Learner
+from tailgate.base.errors import InputError
+from tailgate.core.schema import build
 from tailgate.envs.seat import Seat
-from tailgate.errors import InputError
-from tailgate.rivals import outcomes
-from tailgate.schema import build
+from tailgate.evaluation.baselines import outcomes
+from tailgate.training import comparison, train
 
 ENVIRONMENT: dict[str, Any] = {
     "scenario": "gusty-stop-and-go-v0", "defence": "kf", "threat": {"kinds": ["dos_jam", "fdi"], "budget": 30}, "interval": 5,

@@ -13,8 +13,9 @@ from pathlib import Path
 
 import pytest
 
-from tailgate import adaptive, cli, train
-from tailgate.errors import InputError, Killed
+from tailgate import cli
+from tailgate.base.errors import InputError, Killed
+from tailgate.training import adaptive, train
 
 spec = importlib.util.spec_from_file_location("dying", Path(__file__).with_name("dying.py"))
 assert spec is not None and spec.loader is not None

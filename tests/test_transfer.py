@@ -10,11 +10,11 @@ import pytest
 
 from tailgate import cli
 from tailgate.agents.policy import PolicyAttack
-from tailgate.errors import InputError
-from tailgate.registry import entries
-from tailgate.strength.figures import transfer_figure
-from tailgate.strength.policies import mean, trained
-from tailgate.strength.transfer import _registered, difference, transfer
+from tailgate.base.errors import InputError
+from tailgate.core.registry import entries
+from tailgate.studies.figures import transfer_figure
+from tailgate.studies.policies import mean, trained
+from tailgate.studies.transfer import _registered, difference, transfer
 
 spec = importlib.util.spec_from_file_location("strong", Path(__file__).with_name("strong.py"))
 assert spec is not None and spec.loader is not None

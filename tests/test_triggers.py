@@ -23,12 +23,12 @@ from tailgate.agents.triggers import (
     part,
     rearm,
 )
+from tailgate.base.errors import InputError, NotApplicable
 from tailgate.core import Received, Scene, View
-from tailgate.draws import Role, keys
-from tailgate.errors import InputError, NotApplicable
-from tailgate.registry import Spec
-from tailgate.scenario import load_scenario
-from tailgate.trace import rollout
+from tailgate.core.draws import Role, keys
+from tailgate.core.registry import Spec
+from tailgate.core.scenario import load_scenario
+from tailgate.play.trace import rollout
 
 ONE = Timing(1, 0.1)
 

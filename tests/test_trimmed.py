@@ -5,9 +5,9 @@ import dataclasses
 import numpy as np
 import pytest
 
+from tailgate.base.errors import NotApplicable
 from tailgate.core import Prior
 from tailgate.envs.network import NoControl, SensorNetwork
-from tailgate.errors import NotApplicable
 from tailgate.estimators import TrimmedFilter
 from tailgate.estimators.kalman import steady_state
 from tailgate.estimators.trimmed import clusters, detects, lessons, split, trimmed_mean

@@ -3,7 +3,7 @@
 import dataclasses
 import tracemalloc
 
-from tailgate.scenario import load_suite
+from tailgate.core.scenario import load_suite
 from tailgate.trust.cells import check_cell
 from tailgate.trust.run import jobs_of
 from tailgate.trust.statistics import Sequential

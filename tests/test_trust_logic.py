@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tailgate.errors import InputError
+from tailgate.base.errors import InputError
 from tailgate.trust.formula import parse
 from tailgate.trust.logic import (
     Always,

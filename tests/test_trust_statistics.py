@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from tailgate.errors import InputError
+from tailgate.base.errors import InputError
 from tailgate.trust.statistics import Sequential, Sprt, Verdict, interval, lower, okamoto, runs_for
 
 

@@ -13,14 +13,16 @@ import yaml
 
 pytest.importorskip("optuna")
 
-from tailgate import cli, draws, tuning
+from tailgate import cli
 from tailgate.agents.policy import PolicyAttack
-from tailgate.errors import InputError
-from tailgate.metrics import METRICS
-from tailgate.registry import Spec
-from tailgate.scenario import load_scenario
-from tailgate.trace import rollout
-from tailgate.train import load_config
+from tailgate.base.errors import InputError
+from tailgate.core import draws
+from tailgate.core.registry import Spec
+from tailgate.core.scenario import load_scenario
+from tailgate.play.metrics import METRICS
+from tailgate.play.trace import rollout
+from tailgate.training import tuning
+from tailgate.training.train import load_config
 
 SPACE: tuning.Space = {
     "cem.sd": {"log": [0.3, 2.0]}, "cem.elite": {"range": [0.2, 0.5]}, "cem.episodes": {"range": [2, 4]},
@@ -197,7 +199,7 @@ def test_the_built_in_spaces_are_valid(tmp_path: Path, learner: str) -> None:
     if learner == "ppo":
         pytest.importorskip("stable_baselines3")
     from tailgate.agents.learning import learner_of
-    from tailgate.schema import build
+    from tailgate.core.schema import build
 
     path = tmp_path / "space.yaml"
     path.write_text(yaml.safe_dump(tuning.SPACES[learner]))

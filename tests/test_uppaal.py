@@ -5,7 +5,7 @@ from xml.etree import ElementTree
 
 import pytest
 
-from tailgate.errors import InputError
+from tailgate.base.errors import InputError
 from tailgate.trust.automata import Atom, Edge, load_network, network_of
 from tailgate.trust.uppaal import DTD, ENTRY, RESERVED, document, identifier, names_of, write_uppaal
 

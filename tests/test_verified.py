@@ -8,17 +8,17 @@ from typing import Any
 
 import pytest
 
-from tailgate.adaptive import asked_of
-from tailgate.commands import verify as command
-from tailgate.errors import InputError
-from tailgate.evaluation import cells_of, run
+from tailgate.base.errors import InputError
+from tailgate.cli import verify as command
+from tailgate.core.scenario import Suite, list_suites, load_suite
+from tailgate.core.schema import as_data
+from tailgate.evaluation.cells import cells_of, run
+from tailgate.evaluation.rows import encode
 from tailgate.leaderboard.board_format import read_board
 from tailgate.leaderboard.run import VERIFIED, board_of
 from tailgate.leaderboard.site import build_site
-from tailgate.rows import encode
-from tailgate.scenario import Suite, list_suites, load_suite
-from tailgate.schema import as_data
-from tailgate.train import TrainConfig, plan_key
+from tailgate.training.adaptive import asked_of
+from tailgate.training.train import TrainConfig, plan_key
 
 ROOT = Path(__file__).parents[1]
 SUITE = Suite("small", "", ("thesis-ch4-v0",), (5,), ("none", "kf"), ("none", "fdi:value=5"), 4)

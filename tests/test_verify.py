@@ -11,12 +11,12 @@ from typing import Any
 import pytest
 
 import tailgate
-from tailgate import evaluation
-from tailgate.commands import verify as command
-from tailgate.evaluation import Cell, cells_of, episodes_at_once, run, run_cell
-from tailgate.rows import encode
-from tailgate.scenario import Suite, load_suite
-from tailgate.verify import verify
+from tailgate.cli import verify as command
+from tailgate.core.scenario import Suite, load_suite
+from tailgate.evaluation import cells as evaluation
+from tailgate.evaluation.cells import Cell, cells_of, episodes_at_once, run, run_cell
+from tailgate.evaluation.rows import encode
+from tailgate.evaluation.verify import verify
 
 ATTACKS = ("none", "fdi:value=5", "dropout:probability=0.5")
 SUITE = Suite("small", "", ("thesis-ch4-v0", "thesis-ch4-literal-v0"), (5, 9), ("kf",), ATTACKS, 3)

@@ -9,18 +9,18 @@ import pytest
 
 import tailgate
 from tailgate.agents.scripted import NoAttack
-from tailgate.clean import Bench
+from tailgate.base.errors import NotApplicable
 from tailgate.core import Model
-from tailgate.draws import Role, keys
-from tailgate.errors import NotApplicable
+from tailgate.core.draws import Role, keys
+from tailgate.core.registry import Spec
+from tailgate.core.scenario import Suite, load_scenario
+from tailgate.core.score_threshold import Watched
 from tailgate.estimators import AcceptAll, ChiSquare, Composed, GatedKalman, GateOut, KalmanFilter, Score, compose
 from tailgate.estimators.watched import watched
+from tailgate.evaluation.attack_free import Bench
 from tailgate.num import inverse, quadratic
-from tailgate.registry import Spec
-from tailgate.scenario import Suite, load_scenario
+from tailgate.play.trace import Trace, rollout
 from tailgate.scoring.detection import Effort, detection, stealth_impact
-from tailgate.trace import Trace, rollout
-from tailgate.watch import Watched
 
 BIAS = "fdi:value=-3,start_step=40,length=20"
 ECHO = "echo_delay:start_step=30,delay=60"

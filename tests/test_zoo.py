@@ -9,19 +9,20 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tailgate import cli, draws
+from tailgate import cli
 from tailgate.agents import zoo
 from tailgate.agents.policy import PolicyAttack, load_policy
 from tailgate.agents.zoo import ZooAttack, zoo_card, zoo_names, zoo_path
+from tailgate.base.errors import InputError
+from tailgate.core import draws
+from tailgate.core.registry import Spec
+from tailgate.core.schema import build
 from tailgate.envs.seat import Seat
-from tailgate.errors import InputError
-from tailgate.evaluation import evaluate
-from tailgate.registry import Spec
-from tailgate.schema import build
-from tailgate.strength.collect import BYTES, POINTS, add_policy, add_run, single, thinned
-from tailgate.strength.policies import loop_for, trained
-from tailgate.trace import rollout
-from tailgate.train import TrainConfig, environment_of
+from tailgate.evaluation.cells import evaluate
+from tailgate.play.trace import rollout
+from tailgate.studies.collect import BYTES, POINTS, add_policy, add_run, single, thinned
+from tailgate.studies.policies import loop_for, trained
+from tailgate.training.train import TrainConfig, environment_of
 
 ROOT = Path(__file__).parents[1]
 RUN = ROOT / "results" / "quickstart-v0"

@@ -7,15 +7,16 @@
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
-from tailgate import interrupts as interrupts  # first: the imports below take half a second, in which a user may change his mind
+from tailgate.base import interrupts as interrupts  # first: the imports below take half a second, in which a user may change his mind
 
 try:
     __version__ = version("tailgate")
 except PackageNotFoundError:  # a source tree that was never installed
     __version__ = "0+unknown"
 
-from tailgate.errors import InputError
-from tailgate.registry import entries, make
+from tailgate import moved as moved
+from tailgate.base.errors import InputError
+from tailgate.core.registry import entries, make
 
 __all__ = ["InputError", "evaluate", "list_attacks", "list_defences", "make_attack", "make_defence", "parallel_env", "per_episode"]
 
@@ -46,7 +47,7 @@ def __getattr__(name: str) -> Any:
 
         return per_episode
     if name == "evaluate":
-        from tailgate.evaluation import evaluate
+        from tailgate.evaluation.cells import evaluate
 
         return evaluate
     if name == "parallel_env":

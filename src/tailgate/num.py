@@ -19,19 +19,19 @@ from tailgate.engine import elementary, matrices
 from tailgate.engine.array import Traced
 from tailgate.engine.compiled import elementwise
 from tailgate.engine.functions import tracing as tracing
+from tailgate.engine.hints import broken as broken
+from tailgate.engine.hints import demand as demand
+from tailgate.engine.hints import elsewhere as elsewhere
+from tailgate.engine.hints import every as every
+from tailgate.engine.hints import pick as pick
+from tailgate.engine.hints import present as present
+from tailgate.engine.hints import put as put
+from tailgate.engine.hints import ring_next as ring_next
+from tailgate.engine.hints import some as some
+from tailgate.engine.hints import take as take
 from tailgate.engine.loops import until as until
 from tailgate.engine.matrices import orthogonal as orthogonal
 from tailgate.engine.matrices import root as root
-from tailgate.hints import broken as broken
-from tailgate.hints import demand as demand
-from tailgate.hints import elsewhere as elsewhere
-from tailgate.hints import every as every
-from tailgate.hints import pick as pick
-from tailgate.hints import present as present
-from tailgate.hints import put as put
-from tailgate.hints import ring_next as ring_next
-from tailgate.hints import some as some
-from tailgate.hints import take as take
 
 Array = NDArray[Any]
 Shares = tuple[Array, Array, Array]

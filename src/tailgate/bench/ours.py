@@ -15,19 +15,19 @@ from typing import Any, NamedTuple
 import gymnasium
 import numpy as np
 
-from tailgate import draws, num
+from tailgate import num
 from tailgate.agents.codec import ActionCodec, ActionSpec
 from tailgate.agents.observation import ObservationCodec
 from tailgate.agents.reward import Reward, RewardName
-from tailgate.core import Array, Command, Estimate, Mode, View
-from tailgate.draws import Role
-from tailgate.engine.agreement import Untraced
-from tailgate.engine.seats import Rows, programs_of
+from tailgate.base.pytree import put_rows
+from tailgate.core import Array, Command, Estimate, Mode, View, draws
+from tailgate.core.draws import Role
+from tailgate.core.registry import Spec
+from tailgate.core.scenario import Scenario, load_scenario
 from tailgate.envs.batches import side_by_side
 from tailgate.envs.seat import Seat
-from tailgate.registry import Spec
-from tailgate.scenario import Scenario, load_scenario
-from tailgate.tree import put_rows
+from tailgate.play.agreement import Untraced
+from tailgate.play.seats import Rows, programs_of
 
 from .lines import Go, Missing, Sample, repeated
 from .peers import at_random, batched, stepped

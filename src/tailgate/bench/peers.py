@@ -15,7 +15,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from tailgate.scenario import load_scenario
+from tailgate.core.scenario import load_scenario
 
 from .lines import Go, Missing, Sample, repeated
 

@@ -14,11 +14,11 @@ import numpy as np
 
 from tailgate import num
 from tailgate.core import Array, Innovation
+from tailgate.core.scenario import load_scenario
 from tailgate.estimators.distributed import fixed_point
 from tailgate.estimators.kalman import KalmanState
 from tailgate.estimators.norm_resilient import axes, moved
 from tailgate.estimators.robust import RobustKalmanFilter, believed, load_cvxpy
-from tailgate.scenario import load_scenario
 
 from .lines import Go, Missing, Sample, repeated
 

@@ -10,9 +10,9 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from tailgate.errors import InputError
-from tailgate.files import writable_directory, write_atomic
-from tailgate.reading import load_json
+from tailgate.base.errors import InputError
+from tailgate.base.files import writable_directory, write_atomic
+from tailgate.base.reading import load_json
 
 from .lines import BYTES, NUMBER, RATE, SECONDS, SHARE
 
@@ -149,7 +149,7 @@ def draw(plot: Record) -> bytes:
     """One scaling as a picture: medians, and quartiles as bars."""
     from matplotlib.ticker import NullLocator
 
-    from tailgate.plots import MARKERS, canvas, png
+    from tailgate.base.plots import MARKERS, canvas, png
 
     made, axes = canvas(6.4, 4.2)
     ax = axes[0, 0]

@@ -11,9 +11,9 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
 import tailgate
-from tailgate import sizes
-from tailgate.errors import InputError
-from tailgate.machine import commit, cpuinfo, processor
+from tailgate.base import sizes
+from tailgate.base.errors import InputError
+from tailgate.base.provenance import commit, cpuinfo, processor
 
 from .lines import RATE, Line, Missing
 from .targets import Scaling, Target, chosen, groups

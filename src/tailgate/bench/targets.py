@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
 
-from tailgate.errors import unknown
+from tailgate.base.errors import unknown
 
 from . import ours, peers, problems, yardstick
 from .lines import BYTES, NUMBER, SECONDS, SHARE, Go, Line

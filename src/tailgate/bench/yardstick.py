@@ -19,11 +19,11 @@ from typing import Any, Literal
 import numpy as np
 
 from tailgate.agents.reward import NEAR, Reward
+from tailgate.base.errors import InputError
 from tailgate.core import Array
-from tailgate.draws import Role, keys
+from tailgate.core.draws import Role, keys
+from tailgate.core.scenario import Scenario, load_scenario
 from tailgate.envs import idm
-from tailgate.errors import InputError
-from tailgate.scenario import Scenario, load_scenario
 
 from .lines import Go, Missing, repeated
 

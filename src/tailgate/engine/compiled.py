@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
+from tailgate.base.pytree import leaves, map_leaves
 from tailgate.engine.array import Traced
 from tailgate.engine.functions import tracing
 from tailgate.engine.operations import Array
 from tailgate.engine.untraceable import Untraceable
-from tailgate.tree import leaves, map_leaves
 
 ALIGNED = 64  # bytes: a line of the processor's cache
 KEPT, EACH = 256, 8  # constants whose code is known at once, and code of the same shapes for other answers
@@ -123,7 +123,7 @@ class Shaped:
     def _code(self, given: Any, constants: Any, shapes: Any) -> tuple[Any, Array]:
         from tailgate.engine.parameters import Parameters, lifted
         from tailgate.engine.program import Program, traced
-        from tailgate.engine.remembered import Answers
+        from tailgate.play.remembered import Answers
 
         parameters = Parameters(constants)
         _shortened(self._made)

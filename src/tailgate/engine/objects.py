@@ -16,7 +16,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from tailgate.errors import InputError
+from tailgate.base.errors import InputError
 
 VERSION = b"2"  # of what this module makes of a text
 KEPT = 4000  # files in the folder, those that were used last

@@ -18,10 +18,10 @@ from typing import Any
 
 import numpy as np
 
+from tailgate.base.sources import own
 from tailgate.engine.array import Traced, boxed
 from tailgate.engine.graph import Graph, Node, ordered
 from tailgate.engine.operations import FLOAT
-from tailgate.sources import own
 
 LARGE = 20_000  # numbers of an array that is taken as it is: mostly, code reads few of them
 _PLAIN = (type(None), str, bytes, int, complex, enum.Enum, np.generic, np.dtype, type, types.BuiltinFunctionType, np.ufunc, PurePath)

@@ -19,18 +19,18 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from tailgate.base.errors import InputError
+from tailgate.base.pytree import leaves, map_leaves
 from tailgate.engine import objects
 from tailgate.engine.array import Traced, lifted
 from tailgate.engine.buffers import WIDE, buffer_of, copied
 from tailgate.engine.functions import makers
 from tailgate.engine.graph import Graph, Node
+from tailgate.engine.hints import broken
 from tailgate.engine.llvm import Column, Held, Layout, text_of
 from tailgate.engine.operations import Array
 from tailgate.engine.parameters import Reading
 from tailgate.engine.passes import LEAST
-from tailgate.errors import InputError
-from tailgate.hints import broken
-from tailgate.tree import leaves, map_leaves
 
 _PYTHON = {"f": "d", "b": "?", "i": "q"}  # how Python reads 64-bit numbers and truth values
 WORTH = 2048  # episodes that are worth a thread

@@ -7,12 +7,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-from tailgate.adaptive import configs_of, fitting, policies_of, stem, train_against
-from tailgate.evaluation import evaluate
-from tailgate.progress import cells
-from tailgate.registry import Spec
-from tailgate.scenario import Suite
-from tailgate.submission import play_submission
+from tailgate.base.progress import cells
+from tailgate.core.registry import Spec
+from tailgate.core.scenario import Suite
+from tailgate.evaluation.cells import evaluate
+from tailgate.sandbox import play_submission
+from tailgate.training.adaptive import configs_of, fitting, policies_of, stem, train_against
 
 Progress = Callable[[str, int, int, str], None]  # label, done, total, figures
 

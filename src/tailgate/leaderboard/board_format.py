@@ -10,10 +10,10 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from tailgate.errors import InputError, said, wanted
-from tailgate.files import sweep, write_atomic
-from tailgate.reading import load_json
-from tailgate.stats import mean_time
+from tailgate.base.errors import InputError, said, wanted
+from tailgate.base.files import sweep, write_atomic
+from tailgate.base.reading import load_json
+from tailgate.evaluation.stats import mean_time
 
 from .board_parts import AtThreshold, Board, Detection, EntryTrust
 

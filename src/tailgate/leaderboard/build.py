@@ -11,13 +11,13 @@ from typing import Any
 
 from jinja2 import Environment, StrictUndefined
 
-from tailgate.assets import asset, inline
-from tailgate.errors import InputError
-from tailgate.files import writable_directory, write_atomic
-from tailgate.metrics import METRICS
-from tailgate.registry import Entry, entries
+from tailgate.base.assets import asset, inline
+from tailgate.base.errors import InputError
+from tailgate.base.files import writable_directory, write_atomic
+from tailgate.core.registry import Entry, entries
+from tailgate.evaluation.summary import summarise
+from tailgate.play.metrics import METRICS
 from tailgate.scoring.entry import reference
-from tailgate.summary import summarise
 
 from .words import HERE, TITLE, Name, breakable, names_of, percent, shade, spans, steps, ticks
 

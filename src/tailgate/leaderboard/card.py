@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from tailgate.base.errors import InputError, said, unknown
+from tailgate.base.reading import load_json
 from tailgate.core import param
-from tailgate.errors import InputError, said, unknown
-from tailgate.reading import load_json
-from tailgate.registry import USES
-from tailgate.schema import as_data, build
+from tailgate.core.registry import USES
+from tailgate.core.schema import as_data, build
 
 
 @dataclass(frozen=True)

@@ -14,20 +14,20 @@ from pathlib import Path
 from typing import Any, Literal
 
 import tailgate
-from tailgate import sizes
-from tailgate.draws import constants
-from tailgate.errors import InputError, unknown
-from tailgate.evaluation import Cell, run
-from tailgate.registry import Family, Spec
-from tailgate.scenario import Suite, list_suites, load_suite
-from tailgate.schema import build
+from tailgate.base import sizes
+from tailgate.base.errors import InputError, unknown
+from tailgate.core.draws import constants
+from tailgate.core.registry import Family, Spec
+from tailgate.core.scenario import Suite, list_suites, load_suite
+from tailgate.core.schema import build
+from tailgate.evaluation.cells import Cell, run
+from tailgate.evaluation.verify import files_of
 from tailgate.scoring.attacks import Admitted
 from tailgate.scoring.board import score
 from tailgate.scoring.cells import figures, shared_of
 from tailgate.scoring.damage import Row
 from tailgate.scoring.follow import same, sharpened, strays, untold
 from tailgate.scoring.ranks import CLOSE, PAIR
-from tailgate.verify import files_of
 
 from .board_format import read_board
 from .board_parts import Board, CellPart

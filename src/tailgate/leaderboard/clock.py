@@ -18,14 +18,14 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 import tailgate
-from tailgate import draws, sizes
-from tailgate.core import no_command
-from tailgate.errors import InputError, NotApplicable
-from tailgate.loop import Loop
-from tailgate.machine import commit, processor
-from tailgate.registry import Spec
-from tailgate.scenario import Suite, load_scenario
-from tailgate.schema import read_model
+from tailgate.base import sizes
+from tailgate.base.errors import InputError, NotApplicable
+from tailgate.base.provenance import commit, processor
+from tailgate.core import draws, no_command
+from tailgate.core.loop import Loop
+from tailgate.core.registry import Spec
+from tailgate.core.scenario import Suite, load_scenario
+from tailgate.core.schema import read_model
 
 FILE = "step_time.json"
 ROUNDS, MOST = 5, 200  # episodes of each defence that count; steps of an episode that are looked at

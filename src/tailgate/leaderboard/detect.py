@@ -12,12 +12,12 @@ from pathlib import Path
 from typing import Any
 
 import tailgate
-from tailgate import sizes
-from tailgate.errors import InputError
-from tailgate.locks import alone
-from tailgate.pool import each
-from tailgate.registry import Spec
-from tailgate.scenario import Suite
+from tailgate.base import sizes
+from tailgate.base.errors import InputError
+from tailgate.base.locks import alone
+from tailgate.base.pool import each
+from tailgate.core.registry import Spec
+from tailgate.core.scenario import Suite
 from tailgate.scoring.detection import EFFORT, Effort, Progress, detection, plants, stealth_impact
 from tailgate.scoring.false_alarms import false_alarms
 from tailgate.scoring.follow import same

@@ -15,7 +15,7 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
-from tailgate.schema import read_model
+from tailgate.core.schema import read_model
 
 FILE = "errata.json"
 

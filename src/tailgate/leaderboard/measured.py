@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import NamedTuple
 
-from tailgate.errors import InputError
+from tailgate.base.errors import InputError
 
 from .board_parts import Board
 from .clock import Clock, clock_of

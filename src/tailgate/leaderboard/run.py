@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import tailgate
-from tailgate.errors import InputError, said
-from tailgate.evaluation import evaluate
-from tailgate.reading import lines_of, load_json, parse_json
-from tailgate.rows import read_rows
-from tailgate.scenario import Suite
+from tailgate.base.errors import InputError, said
+from tailgate.base.reading import lines_of, load_json, parse_json
+from tailgate.core.scenario import Suite
+from tailgate.evaluation.cells import evaluate
+from tailgate.evaluation.rows import read_rows
 from tailgate.scoring import attacks as admitted
 from tailgate.scoring.board import score
 from tailgate.scoring.cells import shared_of

@@ -18,10 +18,10 @@ from pathlib import Path
 from typing import Any
 
 import tailgate
-from tailgate.files import sweep, write_atomic
-from tailgate.machine import commit, cores, processor
-from tailgate.scenario import Suite
-from tailgate.submission.guard import TICK, descendants
+from tailgate.base.files import sweep, write_atomic
+from tailgate.base.provenance import commit, cores, processor
+from tailgate.core.scenario import Suite
+from tailgate.sandbox.guard import TICK, descendants
 
 from .run_time import FILE, RunTime, run_of
 

@@ -7,8 +7,8 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from tailgate.errors import InputError
-from tailgate.schema import read_model
+from tailgate.base.errors import InputError
+from tailgate.core.schema import read_model
 
 FILE = "run.json"
 Seconds = Annotated[float, Field(ge=0, allow_inf_nan=False)]

@@ -15,9 +15,9 @@ from typing import Any
 
 from jinja2 import DictLoader, Environment, StrictUndefined
 
-from tailgate.assets import asset, embedded, inline
-from tailgate.errors import InputError
-from tailgate.files import writable_directory, write_atomic
+from tailgate.base.assets import asset, embedded, inline
+from tailgate.base.errors import InputError
+from tailgate.base.files import writable_directory, write_atomic
 
 from .board_format import read_board
 from .measured import Measured

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from tailgate.stats import mean_time
+from tailgate.evaluation.stats import mean_time
 
 from .board_parts import AlarmPart
 from .site_suite import Data, Suite

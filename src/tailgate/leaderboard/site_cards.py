@@ -12,10 +12,10 @@ from collections.abc import Mapping
 from typing import Any
 
 from tailgate.agents.zoo import zoo_card, zoo_names
-from tailgate.registry import Entry, Family, built_in
-from tailgate.scenario import Suite as Played
-from tailgate.scenario import list_suites, load_scenario, load_suite
-from tailgate.threat import ThreatModel
+from tailgate.core.registry import Entry, Family, built_in
+from tailgate.core.scenario import Suite as Played
+from tailgate.core.scenario import list_suites, load_scenario, load_suite
+from tailgate.core.threat import ThreatModel
 
 from .board_parts import EntryPart
 from .site_suite import Data, Suite

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tailgate.errors import InputError
-from tailgate.metrics import ERRORS, METRICS, UNITS
-from tailgate.registry import Spec
+from tailgate.base.errors import InputError
+from tailgate.core.registry import Spec
+from tailgate.play.metrics import ERRORS, METRICS, UNITS
 from tailgate.replay.page import VERDICTS, outcome, write_page
 from tailgate.replay.replay import play
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 
-from tailgate import adaptive
+from tailgate.training import adaptive
 
 from . import site_alarms
 from .board_parts import LEVELS, CellPart, Dose, Level

@@ -6,7 +6,7 @@ from .site_suite import Data, dose_text
 from .timing import Timing
 from .words import names_of, percent
 
-TIMES = (  # as the twins of tailgate.strength.timing
+TIMES = (  # as the twins of tailgate.studies.timing
     "its own times", "those of another of its episodes (yoked)", "as many steps at random (shuffled)", "as many, evenly spread (periodic)",
 )  # fmt: skip
 VERDICTS = {

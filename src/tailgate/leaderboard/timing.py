@@ -5,7 +5,7 @@
 Of each entry a trained attacker is looked at: the one that does most damage among those whose files are here, at the dose where that is
 nearest to half of the board's episodes, since where all come to damage, or none, no schedule is better than another. On the board's
 episodes it has to do what the board's cell says. It was chosen on them, so what is measured is measured on the next ones of the round: at
-its own times, and at those of its twins (tailgate.strength.timing). Rows cannot tell it: a twin is no attack of the board.
+its own times, and at those of its twins (tailgate.studies.timing). Rows cannot tell it: a twin is no attack of the board.
 """
 
 from __future__ import annotations
@@ -18,20 +18,20 @@ import numpy as np
 from pydantic import Field
 
 import tailgate
-from tailgate import draws, sizes
-from tailgate.core import Array
-from tailgate.errors import InputError, NotApplicable
-from tailgate.metrics import measure
-from tailgate.rounds import numbered
-from tailgate.scenario import Suite
-from tailgate.schema import read_model
+from tailgate.base import sizes
+from tailgate.base.errors import InputError, NotApplicable
+from tailgate.core import Array, draws
+from tailgate.core.scenario import Suite
+from tailgate.core.schema import read_model
+from tailgate.evaluation.rounds import numbered
+from tailgate.evaluation.stats import holm, paired_difference, proportion
+from tailgate.play.metrics import measure
+from tailgate.play.trace import Trace
 from tailgate.scoring.cells import hits_of, vague
 from tailgate.scoring.damage import damaged
 from tailgate.scoring.ranks import mcnemar
-from tailgate.stats import holm, paired_difference, proportion
-from tailgate.strength.policies import loop_for, trained
-from tailgate.strength.timing import TWINS, played, schedules
-from tailgate.trace import Trace
+from tailgate.studies.policies import loop_for, trained
+from tailgate.studies.timing import TWINS, played, schedules
 
 from .board_format import read_board
 from .board_parts import LEVELS, Count, Dose, Interval, Limited, Part, Share

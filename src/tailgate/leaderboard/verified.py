@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from tailgate.schema import read_model
+from tailgate.core.schema import read_model
 
 Count = Annotated[int, Field(strict=True, ge=0)]
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from markupsafe import Markup, escape
 
-from tailgate.registry import split_text
+from tailgate.core.registry import split_text
 
 HERE = "tailgate.leaderboard"  # where the files of its pages lie
 TITLE = "Tailgate leaderboard"

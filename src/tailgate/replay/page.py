@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 from jinja2 import Environment, StrictUndefined
 
-from tailgate.assets import asset, embedded, inline
-from tailgate.files import writable_directory, write_atomic
+from tailgate.base.assets import asset, embedded, inline
+from tailgate.base.files import writable_directory, write_atomic
 from tailgate.leaderboard.words import names_of
-from tailgate.metrics import METRICS, unit_in
+from tailgate.play.metrics import METRICS, unit_in
 
 from .episode import Data, episode_of, first_step, noun
 from .replay import Replay

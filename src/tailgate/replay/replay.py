@@ -16,19 +16,18 @@ from typing import Any, Literal
 import numpy as np
 
 import tailgate
-from tailgate import draws
-from tailgate.core import Array, Attack, Frame
-from tailgate.draws import Keys, Role
-from tailgate.errors import InputError
-from tailgate.evaluation import ENGINE
-from tailgate.loop import Loop, LoopState
-from tailgate.metrics import measure
-from tailgate.registry import Spec
-from tailgate.scenario import Scenario, list_scenarios, load_scenario
-from tailgate.schema import build
-from tailgate.threat import ThreatModel
-from tailgate.trace import Recorder, Trace, signals_of
-from tailgate.tree import duplicate
+from tailgate.base.errors import InputError
+from tailgate.base.pytree import duplicate
+from tailgate.core import Array, Attack, Frame, draws
+from tailgate.core.draws import Keys, Role
+from tailgate.core.loop import Loop, LoopState
+from tailgate.core.registry import Spec
+from tailgate.core.scenario import Scenario, list_scenarios, load_scenario
+from tailgate.core.schema import build
+from tailgate.core.threat import ThreatModel
+from tailgate.evaluation.cells import ENGINE
+from tailgate.play.metrics import measure
+from tailgate.play.trace import Recorder, Trace, signals_of
 
 YAML = (".yaml", ".yml")
 

@@ -12,10 +12,10 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
+from tailgate.base.errors import InputError
+from tailgate.base.files import replacing, writable_directory, write_atomic
 from tailgate.core import Array
 from tailgate.envs.render_viewer import Viewer
-from tailgate.errors import InputError
-from tailgate.files import replacing, writable_directory, write_atomic
 from tailgate.leaderboard.words import names_of
 
 from .replay import Replay, episode

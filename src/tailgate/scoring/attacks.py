@@ -22,14 +22,14 @@ from typing import Any
 
 import numpy as np
 
-from tailgate.errors import InputError, said, unknown
-from tailgate.evaluation import cells_of, run
-from tailgate.files import writable_directory, write_atomic
-from tailgate.reading import parse_json, read_bytes
-from tailgate.registry import Spec
-from tailgate.scenario import Suite, config_path, list_suites, load_suite
-from tailgate.schema import build
-from tailgate.stats import holm
+from tailgate.base.errors import InputError, said, unknown
+from tailgate.base.files import writable_directory, write_atomic
+from tailgate.base.reading import parse_json, read_bytes
+from tailgate.core.registry import Spec
+from tailgate.core.scenario import Suite, config_path, list_suites, load_suite
+from tailgate.core.schema import build
+from tailgate.evaluation.cells import cells_of, run
+from tailgate.evaluation.stats import holm
 
 from .damage import CLEAN, order, tabulate
 from .doses import Worst

@@ -7,9 +7,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from tailgate.errors import InputError
-from tailgate.scenario import Suite
-from tailgate.threat import KNOWLEDGE
+from tailgate.base.errors import InputError
+from tailgate.core.scenario import Suite
+from tailgate.core.threat import KNOWLEDGE
 
 from .cells import cells_of, joined, place_of, table_of
 from .damage import CLEAN, Column, Table

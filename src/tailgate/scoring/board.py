@@ -8,11 +8,11 @@ from collections.abc import Iterable, Mapping, Sequence
 import numpy as np
 
 import tailgate
-from tailgate.adaptive import asked_of
-from tailgate.errors import InputError
-from tailgate.scenario import Suite
-from tailgate.strength.dose import CRITICAL
-from tailgate.threat import KNOWLEDGE
+from tailgate.base.errors import InputError
+from tailgate.core.scenario import Suite
+from tailgate.core.threat import KNOWLEDGE
+from tailgate.studies.dose import CRITICAL
+from tailgate.training.adaptive import asked_of
 
 from .attacks import Admitted, standing, taken_back
 from .beside import Beside, beside

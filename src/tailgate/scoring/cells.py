@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
+from tailgate.base.errors import InputError
 from tailgate.core import Array
-from tailgate.errors import InputError
-from tailgate.rounds import numbered
-from tailgate.scenario import Suite, load_scenario
-from tailgate.stats import proportion
+from tailgate.core.scenario import Suite, load_scenario
+from tailgate.evaluation.rounds import numbered
+from tailgate.evaluation.stats import proportion
 
 from .damage import CLEAN, FAILED, MISSING, PLAYED, SKIPPED, Column, Key, Row, Table, columns_of, damaged, doses_of, in_order
 

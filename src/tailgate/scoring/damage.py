@@ -8,11 +8,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from tailgate.base.errors import InputError
 from tailgate.core import Array
-from tailgate.errors import InputError
-from tailgate.metrics import METRICS
-from tailgate.scenario import Scenario, Suite, load_scenario
-from tailgate.threat import KNOWLEDGE
+from tailgate.core.scenario import Scenario, Suite, load_scenario
+from tailgate.core.threat import KNOWLEDGE
+from tailgate.play.metrics import METRICS
 
 Row = dict[str, Any]
 CLEAN = "none"  # the attack that does nothing, and the defence that does

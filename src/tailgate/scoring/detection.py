@@ -3,7 +3,7 @@
 One threshold per defence, plant and wanted mean time between false alarms, found on clean runs of the plant's scenarios (calibrate).
 At that threshold attacks are played: what counts is whether the alarm comes within the metrics' deadline. The stealth attack aims just
 below the same threshold, so that a looser one lets it through with more. A defence without a threshold is watched: its score is held
-against one, which is the standard chi-square on its innovation for those that only filter (tailgate.watch).
+against one, which is the standard chi-square on its innovation for those that only filter (tailgate.core.score_threshold).
 """
 
 from __future__ import annotations
@@ -17,17 +17,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tailgate import draws, sizes
-from tailgate.calibrate import Calibration, calibrate
-from tailgate.clean import Bench
-from tailgate.core import Array
-from tailgate.errors import InputError, NotApplicable
-from tailgate.evaluation import Cell, run_cell
-from tailgate.registry import Spec
-from tailgate.scenario import Suite, load_scenario
-from tailgate.stats import median_limits, proportion
-from tailgate.trace import Trace, episodes_at_once, rollout
-from tailgate.watch import Watched
+from tailgate.base import sizes
+from tailgate.base.errors import InputError, NotApplicable
+from tailgate.core import Array, draws
+from tailgate.core.registry import Spec
+from tailgate.core.scenario import Suite, load_scenario
+from tailgate.core.score_threshold import Watched
+from tailgate.evaluation.attack_free import Bench
+from tailgate.evaluation.calibrate import Calibration, calibrate
+from tailgate.evaluation.cells import Cell, run_cell
+from tailgate.evaluation.stats import median_limits, proportion
+from tailgate.play.trace import Trace, episodes_at_once, rollout
 
 LEVEL = 0.95  # of intervals
 UNTOUCHED = "no attack took effect"

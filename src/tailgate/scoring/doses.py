@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
+from tailgate.base.errors import InputError
 from tailgate.core import Array
-from tailgate.errors import InputError
-from tailgate.strength.dose import CRITICAL, critical_dose, fitted
+from tailgate.studies.dose import CRITICAL, critical_dose, fitted
 
 from .damage import MISSING, PLAYED, Key, Row, Table, damaged
 from .ranks import Harm

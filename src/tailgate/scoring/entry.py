@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from tailgate.adaptive import Asked
-from tailgate.registry import Entry, built_in, split_text
-from tailgate.rounds import numbered
-from tailgate.scenario import Suite
+from tailgate.core.registry import Entry, built_in, split_text
+from tailgate.core.scenario import Suite
+from tailgate.evaluation.rounds import numbered
+from tailgate.training.adaptive import Asked
 
 from .damage import CLEAN, PLAYED, Key, Row, Table, doses_of, has_road, named
 from .doses import Worst

@@ -13,11 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from tailgate import draws
-from tailgate.clean import HOUR, Bench, Count, count_onsets, side_by_side
-from tailgate.core import Array
-from tailgate.rounds import numbered
-from tailgate.scenario import Suite
+from tailgate.core import Array, draws
+from tailgate.core.scenario import Suite
+from tailgate.evaluation.attack_free import HOUR, Bench, Count, count_onsets, side_by_side
+from tailgate.evaluation.rounds import numbered
 
 from .detection import plants
 

@@ -8,8 +8,8 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from tailgate.scenario import Suite
-from tailgate.threat import KNOWLEDGE
+from tailgate.core.scenario import Suite
+from tailgate.core.threat import KNOWLEDGE
 
 from .cells import hits_of, share, table_of, vague
 from .damage import doses_of

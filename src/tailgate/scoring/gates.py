@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from tailgate.errors import InputError
+from tailgate.base.errors import InputError
 
 from .damage import CLEAN, Row, Table, damaged, has_road
 

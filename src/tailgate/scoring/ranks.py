@@ -8,10 +8,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from tailgate.base.errors import InputError
 from tailgate.core import Array
-from tailgate.errors import InputError
-from tailgate.registry import USES
-from tailgate.stats import holm
+from tailgate.core.registry import USES
+from tailgate.evaluation.stats import holm
 
 Data = dict[str, Any]
 PAIR = ("only_a", "only_b", "weaker", "p")  # what was found of two defences

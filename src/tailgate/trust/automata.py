@@ -12,10 +12,10 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
+from tailgate.base.errors import InputError, unknown
 from tailgate.core import Finite, NonNegative, Positive, param
-from tailgate.errors import InputError, unknown
-from tailgate.scenario import config_path
-from tailgate.schema import build, read_yaml
+from tailgate.core.scenario import config_path
+from tailgate.core.schema import build, read_yaml
 
 TIME = "time"  # the clock that everybody reads and nobody sets
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*\Z")

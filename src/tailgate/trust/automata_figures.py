@@ -6,7 +6,7 @@ import math
 from collections.abc import Collection
 from typing import Any
 
-from tailgate.plots import canvas
+from tailgate.base.plots import canvas
 
 from .automata import Component, Edge, Location, Network
 

@@ -14,15 +14,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tailgate import draws
-from tailgate.core import Array
-from tailgate.evaluation import Cell, _head, _why, cell_id
-from tailgate.loop import Loop
-from tailgate.registry import Spec
-from tailgate.scenario import Scenario, load_scenario
-from tailgate.schema import canonical
+from tailgate.core import Array, draws
+from tailgate.core.loop import Loop
+from tailgate.core.registry import Spec
+from tailgate.core.scenario import Scenario, load_scenario
+from tailgate.core.schema import canonical
+from tailgate.evaluation.cells import Cell, _head, _why, cell_id
+from tailgate.play.trace import Trace, episodes_at_once, rollout
 from tailgate.scoring.damage import CLEAN
-from tailgate.trace import Trace, episodes_at_once, rollout
 
 from .false_alarms import DETECTS, false_alarms
 from .logic import Eventually, Interval, along, holds, robustness

@@ -14,7 +14,7 @@ import math
 import re
 from collections.abc import Container
 
-from tailgate.errors import InputError
+from tailgate.base.errors import InputError
 
 from .logic import Always, And, Atom, Eventually, Formula, Interval, Not, Or, Until, implies
 

@@ -18,8 +18,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from tailgate.base.errors import InputError
 from tailgate.core import Array
-from tailgate.errors import InputError
 
 SLACK = 1e-6  # of a step: 0.6 s is six steps of 0.1 s, whatever 0.6 / 0.1 rounds to
 FAR = 1e9  # samples: beyond them lies no episode's end

@@ -18,11 +18,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from tailgate.base.errors import InputError, NotApplicable
 from tailgate.core import Model, Positive, PositiveCount, param
+from tailgate.core.scenario import Scenario
 from tailgate.envs.controllers import BRAKE_ACCEL
-from tailgate.errors import InputError, NotApplicable
-from tailgate.metrics import DETECTION_DEADLINE
-from tailgate.scenario import Scenario
+from tailgate.play.metrics import DETECTION_DEADLINE
 from tailgate.scoring.gates import HOURS
 
 from .formula import parse

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 import tailgate
-from tailgate.scenario import Suite, list_suites, load_suite
+from tailgate.core.scenario import Suite, list_suites, load_suite
+from tailgate.core.threat import KNOWLEDGE
 from tailgate.scoring.damage import CLEAN, order
 from tailgate.scoring.ranks import Harm, class_of, compare
-from tailgate.threat import KNOWLEDGE
 
 from .cells import Row, runs_of
 from .false_alarms import DETECTS, Price, prices, unpaid

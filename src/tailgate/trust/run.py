@@ -16,17 +16,17 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from tailgate import sizes
-from tailgate.errors import InputError
-from tailgate.evaluation import cells_of, run_cell
-from tailgate.files import remove, set_aside, sweep, writable_directory, write_atomic
-from tailgate.locks import alone
-from tailgate.pool import each
-from tailgate.reading import lines_of, parse_json
-from tailgate.registry import Spec
-from tailgate.rows import encode
-from tailgate.scenario import Suite, load_scenario
-from tailgate.schema import as_data
+from tailgate.base import sizes
+from tailgate.base.errors import InputError
+from tailgate.base.files import remove, set_aside, sweep, writable_directory, write_atomic
+from tailgate.base.locks import alone
+from tailgate.base.pool import each
+from tailgate.base.reading import lines_of, parse_json
+from tailgate.core.registry import Spec
+from tailgate.core.scenario import Suite, load_scenario
+from tailgate.core.schema import as_data
+from tailgate.evaluation.cells import cells_of, run_cell
+from tailgate.evaluation.rows import encode
 from tailgate.scoring.damage import CLEAN
 
 from .cells import Job, Row, check_cell, failed, single

@@ -12,11 +12,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from tailgate.base.errors import InputError, NotApplicable, unknown
 from tailgate.core import Array, Model, NonNegative, Positive, param
 from tailgate.envs.controllers import STOP_ACCEL
-from tailgate.errors import InputError, NotApplicable, unknown
-from tailgate.metrics import TTC_CAP
-from tailgate.trace import Trace
+from tailgate.play.metrics import TTC_CAP
+from tailgate.play.trace import Trace
 
 from .logic import Samples
 

@@ -15,10 +15,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tailgate import draws
-from tailgate.core import Array
-from tailgate.draws import Keys, Role
-from tailgate.errors import InputError
+from tailgate.base.errors import InputError
+from tailgate.core import Array, draws
+from tailgate.core.draws import Keys, Role
 
 from .automata import TIME, Atoms, Network, Query
 

@@ -13,10 +13,10 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from tailgate.base.errors import InputError
 from tailgate.core import Array
-from tailgate.errors import InputError
+from tailgate.evaluation.stats import Interval, proportion
 from tailgate.scoring.doses import limits
-from tailgate.stats import Interval, proportion
 
 MOST = 1_000_000  # runs of a rule that stops by itself
 

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import NamedTuple
 from xml.etree import ElementTree
 
-from tailgate.errors import InputError
-from tailgate.files import write_atomic
+from tailgate.base.errors import InputError
+from tailgate.base.files import write_atomic
 
 from .automata import TIME, Atom, Component, Edge, Location, Network, Query, Speed
 

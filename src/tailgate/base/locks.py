@@ -1,0 +1,85 @@
+"""One command at a time writes to a place.
+
+The lock is the kernel's, on a hidden file next to the place: a process that dies, however it dies, holds nothing any more, and what is
+left of the file stops nobody.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import fcntl
+import os
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+from tailgate.base.errors import InputError
+from tailgate.base.files import writable_directory
+
+SUFFIX = ".lock"
+_held: dict[tuple[str, int], int] = {}  # by place and thread: how often it is held here, as one command may consist of others
+
+
+def lock_of(place: Path) -> Path:
+    """The file whose lock is the place's: next to it, as a directory may be set aside."""
+    place = Path(os.path.abspath(place))
+    return place.with_name(f".{place.name}{SUFFIX}")
+
+
+@contextlib.contextmanager
+def alone(place: Path, field: str = "out") -> Iterator[None]:
+    """Within it no other process writes to this file or directory, as far as it asks here too. Raises InputError where one does."""
+    key = str(lock_of(place)), threading.get_ident()
+    if not _held.get(key):
+        handle = _taken(place, field)
+    _held[key] = _held.get(key, 0) + 1
+    try:
+        yield
+    finally:
+        _held[key] -= 1
+        if not _held[key]:
+            del _held[key]
+            _let_go(place, handle)
+
+
+def _taken(place: Path, field: str) -> int | None:
+    """A handle that holds the lock; None where the file system has no locks."""
+    path = lock_of(place)
+    while True:
+        try:
+            handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        except FileNotFoundError:
+            writable_directory(path.parent, field, place)
+            continue
+        except OSError:
+            if not place.is_dir():
+                writable_directory(path.parent, field, place)  # says why
+            handle = os.open(place, os.O_RDONLY | os.O_CLOEXEC)  # a place whose surroundings are not ours
+            path = place
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            if error.errno in (errno.EWOULDBLOCK, errno.EACCES):
+                who = "" if path == place else os.pread(handle, 20, 0).decode(errors="replace").strip()
+                os.close(handle)
+                who = f"; process {who} does" if who else ""
+                raise InputError(field, str(place), f"a place that no other command writes to now{who}") from None
+            os.close(handle)
+            return None
+        with contextlib.suppress(OSError):
+            if path == place or os.stat(path).st_ino == os.fstat(handle).st_ino:
+                if path != place:
+                    os.ftruncate(handle, 0)
+                    os.pwrite(handle, f"{os.getpid()}\n".encode(), 0)
+                return handle
+        os.close(handle)  # whoever held it has just removed it
+
+
+def _let_go(place: Path, handle: int | None) -> None:
+    if handle is None:
+        return
+    with contextlib.suppress(OSError):
+        if os.stat(lock_of(place)).st_ino == os.fstat(handle).st_ino:
+            os.unlink(lock_of(place))
+    os.close(handle)

@@ -1,0 +1,50 @@
+"""tailgate leaderboard attack: train a suite's attackers against a defence, and play them on it."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from tailgate.base import sizes
+from tailgate.base.progress import progress
+
+
+def add(actions: Any) -> None:
+    command = actions.add_parser(
+        "attack", help="train a suite's attackers against a defence, and play them on it",
+        description="Train the learners that the suite names against the defence itself, black and grey box, and play their policies at "
+        "every dose and scenario. A defence without these rows takes no rank. Interrupted, the same command goes on.",
+    )  # fmt: skip
+    command.add_argument("defence", metavar="NAME", help="registered defence, or a class in a sandbox: bwrap/module:Class")
+    command.add_argument("--suite", required=True, metavar="NAME", help="suite that says what is trained")
+    command.add_argument("--out", required=True, metavar="DIR", help="policies go to DIR/policies, rows to DIR/NAME*.jsonl")
+    command.add_argument("--seeds", type=int, metavar="N", help="training seeds instead of the suite's")
+    command.add_argument("--episodes", type=int, metavar="N", help="report episodes per cell instead of the suite's")
+    command.add_argument("--beacon", default="", metavar="TEXT", help="the round of the board: its seeds are played")
+    command.add_argument("--workers", type=int, default=2, metavar="N", help="processes (default 2); change no result")
+    command.add_argument("--set", action="append", default=[], metavar="key=value", help="change the training (repeatable): steps=10000")
+    command.set_defaults(run=_attack, kept="the same command goes on")
+
+
+def _attack(options: argparse.Namespace) -> int:
+    from tailgate.core.scenario import load_suite
+    from tailgate.leaderboard.attacked import attack
+
+    sys.path.insert(0, "")  # module:Class is looked for in the working directory, as `leaderboard submit` does
+
+    sizes.check("workers", options.workers)
+    if options.episodes is not None:  # before anything is trained
+        sizes.check("episodes", options.episodes)
+    with progress(Console(stderr=True)) as update:
+        made = attack(
+            load_suite(options.suite), options.defence, Path(options.out), seeds=options.seeds, episodes=options.episodes,
+            beacon=options.beacon, workers=options.workers, changes=tuple(options.set), progress=update,
+        )  # fmt: skip
+    for file in made.files:
+        print(file)
+    print(f"{len(made.policies)} policies, {made.rows} rows", file=sys.stderr)
+    return 0

@@ -1,0 +1,83 @@
+"""The command line: tailgate COMMAND, one file of `tailgate.cli` each.
+
+Results go to standard output (tables for people, --json for machines), progress and errors to standard error.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from importlib import import_module
+from typing import Any, NoReturn
+
+import tailgate
+from tailgate.base import sizes
+from tailgate.base.errors import InputError, Killed
+from tailgate.base.interrupts import Ending, orderly
+
+EXIT_INPUT = 2
+COMMANDS = (
+    "train", "tune", "selfplay", "evaluate", "timing", "dose", "transfer", "zoo", "calibrate", "leaderboard", "log", "replay",
+    "reproduce", "trust", "bench", "list", "explain",
+)  # fmt: skip
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a command; returns the exit code: 0 done, 1 a component failed, 2 bad input, 130 interrupted, 143 terminated."""
+    chosen = argparse.Namespace()
+    sizes.tell = lambda text: print(f"tailgate: {text}", file=sys.stderr)
+    with orderly(lambda: _kept(chosen)) as ending:
+        return _done(arguments, chosen, ending)
+
+
+def _done(arguments: Sequence[str] | None, chosen: argparse.Namespace, ending: Ending) -> int:
+    try:
+        _parser().parse_args(arguments, chosen)
+        return int(chosen.run(chosen))
+    except InputError as error:
+        print(f"tailgate: error: {error}", file=sys.stderr)
+        if isinstance(error, Killed):
+            print(f"tailgate: {_kept(chosen)}", file=sys.stderr)
+        return EXIT_INPUT
+    except ImportError as error:
+        if "tailgate[" not in str(error):
+            raise
+        print(f"tailgate: error: {error}", file=sys.stderr)
+        return EXIT_INPUT
+    except KeyboardInterrupt as error:
+        return ending.last_words(error)
+    except BrokenPipeError:  # the reader of our output has gone
+        sys.stderr.close()
+        return 0
+
+
+def _kept(chosen: argparse.Namespace) -> str:
+    """What is left of a command that ended before its time."""
+    return getattr(chosen, "kept", "nothing of it is kept")
+
+
+class _Parser(argparse.ArgumentParser):
+    """Says in one line what is wrong with the arguments, and where the command is told; argparse shows the whole usage, or that of all."""
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        found, rest = super().parse_known_args(args, namespace)
+        if rest:
+            self.error(f"unrecognized arguments: {' '.join(rest)}")
+        return found, rest
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(EXIT_INPUT, f"{self.prog}: error: {' '.join(message.split())} (see {self.prog} --help)\n")
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = _Parser(prog="tailgate", description=(tailgate.__doc__ or "").split("\n")[0])
+    parser.add_argument("--version", action="version", version=f"tailgate {tailgate.__version__}")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    for name in COMMANDS:
+        import_module(f"tailgate.cli.{name}").add(commands)
+    return parser
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,63 @@
+"""tailgate explain: what the engine can trace, and where not, why."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from typing import Any
+
+from rich.markup import escape
+from rich.table import Table
+
+from tailgate.base.progress import console
+
+
+def add(commands: Any) -> None:
+    command = commands.add_parser(
+        "explain", help="whether a scenario, a defence and an attack are traced, and if not, why",
+        description="Say whether the engine can trace environments of a scenario and a defence, and, with an attack, whole episodes. "
+        "Where it cannot, the line and what to write in its place are named (docs/engine.md).",
+    )  # fmt: skip
+    command.add_argument("what", choices=["engine"], help="what is explained")
+    command.add_argument("--scenario", metavar="NAME", help="name or YAML file (default: stop-and-go-v0)")
+    command.add_argument("--defence", metavar="NAME", help="name or module:Class (default: chi2_kf)")
+    command.add_argument("--attack", metavar="NAME", help="also whole episodes under this attack")
+    command.add_argument("--json", action="store_true", help="print JSON")
+    command.set_defaults(run=_explain)
+
+
+def _explain(options: argparse.Namespace) -> int:
+    sys.path.insert(0, "")  # module:Class is looked for in the working directory, as `tailgate evaluate` does
+    found = explanation(options.scenario, options.defence, options.attack)
+    if options.json:
+        print(json.dumps(found, indent=1))
+        return 0
+    table = Table("what", "traced", "why not, or how large")
+    for what, said in found.items():
+        table.add_row(what, "no" if "why" in said else "yes", escape(said.get("why") or said["size"]))
+    console().print(table)
+    return 0
+
+
+def explanation(scenario: str | None, defence: str | None, attack: str | None) -> dict[str, dict[str, str]]:
+    """By what is played: `why` it cannot be traced, or the `size` of its code."""
+    from tailgate.core.registry import Spec
+    from tailgate.envs.seat import Seat
+    from tailgate.play.agreement import Untraced
+    from tailgate.play.commanded import commanded
+    from tailgate.play.rollouts import rollout_of
+    from tailgate.play.seats import programs_of
+
+    seat = Seat.make(scenario, defence)
+    made: dict[str, Any] = {"environments": programs_of(seat)}
+    if attack is not None:
+        rival = Spec("attack", attack).make()
+        rival.prepare(seat.loop.brief)  # what does not fit says so
+        made |= {"episodes": commanded(seat.loop), "episodes, attack included": rollout_of(seat.loop, rival)}
+    return {what: {"why": held.why} if isinstance(held, Untraced) else _size(held.programs[0]) for what, held in made.items()}
+
+
+def _size(program: Any) -> dict[str, str]:
+    size, memory = program.size, program.stride // program.lanes
+    return {"size": f"{size['nodes']} operations, {size['branches']} branches, {memory} bytes an episode"}

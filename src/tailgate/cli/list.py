@@ -1,0 +1,102 @@
+"""tailgate list: what there is."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+from rich.markup import escape
+from rich.table import Table
+
+from tailgate.base.errors import InputError
+from tailgate.base.progress import console
+
+
+def add(commands: Any) -> None:
+    command = commands.add_parser("list", help="what there is: defences and their parts, attacks, the zoo, scenarios, suites; or a graph")
+    groups = ["defences", "filters", "detectors", "mitigations", "attacks", "zoo", "scenarios", "suites"]
+    command.add_argument("what", nargs="?", choices=groups, help="only these; attacks: with the zoo of trained policies")
+    command.add_argument("--graph", metavar="SCENARIO", help="draw who hears whom in this scenario instead (needs tailgate[viz])")
+    command.add_argument("--out", metavar="FILE", help="the drawing: .png (default: SCENARIO.png), .svg or .pdf")
+    command.add_argument("--json", action="store_true", help="print cards with every parameter as JSON")
+    command.set_defaults(run=_list)
+
+
+def _list(options: argparse.Namespace) -> int:
+    if options.graph is not None:
+        return _draw(options)
+    if options.out is not None:
+        raise InputError("--out", options.out, "a drawing to write: --graph SCENARIO")
+    from tailgate.agents.zoo import zoo_card, zoo_names
+    from tailgate.core.registry import entries
+    from tailgate.core.scenario import list_scenarios, list_suites, load_scenario, load_suite
+
+    cards: dict[str, list[dict[str, Any]]] = {
+        "defences": [entry.card() for entry in entries("defence").values()],
+        "filters": [entry.card() for entry in entries("filter").values()],
+        "detectors": [entry.card() for entry in entries("detector").values()],
+        "mitigations": [entry.card() for entry in entries("mitigation").values()],
+        "attacks": [entry.card() for entry in entries("attack").values()],
+        "zoo": [zoo_card(name) for name in zoo_names()],
+        "scenarios": [{"name": name, "summary": load_scenario(name).about} for name in list_scenarios()],
+        "suites": [{"name": name, "summary": load_suite(name).about} for name in list_suites()],
+    }
+    wanted = ("attacks", "zoo") if options.what == "attacks" else (options.what,)
+    chosen = {key: value for key, value in cards.items() if options.what is None or key in wanted}
+    if options.json:
+        print(json.dumps(chosen, indent=1))
+        return 0
+    out = console()
+    for title, group in chosen.items():
+        if title == "zoo":
+            out.print(_zoo_table(group))
+            continue
+        table = Table("name", "what it is", "parameters (default)", title=title)
+        for card in group:
+            fields = ", ".join(f"{k} ({json.dumps(p['default'])})" for k, p in card.get("parameters", {}).items())
+            table.add_row(*map(escape, (card["name"], card["summary"], fields)))
+        out.print(table)
+    return 0
+
+
+def _zoo_table(group: list[dict[str, Any]]) -> Table:
+    from tailgate.studies.policies import between, shown
+
+    table = Table(title="zoo: trained policies, played as zoo:name=NAME", caption="outcome: on report seeds, with its 95 % interval")
+    for heading in ("name", "scenario, defence", "learner, decisions", "kinds", "budget, bound", "sees", "outcome", "sha256"):
+        table.add_column(heading, no_wrap=True)  # a name that is cut cannot be played
+    for card in group:
+        threat, measured, decisions = card["threat"] or {}, card["measured"], card["decisions"]
+        outcome = "-"
+        if measured:
+            share = measured["unit"] == "0/1"
+            outcome = f"{measured['outcome']} {shown(measured['value'], share)}\n{between(measured, share)}"
+        count = "-" if decisions is None else f"{decisions / 1e6:.2g} M" if decisions >= 1e6 else f"{decisions / 1e3:.0f} k"
+        budget = "unlimited" if threat.get("budget") is None else f"{threat['budget']} steps"
+        table.add_row(
+            card["name"], f"{card['scenario']}\n{card['defence']}", f"{card['learner']}\n{count}", "\n".join(threat.get("kinds", ())),
+            f"{budget}\n{threat.get('fdi_bound', '-')}", card["knowledge"] + ("\n+ measurement" if threat.get("sees_measurement") else ""),
+            outcome, card["sha256"][:12],
+        )  # fmt: skip
+    return table
+
+
+def _draw(options: argparse.Namespace) -> int:
+    from tailgate.base.drawing import draw_graph, edges
+    from tailgate.core.scenario import load_scenario
+
+    place = load_scenario(options.graph)
+    brief = place.brief()
+    model, attacked = brief.model, [i for i in range(brief.model.agents) if brief.granted[i].any()]
+    path = Path(options.out or f"{place.name}.png")
+    title = f"{place.name}: double rings are open to attack" if model.agents > 1 else place.name
+    draw_graph(model, path, attacked, title)
+    facts = {"scenario": place.name, "agents": model.agents, "edges": len(edges(model.graph)), "attacked": attacked, "drawing": str(path)}
+    if options.json:
+        print(json.dumps(facts, indent=1))
+    else:
+        whom = ", ".join(map(str, attacked))
+        print(f"{place.name}: {model.agents} agents, {facts['edges']} edges, open to attack: {whom}; drawn in {path}")
+    return 0

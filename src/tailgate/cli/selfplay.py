@@ -1,0 +1,81 @@
+"""tailgate selfplay: attacker and defender in turns, and how exploitable the defender is."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from typing import Any
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from tailgate.base.progress import console, progress
+
+
+def add(commands: Any) -> None:
+    from tailgate.training.selfplay import parameters
+
+    fields = "\n".join(f"  {p['name']:<12} {p['doc']} (default: {json.dumps(p['default'])})" for p in parameters())
+    command = commands.add_parser(
+        "selfplay", help="train attacker and defender in turns, and measure how exploitable the defender is",
+        description="An attacker against a defender that turns the knobs of its defence. Without --config, the preset `selfplay`.",
+        epilog=f"keys (dotted below menu, payoff, threat, environment, attacker and defender, for example menu.modes=[normal]):\n{fields}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )  # fmt: skip
+    command.add_argument("--config", metavar="FILE", help="preset by name, or YAML file")
+    command.add_argument(
+        "--resume", action="store_true",
+        help="continue: what is finished is not trained again, unless its opponents are others now; rounds may grow",
+    )  # fmt: skip
+    command.add_argument("--json", action="store_true", help="print the report as JSON")
+    command.add_argument("overrides", nargs="*", metavar="key=value", help="change a field of the configuration")
+    command.set_defaults(run=_selfplay, kept="what was finished is kept")
+
+
+def _selfplay(options: argparse.Namespace) -> int:
+    from tailgate.training.selfplay import Game, load_config
+
+    config = load_config(options.config, list(options.overrides), options.resume)
+    errors = Console(stderr=True)
+    errors.print(f"[bold]{config.name}[/]: self-play with [bold]{config.defence}[/] on {config.scenario}, files in {config.directory}")
+    place = f" out={config.out}" if config.out != type(config)().out else ""
+    options.kept = f"what was finished is kept, go on with: tailgate selfplay --resume name={config.name}{place}"
+    with progress(errors) as update:
+        report = Game(config, update, options.resume).run()
+    if options.json:
+        print(json.dumps(report, indent=1))
+    else:
+        _print_report(report)
+    errors.print(f"defender: {report['defender']}\nreport:   {config.directory / 'report.json'}")
+    return 0
+
+
+def _print_report(report: dict[str, Any]) -> None:
+    guards = list(dict.fromkeys(row["defender"] for row in report["table"]))
+    fixed = ", ".join(f"{name}={value:g}" for name, value in report["fixed"].items() if name != "setting")
+    title = f"{report['episodes']} fresh episodes on {report['scenario']}: collisions [95 % interval], cost of care"
+    table = Table(title=title, caption=f"best fixed setting: {fixed}")
+    for heading in ("attack", *guards):
+        table.add_column(heading, overflow="fold")
+    for name in dict.fromkeys(row["attack"] for row in report["table"]):
+        cells = [row for row in report["table"] if row["attack"] == name]
+        table.add_row(escape(name), *(f"{_share(row['collisions'])}, {row['cost']:.3f}" for row in cells))
+    out = console()
+    out.print(table, highlight=False)
+    for guard, gain in report["exploitability"].items():
+        found = gain["fresh"]["collisions"]
+        weak = f"; the search was too weak: its fresh attacker does {_share(found)}, less than known ones" if gain["weak_search"] else ""
+        told = f"{escape(gain['attack'])} less self-play's last attacker"
+        out.print(f"exploitability, {guard}: at least {_points(gain)} ({told}){weak}", highlight=False)
+    for guard, most in report["worst"].items():
+        out.print(f"worst known attack, {guard}: {_share(most['collisions'])} by {escape(most['attack'])}", highlight=False)
+    out.print(f"worst known attacks, fixed less trained: {_points(report['worst_fixed_minus_trained'])}", highlight=False)
+
+
+def _share(interval: dict[str, float]) -> str:
+    return f"{100 * interval['value']:.1f} % \\[{100 * interval['low']:.1f}, {100 * interval['high']:.1f}]"
+
+
+def _points(gain: dict[str, float]) -> str:
+    return f"{100 * gain['value']:+.1f} points, 95 % interval {100 * gain['low']:+.1f} to {100 * gain['high']:+.1f}"

@@ -1,0 +1,100 @@
+"""tailgate train: an adversary from a preset."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from typing import Any
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from tailgate.base.locks import alone
+from tailgate.base.progress import cells, console, progress
+
+
+def add(commands: Any) -> None:
+    from tailgate.training.train import parameters
+
+    fields = "\n".join(f"  {p['name']:<18} {p['doc']} (default: {json.dumps(p['default'])})" for p in parameters())
+    command = commands.add_parser(
+        "train", help="train an adversary, compare it with scripted attacks on fresh seeds, write a page",
+        description="Train an adversary. Without --config, the preset `quickstart`, which sets some of the fields below.",
+        epilog=f"keys (dotted below environment, threat and the learners, for example ppo.epochs=4):\n{fields}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )  # fmt: skip
+    command.add_argument("--config", metavar="FILE", help="preset by name, or YAML file")
+    command.add_argument("--seed", type=int, help="first training seed (the same as first_seed=N)")
+    command.add_argument("--resume", action="store_true", help="continue, with the run's own configuration; steps may change")
+    command.add_argument("--json", action="store_true", help="print the report as JSON")
+    command.add_argument("overrides", nargs="*", metavar="key=value", help="change a field of the configuration")
+    command.set_defaults(run=_train, kept="what was finished is kept")
+
+
+def _train(options: argparse.Namespace) -> int:
+    from tailgate.training import comparison, train
+
+    sys.path.insert(0, "")  # a sandbox's module:Class is looked for in the working directory, as `leaderboard attack` does
+    overrides = list(options.overrides) + ([f"first_seed={options.seed}"] if options.seed is not None else [])
+    config = train.load_config(options.config, overrides, options.resume)
+    train.check(config)  # before a word of what is done
+    train.long(config)
+    if options.resume:
+        train.same_run(config)
+    errors = Console(stderr=True)
+    errors.print(f"[bold]{config.name}[/]: training against [bold]{config.defence}[/] on {config.scenario}, files in {config.directory}")
+    place = f" out={config.out}" if config.out != type(config)().out else ""
+    options.kept = f"what was finished is kept, go on with: tailgate train --resume name={config.name}{place}"
+    with alone(config.directory), progress(errors) as update:
+
+        decisions: dict[int, int] = {}
+
+        def trained(seed: int, now: Any) -> None:
+            decisions[seed] = now.steps
+            update(f"training, seed {seed}", min(now.steps, config.steps), config.steps, train.figures(now))
+
+        policies = train.train(config, trained, resume=options.resume)
+
+        if (most := max(decisions.values(), default=0)) > config.steps:
+            errors.print(f"{most:,} decisions a seed ({config.steps:,} asked for): learners play whole rounds", highlight=False)
+
+        def played(done: int, total: int) -> None:
+            update("comparing on fresh seeds", done, total, cells(done, total))
+
+        report = comparison.finished(config, policies) if options.resume else None
+        if report is not None:
+            errors.print("the comparison of these policies is there", highlight=False)
+        else:
+            report = comparison.compare(config, policies, played)
+        page = comparison.make_page(config, report)
+    if options.json:
+        print(json.dumps(report | {"page": str(page)}, indent=1))
+    else:
+        _print_report(report)
+    errors.print(f"policy: {', '.join(str(p) for p in policies)}\npage:   {page}")
+    return 0
+
+
+def _print_report(report: dict[str, Any]) -> None:
+    from tailgate.training.comparison import SHARE, shown
+
+    threat = report["threat"]
+    budget = "unlimited budget" if threat["budget"] is None else f"budget {threat['budget']} steps"
+    table = Table(title=f"{report['episodes']} fresh episodes, {report['defence']}, {report['scenario']}, {budget}")
+    what = {"crashed": "collisions"}.get(report["outcome"], f"mean {report['outcome']}")
+    for heading in ("attack", what, "95 % interval", "note"):
+        table.add_column(heading, overflow="fold")
+    for row in report["attacks"]:
+        value, low, high = (shown(report, row[key]) for key in ("value", "low", "high"))
+        table.add_row(escape(row["label"]), value, f"{low} to {high}", row["note"])
+    out = console()
+    out.print(table)
+    for name, why in report["left_out"].items():
+        out.print(f"left out: {name} ({why})", markup=False, highlight=False)
+    for name, gain in report["advantage"].items():
+        verdict = "wins" if gain["low"] > 0 else "loses" if gain["high"] < 0 else "undecided"
+        scale, points = (100.0, " points") if report["unit"] == SHARE else (1.0, "")
+        value, low, high = (f"{scale * gain[key]:+.{1 if points else 3}f}" for key in ("value", "low", "high"))
+        out.print(f"learned against {name}: {value}{points}, 95 % interval {low} to {high} ({verdict})")

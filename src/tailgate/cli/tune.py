@@ -1,0 +1,78 @@
+"""tailgate tune: a search for a learner's hyper-parameters."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from typing import Any
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from tailgate.base import sizes
+from tailgate.base.progress import console, progress
+
+
+def add(commands: Any) -> None:
+    command = commands.add_parser(
+        "tune", help="search a learner's hyper-parameters (needs tailgate[tune])",
+        description="Train one policy per trial and keep the values whose policy does most damage on `tune` seeds. The same command goes "
+        "on where an interrupted one stopped, and more --trials add to it. best.yaml is a configuration for `tailgate train`.",
+    )  # fmt: skip
+    command.add_argument("--config", metavar="FILE", help="preset by name, or YAML file (default: quickstart)")
+    command.add_argument("--trials", type=int, required=True, metavar="N", help="trials in all")
+    command.add_argument("--space", default="default", metavar="FILE", help="YAML file of the search space (default: the learner's own)")
+    command.add_argument("--learner", metavar="NAME", help="learner instead of the preset's")
+    command.add_argument("--episodes", type=int, default=400, metavar="N", help="episodes that a trial is measured on (default 400)")
+    command.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the search itself (default 0)")
+    command.add_argument("--workers", type=int, default=1, metavar="N", help="trials at a time (default 1); more change what is proposed")
+    command.add_argument("--json", action="store_true", help="print the report as JSON")
+    command.add_argument("overrides", nargs="*", metavar="key=value", help="change a field of the configuration, as for `tailgate train`")
+    command.set_defaults(run=_tune, kept="the same command goes on")
+
+
+def _tune(options: argparse.Namespace) -> int:
+    from tailgate.training import train, tuning
+
+    search = tuning.make_search(
+        options.config, options.overrides, options.trials, options.space, options.learner, options.episodes, options.seed
+    )
+    sizes.check("workers", options.workers)
+    errors = Console(stderr=True)
+    errors.print(f"[bold]{search.base.name}[/]: {search.trials} trials of {search.base.steps:,} decisions, files in {search.directory}")
+    with progress(errors) as update:
+
+        def trained(ordinal: int, now: Any) -> None:
+            if now is None:
+                update(f"trial {ordinal}", 1, 1, "")
+            else:
+                update(f"trial {ordinal}", min(now.steps, search.base.steps), search.base.steps, train.figures(now))
+
+        report = tuning.tune(search, options.workers, trained)
+    if options.json:
+        print(json.dumps(report, indent=1, allow_nan=False))
+    else:
+        _print(report)
+    if report["best"] is None:
+        print("tailgate: no trial succeeded; their reasons are above", file=sys.stderr)
+        return 1
+    errors.print(f"train with it: tailgate train --config {report['config']}")
+    return 0
+
+
+def _print(report: dict[str, Any]) -> None:
+    table = Table(title=f"{report['learner']} against {report['defence']} on {report['scenario']}, {report['outcome']} on tune seeds")
+    for heading in ("trial", "outcome", "values", "note"):
+        table.add_column(heading, overflow="fold")
+    for entry in report["trials"]:
+        values = ", ".join(f"{key.rpartition('.')[2]} {_short(value)}" for key, value in entry["parameters"].items())
+        best = report["best"] is not None and entry["ordinal"] == report["best"]["ordinal"]
+        outcome = "-" if entry["value"] is None else f"{entry['value']:.4g}"
+        table.add_row(str(entry["ordinal"]), outcome, values, "best" if best else escape(entry["reason"]))
+    console().print(table)
+
+
+def _short(value: Any) -> str:
+    return f"{value:.3g}" if isinstance(value, float) else escape(json.dumps(value))

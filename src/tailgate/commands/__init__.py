@@ -1,1 +1,0 @@
-"""The commands of the command line; each file adds its own parser and runs it."""

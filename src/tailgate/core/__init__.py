@@ -1,0 +1,35 @@
+"""Models, the threat model and its channel, the loop, random numbers, and the registry of components. The nouns are imported from here."""
+
+from tailgate.core.kinds import AIRED, RADIATED, Kind, Mode
+from tailgate.core.nouns import (
+    Air,
+    Array,
+    Attack,
+    Command,
+    Controller,
+    Defence,
+    Estimate,
+    Frame,
+    Innovation,
+    Manoeuvre,
+    Model,
+    Plant,
+    Prior,
+    Received,
+    Receiver,
+    Scene,
+    Sensor,
+    Sized,
+    View,
+    WhiteBox,
+    no_command,
+    pair_of,
+    param,
+)
+from tailgate.core.quantities import Count, Discount, Finite, NonNegative, Positive, PositiveCount, Probability
+
+__all__ = [
+    "AIRED", "RADIATED", "Air", "Array", "Attack", "Command", "Controller", "Count", "Defence", "Discount", "Estimate", "Finite", "Frame",
+    "Innovation", "Kind", "Manoeuvre", "Mode", "Model", "NonNegative", "Plant", "Positive", "PositiveCount", "Prior", "Probability",
+    "Received", "Receiver", "Scene", "Sensor", "Sized", "View", "WhiteBox", "no_command", "pair_of", "param",
+]  # fmt: skip

@@ -1,0 +1,112 @@
+"""Random numbers by counter: every draw is a pure function of (key, episode, step, stream, element).
+
+key = 64 bits of BLAKE2b(purpose, party, seed); counter = (episode, block, step, stream). A stream belongs to a ROLE, so
+swapping the defence or the attack leaves every other draw identical, and comparisons are paired. The three
+parties have unrelated keys: what a defence or an attack holds tells nothing of the sensor noise.
+"""
+
+import hashlib
+import math
+from collections.abc import Sequence
+from enum import IntEnum
+from functools import cache
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tailgate import num
+from tailgate.base.errors import InputError
+from tailgate.engine import elementary
+from tailgate.engine.array import Traced
+from tailgate.engine.compiled import Code
+
+Array = NDArray[Any]
+
+PURPOSES = ("train", "tune", "calibrate", "select", "report")
+_PARTIES = ("world", "attack", "defence")
+
+
+class Role(IntEnum):
+    """The streams, in one table. A number is never reused for another role."""
+
+    PRIOR = 0
+    PROCESS = 1
+    SENSOR = 2
+    MANOEUVRE = 3
+    TRAFFIC = 4
+    V2V = 5
+    LINK = 6
+    ATTACK = 16
+    POLICY = 17
+    DEFENCE = 32
+
+
+def _party(role: Role) -> int:
+    return 0 if role < 16 else 1 if role < 32 else 2
+
+
+class Keys(NamedTuple):
+    """Who draws: party keys (B, 3) uint64 and the episode counter (B,) uint32 of each row."""
+
+    key: Array
+    episode: Array
+
+    def at(self, role: Role, step: Array) -> "Draws":
+        """The draws of one role at each row's own step (B,)."""
+        return Draws(self.key[:, _party(role)], self.episode, step.astype(np.uint32), int(role))
+
+
+def keys(purpose: str, seeds: Sequence[int]) -> Keys:
+    """Keys of B rows, one seed each, at episode 0. `purpose` keeps training and report seeds apart."""
+    if purpose not in PURPOSES:
+        raise InputError("purpose", purpose, f"one of {', '.join(PURPOSES)}")
+    out = np.empty((3, len(seeds)), np.uint64)
+    for p, party in enumerate(_PARTIES):
+        for i, seed in enumerate(seeds):
+            digest = hashlib.blake2b(f"{purpose}/{party}/{int(seed)}".encode(), digest_size=8).digest()
+            out[p, i] = int.from_bytes(digest, "little")
+    return Keys(out.T, np.zeros(len(seeds), np.uint32))
+
+
+@cache
+def _code(pair: Any) -> Code:
+    return Code(pair, np.uint64, 5)
+
+
+class Draws(NamedTuple):
+    """One role's random numbers at one step. A second independent draw in the same step needs another `tag`."""
+
+    key: Array
+    episode: Array
+    step: Array
+    stream: int
+
+    def _numbers(self, pair: Any, shape: tuple[int, ...], tag: int) -> Array:
+        """(B, *shape) numbers of a function that gives two for each block."""
+        size, batch = math.prod(shape), len(self.key)
+        blocks, stream = (size + 1) // 2, np.uint64(self.stream << 16 | tag)
+        if isinstance(self.key, Traced):
+            counters = self.key, self.episode.astype(np.uint64), self.step.astype(np.uint64), stream
+            out: Any = [number for block in range(blocks) for number in pair(*counters, np.uint64(block))][:size]
+            held: Any = np.stack(out, axis=-1) if out else np.zeros((batch, 0))
+            return cast(Array, held.reshape(batch, *shape))
+        given = np.empty((5, blocks, batch), np.uint64)
+        given[0], given[1], given[2], given[3], given[4] = self.key, self.episode, self.step, stream, np.arange(blocks)[:, None]
+        held = _code(pair)(given.reshape(5, -1)) if given.size else np.empty((2, 0))
+        both = held.reshape(2, blocks, batch).swapaxes(0, 1).reshape(2 * blocks, batch)
+        return num.last_to_first(both[:size].reshape(*shape, batch))
+
+    def normal(self, shape: tuple[int, ...] = (), tag: int = 0) -> Array:
+        """Standard normals (B, *shape)."""
+        return self._numbers(elementary.normal_pair, shape, tag)
+
+    def uniform(self, shape: tuple[int, ...] = (), tag: int = 0) -> Array:
+        """Uniforms on (0, 1), ends excluded, (B, *shape)."""
+        return self._numbers(elementary.uniform_pair, shape, tag)
+
+
+def constants(name: str, seed: int) -> Draws:
+    """Draws for the random constants of a component, such as the matrices of a random system: one row, the same for every episode."""
+    digest = hashlib.blake2b(f"constants/{name}/{int(seed)}".encode(), digest_size=8).digest()
+    return Draws(np.array([int.from_bytes(digest, "little")], np.uint64), np.zeros(1, np.uint32), np.zeros(1, np.uint32), 0)

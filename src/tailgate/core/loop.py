@@ -1,0 +1,308 @@
+"""The loop: the arrows between the nouns, pure on its state.
+
+    each k:  plant -> sensors -> [seat: the attack's command] -> channel -> defence -> controller -> channel -> plant
+
+Time runs k = 1, 2, ..., horizon. At k = 0 the prior is the estimate and the controller drives the first step on it, so that every
+measured step is a predict and an update. `sense` and `advance` are the two halves of a step, with the attack's seat between them.
+"""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+
+from tailgate import num
+from tailgate.base.errors import InputError, NotApplicable
+from tailgate.base.pytree import duplicate, frozen, lock, put_rows
+from tailgate.core import (
+    Air,
+    Array,
+    Attack,
+    Command,
+    Controller,
+    Defence,
+    Estimate,
+    Frame,
+    Manoeuvre,
+    Mode,
+    Model,
+    Plant,
+    Received,
+    Receiver,
+    Sensor,
+    View,
+    WhiteBox,
+    pair_of,
+)  # fmt: skip
+from tailgate.core.draws import Keys, Role
+from tailgate.core.lossy_link import Link, LinkState
+from tailgate.core.score_threshold import Watched
+from tailgate.core.threat import Brief, Channel, ChannelPlan, ChannelState, ThreatModel
+from tailgate.engine.array import Traced
+
+PERFECT = Link()
+_START = np.uint32(0xFFFFFFFF)  # the step under which start() draws: no episode reaches it
+
+
+def check_estimate(estimate: Estimate, model: Model, batch: int, k: Array) -> None:
+    """Raise InputError when a defence's output, of step k (B,), has not the type, shape or finiteness that the loop needs."""
+    shape = (batch, model.agents)
+    wanted = {
+        "x": ((*shape, model.states), "f"), "score": (shape, "f"), "alarm": (shape, "b"), "mode": (shape, "iu"), "probe": (shape, "b"),
+    }  # fmt: skip
+    for name, (size, kinds) in wanted.items():
+        value = getattr(estimate, name, None)
+        if not isinstance(value, (np.ndarray, Traced)) or value.shape != size or value.dtype.kind not in kinds:
+            got = f"{value.dtype} {value.shape}" if isinstance(value, (np.ndarray, Traced)) else type(value).__name__
+            raise InputError(f"defence output {name}", got, f"an array of shape {size}, kind {kinds!r}")
+        if kinds == "f":
+            num.demand(np.isfinite(value), f"defence output {name}", "NaN or infinity", "finite numbers", k)
+    if estimate.limits is not None:
+        size = (*shape, len(model.actuators), 2)
+        if estimate.limits.shape != size:
+            raise InputError("defence output limits", estimate.limits.shape, f"an array of shape {size}, the lower limits first")
+        num.demand(estimate.limits[..., 0] <= estimate.limits[..., 1], "defence output limits", "limits", "the lower limits first", k)
+    known = ", ".join(f"{m.value} ({m.name})" for m in Mode)
+    fits = (estimate.mode >= 0) & (estimate.mode < len(Mode))
+    num.demand(fits, "defence output mode", "another number", f"one of {known}", k, estimate.mode)
+
+
+class LoopPlan(NamedTuple):
+    plant: Any
+    sensor: Any
+    controller: Any
+    manoeuvre: Any
+    defence: Any
+    channel: ChannelPlan
+
+
+class LoopState(NamedTuple):
+    """Every leaf has B first. `received` and `sent` are this step's, before the attack."""
+
+    keys: Keys
+    k: Array  # (B,) int64
+    plant: Any
+    manoeuvre: Any
+    controller: Any
+    defence: Any
+    channel: ChannelState
+    estimate: Estimate
+    probed: Array  # (B, N) bool: the sensor's probe was sent in the step before
+    control: Array  # (B, N, m) what was commanded last
+    known_u: Array  # (B, N, model inputs)
+    sent: Array  # (B, N, q+p)
+    received: Received
+    ended: Array  # (B,) bool: collided
+    link: LinkState | None = None  # where readings are lost or late
+
+
+@dataclass(frozen=True, eq=False)
+class Loop:
+    """A closed loop of one plant under one defence, for B independent episodes.
+
+    `told`: the model that defence, controller, channel and attacker go by, where the plant's and the sensor's own is another; `load`: the
+    vehicle's mass over the nominal one, by which a commanded acceleration is divided [-]; `link`: readings that are lost or late.
+    """
+
+    plant: Plant
+    sensor: Sensor
+    controller: Controller
+    manoeuvre: Manoeuvre
+    threat: ThreatModel
+    horizon: int
+    defence: Defence
+    uses: tuple[str, ...] = ("measurements",)
+    ends_on_collision: bool = True
+    told: Model | None = None
+    load: float = 1.0
+    link: Link = PERFECT
+
+    @cached_property
+    def bare(self) -> Loop:
+        """The loop without a watch on the defence's score: it plays the same episodes, alarms apart."""
+        return dataclasses.replace(self, defence=self.defence.defence) if isinstance(self.defence, Watched) else self
+
+    @cached_property
+    def model(self) -> Model:
+        return self.told or self._own_model
+
+    @cached_property
+    def _own_model(self) -> Model:
+        return self.plant.model(self.sensor, self.controller)
+
+    @cached_property
+    def brief(self) -> Brief:
+        return Brief(self.model, self.threat, self.horizon)
+
+    @cached_property
+    def plan(self) -> LoopPlan:
+        if self.threat.knowledge == "white" and (why := getattr(self.defence, "opaque", "")):
+            raise NotApplicable("attack", "white box", f"a black or grey box: {why}")
+        return LoopPlan(
+            self.plant.prepare(self._own_model),
+            self.sensor.prepare(self._own_model),
+            self.controller.prepare(self.model),
+            self.manoeuvre.prepare(self.model.dt),
+            self.defence.prepare(self.model),
+            Channel().prepare(self.brief),
+        )
+
+    @cached_property
+    def shown(self) -> Any:
+        """The defence's plan as a white-box attacker holds it: a copy, so that nothing it writes reaches the defence."""
+        return lock(copy.deepcopy(self.plan.defence))
+
+    def start(self, keys: Keys) -> LoopState:
+        """States of B fresh episodes at k = 1, measured."""
+        plan, model = self.plan, self.model
+        batch = len(keys.key)
+        at_start = np.full(batch, _START)
+        plant = self.plant.start(plan.plant, keys.at(Role.PRIOR, at_start))
+        controller = self.controller.start(plan.controller, batch)
+        held = self.controller.held(plan.controller, controller, batch)
+        prior = self.plant.prior(plan.plant, plant, held, keys.at(Role.PRIOR, at_start))
+        manoeuvre = self.manoeuvre.start(plan.manoeuvre, keys.at(Role.MANOEUVRE, at_start))
+        shape = (batch, model.agents)
+        estimate = Estimate(
+            prior.mean, num.zeros(shape), num.zeros(shape, bool), num.full(shape, Mode.NORMAL, np.int8), num.full(shape, True, bool)
+        )
+        v2v = self.plant.v2v(plan.plant, plant)
+        expected = np.concatenate([num.matvec(model.C, prior.mean), v2v], axis=-1)
+        k = np.zeros(batch, np.int64)
+        odometry = self.plant.odometry(plan.plant, plant)
+        controller, u = self.controller.step(plan.controller, controller, estimate, v2v, odometry)
+        manoeuvre, plant, known = self._move(keys, k, manoeuvre, plant, u)
+        sent, received = self._measure(keys, k + 1, plant, controller, estimate)
+        link = None if self.link.perfect else self.link.start(sent)
+        return LoopState(
+            keys, k + 1, plant, manoeuvre, controller, self.defence.start(plan.defence, prior),
+            Channel().start(plan.channel, expected, u), estimate, estimate.probe.copy(order="K"), u, known, sent, received,
+            np.zeros(batch, bool), link,
+        )  # fmt: skip
+
+    def restart(self, state: LoopState, mask: Array) -> LoopState:
+        """New episodes in the rows of `mask` (B,) bool, the next of their own counter; the other rows keep every bit."""
+        rows = np.flatnonzero(mask)
+        if not len(rows):
+            return state
+        keys = Keys(state.keys.key[rows], state.keys.episode[rows] + np.uint32(1))
+        return self.reseed(state, rows, keys)
+
+    def reseed(self, state: LoopState, rows: Array, keys: Keys) -> LoopState:
+        """New episodes in `rows` (R,) with the given keys of R rows."""
+        fresh = self.start(keys)
+        out: LoopState = put_rows(state, rows, fresh)
+        return out
+
+    def sense(self, state: LoopState) -> View:
+        """What the threat model lets the attacker see now."""
+        plan, channel = self.plan, state.channel
+        threat = self.threat
+        budget_left = Channel().budget_left(plan.channel, channel)
+        budget = np.full(len(state.k), np.inf if threat.budget is None else threat.budget, np.float64)
+        view = View(
+            k=state.k,
+            progress=state.k / self.horizon,
+            scene=self.plant.scene(plan.plant, state.plant),
+            budget_left=budget_left,
+            budget=budget,
+            burst=channel.burst,
+            cooldown=channel.cooldown,
+            allowed=Channel().allowed(plan.channel, channel, state.k),
+            last=channel.last,
+        )
+        if self.model.air:  # a radio signal: whoever is near hears it
+            view = view._replace(probed=state.probed)
+        if threat.knowledge in ("grey", "white"):
+            view = view._replace(control=state.control)
+        if threat.knowledge == "white":
+            box = WhiteBox(self.defence, self.shown, duplicate(state.defence), frozen(state.known_u))
+            view = view._replace(defence=box, estimate=state.estimate, truth=self._truth(state.plant, state.controller))
+        if threat.sees_measurement or threat.knowledge == "white":
+            view = view._replace(received=state.received)
+        shown: View = frozen(view._replace(defence=None))  # an attack looks; the channel alone acts
+        return shown._replace(defence=view.defence)
+
+    def advance(self, state: LoopState, command: Command) -> tuple[LoopState, Frame]:
+        """The rest of the step: channel, defence, controller, plant, and the next measurement."""
+        plan = self.plan
+        truth, odometry = self._truth(state.plant, state.controller), self.plant.odometry(plan.plant, state.plant)
+        channel, received, arrived, refused = Channel().apply(
+            plan.channel, state.channel, state.sent, state.received, command, state.k, self._again(state, truth)
+        )
+        heard = received._replace(
+            v2v=received.v2v if "v2v" in self.uses else None,
+            odometry=odometry if "odometry" in self.uses else None,
+            attacked=received.attacked if "truth" in self.uses else None,
+        )
+        answer = self.defence.step(
+            plan.defence, state.defence, frozen(heard), frozen(state.known_u), state.keys.at(Role.DEFENCE, state.k)
+        )
+        defence, estimate = pair_of(answer)
+        check_estimate(estimate, self.model, len(state.k), state.k)
+        if "probe" not in self.uses:  # who does not say that it switches the probe off cannot
+            estimate = estimate._replace(probe=num.full(estimate.probe.shape, True, bool))
+        assert received.v2v is not None
+        controller, u = self.controller.step(plan.controller, state.controller, estimate, received.v2v, odometry)
+        if estimate.limits is not None:
+            u = np.clip(u, estimate.limits[..., 0], estimate.limits[..., 1])
+            estimate = estimate._replace(limits=None)
+        channel, applied = Channel().actuate(plan.channel, channel, u)
+        manoeuvre, plant, known = self._move(state.keys, state.k, state.manoeuvre, state.plant, applied, u)
+        scene = self.plant.scene(plan.plant, plant)
+        collided = np.any(scene.gap <= 0.0, axis=1)
+        rear_collided = np.any(scene.rear_gap <= 0.0, axis=1)
+        frame = Frame(
+            state.k, truth, state.sent, arrived, channel.last, refused, estimate, u, applied, scene, received, collided,
+            rear_collided,
+        )
+        sent, fresh = self._measure(state.keys, state.k + 1, plant, controller, estimate)
+        link = state.link
+        if link is not None:
+            link, sent, fresh = self.link.step(link, sent, fresh, state.keys.at(Role.LINK, state.k + 1))
+        ended = state.ended | ((collided | rear_collided) & self.ends_on_collision)
+        state = LoopState(
+            state.keys, state.k + 1, plant, manoeuvre, controller, defence, channel, estimate, state.estimate.probe, u, known, sent,
+            fresh, ended, link,
+        )  # fmt: skip
+        return state, frame
+
+    def step(self, state: LoopState, attack: Attack, plan: Any, memory: Any) -> tuple[LoopState, Any, Frame]:
+        """sense, decide, advance. `plan` and `memory` are the attack's plan and state."""
+        memory, command = attack.decide(plan, memory, self.sense(state), state.keys.at(Role.ATTACK, state.k))
+        state, frame = self.advance(state, command)
+        return state, memory, frame
+
+    def _truth(self, plant: Any, controller: Any) -> Array:
+        held = self.controller.held(self.plan.controller, controller, len(self.plant.lead_speed_of(plant)))
+        return self.plant.truth(self.plan.plant, plant, held)
+
+    def _again(self, state: LoopState, truth: Array) -> Callable[[Air], Received] | None:
+        """This step's measurement under what is radiated; None of sensors that receive nothing over the air."""
+        if not self.model.air:
+            return None
+        sensor, draws = cast(Receiver, self.sensor), state.keys.at(Role.SENSOR, state.k)
+        return lambda air: sensor.disturbed(self.plan.sensor, truth, state.estimate.probe, draws, air)
+
+    def _measure(self, keys: Keys, k: Array, plant: Any, controller: Any, estimate: Estimate) -> tuple[Array, Received]:
+        truth = self._truth(plant, controller)
+        received = self.sensor.measure(self.plan.sensor, truth, estimate.probe, keys.at(Role.SENSOR, k))
+        columns = [received.y[..., i] for i in range(received.y.shape[-1])]
+        v2v = self.plant.v2v(self.plan.plant, plant)
+        return num.stack(columns + [v2v[..., i] for i in range(v2v.shape[-1])]), received
+
+    def _move(self, keys: Keys, k: Array, manoeuvre: Any, plant: Any, applied: Array, u: Array | None = None) -> tuple[Any, Any, Array]:
+        """-> manoeuvre, plant, and what is known of the input; u is what was commanded, where that is not what is applied."""
+        plan = self.plan
+        manoeuvre, exo = self.manoeuvre.accel(
+            plan.manoeuvre, manoeuvre, k, self.plant.lead_speed_of(plant), keys.at(Role.MANOEUVRE, k)
+        )
+        driven = applied if self.load == 1.0 else applied / self.load
+        plant = self.plant.step(plan.plant, plant, driven, exo, keys.at(Role.PROCESS, k))
+        return manoeuvre, plant, self.plant.known(plan.plant, applied if u is None else u, exo, plant)

@@ -1,0 +1,56 @@
+"""The link between a sensor and who reads it, where it is another than everyone is told: readings are lost, or come late.
+
+Nobody attacks here. A reading that is lost is known to be lost (`valid`), and its wire keeps the last value that arrived, as in an attack
+of that kind; one that is late is not known to be.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from tailgate import num
+from tailgate.core import Array, Count, Probability, Received, param
+from tailgate.core.draws import Draws
+
+
+class LinkState(NamedTuple):
+    """Every leaf has B first."""
+
+    way: Array  # (B, N, wires, latency) what is under way, the oldest first
+    last: Array  # (B, N, wires) what arrived last
+
+
+@dataclass(frozen=True)
+class Link:
+    """Loses each reading with a probability, independently, and delivers the others some steps late."""
+
+    loss: Probability = param(0.0, "probability that a reading is lost [-]")
+    latency: Count = param(0, "steps by which readings and messages are late; the first one stands for what is not there yet")
+
+    @property
+    def perfect(self) -> bool:
+        """Whether what is sent arrives at once."""
+        return self.loss == 0.0 and self.latency == 0
+
+    def start(self, sent: Array) -> LinkState:
+        """sent (B, N, wires): the first readings and messages, which arrive."""
+        way = num.zeros((*sent.shape, self.latency))
+        way[...] = sent[..., None]
+        return LinkState(way, sent)
+
+    def step(self, state: LinkState, sent: Array, received: Received, draws: Draws) -> tuple[LinkState, Array, Received]:
+        """-> state, and what arrives of `sent` (B, N, wires) and of the readings among it."""
+        way, q = state.way, received.y.shape[-1]
+        if self.latency:
+            whole = num.zeros((*sent.shape, self.latency + 1))
+            whole[..., :-1], whole[..., -1] = way, sent
+            sent, way = whole[..., 0], num.batch_last(whole[..., 1:])
+        valid = received.valid
+        if self.loss:
+            gone = draws.uniform(sent.shape[1:]) < self.loss
+            sent, valid = np.where(gone, state.last, sent), valid & ~gone[..., :q]
+        sent = num.batch_last(sent)
+        return LinkState(way, sent), sent, received._replace(y=sent[..., :q], valid=valid)

@@ -1,0 +1,398 @@
+"""Names to components. A component is a frozen dataclass; its fields are its parameters.
+
+Built-in ones register where they are defined; others come from the entry-point groups `tailgate.estimators` and `tailgate.agents`,
+from `module:Class` on the command line, or as objects in Python. A configuration file names registered components only.
+"""
+
+import hashlib
+import importlib
+import inspect
+import json
+import re
+import sys
+import traceback
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from importlib.metadata import entry_points
+from importlib.resources import files
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+from tailgate.base.errors import InputError, unknown
+from tailgate.core.schema import as_data, build, fields_of, scalar
+
+Family = Literal["defence", "filter", "detector", "mitigation", "attack", "plant", "sensor", "controller", "manoeuvre"]
+USES = ("measurements", "odometry", "probe", "v2v", "redundant", "leader_input", "truth")
+_MODULES = {
+    "defence": "tailgate.estimators",
+    "filter": "tailgate.estimators",
+    "detector": "tailgate.estimators",
+    "mitigation": "tailgate.estimators",
+    "attack": "tailgate.agents",
+    "plant": "tailgate.envs",
+    "sensor": "tailgate.envs",
+    "controller": "tailgate.envs",
+    "manoeuvre": "tailgate.envs",
+}
+_GROUPS = {"defence": "tailgate.estimators", "attack": "tailgate.agents"}
+SANDBOXES = ("bwrap", "docker")
+_FILES = {".json": "policy", ".yaml": "program", ".yml": "program"}  # attacks that are files
+PARTS: tuple[Family, ...] = ("filter", "detector", "mitigation")  # of the defence `composed`
+_entries: dict[str, dict[str, "Entry"]] = {family: {} for family in _MODULES}
+_plugins_loaded: set[str] = set()
+T = TypeVar("T", bound=type)
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A registered component: what a card shows of it."""
+
+    family: Family
+    name: str
+    cls: type
+    version: int = 1
+    reference: str = ""
+    uses: tuple[str, ...] = ("measurements",)
+    knowledge: str = "black"
+    optimal: bool = False
+    sentinel: str = ""
+
+    @property
+    def built_in(self) -> bool:
+        """Whether it comes with this package; a plug-in is somebody else's code under a name."""
+        return self.cls.__module__.partition(".")[0] == "tailgate"
+
+    @property
+    def learned(self) -> bool:
+        """Whether this attack plays trained policies."""
+        return bool(getattr(self.cls, "learned", False))
+
+    @property
+    def summary(self) -> str:
+        return (inspect.getdoc(self.cls) or "").split("\n\n")[0].replace("\n", " ")
+
+    def card(self) -> dict[str, Any]:
+        """JSON data: name, version, reference, uses and every parameter with its default and sentence."""
+        params = {
+            name: {"default": as_data(f.default), "doc": f.metadata.get("doc", "")} for name, f in fields_of(self.cls).items()
+        }
+        out: dict[str, Any] = {"name": self.name, "version": self.version, "summary": self.summary, "reference": self.reference}
+        if self.family == "defence":
+            out |= {"uses": list(self.uses), "sentinel": self.sentinel}
+        if self.family == "attack":
+            out |= {"knowledge": self.knowledge, "optimal": self.optimal, "learned": self.learned}
+        return out | {"parameters": params}
+
+
+def register(family: Family, name: str, **card: Any) -> Callable[[T], T]:
+    """Class decorator. Reusing a name is an error."""
+
+    def add(cls: T) -> T:
+        put(Entry(family, name, cls, **card))
+        return cls
+
+    return add
+
+
+def put(entry: Entry) -> None:
+    for use in entry.uses:
+        if use not in USES:
+            raise unknown(f"{entry.name}.uses", use, USES)
+    held = _entries[entry.family].get(entry.name)
+    if held is not None and held.cls is not entry.cls:
+        raise InputError(f"{entry.family} name", entry.name, "a name that is not taken")
+    _entries[entry.family][entry.name] = entry
+
+
+@cache
+def _sources(package: str) -> dict[str, str]:
+    """The text of each module of a package whose modules are imported when they are asked for."""
+    return {module: files(package).joinpath(f"{module}.py").read_text("utf-8") for module in importlib.import_module(package).HOMES}
+
+
+def _at_home(family: Family, name: str) -> Entry | None:
+    """A built-in component, for which its own module alone is imported; None where no module says that it has it."""
+    if name not in _entries[family]:
+        said = re.compile(rf'@register\(\s*"{family}",\s*"{re.escape(name)}"')
+        for module, text in _sources(_MODULES[family]).items():
+            if said.search(text):
+                importlib.import_module(f"{_MODULES[family]}.{module}")
+    return _entries[family].get(name)
+
+
+def built_in(family: Family) -> dict[str, Entry]:
+    """The components that come with this package, by name; imports nobody else's."""
+    for module in importlib.import_module(_MODULES[family]).HOMES:
+        importlib.import_module(f"{_MODULES[family]}.{module}")
+    return {name: entry for name, entry in _entries[family].items() if entry.built_in}
+
+
+def _load(family: Family) -> dict[str, Entry]:
+    built_in(family)
+    group = _GROUPS.get(family)
+    if group and group not in _plugins_loaded:
+        for point in entry_points(group=group):
+            try:
+                cls = point.load()
+            except Exception as error:  # somebody's broken package shall not stop those who do not use it
+                warnings.warn(f"plug-in {point.name!r} of {group} cannot be loaded: {error}", stacklevel=2)
+                continue
+            put(entry_of(family, point.name, cls))
+        _plugins_loaded.add(group)  # only now: a plug-in that fails shall fail again, not vanish
+    return _entries[family]
+
+
+@cache
+def _plugged(points: Callable[..., Any], group: str) -> frozenset[str]:
+    """Names of the plug-ins of a group: all installed packages are read for them."""
+    return frozenset(point.name for point in points(group=group))
+
+
+def entry_of(family: Family, name: str, cls: type) -> Entry:
+    """An entry for somebody else's class, which may carry `uses`, `reference` and `version` as class attributes."""
+    uses = tuple(getattr(cls, "uses", ("measurements",)))
+    return Entry(
+        family, name, cls, version=int(getattr(cls, "version", 1)), reference=str(getattr(cls, "reference", "")), uses=uses,
+        knowledge=str(getattr(cls, "knowledge", "black")),
+    )  # fmt: skip
+
+
+def entry_for(family: Family, cls: type) -> Entry:
+    """The entry under which a class is registered, or one made of its attributes."""
+    for entry in _load(family).values():
+        if entry.cls is cls:
+            return entry
+    return entry_of(family, cls.__name__, cls)
+
+
+def text_of(entry: Entry, value: Any) -> str:
+    """The text that names this object on a command line, as far as one can."""
+    cls = type(value)
+    name = entry.name if _entries[entry.family].get(entry.name) is entry else f"{cls.__module__}:{cls.__qualname__}"
+    params = as_data(value)
+    if not isinstance(params, dict):
+        return name
+    shown = [f"{key}={json.dumps(held)}" for key, held in params.items() if key != "class"]
+    return f"{name}:{','.join(shown)}" if shown else name
+
+
+def entries(family: Family) -> dict[str, Entry]:
+    """Every registered component of a family by name, plug-ins included."""
+    return dict(sorted(_load(family).items()))
+
+
+def find(family: Family, name: str) -> Entry:
+    if found := _at_home(family, name):
+        return found
+    known = _load(family)
+    if name not in known:
+        raise unknown(family, name, known)
+    return known[name]
+
+
+def make(family: Family, name: str, /, **params: Any) -> Any:
+    """A component by name, its parameters validated."""
+    if not isinstance(name, str):
+        raise InputError(f"{family}.name", name, "the name of a registered component")
+    entry = find(family, name)
+    return build(entry.cls, params, f"{family} {name}")
+
+
+def make_from(family: Family, data: Any, where: str) -> Any:
+    """A component from configuration data: a name, or a mapping with `name` and parameters."""
+    if isinstance(data, str):
+        data = {"name": data}
+    if not isinstance(data, dict) or "name" not in data:
+        raise InputError(where, data, "a name, or a mapping with a name and parameters")
+    return make(family, data["name"], **{key: value for key, value in data.items() if key != "name"})
+
+
+@dataclass(frozen=True)
+class Spec:
+    """A component as a user names it: text that a row can record and another process can rebuild.
+
+    `name`, `name:key=value,key=value`, `module:Class`, `module:Class:key=value`, or (attacks) the JSON file of an exported policy or the
+    YAML file of a program. `part.key=value` is a parameter of the part that another
+    parameter names. A defence may stand behind a sandbox: `bwrap/module:Class`.
+    """
+
+    family: Family
+    text: str
+
+    def _parts(self) -> tuple[str, dict[str, Any]]:
+        head, tail = split_text(self.text)
+        params: dict[str, Any] = {}
+        for item in _split(tail) if tail else ():
+            key, eq, value = item.partition("=")
+            if not eq:
+                raise InputError(self.family, self.text, "name:key=value,key=value")
+            _put(params, key.strip(), scalar(value))
+        return head, params
+
+    def _imported(self) -> list[tuple[Family, str]]:
+        """Family and module:Class of everything that this text imports."""
+        head, params = self._parts()
+        named: list[tuple[Family, Any]] = [(self.family, head)]
+        for part in PARTS:
+            held = params.get(part)
+            named.append((part, held.get("name") if isinstance(held, dict) else held))
+        return [(family, name) for family, name in named if isinstance(name, str) and ":" in name]
+
+    def refuse_imports(self, where: str) -> None:
+        """Raise InputError when this names a class to import: configuration files never run code."""
+        if self.imports:
+            other = "or a class in a sandbox (bwrap/module:Class)" if self.family == "defence" else "a program (YAML) or a policy (JSON)"
+            raise InputError(f"{where}: {self.family}", self.text, f"a registered name, {other}: a configuration imports nothing")
+
+    @property
+    def sandboxed(self) -> tuple[str, str] | None:
+        """Sandbox and class of a defence that is imported in a sandbox and nowhere else: `bwrap/module:Class`, `docker:IMAGE/...`."""
+        program, slash, text = self.text.partition("/")
+        found = slash and self.family == "defence" and program.partition(":")[0] in SANDBOXES
+        return (program, text) if found else None
+
+    @property
+    def target(self) -> str:
+        """The component itself, wherever it is played."""
+        return self.sandboxed[1] if self.sandboxed else self.text
+
+    @property
+    def entry(self) -> Entry:
+        if self.sandboxed:
+            from tailgate.sandbox.sandboxed import entry_of as card_of
+
+            return card_of(*self.sandboxed)
+        head, _ = self._parts()
+        if self.family == "attack" and (kind := _FILES.get(Path(head).suffix)):
+            return find("attack", kind)
+        if ":" not in head:
+            return find(self.family, head)
+        return imported(self.family, head)
+
+    @property
+    def imports(self) -> bool:
+        """Whether this names a class to import, outside of any sandbox."""
+        return not self.sandboxed and bool(self._imported())
+
+    @property
+    def foreign(self) -> bool:
+        """Whether playing this runs somebody else's code outside of any sandbox: a class to import, or a plug-in."""
+        plugged = _plugged(entry_points, _GROUPS[self.family]) if self.family in _GROUPS else frozenset()
+        return self.imports or (not self.sandboxed and self._parts()[0] in plugged)
+
+    @property
+    def digest(self) -> str:
+        """Of the files that somebody else's components, or the zoo's, come from; empty for other registered ones: they carry a version."""
+        if self.sandboxed:
+            from tailgate.sandbox.sandboxed import digest_of
+
+            return digest_of(self.sandboxed[1])
+        head, params = self._parts()
+        paths = [Path(inspect.getfile(imported(family, name).cls)) for family, name in self._imported()]
+        if self.family == "attack":
+            paths = [Path(str(text)) for text in (head, params.get("path")) if Path(str(text)).suffix in _FILES] or paths
+        if self.family == "defence" and (held := params.get("policy")) is not None:  # a defender that was trained
+            paths += [Path(str(path)) for path in (held if isinstance(held, list) else [held])]
+        if not paths and not self.entry.built_in:
+            paths = [Path(inspect.getfile(self.entry.cls))]
+        if not paths and hasattr(self.entry.cls, "sources"):  # a name that stands for a file
+            paths = list(self.make().sources)
+        if self.family == "defence" and len(paths) == 1 and (":" in head or not self.entry.built_in):
+            from tailgate.sandbox import source
+
+            if told := source.digest_of_file(head.partition(":")[0] if ":" in head else self.entry.cls.__module__, paths[0]):
+                return told  # as a submission's: rows of both are of one class
+        blobs = [path.read_bytes() for path in paths if path.is_file()]
+        return hashlib.sha256(b"".join(blobs)).hexdigest() if blobs else ""
+
+    def make(self) -> Any:
+        if self.sandboxed:
+            from tailgate.sandbox.sandboxed import Sandboxed
+
+            return Sandboxed(*self.sandboxed)
+        head, params = self._parts()
+        if self.family == "attack" and Path(head).suffix in _FILES:
+            params = {"path": head, **params}
+        try:
+            made: Any = build(self.entry.cls, params, f"{self.family} {head}")
+        except Exception as error:
+            if isinstance(error, InputError) or self.entry.built_in:
+                raise
+            raise InputError(self.family, self.text, f"a class that can be made ({said(error)})") from None
+        steps = {"defence": ("prepare", "start", "step"), "attack": ("prepare", "start", "decide")}.get(self.family, ())
+        if not all(callable(getattr(made, name, None)) for name in steps):
+            raise InputError(self.family, self.text, f"a class with {', '.join(steps)}")
+        if self.family == "defence" and _takes(made.step) < 5:
+            raise InputError(
+                self.family, self.text, "a class whose step takes plan, state, received, known_u and draws; a filter, detector or "
+                "mitigation is a part: composed:detector=module:Class"
+            )  # fmt: skip
+        return made
+
+
+def said(error: Exception) -> str:
+    """An error of somebody's code in a line: its type, its words, and the last line of that code on the way to it.
+
+    Compiled code counts for none: its files are not there to be read.
+    """
+    place = ""
+    for frame, line in traceback.walk_tb(error.__traceback__):
+        file, package = frame.f_code.co_filename, str(frame.f_globals.get("__name__", "")).partition(".")[0]
+        if package != "tailgate" and package not in sys.stdlib_module_names and "site-packages" not in file and Path(file).is_file():
+            place = f" ({Path(file).name}, line {line})"
+    return f"{type(error).__name__}: {error}{place}"
+
+
+def imported(family: Family, text: str) -> Entry:
+    """The entry of a class that the user names as module:Class."""
+    module, _, name = text.partition(":")
+    if module in _load(family):
+        raise InputError(family, text, f"{module}:key=value,key=value")
+    try:
+        cls = getattr(importlib.import_module(module), name)
+    except (ImportError, ValueError, TypeError) as error:  # also an empty or relative module name
+        raise InputError(family, text, f"an importable module ({error})") from None
+    except AttributeError:
+        raise InputError(family, text, f"a class that module {module} defines") from None
+    except SyntaxError as error:
+        raise InputError(family, text, f"a module without syntax errors ({error.msg}, line {error.lineno})") from None
+    except Exception as error:  # whatever its first lines do
+        raise InputError(family, text, f"a module that can be imported ({said(error)})") from None
+    if not isinstance(cls, type):
+        raise InputError(family, text, "a class")
+    return entry_of(family, text, cls)
+
+
+def split_text(text: str) -> tuple[str, str]:
+    """Head and parameters of a component's text: `name` and `key=value,...`, or the text and nothing."""
+    found = re.fullmatch(r"(.*?):(\s*[A-Za-z_][\w.]*\s*=.*)", text, re.DOTALL)
+    return (found[1], found[2]) if found else (text, "")
+
+
+def _takes(function: Callable[..., Any]) -> float:
+    """How many arguments a method takes at most."""
+    kinds = [p.kind for p in inspect.signature(function).parameters.values()]
+    return float("inf") if inspect.Parameter.VAR_POSITIONAL in kinds else len(kinds)
+
+
+def _put(params: dict[str, Any], key: str, value: Any) -> None:
+    """params[key] = value; `part.key` goes into the mapping of the part, whose name may stand there already."""
+    part, dot, inner = key.partition(".")
+    held = params.get(part)
+    if not dot:
+        params[part] = held | {"name": value} if isinstance(held, dict) else value
+    else:
+        params[part] = {**(held if isinstance(held, dict) else {"name": held} if held is not None else {}), inner: value}
+
+
+def _split(text: str) -> list[str]:
+    """Split at commas outside of brackets."""
+    out, depth, start = [], 0, 0
+    for i, ch in enumerate(text):
+        depth += (ch in "[({") - (ch in "])}")
+        if ch == "," and depth == 0:
+            out.append(text[start:i])
+            start = i + 1
+    return [*out, text[start:]]

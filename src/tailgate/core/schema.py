@@ -1,0 +1,167 @@
+"""From data to validated parameters: one typed schema (the dataclasses) is the single truth for defaults."""
+
+import dataclasses
+import hashlib
+import json
+import types
+from functools import cache
+from pathlib import Path
+from typing import Any, TypeVar, get_type_hints
+
+from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
+from pydantic.errors import PydanticSchemaGenerationError, PydanticUserError
+
+from tailgate.base.errors import InputError, said, unknown, wanted
+from tailgate.base.reading import load_yaml, parse_json, parse_yaml, read_bytes
+
+T = TypeVar("T")
+M = TypeVar("M", bound=BaseModel)
+# modules whose classes published files know under an earlier name: hashes of configurations hold it
+HOMES = {
+    "tailgate.core.scenario": "tailgate.scenario", "tailgate.core.threat": "tailgate.threat", "tailgate.training.train": "tailgate.train",
+    "tailgate.training.selfplay": "tailgate.selfplay", "tailgate.training.tuning": "tailgate.tuning",
+    "tailgate.training.adaptive": "tailgate.adaptive", "tailgate.core.lossy_link": "tailgate.link",
+}  # fmt: skip
+
+
+def fields_of(cls: type) -> dict[str, Any]:
+    """Name -> dataclasses.Field of the parameters that a user may set."""
+    if not dataclasses.is_dataclass(cls):
+        return {}
+    return {f.name: f for f in dataclasses.fields(cls) if f.init}
+
+
+@cache
+def _adapter(cls: Any) -> TypeAdapter[Any]:
+    try:
+        return TypeAdapter(cls, config=ConfigDict(extra="forbid"))
+    except PydanticUserError:  # the class carries its own configuration
+        return TypeAdapter(cls)
+
+
+def build(cls: type[T], data: dict[str, Any], where: str) -> T:
+    """An instance of dataclass `cls` from `data`; raises InputError that names `where`.field, value and expectation."""
+    known = fields_of(cls)
+    for key in data:
+        if key not in known:
+            raise unknown(f"{where}: unknown field", key, known)
+    if not known:
+        return _made(cls, {}, where)
+    try:
+        adapter = _adapter(cls)  # type: ignore[arg-type]
+    except PydanticSchemaGenerationError:  # a plug-in with fields that are not data: its own constructor decides
+        return _made(cls, data, where)
+    try:
+        return adapter.validate_python(data)  # type: ignore[no-any-return]
+    except ValidationError as error:
+        first = error.errors()[0]
+        if isinstance(inner := first.get("ctx", {}).get("error"), InputError):
+            raise inner from None
+        path = ".".join(str(part) for part in first["loc"]) or cls.__name__
+        raise InputError(f"{where}.{path}", first["input"], wanted(first)) from None
+
+
+def _made(cls: type[T], data: dict[str, Any], where: str) -> T:
+    """What the class's own constructor makes of the data."""
+    try:
+        return cls(**data)
+    except TypeError as error:
+        raise InputError(where, data or None, f"parameters that its constructor takes ({error})") from None
+
+
+def as_data(value: Any) -> Any:
+    """Parameters as plain JSON data: the class, and every default written out, but for empty ones of fields marked `if_any`."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        kind = type(value)
+        shown = [f.name for f in dataclasses.fields(value) if f.init and (getattr(value, f.name) or not f.metadata.get("if_any"))]
+        fields = {name: as_data(getattr(value, name)) for name in shown}
+        return {"class": f"{HOMES.get(kind.__module__, kind.__module__)}.{kind.__qualname__}", **fields}
+    if isinstance(value, dict):
+        return {str(k): as_data(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [as_data(v) for v in value]
+    if isinstance(value, (types.NoneType, bool, int, float, str)):
+        return value
+    if isinstance(value, Path):  # what the file says counts, not where it lies
+        return f"{value.name}#{hashlib.sha256(value.read_bytes()).hexdigest()[:16]}" if value.is_file() else value.name
+    named = value if callable(value) and hasattr(value, "__qualname__") else type(value)  # a repr may hold an address
+    return f"{named.__module__}.{named.__qualname__}"
+
+
+def canonical(value: Any) -> str:
+    """JSON text that is the same for the same parameters: what hashes are taken of."""
+    return json.dumps(as_data(value), sort_keys=True, separators=(",", ":"))
+
+
+def digest(value: Any) -> str:
+    """Sixteen hexadecimal digits that are the same for the same parameters."""
+    return hashlib.blake2b(canonical(value).encode(), digest_size=8).hexdigest()
+
+
+def read_model(model: type[M], path: Path, what: str, made_by: str) -> M:
+    """A JSON file of a model. Raises InputError that names the file, and the field, for anything else than what `made_by` writes."""
+    try:
+        content = read_bytes(path)
+        parse_json(content)
+        return model.model_validate_json(content)
+    except OSError as error:
+        raise InputError(what, str(path), f"a readable report of {made_by} ({said(error)})") from None
+    except ValidationError as error:
+        first = error.errors()[0]
+        field = ".".join(map(str, first["loc"]))
+        if not field:
+            raise InputError(what, str(path), f"a report of {made_by}, which is a JSON object") from None
+        raise InputError(f"{what} {path}: {field}", first["input"] if first["type"] != "missing" else None, wanted(first)) from None
+    except ValueError as error:
+        raise InputError(what, str(path), f"a report of {made_by}, which is a JSON object ({error})") from None
+
+
+def read_yaml(path: Path, where: str) -> dict[str, Any]:
+    """A mapping from a YAML file, read safely."""
+    try:
+        data = load_yaml(path)
+    except OSError as error:
+        raise InputError(where, str(path), f"a readable YAML file ({error.strerror})") from None
+    except ValueError as error:
+        raise InputError(where, str(path), f"valid YAML ({error})") from None
+    if not isinstance(data, dict):
+        raise InputError(where, str(path), "a YAML mapping of fields")
+    return data
+
+
+def scalar(text: str) -> Any:
+    """A command-line value, read as YAML reads a scalar or a flow list ('3', 'true', '[1, 2]', 'none')."""
+    if text.lower() in ("none", "null"):
+        return None
+    try:
+        value = parse_yaml(text)
+    except ValueError:  # no YAML, or a date
+        return text
+    if isinstance(value, str):
+        try:
+            return float(value)  # YAML 1.1 takes 1e5 for text
+        except ValueError:
+            return value
+    return value
+
+
+def override(data: dict[str, Any], assignments: list[str], cls: type) -> dict[str, Any]:
+    """`data`, the fields of `cls`, with dotted `key=value` assignments put in. Whatever is given for a text field is that text."""
+    out: dict[str, Any] = json.loads(json.dumps(data))
+    kinds = get_type_hints(cls)
+    for text in assignments:
+        key, sep, value = text.partition("=")
+        if not sep or not key:
+            raise InputError("override", text, "key=value, for example steps=100000")
+        node = out
+        *parents, leaf = key.split(".")
+        for name in parents:
+            child = node.setdefault(name, {})
+            if not isinstance(child, dict):
+                raise InputError(f"override {key}", value, f"a field below a mapping; {name} is {child!r}")
+            node = child
+        held = scalar(value)
+        if not isinstance(held, (str, list, dict)) and (kinds.get(key) is str or (kinds.get(key) == str | None and held is not None)):
+            held = value.strip("'\"")  # such as nan, 5 or true
+        node[leaf] = "none" if leaf == "defence" and held is None else held  # a defence has this name, and always one
+    return out

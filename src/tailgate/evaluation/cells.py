@@ -1,0 +1,306 @@
+"""Evaluation: cells (scenario x dose x defence x attack) to rows, one per episode.
+
+A row names everything that is needed to play it again. Finished cells are kept beside the output until all are done, so that an
+interrupted run resumes, and a component that crashes costs its own rows only.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import dataclasses
+import hashlib
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import tailgate
+from tailgate.base import sizes, sources
+from tailgate.base.errors import InputError, NotApplicable
+from tailgate.base.files import write_atomic
+from tailgate.base.pool import each
+from tailgate.core import Model, draws
+from tailgate.core.registry import Entry, Spec, entry_for, said, text_of
+from tailgate.core.scenario import Scenario, Suite, load_scenario, load_suite
+from tailgate.core.schema import as_data, canonical
+from tailgate.core.threat import Brief
+from tailgate.evaluation.resume import Parts
+from tailgate.evaluation.rounds import numbered
+from tailgate.evaluation.rows import packed
+from tailgate.play.metrics import METRICS, measure
+from tailgate.play.trace import episode_memory, episodes_at_once, rollout
+
+ENGINE = "plain"
+
+
+@dataclass(frozen=True)
+class Cell:
+    """Episodes that share everything but their seed."""
+
+    suite: str
+    scenario: str
+    dose: int | None
+    defence: str
+    attack: str
+    seeds: int
+    purpose: str = "report"
+    first_seed: int = 0
+    batch: int = 256
+    threat: dict[str, Any] = field(default_factory=dict)
+    beacon: str = ""
+
+    @property
+    def episodes(self) -> Sequence[int]:
+        """Seeds of its episodes: numbers, or those of the round of its beacon."""
+        return numbered(self.beacon, self.suite, self.purpose, self.first_seed, self.seeds)
+
+    def place(self, attack: Any, knowledge: str) -> Scenario:
+        """The scenario under the dose and the knowledge that the attack needs."""
+        changes: dict[str, Any] = dict(self.threat)
+        if self.dose is not None:
+            changes["budget"] = self.dose
+        changes.setdefault("knowledge", getattr(attack, "knowledge", knowledge))
+        if getattr(attack, "sees_measurement", False):
+            changes["sees_measurement"] = True
+        return load_scenario(self.scenario).with_threat(**changes)
+
+
+def _component(family: Any, value: Any) -> tuple[Any, Any, str]:
+    """(object, entry, text) of a spec text or an object."""
+    if isinstance(value, str):
+        spec = Spec(family, value)
+        return spec.make(), spec.entry, value
+    entry = entry_for(family, type(value))
+    return value, entry, text_of(entry, value)
+
+
+def run_cell(cell: Cell, defence: Any = None, attack: Any = None, *, uses: tuple[str, ...] | None = None) -> list[dict[str, Any]]:
+    """The rows of a cell. `defence` and `attack` stand in for the cell's texts when they are objects; `uses`: what is granted to them."""
+    guard, guard_entry, _ = _component("defence", cell.defence if defence is None else defence)
+    rival, rival_entry, _ = _component("attack", cell.attack if attack is None else attack)
+    place = cell.place(rival, rival_entry.knowledge)
+    head = _head(cell, place, guard_entry, rival_entry, cell_id(cell) if defence is None and attack is None else "")
+    rows: list[dict[str, Any]] = []
+    seeds = cell.episodes
+    try:
+        loop = place.loop(guard, guard_entry.uses if uses is None else uses)
+        size = episodes_at_once(loop.model, loop.horizon, cell.batch)
+    except Exception as error:
+        return _failed(head, seeds, *_why(error))
+    for start in range(0, cell.seeds, size):
+        chunk = seeds[start : start + size]
+        try:
+            trace = rollout(loop, rival, draws.keys(cell.purpose, chunk))
+            values = measure(trace)
+        except Exception as error:  # whatever a component raises costs its own rows, and only them
+            rows += _failed(head, chunk, *_why(error, chunk))
+            continue
+        for i, seed in enumerate(chunk):
+            numbers = {name: None if np.isnan(v[i]) else float(v[i]) for name, v in values.items()}
+            hashes = {"trace_hash": trace.trace_hash(i), "decision_hash": trace.decision_hash(i)}
+            rows.append(_own(head) | {"seed": seed, "status": "ok", "reason": "", **numbers, **hashes})
+    return rows
+
+
+def _why(error: Exception, seeds: Sequence[int] = ()) -> tuple[str, str]:
+    """Reason and status of the rows, of these seeds, that an error costs."""
+    if isinstance(error, NotApplicable):
+        return str(error), "skipped"
+    row = error.row if isinstance(error, InputError) else None
+    return said(error) + (f" (row {row}: seed {seeds[row]})" if row is not None and row < len(seeds) else ""), "error"
+
+
+def _head(cell: Cell, place: Scenario, guard: Entry, rival: Entry, identity: str) -> dict[str, Any]:
+    threat = place.threat_model
+    return {
+        "suite": cell.suite, "scenario": place.name, "scenario_file": cell.scenario if cell.scenario.endswith((".yaml", ".yml")) else "",
+        "threat_model": as_data(threat), "dose": threat.budget,
+        "knowledge": threat.knowledge, "defence": cell.defence, "uses": list(guard.uses), "attack": cell.attack,
+        "learned": rival.learned, "optimal": rival.optimal, "purpose": cell.purpose, "beacon": cell.beacon, "batch": cell.batch,
+        "engine": ENGINE, "versions": {"defence": guard.version, "attack": rival.version},
+        "defence_digest": _digest("defence", cell.defence, identity), "attack_digest": _digest("attack", cell.attack, identity),
+        "config_hash": place.config_hash, "version": tailgate.__version__, "cell": identity,
+        "trained": origin(cell.attack) if identity else None,
+    }  # fmt: skip
+
+
+def origin(attack: str) -> dict[str, Any] | None:
+    """How a learned attack was trained, as its file says."""
+    from tailgate.studies.policies import origin_of
+
+    return origin_of(attack)
+
+
+def _digest(family: Any, text: str, identity: str) -> str:
+    """Of the file of a component that is not built in; objects have none."""
+    return Spec(family, text).digest if identity else ""
+
+
+def _failed(head: dict[str, Any], seeds: Iterable[int], reason: str, status: str = "error") -> list[dict[str, Any]]:
+    empty = dict.fromkeys(METRICS) | {"trace_hash": None, "decision_hash": None}
+    text = " ".join(reason.split())[:500]
+    return [_own(head) | {"seed": seed, "status": status, "reason": text, **empty} for seed in seeds]
+
+
+def _own(head: dict[str, Any]) -> dict[str, Any]:
+    """The head of a row that shares nothing with another's."""
+    return {key: copy.deepcopy(value) if isinstance(value, (dict, list)) else value for key, value in head.items()}
+
+
+def failed_rows(cell: Cell, reason: str) -> list[dict[str, Any]]:
+    """The rows of a cell that could not be played."""
+    rival, entry = Spec("attack", cell.attack).make(), Spec("attack", cell.attack).entry
+    head = _head(cell, cell.place(rival, entry.knowledge), Spec("defence", cell.defence).entry, entry, cell_id(cell))
+    return _failed(head, cell.episodes, reason)
+
+
+def cell_id(cell: Cell) -> str:
+    """Of everything that decides a cell's rows: a finished cell with this id is not played again."""
+    data = dataclasses.asdict(cell)
+    data["sources"] = [Spec("defence", cell.defence).digest, Spec("attack", cell.attack).digest]
+    data["scenario"] = load_scenario(cell.scenario).config_hash
+    return hashlib.blake2b(f"{tailgate.__version__}/{sources.own()}/{canonical(data)}".encode(), digest_size=12).hexdigest()
+
+
+@contextlib.contextmanager
+def _sparing() -> Iterator[None]:
+    """Lets bad input through, and nothing else: a pairing without meaning, or a component that breaks, costs its own rows."""
+    try:
+        yield
+    except NotApplicable:
+        return
+    except InputError:
+        raise
+    except Exception:
+        return
+
+
+def cells_of(
+    suite: Suite, *, batch: int = 256, purpose: str = "report", threat: dict[str, Any] | None = None, beacon: str = "", first_seed: int = 0
+) -> list[Cell]:
+    """Every cell of a suite, in its order, from episode `first_seed` on. Raises InputError for anything that does not exist."""
+    if purpose not in draws.PURPOSES:
+        raise InputError("purpose", purpose, f"one of {', '.join(draws.PURPOSES)}")
+    _ = numbered(beacon, suite.name, purpose, 0, 1)  # refuses a beacon that is none
+    changes = suite.granted | dict(threat or {})
+    out = [
+        Cell(suite.name, scenario, dose, defence, attack, suite.seeds, purpose, first_seed, batch, changes, beacon)
+        for scenario in suite.scenarios for dose in suite.doses for defence in suite.defences for attack in suite.attacks
+    ]  # fmt: skip
+    models: dict[str, Model] = {}
+    fitted: set[tuple[str, str]] = set()
+    for cell in out:
+        spec, guard = Spec("attack", cell.attack), Spec("defence", cell.defence)
+        rival, defence = spec.make(), guard.make()
+        place = cell.place(rival, spec.entry.knowledge)
+        if (cell.scenario, cell.defence) not in fitted:  # once: the filter of a large network takes its time
+            fitted.add((cell.scenario, cell.defence))
+            with _sparing():
+                place.loop(defence, guard.entry.uses)
+        if cell.scenario not in models:
+            models[cell.scenario] = model = place.brief().model
+            needed = 2 * episode_memory(model, place.horizon)  # with what is measured of them
+            sizes.fits(needed, f"scenario {place.name}: horizon", place.horizon, "the signals of one episode")
+        brief = Brief(models[cell.scenario], place.threat_model, place.horizon)
+        _ = brief.granted  # names wires and agents that exist
+        with _sparing():
+            rival.prepare(brief)
+    return out
+
+
+def run(
+    cells: Sequence[Cell], out: Path | None = None, workers: int = 1, progress: Callable[[int, int], None] | None = None
+) -> list[dict[str, Any]]:
+    """Rows of all cells in their order. With `out`, cells that an interrupted run finished are not played again."""
+    sizes.check("workers", workers)
+    count = sum(sizes.check("seeds", cell.seeds) for cell in cells)
+    sizes.fits(count * sizes.ROW, "seeds", max((cell.seeds for cell in cells), default=0), f"{count:,} rows")
+    sizes.announce(count / sizes.EPISODES_A_SECOND / workers, count * sizes.ROW, f"{count:,} episodes")
+    ids = [cell_id(cell) for cell in cells]
+    pieces = {i: [(i, seed) for seed in cell.episodes] for i, cell in zip(ids, cells, strict=True)}
+    with contextlib.nullcontext() if out is None else Parts(out) as parts:
+        done = {} if parts is None else parts.finished(pieces)
+        missing = [(i, cell) for i, cell in zip(ids, cells, strict=True) if i not in done]
+        with contextlib.closing(_play([cell for _, cell in missing], workers)) as played:
+            for position, rows in played:
+                done[missing[position][0]] = rows
+                if parts is not None:
+                    parts.put(missing[position][0], rows)
+                if progress is not None:
+                    progress(len(done), len(cells))
+        rows = [row for i in ids for row in done[i]]
+        if parts is not None:
+            parts.finish(rows, pieces)
+    return rows
+
+
+def _play(cells: Sequence[Cell], workers: int) -> Generator[tuple[int, list[dict[str, Any]]]]:
+    foreign = any(Spec("defence", cell.defence).imports or Spec("attack", cell.attack).imports for cell in cells)
+    if not foreign and (workers == 1 or len(cells) < 2):
+        for i, cell in enumerate(cells):
+            yield i, run_cell(cell)
+        return
+    yield from each(
+        run_cell, [(cell,) for cell in cells], workers, lambda i: failed_rows(cells[i], "the process that played this cell died")
+    )
+
+
+def evaluate(
+    suite: str | Suite | None = None,
+    *,
+    defences: Sequence[Any] | None = None,
+    attacks: Sequence[Any] | None = None,
+    scenarios: Sequence[str] | None = None,
+    doses: Sequence[int | None] | None = None,
+    seeds: int | None = None,
+    purpose: str = "report",
+    batch: int = 256,
+    workers: int = 1,
+    out: Path | str | None = None,
+    threat: dict[str, Any] | None = None,
+    beacon: str = "",
+    progress: Callable[[int, int], None] | None = None,
+) -> list[dict[str, Any]]:
+    """Rows of a suite, or of any part of it that is given here; defences and attacks by name or as objects.
+
+    `threat` changes the scenarios' threat models; `beacon` names the round that the episodes belong to.
+    Raises InputError before anything is played.
+    """
+    base = load_suite(suite) if isinstance(suite, str) else suite if suite is not None else Suite(name="custom")
+    guards = list(base.defences if defences is None else defences)
+    rivals = list(base.attacks if attacks is None else attacks)
+    sizes.check("batch", batch)
+    sizes.check("workers", workers)
+    sizes.check("seeds", base.seeds if seeds is None else seeds)
+    named = dataclasses.replace(
+        base,
+        scenarios=tuple(base.scenarios if scenarios is None else scenarios),
+        doses=tuple(base.doses if doses is None else doses),
+        defences=tuple(g for g in guards if isinstance(g, str)),
+        attacks=tuple(r for r in rivals if isinstance(r, str)),
+        seeds=base.seeds if seeds is None else seeds,
+    )
+    for name, value in (("scenarios", named.scenarios), ("defences", guards), ("attacks", rivals)):
+        if not value:
+            raise InputError(name, list(value), "at least one")
+    for dose in named.doses:
+        if dose is not None and (not isinstance(dose, int) or dose < 0):
+            raise InputError("dose", dose, "a whole number of attack steps, not below 0")
+    cells = cells_of(named, batch=batch, purpose=purpose, threat=threat, beacon=beacon)
+    rows = run(cells, Path(out) if out is not None else None, workers, progress) if cells else []
+    for guard in guards:
+        for rival in rivals:
+            if isinstance(guard, str) and isinstance(rival, str):
+                continue
+            texts = _component("defence", guard)[2], _component("attack", rival)[2]
+            for scenario in named.scenarios:
+                for dose in named.doses:
+                    changes = named.threat | dict(threat or {})
+                    cell = Cell(named.name, scenario, dose, *texts, named.seeds, purpose, 0, batch, changes, beacon)
+                    rows += run_cell(cell, guard, rival)
+    if out is not None and len(rows) > sum(cell.seeds for cell in cells):
+        write_atomic(Path(out), packed(rows, Path(out)))  # with the rows of objects
+    return rows

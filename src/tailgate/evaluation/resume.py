@@ -1,0 +1,86 @@
+"""Rows of a long run: what is finished is kept beside the output until all is done, so that an interrupted run goes on."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from tailgate.base.errors import InputError
+from tailgate.base.files import remove, set_aside, sweep, writable_directory, write_atomic
+from tailgate.base.locks import alone
+from tailgate.evaluation.rows import encode, packed, read_rows
+
+Rows = list[dict[str, Any]]
+Wanted = Sequence[tuple[str, int]]  # cell and seed of each row of a piece, in order
+
+
+class Parts:
+    """The pieces of a run that writes to `out`, within `with`, which nobody else may do meanwhile.
+
+    A piece has a name, and is finished when all of its rows are there and none failed.
+    """
+
+    def __init__(self, out: Path) -> None:
+        if out.is_dir():
+            raise InputError("out", str(out), "a file, not a directory")
+        self.out, self.folder = out, out.with_name(f".{out.name}.parts")
+        self.lock = alone(out)
+
+    def __enter__(self) -> Parts:
+        self.lock.__enter__()
+        try:
+            writable_directory(self.folder, asked=self.out)
+            for place in (self.out, self.folder):
+                sweep(place)
+        except BaseException:
+            self.lock.__exit__(None, None, None)
+            raise
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.lock.__exit__(None, None, None)
+
+    def finished(self, pieces: Mapping[str, Wanted]) -> dict[str, Rows]:
+        """Rows of the pieces that an earlier run finished, by name: kept as parts, or in the output itself."""
+        before: dict[tuple[str, int], dict[str, Any]] = {}
+        for row in self._read(self.out):
+            before[str(row.get("cell")), row["seed"]] = row
+        found = {}
+        for name, wanted in pieces.items():
+            for rows in (self._read(self._part(name)), [before[key] for key in wanted if key in before]):
+                if [(row.get("cell"), row["seed"]) for row in rows] == list(wanted) and all(row["status"] != "error" for row in rows):
+                    found[name] = rows
+                    break
+        return found
+
+    def put(self, name: str, rows: Rows) -> None:
+        """Keep the rows of a piece."""
+        write_atomic(self._part(name), encode(rows))
+
+    def finish(self, rows: Rows, pieces: Mapping[str, Wanted]) -> None:
+        """Write all rows, and remove the parts. A file that holds anything but rows of these cells is set aside: it is a result."""
+        if self.out.is_file():
+            cells = {cell for wanted in pieces.values() for cell, _ in wanted}
+            try:
+                held = {row.get("cell") for row in read_rows(self.out)}
+            except InputError:
+                held = {None}
+            if not held <= cells:
+                set_aside(self.out)
+        write_atomic(self.out, packed(rows, self.out))
+        for name in pieces:
+            remove(self._part(name))
+        with contextlib.suppress(OSError):  # something else lies there: not ours to remove
+            self.folder.rmdir()
+
+    def _part(self, name: str) -> Path:
+        return self.folder / f"{name}.jsonl"
+
+    def _read(self, path: Path) -> Rows:
+        """The rows of a file; none where there is none, or where it is damaged: its cells are played again."""
+        try:
+            return read_rows(path) if path.is_file() else []
+        except InputError:
+            return []

@@ -1,0 +1,40 @@
+"""Rounds: everybody on a board plays the same episodes, whose seeds nobody could know when the submissions were made.
+
+Submissions are handed in by their digest; then a beacon becomes public; the seeds of all episodes follow from it. Who comes later waits
+for the next beacon, with which the whole board is played again. Seeds without a beacon are 0, 1, 2, ...: known, and for development.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+
+from tailgate.base.errors import InputError
+from tailgate.core.draws import PURPOSES
+
+SEED_BITS = 53  # whole numbers that every reader of JSON keeps
+SHORTEST = 16  # characters of a beacon
+
+
+def seeds_of(beacon: str, suite: str, purpose: str, count: int) -> list[int]:
+    """Seeds of the first `count` episodes of a suite in the round of a beacon, by keyed BLAKE2b: below 2^53, no two equal.
+
+    The key is the hash of the beacon; the message is suite, purpose and number. Whoever knows the beacon can make them again.
+    """
+    if purpose not in PURPOSES:
+        raise InputError("purpose", purpose, f"one of {', '.join(PURPOSES)}")
+    if len(beacon) < SHORTEST:
+        raise InputError("beacon", beacon, f"at least {SHORTEST} characters that nobody could know when the submissions were made")
+    key = hashlib.blake2b(beacon.encode(), digest_size=32).digest()
+    seeds: dict[int, None] = {}
+    number = 0
+    while len(seeds) < count:
+        digest = hashlib.blake2b(f"{suite}/{purpose}/{number}".encode(), key=key, digest_size=8).digest()
+        seeds[int.from_bytes(digest, "little") >> (64 - SEED_BITS)] = None
+        number += 1
+    return list(seeds)
+
+
+def numbered(beacon: str, suite: str, purpose: str, first: int, count: int) -> Sequence[int]:
+    """Seeds of the episodes first, first + 1, ...: those of a round, or, without a beacon, the numbers themselves."""
+    return seeds_of(beacon, suite, purpose, first + count)[first:] if beacon else range(first, first + count)

@@ -1,0 +1,92 @@
+"""Rows: one JSON object per episode and line, with everything that is needed to play it again. Files that end in .xz are compressed."""
+
+import contextlib
+import json
+import lzma
+from collections.abc import Sequence
+from pathlib import Path
+from sys import intern
+from typing import Annotated, Any, Literal
+
+from pydantic import ConfigDict, Field, ValidationError, create_model
+
+from tailgate.base.errors import InputError, said, wanted
+from tailgate.base.reading import lines_of, parse_json
+from tailgate.play.metrics import METRICS
+
+# What tells one cell from another: rows that differ in one of these are never summed up together.
+KEYS = (
+    "suite", "scenario", "dose", "knowledge", "defence", "attack", "purpose", "config_hash", "version", "defence_digest", "attack_digest",
+)  # fmt: skip
+
+AGAIN = "the command that wrote it makes it whole, given once more"
+_Text = Annotated[str, Field(strict=True)]
+_Number = Annotated[float, Field(strict=True, allow_inf_nan=False)] | None
+_FIELDS: dict[str, Any] = {
+    **{key: (_Text, ...) for key in KEYS}, **{name: (_Number, ...) for name in METRICS},
+    "dose": (Annotated[int, Field(strict=True)] | None, ...), "seed": (Annotated[int, Field(strict=True)], ...),
+    "status": (Literal["ok", "error", "skipped"], ...), "reason": (_Text, ""), "scenario_file": (_Text, ""), "uses": (list[_Text], ...),
+    "learned": (bool, ...), "optimal": (bool, ...),
+}  # fmt: skip
+_Row = create_model("Row", __config__=ConfigDict(extra="allow"), **_FIELDS)
+
+
+def read_rows(path: Path) -> list[dict[str, Any]]:
+    """Rows of a JSON Lines file, checked; raises InputError that names the line."""
+    rows: list[dict[str, Any]] = []
+    lines, number, ahead = lines_of(path), 1, b""
+    try:
+        line = next(lines, b"")
+        while line:
+            ahead = next(lines, b"")
+            damage = "cut" if not ahead and not line.endswith(b"\n") else "damaged" if rows else ""
+            rows.append(_row(line, f"rows {path}, line {number}", damage, number == 1))
+            line, number = ahead, number + 1
+    except (EOFError, lzma.LZMAError) as error:
+        raise InputError("rows", str(path), f"a readable JSON Lines file ({said(error)}): {AGAIN}") from None
+    except OSError as error:
+        raise InputError("rows", str(path), f"a readable JSON Lines file ({said(error)})") from None
+    return rows
+
+
+def _row(line: bytes, where: str, damage: str, first: bool) -> dict[str, Any]:
+    """A line, checked. damage: what became of its file, if it is no JSON object. first: it is the first one."""
+    try:
+        row = parse_json(line)
+    except ValueError as error:
+        loose: Any = None
+        with contextlib.suppress(ValueError):
+            loose = parse_json(line, strict=False)
+        if loose is not None:
+            _check(loose, where)  # NaN and its like are told with their field
+        shown = line[:60].decode("utf-8", "replace").rstrip("\n")
+        cut = f"; the file was {damage} here: {AGAIN}" if damage else ""
+        why = "" if isinstance(error, json.JSONDecodeError) else f" ({error})"
+        a_board = first and (b'"format"' in line[:200] or shown == "{")
+        board = ", a row; a board is played again by `tailgate leaderboard check`" if a_board else ""
+        raise InputError(where, shown, f"a JSON object{why}{board or cut}") from None
+    _check(row, where)
+    if row["status"] == "ok" and row["crashed"] not in (0.0, 1.0):
+        raise InputError(f"{where}: crashed", row["crashed"], "0 or 1")
+    return {intern(key): intern(value) if type(value) is str else value for key, value in row.items()}  # half the memory
+
+
+def _check(row: Any, where: str) -> None:
+    """Raise InputError unless the fields of a row are as they should be."""
+    try:
+        _Row.model_validate(row)
+    except ValidationError as error:
+        found = error.errors()[0]
+        field = ".".join(str(part) for part in found["loc"])
+        held = found["input"] if isinstance(row, dict) and field in row else None
+        raise InputError(f"{where}: {field}", held, wanted(found)) from None
+
+
+def packed(rows: Sequence[dict[str, Any]], path: Path) -> bytes:
+    """What a file of rows holds: JSON Lines, compressed where its name ends in .xz. The same rows give the same bytes."""
+    return lzma.compress(encode(rows), preset=2) if path.suffix == ".xz" else encode(rows)
+
+
+def encode(rows: Sequence[dict[str, Any]]) -> bytes:
+    """Rows as JSON Lines; NaN and infinity are refused."""
+    return "".join(json.dumps(row, allow_nan=False) + "\n" for row in rows).encode()

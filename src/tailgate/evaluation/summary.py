@@ -1,0 +1,47 @@
+"""From rows to the figures that people read: one line per cell, with intervals."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from tailgate.evaluation.rows import KEYS
+from tailgate.evaluation.stats import proportion
+
+
+def summarise(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """One entry per cell (the columns of rows.KEYS), in order of appearance; a seed counts once, its last row.
+
+    crash: share of episodes with a collision in front or behind, with a 95 % Clopper-Pearson interval; the other columns are medians
+    with quartiles. Rows with an error are counted in `failed`; those and skipped pairings are left out of the figures.
+    """
+    groups: dict[tuple[Any, ...], dict[int, dict[str, Any]]] = {}
+    for row in rows:
+        groups.setdefault(tuple(row[key] for key in KEYS), {})[row["seed"]] = row
+    out = []
+    for key, by_seed in groups.items():
+        members = list(by_seed.values())
+        good = [row for row in members if row["status"] == "ok"]
+        entry: dict[str, Any] = dict(zip(KEYS, key, strict=True))
+        entry |= {
+            "n": len(good), "failed": sum(r["status"] == "error" for r in members), "learned": bool(members[0].get("learned")),
+            "optimal": bool(members[0].get("optimal")), "reason": next((r["reason"] for r in members if r["status"] != "ok"), ""),
+        }  # fmt: skip
+        # an attack that the threat model grants nothing of is harmless for that reason alone
+        entry["refused_all"] = bool(good) and all(r["attack_steps"] == 0 and r["refused_commands"] for r in good)
+        if good:
+            share = proportion(sum(bool(r["crashed"]) for r in good), len(good))
+            entry["crash"] = {"value": share.value, "low": share.low, "high": share.high}
+            for name in ("min_gap", "max_error", "rmse_position", "alarm_onsets", "alarm_rate", "attack_steps", "refused_commands"):
+                values = np.array([r[name] for r in good if r[name] is not None], np.float64)
+                if len(values):
+                    low, mid, high = np.quantile(values, [0.25, 0.5, 0.75])
+                    entry[name] = {"median": float(mid), "q25": float(low), "q75": float(high)}
+                else:
+                    entry[name] = None
+        else:
+            entry["crash"] = None
+        out.append(entry)
+    return out

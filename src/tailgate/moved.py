@@ -1,0 +1,55 @@
+"""Import paths of earlier releases: they lead to the modules of today, with a DeprecationWarning. They go with the next release."""
+
+import sys
+import warnings
+from collections.abc import Sequence
+from importlib import import_module
+from importlib.abc import Loader, MetaPathFinder
+from importlib.machinery import ModuleSpec
+from types import ModuleType
+
+ROOMS = {
+    "base": "assets drawing errors files interrupts lazy locks plots pool progress reading sizes sources machine=provenance tree=pytree",
+    "core": "draws kinds loop optimal quantities reach registry scenario schema threat link=lossy_link watch=score_threshold",
+    "engine": "hints",
+    "evaluation": "calibrate golden rounds rows stats summary verify "
+    "clean=attack_free held_out=excluded_attacks parts=resume rivals=baselines",
+    "play": "metrics trace",
+    "studies": "log log_card",
+    "thesis": "bounds resilience string_stability",
+    "training": "adaptive comparison selfplay train trainings tuning",
+}
+PACKAGES = {"commands": "cli", "reproduce": "thesis", "strength": "studies", "submission": "sandbox"}
+
+
+def _table() -> dict[str, str]:
+    out = {f"tailgate.{old}": f"tailgate.{new}" for old, new in PACKAGES.items()}
+    for room, names in ROOMS.items():
+        for name in names.split():
+            old, _, new = name.partition("=")
+            out[f"tailgate.{old}"] = f"tailgate.{room}.{new or old}"
+    return out
+
+
+MOVED = _table()
+
+
+def now(name: str) -> str:
+    """Where a module is today; empty where it has not moved."""
+    head = ".".join(name.split(".")[:2])
+    return MOVED[head] + name[len(head) :] if head in MOVED else ""
+
+
+class Forwarding(MetaPathFinder, Loader):
+    """Finds moved modules by their earlier names."""
+
+    def find_spec(self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None) -> ModuleSpec | None:
+        return ModuleSpec(fullname, self) if now(fullname) else None
+
+    def exec_module(self, module: ModuleType) -> None:
+        name = module.__name__
+        warnings.warn(f"{name} is now {now(name)}", DeprecationWarning, stacklevel=2)
+        sys.modules[name] = import_module(now(name))  # the module itself: a copy would have a registry of its own
+
+
+sys.meta_path.append(Forwarding())

@@ -1,0 +1,1 @@
+"""Episodes, plain or traced: traces, their metrics, and the programs of environments and rollouts."""

@@ -1,0 +1,58 @@
+"""Reasons why code is not traced, and the comparison of two engines."""
+
+from __future__ import annotations
+
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from tailgate.base.errors import InputError
+from tailgate.engine.operations import Array
+from tailgate.engine.untraceable import Untraceable
+
+if TYPE_CHECKING:
+    from tailgate.core.loop import Loop
+
+
+TRIED, ROWS = 24, 64  # steps and episodes in which fresh code is compared with the plain loop
+
+
+class Untraced(NamedTuple):
+    """Why the plain loop plays what somebody asked the engine for."""
+
+    why: str
+
+
+def check_open(loop: Loop) -> None:
+    """Raise TypeError for a defence that runs elsewhere or says itself why it cannot be traced."""
+    defence = loop.defence
+    if why := getattr(defence, "opaque", "") or getattr(defence, "untraced", ""):
+        raise TypeError(f"the defence {type(defence).__name__} is not traced: {why}")
+
+
+def explained(error: Exception) -> str:
+    """Give the text of a failure, with the line of the code that was traced."""
+    if isinstance(error, Untraceable):
+        return str(error)
+    steps = traceback.extract_tb(error.__traceback__)
+    own = [step for step in steps if not step.filename.startswith(str(Path(__file__).parent)) and "/numpy/" not in step.filename]
+    place = f"{own[-1].filename}:{own[-1].lineno}: " if own else ""
+    return f"{place}{type(error).__name__}: {' '.join(str(error).split())[:300]}"
+
+
+def raised(play: Callable[[], Any]) -> Any:
+    """Call, and return the result or the text of its InputError."""
+    try:
+        return play()
+    except InputError as error:
+        return str(error)
+
+
+def same(got: Array, wanted: Array) -> bool:
+    """Equal to the bit, NaN's sign and payload apart."""
+    if got.dtype != wanted.dtype or got.shape != wanted.shape or not np.array_equal(got, wanted, equal_nan=got.dtype.kind == "f"):
+        return False
+    return got.dtype.kind != "f" or bool(((np.signbit(got) == np.signbit(wanted)) | (got != got)).all())

@@ -1,0 +1,156 @@
+"""A traced loop that takes the command of each step: the attack is plain code.
+
+One program serves all attacks on a defence in a scenario. `tailgate.play.rollouts` has the attack in the program as well.
+"""
+
+from __future__ import annotations
+
+import copy
+from typing import Any
+
+import numpy as np
+
+from tailgate.base.pytree import duplicate, leaves, rebuilt
+from tailgate.core import Array, Attack, Command, Kind, View, WhiteBox, draws, no_command
+from tailgate.core.draws import Keys, Role
+from tailgate.core.loop import Loop, LoopState
+from tailgate.engine.parameters import lifted
+from tailgate.engine.program import Call, Program, State, traced
+from tailgate.play.agreement import ROWS, TRIED, Untraced, check_open, raised, same
+from tailgate.play.remembered import Remembered
+from tailgate.play.trace import Recorder, signals_of
+
+
+class Commanded:
+    """The program of a loop that takes commands. Raises whatever its parts raise while they are traced."""
+
+    def __init__(self, loop: Loop) -> None:
+        check_open(loop)
+        self.loop = loop
+        self.values: list[Array] | None = None  # of the parameters, if others than those it was traced with
+        begun = _first(loop)
+        self.rebuilt = rebuilt(_seen(loop, begun))
+        self.program = Program(traced(self._traced, {"loop": begun}, _nothing(loop, 1)._asdict()))
+        results = list(self.program.trace.results)
+        self.names = [name for name in results if name.startswith("seen.")]  # in the order of the leaves
+        self.signals = [(name.partition(".")[2], name) for name in results if name.startswith("signals.")]
+
+    @property
+    def programs(self) -> tuple[Program, ...]:
+        return (self.program,)
+
+    def of(self, loop: Loop, values: list[Array]) -> Commanded:
+        """The same program for a loop of other parameters."""
+        out = copy.copy(self)
+        out.loop, out.values = loop, values
+        return out
+
+    def _traced(self, held: Any, given: Any) -> tuple[Any, Any]:
+        loop = lifted(held["loop"].k.graph, self.loop)
+        state, frame = loop.advance(held["loop"], Command(**given))
+        return {"loop": state}, leaves({"signals": signals_of(frame), "ended": state.ended, "seen": _seen(loop, state)})
+
+    def play(self, attack: Attack, keys: Keys, terminate: bool) -> tuple[Array, dict[str, Array], dict[str, Array]]:
+        """Lengths (B,), signals (K, B, ...) and the road before the first step, as `tailgate.play.trace.Trace` holds them."""
+        loop, batch = self.loop, len(keys.key)
+        begun = loop.start(keys)
+        plan: Any = attack.prepare(loop.brief)
+        memory: Any = attack.start(plan, batch, keys.at(Role.ATTACK, np.zeros(batch, np.int64)))
+        recorder, view, ended, steps = Recorder(loop, begun), loop.sense(begun), begun.ended, Steps(self, begun)
+        for _ in range(loop.horizon):
+            live = ~ended if terminate else np.ones(batch, bool)
+            if not live.any():
+                break
+            memory, command = attack.decide(plan, memory, view, keys.at(Role.ATTACK, view.k))
+            signals, ended, view = steps.play(command)
+            recorder.put(signals, live)
+        trace = recorder.trace()
+        return trace.length, trace.signals, trace.first
+
+
+class Steps:
+    """Steps of a commanded loop from a state of the plain loop on."""
+
+    def __init__(self, commanded: Commanded, begun: LoopState) -> None:
+        self.of, self.k = commanded, begun.k
+        self.state = State(commanded.program, len(begun.k))
+        self.state.put({"loop": begun})
+        self._call = Call(commanded.program, self.state, values=commanded.values)
+
+    def play(self, command: Command) -> tuple[dict[str, Array], Array, View]:
+        """A step under a command: its signals; who has ended (B,) and what an attacker sees, after it."""
+        for name, leaf in zip(Command._fields, command, strict=True):
+            self._call.arguments[name][...] = leaf
+        self._call.begin()
+        self._call.play(1)
+        self._call.sheet.flags.writeable = False  # attacks look at it
+        told = self._call.results()
+        if self._call.broken and not told["demands"].all():
+            raise self.of.program.broken(told["demands"], self.k)
+        self.k = told["seen.view.k"]
+        signals = {name: told[full] for name, full in self.of.signals}
+        return signals, told["ended"], _view(self.of.loop, self.of.rebuilt(told[name] for name in self.of.names))
+
+
+def _first(loop: Loop) -> LoopState:
+    """The state of an episode that begins: an example."""
+    return loop.start(draws.keys("tune", [0]))
+
+
+def _nothing(loop: Loop, batch: int) -> Command:
+    return no_command(batch, loop.model.agents, len(loop.model.wires))
+
+
+def _seen(loop: Loop, state: LoopState) -> dict[str, Any]:
+    """The arrays that an attacker sees."""
+    return _parted(loop.sense(state))
+
+
+def _parted(view: View) -> dict[str, Any]:
+    """The arrays of a view: those of a white box are apart."""
+    box = view.defence
+    return {"view": view._replace(defence=None), "box": None if box is None else (box.state, box.known_u)}
+
+
+def _view(loop: Loop, seen: Any) -> View:
+    view: View = seen["view"]
+    if seen["box"] is None:
+        return view
+    return view._replace(defence=WhiteBox(loop.defence, loop.shown, duplicate(seen["box"][0]), seen["box"][1]))
+
+
+_made: Remembered[Commanded] = Remembered()
+
+
+def commanded(loop: Loop) -> Commanded | Untraced:
+    """The program of a loop that takes commands, once it has been found equal to the plain loop; or why there is none."""
+    return _made.proved(
+        loop, lambda: _seen(loop, _first(loop)), lambda: Commanded(loop), lambda found, values: found.of(loop, values), _difference
+    )
+
+
+def _difference(made: Commanded, batch: int = ROWS) -> str:
+    """Play some steps in both engines, under commands at random; -> what differs first, or nothing."""
+    loop, chance = made.loop, np.random.default_rng(0)
+    kinds = [Kind[name.upper()] for name in loop.threat.kinds] or [Kind.NONE]
+    state = loop.start(draws.keys("tune", range(batch)))
+    steps = Steps(made, state)
+    for step in range(min(TRIED, loop.horizon)):
+        nothing = _nothing(loop, batch)
+        kind = np.where(chance.random(batch) < 0.5, chance.choice(kinds, batch), 0).astype(np.int8)
+        target = loop.brief.granted & (kind != 0)[:, None, None] & (chance.random(nothing.target.shape) < 0.5)
+        command = Command(kind, target, chance.uniform(-2.0, 2.0, nothing.value.shape))
+        found, got = raised(lambda: loop.advance(state, command)), raised(lambda: steps.play(command))  # noqa: B023
+        if isinstance(found, str):
+            return "" if found == got else f"step {step + 1}: {found}"
+        if isinstance(got, str):
+            return f"step {step + 1}: {got}"
+        state, frame = found
+        wanted = leaves(state) | leaves({"signals": signals_of(frame), "seen": _seen(loop, state)})
+        signals, _, view = got
+        held = {name: steps.state.get_leaf(f"loop.{name}") for name in leaves(state)}
+        held |= leaves({"signals": signals, "seen": _parted(view)})
+        for name, leaf in wanted.items():
+            if not same(held[name], leaf):
+                return f"{name}, step {step + 1}"
+    return ""

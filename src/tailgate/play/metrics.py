@@ -1,0 +1,271 @@
+"""Metrics: functions Trace -> (B,) floats, NaN where undefined (null in a row). Names are the columns.
+
+Among several agents a metric of the road is over those that follow another vehicle, in the way that its sentence says; without any it is
+undefined. An estimate's error is that of the gap, or of the whole state's norm where there is no road (`Model.error`).
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from tailgate.core import Array, Model
+from tailgate.play.trace import Trace
+
+TTC_CAP = 100.0  # [s]
+RECOVERY_TOLERANCE = 2.0  # [m]
+DETECTION_DEADLINE = 10  # [steps]
+
+METRICS: dict[str, Callable[[Trace], Array]] = {}
+UNITS: dict[str, str] = {}  # on a road
+ERRORS = ("rmse_position", "max_error", "final_error")  # norms over states of any unit where there is no road
+
+
+def unit_in(name: str, model: Model) -> str:
+    """The unit of a metric in episodes of this model; "-" where it has none, or no one unit."""
+    return "-" if name in ERRORS and not model.followers.any() else UNITS[name]
+
+
+def metric(unit: str) -> Callable[[Callable[[Trace], Array]], Callable[[Trace], Array]]:
+    """Registers a metric under its function's name."""
+
+    def add(function: Callable[[Trace], Array]) -> Callable[[Trace], Array]:
+        METRICS[function.__name__] = function
+        UNITS[function.__name__] = unit
+        return function
+
+    return add
+
+
+def _total(x: Array) -> Array:
+    """Sum over steps in their order: unlike np.sum, the same bits whatever the batch."""
+    return np.asarray(np.add.accumulate(x, axis=0)[-1])
+
+
+def _mean(x: Array, where: Array) -> Array:
+    count = np.count_nonzero(where, axis=0)
+    with np.errstate(invalid="ignore"):
+        return np.asarray(_total(np.where(where, x, 0.0)) / np.where(count, count, np.nan))
+
+
+def _rms(x: Array, where: Array) -> Array:
+    return np.asarray(np.sqrt(_mean(x * x, where)))
+
+
+def _pooled(x: Array, where: Array) -> Array:
+    """Mean over steps and agents of x (K, B, N), in their order."""
+    if not x.shape[2]:
+        return np.full(x.shape[1], np.nan)
+    return _mean(np.concatenate(np.moveaxis(x, 2, 0)), np.concatenate([where] * x.shape[2]))
+
+
+def _road(trace: Trace, name: str) -> Array:
+    """(K, B, followers) of a road signal."""
+    return np.asarray(trace.signals[name][:, :, trace.model.followers])
+
+
+def _before(trace: Trace, name: str) -> Array:
+    """(B, followers) of a road signal before the first step."""
+    return np.asarray(trace.first[name][:, trace.model.followers])
+
+
+def _least(x: Array, where: Array) -> Array:
+    """(B,) smallest of x (K, B, N)."""
+    return np.asarray(np.min(np.where(where[:, :, None], x, np.inf), axis=(0, 2), initial=np.inf))
+
+
+def _finite(x: Array) -> Array:
+    return np.where(np.isfinite(x), x, np.nan)
+
+
+def _attacked(trace: Trace) -> Array:
+    return np.asarray((trace.kind != 0) & trace.live)
+
+
+def _alarm(trace: Trace) -> Array:
+    return np.asarray(trace.alarm.any(axis=2) & trace.live)
+
+
+def _first_step(event: Array) -> Array:
+    """(B,) index of the first True step, NaN where there is none."""
+    return np.where(event.any(axis=0), np.argmax(event, axis=0), np.nan)
+
+
+@metric("0/1")
+def collided(trace: Trace) -> Array:
+    """A car hit the one ahead."""
+    return np.asarray((trace.collided & trace.live).any(axis=0), np.float64)
+
+
+@metric("0/1")
+def rear_collided(trace: Trace) -> Array:
+    """A car behind, no agent, hit the car."""
+    return np.asarray((trace.rear_collided & trace.live).any(axis=0), np.float64)
+
+
+@metric("0/1")
+def crashed(trace: Trace) -> Array:
+    """Either collision: the damage that the safety board counts."""
+    return np.maximum(collided(trace), rear_collided(trace))
+
+
+@metric("m")
+def min_gap(trace: Trace) -> Array:
+    """Smallest gap of any car to the one ahead."""
+    return np.asarray(np.minimum(_least(_road(trace, "gap"), trace.live), np.min(_before(trace, "gap"), axis=1, initial=np.inf)))
+
+
+@metric("m/s")
+def impact_speed(trace: Trace) -> Array:
+    """Closing speed at the first collision with the car ahead, where the gap is smallest, at least 0."""
+    first = _first_step(trace.collided & trace.live)
+    if not trace.model.followers.any():
+        return np.full(trace.batch, np.nan)
+    at = np.where(np.isnan(first), 0, first).astype(np.int64), np.arange(trace.batch)
+    who = np.argmin(_road(trace, "gap")[at], axis=1)[:, None]
+    closing = np.take_along_axis((_road(trace, "speed") - _road(trace, "lead_speed"))[at], who, axis=1)[:, 0]
+    return np.where(np.isnan(first), np.nan, np.maximum(closing, 0.0))
+
+
+@metric("s")
+def min_ttc(trace: Trace) -> Array:
+    """Smallest time to collision of any car, capped at 100 s."""
+    closing = _road(trace, "speed") - _road(trace, "lead_speed")
+    gap = np.maximum(_road(trace, "gap"), 0.0)
+    ttc = np.where(closing > 0.0, gap / np.where(closing > 0.0, closing, 1.0), TTC_CAP)
+    return np.where(trace.model.followers.any(), np.minimum(_least(ttc, trace.live), TTC_CAP), np.nan)
+
+
+@metric("m")
+def rmse_position(trace: Trace) -> Array:
+    """Root mean square error of the estimated position, or gap; without a road of the norm of the state's error."""
+    error, road = trace.model.error(trace.estimate, trace.truth), trace.model.followers
+    error = error[:, :, road] if road.any() else error
+    return np.asarray(np.sqrt(_pooled(error * error, trace.live)))
+
+
+@metric("m/s")
+def rmse_velocity(trace: Trace) -> Array:
+    """Root mean square error of the estimated velocity."""
+    error = trace.model.speed_error(trace.estimate, trace.truth)[:, :, trace.model.followers]
+    return np.asarray(np.sqrt(_pooled(error * error, trace.live)))
+
+
+@metric("m")
+def max_error(trace: Trace) -> Array:
+    """Largest error of an estimated position, or gap; without a road of the norm of the state's error."""
+    error = trace.model.error(trace.estimate, trace.truth)
+    return np.asarray(np.max(np.where(trace.live[:, :, None], error, 0.0), axis=(0, 2)))
+
+
+@metric("m")
+def final_error(trace: Trace) -> Array:
+    """Error of the estimated position, or gap, at the episode's last step, the largest of an agent; without a road of the state's norm."""
+    error = np.max(trace.model.error(trace.estimate, trace.truth), axis=2)
+    return np.asarray(error[trace.length - 1, np.arange(trace.batch)])
+
+
+@metric("s")
+def recovery_time(trace: Trace) -> Array:
+    """From the last attack step until all gap errors stay within 2 m; null without an attack, after a collision, or if it never does."""
+    attacked = _attacked(trace)
+    steps = np.arange(len(attacked))[:, None]
+    last = np.max(np.where(attacked, steps, -1), axis=0)
+    error = np.abs(_road(trace, "gap") - trace.desired_gap(_road(trace, "speed")))
+    restless = np.max(np.where((error > RECOVERY_TOLERANCE).any(axis=2) & trace.live, steps, -1), axis=0)
+    calm_from = np.maximum(restless, last) + 1
+    recovered = (last >= 0) & (calm_from < trace.length) & (crashed(trace) == 0.0) & trace.model.followers.any()
+    return np.where(recovered, (calm_from - last) * trace.dt, np.nan)
+
+
+@metric("steps")
+def detection_delay(trace: Trace) -> Array:
+    """From the first attack step to the first alarm not before it; null if none."""
+    onset = _first_step(_attacked(trace))
+    steps = np.arange(len(trace.kind))[:, None]
+    return np.asarray(_first_step(_alarm(trace) & (steps >= onset)) - onset)
+
+
+@metric("0/1")
+def missed_deadline(trace: Trace) -> Array:
+    """No alarm within 10 steps of the first attack step; null without an attack."""
+    onset, delay = _first_step(_attacked(trace)), detection_delay(trace)
+    late = ~(delay <= DETECTION_DEADLINE)
+    return np.where(np.isnan(onset), np.nan, late.astype(float))
+
+
+@metric("count")
+def alarm_onsets(trace: Trace) -> Array:
+    """Times that the alarm went on."""
+    alarm = _alarm(trace)
+    before = np.concatenate([np.zeros_like(alarm[:1]), alarm[:-1]])
+    return np.asarray(np.count_nonzero(alarm & ~before, axis=0), np.float64)
+
+
+@metric("share")
+def alarm_rate(trace: Trace) -> Array:
+    """Share of the steps with an alarm."""
+    return _mean(_alarm(trace).astype(float), trace.live)
+
+
+@metric("ratio")
+def time_gap_inflation(trace: Trace) -> Array:
+    """Mean gap over the desired gap at the same speed, less one."""
+    desired = trace.desired_gap(_road(trace, "speed"))
+    return _pooled(_road(trace, "gap") / np.maximum(desired, 1e-3) - 1.0, trace.live)
+
+
+@metric("m")
+def distance_travelled(trace: Trace) -> Array:
+    """Distance from the start to the end of the episode, of the car that comes least far."""
+    last = np.maximum(trace.length - 1, 0)
+    moved = _road(trace, "position")[last, np.arange(trace.batch)] - _before(trace, "position")
+    return _finite(np.min(moved, axis=1, initial=np.inf))
+
+
+@metric("m/s^2")
+def max_decel(trace: Trace) -> Array:
+    """Hardest braking of any car that follows another."""
+    hardest = np.max(np.where(trace.live[:, :, None], -_road(trace, "accel"), 0.0), axis=(0, 2), initial=0.0)
+    return np.where(trace.model.followers.any(), hardest, np.nan)
+
+
+@metric("m/s^3")
+def rms_jerk(trace: Trace) -> Array:
+    """Root mean square of the rate of change of the acceleration."""
+    accel = np.concatenate([_before(trace, "accel")[None], _road(trace, "accel")])
+    jerk = (accel[1:] - accel[:-1]) / trace.dt
+    return np.asarray(np.sqrt(_pooled(jerk * jerk, trace.live)))
+
+
+@metric("ratio")
+def string_gain(trace: Trace) -> Array:
+    """Root mean square acceleration of the last car over that of the car ahead of the first; null where that keeps its speed."""
+    if not trace.model.followers.any():
+        return np.full(trace.batch, np.nan)
+    speed = np.concatenate([_before(trace, "lead_speed")[None], _road(trace, "lead_speed")])[:, :, 0]
+    lead = _rms((speed[1:] - speed[:-1]) / trace.dt, trace.live)
+    return np.asarray(_rms(_road(trace, "accel")[:, :, -1], trace.live) / np.where(lead > 0.01, lead, np.nan))
+
+
+@metric("steps")
+def muted_steps(trace: Trace) -> Array:
+    """Steps in which a defence muted its own probe to listen for an attacker: measurements that it gave up."""
+    muted = ~trace.probe.all(axis=2) & trace.live
+    return np.asarray(np.count_nonzero(muted, axis=0), np.float64)
+
+
+@metric("steps")
+def attack_steps(trace: Trace) -> Array:
+    """Steps in which an attack took effect."""
+    return np.asarray(np.count_nonzero(_attacked(trace), axis=0), np.float64)
+
+
+@metric("steps")
+def refused_commands(trace: Trace) -> Array:
+    """Commands that the channel refused."""
+    return np.asarray(np.count_nonzero(trace.refused & trace.live, axis=0), np.float64)
+
+
+def measure(trace: Trace) -> dict[str, Array]:
+    """Every metric of a trace by name, (B,) each, NaN where undefined."""
+    return {name: _finite(function(trace)) for name, function in METRICS.items()}

@@ -1,0 +1,131 @@
+"""Whole episodes of a loop under an attack as a program: what `tailgate.play.trace.rollout` records, with the attack traced as well."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any
+
+import numpy as np
+
+from tailgate.base.pytree import leaves
+from tailgate.core import Attack
+from tailgate.core.draws import Keys, Role
+from tailgate.core.loop import Loop
+from tailgate.engine.operations import Array
+from tailgate.engine.parameters import lifted
+from tailgate.engine.program import Call, Program, State, traced
+from tailgate.play.agreement import ROWS, TRIED, Untraced, check_open, raised, same
+from tailgate.play.remembered import Remembered
+
+STEPS = 32  # between two looks whether an episode is left
+
+
+class Rollout:
+    """The program of a loop under an attack. Raises whatever their parts raise while they are traced."""
+
+    def __init__(self, loop: Loop, attack: Attack, plan: Any) -> None:
+        check_open(loop)
+        self.loop, self.attack, self.plan = loop, attack, plan
+        self.values: list[Array] | None = None  # of the parameters, if others than those it was traced with
+        self.program = Program(traced(self._traced, self.begun(_ONE), {}))
+
+    @property
+    def programs(self) -> tuple[Program, ...]:
+        return (self.program,)
+
+    def of(self, loop: Loop, attack: Attack, plan: Any, values: list[Array]) -> Rollout:
+        """The same program for a loop and an attack of other parameters."""
+        out = copy.copy(self)
+        out.loop, out.attack, out.plan, out.values = loop, attack, plan, values
+        return out
+
+    def begun(self, keys: Keys) -> dict[str, Any]:
+        """The state of episodes that begin."""
+        return _begun(self.loop, self.attack, self.plan, keys)
+
+    def _traced(self, held: Any, given: Any) -> tuple[Any, Any]:
+        loop, attack, plan = lifted(held["loop"].k.graph, (self.loop, self.attack, self.plan))
+        return _step(loop, attack, plan, held)
+
+    def plain(self, held: Any) -> tuple[Any, Any]:
+        """A step of the plain loop: what follows a state, and its signals."""
+        return _step(self.loop, self.attack, self.plan, held)
+
+    def play(self, keys: Keys, terminate: bool) -> tuple[Array, dict[str, Array], dict[str, Array]]:
+        """Lengths (B,), signals (K, B, ...) and the road before the first step, as `tailgate.play.trace.Trace` holds them."""
+        loop, batch, begun = self.loop, len(keys.key), self.begun(keys)
+        first = loop.plant.scene(loop.plan.plant, begun["loop"].plant)._asdict()
+        state = State(self.program, batch)
+        state.put(begun)
+        call = Call(self.program, state, max(2, loop.horizon), self.values)
+        call.begin()
+        signals, done = call.results(), 0
+        demands, ended = signals.pop("demands"), signals.pop("ended")
+        while done < loop.horizon and not (terminate and done and ended[done - 1].all() and state.get_leaf("loop.ended").all()):
+            steps = min(STEPS, loop.horizon - done)
+            call.play(steps)
+            if call.broken:
+                self._demand(demands[done : done + steps], ended[done : done + steps], done, terminate)
+            done += steps
+        length = np.count_nonzero(~ended[:done], axis=0) if terminate else np.full(batch, done)
+        steps = int(length.max(initial=0))
+        return length.astype(np.int64), {name: value[:steps] for name, value in signals.items()}, first
+
+    def _demand(self, held: Array, ended: Array, first: int, terminate: bool) -> None:
+        """Raise what the plain loop would have raised in these steps (K, B, .), of which it plays none when all have ended."""
+        for step in np.flatnonzero(~held.all(axis=(1, 2))):
+            if terminate and ended[step].all():
+                return
+            raise self.program.broken(held[step], np.full(held.shape[1], first + step + 1))
+
+
+def _begun(loop: Loop, attack: Attack, plan: Any, keys: Keys) -> dict[str, Any]:
+    batch = len(keys.key)
+    memory = attack.start(plan, batch, keys.at(Role.ATTACK, np.zeros(batch, np.int64)))
+    return {"loop": loop.start(keys), "memory": memory}
+
+
+def _step(loop: Loop, attack: Attack, plan: Any, held: Any) -> tuple[Any, Any]:
+    from tailgate.play.trace import signals_of
+
+    ended = held["loop"].ended
+    state, memory, frame = loop.step(held["loop"], attack, plan, held["memory"])
+    return {"loop": state, "memory": memory}, signals_of(frame) | {"ended": ended}
+
+
+_ONE = Keys(np.zeros((1, 3), np.uint64), np.zeros(1, np.uint32))
+
+
+_made: Remembered[Rollout] = Remembered()
+
+
+def rollout_of(loop: Loop, attack: Attack) -> Rollout | Untraced:
+    """The program of a loop under an attack, once it has been found equal to the plain loop on this machine; or why there is none."""
+    plan = attack.prepare(loop.brief)
+    return _made.proved(
+        (loop, attack, plan),
+        lambda: loop.sense(_begun(loop, attack, plan, _ONE)["loop"]),
+        lambda: Rollout(loop, attack, plan),
+        lambda found, values: found.of(loop, attack, plan, values),
+        _difference,
+    )
+
+
+def _difference(rollout: Rollout, batch: int = ROWS) -> str:
+    """Play some steps in both engines; -> what differs first, or nothing."""
+    from tailgate.core import draws
+
+    plain = rollout.begun(draws.keys("tune", range(batch)))
+    state = State(rollout.program, batch)
+    state.put(plain)
+    call = Call(rollout.program, state)
+    for step in range(min(TRIED, rollout.loop.horizon)):
+        results, found = call(), raised(lambda: rollout.plain(plain))  # noqa: B023
+        if isinstance(found, str):
+            return "" if not results["demands"].all() else f"step {step + 1}: {found}"
+        plain, wanted = found
+        for name, leaf in (leaves(plain) | wanted).items():
+            got = results[name] if name in wanted else state.get_leaf(name)
+            if not same(got, leaf):
+                return f"{name}, step {step + 1}"
+    return ""

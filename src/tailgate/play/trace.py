@@ -1,0 +1,169 @@
+"""A trace: what happened in B episodes, step by step, and its fingerprints."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from tailgate.core import Array, Attack, Frame, Model
+from tailgate.core.draws import Keys, Role
+from tailgate.core.loop import Loop, LoopState
+from tailgate.core.score_threshold import Watched
+
+WORTH, MANY = 20_000, 1_000_000  # steps for which a loop is traced, and the attack with it: each takes some tenths of a second
+LONG = 300  # steps of an episode for which a loop is traced: the plain loop takes a millisecond for each, however few rows there are
+MEMORY = 1e9  # [bytes] that a trace may take: who plays many episodes plays so many at a time
+Player = Callable[[Keys, bool], tuple[Array, dict[str, Array], dict[str, Array]]]  # keys, terminate: lengths, signals, the road before
+_DECISIONS = ("kind", "target", "alarm", "mode", "refused", "collided", "rear_collided")
+
+
+def signals_of(frame: Frame) -> dict[str, Array]:
+    """What a trace keeps of a step, (B, ...) each."""
+    scene, command, estimate = frame.scene, frame.command, frame.estimate
+    return {
+        "gap": scene.gap, "speed": scene.speed, "accel": scene.accel, "lead_speed": scene.lead_speed, "rear_gap": scene.rear_gap,
+        "rear_speed": scene.rear_speed, "position": scene.position,
+        "truth": frame.truth, "estimate": estimate.x, "score": estimate.score, "clean": frame.clean, "wires": frame.wires,
+        "valid": frame.received.valid, "energy": frame.received.energy, "probe": estimate.probe,
+        "control": frame.control, "applied": frame.applied, "value": command.value,
+        "kind": command.kind, "target": command.target, "alarm": estimate.alarm, "mode": estimate.mode, "refused": frame.refused,
+        "collided": frame.collided, "rear_collided": frame.rear_collided,
+    }  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Trace:
+    """B episodes. `signals` are (K, B, ...); row b is valid for its first length[b] steps (it ends with a collision).
+
+    truth, estimate, wires, commands and what was received belong to step k, `probe` to the measurement at k + 1; the road (gap, speed,
+    ...) to k + 1, after the step. `first` holds the road before the first step.
+    """
+
+    model: Model
+    horizon: int
+    length: Array  # (B,)
+    signals: dict[str, Array]
+    first: dict[str, Array]
+    desired_gap: Callable[[Array], Array]
+
+    @property
+    def dt(self) -> float:
+        return self.model.dt
+
+    def __getattr__(self, name: str) -> Array:
+        try:
+            return self.__dict__["signals"][name]  # type: ignore[no-any-return]
+        except KeyError:
+            raise AttributeError(name) from None
+
+    @property
+    def batch(self) -> int:
+        return len(self.length)
+
+    @property
+    def live(self) -> Array:
+        """(K, B) bool: the steps that belong to the episode."""
+        return np.arange(len(self.kind))[:, None] < self.length
+
+    def _hash(self, row: int, names: list[str]) -> str:
+        digest = hashlib.blake2b(digest_size=16)
+        n = int(self.length[row])
+        digest.update(f"{n}/{self.horizon}/{self.dt!r}".encode())
+        for name in names:
+            column = np.ascontiguousarray(self.signals[name][:n, row])
+            digest.update(f"{name}:{column.dtype.str}:{column.shape}".encode())
+            digest.update(column.tobytes())
+        return digest.hexdigest()
+
+    def trace_hash(self, row: int) -> str:
+        """Of every signal of one episode, to the last bit."""
+        return self._hash(row, sorted(self.signals))
+
+    def decision_hash(self, row: int) -> str:
+        """Of commands, alarms, modes and collisions: the same on every engine and platform."""
+        return self._hash(row, sorted(_DECISIONS))
+
+
+def episodes_at_once(model: Model, horizon: int, most: int) -> int:
+    """How many episodes, at most `most`, can be recorded side by side in MEMORY; at least one. A row does not depend on it."""
+    return int(max(1, min(most, MEMORY // episode_memory(model, horizon))))
+
+
+def episode_memory(model: Model, horizon: int) -> int:
+    """Bytes that the signals of an episode take."""
+    agents, wires = model.agents, len(model.wires)
+    return horizon * (8 * (agents * (model.states + 3 * wires + 9) + model.states) + agents * (2 * wires + 3))
+
+
+class Recorder:
+    """Collects frames into a Trace. A truth that all agents share is stored once."""
+
+    def __init__(self, loop: Loop, state: LoopState) -> None:
+        self.loop = loop
+        self.first = loop.plant.scene(loop.plan.plant, state.plant)._asdict()
+        self.signals: dict[str, Array] = {}
+        self.length = np.zeros(len(state.k), np.int64)
+        self.steps = 0
+
+    def put(self, signals: dict[str, Array], live: Array) -> None:
+        """What `signals_of` gives of a step. `live` (B,): the episodes that this step belongs to."""
+        for name, value in signals.items():
+            held = self.signals.get(name)
+            if name == "truth" and value.strides[1] == 0 and (held is None or held.shape[2] == 1):
+                value = value[:, :1]
+            if held is None:
+                held = self.signals[name] = np.zeros((self.loop.horizon, *value.shape), value.dtype)
+            elif held.shape[1:] != value.shape:  # shared until now
+                held = self.signals[name] = np.repeat(held, value.shape[1], axis=2)
+            held[self.steps] = value
+        self.length += live
+        self.steps += 1
+
+    def trace(self) -> Trace:
+        signals, loop = {name: value[: self.steps] for name, value in self.signals.items()}, self.loop
+        if signals and signals["truth"].shape != signals["estimate"].shape:
+            signals["truth"] = np.broadcast_to(signals["truth"], signals["estimate"].shape)
+        return Trace(loop.model, loop.horizon, self.length, signals, self.first, loop.controller.desired_gap)
+
+
+def rollout(loop: Loop, attack: Attack, keys: Keys, *, terminate: bool = True, plain: bool = False) -> Trace:
+    """Play one episode per key. With `terminate` an episode ends at its first collision, else it runs to the horizon.
+
+    Steps that are worth it are played by a traced loop, where it can be traced; many of them under a traced attack. With `plain` the
+    plain loop plays, to the same bits.
+    """
+    if not plain and isinstance(guard := loop.defence, Watched):
+        seen = rollout(loop.bare, attack, keys, terminate=terminate)
+        return dataclasses.replace(seen, signals=seen.signals | {"alarm": guard.alarms(seen.score)})
+    if not plain and (play := _player(loop, attack, len(keys.key) * loop.horizon)) is not None:
+        return Trace(loop.model, loop.horizon, *play(keys, terminate), loop.controller.desired_gap)
+    state = loop.start(keys)
+    plan = attack.prepare(loop.brief)
+    memory: Any = attack.start(plan, len(keys.key), keys.at(Role.ATTACK, np.zeros(len(keys.key), np.int64)))
+    recorder = Recorder(loop, state)
+    for _ in range(loop.horizon):
+        live = ~state.ended if terminate else np.ones(len(state.k), bool)
+        if not live.any():
+            break
+        state, memory, frame = loop.step(state, attack, plan, memory)
+        recorder.put(signals_of(frame), live)
+    return recorder.trace()
+
+
+def _player(loop: Loop, attack: Attack, steps: int) -> Player | None:
+    """What plays so many steps faster than the plain loop does."""
+    from tailgate.play.agreement import Untraced
+    from tailgate.play.commanded import commanded
+    from tailgate.play.rollouts import rollout_of
+
+    if steps >= MANY and not isinstance(whole := rollout_of(loop, attack), Untraced):
+        return whole.play
+    if (steps >= WORTH or loop.horizon >= LONG) and not isinstance(told := commanded(loop), Untraced):
+        return partial(told.play, attack)
+    return None

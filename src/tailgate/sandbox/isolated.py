@@ -1,0 +1,163 @@
+"""A defence whose class only another process imports."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+from collections.abc import Iterator, Sequence
+from contextvars import ContextVar
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+
+from tailgate.core import Array, Estimate, Model, Prior, Received
+from tailgate.core.draws import Draws
+from tailgate.core.loop import check_estimate
+from tailgate.sandbox.limits import Limits
+from tailgate.sandbox.process import Process
+from tailgate.sandbox.sandbox import Sandbox
+from tailgate.sandbox.wire import Outputs, model_arrays
+
+_veil: ContextVar[bytes] = ContextVar("veil", default=b"")  # a secret of this training; empty where nobody is trained
+_AHEAD = 50  # steps whose processor time is granted at once
+
+
+@contextlib.contextmanager
+def veiled() -> Iterator[None]:
+    """Hides in the keys that isolated defences draw with which episode is played, and that an attacker is trained in it.
+
+    Training seeds are small numbers and episodes are counted: a class that could recognise them would be weak where attackers are trained
+    and itself where it is scored. The secret is new each time, so that a defence which draws is not trained against twice alike.
+    """
+    token = _veil.set(os.urandom(32))
+    try:
+        yield
+    finally:
+        _veil.reset(token)
+
+
+class Veiled(NamedTuple):
+    """Keys as the process is given them, and what they were made of."""
+
+    key: Array  # (B,) uint64
+    episode: Array  # (B,)
+    shown: Array  # (B,) uint64
+    veil: bytes
+
+
+class Tickets(NamedTuple):
+    """What stands for the states that the process keeps: the number of each row's. The process keeps those that were used last."""
+
+    row: Array  # (B,) int64
+
+
+@dataclass(eq=False)
+class IsolatedPlan:
+    """A process with the model prepared, and what was granted to it."""
+
+    process: Process
+    model: Model
+    ticket: int = 0
+    granted: int = 0  # rows times steps that are still granted
+    veiled: Veiled | None = None
+
+
+@dataclass(eq=False)
+class Isolated:
+    """A defence that stands for "module:Class:key=value" and plays it in a process of its own; `prepare` starts one for each plan.
+
+    State stays in that process, so that the loop's state holds tickets only. Close it, or use it in a `with`, to end the processes.
+    """
+
+    untraced: ClassVar[str] = "another process plays it"  # why the engine leaves it to the plain loop
+    text: str
+    source: Path | None = None  # directory that the class is imported from, beside what is installed
+    limits: Limits = field(default_factory=Limits)
+    sandbox: Sandbox | None = None
+    plans: list[IsolatedPlan] = field(default_factory=list)
+
+    @property
+    def card(self) -> dict[str, Any]:
+        """uses, version and reference of the class, asked of a process that ends at once."""
+        with Process(self.text, self.source, self.limits, self.sandbox) as process:
+            return process.card
+
+    def prepare(self, model: Model) -> IsolatedPlan:
+        """A fresh process with the class imported and its constants made."""
+        plan = IsolatedPlan(Process(self.text, self.source, self.limits, self.sandbox), model)
+        self.plans.append(plan)
+        arrays, rest = model_arrays(model)
+        plan.process.ask("prepare", arrays, rest=rest)
+        return plan
+
+    def start(self, plan: IsolatedPlan, prior: Prior) -> Tickets:
+        """States of B episodes."""
+        batch = len(prior.mean)
+        plan.process.ask("start", {"mean": prior.mean, "cov": prior.cov}, ticket=plan.ticket)
+        return _tickets(plan, batch)
+
+    def step(self, plan: IsolatedPlan, state: Tickets, received: Received, known_u: Array, draws: Draws) -> tuple[Tickets, Estimate]:
+        """One step of B episodes, its outputs checked."""
+        state, estimate = self.step_unchecked(plan, state, received, known_u, draws)
+        check_estimate(estimate, plan.model, len(received.y), draws.step)
+        return state, estimate
+
+    def step_unchecked(
+        self, plan: IsolatedPlan, state: Tickets, received: Received, known_u: Array, draws: Draws
+    ) -> tuple[Tickets, Estimate]:
+        """One step; types and shapes are right, numbers may be anything. For who checks row by row, as the mixed batches do.
+
+        The draws hold the key of the party `defence` alone: a hash of its own, which tells nothing of the other parties' keys.
+        """
+        batch, model = len(received.y), plan.model
+        plan.granted -= batch
+        if plan.granted < 0:
+            plan.granted += _AHEAD * batch
+            plan.process.grant(self.limits.steps(_AHEAD, batch, model.agents))
+        arrays = {name: value for name, value in received._asdict().items() if value is not None}
+        key, episode = _shown(plan, draws)
+        arrays |= {"known_u": known_u, "ticket": state.row, "key": key, "episode": episode, "step": draws.step}
+        outputs = Outputs(batch, model.agents, model.states, len(model.actuators))
+        plan.process.make_room(outputs)
+        answer = plan.process.ask("step", arrays, stream=int(draws.stream), ticket=plan.ticket)
+        found = plan.process.read(outputs)
+        fields: dict[str, Any] = found if answer.get("limits") is True else found | {"limits": None}
+        return _tickets(plan, batch), Estimate(**fields)
+
+    def close(self) -> None:
+        """End the processes of all plans."""
+        for plan in self.plans:
+            plan.process.close()
+        self.plans.clear()
+
+    def __enter__(self) -> Isolated:
+        return self
+
+    def __exit__(self, *_: Sequence[Any]) -> None:
+        self.close()
+
+
+def _shown(plan: IsolatedPlan, draws: Draws) -> tuple[Array, Array]:
+    """Key and number of each episode (B,), as the process may know them."""
+    veil = _veil.get()
+    if not veil:
+        return draws.key, draws.episode
+    held = plan.veiled
+    if held is None or held.veil != veil or len(held.key) != len(draws.key):
+        stale, shown = np.ones(len(draws.key), bool), np.zeros_like(draws.key)
+    else:
+        stale, shown = (held.key != draws.key) | (held.episode != draws.episode), held.shown.copy()
+    for i in np.flatnonzero(stale):
+        digest = hashlib.blake2b(f"{int(draws.key[i])}/{int(draws.episode[i])}".encode(), key=veil, digest_size=8).digest()
+        shown[i] = int.from_bytes(digest, "little")
+    plan.veiled = Veiled(draws.key.copy(), draws.episode.copy(), shown, veil)
+    return shown, np.zeros_like(draws.episode)
+
+
+def _tickets(plan: IsolatedPlan, batch: int) -> Tickets:
+    first = plan.ticket
+    plan.ticket += batch
+    return Tickets(np.arange(first, first + batch))

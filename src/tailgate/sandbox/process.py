@@ -1,0 +1,246 @@
+"""Our side of a submission's process: starts the guard, asks, waits no longer than allowed, and reads raw bytes."""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import tailgate
+from tailgate.base.errors import InputError, NotApplicable
+from tailgate.core import Array
+from tailgate.core.registry import USES
+from tailgate.sandbox.limits import Limits, Lost
+from tailgate.sandbox.sandbox import HOME, Sandbox
+from tailgate.sandbox.wire import LINE, Outputs, line, pack, printable
+
+_GUARD = Path(__file__).with_name("guard.py")
+_ROOT = Path(tailgate.__file__).parents[1]
+_ENDING = 30.0  # [s] that the guard may take to kill everything
+
+
+class Verbatim:
+    """A value of which only the text is known."""
+
+    def __init__(self, text: str) -> None:
+        self.text = text
+
+    def __repr__(self) -> str:
+        return self.text
+
+
+class Process:
+    """One process of a submission. Any failure ends it; `ask` then raises Lost with the reason."""
+
+    def __init__(self, text: str, source: Path | None, limits: Limits, sandbox: Sandbox | None) -> None:
+        if sys.platform != "linux":
+            raise InputError("submission", sys.platform, "Linux: elsewhere nothing guards against a submission; use a virtual machine")
+        self.limits, self.lost, self.waited, self.number, self.buffer = limits, "", 0.0, 0, b""
+        self.granted = limits.start_time
+        shared = Path("/dev/shm")
+        self.folder = Path(tempfile.mkdtemp(prefix="tailgate-", dir=shared if os.access(shared, os.W_OK) else None))
+        self.scratch = Path(tempfile.mkdtemp(prefix="tailgate-scratch-"))
+        try:
+            self._spawn(sandbox, source)
+            self.card = self._load(text, source)
+        except BaseException:
+            self.close()
+            raise
+
+    def _spawn(self, sandbox: Sandbox | None, source: Path | None) -> None:
+        self.data, self.out = (os.open(self.folder / name, os.O_RDWR | os.O_CREAT, 0o600) for name in ("in", "out"))
+        options = json.dumps({name: asdict(self.limits)[name] for name in ("memory", "cpu", "file_size")})
+        module = ["-P", "-B", "-m", "tailgate.sandbox.child", str(self.folder), options]
+        home = str(self.scratch) if sandbox is None else HOME
+        inside = _environment(home, str(_ROOT))
+        outside: dict[str, str] | None = inside
+        command, after = [sys.executable, *module], list[str]()
+        if sandbox is not None:
+            command, after = sandbox.command(module, self.folder, source, inside, self.limits)
+            outside = sandbox.outside(inside)
+        child_in, self.ask_fd = os.pipe()
+        self.answer_fd, child_out = os.pipe()
+        job = {
+            "command": command, "environment": outside, "scratch": str(self.scratch), "pipes": [child_in, child_out], "after": after,
+            "remove": [str(self.scratch), str(self.folder)], "cpu": self.granted, "memory": self.limits.memory,
+            "output": self.limits.output, "cpu_limit": self.limits.cpu,
+            "processes": self.limits.processes + (0 if sandbox is None else sandbox.processes),
+        }  # fmt: skip
+        try:
+            self.guard = subprocess.Popen(
+                [sys.executable, "-I", "-S", str(_GUARD), json.dumps(job)], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+                pass_fds=(child_in, child_out), start_new_session=True,
+            )  # fmt: skip
+        finally:
+            os.close(child_in)
+            os.close(child_out)
+
+    def _load(self, text: str, source: Path | None) -> dict[str, Any]:
+        card = self.ask("load", text=text, path=None if source is None else str(source))
+        if card.get("tailgate") != tailgate.__version__:
+            raise InputError("sandbox", card.get("tailgate"), f"an image with tailgate {tailgate.__version__}")
+        uses, version = card.get("uses"), card.get("version")
+        allowed = tuple(use for use in USES if use != "truth")
+        if not isinstance(uses, list) or not all(use in allowed for use in uses) or type(version) is not int:
+            raise InputError("submission: uses, version", [uses, version], f"some of {', '.join(allowed)}, and a whole number")
+        return {"uses": tuple(uses), "version": version, "reference": printable(card.get("reference", ""))}
+
+    def grant(self, seconds: float) -> None:
+        """Allow more processor time [s]."""
+        self.granted += seconds
+        assert self.guard.stdin is not None
+        with suppress(BrokenPipeError):
+            self.guard.stdin.write(line({"cpu": self.granted}))
+            self.guard.stdin.flush()
+
+    def ask(self, op: str, arrays: Mapping[str, Array] | None = None, **rest: Any) -> dict[str, Any]:
+        """The answer to one request. Raises Lost; InputError and NotApplicable as the submission raised them."""
+        if self.lost:
+            raise Lost(self.lost)
+        self.number += 1
+        request: dict[str, Any] = {"id": self.number, "op": op, **rest}
+        if arrays is not None:
+            header, block = pack(arrays)
+            if os.pwrite(self.data, block, 0) != len(block):
+                raise OSError(f"only a part of {len(block)} bytes could be written to {self.folder}")
+            request |= {"arrays": header, "size": len(block)}
+        text = line(request)
+        if len(text) > LINE:
+            raise InputError("submission", f"a request of {len(text)} bytes", f"at most {LINE}: fewer or shorter names")
+        try:
+            os.write(self.ask_fd, text)
+        except BrokenPipeError:
+            self.lose(self._report())
+        try:
+            answer = json.loads(self._line(0.0 if op == "step" else self.limits.start_time))
+            if not isinstance(answer, dict) or answer.get("id") != self.number:
+                raise ValueError
+        except (ValueError, RecursionError):
+            self.lose("answer: not the line of JSON that was asked for")
+        error, ok = answer.get("error"), answer.get("ok")
+        if isinstance(error, dict):
+            self._raise({str(key): printable(value) for key, value in error.items()})
+        if not isinstance(ok, dict):
+            self.lose("answer: neither a result nor an error")
+        return dict(ok)
+
+    def _raise(self, error: dict[str, str]) -> None:
+        """The child's error as ours; it ends the process."""
+        kind, text = error.get("kind", "Exception"), error.get("text", "")
+        self.lost = f"{kind}: {text}"
+        self.close()
+        if "field" in error:
+            cls = NotApplicable if kind == "NotApplicable" else InputError
+            raise cls(error["field"], Verbatim(error.get("value", "")), error.get("expected", ""))
+        raise Lost(self.lost)
+
+    def _line(self, more: float) -> bytes:
+        """The next line of the child, waited for as long as the limits allow, and `more` [s]."""
+        assert self.guard.stdout is not None
+        began, report = time.monotonic(), self.guard.stdout.fileno()
+        allowed = self.limits.silence + self.granted - self.waited  # a sleeper's steps must not add up to days
+        wait = min(self.limits.silence + more, allowed)
+        while b"\n" not in self.buffer:
+            left = wait - (time.monotonic() - began)
+            if left <= 0.0:
+                spent = self.waited + wait
+                self.lose(f"silence: no answer for {wait:g} s" if wait < allowed else f"too slow: {spent:.1f} s of waiting in all")
+            ready, _, _ = select.select([self.answer_fd, report], [], [], left)
+            if self.answer_fd in ready:
+                part = os.read(self.answer_fd, LINE)
+                self.buffer += part
+                if not part:
+                    self.lose(self._report())
+                if len(self.buffer) > LINE:
+                    self.lose("answer: too long")
+            elif ready:
+                self.lose(self._report())
+        found, _, self.buffer = self.buffer.partition(b"\n")
+        if self.buffer:
+            self.lose("answer: more than one line")
+        self.waited += time.monotonic() - began
+        return found
+
+    def _report(self) -> str:
+        """Why the guard ended it."""
+        assert self.guard.stdin is not None and self.guard.stdout is not None
+        why, printed = "", ""
+        ready, _, _ = select.select([self.guard.stdout], [], [], 2.0)
+        if not ready:  # the child closed its pipe and lives on
+            why = "it closed its pipe"
+        else:
+            with suppress(ValueError, KeyError, TypeError):
+                found = json.loads(self.guard.stdout.readline())
+                why, printed = str(found["why"]), printable(" ".join(found["printed"].split())[-160:])
+        return (why or "the process that watched it ended") + (f"; printed last: {printed}" if printed else "")
+
+    def lose(self, reason: str) -> None:
+        """End the process for this reason."""
+        self.lost = reason
+        self.close()
+        raise Lost(reason)
+
+    def make_room(self, outputs: Outputs) -> None:
+        """Let the file `out` be at least as long as a step's results."""
+        if not self.lost and os.fstat(self.out).st_size < outputs.size:
+            os.ftruncate(self.out, outputs.size)
+
+    def read(self, outputs: Outputs) -> dict[str, Array]:
+        """What the child put into the file `out`; our own copies, of the types and shapes that we expect there."""
+        block = os.pread(self.out, outputs.size, 0)
+        if len(block) != outputs.size:
+            self.lose("answer: the file of results was cut")
+        found = {name: np.array(view, order="K") for name, view in outputs.views(block).items()}
+        return found | {name: found[name] != 0 for name in ("alarm", "probe")}
+
+    def close(self) -> None:
+        """End every process of the submission and remove what it wrote; returns when nothing is left."""
+        self.lost = self.lost or "it was closed"
+        guard = getattr(self, "guard", None)
+        if guard is not None and guard.stdin is not None and not guard.stdin.closed:
+            with suppress(BrokenPipeError):
+                guard.stdin.close()
+            try:
+                guard.wait(_ENDING)
+            except subprocess.TimeoutExpired:
+                guard.kill()
+                guard.wait()
+            guard.stdout.close()
+        for name in ("ask_fd", "answer_fd", "data", "out"):
+            if (fd := self.__dict__.pop(name, None)) is not None:
+                os.close(fd)
+        for path in (self.scratch, self.folder):
+            shutil.rmtree(path, ignore_errors=True)
+
+    def __deepcopy__(self, memo: Any) -> Process:
+        return self  # a process cannot be copied, and a plan that holds it is shared
+
+    def __enter__(self) -> Process:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def __del__(self) -> None:
+        with suppress(Exception):
+            self.close()
+
+
+def _environment(home: str, root: str) -> dict[str, str]:
+    """What a submission's process knows of ours: one thread for each library, a scratch directory as home, no variable of the user's."""
+    threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+    kept = {name: os.environ[name] for name in ("PATH", "LD_LIBRARY_PATH") if name in os.environ}
+    own = {"HOME": home, "TMPDIR": home, "PYTHONPATH": root, "PYTHONHASHSEED": "0", "LANG": "C.UTF-8"}
+    return kept | threads | own

@@ -1,0 +1,95 @@
+"""A policy trained again, as its file says it was: the same weights, or not."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import tempfile
+from collections.abc import Callable
+from typing import Any, Literal, NamedTuple
+
+from tailgate.agents.learning import Progress, made_with
+from tailgate.agents.policy import load_policy
+from tailgate.base.errors import InputError
+from tailgate.core.registry import Spec
+from tailgate.training import train
+
+from .collect import packed
+from .policies import Trained, place_of, trained
+
+Verdict = Literal["same", "differs", "unchecked"]
+
+
+class Again(NamedTuple):
+    """What became of one policy; `sha256` of its weights as they are shared, and of those that came out here."""
+
+    policy: str
+    verdict: Verdict
+    why: str = ""
+    sha256: str = ""
+    here: str = ""
+    steps: int = 0
+
+
+def retrain(text: str, progress: Callable[[train.TrainConfig, Progress], None] | None = None) -> Again:
+    """Train the policy of a JSON file, or of the zoo (`zoo:name=NAME`), once more with its configuration and seed, in a temporary folder.
+
+    A record is read and never run: one that names code to import, a scenario that is not built in, or a defence of other files or of
+    another version than here cannot be checked, and the reason is returned. Weights are the same to the last bit on one machine type
+    with the versions of constraints.txt; PPO and what else rests on torch may differ elsewhere, and `why` names what is another here.
+    """
+    try:
+        who = trained(text)
+        config = _config(who)
+    except InputError as error:
+        return Again(text, "unchecked", str(error))
+    with tempfile.TemporaryDirectory(prefix="tailgate-retrain-") as folder:
+        config = dataclasses.replace(config, out=folder)
+
+        def told(seed: int, now: Progress) -> None:
+            if progress is not None:
+                progress(config, now)
+
+        try:
+            (path,) = train.train(config, told)
+        except (InputError, ImportError) as error:  # a learner that is not installed, a field that this version does not know
+            return Again(text, "unchecked", str(error), who.header.sha256)
+        made, _ = load_policy(path)
+        here, there = made.sha256, who.header.sha256
+        if "source_sha256" in who.header.training:  # of the zoo, whose weights are packed: these, as the record might claim any hash
+            here = hashlib.sha256(packed(path.with_name(made.tensors))).hexdigest()
+    steps = int(made.training["steps"])
+    if here == there:
+        return Again(text, "same", "", there, here, steps)
+    return Again(text, "differs", f"weights {there[:12]} there, {here[:12]} here; {_unlike(who)}", there, here, steps)
+
+
+def _unlike(who: Trained) -> str:
+    """In which versions the training of a policy's file was another than one here is, in words."""
+    held, here = who.header.training.get("made_with"), made_with(who.learner)
+    if not isinstance(held, dict):
+        return "not recorded what it was trained with"
+    differing = [f"{key} {str(held.get(key, 'none'))[:40]} there, {mine} here" for key, mine in here.items() if held.get(key) != mine]
+    return "; ".join(differing) or "the same versions and instructions"
+
+
+def _config(who: Trained) -> train.TrainConfig:
+    """The training as the policy's file records it, of the one seed. Raises InputError where it cannot be repeated here."""
+    where, record = f"policy {who.name}: training", who.header.training
+    held = record.get("config")
+    if not isinstance(held, dict) or who.seed is None:
+        raise InputError(where, record.get("seed"), "the configuration and the seed of a training")
+    place_of(who)
+    config = train.checked({key: value for key, value in held.items() if key != "class"})
+    spec = Spec("defence", config.defence)
+    recorded = str(record.get("defence_digest", "")), record.get("defence_version", 1)
+    if recorded != (spec.digest, spec.entry.version):
+        meant = f"version {recorded[1]}, digest {recorded[0] or 'none'}, which is not what is here"
+        raise InputError(f"{where}.defence", config.defence, meant)
+    return dataclasses.replace(config, first_seed=who.seed, seeds=1, workers=1, tensorboard=False, teacher=_teacher(record, config))
+
+
+def _teacher(record: dict[str, Any], config: train.TrainConfig) -> str | None:
+    """The script that was shown: where the best of the rivals was, the record names it, which saves choosing it again."""
+    held = record.get("teacher", config.teacher)
+    return held if held is None or isinstance(held, str) else config.teacher

@@ -1,0 +1,1 @@
+"""Training, tuning and self-play of attackers and defenders."""
