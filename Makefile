@@ -19,6 +19,7 @@ nightly: test-long fuzz crash  ## everything: the long tests and both campaigns,
 lint: $(VENV)/.ready
 	$(BIN)/ruff check .
 	$(BIN)/mypy
+	$(BIN)/lint-imports
 
 bench: $(VENV)/.ready  ## speed beside the peers, in one run; writes benchmarks/results/speed.*
 	$(BIN)/python -m tailgate bench --out benchmarks/results

@@ -1,6 +1,8 @@
 """python train.py [--config FILE] [key=value ...]: train an adversary."""
 
-from tailgate.training.train import main
+import sys
+
+from tailgate.cli import main
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(main(["train", *sys.argv[1:]]))

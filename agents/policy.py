@@ -25,7 +25,7 @@ from tailgate.base.errors import InputError, said
 from tailgate.base.files import write_atomic
 from tailgate.base.reading import TENSORS, load_json, read_bytes, tensors_of
 from tailgate.core import Array, Command, PositiveCount, View, param
-from tailgate.core.draws import Draws, Keys, Role
+from tailgate.core.draws import Draws, Role
 from tailgate.core.registry import register
 from tailgate.core.schema import as_data, build
 from tailgate.core.threat import Brief
@@ -371,13 +371,3 @@ class Yoked:
         keep = on[:, None, None]
         quiet = Command(np.where(on, command.kind, 0).astype(np.int8), command.target & keep, np.where(keep, command.value, 0.0))
         return YokedState(state.row, held), quiet
-
-
-def timing_advantage(loop: Any, policy: PolicyAttack, keys: Keys, outcome: str = "crashed") -> tuple[Array, Array]:
-    """(own, yoked) outcomes (B,) of a policy, a metric: yoked plays the on and off runs of another episode of the same policy."""
-    from tailgate.play.metrics import METRICS
-    from tailgate.studies.timing import played, recorded, yoked_to
-
-    schedules = (None, yoked_to(recorded(loop, policy, keys)))
-    own, yoked = (played(loop, policy, keys, schedule, [METRICS[outcome]])[0] for schedule in schedules)
-    return own, yoked

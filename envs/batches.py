@@ -12,7 +12,7 @@ from tailgate.base.pytree import leaves, with_leaves
 from tailgate.core import Array, Frame, View
 from tailgate.core.draws import Keys
 from tailgate.core.loop import LoopState
-from tailgate.play.agreement import Untraced
+from tailgate.engine.agreement import Untraced
 from tailgate.play.seats import Rows, SeatPrograms, programs_of
 
 from .seat import Outcome, Seat, Tally

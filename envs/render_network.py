@@ -7,8 +7,8 @@ from functools import lru_cache
 
 import numpy as np
 
-from tailgate.base.drawing import edges, layout
 from tailgate.core import Array, Frame
+from tailgate.core.drawing import edges, layout
 from tailgate.core.loop import Loop, LoopState
 
 from .render_canvas import (

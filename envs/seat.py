@@ -134,10 +134,10 @@ class Seat:
 
     def card(self) -> dict[str, Any]:
         """What papers and rows cite: the whole configuration, and its hash."""
-        from tailgate import __version__
+        from tailgate.base.version import VERSION
 
         features, actions = list(self.observation.names), [mode.name for mode in self.action.modes] if self.action.discrete else None
-        card = self.config | {"observation": features, "actions": actions, "version": __version__, "hash": digest(self.config)}
+        card = self.config | {"observation": features, "actions": actions, "version": VERSION, "hash": digest(self.config)}
         return json.loads(json.dumps(card))  # type: ignore[no-any-return]
 
     # -- playing

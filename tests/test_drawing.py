@@ -10,8 +10,8 @@ pytest.importorskip("matplotlib")
 from matplotlib.patches import Circle, FancyArrowPatch
 
 from tailgate import cli
-from tailgate.base.drawing import draw_graph, edges, graph_figure, hops, layout
 from tailgate.base.errors import InputError
+from tailgate.core.drawing import draw_graph, edges, graph_figure, hops, layout
 from tailgate.core.scenario import load_scenario
 from tailgate.envs import CarFollowing, Platoon, SensorNetwork
 from tailgate.envs.network import THESIS_EDGES

@@ -10,8 +10,8 @@ import pytest
 
 from tailgate.base.errors import InputError
 from tailgate.leaderboard.build import build
-from tailgate.leaderboard.words import at_least, breakable, names_of, percent, shade, spans, steps, ticks
 from tailgate.play.metrics import METRICS
+from tailgate.scoring.words import at_least, breakable, names_of, percent, shade, spans, steps, ticks
 
 spec = importlib.util.spec_from_file_location("boards", Path(__file__).with_name("boards.py"))
 boards = importlib.util.module_from_spec(spec)

@@ -13,7 +13,7 @@ from safetensors.numpy import save as save_tensors
 
 from tailgate.agents.codec import ActionCodec, ActionSpec
 from tailgate.agents.observation import ObservationCodec
-from tailgate.agents.policy import Lstm, Memory, Network, PolicyAttack, Yoked, choose, load_policy, save_policy, timing_advantage
+from tailgate.agents.policy import Lstm, Memory, Network, PolicyAttack, Yoked, choose, load_policy, save_policy
 from tailgate.base.errors import InputError
 from tailgate.core import draws
 from tailgate.core.registry import Spec
@@ -22,6 +22,7 @@ from tailgate.envs.faces import AdversaryVectorEnv
 from tailgate.envs.network import SensorNetwork
 from tailgate.play.metrics import METRICS, crashed
 from tailgate.play.trace import Recorder, rollout, signals_of
+from tailgate.studies.timing import timing_advantage
 
 THREAT = {"budget": 20, "kinds": ["dos_jam", "fdi"], "fdi_bound": 5.0}
 SEEDS = list(range(12))

@@ -16,7 +16,7 @@ from tailgate.leaderboard.site import build_site
 from tailgate.leaderboard.site_cards import LICENCE
 from tailgate.leaderboard.site_entry import _imported, replay_of
 from tailgate.leaderboard.site_suite import Suite, critical_of
-from tailgate.leaderboard.words import at_least, percent
+from tailgate.scoring.words import at_least, percent
 
 ROOT = Path(__file__).parent.parent
 spec = importlib.util.spec_from_file_location("boards", Path(__file__).with_name("boards.py"))

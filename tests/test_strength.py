@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from tailgate import cli
-from tailgate.agents.policy import Yoked, timing_advantage
+from tailgate.agents.policy import Yoked
 from tailgate.base.errors import InputError
 from tailgate.core import draws
 from tailgate.core.draws import Role
@@ -22,7 +22,7 @@ from tailgate.studies.collect import add_run
 from tailgate.studies.dose import critical_dose, critical_interval, dose_response, fitted
 from tailgate.studies.figures import dose_figure, timing_figure
 from tailgate.studies.policies import label, loop_for, trained
-from tailgate.studies.timing import periodic, play, shuffled, timing
+from tailgate.studies.timing import periodic, play, shuffled, timing, timing_advantage
 from tailgate.studies.transfer import transfer
 
 spec = importlib.util.spec_from_file_location("strong", Path(__file__).with_name("strong.py"))

@@ -14,10 +14,10 @@ from tailgate.base.errors import InputError
 from tailgate.cli import submit
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import Suite, load_scenario
+from tailgate.engine.agreement import Untraced
 from tailgate.evaluation.cells import Cell, cells_of, run_cell
 from tailgate.evaluation.rounds import seeds_of
 from tailgate.evaluation.rows import read_rows
-from tailgate.play.agreement import Untraced
 from tailgate.play.commanded import commanded
 from tailgate.sandbox import Isolated, digest_of, mixed, play, play_submission
 from tailgate.sandbox.source import staged

@@ -23,12 +23,12 @@ from tailgate.core.scenario import load_scenario
 from tailgate.engine import objects
 from tailgate.engine.evaluation import evaluate
 from tailgate.engine.program import Call, Program, State, traced
+from tailgate.engine.remembered import Remembered
 from tailgate.envs.faces import AdversaryEnv, AdversaryVectorEnv
 from tailgate.envs.seat import Seat
 from tailgate.estimators import ChiSquare, Kalman
 from tailgate.play import rollouts, seats, trace
 from tailgate.play.commanded import Commanded
-from tailgate.play.remembered import Remembered
 from tailgate.play.rollouts import Rollout, rollout_of
 from tailgate.play.seats import SeatPrograms
 from tailgate.play.trace import Trace, rollout

@@ -10,8 +10,8 @@ from tailgate.core import draws
 from tailgate.core.loop import Loop
 from tailgate.core.registry import Spec, entries
 from tailgate.core.scenario import Suite, load_scenario, load_suite
+from tailgate.engine.agreement import Untraced
 from tailgate.envs.seat import Seat
-from tailgate.play.agreement import Untraced
 from tailgate.play.rollouts import Rollout, rollout_of
 from tailgate.play.seats import SeatPrograms, programs_of
 from tailgate.play.trace import Trace, rollout

@@ -23,10 +23,10 @@ from tailgate.evaluation.cells import evaluate, run_cell
 from tailgate.evaluation.rounds import seeds_of
 from tailgate.leaderboard.board_format import read_board
 from tailgate.leaderboard.run import board_of
-from tailgate.leaderboard.words import at_least
 from tailgate.play.metrics import measure
 from tailgate.play.trace import rollout
 from tailgate.scoring.ranks import mcnemar
+from tailgate.scoring.words import at_least
 from tailgate.trust import run as trust_run
 from tailgate.trust.cells import Job, check_cell, outcome, runs_of, single
 from tailgate.trust.false_alarms import false_alarms

@@ -4,21 +4,17 @@
     env = gymnasium.make("tailgate:tailgate/CarFollowing-v0", defence="chi2_kf")
 """
 
-from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
-from tailgate.base import interrupts as interrupts  # first: the imports below take half a second, in which a user may change his mind
-
-try:
-    __version__ = version("tailgate")
-except PackageNotFoundError:  # a source tree that was never installed
-    __version__ = "0+unknown"
-
 from tailgate import moved as moved
+from tailgate.base import interrupts as interrupts  # first: the imports below take half a second, in which a user may change his mind
 from tailgate.base.errors import InputError
+from tailgate.base.version import VERSION as __version__
 from tailgate.core.registry import entries, make
 
-__all__ = ["InputError", "evaluate", "list_attacks", "list_defences", "make_attack", "make_defence", "parallel_env", "per_episode"]
+__all__ = [
+    "InputError", "__version__", "evaluate", "list_attacks", "list_defences", "make_attack", "make_defence", "parallel_env", "per_episode",
+]  # fmt: skip
 
 
 def make_defence(name: str, **params: Any) -> Any:

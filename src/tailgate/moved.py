@@ -9,8 +9,8 @@ from importlib.machinery import ModuleSpec
 from types import ModuleType
 
 ROOMS = {
-    "base": "assets drawing errors files interrupts lazy locks plots pool progress reading sizes sources machine=provenance tree=pytree",
-    "core": "draws kinds loop optimal quantities reach registry scenario schema threat link=lossy_link watch=score_threshold",
+    "base": "assets errors files interrupts lazy locks plots pool progress reading sizes sources machine=provenance tree=pytree",
+    "core": "drawing draws kinds loop optimal quantities reach registry scenario schema threat link=lossy_link watch=score_threshold",
     "engine": "hints",
     "evaluation": "calibrate golden rounds rows stats summary verify "
     "clean=attack_free held_out=excluded_attacks parts=resume rivals=baselines",
@@ -52,4 +52,4 @@ class Forwarding(MetaPathFinder, Loader):
         sys.modules[name] = import_module(now(name))  # the module itself: a copy would have a registry of its own
 
 
-sys.meta_path.append(Forwarding())
+sys.meta_path.insert(0, Forwarding())  # before those that would load a copy from the folder

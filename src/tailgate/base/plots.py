@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from tailgate.base.files import writable_directory, write_atomic
-from tailgate.core import Array
+from tailgate.base.pytree import Array
 
 Table = Sequence[dict[str, Any]]  # of summary.summarise
 PANELS = (  # key, title, colours; each darkens from harmless to harmful

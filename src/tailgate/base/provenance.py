@@ -7,7 +7,7 @@ import platform
 import subprocess
 from pathlib import Path
 
-import tailgate
+from tailgate.base.version import FOLDER
 
 
 def cpuinfo(key: str) -> str:
@@ -33,7 +33,7 @@ def commit() -> str | None:
     """The commit of the source, marked where files differ from it; None outside of a repository."""
 
     def asked(*words: str) -> str:
-        command = ["git", "--no-optional-locks", "-C", str(Path(tailgate.__file__).resolve().parent), *words]
+        command = ["git", "--no-optional-locks", "-C", str(FOLDER.resolve()), *words]
         return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
 
     try:

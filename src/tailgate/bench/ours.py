@@ -24,9 +24,9 @@ from tailgate.core import Array, Command, Estimate, Mode, View, draws
 from tailgate.core.draws import Role
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import Scenario, load_scenario
+from tailgate.engine.agreement import Untraced
 from tailgate.envs.batches import side_by_side
 from tailgate.envs.seat import Seat
-from tailgate.play.agreement import Untraced
 from tailgate.play.seats import Rows, programs_of
 
 from .lines import Go, Missing, Sample, repeated

@@ -10,10 +10,10 @@ from collections.abc import Callable, Iterable, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
-import tailgate
 from tailgate.base import sizes
 from tailgate.base.errors import InputError
 from tailgate.base.provenance import commit, cpuinfo, processor
+from tailgate.base.version import VERSION
 
 from .lines import RATE, Line, Missing
 from .targets import Scaling, Target, chosen, groups
@@ -150,7 +150,7 @@ def bench(
         progress("measuring", total, total, "")
     names, load = {line.name for line in lines}, [round(x, 2) for x in os.getloadavg()] if hasattr(os, "getloadavg") else None
     return {
-        "format": "tailgate-speed-1", "version": tailgate.__version__, "commit": commit(), "machine": machine(),
+        "format": "tailgate-speed-1", "version": VERSION, "commit": commit(), "machine": machine(),
         "load": load, "date": time.strftime("%Y-%m-%d", time.gmtime(started)), "rounds": rounds, "seconds": seconds,
         "targets": [judged(target, measured) for target in targets],
         "lines": {line.name: summary(line, measured.values[line.name]) for line in lines if line.name in measured.values},

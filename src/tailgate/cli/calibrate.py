@@ -11,8 +11,8 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-import tailgate
 from tailgate.base.progress import console, progress
+from tailgate.base.version import VERSION
 
 
 def add(commands: Any) -> None:
@@ -48,7 +48,7 @@ def _calibrate(options: argparse.Namespace) -> int:
             for defence in options.defence for hours in options.hours
         ]  # fmt: skip
     if options.json:
-        print(json.dumps({"command": _command(options), "version": tailgate.__version__, "results": results}, indent=1, allow_nan=False))
+        print(json.dumps({"command": _command(options), "version": VERSION, "results": results}, indent=1, allow_nan=False))
     else:
         _print_results(results)
     return 0

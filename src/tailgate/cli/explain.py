@@ -43,8 +43,8 @@ def _explain(options: argparse.Namespace) -> int:
 def explanation(scenario: str | None, defence: str | None, attack: str | None) -> dict[str, dict[str, str]]:
     """By what is played: `why` it cannot be traced, or the `size` of its code."""
     from tailgate.core.registry import Spec
+    from tailgate.engine.agreement import Untraced
     from tailgate.envs.seat import Seat
-    from tailgate.play.agreement import Untraced
     from tailgate.play.commanded import commanded
     from tailgate.play.rollouts import rollout_of
     from tailgate.play.seats import programs_of

@@ -84,7 +84,7 @@ def _zoo_table(group: list[dict[str, Any]]) -> Table:
 
 
 def _draw(options: argparse.Namespace) -> int:
-    from tailgate.base.drawing import draw_graph, edges
+    from tailgate.core.drawing import draw_graph, edges
     from tailgate.core.scenario import load_scenario
 
     place = load_scenario(options.graph)

@@ -68,7 +68,7 @@ def _train(options: argparse.Namespace) -> int:
             errors.print("the comparison of these policies is there", highlight=False)
         else:
             report = comparison.compare(config, policies, played)
-        page = comparison.make_page(config, report)
+        page = _page(config, report)
     if options.json:
         print(json.dumps(report | {"page": str(page)}, indent=1))
     else:
@@ -98,3 +98,21 @@ def _print_report(report: dict[str, Any]) -> None:
         scale, points = (100.0, " points") if report["unit"] == SHARE else (1.0, "")
         value, low, high = (f"{scale * gain[key]:+.{1 if points else 3}f}" for key in ("value", "low", "high"))
         out.print(f"learned against {name}: {value}{points}, 95 % interval {low} to {high} ({verdict})")
+
+
+def _page(config: Any, report: dict[str, Any]) -> Any:
+    """The page of a finished run."""
+    from tailgate.evaluation.rows import read_rows
+    from tailgate.leaderboard.build import build as build_page
+    from tailgate.training.comparison import ROWS, headline
+    from tailgate.training.train import training_seeds
+    from tailgate.training.trainings import curve_of
+
+    curve = [
+        point for seed in training_seeds(config)
+        for point in curve_of(config.directory / f"curve-{seed}.json")["curve"]
+    ]  # fmt: skip
+    rows = read_rows(config.directory / ROWS)
+    title = f"{config.name}: {config.defence} under attack"
+    drawn = curve if all(point["crash"] is not None for point in curve) else None
+    return build_page(rows, config.directory / "page", title=title, curve=drawn, headline=headline(report))

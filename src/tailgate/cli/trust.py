@@ -161,7 +161,7 @@ def _place(held: dict[str, Any]) -> str:
 
 def _print_bounds(found: dict[str, Any]) -> None:
     """The lower bounds of every defence, at the least and at the most knowledge of the attackers."""
-    from tailgate.leaderboard.words import at_least
+    from tailgate.scoring.words import at_least
 
     out, names = console(), [name for name in ("safety", "trust") if any(name in entry for entry in found["defences"])]
     attacks = [a for a in found["attacks"] if a["attack"] != "none"]

@@ -123,7 +123,7 @@ class Shaped:
     def _code(self, given: Any, constants: Any, shapes: Any) -> tuple[Any, Array]:
         from tailgate.engine.parameters import Parameters, lifted
         from tailgate.engine.program import Program, traced
-        from tailgate.play.remembered import Answers
+        from tailgate.engine.remembered import Answers
 
         parameters = Parameters(constants)
         _shortened(self._made)

@@ -17,11 +17,11 @@ from typing import Any
 
 import numpy as np
 
-import tailgate
 from tailgate.base import sizes, sources
 from tailgate.base.errors import InputError, NotApplicable
 from tailgate.base.files import write_atomic
 from tailgate.base.pool import each
+from tailgate.base.version import VERSION
 from tailgate.core import Model, draws
 from tailgate.core.registry import Entry, Spec, entry_for, said, text_of
 from tailgate.core.scenario import Scenario, Suite, load_scenario, load_suite
@@ -122,7 +122,7 @@ def _head(cell: Cell, place: Scenario, guard: Entry, rival: Entry, identity: str
         "learned": rival.learned, "optimal": rival.optimal, "purpose": cell.purpose, "beacon": cell.beacon, "batch": cell.batch,
         "engine": ENGINE, "versions": {"defence": guard.version, "attack": rival.version},
         "defence_digest": _digest("defence", cell.defence, identity), "attack_digest": _digest("attack", cell.attack, identity),
-        "config_hash": place.config_hash, "version": tailgate.__version__, "cell": identity,
+        "config_hash": place.config_hash, "version": VERSION, "cell": identity,
         "trained": origin(cell.attack) if identity else None,
     }  # fmt: skip
 
@@ -162,7 +162,7 @@ def cell_id(cell: Cell) -> str:
     data = dataclasses.asdict(cell)
     data["sources"] = [Spec("defence", cell.defence).digest, Spec("attack", cell.attack).digest]
     data["scenario"] = load_scenario(cell.scenario).config_hash
-    return hashlib.blake2b(f"{tailgate.__version__}/{sources.own()}/{canonical(data)}".encode(), digest_size=12).hexdigest()
+    return hashlib.blake2b(f"{VERSION}/{sources.own()}/{canonical(data)}".encode(), digest_size=12).hexdigest()
 
 
 @contextlib.contextmanager

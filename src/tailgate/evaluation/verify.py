@@ -13,9 +13,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, cast
 
-import tailgate
 from tailgate.base import sizes
 from tailgate.base.errors import InputError
+from tailgate.base.version import VERSION
 from tailgate.core import draws
 from tailgate.core.draws import constants
 from tailgate.core.registry import SANDBOXES, Spec
@@ -160,8 +160,8 @@ def _cell(row: Row, batch: int | None, trust_code: bool, apart: dict[str, str]) 
     lacks = [name for name in (*HASHES, "threat_model", "engine", "versions") if name not in row]
     if lacks:
         return f"the row does not record {', '.join(lacks)}"
-    if row["version"] != tailgate.__version__:
-        return f"made with tailgate {row['version']}; this is {tailgate.__version__}"
+    if row["version"] != VERSION:
+        return f"made with tailgate {row['version']}; this is {VERSION}"
     if row["engine"] != ENGINE:
         return f"made with the engine {row['engine']!r}; this is {ENGINE!r}"
     if row["purpose"] not in draws.PURPOSES:
@@ -305,7 +305,7 @@ def _report(rows: Sequence[Row], found: list[tuple[int, Finding]], sample: int |
     every = [finding for _, finding in found]
     return {
         "format": "tailgate-verify-1", "status": status(every), "rows": len(rows), "asked": len(found), "sample": sample,
-        "version": tailgate.__version__, "engine": ENGINE, "counts": counts(every),
+        "version": VERSION, "engine": ENGINE, "counts": counts(every),
         "entries": entries(by_defence), "files": [{"file": name, "entries": entries(of)} for name, of in by_file.items()],
         "reasons": [{"why": why, "rows": n} for why, n in sorted(reasons.items(), key=lambda item: -item[1])],
         "findings": [

@@ -18,8 +18,7 @@ from tailgate.core.registry import Entry, entries
 from tailgate.evaluation.summary import summarise
 from tailgate.play.metrics import METRICS
 from tailgate.scoring.entry import reference
-
-from .words import HERE, TITLE, Name, breakable, names_of, percent, shade, spans, steps, ticks
+from tailgate.scoring.words import HERE, TITLE, Name, breakable, names_of, percent, shade, spans, steps, ticks
 
 Data = dict[str, Any]
 COLUMNS = (  # of the table of every cell, after the crash share: key of the summary, heading

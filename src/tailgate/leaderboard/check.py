@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
-import tailgate
 from tailgate.base import sizes
 from tailgate.base.errors import InputError, unknown
+from tailgate.base.version import VERSION
 from tailgate.core.draws import constants
 from tailgate.core.registry import Family, Spec
 from tailgate.core.scenario import Suite, list_suites, load_suite
@@ -155,8 +155,8 @@ def suite_of(board: Board) -> Suite:
 def agree(board: Board, suite: Suite) -> None:
     """Raise InputError for a board of another suite or version than is here."""
     held = board.suite
-    if held.version != tailgate.__version__:
-        raise InputError("board: suite.version", held.version, f"{tailgate.__version__}, which is here")
+    if held.version != VERSION:
+        raise InputError("board: suite.version", held.version, f"{VERSION}, which is here")
     if held.hash != suite.hash:
         raise InputError("board: suite.hash", held.hash, f"{suite.hash}, which the suite {suite.name} has here")
     if held.episodes is None or not 1 <= held.episodes <= 4096:
@@ -246,7 +246,7 @@ def _report(board: Board, asked: list[int], seen: dict[int, Seen], sample: int |
     reasons = Counter(seen[i].why for i in asked if seen[i].verdict == "unchecked")
     counts: Counter[str] = Counter(seen[i].verdict for i in asked)
     return {
-        "format": "tailgate-check-1", "suite": board.suite.name, "version": tailgate.__version__, "cells": len(board.cells),
+        "format": "tailgate-check-1", "suite": board.suite.name, "version": VERSION, "cells": len(board.cells),
         "asked": len(asked), "sample": sample, **({} if sample is None else {"sample_seed": sample_seed}),
         "counts": {verdict: counts[verdict] for verdict in VERDICTS},
         "entries": [

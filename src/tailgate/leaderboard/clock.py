@@ -17,10 +17,10 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-import tailgate
 from tailgate.base import sizes
 from tailgate.base.errors import InputError, NotApplicable
 from tailgate.base.provenance import commit, processor
+from tailgate.base.version import VERSION
 from tailgate.core import draws, no_command
 from tailgate.core.loop import Loop
 from tailgate.core.registry import Spec
@@ -124,7 +124,7 @@ def measure(suite: Suite, defences: Sequence[str] = (), *, rounds: int = ROUNDS,
     model = next(iter(seats.values()))[0].model
     return Clock(
         suite=suite.name, scenario=place.name, agents=model.agents, rounds=rounds, processor=processor(),
-        version=tailgate.__version__, commit=commit(), entries=entries,
+        version=VERSION, commit=commit(), entries=entries,
     )  # fmt: skip
 
 

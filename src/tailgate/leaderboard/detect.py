@@ -11,11 +11,11 @@ from collections.abc import Generator, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import tailgate
 from tailgate.base import sizes
 from tailgate.base.errors import InputError
 from tailgate.base.locks import alone
 from tailgate.base.pool import each
+from tailgate.base.version import VERSION
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import Suite
 from tailgate.scoring.detection import EFFORT, Effort, Progress, detection, plants, stealth_impact
@@ -213,7 +213,7 @@ def check_detection(
         counts[name]["unchecked"] = len(_by_place(held | {"stealth": stealth.get(name)}, name))
     total: Counter[str] = sum(counts.values(), Counter())
     return {
-        "format": "tailgate-check-detection-1", "suite": board.suite.name, "version": tailgate.__version__, "of": len(names),
+        "format": "tailgate-check-detection-1", "suite": board.suite.name, "version": VERSION, "of": len(names),
         "asked": len(asked), "sample": sample, **({} if sample is None else {"sample_seed": sample_seed}),
         "counts": {verdict: total[verdict] for verdict in VERDICTS},
         "entries": [{"defence": name, **{verdict: counts[name][verdict] for verdict in VERDICTS}} for name in asked],

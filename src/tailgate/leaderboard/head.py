@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
+from tailgate.scoring.words import at_least
+
 from .board_format import read_board
 from .order import ordered
-from .words import at_least
 
 Board = dict[str, Any]
 

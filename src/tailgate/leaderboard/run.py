@@ -9,9 +9,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import tailgate
 from tailgate.base.errors import InputError, said
 from tailgate.base.reading import lines_of, load_json, parse_json
+from tailgate.base.version import VERSION
 from tailgate.core.scenario import Suite
 from tailgate.evaluation.cells import evaluate
 from tailgate.evaluation.rows import read_rows
@@ -98,8 +98,8 @@ def board_of(suite: Suite, folder: Path, beacon: str | None = None, keep: bool =
         raise InputError("rows", str(folder), "a folder with rows of `leaderboard run`")
     before = kept_board(folder / BOARD, suite, beacon or "") if keep else load(folder / BOARD) if (folder / BOARD).is_file() else None
     parts = {path: read_rows(path) for path in files}
-    if keep and (other := {row["version"] for rows in parts.values() for row in rows} - {tailgate.__version__}):
-        raise InputError("rows: version", min(other), f"{tailgate.__version__}, as the board's")
+    if keep and (other := {row["version"] for rows in parts.values() for row in rows} - {VERSION}):
+        raise InputError("rows: version", min(other), f"{VERSION}, as the board's")
     board = score(
         (row for rows in parts.values() for row in rows), suite, attacks=admitted.list_of(suite, folder / LIST),
         board=before if keep else None, **options,

@@ -17,9 +17,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import tailgate
 from tailgate.base.files import sweep, write_atomic
 from tailgate.base.provenance import commit, cores, processor
+from tailgate.base.version import VERSION
 from tailgate.core.scenario import Suite
 from tailgate.sandbox.guard import TICK, descendants
 
@@ -46,7 +46,7 @@ class Record:
         self.before = [command.model_dump() for command in held.commands] if held and held.hash == suite.hash else []
         self.began, self.used, self.written, self.played = time.perf_counter(), processor_time(), time.perf_counter(), 0
         self.about = {
-            "workers": workers, "processor": processor(), "cores": cores(), "version": tailgate.__version__, "commit": commit(),
+            "workers": workers, "processor": processor(), "cores": cores(), "version": VERSION, "commit": commit(),
         }  # fmt: skip
 
     def counting(self, told: Callable[..., None]) -> Callable[..., None]:

@@ -18,6 +18,7 @@ from jinja2 import DictLoader, Environment, StrictUndefined
 from tailgate.base.assets import asset, embedded, inline
 from tailgate.base.errors import InputError
 from tailgate.base.files import writable_directory, write_atomic
+from tailgate.scoring.words import HERE, TITLE, breakable
 
 from .board_format import read_board
 from .measured import Measured
@@ -25,7 +26,6 @@ from .order import GROUPS, ordered
 from .site_entry import Replayed, entry_page, replay_of
 from .site_index import section
 from .site_suite import Data, Suite
-from .words import HERE, TITLE, breakable
 
 SUMMARY = "tailgate-site-1"
 MOST = 60  # characters of a file's name that come from a defence's

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from tailgate.evaluation.stats import mean_time
+from tailgate.scoring.words import percent
 
 from .board_parts import AlarmPart
 from .site_suite import Data, Suite
-from .words import percent
 
 FACTOR = 2.0  # times as often as wanted, or as rarely, from which on it is a flag
 APART = 0.75  # of the drives with more false alarms in one half than in the other, from which on it is a flag

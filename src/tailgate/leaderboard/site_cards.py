@@ -16,10 +16,10 @@ from tailgate.core.registry import Entry, Family, built_in
 from tailgate.core.scenario import Suite as Played
 from tailgate.core.scenario import list_suites, load_scenario, load_suite
 from tailgate.core.threat import ThreatModel
+from tailgate.scoring.words import Name
 
 from .board_parts import EntryPart
 from .site_suite import Data, Suite
-from .words import Name
 
 LICENCE = "MIT"  # of the package
 SHOWN = ("name", "summary", "parameters", "knowledge", "learned", "optimal")  # of a card: shown in a place of their own

@@ -13,6 +13,7 @@ from tailgate.core.registry import Spec
 from tailgate.play.metrics import ERRORS, METRICS, UNITS
 from tailgate.replay.page import VERDICTS, outcome, write_page
 from tailgate.replay.replay import play
+from tailgate.scoring.words import names_of, percent
 
 from . import site_alarms
 from .board_parts import LEVELS, CellPart, EntryPart, Robust
@@ -24,7 +25,6 @@ from .site_index import compared_how, comparisons_of
 from .site_suite import Data, Suite, critical_of, dose_text, figure, played, share_of, worse
 from .site_timing import flags_of, timed_of
 from .site_trust import trust_of, trust_page
-from .words import names_of, percent
 
 LEAST = ("progress", "every episode")  # gates whose limit is one from below
 WAYS = ("\N{LESS-THAN OR EQUAL TO}", "\N{GREATER-THAN OR EQUAL TO}")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 
+from tailgate.scoring.words import Name, at_least, percent
 from tailgate.training import adaptive
 
 from . import site_alarms
@@ -15,7 +16,6 @@ from .site_curves import curves_of, stealth_of, together_of
 from .site_suite import Data, Suite, cell_of, critical_of, dose_text, figure, gates_of, played, share_of, worse
 from .site_timing import flags_of
 from .site_trust import trust_cell, trust_of
-from .words import Name, at_least, percent
 
 OWN = ""  # in place of an attack: all that were trained against the row's defence
 TRAINED = Name("trained against it", ("the worst",))

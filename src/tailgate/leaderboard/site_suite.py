@@ -7,10 +7,11 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
+from tailgate.scoring.words import Name, at_least, names_of, percent, shade
+
 from .board_parts import LEVELS, Board, CellPart, Dose, EntryPart, Level, Limited
 from .charts import Axis
 from .order import sort_dose
-from .words import Name, at_least, names_of, percent, shade
 
 Data = dict[str, Any]
 SPREAD = 16  # ratio of the largest dose to the smallest above which doses are drawn on a logarithmic axis at first

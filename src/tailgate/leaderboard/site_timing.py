@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from tailgate.scoring.words import names_of, percent
+
 from .site_suite import Data, dose_text
 from .timing import Timing
-from .words import names_of, percent
 
 TIMES = (  # as the twins of tailgate.studies.timing
     "its own times", "those of another of its episodes (yoked)", "as many steps at random (shuffled)", "as many, evenly spread (periodic)",

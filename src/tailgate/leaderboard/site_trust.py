@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from tailgate.scoring.damage import CLEAN
+from tailgate.scoring.words import at_least
 
 from .board_parts import LEVELS, Bound, EntryPart, Level, TrustPart
 from .site_suite import Data, Suite, dose_text, figure
-from .words import at_least
 
 SPEED, ACCEL = "m/s", "m/s\N{SUPERSCRIPT TWO}"
 UNITS = {

@@ -17,9 +17,9 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
-import tailgate
 from tailgate.base import sizes
 from tailgate.base.errors import InputError, NotApplicable
+from tailgate.base.version import VERSION
 from tailgate.core import Array, draws
 from tailgate.core.scenario import Suite
 from tailgate.core.schema import read_model
@@ -176,7 +176,7 @@ def measure_timing(
     for entry, p in zip(entries, holm([entry.advantage.p for entry in entries]), strict=True):
         entry.advantage.adjusted = p
     return Timing(
-        suite=suite.name, hash=suite.hash, beacon=board["suite"].get("beacon") or "", version=tailgate.__version__, entries=entries,
+        suite=suite.name, hash=suite.hash, beacon=board["suite"].get("beacon") or "", version=VERSION, entries=entries,
         without=without,
     )  # fmt: skip
 

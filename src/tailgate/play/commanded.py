@@ -14,10 +14,10 @@ from tailgate.base.pytree import duplicate, leaves, rebuilt
 from tailgate.core import Array, Attack, Command, Kind, View, WhiteBox, draws, no_command
 from tailgate.core.draws import Keys, Role
 from tailgate.core.loop import Loop, LoopState
+from tailgate.engine.agreement import ROWS, TRIED, Untraced, check_open, raised, same
 from tailgate.engine.parameters import lifted
 from tailgate.engine.program import Call, Program, State, traced
-from tailgate.play.agreement import ROWS, TRIED, Untraced, check_open, raised, same
-from tailgate.play.remembered import Remembered
+from tailgate.engine.remembered import Remembered
 from tailgate.play.trace import Recorder, signals_of
 
 

@@ -11,11 +11,11 @@ from tailgate.base.pytree import leaves
 from tailgate.core import Attack
 from tailgate.core.draws import Keys, Role
 from tailgate.core.loop import Loop
+from tailgate.engine.agreement import ROWS, TRIED, Untraced, check_open, raised, same
 from tailgate.engine.operations import Array
 from tailgate.engine.parameters import lifted
 from tailgate.engine.program import Call, Program, State, traced
-from tailgate.play.agreement import ROWS, TRIED, Untraced, check_open, raised, same
-from tailgate.play.remembered import Remembered
+from tailgate.engine.remembered import Remembered
 
 STEPS = 32  # between two looks whether an episode is left
 

@@ -17,15 +17,14 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from tailgate.agents.observation import ObservationCodec
 from tailgate.base.pytree import leaves, map_leaves
 from tailgate.core import draws
 from tailgate.core.draws import Keys
+from tailgate.engine.agreement import ROWS, TRIED, Untraced, check_open, raised, same
 from tailgate.engine.operations import Array
 from tailgate.engine.parameters import lifted
 from tailgate.engine.program import Call, Program, State, Trace, traced
-from tailgate.play.agreement import ROWS, TRIED, Untraced, check_open, raised, same
-from tailgate.play.remembered import Remembered
+from tailgate.engine.remembered import Remembered
 
 if TYPE_CHECKING:
     from tailgate.envs.seat import Seat
@@ -110,7 +109,7 @@ def _several(seat: Seat) -> bool:
 
 def _shown_once(seat: Seat) -> Seat:
     """The seat as it is traced: it shows one frame."""
-    return dataclasses.replace(seat, observation=ObservationCodec(seat.loop.brief), config={})
+    return dataclasses.replace(seat, observation=type(seat.observation)(seat.loop.brief), config={})
 
 
 def _twins(decide: Trace, begin: Trace, *others: Trace) -> dict[str, str]:

@@ -158,7 +158,7 @@ def rollout(loop: Loop, attack: Attack, keys: Keys, *, terminate: bool = True, p
 
 def _player(loop: Loop, attack: Attack, steps: int) -> Player | None:
     """What plays so many steps faster than the plain loop does."""
-    from tailgate.play.agreement import Untraced
+    from tailgate.engine.agreement import Untraced
     from tailgate.play.commanded import commanded
     from tailgate.play.rollouts import rollout_of
 

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from tailgate.base.drawing import edges, hops, layout
 from tailgate.base.errors import InputError
 from tailgate.core import AIRED, Array, Kind, Mode
+from tailgate.core.drawing import edges, hops, layout
 
 from .replay import Replay, threshold
 

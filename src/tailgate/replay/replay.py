@@ -15,9 +15,9 @@ from typing import Any, Literal
 
 import numpy as np
 
-import tailgate
 from tailgate.base.errors import InputError
 from tailgate.base.pytree import duplicate
+from tailgate.base.version import VERSION
 from tailgate.core import Array, Attack, Frame, draws
 from tailgate.core.draws import Keys, Role
 from tailgate.core.loop import Loop, LoopState
@@ -207,7 +207,7 @@ def play(row: Row, allowed: Filter | None = None) -> Replay:
     metrics = {name: None if np.isnan(value[0]) else float(value[0]) for name, value in measure(trace).items()}
     versions = {"defence": guard.entry.version, "attack": rival.entry.version}
     here = {
-        "trace_hash": trace.trace_hash(0), "decision_hash": trace.decision_hash(0), "version": tailgate.__version__,
+        "trace_hash": trace.trace_hash(0), "decision_hash": trace.decision_hash(0), "version": VERSION,
         "config_hash": place.config_hash, "engine": ENGINE, "versions": ", ".join(f"{k} {v}" for k, v in versions.items()),
         "defence_digest": guard.digest, "attack_digest": rival.digest, "dose": _text(place.threat_model.budget),
         "knowledge": place.threat_model.knowledge, "uses": ", ".join(guard.entry.uses),

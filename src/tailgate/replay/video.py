@@ -16,7 +16,7 @@ from tailgate.base.errors import InputError
 from tailgate.base.files import replacing, writable_directory, write_atomic
 from tailgate.core import Array
 from tailgate.envs.render_viewer import Viewer
-from tailgate.leaderboard.words import names_of
+from tailgate.scoring.words import names_of
 
 from .replay import Replay, episode
 

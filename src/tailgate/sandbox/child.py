@@ -17,9 +17,9 @@ from typing import Any
 
 import numpy as np
 
-import tailgate
 from tailgate.base.errors import InputError
 from tailgate.base.pytree import map_leaves
+from tailgate.base.version import VERSION
 from tailgate.core import Array, Model, Prior, Received, pair_of
 from tailgate.core.draws import Draws
 from tailgate.core.registry import Spec
@@ -61,7 +61,7 @@ class Child:
             if path is None or not isinstance(error.__context__, ImportError):
                 raise
             raise InputError(error.field, error.value, f"{error.expected}; nothing beside the submitted file or folder is found") from None
-        return {"uses": list(entry.uses), "version": entry.version, "reference": entry.reference, "tailgate": tailgate.__version__}
+        return {"uses": list(entry.uses), "version": entry.version, "reference": entry.reference, "tailgate": VERSION}
 
     def prepare(self, arrays: dict[str, Array], rest: dict[str, Any]) -> dict[str, Any]:
         self.model = model_of(arrays, rest)

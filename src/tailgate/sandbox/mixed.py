@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-import tailgate
 from tailgate.base import sources
 from tailgate.base.errors import InputError, NotApplicable
+from tailgate.base.version import VERSION
 from tailgate.core import draws
 from tailgate.core.registry import Entry, Spec
 from tailgate.core.scenario import Scenario
@@ -87,7 +87,7 @@ def identity(cell: Cell, submission: Submission, seeds: Sequence[int], place: Sc
     data = dataclasses.asdict(cell) | {"seeds": list(seeds), "digest": submission.source.digest, "scenario": place.config_hash}
     data |= {"attack_digest": Spec("attack", cell.attack).digest, "limits": dataclasses.asdict(submission.limits)}
     sandbox = "" if submission.sandbox is None else submission.sandbox.program
-    return hashlib.blake2b(f"{tailgate.__version__}/{sources.own()}/{sandbox}/{canonical(data)}".encode(), digest_size=12).hexdigest()
+    return hashlib.blake2b(f"{VERSION}/{sources.own()}/{sandbox}/{canonical(data)}".encode(), digest_size=12).hexdigest()
 
 
 def part_of(cell: Cell, submission: Submission, seeds: Sequence[int]) -> _Part:

@@ -18,8 +18,8 @@ from typing import Any
 
 import numpy as np
 
-import tailgate
 from tailgate.base.errors import InputError, NotApplicable
+from tailgate.base.version import FOLDER, VERSION
 from tailgate.core import Array
 from tailgate.core.registry import USES
 from tailgate.sandbox.limits import Limits, Lost
@@ -27,7 +27,7 @@ from tailgate.sandbox.sandbox import HOME, Sandbox
 from tailgate.sandbox.wire import LINE, Outputs, line, pack, printable
 
 _GUARD = Path(__file__).with_name("guard.py")
-_ROOT = Path(tailgate.__file__).parents[1]
+_ROOT = FOLDER.parent
 _ENDING = 30.0  # [s] that the guard may take to kill everything
 
 
@@ -89,8 +89,8 @@ class Process:
 
     def _load(self, text: str, source: Path | None) -> dict[str, Any]:
         card = self.ask("load", text=text, path=None if source is None else str(source))
-        if card.get("tailgate") != tailgate.__version__:
-            raise InputError("sandbox", card.get("tailgate"), f"an image with tailgate {tailgate.__version__}")
+        if card.get("tailgate") != VERSION:
+            raise InputError("sandbox", card.get("tailgate"), f"an image with tailgate {VERSION}")
         uses, version = card.get("uses"), card.get("version")
         allowed = tuple(use for use in USES if use != "truth")
         if not isinstance(uses, list) or not all(use in allowed for use in uses) or type(version) is not int:

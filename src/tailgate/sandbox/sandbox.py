@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
 
-import tailgate
 from tailgate.base.errors import InputError
+from tailgate.base.version import FOLDER
 from tailgate.core import param
 from tailgate.engine.objects import folder as kept_objects
 from tailgate.sandbox.limits import Limits
@@ -67,7 +67,7 @@ def sandbox_of(text: str | None) -> Sandbox | None:
 
 def bwrap(folder: Path, source: Path | None, limits: Limits) -> list[str]:
     """bubblewrap: new namespaces of every kind, so no network and no other process; what is bound can only be read, but for `out`."""
-    package = Path(tailgate.__file__).parent
+    package = FOLDER
     parts = [package, *(path.resolve() for path in package.iterdir() if path.is_symlink())]
     prefixes = dict.fromkeys(str(Path(path)) for path in (sys.prefix, sys.base_prefix, *map(str, parts)))
     out = ["bwrap", "--unshare-all", "--die-with-parent", "--new-session", "--cap-drop", "ALL", "--hostname", "submission"]

@@ -7,8 +7,8 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
-import tailgate
 from tailgate.base.errors import InputError
+from tailgate.base.version import VERSION
 from tailgate.core.scenario import Suite
 from tailgate.core.threat import KNOWLEDGE
 from tailgate.studies.dose import CRITICAL
@@ -77,7 +77,7 @@ def score(
 def _suite(table: Table, alpha: float) -> Data:
     suite = table.suite
     return {
-        "name": suite.name, "about": suite.about, "version": tailgate.__version__, "hash": suite.hash, "doses": list(table.doses),
+        "name": suite.name, "about": suite.about, "version": VERSION, "hash": suite.hash, "doses": list(table.doses),
         "shown": {str(dose): why for dose, why in suite.shown.items()}, "limit": CRITICAL, "bound": suite.bound, "alpha": alpha,
         "scenarios": [
             {"name": name, "about": place.about, "robustness": name in suite.robustness, "hash": place.config_hash}

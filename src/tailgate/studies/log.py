@@ -18,13 +18,13 @@ from typing import Any
 
 import numpy as np
 
-import tailgate
 from tailgate.base import sizes
 from tailgate.base.errors import InputError, NotApplicable
 from tailgate.base.files import replacing, sweep, writable_directory, write_atomic
 from tailgate.base.locks import alone
 from tailgate.base.pytree import duplicate
 from tailgate.base.reading import load_json
+from tailgate.base.version import VERSION
 from tailgate.core import Array, Frame, Model, draws
 from tailgate.core.draws import Role
 from tailgate.core.kinds import Kind, Mode
@@ -158,7 +158,7 @@ def _written(
         for split in SPLITS for scenario in chosen.scenarios if scenario in columns
     ]  # fmt: skip
     held = {
-        "format": FORMAT, "identity": identity, "suite": base.name, "about": base.about, "version": tailgate.__version__,
+        "format": FORMAT, "identity": identity, "suite": base.name, "about": base.about, "version": VERSION,
         "held_out": sorted(_held_out(base)), "left_out": [text for text in base.attacks if _hidden(base, text)], "splits": SPLITS,
         "attacks": list(chosen.attacks), "defences": list(chosen.defences), "doses": list(chosen.doses), "files": files, "skipped": skipped,
         "scenarios": {

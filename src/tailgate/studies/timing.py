@@ -90,6 +90,13 @@ def yoked_to(schedule: Array) -> Array:
     return np.roll(schedule, 1, axis=1)
 
 
+def timing_advantage(loop: Any, policy: PolicyAttack, keys: Keys, outcome: str = "crashed") -> tuple[Array, Array]:
+    """(own, yoked) outcomes (B,) of a policy, a metric: yoked plays the on and off runs of another episode of the same policy."""
+    schedules = (None, yoked_to(recorded(loop, policy, keys)))
+    own, yoked = (played(loop, policy, keys, schedule, [METRICS[outcome]])[0] for schedule in schedules)
+    return own, yoked
+
+
 def schedules(loop: Loop, policy: PolicyAttack, keys: Keys) -> dict[str, Array | None]:
     """(K, B) bool of each twin: when it attacks; none for the policy itself, which decides as it goes."""
     times = recorded(loop, policy, keys)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from tailgate.base.drawing import graph_figure
 from tailgate.base.plots import canvas, png
+from tailgate.core.drawing import graph_figure
 from tailgate.core.scenario import load_scenario
 
 from .ch5_figures import COLOURS, MARKERS

@@ -15,11 +15,11 @@ from typing import Any
 from jinja2 import Environment, FunctionLoader, StrictUndefined
 from markupsafe import Markup, escape
 
-import tailgate
 from tailgate.base import sizes
 from tailgate.base.errors import InputError, unknown
 from tailgate.base.files import writable_directory, write_atomic
 from tailgate.base.reading import load_json
+from tailgate.base.version import VERSION
 
 from . import whole_theorems
 from .claims import Claim, Figure, Report, Table
@@ -86,7 +86,7 @@ def summary(*reports: Report) -> str:
 
 def markdown(report: Report) -> str:
     """The report as a Markdown text; figures as files beside it."""
-    return "\n".join([f"# {report.title}", "", f"{summary(report)}. Tailgate {tailgate.__version__}.", "", *body(report)]) + "\n"
+    return "\n".join([f"# {report.title}", "", f"{summary(report)}. Tailgate {VERSION}.", "", *body(report)]) + "\n"
 
 
 def body(report: Report, beside: str = "", level: str = "##") -> list[str]:
@@ -117,7 +117,7 @@ def _cell(text: str) -> str:
 
 def html(report: Report) -> str:
     """One self-contained page."""
-    return page("page.html", report=report, summary=summary(report), version=tailgate.__version__)
+    return page("page.html", report=report, summary=summary(report), version=VERSION)
 
 
 def page(name: str, **values: Any) -> str:
@@ -135,7 +135,7 @@ def prose(text: str) -> Markup:
 def write(report: Report, directory: Path, **stamp: Any) -> Path:
     """report.json, report.md, index.html and a PNG per figure; returns the page. `stamp`: further fields of report.json."""
     writable_directory(directory)
-    data = {"chapter": report.chapter, "title": report.title, "version": tailgate.__version__, **stamp, "settings": report.settings}
+    data = {"chapter": report.chapter, "title": report.title, "version": VERSION, **stamp, "settings": report.settings}
     data |= {"claims": as_json(report), "tables": [dataclasses.asdict(table) for table in report.tables]}
     data["figures"] = [{"name": figure.name, "caption": figure.caption} for figure in report.figures]
     for figure in report.figures:

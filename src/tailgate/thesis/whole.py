@@ -10,11 +10,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import tailgate
 from tailgate.base import sources
 from tailgate.base.errors import InputError
 from tailgate.base.files import sweep, writable_directory, write_atomic
 from tailgate.base.locks import alone
+from tailgate.base.version import VERSION
 from tailgate.core import param
 from tailgate.core.schema import build, read_yaml
 
@@ -104,7 +104,7 @@ def _chapter(name: str, seeds: int, place: Path, tick: Callable[[str], None], pl
     writable_directory(place)
     stamp = {"seeds": seeds, "sources": sources.own()}
     found = read(place)
-    if found and all(found[1].get(key) == value for key, value in {"version": tailgate.__version__, **stamp}.items()):
+    if found and all(found[1].get(key) == value for key, value in {"version": VERSION, **stamp}.items()):
         tick(f"{name}: finished before, in {found[1]['seconds']:.0f} s")
         return found[0], float(found[1]["seconds"]), True
     begin = time.monotonic()
@@ -123,7 +123,7 @@ def facts(whole: Whole) -> dict[str, str]:
         "seeds": f"{whole.seeds} where a chapter does not say otherwise",
         "run time": f"{total / 60.0:.1f} minutes of wall-clock time" + (f", of which earlier: {kept}" if kept else ""),
         "measured": "median [quartiles] over seeds, or a share with its exact 95 % interval, where nothing else is said",
-        "Tailgate": tailgate.__version__,
+        "Tailgate": VERSION,
     }
 
 
@@ -156,7 +156,7 @@ def markdown(whole: Whole) -> str:
 def as_data(whole: Whole) -> dict[str, Any]:
     """The report as JSON data."""
     return {
-        "title": TITLE, "version": tailgate.__version__, "seeds": whole.seeds, "sources": whole.sources, "seconds": whole.seconds,
+        "title": TITLE, "version": VERSION, "seeds": whole.seeds, "sources": whole.sources, "seconds": whole.seconds,
         "chapters": {
             r.chapter: {
                 "title": r.title, "settings": r.settings, "claims": as_json(r), "tables": [dataclasses.asdict(t) for t in r.tables],

@@ -74,7 +74,8 @@ def compare(
 
     scripts: what `play_scripts` gave for these policies and rivals: it is not played again.
     """
-    from tailgate.agents.policy import PolicyAttack, timing_advantage
+    from tailgate.agents.policy import PolicyAttack
+    from tailgate.studies.timing import timing_advantage
 
     threat, outcome = dict(config.threat), outcome_of(config)
     guard = config.defence
@@ -195,19 +196,3 @@ def headline(report: dict[str, Any]) -> dict[str, Any]:
         f"{what} {report['episodes']} fresh episodes{which}: {gains} (paired, 95 %; {speaks})."
     )
     return {"text": text, "items": report["attacks"] if share else []}
-
-
-def make_page(config: TrainConfig, report: dict[str, Any]) -> Path:
-    """The page of a finished run."""
-    from tailgate.evaluation.rows import read_rows
-    from tailgate.leaderboard.build import build as build_page
-    from tailgate.training.trainings import curve_of
-
-    curve = [
-        point for seed in training_seeds(config)
-        for point in curve_of(config.directory / f"curve-{seed}.json")["curve"]
-    ]  # fmt: skip
-    rows = read_rows(config.directory / ROWS)
-    title = f"{config.name}: {config.defence} under attack"
-    drawn = curve if all(point["crash"] is not None for point in curve) else None
-    return build_page(rows, config.directory / "page", title=title, curve=drawn, headline=headline(report))

@@ -359,15 +359,6 @@ def same_run(config: TrainConfig) -> None:
         raise InputError("steps", config.steps, f"at least {made}, as {done[0]} was trained: what was learned is not taken back")
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Entry point of train.py."""
-    import sys
-
-    from tailgate.cli import main as command
-
-    return command(["train", *(sys.argv[1:] if arguments is None else arguments)])
-
-
 def figures(progress: Any) -> str:
     """The curve's latest figures, as a progress bar shows them."""
     text = f"{progress.steps / 1e6:5.2f} M decisions"

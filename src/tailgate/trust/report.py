@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-import tailgate
+from tailgate.base.version import VERSION
 from tailgate.core.scenario import Suite, list_suites, load_suite
 from tailgate.core.threat import KNOWLEDGE
 from tailgate.scoring.damage import CLEAN, order
@@ -35,7 +35,7 @@ def report(rows: Sequence[Row], suite: Suite, *, alpha: float, settings: Data, c
     paid = prices([*rows, *clean], settings["demands"]["false_alarms"], suite.nominal)
     entries = [_entry(defence, counted, rows, alpha, names, fixed, paid) for defence in suite.defences]
     return {
-        "format": FORMAT, "suite": {"name": suite.name, "bound": suite.bound}, "version": tailgate.__version__, "alpha": alpha,
+        "format": FORMAT, "suite": {"name": suite.name, "bound": suite.bound}, "version": VERSION, "alpha": alpha,
         "purpose": rows[0]["purpose"], "beacon": rows[0]["beacon"], **settings,
         "scenarios": list(suite.scenarios), "doses": list(suite.doses),
         "attacks": [{"attack": name, "knowledge": _knowledge(rows, name), "note": _note(rows, counted, name)} for name in suite.attacks],

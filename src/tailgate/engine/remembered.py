@@ -9,9 +9,9 @@ from typing import Any, Generic, Protocol, TypeVar
 import numpy as np
 
 from tailgate.engine import objects
+from tailgate.engine.agreement import Untraced, explained
 from tailgate.engine.graph import Graph
 from tailgate.engine.parameters import Parameters, Reading
-from tailgate.play.agreement import Untraced, explained
 
 KEPT, EACH = 64, 8  # keys that are remembered, and things of each
 _MINUS = np.array([-0.0]).view(np.uint64)[0]

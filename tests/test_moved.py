@@ -1,0 +1,29 @@
+"""Import paths of earlier releases lead to the modules of today."""
+
+import importlib
+import sys
+
+import pytest
+
+from tailgate.moved import MOVED, now
+
+
+@pytest.mark.parametrize("name", sorted(MOVED))
+def test_an_earlier_path_is_the_module_of_today(name: str) -> None:
+    sys.modules.pop(name, None)
+    with pytest.warns(DeprecationWarning, match=f"{name} is now {MOVED[name]}"):
+        module = importlib.import_module(name)
+    assert module is importlib.import_module(MOVED[name]) and module.__name__ == module.__spec__.name == MOVED[name]
+
+
+def test_modules_of_a_moved_folder_are_found() -> None:
+    sys.modules.pop("tailgate.reproduce.claims", None)
+    with pytest.warns(DeprecationWarning, match=r"tailgate\.reproduce\.claims is now tailgate\.thesis\.claims"):
+        claims = importlib.import_module("tailgate.reproduce.claims")
+    assert claims is importlib.import_module("tailgate.thesis.claims")
+
+
+def test_what_never_was_is_not_found() -> None:
+    assert now("tailgate.nothing") == "" == now("tailgate.core.threat")
+    with pytest.raises(ModuleNotFoundError, match="tailgate.nothing"):
+        importlib.import_module("tailgate.nothing")
