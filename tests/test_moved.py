@@ -25,5 +25,5 @@ def test_modules_of_a_moved_folder_are_found() -> None:
 
 def test_what_never_was_is_not_found() -> None:
     assert now("tailgate.nothing") == "" == now("tailgate.core.threat")
-    with pytest.raises(ModuleNotFoundError, match="tailgate.nothing"):
+    with pytest.raises(ModuleNotFoundError, match=r"tailgate\.nothing"):
         importlib.import_module("tailgate.nothing")
