@@ -34,7 +34,8 @@ def reason(scenario: str, defence: str) -> str:
 
 
 def seated(scenario: str, defence: str, threat: dict[str, Any]) -> Seat:
-    value = -min(4.0, load_scenario(scenario).with_threat(**threat).threat_model.fdi_bound)
+    model = load_scenario(scenario).with_threat(**threat).threat_model
+    value = max(-min(4.0, model.fdi_bound), model.jam_range[0])
     try:
         return Seat.make(scenario, defence, threat, value=value)
     except InputError as error:
