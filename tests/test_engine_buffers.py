@@ -190,7 +190,7 @@ def test_what_is_too_large_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_number_that_is_read_once_is_never_in_memory() -> None:
-    """Of a chain of elementwise operations only the result has room."""
+    """Only the result of a chain of elementwise operations has room."""
     given = state(1)
     trace = traced(lambda held, _: (held, {"out": np.sqrt(np.abs((held["P"] + 1.0) * 2.0 - held["Z"])) + 3.0}), given, {})
     assert sum(node.op == "sweep" for node in trace.graph.nodes) > 4
