@@ -79,7 +79,7 @@ def root_music(x: Array) -> Array:
 
 
 def _parts(rows: int) -> Iterator[Array]:
-    """Indices of so many rows, a few at a time."""
+    """Yield the indices of all rows, a few at a time."""
     return (np.arange(first, min(first + _ROWS, rows)) for first in range(0, rows, _ROWS))
 
 

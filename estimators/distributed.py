@@ -21,7 +21,7 @@ import numpy as np
 
 from tailgate import num
 from tailgate.base.errors import InputError
-from tailgate.base.pytree import remembered
+from tailgate.base.memo import remembered
 from tailgate.core import Array, Innovation, Model, Positive, Prior, Probability, Received, param
 from tailgate.core.reach import require_detectable
 from tailgate.core.registry import register

@@ -17,7 +17,7 @@ import numpy as np
 
 from tailgate import num
 from tailgate.base.errors import NotApplicable
-from tailgate.base.pytree import remembered
+from tailgate.base.memo import remembered
 from tailgate.core import Array, Innovation, Model, Prior, Received, param
 from tailgate.core.reach import blind
 from tailgate.core.registry import register

@@ -49,7 +49,7 @@ class Forwarding(MetaPathFinder, Loader):
     def exec_module(self, module: ModuleType) -> None:
         name = module.__name__
         warnings.warn(f"{name} is now {now(name)}", DeprecationWarning, stacklevel=2)
-        sys.modules[name] = import_module(now(name))  # the module itself: a copy would have a registry of its own
+        sys.modules[name] = import_module(now(name))  # not a copy, which would register its components twice
 
 
 sys.meta_path.insert(0, Forwarding())  # before those that would load a copy from the folder

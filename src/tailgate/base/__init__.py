@@ -1,1 +1,1 @@
-"""What every room stands on: errors, files, locks, sizes, processes and plots."""
+"""Errors, files, locks, sizes, processes and plots, which every other room uses."""

@@ -1,18 +1,13 @@
 """Walks over states: nested NamedTuples and mappings whose leaves are arrays with B first, or None."""
 
 import copy
-from collections import OrderedDict
 from collections.abc import Callable, Iterator
-from functools import wraps
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[Any]
-
-KEPT = 64  # results of a function of models that are remembered
-T = TypeVar("T")
 
 
 def map_leaves(function: Callable[..., Any], tree: Any, *others: Any) -> Any:
@@ -103,24 +98,3 @@ def lock(plan: Any) -> Any:
     elif isinstance(plan, dict):
         lock(list(plan.values()))
     return plan
-
-
-def remembered(*fields: str) -> Callable[[Callable[[Any], T]], Callable[[Any], T]]:
-    """Decorator of a function of one argument, which depends on its arrays of these names alone: results are kept, read-only."""
-
-    def decorate(function: Callable[[Any], T]) -> Callable[[Any], T]:
-        known: OrderedDict[Any, T] = OrderedDict()
-
-        @wraps(function)
-        def called(held: Any) -> T:
-            arrays = [getattr(held, name) for name in fields]
-            key = tuple((array.shape, array.dtype.str, array.tobytes()) for array in arrays)
-            if key not in known:
-                known[key] = lock(function(held))
-                while len(known) > KEPT:
-                    known.popitem(last=False)
-            return known[key]
-
-        return called
-
-    return decorate

@@ -42,7 +42,8 @@ def _body(graph: Graph) -> Iterator[None]:
 def swept(graph: Graph, function: Callable[..., Any], lead: Sequence[int], arrays: Sequence[Array], nested: bool = False) -> Array:
     """A function of the trailing axes of arrays of nodes, for each index of their first axes, which broadcast to `lead`.
 
-    It gets arrays of nodes, or a node where no axis is left, and gives such; -> (*lead, ...). `nested`: it may make buffers of its own.
+    The function takes arrays of nodes, or single nodes where no axis is left, and returns the same: (*lead, ...) in all.
+    A `nested` function may make buffers itself.
     """
     n = len(lead)
     held = [a[(None,) * (n - a.ndim)] if a.ndim < n else a for a in arrays]
@@ -196,7 +197,8 @@ def sides(graph: Graph, nodes: Array) -> tuple[Node, Array, Array] | None:
         first = first.args[0]
         held = []
         if first.size == nodes.size:
-            held = [graph.copies.get(side.id, graph.picks(side)).reshape(nodes.shape) for side in first.args[1:]]
+            both = [graph.copies[side.id] if side.id in graph.copies else graph.picks(side) for side in first.args[1:]]
+            held = [side.reshape(nodes.shape) for side in both]
     else:
         return None
     return (first.args[0], *held) if any(_fixed(side) for side in held) else None

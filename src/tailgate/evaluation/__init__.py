@@ -2,4 +2,4 @@
 
 from tailgate.base.lazy import exported
 
-__getattr__, __all__ = exported(__name__, {"cells": "Cell cells_of evaluate run run_cell"})
+__getattr__, __all__ = exported(__name__, {"cells": "Cell ENGINE cell_id cells_of evaluate failed_rows origin run run_cell"})
