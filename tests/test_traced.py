@@ -341,8 +341,10 @@ def test_explain_names_the_engine_and_the_line(capsys):
     assert main(["explain", "engine", "--json", "--scenario", "car-following-lossy-v0", "--attack", "dos_hold"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert all("operations" in held["size"] for held in found.values()) and len(found) == 3
+    assert main(["explain", "engine", "--defence", "filterpy_kf", "--json"]) == 0
+    assert "one episode after the other" in capsys.readouterr().out
     assert main(["explain", "engine", "--defence", "filterpy_kf"]) == 0
-    assert "one episode after the other" in " ".join(capsys.readouterr().out.split())
+    assert "environments" in capsys.readouterr().out  # how a cell of the table is broken depends on the length of the paths in it
     assert main(["explain", "engine", "--defence", "nobody"]) == 2
 
 
