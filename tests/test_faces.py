@@ -15,11 +15,11 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
 import tailgate
-from tailgate.agents.codec import ActionName, ActionSpec
-from tailgate.agents.reward import Reward, RewardName
 from tailgate.base.errors import InputError
 from tailgate.core.schema import fields_of
-from tailgate.envs.faces import FACES, AdversaryEnv, AdversaryVectorEnv
+from tailgate.envs.gym.actions import ActionName, ActionSpec
+from tailgate.envs.gym.gymnasium_env import FACES, AdversaryEnv, AdversaryVectorEnv
+from tailgate.envs.gym.rewards import Reward, RewardName
 
 from .tiny import write
 
@@ -102,7 +102,7 @@ def test_the_id_works_in_a_fresh_interpreter(name):
 
 def test_the_defaults_of_an_id_hold_everywhere(tiny):
     """make, make_vec and the VecEnv of one id are the same environment; what is said wins over the default."""
-    sb3 = pytest.importorskip("tailgate.envs.sb3")
+    sb3 = pytest.importorskip("tailgate.envs.gym.sb3")
     for name, defaults in FACES.items():
         cards = [gymnasium.make(name).unwrapped.card(), gymnasium.make_vec(name, num_envs=2).unwrapped.card(), sb3.BatchVecEnv(2, name).batch.card()]
         assert cards[0] == cards[1] == cards[2]

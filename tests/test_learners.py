@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 import torch
 
-from tailgate.agents.learning import ACTIONS, LEARNERS, check_action, learner_of
-from tailgate.agents.policy import PolicyAttack, load_policy
+from tailgate.agents.learners.learning import ACTIONS, LEARNERS, check_action, learner_of
+from tailgate.agents.policy.network_policy import PolicyAttack, load_policy
 from tailgate.base.errors import InputError
 from tailgate.core import draws
 from tailgate.core.schema import build
-from tailgate.envs.faces import AdversaryVectorEnv
-from tailgate.envs.seat import Seat
+from tailgate.envs.gym.attacker_mdp import Seat
+from tailgate.envs.gym.gymnasium_env import AdversaryVectorEnv
 from tailgate.play.trace import rollout
 from tailgate.training import train
 

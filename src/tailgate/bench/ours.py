@@ -16,18 +16,18 @@ import gymnasium
 import numpy as np
 
 from tailgate import num
-from tailgate.agents.codec import ActionCodec, ActionSpec
-from tailgate.agents.observation import ObservationCodec
-from tailgate.agents.reward import Reward, RewardName
 from tailgate.base.pytree import put_rows
 from tailgate.core import Array, Command, Estimate, Mode, View, draws
 from tailgate.core.draws import Role
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import Scenario, load_scenario
 from tailgate.engine.agreement import Untraced
-from tailgate.envs.batches import side_by_side
-from tailgate.envs.seat import Seat
-from tailgate.play.seats import Rows, programs_of
+from tailgate.envs.gym.actions import ActionCodec, ActionSpec
+from tailgate.envs.gym.attacker_mdp import Seat
+from tailgate.envs.gym.batches import side_by_side
+from tailgate.envs.gym.observations import ObservationCodec
+from tailgate.envs.gym.programs import Rows, programs_of
+from tailgate.envs.gym.rewards import Reward, RewardName
 
 from .lines import Go, Missing, Sample, repeated
 from .peers import at_random, batched, stepped
@@ -314,7 +314,7 @@ class _Timed:
 def environment_share() -> Go:
     """The environment's share of the processor time of training: PPO of Stable-Baselines3, 1024 x 32 steps, batches of 8192, 4 epochs."""
     try:
-        from tailgate.agents.ppo import Config, Learner
+        from tailgate.agents.learners.ppo import Config, Learner
     except ImportError as error:
         raise Missing(str(error)) from None
     config = Config(envs=1024, rollout=32, batch_size=8192, epochs=4)

@@ -12,7 +12,7 @@ from tailgate.core import Array, Defence, Estimate, Model, Prior, Received, draw
 from tailgate.core.draws import Draws
 from tailgate.core.registry import Spec, make
 from tailgate.core.scenario import Scenario, load_scenario
-from tailgate.envs.radar_car import GAP
+from tailgate.envs.controllers.radar_car import GAP
 from tailgate.play.trace import Trace, rollout
 
 from .ch4_cases import Tick

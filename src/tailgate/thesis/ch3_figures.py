@@ -6,7 +6,7 @@ import numpy as np
 
 from tailgate.base.plots import canvas, png
 from tailgate.core import Array
-from tailgate.envs.radar_car import GAP, RELATIVE_SPEED
+from tailgate.envs.controllers.radar_car import GAP, RELATIVE_SPEED
 
 from .ch3_cases import OURS, Runs
 from .ch3_limits import Curves

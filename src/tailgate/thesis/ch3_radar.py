@@ -6,8 +6,8 @@ import numpy as np
 
 from tailgate.core import Array
 from tailgate.core.draws import constants
-from tailgate.envs import fmcw_signal
-from tailgate.envs.fmcw import Link
+from tailgate.envs.sensors import fmcw_signal
+from tailgate.envs.sensors.fmcw import Link
 
 from .ch4_cases import Tick
 from .claims import Claim, Report, Table, verdict

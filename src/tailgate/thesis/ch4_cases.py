@@ -15,7 +15,7 @@ from tailgate import num
 from tailgate.core import Array, draws
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import Scenario, load_scenario
-from tailgate.envs.following import CarFollowing, FollowingPlan
+from tailgate.envs.plants.car_following import CarFollowing, FollowingPlan
 from tailgate.play.metrics import measure
 from tailgate.play.trace import Trace, rollout
 

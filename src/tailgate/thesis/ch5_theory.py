@@ -11,7 +11,7 @@ import tailgate
 from tailgate import num
 from tailgate.core import Array, Model, Prior, Received, draws
 from tailgate.core.draws import Role
-from tailgate.estimators.distributed import fixed_point, neighbours
+from tailgate.estimators.distributed.distributed_kalman import fixed_point, neighbours
 from tailgate.thesis.resilience import norm_bound, norm_direction
 
 from .ch4_cases import Tick

@@ -11,8 +11,8 @@ import numpy as np
 import tailgate
 from tailgate.core import Array, draws
 from tailgate.core.scenario import Scenario, load_scenario
-from tailgate.envs.cacc import Column
-from tailgate.estimators.distributed import fixed_point
+from tailgate.envs.controllers.cacc import Column
+from tailgate.estimators.distributed.distributed_kalman import fixed_point
 from tailgate.play.trace import Trace, rollout
 from tailgate.thesis.resilience import lasso_bound, lasso_direction
 

@@ -13,7 +13,7 @@ from tailgate import num
 from tailgate.core import Array, draws
 from tailgate.core.registry import make
 from tailgate.core.scenario import Scenario, load_scenario
-from tailgate.envs.platoon import Platoon
+from tailgate.envs.plants.platoon import Platoon
 from tailgate.evaluation.stats import proportion
 from tailgate.play.metrics import measure
 from tailgate.play.trace import Trace, rollout

@@ -14,9 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from tailgate.agents.codec import ActionCodec, ActionSpec
-from tailgate.agents.learning import LEARNERS, learner_of
-from tailgate.agents.observation import ObservationCodec
+from tailgate.agents.learners.learning import LEARNERS, learner_of
 from tailgate.base import sizes
 from tailgate.base.errors import InputError, unknown
 from tailgate.base.sizes import Seeds
@@ -25,6 +23,8 @@ from tailgate.core.registry import Spec
 from tailgate.core.scenario import Suite, load_scenario
 from tailgate.core.schema import as_data, build, fields_of
 from tailgate.core.threat import KNOWLEDGE
+from tailgate.envs.gym.actions import ActionCodec, ActionSpec
+from tailgate.envs.gym.observations import ObservationCodec
 from tailgate.training import train
 
 Progress = Callable[[str, int, int, str], None]  # label, done, total, figures

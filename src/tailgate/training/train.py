@@ -12,10 +12,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from tailgate.agents.codec import ActionSpec
-from tailgate.agents.finished import finished
-from tailgate.agents.learning import DISCRETE, LEARNERS, Progress, Teachable, check_action, learner_of
-from tailgate.agents.reward import Reward
+from tailgate.agents.learners.finished import finished
+from tailgate.agents.learners.learning import DISCRETE, LEARNERS, Progress, Teachable, check_action, learner_of
 from tailgate.base import sizes
 from tailgate.base.errors import InputError, said, unknown
 from tailgate.base.files import set_aside, writable_directory, write_atomic
@@ -27,7 +25,9 @@ from tailgate.core.registry import Spec
 from tailgate.core.scenario import Suite, config_path, load_scenario
 from tailgate.core.schema import as_data, build, canonical, fields_of, override, read_yaml
 from tailgate.core.threat import KNOWLEDGE
-from tailgate.envs.seat import Seat
+from tailgate.envs.gym.actions import ActionSpec
+from tailgate.envs.gym.attacker_mdp import Seat
+from tailgate.envs.gym.rewards import Reward
 from tailgate.evaluation.baselines import best_of
 from tailgate.evaluation.cells import cells_of
 from tailgate.play.metrics import METRICS

@@ -27,8 +27,8 @@ from typing import Any
 import numpy as np
 import yaml
 
-from tailgate.agents.learning import learner_of
-from tailgate.agents.policy import PolicyAttack
+from tailgate.agents.learners.learning import learner_of
+from tailgate.agents.policy.network_policy import PolicyAttack
 from tailgate.base import sizes
 from tailgate.base.errors import InputError, said, unknown
 from tailgate.base.files import writable_directory, write_atomic
