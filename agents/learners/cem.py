@@ -22,14 +22,14 @@ import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, ClassVar, NamedTuple
 
 import numpy as np
 from pydantic import Field
 from safetensors.numpy import load as load_tensors
 from safetensors.numpy import save as save_tensors
 
-from tailgate.agents.learners.learning import SEED_STRIDE, Progress, header_of, open_checkpoint
+from tailgate.agents.learners.learning import CONTINUOUS, DISCRETE, SEED_STRIDE, Progress, header_of, open_checkpoint
 from tailgate.agents.learners.teacher import Demonstration
 from tailgate.agents.policy.network_policy import save_policy
 from tailgate.base.errors import InputError
@@ -37,6 +37,7 @@ from tailgate.base.files import write_atomic
 from tailgate.base.sizes import Passes, Rows, Width
 from tailgate.core import Array, NonNegative, Positive, PositiveCount, Probability, draws, param
 from tailgate.core.neural import Network
+from tailgate.core.registry import register
 from tailgate.core.schema import canonical
 from tailgate.envs.gym.attacker_mdp import Seat
 from tailgate.envs.gym.batches import framed, side_by_side
@@ -232,8 +233,12 @@ def outputs(layers: list[tuple[Array, Array]], observation: Array) -> Array:
     return x.reshape(-1, x.shape[-1])
 
 
+@register("learner", "cem")
 class Learner(Search):
     """One training run of one seed: an attacker in a seat."""
+
+    actions = (*DISCRETE, *CONTINUOUS)
+    packages: ClassVar[tuple[str, ...]] = ()
 
     def __init__(self, seed: int, gamma: float, config: Config, environment: dict[str, Any], tensorboard: Path | None = None) -> None:
         self.seat = Seat.make(gamma=gamma, **environment)

@@ -16,9 +16,11 @@ try:
 except ImportError as error:
     raise ImportError("torch or Stable-Baselines3 is missing: pip install 'tailgate[train]'") from error
 
+from tailgate.agents.learners.learning import DISCRETE
 from tailgate.agents.learners.stable import Explorer, OffPolicyConfig, OffPolicyLearner, perceptron
 from tailgate.core import Array, Positive, PositiveCount, Probability, param
 from tailgate.core.neural import Network
+from tailgate.core.registry import register
 
 
 @dataclass(frozen=True)
@@ -50,10 +52,12 @@ class _DQN(DQN):
         return action, action
 
 
+@register("learner", "dqn")
 class Learner(OffPolicyLearner):
     """One training run of one seed."""
 
     name = "dqn"
+    actions = DISCRETE
     algorithm: ClassVar[Any] = _DQN
     traits: ClassVar[dict[str, bool]] = {"greedy": True}
     config: Config

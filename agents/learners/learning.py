@@ -8,28 +8,19 @@ from dataclasses import dataclass
 from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, runtime_checkable
 
 from tailgate.base.errors import InputError, unknown
+from tailgate.base.lazy import components
 from tailgate.base.reading import TENSORS, parse_json, read_bytes, tensors_of
 
 if TYPE_CHECKING:
     from tailgate.agents.learners.teacher import Demonstration
     from tailgate.envs.gym.attacker_mdp import Seat
 
-LEARNERS = {
-    "ppo": "PPO of Stable-Baselines3",
-    "cem": "the cross-entropy method",
-    "maskable_ppo": "PPO that chooses among what the channel accepts",
-    "recurrent_ppo": "PPO with an LSTM that remembers the episode",
-    "dqn": "deep Q-learning",
-    "sac": "soft actor-critic, for continuous actions",
-    "tqc": "soft actor-critic with truncated quantile critics",
-}
-CONTRIBUTED = {"maskable_ppo", "recurrent_ppo", "tqc"}  # that come from sb3-contrib
+LEARNERS = tuple(sorted(name for family, name in components("tailgate.agents") if family == "learner"))
 SEED_STRIDE = 1_000_000  # between the episodes of two training seeds
-DISCRETE, CONTINUOUS = ("timing", "mode", "ramp"), ("continuous", "increment")
-ACTIONS = {"maskable_ppo": DISCRETE, "dqn": DISCRETE, "sac": CONTINUOUS, "tqc": CONTINUOUS}  # what a learner can decide; else: everything
+DISCRETE, CONTINUOUS = ("timing", "mode", "ramp"), ("continuous", "increment")  # kinds of action
 
 
 @dataclass(frozen=True)
@@ -49,8 +40,13 @@ class Config(Protocol):
 
 
 class Learner(Protocol):
-    """One training run of one seed. Resumed from a checkpoint it gives the policy of an uninterrupted one."""
+    """One training run of one seed. Resumed from a checkpoint it gives the policy of an uninterrupted one.
 
+    Register the class with `@register("learner", NAME)`, in a module that also defines its `Config`.
+    """
+
+    actions: ClassVar[tuple[str, ...]]  # kinds of action that it can decide on
+    packages: ClassVar[tuple[str, ...]]  # on whose versions the last bits of its weights depend
     seat: Seat
     steps: int  # decisions taken so far
     curve: list[dict[str, Any]]
@@ -77,28 +73,28 @@ class Teachable(Protocol):
 
 
 def learner_of(name: str) -> Any:
-    """The module of a learner, with its classes `Config` and `Learner`. Raises InputError for one that does not exist."""
+    """Return the module of a learner, with its classes `Config` and `Learner`. Raise InputError for an unknown name."""
     if name not in LEARNERS:
         raise unknown("learner", name, LEARNERS)
-    return import_module(f"tailgate.agents.{name}")
+    return import_module(components("tailgate.agents")["learner", name])
 
 
 def made_with(name: str) -> dict[str, str]:
-    """What the last bits of a learner's weights may depend on: the machine type, numpy, and torch with what it adds, where it is used."""
+    """Return all that the last bits of a learner's weights may depend on: the machine type, numpy, and its packages."""
     found = {"machine": platform.machine(), "numpy": version("numpy")}
-    if name == "cem":
+    packages = learner_of(name).Learner.packages
+    if not packages:
         return found
     import torch
 
-    packages = ("torch", "stable-baselines3", *(["sb3-contrib"] if name in CONTRIBUTED else []))
     return found | {package: version(package) for package in packages} | {"torch CPU capability": torch.backends.cpu.get_cpu_capability()}
 
 
 def check_action(name: str, seat: Seat) -> None:
     """Raise InputError when the learner cannot decide on the actions of this seat."""
-    action = seat.action.spec.action
-    if action not in ACTIONS.get(name, (action,)):
-        raise InputError("learner", name, f"one for the action {action}, or for {name} one of: {', '.join(ACTIONS[name])}")
+    action, actions = seat.action.spec.action, learner_of(name).Learner.actions
+    if action not in actions:
+        raise InputError("learner", name, f"one for the action {action}, or for {name} one of: {', '.join(actions)}")
 
 
 def open_checkpoint(path: Path, wanted: dict[str, Any], load_tensors: Callable[[bytes], Any]) -> tuple[Any, dict[str, Any]]:

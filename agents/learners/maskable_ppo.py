@@ -15,6 +15,8 @@ except ImportError as error:
     raise ImportError("torch or sb3-contrib is missing: pip install 'tailgate[train]'") from error
 
 from tailgate.agents.learners import ppo
+from tailgate.agents.learners.learning import DISCRETE
+from tailgate.core.registry import register
 
 
 @dataclass(frozen=True)
@@ -24,9 +26,12 @@ class Config(ppo.Config):
     name: ClassVar[str] = "maskable_ppo"
 
 
+@register("learner", "maskable_ppo")
 class Learner(ppo.Learner):
     """One training run of one seed."""
 
     name = "maskable_ppo"
+    actions = DISCRETE
+    packages = ("torch", "stable-baselines3", "sb3-contrib")
     algorithm: ClassVar[Any] = MaskablePPO
     traits: ClassVar[dict[str, bool]] = {"masked": True}

@@ -19,6 +19,7 @@ from tailgate.base.errors import InputError
 from tailgate.base.sizes import Passes, Rows, Width
 from tailgate.core import NonNegative, Positive, Probability, param
 from tailgate.core.neural import Network
+from tailgate.core.registry import register
 
 LOG_STD = -0.5  # of the first policy's continuous actions
 IMITATION_EPOCHS, IMITATION_BATCH, IMITATION_RATE = 6, 1024, 2e-3
@@ -49,6 +50,7 @@ class Config:
             raise InputError(f"{self.name}.batch_size", self.batch_size, f"a divisor of envs x rollout ({samples}), and at least 2")
 
 
+@register("learner", "ppo")
 class Learner(StableLearner):
     """One training run of one seed."""
 

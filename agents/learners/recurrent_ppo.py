@@ -22,6 +22,7 @@ from tailgate.agents.learners import ppo
 from tailgate.base.sizes import Passes, Rows, Width
 from tailgate.core import Array, Positive, param
 from tailgate.core.neural import Lstm, Network
+from tailgate.core.registry import register
 
 
 @dataclass(frozen=True)
@@ -39,10 +40,12 @@ class Config(ppo.Config):
     memory: Width = param(32, "width of the LSTM, of the policy and of the critic")
 
 
+@register("learner", "recurrent_ppo")
 class Learner(ppo.Learner):
     """One training run of one seed."""
 
     name = "recurrent_ppo"
+    packages = ("torch", "stable-baselines3", "sb3-contrib")
     algorithm: ClassVar[Any] = RecurrentPPO
     policy: ClassVar[str] = "MlpLstmPolicy"
     config: Config

@@ -13,9 +13,11 @@ try:
 except ImportError as error:
     raise ImportError("torch or Stable-Baselines3 is missing: pip install 'tailgate[train]'") from error
 
+from tailgate.agents.learners.learning import CONTINUOUS
 from tailgate.agents.learners.stable import Exploring, OffPolicyConfig, OffPolicyLearner, perceptron, rest_first
 from tailgate.core import Positive, param
 from tailgate.core.neural import Network
+from tailgate.core.registry import register
 
 
 @dataclass(frozen=True)
@@ -32,10 +34,12 @@ class _SAC(Exploring, SAC):
     """Rests more often than not before it learns."""
 
 
+@register("learner", "sac")
 class Learner(OffPolicyLearner):
     """One training run of one seed."""
 
     name = "sac"
+    actions = CONTINUOUS
     algorithm: ClassVar[Any] = _SAC
     traits: ClassVar[dict[str, bool]] = {"greedy": True}
     config: Config

@@ -29,7 +29,7 @@ from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
 from scipy.stats import norm
 
-from tailgate.agents.learners.learning import SEED_STRIDE, Progress, check_action, header_of, open_checkpoint
+from tailgate.agents.learners.learning import CONTINUOUS, DISCRETE, SEED_STRIDE, Progress, check_action, header_of, open_checkpoint
 from tailgate.agents.policy.network_policy import save_policy
 from tailgate.base.errors import InputError
 from tailgate.base.files import write_atomic
@@ -50,6 +50,8 @@ class StableLearner:
     """One training run of one seed. A subclass makes `model` and says what its policy is."""
 
     name: ClassVar[str]
+    actions: ClassVar[tuple[str, ...]] = (*DISCRETE, *CONTINUOUS)
+    packages: ClassVar[tuple[str, ...]] = ("torch", "stable-baselines3")
     traits: ClassVar[dict[str, bool]] = {}  # what the policy's header says besides
 
     def __init__(self, seed: int, gamma: float, config: Any, environment: dict[str, Any], tensorboard: Path | None = None) -> None:

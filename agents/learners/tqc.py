@@ -18,6 +18,7 @@ from tailgate.agents.learners.stable import Exploring
 from tailgate.base.errors import InputError
 from tailgate.base.sizes import Width
 from tailgate.core import Count, param
+from tailgate.core.registry import register
 
 
 @dataclass(frozen=True)
@@ -39,10 +40,12 @@ class _TQC(Exploring, TQC):
     """Rests more often than not before it learns."""
 
 
+@register("learner", "tqc")
 class Learner(sac.Learner):
     """One training run of one seed."""
 
     name = "tqc"
+    packages = ("torch", "stable-baselines3", "sb3-contrib")
     algorithm: ClassVar[Any] = _TQC
     config: Config
 

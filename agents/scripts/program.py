@@ -19,12 +19,12 @@ from tailgate.base.errors import InputError, NotApplicable, unknown
 from tailgate.base.pytree import map_leaves
 from tailgate.core import AIRED, Array, Command, Count, Kind, PositiveCount, Probability, View, no_command, param
 from tailgate.core.draws import Draws
+from tailgate.core.kinds import EFFECTS, KindName
 from tailgate.core.registry import register
 from tailgate.core.scenario import config_path
 from tailgate.core.schema import build, read_yaml
-from tailgate.core.threat import Brief, KindName, fit
+from tailgate.core.threat import Brief, fit
 
-VALUED = (Kind.DOS_JAM, Kind.FDI, Kind.DELAY, Kind.REPLAY, *AIRED)
 HIT, FIRST = 0, TAGS  # tags of the draws: which wires are hit, and the values
 
 
@@ -77,9 +77,9 @@ def _phase(data: Any, where: str) -> Phase:
         raise InputError(where, data, "a mapping of fields")
     phase = build(Phase, data, where)
     kind = Kind[phase.kind.upper()]
-    if kind in VALUED and phase.value is None:
+    if EFFECTS[kind].valued and phase.value is None:
         raise InputError(f"{where}.value", None, f"a law: kind {phase.kind} needs values")
-    if kind not in VALUED and phase.value is not None:
+    if not EFFECTS[kind].valued and phase.value is not None:
         raise InputError(f"{where}.value", phase.value, f"no value: kind {phase.kind} has none")
     law = None if phase.value is None else law_of(phase.value, f"{where}.value")
     trigger = part(TRIGGERS, phase.trigger, f"{where}.trigger")

@@ -12,7 +12,8 @@ from tailgate import num
 from tailgate.base.errors import InputError
 from tailgate.core import AIRED, Array, Command, Finite, Kind, Positive, PositiveCount, View, param
 from tailgate.core.channel import Channel, ChannelPlan
-from tailgate.core.threat import Brief, KindName, fit, receivers
+from tailgate.core.kinds import KindName
+from tailgate.core.threat import Brief, fit, receivers
 
 ActionName = Literal["timing", "mode", "ramp", "continuous", "increment"]
 VECTOR = (Kind.FDI, Kind.ECHO_DELAY, Kind.NOISE_JAM)  # kinds that a vector of values can carry, in the order of the trigger's shares

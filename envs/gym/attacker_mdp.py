@@ -183,7 +183,7 @@ class Seat:
         view = loop.sense(state)
         state, frame = loop.advance(state, action(view) if callable(action) else self.action.decode(action, view))
         least, peak, largest = reward.least(frame.scene.gap, tally.least), tally.peak, tally.error
-        if reward.reward == "peak":
+        if reward.payment.peak:
             peak = np.maximum(np.max(loop.model.error(frame.estimate.x, frame.truth), axis=1), peak)
         gained = reward(loop.model, frame, tally.least - least, frame.k == loop.horizon, peak - tally.peak)
         gap_error = loop.model.gap_error(frame.estimate.x, frame.truth)

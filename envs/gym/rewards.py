@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 
 from tailgate.base.errors import InputError
 from tailgate.core import Array, Discount, Frame, Kind, Model, NonNegative, Positive, param
+from tailgate.core.registry import find, register
 from tailgate.num import clip
 
-RewardName = Literal["collision", "min_gap", "error", "peak", "stealth", "final"]
 NEAR = 20.0  # min_gap: a smaller gap than this counts [m]
 
 
@@ -34,25 +35,117 @@ def small(gap: Array) -> Array:
 
 
 @dataclass(frozen=True)
+class Step:
+    """One step of the loop, as a reward sees it."""
+
+    model: Model
+    frame: Frame
+    fall: Array  # (B,) by how much the smallest gap of the episode fell [m], within [0, NEAR]
+    rise: Array | float  # (B,) by how much the largest error of the episode rose; 0 unless the payment asks for it
+    last: Array  # (B,) bool: the last step of the horizon
+
+    @property
+    def crashed(self) -> Array:
+        """(B,) bool: a collision in front or behind."""
+        return self.frame.collided | self.frame.rear_collided
+
+    @property
+    def error(self) -> Array:
+        """(B,) largest error of an agent (`Model.error`)."""
+        return np.asarray(np.max(self.model.error(self.frame.estimate.x, self.frame.truth), axis=1))
+
+
+class Payment:
+    """Base class of what a step is paid. Register a subclass with `@register("reward", NAME)`, in any module of `envs`."""
+
+    road: ClassVar[bool] = False  # only collisions earn something
+    peak: ClassVar[bool] = False  # asks for `Step.rise`
+
+    def terms(self, step: Step, scale: float) -> tuple[Array, ...]:
+        """Return the terms (B,) of the payment of one step, which are added in this order; scale: `Reward.error_scale`."""
+        raise NotImplementedError
+
+
+@register("reward", "collision")
+class Collision(Payment):
+    """1 at a collision in front or behind."""
+
+    road = True
+
+    def terms(self, step: Step, scale: float) -> tuple[Array, ...]:
+        return (step.crashed,)
+
+
+@register("reward", "min_gap")
+class MinGap(Collision):
+    """1 at a collision, and the metres by which the smallest gap of the episode falls below 20 m, over 20 m.
+
+    A burst at the right moment earns something long before it makes a collision.
+    """
+
+    def terms(self, step: Step, scale: float) -> tuple[Array, ...]:
+        return step.crashed, step.fall / NEAR
+
+
+@register("reward", "error")
+class Error(Payment):
+    """The largest error of an agent over `error_scale`, capped at 1, per second."""
+
+    def terms(self, step: Step, scale: float) -> tuple[Array, ...]:
+        return (step.model.dt * np.minimum(step.error / scale, 1.0),)
+
+
+@register("reward", "stealth")
+class Stealth(Error):
+    """The reward `error`, less one per second of alarm."""
+
+    def terms(self, step: Step, scale: float) -> tuple[Array, ...]:
+        return *super().terms(step, scale), np.asarray(-step.model.dt * step.frame.estimate.alarm.any(axis=1))
+
+
+@register("reward", "peak")
+class Peak(Payment):
+    """By how much the largest error of the episode rises, over `error_scale`: in all, the metric `max_error`."""
+
+    peak = True
+
+    def terms(self, step: Step, scale: float) -> tuple[Array, ...]:
+        return (np.asarray(step.rise / scale),)
+
+
+@register("reward", "final")
+class Final(Payment):
+    """The error over `error_scale`, squared, at the last step of the horizon: its mean is the trace of the error's covariance."""
+
+    def terms(self, step: Step, scale: float) -> tuple[Array, ...]:
+        error = step.error / scale
+        return (np.where(step.last, error * error, 0.0),)
+
+
+@dataclass(frozen=True)
 class Reward:
     """Reward presets. Scores never use them: they use raw outcomes.
 
-    collision: 1 at a collision in front or behind. min_gap: the same, and the metres by which the smallest gap of the episode falls
-    below 20 m, over 20 m: a burst at the right moment earns something long before it makes a collision. error: the largest error of an
-    agent (`Model.error`) over `error_scale`, capped at 1, per second. peak: by how much the largest error of the episode so far rises, over
-    `error_scale`: in all, the metric `max_error`. stealth: error, less one per second of alarm. final: that error over
-    `error_scale`, squared, at the last step of the horizon alone: its mean is the trace of the error's covariance. The shaping terms are
-    potential-based (Ng, Harada, Russell 1999): they leave the best policy unchanged when `gamma` is the learner's, and may use the truth,
-    which the policy does not see. Without a road nothing collides, and the potentials are 0.
+    The field `reward` names the payment of a step (the subclasses of `Payment`). The shaping terms are potential-based (Ng, Harada,
+    Russell 1999): they leave the best policy unchanged when `gamma` is the learner's, and may use the truth, which the policy does not
+    see. Without a road nothing collides, and the potentials are 0.
     """
 
-    reward: RewardName = param("min_gap", "collision, min_gap, error, peak, stealth or final")
+    reward: str = param("min_gap", "payment of a step: collision, min_gap, error, peak, stealth or final")
     error_scale: Positive = param(10.0, "error, peak, stealth, final: the error that earns 1: of the gap [m], or of the state [its unit]")
     gap_shaping: NonNegative = param(0.5, "weight of the closeness of the car ahead as a potential [-]")
     error_shaping: NonNegative = param(1.0, "weight of the believed extra gap, per 10 m and capped at 20 m, as a potential [-]")
     gamma: Discount = param(0.995, "discount in the potential's difference [-]")
     illegal_penalty: NonNegative = param(0.0, "cost of a decision whose command is refused in every step [-]")
     attack_cost: NonNegative = param(0.0, "cost of a step under attack: what makes waiting for the right moment pay [-]")
+
+    def __post_init__(self) -> None:
+        _ = self.payment  # an unknown name shall fail here
+
+    @cached_property
+    def payment(self) -> Payment:
+        """The payment of a step that `reward` names."""
+        return find("reward", self.reward).cls()  # type: ignore[no-any-return]
 
     def potential(self, gap: Array, belief: Array | float = 0.0) -> Array:
         """(B,) potential of a gap (B, N) [m], infinite where nobody is ahead, and of what a car believes it has on top of it (B, N) [m]."""
@@ -65,7 +158,7 @@ class Reward:
 
     def check(self, model: Model) -> None:
         """Raise InputError for a reward that nothing can earn under this model."""
-        if self.reward in ("collision", "min_gap") and not model.followers.any():
+        if self.payment.road and not model.followers.any():
             raise InputError("reward", self.reward, "error, peak, stealth or final: nobody drives in this scenario, so nobody collides")
 
     def __call__(self, model: Model, frame: Frame, fall: Array, last: Array, rise: Array | float = 0.0) -> Array:
@@ -73,19 +166,9 @@ class Reward:
 
         fall (B,) of the smallest gap [m]; rise (B,) of the largest error, which only `peak` asks for.
         """
-        crashed = frame.collided | frame.rear_collided
         out = -self.attack_cost * (frame.command.kind != Kind.NONE)
-        if self.reward in ("collision", "min_gap"):
-            out = out + crashed
-            if self.reward == "min_gap":
-                out = out + fall / NEAR
-        elif self.reward == "peak":
-            out = out + rise / self.error_scale
-        else:
-            error = np.max(model.error(frame.estimate.x, frame.truth), axis=1) / self.error_scale
-            out = out + (np.where(last, error * error, 0.0) if self.reward == "final" else model.dt * np.minimum(error, 1.0))
-            if self.reward == "stealth":
-                out = out - model.dt * frame.estimate.alarm.any(axis=1)
+        for term in self.payment.terms(Step(model, frame, fall, rise, last), self.error_scale):
+            out = out + term
         return np.asarray(out)
 
     def decided(self, raw: Array, illegal: Array, before: Array, after: Array, terminated: Array) -> Array:

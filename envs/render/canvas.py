@@ -13,6 +13,7 @@ except ImportError as error:
     raise ImportError("Pillow is missing, which draws the pictures: pip install 'tailgate[viz]'") from error
 
 from tailgate.core import Array, Command, Frame, Kind, Mode
+from tailgate.core.kinds import EFFECTS
 from tailgate.core.loop import Loop, LoopState
 
 HEIGHT, WIDTH = 320, 960  # multiples of 16, which video encoders ask for
@@ -38,7 +39,6 @@ UNITS = {
     "position": " m", "distance": " m", "velocity": " m/s", "acceleration": " m/s^2", "command": " m/s^2",  # the font has no raised two
     "speed": " m/s",
 }
-AIRED = {Kind.NOISE_JAM: "{:.3g} W", Kind.ECHO_DELAY: "{:.3g} m"}  # over the air: one value reaches all that a receiver reads  # fmt: skip
 
 CAR = 84.0  # length of a car [px]
 CAR_SHAPE, WHEEL_SHAPE = 34.0 / 84.0, 7.5 / 84.0  # its height and wheels, of its length
@@ -176,7 +176,8 @@ def header(canvas: Canvas, loop: Loop, state: LoopState, row: int, refused: bool
     canvas.text(MARGIN, FIRST, f"t = {steps * dt:.{1 if dt >= 0.1 else 2}f} s", size=LARGE, bold=True)
     canvas.text(MARGIN, SECOND, f"step {steps} of {loop.horizon}", GREY, SMALL)
     kind = Kind(int(last.kind[row]))
-    title, does = COMMANDS[kind]
+    effect = EFFECTS.get(kind)
+    title, does = COMMANDS.get(kind) or (f"ATTACK: {effect.title}", f"{effect.does}: ") if effect else COMMANDS[Kind.NONE]
     on, does = kind != Kind.NONE, does + aimed(loop, last, row)
     canvas.box(BADGE[0], 5, BADGE[1], HEADER - 5, ATTACK if on else WHITE, INK if on else GREY, 2 if on else 1)
     room, ink = (BADGE[0] + MARGIN, BADGE[1] - MARGIN), WHITE if on else GREY
@@ -234,10 +235,12 @@ def _of(loop: Loop, agents: list[int]) -> str:
 def aimed(loop: Loop, last: Command, row: int) -> str:
     """The wires that a command hits, each with its value; of many their number and the range of the values."""
     kind, wires = Kind(int(last.kind[row])), loop.model.wires
-    if kind in AIRED:
-        sent = {i: AIRED[kind].format(last.value[row, i].max()) for i in np.flatnonzero(last.target[row].any(axis=1)).tolist()}
+    if kind == Kind.NONE:
+        return ""
+    if EFFECTS[kind].over_air:
+        sent = {i: f"{last.value[row, i].max():.3g} {EFFECTS[kind].unit}" for i in np.flatnonzero(last.target[row].any(axis=1)).tolist()}
         return "; ".join(value + _of(loop, [i for i in sent if sent[i] == value]) for value in dict.fromkeys(sent.values()))
-    valued = {Kind.DOS_JAM: "{:+.4g}", Kind.FDI: "{:+.4g}", Kind.DELAY: "{:g}", Kind.REPLAY: "{:g}"}.get(kind)
+    valued = ("{:g}" if EFFECTS[kind].recorded else "{:+.4g}") if EFFECTS[kind].valued else ""
     groups: dict[tuple[int, float], list[int]] = {}  # agents by wire and value
     for i, w in np.argwhere(last.target[row]).tolist():
         groups.setdefault((w, float(last.value[row, i, w])), []).append(i)
@@ -247,7 +250,7 @@ def aimed(loop: Loop, last: Command, row: int) -> str:
         return f"{len({w for w, _ in groups})} readings{_of(loop, agents)}{': ' + shown.replace(', ', ' to ') if shown else ''}"
     out: dict[str, list[str]] = {}  # words by whose wires they are
     for (w, value), agents in groups.items():
-        unit = UNITS.get(wires[w].split("_")[-1], "") if kind in (Kind.DOS_JAM, Kind.FDI) else ""
+        unit = "" if EFFECTS[kind].recorded else UNITS.get(wires[w].split("_")[-1], "")
         shown = f" {valued.format(value)}{unit}" if valued else ""
         out.setdefault(_of(loop, agents), []).append(wires[w].replace("_", " ") + shown)
     return "; ".join(", ".join(held) + whose for whose, held in out.items())

@@ -27,7 +27,7 @@ from tailgate.envs.gym.attacker_mdp import Seat
 from tailgate.envs.gym.batches import side_by_side
 from tailgate.envs.gym.observations import ObservationCodec
 from tailgate.envs.gym.programs import Rows, programs_of
-from tailgate.envs.gym.rewards import Reward, RewardName
+from tailgate.envs.gym.rewards import Reward
 
 from .lines import Go, Missing, Sample, repeated
 from .peers import at_random, batched, stepped
@@ -126,7 +126,7 @@ def batch(episodes: int, threads: int = 1) -> Go:
     return repeated(lambda: decided(rows))
 
 
-def several(place: Scenario, defence: str, value: float, reward: RewardName, episodes: int) -> Go:
+def several(place: Scenario, defence: str, value: float, reward: str, episodes: int) -> Go:
     """Whole steps of several agents under a learner's action, as in `batch`."""
     guard, spec = Spec("defence", defence), ActionSpec("timing", "fdi", value, interval=HELD)
     loop = place.loop(guard.make(), guard.entry.uses)

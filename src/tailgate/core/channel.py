@@ -8,15 +8,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tailgate import num
-from tailgate.core.kinds import AIRED, RADIATED, Kind
+from tailgate.core.kinds import EFFECTS, Kind, Limits, Recording
 from tailgate.core.nouns import Air, Array, Command, Received, no_command
 from tailgate.core.threat import Brief, ThreatModel
 
-# Plain numbers: in every comparison with a member of an enumeration numpy looks for array methods of it.
-NONE, DOS_JAM, DOS_HOLD, DOS_HOLD_FRESH, DROPOUT, FDI, DELAY, REPLAY, NOISE_JAM, ECHO_DELAY = map(int, Kind)
+NONE, DOS_JAM, DROPOUT, REPLAY, NOISE_JAM, ECHO_DELAY = map(  # plain numbers: numpy looks for array methods of an enumeration's members
+    int, (Kind.NONE, Kind.DOS_JAM, Kind.DROPOUT, Kind.REPLAY, Kind.NOISE_JAM, Kind.ECHO_DELAY)
+)
 _VALUED, _ON_AIR, _RADIATED = (
-    np.isin(np.arange(len(Kind)), kinds, invert=invert)
-    for kinds, invert in (((NONE, DOS_HOLD, DOS_HOLD_FRESH, DROPOUT), True), (AIRED, False), (RADIATED, False))
+    np.array([kind in EFFECTS and getattr(EFFECTS[kind], trait) for kind in map(int, Kind)]) for trait in ("valued", "over_air", "radiated")
 )
 
 
@@ -24,9 +24,7 @@ class ChannelPlan(NamedTuple):
     threat: ThreatModel
     granted: Array  # (N, w) bool
     kinds: Array  # (kinds,) bool
-    bounds: Array  # (w,) of false data injection
-    low: Array  # (w,) of jamming
-    high: Array  # (w,)
+    limits: Limits
     last_step: int
     sensors: int
     air: bool
@@ -80,11 +78,8 @@ class Channel:
         for name in threat.kinds:
             kinds[Kind[name.upper()]] = True
         last = brief.horizon if threat.end is None else min(threat.end, brief.horizon)
-        low, high = (
-            np.where(brief.is_actuator, sign * threat.actuator_bound, end) for sign, end in zip((-1.0, 1.0), threat.jam_range, strict=True)
-        )
-        recorded = threat.memory if kinds[DELAY] or kinds[REPLAY] else 0
-        return ChannelPlan(threat, brief.granted, kinds, brief.bounds, low, high, last, len(brief.model.sensors), brief.model.air, recorded)
+        recorded = threat.memory if any(EFFECTS[kind].recorded for kind in np.flatnonzero(kinds).tolist()) else 0
+        return ChannelPlan(threat, brief.granted, kinds, brief.limits, last, len(brief.model.sensors), brief.model.air, recorded)
 
     def start(self, plan: ChannelPlan, expected: Array, u: Array) -> ChannelState:
         """expected (B, N, q+p) at the prior and the first input u (B, N, m): what is held if an attack comes first."""
@@ -185,23 +180,13 @@ class Channel:
         ok = plan.granted
         with np.errstate(invalid="ignore"):
             for one in num.present(kind, np.flatnonzero(plan.kinds).tolist()):
-                fits = self._fits(plan, one, value)
-                ok = ok if fits is None else ok & ((kind != one)[:, None, None] | fits)
+                effect = EFFECTS[one]
+                if effect.valued:
+                    fits = effect.grants(plan.limits, value)
+                    if effect.over_air:
+                        fits = plan.air & (np.arange(value.shape[2]) < plan.sensors) & fits
+                    ok = ok & ((kind != one)[:, None, None] | fits)
         return np.asarray(legal & ~(command.target & ~ok).any(axis=(1, 2)))
-
-    def _fits(self, plan: ChannelPlan, kind: int, value: Array) -> Array | None:
-        """(B, N, w) bool: the value is granted with that kind; None of kinds without a value."""
-        threat = plan.threat
-        if kind == DOS_JAM:
-            return np.asarray((value >= plan.low) & (value <= plan.high))
-        if kind == FDI:
-            return np.asarray(np.abs(value) <= plan.bounds)
-        if kind in AIRED:
-            most, sensor = threat.jam_power if kind == NOISE_JAM else threat.delay_bound, np.arange(value.shape[2]) < plan.sensors
-            return np.asarray(plan.air & sensor & (value > 0.0) & (value <= most))
-        if kind in (DELAY, REPLAY):
-            return np.asarray((value >= 1) & (value <= threat.memory) & (value == np.floor(value)))
-        return None
 
     def _radiated(self, plan: ChannelPlan, command: Command) -> Air:
         """What a command in force radiates at each receiver."""
@@ -216,29 +201,13 @@ class Channel:
         """What arrives of `sent` (B, N, .), the part `wires` of all wires, under the command in force."""
         command, out = state.last, sent
         target, value = command.target[..., wires], command.value[..., wires]
-        known = [kind for kind in np.flatnonzero(plan.kinds).tolist() if kind not in AIRED]
+        recording = Recording(plan.recorded, *(part[:, None, None] for part in (state.taped, state.anchor, state.played)))
+        known = [kind for kind in np.flatnonzero(plan.kinds).tolist() if not EFFECTS[kind].over_air]
         for kind in num.present(np.where(target.any(axis=(1, 2)), command.kind, NONE), known):
-            hit = target & (command.kind == kind)[:, None, None]
-            if kind == DOS_JAM:
-                changed = value
-            elif kind == FDI:
-                changed = sent + value
-            elif kind == DOS_HOLD:
-                changed = memory.held
-            elif kind in (DELAY, REPLAY):
-                changed = self._taped(plan, state, memory, np.where(hit, value, 1.0).astype(np.int64), kind)
-            else:  # a receiver that hears nothing keeps its last value, as one that holds it does
-                changed = memory.fresh
-            out = np.where(hit, changed, out)
+            hit, effect = target & (command.kind == kind)[:, None, None], EFFECTS[kind]
+            given = np.where(hit, value, 1.0) if effect.recorded else value
+            out = np.where(hit, effect.reads(sent, given, memory, recording), out)
         return out
-
-    def _taped(self, plan: ChannelPlan, state: ChannelState, memory: Memory, span: Array, kind: int) -> Array:
-        """The sample of `span` (B, N, .) steps ago, or the one that a replayed window of that length has come to."""
-        if kind == REPLAY:
-            ring, last = memory.tape, state.anchor[:, None, None] + state.played[:, None, None] % span
-        else:
-            ring, last = memory.history, state.taped[:, None, None]
-        return np.asarray(num.pick(ring, (last - span) % plan.recorded))
 
     def _keep(self, plan: ChannelPlan, state: ChannelState, memory: Memory, sent: Array, hit: Array) -> Memory:
         """The memory after this step's `sent` (B, N, .), of which `hit` was attacked."""

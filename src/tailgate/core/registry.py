@@ -23,7 +23,7 @@ from tailgate.base.errors import InputError, unknown
 from tailgate.base.lazy import components, loaded
 from tailgate.core.schema import as_data, build, fields_of, scalar
 
-Family = Literal["defence", "filter", "detector", "mitigation", "attack", "plant", "sensor", "controller", "manoeuvre"]
+Family = Literal["defence", "filter", "detector", "mitigation", "attack", "plant", "sensor", "controller", "manoeuvre", "reward", "learner"]
 USES = ("measurements", "odometry", "probe", "v2v", "redundant", "leader_input", "truth")
 _MODULES = {
     "defence": "tailgate.estimators",
@@ -35,6 +35,8 @@ _MODULES = {
     "sensor": "tailgate.envs",
     "controller": "tailgate.envs",
     "manoeuvre": "tailgate.envs",
+    "reward": "tailgate.envs",
+    "learner": "tailgate.agents",
 }
 _GROUPS = {"defence": "tailgate.estimators", "attack": "tailgate.agents"}
 SANDBOXES = ("bwrap", "docker")

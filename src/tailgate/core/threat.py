@@ -10,7 +10,6 @@ from pydantic import Field
 
 from tailgate.base.errors import InputError, unknown
 from tailgate.core import (
-    AIRED,
     Array,
     Command,
     Count,
@@ -20,10 +19,9 @@ from tailgate.core import (
     no_command,
     param,
 )  # fmt: skip
+from tailgate.core.kinds import EFFECTS, KindName, Limits
 from tailgate.core.quantities import Bound, Bounded, Time, check_order
 
-FAINTEST = 1e-12  # power [W] or delay [m] that a command over the air has at least
-KindName = Literal["dos_jam", "dos_hold", "dos_hold_fresh", "dropout", "fdi", "delay", "replay", "noise_jam", "echo_delay"]
 Knowledge = Literal["black", "grey", "white"]
 KNOWLEDGE: tuple[Knowledge, ...] = get_args(Knowledge)  # each sees what the one before it sees, and more
 Span = Annotated[int, Field(ge=1, le=10_000)]
@@ -91,6 +89,13 @@ class Brief:
         """(w,) largest |value| that false data injection may add to each wire [unit of the wire]."""
         return np.where(self.is_actuator, self.threat.actuator_bound, self.threat.fdi_bound)
 
+    @property
+    def limits(self) -> Limits:
+        """The bounds of the values of commands."""
+        threat, strongest = self.threat, self.threat.actuator_bound
+        low, high = (np.where(self.is_actuator, sign * strongest, end) for sign, end in zip((-1.0, 1.0), threat.jam_range, strict=True))
+        return Limits(self.bounds, low, high, threat.memory, threat.jam_power, threat.delay_bound)
+
     def command(self, on: Array, kind: Array | Kind, target: Array, value: Array | float) -> Command:
         """A command where `on` (B,) holds, else none. target and value broadcast to (B, N, w)."""
         out = no_command(len(on), self.model.agents, len(self.model.wires))
@@ -107,14 +112,4 @@ def receivers(brief: Brief) -> Array:
 
 def fit(brief: Brief, kind: Kind, value: Array) -> Array:
     """Clip values (B, N, w) to the bounds of their kind; round ages and windows to whole steps."""
-    threat = brief.threat
-    if kind == Kind.FDI:
-        return np.clip(value, -brief.bounds, brief.bounds)
-    if kind == Kind.DOS_JAM:
-        strongest, (low, high) = threat.actuator_bound, threat.jam_range
-        return np.clip(value, np.where(brief.is_actuator, -strongest, low), np.where(brief.is_actuator, strongest, high))
-    if kind in (Kind.DELAY, Kind.REPLAY):
-        return np.clip(np.floor(value + 0.5), 1.0, float(threat.memory))
-    if kind in AIRED:
-        return np.clip(value, FAINTEST, threat.jam_power if kind == Kind.NOISE_JAM else threat.delay_bound)
-    return np.zeros_like(value)
+    return EFFECTS[int(kind)].clip(brief.limits, value)

@@ -50,7 +50,7 @@ class TrainConfig:
     defence: str = param("chi2_kf", "registered defence to attack")
     threat: dict[str, Any] = field(default_factory=dict, metadata={"doc": "changes of the scenario's threat model"})
     environment: dict[str, Any] = field(default_factory=dict, metadata={"doc": "action and reward settings of the environment"})
-    learner: str = param("ppo", f"who learns: {'; '.join(f'{name}, {what}' for name, what in LEARNERS.items())}")
+    learner: str = param("ppo", f"who learns: {', '.join(LEARNERS)}")
     ppo: dict[str, Any] = field(default_factory=dict, metadata={"doc": "hyper-parameters of PPO"})
     maskable_ppo: dict[str, Any] = field(default_factory=dict, metadata={"doc": "hyper-parameters of PPO with action masks"})
     recurrent_ppo: dict[str, Any] = field(default_factory=dict, metadata={"doc": "hyper-parameters of PPO with an LSTM"})
@@ -58,6 +58,9 @@ class TrainConfig:
     sac: dict[str, Any] = field(default_factory=dict, metadata={"doc": "hyper-parameters of SAC"})
     tqc: dict[str, Any] = field(default_factory=dict, metadata={"doc": "hyper-parameters of TQC"})
     cem: dict[str, Any] = field(default_factory=dict, metadata={"doc": "hyper-parameters of the cross-entropy method"})
+    settings: dict[str, Any] = field(
+        default_factory=dict, metadata={"doc": "hyper-parameters of a learner that has no field here", "if_any": True}
+    )
     teacher: str | None = param(None, "script that PPO imitates before it learns: one by name, or `best` of the rivals; none: from scratch")
     demonstrations: Episodes = param(1024, "episodes of its teacher that a learner is shown")
     gamma: Discount = param(0.995, "discount, of the learner and of the shaping [-]")
@@ -78,6 +81,10 @@ class TrainConfig:
     @property
     def directory(self) -> Path:
         return Path(self.out) / self.name
+
+    def settings_of(self, learner: str) -> dict[str, Any]:
+        """Return the hyper-parameters that this run gives to a learner."""
+        return dict(getattr(self, learner) if learner in fields_of(TrainConfig) else self.settings.get(learner, {}))
 
 
 def load_config(source: str | None, overrides: list[str], resume: bool = False) -> TrainConfig:
@@ -117,6 +124,9 @@ def checked(data: dict[str, Any]) -> TrainConfig:
     for key in ("threat", "environment", *LEARNERS):
         if not isinstance(data.get(key, {}), dict):
             raise InputError(f"config.{key}", data[key], "a mapping of fields")
+    if others := {name: data[name] for name in data if name in LEARNERS and name not in fields_of(TrainConfig)}:
+        data = {key: value for key, value in data.items() if key not in others}
+        data["settings"] = data.get("settings", {}) | others
     config = build(TrainConfig, data, "config")
     if Path(config.name).name != config.name:
         raise InputError("config.name", config.name, "the name of a directory, without a separator")
@@ -150,9 +160,9 @@ def outcome_of(config: TrainConfig) -> str:
 def check(config: TrainConfig) -> None:
     """Everything that a run will need, tried before anything is written: a typing error shall not cost an hour."""
     settings = _settings(config)
-    for name in LEARNERS.keys() - {config.learner}:  # a typing error there as well, where that learner is installed
+    for name in set(LEARNERS) - {config.learner}:  # a typing error there as well, where that learner is installed
         with contextlib.suppress(ImportError):
-            build(learner_of(name).Config, dict(getattr(config, name)), f"config.{name}")
+            build(learner_of(name).Config, config.settings_of(name), f"config.{name}")
     seat = Seat.make(**environment_of(config))
     check_action(config.learner, seat)
     _check_memory(config, settings, seat)
@@ -304,7 +314,7 @@ def _is_held(config: TrainConfig, held: Path) -> bool:
 def _settings(config: TrainConfig) -> Any:
     """The learner's hyper-parameters, checked."""
     module = learner_of(config.learner)
-    settings = build(module.Config, dict(getattr(config, config.learner)), f"config.{config.learner}")
+    settings = build(module.Config, config.settings_of(config.learner), f"config.{config.learner}")
     settings.check()
     return settings
 

@@ -158,6 +158,8 @@ def configured(base: TrainConfig, values: dict[str, Any]) -> TrainConfig:
     data: dict[str, Any] = {}
     for field, value in values.items():
         head, dot, leaf = field.partition(".")
+        if dot and head not in fields_of(TrainConfig):  # a learner without a field of its own
+            head, leaf, value = "settings", head, {**data.get("settings", base.settings).get(head, {}), leaf: value}
         data[head] = {**data.get(head, getattr(base, head)), leaf: value} if dot else value
     return dataclasses.replace(base, **data)
 
