@@ -27,10 +27,10 @@ class NoAttack:
     def prepare(self, brief: Brief) -> Brief:
         return brief
 
-    def start(self, plan: Brief, batch: int, draws: Draws) -> Any:
+    def start(self, plan: Brief, batch: int, draws: Draws) -> None:
         return None
 
-    def decide(self, plan: Brief, state: Any, view: View, draws: Draws) -> tuple[Any, Command]:
+    def decide(self, plan: Brief, state: None, view: View, draws: Draws) -> tuple[None, Command]:
         return None, no_command(len(view.k), plan.model.agents, len(plan.model.wires))
 
 
@@ -361,10 +361,10 @@ class ThesisTimes:
     def prepare(self, brief: Brief) -> ScriptPlan:
         return ScriptPlan(brief, brief.granted)
 
-    def start(self, plan: ScriptPlan, batch: int, draws: Draws) -> Any:
+    def start(self, plan: ScriptPlan, batch: int, draws: Draws) -> None:
         return None
 
-    def decide(self, plan: ScriptPlan, state: Any, view: View, draws: Draws) -> tuple[Any, Command]:
+    def decide(self, plan: ScriptPlan, state: None, view: View, draws: Draws) -> tuple[None, Command]:
         u, brief = draws.uniform(plan.target.shape), plan.brief
         if self.kind == "fdi":
             on, value = np.isin(view.k, THESIS_FDI_STEPS) & view.allowed, fit(brief, Kind.FDI, self.fdi_max * u)

@@ -1,7 +1,6 @@
 """What drives: adaptive cruise control with a constant time headway (thesis 4.6.1)."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -63,14 +62,14 @@ class AdaptiveCruise:
     def __post_init__(self) -> None:
         check_order("controller acc.accel_min, accel_max", (self.accel_min, self.accel_max))
 
-    def prepare(self, model: Model) -> Any:
+    def prepare(self, model: Model) -> None:
         if model.v2v[:2] != LEADER:
             raise InputError("controller acc", list(model.v2v), "a car-following plant, whose leader sends its position and velocity")
 
-    def start(self, plan: Any, batch: int) -> Any:
+    def start(self, plan: None, batch: int) -> None:
         return None
 
-    def step(self, plan: Any, state: Any, estimate: Estimate, v2v: Array, odometry: Array) -> tuple[Any, Array]:
+    def step(self, plan: None, state: None, estimate: Estimate, v2v: Array, odometry: Array) -> tuple[None, Array]:
         """estimate.x (B, N, 3) = [x, v, a] and v2v (B, N, 2) = [x_l, v_l] to the command a_des (B, N, 1) [m/s^2]."""
         x, v, mode = estimate.x[..., 0], estimate.x[..., 1], estimate.mode
         headway = widened(self.headway, mode)
@@ -79,7 +78,7 @@ class AdaptiveCruise:
             a = np.minimum(a, (self.set_speed - v) / headway)
         return None, limited(obeyed(a, mode), self.accel_min, self.accel_max)[..., None]
 
-    def held(self, plan: Any, state: Any, batch: int) -> Array:
+    def held(self, plan: None, state: None, batch: int) -> Array:
         return np.zeros((batch, 1, 0))
 
     def desired_gap(self, speed: Array) -> Array:

@@ -93,17 +93,17 @@ class IntelligentDriver:
     def prepare(self, model: Model) -> Any:
         check_radar_car(model, "controller idm")
 
-    def start(self, plan: Any, batch: int) -> Any:
+    def start(self, plan: Any, batch: int) -> None:
         return None
 
-    def step(self, plan: Any, state: Any, estimate: Estimate, v2v: Array, odometry: Array) -> tuple[Any, Array]:
+    def step(self, plan: Any, state: None, estimate: Estimate, v2v: Array, odometry: Array) -> tuple[None, Array]:
         """estimate.x (B, N, 4) = [gap, relative speed, ...] and the own odometry to the acceleration (B, N, 1) [m/s^2]."""
         gap, v, mode = estimate.x[..., GAP], odometry[..., 1], estimate.mode
         lead, headway = v + estimate.x[..., RELATIVE_SPEED], widened(self.headway, mode)
         a = idm(gap, v, lead, self.set_speed, headway, self.standstill, self.accel, self.decel)
         return None, limited(obeyed(a, mode), -self.brake, self.accel)[..., None]
 
-    def held(self, plan: Any, state: Any, batch: int) -> Array:
+    def held(self, plan: Any, state: None, batch: int) -> Array:
         return np.zeros((batch, 1, 0))
 
     def desired_gap(self, speed: Array) -> Array:

@@ -27,7 +27,7 @@ class Mixture:
 
     attacks: tuple[Attack, ...]
 
-    def prepare(self, brief: Brief) -> tuple[Any, ...]:
+    def prepare(self, brief: Brief) -> tuple[MixtureState, ...]:
         return tuple(attack.prepare(brief) for attack in self.attacks)
 
     def start(self, plan: tuple[Any, ...], batch: int, draws: Draws) -> MixtureState:

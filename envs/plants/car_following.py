@@ -9,7 +9,7 @@ the sign of the acceleration, and A_a is unstable; (4.14) has its sign wrong and
 """
 
 from dataclasses import dataclass
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -114,7 +114,7 @@ class CarFollowing:
         x, v, a = drive(plan.A, plan.B, ego[:, 0, 0], ego[:, 0, 1], ego[:, 0, 2], u[:, 0, 0], noise)
         return num.stack([x[:, None], v[:, None], a[:, None]])
 
-    def known(self, plan: FollowingPlan, u: Array, exo: Array, state: Any) -> Array:
+    def known(self, plan: FollowingPlan, u: Array, exo: Array, state: FollowingState) -> Array:
         return u
 
     def truth(self, plan: FollowingPlan, state: FollowingState, held: Array) -> Array:

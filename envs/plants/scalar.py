@@ -6,7 +6,7 @@ The reading is exact, so that a defence that believes it knows the state, and an
 """
 
 from dataclasses import dataclass
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -75,7 +75,7 @@ class ScalarLoop:
     def step(self, plan: float, state: ScalarState, u: Array, exo: Array, draws: Draws) -> ScalarState:
         return ScalarState(self.a * state.x + self.b * u[:, 0, 0] + plan * draws.normal())
 
-    def known(self, plan: float, u: Array, exo: Array, state: Any) -> Array:
+    def known(self, plan: float, u: Array, exo: Array, state: ScalarState) -> Array:
         return u
 
     def truth(self, plan: float, state: ScalarState, held: Array) -> Array:
@@ -109,10 +109,10 @@ class ExactReading:
             raise InputError("sensor exact_reading", type(plant).__name__, "the plant scalar_loop")
         return (WIRE,), np.ones((1, 1, 1)), np.full((1, 1, 1), self.told_var)
 
-    def prepare(self, model: Model) -> Any:
+    def prepare(self, model: Model) -> None:
         return None
 
-    def measure(self, plan: Any, truth: Array, probe: Array, draws: Draws) -> Received:
+    def measure(self, plan: None, truth: Array, probe: Array, draws: Draws) -> Received:
         return Received(truth.copy(order="K"), num.full(truth.shape, True, bool), num.zeros(truth.shape[:2]))
 
 
@@ -123,19 +123,19 @@ class StateFeedback:
 
     gain: Factor = param(0.25, "feedback gain g [-]")
 
-    def prepare(self, model: Model) -> Any:
+    def prepare(self, model: Model) -> None:
         if model.states != 1 or model.actuators != (ACTUATOR,):
             raise InputError("controller state_feedback", list(model.actuators), f"the plant scalar_loop, whose actuator is {ACTUATOR}")
         if abs(model.A[0, 0] - model.B[0, 0] * self.gain) > GROWTH:
             raise InputError("controller state_feedback.gain", self.gain, f"at most {GROWTH:g} as |a - b gain|, by which the loop grows")
 
-    def start(self, plan: Any, batch: int) -> Any:
+    def start(self, plan: None, batch: int) -> None:
         return None
 
-    def step(self, plan: Any, state: Any, estimate: Estimate, v2v: Array, odometry: Array) -> tuple[Any, Array]:
+    def step(self, plan: None, state: None, estimate: Estimate, v2v: Array, odometry: Array) -> tuple[None, Array]:
         return None, -self.gain * estimate.x
 
-    def held(self, plan: Any, state: Any, batch: int) -> Array:
+    def held(self, plan: None, state: None, batch: int) -> Array:
         return np.zeros((batch, 1, 0))
 
     def desired_gap(self, speed: Array) -> Array:

@@ -8,7 +8,7 @@ figure 5.1 shows 12 edges, of which the text gives 11; the twelfth is taken as 4
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -172,7 +172,7 @@ class SensorNetwork:
         x = num.apply(plan.A, state.x[:, None])[:, 0]
         return NetworkState(x + plan.noise_sd * draws.normal((self.states,)) if plan.noise_sd else x)
 
-    def known(self, plan: NetworkPlan, u: Array, exo: Array, state: Any) -> Array:
+    def known(self, plan: NetworkPlan, u: Array, exo: Array, state: NetworkState) -> Array:
         return u
 
     def truth(self, plan: NetworkPlan, state: NetworkState, held: Array) -> Array:
@@ -259,13 +259,13 @@ class NoControl:
             raise InputError("controller none", list(model.actuators), "a plant without actuators")
         return model.agents
 
-    def start(self, plan: int, batch: int) -> Any:
+    def start(self, plan: int, batch: int) -> None:
         return None
 
-    def step(self, plan: int, state: Any, estimate: Estimate, v2v: Array, odometry: Array) -> tuple[Any, Array]:
+    def step(self, plan: int, state: None, estimate: Estimate, v2v: Array, odometry: Array) -> tuple[None, Array]:
         return None, np.zeros((len(v2v), plan, 0))
 
-    def held(self, plan: int, state: Any, batch: int) -> Array:
+    def held(self, plan: int, state: None, batch: int) -> Array:
         return np.zeros((batch, plan, 0))
 
     def desired_gap(self, speed: Array) -> Array:

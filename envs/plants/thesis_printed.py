@@ -11,7 +11,6 @@ car does not keep its distance: nothing here may stand for a car. `car_following
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -53,17 +52,17 @@ class RelativeDistance:
     headway: Lag = param(3.0, "time headway h of the spacing policy (4.13) [s]")
     standstill: Length = param(5.0, "minimum stopping distance d_r [m]")
 
-    def prepare(self, model: Model) -> Any:
+    def prepare(self, model: Model) -> None:
         return None
 
-    def start(self, plan: Any, batch: int) -> Any:
+    def start(self, plan: None, batch: int) -> None:
         return None
 
-    def step(self, plan: Any, state: Any, estimate: Estimate, v2v: Array, odometry: Array) -> tuple[Any, Array]:
+    def step(self, plan: None, state: None, estimate: Estimate, v2v: Array, odometry: Array) -> tuple[None, Array]:
         """estimate.x (B, N, 3) and v2v (B, N, 2) = [x_l, v_l] to u (B, N, 1) [m]."""
         return None, (v2v[..., 0] - estimate.x[..., 0])[..., None]
 
-    def held(self, plan: Any, state: Any, batch: int) -> Array:
+    def held(self, plan: None, state: None, batch: int) -> Array:
         return np.zeros((batch, 1, 0))
 
     def desired_gap(self, speed: Array) -> Array:

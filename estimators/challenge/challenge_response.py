@@ -28,8 +28,9 @@ from tailgate.core.draws import Draws
 from tailgate.core.registry import imported, make_from, register
 from tailgate.core.schema import build
 from tailgate.envs.sensors.fmcw import false_alarm_threshold, from_db
-from tailgate.estimators.compose import AcceptAll, Filter, Look, ModeName, Verdict
+from tailgate.estimators.compose import AcceptAll, Look, ModeName
 from tailgate.estimators.filters.predictors import read_states
+from tailgate.estimators.parts import Filter, Verdict
 
 Chance = Annotated[float, Field(gt=0, lt=1)]
 Steps = tuple[PositiveCount, ...]

@@ -8,13 +8,14 @@ A shut gate widens with P, and so re-opens in time. With the steady gain it does
 """
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 from tailgate import num
 from tailgate.core import Innovation, Positive, param
 from tailgate.core.registry import register
-from tailgate.estimators.compose import Composed, Detector, Filter, GateOut, Mitigation, Stateless, Verdict, blame_all
+from tailgate.estimators.compose import Composed, GateOut
 from tailgate.estimators.filters.kalman import GAIN, Gain, KalmanFilter
+from tailgate.estimators.parts import Detector, Filter, Mitigation, Stateless, Verdict, blame_all
 
 
 @register("detector", "chi2", reference="Dutta 2018, section 4.2")
@@ -25,11 +26,11 @@ class ChiSquare(Stateless):
     threshold_field: ClassVar[str] = "eta"
     eta: Positive = param(20.0, "threshold on r' S^-1 r [-]")
 
-    def step(self, plan: Any, state: Any, innovation: Innovation) -> tuple[Any, Verdict]:
+    def step(self, plan: None, state: None, innovation: Innovation) -> tuple[None, Verdict]:
         score = num.quadratic(innovation.r, num.inverse(innovation.S))
         return None, blame_all(score, score > self.eta, innovation)
 
-    def gate(self, plan: Any, state: Any) -> float:
+    def gate(self, plan: None, state: None) -> float:
         return self.eta
 
 

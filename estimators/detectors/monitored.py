@@ -8,11 +8,12 @@ from typing import ClassVar
 
 from tailgate.core import Count, NonNegative, Positive, PositiveCount, param
 from tailgate.core.registry import register
-from tailgate.estimators.compose import Composed, Detector, Filter, GateOut, Mitigation
+from tailgate.estimators.compose import Composed, GateOut
 from tailgate.estimators.detectors.chi_square import ChiSquare
 from tailgate.estimators.detectors.sequential import Allowance, Cusum, Mewma, Weight, WindowedChiSquare
 from tailgate.estimators.filters.kalman import KalmanFilter
 from tailgate.estimators.mitigations.responses import Brake, Latch, Reacquire, Widen
+from tailgate.estimators.parts import Detector, Filter, Mitigation
 
 LATCH = "steps that the gate stays shut after the last alarm"
 AFTER = "readings rejected in a row before the next one is believed"

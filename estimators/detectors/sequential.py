@@ -19,7 +19,7 @@ from pydantic import Field
 from tailgate import num
 from tailgate.core import Array, Innovation, Model, Positive, PositiveCount, param
 from tailgate.core.registry import register
-from tailgate.estimators.compose import Verdict, blame_all
+from tailgate.estimators.parts import Verdict, blame_all
 
 Allowance = Annotated[float, Field(gt=1, le=1e30, allow_inf_nan=False)]
 Weight = Annotated[float, Field(ge=1e-6, le=1)]

@@ -11,20 +11,21 @@ With two sensors: g > eta, and the more suspect one is dropped if r_i^2 / S_ii <
 """
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
 from tailgate import num
 from tailgate.core import Array, Innovation, Model, Positive, param
 from tailgate.core.registry import register
-from tailgate.estimators.compose import Composed, Detector, Filter, GateOut, Mitigation, Stateless, Verdict
+from tailgate.estimators.compose import Composed, GateOut
 from tailgate.estimators.filters.kalman import KalmanFilter, alone
+from tailgate.estimators.parts import Detector, Filter, Memoryless, Mitigation, Verdict
 
 
 @register("detector", "sparse_chi2", reference="Dutta 2018, section 4.7; Handschin, Schweppe, Kohlas and Fiechter 1975")
 @dataclass(frozen=True)
-class SparseChiSquare(Stateless):
+class SparseChiSquare(Memoryless):
     """Alarms when the normalised innovation squared exceeds eta, and blames the fewest sensors that explain it."""
 
     threshold_field: ClassVar[str] = "eta"
@@ -39,7 +40,7 @@ class SparseChiSquare(Stateless):
         fewer = [min(float(stats.chi2.isf(tail, m)), self.eta) for m in range(1, q)]  # the minimum: of a tail that is 0 in float64
         return np.array([0.0, *fewer, self.eta])
 
-    def step(self, plan: Array, state: Any, innovation: Innovation) -> tuple[Any, Verdict]:
+    def step(self, plan: Array, state: None, innovation: Innovation) -> tuple[None, Verdict]:
         score = num.quadratic(innovation.r, num.inverse(innovation.S))
         alarm = score > self.eta
         suspect = np.zeros(innovation.r.shape, bool)
@@ -59,7 +60,7 @@ class SparseChiSquare(Stateless):
             keep = keep & ~(guilty[..., None] & (sensors == np.argmax(fall, axis=-1)[..., None]))
         return keep
 
-    def gate(self, plan: Array, state: Any) -> float:
+    def gate(self, plan: Array, state: None) -> float:
         """eta: nobody is suspected up to it. Beyond it the attacker pays with a sensor, not always its own (docs/filters.md)."""
         return self.eta
 

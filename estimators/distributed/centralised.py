@@ -14,9 +14,10 @@ from tailgate import num
 from tailgate.core import Array, Estimate, Model, Prior, Received
 from tailgate.core.draws import Draws
 from tailgate.core.registry import register
-from tailgate.estimators.compose import AcceptAll, Composed, Filter, Score, compose
+from tailgate.estimators.compose import AcceptAll, Composed, Score, compose
 from tailgate.estimators.distributed.distributed_kalman import DistributedKalmanFilter
 from tailgate.estimators.distributed.lasso import Lasso, LassoFilter
+from tailgate.estimators.parts import Filter
 
 USES = ("measurements", "redundant", "leader_input")
 

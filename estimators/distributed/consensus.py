@@ -26,9 +26,10 @@ from tailgate.base.errors import NotApplicable
 from tailgate.core import Array, Innovation, Model, Positive, Probability, param
 from tailgate.core.reach import MARGIN, blind
 from tailgate.core.registry import register
-from tailgate.estimators.compose import AcceptAll, Composed, Detector, Filter, Mitigation
+from tailgate.estimators.compose import AcceptAll, Composed
 from tailgate.estimators.distributed.distributed_kalman import ALARM, DistributedFilter, FusionPlan, gate_of, neighbours, one_row
 from tailgate.estimators.filters.kalman import KalmanState, alone
+from tailgate.estimators.parts import Detector, Filter, Mitigation
 
 REFERENCE = "R. Olfati-Saber, Kalman-Consensus Filter: Optimality, Stability, and Performance, CDC 2009"
 CONSENSUS = "consensus gain: pull towards the mean of the neighbours' predictions, times M / (1 + |M|); 0: none [-]"

@@ -20,9 +20,10 @@ import numpy as np
 from tailgate import num
 from tailgate.core import Array, Positive, param
 from tailgate.core.registry import register
-from tailgate.estimators.compose import Composed, Detector, Filter, GateOut, Mitigation
+from tailgate.estimators.compose import Composed, GateOut
 from tailgate.estimators.distributed.distributed_kalman import ETA, DistributedFilter, FusionPlan, gate_of
 from tailgate.estimators.filters.kalman import GAIN, Gain
+from tailgate.estimators.parts import Detector, Filter, Mitigation
 
 REFERENCE = "U. A. Khan, A. M. Stankovic, Secure Distributed Estimation in Cyber-Physical Systems, ICASSP 2013"
 THRESHOLD = "largest disagreement of any state, in standard deviations of the difference [-]"

@@ -25,9 +25,10 @@ from tailgate.base.memo import remembered
 from tailgate.core import Array, Innovation, Model, Positive, Prior, Probability, Received, param
 from tailgate.core.reach import require_detectable
 from tailgate.core.registry import register
-from tailgate.estimators.compose import AcceptAll, Composed, Detector, Filter, GateOut, Mitigation, Score, Stateless, Verdict, blame_all
+from tailgate.estimators.compose import AcceptAll, Composed, GateOut, Score
 from tailgate.estimators.detectors.chi_square import ChiSquare
 from tailgate.estimators.filters.kalman import GAIN, Gain, KalmanState, LinearFilter, alone, broad, precision, riccati
+from tailgate.estimators.parts import Detector, Filter, Memoryless, Mitigation, Verdict, blame_all
 
 SWEEPS = 200
 SETTLED = 1e-13  # relative
@@ -304,7 +305,7 @@ class DistributedKalman(Composed):
 
 @register("detector", "chi2_tail", reference="Dutta 2018, section 4.2")
 @dataclass(frozen=True)
-class TailChiSquare(Stateless):
+class TailChiSquare(Memoryless):
     """Alarms when the normalised innovation squared exceeds the quantile of chi-square that belongs to a false-alarm probability.
 
     The same for any number of sensors: the thesis's threshold 20 for two sensors is 22.8 for three, and 44.7 for fourteen.

@@ -22,10 +22,11 @@ from typing import Any, Literal
 from tailgate import num
 from tailgate.core import Array, Innovation, Positive, param
 from tailgate.core.registry import register
-from tailgate.estimators.compose import AcceptAll, Composed, Detector, Filter, Mitigation, Score
+from tailgate.estimators.compose import AcceptAll, Composed, Score
 from tailgate.estimators.distributed.distributed_kalman import DistributedFilter
 from tailgate.estimators.filters.kalman import GAIN, Gain, alone
 from tailgate.estimators.filters.robust import Solved, believed, believed_by_cvxpy
+from tailgate.estimators.parts import Detector, Filter, Mitigation
 
 
 @dataclass(frozen=True)

@@ -24,10 +24,11 @@ import numpy as np
 from tailgate import num
 from tailgate.core import Array, Innovation, Model, Positive, Prior, Received, param
 from tailgate.core.registry import register
-from tailgate.estimators.compose import AcceptAll, Composed, Detector, Filter, Mitigation, Score
+from tailgate.estimators.compose import AcceptAll, Composed, Score
 from tailgate.estimators.distributed.distributed_kalman import DistributedFilter, FusionPlan, one_row
 from tailgate.estimators.filters.kalman import GAIN, Gain, KalmanState, alone
 from tailgate.estimators.filters.robust import ACCURACY, load_cvxpy
+from tailgate.estimators.parts import Detector, Filter, Mitigation
 
 ROUNDS = 100  # of Newton's iteration; some five are enough
 

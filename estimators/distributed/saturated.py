@@ -27,9 +27,10 @@ import numpy as np
 from tailgate import num
 from tailgate.core import Array, Innovation, Positive, param
 from tailgate.core.registry import register
-from tailgate.estimators.compose import AcceptAll, Composed, Detector, Filter, Mitigation
+from tailgate.estimators.compose import AcceptAll, Composed
 from tailgate.estimators.distributed.distributed_kalman import ALARM, DistributedFilter, FusionPlan, gate_of
 from tailgate.estimators.filters.kalman import GAIN, Gain, alone
+from tailgate.estimators.parts import Detector, Filter, Mitigation
 
 REFERENCE = "Y. Chen, S. Kar, J. M. F. Moura, Resilient Distributed Estimation: Sensor Attacks, arXiv 1709.06156, 2017"
 GAMMA = "length at which an innovation is cut, sqrt(r' S^-1 r / q): 1 is what noise alone has [-]"

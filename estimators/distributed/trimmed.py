@@ -25,9 +25,10 @@ from tailgate.base.errors import NotApplicable
 from tailgate.core import Array, Count, Model, param
 from tailgate.core.reach import MARGIN
 from tailgate.core.registry import register
-from tailgate.estimators.compose import AcceptAll, Composed, Detector, Filter, Mitigation, Score
+from tailgate.estimators.compose import AcceptAll, Composed, Score
 from tailgate.estimators.distributed.distributed_kalman import neighbours
 from tailgate.estimators.filters.kalman import KalmanState, LinearFilter, broad, steady_state
+from tailgate.estimators.parts import Detector, Filter, Mitigation
 
 REFERENCE = "A. Mitra, S. Sundaram, Byzantine-Resilient Distributed Observers for LTI Systems, Automatica 108, 2019"
 FAULTY = "F: attacked neighbours of an agent that are tolerated, of each mode"

@@ -23,10 +23,11 @@ import numpy as np
 from tailgate import num
 from tailgate.core import Array, Innovation, Positive, Prior, Probability, param
 from tailgate.core.registry import register
-from tailgate.estimators.compose import AcceptAll, Composed, Detector, Filter, Mitigation
+from tailgate.estimators.compose import AcceptAll, Composed
 from tailgate.estimators.distributed.disagreement import THRESHOLD, disagreement
 from tailgate.estimators.distributed.distributed_kalman import ALARM, DistributedFilter, FusionPlan, gate_of
 from tailgate.estimators.filters.kalman import GAIN, Gain
+from tailgate.estimators.parts import Detector, Filter, Mitigation
 
 REFERENCE = "I. Matei, J. S. Baras, V. Srinivasan, Trust-Based Multi-Agent Filtering for Increased Smart Grid Security, MED 2012"
 RATE = "share of the lost trust that is regained in a step without disagreement [-]"

@@ -21,7 +21,8 @@ from tailgate.base.memo import remembered
 from tailgate.core import Array, Innovation, Model, Prior, Received, param
 from tailgate.core.reach import blind
 from tailgate.core.registry import register
-from tailgate.estimators.compose import AcceptAll, Composed, Detector, Filter, Mitigation, Score
+from tailgate.estimators.compose import AcceptAll, Composed, Score
+from tailgate.estimators.parts import Detector, Filter, Mitigation
 
 Gain = Literal["varying", "steady"]
 LEAST = 1e-18  # variance that a filter divides by, at least

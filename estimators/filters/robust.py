@@ -21,9 +21,10 @@ import numpy as np
 from tailgate import num
 from tailgate.core import Array, Innovation, Model, Positive, param
 from tailgate.core.registry import register
-from tailgate.estimators.compose import AcceptAll, Composed, Detector, Filter, Mitigation, Stateless, Verdict
+from tailgate.estimators.compose import AcceptAll, Composed
 from tailgate.estimators.detectors.chi_square import ChiSquare
 from tailgate.estimators.filters.kalman import KalmanPlan, KalmanState, LinearFilter, alone, steady_state
+from tailgate.estimators.parts import Detector, Filter, Memoryless, Mitigation, Verdict
 
 ROUNDS = 1000  # far above what was ever seen: a guard against rounding
 ACCURACY = 1e-9  # asked of the interior-point solver
@@ -221,7 +222,7 @@ class RobustKalmanFilter(Solved, LinearFilter):
 
 @register("detector", "outlier", reference="Mattingley and Boyd 2010: the optimality condition of z = 0")
 @dataclass(frozen=True)
-class Outlier(Penalty, Stateless):
+class Outlier(Penalty, Memoryless):
     """Alarms, and blames the sensor, where the robust Kalman filter of the same lam would find an outlier."""
 
     def prepare(self, model: Model) -> Array:
@@ -231,12 +232,12 @@ class Outlier(Penalty, Stateless):
         lam, W = self.price(S), num.inverse(S).diagonal(axis1=-2, axis2=-1)
         return np.asarray((1.0 - 1e-12) * np.min(lam * lam / (4.0 * W), axis=-1))
 
-    def step(self, plan: Array, state: Any, innovation: Innovation) -> tuple[Any, Verdict]:
+    def step(self, plan: Array, state: None, innovation: Innovation) -> tuple[None, Verdict]:
         r, S = innovation
         suspect = believed(r, S, self.price(S)) != r
         return None, Verdict(num.quadratic(r, num.inverse(S)), suspect.any(axis=-1), suspect)
 
-    def gate(self, plan: Array, state: Any) -> Array:
+    def gate(self, plan: Array, state: None) -> Array:
         """The largest ellipsoid r' S^-1 r inside of |2 S^-1 r|_i <= lam_i, for the steady S. Outside of it some raise none either."""
         return plan
 

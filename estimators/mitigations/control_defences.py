@@ -17,7 +17,8 @@ from tailgate import num
 from tailgate.base.errors import InputError, NotApplicable
 from tailgate.core import Array, Finite, Model, NonNegative, Positive, Received, param
 from tailgate.core.registry import register
-from tailgate.estimators.compose import Decision, GateOut, ModeName, Verdict, quiet
+from tailgate.estimators.compose import GateOut, ModeName, quiet
+from tailgate.estimators.parts import Decision, Verdict
 
 OWN = ("distance", "velocity", "acceleration")
 STEPS = 100_000  # longest impulse response that is added up

@@ -12,7 +12,8 @@ import numpy as np
 from tailgate import num
 from tailgate.core import Array, Count, PositiveCount, Received, param
 from tailgate.core.registry import register
-from tailgate.estimators.compose import Decision, GateOut, ModeName, ReactionPlan, Verdict, quiet
+from tailgate.estimators.compose import GateOut, ModeName, ReactionPlan, quiet
+from tailgate.estimators.parts import Decision, Verdict
 
 
 @register("mitigation", "latch")

@@ -1,23 +1,23 @@
 """The oracle: told which measurements are attacked. An upper yardstick, shown and never ranked."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from tailgate.base.errors import InputError
 from tailgate.core import Mode, Received, param
 from tailgate.core.registry import register
-from tailgate.estimators.compose import Composed, Decision, Detector, Filter, Mitigation, Score, Stateless, Verdict
+from tailgate.estimators.compose import Composed, Score
 from tailgate.estimators.distributed.distributed_kalman import DistributedKalmanFilter
 from tailgate.estimators.filters.kalman import GAIN, Gain, KalmanFilter
+from tailgate.estimators.parts import Decision, Detector, Filter, Mitigation, Stateless, Verdict
 
 
 @dataclass(frozen=True)
 class RejectAttacked(Stateless):
     """Accepts exactly the sensors that are not attacked."""
 
-    def step(self, plan: Any, state: Any, verdict: Verdict, received: Received) -> tuple[Any, Decision]:
+    def step(self, plan: None, state: None, verdict: Verdict, received: Received) -> tuple[None, Decision]:
         if received.attacked is None:
             raise InputError("oracle", None, "a loop that grants `truth`")
         return None, Decision(received.valid & ~received.attacked, np.full_like(verdict.alarm, Mode.NORMAL, np.int8))

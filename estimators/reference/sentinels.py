@@ -1,26 +1,27 @@
 """Sentinels: degenerate defences that a sound score must fail. Each names the gate that it has to fail."""
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from tailgate import num
 from tailgate.core import Array, Innovation, Mode, Model, PositiveCount, Received, param
 from tailgate.core.registry import register
-from tailgate.estimators.compose import AcceptAll, Composed, Decision, Detector, Filter, Mitigation, Score, Stateless, Verdict, blame_all
+from tailgate.estimators.compose import AcceptAll, Composed, Score
 from tailgate.estimators.filters.kalman import KalmanFilter
+from tailgate.estimators.parts import Decision, Detector, Filter, Mitigation, Stateless, Verdict, blame_all
 
 
 @dataclass(frozen=True)
 class AlwaysAlarm(Stateless):
     """Alarms at every step."""
 
-    def step(self, plan: Any, state: Any, innovation: Innovation) -> tuple[Any, Verdict]:
+    def step(self, plan: None, state: None, innovation: Innovation) -> tuple[None, Verdict]:
         score = np.ones(innovation.r.shape[:2])
         return None, blame_all(score, np.ones_like(score, bool), innovation)
 
-    def gate(self, plan: Any, state: Any) -> None:
+    def gate(self, plan: None, state: None) -> None:
         return None
 
 
@@ -30,7 +31,7 @@ class AlwaysMode(Stateless):
 
     mode: Mode
 
-    def step(self, plan: Any, state: Any, verdict: Verdict, received: Received) -> tuple[Any, Decision]:
+    def step(self, plan: None, state: None, verdict: Verdict, received: Received) -> tuple[None, Decision]:
         return None, Decision(received.valid, num.full(verdict.alarm.shape, self.mode, np.int8))
 
 

@@ -18,8 +18,8 @@ from tailgate import num
 from tailgate.core import Array, Innovation, Positive, PositiveCount, Probability, param
 from tailgate.core.registry import register
 from tailgate.estimators.challenge.challenge_response import QUIET, WATCH, Challenger, Response
-from tailgate.estimators.compose import Filter
 from tailgate.estimators.filters.predictors import Predictor, PredictorPlan, PredictorState
+from tailgate.estimators.parts import Filter
 
 Factor = Annotated[float, Field(ge=0.01, lt=1)]
 UNIT = 100.0  # of time in h [steps]
