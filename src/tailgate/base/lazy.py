@@ -1,4 +1,4 @@
-"""Packages whose modules are imported when somebody asks for what is in them: all of them take longer than an environment's first step."""
+"""Packages that import their modules on first use: importing all would take longer than an environment's first step."""
 
 import sys
 from collections.abc import Callable
@@ -7,7 +7,10 @@ from typing import Any
 
 
 def exported(package: str, homes: dict[str, str]) -> tuple[Callable[[str], Any], list[str]]:
-    """A package's `__getattr__` and `__all__`, from its modules and the names, with blanks between, that each gives to the package."""
+    """Return a package's `__getattr__` and `__all__`.
+
+    `homes` maps each module to the names that it exports, separated by blanks.
+    """
     where = {name: module for module, names in homes.items() for name in names.split()}
 
     def get(name: str) -> Any:

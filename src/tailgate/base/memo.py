@@ -1,4 +1,4 @@
-"""Results of slow functions of models, remembered."""
+"""A cache for slow functions of models."""
 
 from collections import OrderedDict
 from collections.abc import Callable
@@ -7,12 +7,12 @@ from typing import Any, TypeVar
 
 from tailgate.base.pytree import lock
 
-KEPT = 64  # results of a function
+KEPT = 64  # results per function
 T = TypeVar("T")
 
 
 def remembered(*fields: str) -> Callable[[Callable[[Any], T]], Callable[[Any], T]]:
-    """Decorate a function of one argument that depends on the argument's arrays of these names alone. Results are read-only."""
+    """Decorate a function of one argument that depends only on the argument's arrays of these names. Results are read-only."""
 
     def decorate(function: Callable[[Any], T]) -> Callable[[Any], T]:
         known: OrderedDict[Any, T] = OrderedDict()

@@ -1,4 +1,4 @@
-"""Pictures of an evaluation: what the position error says of each defence and attack, and what the gap says."""
+"""Plots of an evaluation: position errors and gaps, for each defence and attack."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ import numpy as np
 from tailgate.base.files import writable_directory, write_atomic
 from tailgate.base.pytree import Array
 
-Table = Sequence[dict[str, Any]]  # of summary.summarise
-PANELS = (  # key, title, colours; each darkens from harmless to harmful
+Table = Sequence[dict[str, Any]]  # from evaluation.summary.summarise
+PANELS = (  # key, title, colours from harmless to harmful
     ("rmse_position", "position RMSE [m], median", "Blues"),
     ("min_gap", "smallest gap [m], median", "Oranges_r"),
     ("crash", "episodes with a collision [%]", "Reds"),
 )
-NO_ROAD = (  # of systems that nothing drives in
+NO_ROAD = (  # for systems without a road
     ("rmse_position", "RMS of the state's error (2-norm), median", "Blues"),
     ("max_error", "largest error of an agent's state (2-norm), median", "Purples"),
 )
@@ -28,7 +28,7 @@ MARKERS = "osD^v<>PX*phd"
 
 
 def canvas(width: float, height: float, rows: int = 1, columns: int = 1, **options: Any) -> tuple[Any, Any]:
-    """A matplotlib figure and its axes (rows, columns), without the global state of pyplot."""
+    """Return a matplotlib figure and its axes (rows, columns), without the global state of pyplot."""
     try:
         from matplotlib.figure import Figure
     except ImportError as error:
@@ -38,14 +38,14 @@ def canvas(width: float, height: float, rows: int = 1, columns: int = 1, **optio
 
 
 def png(figure: Any) -> bytes:
-    """The figure as a PNG file, the same bytes for the same figure."""
+    """Return the figure as a PNG file; equal figures give equal bytes."""
     out = io.BytesIO()
     figure.savefig(out, format="png", dpi=110, metadata={"Software": None})
     return out.getvalue()
 
 
 def write_overview(table: Table, directory: Path) -> list[Path]:
-    """One picture of matrices per scenario and dose, and one scatter over all that have a road; returns their paths."""
+    """Write matrices for each scenario and dose, and one scatter plot of all cells with a road; return the paths."""
     writable_directory(directory, "plot")
     good = [entry for entry in table if entry["crash"] is not None]
     out = []
@@ -62,14 +62,14 @@ def write_overview(table: Table, directory: Path) -> list[Path]:
 
 
 def value(entry: dict[str, Any], key: str) -> float:
-    """A figure of one cell as it is drawn; NaN where it has none."""
+    """Return a figure of one cell as it is drawn; NaN if the cell has none."""
     if key == "crash":
         return 100.0 * float(entry["crash"]["value"])
     return float(entry[key]["median"]) if entry[key] else float("nan")
 
 
 def matrices(table: Table, title: str) -> bytes:
-    """Defences x attacks, one above the other: position error, smallest gap, collisions; without a road the state's error alone."""
+    """Draw matrices of defences by attacks: position error, smallest gap, collisions; without a road, state errors."""
     panels = PANELS if any(entry["min_gap"] for entry in table) else NO_ROAD
     defences, attacks = (list(dict.fromkeys(e[key] for e in table)) for key in ("defence", "attack"))
     labels = [textwrap.fill(name.replace(",", ", "), 26) for name in attacks]
@@ -100,7 +100,7 @@ def _short(number: float) -> str:
 
 
 def scatter(table: Table) -> bytes:
-    """Position error against smallest gap, one mark a cell: filled where episodes collide."""
+    """Draw position error against smallest gap, one mark per cell; filled marks are cells where most episodes collide."""
     figure, axes = canvas(10.0, 5.8)
     ax, defences = axes[0, 0], list(dict.fromkeys(e["defence"] for e in table))
     for i, name in enumerate(defences):

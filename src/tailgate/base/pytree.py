@@ -1,4 +1,4 @@
-"""Walks over states: nested NamedTuples and mappings whose leaves are arrays with B first, or None."""
+"""Operations on pytrees: nested NamedTuples and mappings whose leaves are arrays (B, ...), or None."""
 
 import copy
 from collections.abc import Callable, Iterator
@@ -11,7 +11,7 @@ Array = NDArray[Any]
 
 
 def map_leaves(function: Callable[..., Any], tree: Any, *others: Any) -> Any:
-    """The tree with `function` applied to its leaves, several trees of one shape side by side."""
+    """Return the tree with `function` applied to its leaves and to the same leaves of `others`."""
     if tree is None:
         return None
     if isinstance(tree, dict):
@@ -23,7 +23,7 @@ def map_leaves(function: Callable[..., Any], tree: Any, *others: Any) -> Any:
 
 
 def rebuilt(like: Any) -> Callable[[Iterator[Any]], Any]:
-    """Return a function that builds a tree shaped as `like` from an iterator of leaves, in less time than `map_leaves` takes."""
+    """Return a function that builds a tree shaped as `like` from an iterator of leaves; it is faster than `map_leaves`."""
     if like is None:
         return lambda leaves: None
     if isinstance(like, dict):
@@ -36,7 +36,7 @@ def rebuilt(like: Any) -> Callable[[Iterator[Any]], Any]:
 
 
 def put_rows(tree: Any, rows: Array, fresh: Any) -> Any:
-    """A copy of the tree with `rows` (R,) replaced by the leaves of `fresh`, which have R rows."""
+    """Return a copy of the tree whose `rows` (R,) hold the leaves (R, ...) of `fresh`."""
 
     def put(leaf: Array, new: Array) -> Array:
         out = leaf.copy(order="K")
@@ -47,7 +47,7 @@ def put_rows(tree: Any, rows: Array, fresh: Any) -> Any:
 
 
 def frozen(tree: Any) -> Any:
-    """The tree with read-only views of its leaves: what others are shown of a state."""
+    """Return the tree with read-only views of its leaves."""
 
     def lock(leaf: Array) -> Array:
         out = leaf.view()
@@ -58,12 +58,12 @@ def frozen(tree: Any) -> Any:
 
 
 def duplicate(tree: Any) -> Any:
-    """A copy that shares nothing, objects inside of arrays included."""
+    """Return a deep copy, including objects inside arrays."""
     return map_leaves(lambda leaf: copy.deepcopy(leaf) if leaf.dtype == object else leaf.copy(order="K"), tree)
 
 
 def leaves(tree: Any, prefix: str = "") -> dict[str, np.ndarray]:
-    """Every leaf by its dotted name."""
+    """Return the leaves by dotted name."""
     if tree is None:
         return {}
     if isinstance(tree, (tuple, dict)):
@@ -76,7 +76,7 @@ def leaves(tree: Any, prefix: str = "") -> dict[str, np.ndarray]:
 
 
 def with_leaves(tree: Any, values: dict[str, np.ndarray], prefix: str = "") -> Any:
-    """The tree with its leaves replaced by name, as `leaves` names them; their memory layout is kept."""
+    """Return the tree with its leaves replaced by name, as `leaves` names them; their memory layout is kept."""
     if tree is None:
         return None
     if isinstance(tree, tuple):
@@ -89,7 +89,7 @@ def with_leaves(tree: Any, values: dict[str, np.ndarray], prefix: str = "") -> A
 
 
 def lock(plan: Any) -> Any:
-    """The plan with every array in it made read-only, in place: constants are shared by all episodes, and by whoever looks."""
+    """Make every array of a plan read-only, in place, because all episodes share it; return the plan."""
     if isinstance(plan, np.ndarray):
         plan.flags.writeable = False
     elif isinstance(plan, (tuple, list)):
