@@ -1,4 +1,4 @@
-"""Functions of numbers as machine code for plain code: made at the first call with arguments of these kinds, or loaded."""
+"""Functions of numbers as machine code for plain code, compiled or loaded at the first call with arguments of a kind."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from tailgate.engine.functions import tracing
 from tailgate.engine.operations import Array
 from tailgate.engine.untraceable import Untraceable
 
-ALIGNED = 64  # bytes: a line of the processor's cache
-KEPT, EACH = 256, 8  # constants whose code is known at once, and code of the same shapes for other answers
+ALIGNED = 64  # bytes of a cache line
+KEPT, EACH = 256, 8  # constants whose code is found at once, and variants of code of the same shapes
 
 
 class Code:
-    """A function of numbers of one type that gives a tuple of numbers of one type, for arrays of them."""
+    """Machine code of a function from arrays of one type to a tuple of arrays of one type."""
 
     def __init__(self, function: Callable[..., Any], dtype: Any, inputs: int) -> None:
-        from tailgate.engine.program import Program, traced  # which need random numbers, and those this code
+        from tailgate.engine.program import Program, traced  # a circular import otherwise
 
         def named(state: Any, given: Any) -> tuple[Any, Any]:
             return state, {str(i): x for i, x in enumerate(function(*given.values()))}
@@ -36,7 +36,7 @@ class Code:
         self._at = self._uniforms.ctypes.data
 
     def __call__(self, given: Array) -> Array:
-        """Return (outputs, M) of (inputs, M)."""
+        """Return (outputs, M) for (inputs, M)."""
         count = given.shape[1]
         blocks = -(-count // self._lanes)
         rows = blocks * self._lanes
@@ -55,7 +55,7 @@ class Code:
 
 
 class Elementwise:
-    """A function of one float that takes arrays of any shape; traced code and few numbers use its source."""
+    """A function of one float for arrays of any shape; traced code and short arrays use its Python source."""
 
     def __init__(self, function: Callable[..., Any], worth: int) -> None:
         self.function, self.worth = function, worth
@@ -78,15 +78,15 @@ class Elementwise:
 
 
 def elementwise(worth: int) -> Callable[[Callable[..., Any]], Elementwise]:
-    """Decorator of a function of one float; worth: numbers for which machine code takes less time than numpy."""
+    """Decorate a function of one float; from `worth` numbers on, machine code is faster than numpy."""
     return lambda function: Elementwise(function, worth)
 
 
 class Shaped:
     """A function of arrays (B, ...) and of constants, which computes each of B by itself; see `Elementwise`.
 
-    Arrays of one row stand for all of B. Arguments may be sequences of arrays. Other constants that give the same answers to what the
-    function asks, as where they are zero, share its code.
+    An array of one row counts for all of B. Arguments may be sequences of arrays.
+    Other constants share its code if they give the same answers to the function's queries, such as where they are zero.
     """
 
     def __init__(self, function: Callable[..., Any], worth: Callable[..., bool], constants: Sequence[str]) -> None:
@@ -94,7 +94,7 @@ class Shaped:
         names = list(inspect.signature(function).parameters)
         self._fixed = [names.index(name) for name in constants]
         self._found: dict[Any, tuple[Any, Array]] = {}  # program and uniforms, by shapes and constants
-        self._made: dict[Any, list[tuple[Any, Any]]] = {}  # answers and programs, by shapes and what is said of constants
+        self._made: dict[Any, list[tuple[Any, Any]]] = {}  # answers and programs, by shapes and the key of constants
         update_wrapper(self, function)
 
     def __call__(self, *arguments: Any) -> Any:
@@ -152,7 +152,7 @@ class Shaped:
 
 
 def _shortened(held: dict[Any, Any]) -> None:
-    """Makes room for one more: what came first goes."""
+    """Remove the oldest entries to make room for one more."""
     while len(held) >= KEPT:
         held.pop(next(iter(held)), None)
 
@@ -162,5 +162,8 @@ def _bits(x: Array) -> tuple[Any, bytes]:
 
 
 def shaped(worth: Callable[..., bool], *constants: str) -> Callable[[Callable[..., Any]], Any]:
-    """Decorator of a function of arrays (B, ...); worth: for which arguments machine code is; constants: names of those without B."""
+    """Decorate a function of arrays (B, ...).
+
+    `worth` says for which arguments machine code is faster; `constants` names the arguments without B.
+    """
     return lambda function: Shaped(function, worth, constants)

@@ -1,4 +1,4 @@
-"""A graph's numbers by numpy: what every backend has to give."""
+"""Evaluation of a graph by numpy: the reference for every backend."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tailgate.engine.operations import Array
 
 
 def evaluate(graph: Graph, roots: Sequence[Node], inputs: dict[Any, Array]) -> list[Array]:
-    """The roots by numpy, of inputs (B,) by name."""
+    """Return the values of the roots by numpy, for inputs (B,) by name."""
     values: dict[int, Any] = {}
     _evaluate(graph, ordered(roots), inputs, values)
     return [values[root.id] for root in roots]

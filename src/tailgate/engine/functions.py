@@ -1,4 +1,4 @@
-"""numpy's other functions on traced arrays, and its makers of arrays while something is traced."""
+"""numpy's other functions on traced arrays, and its array constructors during tracing."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tailgate.engine.untraceable import Untraceable
 
 
 def called(graph: Graph, function: Any, args: Any, options: dict[str, Any]) -> Any:
-    """Return what numpy would. Arrays that are the same for all episodes are handed to numpy itself."""
+    """Return the result of a numpy function; arrays that are the same for all episodes go to numpy itself."""
     if function in _FUNCTIONS:
         return _FUNCTIONS[function](*args, **options)
     held = [x for x in _inside((args, tuple(options.values()))) if isinstance(x, Traced)]
@@ -51,7 +51,7 @@ def _joined(arrays: Sequence[Any], join: Callable[[list[Any]], Any]) -> Traced:
     back = shared_batch(parts)
     nodes = join([part.nodes for part in parts])
     batch = None
-    if back is not None:  # where the episodes' axis went: the same with two of them
+    if back is not None:  # find the new place of the episodes' axis by making it two long
         shadows = [np.zeros([2 if i - p.ndim == back else n for i, n in enumerate(p.shape)], np.int8) for p in parts]
         moved = [i for i, (m, n) in enumerate(zip(join(shadows).shape, nodes.shape, strict=True)) if m != n]
         batch = moved[0] if moved else None
@@ -89,7 +89,7 @@ def _likes(value: Any) -> Callable[..., Traced]:
 
 
 def _least(x: Traced, axis: int, op: str) -> Traced:
-    """The place of the least or the largest along an axis, the first of several."""
+    """Return the index of the smallest or largest number along an axis, the first of several."""
     if axis is None or (x.batch is not None and axis % x.ndim == x.batch):
         raise Untraceable("the place of one number of all episodes", "name another axis")
     graph, parts = x.graph, [np.take(x.nodes, i, axis) for i in range(x.shape[axis])]
@@ -107,7 +107,7 @@ def _count_nonzero(x: Traced, axis: Any = None, keepdims: bool = False) -> Any:
 
 
 def _is_in(x: Traced, values: Any, invert: bool = False) -> Any:
-    """Is each number one of a few? (Whole numbers: enumerations are.)"""
+    """Return where x equals one of a few whole numbers, such as enumerations."""
     found: Any = lifted(x.graph, np.zeros(x.shape, bool))
     for value in np.asarray(values).ravel().tolist():
         found = found | (x == value)
@@ -183,7 +183,7 @@ _FUNCTIONS: dict[Any, Callable[..., Any]] = {
 
 
 def gathered(table: Any, index: Traced) -> Traced:
-    """table[index] of a table (K, ...) that is the same for all episodes."""
+    """Return table[index] of a table (K, ...) that is the same for all episodes."""
     graph, held = index.graph, lifted(index.graph, table)
     columns = held.nodes.reshape(len(held.nodes), -1).T
     nodes = np.empty((*index.shape, len(columns)), object)
@@ -193,11 +193,11 @@ def gathered(table: Any, index: Traced) -> Traced:
     return Traced(graph, nodes.reshape(*index.shape, *held.shape[1:]), held.dtype, index.batch)
 
 
-# -- makers
+# -- constructors
 
 
 def made(graph: Graph, shape: Any, value: Any, dtype: np.dtype[Any]) -> Traced:
-    """A new array that holds a value."""
+    """Return a new array filled with a value."""
     size = (int(shape),) if isinstance(shape, (int, np.integer)) else tuple(shape)
     nodes = np.empty(size, object)
     if isinstance(value, Traced) or np.ndim(value):
@@ -240,13 +240,13 @@ _CONVERT = ("asarray", "ascontiguousarray", "asanyarray", "array")
 
 
 def tracing() -> bool:
-    """Is something traced in this thread?"""
+    """Return True if this thread is tracing."""
     return getattr(_here, "graph", None) is not None
 
 
 @contextlib.contextmanager
 def makers(graph: Graph) -> Iterator[None]:
-    """While this context is open, `np.zeros` and its like return traced arrays to code that is traced in this thread."""
+    """Let `np.zeros` and the other constructors return traced arrays to code that this thread traces, within the block."""
 
     def wrapped(original: Any, mine: Callable[..., Any], converts: bool) -> Any:
         def maker(*args: Any, **options: Any) -> Any:

@@ -1,4 +1,4 @@
-"""Loops until convergence: each row goes on for itself, and a traced block of rows until the last of them has stopped."""
+"""Loops until convergence: each row stops by itself; a traced block runs until its last row has stopped."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ LONG = 400  # operations of a function that is written once for all agents
 
 
 def until(step: Step, state: Sequence[Any], active: Any, most: int) -> list[Any]:
-    """The state (arrays (B, ...)) after step(*state) -> (who goes on, new state), in the rows `active` (B, ...) until none goes on.
+    """Repeat step(*state) -> (continue, new state) in the rows `active` (B, ...) until none continues, at most `most` times.
 
-    Rows that have stopped keep their state. After `most` rounds all have.
+    State arrays are (B, ...). Rows that have stopped keep their state.
     """
     arrays = [active, *state]
     traced = next((x for x in arrays if isinstance(x, Traced) and not x.fixed), None)
@@ -54,7 +54,7 @@ def _round(step: Step, state: Sequence[Any], going: Any) -> tuple[Any, list[Any]
 
 
 def chosen_apart(mask: Any, x: Any, function: Callable[..., Any], arrays: Sequence[Any]) -> Any:
-    """x (B, N, ...) where a mask (B, N) holds, else function(*arrays), agent by agent: a long function in a loop."""
+    """Return x (B, N, ...) where a mask (B, N) is true, else function(*arrays), agent by agent; a long function becomes a loop."""
     graph, agents = mask.graph, mask.shape[1]
     held = [lifted(graph, a) for a in (mask, x, *arrays)]
 
@@ -68,7 +68,7 @@ def chosen_apart(mask: Any, x: Any, function: Callable[..., Any], arrays: Sequen
             break
     else:
         return np.concatenate(parts, axis=1)
-    graph.operations = before  # what was made for the first agent is not used
+    graph.operations = before  # discard what was made for the first agent
 
     def body(*nodes: Any) -> Any:
         given = [Traced(graph, np.reshape(part, (1, 1, *np.shape(part))), a.dtype, 0) for part, a in zip(nodes, held, strict=True)]

@@ -1,4 +1,4 @@
-"""Routines: elementwise functions that machine code calls, in place of a copy of theirs wherever they are used."""
+"""Routines: elementwise functions that machine code calls, instead of repeating their code at each use."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ class Routine:
         self.cost = len(self.graph.nodes)
 
     def values(self, args: list[Any]) -> list[Any]:
-        """What numpy gives."""
+        """Return the results by numpy."""
         return evaluate(self.graph, self.outputs, dict(zip((node.attr for node in self.inputs), args, strict=True)))
 
 
 class _Called:
-    """A function that becomes a routine where its arguments are traced."""
+    """A function that becomes a routine when its arguments are traced."""
 
     def __init__(self, function: Callable[..., Any]) -> None:
         self.function = function
@@ -63,12 +63,12 @@ class _Called:
 
 
 def routine(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Decorator of an elementwise function of arrays, which gives an array or a tuple of them."""
+    """Decorate an elementwise function of arrays that returns an array or a tuple of them."""
     return _Called(function)
 
 
 def bound() -> str:
-    """`step` by the address of its arguments: a call with one of them takes Python less time than with eight."""
+    """Return the text of `bound`: `step` with the address of its arguments, because Python calls it faster with one argument than eight."""
     kinds = ["ptr"] * 5 + ["i64"] * 3
     lines = ["define i64 @bound(ptr %arguments) #0 {"]
     for i, kind in enumerate(kinds):

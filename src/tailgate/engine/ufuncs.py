@@ -1,4 +1,4 @@
-"""numpy's universal functions on traced arrays: types by numpy's own rules, one node for each place."""
+"""numpy's universal functions on traced arrays: types by numpy's rules, one node per number."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _LIBRARY = {
 
 
 def called(graph: Graph, ufunc: Any, method: str, inputs: Sequence[Any], options: dict[str, Any]) -> Any:
-    """What numpy would give."""
+    """Return the result of a universal function."""
     out = options.pop("out", None)
     if any(isinstance(target, np.ndarray) for target in out or ()):
         raise Untraceable("writing a traced array into one of numpy's", "make it with np.zeros or np.empty in the same function")
@@ -79,7 +79,7 @@ def _elementwise(graph: Graph, ufunc: Any, arrays: list[Traced], dtype: Any) -> 
 
 
 def loop_types(ufunc: Any, arrays: Sequence[Traced]) -> list[np.dtype[Any]]:
-    """The types in which numpy computes it."""
+    """Return the types in which numpy computes the function."""
     known = all(a.weak for a in arrays)
     given = [a.weak if a.weak in (int, float) and not known else a.dtype for a in arrays]
     kinds = ufunc.resolve_dtypes((*given, *(None,) * ufunc.nout))[: len(arrays)]
@@ -89,7 +89,7 @@ def loop_types(ufunc: Any, arrays: Sequence[Traced]) -> list[np.dtype[Any]]:
 
 
 def _by_a_constant(graph: Graph, op: str, arrays: list[Traced], dtype: np.dtype[Any]) -> Any:
-    """A remainder or a shift, by numbers that are known: no processor agrees with another about the rest."""
+    """Return a remainder or a shift by constants; processors disagree on other cases."""
     if dtype.kind == "f":
         raise Untraceable("a remainder of floats", "write x - y * np.floor(x / y)")
     if op == "rem" and not arrays[1].fixed:
@@ -102,7 +102,7 @@ def _by_a_constant(graph: Graph, op: str, arrays: list[Traced], dtype: np.dtype[
 
 
 def _remainder(x: Any, y: Any) -> Any:
-    """Of whole numbers by others: with the sign of y, and 0 where y is 0."""
+    """Return the remainder of whole numbers with the sign of y, and 0 where y is 0."""
     graph: Graph = x.graph
     back: Any = y < 0
     size = np.where(back, -y, y) if y.dtype.kind == "i" else y
