@@ -1,6 +1,6 @@
-"""A traced loop that takes the command of each step: the attack is plain code.
+"""A traced loop that takes each step's command from a plain attack.
 
-One program serves all attacks on a defence in a scenario. `tailgate.play.rollouts` has the attack in the program as well.
+One program serves all attacks on a defence in a scenario. `tailgate.play.rollouts` traces the attack too.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from tailgate.play.trace import Recorder, signals_of
 
 
 class Commanded:
-    """The program of a loop that takes commands. Raises whatever its parts raise while they are traced."""
+    """The program of a loop that takes commands; tracing raises whatever the loop's parts raise."""
 
     def __init__(self, loop: Loop) -> None:
         check_open(loop)
         self.loop = loop
-        self.values: list[Array] | None = None  # of the parameters, if others than those it was traced with
+        self.values: list[Array] | None = None  # of the parameters, if they differ from the traced ones
         begun = _first(loop)
         self.rebuilt = rebuilt(_seen(loop, begun))
         self.program = Program(traced(self._traced, {"loop": begun}, _nothing(loop, 1)._asdict()))
@@ -40,7 +40,7 @@ class Commanded:
         return (self.program,)
 
     def of(self, loop: Loop, values: list[Array]) -> Commanded:
-        """The same program for a loop of other parameters."""
+        """Return the same program for a loop with other parameters."""
         out = copy.copy(self)
         out.loop, out.values = loop, values
         return out
@@ -51,7 +51,7 @@ class Commanded:
         return {"loop": state}, leaves({"signals": signals_of(frame), "ended": state.ended, "seen": _seen(loop, state)})
 
     def play(self, attack: Attack, keys: Keys, terminate: bool) -> tuple[Array, dict[str, Array], dict[str, Array]]:
-        """Lengths (B,), signals (K, B, ...) and the road before the first step, as `tailgate.play.trace.Trace` holds them."""
+        """Play episodes; return lengths (B,), signals (K, B, ...) and the road before the first step, as `Trace` holds them."""
         loop, batch = self.loop, len(keys.key)
         begun = loop.start(keys)
         plan: Any = attack.prepare(loop.brief)
@@ -69,7 +69,7 @@ class Commanded:
 
 
 class Steps:
-    """Steps of a commanded loop from a state of the plain loop on."""
+    """The steps of a commanded loop, from a state of the plain loop on."""
 
     def __init__(self, commanded: Commanded, begun: LoopState) -> None:
         self.of, self.k = commanded, begun.k
@@ -78,12 +78,12 @@ class Steps:
         self._call = Call(commanded.program, self.state, values=commanded.values)
 
     def play(self, command: Command) -> tuple[dict[str, Array], Array, View]:
-        """A step under a command: its signals; who has ended (B,) and what an attacker sees, after it."""
+        """Play one step under a command; return its signals, who has ended (B,), and the attacker's view after it."""
         for name, leaf in zip(Command._fields, command, strict=True):
             self._call.arguments[name][...] = leaf
         self._call.begin()
         self._call.play(1)
-        self._call.sheet.flags.writeable = False  # attacks look at it
+        self._call.sheet.flags.writeable = False  # attacks read it
         told = self._call.results()
         if self._call.broken and not told["demands"].all():
             raise self.of.program.broken(told["demands"], self.k)
@@ -93,7 +93,7 @@ class Steps:
 
 
 def _first(loop: Loop) -> LoopState:
-    """The state of an episode that begins: an example."""
+    """Return the first state of an episode, as an example."""
     return loop.start(draws.keys("tune", [0]))
 
 
@@ -102,12 +102,12 @@ def _nothing(loop: Loop, batch: int) -> Command:
 
 
 def _seen(loop: Loop, state: LoopState) -> dict[str, Any]:
-    """The arrays that an attacker sees."""
+    """Return the arrays that an attacker sees."""
     return _parted(loop.sense(state))
 
 
 def _parted(view: View) -> dict[str, Any]:
-    """The arrays of a view: those of a white box are apart."""
+    """Return the arrays of a view, with those of a white box separate."""
     box = view.defence
     return {"view": view._replace(defence=None), "box": None if box is None else (box.state, box.known_u)}
 
@@ -123,14 +123,14 @@ _made: Remembered[Commanded] = Remembered()
 
 
 def commanded(loop: Loop) -> Commanded | Untraced:
-    """The program of a loop that takes commands, once it has been found equal to the plain loop; or why there is none."""
+    """Return the program of a loop that takes commands, if it equals the plain loop; else the reason why there is none."""
     return _made.proved(
         loop, lambda: _seen(loop, _first(loop)), lambda: Commanded(loop), lambda found, values: found.of(loop, values), _difference
     )
 
 
 def _difference(made: Commanded, batch: int = ROWS) -> str:
-    """Play some steps in both engines, under commands at random; -> what differs first, or nothing."""
+    """Play some steps under random commands in both engines; return the first difference, or nothing."""
     loop, chance = made.loop, np.random.default_rng(0)
     kinds = [Kind[name.upper()] for name in loop.threat.kinds] or [Kind.NONE]
     state = loop.start(draws.keys("tune", range(batch)))

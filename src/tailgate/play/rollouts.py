@@ -1,4 +1,4 @@
-"""Whole episodes of a loop under an attack as a program: what `tailgate.play.trace.rollout` records, with the attack traced as well."""
+"""Whole episodes of a loop under an attack as one program: the record of `tailgate.play.trace.rollout`, with the attack traced too."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from tailgate.engine.parameters import lifted
 from tailgate.engine.program import Call, Program, State, traced
 from tailgate.engine.remembered import Remembered
 
-STEPS = 32  # between two looks whether an episode is left
+STEPS = 32  # between checks if all episodes have ended
 
 
 class Rollout:
-    """The program of a loop under an attack. Raises whatever their parts raise while they are traced."""
+    """The program of a loop under an attack; tracing raises whatever their parts raise."""
 
     def __init__(self, loop: Loop, attack: Attack, plan: Any) -> None:
         check_open(loop)
         self.loop, self.attack, self.plan = loop, attack, plan
-        self.values: list[Array] | None = None  # of the parameters, if others than those it was traced with
+        self.values: list[Array] | None = None  # of the parameters, if they differ from the traced ones
         self.program = Program(traced(self._traced, self.begun(_ONE), {}))
 
     @property
@@ -34,13 +34,13 @@ class Rollout:
         return (self.program,)
 
     def of(self, loop: Loop, attack: Attack, plan: Any, values: list[Array]) -> Rollout:
-        """The same program for a loop and an attack of other parameters."""
+        """Return the same program for a loop and an attack with other parameters."""
         out = copy.copy(self)
         out.loop, out.attack, out.plan, out.values = loop, attack, plan, values
         return out
 
     def begun(self, keys: Keys) -> dict[str, Any]:
-        """The state of episodes that begin."""
+        """Return the first state of episodes."""
         return _begun(self.loop, self.attack, self.plan, keys)
 
     def _traced(self, held: Any, given: Any) -> tuple[Any, Any]:
@@ -48,11 +48,11 @@ class Rollout:
         return _step(loop, attack, plan, held)
 
     def plain(self, held: Any) -> tuple[Any, Any]:
-        """A step of the plain loop: what follows a state, and its signals."""
+        """Play a step of the plain loop; return the next state and its signals."""
         return _step(self.loop, self.attack, self.plan, held)
 
     def play(self, keys: Keys, terminate: bool) -> tuple[Array, dict[str, Array], dict[str, Array]]:
-        """Lengths (B,), signals (K, B, ...) and the road before the first step, as `tailgate.play.trace.Trace` holds them."""
+        """Play episodes; return lengths (B,), signals (K, B, ...) and the road before the first step, as `Trace` holds them."""
         loop, batch, begun = self.loop, len(keys.key), self.begun(keys)
         first = loop.plant.scene(loop.plan.plant, begun["loop"].plant)._asdict()
         state = State(self.program, batch)
@@ -72,7 +72,7 @@ class Rollout:
         return length.astype(np.int64), {name: value[:steps] for name, value in signals.items()}, first
 
     def _demand(self, held: Array, ended: Array, first: int, terminate: bool) -> None:
-        """Raise what the plain loop would have raised in these steps (K, B, .), of which it plays none when all have ended."""
+        """Raise the error of the plain loop for the demands of these steps (K, B, .); steps after all episodes ended do not count."""
         for step in np.flatnonzero(~held.all(axis=(1, 2))):
             if terminate and ended[step].all():
                 return
@@ -100,7 +100,7 @@ _made: Remembered[Rollout] = Remembered()
 
 
 def rollout_of(loop: Loop, attack: Attack) -> Rollout | Untraced:
-    """The program of a loop under an attack, once it has been found equal to the plain loop on this machine; or why there is none."""
+    """Return the program of a loop under an attack, if it equals the plain loop on this machine; else the reason why there is none."""
     plan = attack.prepare(loop.brief)
     return _made.proved(
         (loop, attack, plan),
@@ -112,7 +112,7 @@ def rollout_of(loop: Loop, attack: Attack) -> Rollout | Untraced:
 
 
 def _difference(rollout: Rollout, batch: int = ROWS) -> str:
-    """Play some steps in both engines; -> what differs first, or nothing."""
+    """Play some steps in both engines; return the first difference, or nothing."""
     from tailgate.core import draws
 
     plain = rollout.begun(draws.keys("tune", range(batch)))
