@@ -1,4 +1,4 @@
-"""Cells of a suite, their rows and seeds, and what plays them again and compares."""
+"""Evaluation: the cells of a suite, their rows and seeds, and checks that play them again."""
 
 from tailgate.base.lazy import exported
 

@@ -1,7 +1,7 @@
 """Evaluation: cells (scenario x dose x defence x attack) to rows, one per episode.
 
-A row names everything that is needed to play it again. Finished cells are kept beside the output until all are done, so that an
-interrupted run resumes, and a component that crashes costs its own rows only.
+A row names everything that is needed to play it again. Finished cells are kept next to the output until all are done.
+An interrupted run therefore resumes, and a component that crashes loses only its own rows.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class Cell:
         return numbered(self.beacon, self.suite, self.purpose, self.first_seed, self.seeds)
 
     def place(self, attack: Any, knowledge: str) -> Scenario:
-        """The scenario under the dose and the knowledge that the attack needs."""
+        """Return the scenario at the cell's dose, with the knowledge that the attack needs."""
         changes: dict[str, Any] = dict(self.threat)
         if self.dose is not None:
             changes["budget"] = self.dose
@@ -69,7 +69,7 @@ class Cell:
 
 
 def _component(family: Any, value: Any) -> tuple[Any, Any, str]:
-    """(object, entry, text) of a spec text or an object."""
+    """Return (object, entry, text) of a spec text or an object."""
     if isinstance(value, str):
         spec = Spec(family, value)
         return spec.make(), spec.entry, value
@@ -78,7 +78,10 @@ def _component(family: Any, value: Any) -> tuple[Any, Any, str]:
 
 
 def run_cell(cell: Cell, defence: Any = None, attack: Any = None, *, uses: tuple[str, ...] | None = None) -> list[dict[str, Any]]:
-    """The rows of a cell. `defence` and `attack` stand in for the cell's texts when they are objects; `uses`: what is granted to them."""
+    """Play a cell and return its rows.
+
+    `defence` and `attack` replace the cell's texts by objects; `uses` overrides what the defence may use.
+    """
     guard, guard_entry, _ = _component("defence", cell.defence if defence is None else defence)
     rival, rival_entry, _ = _component("attack", cell.attack if attack is None else attack)
     place = cell.place(rival, rival_entry.knowledge)
@@ -95,7 +98,7 @@ def run_cell(cell: Cell, defence: Any = None, attack: Any = None, *, uses: tuple
         try:
             trace = rollout(loop, rival, draws.keys(cell.purpose, chunk))
             values = measure(trace)
-        except Exception as error:  # whatever a component raises costs its own rows, and only them
+        except Exception as error:  # a component may raise anything; only its own rows are lost
             rows += _failed(head, chunk, *_why(error, chunk))
             continue
         for i, seed in enumerate(chunk):
@@ -106,7 +109,7 @@ def run_cell(cell: Cell, defence: Any = None, attack: Any = None, *, uses: tuple
 
 
 def _why(error: Exception, seeds: Sequence[int] = ()) -> tuple[str, str]:
-    """Reason and status of the rows, of these seeds, that an error costs."""
+    """Return the reason and status of the rows of these seeds, which an error affects."""
     if isinstance(error, NotApplicable):
         return str(error), "skipped"
     row = error.row if isinstance(error, InputError) else None
@@ -128,14 +131,14 @@ def _head(cell: Cell, place: Scenario, guard: Entry, rival: Entry, identity: str
 
 
 def origin(attack: str) -> dict[str, Any] | None:
-    """How a learned attack was trained, as its file says."""
+    """Return how a learned attack was trained, from its file; None for other attacks."""
     from tailgate.studies.policies import origin_of
 
     return origin_of(attack)
 
 
 def _digest(family: Any, text: str, identity: str) -> str:
-    """Of the file of a component that is not built in; objects have none."""
+    """Return the digest of the file of a component that is not built in; objects have none."""
     return Spec(family, text).digest if identity else ""
 
 
@@ -146,19 +149,19 @@ def _failed(head: dict[str, Any], seeds: Iterable[int], reason: str, status: str
 
 
 def _own(head: dict[str, Any]) -> dict[str, Any]:
-    """The head of a row that shares nothing with another's."""
+    """Return a copy of the head of a row, so that rows share no mutable values."""
     return {key: copy.deepcopy(value) if isinstance(value, (dict, list)) else value for key, value in head.items()}
 
 
 def failed_rows(cell: Cell, reason: str) -> list[dict[str, Any]]:
-    """The rows of a cell that could not be played."""
+    """Return the rows of a cell that could not be played."""
     rival, entry = Spec("attack", cell.attack).make(), Spec("attack", cell.attack).entry
     head = _head(cell, cell.place(rival, entry.knowledge), Spec("defence", cell.defence).entry, entry, cell_id(cell))
     return _failed(head, cell.episodes, reason)
 
 
 def cell_id(cell: Cell) -> str:
-    """Of everything that decides a cell's rows: a finished cell with this id is not played again."""
+    """Return a hash of everything that determines a cell's rows; a finished cell with this id is not played again."""
     data = dataclasses.asdict(cell)
     data["sources"] = [Spec("defence", cell.defence).digest, Spec("attack", cell.attack).digest]
     data["scenario"] = load_scenario(cell.scenario).config_hash
@@ -167,7 +170,7 @@ def cell_id(cell: Cell) -> str:
 
 @contextlib.contextmanager
 def _sparing() -> Iterator[None]:
-    """Lets bad input through, and nothing else: a pairing without meaning, or a component that breaks, costs its own rows."""
+    """Let only InputError through: a component that fails or does not apply loses its own rows when it is played."""
     try:
         yield
     except NotApplicable:
@@ -181,10 +184,10 @@ def _sparing() -> Iterator[None]:
 def cells_of(
     suite: Suite, *, batch: int = 256, purpose: str = "report", threat: dict[str, Any] | None = None, beacon: str = "", first_seed: int = 0
 ) -> list[Cell]:
-    """Every cell of a suite, in its order, from episode `first_seed` on. Raises InputError for anything that does not exist."""
+    """Return the cells of a suite in order, from episode `first_seed` on; raise InputError for anything that does not exist."""
     if purpose not in draws.PURPOSES:
         raise InputError("purpose", purpose, f"one of {', '.join(draws.PURPOSES)}")
-    _ = numbered(beacon, suite.name, purpose, 0, 1)  # refuses a beacon that is none
+    _ = numbered(beacon, suite.name, purpose, 0, 1)  # checks the beacon
     changes = suite.granted | dict(threat or {})
     out = [
         Cell(suite.name, scenario, dose, defence, attack, suite.seeds, purpose, first_seed, batch, changes, beacon)
@@ -196,16 +199,16 @@ def cells_of(
         spec, guard = Spec("attack", cell.attack), Spec("defence", cell.defence)
         rival, defence = spec.make(), guard.make()
         place = cell.place(rival, spec.entry.knowledge)
-        if (cell.scenario, cell.defence) not in fitted:  # once: the filter of a large network takes its time
+        if (cell.scenario, cell.defence) not in fitted:  # once, because a filter of a large network is slow to prepare
             fitted.add((cell.scenario, cell.defence))
             with _sparing():
                 place.loop(defence, guard.entry.uses)
         if cell.scenario not in models:
             models[cell.scenario] = model = place.brief().model
-            needed = 2 * episode_memory(model, place.horizon)  # with what is measured of them
+            needed = 2 * episode_memory(model, place.horizon)  # twice, for the metrics
             sizes.fits(needed, f"scenario {place.name}: horizon", place.horizon, "the signals of one episode")
         brief = Brief(models[cell.scenario], place.threat_model, place.horizon)
-        _ = brief.granted  # names wires and agents that exist
+        _ = brief.granted  # checks the names of wires and agents
         with _sparing():
             rival.prepare(brief)
     return out
@@ -214,7 +217,7 @@ def cells_of(
 def run(
     cells: Sequence[Cell], out: Path | None = None, workers: int = 1, progress: Callable[[int, int], None] | None = None
 ) -> list[dict[str, Any]]:
-    """Rows of all cells in their order. With `out`, cells that an interrupted run finished are not played again."""
+    """Play cells and return their rows in order; with `out`, skip cells that an interrupted run finished."""
     sizes.check("workers", workers)
     count = sum(sizes.check("seeds", cell.seeds) for cell in cells)
     sizes.fits(count * sizes.ROW, "seeds", max((cell.seeds for cell in cells), default=0), f"{count:,} rows")
@@ -264,10 +267,22 @@ def evaluate(
     beacon: str = "",
     progress: Callable[[int, int], None] | None = None,
 ) -> list[dict[str, Any]]:
-    """Rows of a suite, or of any part of it that is given here; defences and attacks by name or as objects.
+    """Play a suite, or the part of it given by the arguments, and return its rows.
 
-    `threat` changes the scenarios' threat models; `beacon` names the round that the episodes belong to.
-    Raises InputError before anything is played.
+    Parameters
+    ----------
+    suite : name or object; without it, give scenarios, defences and attacks
+    defences, attacks : names or objects
+    scenarios, doses, seeds : replace those of the suite
+    threat : changes of the scenarios' threat models
+    beacon : the round that the episodes belong to
+    batch, workers : episodes played together, and processes; they change no bit
+    out : file for the rows
+
+    Raises
+    ------
+    InputError
+        An argument is invalid; nothing is played then.
     """
     base = load_suite(suite) if isinstance(suite, str) else suite if suite is not None else Suite(name="custom")
     guards = list(base.defences if defences is None else defences)

@@ -1,4 +1,4 @@
-"""Rows of a long run: what is finished is kept beside the output until all is done, so that an interrupted run goes on."""
+"""Rows of a long run, in parts: finished parts are kept next to the output until all are done, so that an interrupted run resumes."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from tailgate.base.locks import alone
 from tailgate.evaluation.rows import encode, packed, read_rows
 
 Rows = list[dict[str, Any]]
-Wanted = Sequence[tuple[str, int]]  # cell and seed of each row of a piece, in order
+Wanted = Sequence[tuple[str, int]]  # cell and seed of each row of a part, in order
 
 
 class Parts:
-    """The pieces of a run that writes to `out`, within `with`, which nobody else may do meanwhile.
+    """The parts of a run that writes to `out`; as a context manager it locks `out` for this process.
 
-    A piece has a name, and is finished when all of its rows are there and none failed.
+    A part has a name. It is finished when all its rows exist and none failed.
     """
 
     def __init__(self, out: Path) -> None:
@@ -43,7 +43,7 @@ class Parts:
         self.lock.__exit__(None, None, None)
 
     def finished(self, pieces: Mapping[str, Wanted]) -> dict[str, Rows]:
-        """Rows of the pieces that an earlier run finished, by name: kept as parts, or in the output itself."""
+        """Return the rows of parts that an earlier run finished, by name, from part files or from the output."""
         before: dict[tuple[str, int], dict[str, Any]] = {}
         for row in self._read(self.out):
             before[str(row.get("cell")), row["seed"]] = row
@@ -56,11 +56,11 @@ class Parts:
         return found
 
     def put(self, name: str, rows: Rows) -> None:
-        """Keep the rows of a piece."""
+        """Write the rows of a part."""
         write_atomic(self._part(name), encode(rows))
 
     def finish(self, rows: Rows, pieces: Mapping[str, Wanted]) -> None:
-        """Write all rows, and remove the parts. A file that holds anything but rows of these cells is set aside: it is a result."""
+        """Write all rows and remove the parts; an output that holds other rows is renamed first, because it is a result."""
         if self.out.is_file():
             cells = {cell for wanted in pieces.values() for cell, _ in wanted}
             try:
@@ -72,14 +72,14 @@ class Parts:
         write_atomic(self.out, packed(rows, self.out))
         for name in pieces:
             remove(self._part(name))
-        with contextlib.suppress(OSError):  # something else lies there: not ours to remove
+        with contextlib.suppress(OSError):  # other files are in it
             self.folder.rmdir()
 
     def _part(self, name: str) -> Path:
         return self.folder / f"{name}.jsonl"
 
     def _read(self, path: Path) -> Rows:
-        """The rows of a file; none where there is none, or where it is damaged: its cells are played again."""
+        """Return the rows of a file; none if it is missing or damaged, so that its cells are played again."""
         try:
             return read_rows(path) if path.is_file() else []
         except InputError:
