@@ -1,4 +1,4 @@
-"""What a submission may take, and the error of one that took more."""
+"""The resource limits of a submission, and the error of exceeding them."""
 
 from dataclasses import dataclass
 from typing import Annotated
@@ -8,20 +8,20 @@ from pydantic import Field
 from tailgate.core import Positive, PositiveCount, param
 
 Bytes = Annotated[int, Field(ge=1, le=2**50)]
-FEWEST = 256  # rows of a batch, where there are as many
+FEWEST = 256  # rows of a batch, if there are as many
 
 
 class Lost(Exception):
-    """A submission's process failed or was ended; the text is the reason that its rows get."""
+    """A submission's process failed or was ended; the text is the reason in its rows."""
 
 
 @dataclass(frozen=True)
 class Limits:
-    """What one process of a submission may take; who takes more is ended, and the rows of that batch get the reason.
+    """The resources of one process of a submission; exceeding them ends it, and the rows of that batch get the reason.
 
-    Memory is limited as RLIMIT_DATA, which counts private memory that can be written. RLIMIT_AS would count address space that libraries
-    reserve and never touch (compilers, allocators of many threads) and hit honest programs. What RLIMIT_DATA does not see (shared
-    memory, several processes) is looked at five times a second.
+    RLIMIT_DATA limits memory: it counts private writable memory.
+    RLIMIT_AS would also count address space that libraries reserve and never touch, and would stop honest programs.
+    The guard checks five times a second what RLIMIT_DATA does not see: shared memory, and several processes.
     """
 
     memory: Bytes = param(4 * 2**30, "memory of all processes of the submission together [bytes]")
@@ -34,5 +34,5 @@ class Limits:
     processes: PositiveCount = param(8, "processes at a time, the submission's own among them")
 
     def steps(self, count: int, rows: int, agents: int) -> float:
-        """Processor time [s] that `count` steps of a batch grant. Fewer than FEWEST rows count as FEWEST: most of it is overhead."""
+        """Return the processor time [s] that `count` steps of a batch get; fewer than FEWEST rows count as FEWEST."""
         return self.step_time * count * max(rows, FEWEST) * agents

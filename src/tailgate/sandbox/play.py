@@ -39,14 +39,18 @@ def play_submission(
     episodes: int | None = None,
     purpose: str = "report",
 ) -> Rows:
-    """Rows of a suite for one submission, "module:Class:key=value": one for each scenario, dose, attack and episode.
+    """Play a suite with one submission, "module:Class:key=value"; return a row for each scenario, dose, attack and episode.
 
-    The attacks are the suite's, and those that joined them by its published list.
+    The attacks are the suite's, and those that joined it by its published list.
+    The class is imported only in separate processes, from a copy of its files.
+    With a `beacon`, the seeds are those of its round (`tailgate.evaluation.rounds`); without one they are public: 0, 1, ...
+    A failure costs rows and gives them a reason: a wrong number those of its cell, a lost process those of its scenario.
+    With `out`, an interrupted run resumes after the scenarios that it finished without an error.
 
-    The class is imported in processes of its own only, from a copy of its files. The episodes' seeds are those of the beacon's round
-    (`tailgate.evaluation.rounds`), without one the public ones 0, 1, ..., for development. Whatever goes wrong costs rows, with a reason:
-    those of a cell where a number is wrong, those of a scenario that are not finished where the process is lost. With `out` an
-    interrupted run resumes after the scenarios that it finished without an error. Raises InputError before anything is played.
+    Raises
+    ------
+    InputError
+        An argument is invalid; nothing is played then.
     """
     base = load_suite(suite) if isinstance(suite, str) else suite
     guard = sandbox_of(sandbox) if isinstance(sandbox, str) else sandbox
@@ -82,7 +86,7 @@ def _run(
     jobs: Sequence[Sequence[Cell]], submission: Submission, seeds: list[int], out: Path | None, workers: int,
     progress: Callable[[int, int], None] | None,
 ) -> Rows:  # fmt: skip
-    """Rows of all jobs, one scenario each, in their order."""
+    """Play all jobs, one scenario each; return their rows in order."""
     ids = [[str(part_of(cell, submission, seeds).head["cell"]) for cell in job] for job in jobs]
     names = [hashlib.blake2b("".join(each).encode(), digest_size=12).hexdigest() for each in ids]
     pieces = {name: [(cell, seed) for cell in cells for seed in seeds] for name, cells in zip(names, ids, strict=True)}
@@ -108,4 +112,4 @@ def _play(jobs: Sequence[Sequence[Cell]], submission: Submission, seeds: list[in
         for i, job in enumerate(jobs):
             yield i, play_mixed(job, submission, seeds)
         return
-    yield from each(play_mixed, [(job, submission, seeds) for job in jobs], workers)  # guards see when a worker is gone
+    yield from each(play_mixed, [(job, submission, seeds) for job in jobs], workers)  # the guard ends a submission whose worker has died
