@@ -1,5 +1,7 @@
 """Tailgate: defences for adaptive cruise control, scored against an adversary that learns when to attack.
 
+Example::
+
     import gymnasium
     env = gymnasium.make("tailgate:tailgate/CarFollowing-v0", defence="chi2_kf")
 """
@@ -18,22 +20,22 @@ __all__ = [
 
 
 def make_defence(name: str, **params: Any) -> Any:
-    """A registered defence by name; raises InputError for an unknown name or field."""
+    """Return a registered defence by name; raise InputError for an unknown name or field."""
     return make("defence", name, **params)
 
 
 def make_attack(name: str, **params: Any) -> Any:
-    """A registered attack by name; raises InputError for an unknown name or field."""
+    """Return a registered attack by name; raise InputError for an unknown name or field."""
     return make("attack", name, **params)
 
 
 def list_defences() -> list[str]:
-    """Names of every defence, plug-ins included."""
+    """Return the names of all defences, plug-ins included."""
     return list(entries("defence"))
 
 
 def list_attacks() -> list[str]:
-    """Names of every attack, plug-ins included."""
+    """Return the names of all attacks, plug-ins included."""
     return list(entries("attack"))
 
 
