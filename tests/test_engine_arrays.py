@@ -149,7 +149,7 @@ REFUSED: dict[str, tuple[Callable[..., Any], str]] = {
     "a remainder of floats": (lambda x: x % 2.0, "np.floor"),
     "a remainder by nothing": (lambda x: x[:, 0].astype(int) % 0, "from 1"),
     "a power": (lambda x: x**3, "products"),
-    "a loop over what there is": (lambda x: [k for k in set((x > 0).tolist())], "a loop over what there can be"),
+    "a loop over what there is": (lambda x: [k for k in set((x > 0).tolist())], "a loop over all possible values"),
     "into numpy's own array": (lambda x: np.add(x, 1, out=CASES and FIXED), "np.zeros"),
     "a list of objects": (lambda x: np.add(x, [object()] * 3), "use numbers"),
 }  # fmt: skip

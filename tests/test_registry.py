@@ -264,7 +264,7 @@ def test_errors_cross_process_borders(cls):
     assert type(error) is cls and (error.field, error.value, error.expected) == ("field", 3, "four")
     assert str(error) == "field: got 3; expected four" and isinstance(error, ValueError)
     assert len(str(InputError("f", "x" * 1000, "y"))) < 150
-    assert str(unknown("f", "ab", [])).endswith("no name: there is none to choose from")
+    assert str(unknown("f", "ab", [])).endswith("no name: none exists")
 
 
 @pytest.mark.parametrize("text", ["chi2_kf:eta", "chi2_kf:eta 3", "chi2_kf:"])

@@ -83,4 +83,4 @@ def unknown(field: str, name: object, known: Iterable[str]) -> InputError:
 def _among(name: object, names: list[str]) -> str:
     near = difflib.get_close_matches(str(name)[:100], names, n=1, cutoff=0.5)
     head = f"one of these (did you mean {near[0]!r}?):" if near else "one of"
-    return f"{head} {', '.join(names)}" if names else "no name: there is none to choose from"
+    return f"{head} {', '.join(names)}" if names else "no name: none exists"

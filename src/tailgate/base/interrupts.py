@@ -62,7 +62,7 @@ class _Once:
     def __call__(self, number: int, _: Any) -> None:
         if not self.called:
             self.called = True
-            _end(number, "it had not begun")
+            _end(number, "nothing had started")
 
 
 def at_start() -> None:

@@ -116,7 +116,7 @@ def scatter(table: Table) -> bytes:
     ax.set_yticks(ticks, [str(tick) for tick in ticks])
     ax.set_ylim(min(-2.0, 1.2 * min(value(e, "min_gap") for e in table)), 120.0)
     ax.set(xscale="log", xlabel="position RMSE [m], median", ylabel="smallest gap [m], median (above 10 m: logarithmic)")
-    ax.set_title(f"What the error hides: rank correlation {_rank_correlation(table):+.2f}\nfilled: most episodes collide", fontsize=10)
+    ax.set_title(f"Error against gap: rank correlation {_rank_correlation(table):+.2f}\nfilled: most episodes collide", fontsize=10)
     ax.grid(alpha=0.3, which="both")
     figure.legend(loc="outside lower center", fontsize=8, ncols=3)
     return png(figure)

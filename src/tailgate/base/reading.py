@@ -81,12 +81,12 @@ def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     out = dict(pairs)
     if len(out) != len(pairs):
         names = [key for key, _ in pairs]
-        raise ValueError(f"the key {next(key for key in names if names.count(key) > 1)[:100]!r} is there twice")
+        raise ValueError(f"the key {next(key for key in names if names.count(key) > 1)[:100]!r} appears twice")
     return out
 
 
 def _no_number(constant: str) -> NoReturn:
-    raise ValueError(f"{constant} is no number of JSON")
+    raise ValueError(f"{constant} is not a JSON number")
 
 
 def _deep() -> ValueError:
@@ -148,10 +148,10 @@ def _unpacked(path: Path) -> Iterator[bytes]:
             packed = reader.unused_data
             out += len(piece)
             if out > ROWS or out > FREE + RATIO * read:
-                raise OSError(errno.EFBIG, f"{out} bytes or more in {read}, which are no rows")
+                raise OSError(errno.EFBIG, f"{read} bytes that unpack to {out} or more: rows do not compress that well")
             yield piece
     if not reader.eof:
-        raise EOFError("the file was cut")
+        raise EOFError("the file is truncated")
 
 
 # -- YAML
@@ -190,7 +190,7 @@ class _Plain(yaml.SafeLoader):
         seen = set()
         for key, _ in node.value if isinstance(node, yaml.MappingNode) else ():
             if key.tag != "tag:yaml.org,2002:merge" and isinstance(key.value, str) and key.value in seen:
-                raise yaml.constructor.ConstructorError(None, None, f"the key {key.value[:100]!r} is there twice", key.start_mark)
+                raise yaml.constructor.ConstructorError(None, None, f"the key {key.value[:100]!r} appears twice", key.start_mark)
             if isinstance(key.value, str):
                 seen.add(key.value)
         return super().construct_mapping(node, deep)
@@ -198,7 +198,7 @@ class _Plain(yaml.SafeLoader):
     def no_value(self, node: yaml.Node) -> NoReturn:
         """Refuse a value that JSON cannot express, such as a date."""
         kind = str(node.tag).rpartition(":")[2][:100]
-        raise yaml.constructor.ConstructorError(None, None, f"a {kind} where a text, a number, a list or a mapping may be", node.start_mark)
+        raise yaml.constructor.ConstructorError(None, None, f"a {kind} instead of a text, number, list or mapping", node.start_mark)
 
 
 _KINDS = {f"tag:yaml.org,2002:{kind}" for kind in ("null", "bool", "int", "float", "str", "seq", "map")}

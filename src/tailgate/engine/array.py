@@ -63,7 +63,7 @@ class Traced:
     def known(self, what: str, instead: str) -> Array:
         """Return the numbers of a fixed array; raise Untraceable with the advice `instead` if episodes differ."""
         if not self.fixed:
-            raise Untraceable(f"{what} of what each episode has its own of", instead)
+            raise Untraceable(f"{what} of numbers that differ between episodes", instead)
         return self.values()
 
     def __repr__(self) -> str:
@@ -96,7 +96,7 @@ class Traced:
 
     def tolist(self) -> Any:
         """Return nested lists of the numbers."""
-        return self.known("tolist()", "write a loop over what there can be, and np.where").tolist()
+        return self.known("tolist()", "write a loop over all possible values, and np.where").tolist()
 
     def __iter__(self) -> Iterator[Any]:
         return (self[i] for i in range(len(self)))

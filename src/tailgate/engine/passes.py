@@ -222,7 +222,7 @@ def _in_order(nodes: Sequence[Node], branches: Sequence[Branch]) -> list[Item]:
             if this.id in done or this.id not in by_id:
                 continue
             if this.id in home:
-                raise AssertionError(f"{this} is asked for outside of its branch")
+                raise AssertionError(f"{this} is needed outside its branch")
             if this.id in gives:
                 for branch in gives[this.id]:
                     enter(branch)

@@ -18,7 +18,7 @@ def outcomes(rows: list[dict[str, Any]], outcome: str) -> Array:
     """Return the outcomes (episodes,) of rows; raise InputError if a row was not played or lacks the outcome."""
     bad = next((row for row in rows if row["status"] != "ok"), None)
     if bad is not None:
-        raise InputError(f"attack {bad['attack']}", bad["status"], f"an attack that plays here ({bad['reason']})")
+        raise InputError(f"attack {bad['attack']}", bad["status"], f"an attack that can be played here ({bad['reason']})")
     if any(row[outcome] is None for row in rows):
         raise InputError("config.outcome", outcome, "a metric that every episode has")
     return np.array([row[outcome] for row in rows], np.float64)

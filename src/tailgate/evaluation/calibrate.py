@@ -175,7 +175,7 @@ class Search:
         if crossings.least == crossings.most:
             raise InputError("hours", self.wanted, f"a mean time that {self.bench.text} can have: its score does not move")
         if at is None or above is None:
-            raise InputError("hours", self.wanted, f"a mean time that {self.bench.text} can have: its score does not climb that often")
+            raise InputError("hours", self.wanted, f"a mean time that {self.bench.text} can have: its score does not rise that often")
         self.low = crossings.least
         spread, ratio = (above - at, 2.0) if below is None else (above - below, 4.0)
         slope = math.log(ratio) / spread if spread > 0.0 else 0.5

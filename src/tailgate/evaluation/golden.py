@@ -172,7 +172,7 @@ def moved_suites(held: dict[str, Any]) -> list[str]:
     out += [f"suite {name} has changed under its name: it needs a new version" for name in changed]
     used = uses()
     out += [f"{key} is not recorded" for key in used if key not in held["scenarios"]]
-    out += [f"{key} is recorded, and there is no such scenario of a suite" for key in held["scenarios"] if key not in used]
+    out += [f"{key} is recorded, but no suite has such a scenario" for key in held["scenarios"] if key not in used]
     return out
 
 
@@ -191,7 +191,7 @@ def check(name: str, held: dict[str, Any]) -> list[str]:
         raise unknown("golden.scenario", name, held["scenarios"])
     of, _, scenario = name.partition("/")
     if of not in list_suites() or scenario not in (suite := load_suite(of)).scenarios:
-        return [f"{name}: there is no such scenario of a suite any more"]
+        return [f"{name}: no suite has such a scenario any more"]
     place = place_of(scenario, suite)
     out = []
     if place.config_hash != entry["hash"]:
@@ -217,8 +217,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return 0 if nothing changed, 1 if something did, 2 for bad input."""
     parser = argparse.ArgumentParser(prog="python -m tailgate.evaluation.golden", description="Golden traces of the published suites.")
     what = parser.add_mutually_exclusive_group(required=True)
-    what.add_argument("--check", action="store_true", help="play them again and say what moved")
-    what.add_argument("--write", action="store_true", help="record them anew: for a new version")
+    what.add_argument("--check", action="store_true", help="play them again and report what changed")
+    what.add_argument("--write", action="store_true", help="record them again, for a new version")
     parser.add_argument("--scenario", action="append", metavar="NAME", help="only this one, under all suites (repeatable; with --check)")
     parser.add_argument("--suite", action="append", metavar="NAME", help="only this one, a new one (repeatable; with --write)")
     options = parser.parse_args(arguments)
@@ -262,7 +262,7 @@ def _write(only: list[str] | None) -> int:
             raise unknown("--suite", name, list_suites())
     used = {key: (name, suite) for key, (name, suite) in uses().items() if only is None or suite.name in only}
     if only is not None and (platform_of := read()["platform"]) != this_platform():
-        raise InputError("--suite", this_platform(), f"the platform of the other suites' traces ({platform_of}), or all of them anew")
+        raise InputError("--suite", this_platform(), f"the platform of the other suites' traces ({platform_of}), or a record of all suites")
     scenarios = {}
     with progress(Console(stderr=True)) as update:
         for done, key in enumerate(sorted(used), 1):

@@ -19,7 +19,7 @@ KEYS = (
     "suite", "scenario", "dose", "knowledge", "defence", "attack", "purpose", "config_hash", "version", "defence_digest", "attack_digest",
 )  # fmt: skip
 
-AGAIN = "the command that wrote it makes it whole, given once more"
+AGAIN = "run the command that wrote it again to complete it"
 _Text = Annotated[str, Field(strict=True)]
 _Number = Annotated[float, Field(strict=True, allow_inf_nan=False)] | None
 _FIELDS: dict[str, Any] = {

@@ -25,10 +25,10 @@ KINDS = {  # for readers: short name, name, effect on the wire
     Kind.DOS_HOLD_FRESH: ("HOLD*", "DoS hold (fresh)", "the receiver is stuck at the last reading before this burst"),
     Kind.DROPOUT: ("DROP", "dropout", "nothing arrives, and the receiver knows it"),
     Kind.FDI: ("FDI", "false data injection", "the value is added"),
-    Kind.DELAY: ("DELAY", "delay", "the receiver reads what was sent so many steps ago"),
-    Kind.REPLAY: ("REPLAY", "replay", "the receiver reads the last so many samples over and over"),
-    Kind.NOISE_JAM: ("NOISE", "noise jamming", "noise of so much power reaches the receiver over the air"),
-    Kind.ECHO_DELAY: ("ECHO", "late echo", "the probe is answered late, so that the car ahead seems so much farther away"),
+    Kind.DELAY: ("DELAY", "delay", "the receiver reads what was sent that many steps ago"),
+    Kind.REPLAY: ("REPLAY", "replay", "the receiver reads the last samples, of that number, repeatedly"),
+    Kind.NOISE_JAM: ("NOISE", "noise jamming", "noise of that power reaches the receiver over the air"),
+    Kind.ECHO_DELAY: ("ECHO", "late echo", "the probe is answered late, so that the car ahead seems that much farther away"),
 }
 VALUED = {  # unit; empty: that of the wire
     Kind.DOS_JAM: "", Kind.FDI: "", Kind.DELAY: "steps", Kind.REPLAY: "steps", Kind.NOISE_JAM: "W", Kind.ECHO_DELAY: "m",

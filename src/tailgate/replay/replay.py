@@ -110,7 +110,7 @@ def choose(rows: Sequence[Row], wanted: Filter) -> Chosen:
         if not wanted.fits(row):
             shown = f"{row['scenario']}, {row['defence']}, {row['attack']}, dose {row['dose']}, seed {row['seed']}"
             raise InputError(f"line {wanted.line}", shown, f"a row that matches the filters ({wanted})")
-        return Chosen(row, wanted.line, 1, "the line that was asked for")
+        return Chosen(row, wanted.line, 1, "the requested line")
     matching = [(i, row) for i, row in enumerate(rows, start=1) if wanted.fits(row)]
     if not matching:
         keys = ("scenario", "defence", "attack", "dose")
@@ -119,7 +119,7 @@ def choose(rows: Sequence[Row], wanted: Filter) -> Chosen:
     played = [(i, row) for i, row in matching if row["status"] == "ok"]
     if not played:
         line, row = matching[0]
-        raise InputError(f"line {line}", f"{row['status']}: {row['reason']}", "a row that was played; no row that matches was")
+        raise InputError(f"line {line}", f"{row['status']}: {row['reason']}", "a row that was played; no matching row was")
 
     def outcome(item: tuple[int, Row]) -> tuple[float, float, float]:
         gap = item[1]["min_gap"]
@@ -273,7 +273,7 @@ def _component(family: Literal["defence", "attack"], row: Row, named: str | None
     spec = held if named is None else Spec(family, named)
     head, _ = _split(spec.text)
     if family == "attack" and Path(head).suffix in (".json", *YAML) and not spec.imports and not Path(head).is_file():
-        raise InputError("the row's attack", spec.text, "a file that is here; say where the same file lies now: --attack FILE")
+        raise InputError("the row's attack", spec.text, "an existing file; give its present path: --attack FILE")
     return spec
 
 
@@ -285,7 +285,7 @@ def _place(row: Row, named: str | None) -> Scenario:
     elif source == row["scenario"] and not source.endswith(YAML) and source not in list_scenarios():
         raise InputError("the row's scenario", source, "a built-in one, or its file: --scenario FILE.yaml")
     elif source.endswith(YAML) and not Path(source).is_file():
-        raise InputError("the row's scenario", source, "a file that is here; say where the same file lies now: --scenario FILE.yaml")
+        raise InputError("the row's scenario", source, "an existing file; give its present path: --scenario FILE.yaml")
     threat = row.get("threat_model")
     if not isinstance(threat, dict):
         raise InputError("the row's threat_model", threat, "a mapping of fields")

@@ -33,7 +33,7 @@ def check_format(path: Path) -> None:
     if path.suffix.lower() not in FORMATS:
         raise InputError("--video", str(path), f"a file that ends in {', '.join(FORMATS)}")
     if FORMATS[path.suffix.lower()] == "MP4" and find_spec("imageio_ffmpeg") is None:
-        raise ImportError("imageio-ffmpeg is missing, which writes MP4: pip install 'tailgate[video]' (.gif and .webp do without)")
+        raise ImportError("MP4 needs imageio-ffmpeg: pip install 'tailgate[video]' (.gif and .webp do not)")
     from tailgate.envs import render  # noqa: F401 - the import error names the extra if Pillow is missing
 
 

@@ -60,7 +60,7 @@ class Child:
         except InputError as error:
             if path is None or not isinstance(error.__context__, ImportError):
                 raise
-            raise InputError(error.field, error.value, f"{error.expected}; nothing beside the submitted file or folder is found") from None
+            raise InputError(error.field, error.value, f"{error.expected}; only the submitted file or folder can be imported") from None
         return {"uses": list(entry.uses), "version": entry.version, "reference": entry.reference, "tailgate": VERSION}
 
     def prepare(self, arrays: dict[str, Array], rest: dict[str, Any]) -> dict[str, Any]:
@@ -125,7 +125,7 @@ class Child:
                 map_leaves(_put(np.flatnonzero(here), tickets[here] - begin), out, state)
                 found |= here
         if not found.all():
-            raise InputError("state", "an old one", f"one of the {KEPT} states that were used last")
+            raise InputError("state", "an old one", f"one of the {KEPT} most recently used states")
         return out
 
 

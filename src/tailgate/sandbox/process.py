@@ -46,7 +46,7 @@ class Process:
 
     def __init__(self, text: str, source: Path | None, limits: Limits, sandbox: Sandbox | None) -> None:
         if sys.platform != "linux":
-            raise InputError("submission", sys.platform, "Linux: elsewhere nothing guards against a submission; use a virtual machine")
+            raise InputError("submission", sys.platform, "Linux: other systems cannot isolate a submission; use a virtual machine")
         self.limits, self.lost, self.waited, self.number, self.buffer = limits, "", 0.0, 0, b""
         self.granted = limits.start_time
         shared = Path("/dev/shm")
@@ -128,7 +128,7 @@ class Process:
             if not isinstance(answer, dict) or answer.get("id") != self.number:
                 raise ValueError
         except (ValueError, RecursionError):
-            self.lose("answer: not the line of JSON that was asked for")
+            self.lose("answer: not the requested line of JSON")
         error, ok = answer.get("error"), answer.get("ok")
         if isinstance(error, dict):
             self._raise({str(key): printable(value) for key, value in error.items()})
@@ -184,7 +184,7 @@ class Process:
             with suppress(ValueError, KeyError, TypeError):
                 found = json.loads(self.guard.stdout.readline())
                 why, printed = str(found["why"]), printable(" ".join(found["printed"].split())[-160:])
-        return (why or "the process that watched it ended") + (f"; printed last: {printed}" if printed else "")
+        return (why or "the guard process ended") + (f"; printed last: {printed}" if printed else "")
 
     def lose(self, reason: str) -> None:
         """End the process for this reason."""
@@ -201,7 +201,7 @@ class Process:
         """Read the child's results from the file `out`, as copies of the expected types and shapes."""
         block = os.pread(self.out, outputs.size, 0)
         if len(block) != outputs.size:
-            self.lose("answer: the file of results was cut")
+            self.lose("answer: the file of results is truncated")
         found = {name: np.array(view, order="K") for name, view in outputs.views(block).items()}
         return found | {name: found[name] != 0 for name in ("alarm", "probe")}
 

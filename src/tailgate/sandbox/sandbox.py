@@ -27,7 +27,7 @@ class Sandbox:
     """The barrier between a submission's process and this machine."""
 
     program: Program = param("bwrap", "bwrap (bubblewrap), or docker")
-    image: str = param("tailgate", "docker: name of an image whose python imports this very version of tailgate")
+    image: str = param("tailgate", "docker: name of an image with this version of tailgate")
 
     @property
     def processes(self) -> int:

@@ -61,7 +61,7 @@ def _files(module: str) -> tuple[Path, list[Path], bool]:
         raise InputError("submission", module, "a module that is a file or a folder")
     for path in files:
         if path.is_symlink():
-            raise InputError("submission", str(path), "a file: links are not followed, what is played is what was hashed")
+            raise InputError("submission", str(path), "a file: links are not followed, so that the played files are the hashed ones")
     if (size := sum(path.stat().st_size for path in files)) > LARGEST:
         raise InputError("submission", f"{size} bytes", f"at most {LARGEST} bytes in {root}")
     return root, files, bool(spec.submodule_search_locations)
