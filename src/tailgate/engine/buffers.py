@@ -197,7 +197,7 @@ def blended(graph: Graph, where: Node, x: Array, y: Array) -> Array:
 
 
 def sides(graph: Graph, nodes: Array) -> tuple[Node, Array, Array] | None:
-    """Return (mask, x, y) if a single mask selects the whole array from x and y, one of them the same for all episodes; else None."""
+    """Return (mask, x, y) if one mask selects the whole array from x and y, of which one is constant; else None."""
     first = nodes.flat[0]
     if first.op == "select" and all(node.op == "select" and node.args[0] is first.args[0] for node in nodes.flat):
         held = [_map(lambda node, i=i: node.args[i], nodes) for i in (1, 2)]  # type: ignore[misc]

@@ -178,7 +178,7 @@ def congruent(A: Any, P: Any, Q: Any) -> Any:
 
 
 def applied(matrix: Any, x: Any, base: Any) -> Any:
-    """Multiply each agent's matrix (N, i, k), or one (1, i, k) for all, by x (B, N, k), and add base (B, N, i) if given."""
+    """Multiply each agent's matrix (N, i, k), or one for all, by x (B, N, k), and add base (B, N, i) if given."""
     moved = constant_on(matrix, x)
     return moved if base is None else base + moved
 

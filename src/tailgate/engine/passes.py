@@ -19,7 +19,7 @@ LEAST = 12  # least cost of a branch, in additions
 
 @dataclass(eq=False)
 class Branch:
-    """What is needed only where `mask` is true (`side` 1) or false (`side` 2), and the selects that need it."""
+    """A part needed only where `mask` is true (`side` 1) or false (`side` 2), and the selects that need it."""
 
     mask: Node
     side: int
