@@ -8,11 +8,10 @@ Arrays are indexed (B, N, ...) and keep B contiguous in memory (`batch_last`), s
 """
 
 import math
-from collections.abc import Callable, Sequence
-from typing import Any, cast
+from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, DTypeLike
 
 from tailgate.engine import elementary, matrices
 from tailgate.engine.array import Traced
@@ -29,10 +28,14 @@ from tailgate.engine.hints import ring_next as ring_next
 from tailgate.engine.hints import some as some
 from tailgate.engine.hints import take as take
 from tailgate.engine.loops import until as until
+from tailgate.engine.matrices import congruent as congruent
+from tailgate.engine.matrices import corrected as corrected
+from tailgate.engine.matrices import moment as moment
 from tailgate.engine.matrices import orthogonal as orthogonal
+from tailgate.engine.matrices import predicted as predicted
 from tailgate.engine.matrices import root as root
+from tailgate.engine.operations import Array
 
-Array = NDArray[Any]
 Shares = tuple[Array, Array, Array]
 
 
@@ -41,13 +44,9 @@ WORTH = 16  # numbers from which machine code is faster than numpy's passes
 exp = elementwise(WORTH)(elementary.exp)
 log = elementwise(WORTH)(elementary.log)
 tanh = elementwise(WORTH)(elementary.tanh)
-congruent: Callable[..., Array] = matrices.congruent
-moment: Callable[..., Array] = matrices.moment
-predicted: Callable[..., Array] = matrices.predicted
-corrected: Callable[..., tuple[Array, Array]] = matrices.corrected
 
 
-def clip(x: Any, low: Any, high: Any) -> Any:
+def clip(x: ArrayLike, low: ArrayLike, high: ArrayLike) -> Array:
     """Limit x to [low, high], elementwise."""
     return np.minimum(np.maximum(x, low), high)
 
@@ -71,12 +70,12 @@ def batch_last(x: Array) -> Array:
     return last_to_first(np.ascontiguousarray(first_to_last(x)))
 
 
-def zeros(shape: Sequence[int], dtype: Any = np.float64) -> Array:
+def zeros(shape: Sequence[int], dtype: DTypeLike = np.float64) -> Array:
     """Return a (B, ...) array of zeros, B contiguous in memory."""
     return last_to_first(np.zeros((*shape[1:], shape[0]), dtype))
 
 
-def full(shape: Sequence[int], value: Any, dtype: Any = np.float64) -> Array:
+def full(shape: Sequence[int], value: ArrayLike | None, dtype: DTypeLike = np.float64) -> Array:
     """Return a (B, ...) array filled with `value` (broadcast over the trailing axes), B contiguous in memory."""
     out = zeros(shape, dtype)
     out[...] = value
@@ -95,10 +94,10 @@ def matmul(x: Array, y: Array) -> Array:
     """
     alike = not isinstance(x, Traced) or x.fixed
     if alike and y.ndim > 3 and (x.ndim == 2 or (x.ndim == 3 and x.shape[0] in (1, *y.shape[1:-2]))):
-        return cast(Array, matrices.constant_times(x, y))
+        return matrices.constant_times(x, y)
     if x.ndim < y.ndim and not isinstance(x, Traced):
         x = x[(None,) * (y.ndim - x.ndim)]
-    return cast(Array, matrices.product(x, y))
+    return matrices.product(x, y)
 
 
 def matvec(x: Array, v: Array) -> Array:
@@ -128,7 +127,7 @@ def inverse(s: Array) -> Array:
     """Return the inverse of symmetric positive definite (..., q, q), see `matrices.inverse`."""
     if s.ndim > 2 and len(s) > 1 and s.strides[0] == 0:  # one matrix for the whole batch
         return np.broadcast_to(inverse(s[:1]), s.shape)
-    return cast(Array, matrices.inverse(s))
+    return matrices.inverse(s)
 
 
 def apply(matrix: Array, x: Array, base: Array | None = None) -> Array:
@@ -136,7 +135,7 @@ def apply(matrix: Array, x: Array, base: Array | None = None) -> Array:
 
     Sums run over k in ascending order and skip structural zeros of the matrices. Returns (B, N, i).
     """
-    return cast(Array, matrices.applied(matrix, x, base))
+    return matrices.applied(matrix, x, base)
 
 
 def fused(heard: Array, x: Array, M: Array, shares: Shares | None = None, step: tuple[Array, Array] | None = None) -> tuple[Array, Array]:
@@ -157,12 +156,12 @@ def fused(heard: Array, x: Array, M: Array, shares: Shares | None = None, step: 
 
 def product(x: Array, y: Array) -> Array:
     """Multiply one (i, k) by one (k, j), summing over k in ascending order without the zeros of x."""
-    return cast(Array, matrices.constant_times(x, y))
+    return matrices.constant_times(x, y)
 
 
 def solve(m: Array, y: Array) -> Array:
     """Return M^-1 Y for one (n, n) and one (n, k), by elimination with row pivots in fixed order."""
-    return cast(Array, matrices.solve(m, y))
+    return matrices.solve(m, y)
 
 
 def expm(m: Array) -> Array:
@@ -195,4 +194,4 @@ def spectral_radius(m: Array) -> float:
 def dense(x: Array, weight: Array, bias: Array, squash: bool) -> Array:
     """Apply one network layer (B, i) -> (B, o) in float64 and fixed order, with tanh if `squash`."""
     out = matrices.dense(x, weight, bias)
-    return cast(Array, tanh(out) if squash else out)
+    return tanh(out) if squash else out

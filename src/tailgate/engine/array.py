@@ -10,32 +10,34 @@ from __future__ import annotations
 import operator
 from collections.abc import Callable, Iterator, Sequence
 from types import SimpleNamespace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from tailgate.engine.buffers import blended, swept, wide
 from tailgate.engine.graph import Graph, Node
-from tailgate.engine.operations import BOOL, Array
+from tailgate.engine.operations import BOOL, Array, ArrayLike, Axis, DTypeLike
 from tailgate.engine.untraceable import Untraceable
 
 _ZERO = np.zeros((), np.int8)
+if TYPE_CHECKING:
+    _Base = np.ndarray[Any, np.dtype[Any]]
+else:
+    _Base = object
 
 
-class Traced:
+class Traced(_Base):
     """An array of nodes; `batch`: the index of the episodes' axis, or None; `weak`: the type of a Python number, or None."""
 
     __slots__ = ("batch", "dtype", "flags", "graph", "nodes", "weak")
-    __hash__ = None  # type: ignore[assignment]
+    __hash__ = None
     __array_priority__ = 1000.0
 
     def __init__(
         self, graph: Graph, nodes: Array, dtype: np.dtype[Any], batch: int | None = None, weak: type | None = None, writeable: bool = True
     ) -> None:
         self.graph, self.nodes, self.dtype, self.batch, self.weak = graph, nodes, dtype, batch, weak
-        self.flags = SimpleNamespace(writeable=writeable)  # like numpy's flags
-
-    # -- properties
+        self.flags: Any = SimpleNamespace(writeable=writeable)  # like numpy's flags
 
     shape = property(lambda self: self.nodes.shape)
     ndim = property(lambda self: self.nodes.ndim)
@@ -69,7 +71,7 @@ class Traced:
     def __repr__(self) -> str:
         return f"Traced{self.shape} {self.dtype}{' fixed' if self.fixed else ''}"
 
-    def __array__(self, dtype: Any = None, copy: bool | None = None) -> Array:
+    def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> Array:
         return self.known("an array of numbers", "use numpy's elementwise functions, num.* or np.where").astype(dtype or self.dtype)
 
     def __len__(self) -> int:
@@ -116,7 +118,7 @@ class Traced:
             batch = there[0] if there else None
         return Traced(self.graph, nodes, self.dtype, batch, self.weak, copied or self.flags.writeable)
 
-    def transpose(self, *axes: Any) -> Traced:
+    def transpose(self, *axes: int | Sequence[int]) -> Traced:
         """Permute the axes."""
         return self._moved(lambda a: a.transpose(*axes))
 
@@ -132,7 +134,7 @@ class Traced:
         """Return the diagonal of two axes, as the last axis."""
         return self._moved(lambda a: a.diagonal(offset, axis1, axis2))
 
-    def reshape(self, *shape: Any, order: Any = "C") -> Traced:
+    def reshape(self, *shape: Any, order: str = "C") -> Traced:
         """Change the shape; the episodes' axis stays first or last."""
         new = tuple(shape[0]) if len(shape) == 1 and isinstance(shape[0], (tuple, list)) else shape
         nodes = self.nodes.reshape(new)
@@ -147,29 +149,29 @@ class Traced:
         """Flatten to one axis."""
         return self.reshape(-1)
 
-    def copy(self, order: Any = None) -> Traced:
+    def copy(self, order: str = "K") -> Traced:
         """Copy the array."""
         return Traced(self.graph, self.nodes.copy(), self.dtype, self.batch, self.weak)
 
-    def view(self, dtype: Any = None) -> Traced:
+    def view(self, dtype: DTypeLike | None = None) -> Traced:
         """Return the same nodes; with another type of the same size, reinterpret their bits."""
         if dtype is None or np.dtype(dtype) == self.dtype:
             return Traced(self.graph, self.nodes, self.dtype, self.batch, self.weak, self.flags.writeable)
         to = np.dtype(dtype)
         return self.mapped(lambda node: self.graph.bits(node, to), to)
 
-    def astype(self, dtype: Any, order: Any = "K", casting: Any = "unsafe", copy: bool = True) -> Traced:
+    def astype(self, dtype: DTypeLike, order: str = "K", casting: str = "unsafe", copy: bool = True) -> Traced:
         """Convert to another type."""
         to = np.dtype(dtype)
         return self.copy() if to == self.dtype else self.mapped(lambda node: self.graph.cast(node, to), to)
 
-    def mapped(self, function: Callable[[Node], Node], dtype: Any = None) -> Traced:
+    def mapped(self, function: Callable[[Node], Node], dtype: DTypeLike | None = None) -> Traced:
         """Apply a function to each node."""
         return Traced(self.graph, each(self.graph, function, self.nodes), np.dtype(dtype or self.dtype), self.batch)
 
     # -- indexing
 
-    def _key(self, key: Any) -> tuple[Any, ...]:
+    def _key(self, key: object) -> tuple[Any, ...]:
         """Return an index of numpy's without traced arrays."""
         parts = key if isinstance(key, tuple) else (key,)
         masks = "write np.where(mask, x, y) for all rows"
@@ -179,11 +181,11 @@ class Traced:
             for part in parts
         )  # fmt: skip
 
-    def __getitem__(self, key: Any) -> Traced:
+    def __getitem__(self, key: object) -> Traced:
         plain = self._key(key)
         return self._moved(lambda a: a[plain])
 
-    def __setitem__(self, key: Any, value: Any) -> None:
+    def __setitem__(self, key: object, value: ArrayLike) -> None:
         if not self.flags.writeable:
             raise ValueError("assignment destination is read-only")
         graph = self.graph
@@ -202,41 +204,41 @@ class Traced:
 
     # -- numpy
 
-    def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **options: Any) -> Any:
+    def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: ArrayLike, **options: Any) -> Any:
         from tailgate.engine import ufuncs
 
         return ufuncs.called(self.graph, ufunc, method, inputs, options)
 
-    def __array_function__(self, function: Any, types: Any, args: Any, options: Any) -> Any:
+    def __array_function__(self, function: Callable[..., object], types: object, args: Sequence[Any], options: dict[str, Any]) -> Any:
         from tailgate.engine import functions
 
         return functions.called(self.graph, function, args, options)
 
-    def any(self, axis: Any = None, out: Any = None, keepdims: bool = False) -> Any:
+    def any(self, axis: Axis = None, out: None = None, keepdims: bool = False) -> Traced:
         """Return True where any is true, along axes other than the episodes'."""
         return reduced(self.astype(bool), "or", axis, keepdims, "write `if num.some(mask):`, or name the axis")
 
-    def all(self, axis: Any = None, out: Any = None, keepdims: bool = False) -> Any:
+    def all(self, axis: Axis = None, out: None = None, keepdims: bool = False) -> Traced:
         """Return True where all are true, along axes other than the episodes'."""
         return reduced(self.astype(bool), "and", axis, keepdims, "write `if num.every(mask):`, or name the axis")
 
-    def max(self, axis: Any = None, out: Any = None, keepdims: bool = False) -> Any:
+    def max(self, axis: Axis = None, out: None = None, keepdims: bool = False) -> Traced:
         """Return the largest number along axes other than the episodes'."""
         return reduced(self, "or" if self.dtype == BOOL else "max", axis, keepdims)
 
-    def min(self, axis: Any = None, out: Any = None, keepdims: bool = False) -> Any:
+    def min(self, axis: Axis = None, out: None = None, keepdims: bool = False) -> Traced:
         """Return the smallest number along axes other than the episodes'."""
         return reduced(self, "and" if self.dtype == BOOL else "min", axis, keepdims)
 
-    def sum(self, axis: Any = None, dtype: Any = None, out: Any = None, keepdims: bool = False) -> Any:
+    def sum(self, axis: Axis = None, dtype: DTypeLike | None = None, out: None = None, keepdims: bool = False) -> Traced:
         """Sum up to seven numbers along an axis; numpy's order for more depends on their layout in memory."""
         return reduced(summands(self, axis, dtype), "add", axis, keepdims)
 
-    def clip(self, low: Any, high: Any) -> Any:
+    def clip(self, low: ArrayLike, high: ArrayLike) -> Array:
         """Limit to [low, high]."""
         return np.minimum(np.maximum(self, low), high)
 
-    def __pow__(self, exponent: Any) -> Any:
+    def __pow__(self, exponent: float) -> Array:
         """Raise to 0.5, 1 or 2; for other exponents numpy calls a library whose bits differ between machines."""
         known = float(exponent)
         if known not in (0.5, 1.0, 2.0):
@@ -252,13 +254,13 @@ def _operators() -> None:
         "matmul": np.matmul,
     }  # fmt: skip
 
-    def plain(ufunc: Any) -> Callable[[Any, Any], Any]:
+    def plain(ufunc: np.ufunc) -> Callable[[Any, Any], Any]:
         return lambda self, other: ufunc(self, other)
 
-    def reflected(ufunc: Any) -> Callable[[Any, Any], Any]:
+    def reflected(ufunc: np.ufunc) -> Callable[[Any, Any], Any]:
         return lambda self, other: ufunc(other, self)
 
-    def in_place(ufunc: Any) -> Callable[[Any, Any], Any]:
+    def in_place(ufunc: np.ufunc) -> Callable[[Any, Any], Any]:
         return lambda self, other: ufunc(self, other, out=(self,))
 
     for name, ufunc in pairs.items():
@@ -272,10 +274,7 @@ def _operators() -> None:
         setattr(Traced, f"__{name}__", (lambda ufunc: lambda self: ufunc(self))(single))
 
 
-# -- functions of nodes
-
-
-def boxed(node: Any) -> Array:
+def boxed(node: object) -> Array:
     """Return an array without axes that holds one node."""
     out = np.empty((), object)
     out[()] = node
@@ -292,7 +291,7 @@ def each(graph: Graph, function: Callable[..., Node], *arrays: Array) -> Array:
     return out
 
 
-def lifted(graph: Graph, x: Any, like: np.dtype[Any] | None = None) -> Traced:
+def lifted(graph: Graph, x: ArrayLike, like: np.dtype[Any] | None = None) -> Traced:
     """Return x as a traced array; numbers become constants, and a Python number gets the type `like`."""
     if isinstance(x, Traced):
         return x
@@ -341,7 +340,7 @@ def result_type(arrays: Sequence[Traced]) -> np.dtype[Any]:
     return np.result_type(*(a.weak(0) if a.weak else a.dtype for a in arrays))
 
 
-def chosen(where: Any, x: Any, y: Any, dtype: np.dtype[Any] | None = None) -> Traced:
+def chosen(where: ArrayLike, x: ArrayLike, y: ArrayLike, dtype: np.dtype[Any] | None = None) -> Traced:
     """Return x where `where` is true, else y, as np.where does."""
     graph = next(a.graph for a in (where, x, y) if isinstance(a, Traced))
     mask, one, other = lifted(graph, where), lifted(graph, x), lifted(graph, y)
@@ -354,7 +353,7 @@ def chosen(where: Any, x: Any, y: Any, dtype: np.dtype[Any] | None = None) -> Tr
     return elementwise(graph, graph.select, arrays, to)
 
 
-def axes_of(x: Traced, axis: Any, instead: str) -> list[int]:
+def axes_of(x: Traced, axis: Axis, instead: str) -> list[int]:
     """Return the axes that a reduction names; raise Untraceable if the episodes' axis is among them."""
     if axis is None:
         if x.fixed or (x.batch is None and x.ndim == 0):
@@ -366,7 +365,7 @@ def axes_of(x: Traced, axis: Any, instead: str) -> list[int]:
     return axes
 
 
-def summands(x: Traced, axis: Any, dtype: Any = None) -> Traced:
+def summands(x: Traced, axis: Axis, dtype: DTypeLike | None = None) -> Traced:
     """Return x in the type of its sum; raise Untraceable if it is too long to sum in a fixed order."""
     long = max((x.shape[a] for a in axes_of(x, axis, "name the axis")), default=0)
     if x.dtype.kind == "f" and long > 7:
@@ -374,11 +373,11 @@ def summands(x: Traced, axis: Any, dtype: Any = None) -> Traced:
     return typed(x.graph, x, np.dtype(dtype or (np.int64 if x.dtype.kind in "bi" else x.dtype)))
 
 
-def reduced(x: Traced, op: str, axis: Any, keepdims: bool, instead: str = "name an axis that is not the episodes'") -> Any:
+def reduced(x: Traced, op: str, axis: Axis, keepdims: bool, instead: str = "name an axis that is not the episodes'") -> Traced:
     """Reduce axes of x by an operation, in ascending order."""
     out = x
     for a in reversed(axes_of(x, axis, instead)):
-        parts = [out._moved(lambda n, a=a, i=i: n.take(i, a)) for i in range(out.shape[a])]  # type: ignore[misc]
+        parts = [out._moved(lambda n, a=a, i=i: n.take(i, a)) for i in range(out.shape[a])]
         if not parts and op not in ("and", "or", "add"):
             raise ValueError(f"zero-size array to reduction operation {op} which has no identity")
         if parts:
@@ -391,7 +390,7 @@ def reduced(x: Traced, op: str, axis: Any, keepdims: bool, instead: str = "name 
         out = held
     if keepdims:
         for a in axes_of(x, axis, instead):
-            out = out._moved(lambda n, a=a: np.expand_dims(n, a))  # type: ignore[misc]
+            out = out._moved(lambda n, a=a: np.expand_dims(n, a))
     return out[()] if out.ndim else out
 
 

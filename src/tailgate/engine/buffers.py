@@ -82,13 +82,13 @@ def swept(graph: Graph, function: Callable[..., Any], lead: Sequence[int], array
     return graph.picks(buffer).reshape(*lead, *made.shape)
 
 
-def _boxed(node: Any) -> Array:
+def _boxed(node: object) -> Array:
     out = np.empty((), object)
     out[()] = node
     return out
 
 
-def _of_one(nodes: Any, rest: tuple[int, ...]) -> Any:
+def _of_one(nodes: Array | Node, rest: tuple[int, ...]) -> Array | Node:
     """Return nodes that no round changes as an array of the trailing axes."""
     return np.broadcast_to(_boxed(nodes), rest) if rest and isinstance(nodes, Node) else nodes
 

@@ -8,10 +8,9 @@ References: Salmon et al., *Parallel random numbers: as easy as 1, 2, 3*, SC11 (
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
+from tailgate.engine.operations import Array
 from tailgate.engine.routines import routine
 
 LN2_HI = 6.93147180369123816490e-01  # ln 2 with its last bits zero: n * LN2_HI is exact for |n| < 2**20
@@ -23,16 +22,16 @@ ONE_BITS = np.uint64(0x3FF0000000000000)
 LOW, SHIFT = np.uint64(0xFFFFFFFF), np.uint64(32)
 
 
-def _polynomial(z: Any, *coefficients: float) -> Any:
+def _polynomial(z: Array, *coefficients: float) -> Array:
     """Evaluate a polynomial by Horner's scheme, the highest power first."""
-    out: Any = coefficients[0]
-    for c in coefficients[1:]:
+    out = coefficients[0] * z + coefficients[1]
+    for c in coefficients[2:]:
         out = out * z + c
     return out
 
 
 @routine
-def exp(x: Any) -> Any:
+def exp(x: Array) -> Array:
     """Return e to the power x; below the normal range it is 0."""
     z = np.where(x == x, x, 0.0)
     y = np.minimum(np.maximum(z, -708.0), 709.7)
@@ -44,7 +43,7 @@ def exp(x: Any) -> Any:
     return np.where(x == x, np.where(z > 709.7, np.inf, np.where(z >= -708.0, p, 0.0)), x)
 
 
-def log_normal(x: Any, e: Any) -> Any:
+def log_normal(x: Array, e: Array | float) -> Array:
     """Return the logarithm of x 2^e for a normal positive x."""
     bits = x.view(np.int64)
     e = e + ((((bits >> 52) & 0x7FF) | TWO_52_BITS).view(np.float64) - (TWO_52 + 1022.0))
@@ -58,7 +57,7 @@ def log_normal(x: Any, e: Any) -> Any:
 
 
 @routine
-def log(x: Any) -> Any:
+def log(x: Array) -> Array:
     """Return the natural logarithm: -inf of 0, NaN of negative numbers."""
     x = np.where(x == x, x, -1.0)
     plain = (x > 0.0) & (x < np.inf)
@@ -70,13 +69,13 @@ def log(x: Any) -> Any:
 
 
 @routine
-def tanh(x: Any) -> Any:
+def tanh(x: Array) -> Array:
     """Return the hyperbolic tangent, to an absolute error below 4e-16."""
     out = 1.0 - 2.0 / (exp(2.0 * x) + 1.0)
     return np.where(x > 20.0, 1.0, np.where(x < -20.0, -1.0, out))
 
 
-def sincos_turn(u: Any) -> tuple[Any, Any]:
+def sincos_turn(u: Array) -> tuple[Array, Array]:
     """Return sine and cosine of 2 pi u, for turns u within [0, 1)."""
     quarter = np.floor(4.0 * u + 0.5)
     t = TWO_PI * (u - 0.25 * quarter)  # |t| <= pi/4
@@ -90,7 +89,7 @@ def sincos_turn(u: Any) -> tuple[Any, Any]:
     return np.where(second | third, -sine, sine), np.where(first | second, -cosine, cosine)
 
 
-def philox(c0: Any, c1: Any, c2: Any, c3: Any, k0: Any, k1: Any) -> tuple[Any, Any, Any, Any]:
+def philox(c0: Array, c1: Array, c2: Array, c3: Array, k0: Array, k1: Array) -> tuple[Array, Array, Array, Array]:
     """Return the four words of Philox4x32-10; counter and key are words of 32 bits, each in a uint64."""
     for _ in range(10):  # bits above 32 do not influence the result
         p0, p1 = np.uint64(0xD2511F53) * (c0 & LOW), np.uint64(0xCD9E8D57) * (c2 & LOW)
@@ -100,12 +99,12 @@ def philox(c0: Any, c1: Any, c2: Any, c3: Any, k0: Any, k1: Any) -> tuple[Any, A
 
 
 @routine
-def uniform_pair(key: Any, episode: Any, step: Any, stream: Any, block: Any) -> tuple[Any, Any]:
+def uniform_pair(key: Array, episode: Array, step: Array, stream: Array, block: Array) -> tuple[Array, Array]:
     """Return two uniforms in (0, 1) of 52 bits each, never 0 nor 1; all arguments are uint64."""
     w0, w1, w2, w3 = philox(episode, block, step, stream, key & LOW, key >> SHIFT)
     half = 1.1102230246251565e-16
 
-    def number(high: Any, low: Any) -> Any:
+    def number(high: Array, low: Array) -> Array:
         mantissa = (((high << SHIFT) | low) >> np.uint64(12)) | ONE_BITS  # of a number in [1, 2)
         return (mantissa.view(np.float64) - 1.0) + half
 
@@ -113,7 +112,7 @@ def uniform_pair(key: Any, episode: Any, step: Any, stream: Any, block: Any) -> 
 
 
 @routine
-def normal_pair(key: Any, episode: Any, step: Any, stream: Any, block: Any) -> tuple[Any, Any]:
+def normal_pair(key: Array, episode: Array, step: Array, stream: Array, block: Array) -> tuple[Array, Array]:
     """Return two standard normals, by Box and Muller."""
     u, v = uniform_pair(key, episode, step, stream, block)
     radius = np.sqrt(-2.0 * log_normal(u, 0.0))

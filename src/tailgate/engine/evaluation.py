@@ -44,7 +44,7 @@ def _multiplied(graph: Graph, held: Matrix, args: Sequence[Any]) -> list[Any]:
     x, out = args[: matrix.shape[1]], list(args[matrix.shape[1] :])
     for i, k in np.ndindex(*matrix.shape):
         if there is None or there[i, k]:
-            out[i] = out[i] + graph.value(matrix[i, k]) * x[k]
+            out[i] = out[i] + graph.value(matrix.item(i, k)) * x[k]
     return out
 
 

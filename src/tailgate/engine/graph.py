@@ -6,14 +6,17 @@ A folded value therefore has the bits of a computed one. No rewriting changes a 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Hashable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from tailgate.engine.operations import BOOL, COMMUTATIVE, COMPARISONS, FLOAT, INT, Array, apply, converted
+from tailgate.engine.operations import BOOL, COMMUTATIVE, COMPARISONS, FLOAT, INT, Array, ArrayLike, apply, converted
 from tailgate.engine.untraceable import Untraceable
+
+if TYPE_CHECKING:
+    from tailgate.engine.routines import Routine
 
 MOST = 45_000  # operations of a graph; larger ones take long to compile as straight code
 _FREE = {"const", "uniform", "input", "carried", "pick"}  # nodes that are no operations
@@ -85,7 +88,7 @@ def dependent(roots: Sequence[Node], sources: Sequence[Node]) -> set[Node]:
 class Matrix(NamedTuple):
     """A matrix (p, q) of fixed nodes, a mask of its structural nonzeros, and tables of their places if it is sparse."""
 
-    nodes: Any
+    nodes: Array
     there: Array | None
     tables: list[list[Node]]
 
@@ -106,25 +109,25 @@ class Graph:
 
     # -- leaves
 
-    def const(self, value: Any, dtype: np.dtype[Any]) -> Node:
+    def const(self, value: ArrayLike, dtype: np.dtype[Any]) -> Node:
         """Return a constant; 0.0 and -0.0 differ."""
-        held = value
+        held: Any = value
         if not (isinstance(value, np.generic) and value.dtype == dtype):
             with np.errstate(all="ignore"):
                 held = converted(np.asarray(value), dtype)[()]
         return self._node("const", dtype, (), held, held.tobytes(), True)
 
-    def input(self, name: Any, dtype: np.dtype[Any]) -> Node:
+    def input(self, name: Hashable, dtype: np.dtype[Any]) -> Node:
         """Return a number that differs between episodes."""
         return self._node("input", dtype, (), name, name, False)
 
-    def uniform(self, name: Any, value: Any) -> Node:
+    def uniform(self, name: Hashable, value: ArrayLike) -> Node:
         """Return a number that all episodes share and that may change between calls: the code does not contain its value."""
         node = self._node("uniform", np.asarray(value).dtype, (), name, name, True)
         self._values[node.id] = np.asarray(value)[()]
         return node
 
-    def _node(self, op: str, dtype: np.dtype[Any], args: tuple[Node, ...], attr: Any, key: Any, fixed: bool, size: int = 0) -> Node:
+    def _node(self, op: str, dtype: np.dtype[Any], args: tuple[Node, ...], attr: object, key: Hashable, fixed: bool, size: int = 0) -> Node:
         known = (op, dtype, key, *(a.id for a in args))
         node = self._known.get(known)
         if node is None:
@@ -206,7 +209,7 @@ class Graph:
 
     # -- routines
 
-    def call(self, routine: Any, args: Sequence[Node]) -> Node:
+    def call(self, routine: Routine, args: Sequence[Node]) -> Node:
         """Return a call of a routine (engine/routines.py); `pick` selects its results."""
         return self._node("call", BOOL, tuple(args), routine, id(routine), all(a.fixed for a in args))
 
@@ -247,7 +250,7 @@ class Graph:
             self._picks[buffer.id] = out
         return self._picks[buffer.id]
 
-    def held(self, name: Any, size: int, dtype: np.dtype[Any]) -> Node:
+    def held(self, name: Hashable, size: int, dtype: np.dtype[Any]) -> Node:
         """Return a buffer that differs between episodes."""
         return self._node("held", dtype, (), name, name, False, size)
 

@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from typing import Any
+from typing import cast
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tailgate.base.errors import InputError
 from tailgate.engine.array import Traced
 from tailgate.engine.functions import gathered
 from tailgate.engine.loops import chosen_apart
+from tailgate.engine.operations import Array, Mask
 
-Array = NDArray[Any]
 
-
-def some(mask: Any) -> bool:
+def some(mask: Array) -> bool:
     """Return True if any is true; traced code always takes the branch.
 
     It is a hint: the branch may be computed for all rows, and must keep the bits of rows outside the mask.
@@ -24,16 +22,17 @@ def some(mask: Any) -> bool:
     return bool(mask.values().any()) if isinstance(mask, Traced) and mask.fixed else isinstance(mask, Traced) or bool(mask.any())
 
 
-def every(mask: Any) -> bool:
+def every(mask: Array) -> bool:
     """Return True if all are true; traced code never takes the branch, which may only skip work that changes no bit."""
     return bool(mask.values().all()) if isinstance(mask, Traced) and mask.fixed else not isinstance(mask, Traced) and bool(mask.all())
 
 
-def elsewhere(mask: Any, x: Any, function: Callable[..., Any], *arrays: Any) -> Any:
+def elsewhere(mask: Mask, x: Array, function: Callable[..., Array], *arrays: Array) -> Array:
     """Return x (B, N, ...) where a mask (B, N) is true, else function(*arrays) of arrays (B or 1, N, ...). N may be missing.
 
     Plain code calls the function with the places that need it, (M, 1, ...), if any; traced code with each agent, (1, 1, ...).
     """
+    mask = cast(Array, mask)
     if mask.ndim == 1:
         return elsewhere(mask[:, None], x[:, None], function, *(array[:, None] for array in arrays))[:, 0]
     if isinstance(mask, Traced) and not mask.fixed:
@@ -48,7 +47,7 @@ def elsewhere(mask: Any, x: Any, function: Callable[..., Any], *arrays: Any) -> 
     return out
 
 
-def present(values: Any, candidates: Iterable[int]) -> list[int]:
+def present(values: Array, candidates: Iterable[int]) -> list[int]:
     """Return the candidates that occur among whole numbers; in traced code, all candidates."""
     if isinstance(values, Traced) and not values.fixed:
         return list(candidates)
@@ -56,19 +55,19 @@ def present(values: Any, candidates: Iterable[int]) -> list[int]:
     return [one for one in candidates if one in held]
 
 
-def pick(ring: Array, place: Any) -> Any:
+def pick(ring: Array, place: Array) -> Array:
     """Return ring[..., place] of a ring (B, ..., L) and whole numbers that broadcast to (B, ...)."""
     if not isinstance(ring, Traced):
         if ring.ndim == 2 and np.ndim(place) == 1:
             return ring[np.arange(len(ring)), place]
         return np.take_along_axis(ring, np.broadcast_to(place, ring.shape[:-1])[..., None], axis=-1)[..., 0]
-    out = ring[..., 0]
+    out: Array = ring[..., 0]
     for i in range(1, ring.shape[-1]):
         out = np.where(place == i, ring[..., i], out)
     return out
 
 
-def put(ring: Array, place: Any, value: Any) -> Any:
+def put(ring: Array, place: Array, value: Array) -> Array:
     """Return the ring (B, ..., L) with `value` (B, ...) at `place`, which broadcasts to (B, ...)."""
     if isinstance(ring, Traced):
         return np.stack([np.where(place == i, value, ring[..., i]) for i in range(ring.shape[-1])], axis=-1)
@@ -80,12 +79,12 @@ def put(ring: Array, place: Any, value: Any) -> Any:
     return out
 
 
-def ring_next(place: Any, size: int) -> Any:
+def ring_next(place: Array, size: int) -> Array:
     """Return the index after `place` in a ring of a size."""
     return np.where(place + 1 == size, 0, place + 1)
 
 
-def demand(condition: Any, field: str, found: str, wanted: str, k: Any, values: Any = None) -> None:
+def demand(condition: Array, field: str, found: str, wanted: str, k: Array, values: Array | None = None) -> None:
     """Raise InputError unless a condition (B, ...) holds in all rows, which are at steps k (B,). Traced code checks after its step.
 
     The error says what is `found`; in plain code it shows `values`, if given.
@@ -96,7 +95,7 @@ def demand(condition: Any, field: str, found: str, wanted: str, k: Any, values: 
     elif not condition.all() and values is not None:
         raise InputError(field, np.unique(values).tolist(), wanted)
     elif not condition.all():
-        raise broken(~condition.reshape(len(condition), -1).all(axis=1), field, found, wanted, k)
+        raise broken(np.asarray(~condition.reshape(len(condition), -1).all(axis=1)), field, found, wanted, k)
 
 
 def broken(rows: Array, field: str, found: str, wanted: str, k: Array) -> InputError:
@@ -111,14 +110,14 @@ def broken(rows: Array, field: str, found: str, wanted: str, k: Array) -> InputE
 LISTED = 8  # entries of a table that traced code compares one by one
 
 
-def take(table: Array, index: Any) -> Any:
+def take(table: Array, index: Array) -> Array:
     """Return table[index] of a table (K, ...) and whole numbers from 0 to K - 1."""
     if not isinstance(index, Traced):
         return table[index]
     if len(table) > LISTED and not index.fixed:
         return gathered(table, index)
-    wide: Any = index[(..., *(None,) * (table.ndim - 1))]
-    out: Any = np.broadcast_to(table[0], (*index.shape, *table.shape[1:]))
+    wide = index[(..., *(None,) * (table.ndim - 1))]
+    out: Array = np.broadcast_to(table[0], (*index.shape, *table.shape[1:]))
     for k in range(1, len(table)):
         out = np.where(wide == k, table[k], out)
     return out

@@ -100,7 +100,7 @@ def cast(e: Emitter, x: str, of: np.dtype[Any], to: np.dtype[Any]) -> str:
     kind, result, lanes = e.vector(of), e.vector(to), e.lanes
     if of == BOOL:
         if to.kind == "f":
-            return e.set(f"select {kind} {x}, {result} {e.splat(np.ones((), to)[()])}, {result} zeroinitializer")
+            return e.set(f"select {kind} {x}, {result} {e.splat(to.type(1))}, {result} zeroinitializer")
         return e.set(f"zext {kind} {x} to {result}")
     if to == BOOL:
         return e.set(f"{'fcmp une' if of.kind == 'f' else 'icmp ne'} {kind} {x}, zeroinitializer")

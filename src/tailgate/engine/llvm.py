@@ -102,7 +102,7 @@ class Emitter:
     def vector(self, dtype: np.dtype[Any]) -> str:
         return f"<{self.lanes} x {scalar(dtype)}>"
 
-    def splat(self, value: Any) -> str:
+    def splat(self, value: np.generic) -> str:
         """Return a constant in all lanes."""
         kind, name = value.dtype.kind, scalar(value.dtype)
         if kind == "f":

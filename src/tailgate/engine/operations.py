@@ -6,23 +6,28 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike as ArrayLike
+from numpy.typing import DTypeLike as DTypeLike
 
 Array = np.ndarray[Any, Any]
+Axis = int | Sequence[int] | None
+Shape = int | Sequence[int]
+Mask = Array | np.bool_  # numpy's reductions return either
 BOOL, FLOAT, INT = np.dtype(bool), np.dtype(np.float64), np.dtype(np.int64)
 DTYPES = [np.dtype(name) for name in ("?", "f8", "f4", "i8", "u8", "i4", "u4", "i2", "u2", "i1", "u1")]
 
 
-def minimum(x: Any, y: Any) -> Any:
+def minimum(x: Array, y: Array) -> Array:
     """Return the smaller number, or NaN if either is NaN; of equal numbers, including -0.0 and 0.0, the second."""
     return np.where((x < y) | (x != x), x, y)
 
 
-def maximum(x: Any, y: Any) -> Any:
+def maximum(x: Array, y: Array) -> Array:
     """Return the larger number, as `minimum` returns the smaller."""
     return np.where((x > y) | (x != x), x, y)
 
 
-def converted(x: Any, dtype: np.dtype[Any]) -> Any:
+def converted(x: Array, dtype: np.dtype[Any]) -> Array:
     """Convert x to another type: NaN and numbers beyond 64 bits become the least integer; narrower types keep the low bits."""
     if x.dtype.kind == "f" and dtype.kind in "iu":
         holds = (x >= -(2.0**63)) & (x < 2.0**63)

@@ -15,28 +15,29 @@ import sys
 import types
 from collections.abc import Sequence
 from pathlib import Path, PurePath
-from typing import Any
+from typing import Any, TypeVar, cast
 
 import numpy as np
 
 from tailgate.base.sources import own
 from tailgate.engine.array import Traced, boxed
 from tailgate.engine.graph import Graph, Node, ordered
-from tailgate.engine.operations import FLOAT
+from tailgate.engine.operations import FLOAT, Array
 
+T = TypeVar("T")
 LARGE = 20_000  # numbers of an array that is used as it is, because code usually reads few of them
 _PLAIN = (type(None), str, bytes, int, complex, enum.Enum, np.generic, np.dtype, type, types.BuiltinFunctionType, np.ufunc, PurePath)
 
 
-def lifted(graph: Graph, held: Any) -> Any:
+def lifted(graph: Graph, held: T) -> T:
     """Copy dataclasses, tuples, lists, mappings and closures with floats, float arrays and whole numbers traced."""
-    return _Reader(graph).visit(held)
+    return cast(T, _Reader(graph).visit(held))
 
 
 class Parameters:
     """The parameters of objects: equal `key`s share code, whatever their `values`. The key of mutable objects is None."""
 
-    def __init__(self, held: Any) -> None:
+    def __init__(self, held: object) -> None:
         reader = _Reader(None)
         reader.visit(held)
         self.values = reader.values
@@ -70,7 +71,7 @@ class Reading:
         self._direct = {leaf: np.array(places).T for leaf, places in direct.items()}
         self._order = ordered(node for _, node in self._rest)
 
-    def bits(self, values: Sequence[np.ndarray[Any, Any]] | None = None) -> np.ndarray[Any, Any]:
+    def bits(self, values: Sequence[Array] | None = None) -> Array:
         """Return each number as 64 bits, for given values of the parameters or for their own."""
         values = self.graph.parameters if values is None else values
         out = np.zeros(max(1, self.size), np.uint64)
@@ -93,13 +94,13 @@ class _Reader:
     def __init__(self, graph: Graph | None) -> None:
         self.graph = graph
         self.key: list[Any] = []
-        self.values: list[np.ndarray[Any, Any]] = [] if graph is None else graph.parameters
+        self.values: list[Array] = [] if graph is None else graph.parameters
         self.kept: list[Any] = []
         self.modules: set[str] = set()
         self.changeable = False
         self._known: dict[int, tuple[int, Any, Any]] = {}
 
-    def visit(self, held: Any) -> Any:
+    def visit(self, held: object) -> Any:
         if type(held) is float or (type(held) is int and abs(held) < 2**62):
             leaf = np.array([held])
             (node,) = self._leaf(leaf)
@@ -119,7 +120,7 @@ class _Reader:
         self._known[id(held)] = number, held, out  # the original stays alive, so that its id is not reused
         return out
 
-    def _leaf(self, values: np.ndarray[Any, Any]) -> Any:
+    def _leaf(self, values: Array) -> Any:
         """Return the nodes of some numbers."""
         leaf = len(self.values)
         self.values.append(values.ravel())
@@ -128,7 +129,7 @@ class _Reader:
             return [None] * values.size
         return [self.graph.uniform((leaf, i), value) for i, value in enumerate(values.flat)]
 
-    def _copied(self, held: Any, number: int) -> Any:
+    def _copied(self, held: object, number: int) -> Any:
         if isinstance(held, np.ndarray):
             return self._array(held)
         if isinstance(held, (tuple, list)):
@@ -153,7 +154,7 @@ class _Reader:
             object.__setattr__(out, key, self.visit(part))
         return out
 
-    def _array(self, held: np.ndarray[Any, Any]) -> Any:
+    def _array(self, held: Array) -> Any:
         if held.dtype != FLOAT or held.size > LARGE:
             self.key += [held.shape, held.dtype.str, held.tobytes()]
             self.changeable = self.changeable or held.dtype == object
@@ -179,7 +180,7 @@ class _Reader:
         return out
 
 
-def _frozen(kind: Any) -> bool:
+def _frozen(kind: type[Any]) -> bool:
     return bool(kind.__dataclass_params__.frozen)
 
 

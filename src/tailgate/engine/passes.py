@@ -7,7 +7,7 @@ The branch is computed if the mask is true in any lane of the block. These passe
 from __future__ import annotations
 
 import bisect
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -115,12 +115,12 @@ def _asked(nodes: Sequence[Node], kept: Collection[int], turns: Mapping[int, int
 class _Path:
     """The selects around a node, the outermost first."""
 
-    def __init__(self, before: _Path | None, key: Any, depth: int) -> None:
-        self.before, self.depth = before, depth
-        self.first: Any = key if depth == 1 else before and before.first
-        self._ways: dict[Any, _Path] = {}
+    def __init__(self, above: _Path | None, key: Hashable, depth: int) -> None:
+        self.above, self.depth = above or self, depth
+        self.first: Hashable = key if depth <= 1 else self.above.first
+        self._ways: dict[Hashable, _Path] = {}
 
-    def to(self, key: Any) -> _Path:
+    def to(self, key: Hashable) -> _Path:
         """Append a select."""
         if key not in self._ways:
             self._ways[key] = _Path(self, key, self.depth + 1)
@@ -128,12 +128,11 @@ class _Path:
 
     def meeting(self, other: _Path) -> _Path:
         """Return the common part of both paths."""
-        one: Any = self
-        two: Any = other
+        one, two = self, other
         while one is not two:
             deep = one.depth - two.depth
-            one, two = one.before if deep >= 0 else one, two.before if deep <= 0 else two
-        return one  # type: ignore[no-any-return]
+            one, two = one.above if deep >= 0 else one, two.above if deep <= 0 else two
+        return one
 
 
 def _cost(node: Node) -> int:

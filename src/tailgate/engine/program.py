@@ -15,7 +15,7 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import cache
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -28,14 +28,16 @@ from tailgate.engine.functions import makers
 from tailgate.engine.graph import Graph, Node
 from tailgate.engine.hints import broken
 from tailgate.engine.llvm import Column, Held, Layout, text_of
-from tailgate.engine.operations import Array
+from tailgate.engine.operations import Array, DTypeLike
 from tailgate.engine.parameters import Reading
 from tailgate.engine.passes import LEAST
 
 _PYTHON = {"f": "d", "b": "?", "i": "q"}  # Python's format of 64-bit numbers and truth values
 WORTH = 2048  # episodes per thread
 ALIGNED = 64  # bytes of a cache line
-Step = Callable[[Any, Any], tuple[Any, dict[str, Any]]]
+S = TypeVar("S")
+G = TypeVar("G")
+T = TypeVar("T")
 
 
 @dataclass(eq=False)
@@ -50,20 +52,19 @@ class Trace:
     large: dict[str, tuple[Node, Node]] = field(default_factory=dict)  # of leaves that are buffers: now and next
 
 
-def traced(function: Step, state: Any, arguments: Any) -> Trace:
+def traced(function: Callable[[S, G], tuple[S, Mapping[str, Array]]], state: S, arguments: G) -> Trace:
     """Trace function(state, arguments) -> (state, results), with trees of example arrays (B, ...)."""
     graph = Graph()
     inside, taken = _inputs(graph, state, "state"), _inputs(graph, arguments, "arguments")
     with makers(graph):
-        following, results = function(inside, taken)
+        following, made = function(inside, taken)
         following = map_leaves(lambda leaf, like: lifted(graph, leaf, like.dtype).astype(like.dtype), following, inside)
-        results = {name: lifted(graph, leaf) for name, leaf in results.items()}
-    before: dict[str, Any] = leaves(inside)
-    after: dict[str, Any] = leaves(following)
+        results = {name: lifted(graph, leaf) for name, leaf in made.items()}
+    before, after = _nodes(inside), _nodes(following)
     for name, leaf in before.items():
         if after[name].shape != leaf.shape:
             raise ValueError(f"state {name}: {after[name].shape} after a step, {leaf.shape} before it")
-    held = {name: (leaf.nodes, after[name].nodes) for name, leaf in before.items()}
+    held = {name: (leaf, after[name]) for name, leaf in before.items()}
     large = {}
     for name, (here, there) in held.items():
         if here.size >= WIDE:
@@ -84,7 +85,7 @@ def _own(graph: Graph, place: Node, new: Node) -> Node:
     return copied(graph, new) if borrowed(new) else new
 
 
-def _inputs(graph: Graph, tree: Any, kind: str) -> Any:
+def _inputs(graph: Graph, tree: T, kind: str) -> T:
     """Return the tree with an input for each number of each leaf."""
     names = iter(leaves(tree))
 
@@ -100,9 +101,8 @@ def _inputs(graph: Graph, tree: Any, kind: str) -> Any:
     return map_leaves(leaf, tree)
 
 
-def _nodes(tree: Any) -> dict[str, Array]:
-    held: dict[str, Any] = leaves(tree)
-    return {name: leaf.nodes for name, leaf in held.items()}
+def _nodes(tree: object) -> dict[str, Array]:
+    return {name: leaf.nodes for name, leaf in leaves(tree).items() if isinstance(leaf, Traced)}
 
 
 def _of_each(leaf: Traced) -> Traced:
@@ -184,7 +184,7 @@ class State:
         raw = self.memory[:, at : at + nodes.size * program.lanes * dtype.itemsize]
         return raw.view(dtype).reshape(self.blocks, nodes.size, program.lanes)
 
-    def put(self, tree: Any, rows: Array | None = None) -> None:
+    def put(self, tree: object, rows: Array | None = None) -> None:
         """Write the leaves of a tree, arrays (episodes, ...), or `rows` (R,) of them. Idle lanes repeat the last row."""
         for name, leaf in leaves(tree).items():
             self.put_leaf(name, leaf, rows)
@@ -202,7 +202,7 @@ class State:
             place[whole, :, : self.episodes - whole * lanes] = numbers[:, whole * lanes :]
             place[whole, :, self.episodes - whole * lanes :] = numbers[:, -1:]
 
-    def get(self, like: Any) -> Any:
+    def get(self, like: T) -> T:
         """Return a copy as a tree of arrays (episodes, ...)."""
         names = iter(leaves(like))
         return map_leaves(lambda old: self.get_leaf(next(names)), like)
@@ -329,7 +329,7 @@ class Call:
         read, order = struct.Struct(layout).unpack_from, operator.itemgetter(*(wanted.index(name) for name in names))
         return lambda: order(read(self.sheet))  # type: ignore[arg-type]
 
-    def reader(self, name: str, row: int, dtype: Any = None) -> Callable[[], Array]:
+    def reader(self, name: str, row: int, dtype: DTypeLike | None = None) -> Callable[[], Array]:
         """Return a function that reads one row of a result from the sheet, as another type of the same size."""
         shape, kept, at, strides = dict(self._views)[name]
         return lambda: np.ndarray(shape[1:], dtype or kept, self.sheet, at + row * strides[0], strides[1:])
@@ -355,7 +355,7 @@ def address(array: Array) -> int:
     return int(array.__array_interface__["data"][0])
 
 
-def aligned(shape: tuple[int, ...], dtype: Any = np.uint8) -> Array:
+def aligned(shape: tuple[int, ...], dtype: DTypeLike = np.uint8) -> Array:
     """Return zeros that begin at a cache line."""
     size = math.prod(shape) * np.dtype(dtype).itemsize
     raw = np.zeros(size + ALIGNED, np.uint8)

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Sequence
-from typing import Any, Generic, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
 
 import numpy as np
 
 from tailgate.engine import objects
 from tailgate.engine.agreement import Untraced, explained
 from tailgate.engine.graph import Graph
+from tailgate.engine.operations import Array
 from tailgate.engine.parameters import Parameters, Reading
+
+if TYPE_CHECKING:
+    from tailgate.engine.program import Program
 
 KEPT, EACH = 64, 8  # keys that are cached, and variants per key
 _MINUS = np.array([-0.0]).view(np.uint64)[0]
@@ -22,7 +26,7 @@ class Programs(Protocol):
     """A group of programs, such as those of one loop."""
 
     @property
-    def programs(self) -> Sequence[Any]: ...
+    def programs(self) -> Sequence[Program]: ...
 
 
 class Answers:
@@ -32,12 +36,12 @@ class Answers:
         self._asked = [(Reading(graph, list(graph.asked[zero].values())), zero) for graph in graphs for zero in (False, True)]
         self._answers = [self._read(reading, zero) for reading, zero in self._asked]
 
-    def fit(self, values: Sequence[np.ndarray[Any, Any]]) -> bool:
+    def fit(self, values: Sequence[Array]) -> bool:
         """Return True if these parameters give the same answers."""
         return all(self._read(*asked, values) == answer for asked, answer in zip(self._asked, self._answers, strict=True))
 
     @staticmethod
-    def _read(reading: Reading, nonzero: bool, values: Any = None) -> bytes:
+    def _read(reading: Reading, nonzero: bool, values: Sequence[Array] | None = None) -> bytes:
         bits = reading.bits(values)
         return ((bits != 0) & (bits != _MINUS) if nonzero else bits).tobytes()
 
@@ -50,7 +54,7 @@ class Remembered(Generic[T]):
         self._lock = threading.Lock()
 
     def proved(
-        self, held: Any, begin: Callable[[], Any], make: Callable[[], T], adopt: Callable[[T, list[Any]], T],
+        self, held: object, begin: Callable[[], object], make: Callable[[], T], adopt: Callable[[T, list[Array]], T],
         difference: Callable[[T], str],
     ) -> T | Untraced:  # fmt: skip
         """Return programs that equal the plain loop on this machine, or the reason why there are none.

@@ -5,11 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import update_wrapper
-from typing import Any
+from typing import Any, TypeVar, cast
 
 from tailgate.engine.array import Traced, boxed, each, lifted, shared_batch
 from tailgate.engine.evaluation import evaluate
 from tailgate.engine.graph import Graph, Node
+from tailgate.engine.operations import ArrayLike
+
+F = TypeVar("F", bound=Callable[..., Any])
 
 
 @dataclass(eq=False)
@@ -38,7 +41,7 @@ class _Called:
         self._made: dict[tuple[Any, ...], tuple[Routine, bool]] = {}
         update_wrapper(self, function)
 
-    def __call__(self, *args: Any) -> Any:
+    def __call__(self, *args: ArrayLike) -> Any:
         found = next((x for x in args if isinstance(x, Traced)), None)
         if found is None:
             return self.function(*args)
@@ -62,9 +65,9 @@ class _Called:
         return self._made[dtypes]
 
 
-def routine(function: Callable[..., Any]) -> Callable[..., Any]:
+def routine(function: F) -> F:
     """Decorate an elementwise function of arrays that returns an array or a tuple of them."""
-    return _Called(function)
+    return cast(F, _Called(function))
 
 
 def bound() -> str:
