@@ -5,7 +5,7 @@ from __future__ import annotations
 import traceback
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from tailgate.engine.untraceable import Untraceable
 if TYPE_CHECKING:
     from tailgate.core.loop import Loop
 
-
+T = TypeVar("T")
 TRIED, ROWS = 24, 64  # steps and episodes in which new code is compared with the plain loop
 
 
@@ -43,7 +43,7 @@ def explained(error: Exception) -> str:
     return f"{place}{type(error).__name__}: {' '.join(str(error).split())[:300]}"
 
 
-def raised(play: Callable[[], Any]) -> Any:
+def raised(play: Callable[[], T]) -> T | str:
     """Call `play`; return its result or the text of its InputError."""
     try:
         return play()

@@ -143,8 +143,8 @@ class Shaped:
             return self.function(*(next(other if i in self._fixed else one) for i in range(len(given) + len(constants))))
 
         def step(state: dict[str, Any], _: None) -> tuple[dict[str, Any], dict[str, Array]]:
-            first = next(x for x in leaves(state).values() if isinstance(x, Traced))
-            return {"given": state["given"], "made": arranged(state["given"], lifted(first.graph, constants))}, {}
+            like = next(iter(leaves(state).values()))
+            return {"given": state["given"], "made": arranged(state["given"], lifted(like, constants))}, {}
 
         example = map_leaves(lambda x: np.array(x[:1]), given)
         with np.errstate(all="ignore"):

@@ -29,9 +29,10 @@ LARGE = 20_000  # numbers of an array that is used as it is, because code usuall
 _PLAIN = (type(None), str, bytes, int, complex, enum.Enum, np.generic, np.dtype, type, types.BuiltinFunctionType, np.ufunc, PurePath)
 
 
-def lifted(graph: Graph, held: T) -> T:
-    """Copy dataclasses, tuples, lists, mappings and closures with floats, float arrays and whole numbers traced."""
-    return cast(T, _Reader(graph).visit(held))
+def lifted(like: Array, held: T) -> T:
+    """Copy dataclasses, tuples, lists, mappings and closures with numbers traced in the graph of `like`."""
+    assert isinstance(like, Traced)
+    return cast(T, _Reader(like.graph).visit(held))
 
 
 class Parameters:

@@ -6,7 +6,7 @@ One program serves all attacks on a defence in a scenario. `tailgate.play.rollou
 from __future__ import annotations
 
 import copy
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,6 +19,13 @@ from tailgate.engine.parameters import lifted
 from tailgate.engine.program import Call, Program, State, traced
 from tailgate.engine.remembered import Remembered
 from tailgate.play.trace import Recorder, signals_of
+
+
+class Seen(NamedTuple):
+    """The arrays that an attacker sees; those of a white box, its state and known input, are separate."""
+
+    view: View
+    box: tuple[object, Array] | None
 
 
 class Commanded:
@@ -45,8 +52,8 @@ class Commanded:
         out.loop, out.values = loop, values
         return out
 
-    def _traced(self, held: Any, given: Any) -> tuple[Any, Any]:
-        loop = lifted(held["loop"].k.graph, self.loop)
+    def _traced(self, held: dict[str, LoopState], given: dict[str, Array]) -> tuple[dict[str, LoopState], dict[str, Array]]:
+        loop = lifted(held["loop"].k, self.loop)
         state, frame = loop.advance(held["loop"], Command(**given))
         return {"loop": state}, leaves({"signals": signals_of(frame), "ended": state.ended, "seen": _seen(loop, state)})
 
@@ -54,8 +61,8 @@ class Commanded:
         """Play episodes; return lengths (B,), signals (K, B, ...) and the road before the first step, as `Trace` holds them."""
         loop, batch = self.loop, len(keys.key)
         begun = loop.start(keys)
-        plan: Any = attack.prepare(loop.brief)
-        memory: Any = attack.start(plan, batch, keys.at(Role.ATTACK, np.zeros(batch, np.int64)))
+        plan = attack.prepare(loop.brief)
+        memory = attack.start(plan, batch, keys.at(Role.ATTACK, np.zeros(batch, np.int64)))
         recorder, view, ended, steps = Recorder(loop, begun), loop.sense(begun), begun.ended, Steps(self, begun)
         for _ in range(loop.horizon):
             live = ~ended if terminate else np.ones(batch, bool)
@@ -101,22 +108,21 @@ def _nothing(loop: Loop, batch: int) -> Command:
     return no_command(batch, loop.model.agents, len(loop.model.wires))
 
 
-def _seen(loop: Loop, state: LoopState) -> dict[str, Any]:
+def _seen(loop: Loop, state: LoopState) -> Seen:
     """Return the arrays that an attacker sees."""
     return _parted(loop.sense(state))
 
 
-def _parted(view: View) -> dict[str, Any]:
-    """Return the arrays of a view, with those of a white box separate."""
+def _parted(view: View) -> Seen:
     box = view.defence
-    return {"view": view._replace(defence=None), "box": None if box is None else (box.state, box.known_u)}
+    return Seen(view._replace(defence=None), None if box is None else (box.state, box.known_u))
 
 
-def _view(loop: Loop, seen: Any) -> View:
-    view: View = seen["view"]
-    if seen["box"] is None:
-        return view
-    return view._replace(defence=WhiteBox(loop.defence, loop.shown, duplicate(seen["box"][0]), seen["box"][1]))
+def _view(loop: Loop, seen: Seen) -> View:
+    if seen.box is None:
+        return seen.view
+    state, known_u = seen.box
+    return seen.view._replace(defence=WhiteBox(loop.defence, loop.shown, duplicate(state), known_u))
 
 
 _made: Remembered[Commanded] = Remembered()

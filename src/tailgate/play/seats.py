@@ -21,17 +21,26 @@ from tailgate.base.pytree import leaves, map_leaves
 from tailgate.core import draws
 from tailgate.core.draws import Keys
 from tailgate.engine.agreement import ROWS, TRIED, Untraced, check_open, raised, same
-from tailgate.engine.operations import Array
+from tailgate.engine.operations import Array, ArrayLike
 from tailgate.engine.parameters import lifted
 from tailgate.engine.program import Call, Program, State, Trace, traced
 from tailgate.engine.remembered import Remembered
 
 if TYPE_CHECKING:
-    from tailgate.envs.seat import Seat
+    from tailgate.core.loop import LoopState
+    from tailgate.envs.seat import Seat, Sums, Tally
 
 
 # results of a step of a single row
 ALONE = ("reward", "damage", "k", "terminated", "truncated", "illegal", "collided", "rear_collided", "allowed")
+
+
+class Episodes(NamedTuple):
+    """The state of a seat's episodes; `sums` are those of a decision of several steps."""
+
+    loop: LoopState
+    tally: Tally
+    sums: Sums | None = None
 
 
 class SeatPrograms:
@@ -45,7 +54,7 @@ class SeatPrograms:
         for name, leaf in leaves(self.example).items():
             if leaf.dtype == object:
                 raise TypeError(f"state {name} holds objects")
-        state = self.example | ({"sums": seat.opened(self.example["tally"])} if _several(seat) else {})
+        state = _opened(seat, self.example)
         flags = np.zeros(1, bool)
         action = np.zeros(1, np.int64) if seat.action.discrete else np.zeros((1, seat.action.size))
         decide = traced(self._decide, state, {"action": action, "over": flags, "again": flags})
@@ -69,37 +78,34 @@ class SeatPrograms:
         out.seat, out.loop, out.values = seat, seat.loop, values
         return out
 
-    def _decide(self, held: Any, given: Any) -> tuple[Any, Any]:
-        seat, over = self._lifted(held), given["over"]
-        loop, tally, sums = held["loop"], held["tally"], held["sums"] if _several(seat) else seat.opened(held["tally"])
-        loop, tally, sums, _ = seat.advanced(loop, tally, sums, given["action"], over)
+    def _decide(self, held: Episodes, given: dict[str, Array]) -> tuple[Episodes, dict[str, Array]]:
+        seat, over = lifted(held.loop.k, self.shown), given["over"]
+        loop, tally, sums, _ = seat.advanced(held.loop, held.tally, held.sums or seat.opened(held.tally), given["action"], over)
         outcome = seat.closed(loop, tally, sums, over)
-        state = _renewed(seat, {"loop": loop, "tally": tally}, held["loop"].keys, given["again"])
-        return self._opened(seat, state), outcome._asdict() | _shown(seat, state)
+        state = _renewed(seat, Episodes(loop, tally), held.loop.keys, given["again"])
+        return _opened(seat, state), outcome._asdict() | _shown(seat, state)
 
-    def _advance(self, held: Any, given: Any) -> tuple[Any, Any]:
-        seat = self._lifted(held)
-        *state, _ = seat.advanced(held["loop"], held["tally"], held["sums"], given["action"], given["over"])
-        return dict(zip(("loop", "tally", "sums"), state, strict=True)), {}
+    def _advance(self, held: Episodes, given: dict[str, Array]) -> tuple[Episodes, dict[str, Array]]:
+        assert held.sums is not None
+        seat = lifted(held.loop.k, self.shown)
+        loop, tally, sums, _ = seat.advanced(held.loop, held.tally, held.sums, given["action"], given["over"])
+        return Episodes(loop, tally, sums), {}
 
-    def _begin(self, held: Any, given: Any) -> tuple[Any, Any]:
-        seat = self._lifted(held)
-        state = _renewed(seat, {"loop": held["loop"], "tally": held["tally"]}, held["loop"].keys, given["again"])
-        return self._opened(seat, state), _shown(seat, state)
-
-    def _opened(self, seat: Seat, state: Any) -> Any:
-        """Return the state with the sums of the next decision, if a decision has several steps."""
-        return state | {"sums": seat.opened(state["tally"])} if _several(seat) else state
-
-    def _lifted(self, held: Any) -> Seat:
-        seat: Seat = lifted(held["loop"].k.graph, self.shown)
-        return seat
+    def _begin(self, held: Episodes, given: dict[str, Array]) -> tuple[Episodes, dict[str, Array]]:
+        seat = lifted(held.loop.k, self.shown)
+        state = _renewed(seat, Episodes(held.loop, held.tally), held.loop.keys, given["again"])
+        return _opened(seat, state), _shown(seat, state)
 
 
-def _example(seat: Seat) -> dict[str, Any]:
+def _opened(seat: Seat, state: Episodes) -> Episodes:
+    """Return the state with the sums of the next decision, if a decision has several steps."""
+    return state._replace(sums=seat.opened(state.tally)) if _several(seat) else state
+
+
+def _example(seat: Seat) -> Episodes:
     """Return the first state of an episode."""
     start = seat.loop.start(draws.keys("tune", [0]))
-    return {"loop": start, "tally": seat.begin(start)}
+    return Episodes(start, seat.begin(start))
 
 
 def _several(seat: Seat) -> bool:
@@ -134,17 +140,17 @@ def _after(trace: Trace, name: str) -> tuple[int, ...]:
     return (trace.large[name][1].id,) if name in trace.large else tuple(node.id for node in trace.state[name][1].flat)
 
 
-def _renewed(seat: Seat, state: Any, keys: Keys, again: Any) -> Any:
+def _renewed(seat: Seat, state: Episodes, keys: Keys, again: Array) -> Episodes:
     """Return the state with the next episode in the rows `again`."""
     loop = seat.loop.start(Keys(keys.key, keys.episode + np.uint32(1)))
-    fresh = {"loop": loop, "tally": seat.begin(loop)}
+    fresh = Episodes(loop, seat.begin(loop))
     return map_leaves(lambda old, new: np.where(again.reshape(len(again), *(1,) * (old.ndim - 1)), new, old), state, fresh)
 
 
-def _shown(seat: Seat, state: Any) -> dict[str, Any]:
+def _shown(seat: Seat, state: Episodes) -> dict[str, Array]:
     """Return the observation of a state, and what may be decided next."""
-    view = seat.loop.sense(state["loop"])
-    damage = np.min(view.scene.gap, axis=1) if seat.road else state["tally"].error
+    view = seat.loop.sense(state.loop)
+    damage = np.min(view.scene.gap, axis=1) if seat.road else state.tally.error
     shown = {"seen": seat.observation.observe(view), "allowed": view.allowed, "k": view.k, "damage": damage}
     return shown | ({"mask": seat.action.mask(view)} if seat.action.discrete else {})
 
@@ -246,7 +252,7 @@ class Rows:
         given["action"][...], given["over"][...], given["again"][...] = actions, over, again
         self._play(self._decide)
 
-    def decide_alone(self, action: Any) -> tuple[Any, ...]:
+    def decide_alone(self, action: ArrayLike) -> tuple[Any, ...]:
         """Play the decision of a single row; return the numbers that ALONE names, its observation and its mask."""
         call, advance, play, given, numbers, seen, mask = self._alone
         given[0] = action

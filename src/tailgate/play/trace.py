@@ -7,7 +7,6 @@ import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import numpy as np
 
@@ -147,7 +146,7 @@ def rollout(loop: Loop, attack: Attack, keys: Keys, *, terminate: bool = True, p
         return Trace(loop.model, loop.horizon, *play(keys, terminate), loop.controller.desired_gap)
     state = loop.start(keys)
     plan = attack.prepare(loop.brief)
-    memory: Any = attack.start(plan, len(keys.key), keys.at(Role.ATTACK, np.zeros(len(keys.key), np.int64)))
+    memory = attack.start(plan, len(keys.key), keys.at(Role.ATTACK, np.zeros(len(keys.key), np.int64)))
     recorder = Recorder(loop, state)
     for _ in range(loop.horizon):
         live = ~state.ended if terminate else np.ones(len(state.k), bool)

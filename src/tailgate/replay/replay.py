@@ -225,7 +225,7 @@ def episode(loop: Loop, attack: Attack, keys: Keys) -> Iterator[tuple[LoopState,
     """Yield the states of one episode: the start, then each step with its frame, until it ends."""
     state = loop.start(keys)
     plan = attack.prepare(loop.brief)
-    memory: Any = attack.start(plan, 1, keys.at(Role.ATTACK, np.zeros(1, np.int64)))
+    memory = attack.start(plan, 1, keys.at(Role.ATTACK, np.zeros(1, np.int64)))
     yield state, None
     for _ in range(loop.horizon):
         if state.ended.all():
