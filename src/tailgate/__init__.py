@@ -19,12 +19,12 @@ __all__ = [
 ]  # fmt: skip
 
 
-def make_defence(name: str, **params: Any) -> Any:
+def make_defence(name: str, **params: object) -> Any:
     """Return a registered defence by name; raise InputError for an unknown name or field."""
     return make("defence", name, **params)
 
 
-def make_attack(name: str, **params: Any) -> Any:
+def make_attack(name: str, **params: object) -> Any:
     """Return a registered attack by name; raise InputError for an unknown name or field."""
     return make("attack", name, **params)
 

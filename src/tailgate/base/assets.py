@@ -22,7 +22,7 @@ def inline(package: str, *names: str) -> dict[str, Any]:
     return {"text": Markup(text), "hash": base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}
 
 
-def embedded(data: Any) -> Markup:
+def embedded(data: object) -> Markup:
     """Return JSON for a script element, escaped such that it cannot end the element or open another."""
     text = json.dumps(data, allow_nan=False, separators=(",", ":"))
     for char in "<>&\u2028\u2029":

@@ -13,7 +13,8 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from typing import Any, NoReturn
+from types import FrameType
+from typing import NoReturn
 
 GRACE = 3.0  # [s] from a signal to the forced end of the process
 WORDS = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated"}
@@ -59,7 +60,7 @@ class _Once:
     def __init__(self) -> None:
         self.called = False
 
-    def __call__(self, number: int, _: Any) -> None:
+    def __call__(self, number: int, _: FrameType | None) -> None:
         if not self.called:
             self.called = True
             _end(number, "nothing had started")
@@ -78,7 +79,7 @@ class Ending:
     def __init__(self, kept: Callable[[], str]) -> None:
         self.kept, self.number, self.said, self.over = kept, 0, False, threading.Event()
 
-    def handle(self, number: int, _: Any) -> None:
+    def handle(self, number: int, _: FrameType | None) -> None:
         if not self.number:
             self.number = number
             raise Terminated if number == signal.SIGTERM else KeyboardInterrupt
@@ -103,7 +104,7 @@ class Ending:
         self.said = True
         return 128 + number
 
-    def unraisable(self, found: Any) -> None:
+    def unraisable(self, found: sys.UnraisableHookArgs) -> None:
         """Raise an interrupt again a moment later if it came where Python cannot raise, such as in a destructor."""
         if isinstance(found.exc_value, KeyboardInterrupt) and self.number:
             number, self.number = self.number, 0

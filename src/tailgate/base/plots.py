@@ -7,12 +7,15 @@ import re
 import textwrap
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from tailgate.base.files import writable_directory, write_atomic
 from tailgate.base.pytree import Array
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 Table = Sequence[dict[str, Any]]  # from evaluation.summary.summarise
 PANELS = (  # key, title, colours from harmless to harmful
@@ -27,7 +30,7 @@ NO_ROAD = (  # for systems without a road
 MARKERS = "osD^v<>PX*phd"
 
 
-def canvas(width: float, height: float, rows: int = 1, columns: int = 1, **options: Any) -> tuple[Any, Any]:
+def canvas(width: float, height: float, rows: int = 1, columns: int = 1, **options: Any) -> tuple[Figure, Array]:
     """Return a matplotlib figure and its axes (rows, columns), without the global state of pyplot."""
     try:
         from matplotlib.figure import Figure
@@ -37,7 +40,7 @@ def canvas(width: float, height: float, rows: int = 1, columns: int = 1, **optio
     return figure, figure.subplots(rows, columns, squeeze=False, **options)
 
 
-def png(figure: Any) -> bytes:
+def png(figure: Figure) -> bytes:
     """Return the figure as a PNG file; equal figures give equal bytes."""
     out = io.BytesIO()
     figure.savefig(out, format="png", dpi=110, metadata={"Software": None})

@@ -27,7 +27,7 @@ R = TypeVar("R")
 ENDING = 5.0  # [s] for an idle worker to end before it is killed
 _SIGNALS = {signal.SIGINT, signal.SIGTERM}
 _crews: weakref.WeakSet[Crew] = weakref.WeakSet()
-_line: Any = None  # in a worker: the pipe to its parent
+_line: connection.Connection | None = None  # in a worker: the pipe to its parent
 
 
 class Remote(Exception):
@@ -98,7 +98,7 @@ class Crew:
     def free(self) -> bool:
         return len(self.busy) < self.most
 
-    def give(self, job: int, function: Callable[..., Any], *arguments: Any) -> None:
+    def give(self, job: int, function: Callable[..., object], *arguments: object) -> None:
         """Let a free worker call function(*arguments), as job number `job`."""
         idle = next((worker for worker in self.workers if worker.job is None), None)
         if idle is None:
@@ -171,8 +171,9 @@ def kill_all() -> None:
         crew.kill()
 
 
-def say(value: Any) -> None:
+def say(value: object) -> None:
     """Send the parent a message about the current job. Call it in a worker only."""
+    assert _line is not None
     _line.send(("said", value))
 
 

@@ -93,9 +93,9 @@ def _deep() -> ValueError:
     return ValueError(f"lists and mappings nested more than {DEPTH} deep")
 
 
-def _checked(data: Any, strict: bool) -> None:
+def _checked(data: object, strict: bool) -> None:
     """Raise ValueError for deep nesting or a number too large for a float."""
-    held = [data]
+    held: list[Any] = [data]
     for _ in range(DEPTH + 1):
         for value in held:
             kind = type(value)

@@ -66,7 +66,7 @@ def free() -> float:
     return max(min(found), 0.0)
 
 
-def fits(needed: float, field: str, value: Any, what: str) -> None:
+def fits(needed: float, field: str, value: object, what: str) -> None:
     """Raise InputError if `needed` bytes are not free."""
     if needed > 1e8 and needed > (have := free()):
         raise InputError(field, value, f"less: {what} take about {needed / 1e9:,.1f} GB, and {have / 1e9:,.1f} GB of memory are free")

@@ -225,12 +225,12 @@ def _makers(graph: Graph) -> dict[str, Callable[..., Any]]:
         held = lifted(graph, value)
         return made(graph, shape, value, np.dtype(dtype) if dtype is not None else held.dtype)
 
-    def as_array(x: Any, dtype: DTypeLike | None = None, order: str | None = None, copy: bool | None = None) -> Any:
+    def as_array(x: object, dtype: DTypeLike | None = None, order: str | None = None, copy: bool | None = None) -> Any:
         if isinstance(x, (list, tuple)) and any(isinstance(part, Traced) for part in _inside(x)):
             x = _stack([as_array(part) for part in x])
         return x if not isinstance(x, Traced) or dtype is None else x.astype(dtype)
 
-    def array(x: Any, dtype: DTypeLike | None = None, order: str | None = None, copy: bool = True, ndmin: int = 0) -> Any:
+    def array(x: object, dtype: DTypeLike | None = None, order: str | None = None, copy: bool = True, ndmin: int = 0) -> Any:
         held = as_array(x, dtype)
         return held.copy() if isinstance(held, Traced) and copy else held
 

@@ -19,7 +19,7 @@ import numpy as np
 
 from tailgate.agents.scripted import NoAttack
 from tailgate.base.errors import InputError, NotApplicable
-from tailgate.core import Array, Model, draws
+from tailgate.core import Array, Defence, Model, draws
 from tailgate.core.loop import Loop
 from tailgate.core.registry import Spec, entry_for, text_of
 from tailgate.core.scenario import Scenario, load_scenario
@@ -119,7 +119,7 @@ def play_clean(loop: Loop, keys: draws.Keys) -> Iterator[tuple[Array, Array, Arr
 class Bench:
     """A defence on attack-free runs of some scenarios."""
 
-    defence: Any
+    defence: Defence
     uses: tuple[str, ...]
     text: str
     places: tuple[Scenario, ...]
@@ -127,7 +127,7 @@ class Bench:
     progress: Progress
 
     @classmethod
-    def of(cls, defence: Any, scenarios: Sequence[str], batch: int, progress: Progress | None) -> Bench:
+    def of(cls, defence: str | Defence, scenarios: Sequence[str], batch: int, progress: Progress | None) -> Bench:
         if isinstance(defence, str):
             spec = Spec("defence", defence)
             made, uses, text = spec.make(), spec.entry.uses, defence
@@ -144,7 +144,7 @@ class Bench:
             place.loop(bench.at(SILENT), uses)  # a defence that does not fit fails here
         return bench
 
-    def at(self, threshold: float) -> Any:
+    def at(self, threshold: float) -> Defence:
         """Return the defence at a threshold: its own, its detector's (`threshold_field`), or else a threshold on its score."""
         return self._turned(threshold)[0]
 
@@ -153,10 +153,10 @@ class Bench:
         """The name of the threshold on the command line; empty if it is a threshold on the score."""
         return self._turned(SILENT)[1]
 
-    def _turned(self, threshold: float) -> tuple[Any, str]:
+    def _turned(self, threshold: float) -> tuple[Defence, str]:
         own = getattr(self.defence, "threshold_field", None)
         if own is not None and dataclasses.is_dataclass(self.defence):
-            return dataclasses.replace(self.defence, **{own: threshold}), str(own)  # type: ignore[type-var]
+            return dataclasses.replace(self.defence, **{own: threshold}), str(own)
         if hasattr(self.defence, "with_threshold"):
             with contextlib.suppress(NotApplicable):
                 inner = getattr(self.defence.parts()[1], "threshold_field", "") if hasattr(self.defence, "parts") else ""

@@ -15,6 +15,7 @@ from typing import Any
 
 from tailgate.base import sizes
 from tailgate.base.errors import InputError
+from tailgate.core import Defence
 from tailgate.evaluation.attack_free import HOUR, MOST_DIGITS, SILENT, Bench, Count, Crossings, Progress
 
 MIXTURE = ("braking-v0", "stop-and-go-v0", "ornstein-uhlenbeck-v0")  # equal shares of the running time
@@ -56,7 +57,7 @@ class Calibration:
 
 
 def calibrate(
-    defence: Any,
+    defence: str | Defence,
     hours: float,
     *,
     scenarios: Sequence[str] = MIXTURE,

@@ -22,8 +22,8 @@ from tailgate.base.errors import InputError, NotApplicable
 from tailgate.base.files import write_atomic
 from tailgate.base.pool import each
 from tailgate.base.version import VERSION
-from tailgate.core import Model, draws
-from tailgate.core.registry import Entry, Spec, entry_for, said, text_of
+from tailgate.core import Attack, Defence, Model, draws
+from tailgate.core.registry import Entry, Family, Spec, entry_for, said, text_of
 from tailgate.core.scenario import Scenario, Suite, load_scenario, load_suite
 from tailgate.core.schema import as_data, canonical
 from tailgate.core.threat import Brief
@@ -57,7 +57,7 @@ class Cell:
         """Seeds of its episodes: numbers, or those of the round of its beacon."""
         return numbered(self.beacon, self.suite, self.purpose, self.first_seed, self.seeds)
 
-    def place(self, attack: Any, knowledge: str) -> Scenario:
+    def place(self, attack: Attack, knowledge: str) -> Scenario:
         """Return the scenario at the cell's dose, with the knowledge that the attack needs."""
         changes: dict[str, Any] = dict(self.threat)
         if self.dose is not None:
@@ -68,7 +68,7 @@ class Cell:
         return load_scenario(self.scenario).with_threat(**changes)
 
 
-def _component(family: Any, value: Any) -> tuple[Any, Any, str]:
+def _component(family: Family, value: object) -> tuple[Any, Entry, str]:
     """Return (object, entry, text) of a spec text or an object."""
     if isinstance(value, str):
         spec = Spec(family, value)
@@ -77,7 +77,9 @@ def _component(family: Any, value: Any) -> tuple[Any, Any, str]:
     return value, entry, text_of(entry, value)
 
 
-def run_cell(cell: Cell, defence: Any = None, attack: Any = None, *, uses: tuple[str, ...] | None = None) -> list[dict[str, Any]]:
+def run_cell(
+    cell: Cell, defence: Defence | None = None, attack: Attack | None = None, *, uses: tuple[str, ...] | None = None
+) -> list[dict[str, Any]]:
     """Play a cell and return its rows.
 
     `defence` and `attack` replace the cell's texts by objects; `uses` overrides what the defence may use.
@@ -137,7 +139,7 @@ def origin(attack: str) -> dict[str, Any] | None:
     return origin_of(attack)
 
 
-def _digest(family: Any, text: str, identity: str) -> str:
+def _digest(family: Family, text: str, identity: str) -> str:
     """Return the digest of the file of a component that is not built in; objects have none."""
     return Spec(family, text).digest if identity else ""
 

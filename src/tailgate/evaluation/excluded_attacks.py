@@ -14,6 +14,7 @@ from tailgate.agents.scripted import Inject, InjectSparse
 from tailgate.agents.triggers import Chance
 from tailgate.agents.values import Constant, Gaussian, PerWire, Ramp, Uniform
 from tailgate.agents.zoo import ZooAttack
+from tailgate.core import Attack
 from tailgate.core.registry import Spec
 
 GROWING = ("ramp", "increment")  # actions of a policy that change the last value sent
@@ -45,7 +46,7 @@ def families(text: str) -> set[str]:
     return {spec.entry.name} | same
 
 
-def _shapes(attack: Any) -> list[Shape]:
+def _shapes(attack: Attack) -> list[Shape]:
     if isinstance(attack, Program):
         phases = attack.sheet.phases
         return [Shape(phase.kind.removesuffix("_fresh"), law, _by_chance(phase)) for phase in phases for law in _laws(phase.value)]
@@ -59,7 +60,7 @@ def _shapes(attack: Any) -> list[Shape]:
     return []
 
 
-def _laws(law: Any) -> list[type[Any]]:
+def _laws(law: object) -> list[type[Any]]:
     """Return the laws of a value, one per wire if they differ."""
     return [type(held) for _, held in law.laws] if isinstance(law, PerWire) else [type(law)]
 

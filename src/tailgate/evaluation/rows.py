@@ -54,7 +54,7 @@ def _row(line: bytes, where: str, damage: str, first: bool) -> dict[str, Any]:
     try:
         row = parse_json(line)
     except ValueError as error:
-        loose: Any = None
+        loose: object = None
         with contextlib.suppress(ValueError):
             loose = parse_json(line, strict=False)
         if loose is not None:
@@ -71,7 +71,7 @@ def _row(line: bytes, where: str, damage: str, first: bool) -> dict[str, Any]:
     return {intern(key): intern(value) if type(value) is str else value for key, value in row.items()}  # halves the memory
 
 
-def _check(row: Any, where: str) -> None:
+def _check(row: object, where: str) -> None:
     """Raise InputError unless the fields of a row are valid."""
     try:
         _Row.model_validate(row)

@@ -53,7 +53,7 @@ def outcome(replay: Replay) -> str:
     return "No collision" + ("" if gap is None else f"; the smallest gap was {gap:.3g} m")
 
 
-def _text(value: Any) -> str:
+def _text(value: object) -> str:
     if value is None:
         return "none"
     if isinstance(value, bool):
@@ -67,7 +67,7 @@ def _text(value: Any) -> str:
     return f"{value:.10g}" if isinstance(value, float) else str(value)
 
 
-def _card(title: str, part: Any, label: str = "") -> Data:
+def _card(title: str, part: object, label: str = "") -> Data:
     """Return a component and its parameters with their descriptions."""
     fields = dataclasses.fields(part) if dataclasses.is_dataclass(part) else ()
     shown = [(f.name, _text(getattr(part, f.name)), f.metadata.get("doc", "")) for f in fields if f.init]

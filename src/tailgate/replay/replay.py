@@ -154,7 +154,7 @@ class Replay:
     row: Row
     place: Scenario
     loop: Loop
-    attack: Any
+    attack: Attack
     trace: Trace
     gate: Array
     metrics: dict[str, float | None]
@@ -234,10 +234,10 @@ def episode(loop: Loop, attack: Attack, keys: Keys) -> Iterator[tuple[LoopState,
         yield state, frame
 
 
-def threshold(defence: Any) -> tuple[str, float] | None:
+def threshold(defence: object) -> tuple[str, float] | None:
     """Return name and value of the alarm threshold of the defence or its detector; None without one."""
-    parts = defence.parts() if callable(getattr(defence, "parts", None)) else ()
-    for part in (defence, *parts):
+    parts = getattr(defence, "parts", None)
+    for part in (defence, *(parts() if callable(parts) else ())):
         name = getattr(part, "threshold_field", None)
         value = getattr(part, name, None) if isinstance(name, str) else None
         if isinstance(name, str) and isinstance(value, int | float):
@@ -258,7 +258,7 @@ def _text(dose: int | None) -> str:
     return "unlimited" if dose is None else str(dose)
 
 
-def _mapping(value: Any) -> dict[str, Any]:
+def _mapping(value: object) -> dict[str, Any]:
     return value if isinstance(value, dict) else {}
 
 

@@ -20,7 +20,7 @@ import numpy as np
 from tailgate.base.errors import InputError
 from tailgate.base.pytree import map_leaves
 from tailgate.base.version import VERSION
-from tailgate.core import Array, Model, Prior, Received, pair_of
+from tailgate.core import Array, Estimate, Model, Prior, Received, pair_of
 from tailgate.core.draws import Draws
 from tailgate.core.registry import Spec
 from tailgate.sandbox.wire import LINE, Header, Outputs, line, model_of, printable, unpack
@@ -39,7 +39,7 @@ class Child:
         self.folder = folder
         self.defence: Any = None
         self.model: Model | None = None
-        self.plan: Any = None
+        self.plan: object = None
         self.states: OrderedDict[int, tuple[int, Any]] = OrderedDict()  # first ticket -> (rows, state)
         self.outputs: Outputs | None = None
         self.views: dict[str, Array] = {}
@@ -82,7 +82,7 @@ class Child:
         self._keep(ticket, batch, state)
         return {"limits": self._write(estimate, batch)}
 
-    def _write(self, estimate: Any, batch: int) -> bool:
+    def _write(self, estimate: Estimate, batch: int) -> bool:
         """Write an estimate to the file; return True if it has limits. The parent checks values; here only types and shapes."""
         assert self.model is not None
         model = self.model
@@ -103,7 +103,7 @@ class Child:
             place[...] = value
         return limited
 
-    def _keep(self, ticket: int, rows: int, state: Any) -> None:
+    def _keep(self, ticket: int, rows: int, state: object) -> None:
         self.states[ticket] = rows, state
         while len(self.states) > KEPT:
             self.states.popitem(last=False)

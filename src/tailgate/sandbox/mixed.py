@@ -15,7 +15,7 @@ import numpy as np
 from tailgate.base import sources
 from tailgate.base.errors import InputError, NotApplicable
 from tailgate.base.version import VERSION
-from tailgate.core import draws
+from tailgate.core import Attack, draws
 from tailgate.core.registry import Entry, Spec
 from tailgate.core.scenario import Scenario
 from tailgate.core.schema import canonical
@@ -58,7 +58,7 @@ class _Part:
 
     cell: Cell
     place: Scenario
-    rival: Any
+    rival: Attack
     head: dict[str, Any]
     uses: tuple[str, ...]
 

@@ -105,7 +105,7 @@ class Process:
             self.guard.stdin.write(line({"cpu": self.granted}))
             self.guard.stdin.flush()
 
-    def ask(self, op: str, arrays: Mapping[str, Array] | None = None, **rest: Any) -> dict[str, Any]:
+    def ask(self, op: str, arrays: Mapping[str, Array] | None = None, **rest: object) -> dict[str, Any]:
         """Return the answer to one request; raise Lost, or InputError and NotApplicable as the submission raised them."""
         if self.lost:
             raise Lost(self.lost)
@@ -224,7 +224,7 @@ class Process:
         for path in (self.scratch, self.folder):
             shutil.rmtree(path, ignore_errors=True)
 
-    def __deepcopy__(self, memo: Any) -> Process:
+    def __deepcopy__(self, memo: object) -> Process:
         return self  # a process cannot be copied; plans share it
 
     def __enter__(self) -> Process:

@@ -45,7 +45,7 @@ class Seat:
         self.prior: Prior | None = None
         self.hand: _Hand | None = None
         self.answer: Estimate | BaseException | None = None
-        self.result: Any = None
+        self.result: object = None
         self.done = False
         self.fault: BaseException | None = None
         self._go, self._back = threading.Semaphore(0), threading.Semaphore(0)

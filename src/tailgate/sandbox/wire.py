@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
+from mmap import mmap
 from typing import Any
 
 import numpy as np
@@ -75,7 +76,7 @@ class Outputs:
         """Number of bytes."""
         return sum(math.prod(shape) * np.dtype(kind).itemsize for shape, kind in self.fields.values())
 
-    def views(self, block: Any) -> dict[str, Array]:
+    def views(self, block: bytes | mmap) -> dict[str, Array]:
         """Return each field as (B, N, ...) on a buffer."""
         out, at = {}, 0
         for name, (shape, kind) in self.fields.items():  # eight-byte fields come first, so that all are aligned
