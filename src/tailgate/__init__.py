@@ -11,6 +11,7 @@ from typing import Any
 from tailgate import moved as moved
 from tailgate.base import interrupts as interrupts  # first: the imports below take half a second, in which a user may change his mind
 from tailgate.base.errors import InputError
+from tailgate.base.lazy import exported
 from tailgate.base.version import VERSION as __version__
 from tailgate.core.registry import entries, make
 
@@ -39,20 +40,7 @@ def list_attacks() -> list[str]:
     return list(entries("attack"))
 
 
-def __getattr__(name: str) -> Any:
-    if name == "per_episode":
-        from tailgate.estimators import per_episode
-
-        return per_episode
-    if name == "evaluate":
-        from tailgate.evaluation.cells import evaluate
-
-        return evaluate
-    if name == "parallel_env":
-        from tailgate.envs.parallel import parallel_env
-
-        return parallel_env
-    raise AttributeError(f"module 'tailgate' has no attribute {name!r}")
+__getattr__, _ = exported(__name__, {"estimators": "per_episode", "evaluation.cells": "evaluate", "envs.parallel": "parallel_env"})
 
 
 def _register() -> None:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tailgate.engine.buffers import blended, swept, wide
+from tailgate.engine.buffers import blended, boxed, swept, wide
 from tailgate.engine.graph import Graph, Node
 from tailgate.engine.operations import BOOL, Array, ArrayLike, Axis, DTypeLike
 from tailgate.engine.untraceable import Untraceable
@@ -272,13 +272,6 @@ def _operators() -> None:
         setattr(Traced, f"__{name}__", plain(ufunc))
     for name, single in {"neg": np.negative, "abs": np.absolute, "invert": np.invert, "pos": np.positive}.items():
         setattr(Traced, f"__{name}__", (lambda ufunc: lambda self: ufunc(self))(single))
-
-
-def boxed(node: object) -> Array:
-    """Return an array without axes that holds one node."""
-    out = np.empty((), object)
-    out[()] = node
-    return out
 
 
 def each(graph: Graph, function: Callable[..., Node], *arrays: Array) -> Array:

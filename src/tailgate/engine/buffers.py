@@ -70,19 +70,20 @@ def swept(graph: Graph, function: Callable[..., Any], lead: Sequence[int], array
         for place in np.ndindex(*rest):
             at = source.offset + sum(i * s for i, s in zip(place, source.strides[n:], strict=True))
             one = nodes[(*(0,) * n, *place)]
-            those[place] = new = graph.carried(_boxed(one)).item()
+            those[place] = new = graph.carried(boxed(one)).item()
             carried.append(new)
             sources.append(Source(source.held, at, tuple(source.strides[i] if nodes.shape[i] > 1 else 0 for i in kept)))
         given.append(those if rest else those.item())
     with contextlib.nullcontext() if nested else _body(graph):
         result = function(*given)
-    made = result if isinstance(result, np.ndarray) else _boxed(result)
+    made = result if isinstance(result, np.ndarray) else boxed(result)
     shape, sources = _fewer([lead[i] for i in kept], sources)
     buffer = graph.sweep(shape, carried, sources, list(made.flat))
     return graph.picks(buffer).reshape(*lead, *made.shape)
 
 
-def _boxed(node: object) -> Array:
+def boxed(node: object) -> Array:
+    """Return an array without axes that holds one node."""
     out = np.empty((), object)
     out[()] = node
     return out
@@ -90,7 +91,7 @@ def _boxed(node: object) -> Array:
 
 def _of_one(nodes: Array | Node, rest: tuple[int, ...]) -> Array | Node:
     """Return nodes that no round changes as an array of the trailing axes."""
-    return np.broadcast_to(_boxed(nodes), rest) if rest and isinstance(nodes, Node) else nodes
+    return np.broadcast_to(boxed(nodes), rest) if rest and isinstance(nodes, Node) else nodes
 
 
 def _alike(nodes: Array) -> bool:

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from tailgate.engine.array import Traced, boxed, chosen, each, lifted, result_type, shared_batch, typed
+from tailgate.engine.array import Traced, chosen, each, lifted, result_type, shared_batch, typed
 from tailgate.engine.graph import Graph, Node
 from tailgate.engine.operations import Array, ArrayLike, Axis, DTypeLike, Shape
 from tailgate.engine.untraceable import Untraceable
@@ -276,5 +276,3 @@ def makers(graph: Graph) -> Iterator[None]:
             for name, original in before.items():
                 setattr(np, name, original)
 
-
-__all__ = ["Node", "boxed", "called", "made", "makers"]

@@ -10,8 +10,8 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from tailgate.engine.array import Traced, boxed, lifted
-from tailgate.engine.buffers import buffer_of, sides, swept, table_of, wide
+from tailgate.engine.array import Traced, lifted
+from tailgate.engine.buffers import boxed, buffer_of, sides, swept, table_of, wide
 from tailgate.engine.compiled import shaped
 from tailgate.engine.functions import gathered
 from tailgate.engine.loops import until

@@ -20,7 +20,8 @@ from typing import Any, TypeVar, cast
 import numpy as np
 
 from tailgate.base.sources import own
-from tailgate.engine.array import Traced, boxed
+from tailgate.engine.array import Traced
+from tailgate.engine.buffers import boxed
 from tailgate.engine.graph import Graph, Node, ordered
 from tailgate.engine.operations import FLOAT, Array
 

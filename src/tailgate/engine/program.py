@@ -363,5 +363,3 @@ def aligned(shape: tuple[int, ...], dtype: DTypeLike = np.uint8) -> Array:
     out: Array = raw[begin : begin + size].view(dtype).reshape(shape)
     return out
 
-
-__all__ = ["Call", "Node", "Program", "State", "Trace", "traced"]

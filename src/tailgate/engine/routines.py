@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 from functools import update_wrapper
 from typing import Any, TypeVar, cast
 
-from tailgate.engine.array import Traced, boxed, each, lifted, shared_batch
+from tailgate.engine.array import Traced, each, lifted, shared_batch
+from tailgate.engine.buffers import boxed
 from tailgate.engine.evaluation import evaluate
 from tailgate.engine.graph import Graph, Node
 from tailgate.engine.operations import ArrayLike

@@ -27,11 +27,11 @@ from tailgate.core.registry import Entry, Family, Spec, entry_for, said, text_of
 from tailgate.core.scenario import Scenario, Suite, load_scenario, load_suite
 from tailgate.core.schema import as_data, canonical
 from tailgate.core.threat import Brief
-from tailgate.evaluation.resume import Parts
+from tailgate.evaluation.resume import complete
 from tailgate.evaluation.rounds import numbered
 from tailgate.evaluation.rows import packed
 from tailgate.play.metrics import METRICS, measure
-from tailgate.play.trace import episode_memory, episodes_at_once, rollout
+from tailgate.play.trace import Trace, episode_memory, episodes_at_once, rollout
 
 ENGINE = "plain"
 
@@ -98,15 +98,19 @@ def run_cell(
     for start in range(0, cell.seeds, size):
         chunk = seeds[start : start + size]
         try:
-            trace = rollout(loop, rival, draws.keys(cell.purpose, chunk))
-            values = measure(trace)
+            rows += _played(head, chunk, rollout(loop, rival, draws.keys(cell.purpose, chunk)))
         except Exception as error:  # a component may raise anything; only its own rows are lost
             rows += _failed(head, chunk, *_why(error, chunk))
-            continue
-        for i, seed in enumerate(chunk):
-            numbers = {name: None if np.isnan(v[i]) else float(v[i]) for name, v in values.items()}
-            hashes = {"trace_hash": trace.trace_hash(i), "decision_hash": trace.decision_hash(i)}
-            rows.append(_own(head) | {"seed": seed, "status": "ok", "reason": "", **numbers, **hashes})
+    return rows
+
+
+def _played(head: dict[str, Any], seeds: Sequence[int], trace: Trace) -> list[dict[str, Any]]:
+    """Return the rows of a trace, one per seed."""
+    rows, values = [], measure(trace)
+    for i, seed in enumerate(seeds):
+        numbers = {name: None if np.isnan(v[i]) else float(v[i]) for name, v in values.items()}
+        hashes = {"trace_hash": trace.trace_hash(i), "decision_hash": trace.decision_hash(i)}
+        rows.append(_own(head) | {"seed": seed, "status": "ok", "reason": "", **numbers, **hashes})
     return rows
 
 
@@ -226,20 +230,7 @@ def run(
     sizes.announce(count / sizes.EPISODES_A_SECOND / workers, count * sizes.ROW, f"{count:,} episodes")
     ids = [cell_id(cell) for cell in cells]
     pieces = {i: [(i, seed) for seed in cell.episodes] for i, cell in zip(ids, cells, strict=True)}
-    with contextlib.nullcontext() if out is None else Parts(out) as parts:
-        done = {} if parts is None else parts.finished(pieces)
-        missing = [(i, cell) for i, cell in zip(ids, cells, strict=True) if i not in done]
-        with contextlib.closing(_play([cell for _, cell in missing], workers)) as played:
-            for position, rows in played:
-                done[missing[position][0]] = rows
-                if parts is not None:
-                    parts.put(missing[position][0], rows)
-                if progress is not None:
-                    progress(len(done), len(cells))
-        rows = [row for i in ids for row in done[i]]
-        if parts is not None:
-            parts.finish(rows, pieces)
-    return rows
+    return complete(ids, pieces, out, lambda missing: _play([cells[i] for i in missing], workers), progress)
 
 
 def _play(cells: Sequence[Cell], workers: int) -> Generator[tuple[int, list[dict[str, Any]]]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,38 @@ from tailgate.evaluation.rows import encode, packed, read_rows
 
 Rows = list[dict[str, Any]]
 Wanted = Sequence[tuple[str, int]]  # cell and seed of each row of a part, in order
+
+
+def complete(
+    names: Sequence[str], pieces: Mapping[str, Wanted], out: Path | None, play: Callable[[list[int]], Generator[tuple[int, Rows]]],
+    progress: Callable[[int, int], None] | None,
+) -> Rows:  # fmt: skip
+    """Play the parts of a run and return their rows in the order of `names`.
+
+    With `out`, parts that an interrupted run finished are not played again, and the rows are written to it.
+
+    Parameters
+    ----------
+    names : of the parts
+    pieces : cell and seed of each row, by name
+    play : plays the parts with these indices; yields (position in the indices, rows) as they finish
+    progress : called with the numbers of finished and of all parts
+    """
+    with contextlib.nullcontext() if out is None else Parts(out) as parts:
+        done = {} if parts is None else parts.finished(pieces)
+        missing = [i for i, name in enumerate(names) if name not in done]
+        with contextlib.closing(play(missing)) as played:
+            for position, rows in played:
+                name = names[missing[position]]
+                done[name] = rows
+                if parts is not None:
+                    parts.put(name, rows)
+                if progress is not None:
+                    progress(len(done), len(names))
+        rows = [row for name in names for row in done[name]]
+        if parts is not None:
+            parts.finish(rows, pieces)
+    return rows
 
 
 class Parts:

@@ -97,17 +97,12 @@ def _believed_gap(replay: Replay, agent: int) -> Array:
 
 def _wires(replay: Replay) -> list[Data]:
     """Return the attacked wires with the kinds that hit them; of very many, those of an agent together."""
-    trace, model, hit = replay.trace, replay.loop.model, _hit(replay)
-    if np.isin(trace.kind[:, 0], AIRED).any():
+    hit = _hit(replay)
+    if np.isin(replay.trace.kind[:, 0], AIRED).any():
         return _receivers(replay)
     pairs = np.argwhere(hit.any(axis=0)).tolist()
     if len(pairs) <= LANES:
-        out = []
-        for i, w in pairs:
-            name = model.wires[w].replace("_", " ") + ("" if model.agents == 1 else f" of {noun(replay)} {i}")
-            unit = WIRE_UNITS.get(model.wires[w].split("_")[-1], "")
-            out.append(_lane(replay, name, unit, hit[:, i, w]) | {"value": [float(v) for v in trace.value[:, 0, i, w]]})
-        return out
+        return [_wire(replay, i, w, hit[:, i, w]) for i, w in pairs]
     agents = sorted({i for i, _ in pairs})
     groups = [[i] for i in agents] if len(agents) <= SHOWN else [agents]
     lanes = []
@@ -124,15 +119,24 @@ def _receivers(replay: Replay) -> list[Data]:
     aired = np.isin(trace.kind[:, 0], AIRED)
     out = []
     for i in range(model.agents):
-        whose = "" if model.agents == 1 else f" of {noun(replay)} {i}"
         reached = hit[:, i].any(axis=1) & aired
         if reached.any():
             value = np.where(reached, trace.value[:, 0, i].max(axis=1), 0.0)
-            out.append(_lane(replay, f"receiver{whose}", "", reached) | {"value": value.tolist()})
-        for w in np.flatnonzero((hit[:, i] & ~aired[:, None]).any(axis=0)).tolist():
-            name, unit = model.wires[w].replace("_", " ") + whose, WIRE_UNITS.get(model.wires[w].split("_")[-1], "")
-            out.append(_lane(replay, name, unit, hit[:, i, w] & ~aired) | {"value": [float(v) for v in trace.value[:, 0, i, w]]})
+            out.append(_lane(replay, f"receiver{_whose(replay, i)}", "", reached) | {"value": value.tolist()})
+        wires = np.flatnonzero((hit[:, i] & ~aired[:, None]).any(axis=0)).tolist()
+        out += [_wire(replay, i, w, hit[:, i, w] & ~aired) for w in wires]
     return out
+
+
+def _whose(replay: Replay, agent: int) -> str:
+    return "" if replay.loop.model.agents == 1 else f" of {noun(replay)} {agent}"
+
+
+def _wire(replay: Replay, agent: int, wire: int, hit: Array) -> Data:
+    """Return the lane of one wire of an agent, attacked in the steps `hit` (K,)."""
+    name, value = replay.loop.model.wires[wire], replay.trace.value[:, 0, agent, wire]
+    lane = _lane(replay, name.replace("_", " ") + _whose(replay, agent), WIRE_UNITS.get(name.split("_")[-1], ""), hit)
+    return lane | {"value": value.astype(float).tolist()}
 
 
 def _lane(replay: Replay, name: str, unit: str, hit: Array) -> Data:

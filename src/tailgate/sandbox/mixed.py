@@ -10,8 +10,6 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
-import numpy as np
-
 from tailgate.base import sources
 from tailgate.base.errors import InputError, NotApplicable
 from tailgate.base.version import VERSION
@@ -19,8 +17,7 @@ from tailgate.core import Attack, draws
 from tailgate.core.registry import Entry, Spec
 from tailgate.core.scenario import Scenario
 from tailgate.core.schema import canonical
-from tailgate.evaluation.cells import Cell, _failed, _head, _why, origin
-from tailgate.play.metrics import measure
+from tailgate.evaluation.cells import Cell, _failed, _head, _played, _why, origin
 from tailgate.play.trace import episodes_at_once, rollout
 from tailgate.sandbox.isolated import Isolated, IsolatedPlan
 from tailgate.sandbox.limits import FEWEST, Limits, Lost
@@ -65,16 +62,10 @@ class _Part:
     def play(self, seeds: Sequence[int], seat: Seat) -> list[dict[str, Any]]:
         """Play some seeds and return their rows, as `evaluation.run_cell` makes them."""
         try:
-            trace = rollout(self.place.loop(seat, self.uses), self.rival, draws.keys(self.cell.purpose, seeds))
-            values = measure(trace)
+            keys = draws.keys(self.cell.purpose, seeds)
+            return _played(self.head, seeds, rollout(self.place.loop(seat, self.uses), self.rival, keys))
         except Exception as error:  # a component may raise anything; only its own rows are lost
             return self.failed(seeds, error)
-        rows = []
-        for i, seed in enumerate(seeds):
-            numbers = {name: None if np.isnan(v[i]) else float(v[i]) for name, v in values.items()}
-            hashes = {"trace_hash": trace.trace_hash(i), "decision_hash": trace.decision_hash(i)}
-            rows.append(self.head | {"seed": seed, "status": "ok", "reason": "", **numbers, **hashes})
-        return rows
 
     def failed(self, seeds: Sequence[int], error: Exception) -> list[dict[str, Any]]:
         """Return rows with the reason only."""

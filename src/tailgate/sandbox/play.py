@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import hashlib
 from collections.abc import Callable, Generator, Sequence
@@ -14,7 +13,7 @@ from tailgate.base.errors import InputError
 from tailgate.base.pool import each
 from tailgate.core.scenario import Suite, load_suite
 from tailgate.evaluation.cells import Cell, cells_of
-from tailgate.evaluation.resume import Parts
+from tailgate.evaluation.resume import Parts, complete
 from tailgate.sandbox.limits import Limits, Lost
 from tailgate.sandbox.mixed import Submission, part_of, play_mixed
 from tailgate.sandbox.process import Process
@@ -90,21 +89,7 @@ def _run(
     ids = [[str(part_of(cell, submission, seeds).head["cell"]) for cell in job] for job in jobs]
     names = [hashlib.blake2b("".join(each).encode(), digest_size=12).hexdigest() for each in ids]
     pieces = {name: [(cell, seed) for cell in cells for seed in seeds] for name, cells in zip(names, ids, strict=True)}
-    with contextlib.nullcontext() if out is None else Parts(out) as parts:
-        done = {} if parts is None else parts.finished(pieces)
-        missing = [i for i, name in enumerate(names) if name not in done]
-        with contextlib.closing(_play([jobs[i] for i in missing], submission, seeds, workers)) as played:
-            for position, rows in played:
-                name = names[missing[position]]
-                done[name] = rows
-                if parts is not None:
-                    parts.put(name, rows)
-                if progress is not None:
-                    progress(len(done), len(jobs))
-        rows = [row for name in names for row in done[name]]
-        if parts is not None:
-            parts.finish(rows, pieces)
-    return rows
+    return complete(names, pieces, out, lambda missing: _play([jobs[i] for i in missing], submission, seeds, workers), progress)
 
 
 def _play(jobs: Sequence[Sequence[Cell]], submission: Submission, seeds: list[int], workers: int) -> Generator[tuple[int, Rows]]:
