@@ -89,8 +89,8 @@ class Ending:
 
         `reads` is the file descriptor to which the interpreter writes signal numbers.
         """
-        with open(reads, "rb", buffering=0) as told:
-            while text := told.read(64):
+        with open(reads, "rb", buffering=0) as pipe:
+            while text := pipe.read(64):
                 if numbers := [byte for byte in text if byte in WORDS]:
                     if not self.over.wait(GRACE):
                         _end(numbers[0], self.kept(), self.said)

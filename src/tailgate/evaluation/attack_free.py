@@ -181,8 +181,8 @@ class Bench:
 
     def run(self, threshold: float, hours: float, purpose: str, label: str, crossings: Crossings | None = None) -> Count:
         """Play attack-free runs of `hours` in total; `crossings` collects how the score rises."""
-        guard = self.at(threshold)
-        loops = {place.name: place.loop(guard, self.uses) for place in self.places}
+        defence = self.at(threshold)
+        loops = {place.name: place.loop(defence, self.uses) for place in self.places}
         chunks = []
         for place, seeds in zip(self.places, self.seeds(hours), strict=True):
             size = side_by_side(loops[place.name], self.batch)

@@ -84,21 +84,22 @@ def run_cell(
 
     `defence` and `attack` replace the cell's texts by objects; `uses` overrides what the defence may use.
     """
-    guard, guard_entry, _ = _component("defence", cell.defence if defence is None else defence)
-    rival, rival_entry, _ = _component("attack", cell.attack if attack is None else attack)
-    place = cell.place(rival, rival_entry.knowledge)
-    head = _head(cell, place, guard_entry, rival_entry, cell_id(cell) if defence is None and attack is None else "")
+    identity = cell_id(cell) if defence is None and attack is None else ""
+    defence, defence_entry, _ = _component("defence", cell.defence if defence is None else defence)
+    attack, attack_entry, _ = _component("attack", cell.attack if attack is None else attack)
+    place = cell.place(attack, attack_entry.knowledge)
+    head = _head(cell, place, defence_entry, attack_entry, identity)
     rows: list[dict[str, Any]] = []
     seeds = cell.episodes
     try:
-        loop = place.loop(guard, guard_entry.uses if uses is None else uses)
+        loop = place.loop(defence, defence_entry.uses if uses is None else uses)
         size = episodes_at_once(loop.model, loop.horizon, cell.batch)
     except Exception as error:
         return _failed(head, seeds, *_why(error))
     for start in range(0, cell.seeds, size):
         chunk = seeds[start : start + size]
         try:
-            rows += _played(head, chunk, rollout(loop, rival, draws.keys(cell.purpose, chunk)))
+            rows += _played(head, chunk, rollout(loop, attack, draws.keys(cell.purpose, chunk)))
         except Exception as error:  # a component may raise anything; only its own rows are lost
             rows += _failed(head, chunk, *_why(error, chunk))
     return rows
@@ -122,14 +123,14 @@ def _why(error: Exception, seeds: Sequence[int] = ()) -> tuple[str, str]:
     return said(error) + (f" (row {row}: seed {seeds[row]})" if row is not None and row < len(seeds) else ""), "error"
 
 
-def _head(cell: Cell, place: Scenario, guard: Entry, rival: Entry, identity: str) -> dict[str, Any]:
+def _head(cell: Cell, place: Scenario, defence: Entry, attack: Entry, identity: str) -> dict[str, Any]:
     threat = place.threat_model
     return {
         "suite": cell.suite, "scenario": place.name, "scenario_file": cell.scenario if cell.scenario.endswith((".yaml", ".yml")) else "",
         "threat_model": as_data(threat), "dose": threat.budget,
-        "knowledge": threat.knowledge, "defence": cell.defence, "uses": list(guard.uses), "attack": cell.attack,
-        "learned": rival.learned, "optimal": rival.optimal, "purpose": cell.purpose, "beacon": cell.beacon, "batch": cell.batch,
-        "engine": ENGINE, "versions": {"defence": guard.version, "attack": rival.version},
+        "knowledge": threat.knowledge, "defence": cell.defence, "uses": list(defence.uses), "attack": cell.attack,
+        "learned": attack.learned, "optimal": attack.optimal, "purpose": cell.purpose, "beacon": cell.beacon, "batch": cell.batch,
+        "engine": ENGINE, "versions": {"defence": defence.version, "attack": attack.version},
         "defence_digest": _digest("defence", cell.defence, identity), "attack_digest": _digest("attack", cell.attack, identity),
         "config_hash": place.config_hash, "version": VERSION, "cell": identity,
         "trained": origin(cell.attack) if identity else None,
@@ -161,8 +162,8 @@ def _own(head: dict[str, Any]) -> dict[str, Any]:
 
 def failed_rows(cell: Cell, reason: str) -> list[dict[str, Any]]:
     """Return the rows of a cell that could not be played."""
-    rival, entry = Spec("attack", cell.attack).make(), Spec("attack", cell.attack).entry
-    head = _head(cell, cell.place(rival, entry.knowledge), Spec("defence", cell.defence).entry, entry, cell_id(cell))
+    spec = Spec("attack", cell.attack)
+    head = _head(cell, cell.place(spec.make(), spec.entry.knowledge), Spec("defence", cell.defence).entry, spec.entry, cell_id(cell))
     return _failed(head, cell.episodes, reason)
 
 
@@ -202,13 +203,13 @@ def cells_of(
     models: dict[str, Model] = {}
     fitted: set[tuple[str, str]] = set()
     for cell in out:
-        spec, guard = Spec("attack", cell.attack), Spec("defence", cell.defence)
-        rival, defence = spec.make(), guard.make()
-        place = cell.place(rival, spec.entry.knowledge)
+        attack_spec, defence_spec = Spec("attack", cell.attack), Spec("defence", cell.defence)
+        attack, defence = attack_spec.make(), defence_spec.make()
+        place = cell.place(attack, attack_spec.entry.knowledge)
         if (cell.scenario, cell.defence) not in fitted:  # once, because a filter of a large network is slow to prepare
             fitted.add((cell.scenario, cell.defence))
             with _sparing():
-                place.loop(defence, guard.entry.uses)
+                place.loop(defence, defence_spec.entry.uses)
         if cell.scenario not in models:
             models[cell.scenario] = model = place.brief().model
             needed = 2 * episode_memory(model, place.horizon)  # twice, for the metrics
@@ -216,7 +217,7 @@ def cells_of(
         brief = Brief(models[cell.scenario], place.threat_model, place.horizon)
         _ = brief.granted  # checks the names of wires and agents
         with _sparing():
-            rival.prepare(brief)
+            attack.prepare(brief)
     return out
 
 
@@ -278,8 +279,8 @@ def evaluate(
         An argument is invalid; nothing is played then.
     """
     base = load_suite(suite) if isinstance(suite, str) else suite if suite is not None else Suite(name="custom")
-    guards = list(base.defences if defences is None else defences)
-    rivals = list(base.attacks if attacks is None else attacks)
+    defences = list(base.defences if defences is None else defences)
+    attacks = list(base.attacks if attacks is None else attacks)
     sizes.check("batch", batch)
     sizes.check("workers", workers)
     sizes.check("seeds", base.seeds if seeds is None else seeds)
@@ -287,11 +288,11 @@ def evaluate(
         base,
         scenarios=tuple(base.scenarios if scenarios is None else scenarios),
         doses=tuple(base.doses if doses is None else doses),
-        defences=tuple(g for g in guards if isinstance(g, str)),
-        attacks=tuple(r for r in rivals if isinstance(r, str)),
+        defences=tuple(d for d in defences if isinstance(d, str)),
+        attacks=tuple(a for a in attacks if isinstance(a, str)),
         seeds=base.seeds if seeds is None else seeds,
     )
-    for name, value in (("scenarios", named.scenarios), ("defences", guards), ("attacks", rivals)):
+    for name, value in (("scenarios", named.scenarios), ("defences", defences), ("attacks", attacks)):
         if not value:
             raise InputError(name, list(value), "at least one")
     for dose in named.doses:
@@ -299,16 +300,16 @@ def evaluate(
             raise InputError("dose", dose, "a whole number of attack steps, not below 0")
     cells = cells_of(named, batch=batch, purpose=purpose, threat=threat, beacon=beacon)
     rows = run(cells, Path(out) if out is not None else None, workers, progress) if cells else []
-    for guard in guards:
-        for rival in rivals:
-            if isinstance(guard, str) and isinstance(rival, str):
+    for defence in defences:
+        for attack in attacks:
+            if isinstance(defence, str) and isinstance(attack, str):
                 continue
-            texts = _component("defence", guard)[2], _component("attack", rival)[2]
+            texts = _component("defence", defence)[2], _component("attack", attack)[2]
             for scenario in named.scenarios:
                 for dose in named.doses:
                     changes = named.threat | dict(threat or {})
                     cell = Cell(named.name, scenario, dose, *texts, named.seeds, purpose, 0, batch, changes, beacon)
-                    rows += run_cell(cell, guard, rival)
+                    rows += run_cell(cell, defence, attack)
     if out is not None and len(rows) > sum(cell.seeds for cell in cells):
         write_atomic(Path(out), packed(rows, Path(out)))  # with the rows of objects
     return rows

@@ -126,11 +126,11 @@ def record(name: str, suite: Suite) -> dict[str, Any]:
         raise InputError("golden", name, "a scenario that one of its suite's defences can serve")
     brief, able = place.brief(), ["none"]
     for text in suite.attacks:
-        rival, entry = Spec("attack", text).make(), Spec("attack", text).entry
-        if text == "none" or getattr(rival, "knowledge", entry.knowledge) != "black" or entry.learned:
+        attack, entry = Spec("attack", text).make(), Spec("attack", text).entry
+        if text == "none" or getattr(attack, "knowledge", entry.knowledge) != "black" or entry.learned:
             continue
         try:
-            rival.prepare(brief)
+            attack.prepare(brief)
         except NotApplicable:
             continue
         able.append(text)

@@ -91,12 +91,12 @@ class Steps:
         self._call.begin()
         self._call.play(1)
         self._call.sheet.flags.writeable = False  # attacks read it
-        told = self._call.results()
-        if self._call.broken and not told["demands"].all():
-            raise self.of.program.broken(told["demands"], self.k)
-        self.k = told["seen.view.k"]
-        signals = {name: told[full] for name, full in self.of.signals}
-        return signals, told["ended"], _view(self.of.loop, self.of.rebuilt(told[name] for name in self.of.names))
+        results = self._call.results()
+        if self._call.broken and not results["demands"].all():
+            raise self.of.program.broken(results["demands"], self.k)
+        self.k = results["seen.view.k"]
+        signals = {name: results[full] for name, full in self.of.signals}
+        return signals, results["ended"], _view(self.of.loop, self.of.rebuilt(results[name] for name in self.of.names))
 
 
 def _first(loop: Loop) -> LoopState:

@@ -263,9 +263,9 @@ class Rows:
                 self._check(advance, self._step)
         if play():
             self._check(call, self._step)
-        self._last, self._brought, told = call, None, numbers()
-        self._k = told[2]
-        return *told, seen.copy(), None if mask is None else mask.copy()
+        self._last, self._brought, results = call, None, numbers()
+        self._k = results[2]
+        return *results, seen.copy(), None if mask is None else mask.copy()
 
     def _step(self) -> Array:
         """Return the step before the decision of a single row."""

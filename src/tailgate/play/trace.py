@@ -139,9 +139,9 @@ def rollout(loop: Loop, attack: Attack, keys: Keys, *, terminate: bool = True, p
     Long work is played by a traced loop if it can be traced, and very long work with a traced attack too.
     `plain` selects the plain loop, with the same bits.
     """
-    if not plain and isinstance(guard := loop.defence, Watched):
+    if not plain and isinstance(watch := loop.defence, Watched):
         seen = rollout(loop.bare, attack, keys, terminate=terminate)
-        return dataclasses.replace(seen, signals=seen.signals | {"alarm": guard.alarms(seen.score)})
+        return dataclasses.replace(seen, signals=seen.signals | {"alarm": watch.alarms(seen.score)})
     if not plain and (play := _player(loop, attack, len(keys.key) * loop.horizon)) is not None:
         return Trace(loop.model, loop.horizon, *play(keys, terminate), loop.controller.desired_gap)
     state = loop.start(keys)
@@ -165,6 +165,6 @@ def _player(loop: Loop, attack: Attack, steps: int) -> Player | None:
 
     if steps >= MANY and not isinstance(whole := rollout_of(loop, attack), Untraced):
         return whole.play
-    if (steps >= WORTH or loop.horizon >= LONG) and not isinstance(told := commanded(loop), Untraced):
-        return partial(told.play, attack)
+    if (steps >= WORTH or loop.horizon >= LONG) and not isinstance(program := commanded(loop), Untraced):
+        return partial(program.play, attack)
     return None

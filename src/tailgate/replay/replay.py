@@ -196,9 +196,9 @@ def play(row: Row, allowed: Filter | None = None) -> Replay:
         raise InputError("row", f"{row['status']}: {row['reason']}", "a row that was played (status ok)")
     if not allowed.fits(row):
         raise InputError("row", f"{row['scenario']}, {row['defence']}, {row['attack']}", f"a row that matches {allowed}")
-    guard, rival = _component("defence", row, allowed.defence), _component("attack", row, allowed.attack)
+    defence_spec, attack_spec = _component("defence", row, allowed.defence), _component("attack", row, allowed.attack)
     place = _place(row, allowed.scenario)
-    loop, attack = place.loop(guard.make(), guard.entry.uses), rival.make()
+    loop, attack = place.loop(defence_spec.make(), defence_spec.entry.uses), attack_spec.make()
     states = episode(loop, attack, draws.keys(row["purpose"], [row["seed"]]))
     start, _ = next(states)
     recorder, gate = Recorder(loop, start), [_gate(loop, start)]
@@ -208,12 +208,12 @@ def play(row: Row, allowed: Filter | None = None) -> Replay:
         gate.append(_gate(loop, state))
     trace = recorder.trace()
     metrics = {name: None if np.isnan(value[0]) else float(value[0]) for name, value in measure(trace).items()}
-    versions = {"defence": guard.entry.version, "attack": rival.entry.version}
+    versions = {"defence": defence_spec.entry.version, "attack": attack_spec.entry.version}
     here = {
         "trace_hash": trace.trace_hash(0), "decision_hash": trace.decision_hash(0), "version": VERSION,
         "config_hash": place.config_hash, "engine": ENGINE, "versions": ", ".join(f"{k} {v}" for k, v in versions.items()),
-        "defence_digest": guard.digest, "attack_digest": rival.digest, "dose": _text(place.threat_model.budget),
-        "knowledge": place.threat_model.knowledge, "uses": ", ".join(guard.entry.uses),
+        "defence_digest": defence_spec.digest, "attack_digest": attack_spec.digest, "dose": _text(place.threat_model.budget),
+        "knowledge": place.threat_model.knowledge, "uses": ", ".join(defence_spec.entry.uses),
     }  # fmt: skip
     held = {**row, "versions": ", ".join(f"{k} {v}" for k, v in _mapping(row.get("versions")).items())}
     held |= {"dose": _text(row["dose"]), "uses": ", ".join(map(str, row["uses"]))}

@@ -55,7 +55,7 @@ class _Part:
 
     cell: Cell
     place: Scenario
-    rival: Attack
+    attack: Attack
     head: dict[str, Any]
     uses: tuple[str, ...]
 
@@ -63,7 +63,7 @@ class _Part:
         """Play some seeds and return their rows, as `evaluation.run_cell` makes them."""
         try:
             keys = draws.keys(self.cell.purpose, seeds)
-            return _played(self.head, seeds, rollout(self.place.loop(seat, self.uses), self.rival, keys))
+            return _played(self.head, seeds, rollout(self.place.loop(seat, self.uses), self.attack, keys))
         except Exception as error:  # a component may raise anything; only its own rows are lost
             return self.failed(seeds, error)
 
@@ -84,14 +84,14 @@ def identity(cell: Cell, submission: Submission, seeds: Sequence[int], place: Sc
 def part_of(cell: Cell, submission: Submission, seeds: Sequence[int]) -> _Part:
     """Return a cell with its attack and the head of its rows, without importing anything of the submission."""
     spec, entry = Spec("attack", cell.attack), submission.entry
-    rival = spec.make()
-    place = cell.place(rival, spec.entry.knowledge)
+    attack = spec.make()
+    place = cell.place(attack, spec.entry.knowledge)
     head = _head(cell, place, entry, spec.entry, "") | {
         "defence_digest": submission.source.digest, "attack_digest": spec.digest, "trained": origin(cell.attack),
         "cell": identity(cell, submission, seeds, place),
         "submission": {"sandbox": "" if submission.sandbox is None else submission.sandbox.program},
     }  # fmt: skip
-    return _Part(cell, place, rival, head, entry.uses)
+    return _Part(cell, place, attack, head, entry.uses)
 
 
 def play_mixed(cells: Sequence[Cell], submission: Submission, seeds: Sequence[int] | None = None) -> list[dict[str, Any]]:

@@ -52,7 +52,7 @@ def play_submission(
         An argument is invalid; nothing is played then.
     """
     base = load_suite(suite) if isinstance(suite, str) else suite
-    guard = sandbox_of(sandbox) if isinstance(sandbox, str) else sandbox
+    sandbox = sandbox_of(sandbox) if isinstance(sandbox, str) else sandbox
     count = base.seeds if episodes is None else episodes
     for name, value in (("episodes", count), ("workers", workers)):
         sizes.check(name, value)
@@ -66,11 +66,11 @@ def play_submission(
         held, lost = limits or Limits(), None
         card: dict[str, Any] = {"uses": ("measurements",), "version": 1, "reference": ""}
         try:
-            with Process(source.text, source.path, held, guard) as process:
+            with Process(source.text, source.path, held, sandbox) as process:
                 card = process.card
         except Lost as error:
             lost = error
-        submission = Submission(source, card, held, guard)
+        submission = Submission(source, card, held, sandbox)
         jobs = [[cell for cell in cells if cell.scenario == name] for name in dict.fromkeys(named.scenarios)]
         if lost is not None:
             rows = [row for cell in cells for row in part_of(cell, submission, seeds).failed(seeds, lost)]
