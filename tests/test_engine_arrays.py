@@ -196,7 +196,7 @@ def test_parameters_are_no_part_of_the_code() -> None:
         graph = Graph()
         nodes = np.array([[graph.input(("arguments", "x", (0,)), FLOAT)]], object)
         x = Traced(graph, nodes, FLOAT, 0)
-        (k,) = lifted(graph, (gain,))
+        (k,) = lifted(x, (gain,))
         with functions.makers(graph):
             out = x * (k * 2 + 1) + (1.0 if k > 0 else -1.0) if k < 5 else x
         from tailgate.engine.program import Trace

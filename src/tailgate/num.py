@@ -34,6 +34,7 @@ from tailgate.engine.matrices import moment as moment
 from tailgate.engine.matrices import orthogonal as orthogonal
 from tailgate.engine.matrices import predicted as predicted
 from tailgate.engine.matrices import root as root
+from tailgate.engine.matrices import solve as solve
 from tailgate.engine.operations import Array
 
 Shares = tuple[Array, Array, Array]
@@ -44,6 +45,7 @@ WORTH = 16  # numbers from which machine code is faster than numpy's passes
 exp = elementwise(WORTH)(elementary.exp)
 log = elementwise(WORTH)(elementary.log)
 tanh = elementwise(WORTH)(elementary.tanh)
+product = matrices.constant_times
 
 
 def clip(x: ArrayLike, low: ArrayLike, high: ArrayLike) -> Array:
@@ -135,7 +137,8 @@ def apply(matrix: Array, x: Array, base: Array | None = None) -> Array:
 
     Sums run over k in ascending order and skip structural zeros of the matrices. Returns (B, N, i).
     """
-    return matrices.applied(matrix, x, base)
+    moved = matrices.constant_on(matrix, x)
+    return moved if base is None else base + moved
 
 
 def fused(heard: Array, x: Array, M: Array, shares: Shares | None = None, step: tuple[Array, Array] | None = None) -> tuple[Array, Array]:
@@ -152,16 +155,6 @@ def fused(heard: Array, x: Array, M: Array, shares: Shares | None = None, step: 
     L, spread = matrices.spreads(heard, M, weight, total, begin, step)
     xb = matrices.means(heard, x, L, spread, weight, total)
     return xb, spread if len(spread) == len(x) else np.broadcast_to(spread, (len(x), *spread.shape[1:]))
-
-
-def product(x: Array, y: Array) -> Array:
-    """Multiply one (i, k) by one (k, j), summing over k in ascending order without the zeros of x."""
-    return matrices.constant_times(x, y)
-
-
-def solve(m: Array, y: Array) -> Array:
-    """Return M^-1 Y for one (n, n) and one (n, k), by elimination with row pivots in fixed order."""
-    return matrices.solve(m, y)
 
 
 def expm(m: Array) -> Array:

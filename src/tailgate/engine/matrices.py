@@ -176,12 +176,6 @@ def congruent(A: Array, P: Array, Q: Array) -> Array:
     return constant_times(A, transposed(constant_times(A, P))) + Q
 
 
-def applied(matrix: Array, x: Array, base: Array | None) -> Array:
-    """Multiply each agent's matrix (N, i, k), or one for all, by x (B, N, k), and add base (B, N, i) if given."""
-    moved = constant_on(matrix, x)
-    return moved if base is None else base + moved
-
-
 def predicted(A: Array, B: Array, c: Array, L: Array, merge: Array, heard: Array, x: Array, u: Array) -> Array:
     """Return merge_i sum_j L_j (A x_j + B u_j + c) (B, N, n) over j in heard (N, N) bool, for x (B, N, n) and u (B, N, m)."""
     sent = constant_on(L, constant_on(A, x) + constant_on(B, u) + c)

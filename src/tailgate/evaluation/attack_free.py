@@ -21,9 +21,9 @@ from tailgate.agents.scripted import NoAttack
 from tailgate.base.errors import InputError, NotApplicable
 from tailgate.core import Array, Defence, Model, draws
 from tailgate.core.loop import Loop
-from tailgate.core.registry import Spec, entry_for, text_of
 from tailgate.core.scenario import Scenario, load_scenario
 from tailgate.estimators.watched import watched
+from tailgate.evaluation.cells import component
 from tailgate.evaluation.stats import mean_time
 from tailgate.play.trace import MEMORY, episodes_at_once, rollout
 
@@ -128,20 +128,15 @@ class Bench:
 
     @classmethod
     def of(cls, defence: str | Defence, scenarios: Sequence[str], batch: int, progress: Progress | None) -> Bench:
-        if isinstance(defence, str):
-            spec = Spec("defence", defence)
-            made, uses, text = spec.make(), spec.entry.uses, defence
-        else:
-            entry = entry_for("defence", type(defence))
-            made, uses, text = defence, entry.uses, text_of(entry, defence)
+        made, entry, text = component("defence", defence)
         if not scenarios:
             raise InputError("scenario", list(scenarios), "at least one")
         places = tuple(load_scenario(name).with_threat(knowledge="black") for name in scenarios)  # nobody attacks
         if len({place.name for place in places}) < len(places):
             raise InputError("scenario", list(scenarios), "each scenario once")
-        bench = cls(made, uses, text, places, batch, progress or (lambda *_: None))
+        bench = cls(made, entry.uses, text, places, batch, progress or (lambda *_: None))
         for place in places:
-            place.loop(bench.at(SILENT), uses)  # a defence that does not fit fails here
+            place.loop(bench.at(SILENT), entry.uses)  # a defence that does not fit fails here
         return bench
 
     def at(self, threshold: float) -> Defence:

@@ -68,7 +68,7 @@ class Cell:
         return load_scenario(self.scenario).with_threat(**changes)
 
 
-def _component(family: Family, value: object) -> tuple[Any, Entry, str]:
+def component(family: Family, value: object) -> tuple[Any, Entry, str]:
     """Return (object, entry, text) of a spec text or an object."""
     if isinstance(value, str):
         spec = Spec(family, value)
@@ -85,8 +85,8 @@ def run_cell(
     `defence` and `attack` replace the cell's texts by objects; `uses` overrides what the defence may use.
     """
     identity = cell_id(cell) if defence is None and attack is None else ""
-    defence, defence_entry, _ = _component("defence", cell.defence if defence is None else defence)
-    attack, attack_entry, _ = _component("attack", cell.attack if attack is None else attack)
+    defence, defence_entry, _ = component("defence", cell.defence if defence is None else defence)
+    attack, attack_entry, _ = component("attack", cell.attack if attack is None else attack)
     place = cell.place(attack, attack_entry.knowledge)
     head = _head(cell, place, defence_entry, attack_entry, identity)
     rows: list[dict[str, Any]] = []
@@ -304,7 +304,7 @@ def evaluate(
         for attack in attacks:
             if isinstance(defence, str) and isinstance(attack, str):
                 continue
-            texts = _component("defence", defence)[2], _component("attack", attack)[2]
+            texts = component("defence", defence)[2], component("attack", attack)[2]
             for scenario in named.scenarios:
                 for dose in named.doses:
                     changes = named.threat | dict(threat or {})

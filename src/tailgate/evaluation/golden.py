@@ -23,6 +23,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from importlib.resources import files
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -121,7 +122,7 @@ def record(name: str, suite: Suite) -> dict[str, Any]:
     """Return the record of a scenario: no attack, and the first two attacks of the suite that are granted and take effect."""
     place = place_of(name, suite)
     episodes = episodes_of(place, suite)
-    chosen = list(_first(loops(place, ("kf", "none", *suite.defences)), DEFENCES))
+    chosen = list(islice(loops(place, ("kf", "none", *suite.defences)), DEFENCES))
     if not chosen:
         raise InputError("golden", name, "a scenario that one of its suite's defences can serve")
     brief, able = place.brief(), ["none"]
@@ -145,11 +146,6 @@ def record(name: str, suite: Suite) -> dict[str, Any]:
         **({"instructions": instructions()} if type(place.plant).__name__ in FOREIGN else {}),
         "cells": [cell for defence, loop in chosen for cell in cells(loop, defence, attacks, episodes)],
     }  # fmt: skip
-
-
-def _first(items: Iterator[tuple[str, Loop]], most: int) -> Iterator[tuple[str, Loop]]:
-    for _, item in zip(range(most), items, strict=False):
-        yield item
 
 
 def read() -> dict[str, Any]:

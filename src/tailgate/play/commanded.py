@@ -38,13 +38,10 @@ class Commanded:
         begun = _first(loop)
         self.rebuilt = rebuilt(_seen(loop, begun))
         self.program = Program(traced(self._traced, {"loop": begun}, _nothing(loop, 1)._asdict()))
+        self.programs = (self.program,)
         results = list(self.program.trace.results)
         self.names = [name for name in results if name.startswith("seen.")]  # in the order of the leaves
         self.signals = [(name.partition(".")[2], name) for name in results if name.startswith("signals.")]
-
-    @property
-    def programs(self) -> tuple[Program, ...]:
-        return (self.program,)
 
     def of(self, loop: Loop, values: list[Array]) -> Commanded:
         """Return the same program for a loop with other parameters."""

@@ -35,10 +35,7 @@ class Rollout:
         self.loop, self.attack, self.plan = loop, attack, plan
         self.values: list[Array] | None = None  # of the parameters, if they differ from the traced ones
         self.program = Program(traced(self._traced, self.begun(_ONE), None))
-
-    @property
-    def programs(self) -> tuple[Program, ...]:
-        return (self.program,)
+        self.programs = (self.program,)
 
     def of(self, loop: Loop, attack: Attack, plan: object, values: list[Array]) -> Rollout:
         """Return the same program for a loop and an attack with other parameters."""
