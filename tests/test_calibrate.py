@@ -153,7 +153,7 @@ def test_defaults_are_the_recorded_thresholds():
 
 BAD = [
     ({"hours": 0.0}, "hours"), ({"hours": -1.0}, "hours"), ({"hours": math.nan}, "hours"), ({"hours": math.inf}, "hours"),
-    ({"hours": 1e-6}, "score does not climb that often"), ({"onsets": 0}, "onsets"), ({"most_steps": 0}, "steps"), ({"batch": 0}, "batch"),
+    ({"hours": 1e-6}, "score does not rise that often"), ({"onsets": 0}, "onsets"), ({"most_steps": 0}, "steps"), ({"batch": 0}, "batch"),
     ({"scenarios": ("stop-and-go",)}, "stop-and-go-v0"), ({"scenarios": ()}, "at least one"),
     ({"scenarios": ("braking-v0", "braking-v0")}, "each scenario once"),
     ({"defence": "cusum_fk"}, "cusum_kf"), ({"defence": "cusum_kf:threshold=0"}, "greater than 0"),

@@ -68,7 +68,7 @@ def test_what_is_no_board_or_no_rows_is_named(arguments: list[str], words: str, 
 
 
 @pytest.mark.parametrize(("name", "words"), [
-    ("cut.jsonl", "cut.jsonl, line 2: got '{\"suite\": "), ("damaged.jsonl", "damaged.jsonl, line 2: got '{'"), ("cut.jsonl.xz", "(the file was cut)"),
+    ("cut.jsonl", "cut.jsonl, line 2: got '{\"suite\": "), ("damaged.jsonl", "damaged.jsonl, line 2: got '{'"), ("cut.jsonl.xz", "(the file is truncated)"),
 ])  # fmt: skip
 def test_of_a_cut_file_of_rows_is_said_which_and_what_makes_it_whole(name: str, words: str, run: Run) -> None:
     """Not the command that reads it. A board's file is named with its folder, as every suite has one of that name."""
@@ -85,7 +85,7 @@ def test_of_a_cut_file_of_rows_is_said_which_and_what_makes_it_whole(name: str, 
         ["replay", str(place), "--out", "page"], ["leaderboard", "run", "quick-v0", "--out", "boards", "--score-only"],
     ):  # fmt: skip
         code, _, errors = run(*command)
-        assert code == 2 and str(place) in errors and words in errors and "the command that wrote it makes it whole" in errors
+        assert code == 2 and str(place) in errors and words in errors and "run the command that wrote it again" in errors
 
 
 def test_evaluate_prints_a_table_or_json_and_writes_rows(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -274,7 +274,7 @@ def test_a_key_that_is_there_twice_is_refused(run: Run, tmp_path: Path) -> None:
     """Of two values one would be lost without a word."""
     (tmp_path / "twice.yaml").write_text("scenarios: [thesis-ch4-v0]\nattacks: [none]\ndefences: [kf]\nseeds: 2\nseeds: 3\n")
     code, _, said = run("evaluate", "--suite", "twice.yaml")
-    assert code == 2 and "the key 'seeds' is there twice" in said and "line 5" in said
+    assert code == 2 and "the key 'seeds' appears twice" in said and "line 5" in said
 
 
 @pytest.mark.parametrize("text", ["{}", "[]", '"board"', "{", '{"format": "tailgate-board-1"}'])

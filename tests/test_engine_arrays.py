@@ -149,7 +149,7 @@ REFUSED: dict[str, tuple[Callable[..., Any], str]] = {
     "a remainder of floats": (lambda x: x % 2.0, "np.floor"),
     "a remainder by nothing": (lambda x: x[:, 0].astype(int) % 0, "from 1"),
     "a power": (lambda x: x**3, "products"),
-    "a loop over what there is": (lambda x: [k for k in set((x > 0).tolist())], "a loop over what there can be"),
+    "a loop over what there is": (lambda x: [k for k in set((x > 0).tolist())], "a loop over all possible values"),
     "into numpy's own array": (lambda x: np.add(x, 1, out=CASES and FIXED), "np.zeros"),
     "a list of objects": (lambda x: np.add(x, [object()] * 3), "use numbers"),
 }  # fmt: skip
@@ -196,7 +196,7 @@ def test_parameters_are_no_part_of_the_code() -> None:
         graph = Graph()
         nodes = np.array([[graph.input(("arguments", "x", (0,)), FLOAT)]], object)
         x = Traced(graph, nodes, FLOAT, 0)
-        (k,) = lifted(graph, (gain,))
+        (k,) = lifted(x, (gain,))
         with functions.makers(graph):
             out = x * (k * 2 + 1) + (1.0 if k > 0 else -1.0) if k < 5 else x
         from tailgate.engine.program import Trace

@@ -123,7 +123,7 @@ threading.Thread(target=send, daemon=True).start()
 from tailgate"""
     code = begin.replace("from tailgate", send.replace("TIMES", str(times))) + "; time.sleep(5)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert done.stderr.splitlines() == ["tailgate: interrupted; it had not begun"] and done.returncode == 130
+    assert done.stderr.splitlines() == ["tailgate: interrupted; nothing had started"] and done.returncode == 130
 
 
 def test_elsewhere_handlers_are_put_back(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

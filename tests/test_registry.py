@@ -201,7 +201,7 @@ def test_canonical_text_is_stable(tmp_path):
     assert one == two and str(tmp_path) not in one
     (tmp_path / "two" / "f.csv").write_text("t,v\n0,1\n")
     assert canonical(Sample(path=tmp_path / "two" / "f.csv")) != one
-    assert as_data(GatedKalman(3.0)) == {"class": "tailgate.estimators.chi_square.GatedKalman", "eta": 3.0, "gain": "varying"}
+    assert as_data(GatedKalman(3.0)) == {"class": "tailgate.estimators.detectors.chi_square.GatedKalman", "eta": 3.0, "gain": "varying"}
 
 
 def test_built_values_have_the_declared_types():
@@ -264,7 +264,7 @@ def test_errors_cross_process_borders(cls):
     assert type(error) is cls and (error.field, error.value, error.expected) == ("field", 3, "four")
     assert str(error) == "field: got 3; expected four" and isinstance(error, ValueError)
     assert len(str(InputError("f", "x" * 1000, "y"))) < 150
-    assert str(unknown("f", "ab", [])).endswith("no name: there is none to choose from")
+    assert str(unknown("f", "ab", [])).endswith("no name: none exists")
 
 
 @pytest.mark.parametrize("text", ["chi2_kf:eta", "chi2_kf:eta 3", "chi2_kf:"])

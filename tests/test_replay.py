@@ -85,7 +85,7 @@ def test_rows_without_the_new_column_stay_readable(folder, pick):
     with pytest.raises(InputError, match=r"scenario.*'tiny'.*--scenario FILE"):
         play(row)
     assert play(row, Filter(scenario=str(folder / "tiny.yaml"))).verdict == "same"
-    with pytest.raises(InputError, match=r"file that is here.*--scenario"):
+    with pytest.raises(InputError, match=r"existing file.*--scenario"):
         play(old | {"scenario_file": "gone/tiny.yaml"})
 
 

@@ -296,7 +296,7 @@ def test_of_the_worst_episode_dose_and_attack_are_said(site, worst_row, tmp_path
 def test_rows_that_cannot_be_played(worst_row, tmp_path):
     """A policy that is not here and a class to import are reasons, without the place of a file; nothing is imported or written."""
     for change, reason in (
-        ({"attack": "/home/x/runs/sac-a/policy.json"}, "a file that is here"), ({"defence": "os:getcwd"}, "must not import code"),
+        ({"attack": "/home/x/runs/sac-a/policy.json"}, "an existing file"), ({"defence": "os:getcwd"}, "must not import code"),
         ({"status": "error", "reason": "boom"}, "a row that was played"), ({"threat_model": None}, "a mapping of fields"), ({"seed": "x"}, "Error"),
     ):  # fmt: skip
         done = replay_of(worst_row | change, tmp_path / "r.html", "")

@@ -72,7 +72,7 @@ def test_a_module_that_lies_beside_the_submission_is_not_found_and_the_error_say
     (tmp_path / "patient.py").write_text("from tailgate.estimators import Kalman as Patient\n", encoding="utf-8")
     (tmp_path / "hurried.py").write_text("from patient import Patient\n", encoding="utf-8")
     monkeypatch.syspath_prepend(str(tmp_path))
-    with pytest.raises(InputError, match=r"No module named 'patient'\); nothing beside the submitted file or folder is found$"):
+    with pytest.raises(InputError, match=r"No module named 'patient'\); only the submitted file or folder can be imported$"):
         play_submission("hurried:Patient", _suite(places[1], seeds=1))
 
 

@@ -66,7 +66,7 @@ def test_an_isolated_defence_plays_in_an_ordinary_loop(short: Callable[..., Scen
                 states = [loop.restart(state, mask) for loop, state in zip((apart, beside), states, strict=True)]
             states = [loop.step(state, attack, plan, None)[0] for loop, state in zip((apart, beside), states, strict=True)]
             assert not same_tree(states[0].estimate, states[1].estimate)
-        with pytest.raises(InputError, match="one of the 8 states that were used last"):
+        with pytest.raises(InputError, match="one of the 8 most recently used states"):
             apart.step(first, attack, plan, None)
 
 

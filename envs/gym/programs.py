@@ -1,10 +1,10 @@
-"""The attacker's seat as a program: what `tailgate.envs.gym.attacker_mdp.Seat` plays, traced as it stands.
+"""The attacker's decision process as programs, traced from `tailgate.envs.gym.attacker_mdp.Seat`.
 
-    advance  a step of a decision of several, but the last
+    advance  one step of a decision of several steps, except the last
     decide   a decision of every row, or its last step; rows `again` begin their next episode instead
     begin    the next episode of the rows `again`, or their first
 
-The last two leave what is to be seen, and what may be decided next.
+The last two return the observation, and what may be decided next.
 """
 
 from __future__ import annotations
@@ -21,31 +21,40 @@ from tailgate.base.pytree import leaves, map_leaves
 from tailgate.core import draws
 from tailgate.core.draws import Keys
 from tailgate.engine.agreement import ROWS, TRIED, Untraced, check_open, raised, same
-from tailgate.engine.operations import Array
+from tailgate.engine.operations import Array, ArrayLike
 from tailgate.engine.parameters import lifted
 from tailgate.engine.program import Call, Program, State, Trace, traced
 from tailgate.engine.remembered import Remembered
 
 if TYPE_CHECKING:
-    from tailgate.envs.gym.attacker_mdp import Seat
+    from tailgate.core.loop import LoopState
+    from tailgate.envs.gym.attacker_mdp import Seat, Sums, Tally
 
 
-# what a step of a single row tells
+# results of a step of a single row
 ALONE = ("reward", "damage", "k", "terminated", "truncated", "illegal", "collided", "rear_collided", "allowed")
 
 
+class Episodes(NamedTuple):
+    """The state of a seat's episodes; `sums` are those of a decision of several steps."""
+
+    loop: LoopState
+    tally: Tally
+    sums: Sums | None = None
+
+
 class SeatPrograms:
-    """The programs of a seat. Raises whatever its parts raise while they are traced."""
+    """The programs of a seat; tracing raises whatever its parts raise."""
 
     def __init__(self, seat: Seat, shown: Seat | None = None) -> None:
         check_open(seat.loop)
         self.seat, self.loop, self.shown = seat, seat.loop, shown or _shown_once(seat)
-        self.values: list[Array] | None = None  # of the parameters, if others than those it was traced with
+        self.values: list[Array] | None = None  # of the parameters, if they differ from the traced ones
         self.example = _example(seat)
         for name, leaf in leaves(self.example).items():
             if leaf.dtype == object:
                 raise TypeError(f"state {name} holds objects")
-        state = self.example | ({"sums": seat.opened(self.example["tally"])} if _several(seat) else {})
+        state = _opened(seat, self.example)
         flags = np.zeros(1, bool)
         action = np.zeros(1, np.int64) if seat.action.discrete else np.zeros((1, seat.action.size))
         decide = traced(self._decide, state, {"action": action, "over": flags, "again": flags})
@@ -60,60 +69,57 @@ class SeatPrograms:
 
     @property
     def between(self) -> int:
-        """Steps of a decision before its last."""
+        """Number of steps of a decision before its last."""
         return self.seat.action.spec.interval - 1
 
     def of(self, seat: Seat, values: list[Array]) -> SeatPrograms:
-        """The same programs for a seat of other parameters."""
+        """Return the same programs for a seat with other parameters."""
         out = copy.copy(self)
         out.seat, out.loop, out.values = seat, seat.loop, values
         return out
 
-    def _decide(self, held: Any, given: Any) -> tuple[Any, Any]:
-        seat, over = self._lifted(held), given["over"]
-        loop, tally, sums = held["loop"], held["tally"], held["sums"] if _several(seat) else seat.opened(held["tally"])
-        loop, tally, sums, _ = seat.advanced(loop, tally, sums, given["action"], over)
+    def _decide(self, held: Episodes, given: dict[str, Array]) -> tuple[Episodes, dict[str, Array]]:
+        seat, over = lifted(held.loop.k, self.shown), given["over"]
+        loop, tally, sums, _ = seat.advanced(held.loop, held.tally, held.sums or seat.opened(held.tally), given["action"], over)
         outcome = seat.closed(loop, tally, sums, over)
-        state = _renewed(seat, {"loop": loop, "tally": tally}, held["loop"].keys, given["again"])
-        return self._opened(seat, state), outcome._asdict() | _shown(seat, state)
+        state = _renewed(seat, Episodes(loop, tally), held.loop.keys, given["again"])
+        return _opened(seat, state), outcome._asdict() | _shown(seat, state)
 
-    def _advance(self, held: Any, given: Any) -> tuple[Any, Any]:
-        seat = self._lifted(held)
-        *state, _ = seat.advanced(held["loop"], held["tally"], held["sums"], given["action"], given["over"])
-        return dict(zip(("loop", "tally", "sums"), state, strict=True)), {}
+    def _advance(self, held: Episodes, given: dict[str, Array]) -> tuple[Episodes, dict[str, Array]]:
+        assert held.sums is not None
+        seat = lifted(held.loop.k, self.shown)
+        loop, tally, sums, _ = seat.advanced(held.loop, held.tally, held.sums, given["action"], given["over"])
+        return Episodes(loop, tally, sums), {}
 
-    def _begin(self, held: Any, given: Any) -> tuple[Any, Any]:
-        seat = self._lifted(held)
-        state = _renewed(seat, {"loop": held["loop"], "tally": held["tally"]}, held["loop"].keys, given["again"])
-        return self._opened(seat, state), _shown(seat, state)
-
-    def _opened(self, seat: Seat, state: Any) -> Any:
-        """With the sums of the next decision, where a decision has several steps."""
-        return state | {"sums": seat.opened(state["tally"])} if _several(seat) else state
-
-    def _lifted(self, held: Any) -> Seat:
-        seat: Seat = lifted(held["loop"].k.graph, self.shown)
-        return seat
+    def _begin(self, held: Episodes, given: dict[str, Array]) -> tuple[Episodes, dict[str, Array]]:
+        seat = lifted(held.loop.k, self.shown)
+        state = _renewed(seat, Episodes(held.loop, held.tally), held.loop.keys, given["again"])
+        return _opened(seat, state), _shown(seat, state)
 
 
-def _example(seat: Seat) -> dict[str, Any]:
-    """The state of an episode that begins."""
+def _opened(seat: Seat, state: Episodes) -> Episodes:
+    """Return the state with the sums of the next decision, if a decision has several steps."""
+    return state._replace(sums=seat.opened(state.tally)) if _several(seat) else state
+
+
+def _example(seat: Seat) -> Episodes:
+    """Return the first state of an episode."""
     start = seat.loop.start(draws.keys("tune", [0]))
-    return {"loop": start, "tally": seat.begin(start)}
+    return Episodes(start, seat.begin(start))
 
 
 def _several(seat: Seat) -> bool:
-    """Has a decision several steps? Traced code asks, so that a program is found again for both kinds apart."""
+    """Return True if a decision has several steps; traced code asks, so that both kinds get separate programs."""
     return bool(seat.action.spec.interval > 1)
 
 
 def _shown_once(seat: Seat) -> Seat:
-    """The seat as it is traced: it shows one frame."""
+    """Return the seat as it is traced: it shows one frame."""
     return dataclasses.replace(seat, observation=type(seat.observation)(seat.loop.brief), config={})
 
 
 def _twins(decide: Trace, begin: Trace, *others: Trace) -> dict[str, str]:
-    """Leaves of the state that equal others after each decision and each beginning, and these."""
+    """Return the leaves of the state that equal others after each decision and each beginning, by those others."""
     first: dict[Any, str] = {}
     out = {}
     for name, (here, _) in decide.state.items():
@@ -130,21 +136,21 @@ def _twins(decide: Trace, begin: Trace, *others: Trace) -> dict[str, str]:
 
 
 def _after(trace: Trace, name: str) -> tuple[int, ...]:
-    """Numbers of what a leaf is in the next state."""
+    """Return the node numbers of a leaf in the next state."""
     return (trace.large[name][1].id,) if name in trace.large else tuple(node.id for node in trace.state[name][1].flat)
 
 
-def _renewed(seat: Seat, state: Any, keys: Keys, again: Any) -> Any:
-    """The state with the next episode in the rows `again`."""
+def _renewed(seat: Seat, state: Episodes, keys: Keys, again: Array) -> Episodes:
+    """Return the state with the next episode in the rows `again`."""
     loop = seat.loop.start(Keys(keys.key, keys.episode + np.uint32(1)))
-    fresh = {"loop": loop, "tally": seat.begin(loop)}
+    fresh = Episodes(loop, seat.begin(loop))
     return map_leaves(lambda old, new: np.where(again.reshape(len(again), *(1,) * (old.ndim - 1)), new, old), state, fresh)
 
 
-def _shown(seat: Seat, state: Any) -> dict[str, Any]:
-    """What is to be seen of a state, and what may be decided next."""
-    view = seat.loop.sense(state["loop"])
-    damage = np.min(view.scene.gap, axis=1) if seat.road else state["tally"].error
+def _shown(seat: Seat, state: Episodes) -> dict[str, Array]:
+    """Return the observation of a state, and what may be decided next."""
+    view = seat.loop.sense(state.loop)
+    damage = np.min(view.scene.gap, axis=1) if seat.road else state.tally.error
     shown = {"seen": seat.observation.observe(view), "allowed": view.allowed, "k": view.k, "damage": damage}
     return shown | ({"mask": seat.action.mask(view)} if seat.action.discrete else {})
 
@@ -153,7 +159,7 @@ _made: Remembered[SeatPrograms] = Remembered()
 
 
 def programs_of(seat: Seat) -> SeatPrograms | Untraced:
-    """The programs of a seat, once they have been found equal to the plain loop on this machine; or why there are none."""
+    """Return the programs of a seat, if they equal the plain loop on this machine; else the reason why there are none."""
     shown = _shown_once(seat)
     return _made.proved(
         shown,
@@ -165,7 +171,7 @@ def programs_of(seat: Seat) -> SeatPrograms | Untraced:
 
 
 def difference(programs: SeatPrograms, batch: int = ROWS, steps: int = TRIED) -> str:
-    """Play some decisions in both engines, resets among them; -> what differs first, or nothing."""
+    """Play some decisions with resets in both engines; return the first difference, or nothing."""
     from tailgate.envs.gym.batches import PlainEpisodes
 
     decisions = max(4, steps // (programs.between + 1))
@@ -190,7 +196,7 @@ def difference(programs: SeatPrograms, batch: int = ROWS, steps: int = TRIED) ->
 
 
 class _Alone(NamedTuple):
-    """A single row: the calls that play it, its action, and readers of its sheet."""
+    """The calls that play a single row, its action, and readers of its results."""
 
     call: Call
     advance: Call | None
@@ -202,7 +208,7 @@ class _Alone(NamedTuple):
 
 
 class Rows:
-    """B rows of a seat's episodes, and what the last call brought (see `SeatPrograms`)."""
+    """The B rows of a seat's episodes, with the results of the last call (see `SeatPrograms`)."""
 
     def __init__(self, programs: SeatPrograms, batch: int, threads: int = 1) -> None:
         self.programs, self.batch, self.threads = programs, batch, threads
@@ -241,13 +247,13 @@ class Rows:
         self._brought = results
 
     def decide(self, actions: Array, over: Array, again: Array) -> None:
-        """One decision of each row: actions (B,) or (B, size), over and again (B,) bool."""
+        """Play one decision of each row: actions (B,) or (B, size), over and again (B,) bool."""
         given = self._decide.arguments
         given["action"][...], given["over"][...], given["again"][...] = actions, over, again
         self._play(self._decide)
 
-    def decide_alone(self, action: Any) -> tuple[Any, ...]:
-        """The decision of a single row; -> what ALONE names, as Python's numbers, its observation and its mask."""
+    def decide_alone(self, action: ArrayLike) -> tuple[Any, ...]:
+        """Play the decision of a single row; return the numbers that ALONE names, its observation and its mask."""
         call, advance, play, given, numbers, seen, mask = self._alone
         given[0] = action
         if advance is not None:
@@ -257,16 +263,16 @@ class Rows:
                 self._check(advance, self._step)
         if play():
             self._check(call, self._step)
-        self._last, self._brought, told = call, None, numbers()
-        self._k = told[2]
-        return *told, seen.copy(), None if mask is None else mask.copy()
+        self._last, self._brought, results = call, None, numbers()
+        self._k = results[2]
+        return *results, seen.copy(), None if mask is None else mask.copy()
 
     def _step(self) -> Array:
-        """The step before the decision of a single row."""
+        """Return the step before the decision of a single row."""
         return np.array([self._k]) if self._last is self._alone.call else self._last.results()["k"]
 
     def again_alone(self) -> tuple[Any, ...]:
-        """The next episode of a single row; -> as `decide_alone`, of a decision that brought nothing."""
+        """Begin the next episode of a single row; return a tuple as `decide_alone` does, without reward."""
         self.begin(np.ones(1, bool))
         new = self.brought
         mask = new["mask"][0].view(np.int8).copy() if "mask" in new else None  # the caller may write to it
@@ -283,13 +289,13 @@ class Rows:
         self._last, self._brought = call, None
 
     def _check(self, call: Call, k: Callable[[], Array]) -> None:
-        """Raise the error of a demand that did not hold, in a decision from steps k (B,) on; idle lanes may hold anything."""
+        """Raise the error of a failed demand in a decision from steps k (B,) on; idle lanes do not count."""
         demands = call.results()["demands"].reshape(call.steps, self.batch, -1)
         for step in np.flatnonzero(~demands.all(axis=(1, 2))):
             raise call.program.broken(demands[step], k() + step + (self.programs.between if call.program is self.programs.decide else 0))
 
     def begin(self, rows: Array, keys: Keys | None = None) -> None:
-        """Begin episodes in the rows (B,) bool: the next of their own, or those of keys, of as many rows."""
+        """Begin episodes in the rows (B,) bool: the next ones, or those of `keys`, one per row."""
         if keys is not None:
             where, state = np.flatnonzero(rows), self.state
             state.put_leaf("loop.keys.key", keys.key, where)
@@ -298,11 +304,11 @@ class Rows:
         self._play(self._begin)
 
     def held(self) -> dict[str, Array]:
-        """All that changes from step to step, by name: copies."""
+        """Return copies of all that changes from step to step, by name."""
         return {name: self.state.get_leaf(name) for name in leaves(self.programs.example)}
 
     def put(self, held: dict[str, Array]) -> None:
-        """What `held` gave, of the same number of rows."""
+        """Restore what `held` returned, for the same number of rows."""
         for name in leaves(self.programs.example):
             self.state.put_leaf(name, held[name])
         self.begin(np.zeros(self.batch, bool))

@@ -1,4 +1,4 @@
-"""`python -m tailgate`: the command line, where the scripts of an environment are not on the path."""
+"""`python -m tailgate`: run the command line where the scripts of an environment are not on the path."""
 
 from tailgate.cli import main
 

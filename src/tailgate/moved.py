@@ -1,4 +1,4 @@
-"""Import paths of earlier releases: they lead to the modules of today, with a DeprecationWarning. They go with the next release."""
+"""Import paths of the previous release: each forwards to its module with a DeprecationWarning. The next release removes them."""
 
 import sys
 import warnings
@@ -74,7 +74,7 @@ MOVED = _table()
 
 
 def now(name: str) -> str:
-    """Return where a module is today; empty where it has not moved."""
+    """Return the present name of a moved module; empty if it has not moved."""
     parts = name.split(".")
     for size in (3, 2):
         head = ".".join(parts[:size])
@@ -98,7 +98,7 @@ def former(package: str) -> Callable[[str], object]:
 
 
 class Forwarding(MetaPathFinder, Loader):
-    """Finds moved modules by their earlier names."""
+    """A finder of moved modules by their earlier names."""
 
     def find_spec(self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None) -> ModuleSpec | None:
         return ModuleSpec(fullname, self) if now(fullname) else None
@@ -109,4 +109,4 @@ class Forwarding(MetaPathFinder, Loader):
         sys.modules[name] = import_module(now(name))  # not a copy, which would register its components twice
 
 
-sys.meta_path.insert(0, Forwarding())  # before those that would load a copy from the folder
+sys.meta_path.insert(0, Forwarding())  # before finders that would load a copy from the folder

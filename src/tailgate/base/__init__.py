@@ -1,1 +1,1 @@
-"""Errors, files, locks, sizes, processes and plots, which every other room uses."""
+"""Errors, files, locks, sizes, processes and plots: the ground floor, which all other rooms use."""

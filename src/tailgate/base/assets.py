@@ -1,4 +1,4 @@
-"""What stands in a page: style sheets, scripts and templates that lie beside a module, and data."""
+"""Assets of a page: style sheets, scripts, templates and embedded data."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from markupsafe import Markup
 
 
 def asset(package: str, *names: str) -> str:
-    """The text of a package's files, one after the other."""
+    """Return the text of a package's files, one after the other."""
     return "".join(files(package).joinpath(name).read_text(encoding="utf-8") for name in names)
 
 
 def inline(package: str, *names: str) -> dict[str, Any]:
-    """A style sheet or script as it stands in the page, and its hash: the page's policy lets nothing else run."""
+    """Return the text of a style sheet or script and its hash; the page's security policy runs nothing else."""
     text = asset(package, *names)
     return {"text": Markup(text), "hash": base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}
 
 
-def embedded(data: Any) -> Markup:
-    """JSON for a script element: nothing in it can end the element or open another."""
+def embedded(data: object) -> Markup:
+    """Return JSON for a script element, escaped such that it cannot end the element or open another."""
     text = json.dumps(data, allow_nan=False, separators=(",", ":"))
     for char in "<>&\u2028\u2029":
         text = text.replace(char, f"\\u{ord(char):04x}")

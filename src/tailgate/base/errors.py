@@ -1,4 +1,4 @@
-"""The one error that a user's input raises."""
+"""The errors that bad input raises."""
 
 import difflib
 from collections.abc import Iterable, Mapping
@@ -6,7 +6,10 @@ from typing import Any
 
 
 class InputError(ValueError):
-    """Bad input: names the field, the value and what was expected, in one line. `row`: one of the batch that it is about, if it is."""
+    """Bad input: one line names the field, the value and the expectation.
+
+    `row` is the index of the episode in the batch that the error is about, or None.
+    """
 
     row: int | None = None
 
@@ -21,9 +24,10 @@ class InputError(ValueError):
 
 
 class UnknownArgument(InputError, TypeError):
-    """An argument that a constructor does not know: a TypeError too, whose words callers such as TorchRL look for.
+    """An argument that a constructor does not know.
 
-    Gymnasium raises it again as `type(error)(text)`, so one text is also taken.
+    It is a TypeError too, because callers such as TorchRL look for the words of one.
+    Gymnasium raises it again as `type(error)(text)`, so the constructor also takes one text.
     """
 
     def __init__(self, name: str, known: Iterable[str] | None = None) -> None:
@@ -44,25 +48,25 @@ def _cut(text: str, most: int) -> str:
 
 
 def _line(text: str) -> str:
-    """The text as a terminal may show it: in one line, and what would steer it written out."""
+    """Return the text in one line, with control characters written out, safe for a terminal."""
     return text if text.isprintable() else "".join(ch if ch.isprintable() else " " if ch.isspace() else repr(ch)[1:-1] for ch in text)
 
 
 class Killed(InputError):
-    """A process was killed from outside: what it had kept is there, and the same work can go on from it."""
+    """A worker process was killed from outside: finished work is kept, and the same command can continue from it."""
 
 
 class NotApplicable(InputError):
-    """A pairing of components that has no meaning: its rows are skipped, with the reason."""
+    """A pairing of components that has no meaning: the caller skips its rows and reports the reason."""
 
 
 def said(error: Exception) -> str:
-    """What an error says: of the operating system's the words alone, as whoever reports it names the file."""
+    """Return the words of an error; an OSError gives its reason alone, because the caller names the file."""
     return getattr(error, "strerror", None) or str(error)
 
 
 def wanted(found: Mapping[str, Any]) -> str:
-    """What was expected, from the first of a validator's errors."""
+    """Return the expectation in plain words, from the first error of a validator."""
     if found["type"] == "missing":
         return "a value: it is missing"
     if found["type"] == "tuple_type":
@@ -72,11 +76,11 @@ def wanted(found: Mapping[str, Any]) -> str:
 
 
 def unknown(field: str, name: object, known: Iterable[str]) -> InputError:
-    """An InputError for a name that does not exist: says the nearest that does, then all of them, which may be many."""
+    """Return an InputError for an unknown name: it suggests the nearest known name and lists them all."""
     return InputError(field, name, _among(name, sorted(known)))
 
 
 def _among(name: object, names: list[str]) -> str:
     near = difflib.get_close_matches(str(name)[:100], names, n=1, cutoff=0.5)
     head = f"one of these (did you mean {near[0]!r}?):" if near else "one of"
-    return f"{head} {', '.join(names)}" if names else "no name: there is none to choose from"
+    return f"{head} {', '.join(names)}" if names else "no name: none exists"

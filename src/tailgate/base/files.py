@@ -1,7 +1,8 @@
-"""Writing so that nothing is ever half written, and what was written survives a crash.
+"""Atomic writing: no file is ever half written, and a finished file survives a crash.
 
-A file is written beside its place, pushed to the disk, and renamed into its place; then the folder is pushed to the disk, or a loss of
-power could undo the rename. A process that is killed in between leaves the old file and a temporary one, which `sweep` removes.
+A writer fills a temporary file, flushes it to the disk, renames it over the target, and flushes the folder.
+Without the last flush, a loss of power could undo the rename.
+A killed writer leaves the old file and a temporary one, which `sweep` removes.
 """
 
 import contextlib
@@ -15,10 +16,10 @@ from typing import IO
 
 from tailgate.base.errors import InputError
 
-TEMPORARY = ".tmp"  # what a file that is not yet in its place ends in
+TEMPORARY = ".tmp"  # suffix of temporary files
 
 step: Callable[[str, Path], None] | None = None
-"""For tests of faults: called before each write, fsync, rename and remove with that word and the path. None in use."""
+"""Hook for tests of faults: called with (word, path) before each write, fsync, rename and remove. None in use."""
 
 
 def _before(what: str, path: Path) -> None:
@@ -27,9 +28,9 @@ def _before(what: str, path: Path) -> None:
 
 
 def _sync(folder: Path) -> None:
-    """Push a folder's names to the disk."""
+    """Flush the names in a folder to the disk."""
     _before("fsync", folder)
-    with contextlib.suppress(OSError):  # some network file systems cannot; there the rename itself is all that can be had
+    with contextlib.suppress(OSError):  # some network file systems cannot flush a folder; the rename must do there
         handle = os.open(folder, os.O_RDONLY)
         try:
             os.fsync(handle)
@@ -46,9 +47,12 @@ def _make(folder: Path) -> None:
 
 @contextlib.contextmanager
 def replacing(path: Path, field: str = "out") -> Iterator[IO[bytes]]:
-    """A file to write, which takes the place of `path` in one step when the block ends; after an error nothing has changed.
+    """Open a file that replaces `path` in one step when the block ends; after an error, `path` is unchanged.
 
-    Raises InputError when it cannot be written.
+    Raises
+    ------
+    InputError
+        The path cannot be written; the error names `field`.
     """
     try:
         _make(path.parent)
@@ -75,33 +79,36 @@ def replacing(path: Path, field: str = "out") -> Iterator[IO[bytes]]:
 
 
 def write_atomic(path: Path, content: bytes, field: str = "out") -> None:
-    """Write a file in one step: readers see the old content or the new one. Raises InputError when it cannot be written."""
+    """Write a file in one step: readers see the old content or the new one. Raise InputError if it cannot be written."""
     with replacing(path, field) as file:
         file.write(content)
 
 
 def sweep(path: Path) -> None:
-    """Remove what a killed writer of `path` left beside it; of a directory, what the writers of any file in it left."""
+    """Remove the temporary files that killed writers of `path` left; for a directory, those of every file in it."""
     folder, name = (path, "*") if path.is_dir() else (path.parent, glob.escape(path.name))
     for left in folder.glob(f".{name}.*{TEMPORARY}"):
         remove(left)
 
 
 def remove(path: Path) -> None:
-    """Remove a file, if it is there."""
+    """Remove a file if it exists."""
     _before("remove", path)
     path.unlink(missing_ok=True)
 
 
 def _refused(field: str, path: Path, what: str, error: OSError) -> InputError:
-    """The error of what cannot be written: it names the file that stands where a directory has to be, if that is why."""
+    """Return the error for a path that cannot be written; it names a file that blocks a directory, if there is one."""
     if files := [str(above) for above in path.parents if os.path.isfile(above)]:
         return InputError(field, files[0], "a writable directory, not a file")
     return InputError(field, str(path), f"a writable {what} ({error.strerror})")
 
 
 def writable_directory(path: Path, field: str = "out", asked: Path | None = None) -> Path:
-    """The directory, made if needed; raises InputError when nothing can be written there. asked: what the user named, if not this."""
+    """Make the directory if needed and return it; raise InputError if it is not writable.
+
+    `asked` is the path that the user named, if it differs.
+    """
     try:
         _make(path)
         with tempfile.TemporaryFile(dir=path):
@@ -112,12 +119,12 @@ def writable_directory(path: Path, field: str = "out", asked: Path | None = None
 
 
 def aside(path: Path | str | None) -> set[str]:
-    """What was set aside for a file."""
+    """Return the paths of earlier versions that `set_aside` kept for a file."""
     return {str(earlier) for earlier in Path(path).parent.glob(f"{Path(path).name}.[0-9]*")} if path else set()
 
 
 def set_aside(path: Path, field: str = "out") -> Path:
-    """Rename a file or directory to name.1, name.2, ...: nothing is lost. Returns the new path."""
+    """Rename a file or directory to name.1, name.2, ... so that nothing is lost; return the new path."""
     number = next(n for n in itertools.count(1) if not path.with_name(f"{path.name}.{n}").exists())
     _before("rename", path)
     try:

@@ -1,4 +1,7 @@
-"""Packages of components: their modules are found by looking at the folder, and imported when somebody asks for what they define."""
+"""Packages that import their modules on first use: importing all would take longer than an environment's first step.
+
+The modules of components are found by looking at the folder.
+"""
 
 import re
 import sys
@@ -7,8 +10,26 @@ from functools import cache
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 _REGISTERED = re.compile(r'^@register\(\s*"(\w+)",\s*"([\w-]+)".*?^class (\w+)', re.MULTILINE | re.DOTALL)
+
+
+def exported(package: str, homes: dict[str, str]) -> tuple[Callable[[str], Any], list[str]]:
+    """Return a package's `__getattr__` and `__all__`.
+
+    `homes` maps each module to the names that it exports, separated by blanks.
+    """
+    where = {name: module for module, names in homes.items() for name in names.split()}
+
+    def get(name: str) -> Any:
+        if name not in where:
+            raise AttributeError(f"module {package!r} has no attribute {name!r}")
+        value = getattr(import_module(f"{package}.{where[name]}"), name)
+        setattr(sys.modules[package], name, value)
+        return value
+
+    return get, sorted(where)
 
 
 @cache
@@ -34,7 +55,7 @@ def homes(package: str) -> dict[str, str]:
     return {kind: module for module, text in texts(package).items() for _, _, kind in _REGISTERED.findall(text)}
 
 
-def exported(package: str, *others: str) -> tuple[Callable[[str], object], Callable[[], list[str]]]:
+def discovered(package: str, *others: str) -> tuple[Callable[[str], object], Callable[[], list[str]]]:
     """Return `__getattr__` and `__dir__` of a package that gives all its registered classes by name.
 
     others: classes and functions that the package gives too, each defined in one of its modules.

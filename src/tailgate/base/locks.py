@@ -1,7 +1,7 @@
-"""One command at a time writes to a place.
+"""Locks: only one command at a time writes to a place.
 
-The lock is the kernel's, on a hidden file next to the place: a process that dies, however it dies, holds nothing any more, and what is
-left of the file stops nobody.
+The kernel holds the lock, on a hidden file next to the place.
+The lock ends with its process, and a leftover file blocks nobody.
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ from tailgate.base.errors import InputError
 from tailgate.base.files import writable_directory
 
 SUFFIX = ".lock"
-_held: dict[tuple[str, int], int] = {}  # by place and thread: how often it is held here, as one command may consist of others
+_held: dict[tuple[str, int], int] = {}  # by place and thread: nesting depth, because one command may run others
 
 
 def lock_of(place: Path) -> Path:
-    """The file whose lock is the place's: next to it, as a directory may be set aside."""
+    """Return the lock file of a place; it is next to the place, because a directory may be renamed."""
     place = Path(os.path.abspath(place))
     return place.with_name(f".{place.name}{SUFFIX}")
 
 
 @contextlib.contextmanager
 def alone(place: Path, field: str = "out") -> Iterator[None]:
-    """Within it no other process writes to this file or directory, as far as it asks here too. Raises InputError where one does."""
+    """Exclude other tailgate processes from a file or directory within the block; raise InputError if one holds it."""
     key = str(lock_of(place)), threading.get_ident()
     if not _held.get(key):
         handle = _taken(place, field)
@@ -44,7 +44,7 @@ def alone(place: Path, field: str = "out") -> Iterator[None]:
 
 
 def _taken(place: Path, field: str) -> int | None:
-    """A handle that holds the lock; None where the file system has no locks."""
+    """Return a file handle that holds the lock, or None if the file system has no locks."""
     path = lock_of(place)
     while True:
         try:
@@ -54,8 +54,8 @@ def _taken(place: Path, field: str) -> int | None:
             continue
         except OSError:
             if not place.is_dir():
-                writable_directory(path.parent, field, place)  # says why
-            handle = os.open(place, os.O_RDONLY | os.O_CLOEXEC)  # a place whose surroundings are not ours
+                writable_directory(path.parent, field, place)  # raises the reason
+            handle = os.open(place, os.O_RDONLY | os.O_CLOEXEC)  # its parent folder is not writable: lock the directory itself
             path = place
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -73,7 +73,7 @@ def _taken(place: Path, field: str) -> int | None:
                     os.ftruncate(handle, 0)
                     os.pwrite(handle, f"{os.getpid()}\n".encode(), 0)
                 return handle
-        os.close(handle)  # whoever held it has just removed it
+        os.close(handle)  # the last holder has just removed it
 
 
 def _let_go(place: Path, handle: int | None) -> None:

@@ -1,24 +1,25 @@
-"""Results of slow functions of models, remembered."""
+"""A cache for slow functions of models."""
 
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from functools import wraps
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from tailgate.base.pytree import lock
 
-KEPT = 64  # results of a function
+KEPT = 64  # results per function
+M = TypeVar("M")
 T = TypeVar("T")
 
 
-def remembered(*fields: str) -> Callable[[Callable[[Any], T]], Callable[[Any], T]]:
-    """Decorate a function of one argument that depends on the argument's arrays of these names alone. Results are read-only."""
+def remembered(*fields: str) -> Callable[[Callable[[M], T]], Callable[[M], T]]:
+    """Decorate a function of one argument that depends only on the argument's arrays of these names. Results are read-only."""
 
-    def decorate(function: Callable[[Any], T]) -> Callable[[Any], T]:
-        known: OrderedDict[Any, T] = OrderedDict()
+    def decorate(function: Callable[[M], T]) -> Callable[[M], T]:
+        known: OrderedDict[Hashable, T] = OrderedDict()
 
         @wraps(function)
-        def called(held: Any) -> T:
+        def called(held: M) -> T:
             arrays = [getattr(held, name) for name in fields]
             key = tuple((array.shape, array.dtype.str, array.tobytes()) for array in arrays)
             if key not in known:

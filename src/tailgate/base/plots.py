@@ -1,4 +1,4 @@
-"""Pictures of an evaluation: what the position error says of each defence and attack, and what the gap says."""
+"""Plots of an evaluation: position errors and gaps, for each defence and attack."""
 
 from __future__ import annotations
 
@@ -7,28 +7,31 @@ import re
 import textwrap
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from tailgate.base.files import writable_directory, write_atomic
 from tailgate.base.pytree import Array
 
-Table = Sequence[dict[str, Any]]  # of summary.summarise
-PANELS = (  # key, title, colours; each darkens from harmless to harmful
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Table = Sequence[dict[str, Any]]  # from evaluation.summary.summarise
+PANELS = (  # key, title, colours from harmless to harmful
     ("rmse_position", "position RMSE [m], median", "Blues"),
     ("min_gap", "smallest gap [m], median", "Oranges_r"),
     ("crash", "episodes with a collision [%]", "Reds"),
 )
-NO_ROAD = (  # of systems that nothing drives in
+NO_ROAD = (  # for systems without a road
     ("rmse_position", "RMS of the state's error (2-norm), median", "Blues"),
     ("max_error", "largest error of an agent's state (2-norm), median", "Purples"),
 )
 MARKERS = "osD^v<>PX*phd"
 
 
-def canvas(width: float, height: float, rows: int = 1, columns: int = 1, **options: Any) -> tuple[Any, Any]:
-    """A matplotlib figure and its axes (rows, columns), without the global state of pyplot."""
+def canvas(width: float, height: float, rows: int = 1, columns: int = 1, **options: Any) -> tuple[Figure, Array]:
+    """Return a matplotlib figure and its axes (rows, columns), without the global state of pyplot."""
     try:
         from matplotlib.figure import Figure
     except ImportError as error:
@@ -37,15 +40,15 @@ def canvas(width: float, height: float, rows: int = 1, columns: int = 1, **optio
     return figure, figure.subplots(rows, columns, squeeze=False, **options)
 
 
-def png(figure: Any) -> bytes:
-    """The figure as a PNG file, the same bytes for the same figure."""
+def png(figure: Figure) -> bytes:
+    """Return the figure as a PNG file; equal figures give equal bytes."""
     out = io.BytesIO()
     figure.savefig(out, format="png", dpi=110, metadata={"Software": None})
     return out.getvalue()
 
 
 def write_overview(table: Table, directory: Path) -> list[Path]:
-    """One picture of matrices per scenario and dose, and one scatter over all that have a road; returns their paths."""
+    """Write matrices for each scenario and dose, and one scatter plot of all cells with a road; return the paths."""
     writable_directory(directory, "plot")
     good = [entry for entry in table if entry["crash"] is not None]
     out = []
@@ -62,14 +65,14 @@ def write_overview(table: Table, directory: Path) -> list[Path]:
 
 
 def value(entry: dict[str, Any], key: str) -> float:
-    """A figure of one cell as it is drawn; NaN where it has none."""
+    """Return a figure of one cell as it is drawn; NaN if the cell has none."""
     if key == "crash":
         return 100.0 * float(entry["crash"]["value"])
     return float(entry[key]["median"]) if entry[key] else float("nan")
 
 
 def matrices(table: Table, title: str) -> bytes:
-    """Defences x attacks, one above the other: position error, smallest gap, collisions; without a road the state's error alone."""
+    """Draw matrices of defences by attacks: position error, smallest gap, collisions; without a road, state errors."""
     panels = PANELS if any(entry["min_gap"] for entry in table) else NO_ROAD
     defences, attacks = (list(dict.fromkeys(e[key] for e in table)) for key in ("defence", "attack"))
     labels = [textwrap.fill(name.replace(",", ", "), 26) for name in attacks]
@@ -100,7 +103,7 @@ def _short(number: float) -> str:
 
 
 def scatter(table: Table) -> bytes:
-    """Position error against smallest gap, one mark a cell: filled where episodes collide."""
+    """Draw position error against smallest gap, one mark per cell; filled marks are cells where most episodes collide."""
     figure, axes = canvas(10.0, 5.8)
     ax, defences = axes[0, 0], list(dict.fromkeys(e["defence"] for e in table))
     for i, name in enumerate(defences):
@@ -116,7 +119,7 @@ def scatter(table: Table) -> bytes:
     ax.set_yticks(ticks, [str(tick) for tick in ticks])
     ax.set_ylim(min(-2.0, 1.2 * min(value(e, "min_gap") for e in table)), 120.0)
     ax.set(xscale="log", xlabel="position RMSE [m], median", ylabel="smallest gap [m], median (above 10 m: logarithmic)")
-    ax.set_title(f"What the error hides: rank correlation {_rank_correlation(table):+.2f}\nfilled: most episodes collide", fontsize=10)
+    ax.set_title(f"Error against gap: rank correlation {_rank_correlation(table):+.2f}\nfilled: most episodes collide", fontsize=10)
     ax.grid(alpha=0.3, which="both")
     figure.legend(loc="outside lower center", fontsize=8, ncols=3)
     return png(figure)

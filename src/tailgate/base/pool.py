@@ -1,7 +1,7 @@
 """Worker processes: spawned, never forked, and none outlives its parent.
 
-Each has a pipe to its parent, and there is no thread, queue or lock that they share: one that is killed, at whatever moment, takes its
-job with it and nothing else, and the parent never waits for what a dead one began to say.
+Each worker has a pipe to its parent; workers share no thread, queue or lock.
+A killed worker therefore loses its own job only, and the parent never waits for it.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ from tailgate.base import sizes
 from tailgate.base.errors import Killed
 
 R = TypeVar("R")
-ENDING = 5.0  # [s] that an idle worker may take to end, before it is killed
+ENDING = 5.0  # [s] for an idle worker to end before it is killed
 _SIGNALS = {signal.SIGINT, signal.SIGTERM}
 _crews: weakref.WeakSet[Crew] = weakref.WeakSet()
-_line: Any = None  # in a worker: the pipe to its parent
+_line: connection.Connection | None = None  # in a worker: the pipe to its parent
 
 
 class Remote(Exception):
-    """The traceback in a worker, as text: the cause of an error that came from there."""
+    """The traceback of an error in a worker, as text; it is the cause of the error that the parent raises."""
 
 
 class Answer(NamedTuple):
-    """What a worker says of a job. said: something in between; failed: an error; died: its process is no more."""
+    """A message from a worker about a job. said: a message before the end; failed: an error; died: the process is gone."""
 
     job: int
     word: Literal["said", "done", "failed", "died"]
@@ -43,15 +43,15 @@ class Answer(NamedTuple):
 
 
 class _Worker:
-    """A process and our end of its pipe."""
+    """A process and the parent's end of its pipe."""
 
     def __init__(self) -> None:
         self.pipe, theirs = multiprocessing.Pipe()
         self.job: int | None = None
-        # a daemon: no exit of an interpreter waits for one that waits for work
+        # a daemon, so that an idle worker does not delay the parent's exit
         self.process = multiprocessing.get_context("spawn").Process(target=_serve, args=(theirs, list(sys.path)), daemon=True)
-        resource_tracker.ensure_running()  # it would let the signals through again
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)  # inherited: a terminal's interrupt is for us alone
+        resource_tracker.ensure_running()  # started later, it would unblock the signals
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)  # inherited: a terminal's interrupt reaches the parent only
         try:
             self.process.start()
         finally:
@@ -59,7 +59,7 @@ class _Worker:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
     def end(self, seconds: float) -> None:
-        """Close the pipe, upon which an idle one ends; kill one that still runs after these seconds."""
+        """Close the pipe, which ends an idle worker; kill a worker that still runs after `seconds`."""
         self.pipe.close()
         self.process.join(seconds)
         if self.process.is_alive():
@@ -68,7 +68,7 @@ class _Worker:
 
 
 class Crew:
-    """As many processes as there are jobs at a time, and at most so many; within `with`, after which none is left."""
+    """A context manager of up to `most` worker processes, started as jobs come; none is left after the block."""
 
     def __init__(self, most: int) -> None:
         self.most, self.workers = sizes.check("workers", most), list[_Worker]()
@@ -78,16 +78,16 @@ class Crew:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        if kind is not None:  # an interrupt does not wait for what is still to play
+        if kind is not None:  # an interrupt does not wait for running jobs
             self.kill()
         for worker in self.workers:
             worker.end(ENDING)
         self.workers.clear()
 
     def kill(self) -> None:
-        """End all of them at once, whatever they do."""
+        """Kill all workers at once."""
         for worker in list(self.workers):
-            with contextlib.suppress(ValueError, AttributeError):  # one that has not begun, or was cleared away
+            with contextlib.suppress(ValueError, AttributeError):  # not started, or already removed
                 worker.process.kill()
 
     @property
@@ -98,17 +98,17 @@ class Crew:
     def free(self) -> bool:
         return len(self.busy) < self.most
 
-    def give(self, job: int, function: Callable[..., Any], *arguments: Any) -> None:
-        """Have a free one call function(*arguments), as the job of this number."""
+    def give(self, job: int, function: Callable[..., object], *arguments: object) -> None:
+        """Let a free worker call function(*arguments), as job number `job`."""
         idle = next((worker for worker in self.workers if worker.job is None), None)
         if idle is None:
             self.workers.append(idle := _Worker())
         idle.job = job
-        with contextlib.suppress(BrokenPipeError):  # it has died: `wait` finds that
+        with contextlib.suppress(BrokenPipeError):  # it has died: `wait` reports that
             idle.pipe.send((function, arguments))
 
     def wait(self) -> list[Answer]:
-        """What has come in, as soon as there is something."""
+        """Wait until at least one message arrives; return all that have arrived."""
         found = []
         held = {worker.pipe: worker for worker in self.busy}
         for pipe in connection.wait(list(held)):
@@ -134,10 +134,11 @@ class Crew:
 def each(
     function: Callable[..., R], jobs: Sequence[tuple[Any, ...]], workers: int, died: Callable[[int], R] | None = None
 ) -> Generator[tuple[int, R]]:
-    """(number, function(*job)) of each job, as they are done, by so many workers; an error of one ends all.
+    """Run function(*job) for each job in `workers` processes; yield (number, result) as they finish.
 
-    A job whose process dies is done once more, by itself: memory may have been short for several. Where that dies too,
-    died(number), or, without that, Killed is raised.
+    An error in one job ends them all.
+    If a worker dies, its job runs once more alone, because memory may have been short for several.
+    If it dies again, the result is died(number); without `died`, raise Killed.
     """
     lost = []
     with Crew(workers) as crew:
@@ -165,22 +166,23 @@ def each(
 
 
 def kill_all() -> None:
-    """End every worker of this process at once: it is about to end itself."""
+    """Kill all workers of this process, because it is about to end."""
     for crew in list(_crews):
         crew.kill()
 
 
-def say(value: Any) -> None:
-    """In a worker: tell the parent something of the job in hand."""
+def say(value: object) -> None:
+    """Send the parent a message about the current job. Call it in a worker only."""
+    assert _line is not None
     _line.send(("said", value))
 
 
 def _serve(pipe: connection.Connection, path: list[str]) -> None:
-    """What a worker does: one job after another, until its parent closes the pipe."""
+    """Run jobs one after another until the parent closes the pipe."""
     global _line
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, _SIGNALS)
-    sys.path[:] = path  # a submission's module is found where the parent found it
+    sys.path[:] = path  # the worker finds a submission's module where the parent found it
     threading.Thread(target=_end_with_parent, daemon=True).start()
     _line = pipe
     with contextlib.suppress(EOFError, ConnectionError):
@@ -193,7 +195,7 @@ def _answer(pipe: connection.Connection) -> None:
         function, arguments = pipe.recv()
     except (EOFError, ConnectionError):
         raise
-    except Exception as error:  # such as a class that is not found here
+    except Exception as error:  # for example, a class that is not importable here
         pipe.send(("failed", _portable(error)))
         return
     try:
@@ -204,17 +206,17 @@ def _answer(pipe: connection.Connection) -> None:
 
 
 def _portable(error: Exception) -> tuple[Exception, str]:
-    """An error as it can cross to another process, and its traceback."""
+    """Return an error that can be pickled for another process, and its traceback."""
     text = "".join(traceback.format_exception(error))
     try:
-        connection._ForkingPickler.dumps(copy.copy(error))  # type: ignore[attr-defined] # some cannot be made again from what they hold
+        connection._ForkingPickler.dumps(copy.copy(error))  # type: ignore[attr-defined] # some cannot be rebuilt
     except Exception:
         error = RuntimeError(f"{type(error).__name__}: {error}")
     return error, text
 
 
 def _end_with_parent() -> None:
-    """A parent that is killed tells nobody: its workers would play on for nobody."""
+    """Exit when the parent dies: a killed parent cannot stop its workers."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()

@@ -1,4 +1,4 @@
-"""Progress of long work on standard error: a bar on a terminal, a line per tenth elsewhere."""
+"""Progress of long work on standard error: a bar on a terminal, one line per tenth elsewhere."""
 
 import sys
 from collections.abc import Callable, Iterator
@@ -12,7 +12,7 @@ Update = Callable[[str, int, int, str], None]  # label, done, total, figures
 
 @contextmanager
 def progress(shown_on: Console) -> Iterator[Update]:
-    """Yields update(label, done, total, figures); each label is a bar of its own."""
+    """Yield a function update(label, done, total, figures); each label has one bar."""
     if not shown_on.is_terminal:
         shown: dict[str, int] = {}
 
@@ -39,10 +39,10 @@ def progress(shown_on: Console) -> Iterator[Update]:
 
 
 def cells(done: int, total: int) -> str:
-    """How far an evaluation is, beside its bar."""
+    """Return the words next to the bar of an evaluation."""
     return f"{done} of {total} cells"
 
 
 def console() -> Console:
-    """Standard output: as wide as the terminal, and wide enough for whole cells where there is none."""
+    """Return the console of standard output: as wide as the terminal, or 160 columns without one."""
     return Console(width=None if sys.stdout.isatty() else 160)

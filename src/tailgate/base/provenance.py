@@ -1,4 +1,4 @@
-"""What figures were made on: the processor and the source."""
+"""Provenance of figures: the processor and the commit of the source."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from tailgate.base.version import FOLDER
 
 
 def cpuinfo(key: str) -> str:
-    """What Linux says of the first processor; empty elsewhere."""
+    """Return the first value of a key in Linux's /proc/cpuinfo; empty on other systems."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:
@@ -20,17 +20,17 @@ def cpuinfo(key: str) -> str:
 
 
 def processor() -> str:
-    """The processor's name."""
+    """Return the processor's name."""
     return cpuinfo("model name") or platform.processor() or "unknown"
 
 
 def cores() -> int:
-    """Processors that this process may run on."""
+    """Return the number of processors that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def commit() -> str | None:
-    """The commit of the source, marked where files differ from it; None outside of a repository."""
+    """Return the commit of the source, marked if tracked files have changed; None outside a repository."""
 
     def asked(*words: str) -> str:
         command = ["git", "--no-optional-locks", "-C", str(FOLDER.resolve()), *words]

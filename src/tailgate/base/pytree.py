@@ -1,29 +1,31 @@
-"""Walks over states: nested NamedTuples and mappings whose leaves are arrays with B first, or None."""
+"""Operations on pytrees: nested NamedTuples and mappings whose leaves are arrays (B, ...), or None."""
 
 import copy
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[Any]
+T = TypeVar("T")
 
 
-def map_leaves(function: Callable[..., Any], tree: Any, *others: Any) -> Any:
-    """The tree with `function` applied to its leaves, several trees of one shape side by side."""
-    if tree is None:
-        return None
+def map_leaves(function: Callable[..., object], tree: T, *others: Any) -> T:
+    """Return the tree with `function` applied to its leaves and to the same leaves of `others`."""
+    out: Any = None
     if isinstance(tree, dict):
-        return {key: map_leaves(function, branch, *(other[key] for other in others)) for key, branch in tree.items()}
-    if isinstance(tree, tuple):
+        out = {key: map_leaves(function, branch, *(other[key] for other in others)) for key, branch in tree.items()}
+    elif isinstance(tree, tuple):
         parts = [map_leaves(function, *branches) for branches in zip(tree, *others, strict=True)]
-        return type(tree)(*parts) if hasattr(tree, "_fields") else tuple(parts)
-    return function(tree, *others)
+        out = type(tree)(*parts) if hasattr(tree, "_fields") else tuple(parts)
+    elif tree is not None:
+        out = function(tree, *others)
+    return cast(T, out)
 
 
-def rebuilt(like: Any) -> Callable[[Iterator[Any]], Any]:
-    """Return a function that builds a tree shaped as `like` from an iterator of leaves, in less time than `map_leaves` takes."""
+def rebuilt(like: object) -> Callable[[Iterator[Any]], Any]:
+    """Return a function that builds a tree shaped as `like` from an iterator of leaves; it is faster than `map_leaves`."""
     if like is None:
         return lambda leaves: None
     if isinstance(like, dict):
@@ -35,8 +37,8 @@ def rebuilt(like: Any) -> Callable[[Iterator[Any]], Any]:
     return next
 
 
-def put_rows(tree: Any, rows: Array, fresh: Any) -> Any:
-    """A copy of the tree with `rows` (R,) replaced by the leaves of `fresh`, which have R rows."""
+def put_rows(tree: T, rows: Array, fresh: T) -> T:
+    """Return a copy of the tree whose `rows` (R,) hold the leaves (R, ...) of `fresh`."""
 
     def put(leaf: Array, new: Array) -> Array:
         out = leaf.copy(order="K")
@@ -46,8 +48,8 @@ def put_rows(tree: Any, rows: Array, fresh: Any) -> Any:
     return map_leaves(put, tree, fresh)
 
 
-def frozen(tree: Any) -> Any:
-    """The tree with read-only views of its leaves: what others are shown of a state."""
+def frozen(tree: T) -> T:
+    """Return the tree with read-only views of its leaves."""
 
     def lock(leaf: Array) -> Array:
         out = leaf.view()
@@ -57,39 +59,38 @@ def frozen(tree: Any) -> Any:
     return map_leaves(lock, tree)
 
 
-def duplicate(tree: Any) -> Any:
-    """A copy that shares nothing, objects inside of arrays included."""
+def duplicate(tree: T) -> T:
+    """Return a deep copy, including objects inside arrays."""
     return map_leaves(lambda leaf: copy.deepcopy(leaf) if leaf.dtype == object else leaf.copy(order="K"), tree)
 
 
-def leaves(tree: Any, prefix: str = "") -> dict[str, np.ndarray]:
-    """Every leaf by its dotted name."""
+def leaves(tree: object, prefix: str = "") -> dict[str, Array]:
+    """Return the leaves by dotted name."""
     if tree is None:
         return {}
     if isinstance(tree, (tuple, dict)):
         names = tree if isinstance(tree, dict) else getattr(tree, "_fields", range(len(tree)))
-        out: dict[str, np.ndarray] = {}
+        out: dict[str, Array] = {}
         for name, branch in zip(names, tree.values() if isinstance(tree, dict) else tree, strict=True):
             out |= leaves(branch, f"{prefix}{name}.")
         return out
-    return {prefix[:-1]: tree}
+    return {prefix[:-1]: cast(Array, tree)}
 
 
-def with_leaves(tree: Any, values: dict[str, np.ndarray], prefix: str = "") -> Any:
-    """The tree with its leaves replaced by name, as `leaves` names them; their memory layout is kept."""
-    if tree is None:
-        return None
-    if isinstance(tree, tuple):
-        names = getattr(tree, "_fields", range(len(tree)))
-        parts = [with_leaves(branch, values, f"{prefix}{name}.") for name, branch in zip(names, tree, strict=True)]
-        return type(tree)(*parts) if hasattr(tree, "_fields") else tuple(parts)
-    out = tree.copy(order="K")
-    out[...] = values[prefix[:-1]]
-    return out
+def with_leaves(tree: T, values: dict[str, Array], prefix: str = "") -> T:
+    """Return the tree with its leaves replaced by name, as `leaves` names them; their memory layout is kept."""
+    names = iter(leaves(tree, prefix))
+
+    def put(leaf: Array) -> Array:
+        out = leaf.copy(order="K")
+        out[...] = values[next(names)]
+        return out
+
+    return map_leaves(put, tree)
 
 
-def lock(plan: Any) -> Any:
-    """The plan with every array in it made read-only, in place: constants are shared by all episodes, and by whoever looks."""
+def lock(plan: T) -> T:
+    """Make every array of a plan read-only, in place, because all episodes share it; return the plan."""
     if isinstance(plan, np.ndarray):
         plan.flags.writeable = False
     elif isinstance(plan, (tuple, list)):

@@ -1,6 +1,6 @@
-"""Files that somebody else wrote: one reader for each format, bounded in size, depth and numbers. Nothing that is read is executed.
+"""Readers of untrusted files, one per format, with limits on size, depth and numbers. They execute nothing.
 
-They raise OSError where a file cannot be read or is too large, and ValueError, in words, for content that is not of the format.
+They raise OSError if a file is unreadable or too large, and ValueError for malformed content.
 """
 
 from __future__ import annotations
@@ -19,22 +19,22 @@ from typing import Any, NoReturn
 import yaml
 from safetensors import SafetensorError
 
-LARGEST = 64 << 20  # bytes of a JSON, CSV or JSON Lines file that is read as a whole
-YAML = 256 << 10  # bytes of a YAML file: its reader takes seconds for so many
-NODES = 100_000  # values of a YAML file, those of an alias counted wherever it is used
-TENSORS = 4 << 30  # bytes of a file of tensors: what a checkpoint with a replay buffer may take
-LINE = 4 << 20  # bytes of a line of JSON
-ROWS = 8_000_000_000  # bytes of rows in a compressed file
-FREE, RATIO = 16 << 20, 200  # bytes that a compressed file may hold anyway, and above it so many for each byte: rows hold hashes
-DICTIONARY = 256 << 20  # bytes that unpacking may need
-DEPTH = 64  # of lists and mappings in each other
+LARGEST = 64 << 20  # [bytes] of a JSON, CSV or JSON Lines file that is read as a whole
+YAML = 256 << 10  # [bytes] of a YAML file; parsing this much takes seconds
+NODES = 100_000  # values of a YAML file; an alias counts each time it is used
+TENSORS = 4 << 30  # [bytes] of a file of tensors, such as a checkpoint with a replay buffer
+LINE = 4 << 20  # [bytes] of a line of JSON
+ROWS = 8_000_000_000  # [bytes] of unpacked rows of a compressed file
+FREE, RATIO = 16 << 20, 200  # [bytes] that every file may unpack to, and the largest ratio above that: hashes do not compress
+DICTIONARY = 256 << 20  # [bytes] of memory for unpacking
+DEPTH = 64  # of nested lists and mappings
 DIGITS = 200  # of a number in a YAML file
 LARGEST_FLOAT = int(sys.float_info.max)
 _PIECE = 1 << 20
 
 
 def read_bytes(path: Path, most: int = LARGEST) -> bytes:
-    """The content of a file of at most so many bytes, also of a pipe or a device."""
+    """Return the content of a file, pipe or device of at most `most` bytes."""
     held = bytearray()
     for piece in _pieces(path):
         held += piece
@@ -54,9 +54,9 @@ def _opened(path: Path) -> Any:
 
 
 def parse_json(content: bytes | str, strict: bool = True) -> Any:
-    """Read JSON text. Refused are keys that are there twice, deep nesting and whole numbers that no float holds.
+    """Read JSON text; refuse duplicate keys, deep nesting, and whole numbers too large for a float.
 
-    strict: also NaN, infinity and halves of characters, which Python writes where nobody forbids it.
+    `strict` also refuses NaN, infinity and lone surrogates, which Python's writer allows by default.
     """
     text = content.decode("utf-8") if isinstance(content, bytes) else content
     rules: dict[str, Any] = {"object_pairs_hook": _once}
@@ -67,7 +67,7 @@ def parse_json(content: bytes | str, strict: bool = True) -> Any:
     except RecursionError:
         raise _deep() from None
     _checked(data, strict)
-    if strict and (r"\ud" in text or r"\uD" in text):  # half of a character, which nothing can write
+    if strict and (r"\ud" in text or r"\uD" in text):  # a lone surrogate, which cannot be encoded
         json.dumps(data, ensure_ascii=False).encode()
     return data
 
@@ -81,21 +81,21 @@ def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     out = dict(pairs)
     if len(out) != len(pairs):
         names = [key for key, _ in pairs]
-        raise ValueError(f"the key {next(key for key in names if names.count(key) > 1)[:100]!r} is there twice")
+        raise ValueError(f"the key {next(key for key in names if names.count(key) > 1)[:100]!r} appears twice")
     return out
 
 
 def _no_number(constant: str) -> NoReturn:
-    raise ValueError(f"{constant} is no number of JSON")
+    raise ValueError(f"{constant} is not a JSON number")
 
 
 def _deep() -> ValueError:
     return ValueError(f"lists and mappings nested more than {DEPTH} deep")
 
 
-def _checked(data: Any, strict: bool) -> None:
-    """Raise ValueError where lists and mappings are nested too deep, or a number is one that no float holds."""
-    held = [data]
+def _checked(data: object, strict: bool) -> None:
+    """Raise ValueError for deep nesting or a number too large for a float."""
+    held: list[Any] = [data]
     for _ in range(DEPTH + 1):
         for value in held:
             kind = type(value)
@@ -112,7 +112,10 @@ def _checked(data: Any, strict: bool) -> None:
 
 
 def lines_of(path: Path) -> Iterator[bytes]:
-    """The lines of a file, of one whose name ends in .xz unpacked, with their ends. Raises EOFError for a compressed file that was cut."""
+    """Yield the lines of a file with their line ends; unpack a file named *.xz.
+
+    Raises EOFError if a compressed file is truncated.
+    """
     rest = b""
     for piece in _unpacked(path) if path.suffix == ".xz" else _pieces(path):
         *whole, rest = (rest + piece).split(b"\n")
@@ -131,12 +134,12 @@ def _pieces(path: Path) -> Iterator[bytes]:
 
 
 def _unpacked(path: Path) -> Iterator[bytes]:
-    """The content of a compressed file, piece by piece; of several such files one behind the other, of all of them."""
+    """Yield the unpacked content of a file of one or more concatenated xz streams, piece by piece."""
     read, out, reader, begun = 0, 0, lzma.LZMADecompressor(memlimit=DICTIONARY), False
     for packed in _pieces(path):
         read += len(packed)
         while packed or (begun and not reader.eof and not reader.needs_input):
-            if reader.eof:  # another one follows, or zeros up to a multiple of four
+            if reader.eof:  # another stream follows, or zero padding up to a multiple of four
                 packed = packed.lstrip(b"\0")
                 if not packed:
                     break
@@ -145,22 +148,22 @@ def _unpacked(path: Path) -> Iterator[bytes]:
             packed = reader.unused_data
             out += len(piece)
             if out > ROWS or out > FREE + RATIO * read:
-                raise OSError(errno.EFBIG, f"{out} bytes or more in {read}, which are no rows")
+                raise OSError(errno.EFBIG, f"{read} bytes that unpack to {out} or more: rows do not compress that well")
             yield piece
     if not reader.eof:
-        raise EOFError("the file was cut")
+        raise EOFError("the file is truncated")
 
 
 # -- YAML
 
 
 class _Plain(yaml.SafeLoader):
-    """A safe loader of JSON's kinds of values. A key that is there twice is refused: the first value would be lost without a word."""
+    """A safe loader of the kinds of values that JSON has; it refuses duplicate keys."""
 
     def __init__(self, text: str) -> None:
         super().__init__(text)
         self.depth = 0
-        self.sizes: dict[int, int] = {}  # values below each node, the node among them
+        self.sizes: dict[int, int] = {}  # number of values in each node, itself included
 
     def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
         event, alias = self.peek_event(), self.check_event(yaml.AliasEvent)  # type: ignore[no-untyped-call]
@@ -171,7 +174,7 @@ class _Plain(yaml.SafeLoader):
         self.depth -= 1
         if node is not None and not alias:
             self.sizes[id(node)] = 1 + self._below(node)
-        if node is None or self.sizes.get(id(node), NODES + 1) > NODES:  # an alias within what it names has no size yet
+        if node is None or self.sizes.get(id(node), NODES + 1) > NODES:  # an alias inside its own anchor has no size yet
             what = "an alias that is part of itself" if alias and id(node) not in self.sizes else f"more than {NODES} values"
             raise yaml.composer.ComposerError(None, None, what, event.start_mark)
         if isinstance(node, yaml.ScalarNode) and node.tag.endswith((":int", ":float")) and len(node.value) > DIGITS:
@@ -187,15 +190,15 @@ class _Plain(yaml.SafeLoader):
         seen = set()
         for key, _ in node.value if isinstance(node, yaml.MappingNode) else ():
             if key.tag != "tag:yaml.org,2002:merge" and isinstance(key.value, str) and key.value in seen:
-                raise yaml.constructor.ConstructorError(None, None, f"the key {key.value[:100]!r} is there twice", key.start_mark)
+                raise yaml.constructor.ConstructorError(None, None, f"the key {key.value[:100]!r} appears twice", key.start_mark)
             if isinstance(key.value, str):
                 seen.add(key.value)
         return super().construct_mapping(node, deep)
 
     def no_value(self, node: yaml.Node) -> NoReturn:
-        """Refuse what JSON has no value for, such as a date."""
+        """Refuse a value that JSON cannot express, such as a date."""
         kind = str(node.tag).rpartition(":")[2][:100]
-        raise yaml.constructor.ConstructorError(None, None, f"a {kind} where a text, a number, a list or a mapping may be", node.start_mark)
+        raise yaml.constructor.ConstructorError(None, None, f"a {kind} instead of a text, number, list or mapping", node.start_mark)
 
 
 _KINDS = {f"tag:yaml.org,2002:{kind}" for kind in ("null", "bool", "int", "float", "str", "seq", "map")}
@@ -203,7 +206,7 @@ _Plain.yaml_constructors = {tag: made for tag, made in yaml.SafeLoader.yaml_cons
 
 
 def parse_yaml(text: str) -> Any:
-    """Read YAML text. Refused are keys that are there twice, deep nesting, aliases that unfold to much, and kinds that JSON has not."""
+    """Read YAML text; refuse duplicate keys, deep nesting, large aliases, and kinds of values that JSON lacks."""
     if len(text) > YAML:
         raise ValueError(f"more than {YAML} characters")
     return copy.deepcopy(_parsed(text))
@@ -226,10 +229,10 @@ def load_yaml(path: Path) -> Any:
 
 
 def tensors_of(blob: bytes, load: Callable[[bytes], dict[str, Any]]) -> tuple[dict[str, Any], dict[str, str]]:
-    """The tensors of a safetensors file, as `load` makes them, and its metadata."""
+    """Return the tensors of a safetensors file, as `load` makes them, and its metadata."""
     try:
         tensors = load(blob)
-    except (SafetensorError, KeyError, TypeError, OverflowError, RuntimeError) as error:  # also numbers that there is no type for
+    except (SafetensorError, KeyError, TypeError, OverflowError, RuntimeError) as error:  # also for unknown number types
         raise ValueError(str(error)) from None
     length = int.from_bytes(blob[:8], "little")
     return tensors, parse_json(blob[8 : 8 + length]).get("__metadata__") or {}

@@ -1,7 +1,7 @@
-"""Sizes: the most that may be asked for, what it takes, and a word before something long begins.
+"""Limits of sizes, estimates of memory, and an announcement before long work.
 
-A size is refused above its limit in LIMITS, and where it would take more memory than is free. Both happen in one line, before anything is
-made. The limits are far above what has been useful; they stop typing errors, such as a million for a thousand.
+A size above its entry in LIMITS, or above the free memory, is refused before anything is allocated.
+The limits are far above useful values; they stop typing errors, such as a million for a thousand.
 """
 
 from __future__ import annotations
@@ -24,22 +24,25 @@ Workers = Annotated[int, Field(ge=1, le=1024)]
 Seeds = Annotated[int, Field(ge=1, le=100_000)]  # trainings, one policy each
 Episodes = Annotated[int, Field(ge=1, le=10_000_000)]
 Steps = Annotated[int, Field(ge=1, le=100_000_000_000)]  # decisions of a training
-Rows = Annotated[int, Field(ge=1, le=10_000_000)]  # side by side, or in a sample: environments, rollouts, populations, batches
-Passes = Annotated[int, Field(ge=1, le=100_000)]  # of one thing in a row: epochs, rounds, gradient steps
+Rows = Annotated[int, Field(ge=1, le=10_000_000)]  # in parallel or in a sample: environments, rollouts, populations, batches
+Passes = Annotated[int, Field(ge=1, le=100_000)]  # repetitions: epochs, rounds, gradient steps
 Width = Annotated[int, Field(ge=1, le=100_000)]  # of a layer
 
-WORKER = 150e6  # [bytes] of a process that plays
-ROW = 9e3  # [bytes] of a row of an episode, as it is held
-ENVIRONMENT = 1.2e3  # [bytes] of an environment in a batch, apart from its matrices
-EPISODES_A_SECOND, DECISIONS_A_SECOND = 5_000, 100_000  # at best, of a process
-LONG = 1800.0  # [s] above that it is said
+WORKER = 150e6  # [bytes] per worker process
+ROW = 9e3  # [bytes] per row in memory
+ENVIRONMENT = 1.2e3  # [bytes] per environment of a batch, without its matrices
+EPISODES_A_SECOND, DECISIONS_A_SECOND = 5_000, 100_000  # upper limits per process
+LONG = 1800.0  # [s] beyond which work is announced
 
 tell: Callable[[str], None] | None = None
-"""What is called with a sentence before something long begins; the command line prints it."""
+"""Hook called with a sentence before long work begins; the command line prints it."""
 
 
 def check(name: str, value: Any, field: str = "") -> int:
-    """The size, if it is a whole number from 1 to its limit; else raises InputError, which calls it `field` where that is given."""
+    """Return the size as an int; raise InputError unless it is a whole number from 1 to its limit.
+
+    The error names `field`, or else `name`.
+    """
     most = LIMITS[name]
     whole = not isinstance(value, bool) and hasattr(value, "__index__")
     if not whole or value < 1:
@@ -52,7 +55,7 @@ def check(name: str, value: Any, field: str = "") -> int:
 
 
 def free() -> float:
-    """Bytes of memory that may still be taken, as the system and a container's limit say; infinite where neither does."""
+    """Return the free memory [bytes] within the limits of the system and the container; infinite if unknown."""
     found = [float("inf")]
     with contextlib.suppress(OSError, StopIteration, ValueError, IndexError):
         lines = Path("/proc/meminfo").read_text().splitlines()
@@ -63,21 +66,21 @@ def free() -> float:
     return max(min(found), 0.0)
 
 
-def fits(needed: float, field: str, value: Any, what: str) -> None:
-    """Raise InputError where so many bytes are not free."""
+def fits(needed: float, field: str, value: object, what: str) -> None:
+    """Raise InputError if `needed` bytes are not free."""
     if needed > 1e8 and needed > (have := free()):
         raise InputError(field, value, f"less: {what} take about {needed / 1e9:,.1f} GB, and {have / 1e9:,.1f} GB of memory are free")
 
 
 def announce(seconds: float, needed: float, what: str) -> None:
-    """Say before it begins what takes long."""
+    """Announce long work before it begins."""
     if tell is not None and seconds > LONG:
         memory = f" and {needed / 1e9:,.1f} GB of memory" if needed > 1e9 else ""
         tell(f"{what} take at least {spoken(seconds)}{memory}, on a fast machine")
 
 
 def spoken(seconds: float) -> str:
-    """A span of time as people say it."""
+    """Return a duration [s] in words."""
     for unit, length in (("years", 31_557_600.0), ("days", 86_400.0), ("hours", 3600.0)):
         if seconds >= length:
             return f"{seconds / length:,.1f} {unit}"

@@ -1,4 +1,4 @@
-"""A fingerprint of everything that a result may depend on in this package: what was played by other sources is played again."""
+"""A fingerprint of all files that results may depend on: results of other sources are not reused."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ DATA = (".py", ".yaml", ".json", ".csv", ".safetensors")
 
 
 def fingerprint(root: Path) -> str:
-    """A hash of every file below `root`, names and contents, links followed."""
+    """Return a hash of the names and contents of all files below `root`, symbolic links followed."""
     found = [Path(folder) / name for folder, _, names in os.walk(root, followlinks=True) for name in names if name.endswith(DATA)]
     digest = hashlib.blake2b(digest_size=16)
     for path in sorted(found):
@@ -22,5 +22,5 @@ def fingerprint(root: Path) -> str:
 
 @functools.cache
 def own() -> str:
-    """Of this package, as it was when first asked."""
+    """Return the fingerprint of this package as it was at the first call."""
     return fingerprint(Path(__file__).parents[1])

@@ -1,4 +1,4 @@
-"""The version of the package, and where its files lie."""
+"""The version and the folder of the package."""
 
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path

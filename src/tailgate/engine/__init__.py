@@ -1,8 +1,8 @@
-"""The engine: plain array code runs once with traced arrays, and what it computes becomes machine code.
+"""The engine: it runs plain array code once with traced arrays, and compiles what that code computes to machine code.
 
-graph       what is computed for one episode, each value once
-array       traced arrays, with numpy's surface
-passes      what is needed, in which order, and what may be skipped
-llvm        machine code of this processor
-program     a function of trees of arrays, traced and compiled
+graph       the computation of one episode, each value once
+array       traced arrays, with numpy's interface
+passes      the order of the computation, and what may be skipped
+llvm        machine code for this processor
+program     a compiled function of pytrees of arrays
 """

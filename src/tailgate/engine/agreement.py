@@ -1,11 +1,11 @@
-"""Reasons why code is not traced, and the comparison of two engines."""
+"""Reasons why code cannot be traced, and the comparison of traced code with the plain loop."""
 
 from __future__ import annotations
 
 import traceback
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -16,25 +16,25 @@ from tailgate.engine.untraceable import Untraceable
 if TYPE_CHECKING:
     from tailgate.core.loop import Loop
 
-
-TRIED, ROWS = 24, 64  # steps and episodes in which fresh code is compared with the plain loop
+T = TypeVar("T")
+TRIED, ROWS = 24, 64  # steps and episodes in which new code is compared with the plain loop
 
 
 class Untraced(NamedTuple):
-    """Why the plain loop plays what somebody asked the engine for."""
+    """The reason why the plain loop runs instead of the engine."""
 
     why: str
 
 
 def check_open(loop: Loop) -> None:
-    """Raise TypeError for a defence that runs elsewhere or says itself why it cannot be traced."""
+    """Raise TypeError for a defence that runs in another process or declares itself untraceable."""
     defence = loop.defence
     if why := getattr(defence, "opaque", "") or getattr(defence, "untraced", ""):
         raise TypeError(f"the defence {type(defence).__name__} is not traced: {why}")
 
 
 def explained(error: Exception) -> str:
-    """Give the text of a failure, with the line of the code that was traced."""
+    """Return the text of a failure, with the line of the traced code."""
     if isinstance(error, Untraceable):
         return str(error)
     steps = traceback.extract_tb(error.__traceback__)
@@ -43,8 +43,8 @@ def explained(error: Exception) -> str:
     return f"{place}{type(error).__name__}: {' '.join(str(error).split())[:300]}"
 
 
-def raised(play: Callable[[], Any]) -> Any:
-    """Call, and return the result or the text of its InputError."""
+def raised(play: Callable[[], T]) -> T | str:
+    """Call `play`; return its result or the text of its InputError."""
     try:
         return play()
     except InputError as error:
@@ -52,7 +52,7 @@ def raised(play: Callable[[], Any]) -> Any:
 
 
 def same(got: Array, wanted: Array) -> bool:
-    """Equal to the bit, NaN's sign and payload apart."""
+    """Return True if both arrays are equal to the bit, except for the sign and payload of NaN."""
     if got.dtype != wanted.dtype or got.shape != wanted.shape or not np.array_equal(got, wanted, equal_nan=got.dtype.kind == "f"):
         return False
     return got.dtype.kind != "f" or bool(((np.signbit(got) == np.signbit(wanted)) | (got != got)).all())

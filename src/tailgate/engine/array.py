@@ -1,10 +1,8 @@
-"""Traced arrays: numpy's surface over the nodes of a graph.
+"""Traced arrays: numpy's interface over the nodes of a graph.
 
-The axis of the episodes has length one. Whatever code does along the other axes happens once, while it is traced: a matrix product becomes
-products and sums of numbers. Arrays that are the same for all episodes (`fixed`) may be asked for their values, as in a Python branch;
-of the others only the code's elementwise results are known.
-
-Types follow numpy's own rules: a Python number takes the type of the array that it meets.
+The episodes' axis has length one; work along the other axes is unrolled, such as a matrix product into products and sums.
+Code may read the values of `fixed` arrays, which all episodes share, as in a Python branch; of others only elementwise results.
+Types follow numpy's rules: a Python number takes the type of the array that it meets.
 """
 
 from __future__ import annotations
@@ -12,32 +10,34 @@ from __future__ import annotations
 import operator
 from collections.abc import Callable, Iterator, Sequence
 from types import SimpleNamespace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tailgate.engine.buffers import blended, swept, wide
+from tailgate.engine.buffers import blended, boxed, swept, wide
 from tailgate.engine.graph import Graph, Node
-from tailgate.engine.operations import BOOL, Array
+from tailgate.engine.operations import BOOL, Array, ArrayLike, Axis, DTypeLike
 from tailgate.engine.untraceable import Untraceable
 
 _ZERO = np.zeros((), np.int8)
+if TYPE_CHECKING:
+    _Base = np.ndarray[Any, np.dtype[Any]]
+else:
+    _Base = object
 
 
-class Traced:
-    """An array of nodes. `batch`: its axis of the episodes, None where it has none or nobody knows it; `weak`: it is a Python number."""
+class Traced(_Base):
+    """An array of nodes; `batch`: the index of the episodes' axis, or None; `weak`: the type of a Python number, or None."""
 
     __slots__ = ("batch", "dtype", "flags", "graph", "nodes", "weak")
-    __hash__ = None  # type: ignore[assignment]
+    __hash__ = None
     __array_priority__ = 1000.0
 
     def __init__(
         self, graph: Graph, nodes: Array, dtype: np.dtype[Any], batch: int | None = None, weak: type | None = None, writeable: bool = True
     ) -> None:
         self.graph, self.nodes, self.dtype, self.batch, self.weak = graph, nodes, dtype, batch, weak
-        self.flags = SimpleNamespace(writeable=writeable)  # as numpy's say it
-
-    # -- what it is
+        self.flags: Any = SimpleNamespace(writeable=writeable)  # like numpy's flags
 
     shape = property(lambda self: self.nodes.shape)
     ndim = property(lambda self: self.nodes.ndim)
@@ -46,32 +46,32 @@ class Traced:
 
     @property
     def strides(self) -> tuple[int, ...]:
-        """As if the numbers stood there."""
+        """Strides [bytes] as if the array held its numbers."""
         return tuple(s // self.nodes.itemsize * self.dtype.itemsize for s in self.nodes.strides)
 
     @property
     def fixed(self) -> bool:
-        """Is it the same for all episodes?"""
+        """True if the array is the same for all episodes."""
         return all(node.fixed for node in self.nodes.flat)
 
     def values(self) -> Array:
-        """The numbers of a fixed array."""
+        """Return the numbers of a fixed array."""
         return self.graph.ask(list(self.nodes.flat), self.dtype).reshape(self.shape)
 
     def nonzero_places(self) -> Array:
-        """Where the numbers of a fixed array are not zero."""
+        """Return where the numbers of a fixed array are not zero."""
         return self.graph.ask(list(self.nodes.flat), self.dtype, nonzero=True).reshape(self.shape)
 
     def known(self, what: str, instead: str) -> Array:
-        """The numbers of a fixed array, which code asks for in a way that no episode's own can answer."""
+        """Return the numbers of a fixed array; raise Untraceable with the advice `instead` if episodes differ."""
         if not self.fixed:
-            raise Untraceable(f"{what} of what each episode has its own of", instead)
+            raise Untraceable(f"{what} of numbers that differ between episodes", instead)
         return self.values()
 
     def __repr__(self) -> str:
         return f"Traced{self.shape} {self.dtype}{' fixed' if self.fixed else ''}"
 
-    def __array__(self, dtype: Any = None, copy: bool | None = None) -> Array:
+    def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> Array:
         return self.known("an array of numbers", "use numpy's elementwise functions, num.* or np.where").astype(dtype or self.dtype)
 
     def __len__(self) -> int:
@@ -93,12 +93,12 @@ class Traced:
         return round(float(self), digits)
 
     def item(self) -> Any:
-        """The only number."""
+        """Return the only number."""
         return self.known("item()", "keep the array").item()
 
     def tolist(self) -> Any:
-        """Nested lists of the numbers."""
-        return self.known("tolist()", "write a loop over what there can be, and np.where").tolist()
+        """Return nested lists of the numbers."""
+        return self.known("tolist()", "write a loop over all possible values, and np.where").tolist()
 
     def __iter__(self) -> Iterator[Any]:
         return (self[i] for i in range(len(self)))
@@ -106,7 +106,7 @@ class Traced:
     # -- the same nodes in another shape
 
     def _moved(self, move: Callable[[Any], Any], copied: bool = False) -> Traced:
-        """A view after a change of shape; a copy of the axis of the episodes goes the same way and shows where it comes to lie."""
+        """Return a view after a change of shape; the same change of a longer axis shows where the episodes' axis goes."""
         nodes, batch = move(self.nodes), None
         if not isinstance(nodes, np.ndarray):
             nodes = boxed(nodes)
@@ -118,24 +118,24 @@ class Traced:
             batch = there[0] if there else None
         return Traced(self.graph, nodes, self.dtype, batch, self.weak, copied or self.flags.writeable)
 
-    def transpose(self, *axes: Any) -> Traced:
-        """Axes in another order."""
+    def transpose(self, *axes: int | Sequence[int]) -> Traced:
+        """Permute the axes."""
         return self._moved(lambda a: a.transpose(*axes))
 
     def swapaxes(self, first: int, second: int) -> Traced:
-        """Two axes exchanged."""
+        """Exchange two axes."""
         return self._moved(lambda a: a.swapaxes(first, second))
 
     def squeeze(self, axis: int | tuple[int, ...]) -> Traced:
-        """Without axes of length one."""
+        """Remove axes of length one."""
         return self._moved(lambda a: a.squeeze(axis))
 
     def diagonal(self, offset: int = 0, axis1: int = 0, axis2: int = 1) -> Traced:
-        """The diagonal of two axes, as the last axis."""
+        """Return the diagonal of two axes, as the last axis."""
         return self._moved(lambda a: a.diagonal(offset, axis1, axis2))
 
-    def reshape(self, *shape: Any, order: Any = "C") -> Traced:
-        """Another shape, of which the axis of the episodes is the first or the last as it was."""
+    def reshape(self, *shape: Any, order: str = "C") -> Traced:
+        """Change the shape; the episodes' axis stays first or last."""
         new = tuple(shape[0]) if len(shape) == 1 and isinstance(shape[0], (tuple, list)) else shape
         nodes = self.nodes.reshape(new)
         if self.batch is None:
@@ -146,33 +146,33 @@ class Traced:
         raise Untraceable("a shape that puts episodes and other axes together", "keep the episodes as the first axis")
 
     def ravel(self) -> Traced:
-        """One axis."""
+        """Flatten to one axis."""
         return self.reshape(-1)
 
-    def copy(self, order: Any = None) -> Traced:
+    def copy(self, order: str = "K") -> Traced:
         """Copy the array."""
         return Traced(self.graph, self.nodes.copy(), self.dtype, self.batch, self.weak)
 
-    def view(self, dtype: Any = None) -> Traced:
-        """The same nodes; with another type of the same size, their bits."""
+    def view(self, dtype: DTypeLike | None = None) -> Traced:
+        """Return the same nodes; with another type of the same size, reinterpret their bits."""
         if dtype is None or np.dtype(dtype) == self.dtype:
             return Traced(self.graph, self.nodes, self.dtype, self.batch, self.weak, self.flags.writeable)
         to = np.dtype(dtype)
         return self.mapped(lambda node: self.graph.bits(node, to), to)
 
-    def astype(self, dtype: Any, order: Any = "K", casting: Any = "unsafe", copy: bool = True) -> Traced:
+    def astype(self, dtype: DTypeLike, order: str = "K", casting: str = "unsafe", copy: bool = True) -> Traced:
         """Convert to another type."""
         to = np.dtype(dtype)
         return self.copy() if to == self.dtype else self.mapped(lambda node: self.graph.cast(node, to), to)
 
-    def mapped(self, function: Callable[[Node], Node], dtype: Any = None) -> Traced:
-        """A function of each node."""
+    def mapped(self, function: Callable[[Node], Node], dtype: DTypeLike | None = None) -> Traced:
+        """Apply a function to each node."""
         return Traced(self.graph, each(self.graph, function, self.nodes), np.dtype(dtype or self.dtype), self.batch)
 
-    # -- places
+    # -- indexing
 
-    def _key(self, key: Any) -> tuple[Any, ...]:
-        """A key of numpy's, without traced arrays."""
+    def _key(self, key: object) -> tuple[Any, ...]:
+        """Return an index of numpy's without traced arrays."""
         parts = key if isinstance(key, tuple) else (key,)
         masks = "write np.where(mask, x, y) for all rows"
         return tuple(
@@ -181,11 +181,11 @@ class Traced:
             for part in parts
         )  # fmt: skip
 
-    def __getitem__(self, key: Any) -> Traced:
+    def __getitem__(self, key: object) -> Traced:
         plain = self._key(key)
         return self._moved(lambda a: a[plain])
 
-    def __setitem__(self, key: Any, value: Any) -> None:
+    def __setitem__(self, key: object, value: ArrayLike) -> None:
         if not self.flags.writeable:
             raise ValueError("assignment destination is read-only")
         graph = self.graph
@@ -204,42 +204,42 @@ class Traced:
 
     # -- numpy
 
-    def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **options: Any) -> Any:
+    def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: ArrayLike, **options: Any) -> Any:
         from tailgate.engine import ufuncs
 
         return ufuncs.called(self.graph, ufunc, method, inputs, options)
 
-    def __array_function__(self, function: Any, types: Any, args: Any, options: Any) -> Any:
+    def __array_function__(self, function: Callable[..., object], types: object, args: Sequence[Any], options: dict[str, Any]) -> Any:
         from tailgate.engine import functions
 
         return functions.called(self.graph, function, args, options)
 
-    def any(self, axis: Any = None, out: Any = None, keepdims: bool = False) -> Any:
-        """True where any is, along axes that are not the episodes'."""
+    def any(self, axis: Axis = None, out: None = None, keepdims: bool = False) -> Traced:
+        """Return True where any is true, along axes other than the episodes'."""
         return reduced(self.astype(bool), "or", axis, keepdims, "write `if num.some(mask):`, or name the axis")
 
-    def all(self, axis: Any = None, out: Any = None, keepdims: bool = False) -> Any:
-        """True where all are, along axes that are not the episodes'."""
+    def all(self, axis: Axis = None, out: None = None, keepdims: bool = False) -> Traced:
+        """Return True where all are true, along axes other than the episodes'."""
         return reduced(self.astype(bool), "and", axis, keepdims, "write `if num.every(mask):`, or name the axis")
 
-    def max(self, axis: Any = None, out: Any = None, keepdims: bool = False) -> Any:
-        """The largest along axes that are not the episodes'."""
+    def max(self, axis: Axis = None, out: None = None, keepdims: bool = False) -> Traced:
+        """Return the largest number along axes other than the episodes'."""
         return reduced(self, "or" if self.dtype == BOOL else "max", axis, keepdims)
 
-    def min(self, axis: Any = None, out: Any = None, keepdims: bool = False) -> Any:
-        """The smallest along axes that are not the episodes'."""
+    def min(self, axis: Axis = None, out: None = None, keepdims: bool = False) -> Traced:
+        """Return the smallest number along axes other than the episodes'."""
         return reduced(self, "and" if self.dtype == BOOL else "min", axis, keepdims)
 
-    def sum(self, axis: Any = None, dtype: Any = None, out: Any = None, keepdims: bool = False) -> Any:
-        """The sum of up to seven along an axis: numpy's order of more than that depends on their place in memory."""
+    def sum(self, axis: Axis = None, dtype: DTypeLike | None = None, out: None = None, keepdims: bool = False) -> Traced:
+        """Sum up to seven numbers along an axis; numpy's order for more depends on their layout in memory."""
         return reduced(summands(self, axis, dtype), "add", axis, keepdims)
 
-    def clip(self, low: Any, high: Any) -> Any:
-        """Within limits."""
+    def clip(self, low: ArrayLike, high: ArrayLike) -> Array:
+        """Limit to [low, high]."""
         return np.minimum(np.maximum(self, low), high)
 
-    def __pow__(self, exponent: Any) -> Any:
-        """Raise to 0.5, 1 or 2: for other exponents numpy calls a library, whose bits differ between machines."""
+    def __pow__(self, exponent: float) -> Array:
+        """Raise to 0.5, 1 or 2; for other exponents numpy calls a library whose bits differ between machines."""
         known = float(exponent)
         if known not in (0.5, 1.0, 2.0):
             raise Untraceable(f"the power {known}", "write products, or num.exp(p * num.log(x))")
@@ -247,20 +247,20 @@ class Traced:
 
 
 def _operators() -> None:
-    """Python's operators, each numpy's function: reflected and in place too."""
+    """Define Python's operators by numpy's functions, also reflected and in place."""
     pairs = {
         "add": np.add, "sub": np.subtract, "mul": np.multiply, "truediv": np.true_divide, "floordiv": np.floor_divide, "mod": np.remainder,
         "and": np.bitwise_and, "or": np.bitwise_or, "xor": np.bitwise_xor, "lshift": np.left_shift, "rshift": np.right_shift,
         "matmul": np.matmul,
     }  # fmt: skip
 
-    def plain(ufunc: Any) -> Callable[[Any, Any], Any]:
+    def plain(ufunc: np.ufunc) -> Callable[[Any, Any], Any]:
         return lambda self, other: ufunc(self, other)
 
-    def reflected(ufunc: Any) -> Callable[[Any, Any], Any]:
+    def reflected(ufunc: np.ufunc) -> Callable[[Any, Any], Any]:
         return lambda self, other: ufunc(other, self)
 
-    def in_place(ufunc: Any) -> Callable[[Any, Any], Any]:
+    def in_place(ufunc: np.ufunc) -> Callable[[Any, Any], Any]:
         return lambda self, other: ufunc(self, other, out=(self,))
 
     for name, ufunc in pairs.items():
@@ -274,18 +274,8 @@ def _operators() -> None:
         setattr(Traced, f"__{name}__", (lambda ufunc: lambda self: ufunc(self))(single))
 
 
-# -- of nodes
-
-
-def boxed(node: Any) -> Array:
-    """An array without axes that holds one node."""
-    out = np.empty((), object)
-    out[()] = node
-    return out
-
-
 def each(graph: Graph, function: Callable[..., Node], *arrays: Array) -> Array:
-    """A function of nodes for each place of arrays of them."""
+    """Apply a function of nodes at each index of the broadcast arrays."""
     shape = np.broadcast_shapes(*(a.shape for a in arrays))
     if wide(graph, *arrays):
         return swept(graph, function, shape, arrays)
@@ -294,8 +284,8 @@ def each(graph: Graph, function: Callable[..., Node], *arrays: Array) -> Array:
     return out
 
 
-def lifted(graph: Graph, x: Any, like: np.dtype[Any] | None = None) -> Traced:
-    """A traced array, or numbers as one: constants. A Python number gets the type `like`."""
+def lifted(graph: Graph, x: ArrayLike, like: np.dtype[Any] | None = None) -> Traced:
+    """Return x as a traced array; numbers become constants, and a Python number gets the type `like`."""
     if isinstance(x, Traced):
         return x
     weak = type(x) if type(x) in (bool, int, float) else None
@@ -310,7 +300,7 @@ def lifted(graph: Graph, x: Any, like: np.dtype[Any] | None = None) -> Traced:
 
 
 def shared_batch(arrays: Sequence[Traced]) -> int | None:
-    """The episodes' axis of what several arrays give together, counted from the last: -1 is the last."""
+    """Return the episodes' axis that several arrays share when broadcast, counted from the last (-1)."""
     found = {a.batch - a.ndim for a in arrays if a.batch is not None}
     if len(found) > 1:
         raise Untraceable("episodes against another axis", "give each array the episodes as its first axis, with None where one is missing")
@@ -318,14 +308,14 @@ def shared_batch(arrays: Sequence[Traced]) -> int | None:
 
 
 def elementwise(graph: Graph, function: Callable[..., Node], arrays: Sequence[Traced], dtype: np.dtype[Any]) -> Traced:
-    """A function of nodes for each place of several arrays."""
+    """Apply a function of nodes at each index of several arrays."""
     shared_batch(arrays)
     nodes = each(graph, function, *(a.nodes for a in arrays))
     return _of_all(graph, nodes, arrays, dtype)
 
 
 def _of_all(graph: Graph, nodes: Array, arrays: Sequence[Traced], dtype: np.dtype[Any]) -> Traced:
-    """The array of what was computed of several ones."""
+    """Wrap nodes computed from several arrays in a traced array."""
     back = shared_batch(arrays)
     if back is not None and nodes.shape[back] != 1:
         raise Untraceable("the axis of the episodes against a longer one", "give each array the episodes as its first axis")
@@ -334,17 +324,17 @@ def _of_all(graph: Graph, nodes: Array, arrays: Sequence[Traced], dtype: np.dtyp
 
 
 def typed(graph: Graph, x: Traced, dtype: np.dtype[Any]) -> Traced:
-    """x of a type."""
+    """Convert x to a type."""
     return x if x.dtype == dtype else x.mapped(lambda node: graph.cast(node, dtype), dtype)
 
 
 def result_type(arrays: Sequence[Traced]) -> np.dtype[Any]:
-    """The type of what may be any of several arrays."""
+    """Return numpy's common type of several arrays."""
     return np.result_type(*(a.weak(0) if a.weak else a.dtype for a in arrays))
 
 
-def chosen(where: Any, x: Any, y: Any, dtype: np.dtype[Any] | None = None) -> Traced:
-    """x where `where` holds, else y: np.where."""
+def chosen(where: ArrayLike, x: ArrayLike, y: ArrayLike, dtype: np.dtype[Any] | None = None) -> Traced:
+    """Return x where `where` is true, else y, as np.where does."""
     graph = next(a.graph for a in (where, x, y) if isinstance(a, Traced))
     mask, one, other = lifted(graph, where), lifted(graph, x), lifted(graph, y)
     to = dtype or result_type([one, other])
@@ -356,8 +346,8 @@ def chosen(where: Any, x: Any, y: Any, dtype: np.dtype[Any] | None = None) -> Tr
     return elementwise(graph, graph.select, arrays, to)
 
 
-def axes_of(x: Traced, axis: Any, instead: str) -> list[int]:
-    """The axes that a reduction names, which are none of the episodes'."""
+def axes_of(x: Traced, axis: Axis, instead: str) -> list[int]:
+    """Return the axes that a reduction names; raise Untraceable if the episodes' axis is among them."""
     if axis is None:
         if x.fixed or (x.batch is None and x.ndim == 0):
             return list(range(x.ndim))
@@ -368,19 +358,19 @@ def axes_of(x: Traced, axis: Any, instead: str) -> list[int]:
     return axes
 
 
-def summands(x: Traced, axis: Any, dtype: Any = None) -> Traced:
-    """x of the type that a sum has, where it is of few enough."""
+def summands(x: Traced, axis: Axis, dtype: DTypeLike | None = None) -> Traced:
+    """Return x in the type of its sum; raise Untraceable if it is too long to sum in a fixed order."""
     long = max((x.shape[a] for a in axes_of(x, axis, "name the axis")), default=0)
     if x.dtype.kind == "f" and long > 7:
         raise Untraceable(f"a sum of {long} numbers", "write num.dot, or a loop: numpy's order of them depends on their place in memory")
     return typed(x.graph, x, np.dtype(dtype or (np.int64 if x.dtype.kind in "bi" else x.dtype)))
 
 
-def reduced(x: Traced, op: str, axis: Any, keepdims: bool, instead: str = "name an axis that is not the episodes'") -> Any:
-    """x with axes put together by an operation, in ascending order."""
+def reduced(x: Traced, op: str, axis: Axis, keepdims: bool, instead: str = "name an axis that is not the episodes'") -> Traced:
+    """Reduce axes of x by an operation, in ascending order."""
     out = x
     for a in reversed(axes_of(x, axis, instead)):
-        parts = [out._moved(lambda n, a=a, i=i: n.take(i, a)) for i in range(out.shape[a])]  # type: ignore[misc]
+        parts = [out._moved(lambda n, a=a, i=i: n.take(i, a)) for i in range(out.shape[a])]
         if not parts and op not in ("and", "or", "add"):
             raise ValueError(f"zero-size array to reduction operation {op} which has no identity")
         if parts:
@@ -393,7 +383,7 @@ def reduced(x: Traced, op: str, axis: Any, keepdims: bool, instead: str = "name 
         out = held
     if keepdims:
         for a in axes_of(x, axis, instead):
-            out = out._moved(lambda n, a=a: np.expand_dims(n, a))  # type: ignore[misc]
+            out = out._moved(lambda n, a=a: np.expand_dims(n, a))
     return out[()] if out.ndim else out
 
 

@@ -1,4 +1,4 @@
-"""Code of more than an instruction: loops, routines, tables, and matrices that all episodes share."""
+"""Code for nodes of several instructions: loops, routines, tables, and matrices that all episodes share."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from tailgate.engine.passes import rounds, schedule
 if TYPE_CHECKING:
     from tailgate.engine.llvm import Column, Emitter
 
-ROWS = 10  # of a matrix that are summed at once
+ROWS = 10  # rows of a matrix that are summed at once
 
 
 def loop(e: Emitter, node: Node) -> None:
-    """Rounds until no lane goes on."""
+    """Emit a loop that runs until no lane continues."""
     body: Body = node.attr
     begin = [e.value(a) for a in node.args[: len(body.carried)]]
     for captured in {a.id: a for inner in (*body.nodes, *body.after) for a in (*inner.args, inner) if a.fixed}.values():
@@ -56,7 +56,7 @@ def loop(e: Emitter, node: Node) -> None:
 
 
 def call(e: Emitter, node: Node) -> None:
-    """A routine, whose text is written when it is met first."""
+    """Emit a call of a routine; the first call also writes the routine."""
     routine = node.attr
     kinds = [e.vector(one.dtype) for one in routine.outputs]
     result = f"{{ {', '.join(kinds)} }}"
@@ -79,7 +79,7 @@ def call(e: Emitter, node: Node) -> None:
 
 
 def gather(e: Emitter, node: Node) -> str:
-    """A number of a table for each lane."""
+    """Emit the lookup of one number of a table per lane."""
     table = e.table(node.attr)
     index, out, name = e.value(node.args[0]), "poison", "i8" if node.dtype == BOOL else scalar(node.dtype)
     for lane in range(e.lanes):
@@ -92,7 +92,10 @@ def gather(e: Emitter, node: Node) -> str:
 
 
 def matvec(e: Emitter, node: Node) -> None:
-    """A matrix that all episodes share times a vector of each, by a function: a loop over columns, or of a sparse one over its numbers."""
+    """Emit a shared matrix times a vector per episode, by a function.
+
+    For a dense matrix the function loops over columns, for a sparse one over the nonzero numbers.
+    """
     (matrix, there, tables), (p, q), room = node.attr, node.attr.nodes.shape, e.room(node)
     x, base = e.together(node.args[:q]), node.args[q:]
     begin = e.splat(base[0].attr) if base[0].op == "const" and all(one is base[0] for one in base) else ""
@@ -138,7 +141,7 @@ def _dense_text(outer: Emitter, name: str, begin: str, p: int, q: int) -> str:
 
 
 def _shared(e: Emitter, place: str) -> str:
-    """A number of a table, in all lanes."""
+    """Emit the load of one number of a table into all lanes."""
     kind = e.vector(FLOAT)
     one = e.set(f"load double, ptr {place}, align 8")
     first = e.set(f"insertelement {kind} poison, double {one}, i32 0")
@@ -146,7 +149,7 @@ def _shared(e: Emitter, place: str) -> str:
 
 
 def _sparse_text(outer: Emitter, name: str, begin: str, *_: int) -> str:
-    """Rows one after the other: the places in `columns` and `last` are in bytes."""
+    """Return the text of a product row by row; entries of `columns` and `last` are offsets in bytes."""
     e, kind, size = outer.fresh(), outer.vector(FLOAT), 8 * outer.lanes
     e.begin("entry")
     e.line("br label %row")
@@ -180,7 +183,7 @@ def _sparse_text(outer: Emitter, name: str, begin: str, *_: int) -> str:
 
 
 def demand(e: Emitter, names: Sequence[str]) -> None:
-    """Remember if one of these does not hold in some lane."""
+    """Emit code that records if one of these conditions fails in some lane."""
     held = names[0]
     for name in names[1:]:
         held = e.set(f"and <{e.lanes} x i1> {held}, {name}")
@@ -190,7 +193,7 @@ def demand(e: Emitter, names: Sequence[str]) -> None:
 
 
 def store_columns(e: Emitter, nodes: Sequence[Node], place: Column) -> None:
-    """Several columns of one array, as whole rows."""
+    """Emit the store of several columns of one array, as whole rows."""
     dtype, lanes, stored = nodes[0].dtype, e.lanes, e.stored(nodes[0].dtype)
     base = e.row(place, dtype)
     for begin in range(0, len(nodes), lanes):
@@ -207,7 +210,7 @@ def store_columns(e: Emitter, nodes: Sequence[Node], place: Column) -> None:
 
 
 def turned(e: Emitter, rows: list[str], kind: str) -> list[str]:
-    """As many vectors as there are lanes, transposed."""
+    """Emit the transposition of as many vectors as there are lanes."""
     n, half = e.lanes, e.lanes // 2
     low = ", ".join(f"i32 {i + side * n}" for i in range(half) for side in (0, 1))
     high = ", ".join(f"i32 {half + i + side * n}" for i in range(half) for side in (0, 1))

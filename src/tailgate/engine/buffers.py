@@ -1,6 +1,6 @@
-"""Large arrays as buffers: what is done for each of their numbers, rows or matrices is a sweep, which machine code plays in loops.
+"""Large arrays as buffers: work on each of their numbers, rows or matrices is a sweep, which machine code runs in loops.
 
-Straight code of a few thousand numbers takes long to compile. The nodes of a large array are picks, each of one place of the buffer.
+Straight code for thousands of numbers takes long to compile. The nodes of a large array are picks, each of one place of its buffer.
 Code that needs a single number reads it there.
 """
 
@@ -15,13 +15,13 @@ import numpy as np
 from tailgate.engine.graph import Graph, Node, Piece, Source
 from tailgate.engine.operations import Array
 
-WIDE = 128  # numbers of an array that is a buffer
-SHORT = 3  # numbers that are put in their place one by one
-_inside: list[Graph] = []  # graphs in which the body of a sweep is traced: its arrays are no buffers
+WIDE = 128  # numbers from which an array is a buffer
+SHORT = 3  # numbers that are stored one by one
+_inside: list[Graph] = []  # graphs that trace the body of a sweep, in which no array is a buffer
 
 
 def wide(graph: Graph, *arrays: Array, size: int = 0) -> bool:
-    """Does an elementwise function of these make a buffer, or what has a size and is made of them?"""
+    """Return True if an elementwise function of these arrays, or an array of `size` made from them, becomes a buffer."""
     made = int(np.prod(np.broadcast_shapes(*(a.shape for a in arrays)), dtype=int))
     return max(size, made) >= WIDE and graph not in _inside and not all(_fixed(a) for a in arrays)
 
@@ -40,10 +40,18 @@ def _body(graph: Graph) -> Iterator[None]:
 
 
 def swept(graph: Graph, function: Callable[..., Any], lead: Sequence[int], arrays: Sequence[Array], nested: bool = False) -> Array:
-    """A function of the trailing axes of arrays of nodes, for each index of their first axes, which broadcast to `lead`.
+    """Apply a function to the trailing axes of arrays of nodes, for each index of their leading axes.
 
-    The function takes arrays of nodes, or single nodes where no axis is left, and returns the same: (*lead, ...) in all.
-    A `nested` function may make buffers itself.
+    Parameters
+    ----------
+    function : of arrays of nodes, or of single nodes where no axis is left; returns the same
+    lead : the shape that the leading axes broadcast to
+    arrays : arrays of nodes (*lead, ...)
+    nested : the function may make buffers itself
+
+    Returns
+    -------
+    Nodes (*lead, ...).
     """
     n = len(lead)
     held = [a[(None,) * (n - a.ndim)] if a.ndim < n else a for a in arrays]
@@ -62,27 +70,28 @@ def swept(graph: Graph, function: Callable[..., Any], lead: Sequence[int], array
         for place in np.ndindex(*rest):
             at = source.offset + sum(i * s for i, s in zip(place, source.strides[n:], strict=True))
             one = nodes[(*(0,) * n, *place)]
-            those[place] = new = graph.carried(_boxed(one)).item()
+            those[place] = new = graph.carried(boxed(one)).item()
             carried.append(new)
             sources.append(Source(source.held, at, tuple(source.strides[i] if nodes.shape[i] > 1 else 0 for i in kept)))
         given.append(those if rest else those.item())
     with contextlib.nullcontext() if nested else _body(graph):
         result = function(*given)
-    made = result if isinstance(result, np.ndarray) else _boxed(result)
+    made = result if isinstance(result, np.ndarray) else boxed(result)
     shape, sources = _fewer([lead[i] for i in kept], sources)
     buffer = graph.sweep(shape, carried, sources, list(made.flat))
     return graph.picks(buffer).reshape(*lead, *made.shape)
 
 
-def _boxed(node: Any) -> Array:
+def boxed(node: object) -> Array:
+    """Return an array without axes that holds one node."""
     out = np.empty((), object)
     out[()] = node
     return out
 
 
-def _of_one(nodes: Any, rest: tuple[int, ...]) -> Any:
-    """An array for the trailing axes, of nodes that no round changes."""
-    return np.broadcast_to(_boxed(nodes), rest) if rest and isinstance(nodes, Node) else nodes
+def _of_one(nodes: Array | Node, rest: tuple[int, ...]) -> Array | Node:
+    """Return nodes that no round changes as an array of the trailing axes."""
+    return np.broadcast_to(boxed(nodes), rest) if rest and isinstance(nodes, Node) else nodes
 
 
 def _alike(nodes: Array) -> bool:
@@ -91,19 +100,19 @@ def _alike(nodes: Array) -> bool:
 
 
 def _source(graph: Graph, nodes: Array) -> Source:
-    """Where the numbers of an array stand: strides for each of its axes. They are put together where they have none."""
+    """Return the place of an array's numbers with a stride per axis; copy them to one buffer if they have none."""
     if found := _strided(nodes):
         return found
     return Source(graph.packed(tuple(_pieces(nodes)), nodes.flat[0].dtype), 0, steps(nodes.shape))
 
 
 def steps(shape: tuple[int, ...]) -> tuple[int, ...]:
-    """The strides of numbers that stand one behind the other."""
+    """Return the strides of contiguous numbers."""
     return tuple(int(np.prod(shape[i + 1 :], dtype=int)) for i in range(len(shape)))
 
 
 def _strided(nodes: Array) -> Source | None:
-    """Where the numbers of an array stand, if they are of one buffer and have strides, or are all fixed."""
+    """Return the place of an array's numbers if they are all fixed, or in one buffer with strides; else None."""
     first = nodes.flat[0]
     if _fixed(nodes):
         return Source(tuple(nodes.flat), 0, steps(nodes.shape))
@@ -116,7 +125,7 @@ def _strided(nodes: Array) -> Source | None:
 
 
 def _pieces(nodes: Array) -> Iterator[Piece]:
-    """An array as few parts that have strides."""
+    """Yield an array as few parts with strides."""
     if found := _strided(nodes):
         yield Piece(found, nodes.shape)
     elif nodes.ndim > 1:
@@ -129,7 +138,7 @@ def _pieces(nodes: Array) -> Iterator[Piece]:
 
 
 def _runs(nodes: Array) -> list[Array]:
-    """An array in one axis, cut where its numbers come from elsewhere or their stride changes."""
+    """Split an array of one axis where its origin or stride changes."""
     origin = np.array([node.args[0].id if is_pick(node) else -1 - i for i, node in enumerate(nodes)])
     place = np.array([node.attr if is_pick(node) else 0 for node in nodes])
     cuts, begin = [], 0
@@ -141,12 +150,12 @@ def _runs(nodes: Array) -> list[Array]:
 
 
 def is_pick(node: Node) -> bool:
-    """Is it a number of a buffer that machine code holds?"""
+    """Return True if the node is a number of a buffer in machine code."""
     return node.op == "pick" and node.args[0].size > 0 and not node.fixed
 
 
 def _fewer(shape: list[int], sources: list[Source]) -> tuple[tuple[int, ...], list[Source]]:
-    """Neighbouring axes as one, where all sources have them so."""
+    """Merge neighbouring axes that are contiguous in all sources."""
     strides = [list(source.strides) for source in sources]
     for i in reversed(range(len(shape) - 1)):
         if all(s[i] == s[i + 1] * shape[i + 1] for s in strides):
@@ -157,7 +166,7 @@ def _fewer(shape: list[int], sources: list[Source]) -> tuple[tuple[int, ...], li
 
 
 def buffer_of(graph: Graph, nodes: Array) -> Node:
-    """The buffer that holds the numbers of an array one behind the other."""
+    """Return a buffer that holds the numbers of an array contiguously."""
     source = _source(graph, nodes.ravel())
     if isinstance(source.held, Node) and source.held.size == nodes.size and source.offset == 0 and source.strides[0] == 1:
         return source.held
@@ -167,12 +176,12 @@ def buffer_of(graph: Graph, nodes: Array) -> Node:
 
 
 def table_of(graph: Graph, nodes: Array) -> Node:
-    """The buffer of fixed nodes, which is fixed itself and in no machine code."""
+    """Return the buffer of fixed nodes, which is fixed too and not part of the machine code."""
     return graph.packed((Piece(Source(tuple(nodes.flat), 0, (1,)), (nodes.size,)),), nodes.flat[0].dtype)
 
 
 def copied(graph: Graph, buffer: Node) -> Node:
-    """A buffer of the same numbers."""
+    """Return a copy of a buffer."""
     return _copied(graph, graph.picks(buffer))
 
 
@@ -184,12 +193,12 @@ def _copied(graph: Graph, nodes: Array) -> Node:
 
 
 def blended(graph: Graph, where: Node, x: Array, y: Array) -> Array:
-    """The array x where `where` holds, else y."""
+    """Return the array x where `where` is true, else y."""
     return graph.picks(graph.blend(where, buffer_of(graph, x), buffer_of(graph, y))).reshape(x.shape)
 
 
 def sides(graph: Graph, nodes: Array) -> tuple[Node, Array, Array] | None:
-    """The mask by which all numbers of an array are chosen, and both sides, if one side is the same for all episodes."""
+    """Return (mask, x, y) if one mask selects the whole array from x and y, of which one is constant; else None."""
     first = nodes.flat[0]
     if first.op == "select" and all(node.op == "select" and node.args[0] is first.args[0] for node in nodes.flat):
         held = [_map(lambda node, i=i: node.args[i], nodes) for i in (1, 2)]  # type: ignore[misc]

@@ -1,34 +1,40 @@
-"""Functions of numbers as machine code for plain code: made at the first call with arguments of these kinds, or loaded."""
+"""Functions of numbers as machine code for plain code, compiled or loaded at the first call with arguments of a kind."""
 
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from functools import update_wrapper
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import numpy as np
 
 from tailgate.base.pytree import leaves, map_leaves
 from tailgate.engine.array import Traced
 from tailgate.engine.functions import tracing
-from tailgate.engine.operations import Array
+from tailgate.engine.operations import Array, ArrayLike, DTypeLike
 from tailgate.engine.untraceable import Untraceable
 
-ALIGNED = 64  # bytes: a line of the processor's cache
-KEPT, EACH = 256, 8  # constants whose code is known at once, and code of the same shapes for other answers
+if TYPE_CHECKING:
+    from tailgate.engine.program import Program
+    from tailgate.engine.remembered import Answers
+
+Arguments = tuple[Any, ...]  # arrays, or sequences of arrays
+F = TypeVar("F", bound=Callable[..., Any])
+ALIGNED = 64  # bytes of a cache line
+KEPT, EACH = 256, 8  # constants whose code is found at once, and variants of code of the same shapes
 
 
 class Code:
-    """A function of numbers of one type that gives a tuple of numbers of one type, for arrays of them."""
+    """Machine code of a function from arrays of one type to a tuple of arrays of one type."""
 
-    def __init__(self, function: Callable[..., Any], dtype: Any, inputs: int) -> None:
-        from tailgate.engine.program import Program, traced  # which need random numbers, and those this code
+    def __init__(self, function: Callable[..., Sequence[Array]], dtype: DTypeLike, inputs: int) -> None:
+        from tailgate.engine.program import Program, traced  # a circular import otherwise
 
-        def named(state: Any, given: Any) -> tuple[Any, Any]:
+        def named(state: None, given: dict[str, Array]) -> tuple[None, dict[str, Array]]:
             return state, {str(i): x for i, x in enumerate(function(*given.values()))}
 
-        trace = traced(named, {}, {str(i): np.zeros(1, dtype) for i in range(inputs)})
+        trace = traced(named, None, {str(i): np.zeros(1, dtype) for i in range(inputs)})
         program = Program(trace)
         self._function, self._lanes, self._size = program.function, program.lanes, program.room
         self._uniforms, self._inputs, self._outputs = program.uniforms(), inputs, len(trace.results)
@@ -36,7 +42,7 @@ class Code:
         self._at = self._uniforms.ctypes.data
 
     def __call__(self, given: Array) -> Array:
-        """Return (outputs, M) of (inputs, M)."""
+        """Return (outputs, M) for (inputs, M)."""
         count = given.shape[1]
         blocks = -(-count // self._lanes)
         rows = blocks * self._lanes
@@ -55,14 +61,14 @@ class Code:
 
 
 class Elementwise:
-    """A function of one float that takes arrays of any shape; traced code and few numbers use its source."""
+    """A function of one float for arrays of any shape; traced code and short arrays use its Python source."""
 
-    def __init__(self, function: Callable[..., Any], worth: int) -> None:
+    def __init__(self, function: Callable[[Array], Array], worth: int) -> None:
         self.function, self.worth = function, worth
         self._code: Code | None = None
         update_wrapper(self, function)
 
-    def __call__(self, x: Any) -> Any:
+    def __call__(self, x: ArrayLike) -> Any:
         if isinstance(x, Traced):
             return self.function(x)
         x = np.asarray(x, np.float64)
@@ -77,27 +83,27 @@ class Elementwise:
         return out.transpose(sorted(range(x.ndim), key=order.__getitem__))
 
 
-def elementwise(worth: int) -> Callable[[Callable[..., Any]], Elementwise]:
-    """Decorator of a function of one float; worth: numbers for which machine code takes less time than numpy."""
+def elementwise(worth: int) -> Callable[[Callable[[Array], Array]], Elementwise]:
+    """Decorate a function of one float; from `worth` numbers on, machine code is faster than numpy."""
     return lambda function: Elementwise(function, worth)
 
 
 class Shaped:
     """A function of arrays (B, ...) and of constants, which computes each of B by itself; see `Elementwise`.
 
-    Arrays of one row stand for all of B. Arguments may be sequences of arrays. Other constants that give the same answers to what the
-    function asks, as where they are zero, share its code.
+    An array of one row counts for all of B. Arguments may be sequences of arrays.
+    Other constants share its code if they give the same answers to the function's queries, such as where they are zero.
     """
 
     def __init__(self, function: Callable[..., Any], worth: Callable[..., bool], constants: Sequence[str]) -> None:
         self.function, self.worth = function, worth
         names = list(inspect.signature(function).parameters)
         self._fixed = [names.index(name) for name in constants]
-        self._found: dict[Any, tuple[Any, Array]] = {}  # program and uniforms, by shapes and constants
-        self._made: dict[Any, list[tuple[Any, Any]]] = {}  # answers and programs, by shapes and what is said of constants
+        self._found: dict[Hashable, tuple[Program | None, Array]] = {}  # program and uniforms, by shapes and constants
+        self._made: dict[Hashable, list[tuple[Answers, Program]]] = {}  # answers and programs, by shapes and the key of constants
         update_wrapper(self, function)
 
-    def __call__(self, *arguments: Any) -> Any:
+    def __call__(self, *arguments: Array | list[Array]) -> Any:
         if tracing() or not self.worth(*arguments):
             return self.function(*arguments)
         from tailgate.engine.program import State
@@ -120,7 +126,7 @@ class Shaped:
         names = (name for name in program.places if name.partition(".")[0] == "made")
         return map_leaves(lambda _: state.get_leaf(next(names)), program.trace.next_state["made"])
 
-    def _code(self, given: Any, constants: Any, shapes: Any) -> tuple[Any, Array]:
+    def _code(self, given: Arguments, constants: Arguments, shapes: Hashable) -> tuple[Program | None, Array]:
         from tailgate.engine.parameters import Parameters, lifted
         from tailgate.engine.program import Program, traced
         from tailgate.engine.remembered import Answers
@@ -132,19 +138,19 @@ class Shaped:
             if answers.fit(parameters.values):
                 return program, program.uniforms(parameters.values)
 
-        def arranged(given: Any, constants: Any) -> Any:
+        def arranged(given: Arguments, constants: Arguments) -> Any:
             one, other = iter(given), iter(constants)
             return self.function(*(next(other if i in self._fixed else one) for i in range(len(given) + len(constants))))
 
-        def step(state: Any, nothing: Any) -> tuple[Any, Any]:
-            first: Any = next(iter(leaves(state).values()))
-            return {"given": state["given"], "made": arranged(state["given"], lifted(first.graph, constants))}, {}
+        def step(state: dict[str, Any], _: None) -> tuple[dict[str, Any], dict[str, Array]]:
+            like = next(iter(leaves(state).values()))
+            return {"given": state["given"], "made": arranged(state["given"], lifted(like, constants))}, {}
 
         example = map_leaves(lambda x: np.array(x[:1]), given)
         with np.errstate(all="ignore"):
             made = map_leaves(np.zeros_like, arranged(example, constants))
         try:
-            program = Program(traced(step, {"given": example, "made": made}, {}))
+            program = Program(traced(step, {"given": example, "made": made}, None))
         except Untraceable:  # too large: numpy computes it
             return None, np.empty(0)
         several[:] = [*several[1 - EACH :], (Answers([program.trace.graph]), program)]
@@ -152,15 +158,22 @@ class Shaped:
 
 
 def _shortened(held: dict[Any, Any]) -> None:
-    """Makes room for one more: what came first goes."""
+    """Remove the oldest entries to make room for one more."""
     while len(held) >= KEPT:
         held.pop(next(iter(held)), None)
 
 
-def _bits(x: Array) -> tuple[Any, bytes]:
+def _bits(x: Array) -> tuple[tuple[int, ...], bytes]:
     return x.shape, x.tobytes()
 
 
-def shaped(worth: Callable[..., bool], *constants: str) -> Callable[[Callable[..., Any]], Any]:
-    """Decorator of a function of arrays (B, ...); worth: for which arguments machine code is; constants: names of those without B."""
-    return lambda function: Shaped(function, worth, constants)
+def shaped(worth: Callable[..., bool], *constants: str) -> Callable[[F], F]:
+    """Decorate a function of arrays (B, ...).
+
+    `worth` says for which arguments machine code is faster; `constants` names the arguments without B.
+    """
+
+    def decorate(function: F) -> F:
+        return cast(F, Shaped(function, worth, constants))
+
+    return decorate

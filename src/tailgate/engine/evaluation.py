@@ -1,4 +1,4 @@
-"""A graph's numbers by numpy: what every backend has to give."""
+"""Evaluation of a graph by numpy: the reference for every backend."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tailgate.engine.operations import Array
 
 
 def evaluate(graph: Graph, roots: Sequence[Node], inputs: dict[Any, Array]) -> list[Array]:
-    """The roots by numpy, of inputs (B,) by name."""
+    """Return the values of the roots by numpy, for inputs (B,) by name."""
     values: dict[int, Any] = {}
     _evaluate(graph, ordered(roots), inputs, values)
     return [values[root.id] for root in roots]
@@ -44,7 +44,7 @@ def _multiplied(graph: Graph, held: Matrix, args: Sequence[Any]) -> list[Any]:
     x, out = args[: matrix.shape[1]], list(args[matrix.shape[1] :])
     for i, k in np.ndindex(*matrix.shape):
         if there is None or there[i, k]:
-            out[i] = out[i] + graph.value(matrix[i, k]) * x[k]
+            out[i] = out[i] + graph.value(matrix.item(i, k)) * x[k]
     return out
 
 

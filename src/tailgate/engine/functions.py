@@ -1,4 +1,4 @@
-"""numpy's other functions on traced arrays, and its makers of arrays while something is traced."""
+"""numpy's other functions on traced arrays, and its array constructors during tracing."""
 
 from __future__ import annotations
 
@@ -11,13 +11,14 @@ from typing import Any
 
 import numpy as np
 
-from tailgate.engine.array import Traced, boxed, chosen, each, lifted, result_type, shared_batch, typed
+from tailgate.engine.array import Traced, chosen, each, lifted, result_type, shared_batch, typed
 from tailgate.engine.graph import Graph, Node
+from tailgate.engine.operations import Array, ArrayLike, Axis, DTypeLike, Shape
 from tailgate.engine.untraceable import Untraceable
 
 
-def called(graph: Graph, function: Any, args: Any, options: dict[str, Any]) -> Any:
-    """Return what numpy would. Arrays that are the same for all episodes are handed to numpy itself."""
+def called(graph: Graph, function: Callable[..., object], args: Sequence[Any], options: dict[str, Any]) -> Any:
+    """Return the result of a numpy function; arrays that are the same for all episodes go to numpy itself."""
     if function in _FUNCTIONS:
         return _FUNCTIONS[function](*args, **options)
     held = [x for x in _inside((args, tuple(options.values()))) if isinstance(x, Traced)]
@@ -26,7 +27,7 @@ def called(graph: Graph, function: Any, args: Any, options: dict[str, Any]) -> A
     raise Untraceable(f"np.{function.__name__}", "write it with elementwise functions, num.* or np.where")
 
 
-def _inside(x: Any) -> Iterator[Any]:
+def _inside(x: object) -> Iterator[object]:
     if isinstance(x, (tuple, list)):
         for part in x:
             yield from _inside(part)
@@ -34,7 +35,7 @@ def _inside(x: Any) -> Iterator[Any]:
         yield x
 
 
-def _known(x: Any) -> Any:
+def _known(x: object) -> Any:
     if isinstance(x, (tuple, list)):
         return type(x)(_known(part) for part in x)
     return x.values() if isinstance(x, Traced) else x
@@ -51,7 +52,7 @@ def _joined(arrays: Sequence[Any], join: Callable[[list[Any]], Any]) -> Traced:
     back = shared_batch(parts)
     nodes = join([part.nodes for part in parts])
     batch = None
-    if back is not None:  # where the episodes' axis went: the same with two of them
+    if back is not None:  # find the new place of the episodes' axis by making it two long
         shadows = [np.zeros([2 if i - p.ndim == back else n for i, n in enumerate(p.shape)], np.int8) for p in parts]
         moved = [i for i, (m, n) in enumerate(zip(join(shadows).shape, nodes.shape, strict=True)) if m != n]
         batch = moved[0] if moved else None
@@ -73,23 +74,25 @@ def _column_stack(arrays: Sequence[Any]) -> Traced:
 # -- one array
 
 
-def _broadcast_to(x: Traced, shape: Any, subok: bool = False) -> Traced:
+def _broadcast_to(x: Traced, shape: Shape, subok: bool = False) -> Traced:
     nodes = np.broadcast_to(x.nodes, shape)
     return Traced(x.graph, nodes, x.dtype, None if x.batch is None else nodes.ndim - x.ndim + x.batch, writeable=False)
 
 
-def _full_like(x: Traced, value: Any, dtype: Any = None, order: Any = "K", subok: bool = True, shape: Any = None) -> Traced:
+def _full_like(
+    x: Traced, value: ArrayLike, dtype: DTypeLike | None = None, order: str = "K", subok: bool = True, shape: Shape | None = None
+) -> Traced:
     out = made(x.graph, x.shape if shape is None else shape, value, np.dtype(dtype or x.dtype))
     out.batch = x.batch if shape is None else None
     return out
 
 
-def _likes(value: Any) -> Callable[..., Traced]:
+def _likes(value: ArrayLike) -> Callable[..., Traced]:
     return lambda x, dtype=None, order="K", subok=True, shape=None: _full_like(x, value, dtype, shape=shape)
 
 
 def _least(x: Traced, axis: int, op: str) -> Traced:
-    """The place of the least or the largest along an axis, the first of several."""
+    """Return the index of the smallest or largest number along an axis, the first of several."""
     if axis is None or (x.batch is not None and axis % x.ndim == x.batch):
         raise Untraceable("the place of one number of all episodes", "name another axis")
     graph, parts = x.graph, [np.take(x.nodes, i, axis) for i in range(x.shape[axis])]
@@ -102,13 +105,13 @@ def _least(x: Traced, axis: int, op: str) -> Traced:
     return Traced(graph, place, np.dtype(np.int64), shadow.batch)
 
 
-def _count_nonzero(x: Traced, axis: Any = None, keepdims: bool = False) -> Any:
+def _count_nonzero(x: Traced, axis: Axis = None, keepdims: bool = False) -> Traced:
     return x.astype(bool).astype(np.int64).sum(axis=axis, keepdims=keepdims)
 
 
-def _is_in(x: Traced, values: Any, invert: bool = False) -> Any:
-    """Is each number one of a few? (Whole numbers: enumerations are.)"""
-    found: Any = lifted(x.graph, np.zeros(x.shape, bool))
+def _is_in(x: Traced, values: ArrayLike, invert: bool = False) -> Array:
+    """Return where x equals one of a few whole numbers, such as enumerations."""
+    found: Array = lifted(x.graph, np.zeros(x.shape, bool))
     for value in np.asarray(values).ravel().tolist():
         found = found | (x == value)
     return ~found if invert else found
@@ -122,11 +125,11 @@ def _untold(what: str, instead: str) -> Any:
     raise Untraceable(what, f"write {instead}")
 
 
-def _copyto(target: Traced, source: Any, casting: Any = "same_kind", where: Any = True) -> None:
+def _copyto(target: Traced, source: ArrayLike, casting: str = "same_kind", where: ArrayLike = True) -> None:
     target[...] = source if where is True else chosen(where, source, target)
 
 
-def _choose(conditions: Sequence[Any], choices: Sequence[Any], default: Any = 0) -> Any:
+def _choose(conditions: Sequence[Array], choices: Sequence[ArrayLike], default: ArrayLike = 0) -> ArrayLike:
     out = default
     for condition, choice in zip(reversed(conditions), reversed(choices), strict=True):
         out = np.where(condition, choice, out)
@@ -182,22 +185,23 @@ _FUNCTIONS: dict[Any, Callable[..., Any]] = {
 # -- tables
 
 
-def gathered(table: Any, index: Traced) -> Traced:
-    """table[index] of a table (K, ...) that is the same for all episodes."""
+def gathered(table: ArrayLike, index: Array) -> Traced:
+    """Return table[index] of a table (K, ...) that is the same for all episodes, for a traced index."""
+    assert isinstance(index, Traced)
     graph, held = index.graph, lifted(index.graph, table)
     columns = held.nodes.reshape(len(held.nodes), -1).T
     nodes = np.empty((*index.shape, len(columns)), object)
     for place in np.ndindex(*index.shape):
-        one: Node = index.nodes[place]  # type: ignore[assignment]
+        one: Node = index.nodes.item(place)
         nodes[place] = [graph.gather(list(column), one) for column in columns]
     return Traced(graph, nodes.reshape(*index.shape, *held.shape[1:]), held.dtype, index.batch)
 
 
-# -- makers
+# -- constructors
 
 
-def made(graph: Graph, shape: Any, value: Any, dtype: np.dtype[Any]) -> Traced:
-    """A new array that holds a value."""
+def made(graph: Graph, shape: Shape, value: ArrayLike, dtype: np.dtype[Any]) -> Traced:
+    """Return a new array filled with a value."""
     size = (int(shape),) if isinstance(shape, (int, np.integer)) else tuple(shape)
     nodes = np.empty(size, object)
     if isinstance(value, Traced) or np.ndim(value):
@@ -214,19 +218,19 @@ _lock = threading.RLock()
 
 
 def _makers(graph: Graph) -> dict[str, Callable[..., Any]]:
-    def filled(value: Any) -> Callable[..., Traced]:
+    def filled(value: float) -> Callable[..., Traced]:
         return lambda shape, dtype=float, order="C": made(graph, shape, value, np.dtype(dtype))
 
-    def full(shape: Any, value: Any, dtype: Any = None, order: Any = "C") -> Traced:
+    def full(shape: Shape, value: ArrayLike, dtype: DTypeLike | None = None, order: str = "C") -> Traced:
         held = lifted(graph, value)
         return made(graph, shape, value, np.dtype(dtype) if dtype is not None else held.dtype)
 
-    def as_array(x: Any, dtype: Any = None, order: Any = None, copy: Any = None) -> Any:
+    def as_array(x: object, dtype: DTypeLike | None = None, order: str | None = None, copy: bool | None = None) -> Any:
         if isinstance(x, (list, tuple)) and any(isinstance(part, Traced) for part in _inside(x)):
             x = _stack([as_array(part) for part in x])
         return x if not isinstance(x, Traced) or dtype is None else x.astype(dtype)
 
-    def array(x: Any, dtype: Any = None, order: Any = None, copy: Any = True, ndmin: int = 0) -> Any:
+    def array(x: object, dtype: DTypeLike | None = None, order: str | None = None, copy: bool = True, ndmin: int = 0) -> Any:
         held = as_array(x, dtype)
         return held.copy() if isinstance(held, Traced) and copy else held
 
@@ -240,15 +244,15 @@ _CONVERT = ("asarray", "ascontiguousarray", "asanyarray", "array")
 
 
 def tracing() -> bool:
-    """Is something traced in this thread?"""
+    """Return True if this thread is tracing."""
     return getattr(_here, "graph", None) is not None
 
 
 @contextlib.contextmanager
 def makers(graph: Graph) -> Iterator[None]:
-    """While this context is open, `np.zeros` and its like return traced arrays to code that is traced in this thread."""
+    """Let `np.zeros` and the other constructors return traced arrays to code that this thread traces, within the block."""
 
-    def wrapped(original: Any, mine: Callable[..., Any], converts: bool) -> Any:
+    def wrapped(original: Callable[..., Any], mine: Callable[..., Any], converts: bool) -> Any:
         def maker(*args: Any, **options: Any) -> Any:
             if getattr(_here, "graph", None) is not graph:
                 return original(*args, **options)
@@ -272,5 +276,3 @@ def makers(graph: Graph) -> Iterator[None]:
             for name, original in before.items():
                 setattr(np, name, original)
 
-
-__all__ = ["Node", "boxed", "called", "made", "makers"]

@@ -1,28 +1,31 @@
-"""The graph of a computation: numbers of one episode, each computed once.
+"""The graph of a computation: the numbers of one episode, each computed once.
 
-Two nodes of one operation on the same arguments are one node. Operations on constants are folded by the same numpy functions that define
-every operation, so that a folded value has the bits of a computed one. No rewriting changes a bit, NaN's sign and payload apart.
+Equal operations on equal arguments are one node. The numpy functions that define the operations also fold constants.
+A folded value therefore has the bits of a computed one. No rewriting changes a bit, except the sign and payload of NaN.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Hashable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from tailgate.engine.operations import BOOL, COMMUTATIVE, COMPARISONS, FLOAT, INT, Array, apply, converted
+from tailgate.engine.operations import BOOL, COMMUTATIVE, COMPARISONS, FLOAT, INT, Array, ArrayLike, apply, converted
 from tailgate.engine.untraceable import Untraceable
 
-MOST = 45_000  # operations of a graph: what has more takes long to compile, as straight code
-_FREE = {"const", "uniform", "input", "carried", "pick"}  # which are none
+if TYPE_CHECKING:
+    from tailgate.engine.routines import Routine
+
+MOST = 45_000  # operations of a graph; larger ones take long to compile as straight code
+_FREE = {"const", "uniform", "input", "carried", "pick"}  # nodes that are no operations
 
 
 class Node:
-    """A number: an operation `op` on other nodes. `fixed`: it is the same for all episodes.
+    """A number: an operation `op` on other nodes; `fixed` if it is the same for all episodes.
 
-    A node with a `size` is a buffer of that many numbers. A `pick` is one of them.
+    A node with a `size` is a buffer of that many numbers, and a `pick` is one of them.
     """
 
     __slots__ = ("args", "attr", "dtype", "fixed", "id", "op", "size")
@@ -37,7 +40,7 @@ class Node:
 
 @dataclass(eq=False)
 class Body:
-    """A round of a loop: `nodes` are those that depend on what is carried. The first that are carried say who goes on."""
+    """One round of a loop: `nodes` depend on the carried numbers, of which the first `going` decide who continues."""
 
     carried: list[Node]
     after: list[Node]
@@ -48,7 +51,7 @@ class Body:
 
 @dataclass(frozen=True)
 class Source:
-    """Where a number stands in each round of a sweep: in a buffer, or in a table of fixed nodes."""
+    """The place of a number in each round of a sweep: in a buffer, or in a table of fixed nodes."""
 
     held: Node | tuple[Node, ...]
     offset: int
@@ -56,7 +59,7 @@ class Source:
 
 
 class Piece(NamedTuple):
-    """Numbers of a source, by an index of a shape; or one number."""
+    """The numbers of a source for all indices of a shape, or one number."""
 
     source: Source | Node
     shape: tuple[int, ...] = ()
@@ -64,7 +67,7 @@ class Piece(NamedTuple):
 
 @dataclass(eq=False)
 class Sweep:
-    """A body that is computed for each index of a shape: `carried` numbers, from their sources, become those of `after`, one by one."""
+    """A body computed for each index of a shape: it maps `carried` numbers, read from their sources, to `after`."""
 
     shape: tuple[int, ...]
     carried: list[Node]
@@ -74,7 +77,7 @@ class Sweep:
 
 
 def dependent(roots: Sequence[Node], sources: Sequence[Node]) -> set[Node]:
-    """The roots and what they need, as far as it depends on the sources; without these."""
+    """Return the roots and their arguments that depend on the sources, without the sources."""
     found = set(sources)
     for node in ordered(roots, min((node.id for node in sources), default=0)):
         if any(a in found for a in node.args):
@@ -83,48 +86,48 @@ def dependent(roots: Sequence[Node], sources: Sequence[Node]) -> set[Node]:
 
 
 class Matrix(NamedTuple):
-    """A matrix (p, q) of fixed nodes, what of it counts, and of a sparse one the places of its numbers."""
+    """A matrix (p, q) of fixed nodes, a mask of its structural nonzeros, and tables of their places if it is sparse."""
 
-    nodes: Any
+    nodes: Array
     there: Array | None
     tables: list[list[Node]]
 
 
 class Graph:
-    """Nodes in an order in which each one follows its arguments."""
+    """Nodes in an order in which each follows its arguments."""
 
     def __init__(self) -> None:
         self.nodes: list[Node] = []
-        self.demands: list[tuple[str, str, str, Node]] = []  # what has to hold: field, what else is found, what is wanted
+        self.demands: list[tuple[str, str, str, Node]] = []  # field, finding, expectation, and the condition that must hold
         self.operations = 0
-        self.parameters: list[Array] = []  # by the first number of a uniform's name: see engine/parameters.py
-        self.asked: tuple[dict[int, Node], dict[int, Node]] = {}, {}  # whose values code asked for, and if they are zero
-        self.copies: dict[int, Array] = {}  # of buffers that hold fixed nodes: these
+        self.parameters: list[Array] = []  # indexed by the first number of a uniform's name, see engine/parameters.py
+        self.asked: tuple[dict[int, Node], dict[int, Node]] = {}, {}  # nodes read, and nodes compared with zero
+        self.copies: dict[int, Array] = {}  # the nodes of buffers that hold fixed nodes
         self._known: dict[Any, Node] = {}
         self._values: dict[int, Any] = {}  # of fixed nodes
         self._picks: dict[int, Array] = {}  # of buffers
 
     # -- leaves
 
-    def const(self, value: Any, dtype: np.dtype[Any]) -> Node:
-        """A constant. Its sign counts, where it is zero."""
-        held = value
+    def const(self, value: ArrayLike, dtype: np.dtype[Any]) -> Node:
+        """Return a constant; 0.0 and -0.0 differ."""
+        held: Any = value
         if not (isinstance(value, np.generic) and value.dtype == dtype):
             with np.errstate(all="ignore"):
                 held = converted(np.asarray(value), dtype)[()]
         return self._node("const", dtype, (), held, held.tobytes(), True)
 
-    def input(self, name: Any, dtype: np.dtype[Any]) -> Node:
-        """A number that each episode brings."""
+    def input(self, name: Hashable, dtype: np.dtype[Any]) -> Node:
+        """Return a number that differs between episodes."""
         return self._node("input", dtype, (), name, name, False)
 
-    def uniform(self, name: Any, value: Any) -> Node:
-        """A number that is the same for all episodes and may be another one the next time: the code does not hold its value."""
+    def uniform(self, name: Hashable, value: ArrayLike) -> Node:
+        """Return a number that all episodes share and that may change between calls: the code does not contain its value."""
         node = self._node("uniform", np.asarray(value).dtype, (), name, name, True)
         self._values[node.id] = np.asarray(value)[()]
         return node
 
-    def _node(self, op: str, dtype: np.dtype[Any], args: tuple[Node, ...], attr: Any, key: Any, fixed: bool, size: int = 0) -> Node:
+    def _node(self, op: str, dtype: np.dtype[Any], args: tuple[Node, ...], attr: object, key: Hashable, fixed: bool, size: int = 0) -> Node:
         known = (op, dtype, key, *(a.id for a in args))
         node = self._known.get(known)
         if node is None:
@@ -136,7 +139,7 @@ class Graph:
         return node
 
     def value(self, node: Node) -> Any:
-        """The number that a fixed node is now."""
+        """Return the present number of a fixed node."""
         if node.op == "const":
             return node.attr
         if node.id not in self._values:
@@ -146,23 +149,23 @@ class Graph:
         return self._values[node.id]
 
     def recomputed(self, node: Node, values: dict[int, Any]) -> Any:
-        """The number that a fixed node is where its arguments have these values."""
+        """Return the number of a fixed node for these values of its arguments."""
         if node.op == "pack":
             return [x for piece in node.attr for x in packed_values(self, piece, values)]
         return node.attr if node.op == "const" else computed(node, [values[a.id] for a in node.args])
 
     def ask(self, nodes: Sequence[Node], dtype: np.dtype[Any], nonzero: bool = False) -> Array:
-        """The numbers of fixed nodes, or where they are not zero: code that asks depends on the answer."""
+        """Return the numbers of fixed nodes, or whether they are nonzero, and record that the code depends on the answer."""
         out = np.empty(len(nodes), dtype)
         for i, node in enumerate(nodes):
             out[i] = self.value(node)
         self.asked[nonzero].update((node.id, node) for node in nodes if node.op != "const")
         return out != 0 if nonzero else out
 
-    # -- operations: each takes nodes of the types that it asks for
+    # -- operations on nodes of matching types
 
     def binary(self, op: str, x: Node, y: Node) -> Node:
-        """x op y of one type."""
+        """Return x op y, both of one type."""
         if x.dtype != y.dtype:
             raise TypeError(f"{op} of {x.dtype} and {y.dtype}")
         dtype = BOOL if op in COMPARISONS else x.dtype
@@ -173,13 +176,13 @@ class Graph:
         return self._folded(op, dtype, (x, y))
 
     def unary(self, op: str, x: Node) -> Node:
-        """op x."""
+        """Return op x."""
         if op == "not" and x.op == "not":
             return x.args[0]
         return self._folded(op, x.dtype, (x,))
 
     def select(self, where: Node, x: Node, y: Node) -> Node:
-        """x where `where` holds, else y."""
+        """Return x where `where` is true, else y."""
         if x.dtype != y.dtype or where.dtype != BOOL:
             raise TypeError(f"a choice by {where.dtype} of {x.dtype} and {y.dtype}")
         if where.op == "const":
@@ -193,11 +196,11 @@ class Graph:
         return self._folded("select", x.dtype, (where, x, y))
 
     def cast(self, x: Node, dtype: np.dtype[Any]) -> Node:
-        """x as another type."""
+        """Convert x to another type."""
         return x if x.dtype == dtype else self._folded("cast", dtype, (x,))
 
     def bits(self, x: Node, dtype: np.dtype[Any]) -> Node:
-        """The bits of x as those of another type of the same size."""
+        """Reinterpret the bits of x as another type of the same size."""
         if x.dtype.itemsize != dtype.itemsize or BOOL in (x.dtype, dtype):
             raise TypeError(f"bits of {x.dtype} as {dtype}")
         if x.dtype == dtype:
@@ -206,18 +209,18 @@ class Graph:
 
     # -- routines
 
-    def call(self, routine: Any, args: Sequence[Node]) -> Node:
-        """A call of a routine (engine/routines.py), whose results are picked."""
+    def call(self, routine: Routine, args: Sequence[Node]) -> Node:
+        """Return a call of a routine (engine/routines.py); `pick` selects its results."""
         return self._node("call", BOOL, tuple(args), routine, id(routine), all(a.fixed for a in args))
 
     def pick(self, node: Node, number: int, dtype: np.dtype[Any]) -> Node:
-        """One of several results."""
+        """Return one of several results."""
         return self._node("pick", dtype, (node,), number, number, node.fixed)
 
     # -- tables
 
     def gather(self, table: Sequence[Node], index: Node) -> Node:
-        """table[index] of fixed nodes of one type; an index beyond its ends takes the number there."""
+        """Return table[index] of fixed nodes of one type; the index is limited to the table."""
         last = self.const(len(table) - 1, INT)
         within = self.binary("min", self.binary("max", self.cast(index, INT), self.const(0, INT)), last)
         return self._node("gather", table[0].dtype, (within,), tuple(table), tuple(node.id for node in table), False)
@@ -225,20 +228,20 @@ class Graph:
     # -- matrices
 
     def matvec(self, matrix: Array, x: Sequence[Node], base: Sequence[Node], there: Array | None = None) -> list[Node]:
-        """base + matrix x, of a matrix (p, q) of fixed nodes: sums begin with the base and run over q in ascending order.
+        """Return base + matrix x for a matrix (p, q) of fixed nodes.
 
-        What is not `there` (p, q) bool counts for nothing.
+        Sums begin with the base and run over q in ascending order; entries that are not in `there` (p, q) bool are skipped.
         """
         key = tuple(node.id for node in matrix.flat), None if there is None else there.tobytes()
         tables: list[list[Node]] = []
-        if there is not None:  # bytes to the column of each number, and to the end of each row
+        if there is not None:  # offsets [bytes] of each number's column and of each row's end
             tables = [[self.const(8 * k, INT) for k in part] for part in (np.nonzero(there)[1], np.cumsum(there.sum(axis=1)))]
         return list(self.picks(self._node("matvec", FLOAT, (*x, *base), Matrix(matrix, there, tables), key, False, len(base))))
 
     # -- buffers
 
     def picks(self, buffer: Node) -> Array:
-        """The numbers of a buffer, by their places."""
+        """Return the numbers of a buffer, by place."""
         if buffer.id not in self._picks:
             out = np.empty(buffer.size, object)
             for i in range(buffer.size):
@@ -247,29 +250,29 @@ class Graph:
             self._picks[buffer.id] = out
         return self._picks[buffer.id]
 
-    def held(self, name: Any, size: int, dtype: np.dtype[Any]) -> Node:
-        """A buffer that each episode brings."""
+    def held(self, name: Hashable, size: int, dtype: np.dtype[Any]) -> Node:
+        """Return a buffer that differs between episodes."""
         return self._node("held", dtype, (), name, name, False, size)
 
     def packed(self, pieces: tuple[Piece, ...], dtype: np.dtype[Any]) -> Node:
-        """A buffer of these, one behind the other."""
+        """Return a buffer of these pieces, one after the other."""
         args = [source if isinstance(source, Node) else source.held for source, _ in pieces]
         size = sum(int(np.prod(shape, dtype=int)) for _, shape in pieces)
         nodes = tuple({a.id: a for a in args if isinstance(a, Node)}.values())
         return self._node("pack", dtype, nodes, pieces, pieces, all(a.fixed for a in nodes), size)
 
     def blend(self, where: Node, x: Node, y: Node) -> Node:
-        """The buffer x where `where` holds, else the buffer y."""
+        """Return the buffer x where `where` is true, else the buffer y."""
         if where.op == "const" or x is y:
             return x if x is y or where.attr else y
         return self._node("blend", x.dtype, (where, x, y), None, None, False, x.size)
 
     def inverses(self, matrices: Node, q: int) -> Node:
-        """The inverses of symmetric positive definite matrices (., q, q)."""
+        """Return the inverses of symmetric positive definite matrices (., q, q)."""
         return self._node("invert", FLOAT, (matrices,), q, q, matrices.fixed, matrices.size)
 
     def sweep(self, shape: tuple[int, ...], carried: list[Node], sources: list[Source], after: list[Node]) -> Node:
-        """A buffer (*shape, len(after)) of what the carried numbers become in each round."""
+        """Return a buffer (*shape, len(after)) of what each round makes of the carried numbers."""
         inside = dependent(after, carried)
         used = {a.id for node in inside for a in node.args} | {node.id for node in after}
         kept = [(one, source) for one, source in zip(carried, sources, strict=True) if one.id in used]
@@ -284,14 +287,14 @@ class Graph:
     # -- loops
 
     def carried(self, begin: Array) -> Array:
-        """What a loop carries from round to round, of the types of what it begins with."""
+        """Return the numbers that a loop carries from round to round, with the types of the initial numbers."""
         out = np.empty(begin.shape, object)
         for i, node in enumerate(begin.flat):
             out.flat[i] = self._node("carried", node.dtype, (), None, len(self.nodes), False)
         return out
 
     def loop(self, begin: list[Node], carried: list[Node], after: list[Node], going: list[Node], most: int) -> list[Node]:
-        """What `carried` nodes are at last, of those that they become `after` a round, while any of `going` holds."""
+        """Return the final `carried` nodes of a loop that replaces them by `after` in each round, while any of `going` is true."""
         inside = dependent(after, carried)
         mine = {*inside, *carried}
         captured = {a.id: a for node in inside for a in node.args if a not in mine and not a.fixed}
@@ -309,12 +312,12 @@ class Graph:
 
 
 def _is(node: Node, value: float) -> bool:
-    """Is the node this constant? Zeros count by their sign."""
+    """Return True if the node is this constant; 0.0 and -0.0 differ."""
     return node.op == "const" and node.attr == value and bool(np.signbit(node.attr)) == (str(value)[0] == "-")
 
 
 def _identity(op: str, x: Node, y: Node) -> Node | None:
-    """What x op y is without a computation, to the bit."""
+    """Return x op y if it needs no computation and keeps every bit; else None."""
     kind = x.dtype.kind
     if kind == "f":
         if (op in ("mul", "div") and _is(y, 1.0)) or (op == "sub" and _is(y, 0.0)) or (op == "add" and _is(y, -0.0)):
@@ -333,7 +336,7 @@ def _identity(op: str, x: Node, y: Node) -> Node | None:
 
 
 def computed(node: Node, args: Sequence[Any]) -> Any:
-    """The value of a node whose arguments have these."""
+    """Return the value of a node for these values of its arguments."""
     if node.op == "call":
         return node.attr.values(list(args))
     if node.op == "pick":
@@ -349,7 +352,7 @@ def computed(node: Node, args: Sequence[Any]) -> Any:
 
 
 def ordered(roots: Iterable[Node], first: int = 0) -> list[Node]:
-    """The roots and all that they need, from the node `first` on, arguments first."""
+    """Return the roots and all that they need, from node number `first` on, arguments first."""
     seen: dict[int, Node] = {}
     left = list(roots)
     while left:
@@ -361,6 +364,7 @@ def ordered(roots: Iterable[Node], first: int = 0) -> list[Node]:
 
 
 def packed_values(graph: Graph, piece: Piece, values: dict[int, Any]) -> list[Any]:
+    """Return the numbers of a piece of a buffer."""
     source, shape = piece
     if isinstance(source, Node):
         return [values[source.id] if source.id in values else graph.value(source)]
@@ -368,6 +372,7 @@ def packed_values(graph: Graph, piece: Piece, values: dict[int, Any]) -> list[An
 
 
 def read(graph: Graph, source: Source, index: Sequence[int], values: dict[int, Any]) -> Any:
+    """Return the number of a source at an index."""
     place = source.offset + sum(i * n for i, n in zip(index, source.strides, strict=True))
     node = source.held[place] if isinstance(source.held, tuple) else source.held
     found = values[node.id] if node.id in values else graph.value(node)

@@ -1,36 +1,38 @@
-"""What plain code asks of a batch, and traced code answers for every episode (docs/engine.md). `tailgate.num` has all of it."""
+"""Queries of plain code on a batch, which traced code answers for each episode (docs/engine.md). `tailgate.num` exports them."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from typing import Any
+from typing import cast
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tailgate.base.errors import InputError
 from tailgate.engine.array import Traced
 from tailgate.engine.functions import gathered
 from tailgate.engine.loops import chosen_apart
+from tailgate.engine.operations import Array, Mask
 
-Array = NDArray[Any]
 
+def some(mask: Array) -> bool:
+    """Return True if any is true; traced code always takes the branch.
 
-def some(mask: Any) -> bool:
-    """Is any of it true? A hint: what follows may be done for all rows, and is where they are traced. So the others keep their bits."""
+    It is a hint: the branch may be computed for all rows, and must keep the bits of rows outside the mask.
+    """
     return bool(mask.values().any()) if isinstance(mask, Traced) and mask.fixed else isinstance(mask, Traced) or bool(mask.any())
 
 
-def every(mask: Any) -> bool:
-    """Is all of it true? A hint, as `some`: what follows spares work that would change no bit."""
+def every(mask: Array) -> bool:
+    """Return True if all are true; traced code never takes the branch, which may only skip work that changes no bit."""
     return bool(mask.values().all()) if isinstance(mask, Traced) and mask.fixed else not isinstance(mask, Traced) and bool(mask.all())
 
 
-def elsewhere(mask: Any, x: Any, function: Callable[..., Any], *arrays: Any) -> Any:
-    """x (B, N, ...) where a mask (B, N) holds, else function(*arrays) of arrays (B or 1, N, ...). N may be missing.
+def elsewhere(mask: Mask, x: Array, function: Callable[..., Array], *arrays: Array) -> Array:
+    """Return x (B, N, ...) where a mask (B, N) is true, else function(*arrays) of arrays (B or 1, N, ...). N may be missing.
 
-    Plain code calls it with the places that need it, (M, 1, ...), if there are any; traced code for each agent, (1, 1, ...).
+    Plain code calls the function with the places that need it, (M, 1, ...), if any; traced code with each agent, (1, 1, ...).
     """
+    mask = cast(Array, mask)
     if mask.ndim == 1:
         return elsewhere(mask[:, None], x[:, None], function, *(array[:, None] for array in arrays))[:, 0]
     if isinstance(mask, Traced) and not mask.fixed:
@@ -45,28 +47,28 @@ def elsewhere(mask: Any, x: Any, function: Callable[..., Any], *arrays: Any) -> 
     return out
 
 
-def present(values: Any, candidates: Iterable[int]) -> list[int]:
-    """The candidates that are among some whole numbers: all of them where these are traced."""
+def present(values: Array, candidates: Iterable[int]) -> list[int]:
+    """Return the candidates that occur among whole numbers; in traced code, all candidates."""
     if isinstance(values, Traced) and not values.fixed:
         return list(candidates)
     held = set((values.values() if isinstance(values, Traced) else values).ravel().tolist())
     return [one for one in candidates if one in held]
 
 
-def pick(ring: Array, place: Any) -> Any:
-    """ring[..., place] of a ring (B, ..., L) and whole numbers that broadcast to (B, ...)."""
+def pick(ring: Array, place: Array) -> Array:
+    """Return ring[..., place] of a ring (B, ..., L) and whole numbers that broadcast to (B, ...)."""
     if not isinstance(ring, Traced):
         if ring.ndim == 2 and np.ndim(place) == 1:
             return ring[np.arange(len(ring)), place]
         return np.take_along_axis(ring, np.broadcast_to(place, ring.shape[:-1])[..., None], axis=-1)[..., 0]
-    out = ring[..., 0]
+    out: Array = ring[..., 0]
     for i in range(1, ring.shape[-1]):
         out = np.where(place == i, ring[..., i], out)
     return out
 
 
-def put(ring: Array, place: Any, value: Any) -> Any:
-    """A ring (B, ..., L) with `value` (B, ...) at `place`, which broadcasts to (B, ...)."""
+def put(ring: Array, place: Array, value: Array) -> Array:
+    """Return the ring (B, ..., L) with `value` (B, ...) at `place`, which broadcasts to (B, ...)."""
     if isinstance(ring, Traced):
         return np.stack([np.where(place == i, value, ring[..., i]) for i in range(ring.shape[-1])], axis=-1)
     out = ring.copy(order="K")
@@ -77,15 +79,15 @@ def put(ring: Array, place: Any, value: Any) -> Any:
     return out
 
 
-def ring_next(place: Any, size: int) -> Any:
-    """The place behind one in a ring of a size."""
+def ring_next(place: Array, size: int) -> Array:
+    """Return the index after `place` in a ring of a size."""
     return np.where(place + 1 == size, 0, place + 1)
 
 
-def demand(condition: Any, field: str, found: str, wanted: str, k: Any, values: Any = None) -> None:
-    """Raise InputError unless a condition (B, ...) holds in all rows, which are at steps k (B,). Traced code asks after its step.
+def demand(condition: Array, field: str, found: str, wanted: str, k: Array, values: Array | None = None) -> None:
+    """Raise InputError unless a condition (B, ...) holds in all rows, which are at steps k (B,). Traced code checks after its step.
 
-    The error says what is `found`; of plain code, the values themselves where they are given.
+    The error says what is `found`; in plain code it shows `values`, if given.
     """
     if isinstance(condition, Traced):
         rows = condition.reshape(len(condition), -1).all(axis=1)
@@ -93,11 +95,11 @@ def demand(condition: Any, field: str, found: str, wanted: str, k: Any, values: 
     elif not condition.all() and values is not None:
         raise InputError(field, np.unique(values).tolist(), wanted)
     elif not condition.all():
-        raise broken(~condition.reshape(len(condition), -1).all(axis=1), field, found, wanted, k)
+        raise broken(np.asarray(~condition.reshape(len(condition), -1).all(axis=1)), field, found, wanted, k)
 
 
 def broken(rows: Array, field: str, found: str, wanted: str, k: Array) -> InputError:
-    """The error of rows (B,) bool at steps k (B,) in which a demand does not hold."""
+    """Return the error for rows (B,) bool at steps k (B,) that break a demand."""
     first = int(np.flatnonzero(rows)[0])
     where = f"{found} in step {k[first]}, in {np.count_nonzero(rows)} of {len(rows)} rows, the first of them row {first}"
     error = InputError(field, where, wanted)
@@ -105,17 +107,17 @@ def broken(rows: Array, field: str, found: str, wanted: str, k: Array) -> InputE
     return error
 
 
-LISTED = 8  # entries of a table that are compared one by one where code is traced
+LISTED = 8  # entries of a table that traced code compares one by one
 
 
-def take(table: Array, index: Any) -> Any:
-    """table[index] of a table (K, ...) and whole numbers from 0 to K - 1."""
+def take(table: Array, index: Array) -> Array:
+    """Return table[index] of a table (K, ...) and whole numbers from 0 to K - 1."""
     if not isinstance(index, Traced):
         return table[index]
     if len(table) > LISTED and not index.fixed:
         return gathered(table, index)
-    wide: Any = index[(..., *(None,) * (table.ndim - 1))]
-    out: Any = np.broadcast_to(table[0], (*index.shape, *table.shape[1:]))
+    wide = index[(..., *(None,) * (table.ndim - 1))]
+    out: Array = np.broadcast_to(table[0], (*index.shape, *table.shape[1:]))
     for k in range(1, len(table)):
         out = np.where(wide == k, table[k], out)
     return out

@@ -1,4 +1,4 @@
-"""One instruction, or a few, for each operation of a graph."""
+"""LLVM instructions for the simple operations of a graph."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ _ROUNDED = {"sqrt": "sqrt", "floor": "floor", "ceil": "ceil", "trunc": "trunc", 
 
 
 def code(dtype: np.dtype[Any]) -> str:
-    """A type's kind and size."""
+    """Return a type's kind and size, such as f8."""
     return f"{dtype.kind}{dtype.itemsize}"
 
 
 def scalar(dtype: np.dtype[Any]) -> str:
-    """LLVM's name of a type."""
+    """Return LLVM's name of a type."""
     return _TYPES[code(dtype)]
 
 
 def operation(e: Emitter, node: Node) -> str:
-    """An operation of two or fewer arguments, a choice, or a change of type."""
+    """Emit an operation of one or two arguments, a select, or a conversion."""
     op, dtype, lanes = node.op, node.dtype, e.lanes
     args = [e.value(a) for a in node.args]
     of = node.args[0].dtype
@@ -71,7 +71,7 @@ def operation(e: Emitter, node: Node) -> str:
 
 
 def smaller(e: Emitter, node: Node, args: Sequence[str], order: str) -> str:
-    """min and max, as `graph.minimum` defines them."""
+    """Emit min or max, as `operations.minimum` defines them."""
     x, y = node.args
     kind, lanes = e.vector(x.dtype), e.lanes
     if x.dtype.kind == "f":
@@ -87,7 +87,7 @@ def smaller(e: Emitter, node: Node, args: Sequence[str], order: str) -> str:
 
 
 def remainder(e: Emitter, kind: str, args: Sequence[str], signed: bool) -> str:
-    """The remainder by a positive constant, which is never negative."""
+    """Emit the remainder by a positive constant, which is never negative."""
     if not signed:
         return e.set(f"urem {kind} {args[0]}, {args[1]}")
     rest = e.set(f"srem {kind} {args[0]}, {args[1]}")
@@ -96,11 +96,11 @@ def remainder(e: Emitter, kind: str, args: Sequence[str], signed: bool) -> str:
 
 
 def cast(e: Emitter, x: str, of: np.dtype[Any], to: np.dtype[Any]) -> str:
-    """x as another type, as `graph.converted` defines it."""
+    """Emit the conversion of x, as `operations.converted` defines it."""
     kind, result, lanes = e.vector(of), e.vector(to), e.lanes
     if of == BOOL:
         if to.kind == "f":
-            return e.set(f"select {kind} {x}, {result} {e.splat(np.ones((), to)[()])}, {result} zeroinitializer")
+            return e.set(f"select {kind} {x}, {result} {e.splat(to.type(1))}, {result} zeroinitializer")
         return e.set(f"zext {kind} {x} to {result}")
     if to == BOOL:
         return e.set(f"{'fcmp une' if of.kind == 'f' else 'icmp ne'} {kind} {x}, zeroinitializer")

@@ -1,9 +1,14 @@
-"""Machine code of this processor: LLVM's text of a scheduled graph, in vectors of `lanes` episodes.
+"""Machine code for this processor: LLVM's text of a scheduled graph, in vectors of `lanes` episodes.
 
-Episodes stand in blocks of one vector each. A block's state lies together in memory, so that a step reads and writes a few KiB at fixed
-places. Operations are neither reordered nor contracted. A function's arguments are the state, the numbers that are the same for all
-episodes, a table of arrays (address, or place on the sheet; bytes a step), room for buffers, the sheet of results, the first block and the
-one behind the last, and the steps to play. It tells if in any lane, an idle one too, something did not hold that code demands.
+A block is one vector of episodes. Its state is contiguous in memory, so that a step reads and writes a few KiB at fixed places.
+Operations are neither reordered nor contracted. The function takes these arguments:
+
+- the state, and the numbers that all episodes share;
+- a table of arrays: address, or offset on the sheet of results, and bytes per step;
+- room for buffers, and the sheet of results;
+- the first block, the block after the last, and the number of steps.
+
+It returns nonzero if a demand of the code fails in any lane, including idle lanes.
 """
 
 from __future__ import annotations
@@ -26,14 +31,14 @@ from tailgate.engine.routines import bound
 
 @dataclass(frozen=True)
 class Held:
-    """A number of the state: its place in a block [bytes]."""
+    """The place of a number of the state: its offset in a block [bytes]."""
 
     offset: int
 
 
 @dataclass(frozen=True)
 class Column:
-    """A number of an array (episodes, columns), or (steps, episodes, columns), of the table."""
+    """The place of a number in an array (episodes, columns), or (steps, episodes, columns), of the table."""
 
     array: int
     column: int
@@ -42,16 +47,16 @@ class Column:
 
 @dataclass
 class Layout:
-    """Where the function finds and leaves its numbers."""
+    """The places from which the function reads its numbers and to which it writes them."""
 
     inputs: dict[int, Held | Column]  # by node
     outputs: list[tuple[Node, Held | Column]]
     stride: int  # bytes of a block's state
-    given: int = 0  # arrays of arguments: those behind them are of results, and stand on the sheet
-    demands: list[Node] = field(default_factory=list)  # what has to hold
+    given: int = 0  # number of argument arrays; the arrays after them are results, on the sheet
+    demands: list[Node] = field(default_factory=list)  # conditions that must hold
     uniforms: dict[int, int] = field(default_factory=dict)  # node -> its slot
-    slots: list[Node] = field(default_factory=list)  # what the table of numbers that all episodes share holds
-    tables: dict[tuple[int, ...], int] = field(default_factory=dict)  # several nodes one behind the other -> the slot of the first
+    slots: list[Node] = field(default_factory=list)  # contents of the table of shared numbers
+    tables: dict[tuple[int, ...], int] = field(default_factory=dict)  # consecutive nodes -> the slot of the first
 
 
 class Emitter:
@@ -61,17 +66,17 @@ class Emitter:
         self.layout, self.lanes = layout, lanes
         self.lines: list[str] = []
         self.declared: set[str] = set()
-        self.routines: dict[Any, str] = {}  # their names
-        self.texts: list[str] = []  # and texts
-        self.rooms: list[str] = []  # on the stack
-        self.places: dict[int, int] = {}  # of buffers in the large one of them
+        self.routines: dict[Any, str] = {}  # names of routines
+        self.texts: list[str] = []  # texts of routines
+        self.rooms: list[str] = []  # allocations on the stack
+        self.places: dict[int, int] = {}  # offsets of buffers in their common room
         self.merged: set[int] = set()  # sweeps that are computed where they are read
         self.names: dict[int | tuple[int, str], str] = {}
         self.count = 0
         self.block = "entry"
 
     def fresh(self) -> Emitter:
-        """Of another function of the same module."""
+        """Return an emitter for another function of the same module."""
         out = Emitter(Layout({}, [], 0), self.lanes)
         out.routines, out.texts, out.declared = self.routines, self.texts, self.declared
         return out
@@ -97,8 +102,8 @@ class Emitter:
     def vector(self, dtype: np.dtype[Any]) -> str:
         return f"<{self.lanes} x {scalar(dtype)}>"
 
-    def splat(self, value: Any) -> str:
-        """A constant in all lanes."""
+    def splat(self, value: np.generic) -> str:
+        """Return a constant in all lanes."""
         kind, name = value.dtype.kind, scalar(value.dtype)
         if kind == "f":
             text = f"0x{struct.unpack('<Q', struct.pack('<d', float(value)))[0]:016X}"
@@ -116,7 +121,7 @@ class Emitter:
     # -- values
 
     def value(self, node: Node) -> str:
-        """The name of a node's vector."""
+        """Return the name of a node's vector."""
         if node.op == "const":
             return self.splat(node.attr)
         if sweeps.is_pick(node):
@@ -132,7 +137,7 @@ class Emitter:
         return self.names[node.id]
 
     def table(self, nodes: Sequence[Node]) -> str:
-        """The address of numbers that all episodes share, one behind the other."""
+        """Return the address of consecutive shared numbers."""
         key = tuple(node.id for node in nodes)
         if key not in self.layout.tables:
             self.layout.tables[key] = len(self.layout.slots)
@@ -140,15 +145,15 @@ class Emitter:
         return self.address("%uniforms", 8 * self.layout.tables[key])
 
     def room(self, node: Node) -> str:
-        """The address of a buffer."""
+        """Return the address of a buffer."""
         return self.address("%large", self.places[node.id])
 
     def kind(self, node: Node) -> str:
-        """The type of what a name of a node is."""
+        """Return the LLVM type of a node's name."""
         return "ptr" if node.size else self.vector(node.dtype)
 
     def uniform(self, place: str, dtype: np.dtype[Any]) -> str:
-        """A number that all episodes share, at an address, in all lanes."""
+        """Load a shared number from an address into all lanes."""
         name = scalar(BOOL) if dtype == BOOL else scalar(dtype)
         stored = "i8" if dtype == BOOL else name
         held = self.set(f"load {stored}, ptr {place}, align 8")
@@ -159,7 +164,7 @@ class Emitter:
         return self.set(f"shufflevector {kind} {first}, {kind} poison, <{self.lanes} x i32> zeroinitializer")
 
     def stored(self, dtype: np.dtype[Any]) -> str:
-        """The type of a vector in memory: a byte for each truth value."""
+        """Return the type of a vector in memory: one byte per truth value."""
         return f"<{self.lanes} x {'i8' if dtype == BOOL else scalar(dtype)}>"
 
     def from_memory(self, address: str, dtype: np.dtype[Any], align: int) -> str:
@@ -189,7 +194,7 @@ class Emitter:
         return out
 
     def row(self, place: Column, dtype: np.dtype[Any]) -> str:
-        """The address of the block's first episode in an array."""
+        """Return the address of the block's first episode in an array."""
         step = self.set(f"mul i64 %time, %bytes{place.array}")
         row = self.set(f"mul i64 %block, {self.lanes * place.columns * dtype.itemsize}")
         return self.address(f"%array{place.array}", self.set(f"add i64 {step}, {row}"))
@@ -216,7 +221,7 @@ class Emitter:
             self.names[node.id] = self.input(node) if node.op == "input" else operation(self, node)
 
     def together(self, nodes: Sequence[Node]) -> str:
-        """The address of vectors one behind the other: where they stand, or room on the stack that they are written to."""
+        """Return the address of contiguous vectors: their own place, or a copy on the stack."""
         kind, size, first = self.vector(FLOAT), 8 * self.lanes, nodes[0]
         if all(sweeps.is_pick(node) and node.args == first.args and node.attr == first.attr + i for i, node in enumerate(nodes)):
             return sweeps.element(self, self.value(first.args[0]), "0", size, first.attr)
@@ -230,7 +235,7 @@ class Emitter:
     # -- order
 
     def emit(self, items: Sequence[Item], stores: dict[int, list[Held | Column]]) -> None:
-        """Code of the items. What is stored is stored at once, where nothing reads its place afterwards."""
+        """Emit the items, and store each result as soon as nothing reads its place afterwards."""
         for item in items:
             if isinstance(item, Branch):
                 self.branch(item)
@@ -270,7 +275,7 @@ class Emitter:
             self.names[choice.id if choice.id in others else (choice.id, "one side")] = held
 
     def _other(self, choice: Node, side: int) -> str:
-        """The side of a choice that this branch does not compute."""
+        """Return the side of a choice that this branch does not compute."""
         return self.names.get((choice.id, "one side")) or self.value(choice.args[3 - side])
 
     def store(self, node: Node, place: Held | Column) -> None:
@@ -282,7 +287,7 @@ class Emitter:
 
 
 def text_of(layout: Layout, arrays: int, lanes: int, least: int) -> tuple[str, dict[str, int], int]:
-    """LLVM's text of `step`, how many nodes and branches it has, and the bytes of its room."""
+    """Return LLVM's text of `step`, its numbers of nodes and branches, and the bytes of its buffers."""
     e = Emitter(layout, lanes)
     e.begin("entry")
     e.lines.append("")
@@ -315,7 +320,7 @@ def text_of(layout: Layout, arrays: int, lanes: int, least: int) -> tuple[str, d
 
 @contextlib.contextmanager
 def _loop(e: Emitter, name: str, first: str, last: str) -> Iterator[None]:
-    """Code for each number of a range; of none where it is empty."""
+    """Emit a loop over the numbers from `first` to before `last`, within the block."""
     e.line(f"%{name}_none = icmp sge i64 {first}, {last}")
     e.line(f"br i1 %{name}_none, label %{name}_end, label %{name}_loop")
     before = e.block
@@ -331,7 +336,7 @@ def _loop(e: Emitter, name: str, first: str, last: str) -> Iterator[None]:
 
 
 def _step(e: Emitter, least: int) -> tuple[list[Item], int]:
-    """One step of one block; -> its items, and the bytes of its buffers."""
+    """Emit one step of one block; return its items and the bytes of its buffers."""
     layout = e.layout
     outputs = [node for node, _ in layout.outputs]
     items = schedule(outputs, least)
@@ -369,7 +374,7 @@ def _step(e: Emitter, least: int) -> tuple[list[Item], int]:
 
 
 def _last_read(items: Sequence[Item], layout: Layout) -> dict[int, int]:
-    """By its offset: at which item a number of the state is read."""
+    """Return the last item that reads each number of the state, by offset."""
     out = {}
     for i, item in enumerate(items):
         if not isinstance(item, Branch) and item.op == "input" and isinstance(place := layout.inputs.get(item.id), Held):

@@ -1,58 +1,57 @@
 """Products and inverses of small matrices, written once for plain and for traced arrays: sums in a fixed order, element by element.
 
-Arrays are (B, ..., rows, columns). What is the same for all episodes has no B, or one.
+Arrays are (B, ..., rows, columns). An array that all episodes share has no B, or one.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from tailgate.engine.array import Traced, boxed, lifted
-from tailgate.engine.buffers import buffer_of, sides, swept, table_of, wide
+from tailgate.engine.array import Traced, lifted
+from tailgate.engine.buffers import boxed, buffer_of, sides, swept, table_of, wide
 from tailgate.engine.compiled import shaped
 from tailgate.engine.functions import gathered
 from tailgate.engine.loops import until
-from tailgate.engine.operations import BOOL, FLOAT
+from tailgate.engine.operations import BOOL, FLOAT, Array
 
-SMALL = 500  # products of numbers that numpy makes sooner than machine code is called
-LOOPED = 64  # numbers in a matrix without zeros that is multiplied in a loop: straight code of more takes long to compile
-SPARSE = 100  # numbers of a matrix with zeros that is multiplied in a loop
+SMALL = 500  # products of numbers up to which numpy is faster than a call of machine code
+LOOPED = 64  # numbers of a dense matrix from which multiplication is a loop, because straight code takes long to compile
+SPARSE = 100  # numbers of a sparse matrix from which multiplication is a loop
 STRAIGHT = 600  # products of numbers in straight code
-AT_ONCE = 20_000  # products of numbers that numpy makes before it adds them
+AT_ONCE = 20_000  # products of numbers that numpy holds in memory before it adds them
 
 
-def _large(size: int, *arrays: Any) -> bool:
-    """Is one of these a buffer, or what has a size and is made of them?"""
+def _large(size: int, *arrays: Array) -> bool:
+    """Return True if one of these is a buffer, or if an array of `size` made from them becomes one."""
     return any(isinstance(a, Traced) and wide(a.graph, a.nodes, size=size) for a in arrays)
 
 
-def _size(x: Any, y: Any) -> int:
-    """How many numbers a product of two arrays has."""
+def _size(x: Array, y: Array) -> int:
+    """Return how many numbers the product of two arrays has."""
     return math.prod((*np.broadcast_shapes(x.shape[:-2], y.shape[:-2]), x.shape[-2], y.shape[-1])) if x.shape[-1] else 0
 
 
-def _products(x: Any, y: Any) -> int:
+def _products(x: Array, y: Array) -> int:
     """Estimate how many scalar multiplications x y needs."""
     return int(max(x.size * y.shape[-1], x.shape[-2] * y.size))
 
 
-def _over(function: Any, lead: Sequence[int], *arrays: Any) -> Traced:
-    """function(*arrays without their first axes), for each index of these: of arrays (B, ...) that broadcast to `lead`."""
+def _over(function: Callable[..., Array], lead: Sequence[int], *arrays: Array) -> Traced:
+    """Apply a function to arrays (B, ...) that broadcast to `lead`, for each index of these first axes."""
     graph = next(a.graph for a in arrays if isinstance(a, Traced))
     given = [lifted(graph, a).nodes for a in arrays]
 
-    def body(*parts: Any) -> Any:
-        return function(*(Traced(graph, part, FLOAT) for part in parts)).nodes
+    def body(*parts: Array) -> Array:
+        return lifted(graph, function(*(Traced(graph, part, FLOAT) for part in parts))).nodes
 
     return Traced(graph, swept(graph, body, lead, given), FLOAT, 0)
 
 
-def _looped(x: Any, y: Traced, base: Any, there: Any = None) -> Traced:
-    """base + x y, of an x that is the same for all episodes: in the order of `constant_times` and `dense`."""
+def _looped(x: Array, y: Traced, base: Array, there: Array | None = None) -> Traced:
+    """Return base + x y for a constant x, in a loop with the order of `constant_times` and `dense`."""
     graph = y.graph
     matrix, begin = lifted(graph, x), lifted(graph, base)
     shape, lead = begin.shape, begin.shape[:-2]
@@ -68,16 +67,16 @@ def _looped(x: Any, y: Traced, base: Any, there: Any = None) -> Traced:
     return Traced(graph, out, FLOAT, None if y.batch is None else y.batch - y.ndim + len(shape))
 
 
-def structure(x: Any) -> Any:
-    """Where a matrix that is the same for all episodes is not zero."""
+def structure(x: Array) -> Array:
+    """Return where a constant matrix is not zero."""
     return x.nonzero_places() if isinstance(x, Traced) else np.asarray(x) != 0.0
 
 
 @shaped(lambda x, y: y.ndim > 2 and _products(x, y) > SMALL, "x")
-def constant_times(x: Any, y: Any) -> Any:
-    """x (..., i, k) times y (B, ..., k, j), of an x that is the same for all: sums run from 0, and its zeros count for nothing."""
+def constant_times(x: Array, y: Array) -> Array:
+    """Multiply a constant x (..., i, k) by y (B, ..., k, j): sums run from 0 and skip the zeros of x."""
     if not (isinstance(x, Traced) or isinstance(y, Traced)) and x.shape[-1] and np.isfinite(y).all():
-        return _summed(x, y) + 0.0  # zeros of x add nothing; a sum from 0 is never -0
+        return _summed(x, y) + 0.0  # zeros of x add nothing, and a sum from 0 is never -0
     if _large(_size(x, y), y):
         if x.ndim > 2 and len(x) > 1:
             return np.stack([constant_times(x[i], y[:, i]) for i in range(len(x))], axis=1)
@@ -88,17 +87,17 @@ def constant_times(x: Any, y: Any) -> Any:
     if isinstance(y, Traced) and (dense or np.count_nonzero(there) > SPARSE):
         zero = np.zeros((*np.broadcast_shapes(x.shape[:-2], y.shape[:-2]), x.shape[-2], y.shape[-1]))
         return _looped(x, y, zero, None if dense else there)
-    out: Any = np.zeros((*np.broadcast_shapes(x.shape[:-2], y.shape[:-2]), x.shape[-2], y.shape[-1]))
-    with np.errstate(all="ignore"):  # whatever stands where x is zero
+    out: Array = np.zeros((*np.broadcast_shapes(x.shape[:-2], y.shape[:-2]), x.shape[-2], y.shape[-1]))
+    with np.errstate(all="ignore"):  # y may hold anything where x is zero
         for k in range(x.shape[-1]):
             out = np.where(there[..., k, None], out + x[..., k, None] * y[..., k, None, :], out)
     return out
 
 
-def _summed(x: Any, y: Any) -> Any:
-    """The sums over k of x (..., i, k) times y (..., k, j), which begin with their first product."""
+def _summed(x: Array, y: Array) -> Array:
+    """Sum x (..., i, k) times y (..., k, j) over k, beginning with the first product."""
     if not (isinstance(x, Traced) or isinstance(y, Traced)) and _products(x, y) <= AT_ONCE:
-        return np.add.accumulate(x[..., None] * y[..., None, :, :], axis=-2)[..., -1, :]  # in ascending order, unlike a sum
+        return np.add.accumulate(x[..., None] * y[..., None, :, :], axis=-2)[..., -1, :]  # in ascending order, unlike np.sum
     out = x[..., :1] * y[..., :1, :]
     for k in range(1, x.shape[-1]):
         out = out + x[..., k : k + 1] * y[..., k : k + 1, :]
@@ -106,11 +105,11 @@ def _summed(x: Any, y: Any) -> Any:
 
 
 @shaped(lambda x, y: x.ndim == y.ndim > 2 and _products(x, y) > SMALL)
-def product(x: Any, y: Any) -> Any:
-    """x (..., i, k) times y (..., k, j): sums begin with their first product."""
+def product(x: Array, y: Array) -> Array:
+    """Multiply x (..., i, k) by y (..., k, j): sums begin with their first product."""
     if _large(_size(x, y), x, y):
         lead = np.broadcast_shapes(x.shape[:-2], y.shape[:-2])
-        if math.prod(lead) == 1:  # in one place of the code among many: a loop over its numbers is the shortest
+        if math.prod(lead) == 1:  # one place among much code: a loop over its numbers is shortest
             turned = np.swapaxes(y, -1, -2)[..., None, :, :]
             return _over(lambda row, column: _dot(row, column), (*lead, x.shape[-2], y.shape[-1]), x[..., None, :], turned)
         if x.shape[-2] * y.shape[-2] * y.shape[-1] <= STRAIGHT:
@@ -120,8 +119,8 @@ def product(x: Any, y: Any) -> Any:
 
 
 @shaped(lambda s: s.ndim > 2 < s.shape[-1] and s.size > SMALL)
-def inverse(s: Any) -> Any:
-    """The inverse of symmetric positive definite (..., q, q): in closed form for q <= 2, else by Gauss and Jordan, without pivots."""
+def inverse(s: Array) -> Array:
+    """Invert symmetric positive definite (..., q, q): in closed form for q <= 2, else by Gauss-Jordan without pivots."""
     q = s.shape[-1]
     if q == 1:
         return 1.0 / s
@@ -131,7 +130,7 @@ def inverse(s: Any) -> Any:
         off = -b * scale
         return np.stack([np.stack([d * scale, off], axis=-1), np.stack([off, a * scale], axis=-1)], axis=-2)
     if isinstance(s, Traced) and any(sides(s.graph, one) for one in s.nodes.reshape(-1, q, q)):
-        parts = [_inverse_by_side(Traced(s.graph, one, FLOAT)) for one in s.nodes.reshape(-1, q, q)]
+        parts = [lifted(s.graph, _inverse_by_side(Traced(s.graph, one, FLOAT))) for one in s.nodes.reshape(-1, q, q)]
         return Traced(s.graph, np.stack([part.nodes for part in parts]).reshape(s.shape), FLOAT, s.batch)
     if isinstance(s, Traced) and (s.fixed or _large(s.size, s)):
         held = table_of(s.graph, s.nodes) if s.fixed else buffer_of(s.graph, s.nodes)
@@ -147,8 +146,8 @@ def inverse(s: Any) -> Any:
     return out
 
 
-def _inverse_by_side(s: Traced) -> Any:
-    """The inverse of one matrix: of what episodes choose from, where one of both is the same for all."""
+def _inverse_by_side(s: Traced) -> Array:
+    """Invert one matrix; if episodes choose it from two matrices of which one is constant, invert both."""
     found = sides(s.graph, s.nodes)
     if found is None:
         return inverse(s)
@@ -156,60 +155,55 @@ def _inverse_by_side(s: Traced) -> Any:
     return np.where(Traced(s.graph, boxed(where), BOOL), *(inverse(Traced(s.graph, side, FLOAT)) for side in both))
 
 
-def transposed(x: Any) -> Any:
-    """The last two axes exchanged."""
+def transposed(x: Array) -> Array:
+    """Exchange the last two axes."""
     return np.swapaxes(x, -1, -2)
 
 
-def times(x: Any, v: Any) -> Any:
-    """x (..., i, k) times v (..., k), by `product`."""
+def times(x: Array, v: Array) -> Array:
+    """Multiply x (..., i, k) by v (..., k), by `product`."""
     return product(x, v[..., None])[..., 0]
 
 
-def constant_on(x: Any, v: Any) -> Any:
-    """x (..., i, k), the same for all, times v (B, ..., k), by `constant_times`."""
+def constant_on(x: Array, v: Array) -> Array:
+    """Multiply a constant x (..., i, k) by v (B, ..., k), by `constant_times`."""
     return constant_times(x, v[..., None])[..., 0]
 
 
 @shaped(lambda A, P, Q: P.size * len(A) > SMALL, "A", "Q")
-def congruent(A: Any, P: Any, Q: Any) -> Any:
-    """A P A' + Q for one A and Q (n, n) and P (B, N, n, n)."""
+def congruent(A: Array, P: Array, Q: Array) -> Array:
+    """Return A P A' + Q for one A and Q (n, n) and P (B, N, n, n)."""
     return constant_times(A, transposed(constant_times(A, P))) + Q
 
 
-def applied(matrix: Any, x: Any, base: Any) -> Any:
-    """Each agent's own matrix (N, i, k), or one (1, i, k) for all, times its vector in x (B, N, k), on top of base (B, N, i) if any."""
-    moved = constant_on(matrix, x)
-    return moved if base is None else base + moved
-
-
-def predicted(A: Any, B: Any, c: Any, L: Any, merge: Any, heard: Any, x: Any, u: Any) -> Any:
-    """merge_i sum_j L_j (A x_j + B u_j + c) (B, N, n) over the j in heard (N, N) bool, for x (B, N, n) and u (B, N, m)."""
+def predicted(A: Array, B: Array, c: Array, L: Array, merge: Array, heard: Array, x: Array, u: Array) -> Array:
+    """Return merge_i sum_j L_j (A x_j + B u_j + c) (B, N, n) over j in heard (N, N) bool, for x (B, N, n) and u (B, N, m)."""
     sent = constant_on(L, constant_on(A, x) + constant_on(B, u) + c)
     return constant_on(merge, np.stack([_heard(sent, 0.0, who) for who in structure(heard)], axis=1))
 
 
-def _heard(sent: Any, begin: Any, who: Any) -> Any:
-    """The sum of what agents send (B, N, ...), in their order, over those that are heard (N,) bool."""
+def _heard(sent: Array, begin: Array | float, who: Array) -> Array | float:
+    """Sum what agents send (B, N, ...), in their order, over those that are heard (N,) bool."""
     out = begin
     for j in np.flatnonzero(who):
         out = out + sent[:, j]
     return out
 
 
-def moment(weights: Any, covariances: Any, offsets: Any) -> Any:
-    """sum_i w_i (P_i + d_i d_i') (B, N, n, n) in that order, of w_i (B, N), P_i (B, N, n, n) and d_i (B, N, n)."""
-    out: Any = None
+def moment(weights: Sequence[Array], covariances: Sequence[Array], offsets: Sequence[Array]) -> Array:
+    """Return sum_i w_i (P_i + d_i d_i') (B, N, n, n) in that order, for w_i (B, N), P_i (B, N, n, n) and d_i (B, N, n)."""
+    out: Array | None = None
     for w, P, d in zip(weights, covariances, offsets, strict=True):
         term = w[..., None, None] * (P + d[..., :, None] * d[..., None, :])
         out = term if out is None else out + term
+    assert out is not None
     return out
 
 
-def spreads(heard: Any, M: Any, weight: Any, total: Any, begin: Any, step: Any) -> tuple[Any, Any]:
-    """L_j = M_j^-1 and Q_i^-1 (B, N, n, n) of covariances M (B, N, n, n) that are sent, after a step (A, Q) if any.
+def spreads(heard: Array, M: Array, weight: Array, total: Array, begin: Array, step: tuple[Array, Array] | None) -> tuple[Array, Array]:
+    """Return L_j = M_j^-1 and Q_i^-1 (B, N, n, n) for sent covariances M (B, N, n, n), after a prediction (A, Q) if given.
 
-    Q_i = (begin_i + sum_j w_ij L_j) / t_i over the j in heard (N, N) bool, of w (B, N, N), t and begin (B, N).
+    Q_i = (begin_i + sum_j w_ij L_j) / t_i over j in heard (N, N) bool, for w (B, N, N), t and begin (B, N).
     """
     L, out = inverse(M if step is None else congruent(step[0], M, step[1])), []
     for i, who in enumerate(structure(heard)):
@@ -220,19 +214,22 @@ def spreads(heard: Any, M: Any, weight: Any, total: Any, begin: Any, step: Any) 
     return L, inverse(np.stack(out, axis=1))
 
 
-def means(heard: Any, x: Any, L: Any, spread: Any, weight: Any, total: Any) -> Any:
-    """xb_i = Q_i^-1 (sum_j w_ij L_j x_j) / t_i (B, N, n) over the j in heard (N, N) bool, of x (B, N, n), and `spreads`."""
+def means(heard: Array, x: Array, L: Array, spread: Array, weight: Array, total: Array) -> Array:
+    """Return xb_i = Q_i^-1 (sum_j w_ij L_j x_j) / t_i (B, N, n) over j in heard (N, N) bool, for x (B, N, n); see `spreads`."""
     y, out = times(L, x), []
     for i, who in enumerate(structure(heard)):
-        mean = 0.0
+        mean: Array | float = 0.0
         for j in np.flatnonzero(who):
             mean = mean + weight[:, i, j, None] * y[:, j]
         out.append(mean / total[:, i, None])
     return times(spread, np.stack(out, axis=1))
 
 
-def corrected(C: Any, W: Any, x: Any, P: Any, r: Any, keep: Any) -> tuple[Any, Any]:
-    """x (B, N, n) and P (B, N, n, n) after an update by r (B, N, q), whose covariance has the inverse W; keep (B, N, q) are the sensors."""
+def corrected(C: Array, W: Array, x: Array, P: Array, r: Array, keep: Array) -> tuple[Array, Array]:
+    """Return x (B, N, n) and P (B, N, n, n) after a Kalman update by the innovation r (B, N, q).
+
+    W is the inverse of the covariance of r; keep (B, N, q) selects the sensors that count.
+    """
     there = keep.astype(np.float64)
     cross = constant_times(C, P) * there[..., None]
     gain = transposed(product(W, cross))
@@ -240,8 +237,8 @@ def corrected(C: Any, W: Any, x: Any, P: Any, r: Any, keep: Any) -> tuple[Any, A
     return x + times(gain, r * there), 0.5 * (left + transposed(left))
 
 
-def solve(m: Any, y: Any) -> Any:
-    """m^-1 y for one m (n, n) and y (n, k), by Gauss-Jordan elimination with row pivots."""
+def solve(m: Array, y: Array) -> Array:
+    """Return m^-1 y for one m (n, n) and y (n, k), by Gauss-Jordan elimination with row pivots."""
     n = len(m)
     both = np.concatenate([m, y], axis=1)
     for p in range(n):
@@ -252,21 +249,22 @@ def solve(m: Any, y: Any) -> Any:
         factor[p] = 0.0
         rest = both[:, p:]
         np.subtract(rest, factor[:, None] * rest[p], out=rest, where=(factor != 0.0)[:, None])
-    return both[:, n:] / np.diagonal(both)[:, None]
+    solution: Array = both[:, n:] / np.diagonal(both)[:, None]
+    return solution
 
 
-PAIRS = 15  # of rows that are turned in straight code
-SWEEPS = 60  # of Jacobi's rotations; some ten are enough
+PAIRS = 15  # pairs of rows that are rotated in straight code
+SWEEPS = 60  # most sweeps of Jacobi's rotations; about ten suffice
 ROUNDING = 1e-15
 
 
 @shaped(lambda x, y: x.shape[1] > 5)
 @np.errstate(all="ignore")
-def orthogonal(x: Any, y: Any) -> tuple[Any, Any]:
-    """V'X, whose rows are orthogonal, and V'Y for X (M, q, n) and Y (M, q, p): each row of V'X to its own relative accuracy.
+def orthogonal(x: Array, y: Array) -> tuple[Array, Array]:
+    """Return V'X, whose rows are orthogonal, and V'Y for X (M, q, n) and Y (M, q, p), each row to its own relative accuracy.
 
-    Jacobi's rotations from one side in fixed order, pair by pair; V is orthogonal. The squared lengths of the rows are the eigenvalues
-    of X X', in no order.
+    V is orthogonal: one-sided Jacobi rotations in fixed order, pair by pair.
+    The squared lengths of the rows of V'X are the eigenvalues of X X', in no order.
     """
     n, both = x.shape[-1], np.concatenate([x, y], axis=-1)
     count = both.shape[1]
@@ -276,7 +274,7 @@ def orthogonal(x: Any, y: Any) -> tuple[Any, Any]:
         rows = _one_by_one(rows, pairs, n, everyone)
     else:
 
-        def sweep(*rows: Any) -> tuple[Any, list[Any]]:
+        def sweep(*rows: Array) -> tuple[Array, list[Array]]:
             held, turned = list(rows), np.zeros(len(both), bool)
             for i, j in pairs:
                 turn, held[i], held[j] = _rotated(held[i], held[j], n)
@@ -288,8 +286,8 @@ def orthogonal(x: Any, y: Any) -> tuple[Any, Any]:
     return both[..., :n], both[..., n:]
 
 
-def _rotated(v: Any, w: Any, n: int) -> tuple[Any, Any, Any]:
-    """Do two rows (M, k) turn, and what they are when the first n numbers of both are orthogonal."""
+def _rotated(v: Array, w: Array, n: int) -> tuple[Array, Array, Array]:
+    """Return whether two rows (M, k) rotate, and the rows after their first n numbers are orthogonal."""
     a, b, g = _dot(v[:, :n], v[:, :n]), _dot(w[:, :n], w[:, :n]), _dot(v[:, :n], w[:, :n])
     turn = ~(np.abs(g) <= ROUNDING * np.sqrt(a * b))
     half = (b - a) / (2.0 * np.where(turn, g, 1.0))
@@ -299,18 +297,18 @@ def _rotated(v: Any, w: Any, n: int) -> tuple[Any, Any, Any]:
     return turn, np.where(there, c * (v - t * w), v), np.where(there, c * (w + t * v), w)
 
 
-def _one_by_one(rows: list[Any], pairs: list[tuple[int, int]], n: int, everyone: Any) -> list[Any]:
-    """The same rotations, a pair in each round of a loop: straight code of all pairs takes long to compile."""
+def _one_by_one(rows: list[Array], pairs: list[tuple[int, int]], n: int, everyone: Array) -> list[Array]:
+    """Apply the same rotations, one pair per round of a loop, because straight code of all pairs takes long to compile."""
     places = np.array(pairs)
 
-    def row(rows: Sequence[Any], which: Any) -> Any:
+    def row(rows: Sequence[Array], which: Array) -> Array:
         out = rows[0]
         for k in range(1, len(rows)):
             out = np.where(which == k, rows[k], out)
         return out
 
-    def round_of(turned: Any, pair: Any, *rows: Any) -> tuple[Any, list[Any]]:
-        which: list[Any] = [gathered(places[:, side], pair)[:, None] for side in (0, 1)]
+    def round_of(turned: Array, pair: Array, *rows: Array) -> tuple[Array, list[Array]]:
+        which: list[Array] = [gathered(places[:, side], pair)[:, None] for side in (0, 1)]
         i, j = which
         turn, v, w = _rotated(row(rows, i), row(rows, j), n)
         held = [np.where(i == k, v, np.where(j == k, w, one)) for k, one in enumerate(rows)]
@@ -321,23 +319,23 @@ def _one_by_one(rows: list[Any], pairs: list[tuple[int, int]], n: int, everyone:
     return until(round_of, state, everyone, SWEEPS * len(pairs))[2:]
 
 
-def root(s: Any) -> tuple[Any, Any]:
-    """D^1/2 V' and D^-1/2 V' for symmetric positive definite V D V' (M, q, q): Y with Y'Y = S, and with Y'Y = S^-1."""
+def root(s: Array) -> tuple[Array, Array]:
+    """Return D^1/2 V' and D^-1/2 V' for symmetric positive definite S = V D V' (M, q, q): Y with Y'Y = S, and with Y'Y = S^-1."""
     rows, turn = orthogonal(s, np.broadcast_to(np.eye(s.shape[-1]), s.shape))
     half = np.sqrt(_dot(rows, turn))[..., None]  # V'S = D V'
     return turn * half, turn / half
 
 
-def _dot(x: Any, y: Any) -> Any:
-    """Products (..., k), summed in ascending order."""
+def _dot(x: Array, y: Array) -> Array:
+    """Sum products (..., k) in ascending order."""
     out = x[..., 0] * y[..., 0]
     for k in range(1, x.shape[-1]):
         out = out + x[..., k] * y[..., k]
     return out
 
 
-def dense(x: Any, weight: Any, bias: Any) -> Any:
-    """x (B, i) times weight (i, o), on top of bias (o,): sums run over i in ascending order."""
+def dense(x: Array, weight: Array, bias: Array) -> Array:
+    """Return x (B, i) times weight (i, o) plus bias (o,): sums begin with the bias and run over i in ascending order."""
     if isinstance(x, Traced) and not x.fixed and weight.size >= LOOPED:
         return _looped(np.swapaxes(weight, 0, 1), x[..., None], np.broadcast_to(bias, (len(x), len(bias)))[..., None])[..., 0]
     out = bias

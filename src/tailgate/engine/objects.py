@@ -1,7 +1,7 @@
-"""Compiled functions: made by LLVM for this processor, and kept on disk as object code.
+"""Compiled functions: LLVM compiles them for this processor, and a folder caches their object code.
 
-The folder of objects is the user's own and nobody else may write to it. An object is named by all that it depends on, and begins with its
-own hash: what does not fit is compiled again. Nothing breaks where the folder cannot be written.
+Only the user may write to the folder. The name of an object is a hash of all that it depends on; the file begins with its own hash.
+A file that does not match is compiled again. A folder that cannot be written does no harm.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from typing import Any
 
 from tailgate.base.errors import InputError
 
-VERSION = b"2"  # of what this module makes of a text
-KEPT = 4000  # files in the folder, those that were used last
+VERSION = b"2"  # of this module's translation
+KEPT = 4000  # most recently used files in the folder
 _lock = threading.RLock()
 
 
 @cache
 def _binding() -> Any:
-    """llvmlite, ready for this processor."""
+    """Return llvmlite, initialised for this processor."""
     import llvmlite.binding as binding
 
     binding.initialize_native_target()
@@ -35,19 +35,19 @@ def _binding() -> Any:
 
 @cache
 def processor() -> tuple[str, str]:
-    """Its name, and what it can do."""
+    """Return the processor's name and features."""
     binding = _binding()
     return str(binding.get_host_cpu_name()), str(binding.get_host_cpu_features().flatten())
 
 
 def lanes() -> int:
-    """How many float64 a vector of this processor holds."""
+    """Return how many float64 numbers a vector of this processor holds."""
     features = processor()[1].split(",")
     return 8 if "+avx512f" in features and "+avx512dq" in features else 4 if "+avx2" in features else 2
 
 
 def level() -> int:
-    """LLVM's level of optimisation: TAILGATE_LLVM, or 1; 2 and 3 take twice the time to compile, for code as fast. No bit depends on it."""
+    """Return LLVM's optimisation level: TAILGATE_LLVM, or 1. Levels 2 and 3 compile twice as long for equally fast code; no bit changes."""
     asked = os.environ.get("TAILGATE_LLVM", "1")
     if asked not in ("0", "1", "2", "3"):
         raise InputError("TAILGATE_LLVM", asked, "0, 1, 2 or 3")
@@ -62,7 +62,7 @@ def _machine() -> Any:
 
 
 def folder() -> Path | None:
-    """Where objects are kept: TAILGATE_CACHE, or below the user's cache. None where it is not the user's own."""
+    """Return the folder of objects: TAILGATE_CACHE, or below the user's cache; None if others may write to it."""
     base = os.environ.get("TAILGATE_CACHE") or os.path.join(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache", "tailgate")
     place = Path(base) / "objects"
     with contextlib.suppress(OSError):
@@ -80,7 +80,7 @@ def _kept(name: str) -> bytes | None:
     with contextlib.suppress(OSError):
         held = (place / name).read_bytes()
         if hashlib.sha256(held[32:]).digest() == held[:32]:
-            with contextlib.suppress(OSError):  # a folder that can only be read
+            with contextlib.suppress(OSError):  # a read-only folder
                 os.utime(place / name)
             return held[32:]
     return None
@@ -104,23 +104,23 @@ def _keep(name: str, content: bytes) -> None:
 def _compiled(text: str) -> bytes:
     binding, machine = _binding(), _machine()
     module = binding.parse_assembly(text)
-    module.verify()  # no passes: they take most of the time and gain little, since nodes are unique and ordered already
+    module.verify()  # without passes, which cost most of the time and gain little: nodes are unique and ordered already
     return bytes(machine.emit_object(module))
 
 
 def proved(names: Sequence[str]) -> bool:
-    """Has code of these objects once been compared with plain code on this machine, and been found equal?"""
+    """Return True if code of these objects has been found equal to plain code on this machine."""
     return all(_kept(f"{name}.equal") is not None for name in names)
 
 
 def prove(names: Sequence[str]) -> None:
-    """Remember that it has."""
+    """Record that code of these objects equals plain code."""
     for name in names:
         _keep(f"{name}.equal", b"")
 
 
 class Function:
-    """`step` of a text, and `bound`, which has the address of its arguments. Calls release Python's lock."""
+    """The compiled functions `step`, and `bound`, which takes the address of its arguments. Calls release Python's lock."""
 
     def __init__(self, text: str) -> None:
         with _lock:

@@ -1,4 +1,4 @@
-"""The operations of a graph, by numpy: these functions define what each of them gives, in every backend."""
+"""The operations of a graph, by numpy: these functions define their results for every backend."""
 
 from __future__ import annotations
 
@@ -6,24 +6,29 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike as ArrayLike
+from numpy.typing import DTypeLike as DTypeLike
 
 Array = np.ndarray[Any, Any]
+Axis = int | Sequence[int] | None
+Shape = int | Sequence[int]
+Mask = Array | np.bool_  # numpy's reductions return either
 BOOL, FLOAT, INT = np.dtype(bool), np.dtype(np.float64), np.dtype(np.int64)
 DTYPES = [np.dtype(name) for name in ("?", "f8", "f4", "i8", "u8", "i4", "u4", "i2", "u2", "i1", "u1")]
 
 
-def minimum(x: Any, y: Any) -> Any:
-    """The smaller one; y where neither is, and NaN where either is: of numbers that are equal, -0.0 and 0.0 too, the second."""
+def minimum(x: Array, y: Array) -> Array:
+    """Return the smaller number, or NaN if either is NaN; of equal numbers, including -0.0 and 0.0, the second."""
     return np.where((x < y) | (x != x), x, y)
 
 
-def maximum(x: Any, y: Any) -> Any:
-    """The larger one, as `minimum` takes the smaller."""
+def maximum(x: Array, y: Array) -> Array:
+    """Return the larger number, as `minimum` returns the smaller."""
     return np.where((x > y) | (x != x), x, y)
 
 
-def converted(x: Any, dtype: np.dtype[Any]) -> Any:
-    """x as another type. What no 64-bit integer holds, NaN too, becomes the least one; a narrower type keeps the low bits."""
+def converted(x: Array, dtype: np.dtype[Any]) -> Array:
+    """Convert x to another type: NaN and numbers beyond 64 bits become the least integer; narrower types keep the low bits."""
     if x.dtype.kind == "f" and dtype.kind in "iu":
         holds = (x >= -(2.0**63)) & (x < 2.0**63)
         return np.where(holds, np.where(holds, x, 0.0).astype(np.int64), np.iinfo(np.int64).min).astype(dtype)
@@ -43,7 +48,7 @@ COMMUTATIVE = {"add", "mul", "and", "or", "xor", "eq", "ne"}
 
 
 def apply(op: str, dtype: np.dtype[Any], args: Sequence[Any]) -> Any:
-    """The operation on numpy's arrays or numbers: what every backend has to give."""
+    """Apply an operation to numpy arrays or numbers."""
     if op == "select":
         return np.where(*args)
     if op == "cast":

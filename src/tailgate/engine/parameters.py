@@ -1,7 +1,8 @@
-"""Parameters as numbers that all episodes share: other values need no other code.
+"""Parameters as numbers that all episodes share, so that other values need no other code.
 
-Plans, components and models are copied with their floats traced. What asks for a value, as a Python branch does, gets it; then the code
-depends on it, and on no more. Things that differ in such numbers alone have the same `key`.
+Plans, components and models are copied with their floats traced. Code that asks for a value, as in a Python branch, depends on that value
+only.
+Objects that differ only in such numbers have the same `key`.
 """
 
 from __future__ import annotations
@@ -14,38 +15,41 @@ import sys
 import types
 from collections.abc import Sequence
 from pathlib import Path, PurePath
-from typing import Any
+from typing import Any, TypeVar, cast
 
 import numpy as np
 
 from tailgate.base.sources import own
-from tailgate.engine.array import Traced, boxed
+from tailgate.engine.array import Traced
+from tailgate.engine.buffers import boxed
 from tailgate.engine.graph import Graph, Node, ordered
-from tailgate.engine.operations import FLOAT
+from tailgate.engine.operations import FLOAT, Array
 
-LARGE = 20_000  # numbers of an array that is taken as it is: mostly, code reads few of them
+T = TypeVar("T")
+LARGE = 20_000  # numbers of an array that is used as it is, because code usually reads few of them
 _PLAIN = (type(None), str, bytes, int, complex, enum.Enum, np.generic, np.dtype, type, types.BuiltinFunctionType, np.ufunc, PurePath)
 
 
-def lifted(graph: Graph, held: Any) -> Any:
-    """A copy of dataclasses, tuples, lists, mappings and closures in which floats, arrays of floats and whole numbers are traced."""
-    return _Reader(graph).visit(held)
+def lifted(like: Array, held: T) -> T:
+    """Copy dataclasses, tuples, lists, mappings and closures with numbers traced in the graph of `like`."""
+    assert isinstance(like, Traced)
+    return cast(T, _Reader(like.graph).visit(held))
 
 
 class Parameters:
-    """The parameters of some things. Equal `key`s have the same code but for their `values`; it is None for things that can change."""
+    """The parameters of objects: equal `key`s share code, whatever their `values`. The key of mutable objects is None."""
 
-    def __init__(self, held: Any) -> None:
+    def __init__(self, held: object) -> None:
         reader = _Reader(None)
         reader.visit(held)
         self.values = reader.values
         self._modules = reader.modules
-        self.kept = reader.kept  # what is known by its number lives as long as the key
+        self.kept = reader.kept  # objects known by their id must live as long as the key
         self.key = None if reader.changeable else tuple(reader.key)
 
     @property
     def sources(self) -> str:
-        """A hash of the files that hold the classes and functions: Tailgate's, and somebody else's."""
+        """A hash of the files that define the classes and functions, of Tailgate and of others."""
         digest = hashlib.sha256(own().encode())
         for name in sorted(self._modules):
             file = getattr(sys.modules.get(name), "__file__", None)
@@ -55,7 +59,7 @@ class Parameters:
 
 
 class Reading:
-    """The numbers of fixed nodes, which parameters of other values change."""
+    """The numbers of fixed nodes as functions of the parameters."""
 
     def __init__(self, graph: Graph, nodes: Sequence[Node]) -> None:
         self.graph, self.size = graph, len(nodes)
@@ -69,8 +73,8 @@ class Reading:
         self._direct = {leaf: np.array(places).T for leaf, places in direct.items()}
         self._order = ordered(node for _, node in self._rest)
 
-    def bits(self, values: Sequence[np.ndarray[Any, Any]] | None = None) -> np.ndarray[Any, Any]:
-        """Each number in 64 bits, of parameters with other values or with their own."""
+    def bits(self, values: Sequence[Array] | None = None) -> Array:
+        """Return each number as 64 bits, for given values of the parameters or for their own."""
         values = self.graph.parameters if values is None else values
         out = np.zeros(max(1, self.size), np.uint64)
         for leaf, (where, places) in self._direct.items():
@@ -87,18 +91,18 @@ class Reading:
 
 
 class _Reader:
-    """Goes through things in a fixed order; with a graph it makes a copy of them."""
+    """A traversal of objects in a fixed order; with a graph it copies them."""
 
     def __init__(self, graph: Graph | None) -> None:
         self.graph = graph
         self.key: list[Any] = []
-        self.values: list[np.ndarray[Any, Any]] = [] if graph is None else graph.parameters
+        self.values: list[Array] = [] if graph is None else graph.parameters
         self.kept: list[Any] = []
         self.modules: set[str] = set()
         self.changeable = False
         self._known: dict[int, tuple[int, Any, Any]] = {}
 
-    def visit(self, held: Any) -> Any:
+    def visit(self, held: object) -> Any:
         if type(held) is float or (type(held) is int and abs(held) < 2**62):
             leaf = np.array([held])
             (node,) = self._leaf(leaf)
@@ -115,11 +119,11 @@ class _Reader:
         self.modules.update(base.__module__ for base in type(held).__mro__)
         self._known[id(held)] = number, held, held
         out = self._copied(held, number)
-        self._known[id(held)] = number, held, out  # the original lives on: its number is not given to another
+        self._known[id(held)] = number, held, out  # the original stays alive, so that its id is not reused
         return out
 
-    def _leaf(self, values: np.ndarray[Any, Any]) -> Any:
-        """The nodes of some numbers."""
+    def _leaf(self, values: Array) -> Any:
+        """Return the nodes of some numbers."""
         leaf = len(self.values)
         self.values.append(values.ravel())
         self.key += [values.shape, values.dtype.kind]
@@ -127,7 +131,7 @@ class _Reader:
             return [None] * values.size
         return [self.graph.uniform((leaf, i), value) for i, value in enumerate(values.flat)]
 
-    def _copied(self, held: Any, number: int) -> Any:
+    def _copied(self, held: object, number: int) -> Any:
         if isinstance(held, np.ndarray):
             return self._array(held)
         if isinstance(held, (tuple, list)):
@@ -146,13 +150,13 @@ class _Reader:
             return held
         self.changeable = self.changeable or not _frozen(type(held))
         out = copy.copy(held)
-        self._known[id(held)] = number, held, out  # before its parts: one of them may lead back
+        self._known[id(held)] = number, held, out  # before its parts, which may refer to it
         self.key.append(tuple(vars(held)))
         for key, part in vars(held).items():
             object.__setattr__(out, key, self.visit(part))
         return out
 
-    def _array(self, held: np.ndarray[Any, Any]) -> Any:
+    def _array(self, held: Array) -> Any:
         if held.dtype != FLOAT or held.size > LARGE:
             self.key += [held.shape, held.dtype.str, held.tobytes()]
             self.changeable = self.changeable or held.dtype == object
@@ -178,10 +182,10 @@ class _Reader:
         return out
 
 
-def _frozen(kind: Any) -> bool:
+def _frozen(kind: type[Any]) -> bool:
     return bool(kind.__dataclass_params__.frozen)
 
 
 def _code_of(kind: type) -> tuple[Any, ...]:
-    """The functions of a class and its bases: somebody may put others in their place."""
+    """Return the functions of a class and its bases, which may be replaced at run time."""
     return tuple(part for base in kind.__mro__ for part in vars(base).values() if isinstance(part, types.FunctionType))

@@ -1,25 +1,25 @@
-"""What is computed in which order, and what is skipped where no episode of a block asks for it.
+"""The order of a computation, and the branches that are skipped where no episode of a block needs them.
 
-A number that is needed only on one side of choices by one mask goes into a branch: it is computed where the mask holds in any lane of the
-block. The branches are found here; no code says where they are.
+A number that is needed only on one side of selects with one mask belongs to a branch.
+The branch is computed if the mask is true in any lane of the block. These passes find branches; no code declares them.
 """
 
 from __future__ import annotations
 
 import bisect
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 from tailgate.engine.graph import Body, Node, Sweep, ordered
 
 _COST = {"const": 0, "uniform": 0, "pick": 0, "loop": 300, "gather": 12, "div": 8, "sqrt": 10, "rem": 20}
-LEAST = 12  # cost of what is worth a branch, in additions
+LEAST = 12  # least cost of a branch, in additions
 
 
 @dataclass(eq=False)
 class Branch:
-    """What is needed only where `mask` holds, or only where it does not (`side` 2), and the choices that ask for it."""
+    """A part needed only where `mask` is true (`side` 1) or false (`side` 2), and the selects that need it."""
 
     mask: Node
     side: int
@@ -27,26 +27,26 @@ class Branch:
     inside: set[int]
     cost: int
     body: list[Item] = field(default_factory=list)
-    decides: list[Node] = field(default_factory=list)  # choices whose result is known after this branch; of the others, one side
+    decides: list[Node] = field(default_factory=list)  # selects that are complete after this branch; of the others, one side is known
 
 
 Item = Node | Branch
 
 
 def schedule(roots: Iterable[Node], least: int = LEAST) -> list[Item]:
-    """All that the roots need but constants and what is the same for all episodes, in the order of its computation."""
+    """Return all that the roots need, except constants and numbers that all episodes share, in the order of computation."""
     wanted = list(roots)
     nodes = [node for node in ordered(wanted) if not node.fixed]
     return _scope(nodes, {node.id for node in wanted}, least)
 
 
 def rounds(body: Body | Sweep, least: int = LEAST) -> list[Item]:
-    """A round of a loop or a sweep, in the order of its computation."""
+    """Return a round of a loop or a sweep, in the order of computation."""
     return _scope(body.nodes, {node.id for node in body.after}, least)
 
 
 def _scope(nodes: Sequence[Node], kept: Collection[int], least: int) -> list[Item]:
-    """The nodes of one scope, of which those in `kept` are needed outside of it, with its branches."""
+    """Return the nodes of one scope with its branches; nodes in `kept` are needed outside the scope."""
     branches = _branches(nodes, kept, least)
     while True:
         try:
@@ -61,12 +61,12 @@ def _scope(nodes: Sequence[Node], kept: Collection[int], least: int) -> list[Ite
     return items
 
 
-# -- which branches there are
+# -- finding branches
 
 
 def _branches(nodes: Sequence[Node], kept: Collection[int], least: int) -> list[Branch]:
-    """The branches of a scope, whatever is in branches of theirs. The nodes are in the order of their numbers."""
-    turns: dict[int, int] = {}  # of a choice that follows from others by the same mask: how many
+    """Return the branches of a scope without their inner branches. Nodes are in the order of their numbers."""
+    turns: dict[int, int] = {}  # by select: how many selects with the same mask precede it
     found = _asked(nodes, kept, turns)
     for several in found.values():
         if len(several.choices) > 1 and several.cost >= least:
@@ -79,7 +79,7 @@ def _branches(nodes: Sequence[Node], kept: Collection[int], least: int) -> list[
 def _asked(nodes: Sequence[Node], kept: Collection[int], turns: Mapping[int, int]) -> dict[Any, Branch]:
     """Find the outermost branches, by mask, side and turn.
 
-    A path lists the choices (mask, side) around a node, the outermost first. A node gets the path that all its users share.
+    A path lists the selects (mask, side) around a node, the outermost first. A node gets the path that all its users share.
     """
     nowhere = _Path(None, None, 0)
     by_id = {node.id: node for node in nodes}
@@ -91,7 +91,7 @@ def _asked(nodes: Sequence[Node], kept: Collection[int], turns: Mapping[int, int
             held = home.get(node.id)
             home[node.id] = path if held is None else held.meeting(path)
 
-    for node in reversed(nodes):  # what needs a node has a higher number
+    for node in reversed(nodes):  # users of a node have higher numbers
         path = home.setdefault(node.id, nowhere)
         if path.depth:
             branch = out[path.first]
@@ -113,27 +113,26 @@ def _asked(nodes: Sequence[Node], kept: Collection[int], turns: Mapping[int, int
 
 
 class _Path:
-    """The choices around a node, the outermost first."""
+    """The selects around a node, the outermost first."""
 
-    def __init__(self, before: _Path | None, key: Any, depth: int) -> None:
-        self.before, self.depth = before, depth
-        self.first: Any = key if depth == 1 else before and before.first
-        self._ways: dict[Any, _Path] = {}
+    def __init__(self, above: _Path | None, key: Hashable, depth: int) -> None:
+        self.above, self.depth = above or self, depth
+        self.first: Hashable = key if depth <= 1 else self.above.first
+        self._ways: dict[Hashable, _Path] = {}
 
-    def to(self, key: Any) -> _Path:
-        """Append a choice."""
+    def to(self, key: Hashable) -> _Path:
+        """Append a select."""
         if key not in self._ways:
             self._ways[key] = _Path(self, key, self.depth + 1)
         return self._ways[key]
 
     def meeting(self, other: _Path) -> _Path:
-        """Return what both paths share."""
-        one: Any = self
-        two: Any = other
+        """Return the common part of both paths."""
+        one, two = self, other
         while one is not two:
             deep = one.depth - two.depth
-            one, two = one.before if deep >= 0 else one, two.before if deep <= 0 else two
-        return one  # type: ignore[no-any-return]
+            one, two = one.above if deep >= 0 else one, two.above if deep <= 0 else two
+        return one
 
 
 def _cost(node: Node) -> int:
@@ -147,7 +146,7 @@ def _cost(node: Node) -> int:
 
 
 def _levels(nodes: Sequence[Node], choices: list[Node]) -> list[list[Node]]:
-    """The choices by how many others of them each one follows from. The nodes are in the order of their numbers."""
+    """Group the selects by how many others they depend on. Nodes are in the order of their numbers."""
     mine = {choice.id for choice in choices}
     if len(mine) == 1:
         return [choices]
@@ -165,7 +164,7 @@ def _levels(nodes: Sequence[Node], choices: list[Node]) -> list[list[Node]]:
     return [levels[deep] for deep in sorted(levels)]
 
 
-# -- in which order
+# -- ordering
 
 
 class _Circle(Exception):
@@ -177,7 +176,7 @@ class _Circle(Exception):
 
 
 def _in_order(nodes: Sequence[Node], branches: Sequence[Branch]) -> list[Item]:
-    """The scope's nodes outside of its branches, each after its arguments, and the branches where they are first asked for."""
+    """Return the scope's nodes outside its branches, each after its arguments, and each branch where it is first needed."""
     home = {i: branch for branch in branches for i in branch.inside}
     by_id = {node.id: node for node in nodes}
     gives: dict[int, list[Branch]] = {}
@@ -187,7 +186,7 @@ def _in_order(nodes: Sequence[Node], branches: Sequence[Branch]) -> list[Item]:
             gives.setdefault(choice.id, []).append(branch)
     for i, several in gives.items():
         several[-1].decides.append(by_id[i])
-    needs: dict[int, list[Node]] = {}  # of a branch: what has to be there before it
+    needs: dict[int, list[Node]] = {}  # by branch: what must precede it
     for branch in branches:
         found = [branch.mask]
         found += [arg for i in branch.inside for arg in by_id[i].args if arg.id not in branch.inside]
@@ -222,7 +221,7 @@ def _in_order(nodes: Sequence[Node], branches: Sequence[Branch]) -> list[Item]:
             if this.id in done or this.id not in by_id:
                 continue
             if this.id in home:
-                raise AssertionError(f"{this} is asked for outside of its branch")
+                raise AssertionError(f"{this} is needed outside its branch")
             if this.id in gives:
                 for branch in gives[this.id]:
                     enter(branch)
@@ -243,7 +242,7 @@ def _in_order(nodes: Sequence[Node], branches: Sequence[Branch]) -> list[Item]:
 
 
 def counted(items: Sequence[Item]) -> dict[str, int]:
-    """How many nodes and branches there are, and how many nodes in branches."""
+    """Count the nodes, the branches, and the nodes in branches."""
     out = {"nodes": 0, "branches": 0, "in branches": 0}
     for item in items:
         if isinstance(item, Branch):

@@ -1,7 +1,7 @@
-"""Programs: a function of trees of arrays, traced once, as machine code on blocks of episodes.
+"""Programs: functions of pytrees of arrays, traced once, as machine code on blocks of episodes.
 
-The function gets parameters, the state and arguments, and gives the next state and results: trees whose leaves have the episodes first.
-Parameters are the same for all episodes. Their values are no part of the code: other values need no other code.
+A function maps parameters, state and arguments to the next state and results; leaves are (episodes, ...).
+All episodes share the parameters. The code does not contain their values, so other values need no other code.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import cache
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -28,19 +28,21 @@ from tailgate.engine.functions import makers
 from tailgate.engine.graph import Graph, Node
 from tailgate.engine.hints import broken
 from tailgate.engine.llvm import Column, Held, Layout, text_of
-from tailgate.engine.operations import Array
+from tailgate.engine.operations import Array, DTypeLike
 from tailgate.engine.parameters import Reading
 from tailgate.engine.passes import LEAST
 
-_PYTHON = {"f": "d", "b": "?", "i": "q"}  # how Python reads 64-bit numbers and truth values
-WORTH = 2048  # episodes that are worth a thread
-ALIGNED = 64  # bytes: a line of the processor's cache
-Step = Callable[[Any, Any], tuple[Any, dict[str, Any]]]
+_PYTHON = {"f": "d", "b": "?", "i": "q"}  # Python's format of 64-bit numbers and truth values
+WORTH = 2048  # episodes per thread
+ALIGNED = 64  # bytes of a cache line
+S = TypeVar("S")
+G = TypeVar("G")
+T = TypeVar("T")
 
 
 @dataclass(eq=False)
 class Trace:
-    """What a function computes. Nodes are by leaf, in the order of its places. The result `demands` (B, .) is what code asks to hold."""
+    """The computation of a function, as nodes by leaf. The result `demands` (B, .) holds the conditions of the code."""
 
     graph: Graph
     state: dict[str, tuple[Array, Array]]  # leaf -> its nodes, and those of the next state
@@ -50,20 +52,19 @@ class Trace:
     large: dict[str, tuple[Node, Node]] = field(default_factory=dict)  # of leaves that are buffers: now and next
 
 
-def traced(function: Step, state: Any, arguments: Any) -> Trace:
-    """function(state, arguments) -> (state, results), of trees of arrays (B, ...) as examples of their shapes and types."""
+def traced(function: Callable[[S, G], tuple[S, Mapping[str, Array]]], state: S, arguments: G) -> Trace:
+    """Trace function(state, arguments) -> (state, results), with trees of example arrays (B, ...)."""
     graph = Graph()
     inside, taken = _inputs(graph, state, "state"), _inputs(graph, arguments, "arguments")
     with makers(graph):
-        following, results = function(inside, taken)
+        following, made = function(inside, taken)
         following = map_leaves(lambda leaf, like: lifted(graph, leaf, like.dtype).astype(like.dtype), following, inside)
-        results = {name: lifted(graph, leaf) for name, leaf in results.items()}
-    before: dict[str, Any] = leaves(inside)
-    after: dict[str, Any] = leaves(following)
+        results = {name: lifted(graph, leaf) for name, leaf in made.items()}
+    before, after = _nodes(inside), _nodes(following)
     for name, leaf in before.items():
         if after[name].shape != leaf.shape:
             raise ValueError(f"state {name}: {after[name].shape} after a step, {leaf.shape} before it")
-    held = {name: (leaf.nodes, after[name].nodes) for name, leaf in before.items()}
+    held = {name: (leaf, after[name]) for name, leaf in before.items()}
     large = {}
     for name, (here, there) in held.items():
         if here.size >= WIDE:
@@ -76,7 +77,7 @@ def traced(function: Step, state: Any, arguments: Any) -> Trace:
 
 
 def _own(graph: Graph, place: Node, new: Node) -> Node:
-    """The next numbers of a place in the state, copied if another place may hold them: that one is written to as well."""
+    """Return the next numbers of a place in the state, copied if they may alias another place that is written too."""
 
     def borrowed(node: Node) -> bool:
         return (node.op == "held" and node is not place) or (node.op == "blend" and any(borrowed(a) for a in node.args[1:]))
@@ -84,8 +85,8 @@ def _own(graph: Graph, place: Node, new: Node) -> Node:
     return copied(graph, new) if borrowed(new) else new
 
 
-def _inputs(graph: Graph, tree: Any, kind: str) -> Any:
-    """The tree with an input for each place of each leaf."""
+def _inputs(graph: Graph, tree: T, kind: str) -> T:
+    """Return the tree with an input for each number of each leaf."""
     names = iter(leaves(tree))
 
     def leaf(x: Array) -> Traced:
@@ -100,21 +101,20 @@ def _inputs(graph: Graph, tree: Any, kind: str) -> Any:
     return map_leaves(leaf, tree)
 
 
-def _nodes(tree: Any) -> dict[str, Array]:
-    held: dict[str, Any] = leaves(tree)
-    return {name: leaf.nodes for name, leaf in held.items()}
+def _nodes(tree: object) -> dict[str, Array]:
+    return {name: leaf.nodes for name, leaf in leaves(tree).items() if isinstance(leaf, Traced)}
 
 
 def _of_each(leaf: Traced) -> Traced:
-    """A result with the episodes first."""
+    """Return a result with the episodes first."""
     return leaf if leaf.ndim and leaf.shape[0] == 1 else Traced(leaf.graph, leaf.nodes[None], leaf.dtype)
 
 
 class Program:
-    """Machine code of a trace."""
+    """The machine code of a trace."""
 
     def __init__(self, trace: Trace, lanes: int | None = None, least: int = LEAST, twins: Mapping[str, str] | None = None) -> None:
-        """twins: leaves of the state that always equal others, in whose place they stand."""
+        """Compile a trace; `twins` maps leaves of the state to others that always equal them and share their place."""
         self.trace, self.lanes, self._twins = trace, lanes or objects.lanes(), dict(twins or {})
         self.places, self.stride = self._places()
         self.arrays = [("arguments", name) for name in trace.arguments] + [("results", name) for name in trace.results]
@@ -143,7 +143,7 @@ class Program:
         self._reading = Reading(trace.graph, layout.slots)
 
     def _places(self) -> tuple[dict[str, int], int]:
-        """Where each leaf of the state begins in a block, and the bytes of a block: the widest numbers first."""
+        """Return the offset of each leaf of the state in a block, widest numbers first, and the bytes of a block."""
         sizes = {name: (here.flat[0].dtype.itemsize if here.size else 1, here.size) for name, (here, _) in self.trace.state.items()}
         places, at = {}, 0
         for name in sorted(sizes.keys() - self._twins.keys(), key=lambda name: (-sizes[name][0], list(sizes).index(name))):
@@ -153,23 +153,23 @@ class Program:
         return places, -(-max(at, 1) // ALIGNED) * ALIGNED
 
     def broken(self, demands: Array, k: Array) -> InputError:
-        """The error of a step k (B,) that broke some demands (B, .)."""
+        """Return the error for demands (B, .) that failed in steps k (B,)."""
         first = int(np.flatnonzero(~demands.all(axis=0))[0])
         field, found, wanted, _ = self.trace.graph.demands[first]
         return broken(~demands[:, first], field, found, wanted, k)
 
     def alone(self, state: State, uniforms: Array) -> None:
-        """A step of code without arguments and results: from the state to the state."""
+        """Run one step of a program without arguments and results on a state."""
         room = aligned((self.room,))
         self.function.call(address(state.memory), address(uniforms), None, address(room), None, 0, state.blocks, 1)
 
     def uniforms(self, values: Sequence[Array] | None = None) -> Array:
-        """The numbers that all episodes share, as the code reads them; of parameters with other `values` (see engine/parameters.py)."""
+        """Return the shared numbers as the code reads them, for other parameter `values` if given (see engine/parameters.py)."""
         return self._reading.bits(values)
 
 
 class State:
-    """The state of episodes in blocks of one vector each: of all programs whose states have the same leaves."""
+    """The state of episodes in blocks of one vector each, for all programs whose states have the same leaves."""
 
     def __init__(self, program: Program, episodes: int) -> None:
         self.program, self.episodes = program, episodes
@@ -177,20 +177,20 @@ class State:
         self.memory = aligned((self.blocks, program.stride))
 
     def _leaf(self, name: str) -> Array:
-        """A leaf (blocks, places, lanes), to be read and written."""
+        """Return a writable view of a leaf (blocks, places, lanes)."""
         program = self.program
         nodes = program.trace.state[name][0]
         dtype, at = nodes.flat[0].dtype if nodes.size else leaves(program.trace.next_state)[name].dtype, program.places[name]
         raw = self.memory[:, at : at + nodes.size * program.lanes * dtype.itemsize]
         return raw.view(dtype).reshape(self.blocks, nodes.size, program.lanes)
 
-    def put(self, tree: Any, rows: Array | None = None) -> None:
-        """Take over the leaves of a tree, arrays (episodes, ...), or of `rows` (R,) alone. Idle lanes repeat the last row."""
+    def put(self, tree: object, rows: Array | None = None) -> None:
+        """Write the leaves of a tree, arrays (episodes, ...), or `rows` (R,) of them. Idle lanes repeat the last row."""
         for name, leaf in leaves(tree).items():
             self.put_leaf(name, leaf, rows)
 
     def put_leaf(self, name: str, leaf: Array, rows: Array | None = None) -> None:
-        """Take over one leaf, as `put` does."""
+        """Write one leaf, as `put` does."""
         lanes, place = self.program.lanes, self._leaf(name)
         if rows is not None:
             place[rows // lanes, :, rows % lanes] = leaf.reshape(len(rows), place.shape[1])
@@ -202,20 +202,20 @@ class State:
             place[whole, :, : self.episodes - whole * lanes] = numbers[:, whole * lanes :]
             place[whole, :, self.episodes - whole * lanes :] = numbers[:, -1:]
 
-    def get(self, like: Any) -> Any:
-        """A tree of arrays (episodes, ...): a copy."""
+    def get(self, like: T) -> T:
+        """Return a copy as a tree of arrays (episodes, ...)."""
         names = iter(leaves(like))
         return map_leaves(lambda old: self.get_leaf(next(names)), like)
 
     def get_leaf(self, name: str) -> Array:
-        """One leaf (episodes, ...), the episodes together in memory: a copy."""
+        """Return a copy of one leaf (episodes, ...), with the episodes contiguous in memory."""
         shape = self.program.trace.state[name][0].shape[1:]
         held = np.array(self._leaf(name).swapaxes(0, 1), order="C").reshape(-1, self.blocks * self.program.lanes)[:, : self.episodes]
         return np.moveaxis(held.reshape(*shape, self.episodes), -1, 0)
 
 
 class _Place(NamedTuple):
-    """Where an array stands on a sheet."""
+    """The place of an array on a sheet."""
 
     shape: tuple[int, ...]
     dtype: np.dtype[Any]
@@ -224,10 +224,11 @@ class _Place(NamedTuple):
 
 
 class Call:
-    """Calls of a program on a state: arguments that stay what they are until they are written to, and results that are new each time.
+    """Calls of a program on a state, with arguments that persist until written, and new results each time.
 
-    Arguments are (episodes, ...), or (steps, episodes, ...) with more `steps` than one; so are results. `broken`: a demand did not hold.
-    Many episodes may share several `threads`: a block depends on no other. `like`: the call whose arguments all steps have.
+    Arguments and results are (episodes, ...), or (steps, episodes, ...) for several `steps`.
+    `broken` is True if a demand failed. Blocks are independent, so several `threads` may share many episodes.
+    `like` is a call whose arguments all steps use.
     """
 
     def __init__(
@@ -241,7 +242,7 @@ class Call:
         self._table = np.zeros((len(program.arrays), 2), np.int64)
         self.arguments: dict[str, Array] = {}
         self._views: list[tuple[str, _Place]] = []
-        self._singles: list[tuple[list[str], _Place]] = []  # results of a number each, together
+        self._singles: list[tuple[list[str], _Place]] = []  # results of one number per episode, together
         self._size = 0  # of the sheet
         rows, trace = state.blocks * program.lanes, program.trace
         singles: dict[np.dtype[Any], list[str]] = {}
@@ -267,22 +268,22 @@ class Call:
             self._singles.append((names, self._place((len(names), state.episodes), (len(names), rows), dtype)))
             for i, name in enumerate(names):
                 self._table[program.arrays.index(("results", name)), 0] = self._singles[-1][1].at + i * rows * dtype.itemsize
-        self._first = self._table[:, 0].copy()  # where the first step reads and writes
+        self._first = self._table[:, 0].copy()  # addresses of the first step
         self._rooms = [aligned((program.room,)) for _ in self._parts]
         self._pointers = tuple(ctypes.c_void_p(a.ctypes.data) for a in (state.memory, self.uniforms, self._table))
         self._places = [ctypes.c_void_p(room.ctypes.data) for room in self._rooms]
-        self.sheet = np.empty(0, np.uint8)  # what the last call wrote
+        self.sheet = np.empty(0, np.uint8)  # the results of the last call
         self._bound = np.empty(0, np.int64)  # arguments of `fixed`
 
     def _place(self, shown: tuple[int, ...], shape: tuple[int, ...], dtype: np.dtype[Any]) -> _Place:
-        """Room on the sheet for each step's array of a shape, of which `shown` is shown."""
+        """Reserve a place on the sheet for arrays of a shape, one per step, of which `shown` is visible."""
         at, size = self._size, int(np.prod(shape)) * dtype.itemsize
         strides = tuple(int(np.prod(shape[i + 1 :])) * dtype.itemsize for i in range(len(shape)))
         self._size += -(-size * self.steps // ALIGNED) * ALIGNED
         return _Place(shown, dtype, at, strides) if self.steps == 1 else _Place((self.steps, *shown), dtype, at, (size, *strides))
 
     def __call__(self) -> dict[str, Array]:
-        """Play all steps; -> the results by name."""
+        """Play all steps; return the results by name."""
         self.begin()
         self.play(self.steps)
         return self.results()
@@ -294,7 +295,7 @@ class Call:
             self._table[:, 0] = self._first
 
     def play(self, steps: int) -> None:
-        """Play steps into the last sheet; the next ones go on from there."""
+        """Play steps into the last sheet; the next call continues there."""
         there = ctypes.addressof(ctypes.c_char.from_buffer(self.sheet)) if self._size else None  # type: ignore[arg-type]
         if len(self._parts) == 1:
             self.broken = self._part(0, there, steps)
@@ -308,14 +309,14 @@ class Call:
         return bool(self.program.function.call(*self._pointers, self._places[part], there, *self._parts[part], steps))
 
     def fixed(self) -> Callable[[], int]:
-        """Return a call that plays one step and writes to the same sheet each time. Copy what is to be kept."""
+        """Return a function that plays one step and writes to the same sheet each time. Copy results to keep them."""
         self.begin()
         pointers = [pointer.value for pointer in (*self._pointers, self._places[0])]
         self._bound = np.array([*pointers, address(self.sheet), *self._parts[0], 1], np.int64)
         return functools.partial(self.program.function.bound, address(self._bound))
 
     def numbers(self, names: Sequence[str]) -> Callable[[], tuple[Any, ...]]:
-        """What reads results of a number each off the sheet of a single episode, as Python's own numbers."""
+        """Return a function that reads results of one number from the sheet of a single episode, as Python numbers."""
         places: dict[str, tuple[int, str, int]] = {}
         for several, (shape, dtype, at, strides) in self._singles:
             assert shape[1] == 1, "a single episode"
@@ -328,13 +329,13 @@ class Call:
         read, order = struct.Struct(layout).unpack_from, operator.itemgetter(*(wanted.index(name) for name in names))
         return lambda: order(read(self.sheet))  # type: ignore[arg-type]
 
-    def reader(self, name: str, row: int, dtype: Any = None) -> Callable[[], Array]:
-        """What reads a row of a result off the sheet, as another type of the same size."""
+    def reader(self, name: str, row: int, dtype: DTypeLike | None = None) -> Callable[[], Array]:
+        """Return a function that reads one row of a result from the sheet, as another type of the same size."""
         shape, kept, at, strides = dict(self._views)[name]
         return lambda: np.ndarray(shape[1:], dtype or kept, self.sheet, at + row * strides[0], strides[1:])
 
     def results(self, sheet: Array | None = None) -> dict[str, Array]:
-        """What stands on the sheet, or on an earlier one, by name."""
+        """Return the results on the sheet, or on an earlier one, by name."""
         out: dict[str, Array] = {}
         sheet = self.sheet if sheet is None else sheet
         for names, (shape, dtype, at, strides) in self._singles:
@@ -354,13 +355,11 @@ def address(array: Array) -> int:
     return int(array.__array_interface__["data"][0])
 
 
-def aligned(shape: tuple[int, ...], dtype: Any = np.uint8) -> Array:
-    """Zeros, beginning at a cache line."""
+def aligned(shape: tuple[int, ...], dtype: DTypeLike = np.uint8) -> Array:
+    """Return zeros that begin at a cache line."""
     size = math.prod(shape) * np.dtype(dtype).itemsize
     raw = np.zeros(size + ALIGNED, np.uint8)
     begin = -address(raw) % ALIGNED
     out: Array = raw[begin : begin + size].view(dtype).reshape(shape)
     return out
 
-
-__all__ = ["Call", "Node", "Program", "State", "Trace", "traced"]

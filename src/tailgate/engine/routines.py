@@ -1,15 +1,19 @@
-"""Routines: elementwise functions that machine code calls, in place of a copy of theirs wherever they are used."""
+"""Routines: elementwise functions that machine code calls, instead of repeating their code at each use."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import update_wrapper
-from typing import Any
+from typing import Any, TypeVar, cast
 
-from tailgate.engine.array import Traced, boxed, each, lifted, shared_batch
+from tailgate.engine.array import Traced, each, lifted, shared_batch
+from tailgate.engine.buffers import boxed
 from tailgate.engine.evaluation import evaluate
 from tailgate.engine.graph import Graph, Node
+from tailgate.engine.operations import ArrayLike
+
+F = TypeVar("F", bound=Callable[..., Any])
 
 
 @dataclass(eq=False)
@@ -26,19 +30,19 @@ class Routine:
         self.cost = len(self.graph.nodes)
 
     def values(self, args: list[Any]) -> list[Any]:
-        """What numpy gives."""
+        """Return the results by numpy."""
         return evaluate(self.graph, self.outputs, dict(zip((node.attr for node in self.inputs), args, strict=True)))
 
 
 class _Called:
-    """A function that becomes a routine where its arguments are traced."""
+    """A function that becomes a routine when its arguments are traced."""
 
     def __init__(self, function: Callable[..., Any]) -> None:
         self.function = function
         self._made: dict[tuple[Any, ...], tuple[Routine, bool]] = {}
         update_wrapper(self, function)
 
-    def __call__(self, *args: Any) -> Any:
+    def __call__(self, *args: ArrayLike) -> Any:
         found = next((x for x in args if isinstance(x, Traced)), None)
         if found is None:
             return self.function(*args)
@@ -62,13 +66,13 @@ class _Called:
         return self._made[dtypes]
 
 
-def routine(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Decorator of an elementwise function of arrays, which gives an array or a tuple of them."""
-    return _Called(function)
+def routine(function: F) -> F:
+    """Decorate an elementwise function of arrays that returns an array or a tuple of them."""
+    return cast(F, _Called(function))
 
 
 def bound() -> str:
-    """`step` by the address of its arguments: a call with one of them takes Python less time than with eight."""
+    """Return the text of `bound`: `step` with the address of its arguments, because Python calls it faster with one argument than eight."""
     kinds = ["ptr"] * 5 + ["i64"] * 3
     lines = ["define i64 @bound(ptr %arguments) #0 {"]
     for i, kind in enumerate(kinds):

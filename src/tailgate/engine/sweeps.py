@@ -1,4 +1,4 @@
-"""Code of what is done on buffers, and the room that each of them has."""
+"""Code for operations on buffers, and the placement of buffers in memory."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from tailgate.engine.untraceable import Untraceable
 if TYPE_CHECKING:
     from tailgate.engine.llvm import Emitter
 
-ROOM = 64_000_000  # bytes
-LINE = 64  # bytes of a line of the cache
+ROOM = 64_000_000  # [bytes] for all buffers
+LINE = 64  # bytes of a cache line
 CHUNK = 16  # numbers of a row that are kept in registers
-MERGED = 3  # readers of a buffer that had rather be no buffer
-LIGHT, HEAVY = 4, 100  # operations of a sweep that is merged into several, or into one
+MERGED = 3  # most readers of a buffer that is computed where it is read
+LIGHT, HEAVY = 4, 100  # most operations of a sweep that is merged into several readers, or into one
 
 
 @contextlib.contextmanager
 def counted(e: Emitter, count: int) -> Iterator[str]:
-    """Code for each number below a count."""
+    """Emit a loop over the numbers below a count, within the block."""
     if count == 1:
         yield "0"
         return
@@ -45,14 +45,14 @@ def counted(e: Emitter, count: int) -> Iterator[str]:
 
 
 def element(e: Emitter, base: str, index: str, size: int, offset: int = 0) -> str:
-    """The address of a number of a buffer."""
+    """Return the address of a number of a buffer."""
     at = index if index == "0" else e.set(f"mul i64 {index}, {size}")
     there = base if at == "0" else e.address(base, at)
     return e.address(there, offset * size) if offset else there
 
 
 def _index(e: Emitter, numbers: Sequence[str], strides: Sequence[int]) -> str:
-    """The sum of indices times their strides."""
+    """Emit the sum of indices times their strides."""
     out = "0"
     for number, stride in zip(numbers, strides, strict=True):
         if stride and number != "0":
@@ -62,7 +62,7 @@ def _index(e: Emitter, numbers: Sequence[str], strides: Sequence[int]) -> str:
 
 
 def sweep(e: Emitter, node: Node) -> None:
-    """Its body, in a loop for each axis."""
+    """Emit a sweep: its body in a loop per axis."""
     body: Sweep = node.attr
     size = node.dtype.itemsize * e.lanes
     tables: dict[int, str] = {}
@@ -79,7 +79,7 @@ def sweep(e: Emitter, node: Node) -> None:
 
 
 def _prepare(e: Emitter, body: Sweep, tables: dict[int, str]) -> None:
-    """Names for what no round changes."""
+    """Emit names for all that no round changes."""
     for fixed in {a.id: a for inner in (*body.nodes, *body.after) for a in (*inner.args, inner) if a.fixed}.values():
         e.value(fixed)
     for source in body.sources:
@@ -90,7 +90,7 @@ def _prepare(e: Emitter, body: Sweep, tables: dict[int, str]) -> None:
 
 
 def _round(e: Emitter, body: Sweep, numbers: Sequence[str], tables: dict[int, str], made: dict[Any, str]) -> None:
-    """One round of a sweep, with what is merged into it."""
+    """Emit one round of a sweep, with the sweeps that are merged into it."""
     at: dict[Any, str] = {}
     found: dict[int | tuple[int, str], str] = {}
     for one, source in zip(body.carried, body.sources, strict=True):
@@ -114,12 +114,12 @@ def _round(e: Emitter, body: Sweep, numbers: Sequence[str], tables: dict[int, st
 
 
 def _alike(inner: Sweep, outer: Sweep, source: Source) -> bool:
-    """Does each round of a sweep read what the same round of the other made?"""
+    """Return True if each round of `outer` reads the result of the same round of `inner`."""
     return inner.shape == outer.shape and source.offset == 0 and source.strides == steps(inner.shape)
 
 
 def merged(items: Sequence[Item], kept: Iterable[Node]) -> set[int]:
-    """Sweeps that need no buffer: those that read them compute their numbers where they need them."""
+    """Return the sweeps that need no buffer, because their readers compute their numbers."""
     uses: dict[int, int] = {}
     sizes: dict[int, int] = {}
 
@@ -157,7 +157,7 @@ def merged(items: Sequence[Item], kept: Iterable[Node]) -> set[int]:
 
 
 def pack(e: Emitter, node: Node) -> None:
-    """Pieces one behind the other."""
+    """Emit pieces, one after the other."""
     room, size, at = e.room(node), node.dtype.itemsize * e.lanes, 0
     for source, shape in node.attr:
         if isinstance(source, Node):
@@ -175,7 +175,7 @@ def pack(e: Emitter, node: Node) -> None:
 
 
 def _read(e: Emitter, source: Source, index: str, like: Node, table: str) -> str:
-    """A number of a source, whose table stands there."""
+    """Emit the load of a number of a source; `table` is the address of a table of fixed nodes."""
     if isinstance(source.held, Node):
         size = like.dtype.itemsize * e.lanes
         return e.from_memory(element(e, e.value(source.held), index, size, source.offset), like.dtype, size)
@@ -183,7 +183,7 @@ def _read(e: Emitter, source: Source, index: str, like: Node, table: str) -> str
 
 
 def copy(e: Emitter, source: str, target: str, node: Node, count: int) -> None:
-    """Some numbers of a buffer's type, from one place to another."""
+    """Emit a copy of `count` numbers of a buffer's type from one place to another."""
     size = node.dtype.itemsize * e.lanes
     with counted(e, count) as i:
         held = e.from_memory(element(e, source, i, size), node.dtype, size)
@@ -191,7 +191,7 @@ def copy(e: Emitter, source: str, target: str, node: Node, count: int) -> None:
 
 
 def blend(e: Emitter, node: Node, mask: str, x: str, y: str) -> str:
-    """The buffer x in the lanes of a mask, and y in the others."""
+    """Emit the buffer x in the lanes of a mask, and y in the others."""
     room, kind, size = e.room(node), e.vector(node.dtype), node.dtype.itemsize * e.lanes
     with counted(e, node.size) as i:
         one, other = (e.from_memory(element(e, place, i, size), node.dtype, size) for place in (x, y))
@@ -201,7 +201,7 @@ def blend(e: Emitter, node: Node, mask: str, x: str, y: str) -> str:
 
 
 def invert(e: Emitter, node: Node) -> None:
-    """The inverses of matrices, in their new place."""
+    """Emit the inverses of matrices in a new buffer."""
     q, room = node.attr, e.room(node)
     copy(e, e.value(node.args[0]), room, node, node.size)
     if ("invert", q) not in e.routines:
@@ -213,7 +213,7 @@ def invert(e: Emitter, node: Node) -> None:
 
 
 def _invert_text(outer: Emitter, q: int) -> str:
-    """As `matrices.inverse`, element by element."""
+    """Return the text of the inverse, element by element as in `matrices.inverse`."""
     e, kind, size = outer.fresh(), outer.vector(FLOAT), 8 * outer.lanes
     e.begin("entry")
 
@@ -257,20 +257,20 @@ def _invert_text(outer: Emitter, q: int) -> str:
 
 
 def fetch(e: Emitter, stride: int) -> None:
-    """Ask for the next block's state while this one is played."""
+    """Emit a prefetch of the next block's state."""
     e.declared.add("declare void @llvm.prefetch.p0(ptr, i32, i32, i32)")
     following = e.address("%state", stride)
     with counted(e, stride // LINE) as i:
         e.line(f"call void @llvm.prefetch.p0(ptr {element(e, following, i, LINE)}, i32 1, i32 3, i32 1)")
 
 
-# -- rooms
+# -- placement
 
 
 def rooms(items: Sequence[Item], kept: Iterable[Node], lanes: int, none: Collection[int] = ()) -> tuple[dict[int, int], int]:
-    """Where each buffer stands in the room of a function [bytes], and its size: a place is free again behind the last that reads it.
+    """Return the offset [bytes] of each buffer, and the total size; a place is reused after its last reader.
 
-    Those in `none` have no room.
+    Buffers in `none` have no place.
     """
     turn: dict[int, int] = {}
     nodes: dict[int, Node] = {}
@@ -282,13 +282,13 @@ def rooms(items: Sequence[Item], kept: Iterable[Node], lanes: int, none: Collect
         if node.id in last:
             last[node.id] = len(items)
     for node in sorted(nodes.values(), key=lambda node: -node.id):
-        through = node.op in ("pick", "blend") or node.id in none  # what reads a buffer later on
+        through = node.op in ("pick", "blend") or node.id in none  # these read the buffer later
         until = last[node.id] if through else turn[node.id]
         for a in node.args:
             if a.id in last:
                 last[a.id] = max(last[a.id], until)
     out: dict[int, int] = {}
-    busy: list[tuple[int, int, int]] = []  # begin, end, last
+    busy: list[tuple[int, int, int]] = []  # begin, end, last reader
     total = 0
     for node in sorted((n for n in nodes.values() if n.size and n.op != "held" and n.id not in none), key=lambda node: turn[node.id]):
         size, at = -(-node.size * node.dtype.itemsize * lanes // 64) * 64, 0
@@ -306,7 +306,7 @@ def rooms(items: Sequence[Item], kept: Iterable[Node], lanes: int, none: Collect
 
 
 def _of(item: Item) -> Iterator[Node]:
-    """The nodes of an item, and of what is in it."""
+    """Yield the nodes of an item, with those inside it."""
     if isinstance(item, Branch):
         yield from item.decides
         for inner in item.body:

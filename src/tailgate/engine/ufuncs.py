@@ -1,4 +1,4 @@
-"""numpy's universal functions on traced arrays: types by numpy's own rules, one node for each place."""
+"""numpy's universal functions on traced arrays: types by numpy's rules, one node per number."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ import numpy as np
 
 from tailgate.engine.array import Traced, each, elementwise, lifted, reduced, summands, typed
 from tailgate.engine.graph import Graph, Node
-from tailgate.engine.operations import BOOL, COMPARISONS
+from tailgate.engine.operations import BOOL, COMPARISONS, Array, ArrayLike, DTypeLike
 from tailgate.engine.untraceable import Untraceable
 
-_PAIRS: dict[Any, str] = {
+_PAIRS: dict[np.ufunc, str] = {
     np.add: "add", np.subtract: "sub", np.multiply: "mul", np.true_divide: "div", np.minimum: "min", np.maximum: "max",
     np.remainder: "rem", np.bitwise_and: "and", np.bitwise_or: "or", np.bitwise_xor: "xor", np.left_shift: "shl", np.right_shift: "shr",
     np.less: "lt", np.less_equal: "le", np.greater: "gt", np.greater_equal: "ge", np.equal: "eq", np.not_equal: "ne",
     np.logical_and: "and", np.logical_or: "or", np.logical_xor: "ne",
 }  # fmt: skip
-_SINGLES: dict[Any, str] = {
+_SINGLES: dict[np.ufunc, str] = {
     np.negative: "neg", np.absolute: "abs", np.fabs: "abs", np.sqrt: "sqrt", np.floor: "floor", np.ceil: "ceil", np.trunc: "trunc",
     np.rint: "rint", np.invert: "not", np.logical_not: "not",
 }  # fmt: skip
@@ -33,14 +33,14 @@ _LIBRARY = {
 }
 
 
-def called(graph: Graph, ufunc: Any, method: str, inputs: Sequence[Any], options: dict[str, Any]) -> Any:
-    """What numpy would give."""
+def called(graph: Graph, ufunc: np.ufunc, method: str, inputs: Sequence[ArrayLike], options: dict[str, Any]) -> Any:
+    """Return the result of a universal function."""
     out = options.pop("out", None)
     if any(isinstance(target, np.ndarray) for target in out or ()):
         raise Untraceable("writing a traced array into one of numpy's", "make it with np.zeros or np.empty in the same function")
     arrays = [lifted(graph, x) for x in inputs]
     if all(a.fixed for a in arrays) and method == "__call__" and not (ufunc in _PAIRS or ufunc in _SINGLES):
-        result: Any = lifted(graph, ufunc(*(a.values() for a in arrays), **options))
+        result: Array = lifted(graph, ufunc(*(a.values() for a in arrays), **options))
     elif method == "reduce":
         result = _reduced(ufunc, arrays[0], options)
     elif method == "accumulate":
@@ -57,7 +57,7 @@ def called(graph: Graph, ufunc: Any, method: str, inputs: Sequence[Any], options
     return result
 
 
-def _elementwise(graph: Graph, ufunc: Any, arrays: list[Traced], dtype: Any) -> Any:
+def _elementwise(graph: Graph, ufunc: np.ufunc, arrays: list[Traced], dtype: DTypeLike | None) -> Array:
     if ufunc in _DERIVED:
         return _DERIVED[ufunc](*arrays)
     op = _PAIRS.get(ufunc) or _SINGLES.get(ufunc)
@@ -78,8 +78,8 @@ def _elementwise(graph: Graph, ufunc: Any, arrays: list[Traced], dtype: Any) -> 
     return elementwise(graph, lambda x, y: graph.binary(op, x, y), arrays, BOOL if op in COMPARISONS else kinds[0])
 
 
-def loop_types(ufunc: Any, arrays: Sequence[Traced]) -> list[np.dtype[Any]]:
-    """The types in which numpy computes it."""
+def loop_types(ufunc: np.ufunc, arrays: Sequence[Traced]) -> list[np.dtype[Any]]:
+    """Return the types in which numpy computes the function."""
     known = all(a.weak for a in arrays)
     given = [a.weak if a.weak in (int, float) and not known else a.dtype for a in arrays]
     kinds = ufunc.resolve_dtypes((*given, *(None,) * ufunc.nout))[: len(arrays)]
@@ -88,8 +88,8 @@ def loop_types(ufunc: Any, arrays: Sequence[Traced]) -> list[np.dtype[Any]]:
     return list(kinds)
 
 
-def _by_a_constant(graph: Graph, op: str, arrays: list[Traced], dtype: np.dtype[Any]) -> Any:
-    """A remainder or a shift, by numbers that are known: no processor agrees with another about the rest."""
+def _by_a_constant(graph: Graph, op: str, arrays: list[Traced], dtype: np.dtype[Any]) -> Array:
+    """Return a remainder or a shift by constants; processors disagree on other cases."""
     if dtype.kind == "f":
         raise Untraceable("a remainder of floats", "write x - y * np.floor(x / y)")
     if op == "rem" and not arrays[1].fixed:
@@ -101,13 +101,13 @@ def _by_a_constant(graph: Graph, op: str, arrays: list[Traced], dtype: np.dtype[
     return elementwise(graph, lambda x, y: _divided(graph, op, x, y), [arrays[0], lifted(graph, by)], dtype)
 
 
-def _remainder(x: Any, y: Any) -> Any:
-    """Of whole numbers by others: with the sign of y, and 0 where y is 0."""
-    graph: Graph = x.graph
-    back: Any = y < 0
+def _remainder(x: Traced, y: Traced) -> Array:
+    """Return the remainder of whole numbers with the sign of y, and 0 where y is 0."""
+    graph = x.graph
+    back = y < 0
     size = np.where(back, -y, y) if y.dtype.kind == "i" else y
     parts: list[Any] = [np.where(back, -x, x), np.where(size == 0, 1, size)]
-    rest: Any = elementwise(graph, lambda p, q: graph.binary("rem", p, q), parts, x.dtype)
+    rest = elementwise(graph, lambda p, q: graph.binary("rem", p, q), parts, x.dtype)
     return np.where(y == 0, 0, np.where(back, -rest, rest) if y.dtype.kind == "i" else rest)
 
 
@@ -117,7 +117,7 @@ def _divided(graph: Graph, op: str, x: Node, y: Node) -> Node:
     return graph.binary(op, x, y)
 
 
-def _partly(result: Traced, where: Any, out: Any) -> Traced:
+def _partly(result: Array, where: ArrayLike, out: Sequence[Array] | None) -> Traced:
     from tailgate.engine.array import chosen
 
     if not out:
@@ -125,7 +125,7 @@ def _partly(result: Traced, where: Any, out: Any) -> Traced:
     return chosen(where, result, out[0])
 
 
-def _reduced(ufunc: Any, x: Traced, options: dict[str, Any]) -> Any:
+def _reduced(ufunc: np.ufunc, x: Traced, options: dict[str, Any]) -> Traced:
     op, axis = _PAIRS.get(ufunc), options.get("axis", 0)
     if op not in ("add", "mul", "min", "max", "and", "or") or set(options) - {"axis", "keepdims", "dtype"}:
         raise Untraceable(f"np.{ufunc.__name__}.reduce", "write a loop over the axis")
@@ -136,7 +136,7 @@ def _reduced(ufunc: Any, x: Traced, options: dict[str, Any]) -> Any:
     return reduced(x, _ON_BOOLS.get(op, op) if x.dtype == BOOL else op, axis, options.get("keepdims", False))
 
 
-def _accumulated(ufunc: Any, x: Traced, axis: int = 0) -> Traced:
+def _accumulated(ufunc: np.ufunc, x: Traced, axis: int = 0) -> Traced:
     op = _PAIRS.get(ufunc)
     if op not in ("add", "mul", "min", "max", "and", "or"):
         raise Untraceable(f"np.{ufunc.__name__}.accumulate", "write a loop over the axis")
@@ -151,18 +151,18 @@ def _accumulated(ufunc: Any, x: Traced, axis: int = 0) -> Traced:
     return Traced(x.graph, nodes, x.dtype, x.batch)
 
 
-def _sign(x: Any) -> Any:
+def _sign(x: Array) -> Array:
     return np.where(x > 0, 1.0, np.where(x < 0, -1.0, np.where(x == 0, 0.0, x)))
 
 
-def _copied_sign(x: Any, y: Any) -> Any:
+def _copied_sign(x: Traced, y: Traced) -> Array:
     graph, word = x.graph, np.dtype(np.uint64)
     x, y = typed(graph, x, np.dtype(float)), typed(graph, y, np.dtype(float))
     sign = np.uint64(1 << 63)
     return ((x.view(word) & ~sign) | (y.view(word) & sign)).view(float)
 
 
-_DERIVED: dict[Any, Callable[..., Any]] = {
+_DERIVED: dict[np.ufunc, Callable[..., Array]] = {
     np.square: lambda x: x * x,
     np.positive: lambda x: x.copy(),
     np.reciprocal: lambda x: 1.0 / x,

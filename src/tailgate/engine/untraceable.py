@@ -1,4 +1,4 @@
-"""What cannot be traced: which line says so, why, and what to write in its place."""
+"""The error for code that cannot be traced: its line, the reason, and what to write instead."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from pathlib import Path
 
 _HERE = str(Path(__file__).parent)
 _NOBODYS = ("numpy", "contextlib", "functools")
-_OURS = ("tailgate.num", "tailgate.engine.hints", "tailgate.core.draws")  # what a component calls: its own line is the one to change
+_OURS = ("tailgate.num", "tailgate.engine.hints", "tailgate.core.draws")  # callers of these matter: their line is the one to change
 
 
 class Untraceable(TypeError):
-    """Code whose course or result depends on more than one episode's numbers by their types. `place`: file and line of it."""
+    """Code whose control flow or result types depend on the numbers of several episodes; `place` is its file and line."""
 
     def __init__(self, what: str, instead: str) -> None:
         self.what, self.instead, self.place = what, instead, caller()
@@ -19,7 +19,7 @@ class Untraceable(TypeError):
 
 
 def caller() -> str:
-    """File and line of the code that called the engine."""
+    """Return the file and line of the code that called the engine."""
     frame = sys._getframe(1)
     while frame.f_back is not None:
         code, module = frame.f_code, str(frame.f_globals.get("__name__", ""))

@@ -1,7 +1,8 @@
-"""Runs without an attack, and the false alarms in them: what a threshold is found on, and what it gives elsewhere.
+"""Attack-free runs and their false alarms, on which thresholds are calibrated and measured.
 
-Several agents raise one alarm: that of the group, on as long as any of them alarms. Its mean time is in hours of the system, not of agents;
-N agents that alarm independently have N times as long each. A step of a network without a step of its own counts as `dt`, 1 s.
+Several agents raise one alarm, which is on as long as any of them alarms. Its mean time is in hours of the system.
+N agents that alarm independently therefore have N times as long each.
+A step of a network without a sampling time counts as `dt`, 1 s.
 """
 
 from __future__ import annotations
@@ -18,17 +19,17 @@ import numpy as np
 
 from tailgate.agents.scripts.scripted import NoAttack
 from tailgate.base.errors import InputError, NotApplicable
-from tailgate.core import Array, Model, draws
+from tailgate.core import Array, Defence, Model, draws
 from tailgate.core.loop import Loop
-from tailgate.core.registry import Spec, entry_for, text_of
 from tailgate.core.scenario import Scenario, load_scenario
 from tailgate.estimators.watched import watched
+from tailgate.evaluation.cells import component
 from tailgate.evaluation.stats import mean_time
 from tailgate.play.trace import MEMORY, episodes_at_once, rollout
 
-SILENT = 1e12  # a threshold that nothing reaches
+SILENT = 1e12  # a threshold that no score reaches
 MOST_DIGITS = 7  # of a threshold
-RECORDED = 512  # episodes that are recorded side by side
+RECORDED = 512  # episodes that are recorded together
 NOTHING = NoAttack()
 HOUR = 3600.0
 
@@ -36,7 +37,7 @@ Progress = Callable[[str, int, int, str], None]  # label, done, total, figures
 
 
 class Count(NamedTuple):
-    """What clean runs gave: false-alarm onsets, running time and steps, and the onsets' variance over their mean, by episode."""
+    """The result of attack-free runs: false-alarm onsets, time [s], steps, and the variance of onsets per episode over their mean."""
 
     onsets: int
     seconds: float
@@ -45,7 +46,7 @@ class Count(NamedTuple):
 
     @classmethod
     def of(cls, each: Array, seconds: float, steps: int) -> Count:
-        """each (B,): onsets of each episode."""
+        """Summarise the onsets of each episode, each (B,)."""
         mean = float(each.mean())
         return cls(int(each.sum()), seconds, steps, float(each.var() / mean) if mean > 0.0 else 1.0)
 
@@ -55,11 +56,11 @@ class Count(NamedTuple):
         return self.seconds / HOUR / self.onsets if self.onsets else None
 
     def interval(self, level: float = 0.95) -> tuple[float, float | None]:
-        """Limits of the mean time [h], for clusters of such dispersion; the upper one is None without any onset."""
+        """Return limits of the mean time [h] for clustered onsets; the upper limit is None without any onset."""
         return mean_time(self.onsets, self.seconds / HOUR, self.dispersion, level)
 
     def may_be(self, hours: float) -> bool:
-        """Whether the interval holds this mean time."""
+        """Return True if the interval contains this mean time."""
         return (ends := self.interval())[0] <= hours and (ends[1] is None or hours <= ends[1])
 
     def as_data(self) -> dict[str, Any]:
@@ -71,15 +72,15 @@ class Count(NamedTuple):
 
 
 class Crossings:
-    """How often a score climbed over each level: a climb from a to b passes every level in [a, b)."""
+    """Counts how often a score rose above each level: a rise from a to b passes every level in [a, b)."""
 
     def __init__(self, keep: int) -> None:
         self.keep = keep
         self.low, self.high = np.empty(0), np.empty(0)
-        self.least, self.most = math.inf, -math.inf  # scores that were seen
+        self.least, self.most = math.inf, -math.inf  # scores that occurred
 
     def add(self, low: Array, high: Array) -> None:
-        """The climbs of some runs. Only the `keep` highest are kept: levels below them are not asked for."""
+        """Add the rises of some runs; keep only the `keep` highest, because lower levels are not needed."""
         low, high = np.concatenate([self.low, low]), np.concatenate([self.high, high])
         if len(high) > self.keep:
             top = np.argpartition(high, len(high) - self.keep)[-self.keep :]
@@ -87,7 +88,7 @@ class Crossings:
         self.low, self.high = low, high
 
     def level(self, wanted: float) -> float | None:
-        """The highest level that was passed at least `wanted` times; None where there is none."""
+        """Return the highest level that was passed at least `wanted` times, or None."""
         ends = np.unique(self.high)[::-1]
         above = len(self.high) - np.searchsorted(np.sort(self.high), ends)
         from_above = len(self.low) - np.searchsorted(np.sort(self.low), ends)
@@ -99,26 +100,26 @@ class Crossings:
 
 
 def most_at_once(model: Model, most: int) -> int:
-    """How many episodes, at most `most`, have room in memory side by side: a filter works on some ten covariances of each agent."""
+    """Return how many episodes, at most `most`, fit in memory together; a filter uses about ten covariances per agent."""
     return int(max(1, min(most, MEMORY // (80 * model.agents * model.states * model.states))))
 
 
 def side_by_side(loop: Loop, most: int) -> int:
-    """How many clean episodes of a loop, at most `most`, are played at once; it changes no bit of them."""
+    """Return how many attack-free episodes of a loop, at most `most`, are played together; this changes no bit."""
     return episodes_at_once(loop.model, loop.horizon, most_at_once(loop.model, min(most, RECORDED)))
 
 
 def play_clean(loop: Loop, keys: draws.Keys) -> Iterator[tuple[Array, Array, Array]]:
-    """(alarm (B, agents), score (B, agents), live (B,)) of each step without an attack; an episode ends with a collision."""
+    """Yield (alarm (B, agents), score (B, agents), live (B,)) of each step without an attack; an episode ends with a collision."""
     trace = rollout(loop, NOTHING, keys)
     yield from zip(trace.alarm, trace.score, trace.live, strict=True)
 
 
 @dataclass(frozen=True)
 class Bench:
-    """A defence on clean runs of some scenarios."""
+    """A defence on attack-free runs of some scenarios."""
 
-    defence: Any
+    defence: Defence
     uses: tuple[str, ...]
     text: str
     places: tuple[Scenario, ...]
@@ -126,36 +127,31 @@ class Bench:
     progress: Progress
 
     @classmethod
-    def of(cls, defence: Any, scenarios: Sequence[str], batch: int, progress: Progress | None) -> Bench:
-        if isinstance(defence, str):
-            spec = Spec("defence", defence)
-            made, uses, text = spec.make(), spec.entry.uses, defence
-        else:
-            entry = entry_for("defence", type(defence))
-            made, uses, text = defence, entry.uses, text_of(entry, defence)
+    def of(cls, defence: str | Defence, scenarios: Sequence[str], batch: int, progress: Progress | None) -> Bench:
+        made, entry, text = component("defence", defence)
         if not scenarios:
             raise InputError("scenario", list(scenarios), "at least one")
         places = tuple(load_scenario(name).with_threat(knowledge="black") for name in scenarios)  # nobody attacks
         if len({place.name for place in places}) < len(places):
             raise InputError("scenario", list(scenarios), "each scenario once")
-        bench = cls(made, uses, text, places, batch, progress or (lambda *_: None))
+        bench = cls(made, entry.uses, text, places, batch, progress or (lambda *_: None))
         for place in places:
-            place.loop(bench.at(SILENT), uses)  # what does not fit together fails here
+            place.loop(bench.at(SILENT), entry.uses)  # a defence that does not fit fails here
         return bench
 
-    def at(self, threshold: float) -> Any:
-        """The defence at a threshold: its own, its detector's (`threshold_field`), or of a watch on its score where it has none."""
+    def at(self, threshold: float) -> Defence:
+        """Return the defence at a threshold: its own, its detector's (`threshold_field`), or else a threshold on its score."""
         return self._turned(threshold)[0]
 
     @cached_property
     def field(self) -> str:
-        """The parameter that is the threshold, as the command line names it; empty where it is that of a watch on the score."""
+        """The name of the threshold on the command line; empty if it is a threshold on the score."""
         return self._turned(SILENT)[1]
 
-    def _turned(self, threshold: float) -> tuple[Any, str]:
+    def _turned(self, threshold: float) -> tuple[Defence, str]:
         own = getattr(self.defence, "threshold_field", None)
         if own is not None and dataclasses.is_dataclass(self.defence):
-            return dataclasses.replace(self.defence, **{own: threshold}), str(own)  # type: ignore[type-var]
+            return dataclasses.replace(self.defence, **{own: threshold}), str(own)
         if hasattr(self.defence, "with_threshold"):
             with contextlib.suppress(NotApplicable):
                 inner = getattr(self.defence.parts()[1], "threshold_field", "") if hasattr(self.defence, "parts") else ""
@@ -163,9 +159,9 @@ class Bench:
         return watched(self.defence, threshold), ""
 
     def seeds(self, hours: float) -> list[range]:
-        """Seeds of each scenario, so that all together last `hours` (a little more, as episodes are whole) in equal shares.
+        """Return the seeds of each scenario, such that all together last `hours`, in equal shares of whole episodes.
 
-        No two scenarios share a seed: a linear filter that knows its input sees the noise alone, not the manoeuvre, and would see it twice.
+        No two scenarios share a seed. A linear filter that knows its input sees only the noise, and would see it twice.
         """
         out, first = [], 0
         for place in self.places:
@@ -175,13 +171,13 @@ class Bench:
         return out
 
     def hours(self, steps: int) -> float:
-        """Running time of a number of steps."""
+        """Return the running time [h] of a number of steps."""
         return len(self.places) * steps / sum(1.0 / place.brief().model.dt for place in self.places) / HOUR
 
     def run(self, threshold: float, hours: float, purpose: str, label: str, crossings: Crossings | None = None) -> Count:
-        """Clean runs of `hours` in all; `crossings` collects how the score climbs."""
-        guard = self.at(threshold)
-        loops = {place.name: place.loop(guard, self.uses) for place in self.places}
+        """Play attack-free runs of `hours` in total; `crossings` collects how the score rises."""
+        defence = self.at(threshold)
+        loops = {place.name: place.loop(defence, self.uses) for place in self.places}
         chunks = []
         for place, seeds in zip(self.places, self.seeds(hours), strict=True):
             size = side_by_side(loops[place.name], self.batch)
@@ -198,9 +194,9 @@ class Bench:
 
 
 def count_onsets(loop: Loop, keys: draws.Keys, crossings: Crossings | None = None) -> tuple[Array, Array]:
-    """(B, 2) alarm onsets of clean episodes in both halves of the drive, counted as the metric does, and the (B,) steps played.
+    """Return the (B, 2) alarm onsets in both halves of attack-free episodes, and the (B,) steps played.
 
-    Of several agents any alarms.
+    Onsets count as in the metric `alarm_onsets`: the alarm is on if any agent alarms.
     """
     batch = len(keys.key)
     alarmed, onsets, last = np.zeros(batch, bool), np.zeros((batch, 2), np.int64), np.full(batch, -np.inf)

@@ -1,4 +1,4 @@
-"""The scripted attacks that a learner is measured against: which of them is best, on seeds of their own."""
+"""The baselines of a learner: the best scripted attack, chosen on separate seeds."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ from tailgate.core import Array
 from tailgate.core.scenario import Suite
 from tailgate.evaluation.cells import cells_of, run
 
-BATCH = 512  # episodes side by side
+BATCH = 512  # episodes in a batch
 
 
 def outcomes(rows: list[dict[str, Any]], outcome: str) -> Array:
-    """(episodes,) of rows that were all played. Raises InputError for one that was not, or that lacks the outcome."""
+    """Return the outcomes (episodes,) of rows; raise InputError if a row was not played or lacks the outcome."""
     bad = next((row for row in rows if row["status"] != "ok"), None)
     if bad is not None:
-        raise InputError(f"attack {bad['attack']}", bad["status"], f"an attack that plays here ({bad['reason']})")
+        raise InputError(f"attack {bad['attack']}", bad["status"], f"an attack that can be played here ({bad['reason']})")
     if any(row[outcome] is None for row in rows):
         raise InputError("config.outcome", outcome, "a metric that every episode has")
     return np.array([row[outcome] for row in rows], np.float64)
 
 
 def best_of(suite: Suite, threat: dict[str, Any], outcome: str, purpose: str, workers: int) -> str | None:
-    """The attack of a suite with one defence that does most, by the mean outcome on seeds of `purpose`; None where it has none."""
+    """Return the suite's attack with the largest mean outcome against its one defence, on seeds of `purpose`; None without attacks."""
     if len(suite.attacks) < 2:
         return next(iter(suite.attacks), None)
     rows = run(cells_of(suite, batch=BATCH, purpose=purpose, threat=threat), workers=workers)

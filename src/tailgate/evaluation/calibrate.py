@@ -1,8 +1,9 @@
-"""The threshold at which a defence raises a false alarm once in a wanted time, on clean runs with manoeuvres.
+"""Calibration of a defence's threshold to a mean time between false alarms, on attack-free runs with manoeuvres.
 
-Alarms feed back into the filter (a gate) and into the detector (a reset), so the loop itself is played. One run without alarms gives the
-first guess: how often its score climbs over each level. A few closed-loop runs on the same random numbers then correct it, by secants on
-the logarithm of the mean time, which is close to linear in the threshold. `docs/detectors.md` tells more.
+Alarms feed back into the filter (a gate) and into the detector (a reset), so the closed loop is played.
+One run without alarms gives the first guess: how often its score rises above each level.
+A few closed-loop runs on the same random numbers correct the guess by secants on the logarithm of the mean time.
+That logarithm is close to linear in the threshold. See `docs/detectors.md`.
 """
 
 from __future__ import annotations
@@ -14,34 +15,35 @@ from typing import Any
 
 from tailgate.base import sizes
 from tailgate.base.errors import InputError
+from tailgate.core import Defence
 from tailgate.evaluation.attack_free import HOUR, MOST_DIGITS, SILENT, Bench, Count, Crossings, Progress
 
 MIXTURE = ("braking-v0", "stop-and-go-v0", "ornstein-uhlenbeck-v0")  # equal shares of the running time
 TOLERANCE = 0.02  # of the mean time, on the seeds of the calibration
-RUNS = 8  # closed-loop runs at most
-NARROWING = 24  # more of them, to find where a score jumps
-LEAST = 20  # onsets in a run that the limit of steps has cut
-DIGITS = 4  # of a threshold, or up to MOST_DIGITS where the score is crowded, as near 1
-COARSE = 0.1  # what the last digit may change of the log mean time
+RUNS = 8  # most closed-loop runs
+NARROWING = 24  # additional runs to find a jump of the score
+LEAST = 20  # onsets in a run that the limit of steps shortens
+DIGITS = 4  # of a threshold; up to MOST_DIGITS if scores are dense, as near 1
+COARSE = 0.1  # largest effect of the last digit on the log mean time
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """A threshold, what was wanted of it, and what it gave: on the seeds that it was fitted to, and on fresh ones if asked for."""
+    """A threshold with the wanted and the measured mean times, on the seeds of the fit and, if requested, on fresh seeds."""
 
     defence: str
     field: str
     threshold: float
     wanted_hours: float
-    settled: bool  # within the tolerance; else the best of the runs, or the least threshold among them that alarms more rarely
+    settled: bool  # within the tolerance; else the best run, or the least threshold with rarer alarms
     measured: Count
     fresh: Count | None
     seeds: dict[str, tuple[int, int]]  # of each scenario: first and last
-    played: int  # steps in all runs together
+    played: int  # steps of all runs
 
     @property
     def rarer(self) -> bool:
-        """Whether the alarm is surely rarer than wanted: the score jumps, and below the threshold it is too frequent."""
+        """True if the alarm is surely rarer than wanted: the score jumps, and a lower threshold alarms too often."""
         return not self.settled and self.measured.interval()[0] > self.wanted_hours
 
     def as_data(self) -> dict[str, Any]:
@@ -55,7 +57,7 @@ class Calibration:
 
 
 def calibrate(
-    defence: Any,
+    defence: str | Defence,
     hours: float,
     *,
     scenarios: Sequence[str] = MIXTURE,
@@ -65,11 +67,22 @@ def calibrate(
     check: bool = False,
     progress: Progress | None = None,
 ) -> Calibration:
-    """The threshold of a defence (text or object) for a mean time of `hours` between the onsets of its false alarms.
+    """Find a defence's threshold for a mean time of `hours` between the onsets of its false alarms.
 
-    A run lasts `onsets` times that, on seeds of the purpose `calibrate`, or `most_steps` steps if that is less: the interval then says
-    how little it knows. With `check` it is measured again on fresh seeds of the purpose `report`.
-    Raises InputError for bad values, and where the time cannot be had. A defence without a threshold is watched (core/score_threshold.py).
+    Parameters
+    ----------
+    defence : text or object; a defence without a threshold gets one on its score (core/score_threshold.py)
+    hours : wanted mean time [h]
+    scenarios : names, with equal shares of the running time
+    onsets : length of a run, in multiples of `hours`
+    most_steps : a shorter limit of a run; the interval then shows the lost precision
+    batch : episodes played together
+    check : measure the threshold again on fresh seeds of the purpose `report`
+
+    Raises
+    ------
+    InputError
+        A value is invalid, or no threshold gives this mean time.
     """
     if not (isinstance(hours, (int, float)) and math.isfinite(hours) and hours > 0.0):
         raise InputError("hours", hours, "a finite number above 0")
@@ -90,27 +103,27 @@ def calibrate(
 
 
 def rounded(threshold: float, digits: int) -> float:
-    """To the digits that are reported: what was measured is what stands there."""
+    """Round to the digits that are reported, so that the reported threshold is the measured one."""
     return float(f"{threshold:.{digits}g}")
 
 
 def _digit(threshold: float, digits: int) -> float:
-    """The last digit's worth."""
+    """Return the value of one unit in the last digit."""
     return 10.0 ** (math.floor(math.log10(abs(threshold))) + 1 - digits) if threshold else 0.0
 
 
 class Search:
-    """Looks for the threshold that gives a mean time of `wanted` hours in runs of `running` hours."""
+    """A search for the threshold that gives a mean time of `wanted` hours in runs of `running` hours."""
 
     def __init__(self, bench: Bench, wanted: float, running: float) -> None:
         self.bench, self.wanted, self.running = bench, wanted, running
         self.played, self.digits = 0, DIGITS
         self.settled = False  # found within the tolerance
         self.tried: dict[float, tuple[float, Count]] = {}  # log of the mean time over the wanted one
-        self.low, self.high = -math.inf, math.inf  # with the one the alarm is too frequent, with the other too rare
+        self.low, self.high = -math.inf, math.inf  # alarms are too frequent at the first, too rare at the second
 
     def solve(self) -> tuple[float, Count]:
-        """The threshold, rounded, and what it gave."""
+        """Return the rounded threshold and its measured count."""
         level, slope = self._guess()
         for _ in range(RUNS):
             level = rounded(level, self.digits)
@@ -128,7 +141,7 @@ class Search:
         return self._best()
 
     def _try(self, level: float) -> float:
-        """Log of the mean time over the wanted one, in a closed-loop run."""
+        """Return the log of the mean time over the wanted one, in a closed-loop run."""
         count = self._run(level, f"closed loop, run {len(self.tried) + 1}")
         error = math.log(count.seconds / HOUR / max(count.onsets, 0.5) / self.wanted)
         self.tried[level] = error, count
@@ -140,7 +153,10 @@ class Search:
         return 0.5 * (self.low + self.high) if math.isfinite(self.high) else self.low + (abs(self.low) or 1.0)
 
     def _best(self) -> tuple[float, Count]:
-        """That of the nearest mean time; where its interval does not hold the wanted one, as the score jumps, the least that is rarer."""
+        """Return the threshold with the nearest mean time.
+
+        If its interval misses the wanted time, because the score jumps, return the least threshold with rarer alarms.
+        """
         while True:
             best = min(self.tried, key=lambda held: abs(self.tried[held][0]))
             if self.tried[best][1].may_be(self.wanted):
@@ -153,14 +169,14 @@ class Search:
         return (self.high, self.tried[self.high][1]) if math.isfinite(self.high) else (best, self.tried[best][1])
 
     def _guess(self) -> tuple[float, float]:
-        """From a run without alarms: the level, and the slope of the log mean time there."""
+        """Return a first threshold and the slope of the log mean time, from a run without alarms."""
         crossings = Crossings(keep=max(20_000, round(50 * self.running / self.wanted)))
         wanted = self._run(SILENT, "run without alarms", crossings).seconds / HOUR / self.wanted
         at, above, below = (crossings.level(share * wanted) for share in (1.0, 0.5, 2.0))
         if crossings.least == crossings.most:
             raise InputError("hours", self.wanted, f"a mean time that {self.bench.text} can have: its score does not move")
         if at is None or above is None:
-            raise InputError("hours", self.wanted, f"a mean time that {self.bench.text} can have: its score does not climb that often")
+            raise InputError("hours", self.wanted, f"a mean time that {self.bench.text} can have: its score does not rise that often")
         self.low = crossings.least
         spread, ratio = (above - at, 2.0) if below is None else (above - below, 4.0)
         slope = math.log(ratio) / spread if spread > 0.0 else 0.5

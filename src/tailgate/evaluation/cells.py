@@ -1,7 +1,7 @@
 """Evaluation: cells (scenario x dose x defence x attack) to rows, one per episode.
 
-A row names everything that is needed to play it again. Finished cells are kept beside the output until all are done, so that an
-interrupted run resumes, and a component that crashes costs its own rows only.
+A row names everything that is needed to play it again. Finished cells are kept next to the output until all are done.
+An interrupted run therefore resumes, and a component that crashes loses only its own rows.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ from tailgate.base.errors import InputError, NotApplicable
 from tailgate.base.files import write_atomic
 from tailgate.base.pool import each
 from tailgate.base.version import VERSION
-from tailgate.core import Model, draws
-from tailgate.core.registry import Entry, Spec, entry_for, said, text_of
+from tailgate.core import Attack, Defence, Model, draws
+from tailgate.core.registry import Entry, Family, Spec, entry_for, said, text_of
 from tailgate.core.scenario import Scenario, Suite, load_scenario, load_suite
 from tailgate.core.schema import as_data, canonical
 from tailgate.core.threat import Brief
-from tailgate.evaluation.resume import Parts
+from tailgate.evaluation.resume import complete
 from tailgate.evaluation.rounds import numbered
 from tailgate.evaluation.rows import packed
 from tailgate.play.metrics import METRICS, measure
-from tailgate.play.trace import episode_memory, episodes_at_once, rollout
+from tailgate.play.trace import Trace, episode_memory, episodes_at_once, rollout
 
 ENGINE = "plain"
 
@@ -57,8 +57,8 @@ class Cell:
         """Seeds of its episodes: numbers, or those of the round of its beacon."""
         return numbered(self.beacon, self.suite, self.purpose, self.first_seed, self.seeds)
 
-    def place(self, attack: Any, knowledge: str) -> Scenario:
-        """The scenario under the dose and the knowledge that the attack needs."""
+    def place(self, attack: Attack, knowledge: str) -> Scenario:
+        """Return the scenario at the cell's dose, with the knowledge that the attack needs."""
         changes: dict[str, Any] = dict(self.threat)
         if self.dose is not None:
             changes["budget"] = self.dose
@@ -68,8 +68,8 @@ class Cell:
         return load_scenario(self.scenario).with_threat(**changes)
 
 
-def _component(family: Any, value: Any) -> tuple[Any, Any, str]:
-    """(object, entry, text) of a spec text or an object."""
+def component(family: Family, value: object) -> tuple[Any, Entry, str]:
+    """Return (object, entry, text) of a spec text or an object."""
     if isinstance(value, str):
         spec = Spec(family, value)
         return spec.make(), spec.entry, value
@@ -77,50 +77,60 @@ def _component(family: Any, value: Any) -> tuple[Any, Any, str]:
     return value, entry, text_of(entry, value)
 
 
-def run_cell(cell: Cell, defence: Any = None, attack: Any = None, *, uses: tuple[str, ...] | None = None) -> list[dict[str, Any]]:
-    """The rows of a cell. `defence` and `attack` stand in for the cell's texts when they are objects; `uses`: what is granted to them."""
-    guard, guard_entry, _ = _component("defence", cell.defence if defence is None else defence)
-    rival, rival_entry, _ = _component("attack", cell.attack if attack is None else attack)
-    place = cell.place(rival, rival_entry.knowledge)
-    head = _head(cell, place, guard_entry, rival_entry, cell_id(cell) if defence is None and attack is None else "")
+def run_cell(
+    cell: Cell, defence: Defence | None = None, attack: Attack | None = None, *, uses: tuple[str, ...] | None = None
+) -> list[dict[str, Any]]:
+    """Play a cell and return its rows.
+
+    `defence` and `attack` replace the cell's texts by objects; `uses` overrides what the defence may use.
+    """
+    identity = cell_id(cell) if defence is None and attack is None else ""
+    defence, defence_entry, _ = component("defence", cell.defence if defence is None else defence)
+    attack, attack_entry, _ = component("attack", cell.attack if attack is None else attack)
+    place = cell.place(attack, attack_entry.knowledge)
+    head = _head(cell, place, defence_entry, attack_entry, identity)
     rows: list[dict[str, Any]] = []
     seeds = cell.episodes
     try:
-        loop = place.loop(guard, guard_entry.uses if uses is None else uses)
+        loop = place.loop(defence, defence_entry.uses if uses is None else uses)
         size = episodes_at_once(loop.model, loop.horizon, cell.batch)
     except Exception as error:
         return _failed(head, seeds, *_why(error))
     for start in range(0, cell.seeds, size):
         chunk = seeds[start : start + size]
         try:
-            trace = rollout(loop, rival, draws.keys(cell.purpose, chunk))
-            values = measure(trace)
-        except Exception as error:  # whatever a component raises costs its own rows, and only them
+            rows += _played(head, chunk, rollout(loop, attack, draws.keys(cell.purpose, chunk)))
+        except Exception as error:  # a component may raise anything; only its own rows are lost
             rows += _failed(head, chunk, *_why(error, chunk))
-            continue
-        for i, seed in enumerate(chunk):
-            numbers = {name: None if np.isnan(v[i]) else float(v[i]) for name, v in values.items()}
-            hashes = {"trace_hash": trace.trace_hash(i), "decision_hash": trace.decision_hash(i)}
-            rows.append(_own(head) | {"seed": seed, "status": "ok", "reason": "", **numbers, **hashes})
+    return rows
+
+
+def _played(head: dict[str, Any], seeds: Sequence[int], trace: Trace) -> list[dict[str, Any]]:
+    """Return the rows of a trace, one per seed."""
+    rows, values = [], measure(trace)
+    for i, seed in enumerate(seeds):
+        numbers = {name: None if np.isnan(v[i]) else float(v[i]) for name, v in values.items()}
+        hashes = {"trace_hash": trace.trace_hash(i), "decision_hash": trace.decision_hash(i)}
+        rows.append(_own(head) | {"seed": seed, "status": "ok", "reason": "", **numbers, **hashes})
     return rows
 
 
 def _why(error: Exception, seeds: Sequence[int] = ()) -> tuple[str, str]:
-    """Reason and status of the rows, of these seeds, that an error costs."""
+    """Return the reason and status of the rows of these seeds, which an error affects."""
     if isinstance(error, NotApplicable):
         return str(error), "skipped"
     row = error.row if isinstance(error, InputError) else None
     return said(error) + (f" (row {row}: seed {seeds[row]})" if row is not None and row < len(seeds) else ""), "error"
 
 
-def _head(cell: Cell, place: Scenario, guard: Entry, rival: Entry, identity: str) -> dict[str, Any]:
+def _head(cell: Cell, place: Scenario, defence: Entry, attack: Entry, identity: str) -> dict[str, Any]:
     threat = place.threat_model
     return {
         "suite": cell.suite, "scenario": place.name, "scenario_file": cell.scenario if cell.scenario.endswith((".yaml", ".yml")) else "",
         "threat_model": as_data(threat), "dose": threat.budget,
-        "knowledge": threat.knowledge, "defence": cell.defence, "uses": list(guard.uses), "attack": cell.attack,
-        "learned": rival.learned, "optimal": rival.optimal, "purpose": cell.purpose, "beacon": cell.beacon, "batch": cell.batch,
-        "engine": ENGINE, "versions": {"defence": guard.version, "attack": rival.version},
+        "knowledge": threat.knowledge, "defence": cell.defence, "uses": list(defence.uses), "attack": cell.attack,
+        "learned": attack.learned, "optimal": attack.optimal, "purpose": cell.purpose, "beacon": cell.beacon, "batch": cell.batch,
+        "engine": ENGINE, "versions": {"defence": defence.version, "attack": attack.version},
         "defence_digest": _digest("defence", cell.defence, identity), "attack_digest": _digest("attack", cell.attack, identity),
         "config_hash": place.config_hash, "version": VERSION, "cell": identity,
         "trained": origin(cell.attack) if identity else None,
@@ -128,14 +138,14 @@ def _head(cell: Cell, place: Scenario, guard: Entry, rival: Entry, identity: str
 
 
 def origin(attack: str) -> dict[str, Any] | None:
-    """How a learned attack was trained, as its file says."""
+    """Return how a learned attack was trained, from its file; None for other attacks."""
     from tailgate.studies.policies import origin_of
 
     return origin_of(attack)
 
 
-def _digest(family: Any, text: str, identity: str) -> str:
-    """Of the file of a component that is not built in; objects have none."""
+def _digest(family: Family, text: str, identity: str) -> str:
+    """Return the digest of the file of a component that is not built in; objects have none."""
     return Spec(family, text).digest if identity else ""
 
 
@@ -146,19 +156,19 @@ def _failed(head: dict[str, Any], seeds: Iterable[int], reason: str, status: str
 
 
 def _own(head: dict[str, Any]) -> dict[str, Any]:
-    """The head of a row that shares nothing with another's."""
+    """Return a copy of the head of a row, so that rows share no mutable values."""
     return {key: copy.deepcopy(value) if isinstance(value, (dict, list)) else value for key, value in head.items()}
 
 
 def failed_rows(cell: Cell, reason: str) -> list[dict[str, Any]]:
-    """The rows of a cell that could not be played."""
-    rival, entry = Spec("attack", cell.attack).make(), Spec("attack", cell.attack).entry
-    head = _head(cell, cell.place(rival, entry.knowledge), Spec("defence", cell.defence).entry, entry, cell_id(cell))
+    """Return the rows of a cell that could not be played."""
+    spec = Spec("attack", cell.attack)
+    head = _head(cell, cell.place(spec.make(), spec.entry.knowledge), Spec("defence", cell.defence).entry, spec.entry, cell_id(cell))
     return _failed(head, cell.episodes, reason)
 
 
 def cell_id(cell: Cell) -> str:
-    """Of everything that decides a cell's rows: a finished cell with this id is not played again."""
+    """Return a hash of everything that determines a cell's rows; a finished cell with this id is not played again."""
     data = dataclasses.asdict(cell)
     data["sources"] = [Spec("defence", cell.defence).digest, Spec("attack", cell.attack).digest]
     data["scenario"] = load_scenario(cell.scenario).config_hash
@@ -167,7 +177,7 @@ def cell_id(cell: Cell) -> str:
 
 @contextlib.contextmanager
 def _sparing() -> Iterator[None]:
-    """Lets bad input through, and nothing else: a pairing without meaning, or a component that breaks, costs its own rows."""
+    """Let only InputError through: a component that fails or does not apply loses its own rows when it is played."""
     try:
         yield
     except NotApplicable:
@@ -181,10 +191,10 @@ def _sparing() -> Iterator[None]:
 def cells_of(
     suite: Suite, *, batch: int = 256, purpose: str = "report", threat: dict[str, Any] | None = None, beacon: str = "", first_seed: int = 0
 ) -> list[Cell]:
-    """Every cell of a suite, in its order, from episode `first_seed` on. Raises InputError for anything that does not exist."""
+    """Return the cells of a suite in order, from episode `first_seed` on; raise InputError for anything that does not exist."""
     if purpose not in draws.PURPOSES:
         raise InputError("purpose", purpose, f"one of {', '.join(draws.PURPOSES)}")
-    _ = numbered(beacon, suite.name, purpose, 0, 1)  # refuses a beacon that is none
+    _ = numbered(beacon, suite.name, purpose, 0, 1)  # checks the beacon
     changes = suite.granted | dict(threat or {})
     out = [
         Cell(suite.name, scenario, dose, defence, attack, suite.seeds, purpose, first_seed, batch, changes, beacon)
@@ -193,48 +203,35 @@ def cells_of(
     models: dict[str, Model] = {}
     fitted: set[tuple[str, str]] = set()
     for cell in out:
-        spec, guard = Spec("attack", cell.attack), Spec("defence", cell.defence)
-        rival, defence = spec.make(), guard.make()
-        place = cell.place(rival, spec.entry.knowledge)
-        if (cell.scenario, cell.defence) not in fitted:  # once: the filter of a large network takes its time
+        attack_spec, defence_spec = Spec("attack", cell.attack), Spec("defence", cell.defence)
+        attack, defence = attack_spec.make(), defence_spec.make()
+        place = cell.place(attack, attack_spec.entry.knowledge)
+        if (cell.scenario, cell.defence) not in fitted:  # once, because a filter of a large network is slow to prepare
             fitted.add((cell.scenario, cell.defence))
             with _sparing():
-                place.loop(defence, guard.entry.uses)
+                place.loop(defence, defence_spec.entry.uses)
         if cell.scenario not in models:
             models[cell.scenario] = model = place.brief().model
-            needed = 2 * episode_memory(model, place.horizon)  # with what is measured of them
+            needed = 2 * episode_memory(model, place.horizon)  # twice, for the metrics
             sizes.fits(needed, f"scenario {place.name}: horizon", place.horizon, "the signals of one episode")
         brief = Brief(models[cell.scenario], place.threat_model, place.horizon)
-        _ = brief.granted  # names wires and agents that exist
+        _ = brief.granted  # checks the names of wires and agents
         with _sparing():
-            rival.prepare(brief)
+            attack.prepare(brief)
     return out
 
 
 def run(
     cells: Sequence[Cell], out: Path | None = None, workers: int = 1, progress: Callable[[int, int], None] | None = None
 ) -> list[dict[str, Any]]:
-    """Rows of all cells in their order. With `out`, cells that an interrupted run finished are not played again."""
+    """Play cells and return their rows in order; with `out`, skip cells that an interrupted run finished."""
     sizes.check("workers", workers)
     count = sum(sizes.check("seeds", cell.seeds) for cell in cells)
     sizes.fits(count * sizes.ROW, "seeds", max((cell.seeds for cell in cells), default=0), f"{count:,} rows")
     sizes.announce(count / sizes.EPISODES_A_SECOND / workers, count * sizes.ROW, f"{count:,} episodes")
     ids = [cell_id(cell) for cell in cells]
     pieces = {i: [(i, seed) for seed in cell.episodes] for i, cell in zip(ids, cells, strict=True)}
-    with contextlib.nullcontext() if out is None else Parts(out) as parts:
-        done = {} if parts is None else parts.finished(pieces)
-        missing = [(i, cell) for i, cell in zip(ids, cells, strict=True) if i not in done]
-        with contextlib.closing(_play([cell for _, cell in missing], workers)) as played:
-            for position, rows in played:
-                done[missing[position][0]] = rows
-                if parts is not None:
-                    parts.put(missing[position][0], rows)
-                if progress is not None:
-                    progress(len(done), len(cells))
-        rows = [row for i in ids for row in done[i]]
-        if parts is not None:
-            parts.finish(rows, pieces)
-    return rows
+    return complete(ids, pieces, out, lambda missing: _play([cells[i] for i in missing], workers), progress)
 
 
 def _play(cells: Sequence[Cell], workers: int) -> Generator[tuple[int, list[dict[str, Any]]]]:
@@ -264,14 +261,26 @@ def evaluate(
     beacon: str = "",
     progress: Callable[[int, int], None] | None = None,
 ) -> list[dict[str, Any]]:
-    """Rows of a suite, or of any part of it that is given here; defences and attacks by name or as objects.
+    """Play a suite, or the part of it given by the arguments, and return its rows.
 
-    `threat` changes the scenarios' threat models; `beacon` names the round that the episodes belong to.
-    Raises InputError before anything is played.
+    Parameters
+    ----------
+    suite : name or object; without it, give scenarios, defences and attacks
+    defences, attacks : names or objects
+    scenarios, doses, seeds : replace those of the suite
+    threat : changes of the scenarios' threat models
+    beacon : the round that the episodes belong to
+    batch, workers : episodes played together, and processes; they change no bit
+    out : file for the rows
+
+    Raises
+    ------
+    InputError
+        An argument is invalid; nothing is played then.
     """
     base = load_suite(suite) if isinstance(suite, str) else suite if suite is not None else Suite(name="custom")
-    guards = list(base.defences if defences is None else defences)
-    rivals = list(base.attacks if attacks is None else attacks)
+    defences = list(base.defences if defences is None else defences)
+    attacks = list(base.attacks if attacks is None else attacks)
     sizes.check("batch", batch)
     sizes.check("workers", workers)
     sizes.check("seeds", base.seeds if seeds is None else seeds)
@@ -279,11 +288,11 @@ def evaluate(
         base,
         scenarios=tuple(base.scenarios if scenarios is None else scenarios),
         doses=tuple(base.doses if doses is None else doses),
-        defences=tuple(g for g in guards if isinstance(g, str)),
-        attacks=tuple(r for r in rivals if isinstance(r, str)),
+        defences=tuple(d for d in defences if isinstance(d, str)),
+        attacks=tuple(a for a in attacks if isinstance(a, str)),
         seeds=base.seeds if seeds is None else seeds,
     )
-    for name, value in (("scenarios", named.scenarios), ("defences", guards), ("attacks", rivals)):
+    for name, value in (("scenarios", named.scenarios), ("defences", defences), ("attacks", attacks)):
         if not value:
             raise InputError(name, list(value), "at least one")
     for dose in named.doses:
@@ -291,16 +300,16 @@ def evaluate(
             raise InputError("dose", dose, "a whole number of attack steps, not below 0")
     cells = cells_of(named, batch=batch, purpose=purpose, threat=threat, beacon=beacon)
     rows = run(cells, Path(out) if out is not None else None, workers, progress) if cells else []
-    for guard in guards:
-        for rival in rivals:
-            if isinstance(guard, str) and isinstance(rival, str):
+    for defence in defences:
+        for attack in attacks:
+            if isinstance(defence, str) and isinstance(attack, str):
                 continue
-            texts = _component("defence", guard)[2], _component("attack", rival)[2]
+            texts = component("defence", defence)[2], component("attack", attack)[2]
             for scenario in named.scenarios:
                 for dose in named.doses:
                     changes = named.threat | dict(threat or {})
                     cell = Cell(named.name, scenario, dose, *texts, named.seeds, purpose, 0, batch, changes, beacon)
-                    rows += run_cell(cell, guard, rival)
+                    rows += run_cell(cell, defence, attack)
     if out is not None and len(rows) > sum(cell.seeds for cell in cells):
         write_atomic(Path(out), packed(rows, Path(out)))  # with the rows of objects
     return rows

@@ -1,7 +1,7 @@
-"""What a suite keeps out of its logs: families of attacks, also where one stands under another name.
+"""Attacks that a suite keeps out of its logs: families of attacks, also under other names.
 
-A family is a registered name with any parameters. A program's phase, the law of `fdi_sparse` and the actions of a policy can be the same
-attack: the same kind with the same law of values.
+A family is a registered name with any parameters. A program's phase, the law of `fdi_sparse` or a policy's actions can be the same attack.
+They are if they have the same kind and the same law of values.
 """
 
 from __future__ import annotations
@@ -14,20 +14,21 @@ from tailgate.agents.scripts.program import Phase, Program
 from tailgate.agents.scripts.scripted import Inject, InjectSparse
 from tailgate.agents.scripts.triggers import Chance
 from tailgate.agents.scripts.values import Constant, Gaussian, PerWire, Ramp, Uniform
+from tailgate.core import Attack
 from tailgate.core.registry import Spec
 
-GROWING = ("ramp", "increment")  # actions of a policy that change the value sent last
+GROWING = ("ramp", "increment")  # actions of a policy that change the last value sent
 
 
 class Shape(NamedTuple):
-    """What an attack does with readings, whenever it does it."""
+    """The effect of an attack on readings, at any time."""
 
     kind: str
-    law: type[Any] | None = None  # of the values; None: whatever they are
-    chance: bool = False  # steps and wires are hit by chance
+    law: type[Any] | None = None  # law of the values; None: any
+    chance: bool = False  # steps and wires are chosen at random
 
 
-SHAPES = {  # of those families that something else can be, too
+SHAPES = {  # of families that other attacks can imitate
     "fdi": Shape("fdi", Constant), "fdi_bernoulli": Shape("fdi", Constant, True), "fdi_gaussian": Shape("fdi", Gaussian),
     "fdi_uniform": Shape("fdi", Uniform), "fdi_ramp": Shape("fdi", Ramp), "dos_jam": Shape("dos_jam", Uniform),
     "radar_jam": Shape("dos_jam", Uniform), "dos_hold": Shape("dos_hold"), "dropout": Shape("dropout"), "delay": Shape("delay"),
@@ -37,7 +38,7 @@ SHAPES = {  # of those families that something else can be, too
 
 
 def families(text: str) -> set[str]:
-    """The families of an attack: the name that it is registered under, and all whose shape it has somewhere."""
+    """Return the families of an attack: its registered name, and all families whose shape some part of it has."""
     spec = Spec("attack", text)
     shown = _shapes(spec.make())
     same = {name for name, (kind, law, chance) in SHAPES.items() for one in shown
@@ -45,7 +46,7 @@ def families(text: str) -> set[str]:
     return {spec.entry.name} | same
 
 
-def _shapes(attack: Any) -> list[Shape]:
+def _shapes(attack: Attack) -> list[Shape]:
     if isinstance(attack, Program):
         phases = attack.sheet.phases
         return [Shape(phase.kind.removesuffix("_fresh"), law, _by_chance(phase)) for phase in phases for law in _laws(phase.value)]
@@ -59,8 +60,8 @@ def _shapes(attack: Any) -> list[Shape]:
     return []
 
 
-def _laws(law: Any) -> list[type[Any]]:
-    """The laws of a value: of each wire, where they differ."""
+def _laws(law: object) -> list[type[Any]]:
+    """Return the laws of a value, one per wire if they differ."""
     return [type(held) for _, held in law.laws] if isinstance(law, PerWire) else [type(law)]
 
 

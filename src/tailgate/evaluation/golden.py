@@ -1,9 +1,12 @@
-"""Golden traces: fingerprints of a few episodes of every scenario of every suite, as the suite plays it, kept in the repository.
+"""Golden traces: fingerprints of a few episodes of every scenario of every suite, as the suite plays it.
 
-A published suite never changes under its name. `check` plays 16 episodes (fewer of a slow plant, or of a suite with fewer) x two defences
-x three attacks of each scenario again and says what moved; `write` records them anew, which is for a new version and never for an old one.
-A decision's hash is the same on every platform. A trace's is exact for one machine type with one numpy and one llvmlite, whose LLVM
-compiles random numbers and traced loops. It is compared where those are the recorded ones.
+A published suite never changes under its name.
+`check` plays 16 episodes per cell again, fewer of a slow plant or a small suite, and reports what changed.
+It covers two defences and three attacks of each scenario.
+`write` records fingerprints of a new version; never use it for a published one.
+A decision's hash is the same on every platform.
+A trace's hash is exact for one machine type with one numpy and one llvmlite, which compiles random numbers and traced loops.
+It is compared only where these match the record.
 
     python -m tailgate.evaluation.golden --check [--scenario NAME ...]
     python -m tailgate.evaluation.golden --write [--suite NAME ...]
@@ -20,6 +23,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from importlib.resources import files
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -41,15 +45,15 @@ from tailgate.play.trace import Trace, rollout
 FORMAT = "tailgate-golden-2"
 FILE = Path(str(files("tailgate.configs").joinpath("golden"))) / "golden.json"
 EPISODES = 16
-FEW = {"Highway": 2}  # of a plant that steps its episodes one by one
-FOREIGN = {"Highway"}  # plants that another library moves: their last bits depend on the instructions that numpy finds, too
+FEW = {"Highway": 2}  # for a plant that steps its episodes one by one
+FOREIGN = {"Highway"}  # plants of other libraries, whose last bits also depend on the instructions that numpy finds
 DEFENCES, ATTACKS = 2, 3
 PURPOSE = "report"  # the first episodes of a board
 
 
 @dataclass(frozen=True, eq=False)
 class _Blocks(Mixture):
-    """Each attack plays as many rows of its own, in one batch: a row does not depend on its companions."""
+    """A mixture in which each attack plays an equal block of rows of one batch."""
 
     def start(self, plan: tuple[Any, ...], batch: int, draws: Draws) -> MixtureState:
         state = super().start(plan, batch, draws)
@@ -57,29 +61,29 @@ class _Blocks(Mixture):
 
 
 def this_platform() -> str:
-    """What a trace's last bits may depend on."""
+    """Return what a trace's last bits may depend on."""
     return f"{platform.machine()}, numpy {np.__version__}, llvmlite {version('llvmlite')}"
 
 
 def instructions() -> str:
-    """Sets of instructions beyond the baseline that numpy found on this processor."""
+    """Return the instruction sets beyond the baseline that numpy found on this processor."""
     return " ".join(np.show_config(mode="dicts")["SIMD Extensions"]["found"])
 
 
 def uses() -> dict[str, tuple[str, Suite]]:
-    """Every scenario of every built-in suite, by `suite/scenario`: a suite has its own threat model, doses and attacks."""
+    """Return all scenarios of all built-in suites by `suite/scenario`, because each suite has its threat model, doses and attacks."""
     return {f"{suite.name}/{name}": (name, suite) for suite in map(load_suite, list_suites()) for name in suite.scenarios}
 
 
 def place_of(name: str, suite: Suite) -> Scenario:
-    """The scenario under the suite's threat model at its middle dose, for a black-box attacker unless the suite grants more."""
+    """Return the scenario with the suite's threat model and middle dose, for a black-box attacker unless the suite grants more."""
     dose = suite.doses[len(suite.doses) // 2]
     changes = suite.threat | {"knowledge": suite.knowledge or "black"} | ({} if dose is None else {"budget": dose})
     return load_scenario(name).with_threat(**changes)
 
 
 def loops(place: Scenario, names: Sequence[str]) -> Iterator[tuple[str, Loop]]:
-    """Those of the defences that have a meaning here, with their loops."""
+    """Yield the defences that apply to a scenario, with their loops."""
     for name in dict.fromkeys(names):
         spec = Spec("defence", name)
         try:
@@ -89,19 +93,19 @@ def loops(place: Scenario, names: Sequence[str]) -> Iterator[tuple[str, Loop]]:
 
 
 def episodes_of(place: Scenario, suite: Suite) -> int:
-    """How many of a cell are recorded: never more than a board of the suite has."""
+    """Return how many episodes of a cell are recorded; never more than a board of the suite has."""
     return min(FEW.get(type(place.plant).__name__, EPISODES), suite.seeds)
 
 
 def play(loop: Loop, attacks: Sequence[str], episodes: int = EPISODES) -> Trace:
-    """So many rows of each attack, one after the other in one batch."""
+    """Play `episodes` rows of each attack in one batch, one attack after the other."""
     keys = draws.keys(PURPOSE, range(episodes))
     some = Keys(np.tile(keys.key, (len(attacks), 1)), np.tile(keys.episode, len(attacks)))
     return rollout(loop, _Blocks(tuple(Spec("attack", text).make() for text in attacks)), some)
 
 
 def cells(loop: Loop, defence: str, attacks: Sequence[str], episodes: int = EPISODES) -> list[dict[str, str]]:
-    """The fingerprints under one defence, one entry for each attack."""
+    """Return the fingerprints of one defence, one entry per attack."""
     trace, out = play(loop, attacks, episodes), []
     for i, attack in enumerate(attacks):
         rows = range(i * episodes, (i + 1) * episodes)
@@ -115,26 +119,26 @@ def _all(hashes: Iterator[str]) -> str:
 
 
 def record(name: str, suite: Suite) -> dict[str, Any]:
-    """What is kept of a scenario: none, and the first two other attacks of the suite that need no more than is granted and take effect."""
+    """Return the record of a scenario: no attack, and the first two attacks of the suite that are granted and take effect."""
     place = place_of(name, suite)
     episodes = episodes_of(place, suite)
-    chosen = list(_first(loops(place, ("kf", "none", *suite.defences)), DEFENCES))
+    chosen = list(islice(loops(place, ("kf", "none", *suite.defences)), DEFENCES))
     if not chosen:
         raise InputError("golden", name, "a scenario that one of its suite's defences can serve")
     brief, able = place.brief(), ["none"]
     for text in suite.attacks:
-        rival, entry = Spec("attack", text).make(), Spec("attack", text).entry
-        if text == "none" or getattr(rival, "knowledge", entry.knowledge) != "black" or entry.learned:
+        attack, entry = Spec("attack", text).make(), Spec("attack", text).entry
+        if text == "none" or getattr(attack, "knowledge", entry.knowledge) != "black" or entry.learned:
             continue
         try:
-            rival.prepare(brief)
+            attack.prepare(brief)
         except NotApplicable:
             continue
         able.append(text)
     trace = play(chosen[0][1], able, episodes)
     steps = ((trace.kind != 0) & trace.live).sum(axis=0).reshape(len(able), episodes).sum(axis=1)
     acting = [text for text, n in zip(able, steps, strict=True) if n]
-    kinds = {Spec("attack", text).entry.name: text for text in reversed(acting)}  # of each sort the first
+    kinds = {Spec("attack", text).entry.name: text for text in reversed(acting)}  # the first of each sort
     acting.sort(key=lambda text: text not in kinds.values())
     attacks = ["none", *acting[: ATTACKS - 1]]
     return {
@@ -144,13 +148,8 @@ def record(name: str, suite: Suite) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _first(items: Iterator[tuple[str, Loop]], most: int) -> Iterator[tuple[str, Loop]]:
-    for _, item in zip(range(most), items, strict=False):
-        yield item
-
-
 def read() -> dict[str, Any]:
-    """The recorded fingerprints."""
+    """Read the recorded fingerprints."""
     try:
         held: dict[str, Any] = load_json(FILE)
     except (OSError, ValueError) as error:
@@ -161,7 +160,7 @@ def read() -> dict[str, Any]:
 
 
 def moved_suites(held: dict[str, Any]) -> list[str]:
-    """Which suites or scenarios are not the recorded ones, without playing."""
+    """Return which suites or scenarios differ from the recorded ones, without playing."""
     here, there = {name: load_suite(name).hash for name in list_suites()}, held["suites"]
     out = [f"suite {name} is not recorded: python -m tailgate.evaluation.golden --write" for name in here if name not in there]
     out += [f"suite {name} is recorded and gone" for name in there if name not in here]
@@ -169,26 +168,26 @@ def moved_suites(held: dict[str, Any]) -> list[str]:
     out += [f"suite {name} has changed under its name: it needs a new version" for name in changed]
     used = uses()
     out += [f"{key} is not recorded" for key in used if key not in held["scenarios"]]
-    out += [f"{key} is recorded, and there is no such scenario of a suite" for key in held["scenarios"] if key not in used]
+    out += [f"{key} is recorded, but no suite has such a scenario" for key in held["scenarios"] if key not in used]
     return out
 
 
 def comparable(held: dict[str, Any], entry: dict[str, Any]) -> bool:
-    """Whether traces of a recorded scenario have to come out here to the last bit."""
+    """Return True if traces of a recorded scenario must match here to the last bit."""
     return held["platform"] == this_platform() and entry.get("instructions", "") in ("", instructions())
 
 
 def check(name: str, held: dict[str, Any]) -> list[str]:
-    """What moved in a scenario of a suite, a sentence each; empty when nothing did. Traces are compared on the platform that was recorded.
+    """Play a scenario (`suite/scenario`) again and return one sentence per change; traces count only on the recorded platform.
 
-    name: `suite/scenario`. Raises ImportError where the scenario needs what is not installed.
+    Raises ImportError if the scenario needs a package that is not installed.
     """
     entry = held["scenarios"].get(name)
     if entry is None:
         raise unknown("golden.scenario", name, held["scenarios"])
     of, _, scenario = name.partition("/")
     if of not in list_suites() or scenario not in (suite := load_suite(of)).scenarios:
-        return [f"{name}: there is no such scenario of a suite any more"]
+        return [f"{name}: no suite has such a scenario any more"]
     place = place_of(scenario, suite)
     out = []
     if place.config_hash != entry["hash"]:
@@ -211,11 +210,11 @@ def check(name: str, held: dict[str, Any]) -> list[str]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Exit code 0 when nothing moved, 1 when something did, 2 for bad input."""
+    """Run the command; return 0 if nothing changed, 1 if something did, 2 for bad input."""
     parser = argparse.ArgumentParser(prog="python -m tailgate.evaluation.golden", description="Golden traces of the published suites.")
     what = parser.add_mutually_exclusive_group(required=True)
-    what.add_argument("--check", action="store_true", help="play them again and say what moved")
-    what.add_argument("--write", action="store_true", help="record them anew: for a new version")
+    what.add_argument("--check", action="store_true", help="play them again and report what changed")
+    what.add_argument("--write", action="store_true", help="record them again, for a new version")
     parser.add_argument("--scenario", action="append", metavar="NAME", help="only this one, under all suites (repeatable; with --check)")
     parser.add_argument("--suite", action="append", metavar="NAME", help="only this one, a new one (repeatable; with --write)")
     options = parser.parse_args(arguments)
@@ -253,13 +252,13 @@ def _check(only: list[str] | None) -> int:
 
 
 def _write(only: list[str] | None) -> int:
-    """Everything, or the suites `only` beside what is recorded of the others."""
+    """Record all suites, or only those given, and keep the record of the others."""
     for name in only or ():
         if name not in list_suites():
             raise unknown("--suite", name, list_suites())
     used = {key: (name, suite) for key, (name, suite) in uses().items() if only is None or suite.name in only}
     if only is not None and (platform_of := read()["platform"]) != this_platform():
-        raise InputError("--suite", this_platform(), f"the platform of the other suites' traces ({platform_of}), or all of them anew")
+        raise InputError("--suite", this_platform(), f"the platform of the other suites' traces ({platform_of}), or a record of all suites")
     scenarios = {}
     with progress(Console(stderr=True)) as update:
         for done, key in enumerate(sorted(used), 1):

@@ -1,9 +1,9 @@
-"""Rows of a long run: what is finished is kept beside the output until all is done, so that an interrupted run goes on."""
+"""Rows of a long run, in parts: finished parts are kept next to the output until all are done, so that an interrupted run resumes."""
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +13,45 @@ from tailgate.base.locks import alone
 from tailgate.evaluation.rows import encode, packed, read_rows
 
 Rows = list[dict[str, Any]]
-Wanted = Sequence[tuple[str, int]]  # cell and seed of each row of a piece, in order
+Wanted = Sequence[tuple[str, int]]  # cell and seed of each row of a part, in order
+
+
+def complete(
+    names: Sequence[str], pieces: Mapping[str, Wanted], out: Path | None, play: Callable[[list[int]], Generator[tuple[int, Rows]]],
+    progress: Callable[[int, int], None] | None,
+) -> Rows:  # fmt: skip
+    """Play the parts of a run and return their rows in the order of `names`.
+
+    With `out`, parts that an interrupted run finished are not played again, and the rows are written to it.
+
+    Parameters
+    ----------
+    names : of the parts
+    pieces : cell and seed of each row, by name
+    play : plays the parts with these indices; yields (position in the indices, rows) as they finish
+    progress : called with the numbers of finished and of all parts
+    """
+    with contextlib.nullcontext() if out is None else Parts(out) as parts:
+        done = {} if parts is None else parts.finished(pieces)
+        missing = [i for i, name in enumerate(names) if name not in done]
+        with contextlib.closing(play(missing)) as played:
+            for position, rows in played:
+                name = names[missing[position]]
+                done[name] = rows
+                if parts is not None:
+                    parts.put(name, rows)
+                if progress is not None:
+                    progress(len(done), len(names))
+        rows = [row for name in names for row in done[name]]
+        if parts is not None:
+            parts.finish(rows, pieces)
+    return rows
 
 
 class Parts:
-    """The pieces of a run that writes to `out`, within `with`, which nobody else may do meanwhile.
+    """The parts of a run that writes to `out`; as a context manager it locks `out` for this process.
 
-    A piece has a name, and is finished when all of its rows are there and none failed.
+    A part has a name. It is finished when all its rows exist and none failed.
     """
 
     def __init__(self, out: Path) -> None:
@@ -43,7 +75,7 @@ class Parts:
         self.lock.__exit__(None, None, None)
 
     def finished(self, pieces: Mapping[str, Wanted]) -> dict[str, Rows]:
-        """Rows of the pieces that an earlier run finished, by name: kept as parts, or in the output itself."""
+        """Return the rows of parts that an earlier run finished, by name, from part files or from the output."""
         before: dict[tuple[str, int], dict[str, Any]] = {}
         for row in self._read(self.out):
             before[str(row.get("cell")), row["seed"]] = row
@@ -56,11 +88,11 @@ class Parts:
         return found
 
     def put(self, name: str, rows: Rows) -> None:
-        """Keep the rows of a piece."""
+        """Write the rows of a part."""
         write_atomic(self._part(name), encode(rows))
 
     def finish(self, rows: Rows, pieces: Mapping[str, Wanted]) -> None:
-        """Write all rows, and remove the parts. A file that holds anything but rows of these cells is set aside: it is a result."""
+        """Write all rows and remove the parts; an output that holds other rows is renamed first, because it is a result."""
         if self.out.is_file():
             cells = {cell for wanted in pieces.values() for cell, _ in wanted}
             try:
@@ -72,14 +104,14 @@ class Parts:
         write_atomic(self.out, packed(rows, self.out))
         for name in pieces:
             remove(self._part(name))
-        with contextlib.suppress(OSError):  # something else lies there: not ours to remove
+        with contextlib.suppress(OSError):  # other files are in it
             self.folder.rmdir()
 
     def _part(self, name: str) -> Path:
         return self.folder / f"{name}.jsonl"
 
     def _read(self, path: Path) -> Rows:
-        """The rows of a file; none where there is none, or where it is damaged: its cells are played again."""
+        """Return the rows of a file; none if it is missing or damaged, so that its cells are played again."""
         try:
             return read_rows(path) if path.is_file() else []
         except InputError:

@@ -1,7 +1,8 @@
-"""Rounds: everybody on a board plays the same episodes, whose seeds nobody could know when the submissions were made.
+"""Rounds: all defences of a board play the same episodes, with seeds that nobody could know at submission.
 
-Submissions are handed in by their digest; then a beacon becomes public; the seeds of all episodes follow from it. Who comes later waits
-for the next beacon, with which the whole board is played again. Seeds without a beacon are 0, 1, 2, ...: known, and for development.
+Participants submit the digests of their defences; then a beacon becomes public; the seeds of all episodes follow from it.
+Later submissions wait for the next beacon, with which the whole board is played again.
+Seeds without a beacon are 0, 1, 2, ...: public, and meant for development.
 """
 
 from __future__ import annotations
@@ -12,14 +13,15 @@ from collections.abc import Sequence
 from tailgate.base.errors import InputError
 from tailgate.core.draws import PURPOSES
 
-SEED_BITS = 53  # whole numbers that every reader of JSON keeps
+SEED_BITS = 53  # whole numbers that every JSON reader keeps
 SHORTEST = 16  # characters of a beacon
 
 
 def seeds_of(beacon: str, suite: str, purpose: str, count: int) -> list[int]:
-    """Seeds of the first `count` episodes of a suite in the round of a beacon, by keyed BLAKE2b: below 2^53, no two equal.
+    """Return the seeds of the first `count` episodes of a suite in the round of a beacon, by keyed BLAKE2b.
 
-    The key is the hash of the beacon; the message is suite, purpose and number. Whoever knows the beacon can make them again.
+    Seeds are distinct and below 2^53. The key is the hash of the beacon; the message is suite, purpose and number.
+    Anyone who knows the beacon can compute them.
     """
     if purpose not in PURPOSES:
         raise InputError("purpose", purpose, f"one of {', '.join(PURPOSES)}")
@@ -36,5 +38,5 @@ def seeds_of(beacon: str, suite: str, purpose: str, count: int) -> list[int]:
 
 
 def numbered(beacon: str, suite: str, purpose: str, first: int, count: int) -> Sequence[int]:
-    """Seeds of the episodes first, first + 1, ...: those of a round, or, without a beacon, the numbers themselves."""
+    """Return the seeds of episodes first, first + 1, ...: those of a round, or the numbers themselves without a beacon."""
     return seeds_of(beacon, suite, purpose, first + count)[first:] if beacon else range(first, first + count)

@@ -1,4 +1,4 @@
-"""Rows: one JSON object per episode and line, with everything that is needed to play it again. Files that end in .xz are compressed."""
+"""Rows: one JSON object per episode and line, with everything needed to play it again. Files named *.xz are compressed."""
 
 import contextlib
 import json
@@ -14,12 +14,12 @@ from tailgate.base.errors import InputError, said, wanted
 from tailgate.base.reading import lines_of, parse_json
 from tailgate.play.metrics import METRICS
 
-# What tells one cell from another: rows that differ in one of these are never summed up together.
+# The columns that identify a cell: rows that differ in one of them are never summarised together.
 KEYS = (
     "suite", "scenario", "dose", "knowledge", "defence", "attack", "purpose", "config_hash", "version", "defence_digest", "attack_digest",
 )  # fmt: skip
 
-AGAIN = "the command that wrote it makes it whole, given once more"
+AGAIN = "run the command that wrote it again to complete it"
 _Text = Annotated[str, Field(strict=True)]
 _Number = Annotated[float, Field(strict=True, allow_inf_nan=False)] | None
 _FIELDS: dict[str, Any] = {
@@ -32,7 +32,7 @@ _Row = create_model("Row", __config__=ConfigDict(extra="allow"), **_FIELDS)
 
 
 def read_rows(path: Path) -> list[dict[str, Any]]:
-    """Rows of a JSON Lines file, checked; raises InputError that names the line."""
+    """Read and check the rows of a JSON Lines file; raise InputError that names the line."""
     rows: list[dict[str, Any]] = []
     lines, number, ahead = lines_of(path), 1, b""
     try:
@@ -50,15 +50,15 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
 
 
 def _row(line: bytes, where: str, damage: str, first: bool) -> dict[str, Any]:
-    """A line, checked. damage: what became of its file, if it is no JSON object. first: it is the first one."""
+    """Check and return one line. `damage` says what happened to the file if the line is not JSON; `first`: it is the first line."""
     try:
         row = parse_json(line)
     except ValueError as error:
-        loose: Any = None
+        loose: object = None
         with contextlib.suppress(ValueError):
             loose = parse_json(line, strict=False)
         if loose is not None:
-            _check(loose, where)  # NaN and its like are told with their field
+            _check(loose, where)  # reports NaN and similar values with their field
         shown = line[:60].decode("utf-8", "replace").rstrip("\n")
         cut = f"; the file was {damage} here: {AGAIN}" if damage else ""
         why = "" if isinstance(error, json.JSONDecodeError) else f" ({error})"
@@ -68,11 +68,11 @@ def _row(line: bytes, where: str, damage: str, first: bool) -> dict[str, Any]:
     _check(row, where)
     if row["status"] == "ok" and row["crashed"] not in (0.0, 1.0):
         raise InputError(f"{where}: crashed", row["crashed"], "0 or 1")
-    return {intern(key): intern(value) if type(value) is str else value for key, value in row.items()}  # half the memory
+    return {intern(key): intern(value) if type(value) is str else value for key, value in row.items()}  # halves the memory
 
 
-def _check(row: Any, where: str) -> None:
-    """Raise InputError unless the fields of a row are as they should be."""
+def _check(row: object, where: str) -> None:
+    """Raise InputError unless the fields of a row are valid."""
     try:
         _Row.model_validate(row)
     except ValidationError as error:
@@ -83,10 +83,10 @@ def _check(row: Any, where: str) -> None:
 
 
 def packed(rows: Sequence[dict[str, Any]], path: Path) -> bytes:
-    """What a file of rows holds: JSON Lines, compressed where its name ends in .xz. The same rows give the same bytes."""
+    """Return the content of a file of rows: JSON Lines, compressed if it is named *.xz. Equal rows give equal bytes."""
     return lzma.compress(encode(rows), preset=2) if path.suffix == ".xz" else encode(rows)
 
 
 def encode(rows: Sequence[dict[str, Any]]) -> bytes:
-    """Rows as JSON Lines; NaN and infinity are refused."""
+    """Return rows as JSON Lines; refuse NaN and infinity."""
     return "".join(json.dumps(row, allow_nan=False) + "\n" for row in rows).encode()

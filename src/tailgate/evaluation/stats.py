@@ -1,4 +1,4 @@
-"""Intervals. Proportions by Clopper and Pearson, mean times by Poisson, medians by ranks (scipy); differences by a seeded bootstrap."""
+"""Confidence intervals: proportions by Clopper-Pearson, mean times by Poisson, medians by ranks, differences by a seeded bootstrap."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -17,7 +17,7 @@ class Interval(NamedTuple):
 
 
 def proportion(successes: int, n: int, level: float = 0.95) -> Interval:
-    """Share of successes with the exact (Clopper-Pearson) interval."""
+    """Return the share of successes with the exact (Clopper-Pearson) interval."""
     from scipy import stats  # its import takes half a second
 
     ci = stats.binomtest(successes, n).proportion_ci(confidence_level=level, method="exact")
@@ -25,15 +25,16 @@ def proportion(successes: int, n: int, level: float = 0.95) -> Interval:
 
 
 def mean_time(events: int, time: float, dispersion: float = 1.0, level: float = 0.95) -> tuple[float, float | None]:
-    """Limits of the mean time between events that came in so much of it: a Poisson interval, exact where they are independent.
+    """Return limits of the mean time between `events` in a span of time: a Poisson interval, exact for independent events.
 
-    Events that come in clusters tell less than their number says: it and the time are divided by the dispersion (variance over mean of
-    their number in a run) where that is above 1. The upper end is None without any event.
+    Clustered events carry less information than their number suggests.
+    A `dispersion` above 1 (variance over mean of their number per run) therefore divides their number and the time.
+    The upper limit is None without any event.
     """
     from scipy import stats
 
     clusters = max(dispersion, 1.0)
-    if events:  # and one at least
+    if events:  # at least one cluster
         clusters = min(clusters, float(events))
     n, time, tail = events / clusters, time / clusters, (1.0 - level) / 2.0
     low = time / float(0.5 * stats.chi2.ppf(1.0 - tail, 2.0 * n + 2.0))
@@ -41,10 +42,10 @@ def mean_time(events: int, time: float, dispersion: float = 1.0, level: float = 
 
 
 def median_limits(values: Array, level: float = 0.95) -> tuple[float, float] | None:
-    """The exact interval of the median of what values (n,) are drawn from: two of them, by the binomial distribution of their ranks.
+    """Return the exact interval of the median of the distribution of values (n,): two of them, by the binomial distribution of ranks.
 
-    It covers with a chance of at least `level` whatever the distribution is. None where so few values cannot. Source: scipy's
-    `quantile_test`; Conover, Practical Nonparametric Statistics, 1999, section 3.2.
+    It covers the median with probability `level` or more for any distribution; None if there are too few values.
+    References: scipy's `quantile_test`; Conover, Practical Nonparametric Statistics, 1999, section 3.2.
     """
     from scipy import stats
 
@@ -53,14 +54,14 @@ def median_limits(values: Array, level: float = 0.95) -> tuple[float, float] | N
 
 
 def paired_difference(a: Array, b: Array, level: float = 0.95, resamples: int = 4000, seed: int = 0, share: bool = False) -> Interval:
-    """Mean of a - b on the same episodes, with an interval.
+    """Return the mean of a - b on the same episodes, with an interval.
 
-    a and b are (episodes,), or (training seeds, episodes). The part of the episodes comes from a bootstrap over them (a seed gives
-    the same interval twice); that of the training seeds from Student's t over their means, as a bootstrap of three or five runs is too
-    narrow. Both are added in squares. With one training seed the interval speaks of that policy alone.
+    a and b are (episodes,), or (training seeds, episodes). A bootstrap over episodes gives their part; `seed` makes it repeatable.
+    Student's t over the means gives the part of the training seeds, because a bootstrap of three to five runs is too narrow.
+    The parts add in squares. With one training seed the interval describes that policy only.
 
-    share: a and b are 0 or 1. An interval is then never narrower than what differences of -1 and of 1 could make of it that happened not to
-    be among so many episodes: where all differences are equal the bootstrap has no width.
+    `share` says that a and b are 0 or 1. The interval then allows for differences of -1 and 1 that happened not to occur.
+    Without this, equal differences would give a bootstrap without width.
     """
     from scipy import stats
 
@@ -73,13 +74,13 @@ def paired_difference(a: Array, b: Array, level: float = 0.95, resamples: int = 
     spread = 0.0
     if runs > 1:
         spread = float(stats.t.ppf((1 + level) / 2, runs - 1) * delta.mean(axis=1).std(ddof=1) / np.sqrt(runs))
-    unseen = 1.0 - ((1.0 - level) / 2.0) ** (1.0 / episodes) if share else 0.0  # the most likely that what was never seen may be
+    unseen = 1.0 - ((1.0 - level) / 2.0) ** (1.0 / episodes) if share else 0.0  # the largest probability of an event that never occurred
     below, above = max(value - low, unseen * (value + 1.0)), max(high - value, unseen * (1.0 - value))
     return Interval(value, value - float(np.hypot(below, spread)), value + float(np.hypot(above, spread)))
 
 
 def paired_ratio(a: Array, b: Array, level: float = 0.95, resamples: int = 4000, seed: int = 0) -> Interval:
-    """Mean of a over mean of b (episodes,), on the same episodes, with a bootstrap interval over them; b has a mean above 0."""
+    """Return the ratio of means of a and b (episodes,), with a bootstrap interval over the episodes; b has a mean above 0."""
     rng, episodes = np.random.default_rng(seed), len(a)
     drawn = rng.integers(episodes, size=(resamples, episodes))
     low, high = np.quantile(a[drawn].mean(axis=1) / b[drawn].mean(axis=1), [(1 - level) / 2, (1 + level) / 2])
@@ -87,7 +88,7 @@ def paired_ratio(a: Array, b: Array, level: float = 0.95, resamples: int = 4000,
 
 
 def holm(p: Sequence[float]) -> list[float]:
-    """p-values adjusted for all of them together (Holm 1979): reject those below the level that one of them would be held to."""
+    """Return p-values adjusted for multiple tests (Holm 1979); compare each with the level of a single test."""
     order = sorted(range(len(p)), key=lambda i: p[i])
     out, so_far = [0.0] * len(p), 0.0
     for rank, i in enumerate(order):

@@ -1,4 +1,4 @@
-"""From rows to the figures that people read: one line per cell, with intervals."""
+"""The summary of rows: one entry per cell, with intervals."""
 
 from __future__ import annotations
 
@@ -12,10 +12,11 @@ from tailgate.evaluation.stats import proportion
 
 
 def summarise(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """One entry per cell (the columns of rows.KEYS), in order of appearance; a seed counts once, its last row.
+    """Return one entry per cell (the columns of rows.KEYS), in order of appearance; of repeated seeds the last row counts.
 
-    crash: share of episodes with a collision in front or behind, with a 95 % Clopper-Pearson interval; the other columns are medians
-    with quartiles. Rows with an error are counted in `failed`; those and skipped pairings are left out of the figures.
+    crash: share of episodes with a collision in front or behind, with a 95 % Clopper-Pearson interval.
+    Other columns are medians with quartiles.
+    `failed` counts rows with an error; they and skipped pairings are not in the figures.
     """
     groups: dict[tuple[Any, ...], dict[int, dict[str, Any]]] = {}
     for row in rows:
@@ -29,7 +30,7 @@ def summarise(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
             "n": len(good), "failed": sum(r["status"] == "error" for r in members), "learned": bool(members[0].get("learned")),
             "optimal": bool(members[0].get("optimal")), "reason": next((r["reason"] for r in members if r["status"] != "ok"), ""),
         }  # fmt: skip
-        # an attack that the threat model grants nothing of is harmless for that reason alone
+        # the threat model grants nothing of the attack, so that it is harmless for that reason alone
         entry["refused_all"] = bool(good) and all(r["attack_steps"] == 0 and r["refused_commands"] for r in good)
         if good:
             share = proportion(sum(bool(r["crashed"]) for r in good), len(good))

@@ -1,12 +1,12 @@
-"""A traced loop that takes the command of each step: the attack is plain code.
+"""A traced loop that takes each step's command from a plain attack.
 
-One program serves all attacks on a defence in a scenario. `tailgate.play.rollouts` has the attack in the program as well.
+One program serves all attacks on a defence in a scenario. `tailgate.play.rollouts` traces the attack too.
 """
 
 from __future__ import annotations
 
 import copy
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,41 +21,45 @@ from tailgate.engine.remembered import Remembered
 from tailgate.play.trace import Recorder, signals_of
 
 
+class Seen(NamedTuple):
+    """The arrays that an attacker sees; those of a white box, its state and known input, are separate."""
+
+    view: View
+    box: tuple[object, Array] | None
+
+
 class Commanded:
-    """The program of a loop that takes commands. Raises whatever its parts raise while they are traced."""
+    """The program of a loop that takes commands; tracing raises whatever the loop's parts raise."""
 
     def __init__(self, loop: Loop) -> None:
         check_open(loop)
         self.loop = loop
-        self.values: list[Array] | None = None  # of the parameters, if others than those it was traced with
+        self.values: list[Array] | None = None  # of the parameters, if they differ from the traced ones
         begun = _first(loop)
         self.rebuilt = rebuilt(_seen(loop, begun))
         self.program = Program(traced(self._traced, {"loop": begun}, _nothing(loop, 1)._asdict()))
+        self.programs = (self.program,)
         results = list(self.program.trace.results)
         self.names = [name for name in results if name.startswith("seen.")]  # in the order of the leaves
         self.signals = [(name.partition(".")[2], name) for name in results if name.startswith("signals.")]
 
-    @property
-    def programs(self) -> tuple[Program, ...]:
-        return (self.program,)
-
     def of(self, loop: Loop, values: list[Array]) -> Commanded:
-        """The same program for a loop of other parameters."""
+        """Return the same program for a loop with other parameters."""
         out = copy.copy(self)
         out.loop, out.values = loop, values
         return out
 
-    def _traced(self, held: Any, given: Any) -> tuple[Any, Any]:
-        loop = lifted(held["loop"].k.graph, self.loop)
+    def _traced(self, held: dict[str, LoopState], given: dict[str, Array]) -> tuple[dict[str, LoopState], dict[str, Array]]:
+        loop = lifted(held["loop"].k, self.loop)
         state, frame = loop.advance(held["loop"], Command(**given))
         return {"loop": state}, leaves({"signals": signals_of(frame), "ended": state.ended, "seen": _seen(loop, state)})
 
     def play(self, attack: Attack, keys: Keys, terminate: bool) -> tuple[Array, dict[str, Array], dict[str, Array]]:
-        """Lengths (B,), signals (K, B, ...) and the road before the first step, as `tailgate.play.trace.Trace` holds them."""
+        """Play episodes; return lengths (B,), signals (K, B, ...) and the road before the first step, as `Trace` holds them."""
         loop, batch = self.loop, len(keys.key)
         begun = loop.start(keys)
-        plan: Any = attack.prepare(loop.brief)
-        memory: Any = attack.start(plan, batch, keys.at(Role.ATTACK, np.zeros(batch, np.int64)))
+        plan = attack.prepare(loop.brief)
+        memory = attack.start(plan, batch, keys.at(Role.ATTACK, np.zeros(batch, np.int64)))
         recorder, view, ended, steps = Recorder(loop, begun), loop.sense(begun), begun.ended, Steps(self, begun)
         for _ in range(loop.horizon):
             live = ~ended if terminate else np.ones(batch, bool)
@@ -69,7 +73,7 @@ class Commanded:
 
 
 class Steps:
-    """Steps of a commanded loop from a state of the plain loop on."""
+    """The steps of a commanded loop, from a state of the plain loop on."""
 
     def __init__(self, commanded: Commanded, begun: LoopState) -> None:
         self.of, self.k = commanded, begun.k
@@ -78,22 +82,22 @@ class Steps:
         self._call = Call(commanded.program, self.state, values=commanded.values)
 
     def play(self, command: Command) -> tuple[dict[str, Array], Array, View]:
-        """A step under a command: its signals; who has ended (B,) and what an attacker sees, after it."""
+        """Play one step under a command; return its signals, who has ended (B,), and the attacker's view after it."""
         for name, leaf in zip(Command._fields, command, strict=True):
             self._call.arguments[name][...] = leaf
         self._call.begin()
         self._call.play(1)
-        self._call.sheet.flags.writeable = False  # attacks look at it
-        told = self._call.results()
-        if self._call.broken and not told["demands"].all():
-            raise self.of.program.broken(told["demands"], self.k)
-        self.k = told["seen.view.k"]
-        signals = {name: told[full] for name, full in self.of.signals}
-        return signals, told["ended"], _view(self.of.loop, self.of.rebuilt(told[name] for name in self.of.names))
+        self._call.sheet.flags.writeable = False  # attacks read it
+        results = self._call.results()
+        if self._call.broken and not results["demands"].all():
+            raise self.of.program.broken(results["demands"], self.k)
+        self.k = results["seen.view.k"]
+        signals = {name: results[full] for name, full in self.of.signals}
+        return signals, results["ended"], _view(self.of.loop, self.of.rebuilt(results[name] for name in self.of.names))
 
 
 def _first(loop: Loop) -> LoopState:
-    """The state of an episode that begins: an example."""
+    """Return the first state of an episode, as an example."""
     return loop.start(draws.keys("tune", [0]))
 
 
@@ -101,36 +105,35 @@ def _nothing(loop: Loop, batch: int) -> Command:
     return no_command(batch, loop.model.agents, len(loop.model.wires))
 
 
-def _seen(loop: Loop, state: LoopState) -> dict[str, Any]:
-    """The arrays that an attacker sees."""
+def _seen(loop: Loop, state: LoopState) -> Seen:
+    """Return the arrays that an attacker sees."""
     return _parted(loop.sense(state))
 
 
-def _parted(view: View) -> dict[str, Any]:
-    """The arrays of a view: those of a white box are apart."""
+def _parted(view: View) -> Seen:
     box = view.defence
-    return {"view": view._replace(defence=None), "box": None if box is None else (box.state, box.known_u)}
+    return Seen(view._replace(defence=None), None if box is None else (box.state, box.known_u))
 
 
-def _view(loop: Loop, seen: Any) -> View:
-    view: View = seen["view"]
-    if seen["box"] is None:
-        return view
-    return view._replace(defence=WhiteBox(loop.defence, loop.shown, duplicate(seen["box"][0]), seen["box"][1]))
+def _view(loop: Loop, seen: Seen) -> View:
+    if seen.box is None:
+        return seen.view
+    state, known_u = seen.box
+    return seen.view._replace(defence=WhiteBox(loop.defence, loop.shown, duplicate(state), known_u))
 
 
 _made: Remembered[Commanded] = Remembered()
 
 
 def commanded(loop: Loop) -> Commanded | Untraced:
-    """The program of a loop that takes commands, once it has been found equal to the plain loop; or why there is none."""
+    """Return the program of a loop that takes commands, if it equals the plain loop; else the reason why there is none."""
     return _made.proved(
         loop, lambda: _seen(loop, _first(loop)), lambda: Commanded(loop), lambda found, values: found.of(loop, values), _difference
     )
 
 
 def _difference(made: Commanded, batch: int = ROWS) -> str:
-    """Play some steps in both engines, under commands at random; -> what differs first, or nothing."""
+    """Play some steps under random commands in both engines; return the first difference, or nothing."""
     loop, chance = made.loop, np.random.default_rng(0)
     kinds = [Kind[name.upper()] for name in loop.threat.kinds] or [Kind.NONE]
     state = loop.start(draws.keys("tune", range(batch)))

@@ -1,7 +1,8 @@
-"""Metrics: functions Trace -> (B,) floats, NaN where undefined (null in a row). Names are the columns.
+"""Metrics: functions from a Trace to (B,) floats, NaN where undefined (null in a row). Their names are the columns of rows.
 
-Among several agents a metric of the road is over those that follow another vehicle, in the way that its sentence says; without any it is
-undefined. An estimate's error is that of the gap, or of the whole state's norm where there is no road (`Model.error`).
+Their docstrings describe the quantity to readers of boards.
+Among several agents, a metric of the road covers those that follow another vehicle; it is undefined without any.
+An estimate's error is that of the gap, or the norm of the whole state's error if there is no road (`Model.error`).
 """
 
 from collections.abc import Callable
@@ -17,16 +18,16 @@ DETECTION_DEADLINE = 10  # [steps]
 
 METRICS: dict[str, Callable[[Trace], Array]] = {}
 UNITS: dict[str, str] = {}  # on a road
-ERRORS = ("rmse_position", "max_error", "final_error")  # norms over states of any unit where there is no road
+ERRORS = ("rmse_position", "max_error", "final_error")  # norms over states of mixed units if there is no road
 
 
 def unit_in(name: str, model: Model) -> str:
-    """The unit of a metric in episodes of this model; "-" where it has none, or no one unit."""
+    """Return the unit of a metric in episodes of this model; "-" if it has none, or several."""
     return "-" if name in ERRORS and not model.followers.any() else UNITS[name]
 
 
 def metric(unit: str) -> Callable[[Callable[[Trace], Array]], Callable[[Trace], Array]]:
-    """Registers a metric under its function's name."""
+    """Register a metric under its function's name."""
 
     def add(function: Callable[[Trace], Array]) -> Callable[[Trace], Array]:
         METRICS[function.__name__] = function
@@ -37,7 +38,7 @@ def metric(unit: str) -> Callable[[Callable[[Trace], Array]], Callable[[Trace], 
 
 
 def _total(x: Array) -> Array:
-    """Sum over steps in their order: unlike np.sum, the same bits whatever the batch."""
+    """Sum over steps in order; unlike np.sum, the bits do not depend on the batch."""
     return np.asarray(np.add.accumulate(x, axis=0)[-1])
 
 
@@ -52,24 +53,24 @@ def _rms(x: Array, where: Array) -> Array:
 
 
 def _pooled(x: Array, where: Array) -> Array:
-    """Mean over steps and agents of x (K, B, N), in their order."""
+    """Return the mean over steps and agents of x (K, B, N), in their order."""
     if not x.shape[2]:
         return np.full(x.shape[1], np.nan)
     return _mean(np.concatenate(np.moveaxis(x, 2, 0)), np.concatenate([where] * x.shape[2]))
 
 
 def _road(trace: Trace, name: str) -> Array:
-    """(K, B, followers) of a road signal."""
+    """Return a road signal of the followers (K, B, followers)."""
     return np.asarray(trace.signals[name][:, :, trace.model.followers])
 
 
 def _before(trace: Trace, name: str) -> Array:
-    """(B, followers) of a road signal before the first step."""
+    """Return a road signal of the followers before the first step (B, followers)."""
     return np.asarray(trace.first[name][:, trace.model.followers])
 
 
 def _least(x: Array, where: Array) -> Array:
-    """(B,) smallest of x (K, B, N)."""
+    """Return the smallest numbers (B,) of x (K, B, N)."""
     return np.asarray(np.min(np.where(where[:, :, None], x, np.inf), axis=(0, 2), initial=np.inf))
 
 
@@ -86,7 +87,7 @@ def _alarm(trace: Trace) -> Array:
 
 
 def _first_step(event: Array) -> Array:
-    """(B,) index of the first True step, NaN where there is none."""
+    """Return the index (B,) of the first True step, NaN if there is none."""
     return np.where(event.any(axis=0), np.argmax(event, axis=0), np.nan)
 
 
@@ -195,7 +196,7 @@ def missed_deadline(trace: Trace) -> Array:
 
 @metric("count")
 def alarm_onsets(trace: Trace) -> Array:
-    """Times that the alarm went on."""
+    """Number of times that the alarm went on."""
     alarm = _alarm(trace)
     before = np.concatenate([np.zeros_like(alarm[:1]), alarm[:-1]])
     return np.asarray(np.count_nonzero(alarm & ~before, axis=0), np.float64)
@@ -267,5 +268,5 @@ def refused_commands(trace: Trace) -> Array:
 
 
 def measure(trace: Trace) -> dict[str, Array]:
-    """Every metric of a trace by name, (B,) each, NaN where undefined."""
+    """Return every metric of a trace by name, (B,) each, NaN where undefined."""
     return {name: _finite(function(trace)) for name, function in METRICS.items()}

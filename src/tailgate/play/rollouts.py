@@ -1,60 +1,64 @@
-"""Whole episodes of a loop under an attack as a program: what `tailgate.play.trace.rollout` records, with the attack traced as well."""
+"""Whole episodes of a loop under an attack as one program: the record of `tailgate.play.trace.rollout`, with the attack traced too."""
 
 from __future__ import annotations
 
 import copy
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 
 from tailgate.base.pytree import leaves
 from tailgate.core import Attack
 from tailgate.core.draws import Keys, Role
-from tailgate.core.loop import Loop
+from tailgate.core.loop import Loop, LoopState
 from tailgate.engine.agreement import ROWS, TRIED, Untraced, check_open, raised, same
 from tailgate.engine.operations import Array
 from tailgate.engine.parameters import lifted
 from tailgate.engine.program import Call, Program, State, traced
 from tailgate.engine.remembered import Remembered
 
-STEPS = 32  # between two looks whether an episode is left
+STEPS = 32  # between checks if all episodes have ended
+
+
+class Episodes(NamedTuple):
+    """The state of a loop and of its attack."""
+
+    loop: LoopState
+    memory: object
 
 
 class Rollout:
-    """The program of a loop under an attack. Raises whatever their parts raise while they are traced."""
+    """The program of a loop under an attack; tracing raises whatever their parts raise."""
 
-    def __init__(self, loop: Loop, attack: Attack, plan: Any) -> None:
+    def __init__(self, loop: Loop, attack: Attack, plan: object) -> None:
         check_open(loop)
         self.loop, self.attack, self.plan = loop, attack, plan
-        self.values: list[Array] | None = None  # of the parameters, if others than those it was traced with
-        self.program = Program(traced(self._traced, self.begun(_ONE), {}))
+        self.values: list[Array] | None = None  # of the parameters, if they differ from the traced ones
+        self.program = Program(traced(self._traced, self.begun(_ONE), None))
+        self.programs = (self.program,)
 
-    @property
-    def programs(self) -> tuple[Program, ...]:
-        return (self.program,)
-
-    def of(self, loop: Loop, attack: Attack, plan: Any, values: list[Array]) -> Rollout:
-        """The same program for a loop and an attack of other parameters."""
+    def of(self, loop: Loop, attack: Attack, plan: object, values: list[Array]) -> Rollout:
+        """Return the same program for a loop and an attack with other parameters."""
         out = copy.copy(self)
         out.loop, out.attack, out.plan, out.values = loop, attack, plan, values
         return out
 
-    def begun(self, keys: Keys) -> dict[str, Any]:
-        """The state of episodes that begin."""
+    def begun(self, keys: Keys) -> Episodes:
+        """Return the first state of episodes."""
         return _begun(self.loop, self.attack, self.plan, keys)
 
-    def _traced(self, held: Any, given: Any) -> tuple[Any, Any]:
-        loop, attack, plan = lifted(held["loop"].k.graph, (self.loop, self.attack, self.plan))
+    def _traced(self, held: Episodes, _: None) -> tuple[Episodes, dict[str, Array]]:
+        loop, attack, plan = lifted(held.loop.k, (self.loop, self.attack, self.plan))
         return _step(loop, attack, plan, held)
 
-    def plain(self, held: Any) -> tuple[Any, Any]:
-        """A step of the plain loop: what follows a state, and its signals."""
+    def plain(self, held: Episodes) -> tuple[Episodes, dict[str, Array]]:
+        """Play a step of the plain loop; return the next state and its signals."""
         return _step(self.loop, self.attack, self.plan, held)
 
     def play(self, keys: Keys, terminate: bool) -> tuple[Array, dict[str, Array], dict[str, Array]]:
-        """Lengths (B,), signals (K, B, ...) and the road before the first step, as `tailgate.play.trace.Trace` holds them."""
+        """Play episodes; return lengths (B,), signals (K, B, ...) and the road before the first step, as `Trace` holds them."""
         loop, batch, begun = self.loop, len(keys.key), self.begun(keys)
-        first = loop.plant.scene(loop.plan.plant, begun["loop"].plant)._asdict()
+        first = loop.plant.scene(loop.plan.plant, begun.loop.plant)._asdict()
         state = State(self.program, batch)
         state.put(begun)
         call = Call(self.program, state, max(2, loop.horizon), self.values)
@@ -72,25 +76,24 @@ class Rollout:
         return length.astype(np.int64), {name: value[:steps] for name, value in signals.items()}, first
 
     def _demand(self, held: Array, ended: Array, first: int, terminate: bool) -> None:
-        """Raise what the plain loop would have raised in these steps (K, B, .), of which it plays none when all have ended."""
+        """Raise the error of the plain loop for the demands of these steps (K, B, .); steps after all episodes ended do not count."""
         for step in np.flatnonzero(~held.all(axis=(1, 2))):
             if terminate and ended[step].all():
                 return
             raise self.program.broken(held[step], np.full(held.shape[1], first + step + 1))
 
 
-def _begun(loop: Loop, attack: Attack, plan: Any, keys: Keys) -> dict[str, Any]:
+def _begun(loop: Loop, attack: Attack, plan: object, keys: Keys) -> Episodes:
     batch = len(keys.key)
     memory = attack.start(plan, batch, keys.at(Role.ATTACK, np.zeros(batch, np.int64)))
-    return {"loop": loop.start(keys), "memory": memory}
+    return Episodes(loop.start(keys), memory)
 
 
-def _step(loop: Loop, attack: Attack, plan: Any, held: Any) -> tuple[Any, Any]:
+def _step(loop: Loop, attack: Attack, plan: object, held: Episodes) -> tuple[Episodes, dict[str, Array]]:
     from tailgate.play.trace import signals_of
 
-    ended = held["loop"].ended
-    state, memory, frame = loop.step(held["loop"], attack, plan, held["memory"])
-    return {"loop": state, "memory": memory}, signals_of(frame) | {"ended": ended}
+    state, memory, frame = loop.step(held.loop, attack, plan, held.memory)
+    return Episodes(state, memory), signals_of(frame) | {"ended": held.loop.ended}
 
 
 _ONE = Keys(np.zeros((1, 3), np.uint64), np.zeros(1, np.uint32))
@@ -100,11 +103,11 @@ _made: Remembered[Rollout] = Remembered()
 
 
 def rollout_of(loop: Loop, attack: Attack) -> Rollout | Untraced:
-    """The program of a loop under an attack, once it has been found equal to the plain loop on this machine; or why there is none."""
+    """Return the program of a loop under an attack, if it equals the plain loop on this machine; else the reason why there is none."""
     plan = attack.prepare(loop.brief)
     return _made.proved(
         (loop, attack, plan),
-        lambda: loop.sense(_begun(loop, attack, plan, _ONE)["loop"]),
+        lambda: loop.sense(_begun(loop, attack, plan, _ONE).loop),
         lambda: Rollout(loop, attack, plan),
         lambda found, values: found.of(loop, attack, plan, values),
         _difference,
@@ -112,7 +115,7 @@ def rollout_of(loop: Loop, attack: Attack) -> Rollout | Untraced:
 
 
 def _difference(rollout: Rollout, batch: int = ROWS) -> str:
-    """Play some steps in both engines; -> what differs first, or nothing."""
+    """Play some steps in both engines; return the first difference, or nothing."""
     from tailgate.core import draws
 
     plain = rollout.begun(draws.keys("tune", range(batch)))

@@ -7,7 +7,6 @@ import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import numpy as np
 
@@ -16,15 +15,15 @@ from tailgate.core.draws import Keys, Role
 from tailgate.core.loop import Loop, LoopState
 from tailgate.core.score_threshold import Watched
 
-WORTH, MANY = 20_000, 1_000_000  # steps for which a loop is traced, and the attack with it: each takes some tenths of a second
-LONG = 300  # steps of an episode for which a loop is traced: the plain loop takes a millisecond for each, however few rows there are
-MEMORY = 1e9  # [bytes] that a trace may take: who plays many episodes plays so many at a time
-Player = Callable[[Keys, bool], tuple[Array, dict[str, Array], dict[str, Array]]]  # keys, terminate: lengths, signals, the road before
+WORTH, MANY = 20_000, 1_000_000  # steps that justify a traced loop, and a traced attack; tracing takes some tenths of a second
+LONG = 300  # steps of an episode that justify a traced loop; the plain loop takes a millisecond per step, even for one row
+MEMORY = 1e9  # [bytes] of one trace; more episodes are played in several batches
+Player = Callable[[Keys, bool], tuple[Array, dict[str, Array], dict[str, Array]]]  # keys, terminate -> lengths, signals, the road before
 _DECISIONS = ("kind", "target", "alarm", "mode", "refused", "collided", "rear_collided")
 
 
 def signals_of(frame: Frame) -> dict[str, Array]:
-    """What a trace keeps of a step, (B, ...) each."""
+    """Return the signals of a step that a trace keeps, (B, ...) each."""
     scene, command, estimate = frame.scene, frame.command, frame.estimate
     return {
         "gap": scene.gap, "speed": scene.speed, "accel": scene.accel, "lead_speed": scene.lead_speed, "rear_gap": scene.rear_gap,
@@ -39,10 +38,11 @@ def signals_of(frame: Frame) -> dict[str, Array]:
 
 @dataclass(frozen=True, eq=False)
 class Trace:
-    """B episodes. `signals` are (K, B, ...); row b is valid for its first length[b] steps (it ends with a collision).
+    """B episodes.
 
-    truth, estimate, wires, commands and what was received belong to step k, `probe` to the measurement at k + 1; the road (gap, speed,
-    ...) to k + 1, after the step. `first` holds the road before the first step.
+    `signals` are (K, B, ...); row b is valid for its first length[b] steps, because it ends with a collision.
+    Truth, estimate, wires, commands and received values belong to step k, `probe` to the measurement at k + 1.
+    The road (gap, speed, ...) belongs to k + 1, after the step. `first` holds the road before the first step.
     """
 
     model: Model
@@ -68,7 +68,7 @@ class Trace:
 
     @property
     def live(self) -> Array:
-        """(K, B) bool: the steps that belong to the episode."""
+        """The steps that belong to each episode, (K, B) bool."""
         return np.arange(len(self.kind))[:, None] < self.length
 
     def _hash(self, row: int, names: list[str]) -> str:
@@ -82,27 +82,27 @@ class Trace:
         return digest.hexdigest()
 
     def trace_hash(self, row: int) -> str:
-        """Of every signal of one episode, to the last bit."""
+        """Return the hash of every signal of one episode, to the last bit."""
         return self._hash(row, sorted(self.signals))
 
     def decision_hash(self, row: int) -> str:
-        """Of commands, alarms, modes and collisions: the same on every engine and platform."""
+        """Return the hash of commands, alarms, modes and collisions: the same on every engine and platform."""
         return self._hash(row, sorted(_DECISIONS))
 
 
 def episodes_at_once(model: Model, horizon: int, most: int) -> int:
-    """How many episodes, at most `most`, can be recorded side by side in MEMORY; at least one. A row does not depend on it."""
+    """Return how many episodes, at least one and at most `most`, fit in MEMORY; rows do not depend on it."""
     return int(max(1, min(most, MEMORY // episode_memory(model, horizon))))
 
 
 def episode_memory(model: Model, horizon: int) -> int:
-    """Bytes that the signals of an episode take."""
+    """Return the bytes that the signals of an episode take."""
     agents, wires = model.agents, len(model.wires)
     return horizon * (8 * (agents * (model.states + 3 * wires + 9) + model.states) + agents * (2 * wires + 3))
 
 
 class Recorder:
-    """Collects frames into a Trace. A truth that all agents share is stored once."""
+    """A collector of frames into a Trace. A truth that all agents share is stored once."""
 
     def __init__(self, loop: Loop, state: LoopState) -> None:
         self.loop = loop
@@ -112,14 +112,14 @@ class Recorder:
         self.steps = 0
 
     def put(self, signals: dict[str, Array], live: Array) -> None:
-        """What `signals_of` gives of a step. `live` (B,): the episodes that this step belongs to."""
+        """Add the result of `signals_of` for a step that belongs to the episodes `live` (B,)."""
         for name, value in signals.items():
             held = self.signals.get(name)
             if name == "truth" and value.strides[1] == 0 and (held is None or held.shape[2] == 1):
                 value = value[:, :1]
             if held is None:
                 held = self.signals[name] = np.zeros((self.loop.horizon, *value.shape), value.dtype)
-            elif held.shape[1:] != value.shape:  # shared until now
+            elif held.shape[1:] != value.shape:  # the truth was shared until now
                 held = self.signals[name] = np.repeat(held, value.shape[1], axis=2)
             held[self.steps] = value
         self.length += live
@@ -133,19 +133,20 @@ class Recorder:
 
 
 def rollout(loop: Loop, attack: Attack, keys: Keys, *, terminate: bool = True, plain: bool = False) -> Trace:
-    """Play one episode per key. With `terminate` an episode ends at its first collision, else it runs to the horizon.
+    """Play one episode per key and return the trace.
 
-    Steps that are worth it are played by a traced loop, where it can be traced; many of them under a traced attack. With `plain` the
-    plain loop plays, to the same bits.
+    With `terminate` an episode ends at its first collision, else it runs to the horizon.
+    Long work is played by a traced loop if it can be traced, and very long work with a traced attack too.
+    `plain` selects the plain loop, with the same bits.
     """
-    if not plain and isinstance(guard := loop.defence, Watched):
+    if not plain and isinstance(watch := loop.defence, Watched):
         seen = rollout(loop.bare, attack, keys, terminate=terminate)
-        return dataclasses.replace(seen, signals=seen.signals | {"alarm": guard.alarms(seen.score)})
+        return dataclasses.replace(seen, signals=seen.signals | {"alarm": watch.alarms(seen.score)})
     if not plain and (play := _player(loop, attack, len(keys.key) * loop.horizon)) is not None:
         return Trace(loop.model, loop.horizon, *play(keys, terminate), loop.controller.desired_gap)
     state = loop.start(keys)
     plan = attack.prepare(loop.brief)
-    memory: Any = attack.start(plan, len(keys.key), keys.at(Role.ATTACK, np.zeros(len(keys.key), np.int64)))
+    memory = attack.start(plan, len(keys.key), keys.at(Role.ATTACK, np.zeros(len(keys.key), np.int64)))
     recorder = Recorder(loop, state)
     for _ in range(loop.horizon):
         live = ~state.ended if terminate else np.ones(len(state.k), bool)
@@ -157,13 +158,13 @@ def rollout(loop: Loop, attack: Attack, keys: Keys, *, terminate: bool = True, p
 
 
 def _player(loop: Loop, attack: Attack, steps: int) -> Player | None:
-    """What plays so many steps faster than the plain loop does."""
+    """Return a function that plays this many steps faster than the plain loop, or None."""
     from tailgate.engine.agreement import Untraced
     from tailgate.play.commanded import commanded
     from tailgate.play.rollouts import rollout_of
 
     if steps >= MANY and not isinstance(whole := rollout_of(loop, attack), Untraced):
         return whole.play
-    if (steps >= WORTH or loop.horizon >= LONG) and not isinstance(told := commanded(loop), Untraced):
-        return partial(told.play, attack)
+    if (steps >= WORTH or loop.horizon >= LONG) and not isinstance(program := commanded(loop), Untraced):
+        return partial(program.play, attack)
     return None

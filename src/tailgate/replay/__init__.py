@@ -1,1 +1,1 @@
-"""One episode played again from its row: replay.py plays, page.py writes the page, video.py the film."""
+"""Replay of one episode from its row: replay.py plays it, page.py writes the page, video.py the film."""

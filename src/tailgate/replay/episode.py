@@ -1,4 +1,4 @@
-"""What the page of a replay draws, as JSON data: the episode for all, and the part of each agent that is looked at."""
+"""The JSON data of a replay's page: the whole episode, and the curves of each displayed agent."""
 
 from __future__ import annotations
 
@@ -16,29 +16,29 @@ from .replay import Replay, threshold
 
 Data = dict[str, Any]
 DIGITS = 6  # of a curve; decisions are exact
-SHOWN = 24  # agents with curves of their own in a page, at most
-LANES = 8  # attacked wires with a lane each, at most; of more the agents have one
+SHOWN = 24  # most agents with curves on a page
+LANES = 8  # most attacked wires with separate lanes; beyond that, agents have lanes
 METRE_S2 = "m/s\N{SUPERSCRIPT TWO}"
 WIRE_UNITS = {"position": "m", "distance": "m", "velocity": "m/s", "acceleration": METRE_S2, "command": METRE_S2, "speed": "m/s"}
 
 
 def curve(values: Array) -> list[float | None]:
-    """Numbers for drawing: some digits, null where not finite."""
+    """Round numbers for drawing; null if not finite."""
     return [float(f"{v:.{DIGITS}g}") if math.isfinite(v) else None for v in values.tolist()]
 
 
 def first_step(event: Array) -> int | None:
-    """The first step (from 1) in which something happened."""
+    """Return the first step (from 1) in which an event happened, or None."""
     return int(np.argmax(event)) + 1 if event.any() else None
 
 
 def noun(replay: Replay) -> str:
-    """What an agent is."""
+    """Return the word for an agent."""
     return "car" if replay.loop.model.followers.any() else "agent"
 
 
 def watched(replay: Replay, agent: int | None = None) -> int:
-    """The agent to look at first: the one that is asked for, else the one attacked most, else the first that follows another."""
+    """Return the agent to show first: the requested one, else the most attacked one, else the first that follows another."""
     model, count = replay.loop.model, replay.loop.model.agents
     if agent is not None:
         if not 0 <= agent < count:
@@ -49,25 +49,28 @@ def watched(replay: Replay, agent: int | None = None) -> int:
 
 
 def shown(replay: Replay, agent: int) -> list[int]:
-    """The agents with curves of their own: all, or of many the one to look at and those with the fewest hops to it."""
+    """Return the agents with curves: all, or of many those with the fewest hops to `agent`."""
     far = hops(replay.loop.model.graph)[agent]
     return sorted(sorted(range(len(far)), key=lambda i: (far[i], i))[:SHOWN])
 
 
 def _hit(replay: Replay) -> Array:
-    """(K, N, w) bool: the wires that are attacked in each step."""
+    """Return the wires that are attacked in each step, (K, N, w) bool."""
     trace = replay.trace
     return np.asarray(trace.target[:, 0] & (trace.kind[:, 0] != Kind.NONE)[:, None, None])
 
 
 def _road(replay: Replay, name: str, agent: int) -> Array:
-    """(K + 1,): before the first step, then after each."""
+    """Return a road signal of an agent (K + 1,): before the first step, then after each."""
     trace = replay.trace
     return np.concatenate([trace.first[name][:, agent], trace.signals[name][:, 0, agent]])
 
 
 def _believed_gap(replay: Replay, agent: int) -> Array:
-    """(K,) the gap as the agent believes it; where its state is a position, the leader's one as it was heard, less the own one."""
+    """Return the gap that the agent believes (K,) [m].
+
+    If the state is a position, the believed gap is the leader's position as received, less the estimated position.
+    """
     trace, model = replay.trace, replay.loop.model
     assert model.gap is not None
     if model.agents > 1 or model.air:
@@ -80,18 +83,13 @@ def _believed_gap(replay: Replay, agent: int) -> Array:
 
 
 def _wires(replay: Replay) -> list[Data]:
-    """The wires that were ever attacked, each with the kinds that hit it; of very many those of an agent together."""
-    trace, model, hit = replay.trace, replay.loop.model, _hit(replay)
-    if np.isin(trace.kind[:, 0], AIRED).any():
+    """Return the attacked wires with the kinds that hit them; of very many, those of an agent together."""
+    hit = _hit(replay)
+    if np.isin(replay.trace.kind[:, 0], AIRED).any():
         return _receivers(replay)
     pairs = np.argwhere(hit.any(axis=0)).tolist()
     if len(pairs) <= LANES:
-        out = []
-        for i, w in pairs:
-            name = model.wires[w].replace("_", " ") + ("" if model.agents == 1 else f" of {noun(replay)} {i}")
-            unit = WIRE_UNITS.get(model.wires[w].split("_")[-1], "")
-            out.append(_lane(replay, name, unit, hit[:, i, w]) | {"value": [float(v) for v in trace.value[:, 0, i, w]]})
-        return out
+        return [_wire(replay, i, w, hit[:, i, w]) for i, w in pairs]
     agents = sorted({i for i, _ in pairs})
     groups = [[i] for i in agents] if len(agents) <= SHOWN else [agents]
     lanes = []
@@ -103,20 +101,29 @@ def _wires(replay: Replay) -> list[Data]:
 
 
 def _receivers(replay: Replay) -> list[Data]:
-    """As `_wires`, where something was sent over the air: that reaches all readings of a receiver, and has one lane for them."""
+    """Return the attacked wires when some attack went over the air: it reaches all readings of a receiver, in one lane."""
     trace, model, hit = replay.trace, replay.loop.model, _hit(replay)
     aired = np.isin(trace.kind[:, 0], AIRED)
     out = []
     for i in range(model.agents):
-        whose = "" if model.agents == 1 else f" of {noun(replay)} {i}"
         reached = hit[:, i].any(axis=1) & aired
         if reached.any():
             value = np.where(reached, trace.value[:, 0, i].max(axis=1), 0.0)
-            out.append(_lane(replay, f"receiver{whose}", "", reached) | {"value": value.tolist()})
-        for w in np.flatnonzero((hit[:, i] & ~aired[:, None]).any(axis=0)).tolist():
-            name, unit = model.wires[w].replace("_", " ") + whose, WIRE_UNITS.get(model.wires[w].split("_")[-1], "")
-            out.append(_lane(replay, name, unit, hit[:, i, w] & ~aired) | {"value": [float(v) for v in trace.value[:, 0, i, w]]})
+            out.append(_lane(replay, f"receiver{_whose(replay, i)}", "", reached) | {"value": value.tolist()})
+        wires = np.flatnonzero((hit[:, i] & ~aired[:, None]).any(axis=0)).tolist()
+        out += [_wire(replay, i, w, hit[:, i, w] & ~aired) for w in wires]
     return out
+
+
+def _whose(replay: Replay, agent: int) -> str:
+    return "" if replay.loop.model.agents == 1 else f" of {noun(replay)} {agent}"
+
+
+def _wire(replay: Replay, agent: int, wire: int, hit: Array) -> Data:
+    """Return the lane of one wire of an agent, attacked in the steps `hit` (K,)."""
+    name, value = replay.loop.model.wires[wire], replay.trace.value[:, 0, agent, wire]
+    lane = _lane(replay, name.replace("_", " ") + _whose(replay, agent), WIRE_UNITS.get(name.split("_")[-1], ""), hit)
+    return lane | {"value": value.astype(float).tolist()}
 
 
 def _lane(replay: Replay, name: str, unit: str, hit: Array) -> Data:
@@ -124,7 +131,7 @@ def _lane(replay: Replay, name: str, unit: str, hit: Array) -> Data:
 
 
 def _of_agent(replay: Replay, agent: int) -> Data:
-    """The curves of one agent."""
+    """Return the curves of one agent."""
     trace, model, follows = replay.trace, replay.loop.model, bool(replay.loop.model.followers[agent])
     limit = threshold(replay.loop.defence) or _energy_threshold(replay)
     score, alarm, gate = trace.score[:, 0, agent], trace.alarm[:, 0, agent], replay.gate[:, agent]
@@ -152,12 +159,12 @@ def _of_agent(replay: Replay, agent: int) -> Data:
 
 
 def _radar(replay: Replay, agent: int) -> Data:
-    """What the radar did and heard: muted (K,), energy over its noise [dB], and where the defence declares it the threshold [dB].
+    """Return the radar's curves: muted (K,), energy over its noise [dB], and the defence's threshold [dB] if it has one.
 
-    `then` (K,) is the true gap at the measurement, to which the belief of the step belongs.
+    `then` (K,) is the true gap at the measurement, to which the step's estimate belongs.
     """
     trace = replay.trace
-    sent = np.concatenate([[True], trace.probe[:-1, 0, agent]])  # each step's probe is chosen in the step before
+    sent = np.concatenate([[True], trace.probe[:-1, 0, agent]])  # the step before chooses each step's probe
     limit = _energy_threshold(replay)
     return {
         "muted": (~sent).astype(int).tolist(), "energy": curve(_decibels(trace.energy[:, 0, agent])),
@@ -167,7 +174,7 @@ def _radar(replay: Replay, agent: int) -> Data:
 
 
 def _energy_threshold(replay: Replay) -> tuple[str, float] | None:
-    """Name and value of the threshold on the energy at a challenge; None of defences that make none."""
+    """Return name and value of the energy threshold at a challenge, or None for a defence without challenges."""
     value = getattr(replay.loop.plan.defence, "threshold", None) if "probe" in replay.loop.uses else None
     return ("energy", float(value)) if isinstance(value, float) else None
 
@@ -177,7 +184,7 @@ def _decibels(power: Array) -> Array:
 
 
 def _errors(replay: Replay, agent: int) -> list[Data]:
-    """The plots of an agent's errors: name, heading, unit, smallest span of the axis, values."""
+    """Return the plots of an agent's errors: name, heading, unit, smallest span of the axis, values."""
     trace, model = replay.trace, replay.loop.model
     if model.agents == 1 and model.followers.any():
         off = trace.estimate[:, 0, 0] - trace.truth[:, 0, 0]
@@ -189,7 +196,7 @@ def _errors(replay: Replay, agent: int) -> list[Data]:
             for i, (name, of, unit, least) in enumerate(parts)
         ]
     if not model.followers.any():
-        return []  # the errors of all agents stand in one plot
+        return []  # one plot shows the errors of all agents
     gap, speed = (error(trace.estimate[:, 0], trace.truth[:, 0])[:, agent] for error in (model.gap_error, model.speed_error))
     own = [("gap", "Error of the believed gap", "m", 1.0, gap)] if model.followers[agent] else []
     return [
@@ -199,7 +206,7 @@ def _errors(replay: Replay, agent: int) -> list[Data]:
 
 
 def _everybody(replay: Replay, agents: list[int]) -> Data:
-    """What the picture and the plots of all agents show."""
+    """Return the data of the picture and the plots of all agents."""
     trace, model = replay.trace, replay.loop.model
     size = model.error(trace.estimate[:, 0], trace.truth[:, 0])
     out: Data = {
@@ -223,10 +230,10 @@ def _everybody(replay: Replay, agents: list[int]) -> Data:
 
 
 def episode_of(replay: Replay, agent: int | None = None) -> Data:
-    """Everything that the page draws, as JSON data. agent: the one to look at first.
+    """Return all data that the page draws; `agent` is the agent to show first.
 
-    Road signals have K + 1 entries, the first before the first step; all others K, entry s - 1 for step s. The curves of one agent stand
-    at the top where there is only one, else below `agents`, by number.
+    Road signals have K + 1 entries, the first before the first step; others have K, entry s - 1 for step s.
+    The curves of a single agent are at the top level, those of several below `agents`, by number.
     """
     trace, threat, model = replay.trace, replay.loop.threat, replay.loop.model
     kind = trace.kind[:, 0]

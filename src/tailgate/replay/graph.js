@@ -19,18 +19,18 @@ const drawGraph = (() => {
       const [x0, y0] = at[a], [x1, y1] = at[b], far = Math.max(1, Math.hypot(x1 - x0, y1 - y0)), ux = (x1 - x0) / far, uy = (y1 - y0) / far;
       line(x0, y0, x1, y1, GREY, 1.2);
       if (!mutual) {
-        const tip = [x1 - ux * radius, y1 - uy * radius]; // an arrow's head at the one who hears
+        const tip = [x1 - ux * radius, y1 - uy * radius]; // an arrowhead at the receiver
         shape([tip, ...[1, -1].map((way) => [tip[0] - 9 * ux + way * 4 * uy, tip[1] - 9 * uy - way * 4 * ux])], GREY);
       }
     }
     at.forEach(([x, y], i) => {
       if (attacked[i]) disc(x, y, radius + 4, WHITE, ATTACK);
-      disc(x, y, radius, shade(size[i]), attacked[i] ? ATTACK : INK, i === agent ? 4 : 2); // a thick rim: whom the plots follow
+      disc(x, y, radius, shade(size[i]), attacked[i] ? ATTACK : INK, i === agent ? 4 : 2); // a thick rim: the agent of the plots
       if (radius >= 8) text(x, y + small * 0.36, String(i), { ink: share(size[i]) > 0.45 ? WHITE : INK, size: radius > 14 ? small + 1 : 10, anchor: "m", bold: true });
       if (attacked[i]) bolt(x - radius * 0.85, y - radius * 0.75, 8);
       if (alarmed[i]) lamp(x + radius * 0.85, y - radius * 0.85, 8);
     });
-    if (narrow) return; // the plots below have the errors
+    if (narrow) return; // the plots below show the errors
     const left = split + 42, right = width - 70, top = 34, low = height - 22;
     line(split, 0, split, height, GREY, 1);
     const order = [...size.keys()].sort((a, b) => size[b] - size[a] || a - b).slice(0, MOST), some = count > MOST ? order : order.sort((a, b) => a - b);

@@ -1,4 +1,4 @@
-// The player: the playhead, what stands at it in words, and the keys.
+// The player: the playhead, the words for its step, and the keys.
 (() => {
   const episode = JSON.parse(document.getElementById("episode").textContent);
   const at = (id) => document.getElementById(id);
@@ -10,7 +10,7 @@
     halt();
     show(s);
   };
-  // one agent: all plots. Many: those of all, and those of the one that is looked at
+  // one agent: all plots. Several: plots of all, and plots of the selected one
   const many = Boolean(episode.agents), drawScene = episode.graph ? drawGraph : many ? drawString : drawRoad;
   const together = many ? buildPlots(at("together"), episode, seek, "all") : null;
   let agent = many ? episode.agent : 0, plots = null;
@@ -35,7 +35,7 @@
     return [`ATTACK: ${name}`, `${list.join(", ")} (${does})`];
   };
 
-  // the smallest gap at a step, or the largest error where there is no road
+  // the smallest gap at a step, or the largest error without a road
   const worst = (s) => {
     if (episode.graph) return s ? Math.max(...episode.graph.error.map((values) => values[s - 1])) : 0;
     return episode.string ? Math.min(...episode.string.gap.map((values) => values[s]).filter((gap) => gap !== null)) : episode.road.gap[s];
@@ -114,7 +114,7 @@
     const moves = { ArrowLeft: now - step, ArrowDown: now - step, ArrowRight: now + step, ArrowUp: now + step, Home: 0, End: length };
     const vertical = event.key === "ArrowUp" || event.key === "ArrowDown" || event.key === "Home" || event.key === "End";
     if (event.key === " " && event.target.tagName !== "BUTTON") toggle();
-    else if (event.key in moves && (!vertical || event.target === slider)) go(moves[event.key]); // elsewhere they scroll the page
+    else if (event.key in moves && (!vertical || event.target === slider)) go(moves[event.key]); // otherwise these keys scroll the page
     else return;
     event.preventDefault();
   });
@@ -135,7 +135,7 @@
     button.addEventListener("click", () => go(s));
     at("jumps").append(button);
   }
-  // where attack (lower) and alarm (upper) lie on the slider's track
+  // attacks (lower) and alarms (upper) on the slider's track
   const marks = at("marks");
   marks.setAttribute("viewBox", `0 0 ${length || 1} 10`);
   marks.setAttribute("preserveAspectRatio", "none");

@@ -1,4 +1,4 @@
-"""The page of a replay: one HTML file with the episode in it, which asks for nothing else."""
+"""The page of a replay: one HTML file that contains the episode and needs no other file."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ LABELS = {"version": "version of Tailgate", "config_hash": "configuration (confi
 
 
 def outcome(replay: Replay) -> str:
-    """How the episode went, in a sentence."""
+    """Return the outcome of the episode in a sentence."""
     trace, metrics, model = replay.trace, replay.metrics, replay.loop.model
     if not model.followers.any():
         size = model.error(trace.estimate[:, 0], trace.truth[:, 0])
@@ -53,7 +53,7 @@ def outcome(replay: Replay) -> str:
     return "No collision" + ("" if gap is None else f"; the smallest gap was {gap:.3g} m")
 
 
-def _text(value: Any) -> str:
+def _text(value: object) -> str:
     if value is None:
         return "none"
     if isinstance(value, bool):
@@ -67,8 +67,8 @@ def _text(value: Any) -> str:
     return f"{value:.10g}" if isinstance(value, float) else str(value)
 
 
-def _card(title: str, part: Any, label: str = "") -> Data:
-    """A component and its parameters with their sentences."""
+def _card(title: str, part: object, label: str = "") -> Data:
+    """Return a component and its parameters with their descriptions."""
     fields = dataclasses.fields(part) if dataclasses.is_dataclass(part) else ()
     shown = [(f.name, _text(getattr(part, f.name)), f.metadata.get("doc", "")) for f in fields if f.init]
     about = (inspect.getdoc(type(part)) or "").split("\n\n")[0].replace("\n", " ")
@@ -76,12 +76,12 @@ def _card(title: str, part: Any, label: str = "") -> Data:
 
 
 def _named(text: str) -> str:
-    """A component's text as people read it: of a file, the folder and the name, not the place on somebody's machine."""
+    """Return a component's text for readers; of a file, the folder and the name instead of the full path."""
     return names_of([text])[text].full
 
 
 def _identity(replay: Replay) -> list[tuple[str, str]]:
-    """The row's own words about what it is: all but the figures and the threat model."""
+    """Return the row's fields that identify the episode, without metrics and threat model."""
     skipped = {*METRICS, "threat_model", "status", "reason", "failed"}
     shown: dict[str, Callable[[Any], str]] = {"defence": _named, "attack": _named, "scenario_file": _file_name}
     row = replay.row.items()
@@ -92,7 +92,7 @@ def _file_name(path: str) -> str:
     return re.split(r"[\\/]", path)[-1]
 
 
-PICTURES = {  # what the canvas shows
+PICTURES = {  # captions of the canvas
     "road": "The road as it is, and where the car believes that it is",
     "string": "The road as it is, and where each car believes that it is",
     "graph": "The graph of the agents, shaded by their errors",
@@ -100,7 +100,7 @@ PICTURES = {  # what the canvas shows
 
 
 def context_of(replay: Replay, source: str) -> Data:
-    """What the template shows in words and tables. `source` says where the row comes from."""
+    """Return the words and tables of the template. `source` says where the row comes from."""
     model = replay.loop.model
     picture = "graph" if not model.followers.any() else "string" if model.agents > 1 else "road"
     row, place = replay.row, replay.place
@@ -130,7 +130,7 @@ def context_of(replay: Replay, source: str) -> Data:
 
 
 def failed(row: Data) -> Data | None:
-    """The property that the run of a row fails, as `tailgate trust` wrote it there."""
+    """Return the property that the run of a row fails, as `tailgate trust` recorded it."""
     held = row.get("failed")
     return {key: str(held.get(key) or "") for key in ("property", "about", "formula")} if isinstance(held, dict) else None
 
@@ -140,7 +140,7 @@ def _measured(value: float | None) -> str:
 
 
 def render(replay: Replay, source: str = "", agent: int | None = None) -> str:
-    """The page as text. agent: the one to look at first, of many."""
+    """Return the page as text; `agent` is the agent to show first."""
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     here = "tailgate.replay"
     css, js = inline(here, "page.css"), inline(here, "pen.js", "road.js", "string.js", "graph.js", "plots.js", "page.js")
@@ -149,7 +149,7 @@ def render(replay: Replay, source: str = "", agent: int | None = None) -> str:
 
 
 def write_page(replay: Replay, out: Path, source: str = "", agent: int | None = None) -> Path:
-    """Writes the page to `out` (a file that ends in .html, or a directory for index.html) and returns its path."""
+    """Write the page to `out`, an .html file or a directory for index.html, and return its path."""
     path = out if out.suffix.lower() in (".html", ".htm") else writable_directory(out) / "index.html"
     write_atomic(path, render(replay, source, agent).encode("utf-8", "replace"))  # a lone surrogate in a row must not stop the page
     return path

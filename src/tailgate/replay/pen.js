@@ -1,5 +1,5 @@
 "use strict";
-// What the pictures share: colours, letters, lines, cars. makePen gives the tools for one canvas, or null while it has no size.
+// Shared by the pictures: colours, letters, lines, cars. makePen returns the tools for one canvas, or null while it has no size.
 const PEN = {
   INK: "#1a1a1a", GREY: "#5f5f5f", WHITE: "#fff", GLASS: "#dcebf5", LEADER: "#4d4d4d", EGO: "#0072b2", HUMAN: "#00805c", BELIEF: "#7a2a6b",
   BELIEF_PALE: "#f8eef5", WARNING: "#f0e442", ATTACK: "#b34700", FAR: 1e6,
@@ -10,7 +10,7 @@ const makePen = (() => {
   const WINDOW = [[0.2, 0.66], [0.3, 0.92], [0.59, 0.92], [0.7, 0.66]];
   const AXLES = [0.22, 0.78], BOLT = [[0, 0], [0.75, -1.1], [0.2, -1], [0.6, -2], [-0.6, -0.85], [-0.05, -0.95]];
   const metres = (x) => {
-    const digits = x && Math.abs(x) < 0.95 ? 2 : 1; // a gap that is not quite nothing shall not read as 0.0
+    const digits = x && Math.abs(x) < 0.95 ? 2 : 1; // a small gap must not read as 0.0
     return `${x.toLocaleString("en", { minimumFractionDigits: digits, maximumFractionDigits: digits }).replace("-", "−")} m`;
   };
   const clamp = (x, low, high) => Math.max(low, Math.min(x, high));
@@ -56,7 +56,7 @@ const makePen = (() => {
       }
     };
     const fitted = (words, size, bold, room) => {
-      // letters shrunk to the room
+      // letters shrink to the room
       pen.font = font(size, bold);
       while (size > 9 && pen.measureText(words).width > room[1] - room[0]) pen.font = font((size -= 1), bold);
       return pen.measureText(words).width;
@@ -73,7 +73,7 @@ const makePen = (() => {
     };
     const head = (x, y, way, ink, size = 7) => shape([[x, y], [x - way * size, y - size * 0.6], [x - way * size, y + size * 0.6]], ink);
     const span = (x0, x1, y, ink, dash = []) => {
-      // a dimension line between two bumpers, an arrow where it leaves the picture; returns the middle of what is seen
+      // a dimension line between two bumpers, an arrow where it leaves the picture; returns the middle of its visible part
       const ends = [Math.min(x0, x1), Math.max(x0, x1)];
       const seen = ends.map((x) => clamp(x, margin / 2, width - margin / 2));
       line(seen[0], y, seen[1], y, ink, 2, dash);

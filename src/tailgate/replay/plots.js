@@ -1,9 +1,9 @@
-// The plots: they share the time axis, and what stands beside a curve's name is its value at the playhead.
+// The plots share the time axis; the number after a curve's name is its value at the playhead.
 const buildPlots = (() => {
   const SVG = "http://www.w3.org/2000/svg";
   const HEIGHT = 150, SLIM = 70, TOP = 10, BOTTOM = 22, RIGHT = 10, LANE = 30, LANE_STEP = 50;
   const BELIEF = "#7a2a6b", EGO = "#0072b2", LEADER = "#4d4d4d", TRUTH = "#1a1a1a", DESIRED = "#00694b", ATTACK = "#b34700";
-  // by number of the kind: colour and pattern, so that neither is needed alone
+  // by number of the kind: colour and pattern, so that each alone suffices
   const LOOKS = {
     1: ["#b34700", "cross"], 2: ["#0072b2", "across"], 3: ["#00694b", "dashes"], 4: ["#4d4d4d", "dots"], 5: ["#7a2a6b", "rising"],
     6: ["#8a5a00", "falling"], 7: ["#1a1a1a", "upright"], 8: ["#a3003c", "specks"], 9: ["#00606b", "waves"],
@@ -75,17 +75,17 @@ const buildPlots = (() => {
   // inks and dashes of the curves of many agents
   const INKS = [TRUTH, EGO, DESIRED, BELIEF, "#8a5a00", LEADER], DASHES = ["none", "7 4", "2 3", "10 3 2 3"];
 
-  // of one agent alone everything; of many the plots of all (part "all") or those of one of them (part "one")
+  // a single agent: everything; several: the plots of all (part "all") or of one of them (part "one")
   return (box, episode, seek, part = "") => {
     const { dt, length, road, believed, errors, wires, kinds, radar } = episode;
-    const age = radar && dt > 0.5 ? 0 : 1, of = age ? "" : " (of this time)"; // where steps are long, a belief stands at the time of its measurement
+    const age = radar && dt > 0.5 ? 0 : 1, of = age ? "" : " (of this time)"; // with long steps, an estimate is drawn at the time of its measurement
     const end = Math.max(length, 1) * dt, digits = dt >= 0.1 ? 1 : dt >= 0.01 ? 2 : 3;
     const attacked = runsOf(length, (s) => episode.kind[s - 1] !== 0);
     const alarms = runsOf(length, (s) => episode.alarm[s - 1]);
     const hits = [episode.hit, episode.rear_hit].filter((step) => step !== null), panels = [];
     if (!document.getElementById("attacked")) document.body.append(patterns());
 
-    // a panel: heading, keys with values, picture; `draw(svg, frame)` fills the picture at the present width
+    // a panel: heading, keys with values, picture; `draw(svg, frame)` draws the picture at the present width
     const panel = (title, unit, height, draw, name) => {
       const figure = html("figure", box, null, "plot");
       figure.id = `plot-${name}`;
@@ -105,7 +105,7 @@ const buildPlots = (() => {
     const note = (one, words) => html("li", one.keys, words, "note");
 
     const base = (one, width) => {
-      // the frame, the time axis and what all panels show
+      // the frame, the time axis, and the parts common to all panels
       const left = parseFloat(getComputedStyle(box).getPropertyValue("--left")) * 16, bottom = one.height - BOTTOM;
       const x = (t) => left + (t / end) * (width - left - RIGHT);
       one.svg.replaceChildren();
@@ -113,7 +113,7 @@ const buildPlots = (() => {
       one.svg.setAttribute("height", one.height);
       for (const t of niceTicks(0, end, Math.max(4, Math.floor(width / 80)))) {
         make("line", { class: "grid", x1: x(t), x2: x(t), y1: TOP, y2: bottom }, one.svg);
-        const last = x(t) > width - 24; // such a label would stand out of the picture
+        const last = x(t) > width - 24; // such a label would leave the picture
         make("text", { x: last ? width - 1 : x(t), y: bottom + 15, "text-anchor": last ? "end" : "middle" }, one.svg, `${minus(t)} s`);
       }
       for (const [a, b] of attacked) {
@@ -130,7 +130,7 @@ const buildPlots = (() => {
       for (const step of hits) make("line", { class: "end", x1: frame.x(step * dt), x2: frame.x(step * dt), y1: TOP - 4, y2: frame.bottom }, one.svg);
       one.playhead = make("line", { class: "playhead", y1: TOP - 6, y2: frame.bottom, x1: 0, x2: 0 }, one.svg);
     };
-    // least and greatest of every pixel column: no peak is lost
+    // minimum and maximum of every pixel column, so that no peak is lost
     const path = (values, offset, x, y) => {
       let d = "", column = null, group = [];
       const flush = () => {
@@ -236,7 +236,7 @@ const buildPlots = (() => {
 
     if (part !== "all" && radar && radar.muted.includes(1)) drawChallenges();
     function drawChallenges() {
-      // a dot for each challenge, filled where more than the threshold was heard
+      // a dot for each challenge, filled above the threshold
       const { muted, energy, threshold } = radar, heard = energy.map((v, i) => (muted[i] ? v : null)), loud = (v) => threshold !== null && v > threshold;
       const curves = [{ name: "heard at a challenge", values: heard, offset: 1, ink: TRUTH, digits: 2 }];
       if (threshold !== null) curves.push({ name: `threshold of the defence = ${short(threshold)} dB`, values: Array(length).fill(threshold), offset: 1, ink: ATTACK, dash: "7 4", level: true });
@@ -290,7 +290,7 @@ const buildPlots = (() => {
       if (!episode.applied) note(control, "applied as commanded throughout");
     }
 
-    // lanes of decisions: a lane for each wire and kind, for refused commands, for modes other than the normal one
+    // lanes of decisions: one for each wire and kind, for refused commands, and for modes other than normal
     const lanes = [];
     for (const wire of wires) for (const kind of wire.kinds) {
       const { valued, unit } = kinds[kind], on = (s) => wire.hit[s - 1] && episode.kind[s - 1] === kind;

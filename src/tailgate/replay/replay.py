@@ -1,7 +1,7 @@
-"""An episode played again from its row: which row, what may be played, and whether it is the same trace.
+"""An episode played again from its row: which row, what may be played, and whether the trace is the same.
 
-Rows may come from strangers. What a row names is read (a scenario, a policy), never run: a row whose component is code to import is
-played only when the user names that component as well.
+Rows may come from strangers. A row's scenario and policy are read as data, never executed.
+A row whose component is code to import is played only if the user names that component too.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ Verdict = Literal["same", "decisions", "different", "unknown"]
 
 @dataclass(frozen=True)
 class Filter:
-    """Which rows a user means; None: any. What is named here is also what the user allows to be imported."""
+    """The rows that a user means; None means any. The user also allows imports of the components named here."""
 
     line: int | None = None
     scenario: str | None = None
@@ -58,7 +58,7 @@ class Filter:
         return str(self.scenario).endswith(YAML) and _name_of(str(self.scenario)) == row["scenario"]
 
     def _attack_fits(self, row: Row) -> bool:
-        """The same text; or a file with the same content and the same parameters, wherever it lies now."""
+        """Return True for the same text, or for a file elsewhere with the same content and parameters."""
         if self.attack in (None, row["attack"]):
             return True
         (head, params), (held, own) = _split(str(self.attack)), _split(row["attack"])
@@ -81,14 +81,14 @@ def _digest_of(attack: str) -> str:
 
 
 def _split(text: str) -> tuple[str, str]:
-    """Head and parameters of a component's text."""
+    """Return head and parameters of a component's text."""
     head, sep, tail = text.rpartition(":")
     return (head, tail) if sep and "=" in tail else (text, "")
 
 
 @dataclass(frozen=True)
 class Chosen:
-    """A row, its line in the file (from 1), how many rows matched, and why it is this one."""
+    """A row, its line in the file (from 1), how many rows matched, and the reason for this choice."""
 
     row: Row
     line: int
@@ -97,7 +97,10 @@ class Chosen:
 
 
 def choose(rows: Sequence[Row], wanted: Filter) -> Chosen:
-    """The row to play: the line that is wanted, or of those that match the worst outcome: a crash, the smallest gap, the largest error."""
+    """Return the row to play: the requested line, or the matching row with the worst outcome.
+
+    A crash is worst, then the smallest gap, then the largest error.
+    """
     if not rows:
         raise InputError("rows", "an empty file", "at least one row")
     if wanted.line is not None:
@@ -107,7 +110,7 @@ def choose(rows: Sequence[Row], wanted: Filter) -> Chosen:
         if not wanted.fits(row):
             shown = f"{row['scenario']}, {row['defence']}, {row['attack']}, dose {row['dose']}, seed {row['seed']}"
             raise InputError(f"line {wanted.line}", shown, f"a row that matches the filters ({wanted})")
-        return Chosen(row, wanted.line, 1, "the line that was asked for")
+        return Chosen(row, wanted.line, 1, "the requested line")
     matching = [(i, row) for i, row in enumerate(rows, start=1) if wanted.fits(row)]
     if not matching:
         keys = ("scenario", "defence", "attack", "dose")
@@ -116,7 +119,7 @@ def choose(rows: Sequence[Row], wanted: Filter) -> Chosen:
     played = [(i, row) for i, row in matching if row["status"] == "ok"]
     if not played:
         line, row = matching[0]
-        raise InputError(f"line {line}", f"{row['status']}: {row['reason']}", "a row that was played; no row that matches was")
+        raise InputError(f"line {line}", f"{row['status']}: {row['reason']}", "a row that was played; no matching row was")
 
     def outcome(item: tuple[int, Row]) -> tuple[float, float, float]:
         gap = item[1]["min_gap"]
@@ -133,7 +136,7 @@ def _some(names: set[str], most: int = 8) -> list[str]:
 
 @dataclass(frozen=True)
 class Check:
-    """Something that the row records and what it is here."""
+    """A field that the row records, and its value here."""
 
     name: str
     row: str
@@ -146,12 +149,12 @@ class Check:
 
 @dataclass(frozen=True, eq=False)
 class Replay:
-    """An episode that was played again. `gate` (K, N) is the defence's own gate at each step, NaN where it has none."""
+    """An episode that was played again. `gate` (K, N) is the defence's gate at each step, NaN without one."""
 
     row: Row
     place: Scenario
     loop: Loop
-    attack: Any
+    attack: Attack
     trace: Trace
     gate: Array
     metrics: dict[str, float | None]
@@ -159,7 +162,7 @@ class Replay:
 
     @property
     def verdict(self) -> Verdict:
-        """Whether this is the episode of the row: to the last bit, in its decisions only, not at all; or the row records no hash."""
+        """Return whether the trace is the same, only its decisions are, it differs, or the row records no hash."""
         by_name = {check.name: check for check in self.checks}
         trace, decisions = by_name["trace_hash"], by_name["decision_hash"]
         if trace.same:
@@ -170,7 +173,7 @@ class Replay:
 
     @property
     def differences(self) -> list[Check]:
-        """What is not as the row says, the hashes of the trace apart; also figures that came out otherwise."""
+        """Return fields and metrics that differ from the row, except the hashes of the trace."""
         figures = [Check(name, _figure(self.row[name]), _figure(value)) for name, value in self.metrics.items()]
         return [check for check in (*self.checks[2:], *figures) if not check.same]
 
@@ -184,18 +187,18 @@ def _figure(value: float | None) -> str:
 
 
 def play(row: Row, allowed: Filter | None = None) -> Replay:
-    """Play a row's episode. `allowed`: the components and the scenario file that the user named.
+    """Play a row's episode. `allowed` holds the components and the scenario file that the user named.
 
-    Raises InputError for a row that was not played, that names code which the user did not, or whose files are not here.
+    Raises InputError for a row that was not played, names code that the user did not, or needs missing files.
     """
     allowed = allowed or Filter()
     if row["status"] != "ok":
         raise InputError("row", f"{row['status']}: {row['reason']}", "a row that was played (status ok)")
     if not allowed.fits(row):
         raise InputError("row", f"{row['scenario']}, {row['defence']}, {row['attack']}", f"a row that matches {allowed}")
-    guard, rival = _component("defence", row, allowed.defence), _component("attack", row, allowed.attack)
+    defence_spec, attack_spec = _component("defence", row, allowed.defence), _component("attack", row, allowed.attack)
     place = _place(row, allowed.scenario)
-    loop, attack = place.loop(guard.make(), guard.entry.uses), rival.make()
+    loop, attack = place.loop(defence_spec.make(), defence_spec.entry.uses), attack_spec.make()
     states = episode(loop, attack, draws.keys(row["purpose"], [row["seed"]]))
     start, _ = next(states)
     recorder, gate = Recorder(loop, start), [_gate(loop, start)]
@@ -205,12 +208,12 @@ def play(row: Row, allowed: Filter | None = None) -> Replay:
         gate.append(_gate(loop, state))
     trace = recorder.trace()
     metrics = {name: None if np.isnan(value[0]) else float(value[0]) for name, value in measure(trace).items()}
-    versions = {"defence": guard.entry.version, "attack": rival.entry.version}
+    versions = {"defence": defence_spec.entry.version, "attack": attack_spec.entry.version}
     here = {
         "trace_hash": trace.trace_hash(0), "decision_hash": trace.decision_hash(0), "version": VERSION,
         "config_hash": place.config_hash, "engine": ENGINE, "versions": ", ".join(f"{k} {v}" for k, v in versions.items()),
-        "defence_digest": guard.digest, "attack_digest": rival.digest, "dose": _text(place.threat_model.budget),
-        "knowledge": place.threat_model.knowledge, "uses": ", ".join(guard.entry.uses),
+        "defence_digest": defence_spec.digest, "attack_digest": attack_spec.digest, "dose": _text(place.threat_model.budget),
+        "knowledge": place.threat_model.knowledge, "uses": ", ".join(defence_spec.entry.uses),
     }  # fmt: skip
     held = {**row, "versions": ", ".join(f"{k} {v}" for k, v in _mapping(row.get("versions")).items())}
     held |= {"dose": _text(row["dose"]), "uses": ", ".join(map(str, row["uses"]))}
@@ -219,10 +222,10 @@ def play(row: Row, allowed: Filter | None = None) -> Replay:
 
 
 def episode(loop: Loop, attack: Attack, keys: Keys) -> Iterator[tuple[LoopState, Frame | None]]:
-    """The states of one episode: the start, then each step with its frame, until it ends."""
+    """Yield the states of one episode: the start, then each step with its frame, until it ends."""
     state = loop.start(keys)
     plan = attack.prepare(loop.brief)
-    memory: Any = attack.start(plan, 1, keys.at(Role.ATTACK, np.zeros(1, np.int64)))
+    memory = attack.start(plan, 1, keys.at(Role.ATTACK, np.zeros(1, np.int64)))
     yield state, None
     for _ in range(loop.horizon):
         if state.ended.all():
@@ -231,10 +234,10 @@ def episode(loop: Loop, attack: Attack, keys: Keys) -> Iterator[tuple[LoopState,
         yield state, frame
 
 
-def threshold(defence: Any) -> tuple[str, float] | None:
-    """Name and value of the parameter at which the defence, or its detector, alarms; None where none is declared."""
-    parts = defence.parts() if callable(getattr(defence, "parts", None)) else ()
-    for part in (defence, *parts):
+def threshold(defence: object) -> tuple[str, float] | None:
+    """Return name and value of the alarm threshold of the defence or its detector; None without one."""
+    parts = getattr(defence, "parts", None)
+    for part in (defence, *(parts() if callable(parts) else ())):
         name = getattr(part, "threshold_field", None)
         value = getattr(part, name, None) if isinstance(name, str) else None
         if isinstance(name, str) and isinstance(value, int | float):
@@ -243,7 +246,7 @@ def threshold(defence: Any) -> tuple[str, float] | None:
 
 
 def _gate(loop: Loop, state: LoopState) -> Array:
-    """(N,) the gate of each agent; NaN where there is none."""
+    """Return the gate of each agent (N,); NaN without one."""
     nobody = np.full(loop.model.agents, np.nan)
     if not hasattr(loop.defence, "look"):
         return nobody
@@ -255,12 +258,12 @@ def _text(dose: int | None) -> str:
     return "unlimited" if dose is None else str(dose)
 
 
-def _mapping(value: Any) -> dict[str, Any]:
+def _mapping(value: object) -> dict[str, Any]:
     return value if isinstance(value, dict) else {}
 
 
 def _component(family: Literal["defence", "attack"], row: Row, named: str | None) -> Spec:
-    """The component that the row names, or the one that the user named for it (`Filter.fits` has seen that they agree)."""
+    """Return the row's component, or the one that the user named for it; `Filter.fits` has checked that they agree."""
     held = Spec(family, row[family])
     if named is None and held.imports:
         raise InputError(
@@ -270,19 +273,19 @@ def _component(family: Literal["defence", "attack"], row: Row, named: str | None
     spec = held if named is None else Spec(family, named)
     head, _ = _split(spec.text)
     if family == "attack" and Path(head).suffix in (".json", *YAML) and not spec.imports and not Path(head).is_file():
-        raise InputError("the row's attack", spec.text, "a file that is here; say where the same file lies now: --attack FILE")
+        raise InputError("the row's attack", spec.text, "an existing file; give its present path: --attack FILE")
     return spec
 
 
 def _place(row: Row, named: str | None) -> Scenario:
-    """The row's scenario under the row's threat model."""
+    """Return the row's scenario with the row's threat model."""
     source = row.get("scenario_file") or row["scenario"]
     if named is not None and named.endswith(YAML):
         source = named
     elif source == row["scenario"] and not source.endswith(YAML) and source not in list_scenarios():
         raise InputError("the row's scenario", source, "a built-in one, or its file: --scenario FILE.yaml")
     elif source.endswith(YAML) and not Path(source).is_file():
-        raise InputError("the row's scenario", source, "a file that is here; say where the same file lies now: --scenario FILE.yaml")
+        raise InputError("the row's scenario", source, "an existing file; give its present path: --scenario FILE.yaml")
     threat = row.get("threat_model")
     if not isinstance(threat, dict):
         raise InputError("the row's threat_model", threat, "a mapping of fields")

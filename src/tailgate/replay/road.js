@@ -14,7 +14,7 @@ const drawRoad = (() => {
     const believedLine = Math.round(strip + (height - strip) * (narrow ? 0.5 : 0.45)), ghostWheels = Math.round(height - 0.22 * (height - strip));
 
     const vehicle = (x, ink, name, speed, room) => {
-      // a car with its name and speed, or an arrow at the edge that it is beyond
+      // a car with its name and speed, or an arrow at the edge if it is outside
       const way = x > width - margin + 1 ? 1 : x < margin + car - 1 ? -1 : 0;
       const middle = way ? (way > 0 ? width - margin : margin) : x - car / 2;
       if (way) head(middle, wheels - tall / 2, way, ink, car * 0.19);
@@ -27,7 +27,7 @@ const drawRoad = (() => {
       sign(x, trueLine, words, from, to);
     };
 
-    const { road, believed, radar } = episode, rear = episode.rear && episode.rear.rear_gap[s] !== null ? episode.rear : null; // among traffic there may be nobody
+    const { road, believed, radar } = episode, rear = episode.rear && episode.rear.rear_gap[s] !== null ? episode.rear : null; // in traffic there may be no car behind
     const shown = (x) => (radar ? Math.max(x, 0) : x); // a long step ends metres beyond a collision
     const gap = shown(road.gap[s]), rearGap = rear ? shown(rear.rear_gap[s]) : Infinity;
     const first = SPANS.findIndex((metre) => gap <= metre), from = first < 0 ? SPANS.length - 1 : first;
@@ -36,7 +36,7 @@ const drawRoad = (() => {
     const leader = nose + gap * scale, lane = ahead / 6;
 
     // the belief
-    const belief = s ? believed.gap[s - 1] : null, off = radar && s ? radar.then[s - 1] - belief : gap - belief; // of the time of the measurement
+    const belief = s ? believed.gap[s - 1] : null, off = radar && s ? radar.then[s - 1] - belief : gap - belief; // at the time of the measurement
     pen.fillStyle = BELIEF_PALE;
     pen.fillRect(0, strip, width, height - strip);
     line(0, strip, width, strip, BELIEF, 1);

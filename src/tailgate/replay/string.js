@@ -22,7 +22,7 @@ const drawString = (() => {
       pen.font = font(size, true);
       return pen.measureText(words).width;
     };
-    // a dimension line, and its words where they fit or must stand
+    // a dimension line, with its words where they fit or are needed
     const dimension = (x0, x1, y, words, ink, dash, must, up = true) => {
       const middle = span(x0, x1, y, ink, dash), fits = Math.abs(x1 - x0) - 4;
       const size = [small + 2, small, 9].find((each) => wide(words, each) <= fits) ?? (must ? small : 0);
@@ -40,7 +40,7 @@ const drawString = (() => {
       if (belief === null) continue;
       const ghost = clamp(tail - belief * scale, -FAR, FAR);
       line(tail, trueLine, tail, ghostWheels, LEADER, 1, [3, 3]); // the same bumper in both strips
-      level = Math.max(tail, ghost) > reached + 1 ? 1 - level : 0; // lines that would lie on each other
+      level = Math.max(tail, ghost) > reached + 1 ? 1 - level : 0; // avoids overlapping lines
       reached = Math.min(tail, ghost);
       dimension(tail, ghost, believedLine + 18 * level, metres(belief), BELIEF, [5, 5], attacked[i], !level);
       if (ghost > 0 && ghost - car < width) drawCar(ghost, ghostWheels, BELIEF, true, car);
@@ -57,7 +57,7 @@ const drawString = (() => {
     text(margin + unit * scale + 8, height - 6, `${unit} m`, { ink: GREY });
     text(width - margin, height - 6, "WHERE EACH CAR BELIEVES IT IS", { ink: BELIEF, anchor: "r", room: [margin + unit * scale + 60, width - margin] });
 
-    // the truth; a sign of a collision leaves no room for the words of the gaps behind it
+    // the truth; the sign of a collision hides the words of the gaps behind it
     const hits = [...gap.keys()].filter((i) => i && gap[i] !== null && gap[i] <= 0);
     const behind = (x) => hits.some((i) => {
       const length = fitted(`COLLISION: car ${i}`, large, true, [0, FAR]) + 2 * margin;
@@ -78,7 +78,7 @@ const drawString = (() => {
       if (wide(short, 9) < pitch) text(middle, wheels + roadHeight + small + 2, short, { ink, size: wide(short, small) < pitch ? small : 9, anchor: "m", bold: true, room: [2, width - 2], ground: WHITE });
       const moves = `${speed[i][s].toFixed(1)} m/s`;
       if (wide(moves, 9) < pitch) text(middle, wheels + roadHeight + 2 * small + 4, moves, { ink, size: wide(moves, small - 1) < pitch ? small - 1 : 9, anchor: "m", room: [2, width - 2], ground: WHITE });
-      if (i === agent) line(nose[i] - car, wheels + roadHeight + 2, nose[i], wheels + roadHeight + 2, ink, 2); // whom the plots follow
+      if (i === agent) line(nose[i] - car, wheels + roadHeight + 2, nose[i], wheels + roadHeight + 2, ink, 2); // the agent of the plots
       const size = clamp(car / 5, 4, 8), top = wheels - tall - 3, both = attacked[i] && alarmed[i] ? size : 0;
       if (attacked[i]) bolt(middle - both, top, size);
       if (alarmed[i]) lamp(middle + both, top - size, size);

@@ -22,33 +22,33 @@ from .replay import Replay, episode
 
 FORMATS = {".gif": "GIF", ".webp": "WEBP", ".mp4": "MP4"}
 FASTEST = 20  # frames a second
-MOST = 600  # frames of an animated picture, which is put together in memory
-SHORTEST = 10.0  # [s]: an episode that lasts less is slowed down
+MOST = 600  # frames of an animated picture, which is built in memory
+SHORTEST = 10.0  # [s]; a shorter episode is slowed down
 HOLD = 2.0  # [s] that the last frame stays
 AUTO = Viewer()
 
 
 def check_format(path: Path) -> None:
-    """Raise InputError for a name whose ending is no format, ImportError for an encoder that is missing."""
+    """Raise InputError for an unknown format, ImportError for a missing encoder."""
     if path.suffix.lower() not in FORMATS:
         raise InputError("--video", str(path), f"a file that ends in {', '.join(FORMATS)}")
     if FORMATS[path.suffix.lower()] == "MP4" and find_spec("imageio_ffmpeg") is None:
-        raise ImportError("imageio-ffmpeg is missing, which writes MP4: pip install 'tailgate[video]' (.gif and .webp do without)")
-    from tailgate.envs.render import picture as render  # noqa: F401 - names the extra where Pillow is missing
+        raise ImportError("MP4 needs imageio-ffmpeg: pip install 'tailgate[video]' (.gif and .webp do not)")
+    from tailgate.envs.render import picture as render  # noqa: F401 - the import error names the extra if Pillow is missing
 
 
 def pace(dt: float, length: int, most: float = math.inf) -> tuple[int, float]:
-    """(steps from frame to frame, frames a second): real time, but every step of an episode that would last less than ten seconds."""
+    """Return (steps per frame, frames a second): real time, but every step of an episode shorter than ten seconds."""
     stride = 1 if length * dt < SHORTEST else max(1, round(1.0 / (dt * FASTEST)), math.ceil(length / most))
     return stride, min(1.0 / (dt * stride), float(FASTEST))
 
 
 def frames(replay: Replay, stride: int, viewer: Viewer = AUTO) -> Iterator[Array]:
-    """(H, W, 3) uint8 pictures of the start, every `stride`-th step, and the last one, with who plays below the road."""
+    """Yield pictures (H, W, 3) uint8 of the start, every `stride`-th step and the last one, with the players' names."""
     from tailgate.envs.render.picture import draw
 
     last, row = int(replay.trace.length[0]), replay.row
-    texts = names_of([row["defence"], row["attack"]])  # of a file its name, not its place on somebody's machine
+    texts = names_of([row["defence"], row["attack"]])  # of a file its name, not its path
     caption = f"{row['scenario']}: {texts[row['defence']].full} against {texts[row['attack']].full}"
     for step, (state, frame) in enumerate(episode(replay.loop, replay.attack, replay.keys)):
         if step % stride == 0 or step == last:
@@ -56,7 +56,7 @@ def frames(replay: Replay, stride: int, viewer: Viewer = AUTO) -> Iterator[Array
 
 
 def write_video(replay: Replay, path: Path, viewer: Viewer = AUTO) -> str:
-    """Writes the film in the format that the file's ending names, and returns a sentence about it."""
+    """Write the film in the format of the file's suffix; return a sentence about it."""
     check_format(path)
     dt, length = replay.trace.dt, int(replay.trace.length[0])
     kind = FORMATS[path.suffix.lower()]
@@ -74,7 +74,7 @@ def write_video(replay: Replay, path: Path, viewer: Viewer = AUTO) -> str:
 def _write_animation(pictures: Iterator[Array], path: Path, kind: str, rate: float, count: int) -> None:
     from PIL import Image
 
-    def reduced(picture: Array) -> Any:  # 256 colours of its own are plenty for drawings, and take a third of the memory
+    def reduced(picture: Array) -> Any:  # 256 colours per picture suffice for drawings, and save two thirds of the memory
         return Image.fromarray(picture).quantize(256, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
 
     pause = round(1000.0 / rate)
@@ -92,7 +92,7 @@ def _write_mp4(pictures: Iterator[Array], path: Path, rate: float) -> None:
     first = next(pictures)
     writable_directory(path.parent, "video")
     with tempfile.TemporaryDirectory() as folder:
-        film = Path(folder) / "film.mp4"  # the encoder goes back in it
+        film = Path(folder) / "film.mp4"  # the encoder needs a seekable file
         size = (first.shape[1], first.shape[0])
         options: dict[str, Any] = {"codec": "libx264", "quality": 7, "macro_block_size": 2, "ffmpeg_log_level": "error"}
         encoder = imageio_ffmpeg.write_frames(str(film), size, fps=rate, **options)

@@ -1,7 +1,7 @@
-"""The submission's side: imports the class, and answers one line of JSON for each that it gets.
+"""The submission's process: it imports the class and answers each line of JSON with one line.
 
-Run as `python -m tailgate.sandbox.child FOLDER LIMITS`: FOLDER holds the files `in`, which is only read here, and `out`; LIMITS is
-JSON. What the submission prints goes to standard error; the real standard output carries the answers.
+Run as `python -m tailgate.sandbox.child FOLDER LIMITS`. FOLDER holds the files `in`, which is only read here, and `out`.
+LIMITS is JSON. What the submission prints goes to standard error; the real standard output carries the answers.
 """
 
 from __future__ import annotations
@@ -20,32 +20,32 @@ import numpy as np
 from tailgate.base.errors import InputError
 from tailgate.base.pytree import map_leaves
 from tailgate.base.version import VERSION
-from tailgate.core import Array, Model, Prior, Received, pair_of
+from tailgate.core import Array, Estimate, Model, Prior, Received, pair_of
 from tailgate.core.draws import Draws
 from tailgate.core.registry import Spec
 from tailgate.sandbox.wire import LINE, Header, Outputs, line, model_of, printable, unpack
 
-KEPT = 8  # states, the most lately used, that a step can go on from
+KEPT = 8  # most recently used states from which a step can continue
 RECEIVED = ("y", "valid", "energy", "v2v", "odometry", "attacked")
 
-KINDS = {"x": "f", "score": "f", "alarm": "b", "mode": "iu", "probe": "b", "limits": "f"}  # of the arrays that a step gives
+KINDS = {"x": "f", "score": "f", "alarm": "b", "mode": "iu", "probe": "b", "limits": "f"}  # of the arrays that a step returns
 
 
 class Child:
-    """What one submission's process keeps: the defence, its plan and its last states."""
+    """The state of one submission's process: the defence, its plan and its last states."""
 
     def __init__(self, folder: Path) -> None:
         self.data = os.open(folder / "in", os.O_RDONLY)
         self.folder = folder
         self.defence: Any = None
         self.model: Model | None = None
-        self.plan: Any = None
-        self.states: OrderedDict[int, tuple[int, Any]] = OrderedDict()  # first ticket to (rows, state)
+        self.plan: object = None
+        self.states: OrderedDict[int, tuple[int, Any]] = OrderedDict()  # first ticket -> (rows, state)
         self.outputs: Outputs | None = None
         self.views: dict[str, Array] = {}
 
     def arrays(self, header: Header, size: int) -> dict[str, Array]:
-        """The arrays of this request: a copy of our own, of bytes, that nobody can write."""
+        """Return the arrays of this request, as read-only copies."""
         block = b""
         while len(block) < size and (part := os.pread(self.data, size - len(block), len(block))):
             block += part
@@ -60,7 +60,7 @@ class Child:
         except InputError as error:
             if path is None or not isinstance(error.__context__, ImportError):
                 raise
-            raise InputError(error.field, error.value, f"{error.expected}; nothing beside the submitted file or folder is found") from None
+            raise InputError(error.field, error.value, f"{error.expected}; only the submitted file or folder can be imported") from None
         return {"uses": list(entry.uses), "version": entry.version, "reference": entry.reference, "tailgate": VERSION}
 
     def prepare(self, arrays: dict[str, Array], rest: dict[str, Any]) -> dict[str, Any]:
@@ -82,8 +82,8 @@ class Child:
         self._keep(ticket, batch, state)
         return {"limits": self._write(estimate, batch)}
 
-    def _write(self, estimate: Any, batch: int) -> bool:
-        """Put an estimate into the file; whether it has limits. Values are the parent's to check: here only what raw bytes cannot show."""
+    def _write(self, estimate: Estimate, batch: int) -> bool:
+        """Write an estimate to the file; return True if it has limits. The parent checks values; here only types and shapes."""
         assert self.model is not None
         model = self.model
         if self.outputs is None or self.outputs.batch != batch:
@@ -99,17 +99,17 @@ class Child:
                 got = f"{value.dtype} {value.shape}" if isinstance(value, np.ndarray) else type(value).__name__
                 raise InputError(f"defence output {name}", got, f"an array of shape {place.shape}, kind {kinds!r}")
             if name == "mode":
-                value = np.clip(value, -1, 127)  # a number that int8 would turn into another one stays wrong
+                value = np.clip(value, -1, 127)  # int8 must not wrap an invalid number to a valid one
             place[...] = value
         return limited
 
-    def _keep(self, ticket: int, rows: int, state: Any) -> None:
+    def _keep(self, ticket: int, rows: int, state: object) -> None:
         self.states[ticket] = rows, state
         while len(self.states) > KEPT:
             self.states.popitem(last=False)
 
     def _state(self, tickets: Array) -> Any:
-        """The state whose rows have these tickets: mostly the one of the last step, else put together of several."""
+        """Return the state whose rows have these tickets: usually that of the last step, else combined from several."""
         first = int(tickets[0])
         if first in self.states and self.states[first][0] == len(tickets) and (tickets == first + np.arange(len(tickets))).all():
             self.states.move_to_end(first)
@@ -125,7 +125,7 @@ class Child:
                 map_leaves(_put(np.flatnonzero(here), tickets[here] - begin), out, state)
                 found |= here
         if not found.all():
-            raise InputError("state", "an old one", f"one of the {KEPT} states that were used last")
+            raise InputError("state", "an old one", f"one of the {KEPT} most recently used states")
         return out
 
 
@@ -144,7 +144,7 @@ def _put(rows: Array, source: Array) -> Any:
 
 
 def _limit(limits: dict[str, int]) -> None:
-    """Limits of the system, for this process and each that it starts."""
+    """Set resource limits for this process and those that it starts."""
     for name, value in (
         ("RLIMIT_DATA", limits["memory"]), ("RLIMIT_CPU", limits["cpu"]), ("RLIMIT_FSIZE", limits["file_size"]),
         ("RLIMIT_CORE", 0), ("RLIMIT_NOFILE", 256),
@@ -156,7 +156,7 @@ def _limit(limits: dict[str, int]) -> None:
 
 
 def _error(error: BaseException) -> dict[str, str]:
-    """An error as text. A submission's own error class may do anything when it is printed, even raise another."""
+    """Return an error as text; a submission's error class may raise another error when it is printed."""
     try:
         out = {"kind": printable(type(error).__name__, 60), "text": printable(error)}
         if isinstance(error, InputError):
@@ -168,6 +168,7 @@ def _error(error: BaseException) -> dict[str, str]:
 
 
 def main() -> None:
+    """Answer the parent's requests until it closes the pipe."""
     _limit(json.loads(sys.argv[2]))
     requests, answers = os.fdopen(os.dup(0), "rb"), os.dup(1)
     os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
@@ -180,7 +181,7 @@ def main() -> None:
             if "arrays" in request:
                 request["arrays"] = child.arrays(request["arrays"], request.pop("size"))
             answer = {"id": number, "ok": getattr(child, done)(**request)}
-        except BaseException as error:  # also SystemExit: whatever ends a step is its answer
+        except BaseException as error:  # also SystemExit: an error is the answer to the step
             answer = {"id": number, "error": _error(error)}
         os.write(answers, line(answer))
 

@@ -1,10 +1,12 @@
-"""The process between ours and a submission's: starts it, watches it, and leaves nothing of it running.
+"""The guard process between tailgate and a submission: it starts the submission, watches it, and leaves nothing of it running.
 
-Run as a plain script with the standard library alone, so that it is up in a moment. It is the subreaper of all that the submission
-starts: a process that changes its session, or outlives its parent, becomes the guard's own child and is found. When our end of the
-`life` pipe closes, whatever the cause, all of them are killed and the scratch directories removed.
+It runs as a plain script with the standard library alone, so that it starts fast.
+It is the subreaper of all processes that the submission starts: a process that changes its session or outlives its parent
+becomes the guard's child. When tailgate's end of the `life` pipe closes, for any reason, the guard kills all of them
+and removes the scratch directories.
 
-Standard input: lines of JSON, {"cpu": seconds granted so far}. Standard output: one line of JSON, {"why": .., "printed": ..}, at the end.
+Standard input: lines of JSON, {"cpu": seconds granted so far}.
+Standard output: one line of JSON at the end, {"why": .., "printed": ..}.
 """
 
 from __future__ import annotations
@@ -23,13 +25,13 @@ from typing import Any
 
 _SUBREAPER = 36  # PR_SET_CHILD_SUBREAPER
 TICK = 1.0 / os.sysconf("SC_CLK_TCK")
-_LOOK = 0.2  # [s] between two looks at the processes
-_TAIL = 1000  # [bytes] of what was printed last
+_LOOK = 0.2  # [s] between checks of the processes
+_TAIL = 1000  # [bytes] of the last output
 _KILLING = 20.0  # [s] after which the guard gives up
 
 
 def descendants() -> dict[int, list[str]]:
-    """Every process below this one: number to the fields of /proc/PID/stat behind the name (state, parent, ...)."""
+    """Return every process below this one: its number, and the fields of /proc/PID/stat after the name (state, parent, ...)."""
     stats: dict[int, list[str]] = {}
     for name in os.listdir("/proc"):
         if name.isdigit():
@@ -47,7 +49,7 @@ def descendants() -> dict[int, list[str]]:
 
 
 def _memory(pids: list[int], limit: int) -> int:
-    """Bytes that the processes hold; what they share counts once, where the quick sum is above the limit."""
+    """Return the bytes that the processes hold; if the quick sum is above the limit, shared memory counts once."""
     page, quick, exact = os.sysconf("SC_PAGE_SIZE"), 0, 0
     for pid in pids:
         with suppress(OSError, IndexError, ValueError), open(f"/proc/{pid}/statm") as file:
@@ -66,14 +68,14 @@ class Guard:
     def __init__(self, job: dict[str, Any]) -> None:
         self.job = job
         self.granted = float(job["cpu"])
-        self.reaped = 0.0  # [s] processor time of those that have ended
+        self.reaped = 0.0  # [s] processor time of ended processes
         self.status: int | None = None
         self.printed, self.tail = 0, b""
         given, answers = job["pipes"]
         self.prints, wrote = os.pipe()
         self.life = sys.stdin.fileno()
         self.listening = [self.life, self.prints]
-        # start_new_session: a signal from a terminal is for the user's process, which then closes the pipe
+        # start_new_session: a terminal's signal reaches only the user's process, which then closes the pipe
         self.child = subprocess.Popen(
             job["command"], stdin=given, stdout=answers, stderr=wrote, cwd=job["scratch"], env=job["environment"], start_new_session=True
         )
@@ -81,7 +83,7 @@ class Guard:
             os.close(fd)
 
     def reap(self) -> None:
-        """Collect who has ended, and the processor time that they took."""
+        """Collect ended processes and their processor time."""
         while True:
             try:
                 pid, status, usage = os.wait4(-1, os.WNOHANG)
@@ -95,7 +97,7 @@ class Guard:
                 self.child.returncode = status  # nobody else waits for it
 
     def look(self) -> str:
-        """Why the submission has to end now, or nothing."""
+        """Return why the submission must end now, or nothing."""
         found = {pid: fields for pid, fields in descendants().items() if fields[0] != "Z"}
         if len(found) > self.job["processes"]:
             return f"processes: {len(found)} at a time, {self.job['processes']} allowed"
@@ -108,16 +110,16 @@ class Guard:
         return ""
 
     def read_output(self) -> str:
-        """Take what was printed; a reason to end when it is too much."""
+        """Read the submission's output; return a reason to end if it is too much."""
         text = os.read(self.prints, 1 << 16)
-        if not text:  # nobody is left who could print
+        if not text:  # no process is left that could print
             self.listening.remove(self.prints)
         self.printed += len(text)
         self.tail = (self.tail + text)[-_TAIL:]
         return f"output: more than {self.job['output']} bytes printed" if self.printed > self.job["output"] else ""
 
     def watch(self) -> str:
-        """Wait until there is a reason to end; empty when our process has gone, or asks for it."""
+        """Wait for a reason to end and return it; return nothing if tailgate has gone or closes the pipe."""
         buffer, next_look = b"", 0.0
         while True:
             ready, _, _ = select.select(self.listening, [], [], 0.02 if self.status is None else 0.0)
@@ -139,14 +141,14 @@ class Guard:
                 next_look = time.monotonic() + _LOOK
 
     def ended(self, status: int) -> str:
-        """How the submission's own process ended."""
+        """Return how the submission's own process ended."""
         code = os.waitstatus_to_exitcode(status)
         if code == -signal.SIGXCPU or (code == -signal.SIGKILL and self.reaped >= self.job["cpu_limit"]):
             return f"processor time: more than {self.job['cpu_limit']} s in one process"
         return f"the process ended with exit code {code}" if code >= 0 else f"the process was killed by signal {-code}"
 
     def kill_all(self) -> None:
-        """Freeze every descendant until no new one appears, then kill them: a process that forks cannot run away."""
+        """Freeze every descendant until no new one appears, then kill them, so that a forking process cannot escape."""
         end = time.monotonic() + _KILLING
         while time.monotonic() < end:
             frozen: set[int] = set()
@@ -163,7 +165,7 @@ class Guard:
 
     def finish(self) -> None:
         self.kill_all()
-        if self.job["after"]:  # what a container's client leaves behind
+        if self.job["after"]:  # cleans up after a container's client
             with suppress(OSError, subprocess.SubprocessError):
                 subprocess.run(self.job["after"], stdin=subprocess.DEVNULL, capture_output=True, timeout=_KILLING, check=False)
         for path in self.job["remove"]:
@@ -176,6 +178,7 @@ def _signal(pid: int, number: int) -> None:
 
 
 def main() -> None:
+    """Start the submission, watch it, and report its end."""
     job = json.loads(sys.argv[1])
     if ctypes.CDLL(None, use_errno=True).prctl(_SUBREAPER, 1, 0, 0, 0) != 0:
         raise OSError(ctypes.get_errno(), "prctl(PR_SET_CHILD_SUBREAPER)")

@@ -1,4 +1,4 @@
-"""A defence whose class only another process imports."""
+"""A defence whose class is imported only in another process."""
 
 from __future__ import annotations
 
@@ -21,16 +21,17 @@ from tailgate.sandbox.process import Process
 from tailgate.sandbox.sandbox import Sandbox
 from tailgate.sandbox.wire import Outputs, model_arrays
 
-_veil: ContextVar[bytes] = ContextVar("veil", default=b"")  # a secret of this training; empty where nobody is trained
-_AHEAD = 50  # steps whose processor time is granted at once
+_veil: ContextVar[bytes] = ContextVar("veil", default=b"")  # a secret of this training; empty outside training
+_AHEAD = 50  # steps per grant of processor time
 
 
 @contextlib.contextmanager
 def veiled() -> Iterator[None]:
-    """Hides in the keys that isolated defences draw with which episode is played, and that an attacker is trained in it.
+    """Hide from isolated defences, within the block, which episode is played and that an attacker is trained.
 
-    Training seeds are small numbers and episodes are counted: a class that could recognise them would be weak where attackers are trained
-    and itself where it is scored. The secret is new each time, so that a defence which draws is not trained against twice alike.
+    Training seeds are small numbers, and episodes are counted.
+    A class that recognised them could be weak in training and strong where it is scored.
+    The keys of its draws are therefore hashed with a secret, which is new each time.
     """
     token = _veil.set(os.urandom(32))
     try:
@@ -40,7 +41,7 @@ def veiled() -> Iterator[None]:
 
 
 class Veiled(NamedTuple):
-    """Keys as the process is given them, and what they were made of."""
+    """Keys as the process gets them, with the original keys."""
 
     key: Array  # (B,) uint64
     episode: Array  # (B,)
@@ -49,44 +50,45 @@ class Veiled(NamedTuple):
 
 
 class Tickets(NamedTuple):
-    """What stands for the states that the process keeps: the number of each row's. The process keeps those that were used last."""
+    """Numbers of the states that the process keeps, one per row. The process keeps the most recently used ones."""
 
     row: Array  # (B,) int64
 
 
 @dataclass(eq=False)
 class IsolatedPlan:
-    """A process with the model prepared, and what was granted to it."""
+    """A process with the model prepared, and its grants."""
 
     process: Process
     model: Model
     ticket: int = 0
-    granted: int = 0  # rows times steps that are still granted
+    granted: int = 0  # rows times steps still granted
     veiled: Veiled | None = None
 
 
 @dataclass(eq=False)
 class Isolated:
-    """A defence that stands for "module:Class:key=value" and plays it in a process of its own; `prepare` starts one for each plan.
+    """A defence "module:Class:key=value" that runs in a separate process; `prepare` starts one for each plan.
 
-    State stays in that process, so that the loop's state holds tickets only. Close it, or use it in a `with`, to end the processes.
+    The state stays in that process, so the loop's state holds only tickets.
+    Close it, or use it as a context manager, to end the processes.
     """
 
-    untraced: ClassVar[str] = "another process plays it"  # why the engine leaves it to the plain loop
+    untraced: ClassVar[str] = "another process plays it"  # why the engine uses the plain loop
     text: str
-    source: Path | None = None  # directory that the class is imported from, beside what is installed
+    source: Path | None = None  # directory from which the class is imported, in addition to installed packages
     limits: Limits = field(default_factory=Limits)
     sandbox: Sandbox | None = None
     plans: list[IsolatedPlan] = field(default_factory=list)
 
     @property
     def card(self) -> dict[str, Any]:
-        """uses, version and reference of the class, asked of a process that ends at once."""
+        """The uses, version and reference of the class, from a process that ends at once."""
         with Process(self.text, self.source, self.limits, self.sandbox) as process:
             return process.card
 
     def prepare(self, model: Model) -> IsolatedPlan:
-        """A fresh process with the class imported and its constants made."""
+        """Start a process, import the class, and prepare its constants."""
         plan = IsolatedPlan(Process(self.text, self.source, self.limits, self.sandbox), model)
         self.plans.append(plan)
         arrays, rest = model_arrays(model)
@@ -94,13 +96,13 @@ class Isolated:
         return plan
 
     def start(self, plan: IsolatedPlan, prior: Prior) -> Tickets:
-        """States of B episodes."""
+        """Start B episodes."""
         batch = len(prior.mean)
         plan.process.ask("start", {"mean": prior.mean, "cov": prior.cov}, ticket=plan.ticket)
         return _tickets(plan, batch)
 
     def step(self, plan: IsolatedPlan, state: Tickets, received: Received, known_u: Array, draws: Draws) -> tuple[Tickets, Estimate]:
-        """One step of B episodes, its outputs checked."""
+        """Play one step of B episodes and check its outputs."""
         state, estimate = self.step_unchecked(plan, state, received, known_u, draws)
         check_estimate(estimate, plan.model, len(received.y), draws.step)
         return state, estimate
@@ -108,9 +110,9 @@ class Isolated:
     def step_unchecked(
         self, plan: IsolatedPlan, state: Tickets, received: Received, known_u: Array, draws: Draws
     ) -> tuple[Tickets, Estimate]:
-        """One step; types and shapes are right, numbers may be anything. For who checks row by row, as the mixed batches do.
+        """Play one step with correct types and shapes but unchecked numbers, for callers that check each row, such as mixed batches.
 
-        The draws hold the key of the party `defence` alone: a hash of its own, which tells nothing of the other parties' keys.
+        The draws hold only the key of the party `defence`: a separate hash that reveals no other party's key.
         """
         batch, model = len(received.y), plan.model
         plan.granted -= batch
@@ -141,7 +143,7 @@ class Isolated:
 
 
 def _shown(plan: IsolatedPlan, draws: Draws) -> tuple[Array, Array]:
-    """Key and number of each episode (B,), as the process may know them."""
+    """Return the key and number of each episode (B,), as the process may know them."""
     veil = _veil.get()
     if not veil:
         return draws.key, draws.episode

@@ -1,4 +1,4 @@
-"""The cells of one scenario, played so that a submission sees their rows side by side, in a secret order, in one batch."""
+"""Cells of one scenario, played such that a submission sees their rows together, in one batch and a secret order."""
 
 from __future__ import annotations
 
@@ -10,17 +10,14 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
-import numpy as np
-
 from tailgate.base import sources
 from tailgate.base.errors import InputError, NotApplicable
 from tailgate.base.version import VERSION
-from tailgate.core import draws
+from tailgate.core import Attack, draws
 from tailgate.core.registry import Entry, Spec
 from tailgate.core.scenario import Scenario
 from tailgate.core.schema import canonical
-from tailgate.evaluation.cells import Cell, _failed, _head, _why, origin
-from tailgate.play.metrics import measure
+from tailgate.evaluation.cells import Cell, _failed, _head, _played, _why, origin
 from tailgate.play.trace import episodes_at_once, rollout
 from tailgate.sandbox.isolated import Isolated, IsolatedPlan
 from tailgate.sandbox.limits import FEWEST, Limits, Lost
@@ -29,13 +26,13 @@ from tailgate.sandbox.sandboxed import WHITE
 from tailgate.sandbox.source import Source
 from tailgate.sandbox.table import Seat, order_of, play_together
 
-ROWS = 4096  # rows of a batch at most: beyond that a step gains nothing
-COMPANIONS = 256  # rows that the companions test plays again, at most
+ROWS = 4096  # most rows of a batch; beyond that a step gains nothing
+COMPANIONS = 256  # most rows that the companions test plays again
 
 
 @dataclass(frozen=True)
 class Submission:
-    """Somebody's class as it is played: what is known of it without importing it."""
+    """A submitted class, described without importing it."""
 
     source: Source
     card: dict[str, Any]  # uses, version, reference
@@ -44,46 +41,40 @@ class Submission:
 
     @property
     def entry(self) -> Entry:
-        """As a component of rows."""
+        """The entry of the submission, for the heads of rows."""
         return Entry("defence", self.source.text, object, **{name: self.card[name] for name in ("uses", "version", "reference")})
 
     def isolated(self) -> Isolated:
-        """As a defence."""
+        """Return the submission as a defence."""
         return Isolated(self.source.text, self.source.path, self.limits, self.sandbox)
 
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """A cell as it is played here: its scenario, attack, row head, and what its rows are."""
+    """A cell with its scenario, attack, head of rows, and what its defence uses."""
 
     cell: Cell
     place: Scenario
-    rival: Any
+    attack: Attack
     head: dict[str, Any]
     uses: tuple[str, ...]
 
     def play(self, seeds: Sequence[int], seat: Seat) -> list[dict[str, Any]]:
-        """The rows of some of its seeds, as `evaluation.run_cell` makes them."""
+        """Play some seeds and return their rows, as `evaluation.run_cell` makes them."""
         try:
-            trace = rollout(self.place.loop(seat, self.uses), self.rival, draws.keys(self.cell.purpose, seeds))
-            values = measure(trace)
-        except Exception as error:  # whatever a component raises costs its own rows, and only them
+            keys = draws.keys(self.cell.purpose, seeds)
+            return _played(self.head, seeds, rollout(self.place.loop(seat, self.uses), self.attack, keys))
+        except Exception as error:  # a component may raise anything; only its own rows are lost
             return self.failed(seeds, error)
-        rows = []
-        for i, seed in enumerate(seeds):
-            numbers = {name: None if np.isnan(v[i]) else float(v[i]) for name, v in values.items()}
-            hashes = {"trace_hash": trace.trace_hash(i), "decision_hash": trace.decision_hash(i)}
-            rows.append(self.head | {"seed": seed, "status": "ok", "reason": "", **numbers, **hashes})
-        return rows
 
     def failed(self, seeds: Sequence[int], error: Exception) -> list[dict[str, Any]]:
-        """Rows with the reason only."""
+        """Return rows with the reason only."""
         reason, status = (str(error), "error") if isinstance(error, Lost) else _why(error)
         return _failed(self.head, seeds, reason, status)
 
 
 def identity(cell: Cell, submission: Submission, seeds: Sequence[int], place: Scenario) -> str:
-    """Of everything that decides the rows of a submission's cell."""
+    """Return a hash of everything that determines the rows of a submission's cell."""
     data = dataclasses.asdict(cell) | {"seeds": list(seeds), "digest": submission.source.digest, "scenario": place.config_hash}
     data |= {"attack_digest": Spec("attack", cell.attack).digest, "limits": dataclasses.asdict(submission.limits)}
     sandbox = "" if submission.sandbox is None else submission.sandbox.program
@@ -91,24 +82,25 @@ def identity(cell: Cell, submission: Submission, seeds: Sequence[int], place: Sc
 
 
 def part_of(cell: Cell, submission: Submission, seeds: Sequence[int]) -> _Part:
-    """A cell with its attack made, and the head of its rows; nothing of the submission is imported."""
+    """Return a cell with its attack and the head of its rows, without importing anything of the submission."""
     spec, entry = Spec("attack", cell.attack), submission.entry
-    rival = spec.make()
-    place = cell.place(rival, spec.entry.knowledge)
+    attack = spec.make()
+    place = cell.place(attack, spec.entry.knowledge)
     head = _head(cell, place, entry, spec.entry, "") | {
         "defence_digest": submission.source.digest, "attack_digest": spec.digest, "trained": origin(cell.attack),
         "cell": identity(cell, submission, seeds, place),
         "submission": {"sandbox": "" if submission.sandbox is None else submission.sandbox.program},
     }  # fmt: skip
-    return _Part(cell, place, rival, head, entry.uses)
+    return _Part(cell, place, attack, head, entry.uses)
 
 
 def play_mixed(cells: Sequence[Cell], submission: Submission, seeds: Sequence[int] | None = None) -> list[dict[str, Any]]:
-    """Rows of cells of one scenario, in the order of the cells and of `seeds` (the cells' own where none are given).
+    """Play cells of one scenario; return rows in the order of the cells and of `seeds` (default: the cells' seeds).
 
-    All rows of a batch go through one step of the submission's process, in an order that is drawn anew for each batch and told to
-    nobody; each batch has a fresh process. Afterwards some rows are played again among others (the companions test): a submission
-    whose rows then differ by a bit loses all of them. A lost process costs what it had not finished.
+    All rows of a batch go through one step of the submission's process, in a secret random order.
+    Each batch has a fresh order and a fresh process.
+    Afterwards the companions test plays some rows again among others; a submission whose rows differ by a bit loses all of them.
+    A lost process loses the rows that it had not finished.
     """
     if len({(cell.scenario, cell.first_seed, cell.seeds, cell.purpose, cell.beacon) for cell in cells}) > 1:
         raise InputError("cells", "cells that differ in scenario, seeds, purpose or beacon", "cells of one scenario and the same seeds")
@@ -126,7 +118,7 @@ def play_mixed(cells: Sequence[Cell], submission: Submission, seeds: Sequence[in
         if lost is None:
             played, lost = _play(parts, submission, batch)
             rows |= played
-        for i, some in batch.items():  # at import or in prepare, or in a batch before this one: no later batch would fare better
+        for i, some in batch.items():  # the process failed in this or an earlier batch; later ones would fail too
             if lost is not None and (missing := [seed for seed in some if (i, seed) not in rows]):
                 rows |= _by_seed(i, parts[i].failed(missing, lost))
     _test_companions(parts, submission, rows)
@@ -134,7 +126,7 @@ def play_mixed(cells: Sequence[Cell], submission: Submission, seeds: Sequence[in
 
 
 def play_again(cells: Sequence[tuple[Cell, Sequence[int]]], submission: Submission) -> list[list[dict[str, Any]]]:
-    """Rows of some seeds of each cell, all of one scenario, played side by side: what `verify` compares with somebody's rows."""
+    """Play some seeds of each cell, all of one scenario, together; return their rows, which `verify` compares with others."""
     parts = [part_of(cell, submission, seeds) for cell, seeds in cells]
     rows, lost = _play(parts, submission, {i: list(seeds) for i, (_, seeds) in enumerate(cells)})
     return [
@@ -148,7 +140,7 @@ def _by_seed(i: int, rows: Sequence[dict[str, Any]]) -> dict[tuple[int, int], di
 
 
 def _deal(parts: Sequence[_Part], fit: Sequence[int], seeds: Sequence[int]) -> Iterator[dict[int, list[int]]]:
-    """Batches: the seeds of each cell in it. Cells meet in secret; where the seeds are cut, each cell of a batch has other ones first."""
+    """Yield batches: the seeds of each cell, with cells in a secret order; if the seeds are split, cells begin with different parts."""
     if not fit:
         return
     place = parts[fit[0]].place
@@ -165,7 +157,7 @@ def _deal(parts: Sequence[_Part], fit: Sequence[int], seeds: Sequence[int]) -> I
 def _play(
     parts: Sequence[_Part], submission: Submission, batch: dict[int, list[int]]
 ) -> tuple[dict[tuple[int, int], dict[str, Any]], Exception | None]:
-    """Rows of a batch by cell and seed, and what went wrong with the process as a whole."""
+    """Play a batch; return its rows by cell and seed, and the error of the process as a whole."""
     rows: dict[tuple[int, int], dict[str, Any]] = {}
     with submission.isolated() as defence:
         try:
@@ -179,10 +171,11 @@ def _play(
 
 
 def _test_companions(parts: Sequence[_Part], submission: Submission, rows: dict[tuple[int, int], dict[str, Any]]) -> None:
-    """Play some rows again, among others and in another order; where one differs by a bit, all of them become errors.
+    """Play some rows again among others, in another order; if one differs by a bit, all rows become errors.
 
-    At most half of the rows, chosen in secret, and of different seeds first: two rows of one seed have the same noise, which a
-    submission that compares rows could tell. The process is a fresh one, so that nothing is remembered.
+    The rows are at most half of all, chosen in secret, with different seeds first.
+    Rows of one seed have the same noise, which a submission that compares rows could recognise.
+    The process is a fresh one without memory of the first run.
     """
     good = [key for key, row in rows.items() if row["status"] == "ok"]
     if len(good) < 2:

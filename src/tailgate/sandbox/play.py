@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import hashlib
 from collections.abc import Callable, Generator, Sequence
@@ -14,7 +13,7 @@ from tailgate.base.errors import InputError
 from tailgate.base.pool import each
 from tailgate.core.scenario import Suite, load_suite
 from tailgate.evaluation.cells import Cell, cells_of
-from tailgate.evaluation.resume import Parts
+from tailgate.evaluation.resume import Parts, complete
 from tailgate.sandbox.limits import Limits, Lost
 from tailgate.sandbox.mixed import Submission, part_of, play_mixed
 from tailgate.sandbox.process import Process
@@ -39,17 +38,21 @@ def play_submission(
     episodes: int | None = None,
     purpose: str = "report",
 ) -> Rows:
-    """Rows of a suite for one submission, "module:Class:key=value": one for each scenario, dose, attack and episode.
+    """Play a suite with one submission, "module:Class:key=value"; return a row for each scenario, dose, attack and episode.
 
-    The attacks are the suite's, and those that joined them by its published list.
+    The attacks are the suite's, and those that joined it by its published list.
+    The class is imported only in separate processes, from a copy of its files.
+    With a `beacon`, the seeds are those of its round (`tailgate.evaluation.rounds`); without one they are public: 0, 1, ...
+    A failure costs rows and gives them a reason: a wrong number those of its cell, a lost process those of its scenario.
+    With `out`, an interrupted run resumes after the scenarios that it finished without an error.
 
-    The class is imported in processes of its own only, from a copy of its files. The episodes' seeds are those of the beacon's round
-    (`tailgate.evaluation.rounds`), without one the public ones 0, 1, ..., for development. Whatever goes wrong costs rows, with a reason:
-    those of a cell where a number is wrong, those of a scenario that are not finished where the process is lost. With `out` an
-    interrupted run resumes after the scenarios that it finished without an error. Raises InputError before anything is played.
+    Raises
+    ------
+    InputError
+        An argument is invalid; nothing is played then.
     """
     base = load_suite(suite) if isinstance(suite, str) else suite
-    guard = sandbox_of(sandbox) if isinstance(sandbox, str) else sandbox
+    sandbox = sandbox_of(sandbox) if isinstance(sandbox, str) else sandbox
     count = base.seeds if episodes is None else episodes
     for name, value in (("episodes", count), ("workers", workers)):
         sizes.check(name, value)
@@ -63,11 +66,11 @@ def play_submission(
         held, lost = limits or Limits(), None
         card: dict[str, Any] = {"uses": ("measurements",), "version": 1, "reference": ""}
         try:
-            with Process(source.text, source.path, held, guard) as process:
+            with Process(source.text, source.path, held, sandbox) as process:
                 card = process.card
         except Lost as error:
             lost = error
-        submission = Submission(source, card, held, guard)
+        submission = Submission(source, card, held, sandbox)
         jobs = [[cell for cell in cells if cell.scenario == name] for name in dict.fromkeys(named.scenarios)]
         if lost is not None:
             rows = [row for cell in cells for row in part_of(cell, submission, seeds).failed(seeds, lost)]
@@ -82,25 +85,11 @@ def _run(
     jobs: Sequence[Sequence[Cell]], submission: Submission, seeds: list[int], out: Path | None, workers: int,
     progress: Callable[[int, int], None] | None,
 ) -> Rows:  # fmt: skip
-    """Rows of all jobs, one scenario each, in their order."""
+    """Play all jobs, one scenario each; return their rows in order."""
     ids = [[str(part_of(cell, submission, seeds).head["cell"]) for cell in job] for job in jobs]
     names = [hashlib.blake2b("".join(each).encode(), digest_size=12).hexdigest() for each in ids]
     pieces = {name: [(cell, seed) for cell in cells for seed in seeds] for name, cells in zip(names, ids, strict=True)}
-    with contextlib.nullcontext() if out is None else Parts(out) as parts:
-        done = {} if parts is None else parts.finished(pieces)
-        missing = [i for i, name in enumerate(names) if name not in done]
-        with contextlib.closing(_play([jobs[i] for i in missing], submission, seeds, workers)) as played:
-            for position, rows in played:
-                name = names[missing[position]]
-                done[name] = rows
-                if parts is not None:
-                    parts.put(name, rows)
-                if progress is not None:
-                    progress(len(done), len(jobs))
-        rows = [row for name in names for row in done[name]]
-        if parts is not None:
-            parts.finish(rows, pieces)
-    return rows
+    return complete(names, pieces, out, lambda missing: _play([jobs[i] for i in missing], submission, seeds, workers), progress)
 
 
 def _play(jobs: Sequence[Sequence[Cell]], submission: Submission, seeds: list[int], workers: int) -> Generator[tuple[int, Rows]]:
@@ -108,4 +97,4 @@ def _play(jobs: Sequence[Sequence[Cell]], submission: Submission, seeds: list[in
         for i, job in enumerate(jobs):
             yield i, play_mixed(job, submission, seeds)
         return
-    yield from each(play_mixed, [(job, submission, seeds) for job in jobs], workers)  # guards see when a worker is gone
+    yield from each(play_mixed, [(job, submission, seeds) for job in jobs], workers)  # the guard ends a submission whose worker has died

@@ -1,4 +1,4 @@
-"""Our side of a submission's process: starts the guard, asks, waits no longer than allowed, and reads raw bytes."""
+"""The parent's side of a submission's process: it starts the guard, sends requests, limits waiting, and reads raw bytes."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ from tailgate.sandbox.wire import LINE, Outputs, line, pack, printable
 
 _GUARD = Path(__file__).with_name("guard.py")
 _ROOT = FOLDER.parent
-_ENDING = 30.0  # [s] that the guard may take to kill everything
+_ENDING = 30.0  # [s] for the guard to kill everything
 
 
 class Verbatim:
-    """A value of which only the text is known."""
+    """A value known only by its text."""
 
     def __init__(self, text: str) -> None:
         self.text = text
@@ -46,7 +46,7 @@ class Process:
 
     def __init__(self, text: str, source: Path | None, limits: Limits, sandbox: Sandbox | None) -> None:
         if sys.platform != "linux":
-            raise InputError("submission", sys.platform, "Linux: elsewhere nothing guards against a submission; use a virtual machine")
+            raise InputError("submission", sys.platform, "Linux: other systems cannot isolate a submission; use a virtual machine")
         self.limits, self.lost, self.waited, self.number, self.buffer = limits, "", 0.0, 0, b""
         self.granted = limits.start_time
         shared = Path("/dev/shm")
@@ -98,15 +98,15 @@ class Process:
         return {"uses": tuple(uses), "version": version, "reference": printable(card.get("reference", ""))}
 
     def grant(self, seconds: float) -> None:
-        """Allow more processor time [s]."""
+        """Grant more processor time [s]."""
         self.granted += seconds
         assert self.guard.stdin is not None
         with suppress(BrokenPipeError):
             self.guard.stdin.write(line({"cpu": self.granted}))
             self.guard.stdin.flush()
 
-    def ask(self, op: str, arrays: Mapping[str, Array] | None = None, **rest: Any) -> dict[str, Any]:
-        """The answer to one request. Raises Lost; InputError and NotApplicable as the submission raised them."""
+    def ask(self, op: str, arrays: Mapping[str, Array] | None = None, **rest: object) -> dict[str, Any]:
+        """Return the answer to one request; raise Lost, or InputError and NotApplicable as the submission raised them."""
         if self.lost:
             raise Lost(self.lost)
         self.number += 1
@@ -128,7 +128,7 @@ class Process:
             if not isinstance(answer, dict) or answer.get("id") != self.number:
                 raise ValueError
         except (ValueError, RecursionError):
-            self.lose("answer: not the line of JSON that was asked for")
+            self.lose("answer: not the requested line of JSON")
         error, ok = answer.get("error"), answer.get("ok")
         if isinstance(error, dict):
             self._raise({str(key): printable(value) for key, value in error.items()})
@@ -137,7 +137,7 @@ class Process:
         return dict(ok)
 
     def _raise(self, error: dict[str, str]) -> None:
-        """The child's error as ours; it ends the process."""
+        """Raise the child's error here; it ends the process."""
         kind, text = error.get("kind", "Exception"), error.get("text", "")
         self.lost = f"{kind}: {text}"
         self.close()
@@ -147,10 +147,10 @@ class Process:
         raise Lost(self.lost)
 
     def _line(self, more: float) -> bytes:
-        """The next line of the child, waited for as long as the limits allow, and `more` [s]."""
+        """Return the child's next line; wait as long as the limits allow, and `more` [s]."""
         assert self.guard.stdout is not None
         began, report = time.monotonic(), self.guard.stdout.fileno()
-        allowed = self.limits.silence + self.granted - self.waited  # a sleeper's steps must not add up to days
+        allowed = self.limits.silence + self.granted - self.waited  # many slow steps must not add up to days
         wait = min(self.limits.silence + more, allowed)
         while b"\n" not in self.buffer:
             left = wait - (time.monotonic() - began)
@@ -174,17 +174,17 @@ class Process:
         return found
 
     def _report(self) -> str:
-        """Why the guard ended it."""
+        """Return why the guard ended the process."""
         assert self.guard.stdin is not None and self.guard.stdout is not None
         why, printed = "", ""
         ready, _, _ = select.select([self.guard.stdout], [], [], 2.0)
-        if not ready:  # the child closed its pipe and lives on
+        if not ready:  # the child closed its pipe but still runs
             why = "it closed its pipe"
         else:
             with suppress(ValueError, KeyError, TypeError):
                 found = json.loads(self.guard.stdout.readline())
                 why, printed = str(found["why"]), printable(" ".join(found["printed"].split())[-160:])
-        return (why or "the process that watched it ended") + (f"; printed last: {printed}" if printed else "")
+        return (why or "the guard process ended") + (f"; printed last: {printed}" if printed else "")
 
     def lose(self, reason: str) -> None:
         """End the process for this reason."""
@@ -193,20 +193,20 @@ class Process:
         raise Lost(reason)
 
     def make_room(self, outputs: Outputs) -> None:
-        """Let the file `out` be at least as long as a step's results."""
+        """Extend the file `out` to the size of a step's results."""
         if not self.lost and os.fstat(self.out).st_size < outputs.size:
             os.ftruncate(self.out, outputs.size)
 
     def read(self, outputs: Outputs) -> dict[str, Array]:
-        """What the child put into the file `out`; our own copies, of the types and shapes that we expect there."""
+        """Read the child's results from the file `out`, as copies of the expected types and shapes."""
         block = os.pread(self.out, outputs.size, 0)
         if len(block) != outputs.size:
-            self.lose("answer: the file of results was cut")
+            self.lose("answer: the file of results is truncated")
         found = {name: np.array(view, order="K") for name, view in outputs.views(block).items()}
         return found | {name: found[name] != 0 for name in ("alarm", "probe")}
 
     def close(self) -> None:
-        """End every process of the submission and remove what it wrote; returns when nothing is left."""
+        """End every process of the submission and remove its files; return when nothing is left."""
         self.lost = self.lost or "it was closed"
         guard = getattr(self, "guard", None)
         if guard is not None and guard.stdin is not None and not guard.stdin.closed:
@@ -224,8 +224,8 @@ class Process:
         for path in (self.scratch, self.folder):
             shutil.rmtree(path, ignore_errors=True)
 
-    def __deepcopy__(self, memo: Any) -> Process:
-        return self  # a process cannot be copied, and a plan that holds it is shared
+    def __deepcopy__(self, memo: object) -> Process:
+        return self  # a process cannot be copied; plans share it
 
     def __enter__(self) -> Process:
         return self
@@ -239,7 +239,7 @@ class Process:
 
 
 def _environment(home: str, root: str) -> dict[str, str]:
-    """What a submission's process knows of ours: one thread for each library, a scratch directory as home, no variable of the user's."""
+    """Return the environment of a submission's process: one thread per library, a scratch directory as home, no variable of the user."""
     threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
     kept = {name: os.environ[name] for name in ("PATH", "LD_LIBRARY_PATH") if name in os.environ}
     own = {"HOME": home, "TMPDIR": home, "PYTHONPATH": root, "PYTHONHASHSEED": "0", "LANG": "C.UTF-8"}

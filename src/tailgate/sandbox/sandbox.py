@@ -1,4 +1,4 @@
-"""The command in front of a stranger's process: bubblewrap or a container. Without one a submission runs with the user's rights."""
+"""The sandbox command of a submission's process: bubblewrap or a container. Without one it runs with the user's rights."""
 
 from __future__ import annotations
 
@@ -18,26 +18,26 @@ from tailgate.engine.objects import folder as kept_objects
 from tailgate.sandbox.limits import Limits
 
 Program = Literal["bwrap", "docker"]
-HOME = "/scratch"  # where a sandboxed submission works
+HOME = "/scratch"  # working directory of a sandboxed submission
 _SYSTEM = ("/usr", "/bin", "/lib", "/lib32", "/lib64", "/etc/ld.so.cache", "/etc/alternatives")
 
 
 @dataclass(frozen=True)
 class Sandbox:
-    """What stands between a stranger's process and this machine."""
+    """The barrier between a submission's process and this machine."""
 
     program: Program = param("bwrap", "bwrap (bubblewrap), or docker")
-    image: str = param("tailgate", "docker: name of an image whose python imports this very version of tailgate")
+    image: str = param("tailgate", "docker: name of an image with this version of tailgate")
 
     @property
     def processes(self) -> int:
-        """Processes of the sandbox itself, which count among those that the guard sees."""
+        """Number of the sandbox's own processes, which the guard counts too."""
         return 3
 
     def command(
         self, module: Sequence[str], folder: Path, source: Path | None, environment: dict[str, str], limits: Limits
     ) -> tuple[list[str], list[str]]:
-        """The command that runs `python MODULE` inside, and the one that removes what it leaves behind (empty: nothing).
+        """Return the command that runs `python MODULE` inside, and the one that cleans up afterwards (empty: none).
 
         `folder` holds the exchanged files, `source` the submission.
         """
@@ -49,12 +49,12 @@ class Sandbox:
         return [*docker(name, folder, source, environment, limits), self.image, "python", *module], ["docker", "rm", "--force", name]
 
     def outside(self, environment: dict[str, str]) -> dict[str, str] | None:
-        """Variables of the sandbox's own process: bwrap hands on all it has; a container's client inherits ours (None): its engine."""
+        """Return the environment of the sandbox program: bwrap passes it on; a container's client keeps the user's (None)."""
         return environment if self.program == "bwrap" else None
 
 
 def sandbox_of(text: str | None) -> Sandbox | None:
-    """A sandbox by its name: bwrap, docker, docker:IMAGE; none for an empty one. Raises InputError for one that is not installed."""
+    """Return a sandbox by name (bwrap, docker, docker:IMAGE), or None for an empty one; raise InputError if it is not installed."""
     if not text:
         return None
     program, _, image = text.partition(":")
@@ -66,7 +66,7 @@ def sandbox_of(text: str | None) -> Sandbox | None:
 
 
 def bwrap(folder: Path, source: Path | None, limits: Limits) -> list[str]:
-    """bubblewrap: new namespaces of every kind, so no network and no other process; what is bound can only be read, but for `out`."""
+    """Return bubblewrap's command: new namespaces, so no network and no other process; all but `out` is read-only."""
     package = FOLDER
     parts = [package, *(path.resolve() for path in package.iterdir() if path.is_symlink())]
     prefixes = dict.fromkeys(str(Path(path)) for path in (sys.prefix, sys.base_prefix, *map(str, parts)))
@@ -79,7 +79,7 @@ def bwrap(folder: Path, source: Path | None, limits: Limits) -> list[str]:
     for prefix in prefixes:
         if not any(prefix == path or prefix.startswith(f"{path}/") for path in _SYSTEM):
             out += ["--ro-bind", prefix, prefix]
-    if objects := kept_objects():  # machine code of products and inverses, to be read
+    if objects := kept_objects():  # machine code of products and inverses, read-only
         out += ["--ro-bind", str(objects), f"{HOME}/.cache/tailgate/objects"]
     out += ["--ro-bind", str(folder / "in"), str(folder / "in"), "--bind", str(folder / "out"), str(folder / "out")]
     if source is not None:
@@ -88,13 +88,13 @@ def bwrap(folder: Path, source: Path | None, limits: Limits) -> list[str]:
 
 
 def docker(name: str, folder: Path, source: Path | None, environment: dict[str, str], limits: Limits) -> list[str]:
-    """A container without network, capabilities or new privileges, under this user's number. It has a python and tailgate of its own."""
+    """Return docker's command: no network, capabilities or new privileges, this user's id, the image's python and tailgate."""
     out = ["docker", "run", "--rm", "--interactive", "--init", "--pull", "never", "--name", name, "--network", "none", "--cap-drop", "ALL"]
     out += ["--security-opt", "no-new-privileges", "--ipc", "none", "--user", f"{os.getuid()}:{os.getgid()}"]
     out += ["--pids-limit", str(32 + limits.processes), "--memory", str(limits.memory), "--memory-swap", str(limits.memory)]
     out += ["--tmpfs", f"{HOME}:rw,mode=1777,size={limits.file_size}", "--workdir", HOME]
     for key, value in environment.items():
-        if key not in ("PATH", "LD_LIBRARY_PATH", "PYTHONPATH"):  # the image's own
+        if key not in ("PATH", "LD_LIBRARY_PATH", "PYTHONPATH"):  # the image has its own
             out += ["--env", f"{key}={value}"]
     out += ["--volume", f"{folder / 'in'}:{folder / 'in'}:ro", "--volume", f"{folder / 'out'}:{folder / 'out'}:rw"]
     if source is not None:

@@ -1,7 +1,7 @@
-"""`bwrap/module:Class` as a defence on any command line: somebody else's class, imported in a sandbox and nowhere else.
+"""The defence `bwrap/module:Class`: a submitted class that is imported only in a sandbox, on any command line.
 
-So it can be trained against, evaluated and replayed like any other. A board takes the rows of
-`play_submission` only, in which its episodes are mixed with others in secret.
+It can be trained against, evaluated and replayed like any other defence.
+A board takes only the rows of `play_submission`, which mixes its episodes with others in secret.
 """
 
 from __future__ import annotations
@@ -25,40 +25,40 @@ WHITE = "a submission's state stays in its own process: white-box attacks cannot
 
 @functools.lru_cache(maxsize=64)
 def entry_of(program: str, text: str) -> Entry:
-    """The entry of a class, as a process in the sandbox tells it. Raises Lost where that fails."""
+    """Return the entry of a class from a process in the sandbox; raise Lost if that fails."""
     with staged(text) as source, Process(source.text, source.path, Limits(), sandbox_of(program)) as process:
         return Entry("defence", f"{program}/{source.text}", Sandboxed, **process.card)
 
 
 def digest_of(text: str) -> str:
-    """Of the files of a class; nothing is imported."""
+    """Return the digest of a class's files, without importing them."""
     with staged(text) as source:
         return source.digest
 
 
 @dataclass(frozen=True)
 class Sandboxed:
-    """A class that somebody else wrote. Each plan has a process of its own, which ends with the plan."""
+    """A submitted class. Each plan has a separate process, which ends with the plan."""
 
     program: str
     text: str
     limits: Limits = field(default_factory=Limits)
-    opaque = WHITE  # why nobody looks ahead through it
+    opaque = WHITE  # why attacks cannot look ahead through it
 
     def prepare(self, model: Model) -> IsolatedPlan:
-        """A fresh process in the sandbox with the class imported and its constants made."""
+        """Start a process in the sandbox, import the class, and prepare its constants."""
         with contextlib.ExitStack() as stack:
             source = stack.enter_context(staged(self.text))
             plan = Isolated(source.text, source.path, self.limits, sandbox_of(self.program)).prepare(model)
-            weakref.finalize(plan, stack.pop_all().close)  # the process ends with the plan, and its files go
+            weakref.finalize(plan, stack.pop_all().close)  # ends the process and removes its files with the plan
         return plan
 
     def start(self, plan: IsolatedPlan, prior: Prior) -> Tickets:
-        """States of B episodes."""
+        """Start B episodes."""
         return self._isolated.start(plan, prior)
 
     def step(self, plan: IsolatedPlan, state: Tickets, received: Received, known_u: Array, draws: Draws) -> tuple[Tickets, Estimate]:
-        """One step of B episodes, its outputs checked."""
+        """Play one step of B episodes and check its outputs."""
         return self._isolated.step(plan, state, received, known_u, draws)
 
     @property

@@ -1,4 +1,4 @@
-"""What is played: a copy of the submission's files, and its digest."""
+"""A copy of a submission's files, from which it is played, and its digest."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from pathlib import Path
 from tailgate.base.errors import InputError
 from tailgate.core.registry import split_text
 
-LARGEST = 2**30  # [bytes] of a submission, weights included
+LARGEST = 2**30  # [bytes] of a submission with its weights
 _LEFT_OUT = ("__pycache__", ".git")
 
 
 @dataclass(frozen=True)
 class Source:
-    """A submission's text as module:Class, its digest, and the directory from which it is imported; none of what is built in."""
+    """A submission as module:Class, its digest, and the directory from which it is imported; None for built-in classes."""
 
     text: str
     digest: str
@@ -29,7 +29,7 @@ class Source:
 
 
 def named(text: str) -> str:
-    """The text with an entry point's name replaced by its module:Class. Nothing is imported."""
+    """Return the text with an entry point's name replaced by its module:Class, without importing it."""
     head, tail = split_text(text)
     if ":" not in head:
         found = list(entry_points(group="tailgate.estimators", name=head))
@@ -43,7 +43,7 @@ def named(text: str) -> str:
 
 
 def _files(module: str) -> tuple[Path, list[Path], bool]:
-    """Where the top-level module of a name lies, its files, and whether it is a package with all that is in it. Nothing is imported."""
+    """Return the folder and files of a top-level module, and True if it is a package, without importing it."""
     top = module.partition(".")[0]
     try:
         spec = importlib.util.find_spec(top)
@@ -61,21 +61,21 @@ def _files(module: str) -> tuple[Path, list[Path], bool]:
         raise InputError("submission", module, "a module that is a file or a folder")
     for path in files:
         if path.is_symlink():
-            raise InputError("submission", str(path), "a file: links are not followed, what is played is what was hashed")
+            raise InputError("submission", str(path), "a file: links are not followed, so that the played files are the hashed ones")
     if (size := sum(path.stat().st_size for path in files)) > LARGEST:
         raise InputError("submission", f"{size} bytes", f"at most {LARGEST} bytes in {root}")
     return root, files, bool(spec.submodule_search_locations)
 
 
 def digest_of(module: str) -> str:
-    """SHA-256 of a module's source, names and contents: its one file, or every file of the top-level package. Nothing is imported."""
+    """Return the SHA-256 of names and contents of a module's one file or a package's files, without importing it."""
     root, files, _ = _files(module)
     return _digest(root, files)
 
 
 def digest_of_file(module: str, path: Path) -> str:
-    """The same of a module that is the file at this path and no package; else empty."""
-    with contextlib.suppress(InputError):  # what cannot be handed in
+    """Return the digest of a module that consists of the file at this path alone; else empty."""
+    with contextlib.suppress(InputError):  # not a valid submission
         root, files, package = _files(module)
         if not package and files == [path.resolve()]:
             return _digest(root, files)
@@ -92,9 +92,9 @@ def _digest(root: Path, files: list[Path]) -> str:
 
 @contextlib.contextmanager
 def staged(text: str) -> Iterator[Source]:
-    """The submission copied to a directory of its own: what was hashed is what is imported, and nothing beside it. Removed afterwards.
+    """Copy the submission to a temporary directory, so that exactly the hashed files can be imported.
 
-    What tailgate itself holds is played where it lies; its version stands for it, as in every row.
+    Classes of tailgate are imported in place; the version identifies them, as in every row.
     """
     text = named(text)
     module = text.partition(":")[0]

@@ -1,6 +1,6 @@
-"""Several rollouts at one table: each waits with its rows until all have handed in theirs, and one step of the defence serves them all.
+"""Several rollouts that share one defence: each waits until all have handed in their rows; one step of the defence serves all.
 
-Rollouts are ordinary ones, in threads of which only one ever runs. Nothing is computed side by side, so nothing depends on who is first.
+Rollouts run in threads, only one of them at a time, so that no result depends on timing.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from tailgate.core import Array, Estimate, Model, Prior, Received
 from tailgate.core.draws import Draws
 from tailgate.sandbox.isolated import Isolated, IsolatedPlan
 
-_STOPPING = 60.0  # [s] that a rollout may take to notice that the table is closed
+_STOPPING = 60.0  # [s] for a rollout to notice that it must stop
 
 
 class _Stopped(BaseException):
-    """The table is closed: unwinds a rollout, which catches every Exception."""
+    """Unwinds a rollout, which catches every Exception."""
 
 
 class _Hand(NamedTuple):
-    """What a rollout hands in for one step."""
+    """The inputs of one step from one rollout."""
 
     received: Received
     known_u: Array
@@ -38,14 +38,14 @@ class _Hand(NamedTuple):
 class Seat:
     """The defence as one rollout sees it."""
 
-    untraced = "its steps wait for other rollouts"  # which would wait for the end of the tracing
+    untraced = "its steps wait for other rollouts"  # which would wait for the end of tracing
 
     def __init__(self, model: Model, work: Callable[[Seat], Any]) -> None:
         self.model, self.work = model, work
         self.prior: Prior | None = None
         self.hand: _Hand | None = None
         self.answer: Estimate | BaseException | None = None
-        self.result: Any = None
+        self.result: object = None
         self.done = False
         self.fault: BaseException | None = None
         self._go, self._back = threading.Semaphore(0), threading.Semaphore(0)
@@ -53,16 +53,16 @@ class Seat:
         self._thread.start()
 
     def prepare(self, model: Model) -> None:
-        """Nothing: the process has its plan, of this very model."""
+        """Check the model; the process already has its plan."""
         if _fingerprint(model) != _fingerprint(self.model):
             raise InputError("cells", "cells of several models", "cells of one scenario")
 
     def start(self, plan: None, prior: Prior) -> None:
-        """Keeps the prior until all are seated."""
+        """Keep the prior until all rollouts have started."""
         self.prior = prior
 
     def step(self, plan: None, state: None, received: Received, known_u: Array, draws: Draws) -> tuple[None, Estimate]:
-        """Hands the rows in, and waits for the estimate."""
+        """Hand in the rows and wait for the estimate."""
         self.hand = _Hand(received, known_u, draws)
         self._back.release()
         self._go.acquire()
@@ -82,7 +82,7 @@ class Seat:
         self._back.release()
 
     def play_on(self, answer: Estimate | BaseException | None) -> None:
-        """Let the rollout run with this answer to its next step, or to its end."""
+        """Run the rollout with this answer to its next step or its end."""
         self.answer = answer
         self._go.release()
         self._back.acquire()
@@ -96,7 +96,7 @@ class Seat:
 
 
 def play_together(defence: Isolated, plan: IsolatedPlan, works: Sequence[Callable[[Seat], Any]], secret: bytes) -> list[Any]:
-    """What each piece of work returns, all played against one process of the defence, their rows in an order that `secret` decides.
+    """Play all pieces of work against one process of the defence; return their results. `secret` decides the order of rows.
 
     A rollout that ends early stays with its last rows, so that the batch never changes; its answers are dropped.
     """
@@ -117,7 +117,7 @@ def play_together(defence: Isolated, plan: IsolatedPlan, works: Sequence[Callabl
 
 
 def _serve(defence: Isolated, plan: IsolatedPlan, seats: list[Seat], secret: bytes) -> None:
-    """Step after step, until every rollout is done."""
+    """Play steps until every rollout has ended."""
     sizes = [len(seat.hand.known_u) for seat in seats if seat.hand is not None]
     order = order_of(secret, sum(sizes))
     places = np.split(order, np.cumsum(sizes)[:-1])
@@ -143,20 +143,20 @@ def _serve(defence: Isolated, plan: IsolatedPlan, seats: list[Seat], secret: byt
 
 
 def _dismiss(seats: list[Seat], error: Exception) -> None:
-    """The defence failed: each rollout that is not done gets the error as the answer to its step."""
+    """Answer the steps of all running rollouts with the error of the defence."""
     for seat in seats:
         if not seat.done:
             seat.play_on(error)
 
 
 def order_of(secret: bytes, count: int) -> Array:
-    """A permutation of `count` rows that only who has the secret can make."""
+    """Return a permutation of `count` rows that only the owner of the secret can compute."""
     keys = [hashlib.blake2b(row.to_bytes(8, "little"), key=secret, digest_size=16).digest() for row in range(count)]
     return np.array(sorted(range(count), key=keys.__getitem__), np.int64)
 
 
 def _merge(parts: Sequence[Any], places: Sequence[Array]) -> Any:
-    """One tree of the rows of several: those of part i go to places[i]. B is last in memory, as everywhere."""
+    """Merge the rows of several trees: those of part i go to places[i]. B is last in memory."""
     first = parts[0]
     if first is None:
         return None

@@ -1,4 +1,4 @@
-"""Somebody's rows of a submission, played again in the sandbox."""
+"""Rows of a submission, played again in the sandbox."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Row = dict[str, Any]
 
 
 def replay(text: str, groups: Sequence[tuple[Cell, Sequence[int]]]) -> list[list[Row]]:
-    """Rows of the seeds of each cell, for a class in a sandbox, `bwrap/module:Class`, as its files lie here."""
+    """Play the seeds of each cell for a class in a sandbox, `bwrap/module:Class`, with its local files; return the rows."""
     spec = Spec("defence", text)
     assert spec.sandboxed is not None
     program, target = spec.sandboxed

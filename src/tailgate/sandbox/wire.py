@@ -1,7 +1,7 @@
-"""What goes between a submission's process and ours: raw numbers through two files in memory, and one short line of JSON each way.
+"""The exchange with a submission's process: raw numbers in two files in memory, and one short line of JSON each way.
 
-Nothing is ever unpickled. The parent alone says where in the files an array lies, of which type and shape; of what the child answers
-it reads the bytes that it expects there, and a few checked fields of the line.
+Nothing is unpickled. The parent alone decides the place, type and shape of each array in the files.
+Of the child's answer it reads the expected bytes, and a few checked fields of the line.
 """
 
 from __future__ import annotations
@@ -9,13 +9,14 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
+from mmap import mmap
 from typing import Any
 
 import numpy as np
 
 from tailgate.core import Array, Model
 
-LINE = 1 << 14  # [bytes] longest line of JSON
+LINE = 1 << 14  # [bytes] of the longest line of JSON
 _ALIGN = 64
 _MODEL = ("A", "B", "c", "C", "Q", "R", "graph", "gap", "speed")
 _NAMES = ("sensors", "v2v", "actuators")
@@ -23,7 +24,7 @@ Header = list[Any]
 
 
 def pack(arrays: Mapping[str, Array]) -> tuple[Header, bytes]:
-    """Arrays as one block, and the header that `unpack` needs: name, type, shape and order of the axes in memory, which is kept."""
+    """Return arrays as one block, and the header for `unpack`: name, type, shape and order of the axes in memory."""
     header, blocks, at = [], [], 0
     for name, array in arrays.items():
         order = sorted(range(array.ndim), key=lambda axis, a=array: -a.strides[axis])  # type: ignore[misc]
@@ -36,7 +37,7 @@ def pack(arrays: Mapping[str, Array]) -> tuple[Header, bytes]:
 
 
 def unpack(header: Header, block: bytes) -> dict[str, Array]:
-    """The arrays of `pack`. They cannot be written, nor made writable: bytes are theirs."""
+    """Return the arrays of `pack`, permanently read-only."""
     out, at = {}, 0
     for name, kind, shape, order in header:
         dtype = np.dtype(kind)
@@ -48,19 +49,19 @@ def unpack(header: Header, block: bytes) -> dict[str, Array]:
 
 
 def model_arrays(model: Model) -> tuple[dict[str, Array], dict[str, Any]]:
-    """A model's arrays, and the rest of it as JSON."""
+    """Return a model's arrays, and the rest of it as JSON."""
     arrays = {name: np.asarray(getattr(model, name)) for name in _MODEL}
     return arrays, {"dt": model.dt, "challenge": model.challenge} | {name: list(getattr(model, name)) for name in _NAMES}
 
 
 def model_of(arrays: Mapping[str, Array], rest: Mapping[str, Any]) -> Model:
-    """The model of `model_arrays`."""
+    """Return the model of `model_arrays`."""
     fields: dict[str, Any] = {name: arrays[name] for name in _MODEL} | {name: tuple(rest[name]) for name in _NAMES}
     return Model(**fields, dt=rest["dt"], challenge=rest["challenge"])
 
 
 class Outputs:
-    """Where the child puts a step's estimate: fixed places for B rows, B last in memory."""
+    """The layout of a step's estimate in the child's file: fixed places for B rows, B last in memory."""
 
     def __init__(self, batch: int, agents: int, states: int, actuators: int) -> None:
         self.batch, self.agents = batch, agents
@@ -72,13 +73,13 @@ class Outputs:
 
     @property
     def size(self) -> int:
-        """Bytes in all."""
+        """Number of bytes."""
         return sum(math.prod(shape) * np.dtype(kind).itemsize for shape, kind in self.fields.values())
 
-    def views(self, block: Any) -> dict[str, Array]:
-        """Each field as (B, N, ...) on a buffer."""
+    def views(self, block: bytes | mmap) -> dict[str, Array]:
+        """Return each field as (B, N, ...) on a buffer."""
         out, at = {}, 0
-        for name, (shape, kind) in self.fields.items():  # the eight-byte ones come first, so that all are aligned
+        for name, (shape, kind) in self.fields.items():  # eight-byte fields come first, so that all are aligned
             count = math.prod(shape)
             out[name] = np.moveaxis(np.frombuffer(block, kind, count, at).reshape(shape), -1, 0)
             at += count * np.dtype(kind).itemsize
@@ -86,10 +87,10 @@ class Outputs:
 
 
 def line(message: Mapping[str, Any]) -> bytes:
-    """A message as one line."""
+    """Return a message as one line."""
     return json.dumps(message, allow_nan=False).encode() + b"\n"
 
 
 def printable(text: object, most: int = 400) -> str:
-    """Somebody else's text in one line, without control characters."""
+    """Return foreign text in one line, without control characters."""
     return "".join(ch if ch.isprintable() else " " for ch in str(text)[:most]).strip()

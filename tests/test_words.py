@@ -1,0 +1,44 @@
+"""The words of docstrings, comments and messages: plain English, in the rooms that are done (docs/glossary.md)."""
+
+import ast
+import io
+import re
+import tokenize
+from pathlib import Path
+
+import pytest
+
+SOURCE = Path(__file__).parents[1] / "src/tailgate"
+DONE = ("*.py", "base/*.py", "engine/*.py", "play/*.py", "evaluation/*.py", "sandbox/*.py", "replay/*.py")  # grows room by room
+LATER = {"evaluation/verify.py"}
+OPENINGS = re.compile(r"(What|Of|Whose|Whether|Whoever)\b")
+DIALECT = re.compile(r"\b(beside|anew|so many|whoever|told|stands|of (its|his|their) own)\b", re.IGNORECASE)
+WORD = re.compile(r"(?<!\S)[A-Za-z'`-]+[,;:.]*(?!\S)")  # parts of formulas do not count
+MOST = 25  # words in a sentence
+FILES = sorted({str(path.relative_to(SOURCE)) for pattern in DONE for path in SOURCE.glob(pattern)} - LATER)
+
+
+def _docstrings(tree: ast.Module) -> list[tuple[int, str]]:
+    """Return line and text of all docstrings, attribute docstrings included."""
+    bodies = [node.body for node in ast.walk(tree) if isinstance(getattr(node, "body", None), list)]
+    held = [statement.value for body in bodies for statement in body if isinstance(statement, ast.Expr)]
+    return [(value.lineno, value.value) for value in held if isinstance(value, ast.Constant) and isinstance(value.value, str)]
+
+
+def _sentences(text: str) -> list[str]:
+    """Return the sentences of a docstring; indented lines, section entries and list items are not prose."""
+    prose = re.sub(r"(?m)^[ ]*(?:[-*] |\w[\w, ]* : |\S+  +).*$|^ {8,}.*$", "", text)
+    return re.split(r"(?<=[.?!])\s+|\n\s*\n", prose)
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_words_are_plain(name: str) -> None:
+    source = (SOURCE / name).read_text(encoding="utf-8")
+    tree = ast.parse(source)
+    docstrings = _docstrings(tree)
+    comments = [(t.start[0], t.string) for t in tokenize.generate_tokens(io.StringIO(source).readline) if t.type == tokenize.COMMENT]
+    strings = [(n.lineno, n.value) for n in ast.walk(tree) if isinstance(n, ast.Constant) and isinstance(n.value, str) and " " in n.value]
+    found = [(line, f"opens with {at[0]}") for line, text in docstrings if (at := OPENINGS.match(text))]
+    found += [(line, f"says {at[0]!r}") for line, text in [*comments, *strings] if (at := DIALECT.search(text))]
+    long = [(line, part) for line, text in docstrings for part in _sentences(text) if len(WORD.findall(part)) > MOST]
+    assert found + long == [], "plain words: see docs/glossary.md and CONTRIBUTING.md"
