@@ -201,7 +201,7 @@ def test_canonical_text_is_stable(tmp_path):
     assert one == two and str(tmp_path) not in one
     (tmp_path / "two" / "f.csv").write_text("t,v\n0,1\n")
     assert canonical(Sample(path=tmp_path / "two" / "f.csv")) != one
-    assert as_data(GatedKalman(3.0)) == {"class": "tailgate.estimators.detectors.chi_square.GatedKalman", "eta": 3.0, "gain": "varying"}
+    assert as_data(GatedKalman(3.0)) == {"class": "tailgate.estimators.chi_square.GatedKalman", "eta": 3.0, "gain": "varying"}
 
 
 def test_built_values_have_the_declared_types():
