@@ -21,7 +21,6 @@ from tailgate.base.files import writable_directory, write_atomic
 from tailgate.base.reading import load_json
 from tailgate.base.version import VERSION
 
-from . import whole_theorems
 from .claims import Claim, Figure, Report, Table
 
 CHAPTERS = {name: f"tailgate.thesis.{name}" for name in ("ch3", "ch4", "ch5", "ch6", "ch7")}
@@ -32,9 +31,6 @@ def reproduce(chapter: str, seeds: int = 200, tick: Callable[[str], None] = lamb
     check_chapter(chapter)
     check_seeds(seeds)
     report: Report = import_module(CHAPTERS[chapter]).reproduce(seeds, tick, figures)
-    if chapter in whole_theorems.CHAPTERS:
-        tick("theorems without a figure")
-        report.add(whole_theorems.report(chapter, seeds))
     return report
 
 
