@@ -43,7 +43,7 @@ class Line:
 
 
 def repeated(chunk: Callable[[], int]) -> Go:
-    """Calls `chunk`, which returns how much it did, until the seconds are over, at least once: how much in how much processor time.
+    """Call `chunk`, which returns how much it did, until the seconds are over, at least once: how much in how much processor time.
 
     Of this process, all its threads together, so that others on the machine do not count, and nobody gains by a second core.
     """

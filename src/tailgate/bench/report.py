@@ -21,7 +21,7 @@ Record = dict[str, Any]
 
 
 def shown(value: float, unit: str) -> str:
-    """A figure with three digits and its unit."""
+    """Return a figure with three digits and its unit."""
     if unit == RATE:
         for size, letter in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
             if value >= 0.9995 * size:
@@ -45,7 +45,7 @@ def _ratio(value: float) -> str:
 
 
 def figure(target: Record, record: Record, key: str = "value") -> str:
-    """A target's figure, or one end of its interval."""
+    """Return a target's figure, or one end of its interval."""
     if target[key] is None:
         return ""
     if target["right"] is not None:
@@ -54,7 +54,7 @@ def figure(target: Record, record: Record, key: str = "value") -> str:
 
 
 def bound(target: Record, record: Record) -> str:
-    """What is asked."""
+    """Return what is asked."""
     if target["bound"] is None:
         return ""
     unit = record["lines"].get(target["left"], {}).get("unit", NUMBER)
@@ -63,21 +63,21 @@ def bound(target: Record, record: Record) -> str:
 
 
 def verdict(target: Record) -> str:
-    """met, missed, not asked, or why it is not known."""
+    """Return met, missed, nothing if nothing is asked, or why the figure is not known."""
     if target["value"] is None:
         return f"not measured: {target['why']}"
     return "" if target["met"] is None else "met" if target["met"] else "missed"
 
 
 def between(target: Record, record: Record) -> str:
-    """The interval over rounds."""
+    """Return the interval over rounds."""
     if target["value"] is None or target["low"] == target["high"]:
         return ""
     return f"{figure(target, record, 'low')} to {figure(target, record, 'high')}"
 
 
 def print_tables(record: Record, out: Console) -> None:
-    """Lines, then targets, on a console."""
+    """Print lines, then targets, on a console."""
     table = Table(title=f"medians of {record['rounds']} rounds of {record['seconds']:g} s")
     for heading in ("line", "what", "median", "quartiles"):
         table.add_column(heading, overflow="fold")
@@ -108,7 +108,7 @@ def print_tables(record: Record, out: Console) -> None:
 
 
 def page(record: Record, plots: list[str]) -> str:
-    """The record as a page in Markdown, with the names of the plots beside it."""
+    """Return the record as a page in Markdown; `plots` are the names of the pictures in the same folder."""
     machine = record["machine"]
     packages = ", ".join(f"{name} {number}" for name, number in machine["packages"].items())
     load = "" if record["load"] is None else f" The load over the last minute was {record['load'][0]} at the end."
@@ -146,7 +146,7 @@ def plot_name(plot: Record) -> str:
 
 
 def draw(plot: Record) -> bytes:
-    """One scaling as a picture: medians, and quartiles as bars."""
+    """Return one scaling as a picture: medians, and quartiles as bars."""
     from matplotlib.ticker import NullLocator
 
     from tailgate.base.plots import MARKERS, canvas, png
@@ -188,7 +188,7 @@ def check_place(directory: Path, wanted: set[str]) -> None:
 
 
 def write(record: Record, directory: Path) -> tuple[list[Path], str | None]:
-    """The record, its page and its plots; returns the paths, and why there are no plots."""
+    """Return the record, its page and its plots; returns the paths, and why there are no plots."""
     paths, plots, why = [], [], None
     for plot in record["scalings"]:
         if not plot["curves"]:

@@ -30,14 +30,14 @@ LEVEL = 0.95
 
 
 def fitted(values: Array) -> Array:
-    """The monotone regression of means (doses,), all measured on as many episodes."""
+    """Return the monotone regression of means (doses,), all measured on as many episodes."""
     from scipy.optimize import isotonic_regression
 
     return np.asarray(isotonic_regression(values, increasing=True).x)
 
 
 def critical_dose(doses: Array, curve: Array, limit: float) -> float:
-    """Where a monotone curve (doses,), straight between its points, first exceeds the limit [steps]; inf where it never does."""
+    """Return the dose [steps] at which a monotone curve (doses,), straight between its points, first exceeds the limit; inf for never."""
     above = np.flatnonzero(curve > limit)
     if not len(above):
         return math.inf
@@ -49,7 +49,7 @@ def critical_dose(doses: Array, curve: Array, limit: float) -> float:
 
 
 def critical_interval(doses: Array, outcomes: Array, limit: float, seed: int = 0) -> tuple[float, float]:
-    """Interval of the critical dose from outcomes (doses, episodes); inf where it lies beyond the largest dose."""
+    """Return interval of the critical dose from outcomes (doses, episodes); inf where it lies beyond the largest dose."""
     rng = np.random.default_rng(seed)
     episodes = outcomes.shape[1]
     found = np.sort([
@@ -64,7 +64,7 @@ def dose_response(
     threat: dict[str, Any] | None = None, outcome: str | None = None, exceeds: float | None = None, limit: float | None = None,
     purpose: str = "report", workers: int = 1, rows_file: Path | None = None, progress: Callable[[int, int], None] | None = None,
 ) -> dict[str, Any]:  # fmt: skip
-    """The report: a curve for each attack and defence. Dose 0 is no attack.
+    """Return the report: a curve for each attack and defence. Dose 0 is no attack.
 
     outcome: a metric. exceeds: count the episodes in which it exceeds this value, instead of its mean. limit: of the mean or the share that
     makes a dose critical; 0.1 of shares, and none of means.

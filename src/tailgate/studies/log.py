@@ -45,7 +45,7 @@ _MODES = np.array([mode.name.lower() for mode in Mode])
 
 
 def pyarrow() -> tuple[Any, Any]:
-    """pyarrow and pyarrow.parquet."""
+    """Import pyarrow and pyarrow.parquet."""
     try:
         import pyarrow
         import pyarrow.parquet
@@ -101,7 +101,7 @@ def _chosen(
     base: Suite, scenarios: Sequence[str] | None, doses: Sequence[int | None] | None, defences: Sequence[str] | None,
     attacks: Sequence[str] | None,
 ) -> Suite:  # fmt: skip
-    """The part of the suite that is logged, with the episodes without attack."""
+    """Return the part of the suite that is logged, with the episodes without attack."""
     for text in attacks or ():
         if hidden := _hidden(base, text):
             raise InputError("attack", text, f"an attack that {base.name} does not hold out of its logs, as it does {', '.join(hidden)}")
@@ -119,12 +119,12 @@ def _held_out(base: Suite) -> set[str]:
 
 
 def _hidden(base: Suite, text: str) -> list[str]:
-    """The families that the suite holds out and the attack belongs to."""
+    """Return the families that the suite holds out and the attack belongs to."""
     return sorted(families(text) & _held_out(base))
 
 
 def _whole(folder: Path) -> dict[str, Any] | None:
-    """What schema.json holds, which is written last; None where the log is not whole."""
+    """Return what schema.json holds, which is written last; None where the log is not whole."""
     try:
         held: dict[str, Any] = load_json(folder / "schema.json")
         sizes = [(folder / file["path"]).stat().st_size == file["bytes"] for file in held["files"]]
@@ -179,7 +179,7 @@ def _named(cell: Cell) -> dict[str, Any]:
 
 
 def _ready(cell: Cell) -> tuple[Loop, Scenario, Any]:
-    """The loop, the scenario and the attack of a cell. Raises NotApplicable for a pairing without meaning."""
+    """Return the loop, the scenario and the attack of a cell. Raises NotApplicable for a pairing without meaning."""
     guard, rival = Spec("defence", cell.defence), Spec("attack", cell.attack)
     attack = rival.make()
     place = cell.place(attack, rival.entry.knowledge)
@@ -194,7 +194,7 @@ def _schema(columns: Sequence[Column]) -> Any:
 
 
 def _good(part: Path, cell: Cell) -> bool:
-    """Whether the part is whole: Parquet keeps its index, and this the cell, at the end."""
+    """Return whether the part is whole: Parquet keeps its index, and this the cell, at the end."""
     pa, pq = pyarrow()
     try:
         held = pq.ParquetFile(part).schema_arrow.metadata or {}
@@ -204,7 +204,7 @@ def _good(part: Path, cell: Cell) -> bool:
 
 
 def _play_part(part: Path, split: str, cell: Cell, loop: Loop, rival: Any, columns: Sequence[Column]) -> None:
-    """One cell as a Parquet file, a row group for so many episodes as GROUP holds."""
+    """Play one cell into a Parquet file, with a row group for as many episodes as GROUP holds."""
     pa, pq = pyarrow()
     schema, size = _schema(columns), max(1, GROUP // (loop.horizon * loop.model.agents))
     schema = schema.with_metadata({"cell": cell_id(cell)})
@@ -228,7 +228,7 @@ def _array(pa: Any, field: Any, value: Any, count: int) -> Any:
 
 
 def steps(loop: Loop, attack: Any, keys: draws.Keys) -> Iterator[tuple[LoopState, Frame, Array, Array]]:
-    """Each step of B episodes: the state before it, its frame, the innovation (B, N, q), NaN where there is none, and live (B,) bool."""
+    """Yield each step of B episodes: the state before it, its frame, the innovation (B, N, q), NaN if none, and live (B,) bool."""
     state = loop.start(keys)
     plan = attack.prepare(loop.brief)
     memory: Any = attack.start(plan, len(keys.key), keys.at(Role.ATTACK, np.zeros(len(keys.key), np.int64)))
@@ -251,7 +251,7 @@ def _innovation(loop: Loop, state: LoopState, frame: Frame) -> Array:
 
 
 def _table(loop: Loop, attack: Any, keys: draws.Keys, seeds: range) -> dict[str, Array]:
-    """Columns of the episodes: episode by episode, in it step by step, in it agent by agent."""
+    """Return columns of the episodes: episode by episode, in it step by step, in it agent by agent."""
     model, held, alive = loop.model, [], []
     for state, frame, innovation, live in steps(loop, attack, keys):
         held.append(_step(loop, state, frame, innovation))
@@ -270,7 +270,7 @@ def _table(loop: Loop, attack: Any, keys: draws.Keys, seeds: range) -> dict[str,
 
 
 def _step(loop: Loop, state: LoopState, frame: Frame, innovation: Array) -> dict[str, Array]:
-    """(B, N) of every column that changes from step to step."""
+    """Return (B, N) of every column that changes from step to step."""
     model, received, estimate, command = loop.model, frame.received, frame.estimate, frame.command
     sensors, agents = model.sensors, (len(frame.k), model.agents)
     hit = command.target & (command.kind != 0)[:, None, None]
@@ -295,7 +295,7 @@ def _step(loop: Loop, state: LoopState, frame: Frame, innovation: Array) -> dict
 
 
 def _joined(folder: Path, parts: Path, split: str, scenario: str, cells: Sequence[Cell], columns: Sequence[Column]) -> dict[str, Any]:
-    """One file of the parts, row group by row group; what schema.json says of it."""
+    """Return one file of the parts, row group by row group; what schema.json says of it."""
     _, pq = pyarrow()
     path, schema = folder / split / f"{Path(scenario).stem}.parquet", _schema(columns)
     rows = groups = 0

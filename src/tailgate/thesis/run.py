@@ -46,12 +46,12 @@ def check_seeds(seeds: int) -> None:
 
 
 def as_json(report: Report) -> list[dict[str, Any]]:
-    """The claims: id, claim, thesis, measured, holds, why."""
+    """Return the claims: id, claim, thesis, measured, holds, why."""
     return [dataclasses.asdict(claim) for claim in report.claims]
 
 
 def flat(value: Any) -> str:
-    """JSON data as people read it, in one line."""
+    """Return JSON data as people read it, in one line."""
     if isinstance(value, dict):
         if set(value) == {"median", "q25", "q75"}:
             return f"{_number(value['median'])} [{_number(value['q25'])}, {_number(value['q75'])}]"
@@ -74,30 +74,30 @@ def _number(value: float) -> str:
 
 
 def summary(*reports: Report) -> str:
-    """How many claims hold."""
+    """Return how many claims hold."""
     claims = [claim for report in reports for claim in report.claims]
     counts = {verdict: sum(c.holds == verdict for c in claims) for verdict in ("yes", "partly", "no")}
     return f"{len(claims)} claims: {counts['yes']} hold, {counts['partly']} hold partly, {counts['no']} do not"
 
 
 def markdown(report: Report) -> str:
-    """The report as a Markdown text; figures as files beside it."""
+    """Return the report as a Markdown text; figures are files in the same folder."""
     return "\n".join([f"# {report.title}", "", f"{summary(report)}. Tailgate {VERSION}.", "", *body(report)]) + "\n"
 
 
-def body(report: Report, beside: str = "", level: str = "##") -> list[str]:
-    """What stands below the title: settings, claims, tables, figures, whose files are at `beside`."""
+def body(report: Report, folder: str = "", level: str = "##") -> list[str]:
+    """Return what is below the title: settings, claims, tables and figures, whose files are in `folder`."""
     lines = [f"- {key}: {flat(value)}" for key, value in report.settings.items()]
     lines += ["", *rows(("id", "claim", "thesis", "measured", "holds", "why"), [_columns(c) for c in report.claims])]
     for table in report.tables:
         lines += ["", f"{level} {table.title}", "", *rows(table.columns, table.rows)]
     for figure in report.figures:
-        lines += ["", f"![{figure.caption}]({beside}{figure.name}.png)", "", figure.caption]
+        lines += ["", f"![{figure.caption}]({folder}{figure.name}.png)", "", figure.caption]
     return lines
 
 
 def rows(heads: Sequence[str], cells: Iterable[Sequence[str]]) -> list[str]:
-    """A Markdown table."""
+    """Return a Markdown table."""
     return [
         "| " + " | ".join(heads) + " |", "|" + "---|" * len(heads), *("| " + " | ".join(_cell(v) for v in row) + " |" for row in cells),
     ]  # fmt: skip
@@ -112,24 +112,24 @@ def _cell(text: str) -> str:
 
 
 def html(report: Report) -> str:
-    """One self-contained page."""
+    """Return one self-contained page."""
     return page("page.html", report=report, summary=summary(report), version=VERSION)
 
 
 def page(name: str, **values: Any) -> str:
-    """A page from one of the templates."""
+    """Return a page from one of the templates."""
     loader = FunctionLoader(lambda file: files("tailgate.thesis").joinpath(file).read_text(encoding="utf-8"))
     made = Environment(autoescape=True, undefined=StrictUndefined, loader=loader)
     return made.get_template(name).render(flat=flat, prose=prose, base64=lambda figure: base64.b64encode(figure.png).decode(), **values)
 
 
 def prose(text: str) -> Markup:
-    """Text of a report as HTML: what stands between backticks is code."""
+    """Return a text of a report as HTML: text between backticks is code."""
     return Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", str(escape(text))))
 
 
 def write(report: Report, directory: Path, **stamp: Any) -> Path:
-    """report.json, report.md, index.html and a PNG per figure; returns the page. `stamp`: further fields of report.json."""
+    """Write report.json, report.md, index.html and a PNG per figure; return the page. `stamp`: further fields of report.json."""
     writable_directory(directory)
     data = {"chapter": report.chapter, "title": report.title, "version": VERSION, **stamp, "settings": report.settings}
     data |= {"claims": as_json(report), "tables": [dataclasses.asdict(table) for table in report.tables]}
@@ -144,7 +144,7 @@ def write(report: Report, directory: Path, **stamp: Any) -> Path:
 
 
 def read(directory: Path) -> tuple[Report, dict[str, Any]] | None:
-    """The report that stands in a directory, and all fields of its report.json; None where there is none that can be read."""
+    """Return the report in a directory and all fields of its report.json; None if there is none that can be read."""
     try:
         data = load_json(directory / "report.json")
         tables = [Table(t["title"], tuple(t["columns"]), tuple(tuple(row) for row in t["rows"])) for t in data["tables"]]

@@ -56,7 +56,7 @@ class Sweep(NamedTuple):
 
 
 def transfer(plant: String, law: Law, frequency: Array, local: bool = False) -> Array:
-    """V_i / V_0 (W, N), complex, at frequencies (W,) [rad/s]; V_i / V_{i-1} is the ratio of two of them. `local`: without V2V messages."""
+    """Return V_i / V_0 (W, N), complex, at frequencies (W,) [rad/s]. `local`: without V2V messages."""
     A, B, _ = closed_loop(law.gains(plant.hears(), law.headway, local), plant.tau)
     s = 1j * np.asarray(frequency, np.float64)[:, None, None] * np.eye(len(A))
     x = np.linalg.solve(s - A, np.broadcast_to(B[:, None].astype(complex), (len(s), len(B), 1)))[..., 0]
@@ -65,7 +65,7 @@ def transfer(plant: String, law: Law, frequency: Array, local: bool = False) -> 
 
 
 def growth(plant: String, law: Law, local: bool = False) -> float:
-    """The largest real part [1/s] of the closed loop's eigenvalues, the leader's two integrators aside: negative for a stable loop."""
+    """Return the largest real part [1/s] of the closed loop's eigenvalues without the leader's two integrators; below 0: stable."""
     A, _, _ = closed_loop(law.gains(plant.hears(), law.headway, local), plant.tau)
     cars = [slice(2, 3), *(slice(Column.gap(i), Column.gap(i) + PER_CAR) for i in range(1, plant.size[0]))]
     if any(A[car, car.stop :].any() for car in cars):
@@ -75,7 +75,7 @@ def growth(plant: String, law: Law, local: bool = False) -> float:
 
 
 def peak(plant: String, law: Law, local: bool = False) -> Peak:
-    """The supremum over frequency of every car's gain. Raises InputError for a loop that is not stable."""
+    """Return the supremum over frequency of every car's gain. Raises InputError for a loop that is not stable."""
     if growth(plant, law, local) >= 0.0:
         raise InputError(f"law {type(law).__name__}", law, "gains with which the closed loop is stable")
     grid = np.geomspace(SLOWEST, FASTEST, 2000)
@@ -95,7 +95,7 @@ def peak(plant: String, law: Law, local: bool = False) -> Peak:
 
 
 def _maximum(f: Callable[[float], float], low: float, high: float) -> float:
-    """Where f with a single maximum between low and high has it, by golden section."""
+    """Return where f has its only maximum between low and high, by golden section."""
     ratio = (math.sqrt(5.0) - 1.0) / 2.0
     a, b = high - ratio * (high - low), low + ratio * (high - low)
     fa, fb = f(a), f(b)
@@ -122,7 +122,7 @@ def sweep(
     periods: int = 4,
     seeds: int = 1,
 ) -> Sweep:
-    """Gains that are measured in the loop of a scenario, whose manoeuvre a sine of each frequency [rad/s] replaces.
+    """Measure gains in the loop of a scenario, whose manoeuvre a sine of each frequency [rad/s] replaces.
 
     The first `settle` seconds are left out, then `periods` whole periods are taken. Defence and attack act as they do in an evaluation,
     within the scenario's threat model.
@@ -160,7 +160,7 @@ CASES = (  # law, defence, attack, style
 
 
 def figure() -> bytes:
-    """Gains over frequency: of the laws, with and without messages, and measured, under attack too."""
+    """Draw gains over frequency: of the laws, with and without messages, and measured, under attack too."""
     place, w = load_scenario("platoon-v2v-v0"), np.geomspace(0.02, 5.0, 300)
     paper, axes = canvas(11.0, 4.8, 1, 2, sharey=True)
     left, right = axes[0]

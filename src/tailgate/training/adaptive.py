@@ -44,7 +44,7 @@ class Adaptive:
 
 
 def plan_of(suite: Suite) -> Adaptive:
-    """What the suite says of training. Raises InputError where it says nothing, or something that does not exist."""
+    """Return what the suite says of training. Raises InputError where it says nothing, or something that does not exist."""
     where = f"suite {suite.name}: adaptive"
     if not suite.adaptive:
         raise InputError(where, None, "a preset and learners: this suite does not say how to attack a defence")
@@ -64,7 +64,7 @@ def plan_of(suite: Suite) -> Adaptive:
 
 
 def configs_of(suite: Suite, defence: str, out: Path, *, seeds: int | None = None, extra: tuple[str, ...] = ()) -> list[train.TrainConfig]:
-    """One training for each scenario that is trained on, learner and knowledge."""
+    """Return one training for each scenario that is trained on, learner and knowledge."""
     plan = plan_of(suite)
     if seeds is not None:
         sizes.check("seeds", seeds)
@@ -98,12 +98,12 @@ def check_plan(suite: Suite) -> None:
 
 
 def stem(defence: str) -> str:
-    """The text of a defence as the beginning of a file's name."""
+    """Return the text of a defence as the beginning of a file's name."""
     return re.sub(r"[^A-Za-z0-9_.=-]+", "_", defence)
 
 
 def fitting(suite: Suite, config: train.TrainConfig) -> tuple[str, ...]:
-    """The suite's scenarios that show an attacker what the training's does, and let it do as much: where its policies play."""
+    """Return the suite's scenarios that show an attacker what the training's does, and let it do as much: where its policies play."""
     spec = build(ActionSpec, {k: v for k, v in config.environment.items() if k in fields_of(ActionSpec)}, "environment")
 
     def seat(name: str) -> tuple[tuple[str, ...], int]:
@@ -124,7 +124,7 @@ class Asked(NamedTuple):
 
 
 def asked_of(suite: Suite) -> list[Asked]:
-    """Every training that the suite asks for against each defence."""
+    """Return every training that the suite asks for against each defence."""
     out = []
     for config in configs_of(suite, "none", Path("runs")):
         name, key, where = config.name.removeprefix("none-"), train.plan_key(as_data(config)), fitting(suite, config)
@@ -133,12 +133,12 @@ def asked_of(suite: Suite) -> list[Asked]:
 
 
 def policies_of(config: train.TrainConfig) -> list[Path]:
-    """Where a training's policies lie once it is done."""
+    """Return where a training's policies are once it is done."""
     return [config.directory / f"policy-{seed}.json" for seed in train.training_seeds(config)]
 
 
 def train_against(configs: list[train.TrainConfig], progress: Progress) -> list[Path]:
-    """The policies of all trainings, in their order. A finished one is not trained again, and one that was interrupted goes on."""
+    """Return the policies of all trainings, in their order. A finished one is not trained again, and one that was interrupted goes on."""
     runs = []
     for config in configs:
         held = config.directory / "config.json"

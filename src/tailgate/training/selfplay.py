@@ -82,7 +82,7 @@ class GameConfig:
 
 
 def load_config(source: str | None, overrides: list[str], resume: bool = False) -> GameConfig:
-    """A preset by name or YAML file (default: selfplay) with `key=value` overrides; with `resume` the run's own configuration."""
+    """Return a preset by name or YAML file (default: selfplay) with `key=value` overrides; with `resume` the run's own configuration."""
     path = config_path("games", source or "selfplay", "config")
     config = _checked(override(read_yaml(path, "config"), overrides, GameConfig))
     if not resume:
@@ -91,7 +91,7 @@ def load_config(source: str | None, overrides: list[str], resume: bool = False) 
 
 
 def _started(held: Path) -> dict[str, Any]:
-    """The configuration that a run was started with."""
+    """Return the configuration that a run was started with."""
     try:
         started: dict[str, Any] = load_json(held, strict=False)
         del started["class"]
@@ -116,7 +116,7 @@ def _checked(data: dict[str, Any]) -> GameConfig:
 
 
 def _seat_of(config: GameConfig) -> dict[str, Any]:
-    """Arguments of the attacker's environment, checked as those of a training are."""
+    """Return arguments of the attacker's environment, checked as those of a training are."""
     names = ("scenario", "defence", "threat", "environment")
     return environment_of(TrainConfig(**{name: getattr(config, name) for name in names}))
 
@@ -151,7 +151,7 @@ class Game:
             self.held = held.pop_all()
 
     def _keep(self, resume: bool) -> None:
-        """Writes the configuration, or raises InputError when the run that is resumed had another one."""
+        """Write the configuration, or raises InputError when the run that is resumed had another one."""
         held, now = self.directory / "config.json", as_data(self.config)
         if resume and held.is_file():
             before, free = _started(held), ("class", "rounds", "episodes", "fresh", "rivals")
@@ -184,7 +184,7 @@ class Game:
         return self._report({AS_IS: self._guard(), FIXED: fixed, TRAINED: frozen}, attackers, fresh, other, setting)
 
     def _guard(self, **who: Any) -> Steered:
-        """The defence in certain hands: a policy's, or those of a fixed setting."""
+        """Return the defence in certain hands: a policy's, or those of a fixed setting."""
         return dataclasses.replace(self.duel.guard, **who)
 
     def _as_it_is(self) -> Path:
@@ -209,7 +209,7 @@ class Game:
         return self._train(f"defender-{r}", lambda: Learner(seed, self.config.gamma, self.defender, self.duel, attacks), facts)
 
     def _train(self, name: str, make: Callable[[], Any], facts: dict[str, Any]) -> Path:
-        """A member of the pools: trained now, unless it was with these facts, the digests of its opponents among them."""
+        """Train a member of the pools, unless it was trained with these facts, the digests of its opponents among them."""
         path, steps = self.directory / name, self.config.steps
         if _finished(path.with_suffix(".json"), facts):
             return path.with_suffix(".json")
@@ -232,7 +232,7 @@ class Game:
     # -- measuring
 
     def _best_setting(self, attacks: tuple[Attack, ...]) -> int:
-        """The setting that pays best when held throughout, against self-play's attackers in equal shares on select seeds."""
+        """Return the setting that pays best when held throughout, against self-play's attackers in equal shares on select seeds."""
         count = len(self.duel.settings)
         paid = np.zeros(count)
         chunk = max(1, BATCH // SELECT_EPISODES)
@@ -247,7 +247,7 @@ class Game:
         return int(np.argmax(paid))
 
     def _play(self, guard: Steered, attack: Attack, purpose: str, episodes: int) -> Played:
-        """The first episodes of a pair on seeds of a purpose."""
+        """Return the first episodes of a pair on seeds of a purpose."""
         seat = dataclasses.replace(self.duel.seat, loop=dataclasses.replace(self.duel.seat.loop, defence=guard))
         duel = dataclasses.replace(self.duel, seat=seat, guard=guard)
         parts = [play(duel, attack, draws.keys(purpose, range(at, min(at + BATCH, episodes)))) for at in range(0, episodes, BATCH)]
@@ -255,7 +255,7 @@ class Game:
         return Played(paid, crashed, cost, sum(part.decisions for part in parts))
 
     def _table(self, guards: dict[str, Steered], attacks: dict[str, Attack]) -> tuple[list[dict[str, Any]], Crashed]:
-        """Every defender against every attack on report seeds: the rows of the table, and who crashed in which episode."""
+        """Return every defender against every attack on report seeds: the rows of the table, and who crashed in which episode."""
         table: list[dict[str, Any]] = []
         crashed: Crashed = {}
         total = len(guards) * len(attacks)
@@ -267,7 +267,7 @@ class Game:
         return table, crashed
 
     def _select(self, guard: str, defence: Steered, attacks: dict[str, Attack]) -> dict[str, Interval]:
-        """The collisions of each attack on select seeds."""
+        """Return the collisions of each attack on select seeds."""
         shares = {}
         for name, attack in attacks.items():
             shares[name] = _share(self._play(defence, attack, "select", SELECT_EPISODES).crashed)
@@ -309,12 +309,12 @@ class Game:
 
 
 def _share(crashed: Array) -> Interval:
-    """Share of the episodes (B,) with a collision."""
+    """Return share of the episodes (B,) with a collision."""
     return proportion(int(np.count_nonzero(crashed)), len(crashed))
 
 
 def _finished(path: Path, facts: dict[str, Any]) -> bool:
-    """Whether a policy lies there whose record holds these facts."""
+    """Return whether a policy lies there whose record holds these facts."""
     if not path.is_file():
         return False
     try:
@@ -325,7 +325,7 @@ def _finished(path: Path, facts: dict[str, Any]) -> bool:
 
 
 def parameters() -> list[dict[str, Any]]:
-    """Every field of the configuration with default and sentence, for --help."""
+    """Return every field of the configuration with default and sentence, for --help."""
     return [
         {"name": f.name, "default": as_data(f.default if f.default is not dataclasses.MISSING else {}), "doc": f.metadata.get("doc", "")}
         for f in dataclasses.fields(GameConfig)

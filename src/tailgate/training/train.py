@@ -81,7 +81,7 @@ class TrainConfig:
 
 
 def load_config(source: str | None, overrides: list[str], resume: bool = False) -> TrainConfig:
-    """A preset by name or YAML file (default: quickstart) with `key=value` overrides.
+    """Return a preset by name or YAML file (default: quickstart) with `key=value` overrides.
 
     With `resume` the configuration that the run of this name was started with takes the preset's place.
     """
@@ -101,7 +101,7 @@ def load_config(source: str | None, overrides: list[str], resume: bool = False) 
 
 
 def _preset(source: str) -> dict[str, Any]:
-    """The fields of a preset; those of its `base`, another preset, where it does not have them. A field is replaced as a whole."""
+    """Return the fields of a preset; those of its `base`, another preset, where it does not have them. A field is replaced as a whole."""
     data = read_yaml(config_path(".", source, "config"), "config")
     base = data.pop("base", None)
     if base is None:
@@ -113,7 +113,7 @@ def _preset(source: str) -> dict[str, Any]:
 
 
 def checked(data: dict[str, Any]) -> TrainConfig:
-    """A configuration from JSON data. Raises InputError for a field that makes no sense, and for one that names code to import."""
+    """Return a configuration from JSON data. Raises InputError for a field that makes no sense, and for one that names code to import."""
     for key in ("threat", "environment", *LEARNERS):
         if not isinstance(data.get(key, {}), dict):
             raise InputError(f"config.{key}", data[key], "a mapping of fields")
@@ -133,7 +133,7 @@ def checked(data: dict[str, Any]) -> TrainConfig:
 
 
 def environment_of(config: TrainConfig) -> dict[str, Any]:
-    """Arguments of the adversary environment."""
+    """Return arguments of the adversary environment."""
     for key in config.environment:
         if key not in ENVIRONMENT:  # the scenario, the defence, the threat model and gamma have a field of their own
             raise unknown("config.environment: unknown field", key, ENVIRONMENT)
@@ -141,14 +141,14 @@ def environment_of(config: TrainConfig) -> dict[str, Any]:
 
 
 def outcome_of(config: TrainConfig) -> str:
-    """The metric that the comparison counts."""
+    """Return the metric that the comparison counts."""
     if config.outcome is not None:
         return config.outcome
     return "crashed" if load_scenario(config.scenario).brief().model.followers.any() else "rmse_position"
 
 
 def check(config: TrainConfig) -> None:
-    """Everything that a run will need, tried before anything is written: a typing error shall not cost an hour."""
+    """Try everything that a run will need before anything is written: a typing error shall not cost an hour."""
     settings = _settings(config)
     for name in LEARNERS.keys() - {config.learner}:  # a typing error there as well, where that learner is installed
         with contextlib.suppress(ImportError):
@@ -195,18 +195,18 @@ def _check_teacher(config: TrainConfig, seat: Seat) -> None:
 
 
 def suite_of(config: TrainConfig, attacks: tuple[str, ...]) -> Suite:
-    """The final comparison, with these attacks."""
+    """Return the final comparison, with these attacks."""
     defences = tuple(dict.fromkeys((config.defence, *config.others)))  # each once
     return Suite(config.name, "", (config.scenario,), (None,), defences, attacks, config.episodes)
 
 
 def rivals_of(config: TrainConfig) -> Suite:
-    """The scripts against the defence, on as many episodes as a choice needs."""
+    """Return the scripts against the defence, on as many episodes as a choice needs."""
     return Suite(config.name, "", (config.scenario,), (None,), (config.defence,), config.rivals, config.select_episodes)
 
 
 def _teacher(config: TrainConfig, chosen: dict[str, str | None]) -> str | None:
-    """The script that the learner is shown; `best` is chosen on tune seeds, once for all learners that are asked the same (chosen)."""
+    """Return the script that the learner is shown; `best` is chosen on tune seeds, once for all that ask the same (chosen)."""
     if config.teacher != "best":
         return config.teacher
     rivals = dataclasses.replace(rivals_of(config), name="rivals")
@@ -225,7 +225,7 @@ def train(config: TrainConfig, progress: Callable[[int, Any], None], resume: boo
 def train_together(
     runs: Sequence[tuple[TrainConfig, bool]], progress: Callable[[TrainConfig, int, Progress], None], workers: int
 ) -> list[list[Path]]:
-    """The policies of several runs, a list for each; their seeds share the workers. A run comes with whether it is resumed.
+    """Train the policies of several runs, a list for each; their seeds share the workers. A run comes with whether it is resumed.
 
     Nothing is written before all runs are known to make sense, nor of a run before its turn comes.
     """
@@ -259,12 +259,12 @@ def _together(
 
 
 def training_seeds(config: TrainConfig) -> range:
-    """The training seeds of a run."""
+    """Return the training seeds of a run."""
     return range(config.first_seed, config.first_seed + config.seeds)
 
 
 def _prepared(config: TrainConfig, resume: bool, chosen: dict[str, str | None]) -> tuple[dict[int, Path], list[Training]]:
-    """Of a run's seeds the policies that are there, and the trainings that are left. Writes nothing."""
+    """Return the policies that a run has, by seed, and the trainings that are left. Writes nothing."""
     done: dict[int, Path] = {}
     if resume and _told(config).is_file():
         same_run(config)
@@ -280,7 +280,7 @@ def _prepared(config: TrainConfig, resume: bool, chosen: dict[str, str | None]) 
 
 
 def _begin(config: TrainConfig, resume: bool) -> None:
-    """A run's directory holds its configuration; what another run left there is set aside."""
+    """Write the configuration into a run's directory; set aside what another run left there."""
     if not resume and config.directory.is_dir() and any(config.directory.iterdir()):
         set_aside(config.directory)
     writable_directory(config.directory)
@@ -293,7 +293,7 @@ def _told(config: TrainConfig) -> Path:
 
 
 def _is_held(config: TrainConfig, held: Path) -> bool:
-    """Whether a file has this configuration already, workers apart, which change no result: published files stay as they are."""
+    """Return whether a file has this configuration already, workers apart, which change no result: published files stay as they are."""
     try:
         before = load_json(held, strict=False)
     except (OSError, ValueError):
@@ -302,7 +302,7 @@ def _is_held(config: TrainConfig, held: Path) -> bool:
 
 
 def _settings(config: TrainConfig) -> Any:
-    """The learner's hyper-parameters, checked."""
+    """Return the learner's hyper-parameters, checked."""
     module = learner_of(config.learner)
     settings = build(module.Config, dict(getattr(config, config.learner)), f"config.{config.learner}")
     settings.check()
@@ -310,24 +310,24 @@ def _settings(config: TrainConfig) -> Any:
 
 
 def free_of(teacher: str | None) -> set[str]:
-    """Fields of a configuration that change no policy."""
+    """Return fields of a configuration that change no policy."""
     return COMPARED | (set() if teacher == "best" else CHOSEN)
 
 
 def training_of(config: dict[str, Any]) -> str:
-    """What decides the policies of a configuration, as JSON data, in text that is the same for the same training wherever it lies."""
+    """Return what decides the policies of a configuration, as a text that is the same for the same training in any folder."""
     free = free_of(config.get("teacher")) | {"out", "name"}
     free |= {f.name for f in dataclasses.fields(TrainConfig) if f.name in LATER and config.get(f.name) == f.default}
     return canonical({key: value for key, value in config.items() if key not in free})
 
 
 def _same_training(config: dict[str, Any], other: Any) -> bool:
-    """Whether what stands in a file is a configuration of the same training."""
+    """Return whether what stands in a file is a configuration of the same training."""
     return isinstance(other, dict) and training_of(other) == training_of(config)
 
 
 def is_training(config: TrainConfig, held: Path) -> bool:
-    """Whether a file holds a configuration of this training; one that cannot be read holds none."""
+    """Return whether a file holds a configuration of this training; one that cannot be read holds none."""
     try:
         return _same_training(as_data(config), load_json(held, strict=False))
     except (OSError, ValueError):
@@ -335,7 +335,7 @@ def is_training(config: TrainConfig, held: Path) -> bool:
 
 
 def plan_key(config: dict[str, Any]) -> str:
-    """The training of a configuration but for the defence that it is against: what a suite's plan asks of everybody."""
+    """Return the training of a configuration but for the defence that it is against: what a suite's plan asks of everybody."""
     text = training_of({key: value for key, value in config.items() if key != "defence"})
     return hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
 
@@ -360,7 +360,7 @@ def same_run(config: TrainConfig) -> None:
 
 
 def figures(progress: Any) -> str:
-    """The curve's latest figures, as a progress bar shows them."""
+    """Return the curve's latest figures, as a progress bar shows them."""
     text = f"{progress.steps / 1e6:5.2f} M decisions"
     if progress.crash is not None:
         text += f", collisions {100 * progress.crash:4.1f} %"
@@ -368,7 +368,7 @@ def figures(progress: Any) -> str:
 
 
 def parameters() -> list[dict[str, Any]]:
-    """Every field of the configuration with default and sentence, for --help."""
+    """Return every field of the configuration with default and sentence, for --help."""
     return [
         {"name": f.name, "default": as_data(f.default if f.default is not dataclasses.MISSING else {}), "doc": f.metadata.get("doc", "")}
         for f in dataclasses.fields(TrainConfig)

@@ -99,7 +99,7 @@ class Search:
 
 
 def optuna() -> Any:
-    """The Optuna module, without its log."""
+    """Return the Optuna module, without its log."""
     try:
         import optuna as module
     except ImportError as error:
@@ -109,7 +109,7 @@ def optuna() -> Any:
 
 
 def read_space(source: str, learner: str) -> Space:
-    """The built-in space of a learner (`default`), or one from a YAML file; every field and form checked."""
+    """Return the built-in space of a learner (`default`), or one from a YAML file; every field and form checked."""
     if source == "default":
         if learner not in SPACES:
             raise InputError("space", source, f"a YAML file: only {', '.join(SPACES)} have a built-in space, {learner} has none")
@@ -145,7 +145,7 @@ def make_search(
     source: str | None, overrides: list[str], trials: int, space: str = "default", learner: str | None = None, episodes: int = 400,
     seed: int = 0,
 ) -> Search:  # fmt: skip
-    """The search of a preset; its files go to the directory `NAME-tune` beside the runs. One training seed per trial."""
+    """Return the search of a preset; its files go to the folder `NAME-tune` among the runs. One training seed per trial."""
     sizes.check("trials", trials)
     sizes.check("episodes", episodes)
     config = load_config(source, overrides + ([f"learner={learner}"] if learner else []))
@@ -154,7 +154,7 @@ def make_search(
 
 
 def configured(base: TrainConfig, values: dict[str, Any]) -> TrainConfig:
-    """The base with dotted fields changed."""
+    """Return the base with dotted fields changed."""
     data: dict[str, Any] = {}
     for field, value in values.items():
         head, dot, leaf = field.partition(".")
@@ -163,7 +163,7 @@ def configured(base: TrainConfig, values: dict[str, Any]) -> TrainConfig:
 
 
 def propose(trial: Any, space: Space) -> dict[str, Any]:
-    """Values of every field, from an Optuna trial. Choices go by their JSON text, as they may be lists."""
+    """Return values of every field, from an Optuna trial. Choices go by their JSON text, as they may be lists."""
     out: dict[str, Any] = {}
     for field, form in space.items():
         ((kind, values),) = form.items()
@@ -177,7 +177,7 @@ def propose(trial: Any, space: Space) -> dict[str, Any]:
 
 
 def objective(config: TrainConfig, policy: Path, episodes: int) -> float:
-    """Mean outcome of a policy against the defence that it was trained on, on the purpose `tune`."""
+    """Return mean outcome of a policy against the defence that it was trained on, on the purpose `tune`."""
     attack, spec, outcome = PolicyAttack(policy), Spec("defence", config.defence), outcome_of(config)
     place = Cell("tune", config.scenario, None, config.defence, str(policy), episodes, "tune", threat=config.threat).place(attack, "black")
     loop = place.loop(spec.make(), spec.entry.uses)
@@ -214,7 +214,7 @@ def _mend(path: Path) -> None:
 
 
 def _open(search: Search, ordinal: int | None = None) -> Any:
-    """The search's study. The sampler is made anew for each trial, so that one that goes on proposes what an uninterrupted one would."""
+    """Return the search's study. Each trial gets a fresh sampler: a search that goes on proposes what an uninterrupted one would."""
     module = optuna()
     path = search.directory / JOURNAL
     backend = module.storages.journal.JournalFileBackend(str(path), _JournalLock(path))  # JSON lines, never pickles
@@ -228,7 +228,7 @@ def _open(search: Search, ordinal: int | None = None) -> Any:
 
 @contextlib.contextmanager
 def _journal_of(search: Search) -> Iterator[None]:
-    """Within it whatever Optuna says of a journal is an InputError, which names the file: it checks nothing that it reads."""
+    """Turn, within a block, what Optuna says of a journal into an InputError that names the file: it checks nothing that it reads."""
     path = search.directory / JOURNAL
     try:
         if path.is_file():
@@ -269,7 +269,7 @@ def _trial(search: Search, ordinal: int, report: Callable[[int, Any], None] | No
 
 
 def _begin(search: Search) -> Any:
-    """The study, checked to be of this very search, with the trials of an interrupted one marked as failed."""
+    """Return the study, checked to be of this very search, with the trials of an interrupted one marked as failed."""
     module = optuna()
     writable_directory(search.directory)
     _mend(search.directory / JOURNAL)
@@ -311,7 +311,7 @@ def _tuned(search: Search, workers: int, progress: Callable[[int, Any], None] | 
 
 
 def _entries(study: Any) -> list[dict[str, Any]]:
-    """What is known of each trial, in its order."""
+    """Return what is known of each trial, in its order."""
     return [
         {
             "ordinal": trial.user_attrs.get("ordinal"), "state": trial.state.name.lower(), "value": trial.value,

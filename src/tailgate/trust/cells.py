@@ -65,7 +65,7 @@ class Outcome(NamedTuple):
 
 
 def outcome(known: Property, trace: Trace, safe: SafeDistance) -> Outcome:
-    """A property with a formula, in every run of a trace."""
+    """Return a property with a formula, in every run of a trace."""
     assert known.formula is not None
     samples = sample(trace, known.signals, safe)
     asked, instants = np.ones(trace.batch, bool), np.zeros(trace.batch, np.int64)
@@ -91,7 +91,7 @@ class Tally:
     failing_run: int | None = None
 
     def add(self, found: Outcome) -> None:
-        """The next runs."""
+        """Return the next runs."""
         worst = np.where(found.holds, np.inf, found.robustness)
         low, lost = int(np.argmin(found.robustness)), int(np.argmin(worst))
         if found.robustness[low] < self.least:
@@ -113,7 +113,7 @@ class Found:
     alarms: int | None = None  # false ones, of clean runs in which detection is asked for
 
     def add(self, outcomes: dict[str, Outcome], alarms: Array | None) -> None:
-        """The next runs."""
+        """Return the next runs."""
         if alarms is not None:
             self.alarms = (self.alarms or 0) + int(alarms.sum())
         for name, of in outcomes.items():
@@ -122,12 +122,12 @@ class Found:
             self.runs[name].append(np.all([outcomes[member].holds for member in members], axis=0))
 
     def of(self, conjunction: str) -> Array:
-        """(n,) bool"""
+        """Return (n,) bool"""
         return np.concatenate([np.zeros(0, bool), *self.runs[conjunction]])
 
 
 def check_cell(job: Job) -> Row:
-    """The row of a cell. What a component raises costs this row, with the reason."""
+    """Return the row of a cell. What a component raises costs this row, with the reason."""
     cell, guard, attack = job.cell, Spec("defence", job.cell.defence), Spec("attack", job.cell.attack).make()
     place = cell.place(attack, Spec("attack", cell.attack).entry.knowledge)
     try:
@@ -141,13 +141,13 @@ def check_cell(job: Job) -> Row:
 
 
 def failed(job: Job, reason: str, status: str = "error") -> Row:
-    """The row of a cell that could not be played."""
+    """Return the row of a cell that could not be played."""
     rival = Spec("attack", job.cell.attack)
     return _blank(job, job.cell.place(rival.make(), rival.entry.knowledge)) | {"status": status, "reason": " ".join(reason.split())[:500]}
 
 
 def _blank(job: Job, place: Scenario) -> Row:
-    """A row of which nothing was played."""
+    """Return a row of which nothing was played."""
     cell, guard, rival = job.cell, Spec("defence", job.cell.defence), Spec("attack", job.cell.attack)
     return _head(cell, place, guard.entry, rival.entry, cell_id(cell)) | {
         "cell": job.identity, "first_seed": cell.first_seed, "dt": place.brief().model.dt, "horizon": place.horizon,
@@ -157,7 +157,7 @@ def _blank(job: Job, place: Scenario) -> Row:
 
 
 def _played(job: Job, loop: Loop, attack: Any, known: Sequence[Property]) -> Found:
-    """The outcome of each property in the order of the seeds, up to where the rule stops."""
+    """Return the outcome of each property in the order of the seeds, up to where the rule stops."""
     cell, episodes = job.cell, job.cell.episodes
     size = episodes_at_once(loop.model, loop.horizon, cell.batch if job.rule is None else min(cell.batch, 64))
     together = {name: members for name, members in conjunctions(known, job.formulas).items() if members}
@@ -179,7 +179,7 @@ def _played(job: Job, loop: Loop, attack: Any, known: Sequence[Property]) -> Fou
 
 @lru_cache(maxsize=16)
 def _keys(purpose: str, seeds: tuple[int, ...]) -> draws.Keys:
-    """Of runs that every cell plays: their digests take longer than some steps."""
+    """Return the keys of runs that every cell plays: their digests take longer than some steps."""
     return draws.keys(purpose, seeds)
 
 
@@ -205,7 +205,10 @@ def _summary(job: Job, known: Sequence[Property], found: Found) -> Row:
 
 
 def _property(known: Property, found: Tally | None, seeds: Sequence[int]) -> Row:
-    """k of n runs satisfy it; its antecedent held in `asked` of them, of which `answered` satisfy it, at a share `instants` of steps."""
+    """Return a property as data: k of n runs satisfy it.
+
+    Its antecedent held in `asked` of them, of which `answered` satisfy it, at a share `instants` of steps.
+    """
     out: Row = {"name": known.name, "about": known.about, "reason": known.reason, "formula": None}
     if found is None:
         return out
@@ -224,7 +227,7 @@ def _finite(value: float) -> float | None:
 
 
 def _worst(known: Sequence[Property], found: Found, seeds: Sequence[int]) -> Row | None:
-    """The run that fails the first of the properties that any run fails, by the most; those of safety come first."""
+    """Return the run that fails the first of the properties that any run fails, by the most; those of safety come first."""
     for p in sorted(known, key=lambda p: p.name not in CONJUNCTIONS["safety"]):
         of = found.tallies.get(p.name)
         if of is not None and of.failing_run is not None:
@@ -237,10 +240,10 @@ def _bits(text: str, n: int) -> Array:
 
 
 def runs_of(row: Row, conjunction: str) -> Array:
-    """(n,) bool: the runs of a row, by seed, in which a conjunction holds."""
+    """Return (n,) bool: the runs of a row, by seed, in which a conjunction holds."""
     return _bits(row["conjunctions"][conjunction]["runs"], row["n"])
 
 
 def single(job: Job, run: int) -> Cell:
-    """The cell of one run of a job, by its number. Its trace is the one that was checked: a row does not depend on those beside it."""
+    """Return the cell of one run of a job, by its number. Its trace is the one that was checked: rows are independent."""
     return replace(job.cell, first_seed=job.cell.first_seed + run, seeds=1)
