@@ -7,12 +7,15 @@ import re
 import textwrap
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from tailgate.base.files import writable_directory, write_atomic
 from tailgate.base.pytree import Array
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 Table = Sequence[dict[str, Any]]  # of summary.summarise
 PANELS = (  # key, title, colours; each darkens from harmless to harmful
@@ -27,17 +30,17 @@ NO_ROAD = (  # of systems that nothing drives in
 MARKERS = "osD^v<>PX*phd"
 
 
-def canvas(width: float, height: float, rows: int = 1, columns: int = 1, **options: Any) -> tuple[Any, Any]:
+def canvas(width: float, height: float, rows: int = 1, columns: int = 1, **options: Any) -> tuple[Figure, Array]:
     """A matplotlib figure and its axes (rows, columns), without the global state of pyplot."""
     try:
-        from matplotlib.figure import Figure
+        from matplotlib import figure as made
     except ImportError as error:
         raise ImportError("figures need matplotlib: pip install 'tailgate[viz]'") from error
-    figure = Figure(figsize=(width, height), layout="constrained")
+    figure = made.Figure(figsize=(width, height), layout="constrained")
     return figure, figure.subplots(rows, columns, squeeze=False, **options)
 
 
-def png(figure: Any) -> bytes:
+def png(figure: Figure) -> bytes:
     """The figure as a PNG file, the same bytes for the same figure."""
     out = io.BytesIO()
     figure.savefig(out, format="png", dpi=110, metadata={"Software": None})

@@ -20,8 +20,8 @@ from tailgate.agents.codec import ActionCodec, ActionSpec
 from tailgate.agents.observation import ObservationCodec
 from tailgate.agents.reward import Reward, RewardName
 from tailgate.base.pytree import put_rows
-from tailgate.core import Array, Command, Estimate, Mode, View, draws
-from tailgate.core.draws import Role
+from tailgate.core import Array, Attack, Command, Defence, Estimate, Mode, Model, Prior, Received, View, draws
+from tailgate.core.draws import Draws, Role
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import Scenario, load_scenario
 from tailgate.engine.agreement import Untraced
@@ -58,11 +58,11 @@ class Playing(NamedTuple):
     """A seat whose attacker is a script, and what a step of it needs."""
 
     seat: Seat
-    attack: Any
+    attack: Attack
     plan: Any
 
 
-def playing(defence: Any) -> Playing:
+def playing(defence: Defence) -> Playing:
     """Return car following under injection by a script."""
     seat = Seat.make(scenario=SCENARIO, defence=defence, reward="min_gap")
     script = Spec("attack", INJECTION).make()
@@ -80,7 +80,7 @@ def played(held: Playing, episodes: int) -> Go:
     def decide(view: View) -> Command:
         nonlocal memory
         memory, command = attack.decide(plan, memory, view, state.keys.at(Role.ATTACK, view.k))
-        return command  # type: ignore[no-any-return]
+        return command
 
     def chunk() -> int:
         nonlocal state, tally, memory
@@ -171,13 +171,13 @@ class Saturated:
     gain: float = 0.2
     limit: float = 0.5
 
-    def prepare(self, model: Any) -> Any:
+    def prepare(self, model: Model) -> Model:
         return model
 
-    def start(self, plan: Any, prior: Any) -> _Belief:
+    def start(self, plan: Model, prior: Prior) -> _Belief:
         return _Belief(prior.mean)
 
-    def step(self, plan: Any, state: _Belief, received: Any, known_u: Array, draws: Any) -> tuple[_Belief, Estimate]:
+    def step(self, plan: Model, state: _Belief, received: Received, known_u: Array, draws: Draws) -> tuple[_Belief, Estimate]:
         x = num.matvec(plan.A, state.x) + num.matvec(plan.B, known_u) + plan.c
         r = np.where(received.valid, received.y - num.matvec(plan.C, x), 0.0)
         x = x + num.matvec(np.swapaxes(plan.C, -1, -2), np.clip(self.gain * r, -self.limit, self.limit))

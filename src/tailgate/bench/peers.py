@@ -10,6 +10,7 @@ import tempfile
 from importlib import import_module
 from itertools import cycle
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import gymnasium
@@ -23,7 +24,7 @@ STEPS = 20  # of a single environment before it looks at the clock
 ASYNC = 64  # environments of the asynchronous vector environment
 
 
-def need(module: str, package: str, how: str) -> Any:
+def need(module: str, package: str, how: str) -> ModuleType:
     """Return the module. Raises Missing, with what to install, where it is not there."""
     try:
         return import_module(module)

@@ -14,7 +14,7 @@ import tempfile
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -49,7 +49,7 @@ def compiler() -> str:
 
 
 @cache
-def library() -> Any:
+def library() -> ctypes.CDLL:
     """Return the compiled yardstick. Raises Missing where there is no compiler, or where it fails."""
     _ = compiler()
     name = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")

@@ -16,7 +16,7 @@ from tailgate.agents.zoo import FOLDER, zoo_names
 from tailgate.base import sizes
 from tailgate.base.errors import InputError
 from tailgate.base.files import writable_directory, write_atomic
-from tailgate.core import Array, draws
+from tailgate.core import Array, Attack, draws
 from tailgate.core.registry import Spec
 from tailgate.core.schema import as_data
 from tailgate.play.metrics import METRICS, unit_in
@@ -74,7 +74,7 @@ def add_policy(policy: Path, name: str, summary: str, *, episodes: int = EPISODE
     keys = draws.keys("report", range(sizes.check("episodes", episodes)))
     outcome = outcome_for(who.outcome, scenario)
 
-    def measured(attack: Any) -> dict[str, float]:
+    def measured(attack: Attack) -> dict[str, float]:
         return mean(np.stack(played(loop, attack, keys, None, [METRICS[outcome]])), outcome)._asdict()
 
     training = record | {

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -11,6 +11,9 @@ from tailgate.base.plots import MARKERS, canvas, png
 
 from .policies import label
 from .timing import TWINS
+
+if TYPE_CHECKING:
+    from matplotlib.patches import Rectangle
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")  # Okabe and Ito
 LINES = ("-", "--", "-.", ":")
@@ -130,7 +133,7 @@ def transfer_figure(report: dict[str, Any]) -> bytes:
     return png(figure)
 
 
-def _frame(column: int, row: int) -> Any:
-    from matplotlib.patches import Rectangle
+def _frame(column: int, row: int) -> Rectangle:
+    from matplotlib import patches
 
-    return Rectangle((column - 0.47, row - 0.45), 0.94, 0.9, fill=False, edgecolor="black", linewidth=1.8)
+    return patches.Rectangle((column - 0.47, row - 0.45), 0.94, 0.9, fill=False, edgecolor="black", linewidth=1.8)

@@ -14,6 +14,7 @@ import os
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -25,7 +26,7 @@ from tailgate.base.locks import alone
 from tailgate.base.pytree import duplicate
 from tailgate.base.reading import load_json
 from tailgate.base.version import VERSION
-from tailgate.core import Array, Frame, Model, draws
+from tailgate.core import Array, Attack, Frame, Model, draws
 from tailgate.core.draws import Role
 from tailgate.core.kinds import Kind, Mode
 from tailgate.core.loop import Loop, LoopState
@@ -44,7 +45,7 @@ _KINDS = np.array([kind.name.lower() for kind in Kind])
 _MODES = np.array([mode.name.lower() for mode in Mode])
 
 
-def pyarrow() -> tuple[Any, Any]:
+def pyarrow() -> tuple[ModuleType, ModuleType]:
     """Import pyarrow and pyarrow.parquet."""
     try:
         import pyarrow
@@ -178,10 +179,10 @@ def _named(cell: Cell) -> dict[str, Any]:
     return {"scenario": cell.scenario, "dose": cell.dose, "defence": cell.defence, "attack": cell.attack}
 
 
-def _ready(cell: Cell) -> tuple[Loop, Scenario, Any]:
+def _ready(cell: Cell) -> tuple[Loop, Scenario, Attack]:
     """Return the loop, the scenario and the attack of a cell. Raises NotApplicable for a pairing without meaning."""
     guard, rival = Spec("defence", cell.defence), Spec("attack", cell.attack)
-    attack = rival.make()
+    attack: Attack = rival.make()
     place = cell.place(attack, rival.entry.knowledge)
     loop = place.loop(guard.make(), guard.entry.uses)
     attack.prepare(loop.brief)
@@ -203,7 +204,7 @@ def _good(part: Path, cell: Cell) -> bool:
     return bool(held.get(b"cell") == cell_id(cell).encode())
 
 
-def _play_part(part: Path, split: str, cell: Cell, loop: Loop, rival: Any, columns: Sequence[Column]) -> None:
+def _play_part(part: Path, split: str, cell: Cell, loop: Loop, attack: Attack, columns: Sequence[Column]) -> None:
     """Play one cell into a Parquet file, with a row group for as many episodes as GROUP holds."""
     pa, pq = pyarrow()
     schema, size = _schema(columns), max(1, GROUP // (loop.horizon * loop.model.agents))
@@ -212,7 +213,7 @@ def _play_part(part: Path, split: str, cell: Cell, loop: Loop, rival: Any, colum
     with replacing(part) as file, pq.ParquetWriter(file, schema, compression="zstd") as writer:
         for first in range(0, cell.seeds, size):
             seeds = range(first, min(first + size, cell.seeds))
-            values = _table(loop, rival, draws.keys(cell.purpose, seeds), seeds)
+            values = _table(loop, attack, draws.keys(cell.purpose, seeds), seeds)
             count = len(values["k"])
             arrays = [
                 _array(pa, field, fixed[field.name], count) if field.name in fixed else _array(pa, field, values[field.name], count)
@@ -221,13 +222,13 @@ def _play_part(part: Path, split: str, cell: Cell, loop: Loop, rival: Any, colum
             writer.write_table(pa.Table.from_arrays(arrays, schema=schema), row_group_size=count)
 
 
-def _array(pa: Any, field: Any, value: Any, count: int) -> Any:
+def _array(pa: ModuleType, field: Any, value: Any, count: int) -> Any:
     if not isinstance(value, np.ndarray):
         return pa.array([value] * count, field.type)
     return pa.array(value, field.type, mask=np.isnan(value) if field.nullable else None)
 
 
-def steps(loop: Loop, attack: Any, keys: draws.Keys) -> Iterator[tuple[LoopState, Frame, Array, Array]]:
+def steps(loop: Loop, attack: Attack, keys: draws.Keys) -> Iterator[tuple[LoopState, Frame, Array, Array]]:
     """Yield each step of B episodes: the state before it, its frame, the innovation (B, N, q), NaN if none, and live (B,) bool."""
     state = loop.start(keys)
     plan = attack.prepare(loop.brief)
@@ -250,7 +251,7 @@ def _innovation(loop: Loop, state: LoopState, frame: Frame) -> Array:
     return np.asarray(loop.defence.look(loop.plan.defence, state.defence, heard, state.known_u).innovation.r)
 
 
-def _table(loop: Loop, attack: Any, keys: draws.Keys, seeds: range) -> dict[str, Array]:
+def _table(loop: Loop, attack: Attack, keys: draws.Keys, seeds: range) -> dict[str, Array]:
     """Return columns of the episodes: episode by episode, in it step by step, in it agent by agent."""
     model, held, alive = loop.model, [], []
     for state, frame, innovation, live in steps(loop, attack, keys):

@@ -4,6 +4,10 @@ from __future__ import annotations
 
 from typing import Any, Literal, NamedTuple
 
+import numpy as np
+
+from tailgate.core import draws
+from tailgate.core.draws import Draws
 from tailgate.core.loop import Loop
 
 LICENCE = "CC0-1.0"
@@ -86,13 +90,8 @@ def columns_of(loop: Loop) -> list[Column]:
     return [*out, Column("truth_collided", "bool_", "", "truth", "somebody collided in this step, the episode's last where that ends it")]
 
 
-def _one_row() -> Any:
-    import numpy as np
-
-    from tailgate.core.draws import Role as Stream
-    from tailgate.core.draws import keys
-
-    return keys("train", [0]).at(Stream.PRIOR, np.zeros(1, np.int64))
+def _one_row() -> Draws:
+    return draws.keys("train", [0]).at(draws.Role.PRIOR, np.zeros(1, np.int64))
 
 
 def readme(held: dict[str, Any]) -> str:

@@ -118,7 +118,7 @@ def origin_of(text: str) -> dict[str, Any] | None:
     }  # fmt: skip
 
 
-def rising(curve: Any) -> bool:
+def rising(curve: object) -> bool:
     """Return whether a learning curve still rose when training ended.
 
     The line through its last quarter rises by more than two standard errors of its slope, and by over a twentieth of all that was learned.
@@ -135,7 +135,7 @@ def rising(curve: Any) -> bool:
     return slope > 2.0 * error and slope * (len(last) - 1) > 0.05 * float(np.ptp(y))
 
 
-def _harmless(family: Family, held: Any, where: str) -> None:
+def _harmless(family: Family, held: object, where: str) -> None:
     """Raise InputError when a component that a record names would have to be imported: only a command line names code."""
     for text in held if isinstance(held, list) else [held]:
         try:
@@ -147,7 +147,7 @@ def _harmless(family: Family, held: Any, where: str) -> None:
             raise InputError(where, text, f"a component's text ({type(error).__name__})") from None
 
 
-def _text(value: Any) -> str | None:
+def _text(value: object) -> str | None:
     return value if isinstance(value, str) else None
 
 

@@ -90,7 +90,7 @@ def yoked_to(schedule: Array) -> Array:
     return np.roll(schedule, 1, axis=1)
 
 
-def timing_advantage(loop: Any, policy: PolicyAttack, keys: Keys, outcome: str = "crashed") -> tuple[Array, Array]:
+def timing_advantage(loop: Loop, policy: PolicyAttack, keys: Keys, outcome: str = "crashed") -> tuple[Array, Array]:
     """Return (own, yoked) outcomes (B,) of a policy, a metric: yoked plays the on and off runs of another episode of the same policy."""
     schedules = (None, yoked_to(recorded(loop, policy, keys)))
     own, yoked = (played(loop, policy, keys, schedule, [METRICS[outcome]])[0] for schedule in schedules)

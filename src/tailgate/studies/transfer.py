@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -27,6 +27,7 @@ from tailgate.play.metrics import unit_in
 from .policies import Trained, check_episodes, defence_of, distinct, is_share, mean, misfit, outcome_for, place_of
 
 LEVEL = 0.95
+T = TypeVar("T")
 ALL = "all"  # the word for every registered defence
 
 
@@ -149,7 +150,7 @@ def _registered(scenario: str, named: Collection[str]) -> tuple[list[str], list[
     return found, skipped
 
 
-def _common(field: str, values: dict[str, Any]) -> Any:
+def _common(field: str, values: dict[str, T]) -> T:
     """Return the value that all policies agree on, or an InputError that names the option."""
     different = {canonical(value) for value in values.values()}
     if len(different) > 1:

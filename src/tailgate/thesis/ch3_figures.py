@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from functools import partial
-from typing import Any
 
 import numpy as np
 
@@ -15,7 +14,7 @@ from tailgate.play.trace import Trace
 
 from .ch3_cases import OURS, Runs
 from .claims import Drawing
-from .figures import BAND, panel
+from .figures import BAND, Picture, panel
 
 NUMBERS = {("i", "DoS"): "3.2a", ("i", "delay"): "3.2b", ("ii", "DoS"): "3.3a", ("ii", "delay"): "3.3b"}
 WORDS = {"DoS": "denial of service from 182 s", "delay": "an echo 6 m late from 180 s"}
@@ -32,7 +31,7 @@ def cases(runs: Runs, row: int = 0) -> Iterator[Drawing]:
         yield Drawing(f"figure-{printed.replace('.', '-')}", caption, partial(_case, runs, number, case, row))
 
 
-def _case(runs: Runs, number: str, case: str, row: int) -> Any:
+def _case(runs: Runs, number: str, case: str, row: int) -> Picture:
     figure, axes = canvas(10.0, 8.4, 3, 1)
     clean, ours, bare = (runs[number, *key].trace for key in (("clean", OURS), (case, OURS), (case, "none")))
     for ax, wire, label in ((axes[0, 0], GAP, "distance [m]"), (axes[1, 0], RELATIVE_SPEED, "relative velocity [m/s]")):
@@ -62,7 +61,7 @@ def _shown(trace: Trace, values: Array, row: int) -> tuple[Array, Array]:
     return np.arange(1, length + 1), values[:length]
 
 
-def latency(curve: Mapping[str, Array]) -> Any:
+def latency(curve: Mapping[str, Array]) -> Picture:
     """Draw the mean latency over the probability of a challenge."""
     figure, axes = canvas(6.0, 4.0)
     ax, p = axes[0, 0], np.geomspace(0.015, 0.6, 100)
@@ -78,7 +77,7 @@ def latency(curve: Mapping[str, Array]) -> Any:
     return figure
 
 
-def reaction(curve: Mapping[str, Array]) -> Any:
+def reaction(curve: Mapping[str, Array]) -> Picture:
     """Draw what attackers are heard and what they do, by their reaction time."""
     figure, axes = canvas(10.0, 4.2, 1, 2)
     styles = {
@@ -93,7 +92,7 @@ def reaction(curve: Mapping[str, Array]) -> Any:
     return figure
 
 
-def denial(ranges: Array, share: Mapping[str, Array]) -> Any:
+def denial(ranges: Array, share: Mapping[str, Array]) -> Picture:
     """Draw the share of readings that a jammer denies."""
     figure, axes = canvas(6.0, 3.8)
     ax = axes[0, 0]

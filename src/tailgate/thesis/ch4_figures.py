@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
-from typing import Any
 
 import numpy as np
 
@@ -12,7 +11,7 @@ from tailgate.base.plots import canvas
 
 from .ch4_cases import CASES, FILTERS, READINGS, Runs
 from .claims import Drawing
-from .figures import STYLES, legend_below, mark, panel
+from .figures import STYLES, Picture, legend_below, mark, panel
 
 NUMBERS = {"clean": "4.4", "fdi": "4.5", "dos": "4.6"}
 LINES = {  # told apart without colour as well
@@ -28,7 +27,7 @@ def cases(runs: Runs, row: int = 0) -> Iterator[Drawing]:
         yield Drawing(f"figure-{printed.replace('.', '-')}", caption, partial(_case, runs, case, row))
 
 
-def _case(runs: Runs, case: str, row: int) -> Any:
+def _case(runs: Runs, case: str, row: int) -> Picture:
     shown = READINGS[::2]  # the corrected plant, printed and fitted noise
     figure, axes = canvas(10.0, 6.2, 2, len(shown))
     for column, reading in enumerate(shown):
@@ -51,7 +50,7 @@ def _case(runs: Runs, case: str, row: int) -> Any:
     return figure
 
 
-def eta(curves: Mapping[str, Mapping[str, Sequence[float]]], etas: Sequence[float]) -> Any:
+def eta(curves: Mapping[str, Mapping[str, Sequence[float]]], etas: Sequence[float]) -> Picture:
     """Draw error, bound and false alarms over the threshold, by reading."""
     figure, axes = canvas(10.0, 3.6, 1, len(curves) + 1)
     for ax, (name, curve) in zip(axes[0], curves.items(), strict=False):
@@ -70,7 +69,7 @@ def eta(curves: Mapping[str, Mapping[str, Sequence[float]]], etas: Sequence[floa
     return figure
 
 
-def cost(times: Mapping[str, Mapping[int, float]]) -> Any:
+def cost(times: Mapping[str, Mapping[int, float]]) -> Picture:
     """Draw the time of a step [s] by shape and size."""
     figure, axes = canvas(6.0, 4.0)
     ax = axes[0, 0]

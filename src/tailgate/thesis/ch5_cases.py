@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterable, Iterator, Sequence
-from typing import Any
 
 import numpy as np
 
@@ -26,7 +25,7 @@ SD, CHANCE = 700.0, 0.9
 Runs = dict[str, Array]
 
 
-def fresh(seed: int, noise_var: float | None = None, **plant: Any) -> Scenario:
+def fresh(seed: int, noise_var: float | None = None, **plant: float) -> Scenario:
     """Return the thesis's scenario with matrices of this seed; `noise_var`: that of system and sensors."""
     held = load_scenario(SCENARIO)
     noise = {} if noise_var is None else {"noise_var": noise_var}
@@ -42,7 +41,7 @@ def defence(name: str, lam: float = LAM) -> Defence:
     return made
 
 
-def random_attack(agents: Sequence[int], **options: Any) -> Attack | str:
+def random_attack(agents: Sequence[int], **options: int) -> Attack | str:
     """Return the thesis's attack on some agents."""
     if not agents:
         return "none"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from functools import partial
-from typing import Any
 
 import numpy as np
 
@@ -15,7 +14,7 @@ from tailgate.core.scenario import load_scenario
 
 from .ch5_cases import COMPROMISED, DEFENCES, ONSET, SCENARIO, Runs
 from .claims import Drawing
-from .figures import legend_below, panel, per_agent
+from .figures import Picture, legend_below, panel, per_agent
 
 
 def cases(runs: Runs, row: int = 0) -> Iterator[Drawing]:
@@ -28,12 +27,13 @@ def cases(runs: Runs, row: int = 0) -> Iterator[Drawing]:
     yield Drawing("figure-5-3-and-5-4", caption, partial(_attacked, {name: runs[name][:, row] for name in DEFENCES}))
 
 
-def _graph() -> Any:
+def _graph() -> Picture:
     plant = load_scenario(SCENARIO).plant
-    return graph_figure(plant.hears(), [str(i) for i in range(plant.agents)], attacked=COMPROMISED)
+    drawn: Picture = graph_figure(plant.hears(), [str(i) for i in range(plant.agents)], attacked=COMPROMISED)
+    return drawn
 
 
-def _clean(error: Array) -> Any:
+def _clean(error: Array) -> Picture:
     figure, axes = canvas(9.0, 3.6, 1, 2)
     agents = range(error.shape[1])
     for ax, scale in zip(axes[0], ("linear", "log"), strict=True):
@@ -43,7 +43,7 @@ def _clean(error: Array) -> Any:
     return figure
 
 
-def _attacked(error: Mapping[str, Array]) -> Any:
+def _attacked(error: Mapping[str, Array]) -> Picture:
     figure, axes = canvas(9.0, 3.8, 1, 2)
     for ax, (name, words) in zip(axes[0], reversed(DEFENCES.items()), strict=True):
         agents = range(error[name].shape[1])
@@ -54,7 +54,7 @@ def _attacked(error: Mapping[str, Array]) -> Any:
     return figure
 
 
-def number(curves: Mapping[str, Array]) -> Any:
+def number(curves: Mapping[str, Array]) -> Picture:
     """Draw the largest error against the number of compromised agents, and of compromised neighbours."""
     figure, axes = canvas(9.0, 3.6, 1, 2)
     left, right = axes[0]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -77,7 +76,7 @@ class Played:
 Runs = dict[tuple[str, str], Played]  # by case, estimator
 
 
-def platoon(**threat: Any) -> Scenario:
+def platoon(**threat: object) -> Scenario:
     """Return the thesis's platoon; denial of service keeps the reading of k = 20, tau in (6.18), whenever the first hit comes."""
     return load_scenario(SCENARIO).with_threat(hold_from_onset=True, **threat)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from functools import partial
-from typing import Any
 
 from tailgate.base.plots import canvas
 from tailgate.core import Array
@@ -13,7 +12,7 @@ from tailgate.core.scenario import load_scenario
 
 from .ch6_cases import CASES, DEFENCES, ONSET, SCENARIO, VICTIM, Runs
 from .claims import Drawing
-from .figures import STYLES, legend_below, mark, panel, per_agent
+from .figures import STYLES, Picture, legend_below, mark, panel, per_agent
 
 NUMBERS = {"dos": "6.4", "fdi": "6.5"}
 
@@ -28,19 +27,20 @@ def cases(runs: Runs, row: int = 0) -> Iterator[Drawing]:
         yield Drawing(f"figure-{printed.replace('.', '-')}", caption, partial(_attacked, runs, case, row))
 
 
-def _graph() -> Any:
+def _graph() -> Picture:
     plant = load_scenario(SCENARIO).plant
-    return graph_figure(plant.hears(), [str(i) for i in range(plant.size[0])], attacked=(VICTIM,))
+    drawn: Picture = graph_figure(plant.hears(), [str(i) for i in range(plant.size[0])], attacked=(VICTIM,))
+    return drawn
 
 
-def _clean(own: Array) -> Any:
+def _clean(own: Array) -> Picture:
     figure, axes = canvas(6.5, 3.8)
     per_agent(axes[0, 0], own, [f"car {i}" for i in range(own.shape[1])], range(1, own.shape[1]))
     panel(axes[0, 0], xlabel="time [s]", ylabel="|distance error| [m]")
     return figure
 
 
-def _attacked(runs: Runs, case: str, row: int) -> Any:
+def _attacked(runs: Runs, case: str, row: int) -> Picture:
     figure, axes = canvas(9.5, 6.0, 2, 2)
     for column, (name, words) in zip(axes.T, reversed(DEFENCES.items()), strict=True):
         played = runs[case, name]
@@ -55,7 +55,7 @@ def _attacked(runs: Runs, case: str, row: int) -> Any:
     return figure
 
 
-def choice(curves: Mapping[str, Array]) -> Any:
+def choice(curves: Mapping[str, Array]) -> Picture:
     """Draw the largest error over the price `lam`."""
     figure, axes = canvas(6.5, 3.8)
     ax = axes[0, 0]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 from tailgate.base.plots import canvas
 from tailgate.core import Array
@@ -12,18 +11,18 @@ from tailgate.trust.automata_figures import automata_figure
 from tailgate.trust.taint import one_hop
 
 from .ch7_trust import THESIS
-from .figures import BAND, COLOURS, panel
+from .figures import BAND, COLOURS, Picture, panel
 
 LINES = ("-", "--", "-.", ":")
 PANELS = (("Intermediate", 100.0, "obs = 1 (the command)"), ("braking", 500.0, "apply_break = 1 (the brake)"))
 
 
-def automata(network: Network) -> Any:
+def automata(network: Network) -> Picture:
     """Draw the automata, with the signals that nobody should trust."""
     return automata_figure(network, one_hop(network))
 
 
-def queries(deadlines: Array, limits: Mapping[str, Sequence[float]], curves: Mapping[tuple[str, float], Array]) -> Any:
+def queries(deadlines: Array, limits: Mapping[str, Sequence[float]], curves: Mapping[tuple[str, float], Array]) -> Picture:
     """Draw the share of runs by deadline, by the location whose limit is varied."""
     figure, axes = canvas(10.0, 4.2, 1, 2, sharey=True)
     for ax, (where, deadline, words) in zip(axes[0], PANELS, strict=True):

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 from tailgate.base.plots import png
 from tailgate.core import Array
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure as Picture
 
 Holds = Literal["yes", "partly", "no"]
 Data = Mapping[str, object] | Sequence[object] | str | float | None  # of JSON
@@ -53,11 +56,11 @@ class Figure:
 
 @dataclass(frozen=True)
 class Drawing:
-    """A figure that is drawn only for a report with figures. `draw` returns one of matplotlib."""
+    """A figure that is drawn only for a report with figures."""
 
     name: str
     caption: str
-    draw: Callable[[], Any]
+    draw: Callable[[], Picture]
 
 
 Part = Claim | Table | Drawing
@@ -69,7 +72,7 @@ class Report:
 
     chapter: str
     title: str
-    settings: dict[str, Any]
+    settings: Mapping[str, object]
     claims: list[Claim] = field(default_factory=list)
     tables: list[Table] = field(default_factory=list)
     figures: list[Figure] = field(default_factory=list)

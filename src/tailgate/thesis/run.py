@@ -50,7 +50,7 @@ def as_json(report: Report) -> list[dict[str, Any]]:
     return [dataclasses.asdict(claim) for claim in report.claims]
 
 
-def flat(value: Any) -> str:
+def flat(value: object) -> str:
     """Return JSON data as people read it, in one line."""
     if isinstance(value, dict):
         if set(value) == {"median", "q25", "q75"}:
@@ -116,7 +116,7 @@ def html(report: Report) -> str:
     return page("page.html", report=report, summary=summary(report), version=VERSION)
 
 
-def page(name: str, **values: Any) -> str:
+def page(name: str, **values: object) -> str:
     """Return a page from one of the templates."""
     loader = FunctionLoader(lambda file: files("tailgate.thesis").joinpath(file).read_text(encoding="utf-8"))
     made = Environment(autoescape=True, undefined=StrictUndefined, loader=loader)
@@ -128,7 +128,7 @@ def prose(text: str) -> Markup:
     return Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", str(escape(text))))
 
 
-def write(report: Report, directory: Path, **stamp: Any) -> Path:
+def write(report: Report, directory: Path, **stamp: object) -> Path:
     """Write report.json, report.md, index.html and a PNG per figure; return the page. `stamp`: further fields of report.json."""
     writable_directory(directory)
     data = {"chapter": report.chapter, "title": report.title, "version": VERSION, **stamp, "settings": report.settings}

@@ -12,8 +12,9 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
+from tailgate.agents import learning
 from tailgate.agents.codec import ActionCodec, ActionSpec
 from tailgate.agents.learning import LEARNERS, learner_of
 from tailgate.agents.observation import ObservationCodec
@@ -146,7 +147,7 @@ def train_against(configs: list[train.TrainConfig], progress: Progress) -> list[
         if not (again and all(path.is_file() and path.with_suffix(".safetensors").is_file() for path in policies_of(config))):
             runs.append((config, again))
 
-    def learned(config: train.TrainConfig, seed: int, now: Any) -> None:
+    def learned(config: train.TrainConfig, seed: int, now: learning.Progress) -> None:
         progress(f"{config.name}, seed {seed}", min(now.steps, config.steps), config.steps, train.figures(now))
 
     train.train_together(runs, learned, max((config.workers for config in configs), default=1))

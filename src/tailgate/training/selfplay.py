@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 
 from tailgate.agents.cem import Config
-from tailgate.agents.learning import LEARNERS, learner_of
+from tailgate.agents.learning import LEARNERS, Progress, learner_of
 from tailgate.agents.policy import PolicyAttack
 from tailgate.agents.selfplay import Learner, Played, constant, export, play
 from tailgate.base.errors import InputError, said
@@ -218,7 +218,7 @@ class Game:
         if checkpoint.is_file():
             learner.load(checkpoint)
 
-        def report(now: Any) -> None:
+        def report(now: Progress) -> None:
             crash = "" if now.crash is None else f"collisions {100 * now.crash:4.1f} %"
             self.update(name, min(now.steps, steps), steps, crash)
 

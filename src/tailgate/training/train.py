@@ -14,7 +14,7 @@ from typing import Any
 
 from tailgate.agents.codec import ActionSpec
 from tailgate.agents.finished import finished
-from tailgate.agents.learning import DISCRETE, LEARNERS, Progress, Teachable, check_action, learner_of
+from tailgate.agents.learning import DISCRETE, LEARNERS, Config, Progress, Teachable, check_action, learner_of
 from tailgate.agents.reward import Reward
 from tailgate.base import sizes
 from tailgate.base.errors import InputError, said, unknown
@@ -216,7 +216,7 @@ def _teacher(config: TrainConfig, chosen: dict[str, str | None]) -> str | None:
     return chosen[asked]
 
 
-def train(config: TrainConfig, progress: Callable[[int, Any], None], resume: bool = False) -> list[Path]:
+def train(config: TrainConfig, progress: Callable[[int, Progress], None], resume: bool = False) -> list[Path]:
     """Train one policy per seed; returns their JSON files. `progress(seed, Progress)` is called after each rollout."""
     (found,) = train_together([(config, resume)], lambda _, seed, now: progress(seed, now), config.workers)
     return found
@@ -301,10 +301,9 @@ def _is_held(config: TrainConfig, held: Path) -> bool:
     return isinstance(before, dict) and before | {"workers": config.workers} == as_data(config)
 
 
-def _settings(config: TrainConfig) -> Any:
+def _settings(config: TrainConfig) -> Config:
     """Return the learner's hyper-parameters, checked."""
-    module = learner_of(config.learner)
-    settings = build(module.Config, dict(getattr(config, config.learner)), f"config.{config.learner}")
+    settings: Config = build(learner_of(config.learner).Config, dict(getattr(config, config.learner)), f"config.{config.learner}")
     settings.check()
     return settings
 
@@ -321,7 +320,7 @@ def training_of(config: dict[str, Any]) -> str:
     return canonical({key: value for key, value in config.items() if key not in free})
 
 
-def _same_training(config: dict[str, Any], other: Any) -> bool:
+def _same_training(config: dict[str, Any], other: object) -> bool:
     """Return whether what stands in a file is a configuration of the same training."""
     return isinstance(other, dict) and training_of(other) == training_of(config)
 
@@ -359,7 +358,7 @@ def same_run(config: TrainConfig) -> None:
         raise InputError("steps", config.steps, f"at least {made}, as {done[0]} was trained: what was learned is not taken back")
 
 
-def figures(progress: Any) -> str:
+def figures(progress: Progress) -> str:
     """Return the curve's latest figures, as a progress bar shows them."""
     text = f"{progress.steps / 1e6:5.2f} M decisions"
     if progress.crash is not None:

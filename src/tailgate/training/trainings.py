@@ -11,7 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from tailgate.agents.learning import Learner, Progress, Teachable, learner_of, made_with
+from tailgate.agents.learning import Config, Learner, Progress, Teachable, learner_of, made_with
 from tailgate.agents.teacher import demonstrate
 from tailgate.base.errors import InputError, Killed, said
 from tailgate.base.files import write_atomic
@@ -30,7 +30,7 @@ class Training(NamedTuple):
     config: TrainConfig
     seed: int
     resume: bool
-    settings: Any  # the learner's hyper-parameters, checked
+    settings: Config  # the learner's hyper-parameters, checked
     environment: dict[str, Any]  # arguments of the environment
     teacher: str | None  # whose decisions the learner is shown first
 

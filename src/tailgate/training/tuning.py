@@ -22,12 +22,13 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import yaml
 
-from tailgate.agents.learning import learner_of
+from tailgate.agents.learning import Progress, learner_of
 from tailgate.agents.policy import PolicyAttack
 from tailgate.base import sizes
 from tailgate.base.errors import InputError, said, unknown
@@ -42,6 +43,9 @@ from tailgate.evaluation.cells import Cell
 from tailgate.play.metrics import METRICS
 from tailgate.play.trace import episodes_at_once, rollout
 from tailgate.training.train import ENVIRONMENT, TrainConfig, load_config, outcome_of, train
+
+if TYPE_CHECKING:
+    from optuna import Study, Trial
 
 Space = dict[str, dict[str, Any]]
 SPACES: dict[str, Space] = {
@@ -98,7 +102,7 @@ class Search:
         return digest([self.trained, self.space, self.episodes, self.seed])
 
 
-def optuna() -> Any:
+def optuna() -> ModuleType:
     """Return the Optuna module, without its log."""
     try:
         import optuna as module
@@ -162,7 +166,7 @@ def configured(base: TrainConfig, values: dict[str, Any]) -> TrainConfig:
     return dataclasses.replace(base, **data)
 
 
-def propose(trial: Any, space: Space) -> dict[str, Any]:
+def propose(trial: Trial, space: Space) -> dict[str, Any]:
     """Return values of every field, from an Optuna trial. Choices go by their JSON text, as they may be lists."""
     out: dict[str, Any] = {}
     for field, form in space.items():
@@ -213,7 +217,7 @@ def _mend(path: Path) -> None:
                 os.truncate(path, whole)
 
 
-def _open(search: Search, ordinal: int | None = None) -> Any:
+def _open(search: Search, ordinal: int | None = None) -> Study:
     """Return the search's study. Each trial gets a fresh sampler: a search that goes on proposes what an uninterrupted one would."""
     module = optuna()
     path = search.directory / JOURNAL
@@ -221,9 +225,10 @@ def _open(search: Search, ordinal: int | None = None) -> Any:
     sampler = module.samplers.TPESampler(seed=search.seed * SAMPLER_STRIDE + (ordinal or 0), multivariate=False)
     with _journal_of(search):
         storage = module.storages.JournalStorage(backend)
-        return module.create_study(
+        study: Study = module.create_study(
             storage=storage, sampler=sampler, study_name=search.base.name, direction="maximize", load_if_exists=True
-        )  # fmt: skip
+        )
+    return study
 
 
 @contextlib.contextmanager
@@ -246,7 +251,7 @@ def _journal_of(search: Search) -> Iterator[None]:
         raise InputError("tune", str(path), f"a journal of a search ({type(error).__name__}: {said(error)})") from None
 
 
-def _trial(search: Search, ordinal: int, report: Callable[[int, Any], None] | None = None) -> None:
+def _trial(search: Search, ordinal: int, report: Callable[[int, Progress | None], None] | None = None) -> None:
     """Train and measure one trial. Values that a learner refuses, and a policy without an outcome, cost this trial alone."""
     module, study = optuna(), _open(search, ordinal)
     trial = study.ask()
@@ -268,7 +273,7 @@ def _trial(search: Search, ordinal: int, report: Callable[[int, Any], None] | No
     study.tell(trial, value)
 
 
-def _begin(search: Search) -> Any:
+def _begin(search: Search) -> Study:
     """Return the study, checked to be of this very search, with the trials of an interrupted one marked as failed."""
     module = optuna()
     writable_directory(search.directory)
@@ -284,7 +289,7 @@ def _begin(search: Search) -> Any:
     return study
 
 
-def tune(search: Search, workers: int = 1, progress: Callable[[int, Any], None] | None = None) -> dict[str, Any]:
+def tune(search: Search, workers: int = 1, progress: Callable[[int, Progress | None], None] | None = None) -> dict[str, Any]:
     """Play the trials that are missing; writes best.yaml and trials.json into the search's directory; returns the report.
 
     With several workers that many trials are played at a time; which values they get then depends on who ends first.
@@ -295,7 +300,7 @@ def tune(search: Search, workers: int = 1, progress: Callable[[int, Any], None] 
         return _tuned(search, workers, progress)
 
 
-def _tuned(search: Search, workers: int, progress: Callable[[int, Any], None] | None) -> dict[str, Any]:
+def _tuned(search: Search, workers: int, progress: Callable[[int, Progress | None], None] | None) -> dict[str, Any]:
     study = _begin(search)
     settled = {entry["ordinal"] for entry in _entries(study) if entry["state"] == "complete" or entry["reason"]}
     missing = [i for i in range(search.trials) if i not in settled]
@@ -310,7 +315,7 @@ def _tuned(search: Search, workers: int, progress: Callable[[int, Any], None] | 
     return _report(search, _open(search))
 
 
-def _entries(study: Any) -> list[dict[str, Any]]:
+def _entries(study: Study) -> list[dict[str, Any]]:
     """Return what is known of each trial, in its order."""
     return [
         {
@@ -325,7 +330,7 @@ def _entries(study: Any) -> list[dict[str, Any]]:
     ]  # fmt: skip
 
 
-def _report(search: Search, study: Any) -> dict[str, Any]:
+def _report(search: Search, study: Study) -> dict[str, Any]:
     entries = sorted((e for e in _entries(study) if e["state"] == "complete" or e["reason"]), key=lambda e: e["ordinal"])
     good = [entry for entry in entries if entry["state"] == "complete"]
     best = max(good, key=lambda entry: (entry["value"], -entry["ordinal"]), default=None)

@@ -4,18 +4,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection
-from typing import Any
+from typing import TYPE_CHECKING
 
 from tailgate.base.plots import canvas
 
 from .automata import Component, Edge, Location, Network
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 INK, EDGE, NODE, MARKED = "#1a1a1a", "#6b7076", "#dcebf5", "#b34700"
 RADIUS = {1: 0.0, 2: 1.0, 3: 1.2, 4: 1.35, 5: 1.6}
 WIDTH, HEIGHT = 0.66, 0.22  # half of a location's box
 
 
-def automata_figure(network: Network, untrusted: Collection[str] = ()) -> Any:
+def automata_figure(network: Network, untrusted: Collection[str] = ()) -> Figure:
     """Return a matplotlib Figure with one panel per component. Edges whose signal is in `untrusted` are dashed, and say so."""
     count = len(network.components)
     figure, axes = canvas(5.2 * count, 4.6, 1, count)
@@ -42,7 +46,7 @@ def edge_words(edge: Edge) -> str:
     return "\n".join([*map(str, edge.guard), *([edge.sync] if edge.sync else []), *sets])
 
 
-def _panel(ax: Any, component: Component, untrusted: Collection[str]) -> None:
+def _panel(ax: Axes, component: Component, untrusted: Collection[str]) -> None:
     from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
 
     count = len(component.locations)

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tailgate.core import Array, draws
+from tailgate.core import Array, Attack, draws
 from tailgate.core.loop import Loop
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import Scenario, load_scenario
@@ -91,7 +91,7 @@ class Tally:
     failing_run: int | None = None
 
     def add(self, found: Outcome) -> None:
-        """Return the next runs."""
+        """Add the next runs."""
         worst = np.where(found.holds, np.inf, found.robustness)
         low, lost = int(np.argmin(found.robustness)), int(np.argmin(worst))
         if found.robustness[low] < self.least:
@@ -113,7 +113,7 @@ class Found:
     alarms: int | None = None  # false ones, of clean runs in which detection is asked for
 
     def add(self, outcomes: dict[str, Outcome], alarms: Array | None) -> None:
-        """Return the next runs."""
+        """Add the next runs."""
         if alarms is not None:
             self.alarms = (self.alarms or 0) + int(alarms.sum())
         for name, of in outcomes.items():
@@ -122,7 +122,7 @@ class Found:
             self.runs[name].append(np.all([outcomes[member].holds for member in members], axis=0))
 
     def of(self, conjunction: str) -> Array:
-        """Return (n,) bool"""
+        """Return (n,) bool: the runs that keep to a conjunction."""
         return np.concatenate([np.zeros(0, bool), *self.runs[conjunction]])
 
 
@@ -156,7 +156,7 @@ def _blank(job: Job, place: Scenario) -> Row:
     }  # fmt: skip
 
 
-def _played(job: Job, loop: Loop, attack: Any, known: Sequence[Property]) -> Found:
+def _played(job: Job, loop: Loop, attack: Attack, known: Sequence[Property]) -> Found:
     """Return the outcome of each property in the order of the seeds, up to where the rule stops."""
     cell, episodes = job.cell, job.cell.episodes
     size = episodes_at_once(loop.model, loop.horizon, cell.batch if job.rule is None else min(cell.batch, 64))
@@ -183,7 +183,7 @@ def _keys(purpose: str, seeds: tuple[int, ...]) -> draws.Keys:
     return draws.keys(purpose, seeds)
 
 
-def _outcomes(job: Job, loop: Loop, attack: Any, known: Sequence[Property], keys: draws.Keys) -> tuple[dict[str, Outcome], Array | None]:
+def _outcomes(job: Job, loop: Loop, attack: Attack, known: Sequence[Property], keys: draws.Keys) -> tuple[dict[str, Outcome], Array | None]:
     """Play the runs of these keys: outcomes, and false alarms of clean ones."""
     trace = rollout(loop, attack, keys)
     priced = job.cell.attack == CLEAN and any(p.name == DETECTS for p in known)

@@ -151,7 +151,7 @@ def rule_data(rule: Sequential | Sprt | None) -> dict[str, Any]:
     return {"name": "fixed"} if rule is None else {"name": type(rule).__name__.lower(), **_plain(rule)}
 
 
-def _plain(value: Any) -> dict[str, Any]:
+def _plain(value: object) -> dict[str, Any]:
     return {key: held for key, held in as_data(value).items() if key != "class"}
 
 
@@ -190,7 +190,7 @@ def replay_command(defence: str, attack: str, folder: Path, line: int) -> str:
     return shlex.join(words + [word for family, text in named for word in (f"--{family}", text)])
 
 
-def with_trust(board: dict[str, Any], found: Any, where: str = "trust", suite: Suite | None = None) -> dict[str, Any]:
+def with_trust(board: dict[str, Any], found: object, where: str = "trust", suite: Suite | None = None) -> dict[str, Any]:
     """Return a board with the field `trust`: what the bounds are about, and the bounds of each entry.
 
     An entry has bounds by what the attacker knows, on `all` properties together and on `safety`, those without detection. An entry that
