@@ -16,6 +16,8 @@ from tailgate.thesis import ch5_cases, ch5_theory, ch6_cases, ch6_loop, write
 from tailgate.thesis.runs import play
 
 LEVEL = 0.999
+# of 300 runs those without a collision, by defence: none, DKF, lasso
+DESIGN = {"+60 m, p = 0.5": (26, 1, 300), "hold d and v, p = 0.5": (16, 0, 300), "+60 m, p = 1": (0, 0, 0), "no attack": (300, 300, 300)}
 
 
 def seeds_of(name, count):
@@ -91,11 +93,11 @@ def test_chapter_6_clean():
 
 
 @pytest.mark.parametrize("guard", list(ch6_loop.DEFENCES))
-@pytest.mark.parametrize("label", list(ch6_loop.SPEC))
+@pytest.mark.parametrize("label", list(DESIGN))
 def test_chapter_6_collisions(label, guard):
     """Runs without a collision in closed loop: the design's counts of 300, by Fisher's exact test at 0.1 %."""
     n, of = 60, 300
-    design = dict(zip(ch6_loop.DEFENCES, ch6_loop.SPEC[label], strict=True))[guard]
+    design = dict(zip(ch6_loop.DEFENCES, DESIGN[label], strict=True))[guard]
     defence = Spec("defence", ch6_loop.DEFENCES[guard]).make()
     trace = play(ch6_loop.SCENARIO, defence, ch6_loop.ATTACKS[label], seeds_of(f"test_chapter_6_{label}_{guard}", n))
     safe = int((measure(trace)["collided"] == 0.0).sum())

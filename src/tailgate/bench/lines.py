@@ -1,4 +1,4 @@
-"""What a measurement is: a line with a name, a unit, and something that runs for about so many seconds."""
+"""A measurement: a line with a name, a unit, and a function that runs for about the seconds that it is given."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ RATE, SECONDS, BYTES, SHARE, NUMBER = "1/s", "s", "bytes", "share", "number"
 
 
 class Missing(Exception):
-    """What a line needs is not installed on this machine: says what, and how to get it."""
+    """A line needs something that is not installed on this machine. The text says what, and how to get it."""
 
 
 class Sample(NamedTuple):
@@ -25,7 +25,7 @@ class Sample(NamedTuple):
         return self.amount / self.per
 
 
-Go = Callable[[float], Sample]  # runs for about so many seconds
+Go = Callable[[float], Sample]  # runs for about these seconds
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""What this package does: one small function for each thing that is measured, all against the public interface."""
+"""Measurements of this package: one small function for each, all against the public interface."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What others do: each peer that is installed, set up to run for about so many seconds. One that is not installed is missing, no error."""
+"""Measurements of the peers that are installed. One that is not installed is missing, and no error."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def need(module: str, package: str, how: str) -> ModuleType:
 
 
 def stepped(env: Any, actions: list[Any], steps: int = STEPS) -> Go:
-    """Return steps per second of a single environment, resets included; it looks at the clock every so many `steps`."""
+    """Return steps per second of a single environment, resets included; it looks at the clock every `steps`."""
     env.reset(seed=0)
     coming = cycle(actions)
 

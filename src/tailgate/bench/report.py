@@ -1,4 +1,4 @@
-"""What is made of a record: a table for people, a page in Markdown, and plots of the scalings (extra: viz)."""
+"""A record for people: tables, a page in Markdown, and plots of the scalings (extra: viz)."""
 
 from __future__ import annotations
 

@@ -54,7 +54,7 @@ LINES: tuple[Line, ...] = (
 
 @dataclass(frozen=True)
 class Target:
-    """What is asked: left over right, or left alone, is at least (or at most) the bound; without a bound it is shown and not judged."""
+    """A demand: left over right, or left alone, is at least (or at most) the bound. Without a bound it is shown and not judged."""
 
     name: str
     what: str

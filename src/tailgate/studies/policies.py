@@ -1,4 +1,4 @@
-"""What a measurement needs to know of a trained policy: where it was trained, and where it is played."""
+"""Trained policies as measurements need them: where each was trained, and where it is played."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ Verdict = Literal["same", "differs", "unchecked"]
 
 
 class Again(NamedTuple):
-    """What became of one policy; `sha256` of its weights as they are shared, and of those that came out here."""
+    """The result for one policy; `sha256` of its weights as they are shared, and of those that came out here."""
 
     policy: str
     verdict: Verdict

@@ -1,4 +1,4 @@
-"""What an attacker's timing is worth: its outcome against that of the same policy at other times.
+"""The worth of an attacker's timing: its outcome against that of the same policy at other times.
 
     timing advantage = P(damage | own schedule) - P(damage | yoked schedule)
 
@@ -36,7 +36,7 @@ _SHUFFLE = 1  # tag of the draws in the policy's stream, at step 0
 
 
 class Played(NamedTuple):
-    """What one policy did on each episode, (B,) under each schedule: its outcome and how many of its steps took effect."""
+    """The results of one policy, (B,) under each schedule: its outcome and how many of its steps took effect."""
 
     outcome: dict[str, Array]
     steps: dict[str, Array]

@@ -1,6 +1,6 @@
 """Transfer: policies trained against one defence, played against others.
 
-A row of the matrix is what was trained on, a column what is played on; an entry is the mean over training seeds. On the diagonal stands
+A row of the matrix is what was trained on, a column what is played on; an entry is the mean over training seeds. The diagonal has
 what was trained against that very defence. Where a row from elsewhere does better than the diagonal, the attackers of that defence were
 not trained to its worst: the entry is flagged.
 """
@@ -55,7 +55,7 @@ def transfer(
 ) -> dict[str, Any]:  # fmt: skip
     """Return the report. Without `defences` the policies are played on those that they were trained on.
 
-    The word `all` stands for these and every registered defence that has a meaning in the scenario: those that a suite plays there, or,
+    The word `all` means these and every registered defence that has a meaning in the scenario: those that a suite plays there, or,
     where no suite goes, those that it admits; sentinels and what plays one episode after the other have to be named. `skipped` says who
     is left out, and why.
 

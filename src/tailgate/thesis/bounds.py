@@ -1,4 +1,4 @@
-"""What a chi-square gate bounds, and what it does not (thesis, Theorems 4.5.1-4.5.3 and Lemma 4.5.4, restated).
+"""Bounds that a chi-square gate gives, and errors that it does not bound (thesis, Theorems 4.5.1-4.5.3 and Lemma 4.5.4, restated).
 
 With gate g = r' S^-1 r <= eta and update x = x- + K r, for one agent: P- (n, n), S (q, q), K (n, q). These are formulas for a reader and
 for tests, not part of the scored path.

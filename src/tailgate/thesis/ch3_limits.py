@@ -1,4 +1,4 @@
-"""What the challenge can do and what it cannot: latency, predictable lists, fast attackers, and what it costs."""
+"""Limits of the challenge: its latency and cost, predictable lists, fast attackers."""
 
 from __future__ import annotations
 

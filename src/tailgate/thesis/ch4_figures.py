@@ -14,7 +14,7 @@ from .claims import Drawing
 from .figures import STYLES, Picture, legend_below, mark, panel
 
 NUMBERS = {"clean": "4.4", "fdi": "4.5", "dos": "4.6"}
-LINES = {  # told apart without colour as well
+LINES = {  # distinct without colour as well
     "kf": {"color": "#0072B2", "linestyle": "--"}, "ours": {"color": "#D55E00", "linestyle": "-"},
     "rkf": {"color": "#009E73", "linestyle": "-."}, "rkf_bad": {"color": "#7F7F7F", "linestyle": ":"},
 }  # fmt: skip

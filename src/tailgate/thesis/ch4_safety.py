@@ -1,4 +1,4 @@
-"""What the thesis concludes of safety, on scenarios that are long enough for a collision: 60 s behind a leader with manoeuvres."""
+"""The thesis's conclusions on safety, in scenarios that are long enough for a collision: 60 s behind a leader with manoeuvres."""
 
 from __future__ import annotations
 

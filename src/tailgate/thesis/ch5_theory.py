@@ -1,4 +1,4 @@
-"""What the theorems of chapter 5 bound, and what they do not: fixed point, convergence, bound, and the number of compromised agents."""
+"""The theorems of chapter 5 and their limits: fixed point, convergence, bound, and the number of compromised agents."""
 
 from __future__ import annotations
 

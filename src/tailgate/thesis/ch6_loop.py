@@ -37,7 +37,6 @@ ATTACKS = {
     "20 randn m, p = 1": "fdi_gaussian:sd=20.0,targets=[distance]",
     "+8 m/s^2 on car 2's message": "fdi:value=8.0,targets=[predecessor_acceleration]",
 }
-SPEC = {"+60 m, p = 0.5": (26, 1, 300), "hold d and v, p = 0.5": (16, 0, 300), "+60 m, p = 1": (0, 0, 0), "no attack": (300, 300, 300)}
 FLIP = 0.25  # change of a share that is one of a verdict
 LAMS = (0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0)
 STRINGS = (

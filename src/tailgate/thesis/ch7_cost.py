@@ -1,4 +1,4 @@
-"""What a run of the automata costs as a model gets more components, and more clocks (thesis 7.3.4)."""
+"""The cost of a run of the automata by the number of components and of clocks (thesis 7.3.4)."""
 
 from __future__ import annotations
 

@@ -159,10 +159,10 @@ def _unharmed(runs: Runs, attack: str) -> dict[str, object]:
 def _ramps(runs: Runs) -> Claim:
     cells, found = [], {}
     for attack in RAMPS:
-        heard, told = _noticed(runs[attack, "monitor"])
+        heard, notified = _noticed(runs[attack, "monitor"])
         cells += [heard] if heard else []
         cells.append(share(~runs[attack, "monitor and brake"].collided))
-        found[attack] = {"notified": told, "without a collision": _unharmed(runs, attack)}
+        found[attack] = {"notified": notified, "without a collision": _unharmed(runs, attack)}
     holds, note = judge(cells, LEVEL)
     return Claim(
         "7.4-ramps", "The same where the distance grows slowly: the fault is detected in time and the collision prevented",
@@ -218,11 +218,11 @@ def _threat(runs: Runs) -> Claim:
 def _table(runs: Runs) -> Table:
     rows = []
     for (attack, defence), run in runs.items():
-        told, answer = run.notice[~np.isnan(run.notice)], answered(run)
-        heard = told[np.isfinite(told)]
+        notice, answer = run.notice[~np.isnan(run.notice)], answered(run)
+        heard = notice[np.isfinite(notice)]
         rows.append((
             attack, defence, f"{100 * run.collided.mean():.1f} %", f"{np.median(run.gap):.1f}",
-            f"{100 * len(heard) / len(told):.0f} %" if len(told) else "", f"{np.median(heard):.2f}" if len(heard) else "",
+            f"{100 * len(heard) / len(notice):.0f} %" if len(notice) else "", f"{np.median(heard):.2f}" if len(heard) else "",
             f"{100 * run.printed.holds.mean():.0f} %",
             percent(answer) if answer else "never unsafe",
             f"{int(run.threat.asked.sum())} of {len(run.collided)}",

@@ -1,4 +1,4 @@
-"""What 36 successes in 36 runs say of trust, and what they do not."""
+"""Trust after 36 successes in 36 runs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a report is made of: claims of the thesis with what is measured, tables and figures."""
+"""The parts of a report: claims of the thesis with what is measured, tables and figures."""
 
 from __future__ import annotations
 

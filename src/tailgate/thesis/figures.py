@@ -1,4 +1,4 @@
-"""What the pictures of the chapters share: panels, curves of agents, and bands at attacked steps."""
+"""Helpers of the chapters' pictures: panels, curves of agents, and bands at attacked steps."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Picture: TypeAlias = "figure_.Figure"
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000", "#7F7F7F", "#8C564B", "#BCBD22")
 MARKERS = "osD^v<>PX*"
-STYLES = (("-", "o"), ("--", "s"), (":", "^"))  # told apart without colour as well
+STYLES = (("-", "o"), ("--", "s"), (":", "^"))  # distinct without colour as well
 BAND = "#F0C000"
 
 

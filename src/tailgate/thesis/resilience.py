@@ -1,4 +1,4 @@
-"""What the resilient distributed estimators guarantee (thesis, Theorems 5.3.3, 5.3.4, 6.5.3 and 6.5.4, restated), for steady gains.
+"""Guarantees of the resilient distributed estimators (thesis, Theorems 5.3.3, 5.3.4, 6.5.3 and 6.5.4, restated), for steady gains.
 
     (5.8)   norm_resilient     (6.26)   lasso_dkf
 

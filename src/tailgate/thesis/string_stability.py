@@ -47,7 +47,7 @@ class Peak(NamedTuple):
 
 
 class Sweep(NamedTuple):
-    """What a loop does with a leader that accelerates as a sine; (W,) frequencies, (W, N) RMS of each car over the leader's."""
+    """The response of a loop to a leader that accelerates as a sine; (W,) frequencies, (W, N) RMS of each car over the leader's."""
 
     frequency: Array  # [rad/s], such that a period is a whole number of steps
     speed: Array  # RMS of the speed about its mean

@@ -119,7 +119,7 @@ class Asked(NamedTuple):
     """A training that a suite asks for against each defence."""
 
     name: str
-    plan: str  # hash of the training, whoever is attacked
+    plan: str  # hash of the training, for any defence
     seed: int
     scenarios: tuple[str, ...]  # where the policy has to play
 

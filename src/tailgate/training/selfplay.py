@@ -10,7 +10,7 @@ Known are scripts, pool and fresh attackers; the worst is chosen on select seeds
 for the best fixed setting. The best answer there is does at least as much. Where the fresh attacker does less than what was known without
 it the search was too weak to say how much more, and the report says so.
 
-A member is trained for certain opponents: a run that goes on trains anew what was trained for others.
+A member is trained for certain opponents: a run that goes on trains again what was trained for others.
 """
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ import dataclasses
 import itertools
 import json
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +44,7 @@ from tailgate.envs.duel import Duel, Payoff
 from tailgate.estimators.steered import Steered
 from tailgate.estimators.steering import nearest
 from tailgate.evaluation.stats import Interval, paired_difference, proportion
+from tailgate.training.settings import check_mappings, check_name, mapping, parameters_of, started_with
 from tailgate.training.train import TrainConfig, environment_of
 
 FRESH, DEFENDERS = 1000, 500  # added to the first seed: seeds of best responses and of defenders differ from those of self-play's attackers
@@ -55,19 +57,19 @@ Crashed = dict[tuple[str, str], Array]  # by defender and attack: (episodes,) 0 
 
 @dataclass(frozen=True)
 class GameConfig:
-    """What `tailgate selfplay` reads."""
+    """The configuration of `tailgate selfplay`."""
 
     name: str = param("selfplay", "name of the run; its files go to out/name")
     out: str = param("runs", "directory of the runs")
     scenario: str = param("gusty-stop-and-go-v0", "scenario, by name or YAML file")
     defence: str = param("chi2_kf", "registered defence whose knobs the defender turns")
-    menu: dict[str, Any] = field(default_factory=dict, metadata={"doc": "settings of the knobs: thresholds, challenges, modes"})
-    payoff: dict[str, Any] = field(default_factory=dict, metadata={"doc": "what the defender is paid for"})
-    threat: dict[str, Any] = field(default_factory=dict, metadata={"doc": "changes of the scenario's threat model"})
-    environment: dict[str, Any] = field(default_factory=dict, metadata={"doc": "action and reward settings of the attacker"})
+    menu: dict[str, Any] = mapping("settings of the knobs: thresholds, challenges, modes")
+    payoff: dict[str, Any] = mapping("what the defender is paid for")
+    threat: dict[str, Any] = mapping("changes of the scenario's threat model")
+    environment: dict[str, Any] = mapping("action and reward settings of the attacker")
     learner: str = param("cem", f"how the attacker learns: {', '.join(LEARNERS)}; the defender learns by cem")
-    attacker: dict[str, Any] = field(default_factory=dict, metadata={"doc": "hyper-parameters of the attacker's learner"})
-    defender: dict[str, Any] = field(default_factory=dict, metadata={"doc": "hyper-parameters of the defender's learner"})
+    attacker: dict[str, Any] = mapping("hyper-parameters of the attacker's learner")
+    defender: dict[str, Any] = mapping("hyper-parameters of the defender's learner")
     gamma: Discount = param(0.99, "discount of both [-]")
     rounds: Passes = param(2, "rounds: an attacker and a defender each")
     steps: Steps = param(300_000, "decisions of a training, over all environments")
@@ -87,26 +89,13 @@ def load_config(source: str | None, overrides: list[str], resume: bool = False) 
     config = _checked(override(read_yaml(path, "config"), overrides, GameConfig))
     if not resume:
         return config
-    return _checked(override(_started(config.directory / "config.json"), overrides, GameConfig))
-
-
-def _started(held: Path) -> dict[str, Any]:
-    """Return the configuration that a run was started with."""
-    try:
-        started: dict[str, Any] = load_json(held, strict=False)
-        del started["class"]
-    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-        raise InputError("resume", str(held), f"the configuration of a run ({said(error)})") from None
-    return started
+    return _checked(override(started_with(config.directory / "config.json"), overrides, GameConfig))
 
 
 def _checked(data: dict[str, Any]) -> GameConfig:
-    for key in ("menu", "payoff", "threat", "environment", "attacker", "defender"):
-        if not isinstance(data.get(key, {}), dict):
-            raise InputError(f"config.{key}", data[key], "a mapping of fields")
+    check_mappings(data, ("menu", "payoff", "threat", "environment", "attacker", "defender"))
     config = build(GameConfig, data, "config")
-    if Path(config.name).name != config.name:
-        raise InputError("config.name", config.name, "the name of a directory, without a separator")
+    check_name(config.name)
     Spec("defence", config.defence).refuse_imports("config")
     for name in config.rivals:
         Spec("attack", name).refuse_imports("config")
@@ -154,7 +143,7 @@ class Game:
         """Write the configuration, or raises InputError when the run that is resumed had another one."""
         held, now = self.directory / "config.json", as_data(self.config)
         if resume and held.is_file():
-            before, free = _started(held), ("class", "rounds", "episodes", "fresh", "rivals")
+            before, free = started_with(held), ("class", "rounds", "episodes", "fresh", "rivals")
             changed = [key for key in now if key not in free and before.get(key) != now[key]]
             if changed:
                 raise InputError("resume", ", ".join(changed), f"the configuration in {held}, apart from {', '.join(free[1:])}")
@@ -324,9 +313,4 @@ def _finished(path: Path, facts: dict[str, Any]) -> bool:
         raise InputError("resume", str(path), f"a policy of this run ({said(error)})") from None
 
 
-def parameters() -> list[dict[str, Any]]:
-    """Return every field of the configuration with default and sentence, for --help."""
-    return [
-        {"name": f.name, "default": as_data(f.default if f.default is not dataclasses.MISSING else {}), "doc": f.metadata.get("doc", "")}
-        for f in dataclasses.fields(GameConfig)
-    ]
+parameters = partial(parameters_of, GameConfig)

@@ -7,7 +7,7 @@ import dataclasses
 import hashlib
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -31,6 +31,7 @@ from tailgate.envs.seat import Seat
 from tailgate.evaluation.baselines import best_of
 from tailgate.evaluation.cells import cells_of
 from tailgate.play.metrics import METRICS
+from tailgate.training.settings import check_mappings, check_name, mapping, parameters_of, started_with
 from tailgate.training.trainings import Training, train_all
 
 ENVIRONMENT = (fields_of(ActionSpec) | fields_of(Reward) | {"frames": None}).keys() - {"gamma"}  # that `environment` may hold
@@ -42,22 +43,22 @@ LATER = {"demonstrations"}  # fields that joined when policies had been publishe
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """What `train.py` reads. A learner's settings stand below its name, the environment's below `environment`."""
+    """The configuration of `train.py`. A learner's settings are below its name, the environment's below `environment`."""
 
     name: str = param("quickstart", "name of the run; its files go to out/name")
     out: str = param("runs", "directory of the runs")
     scenario: str = param("gusty-stop-and-go-v0", "scenario, by name or YAML file")
     defence: str = param("chi2_kf", "registered defence to attack")
-    threat: dict[str, Any] = field(default_factory=dict, metadata={"doc": "changes of the scenario's threat model"})
-    environment: dict[str, Any] = field(default_factory=dict, metadata={"doc": "action and reward settings of the environment"})
+    threat: dict[str, Any] = mapping("changes of the scenario's threat model")
+    environment: dict[str, Any] = mapping("action and reward settings of the environment")
     learner: str = param("ppo", f"who learns: {'; '.join(f'{name}, {what}' for name, what in LEARNERS.items())}")
-    ppo: dict[str, Any] = field(default_factory=dict, metadata={"doc": "hyper-parameters of PPO"})
-    maskable_ppo: dict[str, Any] = field(default_factory=dict, metadata={"doc": "hyper-parameters of PPO with action masks"})
-    recurrent_ppo: dict[str, Any] = field(default_factory=dict, metadata={"doc": "hyper-parameters of PPO with an LSTM"})
-    dqn: dict[str, Any] = field(default_factory=dict, metadata={"doc": "hyper-parameters of DQN"})
-    sac: dict[str, Any] = field(default_factory=dict, metadata={"doc": "hyper-parameters of SAC"})
-    tqc: dict[str, Any] = field(default_factory=dict, metadata={"doc": "hyper-parameters of TQC"})
-    cem: dict[str, Any] = field(default_factory=dict, metadata={"doc": "hyper-parameters of the cross-entropy method"})
+    ppo: dict[str, Any] = mapping("hyper-parameters of PPO")
+    maskable_ppo: dict[str, Any] = mapping("hyper-parameters of PPO with action masks")
+    recurrent_ppo: dict[str, Any] = mapping("hyper-parameters of PPO with an LSTM")
+    dqn: dict[str, Any] = mapping("hyper-parameters of DQN")
+    sac: dict[str, Any] = mapping("hyper-parameters of SAC")
+    tqc: dict[str, Any] = mapping("hyper-parameters of TQC")
+    cem: dict[str, Any] = mapping("hyper-parameters of the cross-entropy method")
     teacher: str | None = param(None, "script that PPO imitates before it learns: one by name, or `best` of the rivals; none: from scratch")
     demonstrations: Episodes = param(1024, "episodes of its teacher that a learner is shown")
     gamma: Discount = param(0.995, "discount, of the learner and of the shaping [-]")
@@ -92,12 +93,7 @@ def load_config(source: str | None, overrides: list[str], resume: bool = False) 
     if not config.directory.is_dir():
         known = sorted(p.parent.name for p in Path(config.out).glob("*/config.json"))
         raise InputError("resume", config.name, f"the name of a run in {config.out}: {', '.join(known) or 'there is none'}")
-    try:
-        started = load_json(held, strict=False)
-        del started["class"]
-    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-        raise InputError("resume", str(held), f"the configuration of the run ({said(error)})") from None
-    return checked(override(started, overrides, TrainConfig))
+    return checked(override(started_with(held), overrides, TrainConfig))
 
 
 def _preset(source: str) -> dict[str, Any]:
@@ -114,19 +110,16 @@ def _preset(source: str) -> dict[str, Any]:
 
 def checked(data: dict[str, Any]) -> TrainConfig:
     """Return a configuration from JSON data. Raises InputError for a field that makes no sense, and for one that names code to import."""
-    for key in ("threat", "environment", *LEARNERS):
-        if not isinstance(data.get(key, {}), dict):
-            raise InputError(f"config.{key}", data[key], "a mapping of fields")
+    check_mappings(data, ("threat", "environment", *LEARNERS))
     config = build(TrainConfig, data, "config")
-    if Path(config.name).name != config.name:
-        raise InputError("config.name", config.name, "the name of a directory, without a separator")
+    check_name(config.name)
     if config.outcome is not None and config.outcome not in METRICS:
         raise unknown("config.outcome", config.outcome, METRICS)
-    for spec in [Spec("defence", config.defence), *(Spec("defence", name) for name in config.others)]:
-        spec.refuse_imports("config")
     shown = () if config.teacher in (None, "best") else (config.teacher,)
-    for spec in (Spec("attack", name) for name in (*config.rivals, *config.white_box, *shown)):
-        spec.refuse_imports("config")
+    for defence in (config.defence, *config.others):
+        Spec("defence", defence).refuse_imports("config")
+    for attack in (*config.rivals, *config.white_box, *shown):
+        Spec("attack", attack).refuse_imports("config")
     if shown:
         _ = Spec("attack", shown[0]).entry  # a name that exists
     return config
@@ -321,7 +314,7 @@ def training_of(config: dict[str, Any]) -> str:
 
 
 def _same_training(config: dict[str, Any], other: object) -> bool:
-    """Return whether what stands in a file is a configuration of the same training."""
+    """Return whether the data of a file are a configuration of the same training."""
     return isinstance(other, dict) and training_of(other) == training_of(config)
 
 
@@ -366,9 +359,4 @@ def figures(progress: Progress) -> str:
     return text if progress.reward is None else f"{text}, return {progress.reward:+.2f}"
 
 
-def parameters() -> list[dict[str, Any]]:
-    """Return every field of the configuration with default and sentence, for --help."""
-    return [
-        {"name": f.name, "default": as_data(f.default if f.default is not dataclasses.MISSING else {}), "doc": f.metadata.get("doc", "")}
-        for f in dataclasses.fields(TrainConfig)
-    ]
+parameters = partial(parameters_of, TrainConfig)

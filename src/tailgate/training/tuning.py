@@ -92,13 +92,13 @@ class Search:
 
     @property
     def trained(self) -> TrainConfig:
-        """What a trial trains: one seed, nothing that is for the comparison alone. A teacher may be the best of the rivals."""
+        """The training of a trial: one seed, nothing that is for the comparison alone. A teacher may be the best of the rivals."""
         rivals = self.base.rivals if self.base.teacher is not None else ()
         return dataclasses.replace(self.base, seeds=1, workers=1, tensorboard=False, rivals=rivals, white_box=(), others=())
 
     @property
     def digest(self) -> str:
-        """Of everything that decides what a trial gives: a search goes on with the same one only."""
+        """A digest of everything that decides what a trial gives: a search goes on with the same one only."""
         return digest([self.trained, self.space, self.episodes, self.seed])
 
 

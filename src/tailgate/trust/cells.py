@@ -27,7 +27,7 @@ from .false_alarms import DETECTS, false_alarms
 from .logic import Eventually, Interval, along, holds, robustness
 from .properties import CONJUNCTIONS, Demands, Property, built_in, conjunctions, own
 from .signals import SafeDistance, sample
-from .statistics import Sequential, Sprt
+from .statistics import Rule
 
 Row = dict[str, Any]
 
@@ -41,11 +41,11 @@ class Job:
     bound: float | None = None
     safe: SafeDistance = field(default_factory=SafeDistance)
     asked: Demands = field(default_factory=Demands)
-    rule: Sequential | Sprt | None = None
+    rule: Rule | None = None
 
     @cached_property
     def identity(self) -> str:
-        """Of everything that decides the row."""
+        """A digest of everything that decides the row."""
         known = [[p.name, str(p.formula), str(p.trigger), p.until] for p in self.properties(load_scenario(self.cell.scenario))]
         rest = [known, self.safe, self.rule, *(["false alarms"] if self.cell.attack == CLEAN and not self.formulas else [])]
         return hashlib.blake2b(f"{cell_id(self.cell)}/{canonical(rest)}".encode(), digest_size=12).hexdigest()
@@ -55,7 +55,7 @@ class Job:
 
 
 class Outcome(NamedTuple):
-    """What became of a property in B runs."""
+    """A property in B runs."""
 
     holds: Array  # (B,) bool
     robustness: Array  # (B,)
@@ -77,7 +77,7 @@ def outcome(known: Property, trace: Trace, safe: SafeDistance) -> Outcome:
 
 @dataclass
 class Tally:
-    """What is known of a property after n runs; they themselves are not kept."""
+    """A property after n runs, which are not kept."""
 
     n: int = 0
     k: int = 0  # runs that hold
@@ -105,7 +105,7 @@ class Tally:
 
 @dataclass
 class Found:
-    """What is known of a cell: a tally of each property, and of each conjunction whether a run keeps to it, one byte a run."""
+    """A cell so far: a tally of each property, and for each conjunction whether a run satisfies it, one byte a run."""
 
     tallies: dict[str, Tally]
     together: dict[str, tuple[str, ...]]  # names of the conjunctions and of what they are made of

@@ -22,7 +22,7 @@ LONGEST = 4000  # characters
 DEEPEST = 60  # brackets and operators within each other
 _TOKEN = re.compile(r"\s*(?:(\d+(?:\.\d*)?(?:[eE][+-]?\d+)?|\.\d+(?:[eE][+-]?\d+)?)|([A-Za-z_]\w*(?:@\d+)?)|(->|>=|<=|[-+*()\[\],<>]))")
 _WORDS = ("and", "or", "not", "true", "false", "end", "F", "G", "U")
-Terms = dict[str, float]  # factor of each signal; "" stands for the constant
+Terms = dict[str, float]  # factor of each signal; "" is the constant
 
 
 def parse(text: str, flags: Container[str] | None = None) -> Formula:

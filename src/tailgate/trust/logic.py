@@ -222,7 +222,7 @@ def response(trigger: Formula, answer: Formula, deadline: float, last: float) ->
 
 
 class _Algebra(NamedTuple):
-    """What makes a semantics: truth and falsehood, the worth of an atom, and of a negation. `and` is the least, `or` the greatest."""
+    """A semantics: truth and falsehood, the worth of an atom, and of a negation. `and` is the least, `or` the greatest."""
 
     top: bool | float
     bottom: bool | float
@@ -310,7 +310,7 @@ def _margin(atom: Atom, samples: Samples) -> Array:
 
 
 def _shifted(x: Array, steps: int, empty: bool | float) -> Array:
-    """Return what stands `steps` samples later."""
+    """Return the samples `steps` later."""
     if not steps:
         return x
     out = np.full_like(x, empty)

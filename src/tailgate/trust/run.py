@@ -33,7 +33,7 @@ from .cells import Job, Row, check_cell, failed, single
 from .properties import CONJUNCTIONS, Demands, own
 from .report import FORMAT, report
 from .signals import SafeDistance
-from .statistics import Sequential, Sprt
+from .statistics import Rule
 
 ROWS, FAILURES, REPORT = "cells.jsonl", "failures.jsonl", "trust.json"
 BATCH = 2048
@@ -43,7 +43,7 @@ Progress = Callable[[int, int], None]
 def jobs_of(
     suite: Suite, *, runs: int, formulas: Sequence[str] = (), purpose: str = "report", beacon: str = "",
     batch: int = BATCH, threat: dict[str, Any] | None = None, safe: SafeDistance | None = None, asked: Demands | None = None,
-    rule: Sequential | Sprt | None = None,
+    rule: Rule | None = None,
 ) -> list[Job]:  # fmt: skip
     """Return every cell of a suite with what is asked of it. Raises InputError for anything that does not exist or cannot be read."""
     for name, value in (("runs", runs), ("batch", batch)):
@@ -103,7 +103,7 @@ def _read(path: Path) -> list[Row]:
 
 
 def _played(jobs: Sequence[Job], workers: int) -> Generator[Row]:
-    """Return rows as they are finished. Somebody's own code plays in a process of its own."""
+    """Return rows as they are finished. Imported code plays in a separate process."""
     foreign = any(Spec("defence", job.cell.defence).imports or Spec("attack", job.cell.attack).imports for job in jobs)
     if not foreign and (workers == 1 or len(jobs) < 2):
         yield from map(check_cell, jobs)
@@ -116,7 +116,7 @@ def _played(jobs: Sequence[Job], workers: int) -> Generator[Row]:
 def check(
     suite: Suite, *, runs: int | None = None, formulas: Sequence[str] = (), alpha: float = 0.05, purpose: str = "report",
     beacon: str = "", batch: int = BATCH, workers: int = 1, folder: Path | None = None, threat: dict[str, Any] | None = None,
-    safe: SafeDistance | None = None, asked: Demands | None = None, rule: Sequential | Sprt | None = None,
+    safe: SafeDistance | None = None, asked: Demands | None = None, rule: Rule | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Any]:  # fmt: skip
     """Return the report on a suite's defences, in the format tailgate-trust-1; docs/trust.md says what its fields mean.
@@ -146,7 +146,7 @@ def check(
     return found
 
 
-def rule_data(rule: Sequential | Sprt | None) -> dict[str, Any]:
+def rule_data(rule: Rule | None) -> dict[str, Any]:
     """Return a rule as JSON data."""
     return {"name": "fixed"} if rule is None else {"name": type(rule).__name__.lower(), **_plain(rule)}
 

@@ -47,7 +47,7 @@ class Plan(NamedTuple):
 
 
 class State(NamedTuple):
-    """Of the A runs that still go on."""
+    """The A runs that still go on."""
 
     run: Array  # (A,) which of the B
     value: Array  # (V, A)

@@ -64,7 +64,7 @@ def runs_for(half: float, level: float) -> int:
 
 
 class Verdict(NamedTuple):
-    """What a rule says, and after how many runs."""
+    """The answer of a rule, and after how many runs."""
 
     runs: int
     holds: bool | None  # of a test: the hypothesis that it settled on
@@ -151,7 +151,7 @@ class Sequential:
 
 
 class Rates(NamedTuple):
-    """Of a test at one true probability."""
+    """Error rates of a test at one true probability."""
 
     accepts: float  # chance that it says p >= high
     rejects: float  # chance that it says p <= low
@@ -180,7 +180,7 @@ class Sprt:
 
     @property
     def _steps(self) -> tuple[float, float]:
-        """What a success and a failure add to log L(low) / L(high)."""
+        """The terms that a success and a failure add to log L(low) / L(high)."""
         return math.log(self.low / self.high), math.log((1.0 - self.low) / (1.0 - self.high))
 
     def _ratio(self, k: Array, n: Array | int) -> Array:
