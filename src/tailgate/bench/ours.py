@@ -126,10 +126,10 @@ def batch(episodes: int, threads: int = 1) -> Go:
     return repeated(lambda: decided(rows))
 
 
-def several(place: Scenario, defence: str, value: float, reward: RewardName, episodes: int) -> Go:
+def several(scenario: Scenario, defence: str, value: float, reward: RewardName, episodes: int) -> Go:
     """Play whole steps of several agents under a learner's action, as in `batch`."""
-    guard, spec = Spec("defence", defence), ActionSpec("timing", "fdi", value, interval=HELD)
-    loop = place.loop(guard.make(), guard.entry.uses)
+    named, spec = Spec("defence", defence), ActionSpec("timing", "fdi", value, interval=HELD)
+    loop = scenario.loop(named.make(), named.entry.uses)
     seat = Seat(loop, ActionCodec(spec, loop.brief), ObservationCodec(loop.brief), Reward(reward), {})
     rows, attack, over = side_by_side(seat), np.ones(episodes, np.int64), np.zeros(episodes, bool)
     rows.begin(draws.keys("tune", range(episodes)))
@@ -145,16 +145,16 @@ def several(place: Scenario, defence: str, value: float, reward: RewardName, epi
 
 def platoon(episodes: int, followers: int = 4, defence: str = "dkf") -> Go:
     """Play whole steps of a platoon, each car with an estimator of the whole state; one gap is attacked."""
-    place = load_scenario("platoon-braking-v0").with_threat(agents=(min(2, followers),), targets=("distance",))
-    place = dataclasses.replace(place, plant=dataclasses.replace(place.plant, followers=followers))
-    return several(place, defence, 60.0, "min_gap", episodes)
+    scenario = load_scenario("platoon-braking-v0").with_threat(agents=(min(2, followers),), targets=("distance",))
+    scenario = dataclasses.replace(scenario, plant=dataclasses.replace(scenario.plant, followers=followers))
+    return several(scenario, defence, 60.0, "min_gap", episodes)
 
 
 def network(episodes: int, sensors: int) -> Go:
     """Play whole steps of chapter 5's network of ten agents under the norm-penalised estimator; one is attacked."""
-    place = load_scenario("thesis-ch5-v0").with_threat(agents=(0,))
-    place = dataclasses.replace(place, sensor=dataclasses.replace(place.sensor, sensors=sensors))
-    return several(place, "norm_resilient", 60.0, "error", episodes)
+    scenario = load_scenario("thesis-ch5-v0").with_threat(agents=(0,))
+    scenario = dataclasses.replace(scenario, sensor=dataclasses.replace(scenario.sensor, sensors=sensors))
+    return several(scenario, "norm_resilient", 60.0, "error", episodes)
 
 
 # -- a defence by somebody else

@@ -146,10 +146,10 @@ def _written(
     for done, (split, cell) in enumerate(every, 1):
         part = parts / f"{cell_id(cell)}.parquet"
         try:
-            loop, place, rival = _ready(cell)
-            columns.setdefault(cell.scenario, (place, loop.model, columns_of(loop)))
+            loop, scenario, attack = _ready(cell)
+            columns.setdefault(cell.scenario, (scenario, loop.model, columns_of(loop)))
             if not _good(part, cell):
-                _play_part(part, split, cell, loop, rival, columns[cell.scenario][2])
+                _play_part(part, split, cell, loop, attack, columns[cell.scenario][2])
         except NotApplicable as error:  # some attacks find out only when they look at the defence
             skipped.append({"split": split, **_named(cell), "reason": str(error)})
         if progress is not None:
@@ -181,12 +181,12 @@ def _named(cell: Cell) -> dict[str, Any]:
 
 def _ready(cell: Cell) -> tuple[Loop, Scenario, Attack]:
     """Return the loop, the scenario and the attack of a cell. Raises NotApplicable for a pairing without meaning."""
-    guard, rival = Spec("defence", cell.defence), Spec("attack", cell.attack)
-    attack: Attack = rival.make()
-    place = cell.place(attack, rival.entry.knowledge)
-    loop = place.loop(guard.make(), guard.entry.uses)
+    defence, spec = Spec("defence", cell.defence), Spec("attack", cell.attack)
+    attack: Attack = spec.make()
+    scenario = cell.place(attack, spec.entry.knowledge)
+    loop = scenario.loop(defence.make(), defence.entry.uses)
     attack.prepare(loop.brief)
-    return loop, place, attack
+    return loop, scenario, attack
 
 
 def _schema(columns: Sequence[Column]) -> Any:

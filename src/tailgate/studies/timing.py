@@ -130,12 +130,12 @@ def timing(
         raise InputError("episodes", episodes, "at least 2: the schedule of another episode is needed")
     groups: dict[str, list[tuple[Trained, Loop, dict[str, Any]]]] = {}
     for who in distinct(texts):
-        where, guard = place_of(who, scenario), defence_of(who, defence)
+        where, against = place_of(who, scenario), defence_of(who, defence)
         changed = who.threat | dict(threat or {})
         counted = outcome_for(outcome or who.outcome, where)
-        loop = loop_for(who, where, guard, changed, dose)
+        loop = loop_for(who, where, against, changed, dose)
         facts = {
-            "scenario": where, "defence": guard, "learner": who.learner, "trained_on": who.defence, "outcome": counted,
+            "scenario": where, "defence": against, "learner": who.learner, "trained_on": who.defence, "outcome": counted,
             "unit": unit_in(counted, loop.model), "threat_model": as_data(loop.threat),
         }  # fmt: skip
         key = canonical(facts | {"action": who.header.action, "trained": [who.scenario, who.threat]})

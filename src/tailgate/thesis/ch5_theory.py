@@ -74,13 +74,13 @@ def scalar_convergence(factor: float, kind: str, a: float = 1.5, c: float = 0.1,
         A=a * one, B=np.zeros((1, 0)), c=np.zeros(1), C=c * one[None], Q=one, R=one[None], graph=np.eye(1, dtype=bool), dt=1.0,
         sensors=("y",),
     )  # fmt: skip
-    guard = make("defence", "norm_resilient", lam=lam) if kind == "norm" else make("defence", "lasso_dkf", lam=lam, unit="sensor")
-    plan = guard.prepare(model)
+    estimator = make("defence", "norm_resilient", lam=lam) if kind == "norm" else make("defence", "lasso_dkf", lam=lam, unit="sensor")
+    plan = estimator.prepare(model)
     error = np.full((1, 1, 1), factor * lam / c)
-    state = guard.start(plan, Prior(error, np.ones((1, 1, 1, 1))))
+    state = estimator.start(plan, Prior(error, np.ones((1, 1, 1, 1))))
     silent = Received(np.zeros((1, 1, 1)), np.ones((1, 1, 1), bool), np.zeros((1, 1)))
     for _ in range(400):
-        state, estimate = guard.step(plan, state, silent, np.zeros((1, 1, 0)), DRAWS)
+        state, estimate = estimator.step(plan, state, silent, np.zeros((1, 1, 0)), DRAWS)
         if abs(estimate.x[0, 0, 0]) > 1e3 * abs(error[0, 0, 0]):
             return False
     return bool(abs(estimate.x[0, 0, 0]) < 1e-6)

@@ -197,13 +197,13 @@ def _known(runs: Runs, seeds: int) -> Claim:
     values: dict[str, dict[str, float]] = {}
     for case in ("clean", "dos"):
         title, attack = CASES[case]
-        for label, guard, told in (
+        for label, estimator, told in (
             ("dkf", defence("dkf"), runs[case, "dkf"]),
             ("lasso", defence("lasso"), runs[case, "lasso"]),
             (f"lasso, lam = {LOOP_LAM:g}", defence("lasso", LOOP_LAM), None),
         ):
-            told = told or run(guard, attack, seeds)
-            values[f"{title}, {label}"] = {"told": median(told.worst), "not told": median(run(guard, attack, seeds, secret).worst)}
+            told = told or run(estimator, attack, seeds)
+            values[f"{title}, {label}"] = {"told": median(told.worst), "not told": median(run(estimator, attack, seeds, secret).worst)}
     change = max(v["not told"] / v["told"] for v in values.values())
     return Claim(
         "6.6-known-input", "The followers know the leader's input u_r (assumed in all figures)", "known", values,

@@ -78,23 +78,23 @@ def compare(
     from tailgate.studies.timing import timing_advantage
 
     threat, outcome = dict(config.threat), outcome_of(config)
-    guard = config.defence
+    defence = config.defence
     scripts = scripts or play_scripts(config, policies, progress)
     rows = scripts.rows
 
     def outcomes(attack: str) -> Array:
-        return outcomes_of([r for r in rows if r["attack"] == attack and r["defence"] == guard], outcome)
+        return outcomes_of([r for r in rows if r["attack"] == attack and r["defence"] == defence], outcome)
 
     # who may not look into a defence has no figures against it, which is no reason to lose the others
-    skipped = {r["attack"]: r["reason"] for r in rows if r["defence"] == guard and r["status"] == "skipped"}
+    skipped = {r["attack"]: r["reason"] for r in rows if r["defence"] == defence and r["status"] == "skipped"}
     left_out = {name: skipped[name] for name in config.white_box if name in skipped}
-    built, uses = Spec("defence", guard).make(), Spec("defence", guard).entry.uses
+    built, uses = Spec("defence", defence).make(), Spec("defence", defence).entry.uses
     keys = draws.keys("report", range(config.first_episode, config.first_episode + config.episodes))
     verdicts = []
     for path, seed in zip(policies, training_seeds(config), strict=True):
         policy = PolicyAttack(path)
-        place = load_scenario(config.scenario).with_threat(**(threat | {"knowledge": policy.knowledge}))
-        own, yoked = timing_advantage(place.loop(built, uses), policy, keys, outcome)
+        scenario = load_scenario(config.scenario).with_threat(**(threat | {"knowledge": policy.knowledge}))
+        own, yoked = timing_advantage(scenario.loop(built, uses), policy, keys, outcome)
         verdicts.append(Verdict(seed, path, own, yoked))
     return _report(config, verdicts, outcomes, scripts, outcome, left_out)
 

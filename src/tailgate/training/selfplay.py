@@ -162,17 +162,17 @@ class Game:
     def _run(self) -> dict[str, Any]:
         defenders, attackers = [self._as_it_is()], []
         for r in range(1, self.config.rounds + 1):
-            pool = self._guard(policy=tuple(defenders))
+            pool = self._defence(policy=tuple(defenders))
             attackers.append(self._attacker(f"attacker-{r}", self.config.first_seed + r, pool))
             defenders.append(self._defender(r, tuple(PolicyAttack(path) for path in attackers)))
-        frozen = self._guard(policy=defenders[-1])
+        frozen = self._defence(policy=defenders[-1])
         setting = self._best_setting(tuple(PolicyAttack(path) for path in attackers))
-        fixed = self._guard(setting=setting)
+        fixed = self._defence(setting=setting)
         fresh = [self._fresh(f"fresh-{i}", i, frozen) for i in range(self.config.fresh)]
         other = [self._fresh(f"fresh-fixed-{i}", i, fixed) for i in range(self.config.fresh)]
-        return self._report({AS_IS: self._guard(), FIXED: fixed, TRAINED: frozen}, attackers, fresh, other, setting)
+        return self._report({AS_IS: self._defence(), FIXED: fixed, TRAINED: frozen}, attackers, fresh, other, setting)
 
-    def _guard(self, **who: Any) -> Steered:
+    def _defence(self, **who: Any) -> Steered:
         """Return the defence in certain hands: a policy's, or those of a fixed setting."""
         return dataclasses.replace(self.duel.guard, **who)
 
@@ -183,13 +183,13 @@ class Game:
             return path.with_suffix(".json")
         return export(path, self.duel, constant(self.duel, setting), facts)
 
-    def _fresh(self, name: str, i: int, guard: Steered) -> Path:
-        return self._attacker(name, self.config.first_seed + FRESH + i, guard)
+    def _fresh(self, name: str, i: int, defence: Steered) -> Path:
+        return self._attacker(name, self.config.first_seed + FRESH + i, defence)
 
-    def _attacker(self, name: str, seed: int, guard: Steered) -> Path:
-        environment = _seat_of(self.config) | {"defence": guard}
+    def _attacker(self, name: str, seed: int, defence: Steered) -> Path:
+        environment = _seat_of(self.config) | {"defence": defence}
         module = learner_of(self.config.learner)
-        facts = {"learner": self.config.learner, "seed": seed, "against": as_data(guard), "settings": as_data(self.settings)}
+        facts = {"learner": self.config.learner, "seed": seed, "against": as_data(defence), "settings": as_data(self.settings)}
         return self._train(name, lambda: module.Learner(seed, self.config.gamma, self.settings, environment), facts)
 
     def _defender(self, r: int, attacks: tuple[Attack, ...]) -> Path:
@@ -235,53 +235,54 @@ class Game:
             self.update("fixed settings", attacks.index(attack) + 1, len(attacks), "")
         return int(np.argmax(paid))
 
-    def _play(self, guard: Steered, attack: Attack, purpose: str, episodes: int) -> Played:
+    def _play(self, defence: Steered, attack: Attack, purpose: str, episodes: int) -> Played:
         """Return the first episodes of a pair on seeds of a purpose."""
-        seat = dataclasses.replace(self.duel.seat, loop=dataclasses.replace(self.duel.seat.loop, defence=guard))
-        duel = dataclasses.replace(self.duel, seat=seat, guard=guard)
+        seat = dataclasses.replace(self.duel.seat, loop=dataclasses.replace(self.duel.seat.loop, defence=defence))
+        duel = dataclasses.replace(self.duel, seat=seat, guard=defence)
         parts = [play(duel, attack, draws.keys(purpose, range(at, min(at + BATCH, episodes)))) for at in range(0, episodes, BATCH)]
         paid, crashed, cost = (np.concatenate([getattr(part, name) for part in parts]) for name in ("paid", "crashed", "cost"))
         return Played(paid, crashed, cost, sum(part.decisions for part in parts))
 
-    def _table(self, guards: dict[str, Steered], attacks: dict[str, Attack]) -> tuple[list[dict[str, Any]], Crashed]:
+    def _table(self, defenders: dict[str, Steered], attacks: dict[str, Attack]) -> tuple[list[dict[str, Any]], Crashed]:
         """Return every defender against every attack on report seeds: the rows of the table, and who crashed in which episode."""
         table: list[dict[str, Any]] = []
         crashed: Crashed = {}
-        total = len(guards) * len(attacks)
-        for (guard, defence), (name, attack) in itertools.product(guards.items(), attacks.items()):
+        total = len(defenders) * len(attacks)
+        for (defender, defence), (name, attack) in itertools.product(defenders.items(), attacks.items()):
             out = self._play(defence, attack, "report", self.config.episodes)
-            crashed[guard, name] = out.crashed.astype(np.float64)
-            table.append({"defender": guard, "attack": name, "collisions": _share(out.crashed)._asdict(), "cost": float(out.cost.mean())})
+            crashed[defender, name] = out.crashed.astype(np.float64)
+            share = _share(out.crashed)._asdict()
+            table.append({"defender": defender, "attack": name, "collisions": share, "cost": float(out.cost.mean())})
             self.update("final table", len(table), total, f"{len(table)} of {total} pairs")
         return table, crashed
 
-    def _select(self, guard: str, defence: Steered, attacks: dict[str, Attack]) -> dict[str, Interval]:
+    def _select(self, defender: str, defence: Steered, attacks: dict[str, Attack]) -> dict[str, Interval]:
         """Return the collisions of each attack on select seeds."""
         shares = {}
         for name, attack in attacks.items():
             shares[name] = _share(self._play(defence, attack, "select", SELECT_EPISODES).crashed)
-            self.update(f"worst attack, {guard}", len(shares), len(attacks), "")
+            self.update(f"worst attack, {defender}", len(shares), len(attacks), "")
         return shares
 
     def _report(
-        self, guards: dict[str, Steered], attackers: list[Path], fresh: list[Path], other: list[Path], setting: int
+        self, defenders: dict[str, Steered], attackers: list[Path], fresh: list[Path], other: list[Path], setting: int
     ) -> dict[str, Any]:
         attacks: dict[str, Attack] = self.scripts | {path.stem: PolicyAttack(path) for path in (*attackers, *fresh, *other)}
-        table, crashed = self._table(guards, attacks)
+        table, crashed = self._table(defenders, attacks)
         last = attackers[-1].stem
         worst: dict[str, dict[str, Any]] = {}
         exploitability: dict[str, dict[str, Any]] = {}
-        for guard, own in {TRAINED: [path.stem for path in fresh], FIXED: [path.stem for path in other]}.items():
-            shares = self._select(guard, guards[guard], attacks)
+        for defender, own in {TRAINED: [path.stem for path in fresh], FIXED: [path.stem for path in other]}.items():
+            shares = self._select(defender, defenders[defender], attacks)
             name, found = (max(names, key=lambda one: shares[one].value) for names in (attacks, own))  # of equal ones the first
-            share = {one: _share(crashed[guard, one]) for one in (name, found, last)}
-            worst[guard] = {"attack": name, "select": shares[name]._asdict(), "collisions": share[name]._asdict()}
-            exploitability[guard] = {
-                **paired_difference(crashed[guard, name], crashed[guard, last], share=True)._asdict(), "attack": name,
+            share = {one: _share(crashed[defender, one]) for one in (name, found, last)}
+            worst[defender] = {"attack": name, "select": shares[name]._asdict(), "collisions": share[name]._asdict()}
+            exploitability[defender] = {
+                **paired_difference(crashed[defender, name], crashed[defender, last], share=True)._asdict(), "attack": name,
                 "fresh": {"attack": found, "collisions": share[found]._asdict()},
                 "weak_search": share[found].value < max(share[name].value, share[last].value),
             }  # fmt: skip
-        fixed, trained = (crashed[guard, worst[guard]["attack"]] for guard in (FIXED, TRAINED))
+        fixed, trained = (crashed[defender, worst[defender]["attack"]] for defender in (FIXED, TRAINED))
         saved = paired_difference(fixed, trained, share=True)
         knobs = self.duel.guard.hand.knobs
         values = {knob.name: float(value) for knob, value in zip(knobs, self.duel.settings[setting], strict=True)}

@@ -50,8 +50,8 @@ class Job:
         rest = [known, self.safe, self.rule, *(["false alarms"] if self.cell.attack == CLEAN and not self.formulas else [])]
         return hashlib.blake2b(f"{cell_id(self.cell)}/{canonical(rest)}".encode(), digest_size=12).hexdigest()
 
-    def properties(self, place: Scenario) -> tuple[Property, ...]:
-        return own(place, self.formulas) if self.formulas else built_in(place, self.bound, self.asked)
+    def properties(self, scenario: Scenario) -> tuple[Property, ...]:
+        return own(scenario, self.formulas) if self.formulas else built_in(scenario, self.bound, self.asked)
 
 
 class Outcome(NamedTuple):
@@ -128,29 +128,29 @@ class Found:
 
 def check_cell(job: Job) -> Row:
     """Return the row of a cell. What a component raises costs this row, with the reason."""
-    cell, guard, attack = job.cell, Spec("defence", job.cell.defence), Spec("attack", job.cell.attack).make()
-    place = cell.place(attack, Spec("attack", cell.attack).entry.knowledge)
+    cell, defence, attack = job.cell, Spec("defence", job.cell.defence), Spec("attack", job.cell.attack).make()
+    scenario = cell.place(attack, Spec("attack", cell.attack).entry.knowledge)
     try:
-        known = job.properties(place)
-        loop = place.loop(guard.make(), guard.entry.uses)
+        known = job.properties(scenario)
+        loop = scenario.loop(defence.make(), defence.entry.uses)
         found = _played(job, loop, attack, [p for p in known if p.formula is not None])
     except Exception as error:
         reason, status = _why(error)
         return failed(job, reason, status)
-    return _blank(job, place) | _summary(job, known, found)
+    return _blank(job, scenario) | _summary(job, known, found)
 
 
 def failed(job: Job, reason: str, status: str = "error") -> Row:
     """Return the row of a cell that could not be played."""
-    rival = Spec("attack", job.cell.attack)
-    return _blank(job, job.cell.place(rival.make(), rival.entry.knowledge)) | {"status": status, "reason": " ".join(reason.split())[:500]}
+    spec = Spec("attack", job.cell.attack)
+    return _blank(job, job.cell.place(spec.make(), spec.entry.knowledge)) | {"status": status, "reason": " ".join(reason.split())[:500]}
 
 
-def _blank(job: Job, place: Scenario) -> Row:
+def _blank(job: Job, scenario: Scenario) -> Row:
     """Return a row of which nothing was played."""
-    cell, guard, rival = job.cell, Spec("defence", job.cell.defence), Spec("attack", job.cell.attack)
-    return _head(cell, place, guard.entry, rival.entry, cell_id(cell)) | {
-        "cell": job.identity, "first_seed": cell.first_seed, "dt": place.brief().model.dt, "horizon": place.horizon,
+    cell, defence, spec = job.cell, Spec("defence", job.cell.defence), Spec("attack", job.cell.attack)
+    return _head(cell, scenario, defence.entry, spec.entry, cell_id(cell)) | {
+        "cell": job.identity, "first_seed": cell.first_seed, "dt": scenario.brief().model.dt, "horizon": scenario.horizon,
         "status": "ok", "reason": "", "n": 0, "properties": [], "conjunctions": {}, "verdict": None, "worst": None,
         "alarms": None,
     }  # fmt: skip

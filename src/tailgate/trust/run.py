@@ -174,8 +174,8 @@ def _keep_failures(found: dict[str, Any], jobs: Sequence[Job], folder: Path) -> 
 
 def _failed(job: Job, name: str) -> dict[str, str]:
     """Return the property of this name in words and as a formula, for who replays a run that fails it."""
-    rival = Spec("attack", job.cell.attack)
-    known = job.properties(job.cell.place(rival.make(), rival.entry.knowledge))
+    spec = Spec("attack", job.cell.attack)
+    known = job.properties(job.cell.place(spec.make(), spec.entry.knowledge))
     return next({"property": p.name, "about": p.about, "formula": str(p.formula)} for p in known if p.name == name)
 
 
