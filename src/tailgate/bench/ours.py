@@ -241,7 +241,7 @@ print(time.perf_counter() - started)
 
 
 def _first_step(cache: str, bytecode: bool = False) -> float:
-    """Return seconds in a fresh process from the first import to the end of the first step, compiled code being cached in this folder.
+    """Measure the seconds in a fresh process from the first import to the end of the first step, compiled code being cached in this folder.
 
     With `bytecode`, that of Python as well, as everybody has it whose environment does not forbid it.
     """

@@ -50,7 +50,7 @@ def compiler() -> str:
 
 @cache
 def library() -> ctypes.CDLL:
-    """Return the compiled yardstick. Raises Missing where there is no compiler, or where it fails."""
+    """Compile the yardstick. Raises Missing where there is no compiler, or where it fails."""
     _ = compiler()
     name = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
     assert name is not None
@@ -125,7 +125,7 @@ def injection(place: Scenario, value: float, first: int, last: int) -> Array:
 
 
 def line(form: Form, episodes: int) -> Go:
-    """Return steps per second of the yardstick, under the injection that the loop is measured with."""
+    """Measure steps per second of the yardstick, under the injection that the loop is measured with."""
     place = load_scenario(SCENARIO)
     held = Yardstick(form, range(episodes), place, injection(place, -4.0, 50, 500))
 

@@ -64,7 +64,7 @@ def dose_response(
     threat: dict[str, Any] | None = None, outcome: str | None = None, exceeds: float | None = None, limit: float | None = None,
     purpose: str = "report", workers: int = 1, rows_file: Path | None = None, progress: Callable[[int, int], None] | None = None,
 ) -> dict[str, Any]:  # fmt: skip
-    """Return the report: a curve for each attack and defence. Dose 0 is no attack.
+    """Play, and return the report: a curve for each attack and defence. Dose 0 is no attack.
 
     outcome: a metric. exceeds: count the episodes in which it exceeds this value, instead of its mean. limit: of the mean or the share that
     makes a dose critical; 0.1 of shares, and none of means.

@@ -33,7 +33,7 @@ def _scale(unit: str) -> float:
 
 
 def timing_figure(entries: Sequence[dict[str, Any]]) -> bytes:
-    """Return one line per entry and schedule: the outcome with its interval. One panel per outcome."""
+    """Draw one line per entry and schedule: the outcome with its interval. One panel per outcome."""
     outcomes = list(dict.fromkeys((e["outcome"], e["unit"]) for e in entries))
     heights = [sum((e["outcome"], e["unit"]) == key for e in entries) for key in outcomes]
     figure, axes = canvas(8.5, 1.3 + 0.9 * sum(heights) + 0.5 * len(outcomes), len(outcomes), 1, height_ratios=heights)
@@ -60,7 +60,7 @@ def timing_figure(entries: Sequence[dict[str, Any]]) -> bytes:
 
 
 def dose_figure(report: dict[str, Any]) -> bytes:
-    """Return one panel per defence, one curve per attack: the measured outcomes with intervals, and the monotone regression."""
+    """Draw one panel per defence, one curve per attack: the measured outcomes with intervals, and the monotone regression."""
     curves = [c for c in report["curves"] if "points" in c]
     defences, attacks = (list(dict.fromkeys(c[key] for c in curves)) for key in ("defence", "attack"))
     columns = min(3, len(defences))

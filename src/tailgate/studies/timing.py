@@ -69,7 +69,7 @@ def recorded(loop: Loop, policy: PolicyAttack, keys: Keys) -> Array:
 
 
 def played(loop: Loop, policy: Any, keys: Keys, schedule: Array | None, counts: Sequence[Callable[[Trace], Array]]) -> list[Array]:
-    """Return metrics (B,) each of a policy at its own times, as of any attack, or where a `schedule` (K, B) is given at those."""
+    """Play, and return metrics (B,) each of a policy at its own times, as of any attack, or where a `schedule` (K, B) is given at those."""
     out = [np.empty(len(keys.key)) for _ in counts]
     for rows, part in _parts(loop, keys):
         trace = rollout(loop, policy if schedule is None else Yoked(policy, schedule[:, rows]), part)
@@ -122,7 +122,7 @@ def timing(
     dose: int | None = None, episodes: int = 1000, outcome: str | None = None, purpose: str = "report",
     progress: Callable[[int, int], None] | None = None,
 ) -> dict[str, Any]:  # fmt: skip
-    """Return the report on policies by file or zoo name; those that differ in nothing but their training seed are one entry.
+    """Play, and return the report on policies by file or zoo name; those that differ in nothing but their training seed are one entry.
 
     Scenario, defence and threat model are those that each was trained in, where nothing else is given.
     """

@@ -53,7 +53,7 @@ def transfer(
     dose: int | None = None, episodes: int = 400, outcome: str | None = None, purpose: str = "report", workers: int = 1,
     rows_file: Path | None = None, progress: Callable[[int, int], None] | None = None,
 ) -> dict[str, Any]:  # fmt: skip
-    """Return the report. Without `defences` the policies are played on those that they were trained on.
+    """Play, and return the report. Without `defences` the policies are played on those that they were trained on.
 
     The word `all` means these and every registered defence that has a meaning in the scenario: those that a suite plays there, or,
     where no suite goes, those that it admits; sentinels and what plays one episode after the other have to be named. `skipped` says who

@@ -45,6 +45,12 @@ def check_seeds(seeds: int) -> None:
     sizes.check("seeds", seeds)
 
 
+def data_of(report: Report) -> dict[str, Any]:
+    """Return title, settings, claims and tables as JSON data."""
+    tables = [dataclasses.asdict(table) for table in report.tables]
+    return {"title": report.title, "settings": report.settings, "claims": as_json(report), "tables": tables}
+
+
 def as_json(report: Report) -> list[dict[str, Any]]:
     """Return the claims: id, claim, thesis, measured, holds, why."""
     return [dataclasses.asdict(claim) for claim in report.claims]
@@ -131,8 +137,8 @@ def prose(text: str) -> Markup:
 def write(report: Report, directory: Path, **stamp: object) -> Path:
     """Write report.json, report.md, index.html and a PNG per figure; return the page. `stamp`: further fields of report.json."""
     writable_directory(directory)
-    data = {"chapter": report.chapter, "title": report.title, "version": VERSION, **stamp, "settings": report.settings}
-    data |= {"claims": as_json(report), "tables": [dataclasses.asdict(table) for table in report.tables]}
+    held = data_of(report)
+    data = {"chapter": report.chapter, "title": held.pop("title"), "version": VERSION, **stamp, **held}
     data["figures"] = [{"name": figure.name, "caption": figure.caption} for figure in report.figures]
     for figure in report.figures:
         write_atomic(directory / f"{figure.name}.png", figure.png)

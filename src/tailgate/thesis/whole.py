@@ -19,7 +19,7 @@ from tailgate.core import param
 from tailgate.core.schema import build, read_yaml
 
 from .claims import Claim, Report
-from .run import CHAPTERS, as_json, body, check_chapter, check_seeds, page, read, reproduce, rows, summary, write
+from .run import CHAPTERS, body, check_chapter, check_seeds, data_of, page, read, reproduce, rows, summary, write
 
 TITLE = "Security of Autonomous Systems under Physical Attacks, claim by claim"
 Play = Callable[..., Report]
@@ -158,11 +158,7 @@ def as_data(whole: Whole) -> dict[str, Any]:
     return {
         "title": TITLE, "version": VERSION, "seeds": whole.seeds, "sources": whole.sources, "seconds": whole.seconds,
         "chapters": {
-            r.chapter: {
-                "title": r.title, "settings": r.settings, "claims": as_json(r), "tables": [dataclasses.asdict(t) for t in r.tables],
-                "figures": [f"{r.chapter}/{f.name}.png" for f in r.figures],
-            }
-            for r in whole.reports
+            r.chapter: data_of(r) | {"figures": [f"{r.chapter}/{f.name}.png" for f in r.figures]} for r in whole.reports
         },
         "coverage": [dataclasses.asdict(item) for item in whole.coverage],
     }  # fmt: skip

@@ -236,7 +236,7 @@ class Game:
         return int(np.argmax(paid))
 
     def _play(self, defence: Steered, attack: Attack, purpose: str, episodes: int) -> Played:
-        """Return the first episodes of a pair on seeds of a purpose."""
+        """Play the first episodes of a pair on seeds of a purpose."""
         seat = dataclasses.replace(self.duel.seat, loop=dataclasses.replace(self.duel.seat.loop, defence=defence))
         duel = dataclasses.replace(self.duel, seat=seat, guard=defence)
         parts = [play(duel, attack, draws.keys(purpose, range(at, min(at + BATCH, episodes)))) for at in range(0, episodes, BATCH)]

@@ -181,7 +181,7 @@ def propose(trial: Trial, space: Space) -> dict[str, Any]:
 
 
 def objective(config: TrainConfig, policy: Path, episodes: int) -> float:
-    """Return mean outcome of a policy against the defence that it was trained on, on the purpose `tune`."""
+    """Return the mean outcome of a policy against the defence that it was trained on, on the purpose `tune`."""
     attack, spec, outcome = PolicyAttack(policy), Spec("defence", config.defence), outcome_of(config)
     place = Cell("tune", config.scenario, None, config.defence, str(policy), episodes, "tune", threat=config.threat).place(attack, "black")
     loop = place.loop(spec.make(), spec.entry.uses)
@@ -274,7 +274,7 @@ def _trial(search: Search, ordinal: int, report: Callable[[int, Progress | None]
 
 
 def _begin(search: Search) -> Study:
-    """Return the study, checked to be of this very search, with the trials of an interrupted one marked as failed."""
+    """Open the study, check that it is of this very search, and mark the trials of an interrupted one as failed."""
     module = optuna()
     writable_directory(search.directory)
     _mend(search.directory / JOURNAL)

@@ -20,7 +20,7 @@ WIDTH, HEIGHT = 0.66, 0.22  # half of a location's box
 
 
 def automata_figure(network: Network, untrusted: Collection[str] = ()) -> Figure:
-    """Return a matplotlib Figure with one panel per component. Edges whose signal is in `untrusted` are dashed, and say so."""
+    """Draw a matplotlib Figure with one panel per component. Edges whose signal is in `untrusted` are dashed, and say so."""
     count = len(network.components)
     figure, axes = canvas(5.2 * count, 4.6, 1, count)
     for ax, component in zip(axes[0], network.components, strict=True):

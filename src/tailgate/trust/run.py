@@ -61,7 +61,10 @@ def jobs_of(
 
 
 def play(jobs: Sequence[Job], folder: Path | None = None, workers: int = 1, progress: Progress | None = None) -> list[Row]:
-    """Return the row of each job. With `folder` finished cells are kept there: an interrupted run resumes, and other rows are set aside."""
+    """Play the jobs, and return a row for each.
+
+    With `folder` finished cells are kept there: an interrupted run resumes, and other rows are set aside.
+    """
     ids = [job.identity for job in jobs]
     done: dict[str, Row] = {}
     parts = out = None
@@ -103,7 +106,7 @@ def _read(path: Path) -> list[Row]:
 
 
 def _played(jobs: Sequence[Job], workers: int) -> Generator[Row]:
-    """Return rows as they are finished. Imported code plays in a separate process."""
+    """Play, and yield rows as they are finished. Imported code plays in a separate process."""
     foreign = any(Spec("defence", job.cell.defence).imports or Spec("attack", job.cell.attack).imports for job in jobs)
     if not foreign and (workers == 1 or len(jobs) < 2):
         yield from map(check_cell, jobs)
@@ -119,7 +122,7 @@ def check(
     safe: SafeDistance | None = None, asked: Demands | None = None, rule: Rule | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Any]:  # fmt: skip
-    """Return the report on a suite's defences, in the format tailgate-trust-1; docs/trust.md says what its fields mean.
+    """Play, and return the report on a suite's defences, in the format tailgate-trust-1; docs/trust.md says what its fields mean.
 
     runs: of each cell, the suite's number of seeds unless given; with a rule the most that it may take. formulas: in place of the built-in
     properties. With `folder` it is also written there as trust.json, with the rows of cells and the worst failing episode of each
