@@ -86,7 +86,7 @@ def _sealed(blob: bytes) -> bytes:
 
 
 def _policy(folder: Path) -> Any:
-    from tailgate.agents.policy import load_policy
+    from tailgate.agents.policy.network_policy import load_policy
 
     return load_policy(folder / "p.json")
 
@@ -177,7 +177,7 @@ CARD = {
 
 def _learner(name: str, changes: dict[str, Any]) -> Any:
     if name not in _held:
-        from tailgate.agents.learning import learner_of
+        from tailgate.agents.learners.learning import learner_of
         from tailgate.core.schema import build
 
         module = learner_of(name)

@@ -87,10 +87,10 @@ class Pulse:
     def prepare(self, dt: float) -> float:
         return dt
 
-    def start(self, plan: float, draws: Draws) -> Any:
+    def start(self, plan: float, draws: Draws) -> None:
         return None
 
-    def accel(self, plan: float, state: Any, k: Array, speed: Array, draws: Draws) -> tuple[Any, Array]:
+    def accel(self, plan: float, state: None, k: Array, speed: Array, draws: Draws) -> tuple[None, Array]:
         return None, between(k * plan, self.begin, self.end, self.value, 0.0)
 
 
@@ -106,10 +106,10 @@ class Switched:
     def prepare(self, dt: float) -> float:
         return dt
 
-    def start(self, plan: float, draws: Draws) -> Any:
+    def start(self, plan: float, draws: Draws) -> None:
         return None
 
-    def accel(self, plan: float, state: Any, k: Array, speed: Array, draws: Draws) -> tuple[Any, Array]:
+    def accel(self, plan: float, state: None, k: Array, speed: Array, draws: Draws) -> tuple[None, Array]:
         return None, between(k * plan, 0.0, self.at, self.value, self.then)
 
 
@@ -167,7 +167,7 @@ class Braking:
     def start(self, plan: float, draws: Draws) -> BrakingState:
         return BrakingState(_within(self.onset, draws.uniform()))
 
-    def accel(self, plan: float, state: BrakingState, k: Array, speed: Array, draws: Draws) -> tuple[Any, Array]:
+    def accel(self, plan: float, state: BrakingState, k: Array, speed: Array, draws: Draws) -> tuple[BrakingState, Array]:
         return state, halt(k * plan, state.onset, self.decel, speed, plan)
 
 
@@ -201,7 +201,7 @@ class StopAndGo:
         clock = _within(self.cruise, draws.uniform())
         return StopAndGoState(np.zeros(len(clock), np.int8), clock)
 
-    def accel(self, plan: float, state: StopAndGoState, k: Array, speed: Array, draws: Draws) -> tuple[Any, Array]:
+    def accel(self, plan: float, state: StopAndGoState, k: Array, speed: Array, draws: Draws) -> tuple[StopAndGoState, Array]:
         dt = plan
         phase, clock = state.phase, state.clock - dt
         done = phase_over(phase, clock, speed, self.low_speed, self.cruise_speed)
@@ -243,7 +243,7 @@ class OrnsteinUhlenbeck:
 
     def accel(
         self, plan: OrnsteinUhlenbeckPlan, state: OrnsteinUhlenbeckState, k: Array, speed: Array, draws: Draws
-    ) -> tuple[Any, Array]:
+    ) -> tuple[OrnsteinUhlenbeckState, Array]:
         a = plan.keep * state.accel + plan.kick * draws.normal()
         return OrnsteinUhlenbeckState(a), drawn_back(a, speed, self.mean_speed, self.pull, self.limit)
 
@@ -304,9 +304,9 @@ class Profile:
         steps = math.ceil((times[-1] - times[0]) / dt) + 2
         return ProfilePlan(dt, np.interp(times[0] + dt * np.arange(steps), times, speeds))
 
-    def start(self, plan: ProfilePlan, draws: Draws) -> Any:
+    def start(self, plan: ProfilePlan, draws: Draws) -> None:
         return None
 
-    def accel(self, plan: ProfilePlan, state: Any, k: Array, speed: Array, draws: Draws) -> tuple[Any, Array]:
+    def accel(self, plan: ProfilePlan, state: None, k: Array, speed: Array, draws: Draws) -> tuple[None, Array]:
         wanted = num.take(plan.speed, np.minimum(k + 1, len(plan.speed) - 1))
         return None, (wanted - speed) / plan.dt

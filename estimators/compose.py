@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple, Protocol
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -18,80 +18,7 @@ from tailgate.core import Array, Count, Estimate, Innovation, Mode, Model, NonNe
 from tailgate.core.draws import Draws
 from tailgate.core.registry import imported, make_from, register
 from tailgate.core.schema import build, fields_of
-
-
-class Verdict(NamedTuple):
-    """What a detector thinks of one step: score (B, N), alarm (B, N) bool, suspect (B, N, q) bool: the readings that it blames."""
-
-    score: Array
-    alarm: Array
-    suspect: Array
-
-
-class Decision(NamedTuple):
-    """What a mitigation makes of it.
-
-    accept (B, N, q) bool: the readings to use; mode (B, N) int8 for the controller; instead (B, N, q): readings to use in place of
-    those received; forget (B, N) bool: where the filter shall first forget how sure it was; limits (B, N, m, 2): the least and the
-    largest command that the controller may give.
-    """
-
-    accept: Array
-    mode: Array
-    instead: Array | None = None
-    forget: Array | None = None
-    limits: Array | None = None
-
-
-class Filter(Protocol):
-    """A state estimator, split where a gate may cut in."""
-
-    def prepare(self, model: Model) -> Any: ...
-
-    def start(self, plan: Any, prior: Prior) -> Any: ...
-
-    def predict(self, plan: Any, state: Any, known_u: Array) -> Any: ...
-
-    def innovation(self, plan: Any, state: Any, received: Received) -> Innovation:
-        """r and S of a predicted state; r is 0 where nothing was received."""
-
-    def update(self, plan: Any, state: Any, innovation: Innovation, accept: Array) -> Any:
-        """Use the sensors that `accept` (B, N, q) names."""
-
-    def forget(self, plan: Any, state: Any, where: Array) -> Any:
-        """A predicted state that, in the rows of `where` (B, N), believes the next measurement almost entirely."""
-
-    def gain(self, plan: Any, state: Any, innovation: Innovation) -> Array:
-        """K (B, N, n, q) of an update with every sensor: what a white-box attacker computes."""
-
-    def estimate(self, state: Any) -> Array:
-        """x (B, N, n)."""
-
-
-class Detector(Protocol):
-    """An innovation monitor. One that alarms at a threshold names that parameter in `threshold_field`."""
-
-    def prepare(self, model: Model) -> Any: ...
-
-    def start(self, plan: Any, batch: int) -> Any: ...
-
-    def step(self, plan: Any, state: Any, innovation: Innovation) -> tuple[Any, Verdict]: ...
-
-    def gate(self, plan: Any, state: Any) -> Array | float | None:
-        """The largest r' S^-1 r (B, N) that raises no alarm in the next step; None where there is no such number.
-
-        Negative in the rows where the memory alone raises an alarm, whatever is received.
-        """
-
-
-class Mitigation(Protocol):
-    """What follows from a verdict."""
-
-    def prepare(self, model: Model) -> Any: ...
-
-    def start(self, plan: Any, batch: int) -> Any: ...
-
-    def step(self, plan: Any, state: Any, verdict: Verdict, received: Received) -> tuple[Any, Decision]: ...
+from tailgate.estimators.parts import Decision, Detector, Filter, Mitigation, Stateless, Verdict, blame_all
 
 
 class ComposedPlan(NamedTuple):
@@ -218,28 +145,12 @@ class NamedParts(Composed):
         return make_from(family, data, f"defence composed.{family}")
 
 
-@dataclass(frozen=True)
-class Stateless:
-    """Base of detectors and mitigations without memory."""
-
-    def prepare(self, model: Model) -> Any:
-        return None
-
-    def start(self, plan: Any, batch: int) -> Any:
-        return None
-
-
 def threshold_field(detector: Any) -> str:
     """The name of a detector's threshold. Raises NotApplicable where it has none."""
     name = getattr(detector, "threshold_field", None)
     if name is None:
         raise NotApplicable("threshold", type(detector).__name__, "a detector that alarms at a threshold")
     return str(name)
-
-
-def blame_all(score: Array, alarm: Array, innovation: Innovation) -> Verdict:
-    """The verdict of a detector that cannot tell the sensors apart."""
-    return Verdict(score, alarm, np.broadcast_to(alarm[..., None], innovation.r.shape))
 
 
 @register("detector", "score")

@@ -2,9 +2,8 @@
 
 from tailgate.core import Defence
 from tailgate.core.score_threshold import Watched
-
-from .chi_square import ChiSquare
-from .compose import AcceptAll, Composed, Score, compose
+from tailgate.estimators.compose import AcceptAll, Composed, Score, compose
+from tailgate.estimators.detectors.chi_square import ChiSquare
 
 OWN = ("prepare", "start", "step", "look")  # what a composed defence does as its parts say, unless it is written anew
 

@@ -18,9 +18,9 @@ from tailgate.base.errors import NotApplicable
 from tailgate.base.pytree import leaves
 from tailgate.core import Model
 from tailgate.core.draws import keys
+from tailgate.core.kinds import KindName
 from tailgate.core.registry import entries
 from tailgate.core.scenario import load_scenario
-from tailgate.core.threat import KindName
 from tailgate.play.trace import rollout
 
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # hundreds of commands are started: each would compile the package

@@ -7,7 +7,7 @@ import numpy as np
 from tailgate.core import draws
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import load_scenario
-from tailgate.envs.faces import AdversaryVectorEnv
+from tailgate.envs.gym.gymnasium_env import AdversaryVectorEnv
 from tailgate.play.commanded import Commanded, commanded
 from tailgate.play.trace import Trace, rollout
 

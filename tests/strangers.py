@@ -6,10 +6,10 @@ from typing import NamedTuple
 import numpy as np
 
 from tailgate import num
-from tailgate.agents.reward import Reward
 from tailgate.core import Kind, Model, Prior, Received, Scene
+from tailgate.envs.gym.rewards import Reward
 from tailgate.estimators import ChiSquare, GateOut, compose
-from tailgate.estimators.kalman import KalmanFilter
+from tailgate.estimators.filters.kalman import KalmanFilter
 from tailgate.play.metrics import metric
 
 

@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 import yaml
 
-from tailgate.agents.codec import ActionCodec, ActionSpec
-from tailgate.agents.observation import ObservationCodec
-from tailgate.agents.policy import Network, save_policy
-from tailgate.agents.zoo import ZooAttack
+from tailgate.agents.policy.network_policy import save_policy
+from tailgate.agents.policy.zoo import ZooAttack
+from tailgate.core.neural import Network
 from tailgate.core.scenario import load_scenario
+from tailgate.envs.gym.actions import ActionCodec, ActionSpec
+from tailgate.envs.gym.observations import ObservationCodec
 
 PLACE = "gusty-stop-and-go-v0"
 THREAT: dict[str, Any] = {"kinds": ["dos_jam", "fdi"], "budget": 20, "fdi_bound": 3.0}

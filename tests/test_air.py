@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 import tailgate
-from tailgate.agents.codec import ActionCodec, ActionSpec
-from tailgate.agents.observation import ObservationCodec
 from tailgate.base.errors import InputError
 from tailgate.core import Array, Kind
 from tailgate.core.draws import keys
 from tailgate.core.scenario import load_scenario
+from tailgate.envs.gym.actions import ActionCodec, ActionSpec
+from tailgate.envs.gym.observations import ObservationCodec
 
 SILENT = (5, 6, 9)  # steps of the challenges of `Mute`
 DISTANCE, SPEED, ACTUATOR = range(3)  # the wires of the radar's plant

@@ -10,9 +10,9 @@ import pytest
 import tailgate
 from tailgate.base.errors import InputError, NotApplicable
 from tailgate.core import Kind
+from tailgate.core.kinds import KindName
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import load_scenario
-from tailgate.core.threat import KindName
 
 K = 40
 OLD = {"kinds": get_args(KindName)}

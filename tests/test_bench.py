@@ -16,7 +16,7 @@ from tailgate.core import draws
 from tailgate.core.draws import Role
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import load_scenario
-from tailgate.envs.seat import Seat
+from tailgate.envs.gym.attacker_mdp import Seat
 
 
 def _compiled() -> bool:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from tailgate.agents.policy import Yoked
+from tailgate.agents.policy.network_policy import Yoked
 from tailgate.base.errors import InputError
 from tailgate.cli import main
 from tailgate.core import draws

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 import tailgate
-from tailgate.agents.burst_loss import BurstLoss, groups
+from tailgate.agents.scripts.burst_loss import BurstLoss, groups
 from tailgate.base.errors import InputError, NotApplicable
 from tailgate.core import Kind
 from tailgate.core.draws import keys
 from tailgate.core.scenario import load_scenario
-from tailgate.envs.cacc import V2V
+from tailgate.envs.controllers.cacc import V2V
 from tailgate.play.trace import rollout
 
 SENDERS = ("predecessor", "leader")

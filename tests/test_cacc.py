@@ -12,9 +12,9 @@ from tailgate.core import Estimate, Mode
 from tailgate.core.draws import keys
 from tailgate.core.registry import make
 from tailgate.core.scenario import load_scenario
-from tailgate.envs.cacc import PER_CAR, V2V, Column, FeedForward
-from tailgate.envs.controllers import BRAKE_ACCEL, STOP_ACCEL, WIDEN_FACTOR
-from tailgate.envs.platoon import Platoon, PlatoonSensors, hears
+from tailgate.envs.controllers.adaptive_cruise import BRAKE_ACCEL, STOP_ACCEL, WIDEN_FACTOR
+from tailgate.envs.controllers.cacc import PER_CAR, V2V, Column, FeedForward
+from tailgate.envs.plants.platoon import Platoon, PlatoonSensors, hears
 from tailgate.play.trace import rollout
 from tailgate.thesis.string_stability import growth, transfer
 

@@ -6,8 +6,8 @@ import json
 import numpy as np
 import pytest
 
-from tailgate.agents.cem import Config, Learner, Shape
-from tailgate.agents.policy import PolicyAttack
+from tailgate.agents.learners.cem import Config, Learner, Shape
+from tailgate.agents.policy.network_policy import PolicyAttack
 from tailgate.base.errors import InputError
 from tailgate.core import draws
 from tailgate.core.scenario import config_path

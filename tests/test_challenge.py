@@ -13,7 +13,7 @@ from tailgate.core import Mode, Prior, Received
 from tailgate.core.draws import Keys, Role, keys
 from tailgate.core.registry import Spec, make
 from tailgate.core.scenario import load_scenario
-from tailgate.envs.fmcw import false_alarm_threshold
+from tailgate.envs.sensors.fmcw import false_alarm_threshold
 from tailgate.play.trace import rollout
 
 FIXED = "cra:challenge=fixed"

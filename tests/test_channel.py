@@ -7,8 +7,9 @@ from hypothesis import strategies as st
 
 from tailgate.base.errors import InputError
 from tailgate.core import AIRED, Command, Kind, Received
+from tailgate.core.channel import Channel
 from tailgate.core.scenario import load_scenario
-from tailgate.core.threat import Brief, Channel, ThreatModel
+from tailgate.core.threat import Brief, ThreatModel
 
 ALL = ("dos_jam", "dos_hold", "dos_hold_fresh", "dropout", "fdi", "delay", "replay")
 P, V, LP, LV, ACC = range(5)  # wires: position, velocity, leader's position and velocity, the acceleration command

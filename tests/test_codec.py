@@ -6,21 +6,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tailgate.agents import observation
-from tailgate.agents.codec import ActionCodec, ActionSpec
-from tailgate.agents.observation import LIMIT, ObservationCodec
-from tailgate.agents.policy import load_policy
-from tailgate.agents.reward import NEAR, Reward
+from tailgate.agents.policy.network_policy import load_policy
 from tailgate.base.errors import InputError
 from tailgate.core import Kind
 from tailgate.core.draws import Role, keys
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import load_scenario
 from tailgate.core.schema import as_data
-from tailgate.envs.faces import AdversaryVectorEnv
-from tailgate.envs.network import LinearSensors, NoControl, SensorNetwork
-from tailgate.envs.platoon import Platoon, PlatoonSensors
-from tailgate.envs.seat import Seat
+from tailgate.envs.gym import observations as observation
+from tailgate.envs.gym.actions import ActionCodec, ActionSpec
+from tailgate.envs.gym.attacker_mdp import Seat
+from tailgate.envs.gym.gymnasium_env import AdversaryVectorEnv
+from tailgate.envs.gym.observations import LIMIT, ObservationCodec
+from tailgate.envs.gym.rewards import NEAR, Reward
+from tailgate.envs.plants.platoon import Platoon, PlatoonSensors
+from tailgate.envs.plants.sensor_network import LinearSensors, NoControl, SensorNetwork
 from tailgate.play.metrics import METRICS
 from tailgate.play.trace import rollout
 

@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 
 import tailgate
-from tailgate.agents.mixture import Mixture
 from tailgate.base.errors import InputError, NotApplicable
 from tailgate.base.pytree import leaves
 from tailgate.core import Command, Kind, Mode
 from tailgate.core.draws import Draws, Keys, Role, keys
+from tailgate.core.kinds import KindName
 from tailgate.core.registry import entries, make
 from tailgate.core.scenario import list_scenarios, list_suites, load_scenario, load_suite
 from tailgate.core.schema import fields_of
-from tailgate.core.threat import KindName
+from tailgate.envs.gym.mixture import Mixture
 from tailgate.play.trace import rollout
 
 DEFENCES = tailgate.list_defences()

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 import tailgate
-from tailgate.agents.mixture import Mixture
 from tailgate.base.errors import NotApplicable
 from tailgate.base.pytree import leaves
 from tailgate.core import Kind, Mode
 from tailgate.core.draws import Keys, Role, keys
+from tailgate.core.kinds import KindName
 from tailgate.core.registry import entries
 from tailgate.core.scenario import load_scenario
-from tailgate.core.threat import KindName
+from tailgate.envs.gym.mixture import Mixture
 from tailgate.estimators import EpisodeByEpisode
 from tailgate.play.trace import rollout
 

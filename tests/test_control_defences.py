@@ -13,11 +13,12 @@ from tailgate.core import Mode, Received
 from tailgate.core.draws import keys
 from tailgate.core.registry import make
 from tailgate.core.scenario import load_scenario
-from tailgate.envs.cacc import Column
+from tailgate.envs.controllers.cacc import Column
 from tailgate.estimators import compose
-from tailgate.estimators.compose import Score, Verdict
-from tailgate.estimators.control_defences import OWN, AccFallback, InputClip, SlidingMode, peak, reachable, response
-from tailgate.estimators.distributed import DistributedKalmanFilter
+from tailgate.estimators.compose import Score
+from tailgate.estimators.distributed.distributed_kalman import DistributedKalmanFilter
+from tailgate.estimators.mitigations.control_defences import OWN, AccFallback, InputClip, SlidingMode, peak, reachable, response
+from tailgate.estimators.parts import Verdict
 from tailgate.play.trace import rollout
 
 DT, MODEL = 0.1, load_scenario("platoon-v2v-v0").brief().model

@@ -13,7 +13,7 @@ from tailgate.core.registry import Spec
 from tailgate.core.scenario import load_scenario
 from tailgate.estimators import ChiSquare, Cusum, GateOut, KalmanFilter, Mewma, NamedParts, WindowedChiSquare, compose
 from tailgate.estimators.compose import Score
-from tailgate.estimators.detectors import whiten
+from tailgate.estimators.detectors.sequential import whiten
 
 RNG = np.random.default_rng(5)
 MODEL = load_scenario("stop-and-go-v0").brief().model  # one agent, two sensors

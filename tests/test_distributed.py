@@ -11,11 +11,11 @@ from tailgate.core import Prior, Received
 from tailgate.core.draws import keys
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import load_scenario
-from tailgate.envs.cacc import no_gains
-from tailgate.envs.network import LinearSensors, NoControl, SensorNetwork
-from tailgate.envs.platoon import Platoon, closed_loop, hold
+from tailgate.envs.controllers.cacc import no_gains
+from tailgate.envs.plants.platoon import Platoon, closed_loop, hold
+from tailgate.envs.plants.sensor_network import LinearSensors, NoControl, SensorNetwork
 from tailgate.estimators import DistributedKalman, DistributedKalmanFilter, Kalman
-from tailgate.estimators.distributed import fixed_point, neighbours
+from tailgate.estimators.distributed.distributed_kalman import fixed_point, neighbours
 from tailgate.play.trace import rollout
 
 RNG = np.random.default_rng(11)

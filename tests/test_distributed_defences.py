@@ -11,7 +11,7 @@ from tailgate.base.errors import InputError, NotApplicable
 from tailgate.core import Innovation, Prior
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import load_scenario
-from tailgate.envs.network import LinearSensors, NoControl, SensorNetwork
+from tailgate.envs.plants.sensor_network import LinearSensors, NoControl, SensorNetwork
 from tailgate.estimators import (
     AcceptAll,
     ChiSquare,
@@ -25,8 +25,8 @@ from tailgate.estimators import (
     TrustFilter,
     compose,
 )
-from tailgate.estimators.disagreement import disagreement
-from tailgate.estimators.distributed import neighbours
+from tailgate.estimators.distributed.disagreement import disagreement
+from tailgate.estimators.distributed.distributed_kalman import neighbours
 
 from .distributed import RNG, error, model_of, place_of, play, random_state
 

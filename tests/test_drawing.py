@@ -14,7 +14,7 @@ from tailgate.base.errors import InputError
 from tailgate.core.drawing import draw_graph, edges, graph_figure, hops, layout
 from tailgate.core.scenario import load_scenario
 from tailgate.envs import CarFollowing, Platoon, SensorNetwork
-from tailgate.envs.network import THESIS_EDGES
+from tailgate.envs.plants.sensor_network import THESIS_EDGES
 
 
 def _ring(n, directed=False):

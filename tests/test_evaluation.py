@@ -228,7 +228,7 @@ def test_a_row_with_a_wrong_value_is_refused_with_its_line(tmp_path: Path, field
 
 def test_different_defences_never_share_an_identity() -> None:
     """Two compositions without parameters differ in their parts, and so do their rows and cards."""
-    from tailgate.envs.faces import AdversaryEnv
+    from tailgate.envs.gym.gymnasium_env import AdversaryEnv
     from tailgate.estimators import AcceptAll, ChiSquare, GateOut, KalmanFilter, Score, compose
 
     plain, gated = compose(KalmanFilter(), Score(), AcceptAll()), compose(KalmanFilter(), ChiSquare(), GateOut())

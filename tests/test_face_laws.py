@@ -10,7 +10,7 @@ import pytest
 
 import tailgate
 from tailgate.base.errors import InputError
-from tailgate.envs.faces import FACES, AdversaryEnv, AdversaryVectorEnv
+from tailgate.envs.gym.gymnasium_env import FACES, AdversaryEnv, AdversaryVectorEnv
 from tailgate.evaluation.cells import Cell, run_cell
 
 from .engines import short as shortened
@@ -69,7 +69,7 @@ class Driver:
         if face == "single":
             self.env = AdversaryEnv(**arguments)
         elif face == "sb3":
-            from tailgate.envs.sb3 import BatchVecEnv
+            from tailgate.envs.gym.sb3 import BatchVecEnv
 
             self.env = BatchVecEnv(3, name, **arguments)
         else:
@@ -203,7 +203,7 @@ def test_a_defence_whose_state_lies_elsewhere_is_not_copied(how):
 def test_the_game_is_copied_in_mid_episode():
     """PettingZoo's environment, the defender's, and both go on alike."""
     pytest.importorskip("pettingzoo")
-    from tailgate.envs.parallel import parallel_env
+    from tailgate.envs.gym.parallel import parallel_env
 
     env = parallel_env(interval=20)
     env.reset(seed=2)
@@ -226,7 +226,7 @@ def test_the_game_is_copied_in_mid_episode():
 
 def test_the_game_has_what_pettingzoo_expects(monkeypatch):
     """A window, a limit of cycles, a state of both, and a mask for either."""
-    parallel = pytest.importorskip("tailgate.envs.parallel")
+    parallel = pytest.importorskip("tailgate.envs.gym.parallel")
     env = parallel.parallel_env(interval=5, max_cycles=3)
     env.reset(seed=1)
     for cycle in range(3):
@@ -247,7 +247,7 @@ def test_the_game_has_what_pettingzoo_expects(monkeypatch):
 
 def test_the_game_is_shown_in_a_window(monkeypatch):
     """Human mode opens a window at reset, shows each step once, and changes no bit."""
-    parallel, pygame = pytest.importorskip("tailgate.envs.parallel"), pytest.importorskip("pygame")
+    parallel, pygame = pytest.importorskip("tailgate.envs.gym.parallel"), pytest.importorskip("pygame")
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     env, twin = (parallel.parallel_env(interval=5, render_mode=mode, viewer="plain") for mode in ("human", "rgb_array"))
     env.metadata["render_fps"] = 10_000

@@ -9,7 +9,7 @@ from gymnasium.vector import AutoresetMode
 
 import tailgate
 from tailgate.base.errors import InputError, UnknownArgument
-from tailgate.envs.faces import FACES, AdversaryEnv, AdversaryVectorEnv
+from tailgate.envs.gym.gymnasium_env import FACES, AdversaryEnv, AdversaryVectorEnv
 
 from .tiny import AUTORESETS, CRASHES
 
@@ -99,7 +99,7 @@ def test_a_bad_limit_is_refused(bad):
 def test_information_has_one_set_of_names_and_types(name):
     """Single, vector and Stable-Baselines3's face: the same keys, and NumPy's types, so that a reader may ask for a dtype."""
     pytest.importorskip("stable_baselines3")
-    from tailgate.envs.sb3 import BatchVecEnv
+    from tailgate.envs.gym.sb3 import BatchVecEnv
 
     env, vec, batch = AdversaryEnv(**FACES[name]), AdversaryVectorEnv(2, **FACES[name]), BatchVecEnv(2, name, max_episode_steps=2)
     _, info = env.reset(seed=0)
@@ -115,4 +115,4 @@ def test_information_has_one_set_of_names_and_types(name):
         for key, value in one.items():
             assert value.dtype == told[key].dtype and value.shape == told[key].shape[1:], key
     assert last["TimeLimit.truncated"] is True and not last["collided"]
-    assert tailgate.envs.faces.AdversaryEnv.row(told)["step"] == 1
+    assert tailgate.envs.gym.gymnasium_env.AdversaryEnv.row(told)["step"] == 1

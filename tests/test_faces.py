@@ -15,11 +15,12 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
 import tailgate
-from tailgate.agents.codec import ActionName, ActionSpec
-from tailgate.agents.reward import Reward, RewardName
 from tailgate.base.errors import InputError
+from tailgate.core.registry import entries
 from tailgate.core.schema import fields_of
-from tailgate.envs.faces import FACES, AdversaryEnv, AdversaryVectorEnv
+from tailgate.envs.gym.actions import ActionName, ActionSpec
+from tailgate.envs.gym.gymnasium_env import FACES, AdversaryEnv, AdversaryVectorEnv
+from tailgate.envs.gym.rewards import Reward
 
 from .tiny import write
 
@@ -58,7 +59,7 @@ def strict(monkeypatch):
 def test_both_checkers_pass_without_a_warning(action, turn, knowledge, strict, brief_scenario):
     """gymnasium's and Stable-Baselines3's check_env, for every action with every knowledge and every reward."""
     sb3 = pytest.importorskip("stable_baselines3.common.env_checker")
-    for reward in get_args(RewardName)[turn::3]:
+    for reward in list(entries("reward"))[turn::3]:
         arguments = dict(scenario=brief_scenario, action=action, knowledge=knowledge, reward=reward)
         check_env(gymnasium.make(ID, **arguments).unwrapped, skip_render_check=True)
         sb3.check_env(gymnasium.make(ID, **arguments), warn=True)
@@ -71,7 +72,7 @@ def test_both_checkers_pass_without_a_warning(action, turn, knowledge, strict, b
 def test_both_checkers_pass_on_every_system(name, action, knowledge, sees, strict, tiny):
     """Radar, platoon and network: modes of single agents and wires, vectors, intervals, every reward that can be earned there."""
     sb3 = pytest.importorskip("stable_baselines3.common.env_checker")
-    rewards = [r for r in get_args(RewardName) if name != NETWORK or r not in ("min_gap", "collision")]
+    rewards = [r for r in list(entries("reward")) if name != NETWORK or r not in ("min_gap", "collision")]
     turn = ACTIONS.index(action) + (knowledge == "white")  # every reward with every system, though not with every action
     for reward in {rewards[turn % len(rewards)], rewards[(turn + 2) % len(rewards)]}:
         arguments = tiny[name] | dict(action=action, knowledge=knowledge, reward=reward, threat={"sees_measurement": sees}, interval=3, per_agent=True)
@@ -102,7 +103,7 @@ def test_the_id_works_in_a_fresh_interpreter(name):
 
 def test_the_defaults_of_an_id_hold_everywhere(tiny):
     """make, make_vec and the VecEnv of one id are the same environment; what is said wins over the default."""
-    sb3 = pytest.importorskip("tailgate.envs.sb3")
+    sb3 = pytest.importorskip("tailgate.envs.gym.sb3")
     for name, defaults in FACES.items():
         cards = [gymnasium.make(name).unwrapped.card(), gymnasium.make_vec(name, num_envs=2).unwrapped.card(), sb3.BatchVecEnv(2, name).batch.card()]
         assert cards[0] == cards[1] == cards[2]
@@ -291,7 +292,7 @@ BAD = [
     ({"defence": "chi2_kff"}, ["defence", "'chi2_kff'", "did you mean 'chi2_kf'"]),
     ({"defence": "chi2_kf:eta=-1"}, ["chi2_kf.eta", "-1", "greater than 0"]), ({"defence": 3}, ["defence", "3", "prepare, start and step"]),
     ({"scenario": "stop-and-go"}, ["scenario", "'stop-and-go'", "stop-and-go-v0"]), ({"scenario": 3}, ["scenario", "3", "name"]),
-    ({"knowledge": "blue"}, ["threat_model.knowledge", "'blue'", "'black'"]), ({"reward": "fame"}, ["reward", "'fame'", "'stealth'"]),
+    ({"knowledge": "blue"}, ["threat_model.knowledge", "'blue'", "'black'"]), ({"reward": "fame"}, ["reward", "'fame'", "stealth"]),
     ({"threat": {"budget": -1}}, ["threat_model.budget", "-1", "than or equal to 0"]), ({"action": "x"}, ["action", "'x'", "'mode'"]),
     ({"threat": {"bugdet": 1}}, ["threat", "'bugdet'", "did you mean 'budget'"]), ({"value": 1e3}, ["value", "1000.0", "fdi_bound (50.0)"]),
     ({"value": float("nan")}, ["value", "nan", "finite"]), ({"render_mode": "ansi"}, ["render_mode", "'ansi'", "rgb_array"]),

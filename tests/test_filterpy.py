@@ -15,7 +15,7 @@ from tailgate.core import Model, Prior, Received
 from tailgate.core.draws import Role, keys
 from tailgate.core.registry import Spec, entry_for, text_of
 from tailgate.core.scenario import load_scenario
-from tailgate.estimators.filterpy_filters import root
+from tailgate.estimators.filters.filterpy_filters import root
 
 NAMES = ("filterpy_kf", "filterpy_ekf", "filterpy_ukf", "filterpy_hinfinity", "filterpy_imm")
 NO_DRAWS = keys("train", [0]).at(Role.DEFENCE, np.zeros(1))

@@ -12,8 +12,9 @@ import tailgate
 from tailgate.core import Air
 from tailgate.core.draws import Role, keys
 from tailgate.core.scenario import load_scenario
-from tailgate.envs import FmcwRadar, RadarCruise, RadarFollowing, fmcw, fmcw_signal
-from tailgate.envs.fmcw_signal import read, root_music, samples
+from tailgate.envs import FmcwRadar, RadarCruise, RadarFollowing
+from tailgate.envs.sensors import fmcw, fmcw_signal
+from tailgate.envs.sensors.fmcw_signal import read, root_music, samples
 from tailgate.play.trace import rollout
 
 LINK = fmcw.Link()

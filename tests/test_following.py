@@ -16,7 +16,7 @@ from tailgate.core.loop import Loop
 from tailgate.core.scenario import list_scenarios, load_scenario
 from tailgate.core.threat import ThreatModel
 from tailgate.envs import AdaptiveCruise, Braking, CarFollowing, Constant, Odometry, OrnsteinUhlenbeck, Profile, StopAndGo
-from tailgate.envs.idm import idm_accel
+from tailgate.envs.controllers.idm import idm_accel
 from tailgate.estimators import Raw
 from tailgate.play.metrics import measure
 from tailgate.play.trace import rollout

@@ -141,7 +141,7 @@ def test_what_cannot_be_played_here_is_said(monkeypatch: pytest.MonkeyPatch, cap
     """Without highway-env a check leaves the road scene out with a word, and nothing has moved."""
     monkeypatch.setitem(sys.modules, "highway_env", None)
     monkeypatch.setitem(sys.modules, "highway_env.road.lane", None)
-    monkeypatch.delitem(sys.modules, "tailgate.envs.highway_scene", raising=False)
+    monkeypatch.delitem(sys.modules, "tailgate.envs.plants.highway_scene", raising=False)
     assert golden.main(["--check", "--scenario", "highway-v0"]) == 0
     said = capsys.readouterr().out
     assert "highway-v0 is not played" in said and "tailgate[highway]" in said and "nothing moved" in said

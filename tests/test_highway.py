@@ -10,19 +10,19 @@ import pytest
 import yaml
 
 import tailgate
-from tailgate.agents.codec import ActionCodec, ActionSpec
-from tailgate.agents.observation import ObservationCodec
 from tailgate.base.errors import InputError
 from tailgate.core import Kind, draws, no_command
 from tailgate.core.draws import Role
 from tailgate.core.scenario import load_scenario, load_suite
 from tailgate.envs import FmcwRadar, Highway, RadarCruise
+from tailgate.envs.gym.actions import ActionCodec, ActionSpec
+from tailgate.envs.gym.observations import ObservationCodec
 from tailgate.evaluation.cells import Cell, evaluate
 from tailgate.play.trace import rollout
 from tailgate.studies.policies import misfit
 
 pytest.importorskip("highway_env")
-from tailgate.envs import highway_scene as hs
+from tailgate.envs.plants import highway_scene as hs
 
 FULL = {"braking": (0.2, 1.0), "cut_in": (0.2, 1.0), "cut_gap": (5.0, 40.0)}  # something happens at once
 

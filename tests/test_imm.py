@@ -15,8 +15,8 @@ from tailgate.core import Innovation, Prior, Received
 from tailgate.core.draws import Role, keys
 from tailgate.core.scenario import load_scenario
 from tailgate.estimators import InteractingModels, Kalman
-from tailgate.estimators.imm import ImmState, Modes, log_likelihood, mix, weigh
-from tailgate.estimators.kalman import KalmanState
+from tailgate.estimators.filters.imm import ImmState, Modes, log_likelihood, mix, weigh
+from tailgate.estimators.filters.kalman import KalmanState
 
 NO_DRAWS = keys("train", [0]).at(Role.DEFENCE, np.zeros(1))
 

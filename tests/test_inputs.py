@@ -8,14 +8,14 @@ import warnings
 
 import pytest
 
-from tailgate.agents.scripted import Inject, Script
+from tailgate.agents.scripts.scripted import Inject, Script
 from tailgate.base.errors import InputError, NotApplicable
 from tailgate.core.draws import keys
 from tailgate.core.registry import PARTS, Spec, entries, make
 from tailgate.core.scenario import load_scenario
 from tailgate.core.schema import build, fields_of
 from tailgate.core.threat import ThreatModel
-from tailgate.envs.seat import Seat
+from tailgate.envs.gym.attacker_mdp import Seat
 from tailgate.play.trace import rollout
 
 FLOATS = (-1.0, 0.0, math.nan, math.inf, -math.inf, 1e300, -1e300, 1e-300)

@@ -17,7 +17,7 @@ from tailgate.core.draws import Role, keys
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import list_scenarios, load_scenario
 from tailgate.estimators import AcceptAll, ChiSquare, GatedKalman, Kalman, KalmanFilter, compose
-from tailgate.estimators.kalman import KalmanState, steady_state
+from tailgate.estimators.filters.kalman import KalmanState, steady_state
 
 RNG = np.random.default_rng(11)
 NO_DRAWS = keys("train", [0]).at(Role.DEFENCE, np.zeros(1))

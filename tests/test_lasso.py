@@ -14,9 +14,9 @@ from tailgate.core.draws import Role, keys
 from tailgate.core.registry import Spec, entries
 from tailgate.core.scenario import load_scenario
 from tailgate.estimators import DistributedKalmanFilter, LassoFilter, LassoKalman
-from tailgate.estimators.centralised import stacked
-from tailgate.estimators.distributed import fixed_point
-from tailgate.estimators.robust import believed, believed_by_cvxpy
+from tailgate.estimators.distributed.centralised import stacked
+from tailgate.estimators.distributed.distributed_kalman import fixed_point
+from tailgate.estimators.filters.robust import believed, believed_by_cvxpy
 from tailgate.play.trace import rollout
 from tailgate.thesis import resilience
 

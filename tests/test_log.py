@@ -12,7 +12,7 @@ import pyarrow.parquet as pq
 import pytest
 
 import tailgate
-from tailgate.agents.zoo import zoo_path
+from tailgate.agents.policy.zoo import zoo_path
 from tailgate.base import files
 from tailgate.cli import log as command
 from tailgate.core import draws

@@ -7,9 +7,10 @@ from hypothesis import strategies as st
 
 import tailgate
 from tailgate.core import Kind, Received
+from tailgate.core.channel import Channel
 from tailgate.core.scenario import load_scenario
-from tailgate.core.threat import Brief, Channel, ThreatModel
-from tailgate.envs.faces import AdversaryVectorEnv
+from tailgate.core.threat import Brief, ThreatModel
+from tailgate.envs.gym.gymnasium_env import AdversaryVectorEnv
 
 from .engines import same
 
@@ -98,7 +99,7 @@ def test_a_decision_that_is_refused_throughout_costs_the_penalty_once(interval):
     """Whatever its length; one that is accepted in part costs nothing."""
     paid = {}
     for penalty in (0.0, 0.25):
-        env = tailgate.envs.faces.AdversaryEnv(interval=interval, illegal_penalty=penalty, threat={"onset": 5, "budget": 3, "kinds": ["fdi"]})
+        env = tailgate.envs.gym.gymnasium_env.AdversaryEnv(interval=interval, illegal_penalty=penalty, threat={"onset": 5, "budget": 3, "kinds": ["fdi"]})
         env.reset(seed=0)
         paid[penalty] = [(reward, info["illegal"]) for reward, info in ((out[1], out[4]) for out in (env.step(1) for _ in range(12)))]
     for (without, illegal), (with_it, again) in zip(*paid.values(), strict=True):

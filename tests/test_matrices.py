@@ -5,7 +5,7 @@ import pytest
 
 import tailgate
 from tailgate import num
-from tailgate.estimators import imm, kalman
+from tailgate.estimators.filters import imm, kalman
 
 RNG = np.random.default_rng(11)
 BATCHES = (1, 2, 7, 8, 9, 31, 32, 33, 70)

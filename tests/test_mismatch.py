@@ -64,7 +64,7 @@ def test_a_loaded_car_brakes_less_than_it_is_told_to() -> None:
     import dataclasses
 
     from tailgate.core.loop import Loop
-    from tailgate.envs.controllers import AdaptiveCruise
+    from tailgate.envs.controllers.adaptive_cruise import AdaptiveCruise
 
     class Steady(AdaptiveCruise):
         def step(self, plan, state, estimate, v2v, odometry):

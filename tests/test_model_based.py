@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import tailgate
-from tailgate.agents.model_based import invariant_zeros
+from tailgate.agents.white_box.model_based import invariant_zeros
 from tailgate.base.errors import InputError, NotApplicable
 from tailgate.core import Kind
 from tailgate.core.draws import keys

@@ -14,8 +14,8 @@ from tailgate.core.draws import Role, keys
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import load_scenario
 from tailgate.estimators import DistributedKalmanFilter, NormResilient, NormResilientFilter
-from tailgate.estimators.distributed import fixed_point
-from tailgate.estimators.norm_resilient import axes, moved, moved_by_cvxpy
+from tailgate.estimators.distributed.distributed_kalman import fixed_point
+from tailgate.estimators.distributed.norm_resilient import axes, moved, moved_by_cvxpy
 from tailgate.play.trace import rollout
 from tailgate.thesis import resilience
 

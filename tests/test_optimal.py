@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import tailgate
-from tailgate.agents.optimal_stealth import farthest_inside
+from tailgate.agents.optimal.optimal_stealth import farthest_inside
 from tailgate.base.errors import InputError, NotApplicable
 from tailgate.core import Kind
 from tailgate.core.draws import keys
@@ -16,7 +16,7 @@ from tailgate.core.optimal import Filtering, Grid, Holding, Rules, best_holds, b
 from tailgate.core.registry import entries
 from tailgate.core.scenario import load_scenario
 from tailgate.core.threat import ThreatModel
-from tailgate.envs.network import LinearSensors, NoControl, SensorNetwork
+from tailgate.envs.plants.sensor_network import LinearSensors, NoControl, SensorNetwork
 from tailgate.evaluation.cells import Cell, run_cell
 from tailgate.play.metrics import METRICS
 from tailgate.play.trace import rollout

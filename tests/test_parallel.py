@@ -12,19 +12,19 @@ import pytest
 from pettingzoo.test import parallel_api_test, parallel_seed_test
 
 import tailgate
-from tailgate.agents.selfplay import constant, export
+from tailgate.agents.learners.selfplay import constant, export
 from tailgate.base.errors import InputError, NotApplicable
 from tailgate.core import Kind, Mode
 from tailgate.core.draws import keys
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import load_scenario
-from tailgate.envs.duel import DefenderEnv, Duel, Rival
+from tailgate.envs.gym.duel import DefenderEnv, Duel, Rival
 from tailgate.estimators import Steered, SteeredChallenge, compose
-from tailgate.estimators.distributed import TailChiSquare
-from tailgate.estimators.kalman import KalmanFilter
-from tailgate.estimators.mitigations import Widen
-from tailgate.estimators.steered import load_defender
-from tailgate.estimators.steering import Hand, Knob, Menu, nearest, settings
+from tailgate.estimators.challenge.steered import load_defender
+from tailgate.estimators.challenge.steering import Hand, Knob, Menu, nearest, settings
+from tailgate.estimators.distributed.distributed_kalman import TailChiSquare
+from tailgate.estimators.filters.kalman import KalmanFilter
+from tailgate.estimators.mitigations.responses import Widen
 from tailgate.play.trace import rollout
 
 GUSTY = {"scenario": "gusty-stop-and-go-v0", "interval": 20}
@@ -215,14 +215,14 @@ def test_the_defenders_view_is_a_gymnasium_environment():
     from gymnasium.utils.env_checker import check_env
     from stable_baselines3.common.env_checker import check_env as check_sb3
 
-    env = gymnasium.make("tailgate.envs.duel:tailgate/Defender-v0", attack=["none", "fdi:trigger=near,threshold=40,value=-4"], **GUSTY)
+    env = gymnasium.make("tailgate.envs.gym.duel:tailgate/Defender-v0", attack=["none", "fdi:trigger=near,threshold=40,value=-4"], **GUSTY)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         check_env(env.unwrapped, skip_render_check=True)
         check_sb3(env.unwrapped, skip_render_check=True)
     first, again = env.reset(seed=4)[0], env.reset(seed=4)[0]
     np.testing.assert_array_equal(first, again)
-    quiet = gymnasium.make("tailgate.envs.duel:tailgate/Defender-v0", attack="none", **GUSTY)
+    quiet = gymnasium.make("tailgate.envs.gym.duel:tailgate/Defender-v0", attack="none", **GUSTY)
     quiet.reset(seed=4)
     game = tailgate.parallel_env(**GUSTY)
     game.reset(seed=4)

@@ -13,8 +13,8 @@ from tailgate.base.errors import InputError
 from tailgate.core.draws import Role, keys
 from tailgate.core.registry import make
 from tailgate.core.scenario import list_scenarios, load_scenario
-from tailgate.envs.cacc import PER_CAR, Column
-from tailgate.envs.platoon import Platoon, PlatoonSensors, closed_loop, hold
+from tailgate.envs.controllers.cacc import PER_CAR, Column
+from tailgate.envs.plants.platoon import Platoon, PlatoonSensors, closed_loop, hold
 from tailgate.envs.vehicle import lag
 from tailgate.play.trace import rollout
 
@@ -251,7 +251,7 @@ def test_any_number_of_cars(followers):
 
 def test_a_hundred_followers(monkeypatch):
     """They run, the first cars drive as in a short string, and the last ones do not notice the braking of the leader before its time."""
-    monkeypatch.setattr("tailgate.envs.platoon.require_detectable", lambda model, where: None)  # slow for so many, and not the point here
+    monkeypatch.setattr("tailgate.envs.plants.platoon.require_detectable", lambda model, where: None)  # slow for so many, and not the point here
     brake = make("manoeuvre", "braking", onset=(0.2, 0.2))
     still = PlatoonSensors(noise_sd=(0.0, 0.0, 0.0), told_sd=(0.1, 0.1, 0.05))
     long, short = (

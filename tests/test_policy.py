@@ -11,15 +11,16 @@ import pytest
 from safetensors.numpy import load as load_tensors
 from safetensors.numpy import save as save_tensors
 
-from tailgate.agents.codec import ActionCodec, ActionSpec
-from tailgate.agents.observation import ObservationCodec
-from tailgate.agents.policy import Lstm, Memory, Network, PolicyAttack, Yoked, choose, load_policy, save_policy
+from tailgate.agents.policy.network_policy import PolicyAttack, Yoked, choose, load_policy, save_policy
 from tailgate.base.errors import InputError
 from tailgate.core import draws
+from tailgate.core.neural import Lstm, Memory, Network
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import Scenario, load_scenario
-from tailgate.envs.faces import AdversaryVectorEnv
-from tailgate.envs.network import SensorNetwork
+from tailgate.envs.gym.actions import ActionCodec, ActionSpec
+from tailgate.envs.gym.gymnasium_env import AdversaryVectorEnv
+from tailgate.envs.gym.observations import ObservationCodec
+from tailgate.envs.plants.sensor_network import SensorNetwork
 from tailgate.play.metrics import METRICS, crashed
 from tailgate.play.trace import Recorder, rollout, signals_of
 from tailgate.studies.timing import timing_advantage

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import tailgate
-from tailgate.agents.program import Phase, Program, Sheet
-from tailgate.agents.triggers import TRIGGERS
-from tailgate.agents.values import LAWS
+from tailgate.agents.scripts.program import Phase, Program, Sheet
+from tailgate.agents.scripts.triggers import TRIGGERS
+from tailgate.agents.scripts.values import LAWS
 from tailgate.base.errors import InputError, NotApplicable
 from tailgate.core import Kind
 from tailgate.core.draws import keys

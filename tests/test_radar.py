@@ -15,7 +15,8 @@ from tailgate.core import Air, Kind
 from tailgate.core.draws import Role, keys
 from tailgate.core.registry import make
 from tailgate.core.scenario import load_scenario
-from tailgate.envs import FmcwRadar, RadarCruise, RadarFollowing, fmcw
+from tailgate.envs import FmcwRadar, RadarCruise, RadarFollowing
+from tailgate.envs.sensors import fmcw
 from tailgate.play.trace import rollout
 
 LINK = fmcw.Link()

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import tailgate
-from tailgate.agents.program import Program
+from tailgate.agents.scripts.program import Program
 from tailgate.base.errors import InputError, NotApplicable
 from tailgate.core import Kind
 from tailgate.core.draws import keys

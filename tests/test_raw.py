@@ -10,7 +10,7 @@ from tailgate.base.errors import NotApplicable
 from tailgate.core import Model, Prior, Received
 from tailgate.core.draws import keys
 from tailgate.core.scenario import load_scenario
-from tailgate.envs.cacc import Column
+from tailgate.envs.controllers.cacc import Column
 from tailgate.play.trace import rollout
 
 NONE = tailgate.make_defence("none")

@@ -15,8 +15,10 @@ from gymnasium.utils.env_checker import check_env
 from tailgate.base.errors import InputError
 from tailgate.base.pytree import duplicate
 from tailgate.core import Kind, Mode
-from tailgate.envs import render, render_canvas, render_following
-from tailgate.envs.faces import AdversaryEnv, AdversaryVectorEnv
+from tailgate.envs.gym.gymnasium_env import AdversaryEnv, AdversaryVectorEnv
+from tailgate.envs.render import canvas as render_canvas
+from tailgate.envs.render import following as render_following
+from tailgate.envs.render import picture as render
 
 HEADER = int(render_canvas.HEADER)
 LEFT_OF_LAMP = int(render_canvas.LAMP - 2 * render_canvas.LAMP_SIZE)

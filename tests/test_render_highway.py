@@ -17,10 +17,13 @@ from tailgate.base.errors import InputError, NotApplicable
 from tailgate.base.pytree import duplicate
 from tailgate.core import Kind, draws
 from tailgate.core.scenario import load_scenario
-from tailgate.envs import render, render_canvas, render_highway, render_viewer
-from tailgate.envs.faces import AdversaryVectorEnv
-from tailgate.envs.render_stage import LENGTH, stage_of
-from tailgate.envs.render_viewer import Viewer
+from tailgate.envs.gym.gymnasium_env import AdversaryVectorEnv
+from tailgate.envs.render import canvas as render_canvas
+from tailgate.envs.render import highway as render_highway
+from tailgate.envs.render import picture as render
+from tailgate.envs.render import viewer as render_viewer
+from tailgate.envs.render.stage import LENGTH, stage_of
+from tailgate.envs.render.viewer import Viewer
 from tailgate.evaluation.cells import Cell, run_cell
 from tailgate.replay.replay import play
 from tailgate.replay.video import frames, write_video

@@ -7,10 +7,11 @@ import pytest
 pytest.importorskip("PIL")
 pytest.importorskip("highway_env")
 
-from tailgate.envs import render_canvas, render_highway
-from tailgate.envs.faces import AdversaryVectorEnv
-from tailgate.envs.render_labels import Box, Places, along, around
-from tailgate.envs.render_stage import stage_of
+from tailgate.envs.gym.gymnasium_env import AdversaryVectorEnv
+from tailgate.envs.render import canvas as render_canvas
+from tailgate.envs.render import highway as render_highway
+from tailgate.envs.render.labels import Box, Places, along, around
+from tailgate.envs.render.stage import stage_of
 
 SIZES = [(400, 144), (480, 160), (640, 200), (960, 240), (1280, 400), (1920, 540)]
 EARLY = {"onset": 5, "end": None}

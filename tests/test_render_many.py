@@ -8,8 +8,11 @@ pytest.importorskip("PIL")
 
 from tailgate.base.pytree import duplicate
 from tailgate.core import Kind
-from tailgate.envs import render, render_canvas, render_network, render_platoon
-from tailgate.envs.faces import AdversaryVectorEnv
+from tailgate.envs.gym.gymnasium_env import AdversaryVectorEnv
+from tailgate.envs.render import canvas as render_canvas
+from tailgate.envs.render import network as render_network
+from tailgate.envs.render import picture as render
+from tailgate.envs.render import platoon as render_platoon
 
 PLATOON = {"scenario": "platoon-braking-v0", "defence": "dkf", "viewer": "plain", "threat": {"onset": 1, "targets": ["distance", "velocity"]}}
 NETWORK = {"scenario": "thesis-ch5-v0", "defence": "dkf", "reward": "error", "threat": {"onset": 1}}

@@ -147,7 +147,7 @@ def test_filters_that_leave_nothing_say_what_there_is(rows):
 @pytest.mark.parametrize("family", ["defence", "attack"])
 def test_a_row_imports_nothing_unless_the_user_names_the_class(pick, tmp_path, monkeypatch, family):
     """A stranger's row that names module:Class leaves the module alone; the same name on the command line plays it."""
-    base = {"defence": "from tailgate.estimators import Kalman as Base", "attack": "from tailgate.agents.scripted import NoAttack as Base"}[family]
+    base = {"defence": "from tailgate.estimators import Kalman as Base", "attack": "from tailgate.agents.scripts.scripted import NoAttack as Base"}[family]
     (tmp_path / f"evil_{family}.py").write_text(f"open({str(tmp_path / 'ran')!r}, 'w').close()\n{base}\n\nclass Mine(Base):\n    pass\n")
     monkeypatch.syspath_prepend(tmp_path)
     text = f"evil_{family}:Mine"
@@ -208,7 +208,7 @@ def test_the_threshold_is_shown_where_the_defence_has_one(pick, monkeypatch):
     gated = episode_of(play(pick("chi2_kf:eta=9", "dos_jam:start_step=20")))
     assert gated["threshold"] == {"name": "eta", "value": 9.0, "rules": True} and gated["gate"] is None and sum(gated["alarm"]) > 0
     assert episode_of(play(pick()))["threshold"] is None
-    from tailgate.estimators.chi_square import ChiSquare, GatedKalman
+    from tailgate.estimators.detectors.chi_square import ChiSquare, GatedKalman
 
     monkeypatch.setattr(GatedKalman, "threshold_field", None)
     monkeypatch.setattr(ChiSquare, "threshold_field", None)

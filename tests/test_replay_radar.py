@@ -7,8 +7,10 @@ import yaml
 pytest.importorskip("PIL")
 
 from tailgate.core import Kind
-from tailgate.envs import render, render_canvas, render_following
-from tailgate.envs.faces import AdversaryVectorEnv
+from tailgate.envs.gym.gymnasium_env import AdversaryVectorEnv
+from tailgate.envs.render import canvas as render_canvas
+from tailgate.envs.render import following as render_following
+from tailgate.envs.render import picture as render
 from tailgate.evaluation.cells import Cell, run_cell
 from tailgate.replay.episode import episode_of
 from tailgate.replay.page import write_page

@@ -106,7 +106,7 @@ def test_chapter_6_collisions(label, guard):
 
 def test_the_fixed_point_is_one():
     """One more step of (5.5) changes the covariances by less than 1e-12 of their size, on a fresh system and on the platoon."""
-    from tailgate.estimators.distributed import fixed_point
+    from tailgate.estimators.distributed.distributed_kalman import fixed_point
 
     for model in (ch5_cases.fresh(9).brief().model, load_scenario(ch6_cases.SCENARIO).brief().model):
         assert ch5_theory.residual(model, fixed_point(model).P) < 1e-12

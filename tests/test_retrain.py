@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from tailgate import cli
-from tailgate.agents.learning import made_with
+from tailgate.agents.learners.learning import made_with
 from tailgate.studies.collect import add_policy
 from tailgate.studies.retrain import retrain
 from tailgate.training import train

@@ -15,7 +15,7 @@ from tailgate.core.draws import Role, keys
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import load_scenario
 from tailgate.estimators import Kalman, Outlier, RobustKalman, RobustKalmanFilter
-from tailgate.estimators.robust import believed, believed_by_cvxpy
+from tailgate.estimators.filters.robust import believed, believed_by_cvxpy
 
 FAMILIES = ("plain", "tiny", "huge", "units", "correlated", "far", "boundary", "none", "one silent")
 NO_DRAWS = keys("train", [0]).at(Role.DEFENCE, np.zeros(1))

@@ -15,8 +15,8 @@ from tailgate.core.registry import Spec
 from tailgate.core.scenario import load_scenario
 from tailgate.envs.vehicle import drive, lag
 from tailgate.estimators import SafeSet, SafeState, SafeStateBrake
-from tailgate.estimators.reactive_brake import stopping_distance
-from tailgate.estimators.safe_state import ACCEL, GAP, LEAD, SPEED, OwnOdometry
+from tailgate.estimators.safe_set.reactive_brake import stopping_distance
+from tailgate.estimators.safe_set.safe_state import ACCEL, GAP, LEAD, SPEED, OwnOdometry
 from tailgate.play import metrics
 from tailgate.play.trace import rollout
 

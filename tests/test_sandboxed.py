@@ -34,7 +34,7 @@ SMALL = Suite(
 def folder(tmp_path_factory) -> Path:
     """Where somebody's class lies: a copy of a built-in one, so that its rows are known."""
     where = tmp_path_factory.mktemp("theirs")
-    (where / "mine.py").write_text("from tailgate.estimators.chi_square import GatedKalman\n\nclass Mine(GatedKalman):\n    '''A copy.'''\n", encoding="utf-8")
+    (where / "mine.py").write_text("from tailgate.estimators.detectors.chi_square import GatedKalman\n\nclass Mine(GatedKalman):\n    '''A copy.'''\n", encoding="utf-8")
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(where)
         yield where

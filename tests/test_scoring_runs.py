@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tailgate import make_attack, make_defence
-from tailgate.agents.zoo import zoo_names
+from tailgate.agents.policy.zoo import zoo_names
 from tailgate.base.errors import InputError, NotApplicable
 from tailgate.core.draws import keys
 from tailgate.core.registry import Spec, entries

@@ -8,13 +8,13 @@ import pytest
 from scipy import stats
 
 import tailgate
-from tailgate.agents import scripted
-from tailgate.agents.values import Gamma
+from tailgate.agents.scripts import scripted
+from tailgate.agents.scripts.values import Gamma
 from tailgate.base.errors import InputError, NotApplicable
 from tailgate.core import Kind
 from tailgate.core.draws import Role, keys
 from tailgate.core.scenario import load_scenario
-from tailgate.envs.faces import AdversaryVectorEnv
+from tailgate.envs.gym.gymnasium_env import AdversaryVectorEnv
 from tailgate.play.trace import rollout
 
 K = 60

@@ -13,16 +13,16 @@ import pytest
 
 import tailgate
 from tailgate import cli
-from tailgate.agents.cem import Config
-from tailgate.agents.mixture import Mixture
-from tailgate.agents.policy import PolicyAttack
-from tailgate.agents.selfplay import Learner, Played, constant, play
+from tailgate.agents.learners.cem import Config
+from tailgate.agents.learners.selfplay import Learner, Played, constant, play
+from tailgate.agents.policy.network_policy import PolicyAttack
 from tailgate.base.errors import InputError
 from tailgate.cli.selfplay import _print_report
 from tailgate.core import Kind, draws
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import config_path, load_scenario
-from tailgate.envs.duel import Duel
+from tailgate.envs.gym.duel import Duel
+from tailgate.envs.gym.mixture import Mixture
 from tailgate.estimators import Steered
 from tailgate.play.trace import rollout
 from tailgate.training import selfplay

@@ -10,7 +10,7 @@ from tailgate.core.draws import Role, keys
 from tailgate.core.registry import make
 from tailgate.core.scenario import load_scenario
 from tailgate.core.schema import as_data
-from tailgate.envs.sensors import Odometry
+from tailgate.envs.sensors.odometry import Odometry
 
 STEPS = np.zeros(20_000, np.int64)
 

@@ -10,7 +10,7 @@ from tailgate import cli, evaluate
 from tailgate.base import sizes
 from tailgate.base.errors import InputError
 from tailgate.base.pool import Crew
-from tailgate.envs.faces import AdversaryVectorEnv
+from tailgate.envs.gym.gymnasium_env import AdversaryVectorEnv
 from tailgate.training import train
 
 SOME = ["--scenario", "thesis-ch4-v0", "--defence", "kf", "--attack", "none"]

@@ -10,15 +10,15 @@ from gymnasium.envs.registration import EnvSpec
 
 import tailgate
 from tailgate.base.errors import InputError
-from tailgate.envs.duel import DefenderEnv
-from tailgate.envs.faces import AdversaryEnv, AdversaryVectorEnv
-from tailgate.envs.parallel import DuelEnv
-from tailgate.envs.specs import in_box
+from tailgate.envs.gym.duel import DefenderEnv
+from tailgate.envs.gym.gymnasium_env import AdversaryEnv, AdversaryVectorEnv
+from tailgate.envs.gym.parallel import DuelEnv
+from tailgate.envs.gym.specs import in_box
+from tailgate.estimators.challenge.steering import Menu
 from tailgate.estimators.compose import compose
-from tailgate.estimators.kalman import Kalman
-from tailgate.estimators.steering import Menu
+from tailgate.estimators.filters.kalman import Kalman
 
-ID, DEFENDER = "tailgate/CarFollowing-v0", "tailgate.envs.duel:tailgate/Defender-v0"
+ID, DEFENDER = "tailgate/CarFollowing-v0", "tailgate.envs.gym.duel:tailgate/Defender-v0"
 
 
 @dataclasses.dataclass(frozen=True)

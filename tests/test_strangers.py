@@ -5,12 +5,12 @@ import dataclasses
 import numpy as np
 import pytest
 
-from tailgate.agents.scripted import NoAttack
+from tailgate.agents.scripts.scripted import NoAttack
 from tailgate.base.errors import InputError
 from tailgate.core import draws
 from tailgate.core.scenario import load_scenario
 from tailgate.core.threat import ThreatModel
-from tailgate.envs.faces import AdversaryEnv, AdversaryVectorEnv
+from tailgate.envs.gym.gymnasium_env import AdversaryEnv, AdversaryVectorEnv
 from tailgate.play.metrics import METRICS, UNITS, measure
 from tailgate.play.rollouts import Rollout, rollout_of
 from tailgate.play.trace import Trace, rollout

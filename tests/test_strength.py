@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from tailgate import cli
-from tailgate.agents.policy import Yoked
+from tailgate.agents.policy.network_policy import Yoked
 from tailgate.base.errors import InputError
 from tailgate.core import draws
 from tailgate.core.draws import Role

@@ -10,7 +10,7 @@ from tailgate.core.draws import keys
 from tailgate.core.registry import make
 from tailgate.core.scenario import load_scenario
 from tailgate.envs.manoeuvres import Sine
-from tailgate.envs.platoon import Platoon, PlatoonSensors
+from tailgate.envs.plants.platoon import Platoon, PlatoonSensors
 from tailgate.thesis.string_stability import Peak, growth, peak, sweep, transfer
 
 WEIGHTS = ((1.0, 1.0), (0.5, 0.5), (1.0, 0.0))

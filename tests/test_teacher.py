@@ -6,16 +6,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tailgate.agents import cem
-from tailgate.agents.learning import Teachable, learner_of
-from tailgate.agents.policy import PolicyAttack
-from tailgate.agents.ppo import Config, Learner
-from tailgate.agents.teacher import demonstrate, nearest
+from tailgate.agents.learners import cem
+from tailgate.agents.learners.learning import Teachable, learner_of
+from tailgate.agents.learners.ppo import Config, Learner
+from tailgate.agents.learners.teacher import demonstrate, nearest
+from tailgate.agents.policy.network_policy import PolicyAttack
 from tailgate.base.errors import InputError
 from tailgate.core import Kind, draws
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import config_path
-from tailgate.envs.seat import Seat
+from tailgate.envs.gym.attacker_mdp import Seat
 from tailgate.play.metrics import crashed
 from tailgate.play.trace import rollout
 from tailgate.training import train

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from tailgate import num
-from tailgate.agents.scripted import NoAttack
-from tailgate.agents.zoo import zoo_card
+from tailgate.agents.policy.zoo import zoo_card
+from tailgate.agents.scripts.scripted import NoAttack
 from tailgate.base.errors import InputError
 from tailgate.cli import main
 from tailgate.core import draws
@@ -24,13 +24,14 @@ from tailgate.engine import objects
 from tailgate.engine.evaluation import evaluate
 from tailgate.engine.program import Call, Program, State, traced
 from tailgate.engine.remembered import Remembered
-from tailgate.envs.faces import AdversaryEnv, AdversaryVectorEnv
-from tailgate.envs.seat import Seat
+from tailgate.envs.gym import programs as seats
+from tailgate.envs.gym.attacker_mdp import Seat
+from tailgate.envs.gym.gymnasium_env import AdversaryEnv, AdversaryVectorEnv
+from tailgate.envs.gym.programs import SeatPrograms
 from tailgate.estimators import ChiSquare, Kalman
-from tailgate.play import rollouts, seats, trace
+from tailgate.play import rollouts, trace
 from tailgate.play.commanded import Commanded
 from tailgate.play.rollouts import Rollout, rollout_of
-from tailgate.play.seats import SeatPrograms
 from tailgate.play.trace import Trace, rollout
 
 from .engines import as_plain

@@ -12,7 +12,7 @@ from tailgate.base.errors import InputError
 from tailgate.core import draws
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import load_scenario
-from tailgate.envs.faces import AdversaryEnv, AdversaryVectorEnv
+from tailgate.envs.gym.gymnasium_env import AdversaryEnv, AdversaryVectorEnv
 from tailgate.play.commanded import Steps, commanded
 from tailgate.play.trace import rollout
 
@@ -246,7 +246,7 @@ import gymnasium
 env = gymnasium.make("tailgate:tailgate/CarFollowing-v0")
 env.reset(seed=0)
 env.step(0)
-print([name for name in ("scipy", "torch", "tailgate.estimators.lasso", "tailgate.envs.radar") if name in sys.modules])
+print([name for name in ("scipy", "torch", "tailgate.estimators.distributed.lasso", "tailgate.envs.sensors.fmcw_radar") if name in sys.modules])
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.stdout.strip() == "[]", done.stdout + done.stderr

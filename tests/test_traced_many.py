@@ -10,7 +10,7 @@ from tailgate.base.pytree import leaves
 from tailgate.core import draws
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import load_scenario
-from tailgate.envs.faces import AdversaryEnv
+from tailgate.envs.gym.gymnasium_env import AdversaryEnv
 from tailgate.envs.manoeuvres import Profile
 from tailgate.play.commanded import Steps, commanded
 from tailgate.play.trace import rollout

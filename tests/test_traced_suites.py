@@ -11,9 +11,9 @@ from tailgate.core.loop import Loop
 from tailgate.core.registry import Spec, entries
 from tailgate.core.scenario import Suite, load_scenario, load_suite
 from tailgate.engine.agreement import Untraced
-from tailgate.envs.seat import Seat
+from tailgate.envs.gym.attacker_mdp import Seat
+from tailgate.envs.gym.programs import SeatPrograms, programs_of
 from tailgate.play.rollouts import Rollout, rollout_of
-from tailgate.play.seats import SeatPrograms, programs_of
 from tailgate.play.trace import Trace, rollout
 
 ROOT = Path(__file__).parent.parent

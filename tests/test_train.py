@@ -16,11 +16,11 @@ from safetensors import safe_open
 from safetensors.numpy import save_file
 
 from tailgate import cli
-from tailgate.agents.cem import Config as CemConfig
-from tailgate.agents.ppo import Config, Learner
+from tailgate.agents.learners.cem import Config as CemConfig
+from tailgate.agents.learners.ppo import Config, Learner
 from tailgate.base.errors import InputError
 from tailgate.core.schema import build
-from tailgate.envs.seat import Seat
+from tailgate.envs.gym.attacker_mdp import Seat
 from tailgate.evaluation.baselines import outcomes
 from tailgate.training import comparison, train
 

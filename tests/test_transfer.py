@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tailgate import cli
-from tailgate.agents.policy import PolicyAttack
+from tailgate.agents.policy.network_policy import PolicyAttack
 from tailgate.base.errors import InputError
 from tailgate.core.registry import entries
 from tailgate.studies.figures import transfer_figure

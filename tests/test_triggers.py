@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import tailgate
-from tailgate.agents.triggers import (
+from tailgate.agents.scripts.triggers import (
     TRIGGERS,
     Bursts,
     Chance,

@@ -7,10 +7,10 @@ import pytest
 
 from tailgate.base.errors import NotApplicable
 from tailgate.core import Prior
-from tailgate.envs.network import NoControl, SensorNetwork
+from tailgate.envs.plants.sensor_network import NoControl, SensorNetwork
 from tailgate.estimators import TrimmedFilter
-from tailgate.estimators.kalman import steady_state
-from tailgate.estimators.trimmed import clusters, detects, lessons, split, trimmed_mean
+from tailgate.estimators.distributed.trimmed import clusters, detects, lessons, split, trimmed_mean
+from tailgate.estimators.filters.kalman import steady_state
 
 from .distributed import RNG, error, model_of, place_of, play
 

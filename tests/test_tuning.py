@@ -14,7 +14,7 @@ import yaml
 pytest.importorskip("optuna")
 
 from tailgate import cli
-from tailgate.agents.policy import PolicyAttack
+from tailgate.agents.policy.network_policy import PolicyAttack
 from tailgate.base.errors import InputError
 from tailgate.core import draws
 from tailgate.core.registry import Spec
@@ -198,7 +198,7 @@ def test_the_built_in_spaces_are_valid(tmp_path: Path, learner: str) -> None:
     """Every field exists, and every end of it makes a configuration that the learner accepts."""
     if learner == "ppo":
         pytest.importorskip("stable_baselines3")
-    from tailgate.agents.learning import learner_of
+    from tailgate.agents.learners.learning import learner_of
     from tailgate.core.schema import build
 
     path = tmp_path / "space.yaml"

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import tailgate
-from tailgate.agents.scripted import NoAttack
+from tailgate.agents.scripts.scripted import NoAttack
 from tailgate.base.errors import NotApplicable
 from tailgate.core import Model
 from tailgate.core.draws import Role, keys

@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 
 from tailgate import cli
-from tailgate.agents import zoo
-from tailgate.agents.policy import PolicyAttack, load_policy
-from tailgate.agents.zoo import ZooAttack, zoo_card, zoo_names, zoo_path
+from tailgate.agents.policy import zoo
+from tailgate.agents.policy.network_policy import PolicyAttack, load_policy
+from tailgate.agents.policy.zoo import ZooAttack, zoo_card, zoo_names, zoo_path
 from tailgate.base.errors import InputError
 from tailgate.core import draws
 from tailgate.core.registry import Spec
 from tailgate.core.schema import build
-from tailgate.envs.seat import Seat
+from tailgate.envs.gym.attacker_mdp import Seat
 from tailgate.evaluation.cells import evaluate
 from tailgate.play.trace import rollout
 from tailgate.studies.collect import BYTES, POINTS, add_policy, add_run, single, thinned

@@ -47,14 +47,14 @@ def __getattr__(name: str) -> Any:
 
         return evaluate
     if name == "parallel_env":
-        from tailgate.envs.parallel import parallel_env
+        from tailgate.envs.gym.parallel import parallel_env
 
         return parallel_env
     raise AttributeError(f"module 'tailgate' has no attribute {name!r}")
 
 
 def _register() -> None:
-    from tailgate.envs.faces import register_all
+    from tailgate.envs.gym.gymnasium_env import register_all
 
     register_all()
 

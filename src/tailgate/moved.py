@@ -2,7 +2,7 @@
 
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib import import_module
 from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec
@@ -19,25 +19,82 @@ ROOMS = {
     "thesis": "bounds resilience string_stability",
     "training": "adaptive comparison selfplay train trainings tuning",
 }
+SUBROOMS = {  # of the folders envs, estimators and agents
+    "envs.plants": "following=car_following radar_following platoon linear_platoon network=sensor_network highway highway_scene "
+    "scalar_loop=scalar literal=thesis_printed",
+    "envs.sensors": "radar=fmcw_radar fmcw fmcw_signal",
+    "envs.controllers": "cacc consensus_cacc idm ploeg radar_car",
+    "envs.gym": "batches duel faces=gymnasium_env seat=attacker_mdp shadow parallel sb3 specs",
+    "envs.render": "render_canvas=canvas render_stage=stage render_platoon=platoon render_following=following render_network=network "
+    "render_radar=radar render_highway=highway render_sheet=sheet render_viewer=viewer render_labels=labels render_bars=bars "
+    "render_road=road",
+    "estimators.filters": "kalman imm kinematic robust filterpy_filters predictors",
+    "estimators.detectors": "chi_square monitored sparse",
+    "estimators.mitigations": "control_defences",
+    "estimators.distributed": "consensus disagreement trimmed trust saturated lasso centralised norm_resilient",
+    "estimators.challenge": "steered steering",
+    "estimators.safe_set": "safe_state reactive_brake algorithm2",
+    "estimators.reference": "oracle sentinels raw",
+    "agents.scripts": "scripted radio burst_loss program aim triggers values",
+    "agents.white_box": "model_based ghost",
+    "agents.optimal": "optimal_dos optimal_hold optimal_stealth",
+    "agents.policy": "zoo",
+    "agents.learners": "cem dqn ppo recurrent_ppo maskable_ppo sac tqc stable learning selfplay teacher finished",
+}
 PACKAGES = {"commands": "cli", "reproduce": "thesis", "strength": "studies", "submission": "sandbox"}
+OTHERS = {
+    "agents.codec": "envs.gym.actions",
+    "agents.observation": "envs.gym.observations",
+    "agents.reward": "envs.gym.rewards",
+    "agents.mixture": "envs.gym.mixture",
+}
+PROMOTED = {  # modules whose name a folder has today: the folder gives what they defined
+    "envs.sensors": "envs.sensors.odometry",
+    "envs.controllers": "envs.controllers.adaptive_cruise",
+    "envs.render": "envs.render.picture",
+    "estimators.detectors": "estimators.detectors.sequential",
+    "estimators.mitigations": "estimators.mitigations.responses",
+    "estimators.distributed": "estimators.distributed.distributed_kalman",
+    "estimators.challenge": "estimators.challenge.challenge_response",
+    "agents.policy": "agents.policy.network_policy",
+}
 
 
 def _table() -> dict[str, str]:
-    out = {f"tailgate.{old}": f"tailgate.{new}" for old, new in PACKAGES.items()}
-    for room, names in ROOMS.items():
+    out = PACKAGES | OTHERS
+    for room, names in (ROOMS | SUBROOMS).items():
+        top = room.partition(".")[0] + "." if room in SUBROOMS else ""
         for name in names.split():
             old, _, new = name.partition("=")
-            out[f"tailgate.{old}"] = f"tailgate.{room}.{new or old}"
-    return out
+            out[top + old] = f"{room}.{new or old}"
+    return {f"tailgate.{old}": f"tailgate.{new}" for old, new in out.items()}
 
 
 MOVED = _table()
 
 
 def now(name: str) -> str:
-    """Where a module is today; empty where it has not moved."""
-    head = ".".join(name.split(".")[:2])
-    return MOVED[head] + name[len(head) :] if head in MOVED else ""
+    """Return where a module is today; empty where it has not moved."""
+    parts = name.split(".")
+    for size in (3, 2):
+        head = ".".join(parts[:size])
+        if head in MOVED:
+            return MOVED[head] + name[len(head) :]
+    return ""
+
+
+def former(package: str) -> Callable[[str], object]:
+    """Return the `__getattr__` of a folder that has the name of an earlier module."""
+    module = f"tailgate.{PROMOTED[package.removeprefix('tailgate.')]}"
+
+    def get(name: str) -> object:
+        if name.startswith("__"):
+            raise AttributeError(f"module {package!r} has no attribute {name!r}")
+        value = getattr(import_module(module), name)
+        warnings.warn(f"{package}.{name} is now {module}.{name}", DeprecationWarning, stacklevel=2)
+        return value
+
+    return get
 
 
 class Forwarding(MetaPathFinder, Loader):

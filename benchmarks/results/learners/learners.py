@@ -13,13 +13,13 @@ from pathlib import Path
 
 import numpy as np
 
-from tailgate.agents.learning import LEARNERS, check_action, learner_of
-from tailgate.agents.policy import PolicyAttack
-from tailgate.agents.reward import NEAR, small
+from tailgate.agents.learners.learning import LEARNERS, check_action, learner_of
+from tailgate.agents.policy.network_policy import PolicyAttack
 from tailgate.base.errors import InputError
 from tailgate.core import draws
 from tailgate.core.registry import Spec
-from tailgate.envs.seat import Seat
+from tailgate.envs.gym.attacker_mdp import Seat
+from tailgate.envs.gym.rewards import NEAR, small
 from tailgate.play.metrics import METRICS
 from tailgate.studies.timing import played
 

@@ -26,7 +26,7 @@ from tailgate.core.draws import Role
 from tailgate.core.loop import Loop
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import load_scenario
-from tailgate.estimators import distributed
+from tailgate.estimators.distributed import distributed_kalman as distributed
 
 EPISODES, STEPS, WARM = 4, 20, 3
 GROUPS = (("none",), ("dkf", "lasso_dkf"))

@@ -12,8 +12,8 @@ import numpy as np
 from scipy import optimize
 
 from tailgate.bench.study import arguments, made_by, write_record
-from tailgate.envs import fmcw
-from tailgate.envs.fmcw_signal import root_music
+from tailgate.envs.sensors import fmcw
+from tailgate.envs.sensors.fmcw_signal import root_music
 
 SIZES = {512: range(-6, 41, 1), 128: range(-6, 41, 4), 1024: range(-6, 41, 4)}  # samples of a sweep: x [dB]
 FITTED = 512

@@ -19,7 +19,7 @@ from tailgate.core import draws
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import Scenario, load_scenario
 from tailgate.estimators import RobustKalman
-from tailgate.estimators.kalman import steady_state
+from tailgate.estimators.filters.kalman import steady_state
 from tailgate.play.metrics import rmse_position
 from tailgate.play.trace import rollout
 

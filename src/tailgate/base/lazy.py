@@ -1,20 +1,67 @@
-"""Packages whose modules are imported when somebody asks for what is in them: all of them take longer than an environment's first step."""
+"""Packages of components: their modules are found by looking at the folder, and imported when somebody asks for what they define."""
 
+import re
 import sys
 from collections.abc import Callable
+from functools import cache
 from importlib import import_module
-from typing import Any
+from pathlib import Path
+from types import ModuleType
+
+_REGISTERED = re.compile(r'^@register\(\s*"(\w+)",\s*"([\w-]+)".*?^class (\w+)', re.MULTILINE | re.DOTALL)
 
 
-def exported(package: str, homes: dict[str, str]) -> tuple[Callable[[str], Any], list[str]]:
-    """A package's `__getattr__` and `__all__`, from its modules and the names, with blanks between, that each gives to the package."""
-    where = {name: module for module, names in homes.items() for name in names.split()}
+@cache
+def texts(package: str) -> dict[str, str]:
+    """Return the text of every module below a package, by the module's full name."""
+    root = Path(str(import_module(package).__file__)).parent
+    return {
+        ".".join((package, *path.relative_to(root).with_suffix("").parts)): path.read_text("utf-8")
+        for path in sorted(root.rglob("*.py"))
+        if path.name != "__init__.py"
+    }
 
-    def get(name: str) -> Any:
-        if name not in where:
+
+@cache
+def components(package: str) -> dict[tuple[str, str], str]:
+    """Return the module that registers each component of a package, by family and name."""
+    return {(family, name): module for module, text in texts(package).items() for family, name, _ in _REGISTERED.findall(text)}
+
+
+@cache
+def homes(package: str) -> dict[str, str]:
+    """Return the module of each registered class of a package, by the name of the class."""
+    return {kind: module for module, text in texts(package).items() for _, _, kind in _REGISTERED.findall(text)}
+
+
+def exported(package: str, *others: str) -> tuple[Callable[[str], object], Callable[[], list[str]]]:
+    """Return `__getattr__` and `__dir__` of a package that gives all its registered classes by name.
+
+    others: classes and functions that the package gives too, each defined in one of its modules.
+    """
+
+    def module_of(name: str) -> str | None:
+        if name in others:
+            opens = re.compile(rf"^(?:class|def) {name}\b", re.MULTILINE)
+            return next(module for module, text in texts(package).items() if opens.search(text))
+        return homes(package).get(name)
+
+    def names() -> list[str]:
+        return sorted({*homes(package), *others})
+
+    def get(name: str) -> object:
+        if name == "__all__":
+            return names()
+        home = None if name.startswith("_") else module_of(name)
+        if home is None:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        value = getattr(import_module(f"{package}.{where[name]}"), name)
+        value = getattr(import_module(home), name)
         setattr(sys.modules[package], name, value)
         return value
 
-    return get, sorted(where)
+    return get, names
+
+
+def loaded(package: str) -> list[ModuleType]:
+    """Import every module below a package that registers a component."""
+    return [import_module(module) for module in dict.fromkeys(components(package).values())]

@@ -16,18 +16,18 @@ import gymnasium
 import numpy as np
 
 from tailgate import num
-from tailgate.agents.codec import ActionCodec, ActionSpec
-from tailgate.agents.observation import ObservationCodec
-from tailgate.agents.reward import Reward, RewardName
 from tailgate.base.pytree import put_rows
 from tailgate.core import Array, Attack, Command, Defence, Estimate, Mode, Model, Prior, Received, View, draws
 from tailgate.core.draws import Draws, Role
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import Scenario, load_scenario
 from tailgate.engine.agreement import Untraced
-from tailgate.envs.batches import side_by_side
-from tailgate.envs.seat import Seat
-from tailgate.play.seats import Rows, programs_of
+from tailgate.envs.gym.actions import ActionCodec, ActionSpec
+from tailgate.envs.gym.attacker_mdp import Seat
+from tailgate.envs.gym.batches import side_by_side
+from tailgate.envs.gym.observations import ObservationCodec
+from tailgate.envs.gym.programs import Rows, programs_of
+from tailgate.envs.gym.rewards import Reward
 
 from .lines import Go, Missing, Sample, repeated
 from .peers import at_random, batched, stepped
@@ -126,7 +126,7 @@ def batch(episodes: int, threads: int = 1) -> Go:
     return repeated(lambda: decided(rows))
 
 
-def several(scenario: Scenario, defence: str, value: float, reward: RewardName, episodes: int) -> Go:
+def several(scenario: Scenario, defence: str, value: float, reward: str, episodes: int) -> Go:
     """Play whole steps of several agents under a learner's action, as in `batch`."""
     named, spec = Spec("defence", defence), ActionSpec("timing", "fdi", value, interval=HELD)
     loop = scenario.loop(named.make(), named.entry.uses)
@@ -314,7 +314,7 @@ class _Timed:
 def environment_share() -> Go:
     """Time the environment's share of a training by PPO of Stable-Baselines3: 1024 x 32 steps, batches of 8192, 4 epochs."""
     try:
-        from tailgate.agents.ppo import Config, Learner
+        from tailgate.agents.learners.ppo import Config, Learner
     except ImportError as error:
         raise Missing(str(error)) from None
     config = Config(envs=1024, rollout=32, batch_size=8192, epochs=4)

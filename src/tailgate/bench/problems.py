@@ -15,10 +15,10 @@ import numpy as np
 from tailgate import num
 from tailgate.core import Array, Innovation
 from tailgate.core.scenario import load_scenario
-from tailgate.estimators.distributed import fixed_point
-from tailgate.estimators.kalman import KalmanState
-from tailgate.estimators.norm_resilient import axes, moved
-from tailgate.estimators.robust import RobustKalmanFilter, believed, load_cvxpy
+from tailgate.estimators.distributed.distributed_kalman import fixed_point
+from tailgate.estimators.distributed.norm_resilient import axes, moved
+from tailgate.estimators.filters.kalman import KalmanState
+from tailgate.estimators.filters.robust import RobustKalmanFilter, believed, load_cvxpy
 
 from .lines import Go, Missing, Sample, repeated
 

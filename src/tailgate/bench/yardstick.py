@@ -18,12 +18,12 @@ from typing import Literal
 
 import numpy as np
 
-from tailgate.agents.reward import NEAR, Reward
 from tailgate.base.errors import InputError
 from tailgate.core import Array
 from tailgate.core.draws import Role, keys
 from tailgate.core.scenario import Scenario, load_scenario
-from tailgate.envs import idm
+from tailgate.envs.controllers import idm
+from tailgate.envs.gym.rewards import NEAR, Reward
 
 from .lines import Go, Missing, repeated
 

@@ -44,10 +44,10 @@ def explanation(scenario: str | None, defence: str | None, attack: str | None) -
     """By what is played: `why` it cannot be traced, or the `size` of its code."""
     from tailgate.core.registry import Spec
     from tailgate.engine.agreement import Untraced
-    from tailgate.envs.seat import Seat
+    from tailgate.envs.gym.attacker_mdp import Seat
+    from tailgate.envs.gym.programs import programs_of
     from tailgate.play.commanded import commanded
     from tailgate.play.rollouts import rollout_of
-    from tailgate.play.seats import programs_of
 
     seat = Seat.make(scenario, defence)
     made: dict[str, Any] = {"environments": programs_of(seat)}

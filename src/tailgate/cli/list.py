@@ -29,7 +29,7 @@ def _list(options: argparse.Namespace) -> int:
         return _draw(options)
     if options.out is not None:
         raise InputError("--out", options.out, "a drawing to write: --graph SCENARIO")
-    from tailgate.agents.zoo import zoo_card, zoo_names
+    from tailgate.agents.policy.zoo import zoo_card, zoo_names
     from tailgate.core.registry import entries
     from tailgate.core.scenario import list_scenarios, list_suites, load_scenario, load_suite
 

@@ -55,7 +55,7 @@ def _size(text: str | None) -> tuple[int, int] | None:
 
 def _replay(options: argparse.Namespace) -> int:
     from tailgate.core.registry import Spec
-    from tailgate.envs.render_viewer import Viewer
+    from tailgate.envs.render.viewer import Viewer
     from tailgate.evaluation.rows import read_rows
     from tailgate.replay.page import failed, outcome, write_page
     from tailgate.replay.replay import Filter, choose, play

@@ -1,25 +1,18 @@
 """Models, the threat model and its channel, the loop, random numbers, and the registry of components. The nouns are imported from here."""
 
+from tailgate.core.components import Attack, Controller, Defence, Manoeuvre, Plant, Receiver, Sensor, Sized
 from tailgate.core.kinds import AIRED, RADIATED, Kind, Mode
 from tailgate.core.nouns import (
     Air,
     Array,
-    Attack,
     Command,
-    Controller,
-    Defence,
     Estimate,
     Frame,
     Innovation,
-    Manoeuvre,
     Model,
-    Plant,
     Prior,
     Received,
-    Receiver,
     Scene,
-    Sensor,
-    Sized,
     View,
     WhiteBox,
     no_command,

@@ -1,29 +1,194 @@
-"""What a command does to the wires that it targets, and what a defence asks of the controller. The numbers are part of published rows."""
+"""Kinds of attack: what a command does to the wires that it targets; and modes, what a defence asks of the controller.
+
+The numbers are part of published rows. A new kind is a member of `Kind`, its name in `KindName`, and a class with its effect.
+"""
+
+from __future__ import annotations
 
 from enum import IntEnum
+from typing import TYPE_CHECKING, ClassVar, Literal, NamedTuple
+
+import numpy as np
+
+from tailgate import num
+
+if TYPE_CHECKING:
+    from tailgate.core.channel import Memory
+    from tailgate.core.nouns import Array
+
+FAINTEST = 1e-12  # power [W] or delay [m] that a command over the air has at least
+KindName = Literal["dos_jam", "dos_hold", "dos_hold_fresh", "dropout", "fdi", "delay", "replay", "noise_jam", "echo_delay"]
 
 
 class Kind(IntEnum):
-    """What a command does to the wires that it targets. The number is part of the published rows."""
+    """A kind of attack."""
 
     NONE = 0
-    DOS_JAM = 1  # the receiver reads the jammer's value
-    DOS_HOLD = 2  # the receiver reads the last good sample before the first attack (6.18)
-    DOS_HOLD_FRESH = 3  # the receiver reads the last good sample before this burst
-    DROPOUT = 4  # nothing is received, and the receiver knows it
-    FDI = 5  # value is added (4.4)
-    DELAY = 6  # the receiver reads what was sent `value` steps ago
-    REPLAY = 7  # the receiver reads the last `value` samples before this replay, over and over
-    NOISE_JAM = 8  # over the air: noise of `value` watts reaches the receiver
-    ECHO_DELAY = 9  # over the air: the receiver's own signal comes back `value` metres too late
+    DOS_JAM = 1
+    DOS_HOLD = 2
+    DOS_HOLD_FRESH = 3
+    DROPOUT = 4
+    FDI = 5
+    DELAY = 6
+    REPLAY = 7
+    NOISE_JAM = 8
+    ECHO_DELAY = 9
 
 
-AIRED = (Kind.NOISE_JAM, Kind.ECHO_DELAY)  # over the air: one value reaches all that a receiver reads, and changes what it measures
-RADIATED = (Kind.DOS_JAM, *AIRED)  # kinds that a receiver which falls silent still hears
+class Limits(NamedTuple):
+    """The bounds that a threat model sets to the values of commands."""
+
+    fdi: Array  # (w,) largest |value| that is added to a wire [unit of the wire]
+    low: Array  # (w,) smallest value of a jammer
+    high: Array  # (w,) largest value of a jammer
+    memory: int  # longest delay, and longest window that is replayed [steps]
+    power: float  # largest power of noise [W]
+    delay: float  # largest extra range of a late echo [m]
+
+
+class Recording(NamedTuple):
+    """The rings of the channel's memory: how many samples they hold, and where they stand."""
+
+    size: int
+    taped: Array  # (B, 1, 1) samples recorded so far
+    anchor: Array  # (B, 1, 1) samples recorded before the running replay began
+    played: Array  # (B, 1, 1) steps that the running replay has lasted
+
+
+class Effect:
+    """Base class of an effect. A subclass says what its kind does to a reading, and which values a threat model grants."""
+
+    valued: ClassVar[bool] = False  # a command carries a value
+    over_air: ClassVar[bool] = False  # one value reaches all that a receiver reads, and changes what it measures
+    radiated: ClassVar[bool] = False  # a receiver that falls silent still hears it
+    recorded: ClassVar[bool] = False  # needs what was sent before
+    code: ClassVar[str]  # words for pages: a short name, a name, what a receiver notices, the unit of the value (empty: that of the wire)
+    title: ClassVar[str]
+    does: ClassVar[str]
+    unit: ClassVar[str] = ""
+
+    def clip(self, limits: Limits, value: Array) -> Array:
+        """Return the values (B, N, w) that the threat model grants, nearest to `value`."""
+        return np.zeros_like(value)
+
+    def grants(self, limits: Limits, value: Array) -> Array:
+        """Return for each value (B, N, w), bool, if the threat model grants it."""
+        return np.asarray(value == self.clip(limits, value))
+
+    def reads(self, sent: Array, value: Array, memory: Memory, recording: Recording) -> Array:
+        """Return what the receiver reads (B, N, w) in place of `sent` (B, N, w). Kinds over the air change the measurement instead."""
+        return memory.fresh
+
+
+class DosJam(Effect):
+    """The receiver reads the jammer's value."""
+
+    valued = radiated = True
+    code, title, does = "JAM", "DoS jam", "the receiver reads the jammer's value"
+
+    def clip(self, limits: Limits, value: Array) -> Array:
+        return np.clip(value, limits.low, limits.high)
+
+    def reads(self, sent: Array, value: Array, memory: Memory, recording: Recording) -> Array:
+        return value
+
+
+class DosHold(Effect):
+    """The receiver reads the last good sample before the first attack (6.18)."""
+
+    code, title, does = "HOLD", "DoS hold", "the receiver is stuck at the last reading before the first attack"
+
+    def reads(self, sent: Array, value: Array, memory: Memory, recording: Recording) -> Array:
+        return memory.held
+
+
+class DosHoldFresh(Effect):
+    """The receiver reads the last good sample before this burst."""
+
+    code, title, does = "HOLD*", "DoS hold (fresh)", "the receiver is stuck at the last reading before this burst"
+
+
+class Dropout(Effect):
+    """Nothing is received, and the receiver knows it; it keeps its last value, as one that holds it does."""
+
+    code, title, does = "DROP", "dropout", "nothing arrives, and the receiver knows it"
+
+
+class FalseData(Effect):
+    """The value is added (4.4)."""
+
+    valued = True
+    code, title, does = "FDI", "false data injection", "the value is added"
+
+    def clip(self, limits: Limits, value: Array) -> Array:
+        return np.clip(value, -limits.fdi, limits.fdi)
+
+    def reads(self, sent: Array, value: Array, memory: Memory, recording: Recording) -> Array:
+        return sent + value
+
+
+class Delay(Effect):
+    """The receiver reads what was sent `value` steps ago."""
+
+    valued = recorded = True
+    code, title, does, unit = "DELAY", "delay", "the receiver reads what was sent so many steps ago", "steps"
+
+    def clip(self, limits: Limits, value: Array) -> Array:
+        return np.clip(np.floor(value + 0.5), 1.0, float(limits.memory))
+
+    def reads(self, sent: Array, value: Array, memory: Memory, recording: Recording) -> Array:
+        return np.asarray(num.pick(memory.history, (recording.taped - value.astype(np.int64)) % recording.size))
+
+
+class Replay(Delay):
+    """The receiver reads the last `value` samples before this replay, over and over."""
+
+    code, title, does = "REPLAY", "replay", "the receiver reads the last so many samples over and over"
+
+    def reads(self, sent: Array, value: Array, memory: Memory, recording: Recording) -> Array:
+        span = value.astype(np.int64)
+        return np.asarray(num.pick(memory.tape, (recording.anchor + recording.played % span - span) % recording.size))
+
+
+class NoiseJam(Effect):
+    """Over the air: noise of `value` watts reaches the receiver."""
+
+    valued = radiated = over_air = True
+    code, title, does, unit = "NOISE", "noise jamming", "noise of so much power reaches the receiver over the air", "W"
+
+    def most(self, limits: Limits) -> float:
+        """Return the largest value that is granted."""
+        return limits.power
+
+    def clip(self, limits: Limits, value: Array) -> Array:
+        return np.clip(value, FAINTEST, self.most(limits))
+
+    def grants(self, limits: Limits, value: Array) -> Array:
+        return np.asarray((value > 0.0) & (value <= self.most(limits)))
+
+
+class EchoDelay(NoiseJam):
+    """Over the air: the receiver's own signal comes back `value` metres too late."""
+
+    code, title, does, unit = "ECHO", "late echo", "the probe is answered late, so that the car ahead seems so much farther away", "m"
+
+    def most(self, limits: Limits) -> float:
+        return limits.delay
+
+
+EFFECTS: dict[int, Effect] = {  # by plain numbers: in every comparison with a member of an enumeration numpy looks for array methods of it
+    int(kind): effect
+    for kind, effect in {
+        Kind.DOS_JAM: DosJam(), Kind.DOS_HOLD: DosHold(), Kind.DOS_HOLD_FRESH: DosHoldFresh(), Kind.DROPOUT: Dropout(),
+        Kind.FDI: FalseData(), Kind.DELAY: Delay(), Kind.REPLAY: Replay(), Kind.NOISE_JAM: NoiseJam(), Kind.ECHO_DELAY: EchoDelay(),
+    }.items()
+}  # fmt: skip
+AIRED = tuple(Kind(kind) for kind, effect in EFFECTS.items() if effect.over_air)
+RADIATED = tuple(Kind(kind) for kind, effect in EFFECTS.items() if effect.radiated)
 
 
 class Mode(IntEnum):
-    """What a defence asks of the controller."""
+    """A request of the defence to the controller."""
 
     NORMAL = 0
     WIDEN = 1  # a longer time headway

@@ -40,10 +40,11 @@ from tailgate.core import (
     WhiteBox,
     pair_of,
 )  # fmt: skip
+from tailgate.core.channel import Channel, ChannelPlan, ChannelState
 from tailgate.core.draws import Keys, Role
 from tailgate.core.lossy_link import Link, LinkState
 from tailgate.core.score_threshold import Watched
-from tailgate.core.threat import Brief, Channel, ChannelPlan, ChannelState, ThreatModel
+from tailgate.core.threat import Brief, ThreatModel
 from tailgate.engine.array import Traced
 
 PERFECT = Link()

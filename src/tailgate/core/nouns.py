@@ -13,13 +13,12 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tailgate.base.errors import InputError
-from tailgate.core.draws import Draws
 from tailgate.core.kinds import AIRED as AIRED
 from tailgate.core.kinds import RADIATED as RADIATED
 from tailgate.core.kinds import Kind as Kind
@@ -33,7 +32,7 @@ from tailgate.core.quantities import PositiveCount as PositiveCount
 from tailgate.core.quantities import Probability as Probability
 
 if TYPE_CHECKING:
-    from tailgate.core.threat import Brief
+    from tailgate.core.components import Defence
 
 Array = NDArray[Any]
 
@@ -259,122 +258,6 @@ class Frame(NamedTuple):
     received: Received  # after the attack
     collided: Array  # (B,) bool
     rear_collided: Array  # (B,) bool
-
-
-class Defence(Protocol):
-    """A method that turns what is received into an estimate, a score and an alarm (spec of the loop)."""
-
-    def prepare(self, model: Model) -> Any:
-        """Constants of this defence for this model, no batch axis."""
-
-    def start(self, plan: Any, prior: Prior) -> Any:
-        """State of B episodes; a NamedTuple whose every leaf has B first, or None."""
-
-    def step(
-        self, plan: Any, state: Any, received: Received, known_u: Array, draws: Draws
-    ) -> tuple[Any, Estimate]:
-        """One step: known_u (B, N, m) is the model's input since the last step (zero where an agent does not know it)."""
-
-
-class Attack(Protocol):
-    """An attacker's policy, scripted or learned."""
-
-    def prepare(self, brief: Brief) -> Any: ...
-
-    def start(self, plan: Any, batch: int, draws: Draws) -> Any: ...
-
-    def decide(self, plan: Any, state: Any, view: View, draws: Draws) -> tuple[Any, Command]: ...
-
-
-class Sized(Protocol):
-    """What a sensor is told of its plant; one that needs more looks for a plant that it knows."""
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """How many agents and how many states of the model there are."""
-
-
-class Plant(Sized, Protocol):
-    """What moves. `truth`, `scene`, `v2v` and `lead_speed_of` read the state that start and step return."""
-
-    def prepare(self, model: Model) -> Any: ...
-
-    def model(self, sensor: Sensor, controller: Controller) -> Model:
-        """The public model. Where agents do not know each other's commands, it is a model of the closed loop."""
-
-    def start(self, plan: Any, draws: Draws) -> Any: ...
-
-    def prior(self, plan: Any, state: Any, held: Array, draws: Draws) -> Prior:
-        """What the defence is told of a state that `start` made; `draws` are those of `start`, whose tags below 16 are taken."""
-
-    def step(self, plan: Any, state: Any, u: Array, exo: Array, draws: Draws) -> Any:
-        """u (B, N, m) commands, exo (B,) the manoeuvre's acceleration of the leader [m/s^2]."""
-
-    def known(self, plan: Any, u: Array, exo: Array, state: Any) -> Array:
-        """(B, N, model inputs): what each agent knows of the model's input in the step with these commands that led to `state`."""
-
-    def truth(self, plan: Any, state: Any, held: Array) -> Array:
-        """(B, N, n) the model's state; `held` (B, N, .) is the part of it that the controllers keep."""
-
-    def scene(self, plan: Any, state: Any) -> Scene: ...
-
-    def v2v(self, plan: Any, state: Any) -> Array: ...
-
-    def odometry(self, plan: Any, state: Any) -> Array:
-        """(B, N, 2) position [m] and speed [m/s] as each agent measures them itself, trusted; (B, N, 0) where it has no such thing."""
-
-    def lead_speed_of(self, state: Any) -> Array:
-        """(B,) speed of the vehicle that the manoeuvre drives [m/s]."""
-
-
-class Sensor(Protocol):
-    """What measures: truth (B, N, n) to readings; probe (B, N) False where the defence muted its own transmitter."""
-
-    def matrices(self, plant: Sized) -> tuple[tuple[str, ...], Array, Array]:
-        """Names of the q readings, C (N, q, n) and R (N, q, q). Raises InputError for a plant that it does not fit."""
-
-    def prepare(self, model: Model) -> Any: ...
-
-    def measure(self, plan: Any, truth: Array, probe: Array, draws: Draws) -> Received: ...
-
-
-@runtime_checkable
-class Receiver(Sensor, Protocol):
-    """A sensor that listens to the echo of its own probe, so that an attacker can reach it over the air."""
-
-    @property
-    def challenge(self) -> int:
-        """Complex samples that it takes while its probe is muted."""
-
-    def disturbed(self, plan: Any, truth: Array, probe: Array, draws: Draws, air: Air) -> Received:
-        """What `measure` gives under `air`, by the same draws: where nothing is radiated the two agree to the last bit."""
-
-
-class Controller(Protocol):
-    """What drives, on the defence's estimate."""
-
-    def prepare(self, model: Model) -> Any: ...
-
-    def start(self, plan: Any, batch: int) -> Any: ...
-
-    def step(self, plan: Any, state: Any, estimate: Estimate, v2v: Array, odometry: Array) -> tuple[Any, Array]:
-        """estimate, messages v2v (B, N, p) as received, and trusted odometry (B, N, 2 or 0) to the commands (B, N, m)."""
-
-    def held(self, plan: Any, state: Any, batch: int) -> Array:
-        """(B, N, .) the part of the model's state that the controllers keep; empty (B, N, 0) for most."""
-
-    def desired_gap(self, speed: Array) -> Array:
-        """The gap [m] that it steers for at a speed [m/s], elementwise."""
-
-
-class Manoeuvre(Protocol):
-    """What the leader does: its acceleration [m/s^2] at each row's step k, given its speed."""
-
-    def prepare(self, dt: float) -> Any: ...
-
-    def start(self, plan: Any, draws: Draws) -> Any: ...
-
-    def accel(self, plan: Any, state: Any, k: Array, speed: Array, draws: Draws) -> tuple[Any, Array]: ...
 
 
 def no_command(batch: int, agents: int, wires: int) -> Command:

@@ -16,14 +16,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import entry_points
-from importlib.resources import files
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 from tailgate.base.errors import InputError, unknown
+from tailgate.base.lazy import components, loaded
 from tailgate.core.schema import as_data, build, fields_of, scalar
 
-Family = Literal["defence", "filter", "detector", "mitigation", "attack", "plant", "sensor", "controller", "manoeuvre"]
+Family = Literal["defence", "filter", "detector", "mitigation", "attack", "plant", "sensor", "controller", "manoeuvre", "reward", "learner"]
 USES = ("measurements", "odometry", "probe", "v2v", "redundant", "leader_input", "truth")
 _MODULES = {
     "defence": "tailgate.estimators",
@@ -35,6 +35,8 @@ _MODULES = {
     "sensor": "tailgate.envs",
     "controller": "tailgate.envs",
     "manoeuvre": "tailgate.envs",
+    "reward": "tailgate.envs",
+    "learner": "tailgate.agents",
 }
 _GROUPS = {"defence": "tailgate.estimators", "attack": "tailgate.agents"}
 SANDBOXES = ("bwrap", "docker")
@@ -106,26 +108,16 @@ def put(entry: Entry) -> None:
     _entries[entry.family][entry.name] = entry
 
 
-@cache
-def _sources(package: str) -> dict[str, str]:
-    """The text of each module of a package whose modules are imported when they are asked for."""
-    return {module: files(package).joinpath(f"{module}.py").read_text("utf-8") for module in importlib.import_module(package).HOMES}
-
-
 def _at_home(family: Family, name: str) -> Entry | None:
-    """A built-in component, for which its own module alone is imported; None where no module says that it has it."""
-    if name not in _entries[family]:
-        said = re.compile(rf'@register\(\s*"{family}",\s*"{re.escape(name)}"')
-        for module, text in _sources(_MODULES[family]).items():
-            if said.search(text):
-                importlib.import_module(f"{_MODULES[family]}.{module}")
+    """Return a built-in component, for which its own module alone is imported; None where no module registers it."""
+    if name not in _entries[family] and (module := components(_MODULES[family]).get((family, name))):
+        importlib.import_module(module)
     return _entries[family].get(name)
 
 
 def built_in(family: Family) -> dict[str, Entry]:
-    """The components that come with this package, by name; imports nobody else's."""
-    for module in importlib.import_module(_MODULES[family]).HOMES:
-        importlib.import_module(f"{_MODULES[family]}.{module}")
+    """Return the components that come with this package, by name; import nobody else's."""
+    loaded(_MODULES[family])
     return {name: entry for name, entry in _entries[family].items() if entry.built_in}
 
 

@@ -3,7 +3,9 @@
 import dataclasses
 import hashlib
 import json
+import re
 import types
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar, get_type_hints
@@ -16,12 +18,43 @@ from tailgate.base.reading import load_yaml, parse_json, parse_yaml, read_bytes
 
 T = TypeVar("T")
 M = TypeVar("M", bound=BaseModel)
-# modules whose classes published files know under an earlier name: hashes of configurations hold it
-HOMES = {
-    "tailgate.core.scenario": "tailgate.scenario", "tailgate.core.threat": "tailgate.threat", "tailgate.training.train": "tailgate.train",
-    "tailgate.training.selfplay": "tailgate.selfplay", "tailgate.training.tuning": "tailgate.tuning",
-    "tailgate.training.adaptive": "tailgate.adaptive", "tailgate.core.lossy_link": "tailgate.link",
-}  # fmt: skip
+# Hashes of configurations hold the names of classes. A module that has another name than when the hashes were published is listed here.
+PUBLISHED = {
+    "tailgate.core.lossy_link": "tailgate.link",
+    "tailgate.core.scenario": "tailgate.scenario",
+    "tailgate.core.threat": "tailgate.threat",
+    "tailgate.training.adaptive": "tailgate.adaptive",
+    "tailgate.training.selfplay": "tailgate.selfplay",
+    "tailgate.training.train": "tailgate.train",
+    "tailgate.training.tuning": "tailgate.tuning",
+    "tailgate.agents.policy.network_policy": "tailgate.agents.policy",
+    "tailgate.envs.controllers.adaptive_cruise": "tailgate.envs.controllers",
+    "tailgate.envs.gym.actions": "tailgate.agents.codec",
+    "tailgate.envs.gym.attacker_mdp": "tailgate.envs.seat",
+    "tailgate.envs.gym.gymnasium_env": "tailgate.envs.faces",
+    "tailgate.envs.gym.mixture": "tailgate.agents.mixture",
+    "tailgate.envs.gym.observations": "tailgate.agents.observation",
+    "tailgate.envs.gym.rewards": "tailgate.agents.reward",
+    "tailgate.envs.plants.car_following": "tailgate.envs.following",
+    "tailgate.envs.plants.scalar": "tailgate.envs.scalar_loop",
+    "tailgate.envs.plants.sensor_network": "tailgate.envs.network",
+    "tailgate.envs.plants.thesis_printed": "tailgate.envs.literal",
+    "tailgate.envs.sensors.fmcw_radar": "tailgate.envs.radar",
+    "tailgate.envs.sensors.odometry": "tailgate.envs.sensors",
+    "tailgate.estimators.challenge.challenge_response": "tailgate.estimators.challenge",
+    "tailgate.estimators.detectors.sequential": "tailgate.estimators.detectors",
+    "tailgate.estimators.distributed.distributed_kalman": "tailgate.estimators.distributed",
+    "tailgate.estimators.mitigations.responses": "tailgate.estimators.mitigations",
+}
+COMPONENTS = re.compile(r"(tailgate\.(?:envs|estimators|agents))\.\w+\.(\w+)")  # hashes leave out which sub-folder a module lies in
+
+
+def published(kind: type | Callable[..., object]) -> str:
+    """Return the name of a class or function that hashes of configurations hold."""
+    module = kind.__module__
+    if module not in PUBLISHED and (found := COMPONENTS.fullmatch(module)):
+        return f"{found[1]}.{found[2]}.{kind.__qualname__}"
+    return f"{PUBLISHED.get(module, module)}.{kind.__qualname__}"
 
 
 def fields_of(cls: type) -> dict[str, Any]:
@@ -75,7 +108,7 @@ def as_data(value: Any) -> Any:
         kind = type(value)
         shown = [f.name for f in dataclasses.fields(value) if f.init and (getattr(value, f.name) or not f.metadata.get("if_any"))]
         fields = {name: as_data(getattr(value, name)) for name in shown}
-        return {"class": f"{HOMES.get(kind.__module__, kind.__module__)}.{kind.__qualname__}", **fields}
+        return {"class": published(kind), **fields}
     if isinstance(value, dict):
         return {str(k): as_data(v) for k, v in value.items()}
     if isinstance(value, (list, tuple)):
@@ -85,7 +118,7 @@ def as_data(value: Any) -> Any:
     if isinstance(value, Path):  # what the file says counts, not where it lies
         return f"{value.name}#{hashlib.sha256(value.read_bytes()).hexdigest()[:16]}" if value.is_file() else value.name
     named = value if callable(value) and hasattr(value, "__qualname__") else type(value)  # a repr may hold an address
-    return f"{named.__module__}.{named.__qualname__}"
+    return published(named)
 
 
 def canonical(value: Any) -> str:

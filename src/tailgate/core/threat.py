@@ -1,40 +1,27 @@
-"""The threat model, and the channel: the only place where a command changes a measurement."""
+"""The threat model: what an attacker may do and see."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, NamedTuple, get_args
+from typing import Annotated, Literal, get_args
 
 import numpy as np
 from pydantic import Field
 
-from tailgate import num
 from tailgate.base.errors import InputError, unknown
 from tailgate.core import (
-    AIRED,
-    RADIATED,
-    Air,
     Array,
     Command,
     Count,
     Kind,
     Model,
     PositiveCount,
-    Received,
     no_command,
     param,
 )  # fmt: skip
+from tailgate.core.kinds import EFFECTS, KindName, Limits
 from tailgate.core.quantities import Bound, Bounded, Time, check_order
 
-# Plain numbers: in every comparison with a member of an enumeration numpy looks for array methods of it.
-NONE, DOS_JAM, DOS_HOLD, DOS_HOLD_FRESH, DROPOUT, FDI, DELAY, REPLAY, NOISE_JAM, ECHO_DELAY = map(int, Kind)
-_VALUED, _ON_AIR, _RADIATED = (
-    np.isin(np.arange(len(Kind)), kinds, invert=invert)
-    for kinds, invert in (((NONE, DOS_HOLD, DOS_HOLD_FRESH, DROPOUT), True), (AIRED, False), (RADIATED, False))
-)
-
-KindName = Literal["dos_jam", "dos_hold", "dos_hold_fresh", "dropout", "fdi", "delay", "replay", "noise_jam", "echo_delay"]
 Knowledge = Literal["black", "grey", "white"]
 KNOWLEDGE: tuple[Knowledge, ...] = get_args(Knowledge)  # each sees what the one before it sees, and more
 Span = Annotated[int, Field(ge=1, le=10_000)]
@@ -102,6 +89,13 @@ class Brief:
         """(w,) largest |value| that false data injection may add to each wire [unit of the wire]."""
         return np.where(self.is_actuator, self.threat.actuator_bound, self.threat.fdi_bound)
 
+    @property
+    def limits(self) -> Limits:
+        """The bounds of the values of commands."""
+        threat, strongest = self.threat, self.threat.actuator_bound
+        low, high = (np.where(self.is_actuator, sign * strongest, end) for sign, end in zip((-1.0, 1.0), threat.jam_range, strict=True))
+        return Limits(self.bounds, low, high, threat.memory, threat.jam_power, threat.delay_bound)
+
     def command(self, on: Array, kind: Array | Kind, target: Array, value: Array | float) -> Command:
         """A command where `on` (B,) holds, else none. target and value broadcast to (B, N, w)."""
         out = no_command(len(on), self.model.agents, len(self.model.wires))
@@ -111,239 +105,11 @@ class Brief:
         return out
 
 
-class ChannelPlan(NamedTuple):
-    threat: ThreatModel
-    granted: Array  # (N, w) bool
-    kinds: Array  # (kinds,) bool
-    bounds: Array  # (w,) of false data injection
-    low: Array  # (w,) of jamming
-    high: Array  # (w,)
-    last_step: int
-    sensors: int
-    air: bool
-    recorded: int  # samples kept for delay and replay; 0 where neither is granted
+def receivers(brief: Brief) -> Array:
+    """Return the granted sensors that listen to their own echo, (N, w) bool: attacks over the air reach them."""
+    return np.asarray(brief.granted & brief.model.air & (np.arange(brief.granted.shape[1]) < len(brief.model.sensors)))
 
 
-class Memory(NamedTuple):
-    """What the channel keeps of some wires: held, fresh (B, N, .); history, tape (B, N, ., recorded), two rings."""
-
-    held: Array  # last good sample before the first attack, or before the onset
-    fresh: Array  # last good sample of each wire
-    history: Array  # what was sent in the last steps
-    tape: Array  # the history as it was when the running replay began
-
-
-class ChannelState(NamedTuple):
-    """The channel's memory; every leaf has B first."""
-
-    used: Array  # (B,) attack steps charged
-    burst: Array  # (B,) length of the running burst
-    cooldown: Array  # (B,) steps before the next burst
-    played: Array  # (B,) steps that the running replay has lasted
-    taped: Array  # (B,) samples recorded so far
-    anchor: Array  # (B,) samples recorded before the running replay began
-    links: Memory  # of sensors and V2V fields
-    drives: Memory  # of actuators
-    last: Command
-
-
-def accepts(k: Any, steps: Any, left: Any, burst: Any, cooldown: Any, onset: Any, last: Any, longest: Any, pause: Any) -> Any:
-    """Whether a command that is legal in itself, given in each of the `steps` steps from k on, is accepted in at least one; elementwise.
-
-    left: attack steps in the budget. burst, cooldown: lengths so far and still [steps]. onset, last, longest, pause: of the threat model.
-    Until the first step that is accepted nothing is charged: a cooldown counts down, a burst that is full ends and is followed by its
-    pause, of which the step that ends it is the first. So it is one moment that decides.
-    """
-    first = np.maximum(k + np.where(burst < longest, cooldown, np.maximum(pause, 1)), onset)
-    return (left > 0) & (first <= last) & (first < k + steps)
-
-
-class Channel:
-    """Applies commands to the wires and enforces the threat model, for scripts and learned policies alike.
-
-    A step has two halves: `apply` decides on the command and changes what is measured and heard, `actuate` then changes what the
-    controller commands.
-    """
-
-    def prepare(self, brief: Brief) -> ChannelPlan:
-        threat = brief.threat
-        kinds = np.zeros(len(Kind), bool)
-        for name in threat.kinds:
-            kinds[Kind[name.upper()]] = True
-        last = brief.horizon if threat.end is None else min(threat.end, brief.horizon)
-        low, high = (
-            np.where(brief.is_actuator, sign * threat.actuator_bound, end) for sign, end in zip((-1.0, 1.0), threat.jam_range, strict=True)
-        )
-        recorded = threat.memory if kinds[DELAY] or kinds[REPLAY] else 0
-        return ChannelPlan(threat, brief.granted, kinds, brief.bounds, low, high, last, len(brief.model.sensors), brief.model.air, recorded)
-
-    def start(self, plan: ChannelPlan, expected: Array, u: Array) -> ChannelState:
-        """expected (B, N, q+p) at the prior and the first input u (B, N, m): what is held if an attack comes first."""
-        batch, agents, links = expected.shape
-        count = np.zeros(batch, np.int64)
-        return ChannelState(
-            count, count.copy(), count.copy(), count.copy(), count.copy(), count.copy(),
-            self._memory(plan, expected), self._memory(plan, u), no_command(batch, agents, links + u.shape[-1]),
-        )  # fmt: skip
-
-    def _memory(self, plan: ChannelPlan, expected: Array) -> Memory:
-        history = num.zeros((*expected.shape, plan.recorded))
-        history[...] = expected[..., None]
-        return Memory(num.batch_last(expected), num.batch_last(expected), history, history.copy(order="K"))
-
-    def budget_left(self, plan: ChannelPlan, state: ChannelState) -> Array:
-        if plan.threat.budget is None:
-            return np.full(len(state.used), np.inf)
-        return np.asarray(plan.threat.budget - state.used, np.float64)
-
-    def allowed(self, plan: ChannelPlan, state: ChannelState, k: Array) -> Array:
-        """(B,) bool: a command of a granted kind, target and value would be accepted at step k (B,)."""
-        return self.open(plan, k, self.budget_left(plan, state), state.burst, state.cooldown)
-
-    def open(self, plan: ChannelPlan, k: Array, left: Array, burst: Array, cooldown: Array, steps: int = 1) -> Array:
-        """(B,) bool: such a command would be accepted in at least one of so many steps from k on, if it were given in all (`accepts`)."""
-        threat = plan.threat
-        longest = np.inf if threat.duration is None else threat.duration
-        return np.asarray(accepts(k, steps, left, burst, cooldown, threat.onset, plan.last_step, longest, threat.cooldown))
-
-    def apply(
-        self, plan: ChannelPlan, state: ChannelState, sent: Array, received: Received, command: Command, k: Array,
-        again: Callable[[Air], Received] | None = None,
-    ) -> tuple[ChannelState, Received, Array, Array]:  # fmt: skip
-        """-> state, received, links (B, N, q+p) as they arrived, refused (B,) bool.
-
-        `sent` (B, N, q+p) holds the sensor readings and the V2V message before the attack; `again` measures under what is radiated.
-        """
-        threat, kind, aimed = plan.threat, command.kind, command.target.any(axis=(1, 2))
-        charged = (kind != NONE) & aimed
-        if num.some(charged):
-            charged = charged & self._legal(plan, command) & self.allowed(plan, state, k)
-        refused = ((kind != NONE) | aimed) & ~charged
-
-        hit = command.target & charged[:, None, None]
-        kind = np.where(charged, kind, 0).astype(np.int8)
-        q, value = plan.sensors, command.value
-        if plan.air and num.some(aired := num.take(_ON_AIR, kind)):  # who reaches a receiver over the air reaches all that it reads
-            strength = np.max(np.where(hit, value, 0.0), axis=2, keepdims=True)
-            whole = aired[:, None, None] & hit.any(axis=2, keepdims=True) & (np.arange(hit.shape[2]) < q)
-            hit, value = hit | whole, np.where(whole, strength, value)
-        valued = num.take(_VALUED, kind)[:, None, None]
-        last = Command(kind, hit, np.where(hit & valued, value, 0.0))
-        begins_to_hold = np.asarray(k) == threat.onset if threat.hold_from_onset else charged & (state.used == 0)
-        ended = (state.burst > 0) & ~charged
-        # the step that ends a burst is itself the first of the pause
-        cooldown = np.where(ended, max(threat.cooldown - 1, 0), np.maximum(state.cooldown - 1, 0))
-        state = state._replace(
-            used=state.used + charged, burst=np.where(charged, state.burst + 1, 0), cooldown=cooldown, last=last,
-        )  # fmt: skip
-        if num.some(begins_to_hold):
-            state = state._replace(links=_hold(state.links, begins_to_hold), drives=_hold(state.drives, begins_to_hold))
-        begins = (kind == REPLAY) & (state.played == 0)
-        if plan.kinds[REPLAY] and num.some(begins):
-            anchor = np.where(begins, state.taped, state.anchor)
-            state = state._replace(anchor=anchor, links=_copy_tape(state.links, begins), drives=_copy_tape(state.drives, begins))
-        heard, under = sent, received
-        if again is not None and num.some(num.take(_RADIATED, kind)):
-            under, left = again(self._radiated(plan, last)), (kind == DOS_JAM)[:, None, None]
-            under = under._replace(valid=np.where(left, received.valid, under.valid))  # what a jammer leaves is read where anything is
-            heard = num.stack([under.y[..., i] for i in range(q)] + [sent[..., i] for i in range(q, sent.shape[-1])])
-        links = self._arrive(plan, state, state.links, heard, slice(0, sent.shape[-1]))
-        lost = hit & (kind == DROPOUT)[:, None, None] if plan.kinds[DROPOUT] else np.zeros_like(hit)
-        out = under._replace(
-            y=links[..., :q], valid=under.valid & ~lost[..., :q], v2v=links[..., q:], attacked=hit[..., :q]
-        )
-        good = sent
-        if not num.every(received.valid):  # a muted sensor's nothing is no sample: the last one stands for it
-            good = sent.copy(order="K")
-            good[..., :q] = np.where(received.valid, sent[..., :q], state.links.fresh[..., :q])
-        return state._replace(links=self._keep(plan, state, state.links, good, hit[..., : sent.shape[-1]])), out, links, refused
-
-    def actuate(self, plan: ChannelPlan, state: ChannelState, u: Array) -> tuple[ChannelState, Array]:
-        """-> state, u (B, N, m) as the actuators get it."""
-        wires = slice(plan.granted.shape[1] - u.shape[-1], None)
-        applied, drives = u, state.drives
-        if plan.granted[:, wires].any():
-            applied = self._arrive(plan, state, state.drives, u, wires)
-            drives = self._keep(plan, state, state.drives, u, state.last.target[..., wires])
-        played = np.where(state.last.kind == REPLAY, state.played + 1, 0)
-        return state._replace(drives=drives, played=played, taped=state.taped + 1), applied
-
-    def _legal(self, plan: ChannelPlan, command: Command) -> Array:
-        """(B,) bool: kind, targets and values are granted."""
-        kind, value = command.kind, command.value
-        known = (kind >= 0) & (kind < len(plan.kinds))
-        legal = known & num.take(plan.kinds, np.where(known, kind, 0))
-        ok = plan.granted
-        with np.errstate(invalid="ignore"):
-            for one in num.present(kind, np.flatnonzero(plan.kinds).tolist()):
-                fits = self._fits(plan, one, value)
-                ok = ok if fits is None else ok & ((kind != one)[:, None, None] | fits)
-        return np.asarray(legal & ~(command.target & ~ok).any(axis=(1, 2)))
-
-    def _fits(self, plan: ChannelPlan, kind: int, value: Array) -> Array | None:
-        """(B, N, w) bool: the value is granted with that kind; None of kinds without a value."""
-        threat = plan.threat
-        if kind == DOS_JAM:
-            return np.asarray((value >= plan.low) & (value <= plan.high))
-        if kind == FDI:
-            return np.asarray(np.abs(value) <= plan.bounds)
-        if kind in AIRED:
-            most, sensor = threat.jam_power if kind == NOISE_JAM else threat.delay_bound, np.arange(value.shape[2]) < plan.sensors
-            return np.asarray(plan.air & sensor & (value > 0.0) & (value <= most))
-        if kind in (DELAY, REPLAY):
-            return np.asarray((value >= 1) & (value <= threat.memory) & (value == np.floor(value)))
-        return None
-
-    def _radiated(self, plan: ChannelPlan, command: Command) -> Air:
-        """What a command in force radiates at each receiver."""
-        hit = command.target[..., : plan.sensors].any(axis=2)
-        strength = np.max(command.value[..., : plan.sensors], axis=2)
-        kind = command.kind[:, None]
-        power = np.where(kind == NOISE_JAM, strength, np.where(kind == DOS_JAM, plan.threat.jam_power, 0.0))
-        reaction = np.inf if plan.threat.reaction is None else plan.threat.reaction
-        return Air(np.where(hit, power, 0.0), np.where(hit & (kind == ECHO_DELAY), strength, 0.0), reaction)
-
-    def _arrive(self, plan: ChannelPlan, state: ChannelState, memory: Memory, sent: Array, wires: slice) -> Array:
-        """What arrives of `sent` (B, N, .), the part `wires` of all wires, under the command in force."""
-        command, out = state.last, sent
-        target, value = command.target[..., wires], command.value[..., wires]
-        known = [kind for kind in np.flatnonzero(plan.kinds).tolist() if kind not in AIRED]
-        for kind in num.present(np.where(target.any(axis=(1, 2)), command.kind, NONE), known):
-            hit = target & (command.kind == kind)[:, None, None]
-            if kind == DOS_JAM:
-                changed = value
-            elif kind == FDI:
-                changed = sent + value
-            elif kind == DOS_HOLD:
-                changed = memory.held
-            elif kind in (DELAY, REPLAY):
-                changed = self._taped(plan, state, memory, np.where(hit, value, 1.0).astype(np.int64), kind)
-            else:  # a receiver that hears nothing keeps its last value, as one that holds it does
-                changed = memory.fresh
-            out = np.where(hit, changed, out)
-        return out
-
-    def _taped(self, plan: ChannelPlan, state: ChannelState, memory: Memory, span: Array, kind: int) -> Array:
-        """The sample of `span` (B, N, .) steps ago, or the one that a replayed window of that length has come to."""
-        if kind == REPLAY:
-            ring, last = memory.tape, state.anchor[:, None, None] + state.played[:, None, None] % span
-        else:
-            ring, last = memory.history, state.taped[:, None, None]
-        return np.asarray(num.pick(ring, (last - span) % plan.recorded))
-
-    def _keep(self, plan: ChannelPlan, state: ChannelState, memory: Memory, sent: Array, hit: Array) -> Memory:
-        """The memory after this step's `sent` (B, N, .), of which `hit` was attacked."""
-        history = memory.history
-        if plan.recorded:
-            history = num.put(history, (state.taped % plan.recorded)[:, None, None], sent)
-        return memory._replace(fresh=np.where(hit, memory.fresh, sent) if num.some(hit) else sent, history=history)
-
-
-def _hold(memory: Memory, rows: Array) -> Memory:
-    """The memory with its held sample taken in `rows` (B,) bool."""
-    return memory._replace(held=np.where(rows[:, None, None], memory.fresh, memory.held))
-
-
-def _copy_tape(memory: Memory, rows: Array) -> Memory:
-    """The memory with the recording of `rows` (B,) bool copied for a replay: the recorder itself runs on."""
-    return memory._replace(tape=np.where(rows[:, None, None, None], memory.history, memory.tape))
+def fit(brief: Brief, kind: Kind, value: Array) -> Array:
+    """Clip values (B, N, w) to the bounds of their kind; round ages and windows to whole steps."""
+    return EFFECTS[int(kind)].clip(brief.limits, value)

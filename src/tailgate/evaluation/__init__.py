@@ -1,5 +1,12 @@
-"""Cells of a suite, their rows and seeds, and what plays them again and compares."""
+"""Cells of a suite, their rows and seeds, and the acts that play them again and compare."""
 
-from tailgate.base.lazy import exported
+from importlib import import_module
+from typing import Any
 
-__getattr__, __all__ = exported(__name__, {"cells": "Cell ENGINE cell_id cells_of evaluate failed_rows origin run run_cell"})
+__all__ = ["ENGINE", "Cell", "cell_id", "cells_of", "evaluate", "failed_rows", "origin", "run", "run_cell"]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in __all__:
+        raise AttributeError(f"module 'tailgate.evaluation' has no attribute {name!r}")
+    return getattr(import_module("tailgate.evaluation.cells"), name)  # late: it takes longer to import than a first step takes

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tailgate.agents.scripted import NoAttack
+from tailgate.agents.scripts.scripted import NoAttack
 from tailgate.base.errors import InputError, NotApplicable
 from tailgate.core import Array, Model, draws
 from tailgate.core.loop import Loop

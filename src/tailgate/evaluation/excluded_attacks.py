@@ -8,12 +8,12 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-from tailgate.agents.policy import PolicyAttack
-from tailgate.agents.program import Phase, Program
-from tailgate.agents.scripted import Inject, InjectSparse
-from tailgate.agents.triggers import Chance
-from tailgate.agents.values import Constant, Gaussian, PerWire, Ramp, Uniform
-from tailgate.agents.zoo import ZooAttack
+from tailgate.agents.policy.network_policy import PolicyAttack
+from tailgate.agents.policy.zoo import ZooAttack
+from tailgate.agents.scripts.program import Phase, Program
+from tailgate.agents.scripts.scripted import Inject, InjectSparse
+from tailgate.agents.scripts.triggers import Chance
+from tailgate.agents.scripts.values import Constant, Gaussian, PerWire, Ramp, Uniform
 from tailgate.core.registry import Spec
 
 GROWING = ("ramp", "increment")  # actions of a policy that change the value sent last

@@ -26,7 +26,6 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from tailgate.agents.mixture import Mixture, MixtureState
 from tailgate.base.errors import InputError, NotApplicable, said, unknown
 from tailgate.base.files import write_atomic
 from tailgate.base.progress import progress
@@ -36,6 +35,7 @@ from tailgate.core.draws import Draws, Keys
 from tailgate.core.loop import Loop
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import Scenario, Suite, list_suites, load_scenario, load_suite
+from tailgate.envs.gym.mixture import Mixture, MixtureState
 from tailgate.play.trace import Trace, rollout
 
 FORMAT = "tailgate-golden-2"

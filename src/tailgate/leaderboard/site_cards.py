@@ -11,7 +11,7 @@ import functools
 from collections.abc import Mapping
 from typing import Any
 
-from tailgate.agents.zoo import zoo_card, zoo_names
+from tailgate.agents.policy.zoo import zoo_card, zoo_names
 from tailgate.core.registry import Entry, Family, built_in
 from tailgate.core.scenario import Suite as Played
 from tailgate.core.scenario import list_suites, load_scenario, load_suite

@@ -10,6 +10,7 @@ import numpy as np
 from tailgate.base.errors import InputError
 from tailgate.core import AIRED, Array, Kind, Mode
 from tailgate.core.drawing import edges, hops, layout
+from tailgate.core.kinds import EFFECTS
 
 from .replay import Replay, threshold
 
@@ -19,20 +20,6 @@ SHOWN = 24  # agents with curves of their own in a page, at most
 LANES = 8  # attacked wires with a lane each, at most; of more the agents have one
 METRE_S2 = "m/s\N{SUPERSCRIPT TWO}"
 WIRE_UNITS = {"position": "m", "distance": "m", "velocity": "m/s", "acceleration": METRE_S2, "command": METRE_S2, "speed": "m/s"}
-KINDS = {  # what a reader sees of a kind: short name, name, what it does to the wire
-    Kind.DOS_JAM: ("JAM", "DoS jam", "the receiver reads the jammer's value"),
-    Kind.DOS_HOLD: ("HOLD", "DoS hold", "the receiver is stuck at the last reading before the first attack"),
-    Kind.DOS_HOLD_FRESH: ("HOLD*", "DoS hold (fresh)", "the receiver is stuck at the last reading before this burst"),
-    Kind.DROPOUT: ("DROP", "dropout", "nothing arrives, and the receiver knows it"),
-    Kind.FDI: ("FDI", "false data injection", "the value is added"),
-    Kind.DELAY: ("DELAY", "delay", "the receiver reads what was sent so many steps ago"),
-    Kind.REPLAY: ("REPLAY", "replay", "the receiver reads the last so many samples over and over"),
-    Kind.NOISE_JAM: ("NOISE", "noise jamming", "noise of so much power reaches the receiver over the air"),
-    Kind.ECHO_DELAY: ("ECHO", "late echo", "the probe is answered late, so that the car ahead seems so much farther away"),
-}
-VALUED = {  # unit; empty: that of the wire
-    Kind.DOS_JAM: "", Kind.FDI: "", Kind.DELAY: "steps", Kind.REPLAY: "steps", Kind.NOISE_JAM: "W", Kind.ECHO_DELAY: "m",
-}  # fmt: skip
 
 
 def curve(values: Array) -> list[float | None]:
@@ -247,8 +234,8 @@ def episode_of(replay: Replay, agent: int | None = None) -> Data:
     out: Data = {
         "dt": trace.dt, "horizon": trace.horizon, "length": int(trace.length[0]), "modes": [mode.name for mode in Mode],
         "kind": kind.tolist(), "wires": _wires(replay), "refused": trace.refused[:, 0].astype(int).tolist(),
-        "kinds": {int(k): {"code": code, "name": name, "does": does, "valued": k in VALUED, "unit": VALUED.get(k, "")}
-                  for k, (code, name, does) in KINDS.items()},
+        "kinds": {k: {"code": effect.code, "name": effect.title, "does": effect.does, "valued": effect.valued, "unit": effect.unit}
+                  for k, effect in EFFECTS.items()},
         "left": None if threat.budget is None else (threat.budget - used).tolist(), "budget": threat.budget,
         "hit": first_step(trace.collided[:, 0]), "rear_hit": first_step(trace.rear_collided[:, 0]),
     }  # fmt: skip

@@ -1,4 +1,4 @@
-"""A film of a replay: the pictures of `tailgate.envs.render`, step by step (extra: viz)."""
+"""A film of a replay: the pictures of `tailgate.envs.render.picture`, step by step (extra: viz)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from typing import Any
 from tailgate.base.errors import InputError
 from tailgate.base.files import replacing, writable_directory, write_atomic
 from tailgate.core import Array
-from tailgate.envs.render_viewer import Viewer
+from tailgate.envs.render.viewer import Viewer
 from tailgate.scoring.words import names_of
 
 from .replay import Replay, episode
@@ -34,7 +34,7 @@ def check_format(path: Path) -> None:
         raise InputError("--video", str(path), f"a file that ends in {', '.join(FORMATS)}")
     if FORMATS[path.suffix.lower()] == "MP4" and find_spec("imageio_ffmpeg") is None:
         raise ImportError("imageio-ffmpeg is missing, which writes MP4: pip install 'tailgate[video]' (.gif and .webp do without)")
-    from tailgate.envs import render  # noqa: F401 - names the extra where Pillow is missing
+    from tailgate.envs.render import picture as render  # noqa: F401 - names the extra where Pillow is missing
 
 
 def pace(dt: float, length: int, most: float = math.inf) -> tuple[int, float]:
@@ -45,7 +45,7 @@ def pace(dt: float, length: int, most: float = math.inf) -> tuple[int, float]:
 
 def frames(replay: Replay, stride: int, viewer: Viewer = AUTO) -> Iterator[Array]:
     """(H, W, 3) uint8 pictures of the start, every `stride`-th step, and the last one, with who plays below the road."""
-    from tailgate.envs.render import draw
+    from tailgate.envs.render.picture import draw
 
     last, row = int(replay.trace.length[0]), replay.row
     texts = names_of([row["defence"], row["attack"]])  # of a file its name, not its place on somebody's machine

@@ -12,7 +12,7 @@ import numpy as np
 from safetensors.numpy import load as load_tensors
 from safetensors.numpy import save as save_tensors
 
-from tailgate.agents.zoo import FOLDER, zoo_names
+from tailgate.agents.policy.zoo import FOLDER, zoo_names
 from tailgate.base import sizes
 from tailgate.base.errors import InputError
 from tailgate.base.files import writable_directory, write_atomic

@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tailgate.agents.policy import Header, PolicyAttack, load_policy
-from tailgate.agents.zoo import ZooAttack
+from tailgate.agents.policy.network_policy import Header, PolicyAttack, load_policy
+from tailgate.agents.policy.zoo import ZooAttack
 from tailgate.base import sizes
 from tailgate.base.errors import InputError, unknown
 from tailgate.core import Array

@@ -8,8 +8,8 @@ import tempfile
 from collections.abc import Callable
 from typing import Any, Literal, NamedTuple
 
-from tailgate.agents.learning import Progress, made_with
-from tailgate.agents.policy import load_policy
+from tailgate.agents.learners.learning import Progress, made_with
+from tailgate.agents.policy.network_policy import load_policy
 from tailgate.base.errors import InputError
 from tailgate.core.registry import Spec
 from tailgate.training import train

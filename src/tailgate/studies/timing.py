@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tailgate.agents.policy import PolicyAttack, Yoked
+from tailgate.agents.policy.network_policy import PolicyAttack, Yoked
 from tailgate.base.errors import InputError
 from tailgate.core import Array, draws
 from tailgate.core.draws import Draws, Keys, Role

@@ -13,7 +13,7 @@ from tailgate.core import Array, Defence, Estimate, Model, Prior, Received
 from tailgate.core.draws import Draws, keys
 from tailgate.core.registry import Spec, make
 from tailgate.core.scenario import load_scenario
-from tailgate.envs.radar_car import GAP
+from tailgate.envs.controllers.radar_car import GAP
 from tailgate.play.trace import Trace, rollout
 
 from .claims import Claim, Part, Spread, Table, Tick, verdict

@@ -9,7 +9,7 @@ import numpy as np
 
 from tailgate.base.plots import canvas
 from tailgate.core import Array
-from tailgate.envs.radar_car import GAP, RELATIVE_SPEED
+from tailgate.envs.controllers.radar_car import GAP, RELATIVE_SPEED
 from tailgate.play.trace import Trace
 
 from .ch3_cases import OURS, Runs

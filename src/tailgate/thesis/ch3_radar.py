@@ -9,8 +9,8 @@ import numpy as np
 
 from tailgate.core import Array
 from tailgate.core.draws import constants
-from tailgate.envs import fmcw_signal
-from tailgate.envs.fmcw import Link
+from tailgate.envs.sensors import fmcw_signal
+from tailgate.envs.sensors.fmcw import Link
 
 from . import ch3_figures
 from .claims import Claim, Drawing, Part, Table, verdict

@@ -13,7 +13,7 @@ from tailgate import num
 from tailgate.core import Array, Defence, draws
 from tailgate.core.registry import Spec, make
 from tailgate.core.scenario import Scenario, load_scenario
-from tailgate.envs.following import CarFollowing, FollowingPlan
+from tailgate.envs.plants.car_following import CarFollowing, FollowingPlan
 from tailgate.play.metrics import measure
 from tailgate.play.trace import Trace, rollout
 

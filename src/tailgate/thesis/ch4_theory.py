@@ -11,9 +11,9 @@ from scipy import stats
 
 from tailgate.core import Array, Model, Received
 from tailgate.core.scenario import load_scenario
-from tailgate.estimators.chi_square import ChiSquare, GatedKalman
 from tailgate.estimators.compose import AcceptAll, compose
-from tailgate.estimators.kalman import KalmanFilter
+from tailgate.estimators.detectors.chi_square import ChiSquare, GatedKalman
+from tailgate.estimators.filters.kalman import KalmanFilter
 from tailgate.evaluation.stats import proportion
 from tailgate.play.metrics import measure
 

@@ -11,7 +11,7 @@ import numpy as np
 from tailgate import num
 from tailgate.core import Array, Defence, Model, Prior, Received, draws
 from tailgate.core.registry import Spec, make
-from tailgate.estimators.distributed import fixed_point, neighbours
+from tailgate.estimators.distributed.distributed_kalman import fixed_point, neighbours
 
 from . import ch5_figures
 from .ch5_cases import CHANCE, COMPROMISED, DEFENCES, LAM, ONSET, SD, defence, errors, figure, fresh, over, random_attack, worst

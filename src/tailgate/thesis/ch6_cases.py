@@ -11,8 +11,8 @@ import numpy as np
 from tailgate.core import Array, Attack, Defence
 from tailgate.core.registry import make
 from tailgate.core.scenario import Scenario, load_scenario
-from tailgate.envs.cacc import Column
-from tailgate.estimators.distributed import fixed_point
+from tailgate.envs.controllers.cacc import Column
+from tailgate.estimators.distributed.distributed_kalman import fixed_point
 from tailgate.play.trace import Trace
 
 from .ch5_theory import initial, parted

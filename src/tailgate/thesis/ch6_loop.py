@@ -14,7 +14,7 @@ from tailgate import num
 from tailgate.core import Array
 from tailgate.core.registry import Spec, make
 from tailgate.core.scenario import Scenario, load_scenario
-from tailgate.envs.platoon import Platoon
+from tailgate.envs.plants.platoon import Platoon
 from tailgate.evaluation.stats import proportion
 from tailgate.play.metrics import measure
 from tailgate.play.trace import Trace

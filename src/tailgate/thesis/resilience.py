@@ -10,7 +10,7 @@ import numpy as np
 
 from tailgate.base.errors import InputError
 from tailgate.core import Array, Model
-from tailgate.estimators.distributed import Fusion, fixed_point
+from tailgate.estimators.distributed.distributed_kalman import Fusion, fixed_point
 
 MOST = 22  # sensors of which all combinations of signs are tried
 

@@ -26,9 +26,9 @@ from tailgate.core import Array, draws
 from tailgate.core.draws import Role
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import Scenario, load_scenario
-from tailgate.envs.cacc import PER_CAR, Column, Law
+from tailgate.envs.controllers.cacc import PER_CAR, Column, Law
 from tailgate.envs.manoeuvres import Sine
-from tailgate.envs.platoon import String, closed_loop
+from tailgate.envs.plants.platoon import String, closed_loop
 
 SLOWEST, FASTEST = 1e-3, 1e2  # [rad/s]
 TOLERANCE = 1e-9  # by which a gain may be above 1: rounding

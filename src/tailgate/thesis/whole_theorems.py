@@ -8,7 +8,7 @@ import numpy as np
 
 from tailgate.core import Array, Model
 from tailgate.core.scenario import load_scenario
-from tailgate.estimators.distributed import fixed_point, neighbours
+from tailgate.estimators.distributed.distributed_kalman import fixed_point, neighbours
 
 from . import ch5_cases, ch5_theory, ch6_cases
 from .claims import Claim, verdict

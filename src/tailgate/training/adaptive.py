@@ -14,10 +14,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
-from tailgate.agents import learning
-from tailgate.agents.codec import ActionCodec, ActionSpec
-from tailgate.agents.learning import LEARNERS, learner_of
-from tailgate.agents.observation import ObservationCodec
+from tailgate.agents.learners.learning import LEARNERS, learner_of
+from tailgate.agents.learners.learning import Progress as Now
 from tailgate.base import sizes
 from tailgate.base.errors import InputError, unknown
 from tailgate.base.sizes import Seeds
@@ -26,6 +24,8 @@ from tailgate.core.registry import Spec
 from tailgate.core.scenario import Suite, load_scenario
 from tailgate.core.schema import as_data, build, fields_of
 from tailgate.core.threat import KNOWLEDGE
+from tailgate.envs.gym.actions import ActionCodec, ActionSpec
+from tailgate.envs.gym.observations import ObservationCodec
 from tailgate.training import train
 
 Progress = Callable[[str, int, int, str], None]  # label, done, total, figures
@@ -147,7 +147,7 @@ def train_against(configs: list[train.TrainConfig], progress: Progress) -> list[
         if not (again and all(path.is_file() and path.with_suffix(".safetensors").is_file() for path in policies_of(config))):
             runs.append((config, again))
 
-    def learned(config: train.TrainConfig, seed: int, now: learning.Progress) -> None:
+    def learned(config: train.TrainConfig, seed: int, now: Now) -> None:
         progress(f"{config.name}, seed {seed}", min(now.steps, config.steps), config.steps, train.figures(now))
 
     train.train_together(runs, learned, max((config.workers for config in configs), default=1))

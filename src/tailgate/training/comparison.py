@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from tailgate.agents.policy import load_policy
+from tailgate.agents.policy.network_policy import load_policy
 from tailgate.base.files import write_atomic
 from tailgate.base.reading import load_json
 from tailgate.core import Array, draws
@@ -74,7 +74,7 @@ def compare(
 
     scripts: what `play_scripts` gave for these policies and rivals: it is not played again.
     """
-    from tailgate.agents.policy import PolicyAttack
+    from tailgate.agents.policy.network_policy import PolicyAttack
     from tailgate.studies.timing import timing_advantage
 
     threat, outcome = dict(config.threat), outcome_of(config)

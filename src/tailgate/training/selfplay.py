@@ -27,10 +27,10 @@ from typing import Any
 
 import numpy as np
 
-from tailgate.agents.cem import Config
-from tailgate.agents.learning import LEARNERS, Progress, learner_of
-from tailgate.agents.policy import PolicyAttack
-from tailgate.agents.selfplay import Learner, Played, constant, export, play
+from tailgate.agents.learners.cem import Config
+from tailgate.agents.learners.learning import LEARNERS, Progress, learner_of
+from tailgate.agents.learners.selfplay import Learner, Played, constant, export, play
+from tailgate.agents.policy.network_policy import PolicyAttack
 from tailgate.base.errors import InputError, said
 from tailgate.base.files import set_aside, writable_directory, write_atomic
 from tailgate.base.locks import alone
@@ -40,9 +40,9 @@ from tailgate.core import Array, Attack, Count, Discount, draws, param
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import config_path
 from tailgate.core.schema import as_data, build, digest, override, read_yaml
-from tailgate.envs.duel import Duel, Payoff
-from tailgate.estimators.steered import Steered
-from tailgate.estimators.steering import nearest
+from tailgate.envs.gym.duel import Duel, Payoff
+from tailgate.estimators.challenge.steered import Steered
+from tailgate.estimators.challenge.steering import nearest
 from tailgate.evaluation.stats import Interval, paired_difference, proportion
 from tailgate.training.settings import check_mappings, check_name, mapping, parameters_of, started_with
 from tailgate.training.train import TrainConfig, environment_of

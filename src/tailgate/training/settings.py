@@ -12,9 +12,9 @@ from tailgate.base.reading import load_json
 from tailgate.core.schema import as_data
 
 
-def mapping(doc: str) -> Any:
-    """Return a dataclass field that holds a mapping of fields, empty by default."""
-    return dataclasses.field(default_factory=dict, metadata={"doc": doc})
+def mapping(doc: str, if_any: bool = False) -> Any:
+    """Return a dataclass field that holds a mapping of fields, empty by default; `if_any`: an empty one leaves no mark in data."""
+    return dataclasses.field(default_factory=dict, metadata={"doc": doc} | ({"if_any": True} if if_any else {}))
 
 
 def check_mappings(data: Mapping[str, object], names: Iterable[str]) -> None:

@@ -12,10 +12,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from tailgate.agents.codec import ActionSpec
-from tailgate.agents.finished import finished
-from tailgate.agents.learning import DISCRETE, LEARNERS, Config, Progress, Teachable, check_action, learner_of
-from tailgate.agents.reward import Reward
+from tailgate.agents.learners.finished import finished
+from tailgate.agents.learners.learning import DISCRETE, LEARNERS, Config, Progress, Teachable, check_action, learner_of
 from tailgate.base import sizes
 from tailgate.base.errors import InputError, said, unknown
 from tailgate.base.files import set_aside, writable_directory, write_atomic
@@ -27,7 +25,9 @@ from tailgate.core.registry import Spec
 from tailgate.core.scenario import Suite, config_path, load_scenario
 from tailgate.core.schema import as_data, build, canonical, fields_of, override, read_yaml
 from tailgate.core.threat import KNOWLEDGE
-from tailgate.envs.seat import Seat
+from tailgate.envs.gym.actions import ActionSpec
+from tailgate.envs.gym.attacker_mdp import Seat
+from tailgate.envs.gym.rewards import Reward
 from tailgate.evaluation.baselines import best_of
 from tailgate.evaluation.cells import cells_of
 from tailgate.play.metrics import METRICS
@@ -51,7 +51,7 @@ class TrainConfig:
     defence: str = param("chi2_kf", "registered defence to attack")
     threat: dict[str, Any] = mapping("changes of the scenario's threat model")
     environment: dict[str, Any] = mapping("action and reward settings of the environment")
-    learner: str = param("ppo", f"who learns: {'; '.join(f'{name}, {what}' for name, what in LEARNERS.items())}")
+    learner: str = param("ppo", f"who learns: {', '.join(LEARNERS)}")
     ppo: dict[str, Any] = mapping("hyper-parameters of PPO")
     maskable_ppo: dict[str, Any] = mapping("hyper-parameters of PPO with action masks")
     recurrent_ppo: dict[str, Any] = mapping("hyper-parameters of PPO with an LSTM")
@@ -59,6 +59,7 @@ class TrainConfig:
     sac: dict[str, Any] = mapping("hyper-parameters of SAC")
     tqc: dict[str, Any] = mapping("hyper-parameters of TQC")
     cem: dict[str, Any] = mapping("hyper-parameters of the cross-entropy method")
+    settings: dict[str, Any] = mapping("hyper-parameters of a learner that has no field here", if_any=True)
     teacher: str | None = param(None, "script that PPO imitates before it learns: one by name, or `best` of the rivals; none: from scratch")
     demonstrations: Episodes = param(1024, "episodes of its teacher that a learner is shown")
     gamma: Discount = param(0.995, "discount, of the learner and of the shaping [-]")
@@ -79,6 +80,10 @@ class TrainConfig:
     @property
     def directory(self) -> Path:
         return Path(self.out) / self.name
+
+    def settings_of(self, learner: str) -> dict[str, Any]:
+        """Return the hyper-parameters that this run gives to a learner."""
+        return dict(getattr(self, learner) if learner in fields_of(TrainConfig) else self.settings.get(learner, {}))
 
 
 def load_config(source: str | None, overrides: list[str], resume: bool = False) -> TrainConfig:
@@ -111,6 +116,9 @@ def _preset(source: str) -> dict[str, Any]:
 def checked(data: dict[str, Any]) -> TrainConfig:
     """Return a configuration from JSON data. Raises InputError for a field that makes no sense, and for one that names code to import."""
     check_mappings(data, ("threat", "environment", *LEARNERS))
+    if others := {name: data[name] for name in data if name in LEARNERS and name not in fields_of(TrainConfig)}:
+        data = {key: value for key, value in data.items() if key not in others}
+        data["settings"] = data.get("settings", {}) | others
     config = build(TrainConfig, data, "config")
     check_name(config.name)
     if config.outcome is not None and config.outcome not in METRICS:
@@ -143,9 +151,9 @@ def outcome_of(config: TrainConfig) -> str:
 def check(config: TrainConfig) -> None:
     """Try everything that a run will need before anything is written: a typing error shall not cost an hour."""
     settings = _settings(config)
-    for name in LEARNERS.keys() - {config.learner}:  # a typing error there as well, where that learner is installed
+    for name in set(LEARNERS) - {config.learner}:  # a typing error there as well, where that learner is installed
         with contextlib.suppress(ImportError):
-            build(learner_of(name).Config, dict(getattr(config, name)), f"config.{name}")
+            build(learner_of(name).Config, config.settings_of(name), f"config.{name}")
     seat = Seat.make(**environment_of(config))
     check_action(config.learner, seat)
     _check_memory(config, settings, seat)
@@ -296,7 +304,7 @@ def _is_held(config: TrainConfig, held: Path) -> bool:
 
 def _settings(config: TrainConfig) -> Config:
     """Return the learner's hyper-parameters, checked."""
-    settings: Config = build(learner_of(config.learner).Config, dict(getattr(config, config.learner)), f"config.{config.learner}")
+    settings: Config = build(learner_of(config.learner).Config, config.settings_of(config.learner), f"config.{config.learner}")
     settings.check()
     return settings
 

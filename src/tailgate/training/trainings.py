@@ -11,8 +11,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from tailgate.agents.learning import Config, Learner, Progress, Teachable, learner_of, made_with
-from tailgate.agents.teacher import demonstrate
+from tailgate.agents.learners.learning import Config, Learner, Progress, Teachable, learner_of, made_with
+from tailgate.agents.learners.teacher import demonstrate
 from tailgate.base.errors import InputError, Killed, said
 from tailgate.base.files import write_atomic
 from tailgate.base.pool import Crew, say

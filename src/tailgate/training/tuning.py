@@ -28,8 +28,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import yaml
 
-from tailgate.agents.learning import Progress, learner_of
-from tailgate.agents.policy import PolicyAttack
+from tailgate.agents.learners.learning import Progress, learner_of
+from tailgate.agents.policy.network_policy import PolicyAttack
 from tailgate.base import sizes
 from tailgate.base.errors import InputError, said, unknown
 from tailgate.base.files import writable_directory, write_atomic
@@ -162,6 +162,8 @@ def configured(base: TrainConfig, values: dict[str, Any]) -> TrainConfig:
     data: dict[str, Any] = {}
     for field, value in values.items():
         head, dot, leaf = field.partition(".")
+        if dot and head not in fields_of(TrainConfig):  # a learner without a field of its own
+            head, leaf, value = "settings", head, {**data.get("settings", base.settings).get(head, {}), leaf: value}
         data[head] = {**data.get(head, getattr(base, head)), leaf: value} if dot else value
     return dataclasses.replace(base, **data)
 

@@ -21,7 +21,7 @@ import numpy as np
 from tailgate.base.errors import InputError, NotApplicable
 from tailgate.core import Model, Positive, PositiveCount, param
 from tailgate.core.scenario import Scenario
-from tailgate.envs.controllers import BRAKE_ACCEL
+from tailgate.envs.controllers.adaptive_cruise import BRAKE_ACCEL
 from tailgate.play.metrics import DETECTION_DEADLINE
 from tailgate.scoring.gates import HOURS
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from tailgate.base.errors import InputError, NotApplicable, unknown
 from tailgate.core import Array, Model, NonNegative, Positive, param
-from tailgate.envs.controllers import STOP_ACCEL
+from tailgate.envs.controllers.adaptive_cruise import STOP_ACCEL
 from tailgate.play.metrics import TTC_CAP
 from tailgate.play.trace import Trace
 

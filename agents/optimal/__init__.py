@@ -1,0 +1,1 @@
+"""Optimal attacks: ceilings by dynamic programming."""

@@ -1,0 +1,1 @@
+"""Scripted attacks, their triggers, and programs from YAML files."""

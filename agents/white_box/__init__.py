@@ -1,0 +1,1 @@
+"""Attacks that know the model of the plant or the defence."""

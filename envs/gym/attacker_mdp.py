@@ -1,0 +1,206 @@
+"""The attacker's seat: the loop with the attack left open, from checked arguments. Environments, learners and games sit on it."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from tailgate.base import sizes
+from tailgate.base.errors import InputError, UnknownArgument, unknown
+from tailgate.core import Array, Command, Frame, Kind, View
+from tailgate.core.loop import Loop, LoopState
+from tailgate.core.registry import Spec
+from tailgate.core.scenario import load_scenario
+from tailgate.core.schema import as_data, build, digest, fields_of
+from tailgate.core.threat import ThreatModel
+from tailgate.envs.gym.actions import ActionCodec, ActionSpec
+from tailgate.envs.gym.observations import FRAMES, ObservationCodec
+from tailgate.envs.gym.rewards import Reward
+
+CAR_FOLLOWING = "tailgate/CarFollowing-v0"
+FACES: dict[str, dict[str, Any]] = {  # what each id is where nothing else is said: the one place of these defaults
+    CAR_FOLLOWING: {"scenario": "stop-and-go-v0", "defence": "chi2_kf"},
+    "tailgate/RadarFollowing-v0": {"scenario": "radar-following-v0", "defence": "cra"},
+    "tailgate/Platoon-v0": {"scenario": "platoon-braking-v0", "defence": "lasso_dkf"},
+    "tailgate/SensorNetwork-v0": {"scenario": "thesis-ch5-v0", "defence": "norm_resilient", "reward": "error"},
+    "tailgate/Highway-v0": {"scenario": "highway-v0", "defence": "chi2_kf"},
+}
+
+
+class Tally(NamedTuple):
+    """What the reward remembers of each episode, (B,) each."""
+
+    potential: Array  # of the shaping
+    least: Array  # smallest gap so far, within the reward's reach [m]
+    error: Array  # largest error of an agent, where there is no road
+    peak: Array  # the largest of the episode so far, where the reward is for that
+
+
+class Sums(NamedTuple):
+    """Sums over the steps of a decision, (B,) each."""
+
+    raw: Array  # reward of the steps
+    begun: Array  # the potential before the decision
+    collided: Array
+    rear_collided: Array
+    refused: Array  # a command was, in a step that counts
+    accepted: Array
+
+
+class Outcome(NamedTuple):
+    """What a decision of the attacker brought, (B,) each; of rows that were over before it nothing."""
+
+    reward: Array
+    collided: Array
+    rear_collided: Array
+    illegal: Array  # a command was refused, and in no step of the decision one was accepted
+    terminated: Array  # a collision ended the episode
+    truncated: Array  # the horizon did
+
+
+def _reward(options: dict[str, Any]) -> Reward:
+    """The reward from its options, or the object that stands for it."""
+    own = options.get("reward")
+    if not isinstance(own, Reward):
+        return build(Reward, options, "reward")
+    for key in options.keys() - {"reward"}:
+        raise InputError(key, options[key], f"no such option: {type(own).__name__}, the reward given as an object, holds it")
+    return own
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Seat:
+    """Everything that an adversary environment is, apart from its episodes: loop, codecs and reward, from checked arguments."""
+
+    loop: Loop
+    action: ActionCodec
+    observation: ObservationCodec
+    reward: Reward
+    config: dict[str, Any]
+
+    @property
+    def memory(self) -> float:
+        """Bytes that an environment of a batch takes, about: the filter's matrices, what it shows, and the rest."""
+        model = self.loop.model
+        return sizes.ENVIRONMENT + 8 * model.agents * model.states**2 * 4 + 8 * len(self.observation.names)
+
+    @classmethod
+    def make(cls, scenario: Any = None, defence: Any = None, threat: dict[str, Any] | None = None, **options: Any) -> Seat:
+        """scenario: name or YAML file. defence: name (`chi2_kf:eta=15`) or object. threat: changes of the scenario's threat model.
+
+        options: the fields of ActionSpec and Reward, `knowledge`, and `frames`: how many decisions the observation shows at once. Scenario
+        and defence are those of car following where they are None. `reward` may be an object of a subclass of Reward.
+        """
+        scenario = FACES[CAR_FOLLOWING]["scenario"] if scenario is None else scenario
+        defence = FACES[CAR_FOLLOWING]["defence"] if defence is None else defence
+        if threat is not None and not isinstance(threat, dict):
+            raise InputError("threat", threat, "a mapping of changes of the threat model")
+        threat = dict(threat or {})
+        if not isinstance(scenario, str):
+            raise InputError("scenario", scenario, "the name of a scenario, or of a YAML file")
+        if "knowledge" in options:
+            threat["knowledge"] = options.pop("knowledge")
+        frames = options.pop("frames", 1)
+        if not isinstance(frames, int) or isinstance(frames, bool) or not 1 <= frames <= FRAMES:
+            raise InputError("frames", frames, f"a whole number from 1 to {FRAMES}")
+        known = fields_of(ActionSpec) | fields_of(Reward)
+        for key in options:
+            if key not in known:
+                raise UnknownArgument(key, [*known, "scenario", "defence", "threat", "knowledge", "frames"])
+        for key in threat:
+            if key not in fields_of(ThreatModel):
+                raise unknown("threat: unknown field", key, fields_of(ThreatModel))
+        action = build(ActionSpec, {k: v for k, v in options.items() if k in fields_of(ActionSpec)}, "action")
+        reward = _reward({k: v for k, v in options.items() if k in fields_of(Reward)})
+        place = load_scenario(scenario).with_threat(**threat)
+        if isinstance(defence, str):
+            spec = Spec("defence", defence)
+            built, uses, named = spec.make(), spec.entry.uses, {"spec": defence, "parameters": as_data(spec.make())}
+        else:
+            if not all(hasattr(defence, name) for name in ("prepare", "start", "step")):
+                raise InputError("defence", defence, "a registered name, or an object with prepare, start and step")
+            built, uses = defence, tuple(getattr(defence, "uses", ("measurements",)))
+            named = {"spec": type(defence).__name__, "parameters": as_data(defence)}
+        loop = place.loop(built, uses)
+        reward.check(loop.model)
+        config = {"scenario": as_data(place), "defence": named, "action": as_data(action), "reward": as_data(reward)}
+        if frames > 1:  # cards from before there were several stay what they are
+            config["frames"] = frames
+        return cls(loop, ActionCodec(action, loop.brief), ObservationCodec(loop.brief, frames), reward, config)
+
+    def card(self) -> dict[str, Any]:
+        """What papers and rows cite: the whole configuration, and its hash."""
+        from tailgate.base.version import VERSION
+
+        features, actions = list(self.observation.names), [mode.name for mode in self.action.modes] if self.action.discrete else None
+        card = self.config | {"observation": features, "actions": actions, "version": VERSION, "hash": digest(self.config)}
+        return json.loads(json.dumps(card))  # type: ignore[no-any-return]
+
+    # -- playing
+
+    @property
+    def road(self) -> bool:
+        """Whether anybody drives here, and can collide."""
+        return bool(self.loop.model.followers.any())
+
+    @property
+    def decisions(self) -> int:
+        """Decisions of an episode that nothing ends early."""
+        return -(-self.loop.horizon // self.action.spec.interval)
+
+    def begin(self, state: LoopState) -> Tally:
+        """The reward's memory of episodes that have just begun."""
+        gap = self.loop.plant.scene(self.loop.plan.plant, state.plant).gap
+        return Tally(self.reward.potential(gap), self.reward.least(gap), np.zeros(len(gap)), np.zeros(len(gap)))
+
+    def step(
+        self, state: LoopState, tally: Tally, action: Array | Callable[[View], Command], over: Array
+    ) -> tuple[LoopState, Tally, Outcome, Frame]:
+        """Play one decision, `interval` steps of the loop; rows that are `over` (B,) count for nothing. -> its last step as well.
+
+        action: as `ActionCodec.decode` takes it, or somebody who decides in every step.
+        """
+        sums = self.opened(tally)
+        for _ in range(self.action.spec.interval):
+            state, tally, sums, frame = self.advanced(state, tally, sums, action, over)
+        return state, tally, self.closed(state, tally, sums, over), frame
+
+    def opened(self, tally: Tally) -> Sums:
+        """The sums before the first step of a decision."""
+        no = np.zeros(len(tally.potential), bool)
+        return Sums(np.zeros(len(no)), tally.potential, no, no, no, no)
+
+    def advanced(
+        self, state: LoopState, tally: Tally, sums: Sums, action: Array | Callable[[View], Command], over: Array
+    ) -> tuple[LoopState, Tally, Sums, Frame]:
+        """One step of a decision."""
+        loop, reward = self.loop, self.reward
+        live = ~over & ~state.ended & (state.k <= loop.horizon)
+        view = loop.sense(state)
+        state, frame = loop.advance(state, action(view) if callable(action) else self.action.decode(action, view))
+        least, peak, largest = reward.least(frame.scene.gap, tally.least), tally.peak, tally.error
+        if reward.payment.peak:
+            peak = np.maximum(np.max(loop.model.error(frame.estimate.x, frame.truth), axis=1), peak)
+        gained = reward(loop.model, frame, tally.least - least, frame.k == loop.horizon, peak - tally.peak)
+        gap_error = loop.model.gap_error(frame.estimate.x, frame.truth)
+        potential = np.where(live, reward.potential(frame.scene.gap, gap_error), tally.potential)
+        if not self.road:
+            largest = np.where(live, np.max(loop.model.error(frame.estimate.x, frame.truth), axis=1), largest)
+        sums = Sums(
+            sums.raw + np.where(live, gained, 0.0), sums.begun, sums.collided | (frame.collided & live),
+            sums.rear_collided | (frame.rear_collided & live), sums.refused | (frame.refused & live),
+            sums.accepted | (frame.command.kind != Kind.NONE),  # also behind a collision, which no mask foresees
+        )  # fmt: skip
+        return state, Tally(potential, least, largest, peak), sums, frame
+
+    def closed(self, state: LoopState, tally: Tally, sums: Sums, over: Array) -> Outcome:
+        """The outcome of a decision, after its last step."""
+        illegal = sums.refused & ~sums.accepted
+        terminated = state.ended & ~over
+        truncated = ~terminated & ~over & (state.k > self.loop.horizon)
+        gained = np.where(over, 0.0, self.reward.decided(sums.raw, illegal, sums.begun, tally.potential, terminated))
+        return Outcome(gained, sums.collided, sums.rear_collided, illegal, terminated, truncated)

@@ -1,0 +1,308 @@
+"""The attacker's seat as a program: what `tailgate.envs.gym.attacker_mdp.Seat` plays, traced as it stands.
+
+    advance  a step of a decision of several, but the last
+    decide   a decision of every row, or its last step; rows `again` begin their next episode instead
+    begin    the next episode of the rows `again`, or their first
+
+The last two leave what is to be seen, and what may be decided next.
+"""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+from collections.abc import Callable
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from tailgate.base.pytree import leaves, map_leaves
+from tailgate.core import draws
+from tailgate.core.draws import Keys
+from tailgate.engine.agreement import ROWS, TRIED, Untraced, check_open, raised, same
+from tailgate.engine.operations import Array
+from tailgate.engine.parameters import lifted
+from tailgate.engine.program import Call, Program, State, Trace, traced
+from tailgate.engine.remembered import Remembered
+
+if TYPE_CHECKING:
+    from tailgate.envs.gym.attacker_mdp import Seat
+
+
+# what a step of a single row tells
+ALONE = ("reward", "damage", "k", "terminated", "truncated", "illegal", "collided", "rear_collided", "allowed")
+
+
+class SeatPrograms:
+    """The programs of a seat. Raises whatever its parts raise while they are traced."""
+
+    def __init__(self, seat: Seat, shown: Seat | None = None) -> None:
+        check_open(seat.loop)
+        self.seat, self.loop, self.shown = seat, seat.loop, shown or _shown_once(seat)
+        self.values: list[Array] | None = None  # of the parameters, if others than those it was traced with
+        self.example = _example(seat)
+        for name, leaf in leaves(self.example).items():
+            if leaf.dtype == object:
+                raise TypeError(f"state {name} holds objects")
+        state = self.example | ({"sums": seat.opened(self.example["tally"])} if _several(seat) else {})
+        flags = np.zeros(1, bool)
+        action = np.zeros(1, np.int64) if seat.action.discrete else np.zeros((1, seat.action.size))
+        decide = traced(self._decide, state, {"action": action, "over": flags, "again": flags})
+        begin = traced(self._begin, state, {"again": flags})
+        traces = [decide, begin]
+        if _several(seat):
+            traces.append(traced(self._advance, state, {"action": action, "over": flags}))
+        twins = _twins(*traces)
+        self.programs = tuple(Program(trace, twins=twins) for trace in traces)
+        self.decide, self.begin, *advance = self.programs
+        self.advance = advance[0] if advance else None
+
+    @property
+    def between(self) -> int:
+        """Steps of a decision before its last."""
+        return self.seat.action.spec.interval - 1
+
+    def of(self, seat: Seat, values: list[Array]) -> SeatPrograms:
+        """The same programs for a seat of other parameters."""
+        out = copy.copy(self)
+        out.seat, out.loop, out.values = seat, seat.loop, values
+        return out
+
+    def _decide(self, held: Any, given: Any) -> tuple[Any, Any]:
+        seat, over = self._lifted(held), given["over"]
+        loop, tally, sums = held["loop"], held["tally"], held["sums"] if _several(seat) else seat.opened(held["tally"])
+        loop, tally, sums, _ = seat.advanced(loop, tally, sums, given["action"], over)
+        outcome = seat.closed(loop, tally, sums, over)
+        state = _renewed(seat, {"loop": loop, "tally": tally}, held["loop"].keys, given["again"])
+        return self._opened(seat, state), outcome._asdict() | _shown(seat, state)
+
+    def _advance(self, held: Any, given: Any) -> tuple[Any, Any]:
+        seat = self._lifted(held)
+        *state, _ = seat.advanced(held["loop"], held["tally"], held["sums"], given["action"], given["over"])
+        return dict(zip(("loop", "tally", "sums"), state, strict=True)), {}
+
+    def _begin(self, held: Any, given: Any) -> tuple[Any, Any]:
+        seat = self._lifted(held)
+        state = _renewed(seat, {"loop": held["loop"], "tally": held["tally"]}, held["loop"].keys, given["again"])
+        return self._opened(seat, state), _shown(seat, state)
+
+    def _opened(self, seat: Seat, state: Any) -> Any:
+        """With the sums of the next decision, where a decision has several steps."""
+        return state | {"sums": seat.opened(state["tally"])} if _several(seat) else state
+
+    def _lifted(self, held: Any) -> Seat:
+        seat: Seat = lifted(held["loop"].k.graph, self.shown)
+        return seat
+
+
+def _example(seat: Seat) -> dict[str, Any]:
+    """The state of an episode that begins."""
+    start = seat.loop.start(draws.keys("tune", [0]))
+    return {"loop": start, "tally": seat.begin(start)}
+
+
+def _several(seat: Seat) -> bool:
+    """Has a decision several steps? Traced code asks, so that a program is found again for both kinds apart."""
+    return bool(seat.action.spec.interval > 1)
+
+
+def _shown_once(seat: Seat) -> Seat:
+    """The seat as it is traced: it shows one frame."""
+    return dataclasses.replace(seat, observation=type(seat.observation)(seat.loop.brief), config={})
+
+
+def _twins(decide: Trace, begin: Trace, *others: Trace) -> dict[str, str]:
+    """Leaves of the state that equal others after each decision and each beginning, and these."""
+    first: dict[Any, str] = {}
+    out = {}
+    for name, (here, _) in decide.state.items():
+        pairs = [begin.large[name]] if name in begin.large else list(zip(*(nodes.flat for nodes in begin.state[name]), strict=True))
+        if here.size and all(new.op in ("select", "blend") and new.args[2] is old for old, new in pairs):
+            key = (
+                here.shape,
+                *(_after(trace, name) for trace in (decide, *others)),
+                tuple((new.args[0].id, new.args[1].id) for _, new in pairs),
+            )
+            if first.setdefault(key, name) != name:
+                out[name] = first[key]
+    return out
+
+
+def _after(trace: Trace, name: str) -> tuple[int, ...]:
+    """Numbers of what a leaf is in the next state."""
+    return (trace.large[name][1].id,) if name in trace.large else tuple(node.id for node in trace.state[name][1].flat)
+
+
+def _renewed(seat: Seat, state: Any, keys: Keys, again: Any) -> Any:
+    """The state with the next episode in the rows `again`."""
+    loop = seat.loop.start(Keys(keys.key, keys.episode + np.uint32(1)))
+    fresh = {"loop": loop, "tally": seat.begin(loop)}
+    return map_leaves(lambda old, new: np.where(again.reshape(len(again), *(1,) * (old.ndim - 1)), new, old), state, fresh)
+
+
+def _shown(seat: Seat, state: Any) -> dict[str, Any]:
+    """What is to be seen of a state, and what may be decided next."""
+    view = seat.loop.sense(state["loop"])
+    damage = np.min(view.scene.gap, axis=1) if seat.road else state["tally"].error
+    shown = {"seen": seat.observation.observe(view), "allowed": view.allowed, "k": view.k, "damage": damage}
+    return shown | ({"mask": seat.action.mask(view)} if seat.action.discrete else {})
+
+
+_made: Remembered[SeatPrograms] = Remembered()
+
+
+def programs_of(seat: Seat) -> SeatPrograms | Untraced:
+    """The programs of a seat, once they have been found equal to the plain loop on this machine; or why there are none."""
+    shown = _shown_once(seat)
+    return _made.proved(
+        shown,
+        lambda: _shown(shown, _example(shown)),
+        lambda: SeatPrograms(seat, shown),
+        lambda found, values: found.of(seat, values),
+        difference,
+    )
+
+
+def difference(programs: SeatPrograms, batch: int = ROWS, steps: int = TRIED) -> str:
+    """Play some decisions in both engines, resets among them; -> what differs first, or nothing."""
+    from tailgate.envs.gym.batches import PlainEpisodes
+
+    decisions = max(4, steps // (programs.between + 1))
+    chance, size = np.random.default_rng(0), programs.seat.action.size
+    keys, everyone = draws.keys("tune", range(batch)), np.ones(batch, bool)
+    rows, plain = Rows(programs, batch), PlainEpisodes(programs.seat)
+    rows.begin(everyone, keys)
+    plain.begin(keys)
+    for decision in range(decisions):
+        over = chance.random(batch) < (0.5 if decision == decisions // 2 else 0.02)
+        actions = chance.integers(0, size, batch) if programs.seat.action.discrete else chance.uniform(-1.0, 1.0, (batch, size))
+        broken, outcome = raised(lambda: rows.decide(actions, over, over)), raised(lambda: plain.decide(actions, over, True))  # noqa: B023
+        if isinstance(outcome, str):
+            return "" if broken == outcome else f"decision {decision}: {outcome}"
+        if isinstance(broken, str):
+            return f"decision {decision}: {broken}"
+        here, there = rows.held() | rows.brought, plain.held() | outcome._asdict() | {"seen": plain.seen()}
+        for name, wanted in there.items():
+            if not same(here[name], wanted):
+                return f"{name}, decision {decision}"
+    return ""
+
+
+class _Alone(NamedTuple):
+    """A single row: the calls that play it, its action, and readers of its sheet."""
+
+    call: Call
+    advance: Call | None
+    play: Callable[[], int]
+    action: Array
+    numbers: Callable[[], tuple[Any, ...]]
+    seen: Array
+    mask: Array | None
+
+
+class Rows:
+    """B rows of a seat's episodes, and what the last call brought (see `SeatPrograms`)."""
+
+    def __init__(self, programs: SeatPrograms, batch: int, threads: int = 1) -> None:
+        self.programs, self.batch, self.threads = programs, batch, threads
+        self.state = State(programs.decide, batch)
+        self._decide = self._last = Call(programs.decide, self.state, values=programs.values, threads=threads)
+        self._brought: dict[str, Array] | None = {}
+        self._k = 0  # of a single row, after its last decision
+
+    @cached_property
+    def _begin(self) -> Call:
+        return Call(self.programs.begin, self.state, values=self.programs.values, threads=self.threads)
+
+    @cached_property
+    def _advance(self) -> Call:
+        assert self.programs.advance is not None
+        return Call(self.programs.advance, self.state, self.programs.between, self.programs.values, self.threads, self._decide)
+
+    @cached_property
+    def _alone(self) -> _Alone:
+        programs = self.programs
+        call = Call(programs.decide, self.state, values=programs.values)
+        advance = Call(programs.advance, self.state, programs.between, programs.values, like=call) if programs.advance else None
+        play = call.fixed()
+        mask = call.reader("mask", 0, np.int8)() if programs.seat.action.discrete else None
+        return _Alone(call, advance, play, call.arguments["action"], call.numbers(ALONE), call.reader("seen", 0)(), mask)
+
+    @property
+    def brought(self) -> dict[str, Array]:
+        """The results of the last call."""
+        if self._brought is None:
+            self._brought = self._last.results()
+        return self._brought
+
+    @brought.setter
+    def brought(self, results: dict[str, Array]) -> None:
+        self._brought = results
+
+    def decide(self, actions: Array, over: Array, again: Array) -> None:
+        """One decision of each row: actions (B,) or (B, size), over and again (B,) bool."""
+        given = self._decide.arguments
+        given["action"][...], given["over"][...], given["again"][...] = actions, over, again
+        self._play(self._decide)
+
+    def decide_alone(self, action: Any) -> tuple[Any, ...]:
+        """The decision of a single row; -> what ALONE names, as Python's numbers, its observation and its mask."""
+        call, advance, play, given, numbers, seen, mask = self._alone
+        given[0] = action
+        if advance is not None:
+            advance.begin()
+            advance.play(advance.steps)
+            if advance.broken:
+                self._check(advance, self._step)
+        if play():
+            self._check(call, self._step)
+        self._last, self._brought, told = call, None, numbers()
+        self._k = told[2]
+        return *told, seen.copy(), None if mask is None else mask.copy()
+
+    def _step(self) -> Array:
+        """The step before the decision of a single row."""
+        return np.array([self._k]) if self._last is self._alone.call else self._last.results()["k"]
+
+    def again_alone(self) -> tuple[Any, ...]:
+        """The next episode of a single row; -> as `decide_alone`, of a decision that brought nothing."""
+        self.begin(np.ones(1, bool))
+        new = self.brought
+        mask = new["mask"][0].view(np.int8).copy() if "mask" in new else None  # the caller may write to it
+        return 0.0, float(new["damage"][0]), int(new["k"][0]), *(False,) * 5, bool(new["allowed"][0]), new["seen"][0], mask
+
+    def _play(self, call: Call) -> None:
+        before, sheet = self._last, self._last.sheet
+        steps = [self._advance, call] if self.programs.between and call is self._decide else [call]
+        for part in steps:
+            part.begin()
+            part.play(part.steps)
+            if part.broken:
+                self._check(part, lambda: before.results(sheet)["k"])
+        self._last, self._brought = call, None
+
+    def _check(self, call: Call, k: Callable[[], Array]) -> None:
+        """Raise the error of a demand that did not hold, in a decision from steps k (B,) on; idle lanes may hold anything."""
+        demands = call.results()["demands"].reshape(call.steps, self.batch, -1)
+        for step in np.flatnonzero(~demands.all(axis=(1, 2))):
+            raise call.program.broken(demands[step], k() + step + (self.programs.between if call.program is self.programs.decide else 0))
+
+    def begin(self, rows: Array, keys: Keys | None = None) -> None:
+        """Begin episodes in the rows (B,) bool: the next of their own, or those of keys, of as many rows."""
+        if keys is not None:
+            where, state = np.flatnonzero(rows), self.state
+            state.put_leaf("loop.keys.key", keys.key, where)
+            state.put_leaf("loop.keys.episode", keys.episode - np.uint32(1), where)
+        self._begin.arguments["again"][...] = rows
+        self._play(self._begin)
+
+    def held(self) -> dict[str, Array]:
+        """All that changes from step to step, by name: copies."""
+        return {name: self.state.get_leaf(name) for name in leaves(self.programs.example)}
+
+    def put(self, held: dict[str, Array]) -> None:
+        """What `held` gave, of the same number of rows."""
+        for name in leaves(self.programs.example):
+            self.state.put_leaf(name, held[name])
+        self.begin(np.zeros(self.batch, bool))

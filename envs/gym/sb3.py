@@ -1,0 +1,78 @@
+"""Stable-Baselines3's VecEnv over the batched environment (extra: train)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+try:
+    from stable_baselines3.common.vec_env.base_vec_env import VecEnv
+except ImportError as error:
+    raise ImportError("Stable-Baselines3 is missing: pip install 'tailgate[train]'") from error
+
+from tailgate.base.errors import unknown
+from tailgate.core import Array
+from tailgate.envs.gym.attacker_mdp import CAR_FOLLOWING, FACES
+from tailgate.envs.gym.gymnasium_env import AdversaryEnv, AdversaryVectorEnv
+
+
+class BatchVecEnv(VecEnv):
+    """One batch as a VecEnv: same-step autoreset, infos filled at episode ends only (with `episode`, as Monitor writes it).
+
+    An info that is filled has the names that a single environment's info has. id: whose defaults hold for what `arguments` leaves open.
+    """
+
+    def __init__(self, num_envs: int, id: str = CAR_FOLLOWING, **arguments: Any) -> None:
+        if id not in FACES:
+            raise unknown("id", id, FACES)
+        self.batch = AdversaryVectorEnv(num_envs, autoreset="same_step", **(FACES[id] | arguments))
+        super().__init__(num_envs, self.batch.single_observation_space, self.batch.single_action_space)
+        self._actions: Array = np.zeros(0)
+        self._returns, self._lengths = np.zeros(num_envs), np.zeros(num_envs, np.int64)
+
+    def reset(self) -> Array:
+        observation, _ = self.batch.reset(seed=self._seeds[0])  # row i: this seed + i, as `seed` sets them
+        self._reset_seeds()
+        self._returns[:], self._lengths[:] = 0.0, 0
+        return observation
+
+    def step_async(self, actions: Array) -> None:
+        self._actions = actions
+
+    def step_wait(self) -> Any:
+        observation, reward, terminated, truncated, info = self.batch.step(self._actions)
+        done = terminated | truncated
+        self._returns += reward
+        self._lengths += 1
+        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        if done.any():
+            final, told = info["final_obs"], info["final_info"]
+            for i in np.flatnonzero(done):
+                infos[i] = AdversaryEnv.row(told, int(i)) | {
+                    "terminal_observation": final[i].copy(), "TimeLimit.truncated": bool(truncated[i] and not terminated[i]),
+                    "episode": {"r": float(self._returns[i]), "l": int(self._lengths[i])},
+                }  # fmt: skip
+            self._returns[done], self._lengths[done] = 0.0, 0
+        return observation, reward.astype(np.float32), done, infos
+
+    def close(self) -> None:
+        self.batch.close()
+
+    def action_masks(self) -> Array:
+        return self.batch.action_masks()
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        return [getattr(self.batch if hasattr(self.batch, attr_name) else self, attr_name)] * len(list(self._get_indices(indices)))
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        raise AttributeError(f"{attr_name}: the rows of a batch have no attributes of their own")
+
+    def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
+        rows: Sequence[int] = list(self._get_indices(indices))
+        result = getattr(self.batch, method_name)(*args, **kwargs)
+        return [result[i] for i in rows]
+
+    def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:
+        return [False] * len(list(self._get_indices(indices)))

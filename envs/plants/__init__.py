@@ -1,0 +1,1 @@
+"""Plants: what moves, one file each."""

@@ -1,0 +1,5 @@
+"""Detectors: an alarm from innovations."""
+
+from tailgate.moved import former
+
+__getattr__ = former(__name__)

@@ -1,0 +1,1 @@
+"""Filters: an estimate from readings."""

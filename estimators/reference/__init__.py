@@ -1,0 +1,1 @@
+"""Baselines to compare with: no defence, the truth, and sentinels."""
