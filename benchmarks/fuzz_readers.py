@@ -8,6 +8,7 @@ import json
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +40,20 @@ def _files(*patterns: str) -> Callable[[], list[bytes]]:
         return [blob for blob in held if len(blob) < SHORT] or held
 
     return found
+
+
+def _call(module: str, function: str, file: str, *more: Any, text: bool = False) -> Callable[[Path], Any]:
+    """Return a reader: a function of the package that is given the path of the file (as `text` where it takes one), and more.
+
+    A list among `more` is of overrides, in which {} is the folder.
+    """
+
+    def read(folder: Path) -> Any:
+        path: Path | str = str(folder / file) if text else folder / file
+        rest = [[part.format(folder) for part in value] if isinstance(value, list) else value for value in more]
+        return getattr(import_module(f"tailgate.{module}"), function)(path, *rest)
+
+    return read
 
 
 # -- valid files that have to be made
@@ -81,12 +96,6 @@ def _tensors(folder: Path) -> Any:
     return _policy(folder)
 
 
-def _config(folder: Path) -> Any:
-    from tailgate.training.train import load_config
-
-    return load_config(str(folder / "config.yaml"), [f"out={folder}"])
-
-
 def _resumed(folder: Path) -> Any:
     from tailgate.training.train import load_config, same_run
 
@@ -105,40 +114,10 @@ def _started() -> list[bytes]:
     return [json.dumps(as_data(load_config(None, [])), indent=1).encode()]
 
 
-def _game(folder: Path) -> Any:
-    from tailgate.training.selfplay import load_config
-
-    return load_config(str(folder / "game.yaml"), [f"out={folder}"])
-
-
-def _scenario(folder: Path) -> Any:
-    from tailgate.core.scenario import load_scenario
-
-    return load_scenario(str(folder / "scenario.yaml"))
-
-
-def _suite(folder: Path) -> Any:
-    from tailgate.core.scenario import load_suite
-
-    return load_suite(str(folder / "suite.yaml"))
-
-
 def _program(folder: Path) -> Any:
     from tailgate.core.registry import Spec
 
     return Spec("attack", str(folder / "program.yaml")).make()
-
-
-def _automata(folder: Path) -> Any:
-    from tailgate.trust.automata import load_network
-
-    return load_network(str(folder / "automata.yaml"))
-
-
-def _space(folder: Path) -> Any:
-    from tailgate.training.tuning import read_space
-
-    return read_space(str(folder / "space.yaml"), "ppo")
 
 
 SPACE = b"ppo.learning_rate: {log: [1.0e-4, 1.0e-2]}\nppo.gae_lambda: {range: [0.9, 1.0]}\ngamma: {choices: [0.99, 0.995]}\n"
@@ -163,27 +142,10 @@ def _read_rows(name: str) -> Callable[[Path], Any]:
     return read
 
 
-def _attacks(folder: Path) -> Any:
-    from tailgate.scoring.attacks import read
-
-    return read(folder / "attacks.jsonl")
-
-
 def _read_board(folder: Path) -> Any:
     from tailgate.leaderboard.board_format import load, read_board
 
     return read_board(load(folder / "board.json"))
-
-
-def _beside(module: str, function: str, *, file: str) -> Callable[[Path], Any]:
-    """A reader of the package that takes the path of the file."""
-
-    def read(folder: Path) -> Any:
-        from importlib import import_module
-
-        return getattr(import_module(f"tailgate.{module}"), function)(folder / file)
-
-    return read
 
 
 def _trust(folder: Path) -> Any:
@@ -314,12 +276,6 @@ def _search(folder: Path) -> Any:
     return _open(make_search(None, [f"out={folder}"], 1)).user_attrs
 
 
-def _spent(folder: Path) -> Any:
-    from tailgate.training.trainings import spent
-
-    return spent(folder / "curve-0.json")
-
-
 # -- texts of the command line
 
 
@@ -389,20 +345,24 @@ def readers() -> dict[str, Reader]:
     game, programs = "configs/games/*.yaml", "configs/attacks/*.yaml"
     tensors = [POLICY.with_suffix(".safetensors")]
     made = [
-        Reader("training preset", "yaml", "config.yaml", _files("configs/*.yaml"), _config, command=("train", "--config", "{}", "out=runs")),
-        Reader("game preset", "yaml", "game.yaml", _files(game), _game, command=("selfplay", "--config", "{}", "out=runs")),
-        Reader("scenario", "yaml", "scenario.yaml", _files("configs/scenarios/*.yaml"), _scenario,
+        Reader("training preset", "yaml", "config.yaml", _files("configs/*.yaml"), _call("training.train", "load_config", "config.yaml", ["out={}"], text=True),
+               command=("train", "--config", "{}", "out=runs")),
+        Reader("game preset", "yaml", "game.yaml", _files(game), _call("training.selfplay", "load_config", "game.yaml", ["out={}"], text=True),
+               command=("selfplay", "--config", "{}", "out=runs")),
+        Reader("scenario", "yaml", "scenario.yaml", _files("configs/scenarios/*.yaml"), _call("core.scenario", "load_scenario", "scenario.yaml", text=True),
                command=("evaluate", "--scenario", "{}", "--defence", "kf", "--out", "rows.jsonl")),
-        Reader("suite", "yaml", "suite.yaml", _files("configs/suites/*.yaml"), _suite, command=("evaluate", "--suite", "{}", "--out", "rows.jsonl")),
+        Reader("suite", "yaml", "suite.yaml", _files("configs/suites/*.yaml"), _call("core.scenario", "load_suite", "suite.yaml", text=True),
+               command=("evaluate", "--suite", "{}", "--out", "rows.jsonl")),
         Reader("program", "yaml", "program.yaml", _files(programs), _program,
                command=("evaluate", "--scenario", "braking-v0", "--defence", "kf", "--attack", "{}", "--out", "rows.jsonl")),
-        Reader("automata", "yaml", "automata.yaml", _files("configs/automata/*.yaml"), _automata),
-        Reader("search space", "yaml", "space.yaml", lambda: [SPACE], _space, command=("tune", "--trials", "1", "--space", "{}", "out=runs")),
+        Reader("automata", "yaml", "automata.yaml", _files("configs/automata/*.yaml"), _call("trust.automata", "load_network", "automata.yaml", text=True)),
+        Reader("search space", "yaml", "space.yaml", lambda: [SPACE], _call("training.tuning", "read_space", "space.yaml", "ppo", text=True),
+               command=("tune", "--trials", "1", "--space", "{}", "out=runs")),
         Reader("speed profile", "csv", "profile.csv", lambda: [PROFILE], _profile),
         Reader("rows", "jsonl", "rows.jsonl", _rows, _read_rows("rows.jsonl"), command=("leaderboard", "build", "--rows", "{}", "--out", "page")),
         Reader("compressed rows", "xz", "rows.jsonl.xz", _rows, _read_rows("rows.jsonl.xz"),
                command=("leaderboard", "build", "--rows", "{}", "--out", "page")),
-        Reader("list of attacks", "jsonl", "attacks.jsonl", _files("configs/suites/*.jsonl"), _attacks),
+        Reader("list of attacks", "jsonl", "attacks.jsonl", _files("configs/suites/*.jsonl"), _call("scoring.attacks", "read", "attacks.jsonl")),
         Reader("board", "json", "board.json", _board, _read_board, command=("leaderboard", "page", "{}", "--out", "page"), slow=2.0),
         Reader("policy", "json", "p.json", lambda: [_sealed(tensors[0].read_bytes())], _policy,
                lambda folder: shutil.copyfile(tensors[0], folder / "p.safetensors"), ("timing", "{}", "--out", "report")),
@@ -411,20 +371,20 @@ def readers() -> dict[str, Reader]:
         Reader("checkpoint of cem", "tensors", "checkpoint.safetensors", *cem),
         Reader("checkpoint of ppo", "tensors", "checkpoint.safetensors", *ppo, slow=2.0),
         Reader("run's configuration", "json", "config.json", _started, _resumed),
-        Reader("run's curve", "json", "curve-0.json", lambda: [b'{"curve": [], "seconds": 12.5}'], _spent),
-        Reader("card", "json", "card.json", lambda: [json.dumps(CARD).encode()], _beside("leaderboard.card", "read_card", file="card.json")),
+        Reader("run's curve", "json", "curve-0.json", lambda: [b'{"curve": [], "seconds": 12.5}'], _call("training.trainings", "spent", "curve-0.json")),
+        Reader("card", "json", "card.json", lambda: [json.dumps(CARD).encode()], _call("leaderboard.card", "read_card", "card.json")),
         Reader("step times", "json", "step_time.json", _files("results/quick-v0/step_time.json"),
-               _beside("leaderboard.clock", "read_clock", file="step_time.json")),
+               _call("leaderboard.clock", "read_clock", "step_time.json")),
         Reader("timing advantages", "json", "timing.json", _files("results/quick-v0/timing.json"),
-               _beside("leaderboard.timing", "read_timing", file="timing.json")),
+               _call("leaderboard.timing", "read_timing", "timing.json")),
         Reader("verification", "json", "verified.json", _files("results/quick-v0/verified/*.json"),
-               _beside("leaderboard.verified", "read_report", file="verified.json")),
-        Reader("errata", "json", "errata.json", _files("results/quick-v0/errata.json"), _beside("leaderboard.errata", "errata_of", file="board.json")),
-        Reader("record of a run", "json", "run.json", _files("results/quick-v0/run.json"), _beside("leaderboard.run_time", "run_of", file="board.json")),
+               _call("leaderboard.verified", "read_report", "verified.json")),
+        Reader("errata", "json", "errata.json", _files("results/quick-v0/errata.json"), _call("leaderboard.errata", "errata_of", "board.json")),
+        Reader("record of a run", "json", "run.json", _files("results/quick-v0/run.json"), _call("leaderboard.run_time", "run_of", "board.json")),
         Reader("trust report", "json", "trust.json", _trust_files, _trust),
         Reader("trust cells", "jsonl", "cells.jsonl", lambda: [b'{"cell": "a", "status": "ok", "properties": [], "conjunctions": {}}\n' * 3],
-               _beside("trust.run", "_read", file="cells.jsonl")),
-        Reader("report of claims", "json", "report.json", _files("results/reproduction/report.json"), _beside("thesis.run", "read", file="")),
+               _call("trust.run", "_read", "cells.jsonl")),
+        Reader("report of claims", "json", "report.json", _files("results/reproduction/report.json"), _call("thesis.run", "read", "")),
         Reader("log's schema", "json", "schema.json", lambda: [b'{"format": "tailgate-log-1", "identity": "x", "files": [{"path": "README.md", "bytes": 0}]}'], _log),
         Reader("log's part", "parquet", "part.parquet", _parquet, _part),
         Reader("search's journal", "jsonl", "journal.jsonl", _journal, _search, slow=2.0),

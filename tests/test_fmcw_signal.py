@@ -119,8 +119,8 @@ def test_a_large_batch_takes_no_more_memory_than_a_small_one():
 
 
 def test_the_constants_are_those_of_the_record():
-    """What the closed form draws was fitted to the signal path by benchmarks/radar_path.py."""
-    record = json.loads((Path(__file__).parents[1] / "benchmarks/results/radar_path.json").read_text(encoding="utf-8"))
+    """What the closed form draws was fitted to the signal path by benchmarks/results/radar_path/radar_path.py."""
+    record = json.loads((Path(__file__).parents[1] / "benchmarks/results/radar_path/radar_path.json").read_text(encoding="utf-8"))
     np.testing.assert_allclose(fmcw._OUTLIER, record["fitted"]["outlier"], rtol=0.01)
     np.testing.assert_allclose(fmcw._EFFICIENCY, record["fitted"]["efficiency"], rtol=0.01)
     for row in record["samples"]["512"]:

@@ -6,7 +6,6 @@ import json
 import numpy as np
 import pytest
 
-import tailgate
 from tailgate import cli
 from tailgate.base.errors import InputError
 from tailgate.thesis import Claim, Report, reproduce, write
@@ -23,12 +22,11 @@ def chapter_4(tmp_path_factory):
     import contextlib
     import io
 
-    from tailgate.thesis import ch4_figures, ch4_theory
+    from tailgate.thesis import ch4_theory
 
-    out, text, etas = tmp_path_factory.mktemp("ch4"), io.StringIO(), ch4_theory.ETAS[::3]
+    out, text = tmp_path_factory.mktemp("ch4"), io.StringIO()
     with contextlib.redirect_stdout(text), pytest.MonkeyPatch.context() as patch:
-        for module in (ch4_theory, ch4_figures):
-            patch.setattr(module, "ETAS", etas)
+        patch.setattr(ch4_theory, "ETAS", ch4_theory.ETAS[::3])
         code = cli.main(["reproduce", "ch4", "--seeds", "10", "--out", str(out), "--json"])
     return code, {claim["id"]: claim for claim in json.loads(text.getvalue())}, out
 
@@ -146,8 +144,8 @@ def test_verdicts_follow_what_is_measured(monkeypatch):
     monkeypatch.setattr(ch4_theory, "GatedKalman", lambda eta: GatedKalman(eta=0.01))  # a gate that alarms at almost everything
     assert ch4_theory._theorem_1(calm, rng, 20).holds == "no"
     monkeypatch.undo()
-    honest = tailgate.make_attack("none")
-    monkeypatch.setattr(ch4_safety.tailgate, "make_attack", lambda name, **_: honest)
+    play = ch4_safety.play
+    monkeypatch.setattr(ch4_safety, "play", lambda scenario, defence, attack, seeds, **options: play(scenario, defence, "none", seeds, **options))
     assert ch4_safety._stealth(4).holds == "yes"
     assert ch4_safety._ramps(4).holds == "no"  # nothing is heard of an attack that does nothing
 

@@ -8,15 +8,16 @@ import numpy as np
 import pytest
 from scipy import stats
 
-import tailgate
 from tailgate import cli
-from tailgate.core import draws
+from tailgate.core.registry import Spec
 from tailgate.core.scenario import load_scenario
 from tailgate.play.metrics import measure
-from tailgate.play.trace import rollout
 from tailgate.thesis import ch5_cases, ch5_theory, ch6_cases, ch6_loop, write
+from tailgate.thesis.runs import play
 
 LEVEL = 0.999
+# of 300 runs those without a collision, by defence: none, DKF, lasso
+DESIGN = {"+60 m, p = 0.5": (26, 1, 300), "hold d and v, p = 0.5": (16, 0, 300), "+60 m, p = 1": (0, 0, 0), "no attack": (300, 300, 300)}
 
 
 def seeds_of(name, count):
@@ -46,7 +47,7 @@ def systems():
     attack = ch5_cases.random_attack(ch5_cases.COMPROMISED)
     out = {
         name: np.concatenate([ch5_cases.errors(ch5_cases.fresh(s), ch5_cases.defence(name), attack, [s]) for s in seeds], axis=1)
-        for name in ch5_cases.GUARDS
+        for name in ch5_cases.DEFENCES
     }
     return out | {"size": np.concatenate([ch5_cases.sizes(ch5_cases.fresh(s), s) for s in seeds], axis=1)}
 
@@ -71,17 +72,13 @@ def test_chapter_5_clean_convergence(systems):
 )
 def test_chapter_6_own_distance(case, guard, figure, digits):
     """Largest own-distance error after 20 s: the design's four figures."""
-    _, attack, options = ch6_cases.CASES[case]
-    seeds = seeds_of(f"test_chapter_6_{case}_{guard}", 300)
-    loop = ch6_cases.platoon().loop(ch6_cases.defence(guard))
-    trace = rollout(loop, tailgate.make_attack(attack, **options), draws.keys("report", seeds), terminate=False)
-    worst = ch6_cases.Played(trace).worst
+    worst = ch6_cases.run(ch6_cases.defence(guard), ch6_cases.CASES[case][1], seeds_of(f"test_chapter_6_{case}_{guard}", 300)).worst
     assert holds(worst, figure, digits) and not holds(worst, 1.5 * figure, digits)
 
 
 def test_chapter_6_replays_the_reading_of_20_s():
     """(6.18): Y_tau with tau = 20, in every hit of every run; in most runs the first hit comes later than at 21 s."""
-    trace = ch6_cases.run(ch6_cases.defence("dkf"), tailgate.make_attack("dos_hold", **ch6_cases.DOS), 50).trace
+    trace = ch6_cases.run(ch6_cases.defence("dkf"), ch6_cases.DOS, 50).trace
     hit, car = trace.kind != 0, ch6_cases.VICTIM
     assert 0.3 < np.mean(hit.argmax(axis=0) > 20) < 0.8 and not hit[:20].any()
     read, sent = trace.wires[:, :, car, :2], trace.clean[:, :, car, :2]
@@ -91,22 +88,19 @@ def test_chapter_6_replays_the_reading_of_20_s():
 
 def test_chapter_6_clean():
     """Attack-free the own-distance error is below 0.01 m at 10 s."""
-    loop = load_scenario(ch6_cases.SCENARIO).loop(ch6_cases.defence("lasso"))
-    trace = rollout(loop, tailgate.make_attack("none"), draws.keys("report", seeds_of("test_chapter_6_clean", 300)), terminate=False)
+    trace = play(ch6_cases.SCENARIO, ch6_cases.defence("lasso"), "none", seeds_of("test_chapter_6_clean", 300), terminate=False)
     assert np.quantile(ch6_cases.Played(trace).own[9].max(axis=1), 0.975) < 0.01
 
 
-@pytest.mark.parametrize("guard", list(ch6_loop.GUARDS))
-@pytest.mark.parametrize("label", list(ch6_loop.SPEC))
+@pytest.mark.parametrize("guard", list(ch6_loop.DEFENCES))
+@pytest.mark.parametrize("label", list(DESIGN))
 def test_chapter_6_collisions(label, guard):
     """Runs without a collision in closed loop: the design's counts of 300, by Fisher's exact test at 0.1 %."""
     n, of = 60, 300
-    design = dict(zip(ch6_loop.GUARDS, ch6_loop.SPEC[label], strict=True))[guard]
-    name, options = ch6_loop.GUARDS[guard]
-    loop = load_scenario(ch6_loop.SCENARIO).loop(tailgate.make_defence(name, **options))
-    attack, arguments = ch6_loop.ATTACKS[label]
-    seeds = seeds_of(f"test_chapter_6_{label}_{guard}", n)
-    safe = int((measure(rollout(loop, tailgate.make_attack(attack, **arguments), draws.keys("report", seeds)))["collided"] == 0.0).sum())
+    design = dict(zip(ch6_loop.DEFENCES, DESIGN[label], strict=True))[guard]
+    defence = Spec("defence", ch6_loop.DEFENCES[guard]).make()
+    trace = play(ch6_loop.SCENARIO, defence, ch6_loop.ATTACKS[label], seeds_of(f"test_chapter_6_{label}_{guard}", n))
+    safe = int((measure(trace)["collided"] == 0.0).sum())
     assert stats.fisher_exact([[safe, n - safe], [design, of - design]]).pvalue > 1.0 - LEVEL
 
 
@@ -130,7 +124,7 @@ def brief_chapters(monkeypatch):
     """Runs that end a few steps after the attack's onset, and fewer rows of the two longest tables."""
     fresh = ch5_cases.fresh
     for module in (ch5_cases, ch5_theory):
-        monkeypatch.setattr(module, "fresh", lambda seed, **plant: dataclasses.replace(fresh(seed, **plant), horizon=26))
+        monkeypatch.setattr(module, "fresh", lambda seed, *noise, **plant: dataclasses.replace(fresh(seed, *noise, **plant), horizon=26))
     monkeypatch.setattr(ch5_theory, "LONG", 26)
     monkeypatch.setattr(ch5_theory, "RADII", (0.9, 1.0))
     monkeypatch.setattr(ch6_loop, "load_scenario", lambda name: dataclasses.replace(load_scenario(name), horizon=220))
@@ -163,13 +157,13 @@ def test_unknown_chapter_names_those_that_exist(capsys):
 def test_verdicts_go_both_ways():
     """The claims on several runs are judged by what is measured: figures of either sign change the verdict."""
     far, near = ch5_theory.SUDDEN, "random, 700 randn"
-    base = {(label, words): 1.0 for label in ch5_theory.CASES for words in ch5_theory.RIVALS}
+    base = {(label, words): 1.0 for label in ch5_theory.CASES for words in ch5_theory.BASELINES}
     kinds = lambda found: [claim.holds for claim in ch5_theory._others(found)]  # noqa: E731
     better = base | {(label, "gate"): 2.0 for label in ch5_theory.CASES}
     worse = base | {(label, "gate"): 0.5 for label in ch5_theory.CASES} | {(far, "resilient (5.8)"): 9.0}
     assert kinds(better) == ["yes", "yes"] and kinds(worse) == ["no", "no"]
     assert kinds(better | {(near, "gate"): 0.5}) == ["yes", "partly"]
-    few = {(label, guard): 100 for label in ch6_loop.ATTACKS for guard in ch6_loop.GUARDS}
+    few = {(label, guard): 100 for label in ch6_loop.ATTACKS for guard in ch6_loop.DEFENCES}
     none = dict.fromkeys(few, 0)
     for judge in (ch6_loop._every_step, ch6_loop._collision):
         assert judge(none, 100).holds == "no"
@@ -183,8 +177,8 @@ def test_whether_a_known_input_counts_depends_on_the_price(monkeypatch):
     """Both prices stand in the claim: with a high one nobody need know, with a low one the leader's own prediction has to."""
     place = load_scenario(ch6_loop.SCENARIO)
     place = dataclasses.replace(place, horizon=240, manoeuvre=dataclasses.replace(place.manoeuvre, onset=(5.0, 5.0)))
-    monkeypatch.setattr(ch6_loop, "_play", lambda place, guard, attack, seeds, play=ch6_loop._play: play(place, guard, attack, 2))
-    safe = {(label, guard): ch6_loop._safe(ch6_loop._play(place, spec, ch6_loop.ATTACKS[label], 2)) for label in ("+60 m, p = 0.5", "+60 m, p = 1") for guard, spec in ch6_loop.GUARDS.items()}
+    monkeypatch.setattr(ch6_loop, "_play", lambda scenario, defence, attack, seeds, play=ch6_loop._play: play(scenario, defence, attack, 2))
+    safe = {(label, guard): ch6_loop._safe(ch6_loop._play(place, spec, ch6_loop.ATTACKS[label], 2)) for label in ("+60 m, p = 0.5", "+60 m, p = 1") for guard, spec in ch6_loop.DEFENCES.items()}
     rows = ch6_loop._known(place, safe, 2).measured
     high, low = (rows[f"+60 m, p = 0.5: lasso, lam = {lam:g}"] for lam in (ch6_cases.LOOP_LAM, ch6_cases.LAM))
     assert set(high.values()) == {1.0} and low["known to nobody"] < low["known to the leader"] == low["known to all"]

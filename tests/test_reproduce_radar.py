@@ -8,12 +8,14 @@ import pytest
 from PIL import Image
 from scipy import stats
 
+from tailgate.base.plots import png
 from tailgate.core import draws
 from tailgate.core.registry import Spec, make
 from tailgate.core.scenario import load_scenario
 from tailgate.play.trace import rollout
 from tailgate.thesis import CHAPTERS, ch3_cases, ch3_figures, ch3_limits, ch3_radar
-from tailgate.thesis.ch3_cases import ATTACKS, DETECTED, OURS, PLACES, Run
+from tailgate.thesis.ch3_cases import ATTACKS, DETECTED, OURS, SCENARIOS, Run
+from tailgate.thesis.claims import Report
 
 LEVEL, SEEDS = 0.999, 60
 
@@ -28,7 +30,7 @@ def interval(values):
 def run(name, number, case, guard, **changes):
     """Episodes on seeds that follow from a test's name."""
     first = int.from_bytes(name.encode()[:64], "little") % 1_000_000_007
-    spec, place = Spec("defence", guard), dataclasses.replace(load_scenario(PLACES[number]), **changes)
+    spec, place = Spec("defence", guard), dataclasses.replace(load_scenario(SCENARIOS[number]), **changes)
     attack = Spec("attack", ATTACKS.get(case, "none")).make()
     return Run.of(rollout(place.loop(spec.make(), spec.entry.uses), attack, draws.keys("report", range(first, first + SEEDS))))
 
@@ -38,7 +40,7 @@ def runs():
     guards = ("none", OURS, "algorithm2")
     return {
         (number, case, guard): run("test_chapter_3", number, case, guard)
-        for number in PLACES for case in ("clean", *ATTACKS) for guard in (guards if case in ATTACKS else guards[1:2])
+        for number in SCENARIOS for case in ("clean", *ATTACKS) for guard in (guards if case in ATTACKS else guards[1:2])
     }  # fmt: skip
 
 
@@ -69,7 +71,7 @@ def test_scenario_ii_with_the_reset(at, figure):
 
 def test_detection_is_at_182_in_every_run(runs):
     """Both attacks, both scenarios; and no alarm without an attack."""
-    for number in PLACES:
+    for number in SCENARIOS:
         for case in ATTACKS:
             np.testing.assert_array_equal(runs[number, case, OURS].alarm, DETECTED)
         assert np.isnan(runs[number, "clean", OURS].alarm).all()
@@ -81,7 +83,7 @@ def test_detection_is_at_182_in_every_run(runs):
 def test_verdicts_can_go_the_other_way(runs):
     """A defence that does nothing in place of ours, and ours in place of nothing, turn the verdicts."""
     assert [claim(runs).holds for claim in (ch3_cases._safety, ch3_cases._recovery, ch3_cases._algorithm1)] == ["partly", "yes", "no"]
-    worse = runs | {(n, c, OURS): runs[n, c, "none"] for n in PLACES for c in ATTACKS}
+    worse = runs | {(n, c, OURS): runs[n, c, "none"] for n in SCENARIOS for c in ATTACKS}
     assert ch3_cases._safety(worse).holds == "no" and ch3_cases._detection(worse).holds == "no" and ch3_cases._false_alarms(worse).holds == "no"
     deaf = runs["i", "delay", OURS]
     silent = Run(dataclasses.replace(deaf.trace, signals=deaf.trace.signals | {"alarm": np.zeros_like(deaf.trace.alarm)}), *deaf[1:])
@@ -95,8 +97,9 @@ def test_verdicts_can_go_the_other_way(runs):
 def test_the_radars_claims():
     """The signs are wrong as printed, a late echo shifts the distance, and a ratio below 1 alone denies nothing; a link can turn the last."""
     assert ch3_radar._signs().holds == "no" and ch3_radar._late().holds == "yes"
-    claim, _, curve = ch3_radar._denial(40)
-    assert claim.holds == "no" and curve["follows the chirp"][1:].min() > 0.5 and curve["fills the band"].max() < 0.05
+    claim, _, _ = ch3_radar._denial(40)
+    shares = {noise: list(by_range.values()) for noise, by_range in claim.measured["readings that are off by more than 5 m"].items()}
+    assert claim.holds == "no" and min(shares["follows the chirp"][1:]) > 0.5 and max(shares["fills the band"]) < 0.05
 
 
 @pytest.mark.long
@@ -128,11 +131,14 @@ def test_the_pictures(runs):
     """Figures 3.2a to 3.3b and three more, each a picture of some size whose caption says which run it shows."""
     latency = {"p": np.array([0.1, 0.5]), "mean": np.array([9.0, 1.0]), "low": np.array([8.0, 0.9]), "high": np.array([10.0, 1.1])}
     reaction = {"reaction": np.array([1e-6, 1e-3])} | {f"{c}: {what}": np.array([0.0, 1.0]) for c in ATTACKS for what in ("heard", "collided, list", "collided, random")}
-    denial = {"range": np.array([10.0, 100.0]), "fills the band": np.zeros(2), "follows the chirp": np.ones(2)}
-    figures = ch3_figures.all_figures(runs, {"latency": latency, "reaction": reaction}, denial)
-    assert [f.name for f in figures] == ["figure-3-2a", "figure-3-2b", "figure-3-3a", "figure-3-3b", "figure-latency", "figure-reaction", "figure-jammer"]
-    for figure in figures:
-        assert min(Image.open(io.BytesIO(figure.png)).size) > 300 and figure.caption.endswith(".")
+    denial = {"fills the band": np.zeros(2), "follows the chirp": np.ones(2)}
+    report = Report("ch3", "", {})
+    report.add(ch3_figures.cases(runs))
+    assert [f.name for f in report.figures] == ["figure-3-2a", "figure-3-2b", "figure-3-3a", "figure-3-3b"]
+    assert all(figure.caption.endswith(".") for figure in report.figures)
+    others = (ch3_figures.latency(latency), ch3_figures.reaction(reaction), ch3_figures.denial(np.array([10.0, 100.0]), denial))
+    for picture in [figure.png for figure in report.figures] + [png(figure) for figure in others]:
+        assert min(Image.open(io.BytesIO(picture)).size) > 300
 
 
 def test_the_chapter_is_known():

@@ -139,8 +139,8 @@ def test_without_outliers_it_is_filterpys_steady_state_filter():
 
 
 def test_the_default_price_is_the_tuned_one():
-    """The record of benchmarks/tune_rkf.py, made with other lam's, names the default."""
-    record = json.loads((Path(__file__).parents[1] / "benchmarks/results/tune_rkf.json").read_text(encoding="utf-8"))
+    """The record of benchmarks/results/tune_rkf/tune_rkf.py, made with other lam's, names the default."""
+    record = json.loads((Path(__file__).parents[1] / "benchmarks/results/tune_rkf/tune_rkf.json").read_text(encoding="utf-8"))
     assert RobustKalman().lam == pytest.approx(record["default"]["lam_sqrt_S"], abs=0.05) and RobustKalman().unit == "sigma"
     scores = [[row["score"] for row in record["settings"][name]["grid"]] for name in ("gusty-stop-and-go-v0", "stop-and-go-v0")]
     best = int(np.argmin(np.prod(scores, axis=0)))

@@ -11,7 +11,7 @@ import pytest
 from tailgate.base.errors import InputError
 from tailgate.training import train
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "results/adversaries-v0"))
 import script_search
 
 CONFIG = ["defence=kf", "threat.kinds=[fdi]", "workers=1"]

@@ -165,7 +165,7 @@ class Link:
         return np.asarray(self.echo_power(d) / (self.noise_power + self.passed * self.jam_power(d, radiated)))
 
 
-# Root-MUSIC's error against the SNR x after integration, fitted to the signal path at 512 samples a sweep by benchmarks/radar_path.py.
+# Root-MUSIC's error against the SNR x after integration, fitted to the signal path at 512 samples a sweep (benchmarks/results/radar_path).
 _EFFICIENCY = (1.42, 21.6, 222.0)  # variance over the Cramer-Rao bound: e0 (1 + e1/x + e2/x^2)
 _OUTLIER = (3.96, 1.08, 0.207)  # odds of an outlier: exp(o0 - o1 ln x - o2 x)
 _CELL = 4.0  # an outlier misses by more than _CELL/M cycles per sample, the resolution of a window of M/4 samples

@@ -33,10 +33,10 @@ MARKERS = "osD^v<>PX*phd"
 def canvas(width: float, height: float, rows: int = 1, columns: int = 1, **options: Any) -> tuple[Figure, Array]:
     """Return a matplotlib figure and its axes (rows, columns), without the global state of pyplot."""
     try:
-        from matplotlib.figure import Figure
+        from matplotlib import figure as made
     except ImportError as error:
         raise ImportError("figures need matplotlib: pip install 'tailgate[viz]'") from error
-    figure = Figure(figsize=(width, height), layout="constrained")
+    figure = made.Figure(figsize=(width, height), layout="constrained")
     return figure, figure.subplots(rows, columns, squeeze=False, **options)
 
 

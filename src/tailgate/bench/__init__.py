@@ -1,1 +1,1 @@
-"""What this package measures of its own speed, beside the peers that are installed (spec of speed; `tailgate bench`)."""
+"""The speed of this package and of the peers that are installed (`tailgate bench`)."""

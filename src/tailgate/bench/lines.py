@@ -1,4 +1,4 @@
-"""What a measurement is: a line with a name, a unit, and something that runs for about so many seconds."""
+"""A measurement: a line with a name, a unit, and a function that runs for about the seconds that it is given."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ RATE, SECONDS, BYTES, SHARE, NUMBER = "1/s", "s", "bytes", "share", "number"
 
 
 class Missing(Exception):
-    """What a line needs is not installed on this machine: says what, and how to get it."""
+    """A line needs something that is not installed on this machine. The text says what, and how to get it."""
 
 
 class Sample(NamedTuple):
@@ -25,7 +25,7 @@ class Sample(NamedTuple):
         return self.amount / self.per
 
 
-Go = Callable[[float], Sample]  # runs for about so many seconds
+Go = Callable[[float], Sample]  # runs for about these seconds
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Line:
 
 
 def repeated(chunk: Callable[[], int]) -> Go:
-    """Calls `chunk`, which returns how much it did, until the seconds are over, at least once: how much in how much processor time.
+    """Call `chunk`, which returns how much it did, until the seconds are over, at least once: how much in how much processor time.
 
     Of this process, all its threads together, so that others on the machine do not count, and nobody gains by a second core.
     """

@@ -1,4 +1,4 @@
-"""What this package does: one small function for each thing that is measured, all against the public interface."""
+"""Measurements of this package: one small function for each, all against the public interface."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ import numpy as np
 
 from tailgate import num
 from tailgate.base.pytree import put_rows
-from tailgate.core import Array, Command, Estimate, Mode, View, draws
-from tailgate.core.draws import Role
+from tailgate.core import Array, Attack, Command, Defence, Estimate, Mode, Model, Prior, Received, View, draws
+from tailgate.core.draws import Draws, Role
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import Scenario, load_scenario
 from tailgate.engine.agreement import Untraced
@@ -41,13 +41,13 @@ SMALL, LARGE = 2048, 6144  # batches whose difference is what an episode takes
 
 
 def single() -> Go:
-    """tailgate/CarFollowing-v0 through gymnasium.make, as everybody makes it; random actions."""
+    """Step tailgate/CarFollowing-v0 through gymnasium.make, with random actions."""
     env = gymnasium.make(CAR_FOLLOWING)
     return stepped(env, at_random(env))
 
 
 def vector(episodes: int) -> Go:
-    """The native vector environment; random actions."""
+    """Step the native vector environment, with random actions."""
     return batched(gymnasium.make_vec(CAR_FOLLOWING, num_envs=episodes))
 
 
@@ -58,19 +58,19 @@ class Playing(NamedTuple):
     """A seat whose attacker is a script, and what a step of it needs."""
 
     seat: Seat
-    attack: Any
+    attack: Attack
     plan: Any
 
 
-def playing(defence: Any) -> Playing:
-    """Car following under injection by a script."""
+def playing(defence: Defence) -> Playing:
+    """Return car following under injection by a script."""
     seat = Seat.make(scenario=SCENARIO, defence=defence, reward="min_gap")
     script = Spec("attack", INJECTION).make()
     return Playing(seat, script, script.prepare(seat.loop.brief))
 
 
 def played(held: Playing, episodes: int) -> Go:
-    """Steps per second of whole steps: leader, readings, attack, defence, controller, reward, autoreset, random numbers."""
+    """Play whole steps: leader, readings, attack, defence, controller, reward, autoreset, random numbers."""
     seat, attack, plan = held
     state = seat.loop.start(draws.keys("tune", range(episodes)))
     tally, over = seat.begin(state), np.zeros(episodes, bool)
@@ -80,7 +80,7 @@ def played(held: Playing, episodes: int) -> Go:
     def decide(view: View) -> Command:
         nonlocal memory
         memory, command = attack.decide(plan, memory, view, state.keys.at(Role.ATTACK, view.k))
-        return command  # type: ignore[no-any-return]
+        return command
 
     def chunk() -> int:
         nonlocal state, tally, memory
@@ -103,7 +103,7 @@ HELD = 16  # steps of one call: rewards in each, an observation and restarts aft
 
 
 def flown(episodes: int, threads: int = 1) -> Rows:
-    """Car following with injection by the learner's action; begun."""
+    """Begin episodes of car following with injection by the learner's action."""
     options: dict[str, Any] = {"action": "timing", "kind": "fdi", "value": -4.0, "interval": HELD, "reward": "min_gap"}
     programs = programs_of(Seat.make(scenario=SCENARIO, defence="chi2_kf", **options))
     assert not isinstance(programs, Untraced)
@@ -113,7 +113,7 @@ def flown(episodes: int, threads: int = 1) -> Rows:
 
 
 def decided(rows: Rows) -> int:
-    """A decision of all rows, which begin again where they are over; -> the steps of it."""
+    """Take a decision in all rows, which begin again after their end; return its steps."""
     brought, attack = rows.brought, np.ones(rows.batch, np.int64)
     over = brought["terminated"] | brought["truncated"] if "terminated" in brought else np.zeros(rows.batch, bool)
     rows.decide(attack, over, over)
@@ -121,15 +121,15 @@ def decided(rows: Rows) -> int:
 
 
 def batch(episodes: int, threads: int = 1) -> Go:
-    """Whole steps of car following under a learner's action: rewards included, an observation and restarts every HELD steps."""
+    """Play whole steps of car following under a learner's action: rewards included, an observation and restarts every HELD steps."""
     rows = flown(episodes, threads)
     return repeated(lambda: decided(rows))
 
 
-def several(place: Scenario, defence: str, value: float, reward: str, episodes: int) -> Go:
-    """Whole steps of several agents under a learner's action, as in `batch`."""
-    guard, spec = Spec("defence", defence), ActionSpec("timing", "fdi", value, interval=HELD)
-    loop = place.loop(guard.make(), guard.entry.uses)
+def several(scenario: Scenario, defence: str, value: float, reward: str, episodes: int) -> Go:
+    """Play whole steps of several agents under a learner's action, as in `batch`."""
+    named, spec = Spec("defence", defence), ActionSpec("timing", "fdi", value, interval=HELD)
+    loop = scenario.loop(named.make(), named.entry.uses)
     seat = Seat(loop, ActionCodec(spec, loop.brief), ObservationCodec(loop.brief), Reward(reward), {})
     rows, attack, over = side_by_side(seat), np.ones(episodes, np.int64), np.zeros(episodes, bool)
     rows.begin(draws.keys("tune", range(episodes)))
@@ -144,17 +144,17 @@ def several(place: Scenario, defence: str, value: float, reward: str, episodes: 
 
 
 def platoon(episodes: int, followers: int = 4, defence: str = "dkf") -> Go:
-    """Whole steps of a platoon, each car with an estimator of the whole state; one gap is attacked."""
-    place = load_scenario("platoon-braking-v0").with_threat(agents=(min(2, followers),), targets=("distance",))
-    place = dataclasses.replace(place, plant=dataclasses.replace(place.plant, followers=followers))
-    return several(place, defence, 60.0, "min_gap", episodes)
+    """Play whole steps of a platoon, each car with an estimator of the whole state; one gap is attacked."""
+    scenario = load_scenario("platoon-braking-v0").with_threat(agents=(min(2, followers),), targets=("distance",))
+    scenario = dataclasses.replace(scenario, plant=dataclasses.replace(scenario.plant, followers=followers))
+    return several(scenario, defence, 60.0, "min_gap", episodes)
 
 
 def network(episodes: int, sensors: int) -> Go:
-    """Whole steps of the network of chapter 5, ten agents with so many sensors each, under the norm-penalised estimator; one attacked."""
-    place = load_scenario("thesis-ch5-v0").with_threat(agents=(0,))
-    place = dataclasses.replace(place, sensor=dataclasses.replace(place.sensor, sensors=sensors))
-    return several(place, "norm_resilient", 60.0, "error", episodes)
+    """Play whole steps of chapter 5's network of ten agents under the norm-penalised estimator; one is attacked."""
+    scenario = load_scenario("thesis-ch5-v0").with_threat(agents=(0,))
+    scenario = dataclasses.replace(scenario, sensor=dataclasses.replace(scenario.sensor, sensors=sensors))
+    return several(scenario, "norm_resilient", 60.0, "error", episodes)
 
 
 # -- a defence by somebody else
@@ -171,13 +171,13 @@ class Saturated:
     gain: float = 0.2
     limit: float = 0.5
 
-    def prepare(self, model: Any) -> Any:
+    def prepare(self, model: Model) -> Model:
         return model
 
-    def start(self, plan: Any, prior: Any) -> _Belief:
+    def start(self, plan: Model, prior: Prior) -> _Belief:
         return _Belief(prior.mean)
 
-    def step(self, plan: Any, state: _Belief, received: Any, known_u: Array, draws: Any) -> tuple[_Belief, Estimate]:
+    def step(self, plan: Model, state: _Belief, received: Received, known_u: Array, draws: Draws) -> tuple[_Belief, Estimate]:
         x = num.matvec(plan.A, state.x) + num.matvec(plan.B, known_u) + plan.c
         r = np.where(received.valid, received.y - num.matvec(plan.C, x), 0.0)
         x = x + num.matvec(np.swapaxes(plan.C, -1, -2), np.clip(self.gain * r, -self.limit, self.limit))
@@ -187,7 +187,7 @@ class Saturated:
 
 
 def plug_in(episodes: int) -> Go:
-    """Whole steps with a defence that is plain numpy."""
+    """Play whole steps with a defence that is plain numpy."""
     return played(playing(Saturated()), episodes)
 
 
@@ -195,7 +195,7 @@ def plug_in(episodes: int) -> Go:
 
 
 def on_cores(episodes: int, cores: int) -> Go:
-    """Whole steps on so many cores at once, by the wall clock: one thread for each, which plays its share of the blocks."""
+    """Play whole steps on several cores at once, by the wall clock: one thread for each, which plays its share of the blocks."""
     if (os.cpu_count() or 1) < cores:
         raise Missing(f"this machine has {os.cpu_count()} cores, not {cores}")
     rows = flown(episodes, cores)
@@ -210,7 +210,7 @@ def on_cores(episodes: int, cores: int) -> Go:
 
 
 def unequal(episodes: int = 4096, threads: int = 2) -> Go:
-    """How many bytes of so many episodes differ between one thread and several."""
+    """Count the bytes of the episodes that differ between one thread and several."""
 
     def go(seconds: float) -> Sample:
         one, several = flown(episodes), flown(episodes, threads)
@@ -241,7 +241,7 @@ print(time.perf_counter() - started)
 
 
 def _first_step(cache: str, bytecode: bool = False) -> float:
-    """Seconds in a fresh process from the first import to the end of the first step, compiled code being cached in this folder.
+    """Measure the seconds in a fresh process from the first import to the end of the first step, compiled code being cached in this folder.
 
     With `bytecode`, that of Python as well, as everybody has it whose environment does not forbid it.
     """
@@ -253,7 +253,7 @@ def _first_step(cache: str, bytecode: bool = False) -> float:
 
 
 def start_cached() -> Go:
-    """Import and first step where the kernels, and Python's bytecode, were compiled before."""
+    """Time import and first step with compiled kernels and Python's bytecode in the cache."""
     folder = tempfile.TemporaryDirectory(prefix="tailgate-")
     _first_step(folder.name, True)
 
@@ -264,7 +264,7 @@ def start_cached() -> Go:
 
 
 def start_cold() -> Go:
-    """Import and first step with an empty cache of compiled code."""
+    """Time import and first step with an empty cache of compiled code."""
 
     def go(seconds: float) -> Sample:
         with tempfile.TemporaryDirectory(prefix="tailgate-") as folder:
@@ -274,7 +274,7 @@ def start_cold() -> Go:
 
 
 def _peak(episodes: int) -> int:
-    """Bytes that a vector environment takes at most, from its making to its third step."""
+    """Return bytes that a vector environment takes at most, from its making to its third step."""
     tracemalloc.start()
     try:
         env: Any = gymnasium.make_vec(CAR_FOLLOWING, num_envs=episodes)
@@ -287,7 +287,7 @@ def _peak(episodes: int) -> int:
 
 
 def memory() -> Go:
-    """Bytes an episode of a vector environment takes at most, temporaries and all: the difference between two batches."""
+    """Measure the bytes that an episode of a vector environment takes at most: the difference between two batches."""
 
     _peak(1)  # what is imported on the way counts for neither
 
@@ -312,7 +312,7 @@ class _Timed:
 
 
 def environment_share() -> Go:
-    """The environment's share of the processor time of training: PPO of Stable-Baselines3, 1024 x 32 steps, batches of 8192, 4 epochs."""
+    """Time the environment's share of a training by PPO of Stable-Baselines3: 1024 x 32 steps, batches of 8192, 4 epochs."""
     try:
         from tailgate.agents.learners.ppo import Config, Learner
     except ImportError as error:

@@ -1,4 +1,4 @@
-"""What others do: each peer that is installed, set up to run for about so many seconds. One that is not installed is missing, no error."""
+"""Measurements of the peers that are installed. One that is not installed is missing, and no error."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import tempfile
 from importlib import import_module
 from itertools import cycle
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import gymnasium
@@ -23,8 +24,8 @@ STEPS = 20  # of a single environment before it looks at the clock
 ASYNC = 64  # environments of the asynchronous vector environment
 
 
-def need(module: str, package: str, how: str) -> Any:
-    """The module. Raises Missing, with what to install, where it is not there."""
+def need(module: str, package: str, how: str) -> ModuleType:
+    """Return the module. Raises Missing, with what to install, where it is not there."""
     try:
         return import_module(module)
     except ImportError:
@@ -32,7 +33,7 @@ def need(module: str, package: str, how: str) -> Any:
 
 
 def stepped(env: Any, actions: list[Any], steps: int = STEPS) -> Go:
-    """Steps per second of a single environment, resets included; it looks at the clock every so many `steps`."""
+    """Return steps per second of a single environment, resets included; it looks at the clock every `steps`."""
     env.reset(seed=0)
     coming = cycle(actions)
 
@@ -47,7 +48,7 @@ def stepped(env: Any, actions: list[Any], steps: int = STEPS) -> Go:
 
 
 def batched(env: Any, rows: int = 16) -> Go:
-    """Steps per second of a vector environment, over all its rows, with actions drawn at random beforehand."""
+    """Return steps per second of a vector environment, over all its rows, with actions drawn at random beforehand."""
     env.reset(seed=0)
     env.action_space.seed(0)
     coming, size = cycle([env.action_space.sample() for _ in range(rows)]), int(env.num_envs)
@@ -62,31 +63,31 @@ def batched(env: Any, rows: int = 16) -> Go:
 
 
 def at_random(env: Any, count: int = 1024) -> list[Any]:
-    """Actions drawn at random beforehand."""
+    """Return actions drawn at random beforehand."""
     env.action_space.seed(0)
     return [env.action_space.sample() for _ in range(count)]
 
 
 def cartpole() -> Go:
-    """CartPole-v1 through gymnasium.make, as everybody makes it."""
+    """Step CartPole-v1 through gymnasium.make."""
     env = gymnasium.make("CartPole-v1")
     return stepped(env, at_random(env))
 
 
 def cartpole_vector(size: int) -> Go:
-    """Gymnasium's native vector environment of CartPole: no noise, no estimator."""
+    """Step Gymnasium's native vector environment of CartPole: no noise, no estimator."""
     return batched(gymnasium.make_vec("CartPole-v1", num_envs=size, vectorization_mode="vector_entry_point"))
 
 
 def highway() -> Go:
-    """highway-fast-v0 with one lane and one other car."""
+    """Step highway-fast-v0 with one lane and one other car."""
     need("highway_env", "highway-env", "pip install 'tailgate[highway]'")
     env = gymnasium.make("highway-fast-v0", config={"lanes_count": 1, "vehicles_count": 1})
     return stepped(env, [1], 5)  # idle: the only action that one lane needs
 
 
 def filterpy_kalman() -> Go:
-    """filterpy's Kalman filter, predict and update, on the model of car following."""
+    """Run filterpy's Kalman filter, predict and update, on the model of car following."""
     filters = need("filterpy.kalman", "filterpy", "pip install filterpy")
     model = load_scenario("stop-and-go-v0").brief().model
     f = filters.KalmanFilter(dim_x=3, dim_z=2, dim_u=1)
@@ -124,7 +125,7 @@ if __name__ == "__main__":
 
 
 def cartpole_async() -> Go:
-    """CartPole in Gymnasium's AsyncVectorEnv, one process an environment, on all cores."""
+    """Step CartPole in Gymnasium's AsyncVectorEnv, one process an environment, on all cores."""
     child = subprocess.Popen([sys.executable, "-c", _CHILD, str(ASYNC)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     assert child.stdin is not None and child.stdout is not None
     send, answer = child.stdin, child.stdout
@@ -159,7 +160,7 @@ def _routes() -> str:
 
 
 def sumo() -> Go:
-    """SUMO in this process (libsumo), five cars with its CACC model, whose positions and speeds are read in every step of 0.1 s."""
+    """Step SUMO in this process (libsumo): five cars of its CACC model, whose positions and speeds are read every 0.1 s."""
     with contextlib.redirect_stdout(sys.stderr):  # it has words about versions, which no record shall hold
         held = need("libsumo", "libsumo", "pip install 'tailgate[sumo]'")
     folder = tempfile.TemporaryDirectory(prefix="tailgate-")

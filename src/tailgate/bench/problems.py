@@ -43,7 +43,7 @@ class Case(NamedTuple):
 
 @cache
 def case(form: Form, batch: int) -> Case:
-    """Innovations as an honest step has them, to every second of which an injection is added."""
+    """Return innovations of honest steps, with an injection added to every second one."""
     scenario, agent, lam, sd = CASES[form]
     model = load_scenario(scenario).brief().model
     C, R, Qinv = model.C[agent], model.R[agent], fixed_point(model).Qinv[agent]
@@ -57,7 +57,7 @@ def _innovations(S: Array, sd: float, batch: int) -> Array:
 
 
 def exactly(c: Case, form: Form) -> Callable[[], Array]:
-    """The problems as the filter solves them in a step: xh - xb (B, n)."""
+    """Return the problems as the filter solves them in a step: xh - xb (B, n)."""
     r = num.batch_last(c.r[:, None])
     if form == "norm":
         constants = axes(c.C[None], c.R[None], num.root(c.Qinv[None])[0])
@@ -76,7 +76,7 @@ def _cvxpy() -> Any:
 
 
 def by_cvxpy(c: Case, form: Form) -> Callable[[], Array]:
-    """The same, one parametrised solve each: xh - xb (B, n)."""
+    """Return the same, one parametrised solve each: xh - xb (B, n)."""
     cp: Any = _cvxpy()
     white, root = np.linalg.inv(np.linalg.cholesky(c.R)), np.linalg.cholesky(c.Q).T
     d, a, r = cp.Variable(len(c.Q)), cp.Variable(len(c.C)), cp.Parameter(len(c.C))
@@ -101,7 +101,7 @@ def _solves(problem: Any, parameter: Any, wanted: Any, values: Array) -> Callabl
 
 
 def objective(c: Case, form: Form, d: Array) -> Array:
-    """(B,) the value of (5.8), or of (6.26) with the best a for this X (Huber's loss; Sv is diagonal there)."""
+    """Return (B,) the value of (5.8), or of (6.26) with the best a for this X (Huber's loss; Sv is diagonal there)."""
     e, prior = c.r - d @ c.C.T, np.einsum("bn,nm,bm->b", d, c.Q, d)
     if form == "norm":
         return np.asarray(c.lam * np.sqrt(np.einsum("bq,ql,bl->b", e, np.linalg.inv(c.R), e)) + prior)
@@ -115,17 +115,17 @@ def _counted(solve: Callable[[], Array]) -> Go:
 
 
 def ours(form: Form, batch: int) -> Go:
-    """Problems per second of the exact solver, `batch` at once."""
+    """Return problems per second of the exact solver, `batch` at once."""
     return _counted(exactly(case(form, batch), form))
 
 
 def theirs(form: Form) -> Go:
-    """Problems per second of cvxpy."""
+    """Return problems per second of cvxpy."""
     return _counted(by_cvxpy(case(form, ROWS), form))
 
 
 def above(form: Form) -> Go:
-    """By how much, relatively, an exact objective is above cvxpy's at most; negative where it is below everywhere."""
+    """Measure by how much, relatively, an exact objective is above cvxpy's at most; negative if it is below everywhere."""
     c = case(form, ROWS)
     mine, other = exactly(c, form), by_cvxpy(c, form)
     return lambda seconds: Sample(float(np.max(objective(c, form, mine()) / objective(c, form, other()) - 1.0)), 1.0)
@@ -153,7 +153,7 @@ def robust(batch: int) -> Robust:
 
 
 def robust_updates(batch: int) -> Go:
-    """Updates per second of the filter `rkf` with two sensors, `batch` at once."""
+    """Update the filter `rkf` with two sensors, `batch` at once."""
     held = robust(batch)
     accept = num.full(held.innovation.r.shape, True, bool)
 
@@ -165,7 +165,7 @@ def robust_updates(batch: int) -> Go:
 
 
 def robust_by_cvxpy() -> Go:
-    """The same update with a parametrised solve of its problem, one after the other."""
+    """Return the same update with a parametrised solve of its problem, one after the other."""
     cp: Any = _cvxpy()
     held = robust(ROWS)
     S, lam = held.innovation.S[0, 0], held.filter.price(held.innovation.S[:1])[0, 0]

@@ -1,4 +1,4 @@
-"""What is made of a record: a table for people, a page in Markdown, and plots of the scalings (extra: viz)."""
+"""A record for people: tables, a page in Markdown, and plots of the scalings (extra: viz)."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Record = dict[str, Any]
 
 
 def shown(value: float, unit: str) -> str:
-    """A figure with three digits and its unit."""
+    """Return a figure with three digits and its unit."""
     if unit == RATE:
         for size, letter in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
             if value >= 0.9995 * size:
@@ -45,7 +45,7 @@ def _ratio(value: float) -> str:
 
 
 def figure(target: Record, record: Record, key: str = "value") -> str:
-    """A target's figure, or one end of its interval."""
+    """Return a target's figure, or one end of its interval."""
     if target[key] is None:
         return ""
     if target["right"] is not None:
@@ -54,7 +54,7 @@ def figure(target: Record, record: Record, key: str = "value") -> str:
 
 
 def bound(target: Record, record: Record) -> str:
-    """What is asked."""
+    """Return what is asked."""
     if target["bound"] is None:
         return ""
     unit = record["lines"].get(target["left"], {}).get("unit", NUMBER)
@@ -63,42 +63,51 @@ def bound(target: Record, record: Record) -> str:
 
 
 def verdict(target: Record) -> str:
-    """met, missed, not asked, or why it is not known."""
+    """Return met, missed, nothing if nothing is asked, or why the figure is not known."""
     if target["value"] is None:
         return f"not measured: {target['why']}"
     return "" if target["met"] is None else "met" if target["met"] else "missed"
 
 
 def between(target: Record, record: Record) -> str:
-    """The interval over rounds."""
+    """Return the interval over rounds."""
     if target["value"] is None or target["low"] == target["high"]:
         return ""
     return f"{figure(target, record, 'low')} to {figure(target, record, 'high')}"
 
 
+def quartiles(line: Record) -> str:
+    """Return the spread of a line's rounds; empty where all are equal."""
+    return "" if line["q25"] == line["q75"] else f"{shown(line['q25'], line['unit'])} to {shown(line['q75'], line['unit'])}"
+
+
+def judged(target: Record, record: Record) -> tuple[str, str, str, str, str]:
+    """Return a target as people read it: what, figure, interval, bound, verdict."""
+    return target["what"], figure(target, record), between(target, record), bound(target, record), verdict(target)
+
+
+def _table(title: str, *heads: str) -> Table:
+    table = Table(title=title)
+    for head in heads:
+        table.add_column(head, overflow="fold")
+    return table
+
+
 def print_tables(record: Record, out: Console) -> None:
-    """Lines, then targets, on a console."""
-    table = Table(title=f"medians of {record['rounds']} rounds of {record['seconds']:g} s")
-    for heading in ("line", "what", "median", "quartiles"):
-        table.add_column(heading, overflow="fold")
+    """Print lines, then targets, on a console."""
+    table = _table(f"medians of {record['rounds']} rounds of {record['seconds']:g} s", "line", "what", "median", "quartiles")
     for name, line in record["lines"].items():
-        spread = "" if line["q25"] == line["q75"] else f"{shown(line['q25'], line['unit'])} to {shown(line['q75'], line['unit'])}"
-        table.add_row(name, escape(line["what"]), shown(line["median"], line["unit"]), spread)
+        table.add_row(name, escape(line["what"]), shown(line["median"], line["unit"]), quartiles(line))
     if record["lines"]:
         out.print(table)
     if record["targets"]:
-        table = Table(title="targets")
-        for heading in ("target", "what", "measured", "interval", "asked", "verdict"):
-            table.add_column(heading, overflow="fold")
+        table = _table("targets", "target", "what", "measured", "interval", "asked", "verdict")
         for target in record["targets"]:
-            row = (figure(target, record), between(target, record), bound(target, record), verdict(target))
-            table.add_row(target["name"], escape(target["what"]), *map(escape, row))
+            table.add_row(target["name"], *map(escape, judged(target, record)))
         out.print(table)
     for plot in record["scalings"]:
-        table = Table(title=escape(plot["what"]))
+        table = _table(escape(plot["what"]), *map(escape, (plot["axis"], *plot["curves"])))
         sizes = sorted({point["at"] for curve in plot["curves"].values() for point in curve})
-        for heading in (plot["axis"], *plot["curves"]):
-            table.add_column(escape(heading), overflow="fold")
         for n in sizes:
             at = [next((shown(p["median"], RATE) for p in curve if p["at"] == n), "") for curve in plot["curves"].values()]
             table.add_row(str(n), *at)
@@ -108,7 +117,7 @@ def print_tables(record: Record, out: Console) -> None:
 
 
 def page(record: Record, plots: list[str]) -> str:
-    """The record as a page in Markdown, with the names of the plots beside it."""
+    """Return the record as a page in Markdown; `plots` are the names of the pictures in the same folder."""
     machine = record["machine"]
     packages = ", ".join(f"{name} {number}" for name, number in machine["packages"].items())
     load = "" if record["load"] is None else f" The load over the last minute was {record['load'][0]} at the end."
@@ -123,13 +132,11 @@ def page(record: Record, plots: list[str]) -> str:
         "## Targets", "", "| what | measured | interval over rounds | asked | |", "|---|---|---|---|---|",
     ]  # fmt: skip
     for target in record["targets"]:
-        cells = (target["what"], figure(target, record), between(target, record), bound(target, record), verdict(target))
-        out.append(f"| {' | '.join(cells)} |")
+        out.append(f"| {' | '.join(judged(target, record))} |")
     out += ["", "## Lines", "", "| what | median | quartiles |", "|---|---|---|"]
     for line in record["lines"].values():
-        spread = "" if line["q25"] == line["q75"] else f"{shown(line['q25'], line['unit'])} to {shown(line['q75'], line['unit'])}"
         counted = f", {line['of']}" if line["unit"] == RATE and line["of"] != "steps" else ""
-        out.append(f"| {line['what']}{counted} | {shown(line['median'], line['unit'])} | {spread} |")
+        out.append(f"| {line['what']}{counted} | {shown(line['median'], line['unit'])} | {quartiles(line)} |")
     if record["missing"]:
         out += ["", "## Not measured", "", *(f"- {name}: {why}" for name, why in record["missing"].items())]
     if plots:
@@ -146,7 +153,7 @@ def plot_name(plot: Record) -> str:
 
 
 def draw(plot: Record) -> bytes:
-    """One scaling as a picture: medians, and quartiles as bars."""
+    """Draw one scaling as a picture: medians, and quartiles as bars."""
     from matplotlib.ticker import NullLocator
 
     from tailgate.base.plots import MARKERS, canvas, png
@@ -188,7 +195,7 @@ def check_place(directory: Path, wanted: set[str]) -> None:
 
 
 def write(record: Record, directory: Path) -> tuple[list[Path], str | None]:
-    """The record, its page and its plots; returns the paths, and why there are no plots."""
+    """Write the record, its page and its plots; return the paths, and why there are no plots."""
     paths, plots, why = [], [], None
     for plot in record["scalings"]:
         if not plot["curves"]:

@@ -1,4 +1,4 @@
-"""Measuring: rounds in which every line of a group runs once, A B A B ..., so that whatever slows the machine down slows both sides."""
+"""Measure in rounds: every line of a group runs once in each, A B A B ..., so that a slow machine slows both sides."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ Report = Callable[[str, int, int, str], None]  # label, done, total, figures
 
 
 def machine() -> dict[str, Any]:
-    """What the figures were made on."""
+    """Return what the figures were made on."""
     found: dict[str, Any] = {
         "processor": processor(), "vectors": _vectors(), "cores": os.cpu_count(), "system": f"{platform.system()} {platform.machine()}",
         "python": platform.python_version(), "packages": {},
@@ -46,13 +46,13 @@ def machine() -> dict[str, Any]:
 
 
 def _vectors() -> str:
-    """The widest vector instructions of this processor, as far as known."""
+    """Return the widest vector instructions of this processor, as far as known."""
     flags = cpuinfo("flags").split()
     return next((words for flag, words in (("avx512f", "AVX-512"), ("avx2", "AVX2"), ("asimd", "NEON")) if flag in flags), "unknown")
 
 
 def interval(values: Sequence[float], level: float = LEVEL) -> tuple[float, float, float]:
-    """Ends of an interval for the median from order statistics, and its coverage.
+    """Return ends of an interval for the median from order statistics, and its coverage.
 
     It is the narrowest one that covers at least `level`; where none does, from the smallest to the largest.
     No distribution is assumed, only rounds that do not depend on each other.
@@ -65,7 +65,7 @@ def interval(values: Sequence[float], level: float = LEVEL) -> tuple[float, floa
 
 
 def summary(line: Line, values: Sequence[float]) -> dict[str, Any]:
-    """Median and quartiles of a line."""
+    """Return median and quartiles of a line."""
     low, high = (statistics.quantiles(values, n=4, method="inclusive")[i] for i in (0, 2)) if len(values) > 1 else (values[0], values[0])
     return {
         "what": line.what, "unit": line.unit, "of": line.of, "ours": line.ours, "cores": line.cores, "median": statistics.median(values),
@@ -82,7 +82,7 @@ class Measured:
         self.missing: dict[str, str] = {}
 
     def measure(self, lines: Sequence[Line], rounds: int, said: Callable[[Line], None]) -> None:
-        """Sets the lines up, runs each once unmeasured, then round by round."""
+        """Set the lines up, runs each once unmeasured, then round by round."""
         ready = []
         for line in lines:
             said(line)
@@ -105,7 +105,7 @@ class Measured:
 
 
 def judged(target: Target, measured: Measured) -> dict[str, Any]:
-    """A target's figure, with the interval over rounds, and whether it is met; `met` is None where it is not known or nothing is asked."""
+    """Return a target's figure with the interval over rounds; `met` is None if it is not known or nothing is asked."""
     out: dict[str, Any] = {
         "name": target.name, "what": target.what, "left": target.left, "right": target.right, "bound": target.bound,
         "at": "most" if target.most else "least", "value": None, "low": None, "high": None, "coverage": None, "met": None,
@@ -128,7 +128,7 @@ def judged(target: Target, measured: Measured) -> dict[str, Any]:
 def bench(
     only_these: Iterable[str] | None = None, rounds: int = 7, seconds: float = 0.5, progress: Report | None = None
 ) -> dict[str, Any]:
-    """The record of a run: machine, lines, targets, scalings, and what is missing. Raises InputError for a name that does not exist."""
+    """Measure, and return the record: machine, lines, targets, scalings, what is missing. Raises InputError for an unknown name."""
     sizes.check("rounds", rounds)
     if not 0.0 < seconds <= 60.0:
         raise InputError("seconds", seconds, "seconds above 0, at most 60")
@@ -160,7 +160,7 @@ def bench(
 
 
 def _points(plot: Scaling) -> list[Line]:
-    """The lines of a plot, point by point: curves that meet at a point are measured side by side."""
+    """Return the lines of a plot, point by point: curves that meet at a point are measured side by side."""
     sizes = sorted({n for curve in plot.curves.values() for n in curve})
     return [curve[n] for n in sizes for curve in plot.curves.values() if n in curve]
 

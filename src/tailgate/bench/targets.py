@@ -54,7 +54,7 @@ LINES: tuple[Line, ...] = (
 
 @dataclass(frozen=True)
 class Target:
-    """What is asked: left over right, or left alone, is at least (or at most) the bound; without a bound it is shown and not judged."""
+    """A demand: left over right, or left alone, is at least (or at most) the bound. Without a bound it is shown and not judged."""
 
     name: str
     what: str
@@ -109,7 +109,7 @@ def _curve(name: str, sizes: Iterable[int], make: Callable[[int], Go], ours: boo
 
 
 def scalings() -> tuple[Scaling, ...]:
-    """What the plots show."""
+    """Return what the plots show."""
     sizes, lanes, cores = (1, 4, 16, 64, 256, 1024, 4096, 16384), (64, 256, 1024, 4096, 16384), range(1, (os.cpu_count() or 1) + 1)
     return (
         Scaling("scaling-episodes", "car following, episodes side by side", "episodes", {
@@ -132,7 +132,7 @@ def scalings() -> tuple[Scaling, ...]:
 
 
 def chosen(names: Iterable[str] | None) -> tuple[list[Target], list[Line], list[Scaling]]:
-    """The targets, lines and scalings of these names; all without any. Raises InputError for a name that does not exist."""
+    """Return the targets, lines and scalings of these names; all without any. Raises InputError for a name that does not exist."""
     lines, plots = {line.name: line for line in LINES}, {scaling.name: scaling for scaling in scalings()}
     targets = {target.name: target for target in TARGETS}
     if not names:
@@ -147,7 +147,7 @@ def chosen(names: Iterable[str] | None) -> tuple[list[Target], list[Line], list[
 
 
 def groups(lines: list[Line]) -> list[list[Line]]:
-    """The lines in groups that targets join: what is compared is measured side by side, and nothing else between."""
+    """Return the lines in groups that targets join: what is compared is measured side by side, and nothing else between."""
     of = {line.name: {line.name} for line in lines}
     for target in TARGETS:
         if all(name in of for name in target.lines):

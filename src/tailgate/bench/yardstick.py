@@ -14,7 +14,7 @@ import tempfile
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -40,7 +40,7 @@ Form = Literal["whole", "bare"]
 
 
 def compiler() -> str:
-    """The first line of the compiler's version. Raises Missing where there is no compiler."""
+    """Return the first line of the compiler's version. Raises Missing where there is no compiler."""
     name = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
     if name is None:
         raise Missing("no C compiler: the yardstick needs cc, gcc or clang")
@@ -49,8 +49,8 @@ def compiler() -> str:
 
 
 @cache
-def library() -> Any:
-    """The compiled yardstick. Raises Missing where there is no compiler, or where it fails."""
+def library() -> ctypes.CDLL:
+    """Compile the yardstick. Raises Missing where there is no compiler, or where it fails."""
     _ = compiler()
     name = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
     assert name is not None
@@ -72,7 +72,7 @@ def library() -> Any:
 
 
 def constants(place: Scenario) -> Array:
-    """The numbers of a scenario in the order of `enum constant`."""
+    """Return the numbers of a scenario in the order of `enum constant`."""
     plant, acc, road = place.plant, place.controller, place.manoeuvre
     model, reward = place.brief().model, Reward()
     A, B = model.A, model.B
@@ -107,25 +107,25 @@ class Yardstick:
         return tuple(part.ctypes.data for part in (self.state, self.words, self.constants, self.table))
 
     def run(self, steps: int) -> int:
-        """So many steps of every episode; returns how many episodes ended, and began anew."""
+        """Play `steps` of every episode; return how many episodes ended, and began again."""
         ended = getattr(self._held, self.form)(self.blocks, self.done, steps, *self._addresses())
         self.done += steps
         return int(ended)
 
     def row(self, name: str) -> Array:
-        """(n,) a row of the state by its name in ROW."""
+        """Return (n,) a row of the state by its name in ROW."""
         return self.state[:, ROW[name]].reshape(-1)
 
 
 def injection(place: Scenario, value: float, first: int, last: int) -> Array:
-    """(2, horizon + 1) the bias of both readings by step."""
+    """Return (2, horizon + 1) the bias of both readings by step."""
     bias = np.zeros((2, place.horizon + 1))
     bias[:, first : last + 1] = value
     return bias
 
 
 def line(form: Form, episodes: int) -> Go:
-    """Steps per second of the yardstick, under the injection that the loop is measured with."""
+    """Measure steps per second of the yardstick, under the injection that the loop is measured with."""
     place = load_scenario(SCENARIO)
     held = Yardstick(form, range(episodes), place, injection(place, -4.0, 50, 500))
 

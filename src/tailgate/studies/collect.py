@@ -16,7 +16,7 @@ from tailgate.agents.policy.zoo import FOLDER, zoo_names
 from tailgate.base import sizes
 from tailgate.base.errors import InputError
 from tailgate.base.files import writable_directory, write_atomic
-from tailgate.core import Array, draws
+from tailgate.core import Array, Attack, draws
 from tailgate.core.registry import Spec
 from tailgate.core.schema import as_data
 from tailgate.play.metrics import METRICS, unit_in
@@ -31,25 +31,25 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
 
 
 def thinned(curve: list[Any], points: int = POINTS) -> list[Any]:
-    """At most `points` of a learning curve, evenly spaced, the first and the last among them."""
+    """Return at most `points` of a learning curve, evenly spaced, the first and the last among them."""
     if len(curve) <= points:
         return list(curve)
     return [curve[round(i * (len(curve) - 1) / (points - 1))] for i in range(points)]
 
 
 def single(x: Array) -> Array:
-    """The array as float32 where no value changes by it, else as it is."""
+    """Return the array as float32 where no value changes by it, else as it is."""
     small = x.astype(np.float32)
     return small if np.array_equal(small.astype(np.float64), x) else x
 
 
 def packed(file: Path) -> bytes:
-    """A tensor file as the zoo keeps it, its arrays as `single` has them: of equal values, of equal bytes."""
+    """Return a tensor file as the zoo keeps it, its arrays as `single` has them: of equal values, of equal bytes."""
     return save_tensors({key: single(x) for key, x in load_tensors(file.read_bytes()).items()})
 
 
 def add_policy(policy: Path, name: str, summary: str, *, episodes: int = EPISODES, replace: bool = False, folder: Path = FOLDER) -> Path:
-    """Copy a trained policy into the zoo as `name`; returns its JSON file. Its outcome is measured anew, on report seeds.
+    """Copy a trained policy into the zoo as `name`; returns its JSON file. Its outcome is measured again, on report seeds.
 
     Raises InputError for a policy without a record of its training, for one that is too large, and, without `replace`, for a name
     that is taken.
@@ -74,7 +74,7 @@ def add_policy(policy: Path, name: str, summary: str, *, episodes: int = EPISODE
     keys = draws.keys("report", range(sizes.check("episodes", episodes)))
     outcome = outcome_for(who.outcome, scenario)
 
-    def measured(attack: Any) -> dict[str, float]:
+    def measured(attack: Attack) -> dict[str, float]:
         return mean(np.stack(played(loop, attack, keys, None, [METRICS[outcome]])), outcome)._asdict()
 
     training = record | {
@@ -113,7 +113,7 @@ def add_run(run: Path, prefix: str, summary: str = "", *, episodes: int = EPISOD
 
 
 def facts(path: Path) -> dict[str, Any]:
-    """What the command prints of a policy that was added."""
+    """Return what the command prints of a policy that was added."""
     data = json.loads(path.read_text(encoding="utf-8"))
     size = path.with_suffix(".safetensors").stat().st_size
     return {"name": path.stem, "file": str(path), "bytes": size, "sha256": data["sha256"], "measured": data["training"]["measured"]}

@@ -30,14 +30,14 @@ LEVEL = 0.95
 
 
 def fitted(values: Array) -> Array:
-    """The monotone regression of means (doses,), all measured on as many episodes."""
+    """Return the monotone regression of means (doses,), all measured on as many episodes."""
     from scipy.optimize import isotonic_regression
 
     return np.asarray(isotonic_regression(values, increasing=True).x)
 
 
 def critical_dose(doses: Array, curve: Array, limit: float) -> float:
-    """Where a monotone curve (doses,), straight between its points, first exceeds the limit [steps]; inf where it never does."""
+    """Return the dose [steps] at which a monotone curve (doses,), straight between its points, first exceeds the limit; inf for never."""
     above = np.flatnonzero(curve > limit)
     if not len(above):
         return math.inf
@@ -49,7 +49,7 @@ def critical_dose(doses: Array, curve: Array, limit: float) -> float:
 
 
 def critical_interval(doses: Array, outcomes: Array, limit: float, seed: int = 0) -> tuple[float, float]:
-    """Interval of the critical dose from outcomes (doses, episodes); inf where it lies beyond the largest dose."""
+    """Return interval of the critical dose from outcomes (doses, episodes); inf where it lies beyond the largest dose."""
     rng = np.random.default_rng(seed)
     episodes = outcomes.shape[1]
     found = np.sort([
@@ -64,7 +64,7 @@ def dose_response(
     threat: dict[str, Any] | None = None, outcome: str | None = None, exceeds: float | None = None, limit: float | None = None,
     purpose: str = "report", workers: int = 1, rows_file: Path | None = None, progress: Callable[[int, int], None] | None = None,
 ) -> dict[str, Any]:  # fmt: skip
-    """The report: a curve for each attack and defence. Dose 0 is no attack.
+    """Play, and return the report: a curve for each attack and defence. Dose 0 is no attack.
 
     outcome: a metric. exceeds: count the episodes in which it exceeds this value, instead of its mean. limit: of the mean or the share that
     makes a dose critical; 0.1 of shares, and none of means.
@@ -81,26 +81,26 @@ def dose_response(
     if not steps or any(isinstance(dose, bool) or not isinstance(dose, int) or dose < 1 for dose in steps):
         raise InputError("doses", list(doses), "whole numbers of attack steps, at least 1")
     threat = dict(threat or {})
-    guards, rivals = tuple(dict.fromkeys(defences)), tuple(dict.fromkeys(attacks))
-    if not guards or not rivals:
-        raise InputError("attacks and defences", [*rivals, *guards], "at least one of each")
+    against, tried = tuple(dict.fromkeys(defences)), tuple(dict.fromkeys(attacks))
+    if not against or not tried:
+        raise InputError("attacks and defences", [*tried, *against], "at least one of each")
     reasons = {
-        rival: misfit(Cell("", scenario, steps[0], guards[0], rival, 1, threat=threat)) for rival in rivals if is_policy(rival)
+        attack: misfit(Cell("", scenario, steps[0], against[0], attack, 1, threat=threat)) for attack in tried if is_policy(attack)
     }  # fmt: skip
-    playing = tuple(rival for rival in rivals if not reasons.get(rival))
-    suites = [Suite("dose-response", "", (scenario,), (0,), guards, ("none",), episodes, threat)]
-    suites.append(Suite("dose-response", "", (scenario,), tuple(steps), guards, playing, episodes, threat))
+    playing = tuple(attack for attack in tried if not reasons.get(attack))
+    suites = [Suite("dose-response", "", (scenario,), (0,), against, ("none",), episodes, threat)]
+    suites.append(Suite("dose-response", "", (scenario,), tuple(steps), against, playing, episodes, threat))
     cells = [cell for suite in suites for cell in cells_of(suite, purpose=purpose)]
     rows = run(cells, rows_file, workers, progress)
     held: dict[tuple[str, str, int], list[dict[str, Any]]] = {}
     for i, cell in enumerate(cells):
         held[cell.defence, cell.attack, cell.dose or 0] = rows[i * episodes : (i + 1) * episodes]
     curves = []
-    for guard in guards:
-        for rival in playing:
-            played = [held[guard, "none", 0], *(held[guard, rival, dose] for dose in steps)]
-            curves.append(_curve(rival, guard, played, [0, *steps], counted, exceeds, limit))
-    curves += [{"attack": attack, "defence": guard, "skipped": why} for guard in guards for attack, why in reasons.items() if why]
+    for defence in against:
+        for attack in playing:
+            played = [held[defence, "none", 0], *(held[defence, attack, dose] for dose in steps)]
+            curves.append(_curve(attack, defence, played, [0, *steps], counted, exceeds, limit))
+    curves += [{"attack": attack, "defence": defence, "skipped": why} for defence in against for attack, why in reasons.items() if why]
     place = load_scenario(scenario).with_threat(**threat)
     return {
         "measure": "dose-response", "scenario": scenario, "purpose": purpose, "episodes": episodes, "outcome": counted,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -12,13 +12,16 @@ from tailgate.base.plots import MARKERS, canvas, png
 from .policies import label
 from .timing import TWINS
 
+if TYPE_CHECKING:
+    from matplotlib.patches import Rectangle
+
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")  # Okabe and Ito
 LINES = ("-", "--", "-.", ":")
 WORDS = {"crashed": "episodes with a collision", "collided": "episodes with a collision ahead"}
 
 
 def axis_label(outcome: str, unit: str, exceeds: float | None = None) -> str:
-    """What is measured, with its unit."""
+    """Return what is measured, with its unit."""
     if unit == "0/1":
         what = WORDS.get(outcome, f"episodes with {outcome}") if exceeds is None else f"episodes with {outcome} above {exceeds:g}"
         return f"{what} [%]"
@@ -30,7 +33,7 @@ def _scale(unit: str) -> float:
 
 
 def timing_figure(entries: Sequence[dict[str, Any]]) -> bytes:
-    """One line per entry and schedule: the outcome with its interval. One panel per outcome."""
+    """Draw one line per entry and schedule: the outcome with its interval. One panel per outcome."""
     outcomes = list(dict.fromkeys((e["outcome"], e["unit"]) for e in entries))
     heights = [sum((e["outcome"], e["unit"]) == key for e in entries) for key in outcomes]
     figure, axes = canvas(8.5, 1.3 + 0.9 * sum(heights) + 0.5 * len(outcomes), len(outcomes), 1, height_ratios=heights)
@@ -57,7 +60,7 @@ def timing_figure(entries: Sequence[dict[str, Any]]) -> bytes:
 
 
 def dose_figure(report: dict[str, Any]) -> bytes:
-    """One panel per defence, one curve per attack: the measured outcomes with intervals, and the monotone regression."""
+    """Draw one panel per defence, one curve per attack: the measured outcomes with intervals, and the monotone regression."""
     curves = [c for c in report["curves"] if "points" in c]
     defences, attacks = (list(dict.fromkeys(c[key] for c in curves)) for key in ("defence", "attack"))
     columns = min(3, len(defences))
@@ -98,8 +101,9 @@ def dose_figure(report: dict[str, Any]) -> bytes:
 
 
 def transfer_figure(report: dict[str, Any]) -> bytes:
-    """Trained on (rows, below a row without an attack) x played on (columns): the mean outcome; framed where both are the same, starred
-    where flagged. Shades are of the logarithm where the outcome is no share."""
+    """Draw the mean outcome of what was trained on (rows, below a row without an attack) and played on (columns).
+
+    Frames: both are the same; stars: flagged. Shades are of the logarithm where the outcome is no share."""
     rows, columns, share = ["(no attack)", *report["trained_on"]], report["played_on"], report["unit"] == "0/1"
     grid = np.full((len(rows), len(columns)), np.nan)
     grid[0] = [report["no_attack"].get(column, np.nan) for column in columns]
@@ -129,7 +133,7 @@ def transfer_figure(report: dict[str, Any]) -> bytes:
     return png(figure)
 
 
-def _frame(column: int, row: int) -> Any:
-    from matplotlib.patches import Rectangle
+def _frame(column: int, row: int) -> Rectangle:
+    from matplotlib import patches
 
-    return Rectangle((column - 0.47, row - 0.45), 0.94, 0.9, fill=False, edgecolor="black", linewidth=1.8)
+    return patches.Rectangle((column - 0.47, row - 0.45), 0.94, 0.9, fill=False, edgecolor="black", linewidth=1.8)

@@ -2,7 +2,7 @@
 
 One row per step and agent. Training episodes have seeds of the purpose `train` and development episodes of `tune`: neither ever meets the
 seeds of a board. The attacks that a suite holds out are not in its logs, so that a board also shows what a detector makes of attacks that
-it has never seen. Each cell is a part of its own until all are done, so that an interrupted log goes on; the same log has the same bytes.
+it has never seen. Each cell is a separate part until all are done, so that an interrupted log goes on; the same log has the same bytes.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import os
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -25,7 +26,7 @@ from tailgate.base.locks import alone
 from tailgate.base.pytree import duplicate
 from tailgate.base.reading import load_json
 from tailgate.base.version import VERSION
-from tailgate.core import Array, Frame, Model, draws
+from tailgate.core import Array, Attack, Frame, Model, draws
 from tailgate.core.draws import Role
 from tailgate.core.kinds import Kind, Mode
 from tailgate.core.loop import Loop, LoopState
@@ -44,8 +45,8 @@ _KINDS = np.array([kind.name.lower() for kind in Kind])
 _MODES = np.array([mode.name.lower() for mode in Mode])
 
 
-def pyarrow() -> tuple[Any, Any]:
-    """pyarrow and pyarrow.parquet."""
+def pyarrow() -> tuple[ModuleType, ModuleType]:
+    """Import pyarrow and pyarrow.parquet."""
     try:
         import pyarrow
         import pyarrow.parquet
@@ -101,7 +102,7 @@ def _chosen(
     base: Suite, scenarios: Sequence[str] | None, doses: Sequence[int | None] | None, defences: Sequence[str] | None,
     attacks: Sequence[str] | None,
 ) -> Suite:  # fmt: skip
-    """The part of the suite that is logged, with the episodes without attack."""
+    """Return the part of the suite that is logged, with the episodes without attack."""
     for text in attacks or ():
         if hidden := _hidden(base, text):
             raise InputError("attack", text, f"an attack that {base.name} does not hold out of its logs, as it does {', '.join(hidden)}")
@@ -119,12 +120,12 @@ def _held_out(base: Suite) -> set[str]:
 
 
 def _hidden(base: Suite, text: str) -> list[str]:
-    """The families that the suite holds out and the attack belongs to."""
+    """Return the families that the suite holds out and the attack belongs to."""
     return sorted(families(text) & _held_out(base))
 
 
 def _whole(folder: Path) -> dict[str, Any] | None:
-    """What schema.json holds, which is written last; None where the log is not whole."""
+    """Return what schema.json holds, which is written last; None where the log is not whole."""
     try:
         held: dict[str, Any] = load_json(folder / "schema.json")
         sizes = [(folder / file["path"]).stat().st_size == file["bytes"] for file in held["files"]]
@@ -145,10 +146,10 @@ def _written(
     for done, (split, cell) in enumerate(every, 1):
         part = parts / f"{cell_id(cell)}.parquet"
         try:
-            loop, place, rival = _ready(cell)
-            columns.setdefault(cell.scenario, (place, loop.model, columns_of(loop)))
+            loop, scenario, attack = _ready(cell)
+            columns.setdefault(cell.scenario, (scenario, loop.model, columns_of(loop)))
             if not _good(part, cell):
-                _play_part(part, split, cell, loop, rival, columns[cell.scenario][2])
+                _play_part(part, split, cell, loop, attack, columns[cell.scenario][2])
         except NotApplicable as error:  # some attacks find out only when they look at the defence
             skipped.append({"split": split, **_named(cell), "reason": str(error)})
         if progress is not None:
@@ -178,14 +179,14 @@ def _named(cell: Cell) -> dict[str, Any]:
     return {"scenario": cell.scenario, "dose": cell.dose, "defence": cell.defence, "attack": cell.attack}
 
 
-def _ready(cell: Cell) -> tuple[Loop, Scenario, Any]:
-    """The loop, the scenario and the attack of a cell. Raises NotApplicable for a pairing without meaning."""
-    guard, rival = Spec("defence", cell.defence), Spec("attack", cell.attack)
-    attack = rival.make()
-    place = cell.place(attack, rival.entry.knowledge)
-    loop = place.loop(guard.make(), guard.entry.uses)
+def _ready(cell: Cell) -> tuple[Loop, Scenario, Attack]:
+    """Return the loop, the scenario and the attack of a cell. Raises NotApplicable for a pairing without meaning."""
+    defence, spec = Spec("defence", cell.defence), Spec("attack", cell.attack)
+    attack: Attack = spec.make()
+    scenario = cell.place(attack, spec.entry.knowledge)
+    loop = scenario.loop(defence.make(), defence.entry.uses)
     attack.prepare(loop.brief)
-    return loop, place, attack
+    return loop, scenario, attack
 
 
 def _schema(columns: Sequence[Column]) -> Any:
@@ -194,7 +195,7 @@ def _schema(columns: Sequence[Column]) -> Any:
 
 
 def _good(part: Path, cell: Cell) -> bool:
-    """Whether the part is whole: Parquet keeps its index, and this the cell, at the end."""
+    """Return whether the part is whole: Parquet keeps its index, and this the cell, at the end."""
     pa, pq = pyarrow()
     try:
         held = pq.ParquetFile(part).schema_arrow.metadata or {}
@@ -203,8 +204,8 @@ def _good(part: Path, cell: Cell) -> bool:
     return bool(held.get(b"cell") == cell_id(cell).encode())
 
 
-def _play_part(part: Path, split: str, cell: Cell, loop: Loop, rival: Any, columns: Sequence[Column]) -> None:
-    """One cell as a Parquet file, a row group for so many episodes as GROUP holds."""
+def _play_part(part: Path, split: str, cell: Cell, loop: Loop, attack: Attack, columns: Sequence[Column]) -> None:
+    """Play one cell into a Parquet file, with a row group for as many episodes as GROUP holds."""
     pa, pq = pyarrow()
     schema, size = _schema(columns), max(1, GROUP // (loop.horizon * loop.model.agents))
     schema = schema.with_metadata({"cell": cell_id(cell)})
@@ -212,7 +213,7 @@ def _play_part(part: Path, split: str, cell: Cell, loop: Loop, rival: Any, colum
     with replacing(part) as file, pq.ParquetWriter(file, schema, compression="zstd") as writer:
         for first in range(0, cell.seeds, size):
             seeds = range(first, min(first + size, cell.seeds))
-            values = _table(loop, rival, draws.keys(cell.purpose, seeds), seeds)
+            values = _table(loop, attack, draws.keys(cell.purpose, seeds), seeds)
             count = len(values["k"])
             arrays = [
                 _array(pa, field, fixed[field.name], count) if field.name in fixed else _array(pa, field, values[field.name], count)
@@ -221,14 +222,14 @@ def _play_part(part: Path, split: str, cell: Cell, loop: Loop, rival: Any, colum
             writer.write_table(pa.Table.from_arrays(arrays, schema=schema), row_group_size=count)
 
 
-def _array(pa: Any, field: Any, value: Any, count: int) -> Any:
+def _array(pa: ModuleType, field: Any, value: Any, count: int) -> Any:
     if not isinstance(value, np.ndarray):
         return pa.array([value] * count, field.type)
     return pa.array(value, field.type, mask=np.isnan(value) if field.nullable else None)
 
 
-def steps(loop: Loop, attack: Any, keys: draws.Keys) -> Iterator[tuple[LoopState, Frame, Array, Array]]:
-    """Each step of B episodes: the state before it, its frame, the innovation (B, N, q), NaN where there is none, and live (B,) bool."""
+def steps(loop: Loop, attack: Attack, keys: draws.Keys) -> Iterator[tuple[LoopState, Frame, Array, Array]]:
+    """Yield each step of B episodes: the state before it, its frame, the innovation (B, N, q), NaN if none, and live (B,) bool."""
     state = loop.start(keys)
     plan = attack.prepare(loop.brief)
     memory: Any = attack.start(plan, len(keys.key), keys.at(Role.ATTACK, np.zeros(len(keys.key), np.int64)))
@@ -250,8 +251,8 @@ def _innovation(loop: Loop, state: LoopState, frame: Frame) -> Array:
     return np.asarray(loop.defence.look(loop.plan.defence, state.defence, heard, state.known_u).innovation.r)
 
 
-def _table(loop: Loop, attack: Any, keys: draws.Keys, seeds: range) -> dict[str, Array]:
-    """Columns of the episodes: episode by episode, in it step by step, in it agent by agent."""
+def _table(loop: Loop, attack: Attack, keys: draws.Keys, seeds: range) -> dict[str, Array]:
+    """Return columns of the episodes: episode by episode, in it step by step, in it agent by agent."""
     model, held, alive = loop.model, [], []
     for state, frame, innovation, live in steps(loop, attack, keys):
         held.append(_step(loop, state, frame, innovation))
@@ -270,7 +271,7 @@ def _table(loop: Loop, attack: Any, keys: draws.Keys, seeds: range) -> dict[str,
 
 
 def _step(loop: Loop, state: LoopState, frame: Frame, innovation: Array) -> dict[str, Array]:
-    """(B, N) of every column that changes from step to step."""
+    """Return (B, N) of every column that changes from step to step."""
     model, received, estimate, command = loop.model, frame.received, frame.estimate, frame.command
     sensors, agents = model.sensors, (len(frame.k), model.agents)
     hit = command.target & (command.kind != 0)[:, None, None]
@@ -295,7 +296,7 @@ def _step(loop: Loop, state: LoopState, frame: Frame, innovation: Array) -> dict
 
 
 def _joined(folder: Path, parts: Path, split: str, scenario: str, cells: Sequence[Cell], columns: Sequence[Column]) -> dict[str, Any]:
-    """One file of the parts, row group by row group; what schema.json says of it."""
+    """Return one file of the parts, row group by row group; what schema.json says of it."""
     _, pq = pyarrow()
     path, schema = folder / split / f"{Path(scenario).stem}.parquet", _schema(columns)
     rows = groups = 0

@@ -1,9 +1,13 @@
-"""What the columns of a log mean, and the data card that is written beside it."""
+"""The meaning of a log's columns, and its data card."""
 
 from __future__ import annotations
 
 from typing import Any, Literal, NamedTuple
 
+import numpy as np
+
+from tailgate.core import draws
+from tailgate.core.draws import Draws
 from tailgate.core.loop import Loop
 
 LICENCE = "CC0-1.0"
@@ -28,7 +32,7 @@ class Column(NamedTuple):
 
 
 def unit_of(wire: str) -> str:
-    """Unit of a wire by the quantity in its name; 1 for the dimensionless sensors of a network."""
+    """Return the unit of a wire by the quantity in its name; 1 for the dimensionless sensors of a network."""
     for words, unit in (
         (("acceleration", "command"), "m/s^2"), (("speed", "velocity"), "m/s"), (("position", "distance", "gap"), "m"),
     ):  # fmt: skip
@@ -38,7 +42,7 @@ def unit_of(wire: str) -> str:
 
 
 def columns_of(loop: Loop) -> list[Column]:
-    """The columns of a scenario's log, in their order."""
+    """Return the columns of a scenario's log, in their order."""
     model = loop.model
     out = [
         Column("suite", "string", "", "key", "suite"), Column("scenario", "string", "", "key", "scenario"),
@@ -86,17 +90,12 @@ def columns_of(loop: Loop) -> list[Column]:
     return [*out, Column("truth_collided", "bool_", "", "truth", "somebody collided in this step, the episode's last where that ends it")]
 
 
-def _one_row() -> Any:
-    import numpy as np
-
-    from tailgate.core.draws import Role as Stream
-    from tailgate.core.draws import keys
-
-    return keys("train", [0]).at(Stream.PRIOR, np.zeros(1, np.int64))
+def _one_row() -> Draws:
+    return draws.keys("train", [0]).at(draws.Role.PRIOR, np.zeros(1, np.int64))
 
 
 def readme(held: dict[str, Any]) -> str:
-    """The data card (README.md) of a log, from what schema.json holds."""
+    """Return the data card (README.md) of a log, from what schema.json holds."""
     out = [f"# Episodes of {held['suite']}", "", held["about"] or "Simulated episodes.", ""]
     out += [
         f"Made by tailgate {held['version']}, format {held['format']}, identity {held['identity']}. Everything is simulated: nobody's "

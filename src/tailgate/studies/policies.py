@@ -1,4 +1,4 @@
-"""What a measurement needs to know of a trained policy: where it was trained, and where it is played."""
+"""Trained policies as measurements need them: where each was trained, and where it is played."""
 
 from __future__ import annotations
 
@@ -53,13 +53,13 @@ class Trained(NamedTuple):
 
 
 def is_policy(text: str) -> bool:
-    """Whether an attack's text names a policy: a file, or one of the zoo."""
+    """Return whether an attack's text names a policy: a file, or one of the zoo."""
     spec = Spec("attack", text)
     return not spec.imports and spec.entry.cls in (PolicyAttack, ZooAttack)
 
 
 def misfit(cell: Cell) -> str:
-    """Why the policy of a cell cannot be played there, or nothing: its observation or its actions are others."""
+    """Return why the policy of a cell cannot be played there (other observations or actions), or nothing."""
     spec = Spec("attack", cell.attack)
     policy = spec.make()
     try:
@@ -70,7 +70,7 @@ def misfit(cell: Cell) -> str:
 
 
 def trained(text: str) -> Trained:
-    """A policy by its JSON file or its name in the zoo, `zoo:name=NAME`. Raises InputError for any other attack."""
+    """Return a policy by its JSON file or its name in the zoo, `zoo:name=NAME`. Raises InputError for any other attack."""
     if not is_policy(text):
         raise InputError("policy", text, "the JSON file of an exported policy, or zoo:name=NAME")
     made = Spec("attack", text).make()
@@ -94,7 +94,7 @@ def trained(text: str) -> Trained:
 
 
 def distinct(texts: Sequence[str]) -> list[Trained]:
-    """The policies, each once: a copy of one under another name is no training seed more."""
+    """Return the policies, each once: a copy of one under another name is no training seed more."""
     out: dict[str, Trained] = {}
     for text in texts:
         who = trained(text)
@@ -103,7 +103,7 @@ def distinct(texts: Sequence[str]) -> list[Trained]:
 
 
 def origin_of(text: str) -> dict[str, Any] | None:
-    """What a trained policy says of its training: against which defence (digest, version), by which plan, and the training seed."""
+    """Return what a trained policy says of its training: against which defence (digest, version), by which plan, and the training seed."""
     if not is_policy(text):
         return None
     who = trained(text)
@@ -118,9 +118,11 @@ def origin_of(text: str) -> dict[str, Any] | None:
     }  # fmt: skip
 
 
-def rising(curve: Any) -> bool:
-    """Whether a learning curve still rose when training ended: the line through its last quarter, by more than two standard errors of its
-    slope, and by more than a twentieth of all that was learned."""
+def rising(curve: object) -> bool:
+    """Return whether a learning curve still rose when training ended.
+
+    The line through its last quarter rises by more than two standard errors of its slope, and by over a twentieth of all that was learned.
+    """
     rewards = [point.get("reward") for point in curve if isinstance(point, dict)] if isinstance(curve, list) else []
     y = np.array([x for x in rewards if isinstance(x, int | float)], np.float64)
     last = y[-(len(y) // 4) :] if len(y) >= 4 * LEAST else y[:0]
@@ -133,7 +135,7 @@ def rising(curve: Any) -> bool:
     return slope > 2.0 * error and slope * (len(last) - 1) > 0.05 * float(np.ptp(y))
 
 
-def _harmless(family: Family, held: Any, where: str) -> None:
+def _harmless(family: Family, held: object, where: str) -> None:
     """Raise InputError when a component that a record names would have to be imported: only a command line names code."""
     for text in held if isinstance(held, list) else [held]:
         try:
@@ -145,12 +147,12 @@ def _harmless(family: Family, held: Any, where: str) -> None:
             raise InputError(where, text, f"a component's text ({type(error).__name__})") from None
 
 
-def _text(value: Any) -> str | None:
+def _text(value: object) -> str | None:
     return value if isinstance(value, str) else None
 
 
 def place_of(who: Trained, named: str | None = None) -> str:
-    """The scenario that the user names, or else that of the training: a registered one, as a record shall not choose a file."""
+    """Return the scenario that the user names, or else that of the training: a registered one, as a record shall not choose a file."""
     if named:
         return named
     found = _required(who.scenario, "scenario", who)
@@ -160,7 +162,7 @@ def place_of(who: Trained, named: str | None = None) -> str:
 
 
 def defence_of(who: Trained, named: str | None = None) -> str:
-    """The defence that the user names, or else that of the training."""
+    """Return the defence that the user names, or else that of the training."""
     return named or _required(who.defence, "defence", who)
 
 
@@ -171,7 +173,7 @@ def _required(value: str | None, option: str, who: Trained) -> str:
 
 
 def outcome_for(outcome: str | None, scenario: str) -> str:
-    """The metric that is counted: the one asked for, else crashed, or rmse_position where there is no road."""
+    """Return the metric that is counted: the one asked for, else crashed, or rmse_position where there is no road."""
     if outcome is not None and outcome not in METRICS:
         raise unknown("outcome", outcome, METRICS)
     return outcome_of(TrainConfig(scenario=scenario, outcome=outcome))
@@ -183,7 +185,7 @@ def check_episodes(episodes: int) -> None:
 
 
 def loop_for(who: Trained, scenario: str, defence: str, threat: dict[str, Any], dose: int | None = None) -> Loop:
-    """The loop that a policy is played in, with the knowledge that it was trained with."""
+    """Return the loop that a policy is played in, with the knowledge that it was trained with."""
     place = Cell("", scenario, dose, defence, who.text, 1, threat=threat).place(who.policy, who.header.knowledge)
     spec = Spec("defence", defence)
     loop = place.loop(spec.make(), spec.entry.uses)
@@ -192,7 +194,7 @@ def loop_for(who: Trained, scenario: str, defence: str, threat: dict[str, Any], 
 
 
 def mean(x: Array, outcome: str) -> Interval:
-    """Mean of outcomes (training seeds, episodes): the exact interval of shares of one policy, else over episodes and seeds."""
+    """Return mean of outcomes (training seeds, episodes): the exact interval of shares of one policy, else over episodes and seeds."""
     if UNITS[outcome] != SHARE:
         return paired_difference(x, np.zeros_like(x))
     if len(x) == 1:
@@ -202,30 +204,30 @@ def mean(x: Array, outcome: str) -> Interval:
 
 
 def is_share(outcome: str) -> bool:
-    """Whether a metric is yes or no, so that its mean is a share."""
+    """Return whether a metric is yes or no, so that its mean is a share."""
     return UNITS[outcome] == SHARE
 
 
 def shown(value: float, share: bool, sign: str = "") -> str:
-    """An outcome, or with sign "+" a difference of two, as people read it."""
+    """Return an outcome, or with sign "+" a difference of two, as people read it."""
     if not share:
         return f"{value:{sign}.3g}"
     return f"{100 * value:{sign}.1f} {'points' if sign else '%'}"
 
 
 def between(interval: dict[str, float], share: bool, sign: str = "") -> str:
-    """An interval as people read it, without its unit."""
+    """Return an interval as people read it, without its unit."""
     scale, digits = (100.0, ".1f") if share else (1.0, ".3g")
     return f"{scale * interval['low'] + 0.0:{sign}{digits}} to {scale * interval['high'] + 0.0:{sign}{digits}}"
 
 
 def label(text: str, width: int = 30) -> str:
-    """A component's text over several lines that break at commas and blanks only, never inside a word."""
+    """Return a component's text over several lines that break at commas and blanks only, never inside a word."""
     return textwrap.fill(text.replace(",", ", "), width, break_long_words=False, break_on_hyphens=False)
 
 
 def changes(pairs: Sequence[str]) -> dict[str, Any]:
-    """The changes of a threat model that --threat key=value names."""
+    """Return the changes of a threat model that --threat key=value names."""
     from tailgate.core.schema import scalar
 
     out = {}

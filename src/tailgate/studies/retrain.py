@@ -21,7 +21,7 @@ Verdict = Literal["same", "differs", "unchecked"]
 
 
 class Again(NamedTuple):
-    """What became of one policy; `sha256` of its weights as they are shared, and of those that came out here."""
+    """The result for one policy; `sha256` of its weights as they are shared, and of those that came out here."""
 
     policy: str
     verdict: Verdict
@@ -65,7 +65,7 @@ def retrain(text: str, progress: Callable[[train.TrainConfig, Progress], None] |
 
 
 def _unlike(who: Trained) -> str:
-    """In which versions the training of a policy's file was another than one here is, in words."""
+    """Say in which versions the training of a policy's file differs from one here."""
     held, here = who.header.training.get("made_with"), made_with(who.learner)
     if not isinstance(held, dict):
         return "not recorded what it was trained with"
@@ -74,7 +74,7 @@ def _unlike(who: Trained) -> str:
 
 
 def _config(who: Trained) -> train.TrainConfig:
-    """The training as the policy's file records it, of the one seed. Raises InputError where it cannot be repeated here."""
+    """Return the training as the policy's file records it, of the one seed. Raises InputError where it cannot be repeated here."""
     where, record = f"policy {who.name}: training", who.header.training
     held = record.get("config")
     if not isinstance(held, dict) or who.seed is None:
@@ -90,6 +90,6 @@ def _config(who: Trained) -> train.TrainConfig:
 
 
 def _teacher(record: dict[str, Any], config: train.TrainConfig) -> str | None:
-    """The script that was shown: where the best of the rivals was, the record names it, which saves choosing it again."""
+    """Return the script that was shown: where the best of the rivals was, the record names it, which saves choosing it again."""
     held = record.get("teacher", config.teacher)
     return held if held is None or isinstance(held, str) else config.teacher

@@ -1,4 +1,4 @@
-"""What an attacker's timing is worth: its outcome against that of the same policy at other times.
+"""The worth of an attacker's timing: its outcome against that of the same policy at other times.
 
     timing advantage = P(damage | own schedule) - P(damage | yoked schedule)
 
@@ -36,14 +36,14 @@ _SHUFFLE = 1  # tag of the draws in the policy's stream, at step 0
 
 
 class Played(NamedTuple):
-    """What one policy did on each episode, (B,) under each schedule: its outcome and how many of its steps took effect."""
+    """The results of one policy, (B,) under each schedule: its outcome and how many of its steps took effect."""
 
     outcome: dict[str, Array]
     steps: dict[str, Array]
 
 
 def shuffled(recorded: Array, first: int, last: int, chance: Draws) -> Array:
-    """As many steps of each episode as `recorded` (K, B) bool has, at random among the steps first..last, counted from 1."""
+    """Return as many steps of each episode as `recorded` (K, B) bool has, at random among the steps first..last, counted from 1."""
     order = np.ascontiguousarray(chance.uniform((len(recorded),), tag=_SHUFFLE).T)
     order[: first - 1], order[last:] = 2.0, 2.0  # behind every step that is allowed
     rank = np.argsort(np.argsort(order, axis=0, kind="stable"), axis=0, kind="stable")
@@ -51,7 +51,7 @@ def shuffled(recorded: Array, first: int, last: int, chance: Draws) -> Array:
 
 
 def periodic(recorded: Array, first: int, last: int) -> Array:
-    """As many steps of each episode as `recorded` (K, B) bool has, evenly spread over the steps first..last, counted from 1."""
+    """Return as many steps of each episode as `recorded` (K, B) bool has, evenly spread over the steps first..last, counted from 1."""
     out = np.zeros_like(recorded)
     span = min(last, len(recorded)) - first + 1
     count, at = np.count_nonzero(recorded, axis=0), np.arange(span + 1)[:, None]
@@ -61,7 +61,7 @@ def periodic(recorded: Array, first: int, last: int) -> Array:
 
 
 def recorded(loop: Loop, policy: PolicyAttack, keys: Keys) -> Array:
-    """(K, B) bool: the steps at which a policy attacks, to the horizon: an episode that ended early would have a short schedule."""
+    """Return (K, B) bool: the steps at which a policy attacks, to the horizon: an episode that ended early would have a short schedule."""
     out = np.zeros((loop.horizon, len(keys.key)), bool)
     for rows, part in _parts(loop, keys):
         out[:, rows] = rollout(loop, policy, part, terminate=False).kind != 0
@@ -69,7 +69,7 @@ def recorded(loop: Loop, policy: PolicyAttack, keys: Keys) -> Array:
 
 
 def played(loop: Loop, policy: Any, keys: Keys, schedule: Array | None, counts: Sequence[Callable[[Trace], Array]]) -> list[Array]:
-    """Metrics (B,) each of a policy at its own times, as of any attack, or where a `schedule` (K, B) is given at those."""
+    """Play, and return metrics (B,) each of a policy at its own times, as of any attack, or where a `schedule` (K, B) is given at those."""
     out = [np.empty(len(keys.key)) for _ in counts]
     for rows, part in _parts(loop, keys):
         trace = rollout(loop, policy if schedule is None else Yoked(policy, schedule[:, rows]), part)
@@ -79,26 +79,26 @@ def played(loop: Loop, policy: Any, keys: Keys, schedule: Array | None, counts: 
 
 
 def _parts(loop: Loop, keys: Keys) -> list[tuple[slice, Keys]]:
-    """As many episodes at a time as the memory for their traces allows."""
+    """Return slices of as many episodes at a time as the memory for their traces allows."""
     size = episodes_at_once(loop.model, loop.horizon, BATCH)
     rows = [slice(start, start + size) for start in range(0, len(keys.key), size)]
     return [(part, Keys(keys.key[part], keys.episode[part])) for part in rows]
 
 
 def yoked_to(schedule: Array) -> Array:
-    """(K, B): each episode has the times of another one, the one before it."""
+    """Return (K, B): each episode has the times of another one, the one before it."""
     return np.roll(schedule, 1, axis=1)
 
 
-def timing_advantage(loop: Any, policy: PolicyAttack, keys: Keys, outcome: str = "crashed") -> tuple[Array, Array]:
-    """(own, yoked) outcomes (B,) of a policy, a metric: yoked plays the on and off runs of another episode of the same policy."""
+def timing_advantage(loop: Loop, policy: PolicyAttack, keys: Keys, outcome: str = "crashed") -> tuple[Array, Array]:
+    """Return (own, yoked) outcomes (B,) of a policy, a metric: yoked plays the on and off runs of another episode of the same policy."""
     schedules = (None, yoked_to(recorded(loop, policy, keys)))
     own, yoked = (played(loop, policy, keys, schedule, [METRICS[outcome]])[0] for schedule in schedules)
     return own, yoked
 
 
 def schedules(loop: Loop, policy: PolicyAttack, keys: Keys) -> dict[str, Array | None]:
-    """(K, B) bool of each twin: when it attacks; none for the policy itself, which decides as it goes."""
+    """Return (K, B) bool of each twin: when it attacks; none for the policy itself, which decides as it goes."""
     times = recorded(loop, policy, keys)
     first, last = loop.threat.onset, min(loop.threat.end or loop.horizon, loop.horizon)
     chance = keys.at(Role.POLICY, np.zeros(len(keys.key), np.int64))
@@ -122,7 +122,7 @@ def timing(
     dose: int | None = None, episodes: int = 1000, outcome: str | None = None, purpose: str = "report",
     progress: Callable[[int, int], None] | None = None,
 ) -> dict[str, Any]:  # fmt: skip
-    """The report on policies by file or zoo name; those that differ in nothing but their training seed are one entry.
+    """Play, and return the report on policies by file or zoo name; those that differ in nothing but their training seed are one entry.
 
     Scenario, defence and threat model are those that each was trained in, where nothing else is given.
     """
@@ -130,12 +130,12 @@ def timing(
         raise InputError("episodes", episodes, "at least 2: the schedule of another episode is needed")
     groups: dict[str, list[tuple[Trained, Loop, dict[str, Any]]]] = {}
     for who in distinct(texts):
-        where, guard = place_of(who, scenario), defence_of(who, defence)
+        where, against = place_of(who, scenario), defence_of(who, defence)
         changed = who.threat | dict(threat or {})
         counted = outcome_for(outcome or who.outcome, where)
-        loop = loop_for(who, where, guard, changed, dose)
+        loop = loop_for(who, where, against, changed, dose)
         facts = {
-            "scenario": where, "defence": guard, "learner": who.learner, "trained_on": who.defence, "outcome": counted,
+            "scenario": where, "defence": against, "learner": who.learner, "trained_on": who.defence, "outcome": counted,
             "unit": unit_in(counted, loop.model), "threat_model": as_data(loop.threat),
         }  # fmt: skip
         key = canonical(facts | {"action": who.header.action, "trained": [who.scenario, who.threat]})

@@ -1,6 +1,6 @@
 """Transfer: policies trained against one defence, played against others.
 
-A row of the matrix is what was trained on, a column what is played on; an entry is the mean over training seeds. On the diagonal stands
+A row of the matrix is what was trained on, a column what is played on; an entry is the mean over training seeds. The diagonal has
 what was trained against that very defence. Where a row from elsewhere does better than the diagonal, the attackers of that defence were
 not trained to its worst: the entry is flagged.
 """
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -27,11 +27,12 @@ from tailgate.play.metrics import unit_in
 from .policies import Trained, check_episodes, defence_of, distinct, is_share, mean, misfit, outcome_for, place_of
 
 LEVEL = 0.95
+T = TypeVar("T")
 ALL = "all"  # the word for every registered defence
 
 
 def difference(a: Array, b: Array, share: bool = False) -> Interval:
-    """Mean of a (runs, episodes) less that of b (other runs, the same episodes), with an interval.
+    """Return mean of a (runs, episodes) less that of b (other runs, the same episodes), with an interval.
 
     Episodes are paired, training seeds are not: their part is Welch's t over the runs' means, and missing where each side has one.
     """
@@ -52,9 +53,9 @@ def transfer(
     dose: int | None = None, episodes: int = 400, outcome: str | None = None, purpose: str = "report", workers: int = 1,
     rows_file: Path | None = None, progress: Callable[[int, int], None] | None = None,
 ) -> dict[str, Any]:  # fmt: skip
-    """The report. Without `defences` the policies are played on those that they were trained on.
+    """Play, and return the report. Without `defences` the policies are played on those that they were trained on.
 
-    The word `all` stands for these and every registered defence that has a meaning in the scenario: those that a suite plays there, or,
+    The word `all` means these and every registered defence that has a meaning in the scenario: those that a suite plays there, or,
     where no suite goes, those that it admits; sentinels and what plays one episode after the other have to be named. `skipped` says who
     is left out, and why.
 
@@ -129,7 +130,7 @@ def transfer(
 
 
 def _registered(scenario: str, named: Collection[str]) -> tuple[list[str], list[dict[str, Any]]]:
-    """The defences that have a meaning in a scenario beside those that are named, and which others there are, with the reason."""
+    """Return the defences that have a meaning in a scenario besides the named ones, and the others with the reason."""
     listed = [name for suite in map(load_suite, list_suites()) if scenario in suite.scenarios for name in suite.defences]
     found, skipped = [], []
     for name in dict.fromkeys((*listed, *registered("defence"))):
@@ -149,8 +150,8 @@ def _registered(scenario: str, named: Collection[str]) -> tuple[list[str], list[
     return found, skipped
 
 
-def _common(field: str, values: dict[str, Any]) -> Any:
-    """The value that all policies agree on, or an InputError that names the option."""
+def _common(field: str, values: dict[str, T]) -> T:
+    """Return the value that all policies agree on, or an InputError that names the option."""
     different = {canonical(value) for value in values.values()}
     if len(different) > 1:
         raise InputError(field, " and ".join(sorted(different)), f"policies of one {field}, or --{field}")

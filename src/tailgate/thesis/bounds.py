@@ -1,4 +1,4 @@
-"""What a chi-square gate bounds, and what it does not (thesis, Theorems 4.5.1-4.5.3 and Lemma 4.5.4, restated).
+"""Bounds that a chi-square gate gives, and errors that it does not bound (thesis, Theorems 4.5.1-4.5.3 and Lemma 4.5.4, restated).
 
 With gate g = r' S^-1 r <= eta and update x = x- + K r, for one agent: P- (n, n), S (q, q), K (n, q). These are formulas for a reader and
 for tests, not part of the scored path.
@@ -21,7 +21,7 @@ class Steady(NamedTuple):
 
 
 def steady_state(model: Model, agent: int = 0) -> Steady:
-    """The steady-state filter of one agent on its own sensors. Raises LinAlgError where none exists."""
+    """Return the steady-state filter of one agent on its own sensors. Raises LinAlgError where none exists."""
     from scipy.linalg import solve_discrete_are  # takes long to import, and most attacks do without
 
     C, R = model.C[agent], model.R[agent]
@@ -29,7 +29,7 @@ def steady_state(model: Model, agent: int = 0) -> Steady:
 
 
 def updated(before: Array, C: Array, R: Array) -> Steady:
-    """One measurement update of the covariance P- (n, n)."""
+    """Return one measurement update of the covariance P- (n, n)."""
     S = C @ before @ C.T + R
     K = np.linalg.solve(S, C @ before).T
     after = before - K @ S @ K.T
@@ -37,7 +37,7 @@ def updated(before: Array, C: Array, R: Array) -> Steady:
 
 
 def accepted_jump(before: Array, after: Array, eta: float) -> float:
-    """c = sqrt(eta lambda_max(P- - P+)): the farthest that one accepted sample moves the estimate. Tight.
+    """Return c = sqrt(eta lambda_max(P- - P+)): the farthest that one accepted sample moves the estimate. Tight.
 
     K S K' = P- - P+, so this is Theorem 4.5.3's constant. It bounds the jump of one step and not the error, and it grows while the gate
     is shut, as P- does.
@@ -46,7 +46,7 @@ def accepted_jump(before: Array, after: Array, eta: float) -> float:
 
 
 def innovation_norms(S: Array, eta: float) -> tuple[float, float]:
-    """(c1, c2) of Lemma 4.5.4: |r| > c1 always alarms, |r| <= c2 never does. Both tight.
+    """Return (c1, c2) of Lemma 4.5.4: |r| > c1 always alarms, |r| <= c2 never does. Both tight.
 
     Erratum: the thesis takes the eigenvalues of P and leaves eta out of c2; r has the covariance S.
     """
@@ -55,7 +55,7 @@ def innovation_norms(S: Array, eta: float) -> tuple[float, float]:
 
 
 def stealth_bound(A: Array, filters: list[Steady], eta: float, direction: Array) -> float:
-    """sqrt(eta) sum_j || S^(1/2) K' (A')^j e ||: how far N unnoticed samples move the estimate along e (n,). Tight.
+    """Return sqrt(eta) sum_j || S^(1/2) K' (A')^j e ||: how far N unnoticed samples move the estimate along e (n,). Tight.
 
     A is the filter's predictor, as the known input cancels; `filters` holds S and K of each of the N steps in their order. What is
     injected is counted as innovation: x_k = A x_k-1 + K_k r_k with every r_k inside of its gate.
@@ -68,7 +68,7 @@ def stealth_bound(A: Array, filters: list[Steady], eta: float, direction: Array)
 
 
 def stealth_innovations(A: Array, filters: list[Steady], eta: float, direction: Array) -> Array:
-    """(N, q) the innovations that reach `stealth_bound`: r_k along S K' (A')^j e, on the gate."""
+    """Return (N, q) the innovations that reach `stealth_bound`: r_k along S K' (A')^j e, on the gate."""
     out, reach = [], np.asarray(direction, np.float64)
     for step in reversed(filters):
         push = step.S @ step.K.T @ reach
@@ -79,7 +79,7 @@ def stealth_innovations(A: Array, filters: list[Steady], eta: float, direction: 
 
 
 def lock_out(steady: Steady, Q: Array, steps: int, index: int = 0) -> float:
-    """About how many honest samples a gate rejects after `steps` stealth steps along state `index`, while that is positive.
+    """Return about how many honest samples a gate rejects after `steps` stealth steps along state `index`, while that is positive.
 
     (n^2 (P- - P+)_pp - S_pp) / Q_pp: the displacement n c against a gate that opens by Q_pp a step. Sensor `index` reads state `index`.
     """
@@ -88,7 +88,7 @@ def lock_out(steady: Steady, Q: Array, steps: int, index: int = 0) -> float:
 
 
 def reopening(steady: Steady, Q: Array, bias: float, eta: float, index: int = 0) -> float:
-    """About how many samples with a lasting bias on the sensor of a random-walk state a gate rejects before it opens again.
+    """Return about how many samples with a lasting bias on the sensor of a random-walk state a gate rejects before it opens again.
 
     The gate opens when eta S_pp has grown to bias^2: alarms stop, and the error becomes the bias.
     """
@@ -96,5 +96,5 @@ def reopening(steady: Steady, Q: Array, bias: float, eta: float, index: int = 0)
 
 
 def false_alarm_rate(eta: float) -> float:
-    """Per step and with two sensors: Pr(chi2_2 > eta) = exp(-eta / 2)."""
+    """Return Pr(chi2_2 > eta) = exp(-eta / 2), the rate per step with two sensors."""
     return float(np.exp(-0.5 * eta))

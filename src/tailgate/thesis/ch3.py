@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from . import ch3_cases, ch3_figures, ch3_limits, ch3_radar
-from .ch4_cases import Tick
-from .claims import Report
+from .claims import Report, Tick
 
 TITLE = "Chapter 3: challenge-response authentication and recovery of a radar"
 
 
 def reproduce(seeds: int, tick: Tick, figures: bool) -> Report:
-    """Everything of the chapter on `seeds` report seeds."""
+    """Return everything of the chapter on `seeds` report seeds."""
     runs = ch3_cases.play_all(seeds, tick)
     settings = {
         "seeds": seeds,
@@ -20,13 +19,12 @@ def reproduce(seeds: int, tick: Tick, figures: bool) -> Report:
         "challenges": "at 15, 50, 175 and 182 s where nothing else is said",
         "scenario (ii)": "the leader changes its acceleration at 100 s, which the thesis does not give",
     }
-    out = Report("ch3", TITLE, settings)
-    radar, denial = ch3_radar.report(seeds, tick)
+    out = Report("ch3", TITLE, settings, drawn=figures)
+    tick("the radar's signal")
+    *radar, jammer = ch3_radar.parts(seeds)
     out.add(radar)
-    out.add(ch3_cases.report(runs, seeds, tick))
-    limits, curves = ch3_limits.report(seeds, tick)
-    out.add(limits)
-    if figures:
-        tick("pictures")
-        out.figures += ch3_figures.all_figures(runs, curves, denial)
+    out.add(ch3_cases.parts(runs, seeds, tick))
+    out.add(ch3_figures.cases(runs))
+    out.add(ch3_limits.parts(seeds, tick))
+    out.add([jammer])
     return out

@@ -4,27 +4,28 @@ from __future__ import annotations
 
 import dataclasses
 import time
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from tailgate.core import Array, Defence, Estimate, Model, Prior, Received, draws
-from tailgate.core.draws import Draws
+from tailgate.core import Array, Defence, Estimate, Model, Prior, Received
+from tailgate.core.draws import Draws, keys
 from tailgate.core.registry import Spec, make
-from tailgate.core.scenario import Scenario, load_scenario
+from tailgate.core.scenario import load_scenario
 from tailgate.envs.controllers.radar_car import GAP
 from tailgate.play.trace import Trace, rollout
 
-from .ch4_cases import Tick
-from .claims import Claim, Report, Spread, Table, verdict
+from .claims import Claim, Part, Spread, Table, Tick, verdict
+from .runs import collided, collisions, median, play
 
 DETECTED = 182  # step at which the thesis detects both attacks
-PLACES = {"i": "thesis-ch3-v0", "ii": "thesis-ch3-switched-v0"}
+SCENARIOS = {"i": "thesis-ch3-v0", "ii": "thesis-ch3-switched-v0"}
 ATTACKS = {
     "DoS": f"radar_jam:start_step={DETECTED}",
     "delay": "echo_delay:start_step=180,delay=6",
 }
-GUARDS = {
+DEFENCES = {
     "none": "no defence",
     "algorithm2": "Algorithms 1 and 2 as printed",
     "cra:filter=hold_last,challenge=fixed,watch=none": "challenge, last value held",
@@ -47,18 +48,29 @@ class Run(NamedTuple):
     alarm: Array  # first step with an alarm, from 1; NaN for none
     error: Array  # RMSE of the gap from the attack's detection by the list to the end [m]
 
+    @property
+    def crashed(self) -> float:
+        """Share of the runs that collide."""
+        return float(self.collided.mean())
+
+    @property
+    def heard(self) -> Array:
+        """Steps of the first alarms; runs without one are left out."""
+        return self.alarm[np.isfinite(self.alarm)]
+
     @classmethod
     def of(cls, trace: Trace) -> Run:
+        """Return the figures of a trace."""
         alarm = trace.alarm.any(axis=2) & trace.live
         first = np.where(alarm.any(axis=0), np.argmax(alarm, axis=0) + 1.0, np.nan)
-        return cls(trace, np.asarray((trace.collided & trace.live).any(axis=0)), first, _rmse(trace))
+        return cls(trace, collided(trace), first, _rmse(trace))
 
 
 Runs = dict[tuple[str, str, str], Run]
 
 
 def _rmse(trace: Trace) -> Array:
-    """(B,) RMSE of the gap from step 182 on [m], over the steps of the episode; NaN where it has ended before."""
+    """Return (B,) RMSE of the gap from step 182 on [m], over the steps of the episode; NaN where it has ended before."""
     error = (trace.estimate - trace.truth)[DETECTED - 1 :, :, 0, GAP]
     live = trace.live[DETECTED - 1 :]
     count = live.sum(axis=0)
@@ -66,52 +78,43 @@ def _rmse(trace: Trace) -> Array:
         return np.asarray(np.sqrt(np.where(live, error * error, 0.0).sum(axis=0) / np.where(count, count, np.nan)))
 
 
-def play(place: Scenario, defence: str, attack: str, seeds: int, *, terminate: bool = True) -> Trace:
-    """`seeds` report episodes of a defence under an attack, both as on the command line."""
-    guard = Spec("defence", defence)
-    keys = draws.keys("report", range(seeds))
-    return rollout(place.loop(guard.make(), guard.entry.uses), Spec("attack", attack).make(), keys, terminate=terminate)
-
-
 def play_all(seeds: int, tick: Tick) -> Runs:
-    """Every scenario, attack (also none) and defence."""
+    """Play every scenario, attack (also none) and defence."""
     out: Runs = {}
-    for number, name in PLACES.items():
-        place = load_scenario(name)
+    for number, name in SCENARIOS.items():
         for case, attack in ({"clean": "none"} | ATTACKS).items():
             tick(f"scenario ({number}), {case}")
-            for guard in GUARDS:
-                out[number, case, guard] = Run.of(play(place, guard, attack, seeds))
+            for defence in DEFENCES:
+                out[number, case, defence] = Run.of(play(name, defence, attack, seeds))
     return out
 
 
-def report(runs: Runs, seeds: int, tick: Tick) -> Report:
-    out = Report("ch3", "", {})
-    out.claims += [_detection(runs), _false_alarms(runs), _recovery(runs), _safety(runs), _algorithm1(runs)]
-    out.tables += [_table(runs, number, case) for number in PLACES for case in ("clean", *ATTACKS)]
+def parts(runs: Runs, seeds: int, tick: Tick) -> Iterator[Part]:
+    """Return claims and tables of the two scenarios."""
+    yield from (_detection(runs), _false_alarms(runs), _recovery(runs), _safety(runs), _algorithm1(runs))
+    yield from (_table(runs, number, case) for number in SCENARIOS for case in ("clean", *ATTACKS))
     tick("what the jammer leaves at the receiver")
-    out.claims.append(_zeros(seeds))
+    yield _zeros(seeds)
     tick("scenario (ii): when the leader changes its acceleration")
-    claim, table = _switches(seeds)
-    out.claims.append(claim)
-    out.tables.append(table)
+    yield from _switches(seeds)
     tick("run time")
-    out.claims.append(_run_time())
+    yield _run_time()
     tick("the intelligent driver model in place of the cruise control")
-    out.tables.append(_drivers(seeds))
-    return out
+    yield _drivers(seeds)
+
+
+def _attacked(runs: Runs, defence: str = OURS) -> Iterator[tuple[str, Run]]:
+    """Return the runs of a defence under attack, each with its name."""
+    for number in SCENARIOS:
+        for case in ATTACKS:
+            yield f"({number}), {case}", runs[number, case, defence]
 
 
 def _detection(runs: Runs) -> Claim:
     found, share = {}, []
-    for number in PLACES:
-        for case in ATTACKS:
-            at = runs[number, case, OURS].alarm
-            found[f"({number}), {case}"] = {
-                "median step": _median(at[np.isfinite(at)]),
-                "runs with this step": float(np.mean(at == DETECTED)),
-            }
-            share.append(np.mean(at == DETECTED))
+    for words, run in _attacked(runs):
+        share.append(float(np.mean(run.alarm == DETECTED)))
+        found[words] = {"median step": median(run.heard) if len(run.heard) else None, "runs with this step": share[-1]}
     return Claim(
         "3.5-detection", "Both attacks are detected at k = 182 s, in both scenarios", DETECTED, found,
         verdict(min(share) == 1.0, max(share) < 0.5), "challenges at 15, 50, 175 and 182; the delay begins at 180. The attacker does not "
@@ -119,23 +122,13 @@ def _detection(runs: Runs) -> Claim:
     )  # fmt: skip
 
 
-def _median(values: Array) -> float | None:
-    return float(np.median(values)) if len(values) else None
-
-
 def _false_alarms(runs: Runs) -> Claim:
-    positive = negative = challenges = attacked = 0
-    for number in PLACES:
-        clean = runs[number, "clean", OURS].trace
-        muted = _muted(clean)
-        positive += int((clean.alarm[:, :, 0] & muted & clean.live).sum())
-        challenges += int((muted & clean.live).sum())
-        for case in ATTACKS:
-            trace = runs[number, case, OURS].trace
-            hit = _muted(trace) & (trace.kind != 0) & trace.live
-            attacked += int(hit.sum())
-            negative += int((hit & ~trace.alarm[:, :, 0]).sum())
-            challenges += int((_muted(trace) & trace.live).sum())
+    clean = [runs[number, "clean", OURS].trace for number in SCENARIOS]
+    hit = [run.trace for _, run in _attacked(runs)]
+    positive = sum(int((trace.alarm[:, :, 0] & _challenged(trace)).sum()) for trace in clean)
+    challenges = sum(int(_challenged(trace).sum()) for trace in clean + hit)
+    attacked = sum(int((_challenged(trace) & (trace.kind != 0)).sum()) for trace in hit)
+    negative = sum(int((_challenged(trace) & (trace.kind != 0) & ~trace.alarm[:, :, 0]).sum()) for trace in hit)
     return Claim(
         "3.5-errors", "The detection has no false positive and no false negative", "0 and 0",
         {"false positives": positive, "false negatives": negative, "of challenges": challenges, "of these under attack": attacked},
@@ -144,18 +137,14 @@ def _false_alarms(runs: Runs) -> Claim:
     )  # fmt: skip
 
 
-def _muted(trace: Trace) -> Array:
-    """(K, B) bool: the steps that were measured with a muted probe."""
-    return np.concatenate([np.zeros_like(trace.probe[:1, :, 0]), ~trace.probe[:-1, :, 0]])
+def _challenged(trace: Trace) -> Array:
+    """Return (K, B) bool: the steps of the episode that were measured with a muted probe."""
+    return np.concatenate([np.zeros_like(trace.probe[:1, :, 0]), ~trace.probe[:-1, :, 0]]) & trace.live
 
 
 def _recovery(runs: Runs) -> Claim:
-    found, good = {}, []
-    for number in PLACES:
-        for case in ATTACKS:
-            spread = Spread.of(runs[number, case, OURS].error)
-            found[f"({number}), {case}: RMSE of the gap [m]"] = spread.data()
-            good.append(spread.median)
+    spreads = {f"{words}: RMSE of the gap [m]": Spread.of(run.error) for words, run in _attacked(runs)}
+    found, good = {words: spread.data() for words, spread in spreads.items()}, [spread.median for spread in spreads.values()]
     return Claim(
         "3.4-recovery", "Recursive least squares predicts distance and relative velocity for the duration of the attack (182 to 300 s)",
         "estimates follow the data without attack", found, verdict(max(good) < 1.0, min(good) > 5.0),
@@ -164,13 +153,8 @@ def _recovery(runs: Runs) -> Claim:
 
 
 def _safety(runs: Runs) -> Claim:
-    found, without, ours = {}, [], []
-    for number in PLACES:
-        for case in ATTACKS:
-            shares = {guard: float(runs[number, case, guard].collided.mean()) for guard in ("none", OURS)}
-            found[f"({number}), {case}"] = {"no defence": shares["none"], "with it": shares[OURS]}
-            without.append(shares["none"])
-            ours.append(shares[OURS])
+    without, ours = ([run.crashed for _, run in _attacked(runs, defence)] for defence in ("none", OURS))
+    found = {words: {"no defence": a, "with it": b} for (words, _), a, b in zip(_attacked(runs), without, ours, strict=True)}
     return Claim(
         "3.5-safety", "Without the defence the follower does not slow down as desired; with it it operates safely", "safe", found,
         verdict(max(ours) == 0.0 and min(without) > 0.5, max(ours) > 0.5),
@@ -182,8 +166,8 @@ def _algorithm1(runs: Runs) -> Claim:
     found, shares = {}, []
     for case in ATTACKS:
         run = runs["i", case, "algorithm2"]
-        found[case] = {"collisions": float(run.collided.mean()), "RMSE of the gap [m]": Spread.of(run.error[np.isfinite(run.error)]).data()}
-        shares.append(run.collided.mean())
+        found[case] = {"collisions": run.crashed, "RMSE of the gap [m]": Spread.of(run.error[np.isfinite(run.error)]).data()}
+        shares.append(run.crashed)
     return Claim(
         "3.4-algorithm-1", "Algorithm 1 recovers the measurements from y', also under attack",
         "recovers", found, verdict(max(shares) == 0.0, min(shares) > 0.5),
@@ -193,16 +177,14 @@ def _algorithm1(runs: Runs) -> Claim:
 
 def _table(runs: Runs, number: str, case: str) -> Table:
     rows = []
-    for guard, words in GUARDS.items():
-        run = runs[number, case, guard]
-        length = run.trace.length[run.collided]
-        at = run.alarm[np.isfinite(run.alarm)]
-        seen = np.isfinite(run.error)
+    for defence, words in DEFENCES.items():
+        run = runs[number, case, defence]
+        length, seen = run.trace.length[run.collided], run.error[np.isfinite(run.error)]
         gap = run.trace.gap[-1, ~run.collided, 0]
         rows.append((
-            words, f"{100 * run.collided.mean():.3g} %", f"{np.median(length) + 1:.0f}" if len(length) else "",
-            f"{100 * len(at) / len(run.alarm):.0f} %", f"{np.median(at):.0f}" if len(at) else "",
-            str(Spread.of(run.error[seen])) if seen.any() else "", f"{np.median(gap):.2f}" if len(gap) else "",
+            words, f"{100 * run.crashed:.3g} %", f"{np.median(length) + 1:.0f}" if len(length) else "",
+            f"{100 * len(run.heard) / len(run.alarm):.0f} %", f"{np.median(run.heard):.0f}" if len(run.heard) else "",
+            str(Spread.of(seen)) if len(seen) else "", f"{np.median(gap):.2f}" if len(gap) else "",
         ))  # fmt: skip
     heads = (
         "defence", "collisions", "at [s], median", "runs that alarm", "first alarm [s], median", "gap RMSE from 182 s [m]", "last gap [m]",
@@ -212,14 +194,13 @@ def _table(runs: Runs, number: str, case: str) -> Table:
 
 
 def _zeros(seeds: int) -> Claim:
-    place, shares = load_scenario(PLACES["i"]), {}
+    shares = {}
     for words, attack in (
         ("U(180, 250) m, U(0, 60) m/s", ATTACKS["DoS"]),
         ("zeros", f"dos_jam:start_step={DETECTED},low=0,high=0"),
         ("U(0, 250), both", f"dos_jam:start_step={DETECTED},low=0,high=250"),
     ):
-        trace = play(place, "none", attack, seeds)
-        shares[words] = float((trace.collided & trace.live).any(axis=0).mean())
+        shares[words] = collisions(play(SCENARIOS["i"], "none", attack, seeds))
     return Claim(
         "3.5-jammer", "A jammer that corrupts the measurements causes a collision", "very high values", shares,
         verdict(min(shares.values()) > 0.9, max(shares.values()) < 0.1),
@@ -228,23 +209,21 @@ def _zeros(seeds: int) -> Claim:
 
 
 def _switches(seeds: int) -> tuple[Claim, Table]:
-    place, rows, found = load_scenario(PLACES["ii"]), [], {}
-    median: dict[float, float] = {}
+    rows, found, medians = [], {}, []
     for at in SWITCHES:
-        moved = dataclasses.replace(place, manoeuvre=make("manoeuvre", "switched", at=at))
+        moved = dataclasses.replace(load_scenario(SCENARIOS["ii"]), manoeuvre=make("manoeuvre", "switched", at=at))
         cells = []
-        for words, guard in (("with reset", OURS), ("without", OURS + ",filter.threshold=none")):
-            trace = play(moved, guard, ATTACKS["DoS"], seeds, terminate=False)
-            error = _rmse(trace)
-            crashed = float(trace.collided.any(axis=0).mean())
-            found[f"{at:g} s, {words}"] = {"RMSE of the gap [m]": Spread.of(error).data(), "collisions": crashed}
-            cells += [str(Spread.of(error)), f"{100 * crashed:.0f} %"]
+        for words, defence in (("with reset", OURS), ("without", OURS + ",filter.threshold=none")):
+            trace = play(moved, defence, ATTACKS["DoS"], seeds, terminate=False)
+            spread, crashed = Spread.of(_rmse(trace)), float(trace.collided.any(axis=0).mean())
+            found[f"{at:g} s, {words}"] = {"RMSE of the gap [m]": spread.data(), "collisions": crashed}
+            cells += [str(spread), f"{100 * crashed:.0f} %"]
             if words == "with reset":
-                median[at] = float(np.median(error))
+                medians.append(spread.median)
         rows.append((f"{at:g}", *cells))
     claim = Claim(
         "3.5-scenario-ii", "In scenario (ii) the estimates recover as in scenario (i)", "recovers", found,
-        verdict(max(median.values()) < 1.0, min(median.values()) > 1.0),
+        verdict(max(medians) < 1.0, min(medians) > 1.0),
         "DoS from 182 s; the thesis does not say when the leader changes its acceleration: a late change leaves too few samples for 118 s",
     )  # fmt: skip
     heads = ("leader's change at [s]", "RMSE of the gap, with reset [m]", "collisions", "without reset [m]", "collisions")
@@ -271,13 +250,13 @@ class _Timed:
 
 
 def _run_time() -> Claim:
-    guard, times = Spec("defence", OURS), {}
+    spec, times = Spec("defence", OURS), {}
     for words, batch in (("one episode", 1), ("each of 1000 side by side", 1000)):
         fastest = np.inf
         for _ in range(3):
-            timed = _Timed(guard.make())
-            loop = load_scenario(PLACES["i"]).loop(timed, guard.entry.uses)
-            rollout(loop, Spec("attack", ATTACKS["DoS"]).make(), draws.keys("report", range(batch)))
+            timed = _Timed(spec.make())
+            loop = load_scenario(SCENARIOS["i"]).loop(timed, spec.entry.uses)
+            rollout(loop, Spec("attack", ATTACKS["DoS"]).make(), keys("report", range(batch)))
             fastest = min(fastest, timed.total / batch)
         times[words] = float(f"{1e9 * fastest:.2g}")
     return Claim(
@@ -290,13 +269,10 @@ def _run_time() -> Claim:
 def _drivers(seeds: int) -> Table:
     rows = []
     for words, driver in (("the thesis's ACC, corrected", "acc_radar"), ("IDM", "idm")):
-        place = dataclasses.replace(load_scenario(PLACES["i"]), controller=make("controller", driver))
+        driven = dataclasses.replace(load_scenario(SCENARIOS["i"]), controller=make("controller", driver))
         for case, attack in ({"no attack": "none"} | ATTACKS).items():
-            cells = []
-            for guard in ("none", OURS):
-                trace = play(place, guard, attack, seeds)
-                crash = (trace.collided & trace.live).any(axis=0)
-                cells += [f"{100 * crash.mean():.0f} %", f"{np.median(trace.gap.min(axis=(0, 2))):.2f}"]
-            rows.append((words, case, *cells))
+            traces = [play(driven, defence, attack, seeds) for defence in ("none", OURS)]
+            cells = [(f"{100 * collisions(trace):.0f} %", f"{np.median(trace.gap.min(axis=(0, 2))):.2f}") for trace in traces]
+            rows.append((words, case, *cells[0], *cells[1]))
     heads = ("controller", "attack", "collisions, no defence", "least gap [m]", "collisions, challenge + RLS", "least gap [m]")
     return Table("Scenario (i) with the published Intelligent Driver Model in place of the cruise control", heads, tuple(rows))

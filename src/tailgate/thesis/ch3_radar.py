@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from functools import partial
+
 import numpy as np
 
 from tailgate.core import Array
@@ -9,29 +12,24 @@ from tailgate.core.draws import constants
 from tailgate.envs.sensors import fmcw_signal
 from tailgate.envs.sensors.fmcw import Link
 
-from .ch4_cases import Tick
-from .claims import Claim, Report, Table, verdict
+from . import ch3_figures
+from .claims import Claim, Drawing, Part, Table, verdict
+from .runs import median
 
 RANGES = (10.0, 30.0, 60.0, 100.0, 150.0, 200.0)
 POWER = 0.1  # the thesis's jammer P_J [W]
 FAR = 5.0  # a reading that is off by more than this counts as denied [m]
-FOLLOWS = Link(in_band=1.0)
-Denial = dict[str, Array]
+LINKS = {"fills the band": Link(), "follows the chirp": Link(in_band=1.0)}  # what the jammer's noise does
 
 
-def report(seeds: int, tick: Tick) -> tuple[Report, Denial]:
-    out = Report("ch3", "", {})
-    tick("the radar's signal: signs, late echo")
-    out.claims += [_signs(), _late()]
-    tick("the radar's signal under a jammer")
-    claim, table, curve = _denial(seeds)
-    out.claims.append(claim)
-    out.tables.append(table)
-    return out, curve
+def parts(seeds: int) -> Iterator[Part]:
+    """Return the claims and the table on the signal, and last the drawing."""
+    yield from (_signs(), _late())
+    yield from _denial(seeds)
 
 
 def _read(link: Link, d: float, dv: float, count: int, late: float = 0.0, jam: float = 0.0, seed: int = 0) -> tuple[Array, Array]:
-    """(count,) distances [m] and relative speeds [m/s] by the signal path, the jammer radiating `jam` [W]."""
+    """Return (count,) distances [m] and relative speeds [m/s] by the signal path, the jammer radiating `jam` [W]."""
     one = np.ones((count, 1))
     noise = 1.0 + link.passed * link.jam_power(d, jam) / link.noise_power
     snr = link.echo_power(d) / link.noise_power
@@ -43,7 +41,7 @@ def _read(link: Link, d: float, dv: float, count: int, late: float = 0.0, jam: f
 def _signs() -> Claim:
     found, right = {}, []
     for dv in (-20.0, 20.0):
-        speed = float(np.median(_read(Link(), 60.0, dv, 50)[1]))
+        speed = median(_read(Link(), 60.0, dv, 50)[1])
         up, down = (float(v) for v in Link().beats(np.array(60.0), np.array(dv)))
         found[f"dv = v_leader - v_follower = {dv:+g} m/s"] = {
             "by (3.8) with the corrected sign [m/s]": round(speed, 2), "by (3.8) as printed [m/s]": round(-speed, 2),
@@ -58,7 +56,7 @@ def _signs() -> Claim:
 
 def _late() -> Claim:
     clean, late = _read(Link(), 60.0, -3.0, 200), _read(Link(), 60.0, -3.0, 200, late=6.0)
-    shift, speed = (float(np.median(b - a)) for a, b in zip(clean, late, strict=True))
+    shift, speed = (median(b - a) for a, b in zip(clean, late, strict=True))
     return Claim(
         "3.3-late", "A late echo makes the car ahead appear farther away", "6 m",
         {"shift of the distance [m]": round(shift, 3), "shift of the relative speed [m/s]": round(speed, 3), "delay [ns]": 40.03},
@@ -67,35 +65,29 @@ def _late() -> Claim:
     )  # fmt: skip
 
 
-def _denial(seeds: int) -> tuple[Claim, Table, Denial]:
-    links = {"fills the band": Link(), "follows the chirp": FOLLOWS}
-    rows, curve = [], {"range": np.array(RANGES)}
-    share: dict[str, list[float]] = {name: [] for name in links}
-    for d in RANGES:
-        ratio = float(Link().echo_power(d) / Link().jam_power(d, POWER))
-        cells = [f"{d:g}", f"{ratio:.4f}"]
-        for name, link in links.items():
+def _denial(seeds: int) -> tuple[Claim, Table, Drawing]:
+    rows, share = [], {name: np.zeros(len(RANGES)) for name in LINKS}
+    for i, d in enumerate(RANGES):
+        cells = [f"{d:g}", f"{float(Link().echo_power(d) / Link().jam_power(d, POWER)):.4f}"]
+        for name, link in LINKS.items():
             x, _ = _read(link, d, 0.0, seeds, jam=POWER, seed=round(d))
-            denied = float((np.abs(x - d) > FAR).mean())
+            share[name][i] = (np.abs(x - d) > FAR).mean()
             gain = float(10.0 * np.log10(link.samples * link.snr(d, POWER)))
-            share[name].append(denied)
-            cells += [f"{gain:.1f}", f"{100 * denied:.0f} %"]
+            cells += [f"{gain:.1f}", f"{100 * share[name][i]:.0f} %"]
         rows.append(tuple(cells))
-    curve |= {name: np.array(values) for name, values in share.items()}
     claim = Claim(
         "3.3-ratio", "When Pr/PJ < 1 the radar starts receiving corrupted measurements (3.11)", "below 1",
         {
             "burn-through range [m]": round(Link().burn_through(POWER), 2),
             "readings that are off by more than 5 m": {
-                name: {f"{d:g} m": v for d, v in zip(RANGES, values, strict=True)} for name, values in share.items()
+                name: {f"{d:g} m": v for d, v in zip(RANGES, values.tolist(), strict=True)} for name, values in share.items()
             },
-        }, verdict(min(share["fills the band"]) > 0.5, max(share["fills the band"]) < 0.05),
+        }, verdict(bool(share["fills the band"].min() > 0.5), bool(share["fills the band"].max() < 0.05)),
         "signal path with root-MUSIC, s = 10 m^2: the ratio is below 1 at all these ranges, but IF filter and integration take most of a "
         "noise that fills 155 MHz; one that follows the chirp does deny service",
     )  # fmt: skip
     heads = ("range [m]", "Pr/PJ", "noise that fills the band: SNR [dB]", "denied", "noise that follows the chirp: SNR [dB]", "denied")
-    return (
-        claim,
-        Table("A jammer of 100 mW: ratio (3.11), SNR after integration, and readings off by more than 5 m", heads, tuple(rows)),
-        curve,
-    )
+    title = "A jammer of 100 mW: ratio (3.11), SNR after integration, and readings off by more than 5 m"
+    caption = "A jammer of 100 mW on the car ahead, whose echo is weaker than its noise at every range shown."
+    drawing = Drawing("figure-jammer", caption, partial(ch3_figures.denial, np.array(RANGES), share))
+    return claim, Table(title, heads, tuple(rows)), drawing

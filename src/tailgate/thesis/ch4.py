@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from . import ch4_cases, ch4_figures, ch4_safety, ch4_theory
-from .ch4_cases import READINGS, Tick
-from .claims import Report
+from .ch4_cases import READINGS
+from .claims import Report, Tick
 
 TITLE = "Chapter 4: attack-resilient state estimation with a chi-square gate"
 
 
 def reproduce(seeds: int, tick: Tick, figures: bool) -> Report:
-    """Everything of the chapter on `seeds` report seeds."""
-    runs = ch4_cases.play(seeds, tick)
+    """Return everything of the chapter on `seeds` report seeds."""
+    runs = ch4_cases.play_all(seeds, tick)
     settings = {
         "seeds": seeds, "steps": 150,
         "attack values": "not given in the thesis: FDI U(0, 77), DoS U(-108, 108), on position and velocity, at the thesis's steps",
@@ -20,12 +20,9 @@ def reproduce(seeds: int, tick: Tick, figures: bool) -> Report:
         "drawn; a table says what it comes to, and what Algorithm 3 errs where a car may roll back",
         "robust KF, lam [1/m] tuned on other attacks and seeds": {r.name: round(r.lam, 4) for r in READINGS},
     }  # fmt: skip
-    out = Report("ch4", TITLE, settings)
-    out.add(ch4_cases.report(runs))
-    theory, curves, times = ch4_theory.report(seeds, tick)
-    out.add(theory)
-    out.add(ch4_safety.report(seeds, tick))
-    if figures:
-        tick("figures")
-        out.figures += ch4_figures.all_figures(runs, curves, times)
+    out = Report("ch4", TITLE, settings, drawn=figures)
+    out.add(ch4_cases.parts(runs))
+    out.add(ch4_figures.cases(runs))
+    out.add(ch4_theory.parts(seeds, tick))
+    out.add(ch4_safety.parts(seeds, tick))
     return out

@@ -1,77 +1,67 @@
-"""What the thesis concludes of safety, on scenarios that are long enough for a collision: 60 s behind a leader with manoeuvres."""
+"""The thesis's conclusions on safety, in scenarios that are long enough for a collision: 60 s behind a leader with manoeuvres."""
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Iterator
 
 import numpy as np
 
-import tailgate
-from tailgate.core import Array, draws
-from tailgate.core.scenario import Scenario, load_scenario
+from tailgate.core import Array
+from tailgate.core.scenario import load_scenario
 from tailgate.evaluation.stats import paired_difference
 from tailgate.play.metrics import measure
-from tailgate.play.trace import Trace, rollout
 
-from .ch4_cases import Tick
-from .claims import Claim, Report, Spread, Table, verdict
+from .claims import Claim, Part, Spread, Table, Tick, verdict
+from .runs import collided, collisions, median, play
 
-PLACES = ("stop-and-go-v0", "braking-v0")
-GUARDS = {"kf": "Kalman filter", "chi2_kf": "Algorithm 3", "rkf": "robust KF"}
+SCENARIOS = ("stop-and-go-v0", "braking-v0")
+DEFENCES = {"kf": "Kalman filter", "chi2_kf": "Algorithm 3", "rkf": "robust KF"}
+DUTY = {  # label: attack on each sensor in 9 % of the steps, as often as in the thesis's cases
+    "none": "none",
+    "U(0, 77)": "fdi_sparse:probability=0.09,value.name=uniform,value.low=0.0,value.high=77.0",
+    "U(-77, 77)": "fdi_sparse:probability=0.09,value.name=uniform,value.low=-77.0,value.high=77.0",
+}
 ONSET = 100
 
 
-def _play(place: Scenario, guard: str, attack: Any, seeds: int, *, terminate: bool = True) -> Trace:
-    return rollout(place.loop(tailgate.make_defence(guard)), attack, draws.keys("report", range(seeds)), terminate=terminate)
-
-
-def report(seeds: int, tick: Tick) -> Report:
-    out = Report("ch4", "", {})
+def parts(seeds: int, tick: Tick) -> Iterator[Part]:
+    """Return claims and a table on safety."""
     tick("random attacks at 9 % duty, 60 s")
-    claim, table = _duty(seeds)
-    out.claims.append(claim)
-    out.tables.append(table)
+    yield from _duty(seeds)
     tick("sustained stealth, 60 s")
-    out.claims.append(_stealth(seeds))
+    yield _stealth(seeds)
     tick("blind ramps, a lasting bias, replay")
-    out.claims += [_ramps(seeds), _reopening(seeds), _replay(seeds)]
+    yield from (_ramps(seeds), _reopening(seeds), _replay(seeds))
     tick("sparse attacks")
-    out.claims.append(_sparse(seeds))
-    return out
+    yield _sparse(seeds)
 
 
 def _duty(seeds: int) -> tuple[Claim, Table]:
-    """Random values on each sensor in 9 % of the steps, as often as in the thesis's cases, but for a minute."""
+    """Play random values for a minute."""
     rows, change, excess, crashes = [], {}, {}, {}
-    outcomes: dict[tuple[str, str], list[Array]] = {}
-    laws = {"none": None, "U(0, 77)": (0.0, 77.0), "U(-77, 77)": (-77.0, 77.0)}
-    for name in PLACES:
-        place = load_scenario(name).with_threat(fdi_bound=77.0)
-        for guard, words in GUARDS.items():
-            clean = None
-            for label, law in laws.items():
-                attack: Any = tailgate.make_attack("none")
-                if law is not None:
-                    value = {"name": "uniform", "low": law[0], "high": law[1]}
-                    attack = tailgate.make_attack("fdi_sparse", probability=0.09, value=value)
-                m = measure(_play(place, guard, attack, seeds))
-                clean = m if clean is None else clean
+    outcomes: dict[str, list[Array]] = {defence: [] for defence in DEFENCES}
+    for name in SCENARIOS:
+        scenario = load_scenario(name).with_threat(fdi_bound=77.0)
+        for defence, words in DEFENCES.items():
+            metrics = {label: measure(play(scenario, defence, attack, seeds)) for label, attack in DUTY.items()}
+            clean = metrics["none"]
+            for label, m in metrics.items():
                 spreads = [str(Spread.of(m[k])) for k in ("rmse_position", "min_gap")]
                 rows.append((name, words, label, *spreads, f"{100 * m['crashed'].mean():.1f} %"))
-                if law is not None:
+                if label != "none":
                     key = f"{name}, {label}: {words}"
-                    change[key] = float(np.median(m["min_gap"] - clean["min_gap"]))
-                    excess[key] = float(np.median(m["rmse_position"] / clean["rmse_position"]))
+                    change[key] = median(m["min_gap"] - clean["min_gap"])
+                    excess[key] = median(m["rmse_position"] / clean["rmse_position"])
                     crashes[key] = float(m["crashed"].mean())
-                    outcomes.setdefault(("crashed", guard), []).append(m["crashed"])
+                    outcomes[defence].append(m["crashed"])
     spared: dict[str, list[float]] = {}
     beaten: list[str] = []
     tied: list[str] = []
-    for guard in ("kf", "rkf"):
-        theirs, ours = (np.concatenate(outcomes["crashed", name]) for name in (guard, "chi2_kf"))
+    for defence in ("kf", "rkf"):
+        theirs, ours = (np.concatenate(outcomes[name]) for name in (defence, "chi2_kf"))
         gain = paired_difference(theirs, ours, share=True)
-        spared[f"than the {GUARDS[guard]}"] = [round(v, 4) for v in gain]
-        (beaten if gain.low > 0.0 else tied if not theirs.any() and not ours.any() else []).append(GUARDS[guard])
+        spared[f"than the {DEFENCES[defence]}"] = [round(v, 4) for v in gain]
+        (beaten if gain.low > 0.0 else tied if not theirs.any() and not ours.any() else []).append(DEFENCES[defence])
     claim = Claim(
         "4.6.2-collision", "With its smaller error Algorithm 3 is likelier to prevent a collision than the others", "likelier",
         {
@@ -87,14 +77,13 @@ def _duty(seeds: int) -> tuple[Claim, Table]:
 
 def _stealth(seeds: int) -> Claim:
     shares, delays = {}, {}
-    for name in PLACES:
-        place = load_scenario(name).with_threat(knowledge="white", onset=ONSET, end=None)
-        for guard, words in GUARDS.items():
-            trace = _play(place, guard, tailgate.make_attack("stealth"), seeds)
-            hit = (trace.collided & trace.live).any(axis=0)
-            shares[f"{name}: {words}"] = float(hit.mean())
-            if hit.any():
-                delays[f"{name}: {words}"] = round(float(np.median((trace.length[hit] - ONSET) * trace.dt)), 1)
+    for name in SCENARIOS:
+        scenario = load_scenario(name).with_threat(knowledge="white", onset=ONSET, end=None)
+        for defence, words in DEFENCES.items():
+            trace = play(scenario, defence, "stealth", seeds)
+            shares[f"{name}: {words}"] = collisions(trace)
+            if (hit := collided(trace)).any():
+                delays[f"{name}: {words}"] = round(median((trace.length[hit] - ONSET) * trace.dt), 1)
     return Claim(
         "4.3-stealth", "A stealthy attack that passes the chi-square detector does not have any impact on the stability of the system",
         "no impact", {"share of runs that collide": shares, "median time from onset to collision [s]": delays},
@@ -104,15 +93,14 @@ def _stealth(seeds: int) -> Claim:
 
 
 def _ramps(seeds: int) -> Claim:
-    place = load_scenario("thesis-ch4-v0").with_threat(targets=("position",))
+    scenario = load_scenario("thesis-ch4-v0").with_threat(targets=("position",))
     found, heard = {}, []
-    clean = float(_play(place, "chi2_kf", tailgate.make_attack("none"), seeds).alarm[49:99].any(axis=0).mean())
+    clean = float(play(scenario, "chi2_kf", "none", seeds).alarm[49:99].any(axis=0).mean())
     for rate in (0.5, 1.0, 2.0):
-        attack = tailgate.make_attack("fdi_ramp", rate=-rate, start_step=50, limit=108.0)
-        trace = _play(place, "chi2_kf", attack, seeds)
+        trace = play(scenario, "chi2_kf", f"fdi_ramp:rate={-rate},start_step=50,limit=108.0", seeds)
         alarm = trace.alarm[49:99, :, 0]
         heard.append(float(alarm.any(axis=0).mean()))
-        error = float(np.median(trace.estimate[98, :, 0, 0] - trace.truth[98, :, 0, 0]))
+        error = median(trace.estimate[98, :, 0, 0] - trace.truth[98, :, 0, 0])
         found[f"{rate:g} m a step"] = {
             "alarms per step": float(alarm.mean()), "runs with an alarm": heard[-1], "error after 50 steps [m]": round(error, 1)
         }
@@ -124,12 +112,11 @@ def _ramps(seeds: int) -> Claim:
 
 
 def _reopening(seeds: int) -> Claim:
-    place = load_scenario("stop-and-go-v0").with_threat(targets=("position",), onset=ONSET, end=None)
-    trace = _play(place, "chi2_kf", tailgate.make_attack("fdi", value=-20.0), seeds, terminate=False)
+    scenario = load_scenario("stop-and-go-v0").with_threat(targets=("position",), onset=ONSET, end=None)
+    trace = play(scenario, "chi2_kf", "fdi:value=-20.0", seeds, terminate=False)
     alarm, error = trace.alarm[:, :, 0], trace.estimate[:, :, 0, 0] - trace.truth[:, :, 0, 0]
-    late = slice(-100, None)
-    shut, rate = float(np.median(np.sum(alarm[ONSET - 1 :], axis=0)) * trace.dt), float(alarm[late].mean())
-    final = float(np.median(error[late]))
+    shut, rate = median(np.sum(alarm[ONSET - 1 :], axis=0)) * trace.dt, float(alarm[-100:].mean())
+    final = median(error[-100:])
     return Claim(
         "4.5-lasting-bias", "An attack that is detected is kept out: the filter runs open loop until it ends", "kept out",
         {
@@ -144,29 +131,26 @@ def _reopening(seeds: int) -> Claim:
 def _replay(seeds: int) -> Claim:
     found = {}
     for name in ("thesis-ch4-v0", "stop-and-go-v0"):
-        place = load_scenario(name)
-        place = place.with_threat(kinds=("replay",), onset=ONSET, end=None)
-        trace = _play(place, "chi2_kf", tailgate.make_attack("replay", window=10, length=40), seeds, terminate=False)
-        played = trace.kind != 0
-        found[name] = {"alarms per replayed step": float(trace.alarm[:, :, 0][played].mean()), "runs detected": _detected(trace)}
+        scenario = load_scenario(name).with_threat(kinds=("replay",), onset=ONSET, end=None)
+        trace = play(scenario, "chi2_kf", "replay:window=10,length=40", seeds, terminate=False)
+        alarm, played = trace.alarm[:, :, 0], trace.kind != 0
+        detected = float((alarm & played).any(axis=0).mean())
+        found[name] = {"alarms per replayed step": float(alarm[played].mean()), "runs detected": detected}
     share = [v["runs detected"] for v in found.values()]
     return Claim(
         "4.7-replay", "The algorithm is not designed for replay, which is small and escapes the detector", "escapes", found,
-        "yes" if max(share) < 0.1 else "partly" if min(share) < 0.5 else "no",
+        verdict(max(share) < 0.1, min(share) >= 0.5),
         "share of runs that alarm while the last 10 samples are played four times over; escapes: less than a tenth of them",
     )  # fmt: skip
 
 
-def _detected(trace: Trace) -> float:
-    return float((trace.alarm[:, :, 0] & (trace.kind != 0)).any(axis=0).mean())
-
-
 def _sparse(seeds: int) -> Claim:
-    """Section 4.7: few of the sensors are attacked in a step."""
-    place, found, wins = load_scenario("thesis-ch4-fitted-v0"), {}, []
-    for label, probability in (("the velocity alone", (0.0, 0.3)), ("each sensor by itself", (0.3, 0.3))):
-        attack = tailgate.make_attack("fdi_sparse", probability=probability, value=60.0)
-        errors = {g: measure(_play(place, g, attack, seeds))["rmse_position"] for g in ("chi2_kf", "chi2_kf_sparse")}
+    """Attack few of the sensors in a step (section 4.7)."""
+    found, wins = {}, []
+    for label, chances in (("the velocity alone", "[0.0,0.3]"), ("each sensor by itself", "[0.3,0.3]")):
+        attack = f"fdi_sparse:probability={chances},value=60.0"
+        traces = {g: play("thesis-ch4-fitted-v0", g, attack, seeds) for g in ("chi2_kf", "chi2_kf_sparse")}
+        errors = {g: measure(trace)["rmse_position"] for g, trace in traces.items()}
         wins.append(float(np.mean(errors["chi2_kf_sparse"] < errors["chi2_kf"])))
         found[label] = {g: Spread.of(e).data() for g, e in errors.items()} | {"share of seeds won by the gate per sensor": wins[-1]}
     return Claim(

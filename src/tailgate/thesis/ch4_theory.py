@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
+from functools import partial
 
 import numpy as np
 from scipy import stats
@@ -12,42 +14,45 @@ from tailgate.core.scenario import load_scenario
 from tailgate.estimators.compose import AcceptAll, compose
 from tailgate.estimators.detectors.chi_square import ChiSquare, GatedKalman
 from tailgate.estimators.filters.kalman import KalmanFilter
+from tailgate.evaluation.stats import proportion
 from tailgate.play.metrics import measure
-from tailgate.thesis import bounds
 
-from .ch4_cases import READINGS, Reading, Tick, attack_of
-from .claims import Claim, Report, Spread, verdict
+from . import bounds, ch4_figures
+from .ch4_cases import ATTACKS, HARMFUL, READINGS, Reading
+from .claims import Claim, Drawing, Part, Tick, verdict
 from .probe import DRAWS, feed, start
+from .runs import median, play
 
-Curves = dict[str, dict[str, list[float]]]  # by reading and quantity, over ETAS
-Times = dict[str, dict[int, float]]  # by shape and size [s]
 ETA = 20.0
 ETAS = (1.0, 3.0, 6.0, 9.0, 13.0, 20.0, 40.0, 100.0)
 SIZES = (4, 8, 16, 32, 64)
 
 
 def case_study() -> Model:
-    """The model of 4.6.2 as printed, Q = R = I."""
+    """Return the model of 4.6.2 as printed, Q = R = I."""
     return load_scenario("thesis-ch4-v0").brief().model
 
 
 def _sizes(e: Array, P: Array) -> Array:
-    """e' P^-1 e of (..., n) and (..., n, n)."""
+    """Return e' P^-1 e of (..., n) and (..., n, n)."""
     return np.asarray(np.einsum("...i,...i->...", e, np.linalg.solve(P, e[..., None])[..., 0]))
 
 
 def _on_edge(rng: np.random.Generator, count: int, S: Array, eta: float) -> Array:
-    """(count, n) random vectors with r' S^-1 r = eta."""
+    """Return (count, n) random vectors with r' S^-1 r = eta."""
     r = rng.normal(size=(count, len(S)))
     return np.asarray(r * np.sqrt(eta / _sizes(r, np.broadcast_to(S, (count, *S.shape))))[:, None])
 
 
-def theorems(runs: int = 2000, seed: int = 0) -> list[Claim]:
-    model, rng = case_study(), np.random.default_rng(seed)
-    return [
-        _theorem_1(model, rng, runs), _theorem_2(model, rng, runs), *_theorem_3(model, rng, runs), _lemma(model, rng, runs),
-        *_false_alarms(model, rng, runs),
-    ]  # fmt: skip
+def parts(seeds: int, tick: Tick) -> Iterator[Part]:
+    """Return the claims on theorems, threshold and cost, and the drawings of the last two."""
+    tick("theorems 4.5.1 to 4.5.3 and lemma 4.5.4")
+    model, rng, runs = case_study(), np.random.default_rng(0), 2000
+    yield from (_theorem_1(model, rng, runs), _theorem_2(model, rng, runs), *_theorem_3(model, rng, runs), _lemma(model, rng, runs))
+    yield from _false_alarms(model, rng, runs)
+    yield from _trade_off(seeds, tick)
+    tick("time of a step against n and q")
+    yield from _step_times()
 
 
 def _theorem_1(model: Model, rng: np.random.Generator, runs: int) -> Claim:
@@ -69,7 +74,7 @@ def _theorem_1(model: Model, rng: np.random.Generator, runs: int) -> Claim:
 
 
 def _simulate(model: Model, rng: np.random.Generator, e0: Array, steps: int) -> tuple[Array, Array]:
-    """Truth (K, B, n) from e0 (B, n) without input, and readings (K, B, q)."""
+    """Return truth (K, B, n) from e0 (B, n) without input, and readings (K, B, q)."""
     truth, x = np.empty((steps, *e0.shape)), e0
     w, v = np.linalg.cholesky(model.Q), np.linalg.cholesky(model.R[0])
     for k in range(steps):
@@ -99,10 +104,10 @@ def _theorem_3(model: Model, rng: np.random.Generator, runs: int) -> list[Claim]
     rest = bounds.steady_state(model)
     c = bounds.accepted_jump(rest.before, rest.after, ETA)
     worst = bounds.stealth_innovations(model.A, [rest], ETA * (1 - 1e-9), np.linalg.eigh(rest.before - rest.after)[1][:, -1])
-    guard = GatedKalman(eta=ETA)
-    reached = float(np.linalg.norm(feed(guard, model, rest.after, innovations=worst[:, None]).x[0, 0]) / c)
+    gate = GatedKalman(eta=ETA)
+    reached = float(np.linalg.norm(feed(gate, model, rest.after, innovations=worst[:, None]).x[0, 0]) / c)
     sizes = rng.uniform(0.0, 100.0, size=(1, runs, 1)) * rng.normal(size=(1, runs, len(rest.S)))
-    others = feed(guard, model, rest.after, innovations=sizes)
+    others = feed(gate, model, rest.after, innovations=sizes)
     passed = int((np.linalg.norm(others.x[0], axis=1) > c * (1 + 1e-9)).sum())
     grown, P = {}, rest.after
     for k in range(1, 151):
@@ -122,7 +127,7 @@ def _theorem_3(model: Model, rng: np.random.Generator, runs: int) -> list[Claim]
     )  # fmt: skip
     e = np.eye(model.states)[0]
     reach = {f"{n} steps": round(bounds.stealth_bound(model.A, [rest] * n, ETA, e), 1) for n in (1, 10, 50, 150)}
-    played = feed(guard, model, rest.after, innovations=bounds.stealth_innovations(model.A, [rest] * 150, ETA * (1 - 1e-9), e)[:, None])
+    played = feed(gate, model, rest.after, innovations=bounds.stealth_innovations(model.A, [rest] * 150, ETA * (1 - 1e-9), e)[:, None])
     unnoticed = not played.alarm.any()
     error = Claim(
         "4.5.2-resilience", "The theorem shows resilience: an arbitrary attack causes a bounded error only", "bounded error",
@@ -141,14 +146,14 @@ def _lemma(model: Model, rng: np.random.Generator, runs: int) -> Claim:
     c1, c2 = bounds.innovation_norms(S, ETA)
     r = rng.normal(size=(1, runs, len(S)))
     r /= np.linalg.norm(r, axis=2)[..., None]
-    guard = GatedKalman(eta=ETA)
-    above = feed(guard, model, P, innovations=c1 * (1 + 1e-9) * r).alarm.mean()
-    below = feed(guard, model, P, innovations=c2 * (1 - 1e-9) * r).alarm.mean()
+    gate = GatedKalman(eta=ETA)
+    above = feed(gate, model, P, innovations=c1 * (1 + 1e-9) * r).alarm.mean()
+    below = feed(gate, model, P, innovations=c2 * (1 - 1e-9) * r).alarm.mean()
     printed = float(np.sqrt(ETA * np.linalg.eigvalsh(P)[-1])), float(np.sqrt(np.linalg.eigvalsh(P)[0]))
     axes = np.linalg.eigh(S)[1].T[:, None, None]
     tight = {
-        "just below c1 along its axis": feed(guard, model, P, innovations=c1 * (1 - 1e-9) * axes[-1]).alarm.any(),
-        "just above c2 along its axis": feed(guard, model, P, innovations=c2 * (1 + 1e-9) * axes[0]).alarm.any(),
+        "just below c1 along its axis": feed(gate, model, P, innovations=c1 * (1 - 1e-9) * axes[-1]).alarm.any(),
+        "just above c2 along its axis": feed(gate, model, P, innovations=c2 * (1 + 1e-9) * axes[0]).alarm.any(),
     }
     is_tight = not tight["just below c1 along its axis"] and tight["just above c2 along its axis"]
     return Claim(
@@ -168,10 +173,10 @@ def _false_alarms(model: Model, rng: np.random.Generator, runs: int) -> list[Cla
     _, y = _simulate(model, rng, rng.normal(size=(runs, model.states)), 150)
     for eta in (4.0, 9.0, 13.0):
         watch = feed(compose(KalmanFilter(), ChiSquare(eta=eta), AcceptAll()), model, P0, readings=y).alarm
-        interval = stats.binomtest(int(watch.sum()), watch.size).proportion_ci(0.999)
+        interval = proportion(int(watch.sum()), watch.size, 0.999)
         theory = bounds.false_alarm_rate(eta)
         measured[f"eta = {eta:g}"] = {
-            "theory": theory, "watching": float(watch.mean()), "99.9 %": [float(interval.low), float(interval.high)]
+            "theory": theory, "watching": float(watch.mean()), "99.9 %": [interval.low, interval.high]
         }
         fits.append(interval.low <= theory <= interval.high)
         gated[f"eta = {eta:g}"] = float(feed(GatedKalman(eta=eta), model, P0, readings=y).alarm.mean() / theory)
@@ -189,70 +194,66 @@ def _false_alarms(model: Model, rng: np.random.Generator, runs: int) -> list[Cla
     ]
 
 
-def trade_off(seeds: int, tick: Tick) -> tuple[Curves, list[Claim]]:
-    """Figures by reading over ETAS, and the claims of 4.7."""
-    curves: Curves = {}
+def _trade_off(seeds: int, tick: Tick) -> Iterator[Claim | Drawing]:
+    """Return the claims of 4.7, and their drawing."""
+    curves = {}
     for reading in READINGS[::2]:  # the corrected plant
         tick(f"eta trade-off, {reading.name}")
-        curves[reading.name] = _curve(reading, seeds)
-    claims = []
-    for name, curve in curves.items():
+        curves[reading.name] = curve = _curve(reading, seeds)
         cleanest, small = min(curve["clean"]), curve["clean"][0]
-        best = {case: ETAS[int(np.argmin(curve[case]))] for case in ("fdi", "dos")}
-        small_best = [eta == ETAS[0] for eta in best.values()]
-        claims += [
-            Claim(
-                f"4.7-eta-bound-{name}", "A smaller eta gives a smaller bound, and an algorithm more resilient to attacks", "smaller",
-                {"c over sqrt(eta)": round(curve["bound"][0] / ETAS[0] ** 0.5, 4), "eta of the least error": best},
-                verdict(all(small_best), False),
-                f"the bound falls as sqrt(eta); the error under attack is least at the eta given, of {ETAS[0]:g} to {ETAS[-1]:g}",
-            ),
-            Claim(
-                f"4.7-eta-false-positives-{name}", "With a very small eta there are many false positives and large errors",
-                "bad at small eta",
-                {"eta": ETAS[0], "false alarms per step": curve["alarms"][0], "clean error over the best": small / cleanest},
-                verdict(small > 1.2 * cleanest and curve["alarms"][0] > 0.1, small < 1.05 * cleanest and curve["alarms"][0] < 0.01),
-                "attack-free runs; yes: an alarm in more than a tenth of the steps, and an error 1.2 times the least",
-            ),
-        ]
-    return curves, claims
+        best = {case: ETAS[int(np.argmin(curve[case]))] for case in HARMFUL}
+        yield Claim(
+            f"4.7-eta-bound-{reading.name}", "A smaller eta gives a smaller bound, and an algorithm more resilient to attacks", "smaller",
+            {"c over sqrt(eta)": round(curve["bound"][0] / ETAS[0] ** 0.5, 4), "eta of the least error": best},
+            verdict(all(eta == ETAS[0] for eta in best.values()), False),
+            f"the bound falls as sqrt(eta); the error under attack is least at the eta given, of {ETAS[0]:g} to {ETAS[-1]:g}",
+        )  # fmt: skip
+        yield Claim(
+            f"4.7-eta-false-positives-{reading.name}", "With a very small eta there are many false positives and large errors",
+            "bad at small eta",
+            {"eta": ETAS[0], "false alarms per step": curve["alarms"][0], "clean error over the best": small / cleanest},
+            verdict(small > 1.2 * cleanest and curve["alarms"][0] > 0.1, small < 1.05 * cleanest and curve["alarms"][0] < 0.01),
+            "attack-free runs; yes: an alarm in more than a tenth of the steps, and an error 1.2 times the least",
+        )  # fmt: skip
+    caption = "Section 4.7, the choice of eta: error with and without attack, the bound of one step's jump, false alarms."
+    yield Drawing("figure-eta", caption, partial(ch4_figures.eta, curves, ETAS))
 
 
 def _curve(reading: Reading, seeds: int) -> dict[str, list[float]]:
-    model = load_scenario(reading.scenario).brief().model
-    rest = bounds.steady_state(model)
-    out: dict[str, list[float]] = {"bound": [], "alarms": [], "clean": [], "fdi": [], "dos": []}
+    """Return the bound, the errors and the false alarms over ETAS."""
+    rest = bounds.steady_state(load_scenario(reading.scenario).brief().model)
+    out: dict[str, list[float]] = {"bound": [], "alarms": [], **{case: [] for case in ATTACKS}}
     for eta in ETAS:
         out["bound"].append(bounds.accepted_jump(rest.before, rest.after, eta))
-        for case in ("clean", "fdi", "dos"):
-            trace = reading.play(GatedKalman(eta=eta), attack_of(case), seeds)
-            out[case].append(Spread.of(measure(trace)["rmse_position"]).median)
+        for case, attack in ATTACKS.items():
+            trace = play(reading.scenario, GatedKalman(eta=eta), attack, seeds, terminate=False)
+            out[case].append(median(measure(trace)["rmse_position"]))
             if case == "clean":
                 out["alarms"].append(float(trace.alarm.mean()))
     return out
 
 
-def step_times(tick: Tick, batch: int = 16, repeats: int = 5) -> tuple[Times, Claim]:
-    """Seconds of a step of Algorithm 3 per episode against n and q, each alone and both; and the claim of 4.5.1."""
-    tick("time of a step against n and q")
-    times: Times = {
+def _step_times(batch: int = 16, repeats: int = 5) -> Iterator[Claim | Drawing]:
+    """Return the claim of 4.5.1 on the seconds of a step of Algorithm 3 against n and q, each alone and both, and its drawing."""
+    times = {
         "n (q = 2)": {size: _step_time(size, 2, batch, repeats) for size in SIZES},
         "q (n = 2)": {size: _step_time(2, size, batch, repeats) for size in SIZES},
         "n = q": {size: _step_time(size, size, batch, repeats) for size in SIZES},
     }
-    slopes = {}
-    for name, curve in times.items():
-        big = [s for s in SIZES if s >= 16]
-        slopes[name] = round(float(np.polyfit(np.log(big), np.log([curve[s] for s in big]), 1)[0]), 2)
+    big = [size for size in SIZES if size >= 16]
+    slopes = {name: round(float(np.polyfit(np.log(big), np.log([curve[s] for s in big]), 1)[0]), 2) for name, curve in times.items()}
     steepest = max(slopes.values())
-    return times, Claim(
+    yield Claim(
         "4.5.1-complexity", "A step costs O(max(n, q)^3), as that of the Kalman filter", 3, {"exponent from 16 to 64": slopes},
         verdict(steepest <= 3.0, steepest > 3.5),
         f"least time of {repeats}, {batch} episodes side by side; an exponent of at most 3 agrees with the bound",
     )  # fmt: skip
+    caption = "Time of a step against the number of states n and of sensors q; the claim is at most slope 3. Wall-clock: other load shows."
+    yield Drawing("figure-cost", caption, partial(ch4_figures.cost, times))
 
 
 def _step_time(n: int, q: int, batch: int, repeats: int) -> float:
+    """Return the least seconds of a step of one episode."""
     rng = np.random.default_rng(n * 1000 + q)
     A = rng.normal(size=(n, n))
     A *= 0.9 / np.max(np.abs(np.linalg.eigvals(A)))
@@ -260,22 +261,11 @@ def _step_time(n: int, q: int, batch: int, repeats: int) -> float:
         A, np.zeros((n, 1)), np.zeros(n), rng.normal(size=(1, q, n)), np.eye(n), np.eye(q)[None], np.eye(1, dtype=bool), 0.01,
         tuple(f"y{i}" for i in range(q)),
     )  # fmt: skip
-    guard, best = GatedKalman(eta=1e9), np.inf
-    plan, state = start(guard, model, np.zeros((batch, n)), np.eye(n))
+    gate, best = GatedKalman(eta=1e9), np.inf
+    plan, state = start(gate, model, np.zeros((batch, n)), np.eye(n))
     received = Received(rng.normal(size=(batch, 1, q)), np.ones((batch, 1, q), bool), np.zeros((batch, 1)))
     for _ in range(repeats):
         begun = time.perf_counter()
-        guard.step(plan, state, received, np.zeros((batch, 1, 1)), DRAWS)
+        gate.step(plan, state, received, np.zeros((batch, 1, 1)), DRAWS)
         best = min(best, time.perf_counter() - begun)
     return best / batch
-
-
-def report(seeds: int, tick: Tick) -> tuple[Report, Curves, Times]:
-    """Claims, and the curves that the figures draw."""
-    out = Report("ch4", "", {})
-    tick("theorems 4.5.1 to 4.5.3 and lemma 4.5.4")
-    out.claims += theorems()
-    curves, claims = trade_off(seeds, tick)
-    times, cost = step_times(tick)
-    out.claims += [*claims, cost]
-    return out, curves, times

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from . import ch5_cases, ch5_figures, ch5_theory
-from .ch4_cases import Tick
-from .claims import Report
+from . import ch5_cases, ch5_figures, ch5_theory, whole_theorems
+from .claims import Report, Tick
 
 TITLE = "Chapter 5: distributed resilient state estimation"
 
 
 def reproduce(seeds: int, tick: Tick, figures: bool) -> Report:
-    """Everything of the chapter on `seeds` fresh systems: matrices, initial states and attacks are drawn anew in every run."""
-    runs = ch5_cases.play(seeds, tick)
+    """Return everything of the chapter on `seeds` fresh systems: every run draws its own matrices, initial states and attacks."""
+    runs = ch5_cases.play_all(seeds, tick)
     settings = {
         "runs": f"{seeds}, each with its own A, C_i, initial state and attack",
         "system": "10 agents, 20 states, 14 sensors each, no noise, x0 ~ N(0, I), estimates start at 0",
@@ -20,11 +19,10 @@ def reproduce(seeds: int, tick: Tick, figures: bool) -> Report:
         "not given in the thesis": "the scale of A (here a spectral radius of 1), the size of the attack, the twelfth edge (here 4-9), "
         "how errors are normalised (here not)",
     }
-    out = Report("ch5", TITLE, settings)
-    out.add(ch5_cases.report(runs))
-    theory, curves = ch5_theory.report(seeds, tick)
-    out.add(theory)
-    if figures:
-        tick("pictures")
-        out.figures += ch5_figures.all_figures(runs, curves)
+    out = Report("ch5", TITLE, settings, drawn=figures)
+    out.add(ch5_cases.parts(runs))
+    out.add(ch5_figures.cases(runs))
+    out.add(ch5_theory.parts(seeds, tick))
+    tick("theorems without a figure")
+    out.add(whole_theorems.chapter_5(seeds))
     return out

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from . import ch6_cases, ch6_figures, ch6_loop
-from .ch4_cases import Tick
-from .claims import Report
+from . import ch6_cases, ch6_figures, ch6_loop, whole_theorems
+from .claims import Report, Tick
 
 TITLE = "Chapter 6: resilient state estimation in a vehicle platoon"
 
 
 def reproduce(seeds: int, tick: Tick, figures: bool) -> Report:
-    """Everything of the chapter on `seeds` report seeds."""
+    """Return everything of the chapter on `seeds` report seeds."""
     tick("figures 6.3 to 6.5: five cars, 50 s, three sensors a car")
-    runs = ch6_cases.play(seeds)
+    runs = ch6_cases.play_all(seeds)
     settings = {
         "seeds": seeds,
         "figures": "dt = 1 s, the linear closed loop, w = (1, 1), Sigma = I, lam = 0.1, u_r known; largest |error| after 20 s",
@@ -20,11 +19,10 @@ def reproduce(seeds: int, tick: Tick, figures: bool) -> Report:
         "closed loop": f"{ch6_loop.SCENARIO}: dt = 0.1 s, 55 s, controllers on the estimates, u_r unknown to the followers, lam = 5",
         "not given in the thesis": "the gains kp = 0.5 and kd = 1, the initial gaps 65 + 5 randn m, the leader's input, the attack's size",
     }
-    out = Report("ch6", TITLE, settings)
-    out.add(ch6_cases.report(runs, seeds, tick))
-    loop, curves = ch6_loop.report(seeds, tick)
-    out.add(loop)
-    if figures:
-        tick("pictures")
-        out.figures += ch6_figures.all_figures(runs, curves)
+    out = Report("ch6", TITLE, settings, drawn=figures)
+    out.add(ch6_cases.parts(runs, seeds, tick))
+    out.add(ch6_figures.cases(runs))
+    out.add(ch6_loop.parts(seeds, tick))
+    tick("theorems without a figure")
+    out.add(whole_theorems.chapter_6(seeds))
     return out

@@ -1,18 +1,17 @@
-"""Chapter 7: trust by statistical model checking of the case study's automata, and of the loop that they stand for."""
+"""Chapter 7: trust by statistical model checking of the case study's automata, and of the loop that they represent."""
 
 from __future__ import annotations
 
-from . import ch7_automata, ch7_cost, ch7_figures, ch7_loop, ch7_ratings, ch7_signals, ch7_trust, ch7_width
-from .ch4_cases import Tick
-from .claims import Report
+from . import ch7_automata, ch7_cost, ch7_loop, ch7_ratings, ch7_signals, ch7_trust, ch7_width
+from .claims import Report, Tick
 
 TITLE = "Chapter 7: quantifying trust by statistical model checking"
 
 
 def reproduce(seeds: int, tick: Tick, figures: bool) -> Report:
-    """Everything of the chapter: half of `seeds` runs of the loop in each cell, a hundred times `seeds` of the automata."""
+    """Return everything of the chapter: half of `seeds` runs of the loop in each cell, a hundred times `seeds` of the automata."""
     tick("runs of the automata")
-    runs = ch7_automata.play(seeds)
+    runs = ch7_automata.play_all(seeds)
     settings = {
         "runs of the automata": f"{runs.many}, and the first {ch7_trust.RUNS} of them as in the thesis; up to 1000 time units",
         "automata": "figure 7.2 is not in the thesis's text: configs/automata/reactive-braking.yaml is a reading of section 7.4",
@@ -24,20 +23,16 @@ def reproduce(seeds: int, tick: Tick, figures: bool) -> Report:
         "runs are too few to decide",
         "not given in the thesis": "rates of exponential delays, which limits are invariants and which guards, when apply_break is set",
     }
-    out = Report("ch7", TITLE, settings)
+    out = Report("ch7", TITLE, settings, drawn=figures)
     tick("what the queries say")
-    automata, curves = ch7_automata.report(runs, seeds)
-    out.add(automata)
-    out.add(ch7_signals.report())
+    out.add(ch7_automata.parts(runs, seeds))
+    out.add(ch7_signals.parts())
     tick("intervals")
-    out.add(ch7_trust.report(runs))
-    out.add(ch7_ratings.report(runs, seeds))
-    out.add(ch7_loop.report(seeds, tick))
+    out.add(ch7_trust.parts(runs))
+    out.add(ch7_ratings.parts(runs, seeds))
+    out.add(ch7_loop.parts(seeds, tick))
     tick("widths of the interval")
-    out.add(ch7_width.report(seeds))
+    out.add(ch7_width.parts(seeds))
     tick("what a run costs")
-    out.add(ch7_cost.report())
-    if figures:
-        tick("pictures")
-        out.figures += ch7_figures.all_figures(curves)
+    out.add(ch7_cost.parts())
     return out

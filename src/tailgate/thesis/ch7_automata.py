@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -12,8 +14,10 @@ from tailgate.evaluation.stats import Interval, proportion
 from tailgate.trust.automata import Atom, Network, Query, load_network
 from tailgate.trust.simulate import Runs, simulate
 
+from . import ch7_figures
 from .ch7_trust import PRINTED, RUNS, THESIS, first, interval, judge
-from .claims import Claim, Report, Table, verdict
+from .claims import Claim, Drawing, Part, Table, verdict
+from .runs import share
 
 NETWORK = "reactive-braking"
 TEXTS = {
@@ -27,7 +31,7 @@ MEAN_ALARM = 1.5 * math.log(2.0)  # of a delay between 1 / r and 2 / r, r drawn 
 
 
 def closed_form(limit: float, deadline: float, before: float = 0.0) -> float:
-    """P(alarm + U(0, before) + U(0, limit) < deadline) where all but the last are over by the deadline and it may not be.
+    """Return P(alarm + U(0, before) + U(0, limit) < deadline) where all but the last are over by the deadline and it may not be.
 
     `before` is the limit of an earlier uniform delay; needs 2 + before <= deadline <= limit.
     """
@@ -46,55 +50,57 @@ Curves = dict[tuple[str, float], Array]  # share of runs by deadline, by the loc
 
 
 class Played(NamedTuple):
-    """Runs by reading, of which the first RUNS stand for the thesis's."""
+    """Runs by reading of the limits: as invariants, or as guards. The first RUNS represent the thesis's."""
 
     many: int
-    declared: Runs
+    invariants: Runs
     guards: Runs
 
-    def reading(self, name: str) -> Runs:
-        return self.declared if name == "invariants" else self.guards
-
-
-READINGS = ("invariants", "guards")
+    def of(self, row: int) -> dict[str, Array]:
+        """Return (many,) when a query is first met, by reading."""
+        return {"invariants": self.invariants.hit[row], "guards": self.guards.hit[row]}
 
 
 def as_guards(network: Network) -> Network:
-    """The limits of 100 and 500 as guards: the location is left after an exponential delay of rate 1."""
+    """Make the limits of 100 and 500 guards: the location is left after an exponential delay of rate 1."""
     out = network.with_location("controller", "Intermediate", invariant=())
     out = out.with_edge("controller", "Intermediate", "Command", guard=(Atom("react", "<=", 100.0),))
     out = out.with_location("actuator", "braking", invariant=())
     return out.with_edge("actuator", "braking", "break", guard=(Atom("press", "<=", 500.0),))
 
 
-def play(seeds: int) -> Played:
+def play_all(seeds: int) -> Played:
+    """Run both readings, a hundred times as often as a chapter has seeds."""
     network, many = load_network(NETWORK), 100 * seeds
     return Played(many, simulate(network, range(many)), simulate(as_guards(network), range(many)))
 
 
-def report(runs: Played, seeds: int) -> tuple[Report, Curves]:
-    out, network = Report("ch7", "", {}), load_network(NETWORK)
-    out.claims += [_query(runs, i, name) for i, name in enumerate(TEXTS)]
+def parts(runs: Played, seeds: int) -> Iterator[Part]:
+    """Return claims, tables and drawings of the automata."""
+    network = load_network(NETWORK)
+    yield from (_query(runs, i, name) for i, name in enumerate(TEXTS))
     curves = _curves(network, 10 * seeds)
-    out.claims += [_construction(runs, curves, 10 * seeds), _in_time(network, 10 * seeds), *_long(network, seeds)]
-    out.tables += [_table(runs), _limits(curves)]
-    return out, curves
+    yield from (_construction(runs, curves, 10 * seeds), _in_time(network, 10 * seeds), *_long(network, seeds))
+    yield from (_table(runs), _limits(curves))
+    caption = "Figure 7.2 again, as read from section 7.4. Thick: where it begins; dashed: signals that table 7.1 does not trust."
+    yield Drawing("figure-7-2", caption, partial(ch7_figures.automata, network))
+    caption = (
+        "The answer to a query is what its deadline and the location's limit make it. Band: the thesis's interval; line: its deadline; "
+        "the thesis's limits are 100 and 500."
+    )
+    yield Drawing("figure-queries", caption, partial(ch7_figures.queries, DEADLINES, LIMITS, curves))
 
 
-def successes(hit: Array) -> int:
-    return int(np.isfinite(hit).sum())
+def met(hit: Array) -> Interval:
+    """Return the share of the runs (n,) in which a query is met."""
+    return share(np.isfinite(hit))
 
 
 def _query(runs: Played, row: int, name: str) -> Claim:
     found, intervals = {}, []
-    for reading in READINGS:
-        hit = runs.reading(reading).hit[row]
-        all_of_them = proportion(successes(hit), runs.many)
-        intervals.append(all_of_them)
-        found[reading] = {
-            f"of {RUNS}": interval(proportion(successes(first(hit)), len(first(hit)))),
-            f"of {runs.many}": interval(all_of_them),
-        }
+    for reading, hit in runs.of(row).items():
+        intervals.append(met(hit))
+        found[reading] = {f"of {RUNS}": interval(met(first(hit))), f"of {runs.many}": interval(met(hit))}
     holds, note = judge(intervals, THESIS[0], THESIS[0])
     return Claim(f"7.4-{name}", TEXTS[name], PRINTED, found, holds, WHY[name] + note)
 
@@ -102,20 +108,10 @@ def _query(runs: Played, row: int, name: str) -> Claim:
 def _table(runs: Played) -> Table:
     rows = []
     for row, name in enumerate(TEXTS):
-        for reading in READINGS:
-            hit = runs.reading(reading).hit[row]
-            few, many = successes(first(hit)), successes(hit)
-            p = many / runs.many
-            rows.append(
-                (
-                    TEXTS[name],
-                    reading,
-                    f"{few} of {RUNS}",
-                    _words(proportion(few, RUNS)),
-                    _words(proportion(many, runs.many)),
-                    f"{p**RUNS:.3f}",
-                )
-            )
+        for reading, hit in runs.of(row).items():
+            few = int(np.isfinite(first(hit)).sum())
+            chance = f"{met(hit).value ** RUNS:.3f}"
+            rows.append((TEXTS[name], reading, f"{few} of {RUNS}", _words(proportion(few, RUNS)), _words(met(hit)), chance))
     heads = ("query", "limits are", "runs", "95 %", f"of {runs.many}, 95 %", "chance of 36 in 36")
     return Table("The three queries", heads, tuple(rows))
 
@@ -125,7 +121,7 @@ def _words(i: Interval) -> str:
 
 
 def _curves(network: Network, count: int) -> Curves:
-    """When the variable is first 1, as a distribution: its value at a deadline is the answer of the query with that deadline."""
+    """Return when the variable is first 1, as a distribution: its value at a deadline answers the query with that deadline."""
     out: Curves = {}
     for where, clock, component, variable in (
         ("Intermediate", "react", "controller", "obs"), ("braking", "press", "actuator", "apply_break"),
@@ -143,20 +139,19 @@ def _at(curves: Curves, where: str, limit: float, deadline: float) -> float:
 
 
 def _construction(runs: Played, curves: Curves, count: int) -> Claim:
-    """The thesis's own limits decide; what other limits give is beside it."""
+    """Judge by the thesis's own limits, and show what other limits give."""
     own, sensitivity, off = {}, {}, []
     for row, name, form in ((1, "controller", closed_form(100.0, 100.0)), (2, "actuator", BELOW)):
-        share = proportion(successes(runs.declared.hit[row]), runs.many)
-        own[name] = {"as invariants": interval(share), "closed form": round(form, 4)}
-        own[name]["as guards"] = successes(runs.guards.hit[row]) / runs.many
-        off.append(abs(share.value - form) / math.sqrt(form * (1.0 - form) / runs.many))
+        declared, guards = (met(hit) for hit in runs.of(row).values())
+        own[name] = {"as invariants": interval(declared), "closed form": round(form, 4), "as guards": guards.value}
+        off.append(abs(declared.value - form) / math.sqrt(form * (1.0 - form) / runs.many))
     for where, deadline, before in (("Intermediate", 100.0, 0.0), ("braking", 500.0, 100.0)):
         for limit in LIMITS[where]:
-            share_ = _at(curves, where, limit, deadline)
-            sensitivity[f"{where} <= {limit:g}, deadline {deadline:g}"] = share_
+            found = _at(curves, where, limit, deadline)
+            sensitivity[f"{where} <= {limit:g}, deadline {deadline:g}"] = found
             if limit >= deadline:
                 form = closed_form(limit, deadline, before)
-                off.append(abs(share_ - form) / math.sqrt(form * (1.0 - form) / count))
+                off.append(abs(found - form) / math.sqrt(form * (1.0 - form) / count))
     forms, agree = [closed_form(100.0, 100.0), BELOW], max(off) < 4.0
     return Claim(
         "7.4-verified", "The queries verify that the reactive sub-system acts within its deadlines", "verified",
@@ -173,19 +168,17 @@ def _limits(curves: Curves) -> Table:
         rows += [
             (where, f"{limit:g}", *(f"before {d:g}: {_at(curves, where, limit, d):.3f}" for d in deadlines)) for limit in LIMITS[where]
         ]
-    heads = ("location", "its limit", *("share" for _ in range(4)))
-    return Table(
-        "What changes when limits and deadlines change: share of runs in which the command (the brake) comes in time", heads, tuple(rows)
-    )
+    title = "What changes when limits and deadlines change: share of runs in which the command (the brake) comes in time"
+    return Table(title, ("location", "its limit", *["share"] * 4), tuple(rows))
 
 
 def _in_time(network: Network, count: int) -> Claim:
-    """From the alarm to the brake, not from the beginning of time."""
+    """Measure from the alarm to the brake, not from the beginning of time."""
     alarm = Query("alarm", 1000.0, (Atom("clk_p", ">", 1.0),))
     brake = Query("brake", 1000.0, (Atom("apply_break", "=", 1.0),))
     hit = simulate(network, range(count), queries=[alarm, brake]).hit
     took = hit[1] - hit[0]
-    within = proportion(int((took <= 600.0 + 1.0).sum()), count)
+    within = share(took <= 600.0 + 1.0)
     holds, note = judge([within], 0.95, 0.9)
     return Claim(
         "7.4-600", "When the distance is below 20 m the reactive controller brakes within 600 ms", 600,
@@ -196,7 +189,7 @@ def _in_time(network: Network, count: int) -> Claim:
 
 
 def _long(network: Network, seeds: int) -> list[Claim]:
-    """The whole 1000 time units, whatever has held."""
+    """Run the whole 1000 time units, whatever has held."""
     runs = simulate(network, range(seeds), within=1000.0, queries=[])
     taken = {edge.sync: runs.taken[e] for e, (_, edge) in enumerate(network.edges()) if edge.sync}
     alarms = taken["obs_detect!"]

@@ -2,23 +2,23 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
 
-from tailgate.core import Array, draws
-from tailgate.core.registry import Spec
+from tailgate.core import Array
 from tailgate.core.scenario import load_scenario
-from tailgate.evaluation.stats import Interval, proportion
-from tailgate.play.trace import Trace, rollout
+from tailgate.evaluation.stats import Interval
+from tailgate.play.trace import Trace
 from tailgate.trust.cells import Outcome, outcome
 from tailgate.trust.properties import Demands, Property, built_in
 from tailgate.trust.properties import own as own_properties
 from tailgate.trust.signals import SafeDistance
 
-from .ch4_cases import Tick
 from .ch7_trust import THESIS, interval, judge
-from .claims import Claim, Report, Table
+from .claims import Claim, Part, Table, Tick
+from .runs import collided, median, percent, play, share
 
 SCENARIO = "ch7-v0"
 ABOUT = f"{SCENARIO}: 30 s of stop and go at dt = 0.05 s, a lidar accurate to 0.3 m, readings of its gap attacked"
@@ -34,7 +34,7 @@ ATTACKS = {
 }
 SPOOFED, OTHER = list(ATTACKS)[1], list(ATTACKS)[2]  # the thesis's: shown beyond 20 m while it is nearer; the same at another time
 RAMPS = list(ATTACKS)[3:]  # which the thesis does not describe
-GUARDS = {
+DEFENCES = {
     "no monitor": "kf",
     "chi-square gate": "chi2_kf",
     "monitor": "safe_state",
@@ -42,7 +42,7 @@ GUARDS = {
     "monitor at the lidar's accuracy, and brake": "safe_state_brake:sigmas=1.7321",
     "monitor, brakes below 20 m": "safe_state_brake:distance=20",
 }
-BRAKES = list(GUARDS)[3:]
+BRAKES = list(DEFENCES)[3:]
 LEVEL = 0.95  # that a share has to reach
 
 
@@ -53,19 +53,20 @@ class Run(NamedTuple):
     notice: Array  # (B,) from the first attacked step to the first alarm [s]; inf for none, NaN without an attack
     alarms: Array  # (B,) steps with an alarm
     gap: Array  # (B,) smallest [m]
-    literal: Outcome  # below 20 m it brakes within 600 ms
+    printed: Outcome  # below 20 m it brakes within 600 ms
     threat: Outcome  # the same once an attack has begun and the gap is unsafe
 
 
-def literal() -> Property:
-    """The thesis's demand, word for word."""
-    place, asked = load_scenario(SCENARIO), Demands()
-    last = (place.horizon - 1) * place.plant.dt - DEADLINE
+def printed_demand() -> Property:
+    """Return the thesis's demand, word for word."""
+    scenario, asked = load_scenario(SCENARIO), Demands()
+    last = (scenario.horizon - 1) * scenario.plant.dt - DEADLINE
     answer = f"(applied <= {-asked.braking:g} or speed <= {asked.stands:g})"
-    return own_properties(place, [f"G[0,{last:g}] (gap < {BELOW:g} -> F[0,{DEADLINE:g}] {answer})"])[0]
+    return own_properties(scenario, [f"G[0,{last:g}] (gap < {BELOW:g} -> F[0,{DEADLINE:g}] {answer})"])[0]
 
 
 def measured(trace: Trace) -> Run:
+    """Read everything off a trace."""
     live = trace.live
     attacked, alarm = (trace.kind != 0) & live, trace.alarm.any(axis=2) & live
     begin = np.where(attacked.any(axis=0), attacked.argmax(axis=0), 0)
@@ -74,50 +75,41 @@ def measured(trace: Trace) -> Run:
     threat = next(p for p in built_in(load_scenario(SCENARIO)) if p.name == "brakes")
     safe = SafeDistance()
     return Run(
-        np.asarray((trace.collided & live).any(axis=0)), np.where(attacked.any(axis=0), notice, np.nan), alarm.sum(axis=0),
-        np.where(live[:, :, None], trace.gap, np.inf).min(axis=(0, 2)), outcome(literal(), trace, safe), outcome(threat, trace, safe),
+        collided(trace), np.where(attacked.any(axis=0), notice, np.nan), alarm.sum(axis=0),
+        np.where(live[:, :, None], trace.gap, np.inf).min(axis=(0, 2)), outcome(printed_demand(), trace, safe),
+        outcome(threat, trace, safe),
     )  # fmt: skip
 
 
 Runs = dict[tuple[str, str], Run]
 
 
-def play(seeds: int, tick: Tick) -> Runs:
-    place, out = load_scenario(SCENARIO), {}
+def parts(seeds: int, tick: Tick) -> Iterator[Part]:
+    """Play every attack against every defence; return the claims and the table."""
+    count = max(10, seeds // 2)
+    runs: Runs = {}
     for attack, text in ATTACKS.items():
         tick(f"in the loop: {attack}")
-        for guard, name in GUARDS.items():
-            spec = Spec("defence", name)
-            keys = draws.keys("report", range(seeds))
-            out[attack, guard] = measured(rollout(place.loop(spec.make(), spec.entry.uses), Spec("attack", text).make(), keys))
-    return out
-
-
-def report(seeds: int, tick: Tick) -> Report:
-    runs, out = play(max(10, seeds // 2), tick), Report("ch7", "", {})
-    out.claims += [_collision(runs), _interval(runs), _notified(runs), _prevented(runs), _ramps(runs), _brakes(runs), _threat(runs)]
-    out.tables.append(_table(runs))
-    return out
-
-
-def _share(good: Array) -> Interval:
-    return proportion(int(np.count_nonzero(good)), len(good))
+        for defence, name in DEFENCES.items():
+            runs[attack, defence] = measured(play(load_scenario(SCENARIO), name, text, count))
+    yield from (_collision(runs), _interval(runs), _notified(runs), _prevented(runs), _ramps(runs), _brakes(runs), _threat(runs))
+    yield _table(runs)
 
 
 def _collision(runs: Runs) -> Claim:
-    found = {attack: _share(runs[attack, "no monitor"].collided) for attack in ATTACKS}
+    found = {attack: share(runs[attack, "no monitor"].collided) for attack in ATTACKS}
     holds, note = judge([found[SPOOFED]], LEVEL)
     return Claim(
         "7.4-collision", "With spoofed lidar signals the controller cannot brake in time, and the car collides", "a collision",
-        {attack: interval(share) for attack, share in found.items()}, holds,
+        {attack: interval(hit) for attack, hit in found.items()}, holds,
         f"share of runs that collide without a monitor: a Kalman filter believes the lidar; decided by {SPOOFED}{note}",
     )  # fmt: skip
 
 
 def _interval(runs: Runs) -> Claim:
-    hits = {attack: interval(_share(runs[attack, "monitor"].alarms > 0)) for attack in (SPOOFED, OTHER, *RAMPS)}
-    exact = _share(runs["none", BRAKES[1]].alarms == 0)
-    holds, note = judge([_share(runs["none", "monitor"].alarms == 0), exact], LEVEL)
+    hits = {attack: interval(share(runs[attack, "monitor"].alarms > 0)) for attack in (SPOOFED, OTHER, *RAMPS)}
+    exact = share(runs["none", BRAKES[1]].alarms == 0)
+    holds, note = judge([share(runs["none", "monitor"].alarms == 0), exact], LEVEL)
     alarms = runs["none", "monitor"].alarms
     found = {
         "alarms without an attack": int(alarms.sum()), "in runs": len(alarms),
@@ -131,18 +123,18 @@ def _interval(runs: Runs) -> Claim:
     )  # fmt: skip
 
 
-def _noticed(run: Run) -> tuple[Interval | None, dict[str, Any]]:
-    """Of the runs in which the attack began; of none, None."""
+def _noticed(run: Run) -> tuple[Interval | None, dict[str, object]]:
+    """Return the share of the runs in which the attack began that notice it in time (None if it began in none), and figures."""
     notice = run.notice[~np.isnan(run.notice)]
     if not len(notice):
         return None, {"runs in which it began": 0}
-    share, median = _share(notice <= NOTICE + 1e-9), float(np.median(notice))
-    return share, {f"within {1000 * NOTICE:g} ms": interval(share), "median [s]": median if np.isfinite(median) else "never"}
+    heard, after = share(notice <= NOTICE + 1e-9), median(notice)
+    return heard, {f"within {1000 * NOTICE:g} ms": interval(heard), "median [s]": after if np.isfinite(after) else "never"}
 
 
 def _notified(runs: Runs) -> Claim:
-    share, _ = _noticed(runs[SPOOFED, "monitor"])
-    holds, note = judge([share], LEVEL) if share else ("partly", "; it began in no run")
+    heard, _ = _noticed(runs[SPOOFED, "monitor"])
+    holds, note = judge([heard], LEVEL) if heard else ("partly", "; it began in no run")
     return Claim(
         "7.4-notified", "Safe state estimation detects the fault and notifies the controller within the desired time", "notified",
         {attack: _noticed(runs[attack, "monitor"])[1] for attack in (SPOOFED, OTHER)}, holds,
@@ -151,7 +143,7 @@ def _notified(runs: Runs) -> Claim:
 
 
 def _prevented(runs: Runs) -> Claim:
-    holds, note = judge([_share(~runs[SPOOFED, "monitor and brake"].collided)], LEVEL)
+    holds, note = judge([share(~runs[SPOOFED, "monitor and brake"].collided)], LEVEL)
     return Claim(
         "7.4-prevented", "Monitor and reactive controller prevent the collision", "prevented",
         {attack: _unharmed(runs, attack) for attack in (SPOOFED, OTHER)}, holds,
@@ -160,17 +152,17 @@ def _prevented(runs: Runs) -> Claim:
     )  # fmt: skip
 
 
-def _unharmed(runs: Runs, attack: str) -> dict[str, Any]:
-    return {guard: interval(_share(~runs[attack, guard].collided)) for guard in GUARDS if guard != "no monitor"}
+def _unharmed(runs: Runs, attack: str) -> dict[str, object]:
+    return {name: interval(share(~runs[attack, name].collided)) for name in DEFENCES if name != "no monitor"}
 
 
 def _ramps(runs: Runs) -> Claim:
     cells, found = [], {}
     for attack in RAMPS:
-        share, told = _noticed(runs[attack, "monitor"])
-        cells += [share] if share else []
-        cells.append(_share(~runs[attack, "monitor and brake"].collided))
-        found[attack] = {"notified": told, "without a collision": _unharmed(runs, attack)}
+        heard, notified = _noticed(runs[attack, "monitor"])
+        cells += [heard] if heard else []
+        cells.append(share(~runs[attack, "monitor and brake"].collided))
+        found[attack] = {"notified": notified, "without a collision": _unharmed(runs, attack)}
     holds, note = judge(cells, LEVEL)
     return Claim(
         "7.4-ramps", "The same where the distance grows slowly: the fault is detected in time and the collision prevented",
@@ -181,38 +173,38 @@ def _ramps(runs: Runs) -> Claim:
 
 
 def _brakes(runs: Runs) -> Claim:
-    guard = "monitor, brakes below 20 m"
-    shares = {(attack, guard): _share(runs[attack, guard].literal.holds) for attack in (SPOOFED, "none")}
-    beside = {(attack, g): _share(runs[attack, g].literal.holds) for attack, g in (("none", "no monitor"), (SPOOFED, "monitor and brake"))}
-    holds, note = judge(list(shares.values()), LEVEL)
+    brake = "monitor, brakes below 20 m"
+    cells = ((SPOOFED, brake), ("none", brake), ("none", "no monitor"), (SPOOFED, "monitor and brake"))
+    shares = {cell: share(runs[cell].printed.holds) for cell in cells}
+    holds, note = judge([shares[cell] for cell in cells[:2]], LEVEL)
     return Claim(
         "7.4-600-loop", "When the distance is below 20 m the reactive controller brakes within 600 ms", "600 ms",
-        {f"{attack}; {g}": interval(share) for (attack, g), share in (shares | beside).items()}, holds,
+        {f"{attack}; {defence}": interval(held) for (attack, defence), held in shares.items()}, holds,
         "as worded it is the wrong demand: a healthy car that creeps at 10 m has no reason to brake; decided by the brake below 20 m, "
         f"under {SPOOFED} and without an attack{note}",
     )  # fmt: skip
 
 
 def answered(run: Run) -> Interval | None:
-    """Share of the runs in which the threat came about that answer it; None where it came about in none."""
+    """Return the share of the runs in which the threat came about that answer it; None where it came about in none."""
     asked = run.threat.asked
-    return _share(run.threat.holds[asked]) if asked.any() else None
+    return share(run.threat.holds[asked]) if asked.any() else None
 
 
 def _threat(runs: Runs) -> Claim:
-    """A run in which the threat never came about says nothing of the answer, and does not count."""
+    """Judge runs in which the threat came about: others do not count, as they show no answer."""
     cells, found = [], {}
     for attack in (SPOOFED, OTHER, *RAMPS):
-        for guard in ("no monitor", *BRAKES):
-            run = runs[attack, guard]
-            share = answered(run)
-            said: dict[str, Any] = {"asked": f"{int(run.threat.asked.sum())} of {len(run.collided)}"}
-            said["answered"] = interval(share) if share else None
-            if share is None:
+        for defence in ("no monitor", *BRAKES):
+            run = runs[attack, defence]
+            answer = answered(run)
+            said: dict[str, object] = {"asked": f"{int(run.threat.asked.sum())} of {len(run.collided)}"}
+            said["answered"] = interval(answer) if answer else None
+            if answer is None:
                 said["reason"] = "never unsafe under attack"
-            elif guard == "monitor and brake":
-                cells.append(share)
-            found[f"{attack}; {guard}"] = said
+            elif defence == "monitor and brake":
+                cells.append(answer)
+            found[f"{attack}; {defence}"] = said
     holds, note = judge(cells, THESIS[0]) if cells else ("partly", "; the threat came about in no run")
     return Claim(
         "7.4-600-threat", "Where an attack brings the car too close, the reactive controller brakes within 600 ms",
@@ -225,14 +217,14 @@ def _threat(runs: Runs) -> Claim:
 
 def _table(runs: Runs) -> Table:
     rows = []
-    for (attack, guard), run in runs.items():
-        told, share = run.notice[~np.isnan(run.notice)], answered(run)
-        heard = told[np.isfinite(told)]
+    for (attack, defence), run in runs.items():
+        notice, answer = run.notice[~np.isnan(run.notice)], answered(run)
+        heard = notice[np.isfinite(notice)]
         rows.append((
-            attack, guard, f"{100 * run.collided.mean():.1f} %", f"{np.median(run.gap):.1f}",
-            f"{100 * len(heard) / len(told):.0f} %" if len(told) else "", f"{np.median(heard):.2f}" if len(heard) else "",
-            f"{100 * run.literal.holds.mean():.0f} %",
-            f"{100 * share.value:.0f} % [{100 * share.low:.0f}, {100 * share.high:.0f}]" if share else "never unsafe",
+            attack, defence, f"{100 * run.collided.mean():.1f} %", f"{np.median(run.gap):.1f}",
+            f"{100 * len(heard) / len(notice):.0f} %" if len(notice) else "", f"{np.median(heard):.2f}" if len(heard) else "",
+            f"{100 * run.printed.holds.mean():.0f} %",
+            percent(answer) if answer else "never unsafe",
             f"{int(run.threat.asked.sum())} of {len(run.collided)}",
         ))  # fmt: skip
     heads = (

@@ -2,26 +2,28 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Iterator
 
 import numpy as np
 
-from tailgate.evaluation.stats import Interval, proportion
+from tailgate.core import Array
+from tailgate.evaluation.stats import Interval
 from tailgate.trust.automata import Atom, Network, load_network
 from tailgate.trust.simulate import simulate
 
-from .ch7_automata import NETWORK, TEXTS, Played, successes
+from .ch7_automata import NETWORK, TEXTS, Played, met
 from .ch7_trust import interval
-from .claims import Claim, Report, verdict
+from .claims import Claim, verdict
+from .runs import share
 
 PAIR = {"a slow brake": (100.0, 3000.0), "both slow": (220.0, 700.0)}  # limits of controller and actuator; deadlines stay
 
 
-def report(runs: Played, seeds: int) -> Report:
-    """Three ratings as they stand, and of two other systems which one the sum prefers."""
+def parts(runs: Played, seeds: int) -> Iterator[Claim]:
+    """Judge the sum of the three ratings, and which of two other systems it prefers."""
     network, count = load_network(NETWORK), 10 * seeds
-    rates, every = _rated(runs.declared.hit)
-    found: dict[str, Any] = {"as in the thesis": _words(rates, every)}
+    rates, every = _rated(runs.invariants.hit)
+    found: dict[str, object] = {"as in the thesis": _words(rates, every)}
     sums, joint = {}, {}
     for name, limits in PAIR.items():
         parts, all_ = _rated(simulate(_slow(network, *limits), range(count)).hit)
@@ -32,14 +34,12 @@ def report(runs: Played, seeds: int) -> Report:
         "the sum prefers": max(sums, key=lambda name: sums[name]),
         "all at once is likelier with": max(joint, key=lambda name: joint[name]),
     }
-    out = Report("ch7", "", {})
-    out.claims.append(Claim(
+    yield Claim(
         "7.3.5-sum", "Trust in the system is quantified by adding the ratings of all its controllers", "sum of the ratings", found,
         verdict(every.low <= mean <= every.high, mean > every.high),
         "a sum of three probabilities is none, and divided by three it is not the chance that all three do what they should; nor does it "
         f"put two systems in the order of that chance ({count} runs each)",
-    ))  # fmt: skip
-    return out
+    )  # fmt: skip
 
 
 def _slow(network: Network, controller: float, actuator: float) -> Network:
@@ -47,13 +47,12 @@ def _slow(network: Network, controller: float, actuator: float) -> Network:
     return out.with_location("actuator", "braking", invariant=(Atom("press", "<=", actuator),))
 
 
-def _rated(hit: Any) -> tuple[list[float], Interval]:
-    """Share of the runs in which each query (Q, B) holds, and in which all do."""
-    many = hit.shape[1]
-    return [successes(row) / many for row in hit], proportion(int(np.isfinite(hit).all(axis=0).sum()), many)
+def _rated(hit: Array) -> tuple[list[float], Interval]:
+    """Return the share of the runs in which each query of `hit` (Q, B) holds, and in which all do."""
+    return [met(row).value for row in hit], share(np.isfinite(hit).all(axis=0))
 
 
-def _words(rates: list[float], every: Interval) -> dict[str, Any]:
+def _words(rates: list[float], every: Interval) -> dict[str, object]:
     return {
         "ratings": dict(zip(TEXTS, (round(rate, 4) for rate in rates), strict=True)), "sum": round(sum(rates), 4),
         "mean": round(sum(rates) / len(rates), 4), "all at once": interval(every),

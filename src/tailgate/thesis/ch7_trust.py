@@ -1,10 +1,10 @@
-"""What 36 successes in 36 runs say of trust, and what they do not."""
+"""Trust after 36 successes in 36 runs."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,7 +12,8 @@ from tailgate.core import Array
 from tailgate.evaluation.stats import Interval, proportion
 from tailgate.trust.statistics import Sequential
 
-from .claims import Claim, Holds, Report, Table, verdict
+from .claims import Claim, Holds, Part, Table, verdict
+from .runs import share
 
 if TYPE_CHECKING:
     from .ch7_automata import Played
@@ -25,11 +26,12 @@ LEVELS = (0.9, 0.95, 0.99, 0.999)
 
 
 def interval(i: Interval) -> dict[str, float]:
+    """Return a share with its limits, as reports have them."""
     return {"share": round(i.value, 4), "low": round(i.low, 4), "high": round(i.high, 4)}
 
 
 def judge(cells: Sequence[Interval], level: float, floor: float = 0.5) -> tuple[Holds, str]:
-    """The verdict on shares that have to reach a level, and what to add to `why` where an interval does not decide it.
+    """Return the verdict on shares that have to reach a level, and what to add to `why` where an interval does not decide it.
 
     A share that reaches the level counts for the claim even if its interval goes below, so that neither the number of runs nor one failure
     decides; one whose whole interval is below `floor` against it.
@@ -41,20 +43,18 @@ def judge(cells: Sequence[Interval], level: float, floor: float = 0.5) -> tuple[
 
 
 def first(hit: Array) -> Array:
-    """The runs that stand for the thesis's."""
+    """Return the runs that represent the thesis's."""
     return hit[:RUNS]
 
 
 def frechet(lows: list[float]) -> float:
-    """Least probability of all events together, given the least of each, whatever they have to do with each other."""
+    """Return the least probability of all events together, given the least of each, for any dependence among them."""
     return max(0.0, 1.0 - sum(1.0 - low for low in lows))
 
 
-def report(runs: Played) -> Report:
-    out = Report("ch7", "", {})
-    out.claims += [_interval(), _coverage(), _confidence(), _trust(), _all(runs)]
-    out.tables.append(_levels())
-    return out
+def parts(runs: Played) -> Iterator[Part]:
+    """Return claims and a table on what 36 runs say."""
+    yield from (_interval(), _coverage(), _confidence(), _trust(), _all(runs), _levels())
 
 
 def _interval() -> Claim:
@@ -69,7 +69,7 @@ def _interval() -> Claim:
 
 
 def _coverage() -> Claim:
-    """The rule by which 36 comes about, where runs do fail."""
+    """Judge the rule by which 36 comes about, where runs do fail."""
     worst, p = Sequential(WIDTH).worst_coverage()
     return Claim(
         "7.3.5-coverage", "The interval at which the runs stop has 95 % confidence", 0.95,
@@ -91,7 +91,7 @@ def _confidence() -> Claim:
 
 
 def _trust() -> Claim:
-    """What 95 % can mean, and how often bad systems pass."""
+    """Show what 95 % can mean, and how often bad systems pass."""
     passes = {f"P = {p}": round(p**RUNS, 3) for p in (0.9, 0.95, 0.98)}
     one_sided = 0.05 ** (1.0 / RUNS)
     return Claim(
@@ -104,18 +104,17 @@ def _trust() -> Claim:
 
 
 def _all(runs: Played) -> Claim:
-    """Trust in the vehicle needs all three at once."""
-    hit = np.isfinite(runs.declared.hit)
-    every = proportion(int(hit.all(axis=0).sum()), runs.many)
+    """Judge all three at once, as trust in the vehicle needs them."""
+    hit = np.isfinite(runs.invariants.hit)
+    every = share(hit.all(axis=0))
     holds, note = judge([every], THESIS[0], THESIS[0])
     split = (0.05 / len(hit)) ** (1.0 / RUNS)
-    measured: dict[str, Any] = {
-        "three times 36 of 36, 5 % split over them": round(frechet([split] * len(hit)), 4),
-        f"all three in one run, of {runs.many}": interval(every),
-    }
     return Claim(
-        "7.4-overall", "Based on the results of the three automata, the overall trust is that of each", PRINTED, measured,
-        holds,
+        "7.4-overall", "Based on the results of the three automata, the overall trust is that of each", PRINTED,
+        {
+            "three times 36 of 36, 5 % split over them": round(frechet([split] * len(hit)), 4),
+            f"all three in one run, of {runs.many}": interval(every),
+        }, holds,
         "of three statements only their joint probability counts: without independence 1 less the sum of what is missing (Frechet), or all "
         f"three counted run by run{note}",
     )  # fmt: skip
@@ -125,9 +124,5 @@ def _levels() -> Table:
     rows = []
     for n in (36, 73, 299, 1000, 20000):
         rows.append((str(n), *(f"{proportion(n, n, level).low:.4f}" for level in LEVELS), *(f"{p**n:.3g}" for p in (0.9, 0.95, 0.99))))
-    heads = (
-        "runs, all good",
-        *(f"at least, {100 * level:g} % interval" for level in LEVELS),
-        *(f"passes with P = {p}" for p in (0.9, 0.95, 0.99)),
-    )
-    return Table("What so many successes without a failure say", heads, tuple(rows))
+    heads = (*(f"at least, {100 * level:g} % interval" for level in LEVELS), *(f"passes with P = {p}" for p in (0.9, 0.95, 0.99)))
+    return Table("What so many successes without a failure say", ("runs, all good", *heads), tuple(rows))

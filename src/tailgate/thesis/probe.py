@@ -24,7 +24,7 @@ class Fed(NamedTuple):
 
 
 def start(defence: Composed, model: Model, x: Array, P: Array) -> tuple[Any, Any]:
-    """Plan and state of B runs from means x (B, n) and one covariance P (n, n)."""
+    """Return plan and state of B runs from means x (B, n) and one covariance P (n, n)."""
     plan = defence.prepare(model)
     cov = num.full((len(x), 1, *P.shape), P)
     return plan, defence.start(plan, Prior(num.batch_last(x[:, None]), cov))
@@ -33,7 +33,7 @@ def start(defence: Composed, model: Model, x: Array, P: Array) -> tuple[Any, Any
 def feed(
     defence: Composed, model: Model, P: Array, *, innovations: Array | None = None, readings: Array | None = None, x: Array | None = None
 ) -> Fed:
-    """Runs of one agent without input, from covariance P (n, n) and means x (B, n), zero if not given.
+    """Return runs of one agent without input, from covariance P (n, n) and means x (B, n), zero if not given.
 
     Either innovations (K, B, q): what each reading adds to the filter's own prediction; or readings (K, B, q) themselves.
     """

@@ -1,4 +1,4 @@
-"""What the resilient distributed estimators guarantee (thesis, Theorems 5.3.3, 5.3.4, 6.5.3 and 6.5.4, restated), for steady gains.
+"""Guarantees of the resilient distributed estimators (thesis, Theorems 5.3.3, 5.3.4, 6.5.3 and 6.5.4, restated), for steady gains.
 
     (5.8)   norm_resilient     (6.26)   lasso_dkf
 
@@ -16,7 +16,7 @@ MOST = 22  # sensors of which all combinations of signs are tried
 
 
 def _white(model: Model) -> Array:
-    """Sv_i^-1/2 C_i (N, q, n); any root gives the same norms."""
+    """Return Sv_i^-1/2 C_i (N, q, n); any root gives the same norms."""
     from scipy.linalg import cholesky, solve_triangular
 
     pairs = zip(model.C, model.R, strict=True)
@@ -24,13 +24,15 @@ def _white(model: Model) -> Array:
 
 
 def _push(model: Model, fusion: Fusion | None) -> tuple[Fusion, Array]:
-    """The fixed point, and Q_i^-1 C_i' (N, n, q)."""
+    """Return the fixed point, and Q_i^-1 C_i' (N, n, q)."""
     fusion = fusion or fixed_point(model)
     return fusion, np.asarray(fusion.Qinv @ np.swapaxes(model.C, 1, 2))
 
 
 def norm_bound(model: Model, lam: float, fusion: Fusion | None = None) -> Array:
-    """(N,) lam |Q_i^-1 C_i' Sv_i^-1/2|_2: how far two attacks can part the estimates (5.8) of one step. Tight; half of it from the prior.
+    """Return (N,) lam |Q_i^-1 C_i' Sv_i^-1/2|_2: how far two attacks can part the estimates (5.8) of one step.
+
+    Tight; half of it from the prior.
 
     Erratum: (5.11) of Theorem 5.3.4 has the factors in an order that does not multiply.
     """
@@ -39,7 +41,7 @@ def norm_bound(model: Model, lam: float, fusion: Fusion | None = None) -> Array:
 
 
 def norm_direction(model: Model, fusion: Fusion | None = None) -> Array:
-    """(N, q) injections, of length 1 after whitening, that reach `norm_bound` in the limit of a large factor of either sign."""
+    """Return (N, q) injections, of length 1 after whitening, that reach `norm_bound` in the limit of a large factor of either sign."""
     from scipy.linalg import cholesky
 
     fusion = fusion or fixed_point(model)
@@ -48,7 +50,7 @@ def norm_direction(model: Model, fusion: Fusion | None = None) -> Array:
 
 
 def lasso_bound(model: Model, lam: float | Array, fusion: Fusion | None = None) -> Array:
-    """(N,) lam max_{s in {-1, 1}^q} |Q_i^-1 C_i' s|_2: as `norm_bound`, for (6.26). lam may be (N, q), a price of each sensor.
+    """Return (N,) lam max_{s in {-1, 1}^q} |Q_i^-1 C_i' s|_2: as `norm_bound`, for (6.26). lam may be (N, q), a price of each sensor.
 
     Tight; half of it from the prior. Erratum: (6.29) of Theorem 6.5.4 repeats (5.11), which does not bound (6.26).
     Raises InputError for more sensors than all signs can be tried of.
@@ -58,12 +60,12 @@ def lasso_bound(model: Model, lam: float | Array, fusion: Fusion | None = None) 
 
 
 def lasso_direction(model: Model, lam: float | Array = 1.0, fusion: Fusion | None = None) -> Array:
-    """(N, q) signs s: injections that reach `lasso_bound` when multiplied by large factors of either sign."""
+    """Return (N, q) signs s: injections that reach `lasso_bound` when multiplied by large factors of either sign."""
     return _worst_signs(model, lam, fusion)[1]
 
 
 def _worst_signs(model: Model, lam: float | Array, fusion: Fusion | None) -> tuple[Array, Array]:
-    """Q_i^-1 C_i' diag(lam) (N, n, q) and the signs (N, q) of the largest product."""
+    """Return Q_i^-1 C_i' diag(lam) (N, n, q) and the signs (N, q) of the largest product."""
     q = model.C.shape[1]
     if q > MOST:
         raise InputError("model", f"{q} sensors", f"at most {MOST} sensors of each agent: all combinations of signs are tried")
@@ -82,14 +84,14 @@ def _worst_signs(model: Model, lam: float | Array, fusion: Fusion | None) -> tup
 
 
 def weighted_error(model: Model, error: Array, fusion: Fusion | None = None) -> Array:
-    """(..., N) sqrt(e_i' P_i^-1 e_i) of errors e (..., N, n), P_i being the fixed point of (5.5)."""
+    """Return (..., N) sqrt(e_i' P_i^-1 e_i) of errors e (..., N, n), P_i being the fixed point of (5.5)."""
     fusion = fusion or fixed_point(model)
     inverse = np.linalg.inv(fusion.P)
     return np.asarray(np.sqrt(np.einsum("...in,inm,...im->...i", error, inverse, error)))
 
 
 def norm_basin(model: Model, lam: float, fusion: Fusion | None = None) -> Array:
-    """(N,) lam / |Sv_i^-1/2 C_i P_i^1/2|_2; infinite for a blind agent.
+    """Return (N,) lam / |Sv_i^-1/2 C_i P_i^1/2|_2; infinite for a blind agent.
 
     Without attack and noise (5.8) converges where the largest `weighted_error` before the first prediction is at most the least of these:
     then { x' P_i^-1 x <= max_j e_j' P_j^-1 e_j } lies in { |Sv_i^-1/2 C_i x|_2 <= lam } for every agent i. Erratum: Theorem 5.3.3 has
@@ -101,7 +103,7 @@ def norm_basin(model: Model, lam: float, fusion: Fusion | None = None) -> Array:
 
 
 def lasso_basin(model: Model, lam: float | Array, fusion: Fusion | None = None) -> Array:
-    """(N,) the least over the sensors l of lam_l / |(Sv_i^-1 C_i P_i^1/2)_l|_2: as `norm_basin`, for (6.26).
+    """Return (N,) the least over the sensors l of lam_l / |(Sv_i^-1 C_i P_i^1/2)_l|_2: as `norm_basin`, for (6.26).
 
     The set is { |(Sv_i^-1 C_i x)_l| <= lam_l }. Erratum: Theorem 6.5.3 has the 2-norm of Sv^-1/2 C x and 2 lam in (6.28).
     """
@@ -111,5 +113,5 @@ def lasso_basin(model: Model, lam: float | Array, fusion: Fusion | None = None) 
 
 
 def _over(lam: float | Array, size: Array) -> Array:
-    """lam / size, infinite where size is 0."""
+    """Return lam / size, infinite where size is 0."""
     return np.asarray(np.divide(lam, size, out=np.full(size.shape, np.inf), where=size > 0.0))

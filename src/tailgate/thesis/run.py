@@ -21,7 +21,6 @@ from tailgate.base.files import writable_directory, write_atomic
 from tailgate.base.reading import load_json
 from tailgate.base.version import VERSION
 
-from . import whole_theorems
 from .claims import Claim, Figure, Report, Table
 
 CHAPTERS = {name: f"tailgate.thesis.{name}" for name in ("ch3", "ch4", "ch5", "ch6", "ch7")}
@@ -32,9 +31,6 @@ def reproduce(chapter: str, seeds: int = 200, tick: Callable[[str], None] = lamb
     check_chapter(chapter)
     check_seeds(seeds)
     report: Report = import_module(CHAPTERS[chapter]).reproduce(seeds, tick, figures)
-    if chapter in whole_theorems.CHAPTERS:
-        tick("theorems without a figure")
-        report.add(whole_theorems.report(chapter, seeds))
     return report
 
 
@@ -49,13 +45,19 @@ def check_seeds(seeds: int) -> None:
     sizes.check("seeds", seeds)
 
 
+def data_of(report: Report) -> dict[str, Any]:
+    """Return title, settings, claims and tables as JSON data."""
+    tables = [dataclasses.asdict(table) for table in report.tables]
+    return {"title": report.title, "settings": report.settings, "claims": as_json(report), "tables": tables}
+
+
 def as_json(report: Report) -> list[dict[str, Any]]:
-    """The claims: id, claim, thesis, measured, holds, why."""
+    """Return the claims: id, claim, thesis, measured, holds, why."""
     return [dataclasses.asdict(claim) for claim in report.claims]
 
 
-def flat(value: Any) -> str:
-    """JSON data as people read it, in one line."""
+def flat(value: object) -> str:
+    """Return JSON data as people read it, in one line."""
     if isinstance(value, dict):
         if set(value) == {"median", "q25", "q75"}:
             return f"{_number(value['median'])} [{_number(value['q25'])}, {_number(value['q75'])}]"
@@ -78,30 +80,30 @@ def _number(value: float) -> str:
 
 
 def summary(*reports: Report) -> str:
-    """How many claims hold."""
+    """Return how many claims hold."""
     claims = [claim for report in reports for claim in report.claims]
     counts = {verdict: sum(c.holds == verdict for c in claims) for verdict in ("yes", "partly", "no")}
     return f"{len(claims)} claims: {counts['yes']} hold, {counts['partly']} hold partly, {counts['no']} do not"
 
 
 def markdown(report: Report) -> str:
-    """The report as a Markdown text; figures as files beside it."""
+    """Return the report as a Markdown text; figures are files in the same folder."""
     return "\n".join([f"# {report.title}", "", f"{summary(report)}. Tailgate {VERSION}.", "", *body(report)]) + "\n"
 
 
-def body(report: Report, beside: str = "", level: str = "##") -> list[str]:
-    """What stands below the title: settings, claims, tables, figures, whose files are at `beside`."""
+def body(report: Report, folder: str = "", level: str = "##") -> list[str]:
+    """Return what is below the title: settings, claims, tables and figures, whose files are in `folder`."""
     lines = [f"- {key}: {flat(value)}" for key, value in report.settings.items()]
     lines += ["", *rows(("id", "claim", "thesis", "measured", "holds", "why"), [_columns(c) for c in report.claims])]
     for table in report.tables:
         lines += ["", f"{level} {table.title}", "", *rows(table.columns, table.rows)]
     for figure in report.figures:
-        lines += ["", f"![{figure.caption}]({beside}{figure.name}.png)", "", figure.caption]
+        lines += ["", f"![{figure.caption}]({folder}{figure.name}.png)", "", figure.caption]
     return lines
 
 
 def rows(heads: Sequence[str], cells: Iterable[Sequence[str]]) -> list[str]:
-    """A Markdown table."""
+    """Return a Markdown table."""
     return [
         "| " + " | ".join(heads) + " |", "|" + "---|" * len(heads), *("| " + " | ".join(_cell(v) for v in row) + " |" for row in cells),
     ]  # fmt: skip
@@ -116,27 +118,27 @@ def _cell(text: str) -> str:
 
 
 def html(report: Report) -> str:
-    """One self-contained page."""
+    """Return one self-contained page."""
     return page("page.html", report=report, summary=summary(report), version=VERSION)
 
 
-def page(name: str, **values: Any) -> str:
-    """A page from one of the templates."""
+def page(name: str, **values: object) -> str:
+    """Return a page from one of the templates."""
     loader = FunctionLoader(lambda file: files("tailgate.thesis").joinpath(file).read_text(encoding="utf-8"))
     made = Environment(autoescape=True, undefined=StrictUndefined, loader=loader)
     return made.get_template(name).render(flat=flat, prose=prose, base64=lambda figure: base64.b64encode(figure.png).decode(), **values)
 
 
 def prose(text: str) -> Markup:
-    """Text of a report as HTML: what stands between backticks is code."""
+    """Return a text of a report as HTML: text between backticks is code."""
     return Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", str(escape(text))))
 
 
-def write(report: Report, directory: Path, **stamp: Any) -> Path:
-    """report.json, report.md, index.html and a PNG per figure; returns the page. `stamp`: further fields of report.json."""
+def write(report: Report, directory: Path, **stamp: object) -> Path:
+    """Write report.json, report.md, index.html and a PNG per figure; return the page. `stamp`: further fields of report.json."""
     writable_directory(directory)
-    data = {"chapter": report.chapter, "title": report.title, "version": VERSION, **stamp, "settings": report.settings}
-    data |= {"claims": as_json(report), "tables": [dataclasses.asdict(table) for table in report.tables]}
+    held = data_of(report)
+    data = {"chapter": report.chapter, "title": held.pop("title"), "version": VERSION, **stamp, **held}
     data["figures"] = [{"name": figure.name, "caption": figure.caption} for figure in report.figures]
     for figure in report.figures:
         write_atomic(directory / f"{figure.name}.png", figure.png)
@@ -148,7 +150,7 @@ def write(report: Report, directory: Path, **stamp: Any) -> Path:
 
 
 def read(directory: Path) -> tuple[Report, dict[str, Any]] | None:
-    """The report that stands in a directory, and all fields of its report.json; None where there is none that can be read."""
+    """Return the report in a directory and all fields of its report.json; None if there is none that can be read."""
     try:
         data = load_json(directory / "report.json")
         tables = [Table(t["title"], tuple(t["columns"]), tuple(tuple(row) for row in t["rows"])) for t in data["tables"]]

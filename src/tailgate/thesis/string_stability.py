@@ -47,7 +47,7 @@ class Peak(NamedTuple):
 
 
 class Sweep(NamedTuple):
-    """What a loop does with a leader that accelerates as a sine; (W,) frequencies, (W, N) RMS of each car over the leader's."""
+    """The response of a loop to a leader that accelerates as a sine; (W,) frequencies, (W, N) RMS of each car over the leader's."""
 
     frequency: Array  # [rad/s], such that a period is a whole number of steps
     speed: Array  # RMS of the speed about its mean
@@ -56,7 +56,7 @@ class Sweep(NamedTuple):
 
 
 def transfer(plant: String, law: Law, frequency: Array, local: bool = False) -> Array:
-    """V_i / V_0 (W, N), complex, at frequencies (W,) [rad/s]; V_i / V_{i-1} is the ratio of two of them. `local`: without V2V messages."""
+    """Return V_i / V_0 (W, N), complex, at frequencies (W,) [rad/s]. `local`: without V2V messages."""
     A, B, _ = closed_loop(law.gains(plant.hears(), law.headway, local), plant.tau)
     s = 1j * np.asarray(frequency, np.float64)[:, None, None] * np.eye(len(A))
     x = np.linalg.solve(s - A, np.broadcast_to(B[:, None].astype(complex), (len(s), len(B), 1)))[..., 0]
@@ -65,7 +65,7 @@ def transfer(plant: String, law: Law, frequency: Array, local: bool = False) -> 
 
 
 def growth(plant: String, law: Law, local: bool = False) -> float:
-    """The largest real part [1/s] of the closed loop's eigenvalues, the leader's two integrators aside: negative for a stable loop."""
+    """Return the largest real part [1/s] of the closed loop's eigenvalues without the leader's two integrators; below 0: stable."""
     A, _, _ = closed_loop(law.gains(plant.hears(), law.headway, local), plant.tau)
     cars = [slice(2, 3), *(slice(Column.gap(i), Column.gap(i) + PER_CAR) for i in range(1, plant.size[0]))]
     if any(A[car, car.stop :].any() for car in cars):
@@ -75,12 +75,12 @@ def growth(plant: String, law: Law, local: bool = False) -> float:
 
 
 def peak(plant: String, law: Law, local: bool = False) -> Peak:
-    """The supremum over frequency of every car's gain. Raises InputError for a loop that is not stable."""
+    """Return the supremum over frequency of every car's gain. Raises InputError for a loop that is not stable."""
     if growth(plant, law, local) >= 0.0:
         raise InputError(f"law {type(law).__name__}", law, "gains with which the closed loop is stable")
     grid = np.geomspace(SLOWEST, FASTEST, 2000)
     coarse = np.abs(transfer(plant, law, grid, local))
-    gain, place = np.ones(coarse.shape[1]), np.zeros(coarse.shape[1])  # the gain at frequency 0
+    gain, where = np.ones(coarse.shape[1]), np.zeros(coarse.shape[1])  # the gain at frequency 0
     for i in range(1, len(gain)):
         best = int(np.argmax(coarse[:, i]))
         low, high = math.log(grid[max(best - 1, 0)]), math.log(grid[min(best + 1, len(grid) - 1)])
@@ -90,12 +90,12 @@ def peak(plant: String, law: Law, local: bool = False) -> Peak:
 
         point = _maximum(at, low, high)
         if at(point) > 1.0 + TOLERANCE:
-            gain[i], place[i] = at(point), math.exp(point)
-    return Peak(gain, place)
+            gain[i], where[i] = at(point), math.exp(point)
+    return Peak(gain, where)
 
 
 def _maximum(f: Callable[[float], float], low: float, high: float) -> float:
-    """Where f with a single maximum between low and high has it, by golden section."""
+    """Return where f has its only maximum between low and high, by golden section."""
     ratio = (math.sqrt(5.0) - 1.0) / 2.0
     a, b = high - ratio * (high - low), low + ratio * (high - low)
     fa, fb = f(a), f(b)
@@ -112,7 +112,7 @@ def _maximum(f: Callable[[float], float], low: float, high: float) -> float:
 
 
 def sweep(
-    place: Scenario,
+    scenario: Scenario,
     frequencies: Sequence[float],
     defence: str = "dkf",
     attack: str = "none",
@@ -122,19 +122,19 @@ def sweep(
     periods: int = 4,
     seeds: int = 1,
 ) -> Sweep:
-    """Gains that are measured in the loop of a scenario, whose manoeuvre a sine of each frequency [rad/s] replaces.
+    """Measure gains in the loop of a scenario, whose manoeuvre a sine of each frequency [rad/s] replaces.
 
     The first `settle` seconds are left out, then `periods` whole periods are taken. Defence and attack act as they do in an evaluation,
     within the scenario's threat model.
     """
-    guard, rival = Spec("defence", defence), Spec("attack", attack)
+    driver, spec = Spec("defence", defence), Spec("attack", attack)
     out = []
     for wanted in frequencies:
-        period = max(2, round(2.0 * math.pi / (wanted * place.plant.dt)))
-        before, steps = round(settle / place.plant.dt), periods * period
-        hertz = 1.0 / (period * place.plant.dt)
-        here = dataclasses.replace(place, manoeuvre=Sine(amplitude, hertz), horizon=before + steps, ends_on_collision=False)
-        loop, attacker = here.loop(guard.make(), guard.entry.uses), rival.make()
+        period = max(2, round(2.0 * math.pi / (wanted * scenario.plant.dt)))
+        before, steps = round(settle / scenario.plant.dt), periods * period
+        hertz = 1.0 / (period * scenario.plant.dt)
+        here = dataclasses.replace(scenario, manoeuvre=Sine(amplitude, hertz), horizon=before + steps, ends_on_collision=False)
+        loop, attacker = here.loop(driver.make(), driver.entry.uses), spec.make()
         state, plan = loop.start(draws.keys("tune", range(seeds))), attacker.prepare(loop.brief)
         memory = attacker.start(plan, seeds, state.keys.at(Role.ATTACK, np.zeros(seeds, np.int64)))
         speed, accel = (np.zeros((steps, seeds, loop.model.agents)) for _ in range(2))
@@ -160,17 +160,17 @@ CASES = (  # law, defence, attack, style
 
 
 def figure() -> bytes:
-    """Gains over frequency: of the laws, with and without messages, and measured, under attack too."""
-    place, w = load_scenario("platoon-v2v-v0"), np.geomspace(0.02, 5.0, 300)
+    """Draw gains over frequency: of the laws, with and without messages, and measured, under attack too."""
+    scenario, w = load_scenario("platoon-v2v-v0"), np.geomspace(0.02, 5.0, 300)
     paper, axes = canvas(11.0, 4.8, 1, 2, sharey=True)
     left, right = axes[0]
     for colour, text in enumerate(LAWS):
         for line, local in (("-", False), (":", True)):
             if not local or ":" not in text:
-                gains = np.abs(transfer(place.plant, Spec("controller", text).make(), w, local))
+                gains = np.abs(transfer(scenario.plant, Spec("controller", text).make(), w, local))
                 left.plot(w, gains[:, 1:].max(axis=1), line, color=f"C{colour}", label=text + (", no messages" if local else ""))
     left.set(title="by the model: the largest gain of four followers", ylabel="$|V_i / V_0|$")
-    granted = place.with_threat(onset=1, kinds=("dropout", "delay"))
+    granted = scenario.with_threat(onset=1, kinds=("dropout", "delay"))
     for law, defence, attack, style in CASES:
         driven = dataclasses.replace(granted, controller=Spec("controller", law).make())
         found = sweep(driven, np.geomspace(0.08, 1.5, 8).tolist(), defence, attack, amplitude=1.0, settle=40.0, periods=3)

@@ -19,7 +19,7 @@ from tailgate.core import param
 from tailgate.core.schema import build, read_yaml
 
 from .claims import Claim, Report
-from .run import CHAPTERS, as_json, body, check_chapter, check_seeds, page, read, reproduce, rows, summary, write
+from .run import CHAPTERS, body, check_chapter, check_seeds, data_of, page, read, reproduce, rows, summary, write
 
 TITLE = "Security of Autonomous Systems under Physical Attacks, claim by claim"
 Play = Callable[..., Report]
@@ -53,7 +53,7 @@ class Whole:
 
 
 def load_coverage() -> list[Item]:
-    """The list of what the thesis contains. Raises InputError for an item with neither a claim nor a reason."""
+    """Return the list of what the thesis contains. Raises InputError for an item with neither a claim nor a reason."""
     data = read_yaml(Path(__file__).with_name("coverage.yaml"), "coverage")
     items = [build(Item, held, f"coverage, item {i}") for i, held in enumerate(data.get("items", []), start=1)]
     for item in items:
@@ -63,7 +63,7 @@ def load_coverage() -> list[Item]:
 
 
 def check_coverage(items: Iterable[Item], claims: Iterable[str]) -> None:
-    """Raises InputError if an item names a claim that no chapter makes, or a claim answers nothing that the thesis contains."""
+    """Raise InputError if an item names a claim that no chapter makes, or a claim answers nothing that the thesis contains."""
     known, named = set(claims), {name for item in items for name in item.claims}
     if named - known:
         raise InputError("coverage", sorted(named - known), "claims that a chapter makes")
@@ -78,7 +78,7 @@ def reproduce_whole(
     chapters: Iterable[str] = tuple(CHAPTERS),
     play: Play = reproduce,
 ) -> Whole:
-    """Every chapter into its own folder of `directory`. One that an earlier run of the same version, sources and seeds finished is kept."""
+    """Reproduce every chapter into its own folder of `directory`; keep those that a run of the same version, sources and seeds finished."""
     check_seeds(seeds)
     writable_directory(directory)
     out = Whole(seeds, sources.own(), [], {}, (), load_coverage())
@@ -93,7 +93,7 @@ def reproduce_whole(
 def chapter(
     name: str, seeds: int, place: Path, tick: Callable[[str], None] = lambda _: None, play: Play = reproduce
 ) -> tuple[Report, float, bool]:
-    """A chapter into its folder: the report, the seconds that it took, and whether an earlier run had finished it."""
+    """Reproduce a chapter into its folder; return its report, its seconds, and whether an earlier run had finished it."""
     check_chapter(name)
     check_seeds(seeds)
     with alone(place):
@@ -117,7 +117,7 @@ def _chapter(name: str, seeds: int, place: Path, tick: Callable[[str], None], pl
 
 
 def facts(whole: Whole) -> dict[str, str]:
-    """What the report rests on."""
+    """Return what the report rests on."""
     total, kept = sum(whole.seconds.values()), ", ".join(whole.kept)
     return {
         "seeds": f"{whole.seeds} where a chapter does not say otherwise",
@@ -133,7 +133,7 @@ def covered(items: list[Item]) -> str:
 
 
 def counts(whole: Whole) -> list[tuple[str, ...]]:
-    """A row per chapter: claims, how many hold, partly, do not, and seconds."""
+    """Return a row per chapter: claims, how many hold, partly, do not, and seconds."""
     out = []
     for report in whole.reports:
         held = [str(sum(c.holds == word for c in report.claims)) for word in ("yes", "partly", "no")]
@@ -142,7 +142,7 @@ def counts(whole: Whole) -> list[tuple[str, ...]]:
 
 
 def markdown(whole: Whole) -> str:
-    """The report as one Markdown text; pictures are in the chapters' folders."""
+    """Return the report as one Markdown text; pictures are in the chapters' folders."""
     verdicts = {claim.id: claim.holds for claim in whole.claims}
     lines = [f"# {TITLE}", "", f"{summary(*whole.reports)}.", "", *(f"- {key}: {value}" for key, value in facts(whole).items()), ""]
     lines += rows(("chapter", "claims", "hold", "partly", "do not", "seconds"), counts(whole))
@@ -154,22 +154,21 @@ def markdown(whole: Whole) -> str:
 
 
 def as_data(whole: Whole) -> dict[str, Any]:
-    """The report as JSON data."""
+    """Return the report as JSON data."""
     return {
         "title": TITLE, "version": VERSION, "seeds": whole.seeds, "sources": whole.sources, "seconds": whole.seconds,
         "chapters": {
-            r.chapter: {
-                "title": r.title, "settings": r.settings, "claims": as_json(r), "tables": [dataclasses.asdict(t) for t in r.tables],
-                "figures": [f"{r.chapter}/{f.name}.png" for f in r.figures],
-            }
-            for r in whole.reports
+            r.chapter: data_of(r) | {"figures": [f"{r.chapter}/{f.name}.png" for f in r.figures]} for r in whole.reports
         },
         "coverage": [dataclasses.asdict(item) for item in whole.coverage],
     }  # fmt: skip
 
 
 def write_whole(whole: Whole, directory: Path) -> Path:
-    """report.json, report.md and index.html of the whole; returns the page. Raises InputError if the coverage does not fit the claims."""
+    """Write report.json, report.md and index.html of the whole; return the page.
+
+    Raises InputError if the coverage does not fit the claims.
+    """
     check_coverage(whole.coverage, [claim.id for claim in whole.claims])
     drawn = {f"{r.chapter}-{f.name}" for r in whole.reports for f in r.figures}
     if missing := {name for item in whole.coverage for name in item.figures} - drawn:

@@ -2,34 +2,34 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
-import tailgate
 from tailgate.core import Array, Model
 from tailgate.core.scenario import load_scenario
 from tailgate.estimators.distributed.distributed_kalman import fixed_point, neighbours
 
 from . import ch5_cases, ch5_theory, ch6_cases
-from .claims import Claim, Report, verdict
+from .claims import Claim, verdict
 
-CHAPTERS = ("ch5", "ch6")
 RADII = (0.9, 1.0, 1.1)  # spectral radii of A: the theorems ask for none below 1
 LAMBDA = 1.0
 FAR = 1e6  # norm of a, by which the minimiser is at its farthest
 
 
-def report(chapter: str, seeds: int) -> Report:
-    """What is added to chapter 5 or 6."""
-    out = Report(chapter, "", {})
-    if chapter == "ch5":
-        out.claims += [_networks(range(max(4, seeds // 10))), lemma("5.3.5")]
-    if chapter == "ch6":
-        out.claims += [_fixed_point(), _platoon(seeds), lemma("6.5.5")]
-    return out
+def chapter_5(seeds: int) -> Iterator[Claim]:
+    """Return what is added to chapter 5."""
+    yield from (_networks(range(max(4, seeds // 10))), lemma("5.3.5"))
+
+
+def chapter_6(seeds: int) -> Iterator[Claim]:
+    """Return what is added to chapter 6."""
+    yield from (_fixed_point(), _platoon(seeds), lemma("6.5.5"))
 
 
 def contraction(model: Model) -> float:
-    """Spectral radius of the errors' recursion e_i+ = P_i (1 / d_i) sum_j (A P_j A' + Sw)^-1 A e_j: below 1 they vanish."""
+    """Return the spectral radius of the errors' recursion e_i+ = P_i (1 / d_i) sum_j (A P_j A' + Sw)^-1 A e_j: below 1 they vanish."""
     P, n = fixed_point(model).P, model.states
     L = [np.linalg.inv(model.A @ one @ model.A.T + model.Q) @ model.A for one in P]
     out = np.zeros((len(P) * n, len(P) * n))
@@ -40,15 +40,15 @@ def contraction(model: Model) -> float:
 
 
 def _networks(systems: range) -> Claim:
-    """Theorem 5.3.2 on fresh systems, stable and not: the error over the norm of the state, from the first step to the last."""
-    quiet, found, worst = tailgate.make_attack("none"), {}, []
+    """Measure the error over the norm of the state on fresh systems, stable and not (Theorem 5.3.2)."""
+    found, worst = {}, []
     for radius in RADII:
         end, radii = [], []
         for seed in systems:
-            place = ch5_cases.fresh(seed, spectral_radius=radius)
-            wrong = ch5_cases.errors(place, ch5_cases.defence("dkf"), quiet, [seed])
-            end.append(float(wrong[-1].max() / ch5_cases.sizes(place, seed)[-1, 0, 0]))
-            radii.append(contraction(place.brief().model))
+            scenario = ch5_cases.fresh(seed, spectral_radius=radius)
+            wrong = ch5_cases.errors(scenario, ch5_cases.defence("dkf"), "none", [seed])
+            end.append(float(wrong[-1].max() / ch5_cases.sizes(scenario, seed)[-1, 0, 0]))
+            radii.append(contraction(scenario.brief().model))
         found[f"spectral radius of A {radius:g}"] = {"of the errors' recursion": max(radii), "error after 50 steps": max(end)}
         worst += radii
     return Claim(
@@ -69,7 +69,7 @@ def _fixed_point() -> Claim:
 
 def _platoon(seeds: int) -> Claim:
     radius = contraction(load_scenario(ch6_cases.SCENARIO).brief().model)
-    error = ch6_cases.run(ch6_cases.defence("dkf"), tailgate.make_attack("none"), seeds).own
+    error = ch6_cases.run(ch6_cases.defence("dkf"), "none", seeds).own
     found = {f"after {k} s [m]": float(error[k - 1].max()) for k in (1, 10, 50)}
     return Claim(
         "6.5.2", "Without an attack the linear estimator (6.27) converges to the true state at every car", "converges",
@@ -79,7 +79,7 @@ def _platoon(seeds: int) -> Claim:
 
 
 def minimiser(Q: Array, A: Array, a: Array, lam: float = LAMBDA, rounds: int = 30) -> Array:
-    """argmin x' Q x + lam |A x - a| for an `a` far away: the fixed point of x = -lam / 2 Q^-1 A' (A x - a) / |A x - a|."""
+    """Return argmin x' Q x + lam |A x - a| for an `a` far away: the fixed point of x = -lam / 2 Q^-1 A' (A x - a) / |A x - a|."""
     x = np.zeros(len(Q))
     for _ in range(rounds):
         rest = A @ x - a
@@ -88,7 +88,7 @@ def minimiser(Q: Array, A: Array, a: Array, lam: float = LAMBDA, rounds: int = 3
 
 
 def lemma(number: str, trials: int = 200) -> Claim:
-    """|x| <= lam / 2 |Q^-1 A| as printed, and with A' in place of A; a in its worst direction."""
+    """Test |x| <= lam / 2 |Q^-1 A| as printed, and with A' in place of A; a in its worst direction."""
     rng = np.random.default_rng(0)
     printed, corrected = [], []
     for _ in range(trials):

@@ -12,9 +12,10 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from tailgate.agents.learners.learning import LEARNERS, learner_of
+from tailgate.agents.learners.learning import Progress as Now
 from tailgate.base import sizes
 from tailgate.base.errors import InputError, unknown
 from tailgate.base.sizes import Seeds
@@ -44,7 +45,7 @@ class Adaptive:
 
 
 def plan_of(suite: Suite) -> Adaptive:
-    """What the suite says of training. Raises InputError where it says nothing, or something that does not exist."""
+    """Return what the suite says of training. Raises InputError where it says nothing, or something that does not exist."""
     where = f"suite {suite.name}: adaptive"
     if not suite.adaptive:
         raise InputError(where, None, "a preset and learners: this suite does not say how to attack a defence")
@@ -64,7 +65,7 @@ def plan_of(suite: Suite) -> Adaptive:
 
 
 def configs_of(suite: Suite, defence: str, out: Path, *, seeds: int | None = None, extra: tuple[str, ...] = ()) -> list[train.TrainConfig]:
-    """One training for each scenario that is trained on, learner and knowledge."""
+    """Return one training for each scenario that is trained on, learner and knowledge."""
     plan = plan_of(suite)
     if seeds is not None:
         sizes.check("seeds", seeds)
@@ -98,12 +99,12 @@ def check_plan(suite: Suite) -> None:
 
 
 def stem(defence: str) -> str:
-    """The text of a defence as the beginning of a file's name."""
+    """Return the text of a defence as the beginning of a file's name."""
     return re.sub(r"[^A-Za-z0-9_.=-]+", "_", defence)
 
 
 def fitting(suite: Suite, config: train.TrainConfig) -> tuple[str, ...]:
-    """The suite's scenarios that show an attacker what the training's does, and let it do as much: where its policies play."""
+    """Return the suite's scenarios that show an attacker what the training's does, and let it do as much: where its policies play."""
     spec = build(ActionSpec, {k: v for k, v in config.environment.items() if k in fields_of(ActionSpec)}, "environment")
 
     def seat(name: str) -> tuple[tuple[str, ...], int]:
@@ -118,13 +119,13 @@ class Asked(NamedTuple):
     """A training that a suite asks for against each defence."""
 
     name: str
-    plan: str  # hash of the training, whoever is attacked
+    plan: str  # hash of the training, for any defence
     seed: int
     scenarios: tuple[str, ...]  # where the policy has to play
 
 
 def asked_of(suite: Suite) -> list[Asked]:
-    """Every training that the suite asks for against each defence."""
+    """Return every training that the suite asks for against each defence."""
     out = []
     for config in configs_of(suite, "none", Path("runs")):
         name, key, where = config.name.removeprefix("none-"), train.plan_key(as_data(config)), fitting(suite, config)
@@ -133,12 +134,12 @@ def asked_of(suite: Suite) -> list[Asked]:
 
 
 def policies_of(config: train.TrainConfig) -> list[Path]:
-    """Where a training's policies lie once it is done."""
+    """Return where a training's policies are once it is done."""
     return [config.directory / f"policy-{seed}.json" for seed in train.training_seeds(config)]
 
 
 def train_against(configs: list[train.TrainConfig], progress: Progress) -> list[Path]:
-    """The policies of all trainings, in their order. A finished one is not trained again, and one that was interrupted goes on."""
+    """Return the policies of all trainings, in their order. A finished one is not trained again, and one that was interrupted goes on."""
     runs = []
     for config in configs:
         held = config.directory / "config.json"
@@ -146,7 +147,7 @@ def train_against(configs: list[train.TrainConfig], progress: Progress) -> list[
         if not (again and all(path.is_file() and path.with_suffix(".safetensors").is_file() for path in policies_of(config))):
             runs.append((config, again))
 
-    def learned(config: train.TrainConfig, seed: int, now: Any) -> None:
+    def learned(config: train.TrainConfig, seed: int, now: Now) -> None:
         progress(f"{config.name}, seed {seed}", min(now.steps, config.steps), config.steps, train.figures(now))
 
     train.train_together(runs, learned, max((config.workers for config in configs), default=1))

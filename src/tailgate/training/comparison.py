@@ -56,13 +56,13 @@ def play_scripts(config: TrainConfig, policies: list[Path], progress: Callable[[
 
 
 def _cells(config: TrainConfig, policies: list[Path]) -> list[Cell]:
-    """What is played on report seeds."""
+    """Return what is played on report seeds."""
     attacks = tuple(dict.fromkeys(("none", *config.rivals, *config.white_box, *map(str, policies))))  # each once
     return cells_of(suite_of(config, attacks), batch=BATCH, threat=dict(config.threat), first_seed=config.first_episode)
 
 
 def _made_of(config: TrainConfig, policies: list[Path]) -> str:
-    """A hash of everything that decides a comparison: what is played, whatever files it names, and the rows that came of it."""
+    """Return a hash of everything that decides a comparison: what is played, whatever files it names, and the rows that came of it."""
     parts = [cell_id(cell) for cell in _cells(config, policies)] + [hashlib.sha256((config.directory / ROWS).read_bytes()).hexdigest()]
     return hashlib.blake2b(canonical([parts, config]).encode(), digest_size=16).hexdigest()
 
@@ -78,23 +78,23 @@ def compare(
     from tailgate.studies.timing import timing_advantage
 
     threat, outcome = dict(config.threat), outcome_of(config)
-    guard = config.defence
+    defence = config.defence
     scripts = scripts or play_scripts(config, policies, progress)
     rows = scripts.rows
 
     def outcomes(attack: str) -> Array:
-        return outcomes_of([r for r in rows if r["attack"] == attack and r["defence"] == guard], outcome)
+        return outcomes_of([r for r in rows if r["attack"] == attack and r["defence"] == defence], outcome)
 
     # who may not look into a defence has no figures against it, which is no reason to lose the others
-    skipped = {r["attack"]: r["reason"] for r in rows if r["defence"] == guard and r["status"] == "skipped"}
+    skipped = {r["attack"]: r["reason"] for r in rows if r["defence"] == defence and r["status"] == "skipped"}
     left_out = {name: skipped[name] for name in config.white_box if name in skipped}
-    built, uses = Spec("defence", guard).make(), Spec("defence", guard).entry.uses
+    built, uses = Spec("defence", defence).make(), Spec("defence", defence).entry.uses
     keys = draws.keys("report", range(config.first_episode, config.first_episode + config.episodes))
     verdicts = []
     for path, seed in zip(policies, training_seeds(config), strict=True):
         policy = PolicyAttack(path)
-        place = load_scenario(config.scenario).with_threat(**(threat | {"knowledge": policy.knowledge}))
-        own, yoked = timing_advantage(place.loop(built, uses), policy, keys, outcome)
+        scenario = load_scenario(config.scenario).with_threat(**(threat | {"knowledge": policy.knowledge}))
+        own, yoked = timing_advantage(scenario.loop(built, uses), policy, keys, outcome)
         verdicts.append(Verdict(seed, path, own, yoked))
     return _report(config, verdicts, outcomes, scripts, outcome, left_out)
 
@@ -109,7 +109,7 @@ def _report(
     none = np.broadcast_to(outcomes("none"), learned.shape)
 
     def mean(x: Array) -> Interval:
-        """Of the outcomes (episodes,): of 0 and 1 the exact interval, of others the bootstrap's."""
+        """Return the interval of outcomes (episodes,): exact for 0 and 1, by bootstrap for others."""
         return proportion(int(x.sum()), x.size) if UNITS[outcome] == SHARE else paired_difference(x, np.zeros_like(x))
 
     def difference(other: Array) -> Interval:
@@ -150,7 +150,7 @@ def _report(
 
 
 def finished(config: TrainConfig, policies: list[Path]) -> dict[str, Any] | None:
-    """The report that `compare` wrote of this comparison and of the rows that are there; None where something is another now."""
+    """Return the report that `compare` wrote of this comparison and of the rows that are there; None where something is another now."""
     try:
         held: dict[str, Any] = load_json(config.directory / "report.json")
         return held if held["made_of"] == _made_of(config, policies) else None
@@ -159,12 +159,12 @@ def finished(config: TrainConfig, policies: list[Path]) -> dict[str, Any] | None
 
 
 def _reached(learned: Array, optimum: Array) -> Interval:
-    """Share of what a computed optimum makes large, the mean square of the outcome, with the bootstrap's interval over episodes."""
+    """Return share of what a computed optimum makes large, the mean square of the outcome, with the bootstrap's interval over episodes."""
     return paired_ratio(learned**2, optimum**2)
 
 
 def _note(attack: str) -> str:
-    """What is said of an attack beside the rivals."""
+    """Return what is said of an attack that is no rival."""
     entry = Spec("attack", attack).entry
     if entry.optimal:
         return f"{entry.knowledge} box, the computed optimum: a ceiling and no rival"
@@ -172,14 +172,14 @@ def _note(attack: str) -> str:
 
 
 def shown(report: dict[str, Any], value: float, sign: str = "") -> str:
-    """An outcome, or with sign "+" a difference of two, as people read it."""
+    """Return an outcome, or with sign "+" a difference of two, as people read it."""
     if report["unit"] != SHARE:
         return f"{value:{sign}.3g}"
     return f"{round(100 * value) + 0:+d}" if sign else f"{100 * value:.1f} %"
 
 
 def headline(report: dict[str, Any]) -> dict[str, Any]:
-    """The report as the page shows it at its top."""
+    """Return the report as the page shows it at its top."""
     share = report["unit"] == SHARE
     points = " points" if share else ""
     gains = "; ".join(

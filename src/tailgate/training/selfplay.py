@@ -10,7 +10,7 @@ Known are scripts, pool and fresh attackers; the worst is chosen on select seeds
 for the best fixed setting. The best answer there is does at least as much. Where the fresh attacker does less than what was known without
 it the search was too weak to say how much more, and the report says so.
 
-A member is trained for certain opponents: a run that goes on trains anew what was trained for others.
+A member is trained for certain opponents: a run that goes on trains again what was trained for others.
 """
 
 from __future__ import annotations
@@ -20,14 +20,15 @@ import dataclasses
 import itertools
 import json
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from tailgate.agents.learners.cem import Config
-from tailgate.agents.learners.learning import LEARNERS, learner_of
+from tailgate.agents.learners.learning import LEARNERS, Progress, learner_of
 from tailgate.agents.learners.selfplay import Learner, Played, constant, export, play
 from tailgate.agents.policy.network_policy import PolicyAttack
 from tailgate.base.errors import InputError, said
@@ -43,6 +44,7 @@ from tailgate.envs.gym.duel import Duel, Payoff
 from tailgate.estimators.challenge.steered import Steered
 from tailgate.estimators.challenge.steering import nearest
 from tailgate.evaluation.stats import Interval, paired_difference, proportion
+from tailgate.training.settings import check_mappings, check_name, mapping, parameters_of, started_with
 from tailgate.training.train import TrainConfig, environment_of
 
 FRESH, DEFENDERS = 1000, 500  # added to the first seed: seeds of best responses and of defenders differ from those of self-play's attackers
@@ -55,19 +57,19 @@ Crashed = dict[tuple[str, str], Array]  # by defender and attack: (episodes,) 0 
 
 @dataclass(frozen=True)
 class GameConfig:
-    """What `tailgate selfplay` reads."""
+    """The configuration of `tailgate selfplay`."""
 
     name: str = param("selfplay", "name of the run; its files go to out/name")
     out: str = param("runs", "directory of the runs")
     scenario: str = param("gusty-stop-and-go-v0", "scenario, by name or YAML file")
     defence: str = param("chi2_kf", "registered defence whose knobs the defender turns")
-    menu: dict[str, Any] = field(default_factory=dict, metadata={"doc": "settings of the knobs: thresholds, challenges, modes"})
-    payoff: dict[str, Any] = field(default_factory=dict, metadata={"doc": "what the defender is paid for"})
-    threat: dict[str, Any] = field(default_factory=dict, metadata={"doc": "changes of the scenario's threat model"})
-    environment: dict[str, Any] = field(default_factory=dict, metadata={"doc": "action and reward settings of the attacker"})
+    menu: dict[str, Any] = mapping("settings of the knobs: thresholds, challenges, modes")
+    payoff: dict[str, Any] = mapping("what the defender is paid for")
+    threat: dict[str, Any] = mapping("changes of the scenario's threat model")
+    environment: dict[str, Any] = mapping("action and reward settings of the attacker")
     learner: str = param("cem", f"how the attacker learns: {', '.join(LEARNERS)}; the defender learns by cem")
-    attacker: dict[str, Any] = field(default_factory=dict, metadata={"doc": "hyper-parameters of the attacker's learner"})
-    defender: dict[str, Any] = field(default_factory=dict, metadata={"doc": "hyper-parameters of the defender's learner"})
+    attacker: dict[str, Any] = mapping("hyper-parameters of the attacker's learner")
+    defender: dict[str, Any] = mapping("hyper-parameters of the defender's learner")
     gamma: Discount = param(0.99, "discount of both [-]")
     rounds: Passes = param(2, "rounds: an attacker and a defender each")
     steps: Steps = param(300_000, "decisions of a training, over all environments")
@@ -82,31 +84,18 @@ class GameConfig:
 
 
 def load_config(source: str | None, overrides: list[str], resume: bool = False) -> GameConfig:
-    """A preset by name or YAML file (default: selfplay) with `key=value` overrides; with `resume` the run's own configuration."""
+    """Return a preset by name or YAML file (default: selfplay) with `key=value` overrides; with `resume` the run's own configuration."""
     path = config_path("games", source or "selfplay", "config")
     config = _checked(override(read_yaml(path, "config"), overrides, GameConfig))
     if not resume:
         return config
-    return _checked(override(_started(config.directory / "config.json"), overrides, GameConfig))
-
-
-def _started(held: Path) -> dict[str, Any]:
-    """The configuration that a run was started with."""
-    try:
-        started: dict[str, Any] = load_json(held, strict=False)
-        del started["class"]
-    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-        raise InputError("resume", str(held), f"the configuration of a run ({said(error)})") from None
-    return started
+    return _checked(override(started_with(config.directory / "config.json"), overrides, GameConfig))
 
 
 def _checked(data: dict[str, Any]) -> GameConfig:
-    for key in ("menu", "payoff", "threat", "environment", "attacker", "defender"):
-        if not isinstance(data.get(key, {}), dict):
-            raise InputError(f"config.{key}", data[key], "a mapping of fields")
+    check_mappings(data, ("menu", "payoff", "threat", "environment", "attacker", "defender"))
     config = build(GameConfig, data, "config")
-    if Path(config.name).name != config.name:
-        raise InputError("config.name", config.name, "the name of a directory, without a separator")
+    check_name(config.name)
     Spec("defence", config.defence).refuse_imports("config")
     for name in config.rivals:
         Spec("attack", name).refuse_imports("config")
@@ -116,7 +105,7 @@ def _checked(data: dict[str, Any]) -> GameConfig:
 
 
 def _seat_of(config: GameConfig) -> dict[str, Any]:
-    """Arguments of the attacker's environment, checked as those of a training are."""
+    """Return arguments of the attacker's environment, checked as those of a training are."""
     names = ("scenario", "defence", "threat", "environment")
     return environment_of(TrainConfig(**{name: getattr(config, name) for name in names}))
 
@@ -151,10 +140,10 @@ class Game:
             self.held = held.pop_all()
 
     def _keep(self, resume: bool) -> None:
-        """Writes the configuration, or raises InputError when the run that is resumed had another one."""
+        """Write the configuration, or raises InputError when the run that is resumed had another one."""
         held, now = self.directory / "config.json", as_data(self.config)
         if resume and held.is_file():
-            before, free = _started(held), ("class", "rounds", "episodes", "fresh", "rivals")
+            before, free = started_with(held), ("class", "rounds", "episodes", "fresh", "rivals")
             changed = [key for key in now if key not in free and before.get(key) != now[key]]
             if changed:
                 raise InputError("resume", ", ".join(changed), f"the configuration in {held}, apart from {', '.join(free[1:])}")
@@ -173,18 +162,18 @@ class Game:
     def _run(self) -> dict[str, Any]:
         defenders, attackers = [self._as_it_is()], []
         for r in range(1, self.config.rounds + 1):
-            pool = self._guard(policy=tuple(defenders))
+            pool = self._defence(policy=tuple(defenders))
             attackers.append(self._attacker(f"attacker-{r}", self.config.first_seed + r, pool))
             defenders.append(self._defender(r, tuple(PolicyAttack(path) for path in attackers)))
-        frozen = self._guard(policy=defenders[-1])
+        frozen = self._defence(policy=defenders[-1])
         setting = self._best_setting(tuple(PolicyAttack(path) for path in attackers))
-        fixed = self._guard(setting=setting)
+        fixed = self._defence(setting=setting)
         fresh = [self._fresh(f"fresh-{i}", i, frozen) for i in range(self.config.fresh)]
         other = [self._fresh(f"fresh-fixed-{i}", i, fixed) for i in range(self.config.fresh)]
-        return self._report({AS_IS: self._guard(), FIXED: fixed, TRAINED: frozen}, attackers, fresh, other, setting)
+        return self._report({AS_IS: self._defence(), FIXED: fixed, TRAINED: frozen}, attackers, fresh, other, setting)
 
-    def _guard(self, **who: Any) -> Steered:
-        """The defence in certain hands: a policy's, or those of a fixed setting."""
+    def _defence(self, **who: Any) -> Steered:
+        """Return the defence in certain hands: a policy's, or those of a fixed setting."""
         return dataclasses.replace(self.duel.guard, **who)
 
     def _as_it_is(self) -> Path:
@@ -194,13 +183,13 @@ class Game:
             return path.with_suffix(".json")
         return export(path, self.duel, constant(self.duel, setting), facts)
 
-    def _fresh(self, name: str, i: int, guard: Steered) -> Path:
-        return self._attacker(name, self.config.first_seed + FRESH + i, guard)
+    def _fresh(self, name: str, i: int, defence: Steered) -> Path:
+        return self._attacker(name, self.config.first_seed + FRESH + i, defence)
 
-    def _attacker(self, name: str, seed: int, guard: Steered) -> Path:
-        environment = _seat_of(self.config) | {"defence": guard}
+    def _attacker(self, name: str, seed: int, defence: Steered) -> Path:
+        environment = _seat_of(self.config) | {"defence": defence}
         module = learner_of(self.config.learner)
-        facts = {"learner": self.config.learner, "seed": seed, "against": as_data(guard), "settings": as_data(self.settings)}
+        facts = {"learner": self.config.learner, "seed": seed, "against": as_data(defence), "settings": as_data(self.settings)}
         return self._train(name, lambda: module.Learner(seed, self.config.gamma, self.settings, environment), facts)
 
     def _defender(self, r: int, attacks: tuple[Attack, ...]) -> Path:
@@ -209,7 +198,7 @@ class Game:
         return self._train(f"defender-{r}", lambda: Learner(seed, self.config.gamma, self.defender, self.duel, attacks), facts)
 
     def _train(self, name: str, make: Callable[[], Any], facts: dict[str, Any]) -> Path:
-        """A member of the pools: trained now, unless it was with these facts, the digests of its opponents among them."""
+        """Train a member of the pools, unless it was trained with these facts, the digests of its opponents among them."""
         path, steps = self.directory / name, self.config.steps
         if _finished(path.with_suffix(".json"), facts):
             return path.with_suffix(".json")
@@ -218,7 +207,7 @@ class Game:
         if checkpoint.is_file():
             learner.load(checkpoint)
 
-        def report(now: Any) -> None:
+        def report(now: Progress) -> None:
             crash = "" if now.crash is None else f"collisions {100 * now.crash:4.1f} %"
             self.update(name, min(now.steps, steps), steps, crash)
 
@@ -232,7 +221,7 @@ class Game:
     # -- measuring
 
     def _best_setting(self, attacks: tuple[Attack, ...]) -> int:
-        """The setting that pays best when held throughout, against self-play's attackers in equal shares on select seeds."""
+        """Return the setting that pays best when held throughout, against self-play's attackers in equal shares on select seeds."""
         count = len(self.duel.settings)
         paid = np.zeros(count)
         chunk = max(1, BATCH // SELECT_EPISODES)
@@ -246,53 +235,54 @@ class Game:
             self.update("fixed settings", attacks.index(attack) + 1, len(attacks), "")
         return int(np.argmax(paid))
 
-    def _play(self, guard: Steered, attack: Attack, purpose: str, episodes: int) -> Played:
-        """The first episodes of a pair on seeds of a purpose."""
-        seat = dataclasses.replace(self.duel.seat, loop=dataclasses.replace(self.duel.seat.loop, defence=guard))
-        duel = dataclasses.replace(self.duel, seat=seat, guard=guard)
+    def _play(self, defence: Steered, attack: Attack, purpose: str, episodes: int) -> Played:
+        """Play the first episodes of a pair on seeds of a purpose."""
+        seat = dataclasses.replace(self.duel.seat, loop=dataclasses.replace(self.duel.seat.loop, defence=defence))
+        duel = dataclasses.replace(self.duel, seat=seat, guard=defence)
         parts = [play(duel, attack, draws.keys(purpose, range(at, min(at + BATCH, episodes)))) for at in range(0, episodes, BATCH)]
         paid, crashed, cost = (np.concatenate([getattr(part, name) for part in parts]) for name in ("paid", "crashed", "cost"))
         return Played(paid, crashed, cost, sum(part.decisions for part in parts))
 
-    def _table(self, guards: dict[str, Steered], attacks: dict[str, Attack]) -> tuple[list[dict[str, Any]], Crashed]:
-        """Every defender against every attack on report seeds: the rows of the table, and who crashed in which episode."""
+    def _table(self, defenders: dict[str, Steered], attacks: dict[str, Attack]) -> tuple[list[dict[str, Any]], Crashed]:
+        """Return every defender against every attack on report seeds: the rows of the table, and who crashed in which episode."""
         table: list[dict[str, Any]] = []
         crashed: Crashed = {}
-        total = len(guards) * len(attacks)
-        for (guard, defence), (name, attack) in itertools.product(guards.items(), attacks.items()):
+        total = len(defenders) * len(attacks)
+        for (defender, defence), (name, attack) in itertools.product(defenders.items(), attacks.items()):
             out = self._play(defence, attack, "report", self.config.episodes)
-            crashed[guard, name] = out.crashed.astype(np.float64)
-            table.append({"defender": guard, "attack": name, "collisions": _share(out.crashed)._asdict(), "cost": float(out.cost.mean())})
+            crashed[defender, name] = out.crashed.astype(np.float64)
+            share = _share(out.crashed)._asdict()
+            table.append({"defender": defender, "attack": name, "collisions": share, "cost": float(out.cost.mean())})
             self.update("final table", len(table), total, f"{len(table)} of {total} pairs")
         return table, crashed
 
-    def _select(self, guard: str, defence: Steered, attacks: dict[str, Attack]) -> dict[str, Interval]:
-        """The collisions of each attack on select seeds."""
+    def _select(self, defender: str, defence: Steered, attacks: dict[str, Attack]) -> dict[str, Interval]:
+        """Return the collisions of each attack on select seeds."""
         shares = {}
         for name, attack in attacks.items():
             shares[name] = _share(self._play(defence, attack, "select", SELECT_EPISODES).crashed)
-            self.update(f"worst attack, {guard}", len(shares), len(attacks), "")
+            self.update(f"worst attack, {defender}", len(shares), len(attacks), "")
         return shares
 
     def _report(
-        self, guards: dict[str, Steered], attackers: list[Path], fresh: list[Path], other: list[Path], setting: int
+        self, defenders: dict[str, Steered], attackers: list[Path], fresh: list[Path], other: list[Path], setting: int
     ) -> dict[str, Any]:
         attacks: dict[str, Attack] = self.scripts | {path.stem: PolicyAttack(path) for path in (*attackers, *fresh, *other)}
-        table, crashed = self._table(guards, attacks)
+        table, crashed = self._table(defenders, attacks)
         last = attackers[-1].stem
         worst: dict[str, dict[str, Any]] = {}
         exploitability: dict[str, dict[str, Any]] = {}
-        for guard, own in {TRAINED: [path.stem for path in fresh], FIXED: [path.stem for path in other]}.items():
-            shares = self._select(guard, guards[guard], attacks)
+        for defender, own in {TRAINED: [path.stem for path in fresh], FIXED: [path.stem for path in other]}.items():
+            shares = self._select(defender, defenders[defender], attacks)
             name, found = (max(names, key=lambda one: shares[one].value) for names in (attacks, own))  # of equal ones the first
-            share = {one: _share(crashed[guard, one]) for one in (name, found, last)}
-            worst[guard] = {"attack": name, "select": shares[name]._asdict(), "collisions": share[name]._asdict()}
-            exploitability[guard] = {
-                **paired_difference(crashed[guard, name], crashed[guard, last], share=True)._asdict(), "attack": name,
+            share = {one: _share(crashed[defender, one]) for one in (name, found, last)}
+            worst[defender] = {"attack": name, "select": shares[name]._asdict(), "collisions": share[name]._asdict()}
+            exploitability[defender] = {
+                **paired_difference(crashed[defender, name], crashed[defender, last], share=True)._asdict(), "attack": name,
                 "fresh": {"attack": found, "collisions": share[found]._asdict()},
                 "weak_search": share[found].value < max(share[name].value, share[last].value),
             }  # fmt: skip
-        fixed, trained = (crashed[guard, worst[guard]["attack"]] for guard in (FIXED, TRAINED))
+        fixed, trained = (crashed[defender, worst[defender]["attack"]] for defender in (FIXED, TRAINED))
         saved = paired_difference(fixed, trained, share=True)
         knobs = self.duel.guard.hand.knobs
         values = {knob.name: float(value) for knob, value in zip(knobs, self.duel.settings[setting], strict=True)}
@@ -309,12 +299,12 @@ class Game:
 
 
 def _share(crashed: Array) -> Interval:
-    """Share of the episodes (B,) with a collision."""
+    """Return share of the episodes (B,) with a collision."""
     return proportion(int(np.count_nonzero(crashed)), len(crashed))
 
 
 def _finished(path: Path, facts: dict[str, Any]) -> bool:
-    """Whether a policy lies there whose record holds these facts."""
+    """Return whether a policy lies there whose record holds these facts."""
     if not path.is_file():
         return False
     try:
@@ -324,9 +314,4 @@ def _finished(path: Path, facts: dict[str, Any]) -> bool:
         raise InputError("resume", str(path), f"a policy of this run ({said(error)})") from None
 
 
-def parameters() -> list[dict[str, Any]]:
-    """Every field of the configuration with default and sentence, for --help."""
-    return [
-        {"name": f.name, "default": as_data(f.default if f.default is not dataclasses.MISSING else {}), "doc": f.metadata.get("doc", "")}
-        for f in dataclasses.fields(GameConfig)
-    ]
+parameters = partial(parameters_of, GameConfig)

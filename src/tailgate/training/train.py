@@ -7,13 +7,13 @@ import dataclasses
 import hashlib
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from tailgate.agents.learners.finished import finished
-from tailgate.agents.learners.learning import DISCRETE, LEARNERS, Progress, Teachable, check_action, learner_of
+from tailgate.agents.learners.learning import DISCRETE, LEARNERS, Config, Progress, Teachable, check_action, learner_of
 from tailgate.base import sizes
 from tailgate.base.errors import InputError, said, unknown
 from tailgate.base.files import set_aside, writable_directory, write_atomic
@@ -31,6 +31,7 @@ from tailgate.envs.gym.rewards import Reward
 from tailgate.evaluation.baselines import best_of
 from tailgate.evaluation.cells import cells_of
 from tailgate.play.metrics import METRICS
+from tailgate.training.settings import check_mappings, check_name, mapping, parameters_of, started_with
 from tailgate.training.trainings import Training, train_all
 
 ENVIRONMENT = (fields_of(ActionSpec) | fields_of(Reward) | {"frames": None}).keys() - {"gamma"}  # that `environment` may hold
@@ -42,25 +43,23 @@ LATER = {"demonstrations"}  # fields that joined when policies had been publishe
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """What `train.py` reads. A learner's settings stand below its name, the environment's below `environment`."""
+    """The configuration of `train.py`. A learner's settings are below its name, the environment's below `environment`."""
 
     name: str = param("quickstart", "name of the run; its files go to out/name")
     out: str = param("runs", "directory of the runs")
     scenario: str = param("gusty-stop-and-go-v0", "scenario, by name or YAML file")
     defence: str = param("chi2_kf", "registered defence to attack")
-    threat: dict[str, Any] = field(default_factory=dict, metadata={"doc": "changes of the scenario's threat model"})
-    environment: dict[str, Any] = field(default_factory=dict, metadata={"doc": "action and reward settings of the environment"})
+    threat: dict[str, Any] = mapping("changes of the scenario's threat model")
+    environment: dict[str, Any] = mapping("action and reward settings of the environment")
     learner: str = param("ppo", f"who learns: {', '.join(LEARNERS)}")
-    ppo: dict[str, Any] = field(default_factory=dict, metadata={"doc": "hyper-parameters of PPO"})
-    maskable_ppo: dict[str, Any] = field(default_factory=dict, metadata={"doc": "hyper-parameters of PPO with action masks"})
-    recurrent_ppo: dict[str, Any] = field(default_factory=dict, metadata={"doc": "hyper-parameters of PPO with an LSTM"})
-    dqn: dict[str, Any] = field(default_factory=dict, metadata={"doc": "hyper-parameters of DQN"})
-    sac: dict[str, Any] = field(default_factory=dict, metadata={"doc": "hyper-parameters of SAC"})
-    tqc: dict[str, Any] = field(default_factory=dict, metadata={"doc": "hyper-parameters of TQC"})
-    cem: dict[str, Any] = field(default_factory=dict, metadata={"doc": "hyper-parameters of the cross-entropy method"})
-    settings: dict[str, Any] = field(
-        default_factory=dict, metadata={"doc": "hyper-parameters of a learner that has no field here", "if_any": True}
-    )
+    ppo: dict[str, Any] = mapping("hyper-parameters of PPO")
+    maskable_ppo: dict[str, Any] = mapping("hyper-parameters of PPO with action masks")
+    recurrent_ppo: dict[str, Any] = mapping("hyper-parameters of PPO with an LSTM")
+    dqn: dict[str, Any] = mapping("hyper-parameters of DQN")
+    sac: dict[str, Any] = mapping("hyper-parameters of SAC")
+    tqc: dict[str, Any] = mapping("hyper-parameters of TQC")
+    cem: dict[str, Any] = mapping("hyper-parameters of the cross-entropy method")
+    settings: dict[str, Any] = mapping("hyper-parameters of a learner that has no field here", if_any=True)
     teacher: str | None = param(None, "script that PPO imitates before it learns: one by name, or `best` of the rivals; none: from scratch")
     demonstrations: Episodes = param(1024, "episodes of its teacher that a learner is shown")
     gamma: Discount = param(0.995, "discount, of the learner and of the shaping [-]")
@@ -88,7 +87,7 @@ class TrainConfig:
 
 
 def load_config(source: str | None, overrides: list[str], resume: bool = False) -> TrainConfig:
-    """A preset by name or YAML file (default: quickstart) with `key=value` overrides.
+    """Return a preset by name or YAML file (default: quickstart) with `key=value` overrides.
 
     With `resume` the configuration that the run of this name was started with takes the preset's place.
     """
@@ -99,16 +98,11 @@ def load_config(source: str | None, overrides: list[str], resume: bool = False) 
     if not config.directory.is_dir():
         known = sorted(p.parent.name for p in Path(config.out).glob("*/config.json"))
         raise InputError("resume", config.name, f"the name of a run in {config.out}: {', '.join(known) or 'there is none'}")
-    try:
-        started = load_json(held, strict=False)
-        del started["class"]
-    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-        raise InputError("resume", str(held), f"the configuration of the run ({said(error)})") from None
-    return checked(override(started, overrides, TrainConfig))
+    return checked(override(started_with(held), overrides, TrainConfig))
 
 
 def _preset(source: str) -> dict[str, Any]:
-    """The fields of a preset; those of its `base`, another preset, where it does not have them. A field is replaced as a whole."""
+    """Return the fields of a preset; those of its `base`, another preset, where it does not have them. A field is replaced as a whole."""
     data = read_yaml(config_path(".", source, "config"), "config")
     base = data.pop("base", None)
     if base is None:
@@ -120,30 +114,27 @@ def _preset(source: str) -> dict[str, Any]:
 
 
 def checked(data: dict[str, Any]) -> TrainConfig:
-    """A configuration from JSON data. Raises InputError for a field that makes no sense, and for one that names code to import."""
-    for key in ("threat", "environment", *LEARNERS):
-        if not isinstance(data.get(key, {}), dict):
-            raise InputError(f"config.{key}", data[key], "a mapping of fields")
+    """Return a configuration from JSON data. Raises InputError for a field that makes no sense, and for one that names code to import."""
+    check_mappings(data, ("threat", "environment", *LEARNERS))
     if others := {name: data[name] for name in data if name in LEARNERS and name not in fields_of(TrainConfig)}:
         data = {key: value for key, value in data.items() if key not in others}
         data["settings"] = data.get("settings", {}) | others
     config = build(TrainConfig, data, "config")
-    if Path(config.name).name != config.name:
-        raise InputError("config.name", config.name, "the name of a directory, without a separator")
+    check_name(config.name)
     if config.outcome is not None and config.outcome not in METRICS:
         raise unknown("config.outcome", config.outcome, METRICS)
-    for spec in [Spec("defence", config.defence), *(Spec("defence", name) for name in config.others)]:
-        spec.refuse_imports("config")
     shown = () if config.teacher in (None, "best") else (config.teacher,)
-    for spec in (Spec("attack", name) for name in (*config.rivals, *config.white_box, *shown)):
-        spec.refuse_imports("config")
+    for defence in (config.defence, *config.others):
+        Spec("defence", defence).refuse_imports("config")
+    for attack in (*config.rivals, *config.white_box, *shown):
+        Spec("attack", attack).refuse_imports("config")
     if shown:
         _ = Spec("attack", shown[0]).entry  # a name that exists
     return config
 
 
 def environment_of(config: TrainConfig) -> dict[str, Any]:
-    """Arguments of the adversary environment."""
+    """Return arguments of the adversary environment."""
     for key in config.environment:
         if key not in ENVIRONMENT:  # the scenario, the defence, the threat model and gamma have a field of their own
             raise unknown("config.environment: unknown field", key, ENVIRONMENT)
@@ -151,14 +142,14 @@ def environment_of(config: TrainConfig) -> dict[str, Any]:
 
 
 def outcome_of(config: TrainConfig) -> str:
-    """The metric that the comparison counts."""
+    """Return the metric that the comparison counts."""
     if config.outcome is not None:
         return config.outcome
     return "crashed" if load_scenario(config.scenario).brief().model.followers.any() else "rmse_position"
 
 
 def check(config: TrainConfig) -> None:
-    """Everything that a run will need, tried before anything is written: a typing error shall not cost an hour."""
+    """Try everything that a run will need before anything is written: a typing error shall not cost an hour."""
     settings = _settings(config)
     for name in set(LEARNERS) - {config.learner}:  # a typing error there as well, where that learner is installed
         with contextlib.suppress(ImportError):
@@ -205,18 +196,18 @@ def _check_teacher(config: TrainConfig, seat: Seat) -> None:
 
 
 def suite_of(config: TrainConfig, attacks: tuple[str, ...]) -> Suite:
-    """The final comparison, with these attacks."""
+    """Return the final comparison, with these attacks."""
     defences = tuple(dict.fromkeys((config.defence, *config.others)))  # each once
     return Suite(config.name, "", (config.scenario,), (None,), defences, attacks, config.episodes)
 
 
 def rivals_of(config: TrainConfig) -> Suite:
-    """The scripts against the defence, on as many episodes as a choice needs."""
+    """Return the scripts against the defence, on as many episodes as a choice needs."""
     return Suite(config.name, "", (config.scenario,), (None,), (config.defence,), config.rivals, config.select_episodes)
 
 
 def _teacher(config: TrainConfig, chosen: dict[str, str | None]) -> str | None:
-    """The script that the learner is shown; `best` is chosen on tune seeds, once for all learners that are asked the same (chosen)."""
+    """Return the script that the learner is shown; `best` is chosen on tune seeds, once for all that ask the same (chosen)."""
     if config.teacher != "best":
         return config.teacher
     rivals = dataclasses.replace(rivals_of(config), name="rivals")
@@ -226,7 +217,7 @@ def _teacher(config: TrainConfig, chosen: dict[str, str | None]) -> str | None:
     return chosen[asked]
 
 
-def train(config: TrainConfig, progress: Callable[[int, Any], None], resume: bool = False) -> list[Path]:
+def train(config: TrainConfig, progress: Callable[[int, Progress], None], resume: bool = False) -> list[Path]:
     """Train one policy per seed; returns their JSON files. `progress(seed, Progress)` is called after each rollout."""
     (found,) = train_together([(config, resume)], lambda _, seed, now: progress(seed, now), config.workers)
     return found
@@ -235,7 +226,7 @@ def train(config: TrainConfig, progress: Callable[[int, Any], None], resume: boo
 def train_together(
     runs: Sequence[tuple[TrainConfig, bool]], progress: Callable[[TrainConfig, int, Progress], None], workers: int
 ) -> list[list[Path]]:
-    """The policies of several runs, a list for each; their seeds share the workers. A run comes with whether it is resumed.
+    """Train the policies of several runs, a list for each; their seeds share the workers. A run comes with whether it is resumed.
 
     Nothing is written before all runs are known to make sense, nor of a run before its turn comes.
     """
@@ -269,12 +260,12 @@ def _together(
 
 
 def training_seeds(config: TrainConfig) -> range:
-    """The training seeds of a run."""
+    """Return the training seeds of a run."""
     return range(config.first_seed, config.first_seed + config.seeds)
 
 
 def _prepared(config: TrainConfig, resume: bool, chosen: dict[str, str | None]) -> tuple[dict[int, Path], list[Training]]:
-    """Of a run's seeds the policies that are there, and the trainings that are left. Writes nothing."""
+    """Return the policies that a run has, by seed, and the trainings that are left. Writes nothing."""
     done: dict[int, Path] = {}
     if resume and _told(config).is_file():
         same_run(config)
@@ -290,7 +281,7 @@ def _prepared(config: TrainConfig, resume: bool, chosen: dict[str, str | None]) 
 
 
 def _begin(config: TrainConfig, resume: bool) -> None:
-    """A run's directory holds its configuration; what another run left there is set aside."""
+    """Write the configuration into a run's directory; set aside what another run left there."""
     if not resume and config.directory.is_dir() and any(config.directory.iterdir()):
         set_aside(config.directory)
     writable_directory(config.directory)
@@ -303,7 +294,7 @@ def _told(config: TrainConfig) -> Path:
 
 
 def _is_held(config: TrainConfig, held: Path) -> bool:
-    """Whether a file has this configuration already, workers apart, which change no result: published files stay as they are."""
+    """Return whether a file has this configuration already, workers apart, which change no result: published files stay as they are."""
     try:
         before = load_json(held, strict=False)
     except (OSError, ValueError):
@@ -311,33 +302,32 @@ def _is_held(config: TrainConfig, held: Path) -> bool:
     return isinstance(before, dict) and before | {"workers": config.workers} == as_data(config)
 
 
-def _settings(config: TrainConfig) -> Any:
-    """The learner's hyper-parameters, checked."""
-    module = learner_of(config.learner)
-    settings = build(module.Config, config.settings_of(config.learner), f"config.{config.learner}")
+def _settings(config: TrainConfig) -> Config:
+    """Return the learner's hyper-parameters, checked."""
+    settings: Config = build(learner_of(config.learner).Config, config.settings_of(config.learner), f"config.{config.learner}")
     settings.check()
     return settings
 
 
 def free_of(teacher: str | None) -> set[str]:
-    """Fields of a configuration that change no policy."""
+    """Return fields of a configuration that change no policy."""
     return COMPARED | (set() if teacher == "best" else CHOSEN)
 
 
 def training_of(config: dict[str, Any]) -> str:
-    """What decides the policies of a configuration, as JSON data, in text that is the same for the same training wherever it lies."""
+    """Return what decides the policies of a configuration, as a text that is the same for the same training in any folder."""
     free = free_of(config.get("teacher")) | {"out", "name"}
     free |= {f.name for f in dataclasses.fields(TrainConfig) if f.name in LATER and config.get(f.name) == f.default}
     return canonical({key: value for key, value in config.items() if key not in free})
 
 
-def _same_training(config: dict[str, Any], other: Any) -> bool:
-    """Whether what stands in a file is a configuration of the same training."""
+def _same_training(config: dict[str, Any], other: object) -> bool:
+    """Return whether the data of a file are a configuration of the same training."""
     return isinstance(other, dict) and training_of(other) == training_of(config)
 
 
 def is_training(config: TrainConfig, held: Path) -> bool:
-    """Whether a file holds a configuration of this training; one that cannot be read holds none."""
+    """Return whether a file holds a configuration of this training; one that cannot be read holds none."""
     try:
         return _same_training(as_data(config), load_json(held, strict=False))
     except (OSError, ValueError):
@@ -345,7 +335,7 @@ def is_training(config: TrainConfig, held: Path) -> bool:
 
 
 def plan_key(config: dict[str, Any]) -> str:
-    """The training of a configuration but for the defence that it is against: what a suite's plan asks of everybody."""
+    """Return the training of a configuration but for the defence that it is against: what a suite's plan asks of everybody."""
     text = training_of({key: value for key, value in config.items() if key != "defence"})
     return hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
 
@@ -369,17 +359,12 @@ def same_run(config: TrainConfig) -> None:
         raise InputError("steps", config.steps, f"at least {made}, as {done[0]} was trained: what was learned is not taken back")
 
 
-def figures(progress: Any) -> str:
-    """The curve's latest figures, as a progress bar shows them."""
+def figures(progress: Progress) -> str:
+    """Return the curve's latest figures, as a progress bar shows them."""
     text = f"{progress.steps / 1e6:5.2f} M decisions"
     if progress.crash is not None:
         text += f", collisions {100 * progress.crash:4.1f} %"
     return text if progress.reward is None else f"{text}, return {progress.reward:+.2f}"
 
 
-def parameters() -> list[dict[str, Any]]:
-    """Every field of the configuration with default and sentence, for --help."""
-    return [
-        {"name": f.name, "default": as_data(f.default if f.default is not dataclasses.MISSING else {}), "doc": f.metadata.get("doc", "")}
-        for f in dataclasses.fields(TrainConfig)
-    ]
+parameters = partial(parameters_of, TrainConfig)

@@ -11,7 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from tailgate.agents.learners.learning import Learner, Progress, Teachable, learner_of, made_with
+from tailgate.agents.learners.learning import Config, Learner, Progress, Teachable, learner_of, made_with
 from tailgate.agents.learners.teacher import demonstrate
 from tailgate.base.errors import InputError, Killed, said
 from tailgate.base.files import write_atomic
@@ -30,12 +30,12 @@ class Training(NamedTuple):
     config: TrainConfig
     seed: int
     resume: bool
-    settings: Any  # the learner's hyper-parameters, checked
+    settings: Config  # the learner's hyper-parameters, checked
     environment: dict[str, Any]  # arguments of the environment
     teacher: str | None  # whose decisions the learner is shown first
 
     def failed(self, error: BaseException) -> BaseException:
-        """The error, which says now in which training it came up."""
+        """Return the error, which says now in which training it came up."""
         if isinstance(error, InputError):
             return type(error)(f"{self}: {error.field}", error.value, error.expected)
         error.add_note(f"in the training {self}")
@@ -49,7 +49,7 @@ Report = Callable[[Training, Progress], None]
 
 
 def train_all(trainings: Sequence[Training], begin: Callable[[Training], None], progress: Report, workers: int) -> list[Path]:
-    """JSON files of the policies, in the order of the trainings, as many of which run at a time as there are workers.
+    """Train, and return JSON files of the policies, in the order of the trainings, as many of which run at a time as there are workers.
 
     begin: called with each, before anything of it is done. Where one fails, those that have begun end, no other begins, and the error
     names it.
@@ -67,7 +67,7 @@ def train_all(trainings: Sequence[Training], begin: Callable[[Training], None], 
 
 
 def curve_of(path: Path) -> dict[str, Any]:
-    """What curve-SEED.json of a run holds: `curve`, a list of points, and `seconds`. Raises InputError for anything else."""
+    """Return what curve-SEED.json of a run holds: `curve`, a list of points, and `seconds`. Raises InputError for anything else."""
     try:
         held = load_json(path, strict=False)
     except (OSError, ValueError) as error:
@@ -82,7 +82,7 @@ def curve_of(path: Path) -> dict[str, Any]:
 
 
 def spent(path: Path) -> float:
-    """Processor time that a training took before, by its curve [s]."""
+    """Return the processor time that a training took before, by its curve [s]."""
     return float(curve_of(path).get("seconds", 0.0))
 
 
@@ -116,7 +116,7 @@ def _train(training: Training, report: Callable[[Progress], None]) -> Path:
 
 
 def _apart(defence: str) -> contextlib.AbstractContextManager[None]:
-    """Within it a defence in a sandbox cannot tell training from scoring by the keys that it draws with."""
+    """Hide from a defence in a sandbox, within a block, whether the keys that it draws with are of training or of scoring."""
     if Spec("defence", defence).sandboxed is None:
         return contextlib.nullcontext()
     from tailgate.sandbox.isolated import veiled
@@ -132,7 +132,7 @@ def _train_in_child(training: Training) -> Path:
 
 
 def _train_apart(trainings: Sequence[Training], begin: Callable[[Training], None], progress: Report, workers: int) -> list[Path]:
-    """In processes of their own, which an interrupt ends."""
+    """Train in separate processes, which an interrupt ends."""
     waiting = list(enumerate(trainings))
     paths: dict[int, Path] = {}
     failed: BaseException | None = None

@@ -22,12 +22,13 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import yaml
 
-from tailgate.agents.learners.learning import learner_of
+from tailgate.agents.learners.learning import Progress, learner_of
 from tailgate.agents.policy.network_policy import PolicyAttack
 from tailgate.base import sizes
 from tailgate.base.errors import InputError, said, unknown
@@ -42,6 +43,9 @@ from tailgate.evaluation.cells import Cell
 from tailgate.play.metrics import METRICS
 from tailgate.play.trace import episodes_at_once, rollout
 from tailgate.training.train import ENVIRONMENT, TrainConfig, load_config, outcome_of, train
+
+if TYPE_CHECKING:
+    from optuna import Study, Trial
 
 Space = dict[str, dict[str, Any]]
 SPACES: dict[str, Space] = {
@@ -88,18 +92,18 @@ class Search:
 
     @property
     def trained(self) -> TrainConfig:
-        """What a trial trains: one seed, nothing that is for the comparison alone. A teacher may be the best of the rivals."""
+        """The training of a trial: one seed, nothing that is for the comparison alone. A teacher may be the best of the rivals."""
         rivals = self.base.rivals if self.base.teacher is not None else ()
         return dataclasses.replace(self.base, seeds=1, workers=1, tensorboard=False, rivals=rivals, white_box=(), others=())
 
     @property
     def digest(self) -> str:
-        """Of everything that decides what a trial gives: a search goes on with the same one only."""
+        """A digest of everything that decides what a trial gives: a search goes on with the same one only."""
         return digest([self.trained, self.space, self.episodes, self.seed])
 
 
-def optuna() -> Any:
-    """The Optuna module, without its log."""
+def optuna() -> ModuleType:
+    """Return the Optuna module, without its log."""
     try:
         import optuna as module
     except ImportError as error:
@@ -109,7 +113,7 @@ def optuna() -> Any:
 
 
 def read_space(source: str, learner: str) -> Space:
-    """The built-in space of a learner (`default`), or one from a YAML file; every field and form checked."""
+    """Return the built-in space of a learner (`default`), or one from a YAML file; every field and form checked."""
     if source == "default":
         if learner not in SPACES:
             raise InputError("space", source, f"a YAML file: only {', '.join(SPACES)} have a built-in space, {learner} has none")
@@ -145,7 +149,7 @@ def make_search(
     source: str | None, overrides: list[str], trials: int, space: str = "default", learner: str | None = None, episodes: int = 400,
     seed: int = 0,
 ) -> Search:  # fmt: skip
-    """The search of a preset; its files go to the directory `NAME-tune` beside the runs. One training seed per trial."""
+    """Return the search of a preset; its files go to the folder `NAME-tune` among the runs. One training seed per trial."""
     sizes.check("trials", trials)
     sizes.check("episodes", episodes)
     config = load_config(source, overrides + ([f"learner={learner}"] if learner else []))
@@ -154,7 +158,7 @@ def make_search(
 
 
 def configured(base: TrainConfig, values: dict[str, Any]) -> TrainConfig:
-    """The base with dotted fields changed."""
+    """Return the base with dotted fields changed."""
     data: dict[str, Any] = {}
     for field, value in values.items():
         head, dot, leaf = field.partition(".")
@@ -164,8 +168,8 @@ def configured(base: TrainConfig, values: dict[str, Any]) -> TrainConfig:
     return dataclasses.replace(base, **data)
 
 
-def propose(trial: Any, space: Space) -> dict[str, Any]:
-    """Values of every field, from an Optuna trial. Choices go by their JSON text, as they may be lists."""
+def propose(trial: Trial, space: Space) -> dict[str, Any]:
+    """Return values of every field, from an Optuna trial. Choices go by their JSON text, as they may be lists."""
     out: dict[str, Any] = {}
     for field, form in space.items():
         ((kind, values),) = form.items()
@@ -179,7 +183,7 @@ def propose(trial: Any, space: Space) -> dict[str, Any]:
 
 
 def objective(config: TrainConfig, policy: Path, episodes: int) -> float:
-    """Mean outcome of a policy against the defence that it was trained on, on the purpose `tune`."""
+    """Return the mean outcome of a policy against the defence that it was trained on, on the purpose `tune`."""
     attack, spec, outcome = PolicyAttack(policy), Spec("defence", config.defence), outcome_of(config)
     place = Cell("tune", config.scenario, None, config.defence, str(policy), episodes, "tune", threat=config.threat).place(attack, "black")
     loop = place.loop(spec.make(), spec.entry.uses)
@@ -215,22 +219,23 @@ def _mend(path: Path) -> None:
                 os.truncate(path, whole)
 
 
-def _open(search: Search, ordinal: int | None = None) -> Any:
-    """The search's study. The sampler is made anew for each trial, so that one that goes on proposes what an uninterrupted one would."""
+def _open(search: Search, ordinal: int | None = None) -> Study:
+    """Return the search's study. Each trial gets a fresh sampler: a search that goes on proposes what an uninterrupted one would."""
     module = optuna()
     path = search.directory / JOURNAL
     backend = module.storages.journal.JournalFileBackend(str(path), _JournalLock(path))  # JSON lines, never pickles
     sampler = module.samplers.TPESampler(seed=search.seed * SAMPLER_STRIDE + (ordinal or 0), multivariate=False)
     with _journal_of(search):
         storage = module.storages.JournalStorage(backend)
-        return module.create_study(
+        study: Study = module.create_study(
             storage=storage, sampler=sampler, study_name=search.base.name, direction="maximize", load_if_exists=True
-        )  # fmt: skip
+        )
+    return study
 
 
 @contextlib.contextmanager
 def _journal_of(search: Search) -> Iterator[None]:
-    """Within it whatever Optuna says of a journal is an InputError, which names the file: it checks nothing that it reads."""
+    """Turn, within a block, what Optuna says of a journal into an InputError that names the file: it checks nothing that it reads."""
     path = search.directory / JOURNAL
     try:
         if path.is_file():
@@ -248,7 +253,7 @@ def _journal_of(search: Search) -> Iterator[None]:
         raise InputError("tune", str(path), f"a journal of a search ({type(error).__name__}: {said(error)})") from None
 
 
-def _trial(search: Search, ordinal: int, report: Callable[[int, Any], None] | None = None) -> None:
+def _trial(search: Search, ordinal: int, report: Callable[[int, Progress | None], None] | None = None) -> None:
     """Train and measure one trial. Values that a learner refuses, and a policy without an outcome, cost this trial alone."""
     module, study = optuna(), _open(search, ordinal)
     trial = study.ask()
@@ -270,8 +275,8 @@ def _trial(search: Search, ordinal: int, report: Callable[[int, Any], None] | No
     study.tell(trial, value)
 
 
-def _begin(search: Search) -> Any:
-    """The study, checked to be of this very search, with the trials of an interrupted one marked as failed."""
+def _begin(search: Search) -> Study:
+    """Open the study, check that it is of this very search, and mark the trials of an interrupted one as failed."""
     module = optuna()
     writable_directory(search.directory)
     _mend(search.directory / JOURNAL)
@@ -286,7 +291,7 @@ def _begin(search: Search) -> Any:
     return study
 
 
-def tune(search: Search, workers: int = 1, progress: Callable[[int, Any], None] | None = None) -> dict[str, Any]:
+def tune(search: Search, workers: int = 1, progress: Callable[[int, Progress | None], None] | None = None) -> dict[str, Any]:
     """Play the trials that are missing; writes best.yaml and trials.json into the search's directory; returns the report.
 
     With several workers that many trials are played at a time; which values they get then depends on who ends first.
@@ -297,7 +302,7 @@ def tune(search: Search, workers: int = 1, progress: Callable[[int, Any], None] 
         return _tuned(search, workers, progress)
 
 
-def _tuned(search: Search, workers: int, progress: Callable[[int, Any], None] | None) -> dict[str, Any]:
+def _tuned(search: Search, workers: int, progress: Callable[[int, Progress | None], None] | None) -> dict[str, Any]:
     study = _begin(search)
     settled = {entry["ordinal"] for entry in _entries(study) if entry["state"] == "complete" or entry["reason"]}
     missing = [i for i in range(search.trials) if i not in settled]
@@ -312,8 +317,8 @@ def _tuned(search: Search, workers: int, progress: Callable[[int, Any], None] | 
     return _report(search, _open(search))
 
 
-def _entries(study: Any) -> list[dict[str, Any]]:
-    """What is known of each trial, in its order."""
+def _entries(study: Study) -> list[dict[str, Any]]:
+    """Return what is known of each trial, in its order."""
     return [
         {
             "ordinal": trial.user_attrs.get("ordinal"), "state": trial.state.name.lower(), "value": trial.value,
@@ -327,7 +332,7 @@ def _entries(study: Any) -> list[dict[str, Any]]:
     ]  # fmt: skip
 
 
-def _report(search: Search, study: Any) -> dict[str, Any]:
+def _report(search: Search, study: Study) -> dict[str, Any]:
     entries = sorted((e for e in _entries(study) if e["state"] == "complete" or e["reason"]), key=lambda e: e["ordinal"])
     good = [entry for entry in entries if entry["state"] == "complete"]
     best = max(good, key=lambda entry: (entry["value"], -entry["ordinal"]), default=None)

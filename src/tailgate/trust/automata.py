@@ -88,7 +88,7 @@ class Component:
     about: str = ""
 
     def location(self, name: str) -> Location:
-        """Raises InputError for a name that does not exist."""
+        """Raise InputError for a name that does not exist."""
         for place in self.locations:
             if place.name == name:
                 return place
@@ -132,32 +132,32 @@ class Network:
         return tuple(dict.fromkeys(edge.channel for _, edge in self.edges() if edge.sync))
 
     def edges(self) -> list[tuple[int, Edge]]:
-        """Every edge with the number of its component."""
+        """Return every edge with the number of its component."""
         return [(i, edge) for i, c in enumerate(self.components) for edge in c.edges]
 
     def component(self, name: str) -> Component:
-        """Raises InputError for a name that does not exist."""
+        """Raise InputError for a name that does not exist."""
         for c in self.components:
             if c.name == name:
                 return c
         raise unknown(f"network {self.name}: component", name, [c.name for c in self.components])
 
     def query(self, name: str) -> Query:
-        """Raises InputError for a name that does not exist."""
+        """Raise InputError for a name that does not exist."""
         for q in self.queries:
             if q.name == name:
                 return q
         raise unknown(f"network {self.name}: query", name, [q.name for q in self.queries])
 
     def with_location(self, component: str, location: str, **changes: Any) -> Network:
-        """The same network with other fields of one location."""
+        """Return the same network with other fields of one location."""
         held = self.component(component)
         place = dataclasses.replace(held.location(location), **changes)
         places = tuple(place if p.name == location else p for p in held.locations)
         return self._with(dataclasses.replace(held, locations=places))
 
     def with_edge(self, component: str, source: str, target: str, **changes: Any) -> Network:
-        """The same network with other fields of the edges from one location to another."""
+        """Return the same network with other fields of the edges from one location to another."""
         held = self.component(component)
         edges = tuple(dataclasses.replace(e, **changes) if (e.source, e.target) == (source, target) else e for e in held.edges)
         return self._with(dataclasses.replace(held, edges=edges))
@@ -169,13 +169,13 @@ class Network:
 
 
 def load_network(name: str) -> Network:
-    """A network by its built-in name, or from a YAML file. Raises InputError that names the component and the field."""
+    """Return a network by its built-in name, or from a YAML file. Raises InputError that names the component and the field."""
     path = config_path("automata", name, "automata")
     return network_of({"name": path.stem} | read_yaml(path, "automata"))
 
 
 def network_of(data: dict[str, Any]) -> Network:
-    """A network from data as the YAML file has it, checked as a whole."""
+    """Return a network from data as the YAML file has it, checked as a whole."""
     where = f"automata {data.get('name', '')}".strip()
     components = tuple(_component(held, f"{where}: component {i}") for i, held in enumerate(_list(data, "components", where), start=1))
     queries = tuple(build(Query, held, f"{where}: query {i}") for i, held in enumerate(_list(data, "queries", where), start=1))
@@ -202,7 +202,7 @@ def _component(data: dict[str, Any], where: str) -> Component:
 
 
 def check(network: Network) -> None:
-    """Raises InputError where names do not fit together or a condition has no meaning."""
+    """Raise InputError where names do not fit together or a condition has no meaning."""
     where = f"automata {network.name}"
     if not network.components:
         raise InputError(f"{where}.components", [], "at least one component")

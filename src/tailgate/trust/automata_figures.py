@@ -1,22 +1,26 @@
-"""Automata drawn (thesis figure 7.2; extra: viz): locations on a ring in the order of the declaration, labels beside their edges."""
+"""Automata drawn (thesis figure 7.2; extra: viz): locations on a ring in the order of the declaration, labels next to their edges."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Collection
-from typing import Any
+from typing import TYPE_CHECKING
 
 from tailgate.base.plots import canvas
 
 from .automata import Component, Edge, Location, Network
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 INK, EDGE, NODE, MARKED = "#1a1a1a", "#6b7076", "#dcebf5", "#b34700"
 RADIUS = {1: 0.0, 2: 1.0, 3: 1.2, 4: 1.35, 5: 1.6}
 WIDTH, HEIGHT = 0.66, 0.22  # half of a location's box
 
 
-def automata_figure(network: Network, untrusted: Collection[str] = ()) -> Any:
-    """A matplotlib Figure with one panel per component. Edges whose signal is in `untrusted` are dashed, and say so."""
+def automata_figure(network: Network, untrusted: Collection[str] = ()) -> Figure:
+    """Draw a matplotlib Figure with one panel per component. Edges whose signal is in `untrusted` are dashed, and say so."""
     count = len(network.components)
     figure, axes = canvas(5.2 * count, 4.6, 1, count)
     for ax, component in zip(axes[0], network.components, strict=True):
@@ -25,7 +29,7 @@ def automata_figure(network: Network, untrusted: Collection[str] = ()) -> Any:
 
 
 def place_words(place: Location, leaves: bool = True) -> str:
-    """What a location says of itself: invariant, clock rates, committed, and the rate where it decides itself when it is left."""
+    """Return what a location says of itself: invariant, clock rates, committed, and the rate where it decides itself when it is left."""
     lines = [place.name, *map(str, place.invariant)]
     for clock, speed in place.rates.items():
         lines.append(f"{clock}' in [{speed[0]:g}, {speed[1]:g}]" if isinstance(speed, tuple) else f"{clock}' = {speed:g}")
@@ -37,12 +41,12 @@ def place_words(place: Location, leaves: bool = True) -> str:
 
 
 def edge_words(edge: Edge) -> str:
-    """Guard, signal and what is set, a line each."""
+    """Return guard, signal and what is set, a line each."""
     sets = [f"{name} := {value:g}" for name, value in edge.assign.items()]
     return "\n".join([*map(str, edge.guard), *([edge.sync] if edge.sync else []), *sets])
 
 
-def _panel(ax: Any, component: Component, untrusted: Collection[str]) -> None:
+def _panel(ax: Axes, component: Component, untrusted: Collection[str]) -> None:
     from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
 
     count = len(component.locations)

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tailgate.core import Array, draws
+from tailgate.core import Array, Attack, draws
 from tailgate.core.loop import Loop
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import Scenario, load_scenario
@@ -27,7 +27,7 @@ from .false_alarms import DETECTS, false_alarms
 from .logic import Eventually, Interval, along, holds, robustness
 from .properties import CONJUNCTIONS, Demands, Property, built_in, conjunctions, own
 from .signals import SafeDistance, sample
-from .statistics import Sequential, Sprt
+from .statistics import Rule
 
 Row = dict[str, Any]
 
@@ -41,21 +41,21 @@ class Job:
     bound: float | None = None
     safe: SafeDistance = field(default_factory=SafeDistance)
     asked: Demands = field(default_factory=Demands)
-    rule: Sequential | Sprt | None = None
+    rule: Rule | None = None
 
     @cached_property
     def identity(self) -> str:
-        """Of everything that decides the row."""
+        """A digest of everything that decides the row."""
         known = [[p.name, str(p.formula), str(p.trigger), p.until] for p in self.properties(load_scenario(self.cell.scenario))]
         rest = [known, self.safe, self.rule, *(["false alarms"] if self.cell.attack == CLEAN and not self.formulas else [])]
         return hashlib.blake2b(f"{cell_id(self.cell)}/{canonical(rest)}".encode(), digest_size=12).hexdigest()
 
-    def properties(self, place: Scenario) -> tuple[Property, ...]:
-        return own(place, self.formulas) if self.formulas else built_in(place, self.bound, self.asked)
+    def properties(self, scenario: Scenario) -> tuple[Property, ...]:
+        return own(scenario, self.formulas) if self.formulas else built_in(scenario, self.bound, self.asked)
 
 
 class Outcome(NamedTuple):
-    """What became of a property in B runs."""
+    """A property in B runs."""
 
     holds: Array  # (B,) bool
     robustness: Array  # (B,)
@@ -65,7 +65,7 @@ class Outcome(NamedTuple):
 
 
 def outcome(known: Property, trace: Trace, safe: SafeDistance) -> Outcome:
-    """A property with a formula, in every run of a trace."""
+    """Return a property with a formula, in every run of a trace."""
     assert known.formula is not None
     samples = sample(trace, known.signals, safe)
     asked, instants = np.ones(trace.batch, bool), np.zeros(trace.batch, np.int64)
@@ -77,7 +77,7 @@ def outcome(known: Property, trace: Trace, safe: SafeDistance) -> Outcome:
 
 @dataclass
 class Tally:
-    """What is known of a property after n runs; they themselves are not kept."""
+    """A property after n runs, which are not kept."""
 
     n: int = 0
     k: int = 0  # runs that hold
@@ -91,7 +91,7 @@ class Tally:
     failing_run: int | None = None
 
     def add(self, found: Outcome) -> None:
-        """The next runs."""
+        """Add the next runs."""
         worst = np.where(found.holds, np.inf, found.robustness)
         low, lost = int(np.argmin(found.robustness)), int(np.argmin(worst))
         if found.robustness[low] < self.least:
@@ -105,7 +105,7 @@ class Tally:
 
 @dataclass
 class Found:
-    """What is known of a cell: a tally of each property, and of each conjunction whether a run keeps to it, one byte a run."""
+    """A cell so far: a tally of each property, and for each conjunction whether a run satisfies it, one byte a run."""
 
     tallies: dict[str, Tally]
     together: dict[str, tuple[str, ...]]  # names of the conjunctions and of what they are made of
@@ -113,7 +113,7 @@ class Found:
     alarms: int | None = None  # false ones, of clean runs in which detection is asked for
 
     def add(self, outcomes: dict[str, Outcome], alarms: Array | None) -> None:
-        """The next runs."""
+        """Add the next runs."""
         if alarms is not None:
             self.alarms = (self.alarms or 0) + int(alarms.sum())
         for name, of in outcomes.items():
@@ -122,42 +122,42 @@ class Found:
             self.runs[name].append(np.all([outcomes[member].holds for member in members], axis=0))
 
     def of(self, conjunction: str) -> Array:
-        """(n,) bool"""
+        """Return (n,) bool: the runs that keep to a conjunction."""
         return np.concatenate([np.zeros(0, bool), *self.runs[conjunction]])
 
 
 def check_cell(job: Job) -> Row:
-    """The row of a cell. What a component raises costs this row, with the reason."""
-    cell, guard, attack = job.cell, Spec("defence", job.cell.defence), Spec("attack", job.cell.attack).make()
-    place = cell.place(attack, Spec("attack", cell.attack).entry.knowledge)
+    """Return the row of a cell. What a component raises costs this row, with the reason."""
+    cell, defence, attack = job.cell, Spec("defence", job.cell.defence), Spec("attack", job.cell.attack).make()
+    scenario = cell.place(attack, Spec("attack", cell.attack).entry.knowledge)
     try:
-        known = job.properties(place)
-        loop = place.loop(guard.make(), guard.entry.uses)
+        known = job.properties(scenario)
+        loop = scenario.loop(defence.make(), defence.entry.uses)
         found = _played(job, loop, attack, [p for p in known if p.formula is not None])
     except Exception as error:
         reason, status = _why(error)
         return failed(job, reason, status)
-    return _blank(job, place) | _summary(job, known, found)
+    return _blank(job, scenario) | _summary(job, known, found)
 
 
 def failed(job: Job, reason: str, status: str = "error") -> Row:
-    """The row of a cell that could not be played."""
-    rival = Spec("attack", job.cell.attack)
-    return _blank(job, job.cell.place(rival.make(), rival.entry.knowledge)) | {"status": status, "reason": " ".join(reason.split())[:500]}
+    """Return the row of a cell that could not be played."""
+    spec = Spec("attack", job.cell.attack)
+    return _blank(job, job.cell.place(spec.make(), spec.entry.knowledge)) | {"status": status, "reason": " ".join(reason.split())[:500]}
 
 
-def _blank(job: Job, place: Scenario) -> Row:
-    """A row of which nothing was played."""
-    cell, guard, rival = job.cell, Spec("defence", job.cell.defence), Spec("attack", job.cell.attack)
-    return _head(cell, place, guard.entry, rival.entry, cell_id(cell)) | {
-        "cell": job.identity, "first_seed": cell.first_seed, "dt": place.brief().model.dt, "horizon": place.horizon,
+def _blank(job: Job, scenario: Scenario) -> Row:
+    """Return a row of which nothing was played."""
+    cell, defence, spec = job.cell, Spec("defence", job.cell.defence), Spec("attack", job.cell.attack)
+    return _head(cell, scenario, defence.entry, spec.entry, cell_id(cell)) | {
+        "cell": job.identity, "first_seed": cell.first_seed, "dt": scenario.brief().model.dt, "horizon": scenario.horizon,
         "status": "ok", "reason": "", "n": 0, "properties": [], "conjunctions": {}, "verdict": None, "worst": None,
         "alarms": None,
     }  # fmt: skip
 
 
-def _played(job: Job, loop: Loop, attack: Any, known: Sequence[Property]) -> Found:
-    """The outcome of each property in the order of the seeds, up to where the rule stops."""
+def _played(job: Job, loop: Loop, attack: Attack, known: Sequence[Property]) -> Found:
+    """Return the outcome of each property in the order of the seeds, up to where the rule stops."""
     cell, episodes = job.cell, job.cell.episodes
     size = episodes_at_once(loop.model, loop.horizon, cell.batch if job.rule is None else min(cell.batch, 64))
     together = {name: members for name, members in conjunctions(known, job.formulas).items() if members}
@@ -179,11 +179,11 @@ def _played(job: Job, loop: Loop, attack: Any, known: Sequence[Property]) -> Fou
 
 @lru_cache(maxsize=16)
 def _keys(purpose: str, seeds: tuple[int, ...]) -> draws.Keys:
-    """Of runs that every cell plays: their digests take longer than some steps."""
+    """Return the keys of runs that every cell plays: their digests take longer than some steps."""
     return draws.keys(purpose, seeds)
 
 
-def _outcomes(job: Job, loop: Loop, attack: Any, known: Sequence[Property], keys: draws.Keys) -> tuple[dict[str, Outcome], Array | None]:
+def _outcomes(job: Job, loop: Loop, attack: Attack, known: Sequence[Property], keys: draws.Keys) -> tuple[dict[str, Outcome], Array | None]:
     """Play the runs of these keys: outcomes, and false alarms of clean ones."""
     trace = rollout(loop, attack, keys)
     priced = job.cell.attack == CLEAN and any(p.name == DETECTS for p in known)
@@ -205,7 +205,10 @@ def _summary(job: Job, known: Sequence[Property], found: Found) -> Row:
 
 
 def _property(known: Property, found: Tally | None, seeds: Sequence[int]) -> Row:
-    """k of n runs satisfy it; its antecedent held in `asked` of them, of which `answered` satisfy it, at a share `instants` of steps."""
+    """Return a property as data: k of n runs satisfy it.
+
+    Its antecedent held in `asked` of them, of which `answered` satisfy it, at a share `instants` of steps.
+    """
     out: Row = {"name": known.name, "about": known.about, "reason": known.reason, "formula": None}
     if found is None:
         return out
@@ -224,7 +227,7 @@ def _finite(value: float) -> float | None:
 
 
 def _worst(known: Sequence[Property], found: Found, seeds: Sequence[int]) -> Row | None:
-    """The run that fails the first of the properties that any run fails, by the most; those of safety come first."""
+    """Return the run that fails the first of the properties that any run fails, by the most; those of safety come first."""
     for p in sorted(known, key=lambda p: p.name not in CONJUNCTIONS["safety"]):
         of = found.tallies.get(p.name)
         if of is not None and of.failing_run is not None:
@@ -237,10 +240,10 @@ def _bits(text: str, n: int) -> Array:
 
 
 def runs_of(row: Row, conjunction: str) -> Array:
-    """(n,) bool: the runs of a row, by seed, in which a conjunction holds."""
+    """Return (n,) bool: the runs of a row, by seed, in which a conjunction holds."""
     return _bits(row["conjunctions"][conjunction]["runs"], row["n"])
 
 
 def single(job: Job, run: int) -> Cell:
-    """The cell of one run of a job, by its number. Its trace is the one that was checked: a row does not depend on those beside it."""
+    """Return the cell of one run of a job, by its number. Its trace is the one that was checked: rows are independent."""
     return replace(job.cell, first_seed=job.cell.first_seed + run, seeds=1)

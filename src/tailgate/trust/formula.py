@@ -22,11 +22,11 @@ LONGEST = 4000  # characters
 DEEPEST = 60  # brackets and operators within each other
 _TOKEN = re.compile(r"\s*(?:(\d+(?:\.\d*)?(?:[eE][+-]?\d+)?|\.\d+(?:[eE][+-]?\d+)?)|([A-Za-z_]\w*(?:@\d+)?)|(->|>=|<=|[-+*()\[\],<>]))")
 _WORDS = ("and", "or", "not", "true", "false", "end", "F", "G", "U")
-Terms = dict[str, float]  # factor of each signal; "" stands for the constant
+Terms = dict[str, float]  # factor of each signal; "" is the constant
 
 
 def parse(text: str, flags: Container[str] | None = None) -> Formula:
-    """A formula from its text; `flags` are the signals that may stand by themselves, none given: all.
+    """Return a formula from its text; `flags` are the signals that may stand by themselves, none given: all.
 
     Raises InputError that shows where it cannot be read.
     """
@@ -48,7 +48,7 @@ class _Reader:
         self.next()
 
     def next(self) -> str:
-        """The token that was ahead; reads the one after it."""
+        """Return the token that was ahead; reads the one after it."""
         before = self.token
         found = _TOKEN.match(self.text, self.at)
         if found is None and self.text[self.at :].strip():
@@ -64,7 +64,7 @@ class _Reader:
         return InputError("formula", self.text, f"{wanted}, in place of {shown}")
 
     def take(self, *tokens: str) -> str:
-        """The token ahead if it is one of these; else nothing, and empty."""
+        """Return the token ahead if it is one of these; else nothing, and empty."""
         return self.next() if self.token in tokens else ""
 
     def need(self, token: str) -> None:
@@ -185,7 +185,7 @@ class _Reader:
 
 
 def _compared(more: Terms, less: Terms, strict: bool) -> Atom:
-    """more > less as an atom."""
+    """Return more > less as an atom."""
     names = dict.fromkeys([*more, *less])
     total = {name: more.get(name, 0.0) - less.get(name, 0.0) for name in names}
     return Atom(tuple((name, factor) for name, factor in total.items() if name), total.get("", 0.0), strict)

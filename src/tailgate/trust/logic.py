@@ -1,12 +1,12 @@
-"""Bounded temporal logic over sampled traces, for a whole batch at once: formulas, and what they are worth.
+"""Bounded temporal logic over sampled traces, for a whole batch at once: formulas, and their truth or robustness.
 
 A formula is read at a sample. Atoms compare sums of signals; F, G and U look ahead over a closed interval of seconds, counted from the
 sample that they are read at. Two semantics: boolean, and the robustness of Fainekos and Pappas (2009) and Donze and Maler (2010): by how
 much the signals may change before the truth does. A robustness above 0 means true, one below 0 false.
 
-A window that runs past an episode's end holds the samples that there are: over none G is true, and F and U are false (the neutral view of
-truncated paths, Eisner et al. 2003), so that F is still not G not. Who wants a deadline that the horizon does not cut asks no later than a
-deadline before it: `response` does. An episode that ends with a collision is over: what was due after it did not come.
+A window that runs past an episode's end holds the samples that there are. Over none G is true, and F and U are false (the neutral view
+of truncated paths, Eisner et al. 2003), so that F is still not G not. `response` asks no later than a deadline before the horizon, which
+then cuts no deadline. An episode ends with a collision: answers that were due after it did not come.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
@@ -45,7 +45,7 @@ class Samples:
 
 
 def _number(x: float) -> str:
-    """The shortest text that is read as x."""
+    """Return the shortest text that is read as x."""
     return str(int(x)) if x.is_integer() and abs(x) < 1e6 else repr(x)
 
 
@@ -61,7 +61,10 @@ class Interval:
             raise InputError("interval", [self.first, self.last], "two times [s], 0 <= first <= last")
 
     def steps(self, dt: float) -> tuple[int, int | None]:
-        """First and last sample, counted from the one that is read; None: to the end. Raises InputError where no sample lies within."""
+        """Return first and last sample, counted from the one that is read; None: to the end.
+
+        Raises InputError if the interval holds no sample.
+        """
         if self.first / dt > FAR:
             raise InputError("interval", f"{self}", f"one that begins within {FAR:g} samples")
         low = math.ceil(self.first / dt - SLACK)
@@ -80,16 +83,51 @@ class Interval:
 
 @dataclass(frozen=True)
 class Formula:
-    """Base. `parts` are the formulas that it is made of."""
+    """Base of all formulas."""
 
     @property
     def parts(self) -> tuple[Formula, ...]:
+        """The formulas that it is made of."""
         return ()
 
     @property
     def signals(self) -> set[str]:
         """Names of the signals that it reads."""
         return set().union(*(part.signals for part in self.parts))
+
+
+@dataclass(frozen=True)
+class _Several(Formula):
+    """Base of what joins formulas by a word."""
+
+    of: tuple[Formula, ...] = ()
+
+    word: ClassVar[str]
+    empty: ClassVar[str]  # what it is worth of none
+
+    @property
+    def parts(self) -> tuple[Formula, ...]:
+        return self.of
+
+    def __str__(self) -> str:
+        return f" {self.word} ".join(map(_bracketed, self.of)) if len(self.of) > 1 else f"({self.of[0]})" if self.of else self.empty
+
+
+@dataclass(frozen=True)
+class _Ahead(Formula):
+    """Base of what looks ahead at one formula over an interval."""
+
+    of: Formula
+    within: Interval = field(default_factory=Interval)
+
+    letter: ClassVar[str]
+
+    @property
+    def parts(self) -> tuple[Formula, ...]:
+        return (self.of,)
+
+    def __str__(self) -> str:
+        return f"{self.letter}{self.within} {_bracketed(self.of)}"
 
 
 @dataclass(frozen=True)
@@ -126,61 +164,31 @@ class Not(Formula):
 
 
 @dataclass(frozen=True)
-class And(Formula):
+class And(_Several):
     """All of them; of none, true."""
 
-    of: tuple[Formula, ...] = ()
-
-    @property
-    def parts(self) -> tuple[Formula, ...]:
-        return self.of
-
-    def __str__(self) -> str:
-        return " and ".join(map(_bracketed, self.of)) if len(self.of) > 1 else f"({self.of[0]})" if self.of else "true"
+    word, empty = "and", "true"
 
 
 @dataclass(frozen=True)
-class Or(Formula):
+class Or(_Several):
     """One of them at least; of none, false."""
 
-    of: tuple[Formula, ...] = ()
-
-    @property
-    def parts(self) -> tuple[Formula, ...]:
-        return self.of
-
-    def __str__(self) -> str:
-        return " or ".join(map(_bracketed, self.of)) if len(self.of) > 1 else f"({self.of[0]})" if self.of else "false"
+    word, empty = "or", "false"
 
 
 @dataclass(frozen=True)
-class Eventually(Formula):
+class Eventually(_Ahead):
     """F[a,b]: at some sample of the interval."""
 
-    of: Formula
-    within: Interval = field(default_factory=Interval)
-
-    @property
-    def parts(self) -> tuple[Formula, ...]:
-        return (self.of,)
-
-    def __str__(self) -> str:
-        return f"F{self.within} {_bracketed(self.of)}"
+    letter = "F"
 
 
 @dataclass(frozen=True)
-class Always(Formula):
+class Always(_Ahead):
     """G[a,b]: at every sample of the interval."""
 
-    of: Formula
-    within: Interval = field(default_factory=Interval)
-
-    @property
-    def parts(self) -> tuple[Formula, ...]:
-        return (self.of,)
-
-    def __str__(self) -> str:
-        return f"G{self.within} {_bracketed(self.of)}"
+    letter = "G"
 
 
 @dataclass(frozen=True)
@@ -204,17 +212,17 @@ def _bracketed(formula: Formula) -> str:
 
 
 def implies(a: Formula, b: Formula) -> Formula:
-    """Wherever a holds, b does."""
+    """Return the formula: wherever a holds, b does."""
     return Or((Not(a), b))
 
 
 def response(trigger: Formula, answer: Formula, deadline: float, last: float) -> Formula:
-    """Each time that the trigger holds, up to `last` [s], the answer comes within the deadline [s]: at once counts too."""
+    """Return the formula: whenever the trigger holds, up to `last` [s], the answer comes within the deadline [s], or at once."""
     return Always(implies(trigger, Eventually(answer, Interval(0.0, deadline))), Interval(0.0, last))
 
 
 class _Algebra(NamedTuple):
-    """What makes a semantics: truth and falsehood, the worth of an atom, and of a negation. `and` is the least, `or` the greatest."""
+    """A semantics: truth and falsehood, the worth of an atom, and of a negation. `and` is the least, `or` the greatest."""
 
     top: bool | float
     bottom: bool | float
@@ -227,24 +235,24 @@ _ROBUST = _Algebra(np.inf, -np.inf, lambda x, strict: x, np.negative)
 
 
 def holds(formula: Formula, samples: Samples) -> Array:
-    """(B,) bool: whether each episode satisfies the formula, read at its first sample. Raises InputError where it cannot be read."""
+    """Return (B,) bool: whether each episode satisfies the formula, read at its first sample. Raises InputError where it cannot be read."""
     return np.asarray(along(formula, samples)[0])
 
 
 def robustness(formula: Formula, samples: Samples) -> Array:
-    """(B,) of each episode: above 0 where the formula holds, below where it does not [unit of the atom that decides]."""
+    """Return (B,) of each episode: above 0 where the formula holds, below where it does not [unit of the atom that decides]."""
     _check(formula, samples, 0)
     return np.asarray(_value(formula, samples, _ROBUST)[0])
 
 
 def along(formula: Formula, samples: Samples) -> Array:
-    """(K, B) bool: the formula read at every sample; samples after an episode's end say nothing."""
+    """Return (K, B) bool: the formula read at every sample; samples after an episode's end say nothing."""
     _check(formula, samples, 0)
     return _value(formula, samples, _BOOLEAN)
 
 
 def _check(formula: Formula, samples: Samples, start: int) -> None:
-    """Raises InputError for signals that are not there, and windows that begin after the last sample: what they say is no property."""
+    """Raise InputError for signals that are not there, and windows that begin after the last sample: what they say is no property."""
     if isinstance(formula, Atom) and (missing := formula.signals - set(samples.values)):
         raise InputError("formula", sorted(missing), f"signals that are there: {', '.join(sorted(samples.values))}")
     window = getattr(formula, "within", None)
@@ -257,7 +265,7 @@ def _check(formula: Formula, samples: Samples, start: int) -> None:
 
 
 def _value(formula: Formula, samples: Samples, algebra: _Algebra) -> Array:
-    """(K, B) at every sample."""
+    """Return (K, B) at every sample."""
     shape = samples.count, len(samples.length)
     if isinstance(formula, Atom):
         return algebra.atom(_margin(formula, samples), formula.strict)
@@ -290,7 +298,7 @@ def _ends(within: Interval, samples: Samples) -> tuple[int, int]:
 
 
 def _margin(atom: Atom, samples: Samples) -> Array:
-    """(K, B) what an atom compares with 0."""
+    """Return (K, B) what an atom compares with 0."""
     out = np.full((samples.count, len(samples.length)), atom.constant)
     with np.errstate(invalid="ignore"):
         for name, factor in atom.terms:
@@ -302,7 +310,7 @@ def _margin(atom: Atom, samples: Samples) -> Array:
 
 
 def _shifted(x: Array, steps: int, empty: bool | float) -> Array:
-    """What stands `steps` samples later."""
+    """Return the samples `steps` later."""
     if not steps:
         return x
     out = np.full_like(x, empty)
@@ -311,7 +319,7 @@ def _shifted(x: Array, steps: int, empty: bool | float) -> Array:
 
 
 def _window(x: Array, width: int, of: Callable[[Array, Array], Array], empty: bool | float) -> Array:
-    """`of` all samples from each on, `width` of them; by windows of twice the width each time."""
+    """Apply `of` to `width` samples from each on; by windows of twice the width each time."""
     reach = 1
     while 2 * reach <= width:
         x = of(x, _shifted(x, reach, empty))
@@ -320,7 +328,7 @@ def _window(x: Array, width: int, of: Callable[[Array, Array], Array], empty: bo
 
 
 def _until(left: Array, right: Array, width: int, algebra: _Algebra) -> Array:
-    """left U right over `width` samples from each on; windows are put together: until(m + n) = until(m) or all(m) and until(n)."""
+    """Return left U right over `width` samples from each on; windows are put together: until(m + n) = until(m) or all(m) and until(n)."""
     out, every, done = np.full_like(right, algebra.bottom), np.full_like(left, algebra.top), 0
     block, whole, size = right, left, 1  # until and all over `size` samples
     while done < width:

@@ -1,4 +1,4 @@
-"""What is asked of a run: the built-in properties of a scenario as formulas, and a user's own.
+"""Properties of a run as formulas: the built-in ones of a scenario, and a user's own.
 
     no_collision   G (gap > 0 and rear_gap > 0)
     brakes         whenever a gap is unsafe once an attack has begun, that car begins to brake within 0.6 s, strictly later, and
@@ -6,8 +6,8 @@
     detects        an alarm within ten steps of the first step of an attack; it counts under a limit of false alarms (false_alarms.py)
     error          G (error <= bound), where nobody drives
 
-A property that has no meaning in a scenario has a reason in place of a formula. One with an antecedent, the trigger, also holds of a run in
-which that never came about; how often it did stands beside it.
+A property that has no meaning in a scenario has a reason in place of a formula. One with an antecedent, the trigger, also holds of a run
+without it; reports say how often the trigger came about.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ CONJUNCTIONS: dict[str, tuple[str, ...]] = {  # of what is defined among these o
 
 
 def _over(signal: str, factor: float, bound: float, strict: bool = True) -> Atom:
-    """factor x signal > bound."""
+    """Return factor x signal > bound."""
     return Atom(((signal, factor),), -bound, strict)
 
 
@@ -124,13 +124,13 @@ def _error(model: Model, bound: float | None) -> Property:
 
 
 def built_in(place: Scenario, bound: float | None = None, asked: Demands | None = None) -> tuple[Property, ...]:
-    """The built-in properties of a scenario; `bound` is the suite's, of an error where nobody drives."""
+    """Return the built-in properties of a scenario; `bound` is the suite's, of an error where nobody drives."""
     model, asked = place.brief().model, asked or Demands()
     return _no_collision(model), _brakes(model, place.horizon, asked), _detects(model, place.horizon, asked), _error(model, bound)
 
 
 def own(place: Scenario, texts: Sequence[str]) -> tuple[Property, ...]:
-    """A user's formulas as properties of a scenario. Raises InputError for one that cannot be read, or whose window begins too late."""
+    """Return a user's formulas as properties. Raises InputError for one that cannot be read, or whose window begins too late."""
     out, model = [], place.brief().model
     for text in texts:
         formula = parse(text, FLAGS)
@@ -155,7 +155,7 @@ def _fits(formula: Formula, dt: float, horizon: int, start: int) -> None:
 
 
 def conjunctions(properties: Sequence[Property], texts: Sequence[str] = ()) -> dict[str, tuple[str, ...]]:
-    """Names of the properties that are taken together, those without a meaning left out; of a user's own formulas all, as `trust`."""
+    """Return names of the properties that are taken together, those with a meaning only; a user's own formulas all, as `trust`."""
     defined = [p.name for p in properties if p.formula is not None]
     if texts:
         return {"trust": tuple(defined)}

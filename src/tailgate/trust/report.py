@@ -24,7 +24,7 @@ Paid = Mapping[tuple[str, str], Price]  # by defence and scenario: what its clea
 
 
 def report(rows: Sequence[Row], suite: Suite, *, alpha: float, settings: Data, clean: Sequence[Row] = ()) -> Data:
-    """What `check` returns. The rows are those of every defence, scenario, dose and attack of the suite, once each.
+    """Return what `check` returns. The rows are those of every defence, scenario, dose and attack of the suite, once each.
 
     clean: runs without an attack that are no part of the suite, by which alarms are judged.
     """
@@ -45,17 +45,17 @@ def report(rows: Sequence[Row], suite: Suite, *, alpha: float, settings: Data, c
 
 
 def _own(rows: Sequence[Row]) -> bool:
-    """Whether the properties are a user's."""
+    """Return whether the properties are a user's."""
     return not {p["name"] for row in rows for p in row["properties"]} <= set(CONJUNCTIONS["trust"])
 
 
 def _whole(suite: Suite) -> bool:
-    """Whether all defences of the suite of this name are in it: what does not fit some of them may fit the others."""
+    """Return whether all defences of the suite of this name are in it: what does not fit some of them may fit the others."""
     return suite.name not in list_suites() or set(load_suite(suite.name).defences) <= set(suite.defences)
 
 
 def _counted(rows: Sequence[Row], whole: bool) -> list[Row]:
-    """The rows that bounds are over. Computed optima are ceilings; an attack that fits no defence of the suite in a scenario is left out
+    """Return the rows that bounds are over. Optima are ceilings; an attack that fits no defence of the suite in a scenario is left out
     there, which only a report on all of them can tell."""
     fits = {(row["scenario"], row["attack"]) for row in rows if row["status"] != "skipped" or not whole}
     return [row for row in rows if not row["optimal"] and (row["scenario"], row["attack"]) in fits]
@@ -98,7 +98,7 @@ def _entry(
 
 
 def _bound(rows: Sequence[Row], name: str, alpha: float, fixed: bool, paid: Paid) -> Data | None:
-    """The least lower limit of a conjunction over cells, each at alpha over their number; None where a cell has no figure.
+    """Return the least lower limit of a conjunction over cells, each at alpha over their number; None where a cell has no figure.
 
     Nor has one in which detection is asked for and does not count.
     """
@@ -117,12 +117,12 @@ def _bound(rows: Sequence[Row], name: str, alpha: float, fixed: bool, paid: Paid
 
 
 def _counts(known: Row) -> tuple[int, int]:
-    """(k, n) of a property: of one with an antecedent, among the runs in which that held."""
+    """Return (k, n) of a property: of one with an antecedent, among the runs in which that held."""
     return (known["answered"], known["asked"]) if known["asked"] is not None else (known["k"], known["n"])
 
 
 def _properties(rows: Sequence[Row], alpha: float, paid: Paid) -> list[Data]:
-    """The worst cell of each property, with an interval that holds for all cells together; null where it is defined in none.
+    """Return the worst cell of each property, with an interval that holds for all cells together; null where it is defined in none.
 
     Detection has the alarms of the clean runs with it, and is null where it does not count in a scenario.
     """
@@ -152,12 +152,12 @@ def _why_none(held: Sequence[tuple[Row, Row]]) -> str:
 
 
 def _antecedent(row: Row, known: Row) -> Data | None:
-    """How often the condition of a property held: in how many runs, and at what share of all steps."""
+    """Return how often the condition of a property held: in how many runs, and at what share of all steps."""
     return None if known["asked"] is None else {"runs": known["asked"], "of": row["n"], "instants": known["instants"]}
 
 
 def _failure(rows: Sequence[Row], names: Sequence[str]) -> Data | None:
-    """The worst failing run, of the cell that fails most often: for safety if any run fails it."""
+    """Return the worst failing run, of the cell that fails most often: for safety if any run fails it."""
     for name in reversed(names):
         failing = [row for row in rows if name in row["conjunctions"] and row["conjunctions"][name]["k"] < row["n"]]
         if failing:
@@ -167,7 +167,7 @@ def _failure(rows: Sequence[Row], names: Sequence[str]) -> Data | None:
 
 
 def _cell(row: Row, alpha: float, names: Sequence[str], paid: Paid) -> Data:
-    """A cell as the report shows it: intervals hold for each by itself. Detection that does not count keeps the share that was played."""
+    """Return a cell as the report shows it, each interval by itself. Detection that does not count keeps the share that was played."""
     out: Data = {key: row[key] for key in ("scenario", "dose", "defence", "attack", "knowledge", "status", "reason", "n", "verdict")}
     for name in names:
         held = row["conjunctions"].get(name)
@@ -183,7 +183,7 @@ def _cell(row: Row, alpha: float, names: Sequence[str], paid: Paid) -> Data:
 
 
 def _compared(entries: Sequence[Data], counted: Sequence[Row], name: str, alpha: float) -> list[Data]:
-    """Pairs of a class, each at its own worst black-box cell, on the same seeds (McNemar, exact); only_a: runs in which a alone fails."""
+    """Compare pairs of a class, each at its own worst black-box cell, on the same seeds (McNemar, exact); only_a: only a fails."""
     out: list[Data] = []
     ready = [entry for entry in entries if entry[name]["black"] is not None]
     for group in dict.fromkeys(entry["class"] for entry in ready):

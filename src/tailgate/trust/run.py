@@ -33,7 +33,7 @@ from .cells import Job, Row, check_cell, failed, single
 from .properties import CONJUNCTIONS, Demands, own
 from .report import FORMAT, report
 from .signals import SafeDistance
-from .statistics import Sequential, Sprt
+from .statistics import Rule
 
 ROWS, FAILURES, REPORT = "cells.jsonl", "failures.jsonl", "trust.json"
 BATCH = 2048
@@ -43,9 +43,9 @@ Progress = Callable[[int, int], None]
 def jobs_of(
     suite: Suite, *, runs: int, formulas: Sequence[str] = (), purpose: str = "report", beacon: str = "",
     batch: int = BATCH, threat: dict[str, Any] | None = None, safe: SafeDistance | None = None, asked: Demands | None = None,
-    rule: Sequential | Sprt | None = None,
+    rule: Rule | None = None,
 ) -> list[Job]:  # fmt: skip
-    """Every cell of a suite with what is asked of it. Raises InputError for anything that does not exist or cannot be read."""
+    """Return every cell of a suite with what is asked of it. Raises InputError for anything that does not exist or cannot be read."""
     for name, value in (("runs", runs), ("batch", batch)):
         sizes.check(name, value)
     for name, held in (("scenarios", suite.scenarios), ("defences", suite.defences), ("attacks", suite.attacks)):
@@ -61,7 +61,10 @@ def jobs_of(
 
 
 def play(jobs: Sequence[Job], folder: Path | None = None, workers: int = 1, progress: Progress | None = None) -> list[Row]:
-    """The row of each job. With `folder` finished cells are kept there: an interrupted run resumes, and other rows are set aside."""
+    """Play the jobs, and return a row for each.
+
+    With `folder` finished cells are kept there: an interrupted run resumes, and other rows are set aside.
+    """
     ids = [job.identity for job in jobs]
     done: dict[str, Row] = {}
     parts = out = None
@@ -94,7 +97,7 @@ def play(jobs: Sequence[Job], folder: Path | None = None, workers: int = 1, prog
 
 
 def _read(path: Path) -> list[Row]:
-    """The rows of a file that an earlier run wrote; none of a damaged one: its cells are played again."""
+    """Return the rows of a file that an earlier run wrote; none of a damaged one: its cells are played again."""
     try:
         rows = [parse_json(line) for line in lines_of(path)]
     except (OSError, ValueError):
@@ -103,7 +106,7 @@ def _read(path: Path) -> list[Row]:
 
 
 def _played(jobs: Sequence[Job], workers: int) -> Generator[Row]:
-    """Rows as they are finished. Somebody's own code plays in a process of its own."""
+    """Play, and yield rows as they are finished. Imported code plays in a separate process."""
     foreign = any(Spec("defence", job.cell.defence).imports or Spec("attack", job.cell.attack).imports for job in jobs)
     if not foreign and (workers == 1 or len(jobs) < 2):
         yield from map(check_cell, jobs)
@@ -116,13 +119,13 @@ def _played(jobs: Sequence[Job], workers: int) -> Generator[Row]:
 def check(
     suite: Suite, *, runs: int | None = None, formulas: Sequence[str] = (), alpha: float = 0.05, purpose: str = "report",
     beacon: str = "", batch: int = BATCH, workers: int = 1, folder: Path | None = None, threat: dict[str, Any] | None = None,
-    safe: SafeDistance | None = None, asked: Demands | None = None, rule: Sequential | Sprt | None = None,
+    safe: SafeDistance | None = None, asked: Demands | None = None, rule: Rule | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Any]:  # fmt: skip
-    """The report on a suite's defences, in the format tailgate-trust-1; docs/trust.md says what its fields mean.
+    """Play, and return the report on a suite's defences, in the format tailgate-trust-1; docs/trust.md says what its fields mean.
 
     runs: of each cell, the suite's number of seeds unless given; with a rule the most that it may take. formulas: in place of the built-in
-    properties. With `folder` it is also written there as trust.json, beside the rows of cells and the worst failing episode of each
+    properties. With `folder` it is also written there as trust.json, with the rows of cells and the worst failing episode of each
     defence, as rows for `tailgate replay`. Raises InputError before anything is played.
     """
     if not 0.0 < alpha < 1.0:
@@ -146,17 +149,17 @@ def check(
     return found
 
 
-def rule_data(rule: Sequential | Sprt | None) -> dict[str, Any]:
-    """A rule as JSON data."""
+def rule_data(rule: Rule | None) -> dict[str, Any]:
+    """Return a rule as JSON data."""
     return {"name": "fixed"} if rule is None else {"name": type(rule).__name__.lower(), **_plain(rule)}
 
 
-def _plain(value: Any) -> dict[str, Any]:
+def _plain(value: object) -> dict[str, Any]:
     return {key: held for key, held in as_data(value).items() if key != "class"}
 
 
 def _keep_failures(found: dict[str, Any], jobs: Sequence[Job], folder: Path) -> None:
-    """Writes the row of each defence's worst failing run, and puts its line into the report."""
+    """Write the row of each defence's worst failing run, and puts its line into the report."""
     rows: list[Row] = []
     by_identity = {job.identity: job for job in jobs}
     for entry in found["defences"]:
@@ -173,9 +176,9 @@ def _keep_failures(found: dict[str, Any], jobs: Sequence[Job], folder: Path) -> 
 
 
 def _failed(job: Job, name: str) -> dict[str, str]:
-    """The property of this name in words and as a formula, for who replays a run that fails it."""
-    rival = Spec("attack", job.cell.attack)
-    known = job.properties(job.cell.place(rival.make(), rival.entry.knowledge))
+    """Return the property of this name in words and as a formula, for who replays a run that fails it."""
+    spec = Spec("attack", job.cell.attack)
+    known = job.properties(job.cell.place(spec.make(), spec.entry.knowledge))
     return next({"property": p.name, "about": p.about, "formula": str(p.formula)} for p in known if p.name == name)
 
 
@@ -184,16 +187,18 @@ def _foreign(spec: Spec) -> bool:
 
 
 def replay_command(defence: str, attack: str, folder: Path, line: int) -> str:
-    """What plays a line of the failures again. A row must not import code: who wants it names the class."""
+    """Return what plays a line of the failures again. A row must not import code: who wants it names the class."""
     named = [(family, text) for family, text in (("defence", defence), ("attack", attack)) if _foreign(Spec(family, text))]  # type: ignore[arg-type]
     words = ["tailgate", "replay", str(folder / FAILURES), "--line", str(line), "--out", str(folder / f"failure-{line}.html")]
     return shlex.join(words + [word for family, text in named for word in (f"--{family}", text)])
 
 
-def with_trust(board: dict[str, Any], found: Any, where: str = "trust", suite: Suite | None = None) -> dict[str, Any]:
-    """A board with the field `trust`: of the board what the bounds are about; of each entry its bounds by what the attacker knows, of `all`
-    properties together and of `safety`, those without detection. An entry that the report does not know has null, and so has one that is
-    not built in: here nobody mixes its rows with others, so that it could tell from its batch who is attacked.
+def with_trust(board: dict[str, Any], found: object, where: str = "trust", suite: Suite | None = None) -> dict[str, Any]:
+    """Return a board with the field `trust`: what the bounds are about, and the bounds of each entry.
+
+    An entry has bounds by what the attacker knows, on `all` properties together and on `safety`, those without detection. An entry that
+    the report does not know has null. So has one that is not built in: its rows are not mixed with others, and its batch would tell it
+    who is attacked.
 
     Raises InputError for what is no report, and for one of another suite, version or round, of own formulas or of runs that a rule stopped.
     """
@@ -222,7 +227,7 @@ def with_trust(board: dict[str, Any], found: Any, where: str = "trust", suite: S
 
 
 def _listed(suite: Suite, board: Mapping[str, Any]) -> list[str]:
-    """The attacks of a suite, and those that joined it by the list of a board."""
+    """Return the attacks of a suite, and those that joined it by the list of a board."""
     joined = (a["attack"] for a in board.get("attacks", ()) if a.get("admitted") and not a.get("withdrawn"))
     return list(dict.fromkeys([*suite.attacks, *joined]))
 
@@ -241,7 +246,7 @@ def _of_suite(found: Mapping[str, Any], suite: Suite, asked: Sequence[str], alph
 
 
 def _asked(found: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """The properties that have a meaning in some scenario of a report, and which of them are of safety."""
+    """Return the properties that have a meaning in some scenario of a report, and which of them are of safety."""
     asked = {p["name"] for cell in found["cells"] for p in cell["properties"] if p["formula"] is not None}
     about = {p["name"]: p["about"] for entry in found["defences"] for p in entry["properties"]}
     return [{"name": name, "about": text, "safety": name in CONJUNCTIONS["safety"]} for name, text in about.items() if name in asked]

@@ -36,7 +36,7 @@ class SafeDistance:
     lead_brake: Positive = param(-STOP_ACCEL, "hardest deceleration b_l of the car ahead [m/s^2]; no manoeuvre here brakes harder")
 
     def of(self, speed: Array, lead_speed: Array) -> Array:
-        """The distance [m] at speeds [m/s], elementwise."""
+        """Return the distance [m] at speeds [m/s], elementwise."""
         after = speed + self.accel * self.response
         own = speed * self.response + 0.5 * self.accel * self.response**2 + after * after / (2.0 * self.brake)
         return np.asarray(np.maximum(own - lead_speed * lead_speed / (2.0 * self.lead_brake), 0.0))
@@ -62,7 +62,7 @@ def _attacked(trace: Trace, _: SafeDistance) -> Array:
 
 
 def _so_far(once: bool) -> Callable[[Trace, SafeDistance], Array]:
-    """From the first step of an episode on in which any command took effect, or in that step alone; the same for all agents."""
+    """Return a signal that is on from the first step in which a command took effect, or in that step alone; the same for all agents."""
 
     def of(trace: Trace, _: SafeDistance) -> Array:
         on = np.asarray(trace.kind != 0)
@@ -115,7 +115,7 @@ FLAGS = {name for name, signal in SIGNALS.items() if signal.unit == "0/1"}
 
 
 def check_names(names: Iterable[str], model: Model) -> None:
-    """Raises InputError for a name that does not exist, NotApplicable for one that has no meaning in the scenario of this model."""
+    """Raise InputError for a name that does not exist, NotApplicable for one that has no meaning in the scenario of this model."""
     for name in sorted(names):
         head, _, number = name.partition("@")
         if head not in SIGNALS:
@@ -128,7 +128,7 @@ def check_names(names: Iterable[str], model: Model) -> None:
 
 
 def sample(trace: Trace, names: Iterable[str], safe: SafeDistance) -> Samples:
-    """Signals (K, B) of a trace: `name` over all agents, the worst in the way that SIGNALS says, `name@i` of agent i."""
+    """Return signals (K, B) of a trace: `name` over all agents, the worst in the way that SIGNALS says, `name@i` of agent i."""
     names = sorted(set(names))
     check_names(names, trace.model)
     values: dict[str, Array] = {}

@@ -47,7 +47,7 @@ class Plan(NamedTuple):
 
 
 class State(NamedTuple):
-    """Of the A runs that still go on."""
+    """The A runs that still go on."""
 
     run: Array  # (A,) which of the B
     value: Array  # (V, A)
@@ -62,7 +62,7 @@ def prepare(network: Network) -> Plan:
 
 
 def holds(plan: Plan, atoms: Atoms, value: Array) -> Array:
-    """(A,) whether all conditions hold at these values (V, A)."""
+    """Return (A,) whether all conditions hold at these values (V, A)."""
     out = np.ones(value.shape[1], bool)
     for name, op, limit in atoms:
         over, slack = value[plan.row[name]] - limit, SLACK * max(1.0, abs(limit))
@@ -76,7 +76,7 @@ def holds(plan: Plan, atoms: Atoms, value: Array) -> Array:
 
 
 def window(plan: Plan, atoms: Atoms, value: Array, speed: Array) -> tuple[Array, Array]:
-    """The delays from now [low, high], (A,) each, in which all conditions hold while nothing but clocks moves; low > high for none.
+    """Return the delays from now [low, high], (A,) each, in which all conditions hold while nothing but clocks moves; low > high for none.
 
     An open end counts as belonging to it, but an interval of one point with an open end is none.
     """
@@ -110,7 +110,7 @@ def simulate(
     stop: bool = True,
     steps: int = STEPS,
 ) -> Runs:
-    """One run per seed (or per row of keys), up to a time.
+    """Return one run per seed (or per row of keys), up to a time.
 
     queries: what to look for, the network's own if not given; within: how long, as the longest query says if not given. stop: a run ends
     as soon as all of them have held, or no longer can as their time is over. One in which nobody can move any more lasts to the end. Raises
@@ -159,7 +159,7 @@ def _start(plan: Plan, keys: Keys) -> State:
 
 
 def _enter(plan: Plan, speed: Array, place: Array, moved: Array, u: Array) -> None:
-    """Sets how fast the clocks of components that moved (C, A) run where they are now; u (V, A) draws what is drawn."""
+    """Set how fast the clocks of components that moved (C, A) run where they are now; u (V, A) draws what is drawn."""
     for i, component in enumerate(plan.network.components):
         for j, where in enumerate(component.locations):
             here = moved[i] & (place[i] == j)
@@ -170,7 +170,7 @@ def _enter(plan: Plan, speed: Array, place: Array, moved: Array, u: Array) -> No
 
 
 def _move(plan: Plan, state: State, keys: Keys, step: int, until: float, asked: tuple[Query, ...], stop: bool, out: Runs) -> State:
-    """One move of every run that goes on; writes what ended into `out`."""
+    """Move every run that goes on once; write what ended into `out`."""
     count, parts, edges = len(state.run), len(plan.places), len(plan.edges)
     own = Keys(keys.key[state.run], keys.episode[state.run])
     u = own.at(Role.PROCESS, np.full(count, step)).uniform((2 * parts + edges + len(plan.row),)).T
@@ -194,12 +194,12 @@ def _move(plan: Plan, state: State, keys: Keys, step: int, until: float, asked: 
 
 
 def _expires(query: Query) -> float:
-    """The time after which it can no longer begin to hold."""
+    """Return the time after which it can no longer begin to hold."""
     return min([query.within, *(atom.value for atom in query.holds if atom.name == TIME and atom.op in ("<", "<="))])
 
 
 def _look(plan: Plan, state: State, passed: Array, asked: tuple[Query, ...], out: Runs) -> None:
-    """Notes the moment at which a query first holds, if it does before `passed` (A,) is over."""
+    """Note the moment at which a query first holds, if it does before `passed` (A,) is over."""
     for query, hit in zip(asked, out.hit, strict=True):
         low, high = window(plan, query.holds, state.value, state.speed)
         at = state.value[0] + low
@@ -208,7 +208,7 @@ def _look(plan: Plan, state: State, passed: Array, asked: tuple[Query, ...], out
 
 
 def _delays(plan: Plan, state: State, u: Array, until: float) -> Array:
-    """(C, A) what each component draws; infinite for one that waits for others."""
+    """Return (C, A) what each component draws; infinite for one that waits for others."""
     delay, limit, urgent = np.full(state.place.shape, np.inf), np.full(state.place.shape, np.inf), np.zeros(state.place.shape, bool)
     for i, component in enumerate(plan.network.components):
         for j, where in enumerate(component.locations):
@@ -245,7 +245,7 @@ def _delays(plan: Plan, state: State, u: Array, until: float) -> Array:
 
 
 def _fire(plan: Plan, state: State, first: Array, tie: Array, choice: Array, rates: Array, out: Runs) -> State:
-    """The winner's move and its listeners'; `first` (C, A) marks whose delay was the shortest."""
+    """Return the winner's move and its listeners'; `first` (C, A) marks whose delay was the shortest."""
     winner = np.where(first, tie, np.inf).argmin(axis=0)
     open_ = np.array([holds(plan, e.guard, state.value) & (state.place[i] == plan.places[i][e.source]) for i, e in plan.edges])
     component = np.array([i for i, _ in plan.edges])[:, None]
@@ -273,7 +273,7 @@ def _fire(plan: Plan, state: State, first: Array, tie: Array, choice: Array, rat
 
 
 def _one_of(may: Array, score: Array) -> Array:
-    """(E, A) at most one of the edges that may be taken in each run, each as likely."""
+    """Return (E, A) at most one of the edges that may be taken in each run, each as likely."""
     best = np.where(may, score, np.inf).argmin(axis=0)
     return np.asarray(may & (np.arange(len(may))[:, None] == best))
 

@@ -28,29 +28,29 @@ def _share(field: str, value: float) -> float:
 
 
 def interval(k: int, n: int, level: float = 0.95) -> Interval:
-    """Share of k in n with the two-sided Clopper-Pearson interval."""
+    """Return share of k in n with the two-sided Clopper-Pearson interval."""
     return proportion(k, n, level)
 
 
 def lower(k: int, n: int, alpha: float) -> float:
-    """One-sided Clopper-Pearson limit of k in n: the true probability lies below it with a chance of at most alpha."""
+    """Return the one-sided Clopper-Pearson limit of k in n: the true probability lies below it with a chance of at most alpha."""
     return float(limits(np.array([k]), np.array([n]), alpha)[0][0])
 
 
 def okamoto(half: float, delta: float) -> int:
-    """Runs after which a share is within `half` of the probability with a chance of 1 - delta, whatever it is (Okamoto 1958)."""
+    """Return runs after which a share is within `half` of the probability with a chance of 1 - delta, whatever it is (Okamoto 1958)."""
     return math.ceil(math.log(2.0 / _share("delta", delta)) / (2.0 * _share("half", half) ** 2))
 
 
 def _reach(n: int, level: float) -> float:
-    """The farthest that an end of the Clopper-Pearson interval lies from its share, of all that n runs may give."""
+    """Return the farthest that an end of the Clopper-Pearson interval lies from its share, of all that n runs may give."""
     k = np.arange(n + 1)
     low, high = limits(k, np.full(n + 1, n), (1.0 - level) / 2.0)
     return float(max(np.max(k / n - low), np.max(high - k / n)))
 
 
 def runs_for(half: float, level: float) -> int:
-    """The least number of runs with which every Clopper-Pearson interval lies within `half` of its share, whatever comes out."""
+    """Return the least number of runs with which every Clopper-Pearson interval lies within `half` of its share, whatever comes out."""
     _share("precision", half), _share("confidence", level)
     if okamoto(half, 1.0 - level) > MOST:
         raise InputError("precision", half, f"one that {MOST} runs can give")
@@ -64,7 +64,7 @@ def runs_for(half: float, level: float) -> int:
 
 
 class Verdict(NamedTuple):
-    """What a rule says, and after how many runs."""
+    """The answer of a rule, and after how many runs."""
 
     runs: int
     holds: bool | None  # of a test: the hypothesis that it settled on
@@ -74,7 +74,7 @@ class Rule(Protocol):
     """When to stop."""
 
     def stop(self, outcomes: Array) -> Verdict | None:
-        """The verdict on outcomes (n,) bool in their order; None: go on."""
+        """Return the verdict on outcomes (n,) bool in their order; None: go on."""
 
 
 @dataclass(frozen=True)
@@ -125,7 +125,7 @@ class Sequential:
         return out
 
     def coverage(self, p: Array) -> Array:
-        """Chance that the interval at which the rule stops holds p, for each of p: exact, by dynamic programming over (n, k)."""
+        """Return chance that the interval at which the rule stops holds p, for each of p: exact, by dynamic programming over (n, k)."""
         p = np.atleast_1d(np.asarray(p, np.float64))
         n, k, low, high, logs = self._table
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -141,7 +141,7 @@ class Sequential:
         return n, k, low, high, np.array([math.log(end[2]) for end in self.ends])
 
     def worst_coverage(self) -> tuple[float, float]:
-        """(coverage, p) where it is least: just inside or outside of the ends of intervals, at which alone it jumps, and between."""
+        """Return (coverage, p) where it is least: just inside or outside of the ends of intervals, at which alone it jumps, and between."""
         _, _, low, high, _ = self._table
         edges = np.unique(np.concatenate([low, high]))
         edges = np.concatenate([edges - 1e-12, edges, edges + 1e-12, 0.5 * (edges[1:] + edges[:-1])])
@@ -151,7 +151,7 @@ class Sequential:
 
 
 class Rates(NamedTuple):
-    """Of a test at one true probability."""
+    """Error rates of a test at one true probability."""
 
     accepts: float  # chance that it says p >= high
     rejects: float  # chance that it says p <= low
@@ -180,7 +180,7 @@ class Sprt:
 
     @property
     def _steps(self) -> tuple[float, float]:
-        """What a success and a failure add to log L(low) / L(high)."""
+        """The terms that a success and a failure add to log L(low) / L(high)."""
         return math.log(self.low / self.high), math.log((1.0 - self.low) / (1.0 - self.high))
 
     def _ratio(self, k: Array, n: Array | int) -> Array:
@@ -194,7 +194,7 @@ class Sprt:
         return Verdict(int(out[0]) + 1, bool(ratio[out[0]] < 0.0)) if len(out) else None
 
     def rates(self, p: float, left: float = 1e-12) -> Rates:
-        """Exact chances and mean length at a true probability, by dynamic programming until no more than `left` is undecided."""
+        """Return exact chances and mean length at a true probability, by dynamic programming until no more than `left` is undecided."""
         going, first = np.ones(1), 0  # chance of each number of successes from `first` on, undecided so far
         accepts = rejects = runs = 0.0
         n = 0

@@ -20,12 +20,12 @@ class Signal(NamedTuple):
 
 
 def signals(network: Network) -> list[str]:
-    """Every synchronisation once, in the order of the declaration."""
+    """Return every synchronisation once, in the order of the declaration."""
     return list(dict.fromkeys(edge.sync for _, edge in network.edges() if edge.sync))
 
 
 def influences(network: Network) -> dict[Node, list[Node]]:
-    """What each name, location and edge has an influence on.
+    """Return what each name, location and edge has an influence on.
 
     A name on the edges whose guard reads it and on those that leave a location whose invariant reads it; a location on the edges that
     leave it; an edge on the location that it leads to, on what it sets, and on those who hear it.
@@ -51,14 +51,14 @@ def influences(network: Network) -> dict[Node, list[Node]]:
 
 
 def one_hop(network: Network) -> set[str]:
-    """Signals of edges whose guard reads sensor state, and of those who hear them: the thesis's reading."""
+    """Return signals of edges whose guard reads sensor state, and of those who hear them: the thesis's reading."""
     guarded = [edge for _, edge in network.edges() if any(atom.name in network.sensor for atom in edge.guard)]
     sent = {edge.channel for edge in guarded if edge.sends}
     return {edge.sync for edge in guarded if edge.sync} | {edge.sync for _, edge in network.edges() if edge.hears and edge.channel in sent}
 
 
 def paths(network: Network) -> dict[Node, tuple[Node, ...]]:
-    """Everything that sensor state has an influence on, with the shortest chain of influences to it (breadth first)."""
+    """Return everything that sensor state has an influence on, with the shortest chain of influences to it (breadth first)."""
     follows = influences(network)
     found: dict[Node, tuple[Node, ...]] = {("name", name): (("name", name),) for name in network.sensor}
     todo = deque(found)
@@ -72,7 +72,7 @@ def paths(network: Network) -> dict[Node, tuple[Node, ...]]:
 
 
 def table(network: Network) -> list[Signal]:
-    """Table 7.1 by both readings."""
+    """Return table 7.1 by both readings."""
     direct, reached = one_hop(network), paths(network)
     out = []
     for sync in signals(network):

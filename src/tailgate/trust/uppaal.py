@@ -47,14 +47,14 @@ class Names(NamedTuple):
 
 
 def identifier(name: str, taken: Container[str] = ()) -> str:
-    """A name as UPPAAL takes it: its own words, and what is taken, get an underscore."""
+    """Return a name as UPPAAL takes it: its own words, and what is taken, get an underscore."""
     while name in RESERVED or name in taken:
         name += "_"
     return name
 
 
 def _named(wanted: list[str], taken: set[str]) -> dict[str, str]:
-    """Identifiers in the order of the names; they become taken. A name that need not change keeps itself, whatever stands before it."""
+    """Return identifiers in the order of the names; they become taken. A name that need not change stays, whatever comes before it."""
     kept = [name for name in wanted if name not in RESERVED and name not in taken]
     taken.update(kept)
     out = {}
@@ -85,14 +85,14 @@ def number(value: float) -> str:
 
 
 def whole(where: str, value: float) -> str:
-    """A value of an integer variable. Raises InputError for one that UPPAAL's integers do not hold."""
+    """Return a value of an integer variable. Raises InputError for one that UPPAAL's integers do not hold."""
     if not -INT - 1 <= value <= INT:
         raise InputError(where, value, f"from {-INT - 1} to {INT}, as UPPAAL's integers are")
     return str(int(value))
 
 
 def condition(atoms: tuple[Atom, ...], names: Names) -> str:
-    """A guard, an invariant or a state formula."""
+    """Return a guard, an invariant or a state formula."""
     return " && ".join(f"{names.shared[a.name]} {'==' if a.op == '=' else a.op} {number(a.value)}" for a in atoms)
 
 
@@ -101,12 +101,12 @@ def formula(query: Query, names: Names) -> str:
 
 
 def draws_of(place: Location) -> dict[str, tuple[float, float]]:
-    """Clocks whose rate is drawn on entry."""
+    """Return clocks whose rate is drawn on entry."""
     return {clock: speed for clock, speed in place.rates.items() if isinstance(speed, tuple)}
 
 
 def invariant(place: Location, names: Names) -> str:
-    """Limits, and the rates of clocks that do not run at 1."""
+    """Return limits, and the rates of clocks that do not run at 1."""
     rates = [f"{names.shared[clock]}' == {_speed(clock, speed, names)}" for clock, speed in place.rates.items()]
     return " && ".join([*([condition(place.invariant, names)] if place.invariant else []), *rates])
 
@@ -116,7 +116,7 @@ def _speed(clock: str, speed: Speed, names: Names) -> str:
 
 
 def assignment(edge: Edge, component: Component, names: Names) -> str:
-    """What is set, and what is drawn for the location that is entered."""
+    """Return what is set, and what is drawn for the location that is entered."""
     sets = []
     for name, value in edge.assign.items():
         text = number(value) if name in component.clocks else whole(f"component {component.name}: assign.{name}", value)
@@ -129,7 +129,7 @@ def _drawn(place: Location, names: Names) -> list[str]:
 
 
 def declaration(network: Network, names: Names) -> str:
-    """Clocks, variables and broadcast channels, all of them global."""
+    """Return clocks, variables and broadcast channels, all of them global."""
     shared = names.shared
     lines = ["// " + " ".join(f"{network.name}: {network.about}".split()).rstrip(": \\")]  # one line, whatever the text holds
     lines += [f"clock {', '.join(shared[name] for name in (TIME, *network.clocks))};"]
@@ -140,7 +140,7 @@ def declaration(network: Network, names: Names) -> str:
 
 
 def element(network: Network) -> ElementTree.Element:
-    """The whole document, elements in the order of the DTD. Raises InputError for a value that UPPAAL's integers do not hold."""
+    """Return the whole document, elements in the order of the DTD. Raises InputError for a value that UPPAAL's integers do not hold."""
     root, names = ElementTree.Element("nta"), names_of(network)
     _text(root, "declaration", declaration(network, names))
     for i in range(len(network.components)):
@@ -204,13 +204,13 @@ def _text(parent: ElementTree.Element, tag: str, text: str, **attributes: str) -
 
 
 def document(network: Network) -> str:
-    """The XML file's text."""
+    """Return the XML file's text."""
     root = element(network)
     ElementTree.indent(root, "  ")
     return f'<?xml version="1.0" encoding="utf-8"?>\n{DTD}\n{ElementTree.tostring(root, encoding="unicode")}\n'
 
 
 def write_uppaal(network: Network, path: Path) -> Path:
-    """Writes the model; returns its path. Raises InputError when it cannot be written, or holds an integer beyond UPPAAL's."""
+    """Write the model; returns its path. Raises InputError when it cannot be written, or holds an integer beyond UPPAAL's."""
     write_atomic(path, document(network).encode())
     return path

@@ -1,23 +1,20 @@
 """Does the fast radar car tell the truth about the road scene? Attackers of either are played on both, and the defences' order is compared.
 
-    python benchmarks/highway_transfer.py [--episodes 8] [--runs runs/highway-transfer] [--out benchmarks/results/highway_transfer.json]
+    python benchmarks/results/highway_transfer/highway_transfer.py [--episodes 8] [--runs runs/highway-transfer] [--out FILE]
 
 Three worlds, the same kinds of attack and bounds: `radar-following-v0` as published, in steps of 1 s, at a dose of 9 s (3 s break one
 defence there); the same plant tuned to the scene (0.1 s, its controller, a leader who brakes as hard); and `highway-braking-v0`, both at
 3 s. Attackers are trained by the cross-entropy method, many episodes in the fast worlds and few in the scene. Finished trainings and cells
 are not made again.
-Writes the record and, beside the documentation, its picture.
+Writes the record, and its picture for the documentation.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import os
-import platform
 import sys
 import time
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,11 +22,11 @@ import numpy as np
 from rich.console import Console
 from scipy.stats import kendalltau
 
-import tailgate
 from tailgate.base.files import write_atomic
 from tailgate.base.plots import MARKERS, canvas, png
 from tailgate.base.progress import cells as words
 from tailgate.base.progress import progress
+from tailgate.bench.study import arguments, made_by, write_record
 from tailgate.core import Array
 from tailgate.core.scenario import Suite
 from tailgate.evaluation.baselines import outcomes
@@ -221,12 +218,11 @@ def picture(record: dict[str, Any]) -> bytes:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = arguments(__file__, __doc__)
     parser.add_argument("--episodes", type=int, default=8, help="of a cell of the scene (default 8)")
     parser.add_argument("--fast-episodes", type=int, default=60, help="of a cell of a fast world (default 60)")
     parser.add_argument("--workers", type=int, default=1, help="processes (default 1); change no figure")
     parser.add_argument("--runs", default="runs/highway-transfer", help="where policies and rows lie")
-    parser.add_argument("--out", type=Path, default=Path("benchmarks/results/highway_transfer.json"), help="where the record goes")
     parser.add_argument("--picture", type=Path, default=Path("docs/images/highway-transfer.png"), help="where the picture goes")
     options = parser.parse_args()
     runs = Path(options.runs)
@@ -248,8 +244,7 @@ def main() -> None:
         found["cut-ins"] = played(scene, "highway-cut-in-v0", few, options, update)
         seconds["play, cut-ins"] = time.process_time() - begun
     record = recorded(found, trained, seconds, places, options)
-    lines = ",\n".join(f"{json.dumps(key)}: {json.dumps(rounded(value), allow_nan=False)}" for key, value in record.items())
-    write_atomic(options.out, f"{{\n{lines}\n}}\n".encode())
+    write_record(options.out, rounded(record), by_lines=True)
     write_atomic(options.picture, picture(record))
     for name, held in record["order"].items():
         found_there = {key: held[key] for key in ("mean", "worst") if key in held}
@@ -291,11 +286,8 @@ def recorded(
         {"attack": label, "world": world.name, "decisions": json.loads(path.read_text(encoding="utf-8"))["training"]["steps"]}
         for label, (world, path) in trained.items()
     ]  # fmt: skip
-    command = f"python benchmarks/highway_transfer.py --episodes {options.episodes} --fast-episodes {options.fast_episodes}"
     return {
-        "command": command, "version": tailgate.__version__, "highway_env": version("highway-env"), "python": platform.python_version(),
-        "numpy": np.__version__, "machine": platform.machine(), "cores": os.cpu_count(), "workers": options.workers,
-        "load": [round(x, 2) for x in os.getloadavg()], "seconds": {k: round(v, 1) for k, v in seconds.items()},
+        **made_by("highway-env", "numpy"), "workers": options.workers, "seconds": {k: round(v, 1) for k, v in seconds.items()},
         "worlds": {
             name: world._asdict() | {"scenario": Path(world.scenario).stem, "seeds": f"report 0 to {world.episodes - 1}"}
             for name, world in places.items()

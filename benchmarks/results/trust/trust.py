@@ -1,20 +1,16 @@
 """The record of model checking: exact error rates of the rules, and P(no collision) of every defence against every attack of quick-v0.
 
-    python benchmarks/trust.py [--precision 0.03] [--confidence 0.99] [--workers 2] [--out benchmarks/results/trust.json]
-    python benchmarks/trust.py --collisions --precision 0.01 --folder runs/collisions --out benchmarks/results/collisions.json
+    python benchmarks/results/trust/trust.py [--precision 0.03] [--confidence 0.99] [--workers 2] [--out FILE]
+    python benchmarks/results/trust/trust.py --collisions --precision 0.01 --folder runs/collisions [--out FILE]
 
 With --collisions nothing but P(no collision) is asked, for which runs are counted without a trace: a finer record in less time.
 Each probability is known to within the precision at the confidence, whatever it is: the number of runs of a cell is fixed beforehand.
 Finished cells are kept in --folder, so that an interrupted record goes on.
 """
 
-import argparse
 import dataclasses
 import json
-import os
-import platform
 import resource
-import subprocess
 import time
 from pathlib import Path
 from typing import Any
@@ -22,9 +18,8 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-import tailgate
-from tailgate.base.files import write_atomic
 from tailgate.base.progress import cells, progress
+from tailgate.bench.study import arguments, made_by, write_record
 from tailgate.core.scenario import load_suite
 from tailgate.trust.run import check
 from tailgate.trust.statistics import Sequential, Sprt, interval, okamoto, runs_for
@@ -80,19 +75,8 @@ def processor_seconds() -> float:
     return sum(used.ru_utime + used.ru_stime for used in map(resource.getrusage, (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)))
 
 
-def by_lines(record: dict[str, Any]) -> str:
-    """JSON with a line for each field, and for each entry of a list."""
-    fields = []
-    for key, value in record.items():
-        held = json.dumps(value, allow_nan=False)
-        if isinstance(value, list) and value:
-            held = "[\n" + ",\n".join(json.dumps(entry, allow_nan=False) for entry in value) + "\n]"
-        fields.append(f"{json.dumps(key)}: {held}")
-    return "{\n" + ",\n".join(fields) + "\n}\n"
-
-
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = arguments(__file__, __doc__)
     parser.add_argument("--precision", type=float, default=0.03, help="how far a share may be off")
     parser.add_argument("--confidence", type=float, default=0.99, help="how surely")
     parser.add_argument("--collisions", action="store_true", help="P(no collision) alone, counted without traces")
@@ -101,8 +85,9 @@ def main() -> None:
     parser.add_argument("--sequences", type=int, default=40_000, help="simulated sequences of a rule")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--folder", type=Path, default=Path("runs/trust"), help="rows of cells and failing runs")
-    parser.add_argument("--out", type=Path, help="also write the record to this file")
     options = parser.parse_args()
+    if options.collisions and options.out == parser.get_default("out"):
+        options.out = options.out.with_name("collisions.json")
     runs = options.runs or runs_for(options.precision, options.confidence)
     found: dict[str, Any] = {}
     if not options.collisions:
@@ -139,15 +124,12 @@ def main() -> None:
             {"defence": c["defence"], "scenario": c["scenario"], **{p["name"]: p["share"] for p in c["properties"]}}
             for c in literal["cells"]
         ]  # fmt: skip
-    if options.out:
-        found |= {
-            "suite": SUITE, "runs": runs, "confidence": options.confidence, "reach": reach, "seconds": seconds, "cells": table,
-            "bounds": [{key: entry[key] for key in ("defence", "trust", "safety", "why") if key in entry} for entry in report["defences"]],
-            "workers": options.workers, "version": tailgate.__version__, "machine": platform.machine(), "cores": os.cpu_count(),
-            "load": [round(x, 2) for x in os.getloadavg()], "python": platform.python_version(), "numpy": np.__version__,
-            "commit": subprocess.run(["git", "rev-parse", "HEAD"], capture_output=True, text=True, check=False).stdout.strip(),
-        }  # fmt: skip
-        write_atomic(options.out, by_lines(found).encode())
+    found |= {
+        "suite": SUITE, "runs": runs, "confidence": options.confidence, "reach": reach, "seconds": seconds, "cells": table,
+        "bounds": [{key: entry[key] for key in ("defence", "trust", "safety", "why") if key in entry} for entry in report["defences"]],
+        "workers": options.workers, **made_by("numpy"),
+    }  # fmt: skip
+    write_record(options.out, found, by_lines=True)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """What each learner makes of a few seconds: decisions per second, and the return of its policy; one thread, processor time.
 
-    python benchmarks/learners.py [--seconds 12] [--learner cem ...]
+    python benchmarks/results/learners/learners.py [--seconds 12] [--learner cem ...]
 
 Prints the table of docs/learners.md. The task: `gusty-stop-and-go-v0` against `kf`, injection of 6 m and 6 m/s for 30 steps, one decision
 every 30 steps, reward `min_gap`, defaults of the learners, training seed 0.

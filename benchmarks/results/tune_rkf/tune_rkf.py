@@ -1,22 +1,20 @@
 """Tunes lam, the price of an outlier, of the robust Kalman filter: position error over a grid, on seeds and attacks kept for tuning.
 
-    python benchmarks/tune_rkf.py [--seeds 100] [--out benchmarks/results/tune_rkf.json]
+    python benchmarks/results/tune_rkf/tune_rkf.py [--seeds 100] [--out FILE]
 
 The attacks are not the reported ones (`thesis_times`), nor are their steps. Each scenario is played to its horizon, collisions or not.
 lam is given in 1/sqrt(R_11) and, what decides, in 1/sqrt(S_11): S is the covariance of the innovation in steady state. The best lam has the
 smallest geometric mean, over the clean runs and the attacks, of the median position error.
 """
 
-import argparse
 import dataclasses
-import json
 import math
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 import tailgate
+from tailgate.bench.study import arguments, made_by, write_record
 from tailgate.core import draws
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import Scenario, load_scenario
@@ -87,9 +85,8 @@ def shared(found: dict[str, Any]) -> dict[str, float]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = arguments(__file__, __doc__)
     parser.add_argument("--seeds", type=int, default=100, help="episodes per cell")
-    parser.add_argument("--out", type=Path, help="also write the record to this file")
     options = parser.parse_args()
     found = {}
     for name, (place, attacks) in settings().items():
@@ -97,12 +94,7 @@ def main() -> None:
         report(name, found[name])
     default = shared(found)
     print(f"\nbest on {' and '.join(ROADS)} together: lam = {default['lam_sqrt_S']:.2f} / sqrt(S)")
-    if options.out:
-        command = f"python benchmarks/tune_rkf.py --seeds {options.seeds} --out {options.out}"
-        head = {"command": command, "version": tailgate.__version__, "purpose": "tune", "seeds": options.seeds}
-        record = head | {"default": default, "settings": found}
-        options.out.parent.mkdir(parents=True, exist_ok=True)
-        options.out.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+    write_record(options.out, made_by() | {"purpose": "tune", "seeds": options.seeds, "default": default, "settings": found})
 
 
 if __name__ == "__main__":

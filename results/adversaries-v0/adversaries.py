@@ -1,6 +1,6 @@
 """How strong the learned attacks are: no attack, the best script, learned, yoked and optimal, in every cell of adversaries.yaml.
 
-    python benchmarks/adversaries.py [CELL ...] [--seeds 5] [--episodes 1000] [--first-episode N] [--out results/adversaries-v0] [--zoo]
+    python results/adversaries-v0/adversaries.py [CELL ...] [--seeds 5] [--episodes 1000] [--first-episode N] [--out DIR] [--zoo]
 
 Searches a cell's scripts on tune seeds, trains each of its learners (one process per training seed; finished policies are not trained
 again), plays them on report seeds, and writes report.json, report.md and a picture, in which cells that are not named stay as they are.

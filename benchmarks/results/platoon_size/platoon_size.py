@@ -1,8 +1,8 @@
 """What a platoon costs by its number of cars: making the model, preparing a defence, a step, memory; one core, CPU time.
 
-    python benchmarks/platoon_size.py [--cars 5 10 20 50 100] [--out benchmarks/results/platoon_size.json]
+    python benchmarks/results/platoon_size/platoon_size.py [--cars 5 10 20 50 100] [--out FILE]
 
-Writes the figures and, beside them, a picture. `dkf` and `lasso_dkf` share their constants (5.5), which are made once. Attacked is car 2's
+Writes the figures and a picture. `dkf` and `lasso_dkf` share their constants (5.5), which are made once. Attacked is car 2's
 distance, half of the time.
 """
 
@@ -10,19 +10,17 @@ import argparse
 import dataclasses
 import json
 import os
-import platform
 import resource
 import statistics
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 from matplotlib.ticker import NullLocator
 
-import tailgate
 from tailgate.base.files import write_atomic
 from tailgate.base.plots import canvas, png
+from tailgate.bench.study import arguments, made_by, write_record
 from tailgate.core import draws
 from tailgate.core.draws import Role
 from tailgate.core.loop import Loop
@@ -109,9 +107,8 @@ def picture(rows):
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser = arguments(__file__, __doc__)
     parser.add_argument("--cars", type=int, nargs="+", default=[5, 10, 20, 50, 100])
-    parser.add_argument("--out", type=Path, default=Path("benchmarks/results/platoon_size.json"))
     parser.add_argument("--one", nargs="+", help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.one:
@@ -125,8 +122,7 @@ def main():
             rows += json.loads(done.stdout)
             for row in rows[-len(group) :]:
                 print(row, file=sys.stderr, flush=True)
-            head = {"version": tailgate.__version__, "python": platform.python_version(), "episodes": EPISODES, "steps": STEPS}
-            write_atomic(options.out, (json.dumps(head | {"rows": rows}, indent=1) + "\n").encode())
+            write_record(options.out, made_by() | {"episodes": EPISODES, "steps": STEPS, "rows": rows})
     write_atomic(options.out.with_suffix(".png"), picture(rows))
 
 

@@ -1,20 +1,17 @@
 """Measures root-MUSIC's error on one tone in noise, and fits what the closed-form path of the radar draws in its place.
 
-    python benchmarks/radar_path.py [--runs 4000] [--out benchmarks/results/radar_path.json]
+    python benchmarks/results/radar_path/radar_path.py [--runs 4000] [--out FILE]
 
 Against the SNR x after integration (the sample's times M): the share of outliers, which miss by more than 4/M cycles per sample, and the
 variance of the others over the Cramer-Rao bound. The fit is made at M = 512, the default; the other sizes show how far it holds.
 """
 
-import argparse
-import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy import optimize
 
-import tailgate
+from tailgate.bench.study import arguments, made_by, write_record
 from tailgate.envs.sensors import fmcw
 from tailgate.envs.sensors.fmcw_signal import root_music
 
@@ -57,9 +54,8 @@ def fit(rows: list[dict[str, Any]]) -> dict[str, list[float]]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = arguments(__file__, __doc__)
     parser.add_argument("--runs", type=int, default=4000)
-    parser.add_argument("--out", type=Path)
     options = parser.parse_args()
     found: dict[str, Any] = {}
     for count, grid in SIZES.items():
@@ -75,10 +71,7 @@ def main() -> None:
             print(f"{row['snr_db']:>8.0f}{row['outliers']:>10.4f}{float(fmcw.outlier_probability(np.array(x))):>10.4f}{over:>10}{drawn:>10.2f}")
     constants = fit(found[str(FITTED)])
     print("\nfitted:", constants, " in use:", {"outlier": fmcw._OUTLIER, "efficiency": fmcw._EFFICIENCY})
-    if options.out:
-        command = f"python benchmarks/radar_path.py --runs {options.runs} --out {options.out}"
-        record = {"command": command, "version": tailgate.__version__, "fitted": constants, "samples": found}
-        options.out.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+    write_record(options.out, made_by("numpy", "scipy") | {"fitted": constants, "samples": found})
 
 
 if __name__ == "__main__":

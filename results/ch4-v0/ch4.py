@@ -1,6 +1,6 @@
-"""Beside the reproduction of thesis chapter 4: every defence against every attack on minutes of driving.
+"""Chapter 4 on longer roads than the thesis has: every defence against every attack on minutes of driving.
 
-    python benchmarks/ch4.py [--seeds 100] [--out results/ch4-v0]
+python results/ch4-v0/ch4.py [--seeds 100] [--out results/ch4-v0]
 """
 
 import argparse
@@ -76,8 +76,8 @@ def main():
     places = list(dict.fromkeys((e["scenario"], e["dose"]) for e in table))
     text = [
         "# Chapter 4 on minutes of driving", "",
-        f"`python benchmarks/ch4.py`: suites {' and '.join(SUITES)}, {options.seeds} report seeds a cell; Tailgate {tailgate.__version__}, "
-        f"Python {platform.python_version()}, {options.workers} workers; seconds: "
+        f"`python results/ch4-v0/ch4.py`: suites {' and '.join(SUITES)}, {options.seeds} report seeds a cell; "
+        f"Tailgate {tailgate.__version__}, Python {platform.python_version()}, {options.workers} workers; seconds: "
         + ", ".join(f"{key} {value:.0f}" for key, value in seconds.items()) + ".", "",
         "![position error against smallest gap](rmse-against-gap.png)", "",
         *(f"![{scenario}]({path.name})" for (scenario, _), path in zip(places, write_overview(table, out), strict=False)),

@@ -1,0 +1,48 @@
+"""Parts of the configurations of a training and of self-play: fields, checks, and the configuration that started a run."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from tailgate.base.errors import InputError, said
+from tailgate.base.reading import load_json
+from tailgate.core.schema import as_data
+
+
+def mapping(doc: str, if_any: bool = False) -> Any:
+    """Return a dataclass field that holds a mapping of fields, empty by default; `if_any`: an empty one leaves no mark in data."""
+    return dataclasses.field(default_factory=dict, metadata={"doc": doc} | ({"if_any": True} if if_any else {}))
+
+
+def check_mappings(data: Mapping[str, object], names: Iterable[str]) -> None:
+    """Raise InputError unless each of these fields is a mapping."""
+    for name in names:
+        if not isinstance(data.get(name, {}), dict):
+            raise InputError(f"config.{name}", data[name], "a mapping of fields")
+
+
+def check_name(name: str) -> None:
+    """Raise InputError unless the name of a run can be that of its folder."""
+    if Path(name).name != name:
+        raise InputError("config.name", name, "the name of a directory, without a separator")
+
+
+def started_with(held: Path) -> dict[str, Any]:
+    """Return the configuration that a run was started with. Raises InputError for a file that is none."""
+    try:
+        started: dict[str, Any] = load_json(held, strict=False)
+        del started["class"]
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+        raise InputError("resume", str(held), f"the configuration of the run ({said(error)})") from None
+    return started
+
+
+def parameters_of(config: type) -> list[dict[str, Any]]:
+    """Return every field of a configuration with default and sentence, for --help."""
+    return [
+        {"name": f.name, "default": as_data(f.default if f.default is not dataclasses.MISSING else {}), "doc": f.metadata.get("doc", "")}
+        for f in dataclasses.fields(config)
+    ]
