@@ -154,8 +154,8 @@ def _profile(folder: Path) -> Any:
 
 def _read_rows(name: str) -> Callable[[Path], Any]:
     def read(folder: Path) -> Any:
+        from tailgate.board import run
         from tailgate.evaluation.rows import read_rows
-        from tailgate.leaderboard import run
 
         run._one_round(folder, "")
         return read_rows(folder / name)
@@ -164,13 +164,13 @@ def _read_rows(name: str) -> Callable[[Path], Any]:
 
 
 def _attacks(folder: Path) -> Any:
-    from tailgate.scoring.attacks import read
+    from tailgate.evaluation.attack_list import read
 
     return read(folder / "attacks.jsonl")
 
 
 def _read_board(folder: Path) -> Any:
-    from tailgate.leaderboard.board_format import load, read_board
+    from tailgate.board.board_format import load, read_board
 
     return read_board(load(folder / "board.json"))
 
@@ -188,7 +188,7 @@ def _beside(module: str, function: str, *, file: str) -> Callable[[Path], Any]:
 
 def _trust(folder: Path) -> Any:
     import tailgate
-    from tailgate.leaderboard.run import _report
+    from tailgate.board.run import _report
     from tailgate.trust.run import with_trust
 
     if "board" not in _held:

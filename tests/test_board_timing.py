@@ -13,15 +13,15 @@ from scipy import stats
 
 from tailgate.agents.policy import Yoked
 from tailgate.base.errors import InputError
+from tailgate.board.cells import hits_of
+from tailgate.board.measured import Measured
+from tailgate.board.timing import Gain, Shown, Timed, Timing, measure_timing, read_timing, telling
 from tailgate.cli import main
 from tailgate.core import draws
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import load_scenario, load_suite
-from tailgate.leaderboard.measured import Measured
-from tailgate.leaderboard.site import build_site
-from tailgate.leaderboard.timing import Gain, Shown, Timed, Timing, measure_timing, read_timing, telling
 from tailgate.play.trace import Trace, rollout
-from tailgate.scoring.cells import hits_of
+from tailgate.site.build import build_site
 
 Data = dict[str, Any]
 ROOT = Path(__file__).parents[1]

@@ -9,14 +9,14 @@ from pathlib import Path
 import pytest
 
 from tailgate.base.errors import InputError
+from tailgate.board.clock import Clock, StepTime, _round, _Timed, clock_of, measure, read_clock
+from tailgate.board.run import board_of
 from tailgate.cli import main
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import Suite, load_scenario
 from tailgate.evaluation.cells import cells_of, run
 from tailgate.evaluation.rows import encode
-from tailgate.leaderboard.clock import Clock, StepTime, _round, _Timed, clock_of, measure, read_clock
-from tailgate.leaderboard.run import board_of
-from tailgate.leaderboard.site import build_site
+from tailgate.site.build import build_site
 
 SUITE = Suite("small", "", ("thesis-ch4-v0",), (5,), ("none", "kf"), ("none",), 4)
 
@@ -141,6 +141,6 @@ def test_a_defence_that_fails_is_not_left_out(monkeypatch: pytest.MonkeyPatch) -
     def broken(*arguments):
         raise InputError("defence output x", "NaN or infinity", "finite numbers")
 
-    monkeypatch.setattr("tailgate.leaderboard.clock._round", broken)
+    monkeypatch.setattr("tailgate.board.clock._round", broken)
     with pytest.raises(InputError, match="defence output x"):
         measure(SUITE, rounds=1)

@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 from tailgate.base.errors import InputError
-from tailgate.leaderboard.errata import Errata, errata_of
-from tailgate.leaderboard.measured import Measured, measured_of
-from tailgate.leaderboard.site import build_site
+from tailgate.board.errata import Errata, errata_of
+from tailgate.board.measured import Measured, measured_of
+from tailgate.site.build import build_site
 
 ROOT = Path(__file__).resolve().parents[1]
 spec = importlib.util.spec_from_file_location("boards", Path(__file__).with_name("boards.py"))

@@ -11,16 +11,16 @@ import pytest
 
 from tailgate.base import sources
 from tailgate.base.provenance import cores, processor
+from tailgate.board import run_record
+from tailgate.board.board_format import load
+from tailgate.board.measured import measured_of
+from tailgate.board.run_record import Record, processor_time
+from tailgate.board.run_time import FILE, RunTime, lasting, run_of
 from tailgate.cli import board as command
 from tailgate.core.scenario import load_suite
 from tailgate.evaluation import cells as evaluation
-from tailgate.leaderboard import run_record
-from tailgate.leaderboard.board_format import load
-from tailgate.leaderboard.measured import measured_of
-from tailgate.leaderboard.run_record import Record, processor_time
-from tailgate.leaderboard.run_time import FILE, RunTime, lasting, run_of
-from tailgate.leaderboard.site import build_site
-from tailgate.scoring.attacks import attacks_of
+from tailgate.evaluation.attack_list import attacks_of
+from tailgate.site.build import build_site
 
 SUITE = "name: mine\nscenarios: [gusty-stop-and-go-v0]\ndoses: [12]\ndefences: [none, kf]\nattacks: [none, dropout, 'fdi:value=5']\nseeds: 3\n"
 

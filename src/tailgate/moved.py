@@ -19,7 +19,17 @@ ROOMS = {
     "thesis": "bounds resilience string_stability",
     "training": "adaptive comparison selfplay train trainings tuning",
 }
-PACKAGES = {"commands": "cli", "reproduce": "thesis", "strength": "studies", "submission": "sandbox"}
+PACKAGES = {
+    "commands": "cli", "reproduce": "thesis", "strength": "studies", "submission": "sandbox", "leaderboard": "board", "scoring": "board",
+}  # fmt: skip
+WITHIN = {  # rooms whose modules are in several rooms today, or have other names
+    "leaderboard": "attacked card check clock detect head order run run_record timing errata kept measured run_time verified "
+    "board_format board_parts=schema build=site.rows_page charts=site.charts site=site.build site_alarms=site.alarms "
+    "site_cards=site.cards site_curves=site.curves site_entry=site.entry site_index=site.index site_suite=site.suite "
+    "site_timing=site.timing site_trust=site.trust",
+    "scoring": "cells damage detection entry false_alarms flags gates words attacks=admission beside=update board=score doses=worst "
+    "follow=consistency ranks=evaluation.paired",
+}
 
 
 def _table() -> dict[str, str]:
@@ -28,6 +38,10 @@ def _table() -> dict[str, str]:
         for name in names.split():
             old, _, new = name.partition("=")
             out[f"tailgate.{old}"] = f"tailgate.{room}.{new or old}"
+    for package, names in WITHIN.items():
+        for name in names.split():
+            old, _, new = name.partition("=")
+            out[f"tailgate.{package}.{old}"] = f"tailgate.{new if '.' in new else f'board.{new or old}'}"
     return out
 
 
@@ -36,8 +50,9 @@ MOVED = _table()
 
 def now(name: str) -> str:
     """Where a module is today; empty where it has not moved."""
-    head = ".".join(name.split(".")[:2])
-    return MOVED[head] + name[len(head) :] if head in MOVED else ""
+    parts = name.split(".")
+    head = next((head for n in (3, 2) if (head := ".".join(parts[:n])) in MOVED), "")
+    return MOVED[head] + name[len(head) :] if head else ""
 
 
 class Forwarding(MetaPathFinder, Loader):

@@ -38,9 +38,9 @@ def add(actions: Any) -> None:
 
 
 def _admit(options: argparse.Namespace) -> int:
+    from tailgate.board.admission import admit, withdraw
+    from tailgate.board.run import LIST
     from tailgate.core.scenario import load_suite
-    from tailgate.leaderboard.run import LIST
-    from tailgate.scoring.attacks import admit, withdraw
 
     sys.path.insert(0, "")  # a defence module:Class is looked for in the working directory, as `tailgate evaluate` does
     suite = load_suite(options.suite)

@@ -31,8 +31,8 @@ def add(actions: Any) -> None:
 
 
 def _attack(options: argparse.Namespace) -> int:
+    from tailgate.board.attacked import attack
     from tailgate.core.scenario import load_suite
-    from tailgate.leaderboard.attacked import attack
 
     sys.path.insert(0, "")  # module:Class is looked for in the working directory, as `leaderboard submit` does
 

@@ -59,13 +59,13 @@ def add(actions: Any) -> None:
 
 def _run(options: argparse.Namespace) -> int:
     sys.path.insert(0, "")  # module:Class is looked for in the working directory, as `tailgate evaluate` does
+    from tailgate.board.attacked import attack
+    from tailgate.board.detect import detect
+    from tailgate.board.measured import measured_of
+    from tailgate.board.run import BOARD, board_of, kept_board, play
+    from tailgate.board.run_record import Record
     from tailgate.core.scenario import load_suite
-    from tailgate.leaderboard.attacked import attack
-    from tailgate.leaderboard.detect import detect
-    from tailgate.leaderboard.measured import measured_of
-    from tailgate.leaderboard.run import BOARD, board_of, kept_board, play
-    from tailgate.leaderboard.run_record import Record
-    from tailgate.leaderboard.site import build_site
+    from tailgate.site.build import build_site
 
     if options.attack and not options.keep_entries:
         raise InputError("--attack", options.attack[0], "--keep-entries too: a board of some attacks alone would say too little")
@@ -117,7 +117,7 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _print_board(board: dict[str, Any]) -> None:
-    from tailgate.leaderboard.head import lines, title
+    from tailgate.board.head import lines, title
 
     headings, *rows = lines(board)
     table = Table(title=escape(title(board)))
@@ -129,8 +129,8 @@ def _print_board(board: dict[str, Any]) -> None:
 
 
 def _head(options: argparse.Namespace) -> int:
-    from tailgate.leaderboard.board_format import load
-    from tailgate.leaderboard.head import markdown
+    from tailgate.board.board_format import load
+    from tailgate.board.head import markdown
 
     board = load(Path(options.board))
     if options.most is not None:
@@ -140,9 +140,9 @@ def _head(options: argparse.Namespace) -> int:
 
 
 def _page(options: argparse.Namespace) -> int:
-    from tailgate.leaderboard.board_format import load
-    from tailgate.leaderboard.measured import measured_of
-    from tailgate.leaderboard.site import build_site
+    from tailgate.board.board_format import load
+    from tailgate.board.measured import measured_of
+    from tailgate.site.build import build_site
 
     boards = [load(Path(name)) for name in options.boards]
     measured = [measured_of(Path(name)) for name in options.boards]

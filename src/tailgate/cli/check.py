@@ -43,9 +43,9 @@ def add(actions: Any) -> None:
 
 
 def _check(options: argparse.Namespace) -> int:
-    from tailgate.leaderboard.board_format import load, save
-    from tailgate.leaderboard.check import check, with_check
-    from tailgate.leaderboard.detect import check_detection
+    from tailgate.board.board_format import load, save
+    from tailgate.board.check import check, with_check
+    from tailgate.board.detect import check_detection
 
     if options.detection and options.write:
         raise InputError("--write", True, "the cells of a board, without --detection")
@@ -151,7 +151,7 @@ def _print(report: dict[str, Any]) -> None:
 
 def _first(board: Any, here: Any) -> tuple[str, Any, Any]:
     """Where two pieces of JSON first differ, and what stands there: a list may be long, and its difference at the end."""
-    from tailgate.scoring.follow import same
+    from tailgate.board.consistency import same
 
     pairs: list[tuple[str, Any, Any]] = []
     if isinstance(board, dict) and isinstance(here, dict):

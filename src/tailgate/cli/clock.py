@@ -31,8 +31,8 @@ def add(actions: Any) -> None:
 
 def _clock(options: argparse.Namespace) -> int:
     from tailgate.base.files import writable_directory, write_atomic
+    from tailgate.board.clock import FILE, measure
     from tailgate.core.scenario import load_suite
-    from tailgate.leaderboard.clock import FILE, measure
 
     sizes.check("rounds", options.rounds)
     suite = load_suite(options.suite)

@@ -36,11 +36,11 @@ def add(actions: Any) -> None:
 
 
 def _detect(options: argparse.Namespace) -> int:
+    from tailgate.board.board_format import load
+    from tailgate.board.detect import detect
+    from tailgate.board.detection import Effort
+    from tailgate.board.run import BOARD
     from tailgate.core.scenario import load_suite
-    from tailgate.leaderboard.board_format import load
-    from tailgate.leaderboard.detect import detect
-    from tailgate.leaderboard.run import BOARD
-    from tailgate.scoring.detection import Effort
 
     sys.path.insert(0, "")  # module:Class is looked for in the working directory, as `tailgate evaluate` does
     suite = load_suite(options.suite)

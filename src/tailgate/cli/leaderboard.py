@@ -32,7 +32,7 @@ def add(commands: Any) -> None:
 def _build(options: argparse.Namespace) -> int:
     from tailgate.base.errors import InputError
     from tailgate.evaluation.rows import read_rows
-    from tailgate.leaderboard.build import build
+    from tailgate.site.rows_page import build
 
     rows = [row for name in options.rows for row in read_rows(Path(name))]
     if not rows:

@@ -33,11 +33,11 @@ def add(actions: Any) -> None:
 
 def _timing(options: argparse.Namespace) -> int:
     from tailgate.base.files import write_atomic
+    from tailgate.board.board_format import load
+    from tailgate.board.run import BOARD
+    from tailgate.board.timing import FILE, measure_timing
     from tailgate.core.scenario import load_suite
-    from tailgate.leaderboard.board_format import load
-    from tailgate.leaderboard.run import BOARD
-    from tailgate.leaderboard.site_timing import points
-    from tailgate.leaderboard.timing import FILE, measure_timing
+    from tailgate.site.timing import points
 
     suite = load_suite(options.suite)
     folder = Path(options.out) / suite.name

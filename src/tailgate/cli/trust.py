@@ -71,7 +71,7 @@ def _values(option: str, texts: list[str]) -> dict[str, Any]:
 def _suite(options: argparse.Namespace) -> Any:
     """The suite, or the part of it that the options name."""
     from tailgate.core.scenario import load_suite
-    from tailgate.scoring.attacks import attacks_of
+    from tailgate.evaluation.attack_list import attacks_of
 
     suite = load_suite(options.suite or "quick-v0")
     suite = dataclasses.replace(suite, attacks=attacks_of(suite))
@@ -161,7 +161,7 @@ def _place(held: dict[str, Any]) -> str:
 
 def _print_bounds(found: dict[str, Any]) -> None:
     """The lower bounds of every defence, at the least and at the most knowledge of the attackers."""
-    from tailgate.scoring.words import at_least
+    from tailgate.board.words import at_least
 
     out, names = console(), [name for name in ("safety", "trust") if any(name in entry for entry in found["defences"])]
     attacks = [a for a in found["attacks"] if a["attack"] != "none"]

@@ -44,9 +44,9 @@ def add(actions: Any) -> None:
 
 def _verify(options: argparse.Namespace) -> int:
     from tailgate.base.files import writable_directory, write_atomic
+    from tailgate.board.verified import digest
     from tailgate.evaluation.rows import read_rows
     from tailgate.evaluation.verify import verify
-    from tailgate.leaderboard.verified import digest
 
     if options.out is not None:  # before anything is played
         writable_directory(Path(options.out).parent)

@@ -19,6 +19,7 @@ KEYS = (
     "suite", "scenario", "dose", "knowledge", "defence", "attack", "purpose", "config_hash", "version", "defence_digest", "attack_digest",
 )  # fmt: skip
 
+CLEAN = "none"  # the attack that does nothing, and the defence that does nothing
 AGAIN = "the command that wrote it makes it whole, given once more"
 _Text = Annotated[str, Field(strict=True)]
 _Number = Annotated[float, Field(strict=True, allow_inf_nan=False)] | None

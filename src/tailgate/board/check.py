@@ -1,0 +1,301 @@
+"""A board's cells played again from the board alone: a figure can be checked by who has none of its rows.
+
+A cell names a scenario, a dose, a defence and an attack of a suite that is here; its seeds are those of the suite's round. As with rows,
+nothing is imported that the board names. Figures of entries are made again: what follows from cells always, and all else where all cells
+of the board were played.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+from tailgate.base import sizes
+from tailgate.base.errors import InputError, unknown
+from tailgate.base.version import VERSION
+from tailgate.core.draws import constants
+from tailgate.core.registry import Family, Spec
+from tailgate.core.scenario import Suite, list_suites, load_suite
+from tailgate.core.schema import build
+from tailgate.evaluation.attack_list import Admitted
+from tailgate.evaluation.cells import Cell, run
+from tailgate.evaluation.paired import CLOSE, PAIR
+from tailgate.evaluation.verify import files_of
+
+from .board_format import read_board
+from .cells import figures, shared_of
+from .consistency import same, sharpened, strays, untold
+from .damage import Row
+from .schema import Board, CellPart
+from .score import score
+
+Data = dict[str, Any]
+VERDICTS = ("equal", "differs", "unchecked")
+PRINTS = ("hits", "decisions", "trace")  # which a board of before they were made lacks
+SCORED = ("class", "uses", "status", "why", "gates", "critical_dose", "rates", "rank", "clean", "flags", "robustness")  # of an entry
+COMPARED = ("n", "failed", "damage", *PRINTS)
+EPISODES = 20_000  # whose rows are held at a time
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What became of a cell; `here`: what came out, None where it was not played."""
+
+    verdict: Literal["equal", "differs", "unchecked"]
+    why: str = ""
+    here: Data | None = None
+
+
+def check(
+    data: Data, *, sample: int | None = None, sample_seed: int = 0, defences: Sequence[str] = (), workers: int = 1,
+    progress: Callable[[int, int], None] | None = None,
+) -> Data:  # fmt: skip
+    """Play the cells of a board again, and compare how many episodes were played, failed and came to damage, which these
+    were, and the fingerprints of all.
+
+    data: a board, as JSON; sample: so many cells, drawn by sample_seed (default: all); defences: only the cells of these.
+    The report has `counts`, `entries` (the same for each defence), `reasons` and `findings`, cells that differ or could not be checked;
+    `untrained`: attackers whose files are not here, though `leaderboard attack` would train them again, to the same weights;
+    `strays`: figures that do not follow from the cells, by `defence` and `field`; `untold`: ranked entries of whose comparisons cells tell
+    the limits only, as these do not say which episodes came to damage; `scored`: whether ranks, gates and all else could be made
+    again, as all cells were played; `prints` has hits and fingerprints of each cell that came out equal, by its place in the board.
+    Raises InputError for a board of another suite or version than is here, and for a defence that is not on it.
+    """
+    board = read_board(data)
+    suite = suite_of(board)
+    known(defences, [entry.defence for entry in board.entries])
+    mine = [i for i, cell in enumerate(board.cells) if not defences or cell.defence in defences]
+    asked = drawn(mine, sample, sample_seed)
+    seen: dict[int, Seen] = {}
+    files = {attack.attack: attack.digest for attack in board.attacks}
+    cells: dict[int, Cell] = {}
+    for i in asked:
+        cell = _cell(board.cells[i], board, suite)
+        if isinstance(cell, str):
+            seen[i] = Seen("unchecked", cell)
+        else:
+            cells[i] = cell
+
+    def told(done: int, _: int) -> None:
+        if progress is not None:
+            progress(len(seen) + done, len(asked))
+
+    whole = len(cells) == len(board.cells)
+    held: list[Row] = []
+    for some in _slices(cells):
+        rows = run([cells[i] for i in some], workers=workers, progress=told)
+        held += rows if whole else []
+        each = iter(rows)
+        for i in some:
+            found = compared(board.cells[i], figures([next(each) for _ in range(cells[i].seeds)], suite))
+            if found.verdict == "differs" and files.get(cells[i].attack) not in (None, Spec("attack", cells[i].attack).digest):
+                found = replace(found, why=f"the attack's file here is another one than that of the board; {found.why}")
+            seen[i] = found
+    off = strays(data, suite)
+    listed = {(stray["defence"], stray["field"]) for stray in off}
+    off += [stray for stray in _scored(data, held, suite) if (stray["defence"], stray["field"]) not in listed]
+    return _report(board, asked, seen, sample, sample_seed) | {"strays": off, "untold": untold(data, suite), "scored": bool(held)}
+
+
+def _scored(data: Data, rows: list[Row], suite: Suite) -> Iterator[Data]:
+    """How the board differs from the one that these rows make; nothing without rows."""
+    if not rows:
+        return
+    said = data["suite"]
+    lines = [build(Admitted, a["admitted"], "board: attacks") for a in data["attacks"] if a.get("admitted")]
+    try:
+        adaptive = said.get("require_adaptive", True)
+        here = score(rows, suite, attacks=lines, alpha=said.get("alpha", 0.05), require_adaptive=adaptive, shared=shared_of(data))
+    except InputError as error:
+        yield {"defence": "", "field": "cells", "board": f"{len(data['cells'])} cells", "here": str(error)}
+        return
+    entries = {entry["defence"]: entry for entry in here["entries"]}
+    bounds = {duel.get("class") for duel in data["comparisons"] if duel.get("bound")}
+    for entry in data["entries"]:
+        mine = entries.get(entry["defence"], {})
+        for key in SCORED:
+            wide = key == "rank" and entry.get("class") in bounds and _within(mine.get(key), entry.get(key))
+            if not wide and not same(entry.get(key), mine.get(key)):
+                yield {"defence": entry["defence"], "field": key, "board": entry.get(key), "here": mine.get(key)}
+    if not _same_pairs(data["comparisons"], here["comparisons"]):
+        yield {"defence": "", "field": "comparisons", "board": f"{len(data['comparisons'])} of them", "here": "others"}
+
+
+def _within(rank: Data | None, wider: Data | None) -> bool:
+    """Whether a rank set lies in one that was made of bounds, of which fewer are significant."""
+    return rank is not None and wider is not None and bool(wider["best"] <= rank["best"] and rank["worst"] <= wider["worst"])
+
+
+def _same_pairs(board: list[Data], here: list[Data]) -> bool:
+    """Whether all pairs came out as a board has them, those that it has as bounds within these."""
+    if [(duel["a"], duel["b"]) for duel in board] != [(duel["a"], duel["b"]) for duel in here]:
+        return False
+    for told, made in zip(board, here, strict=True):
+        if told.get("bound"):
+            fits = told["p"] >= made["p"] * (1.0 - CLOSE) and told["only_a"] - told["only_b"] == made["only_a"] - made["only_b"]
+        else:
+            fits = all(same(told.get(key), made[key]) for key in PAIR)
+        if not fits:
+            return False
+    return True
+
+
+def suite_of(board: Board) -> Suite:
+    """The suite of the package that the board is of. Raises InputError where there is none."""
+    if board.suite.name not in list_suites():
+        raise unknown("board: suite.name", board.suite.name, list_suites())
+    suite = load_suite(board.suite.name)
+    agree(board, suite)
+    return suite
+
+
+def agree(board: Board, suite: Suite) -> None:
+    """Raise InputError for a board of another suite or version than is here."""
+    held = board.suite
+    if held.version != VERSION:
+        raise InputError("board: suite.version", held.version, f"{VERSION}, which is here")
+    if held.hash != suite.hash:
+        raise InputError("board: suite.hash", held.hash, f"{suite.hash}, which the suite {suite.name} has here")
+    if held.episodes is None or not 1 <= held.episodes <= 4096:
+        raise InputError("board: suite.episodes", held.episodes, "1 to 4096 episodes of a cell")
+
+
+def known(names: Sequence[str], entries: Sequence[str]) -> None:
+    """Raise InputError for a name that is none of the entries'."""
+    for name in names:
+        if name not in entries:
+            raise unknown("defence", name, entries)
+
+
+def drawn(places: list[int], sample: int | None, seed: int) -> list[int]:
+    """So many of the places, ascending; all where no number is asked for, or a larger one. Raises InputError for one below 1."""
+    if sample is not None:
+        sizes.check("sample", sample)
+    if sample is None or sample >= len(places):
+        return places
+    order = constants("check", seed).uniform((len(places),))[0].argsort()
+    return sorted(places[int(i)] for i in order[:sample])
+
+
+def _cell(part: CellPart, board: Board, suite: Suite) -> Cell | str:
+    """The cell to play; or why it cannot be played here."""
+    try:
+        for family, text in (("defence", part.defence), ("attack", part.attack)):
+            if why := refused(family, text):  # type: ignore[arg-type]
+                return why
+        cell = Cell(
+            suite.name, part.scenario, part.dose, part.defence, part.attack, board.suite.episodes or 0, board.suite.purpose or "report",
+            threat=suite.granted, beacon=board.suite.beacon or "",
+        )  # fmt: skip
+        spec = Spec("attack", part.attack)
+        knowledge = cell.place(spec.make(), spec.entry.knowledge).threat_model.knowledge
+        _ = Spec("defence", part.defence).make(), cell.episodes
+    except Exception as error:  # a board can hold anything
+        return str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
+    if knowledge != part.knowledge:
+        return f"the attack {part.attack!r} is granted the knowledge {knowledge} here"
+    return cell
+
+
+def refused(family: Family, text: str) -> str:
+    """Why a component that a board names is not played here; empty where it is."""
+    spec = Spec(family, text)
+    if spec.foreign or spec.sandboxed:
+        return f"the {family} {text!r} is code to import, which a board may not make us do"
+    return f"the {family}'s file is not here" if any(not path.is_file() for path in files_of(spec)) else ""
+
+
+def _slices(cells: dict[int, Cell]) -> Iterator[list[int]]:
+    """Places of cells whose rows are held together."""
+    some: list[int] = []
+    for i in cells:
+        some.append(i)
+        if sum(cells[k].seeds for k in some) >= EPISODES:
+            yield some
+            some = []
+    if some:
+        yield some
+
+
+def compared(part: CellPart, here: Data) -> Seen:
+    """What the figures of a cell, as `scoring.cells.figures` makes them, say of the cell of a board."""
+    says = {name: value for name, value in part.model_dump(include=set(COMPARED)).items() if name not in PRINTS or value is not None}
+    off = [name for name in COMPARED if name in says and says[name] != here[name]]
+    parts = [part for name in off for part in _parts(name, says[name], here[name])]
+    why = ", ".join(f"{name}: board {one}, here {other}" for name, one, other in parts)
+    if off == ["trace"]:
+        why = "trace only: decisions and figures agree, as between two platforms whose last bits differ"
+    return Seen("differs", why, here) if off else Seen("equal", "", here)
+
+
+def _parts(name: str, says: Any, here: Any) -> list[tuple[str, Any, Any]]:
+    """What of a figure differs: of a share with limits each by itself."""
+    if not isinstance(says, dict) or not isinstance(here, dict):
+        return [(name, says, here)]
+    return [(name if key == "value" else f"{name}.{key}", value, here.get(key)) for key, value in says.items() if value != here.get(key)]
+
+
+def _report(board: Board, asked: list[int], seen: dict[int, Seen], sample: int | None, sample_seed: int) -> Data:
+    total = Counter(cell.defence for cell in board.cells)
+    by_defence: dict[str, Counter[str]] = {}
+    for i in asked:
+        by_defence.setdefault(board.cells[i].defence, Counter())[seen[i].verdict] += 1
+    reasons = Counter(seen[i].why for i in asked if seen[i].verdict == "unchecked")
+    counts: Counter[str] = Counter(seen[i].verdict for i in asked)
+    return {
+        "format": "tailgate-check-1", "suite": board.suite.name, "version": VERSION, "cells": len(board.cells),
+        "asked": len(asked), "sample": sample, **({} if sample is None else {"sample_seed": sample_seed}),
+        "counts": {verdict: counts[verdict] for verdict in VERDICTS},
+        "entries": [
+            {"defence": name, "cells": total[name], **{verdict: held[verdict] for verdict in VERDICTS}} for name, held in by_defence.items()
+        ],
+        "reasons": [{"why": why, "cells": n} for why, n in reasons.most_common()],
+        "untrained": _untrained(board, [i for i in asked if seen[i].verdict == "unchecked"]),
+        "findings": [
+            {**board.cells[i].model_dump(include={"scenario", "dose", "defence", "attack", "knowledge"}),
+             "verdict": seen[i].verdict, "why": seen[i].why}
+            for i in asked if seen[i].verdict != "equal"
+        ],
+        "prints": {
+            str(i): {name: held.here[name] for name in PRINTS} for i in asked if (held := seen[i]).verdict == "equal" and held.here
+        },
+    }  # fmt: skip
+
+
+def _untrained(board: Board, places: list[int]) -> list[Data]:
+    """Of each defence the policies that lie where `leaderboard attack DEFENCE --out FOLDER` puts them, and are not here."""
+    cells: Counter[tuple[str, str]] = Counter()
+    files: dict[tuple[str, str], set[Path]] = {}
+    for cell in (board.cells[i] for i in places):
+        path = Path(cell.attack)
+        if path.suffix == ".json" and path.parts[-3:-2] == ("policies",) and not path.is_file():
+            held = cell.defence, path.parents[2].as_posix()
+            cells[held] += 1
+            files.setdefault(held, set()).add(path)
+    return [{"defence": name, "folder": folder, "policies": len(files[name, folder]), "cells": n} for (name, folder), n in cells.items()]
+
+
+def _played(found: Data) -> int:
+    """How many cells a check has played."""
+    return int(found["equal"] + found["differs"])
+
+
+def with_check(data: Data, report: Data) -> Data:
+    """The board with what a check found: `checked` in the entries that it looked into, fingerprints in cells that came out equal.
+
+    Of two checks of an entry the one stays that played more cells; one that was of another number of cells is of another board.
+    Comparisons that were bounds are made again of cells that tell now which episodes came to damage, and ranks with them.
+    """
+    found = {entry["defence"]: {key: entry[key] for key in ("cells", *VERDICTS)} for entry in report["entries"]}
+
+    def told(entry: Data) -> Data:
+        new, held = found.get(entry["defence"]), entry.get("checked")
+        if new is None or (held and held["cells"] == new["cells"] and _played(held) > _played(new)):
+            return entry
+        return entry | {"checked": new}
+
+    cells = [cell | report["prints"].get(str(i), {}) for i, cell in enumerate(data["cells"])]
+    return sharpened(data | {"entries": [told(entry) for entry in data["entries"]], "cells": cells}, suite_of(read_board(data)))

@@ -1,0 +1,236 @@
+"""Detection and stealth impact of a board's entries, played from the board alone, entry by entry; and played again, to be checked."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import functools
+import itertools
+from collections import Counter
+from collections.abc import Generator, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from tailgate.base import sizes
+from tailgate.base.errors import InputError
+from tailgate.base.locks import alone
+from tailgate.base.pool import each
+from tailgate.base.version import VERSION
+from tailgate.core.registry import Spec
+from tailgate.core.scenario import Suite
+
+from .board_format import load, read_board, save
+from .check import VERDICTS, agree, drawn, known, refused, suite_of
+from .consistency import same
+from .detection import EFFORT, Effort, Progress, detection, plants, stealth_impact
+from .false_alarms import false_alarms
+
+Data = dict[str, Any]
+LINES = ("entries", "without", "alarms")  # of a detection board: figures, why there are none, and false alarms at the thresholds
+PARTS = 4  # of the longest clean run: what one scenario may take of it when a threshold is checked
+YOUNG = ("low", "high")  # fields of stealth that older boards lack
+PLACE = ("plant", "scenario", "attack", "hours")  # what a figure is of
+
+
+def detect(
+    path: Path, suite: Suite, *, defences: Sequence[str] = (), effort: Effort = EFFORT, workers: int = 1, progress: Progress | None = None
+) -> Data:
+    """Play detection and stealth impact of the board in a file; returns it. It is written as soon as an entry is done, and resumes.
+
+    defences: only these entries; classes of somebody's own are imported where they are named here. Of all, those that come with it;
+    not `none`, sentinels, or who is told the truth. Attacks are the black-box scripts of the board's list that can be played here. Raises
+    InputError for a board of another suite or version, or with figures of another effort, and for a defence that takes no place here.
+    """
+    with alone(path.parent):
+        return _detected(path, suite, defences, effort, workers, progress)
+
+
+def _detected(path: Path, suite: Suite, defences: Sequence[str], effort: Effort, workers: int, progress: Progress | None) -> Data:
+    board = load(path)
+    agree(read_board(board), suite)
+    guards = [e["defence"] for e in board["entries"] if e.get("card") and _takes_part(e)]
+    known(defences, [e["defence"] for e in board["entries"] if _takes_part(e)])
+    for entry in (e for e in board["entries"] if e["defence"] in defences):
+        told, here = (entry.get("worst_episode") or {}).get("defence_digest"), Spec("defence", entry["defence"]).digest
+        if told is not None and told != here:
+            wanted = f"{told[:12] or 'none'}, of the class that the board's rows are of"
+            raise InputError(f"defence {entry['defence']}: digest", here[:12] or "none", wanted)
+    listed = [a for a in board["attacks"] if a["attack"] in suite.attacks or a.get("admitted")]
+    attacks = [a["attack"] for a in listed if a["knowledge"] == "black" and not (a.get("optimal") or a.get("learned"))]
+    attacks = [attack for attack in attacks if not refused("attack", attack)]
+    held = board.get("detection") or _nothing(effort, suite)
+    for name, value in dataclasses.asdict(_effort(held, effort)).items():
+        if value != getattr(effort, name):
+            raise InputError(f"detection: {name}", getattr(effort, name), f"{value}, with which the figures of the board were made")
+    if (told := held.get("plants")) != _shared(suite):
+        wanted = f"{_shared(suite)}, scenarios that share a threshold; without its field `detection` a board is played again"
+        raise InputError("detection: plants", told, wanted)
+    asked = [guard for guard in defences or guards if not _whole(held, guard, suite, attacks, effort)]
+    there = {guard: _of(board, held, guard) for guard in defences or guards if guard not in asked and not _checked(held, guard, suite)}
+    with contextlib.closing(_play(suite, asked, attacks, effort, board["suite"].get("beacon") or "", workers, progress, there)) as played:
+        for guard, found in played:
+            board = _with(load(path), guard, found, effort, suite)  # read again: it may have been marked in the meantime
+            save(board, path)
+    return dict(board)
+
+
+def _takes_part(entry: Data) -> bool:
+    """Not the undefended car, nor who is told the truth, nor a sentinel."""
+    return entry["defence"] != "none" and "truth" not in entry["uses"] and not (entry.get("card") or {}).get("sentinel")
+
+
+def _nothing(effort: Effort, suite: Suite) -> Data:
+    return _said(effort, suite) | {key: [] for key in LINES}
+
+
+def _said(effort: Effort, suite: Suite) -> Data:
+    return dataclasses.asdict(effort) | {"hours": list(effort.hours), "plants": _shared(suite)}
+
+
+def _shared(suite: Suite) -> list[list[str]]:
+    """Scenarios that share a threshold."""
+    return [list(names) for names in plants(suite.nominal).values()]
+
+
+def _effort(held: Data, effort: Effort = EFFORT) -> Effort:
+    """With which the figures of a board were made; boards of before do not say, and had the usual one. A number that none is of is free."""
+    given = {f.name: held[f.name] for f in dataclasses.fields(Effort) if f.name in held}
+    free = {} if held.get("alarms") else {"checked": effort.checked}
+    return dataclasses.replace(EFFORT, **given | free | {"hours": tuple(map(float, held["hours"]))})
+
+
+def _whole(held: Data, guard: str, suite: Suite, attacks: Sequence[str], effort: Effort) -> bool:
+    """Whether an entry has all figures, or the reasons why it has none."""
+    lines = [line for part in LINES for line in held.get(part, ()) if line["defence"] == guard and not _outdated(line)]
+    there = {tuple(line[key] for key in PLACE if key in line) for line in lines}
+    return all(
+        (plant, h) in there or all((name, attack, h) in there for name in names for attack in attacks)
+        for plant, names in plants(suite.nominal).items() for h in effort.hours
+    )  # fmt: skip
+
+
+def _of(board: Data, held: Data, guard: str) -> Data:
+    """What a board says of the detection of one entry."""
+    stealth = next(entry.get("stealth") for entry in board["entries"] if entry["defence"] == guard)
+    return {part: [line for line in held.get(part, ()) if line["defence"] == guard] for part in LINES} | {"stealth": stealth}
+
+
+def _checked(held: Data, guard: str, suite: Suite) -> bool:
+    """Whether false alarms at all thresholds of an entry are there, or nothing is."""
+    wanted = {(line["scenario"], line["hours"]) for line in held["entries"] if line["defence"] == guard}
+    return wanted <= {(line["scenario"], line["hours"]) for line in held.get("alarms", ()) if line["defence"] == guard}
+
+
+def _outdated(line: Data) -> bool:
+    """Whether a line says that an entry has no threshold, of when only one of its own was looked for."""
+    return str(line.get("reason", "")).startswith("defence: ")
+
+
+def _with(board: Data, guard: str, found: Data, effort: Effort, suite: Suite) -> Data:
+    """The board with the figures of one entry, in the order of its entries."""
+    order = [entry["defence"] for entry in board["entries"]]
+    held = board.get("detection") or _nothing(effort, suite)
+    apart = {guard, *(e["defence"] for e in board["entries"] if not _takes_part(e))}
+    lines = {part: [line for line in held.get(part, ()) if line["defence"] not in apart] + found[part] for part in LINES}
+    lines = {part: sorted(mine, key=lambda line: order.index(line["defence"])) for part, mine in lines.items()}
+    entries = [entry | {"stealth": found["stealth"]} if entry["defence"] == guard else entry for entry in board["entries"]]
+    return board | {"entries": entries, "detection": held | _said(effort, suite) | lines}
+
+
+def figures(
+    suite: Suite, guard: str, attacks: Sequence[str], effort: Effort, beacon: str, there: Data | None = None,
+    progress: Progress | None = None,
+) -> Data:  # fmt: skip
+    """`entries`, `without` and `alarms` of the detection board of one defence, and its `stealth`. there: of these all but the alarms."""
+    found = there or detection(suite, [guard], attacks, effort, beacon=beacon, progress=progress)
+    if there is None:
+        found = found | {"stealth": stealth_impact(suite, guard, effort, beacon=beacon, progress=progress)}
+    most = max(1, effort.most_steps // PARTS)
+    return found | {"alarms": false_alarms(suite, found["entries"], effort.checked, most, beacon=beacon)}
+
+
+def _play(
+    suite: Suite, asked: Sequence[str], attacks: Sequence[str], effort: Effort, beacon: str, workers: int, progress: Progress | None,
+    there: Mapping[str, Data] | None = None,
+) -> Generator[tuple[str, Data]]:  # fmt: skip
+    """Figures of each defence, as they are done; of those that are there in part, what is missing."""
+    have = there or {}
+    guards = [*asked, *have]
+    sizes.check("workers", workers)
+    update, rest = progress or (lambda *_: None), (attacks, effort, beacon)
+    if workers == 1 or len(guards) < 2:
+        ticks = 2 * len(effort.hours)  # of an entry: the stealth attack and the others at each threshold
+        for i, guard in enumerate(guards):
+            steps = itertools.count(i * ticks + 1)
+            tick = functools.partial(_tick, update, steps, ticks * len(guards), guard)
+            yield guard, figures(suite, guard, *rest, have.get(guard), tick)
+        return
+    jobs = [(suite, guard, *rest, have.get(guard)) for guard in guards]
+    for done, (i, found) in enumerate(each(figures, jobs, workers), start=1):
+        yield guards[i], found
+        update("detection", done, len(guards), guards[i])
+
+
+def _tick(update: Progress, steps: Iterator[int], total: int, guard: str, *_: Any) -> None:
+    update("detection", next(steps), total, guard)
+
+
+def check_detection(
+    data: Data, *, sample: int | None = None, sample_seed: int = 0, defences: Sequence[str] = (), workers: int = 1,
+    progress: Progress | None = None,
+) -> Data:  # fmt: skip
+    """Play detection and stealth impact of entries of a board again, and compare them figure by figure, numbers to six digits.
+
+    data: a board, as JSON; sample: so many entries, drawn by sample_seed (default: all that have figures); defences: only of these.
+    The report has `counts` of figures, `entries` (the same for each defence) and `findings`: figures that differ, by `field`, with what the
+    `board` says and what is `here`; `reasons`: why entries could not be played. Raises InputError for a board without such figures, and as
+    `check.check` does.
+    """
+    board = read_board(data)
+    suite = suite_of(board)
+    if not (held := data.get("detection")):
+        raise InputError("board: detection", None, "figures of `leaderboard detect`")
+    part = {entry["defence"] for entry in data["entries"] if _takes_part(entry)}
+    names = list(dict.fromkeys(line["defence"] for key in LINES for line in held.get(key, ()) if line["defence"] in part))
+    known(defences, names)
+    mine = list(defences) or names
+    asked = [mine[i] for i in drawn(list(range(len(mine))), sample, sample_seed)]
+    attacks = list(dict.fromkeys(line["attack"] for line in held["entries"]))
+    away = {name: why for name in asked if (why := refused("defence", name))}
+    if why := next(filter(None, (refused("attack", attack) for attack in attacks)), ""):
+        away = dict.fromkeys(asked, why)
+    effort, counts, findings = _effort(held), {name: Counter[str]() for name in asked}, []
+    stealth = {entry["defence"]: entry.get("stealth") for entry in data["entries"]}
+    guards = [name for name in asked if name not in away]
+    for guard, here in _play(suite, guards, attacks, effort, board.suite.beacon or "", workers, progress):
+        told = {part: lines for part, lines in here.items() if part not in LINES or part in held}
+        says, made = _by_place(held | {"stealth": stealth.get(guard)}, guard), _by_place(told, guard)
+        for place in dict.fromkeys((*says, *made)):
+            off = _differences(says.get(place), made.get(place))
+            counts[guard]["differs" if off else "equal"] += 1
+            findings += [dict(zip((*PLACE, "of"), place, strict=True)) | {"defence": guard} | one for one in off]
+    for name in away:
+        counts[name]["unchecked"] = len(_by_place(held | {"stealth": stealth.get(name)}, name))
+    total: Counter[str] = sum(counts.values(), Counter())
+    return {
+        "format": "tailgate-check-detection-1", "suite": board.suite.name, "version": VERSION, "of": len(names),
+        "asked": len(asked), "sample": sample, **({} if sample is None else {"sample_seed": sample_seed}),
+        "counts": {verdict: total[verdict] for verdict in VERDICTS},
+        "entries": [{"defence": name, **{verdict: counts[name][verdict] for verdict in VERDICTS}} for name in asked],
+        "findings": findings, "reasons": [{"defence": name, "why": why} for name, why in away.items()],
+    }  # fmt: skip
+
+
+def _by_place(held: Data, guard: str) -> dict[tuple[Any, ...], Data]:
+    """The figures of an entry by what they are of."""
+    lines = [(part, line) for part in LINES for line in held.get(part, ()) if line["defence"] == guard]
+    lines += [("stealth", item) for item in held["stealth"] or ()]
+    return {(*(line.get(key) for key in PLACE), part): line for part, line in lines}
+
+
+def _differences(says: Data | None, here: Data | None) -> list[Data]:
+    """Field by field; a board of before the limits of stealth were there says nothing of them."""
+    if says is None or here is None:
+        return [{"field": "", "board": says, "here": here}]
+    keys = [*says, *(key for key in here if key not in says and key not in YOUNG)]
+    return [{"field": key, "board": says.get(key), "here": here.get(key)} for key in keys if not same(says.get(key), here.get(key))]
