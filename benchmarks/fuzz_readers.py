@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import operator
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -170,7 +171,7 @@ def _attacks(folder: Path) -> Any:
 
 
 def _read_board(folder: Path) -> Any:
-    from tailgate.board.board_format import load, read_board
+    from tailgate.board.files import load, read_board
 
     return read_board(load(folder / "board.json"))
 
@@ -181,7 +182,7 @@ def _beside(module: str, function: str, *, file: str) -> Callable[[Path], Any]:
     def read(folder: Path) -> Any:
         from importlib import import_module
 
-        return getattr(import_module(f"tailgate.{module}"), function)(folder / file)
+        return operator.attrgetter(function)(import_module(f"tailgate.{module}"))(folder / file)
 
     return read
 
@@ -412,15 +413,15 @@ def readers() -> dict[str, Reader]:
         Reader("checkpoint of ppo", "tensors", "checkpoint.safetensors", *ppo, slow=2.0),
         Reader("run's configuration", "json", "config.json", _started, _resumed),
         Reader("run's curve", "json", "curve-0.json", lambda: [b'{"curve": [], "seconds": 12.5}'], _spent),
-        Reader("card", "json", "card.json", lambda: [json.dumps(CARD).encode()], _beside("leaderboard.card", "read_card", file="card.json")),
+        Reader("card", "json", "card.json", lambda: [json.dumps(CARD).encode()], _beside("board.card", "read_card", file="card.json")),
         Reader("step times", "json", "step_time.json", _files("results/quick-v0/step_time.json"),
-               _beside("leaderboard.clock", "read_clock", file="step_time.json")),
+               _beside("board.attachments", "Clock.read", file="step_time.json")),
         Reader("timing advantages", "json", "timing.json", _files("results/quick-v0/timing.json"),
-               _beside("leaderboard.timing", "read_timing", file="timing.json")),
+               _beside("board.attachments", "Timing.read", file="timing.json")),
         Reader("verification", "json", "verified.json", _files("results/quick-v0/verified/*.json"),
-               _beside("leaderboard.verified", "read_report", file="verified.json")),
-        Reader("errata", "json", "errata.json", _files("results/quick-v0/errata.json"), _beside("leaderboard.errata", "errata_of", file="board.json")),
-        Reader("record of a run", "json", "run.json", _files("results/quick-v0/run.json"), _beside("leaderboard.run_time", "run_of", file="board.json")),
+               _beside("board.verified", "read_report", file="verified.json")),
+        Reader("errata", "json", "errata.json", _files("results/quick-v0/errata.json"), _beside("board.attachments", "Errata.of", file="board.json")),
+        Reader("record of a run", "json", "run.json", _files("results/quick-v0/run.json"), _beside("board.attachments", "Run.of", file="board.json")),
         Reader("trust report", "json", "trust.json", _trust_files, _trust),
         Reader("trust cells", "jsonl", "cells.jsonl", lambda: [b'{"cell": "a", "status": "ok", "properties": [], "conjunctions": {}}\n' * 3],
                _beside("trust.run", "_read", file="cells.jsonl")),

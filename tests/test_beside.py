@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 
 from tailgate.base.errors import InputError
-from tailgate.board.board_format import read_board
 from tailgate.board.cells import digits, hits_of, shared_of
 from tailgate.board.check import _scored
 from tailgate.board.consistency import sharpened, strays, untold
+from tailgate.board.files import read_board
 from tailgate.cli import board as command
 from tailgate.core.scenario import load_suite
 from tailgate.evaluation.attack_list import Admitted

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from tailgate.base.errors import InputError
-from tailgate.board.board_format import read_board
 from tailgate.board.consistency import strays
+from tailgate.board.files import read_board
 from tailgate.evaluation.attack_list import Admitted
 
 spec = importlib.util.spec_from_file_location("scored", Path(__file__).with_name("scored.py"))

@@ -13,9 +13,9 @@ import pytest
 
 from tailgate.base.errors import InputError
 from tailgate.board import detect as module
-from tailgate.board.board_format import read_board
 from tailgate.board.detect import check_detection, detect
 from tailgate.board.detection import Effort
+from tailgate.board.files import read_board
 from tailgate.board.score import score
 from tailgate.cli import main
 from tailgate.core.scenario import load_scenario, load_suite

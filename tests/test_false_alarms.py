@@ -9,8 +9,8 @@ import pytest
 
 from tailgate.base.errors import InputError
 from tailgate.board import false_alarms as module
-from tailgate.board.board_format import read_board
 from tailgate.board.false_alarms import FIRST, Drives, dispersion, false_alarms
+from tailgate.board.files import read_board
 from tailgate.core.scenario import load_scenario, load_suite
 from tailgate.evaluation.attack_free import Bench
 from tailgate.evaluation.cells import Cell, run_cell

@@ -15,7 +15,7 @@ from scipy import stats
 
 from tailgate.base.errors import InputError
 from tailgate.board import score
-from tailgate.board.board_format import read_board
+from tailgate.board.files import read_board
 from tailgate.evaluation.paired import mcnemar
 from tailgate.evaluation.stats import limits
 from tailgate.studies.policies import rising

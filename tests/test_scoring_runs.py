@@ -12,8 +12,8 @@ from tailgate import make_attack, make_defence
 from tailgate.agents.zoo import zoo_names
 from tailgate.base.errors import InputError, NotApplicable
 from tailgate.board import score
-from tailgate.board.board_format import read_board
 from tailgate.board.detection import Effort, detection, deviation, plants, stealth_impact, threshold
+from tailgate.board.files import read_board
 from tailgate.core.draws import keys
 from tailgate.core.registry import Spec, entries
 from tailgate.core.scenario import Suite, list_suites, load_scenario, load_suite

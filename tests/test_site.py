@@ -11,7 +11,7 @@ from urllib.parse import unquote, urlsplit
 
 import pytest
 
-from tailgate.board.board_format import read_board
+from tailgate.board.files import read_board
 from tailgate.board.words import at_least, percent
 from tailgate.site.build import build_site
 from tailgate.site.cards import LICENCE

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tailgate.board.board_format import read_board
+from tailgate.board.files import read_board
 from tailgate.board.order import ordered
 from tailgate.board.words import at_least, percent
 from tailgate.site.index import attacks_of, detection_of, ranked_against

@@ -10,7 +10,7 @@ import pytest
 
 from tailgate.base.errors import InputError
 from tailgate.board import head
-from tailgate.board.board_format import read_board
+from tailgate.board.files import read_board
 from tailgate.board.order import ordered
 from tailgate.site.build import build_site, slug
 from tailgate.site.charts import Axis, Dot, Line, chart, nice, spread, ticks_at

@@ -15,7 +15,7 @@ import pytest
 
 from tailgate import cli
 from tailgate.base.errors import InputError
-from tailgate.board.board_format import read_board
+from tailgate.board.files import read_board
 from tailgate.board.run import board_of
 from tailgate.board.words import at_least
 from tailgate.cli.board import _print_board

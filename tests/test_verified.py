@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from tailgate.base.errors import InputError
-from tailgate.board.board_format import read_board
+from tailgate.board.files import read_board
 from tailgate.board.run import VERIFIED, board_of
 from tailgate.cli import verify as command
 from tailgate.core.scenario import Suite, list_suites, load_suite

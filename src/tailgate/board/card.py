@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from tailgate.base.errors import InputError, said, unknown
 from tailgate.base.reading import load_json
 from tailgate.core import param
 from tailgate.core.registry import USES
 from tailgate.core.schema import as_data, build
+
+from .schema import Data
 
 
 @dataclass(frozen=True)
@@ -55,19 +57,17 @@ def read_card(path: Path) -> Card:
     return card
 
 
-def with_cards(board: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """The board with what the cards of a folder say of its defences and attacks. Raises InputError for two cards of one entry."""
-    cards: dict[tuple[str, str], Card] = {}
+def with_cards(board: Data, folder: Path) -> Data:
+    """Return the board with what the cards of a folder say of its defences and attacks. Raises InputError for two cards of one entry."""
+    cards: dict[tuple[str, str], Data] = {}
     for path in sorted(folder.glob("*.json")):
         card = read_card(path)
-        if cards.setdefault((card.kind, card.text), card) is not card:
+        if (card.kind, card.text) in cards:
             raise InputError(f"card {path.name}", card.text, "an entry that has no other card")
+        cards[card.kind, card.text] = {key: value for key, value in as_data(card).items() if value and key not in ("class", "kind", "text")}
 
-    def told(kind: str, item: dict[str, Any]) -> dict[str, Any]:
-        card = cards.get((kind, item[kind]))
-        if card is None:
-            return item
-        said = {key: value for key, value in as_data(card).items() if value and key not in ("class", "kind", "text")}
-        return item | {"card": (item.get("card") or {}) | said}
+    def carded(kind: str, line: Data) -> Data:
+        card = cards.get((kind, line[kind]))
+        return line if card is None else line | {"card": (line.get("card") or {}) | card}
 
-    return board | {"entries": [told("defence", e) for e in board["entries"]], "attacks": [told("attack", a) for a in board["attacks"]]}
+    return board | {"entries": [carded("defence", e) for e in board["entries"]], "attacks": [carded("attack", a) for a in board["attacks"]]}

@@ -25,11 +25,11 @@ from tailgate.evaluation.cells import Cell, run
 from tailgate.evaluation.paired import CLOSE, PAIR
 from tailgate.evaluation.verify import files_of
 
-from .board_format import read_board
 from .cells import figures, shared_of
 from .consistency import same, sharpened, strays, untold
 from .damage import Row
-from .schema import Board, CellPart
+from .files import amended, read_board
+from .schema import Board, CellLine
 from .score import score
 
 Data = dict[str, Any]
@@ -180,7 +180,7 @@ def drawn(places: list[int], sample: int | None, seed: int) -> list[int]:
     return sorted(places[int(i)] for i in order[:sample])
 
 
-def _cell(part: CellPart, board: Board, suite: Suite) -> Cell | str:
+def _cell(part: CellLine, board: Board, suite: Suite) -> Cell | str:
     """The cell to play; or why it cannot be played here."""
     try:
         for family, text in (("defence", part.defence), ("attack", part.attack)):
@@ -220,7 +220,7 @@ def _slices(cells: dict[int, Cell]) -> Iterator[list[int]]:
         yield some
 
 
-def compared(part: CellPart, here: Data) -> Seen:
+def compared(part: CellLine, here: Data) -> Seen:
     """What the figures of a cell, as `scoring.cells.figures` makes them, say of the cell of a board."""
     says = {name: value for name, value in part.model_dump(include=set(COMPARED)).items() if name not in PRINTS or value is not None}
     off = [name for name in COMPARED if name in says and says[name] != here[name]]
@@ -289,13 +289,11 @@ def with_check(data: Data, report: Data) -> Data:
     Of two checks of an entry the one stays that played more cells; one that was of another number of cells is of another board.
     Comparisons that were bounds are made again of cells that tell now which episodes came to damage, and ranks with them.
     """
-    found = {entry["defence"]: {key: entry[key] for key in ("cells", *VERDICTS)} for entry in report["entries"]}
-
-    def told(entry: Data) -> Data:
-        new, held = found.get(entry["defence"]), entry.get("checked")
-        if new is None or (held and held["cells"] == new["cells"] and _played(held) > _played(new)):
-            return entry
-        return entry | {"checked": new}
-
+    before = {entry["defence"]: entry.get("checked") for entry in data["entries"]}
+    checked: dict[str, Data] = {}
+    for entry in report["entries"]:
+        new, old = {key: entry[key] for key in ("cells", *VERDICTS)}, before.get(entry["defence"])
+        if not (old and old["cells"] == new["cells"] and _played(old) > _played(new)):
+            checked[entry["defence"]] = {"checked": new}
     cells = [cell | report["prints"].get(str(i), {}) for i, cell in enumerate(data["cells"])]
-    return sharpened(data | {"entries": [told(entry) for entry in data["entries"]], "cells": cells}, suite_of(read_board(data)))
+    return sharpened(amended(data, checked, cells=cells), suite_of(read_board(data)))

@@ -12,10 +12,7 @@ from __future__ import annotations
 import statistics
 import time
 from collections.abc import Callable, Sequence
-from pathlib import Path
-from typing import Annotated, Any, Literal
-
-from pydantic import BaseModel, ConfigDict, Field
+from typing import Any
 
 from tailgate.base import sizes
 from tailgate.base.errors import InputError, NotApplicable
@@ -25,37 +22,11 @@ from tailgate.core import draws, no_command
 from tailgate.core.loop import Loop
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import Suite, load_scenario
-from tailgate.core.schema import read_model
 
-FILE = "step_time.json"
+from .attachments import Clock, StepTime
+
 ROUNDS, MOST = 5, 200  # episodes of each defence that count; steps of an episode that are looked at
 Progress = Callable[[int, int], None]
-Microseconds = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-
-
-class StepTime(BaseModel):
-    """One defence: the median of its rounds, the least and the largest of them [us]."""
-
-    model_config = ConfigDict(strict=True)
-    defence: str
-    median: Microseconds
-    low: Microseconds
-    high: Microseconds
-
-
-class Clock(BaseModel):
-    """A file of step times."""
-
-    model_config = ConfigDict(strict=True)
-    format: Literal["tailgate-step-time-1"] = "tailgate-step-time-1"
-    suite: str
-    scenario: str
-    agents: Annotated[int, Field(ge=1)]
-    rounds: Annotated[int, Field(ge=1)]
-    processor: str
-    version: str
-    commit: str | None
-    entries: list[StepTime]
 
 
 class _Timed:
@@ -126,14 +97,3 @@ def measure(suite: Suite, defences: Sequence[str] = (), *, rounds: int = ROUNDS,
         suite=suite.name, scenario=place.name, agents=model.agents, rounds=rounds, processor=processor(),
         version=VERSION, commit=commit(), entries=entries,
     )  # fmt: skip
-
-
-def read_clock(path: Path) -> Clock:
-    """Raises InputError that names the file and the field for anything else than step times."""
-    return read_model(Clock, path, "step times", "leaderboard clock")
-
-
-def clock_of(board: Path) -> Clock | None:
-    """The step times that lie beside a board's file; none where there are none."""
-    path = board.parent / FILE
-    return read_clock(path) if path.is_file() else None

@@ -15,6 +15,7 @@ from tailgate.evaluation.paired import CLOSE, class_of, compare, settled
 from .cells import hits_of, share, table_of, vague
 from .damage import doses_of
 from .entry import Levels, curves, middle, of_worst, shown
+from .files import amended
 from .worst import Worst
 
 Data = dict[str, Any]
@@ -107,8 +108,7 @@ def sharpened(board: Data, suite: Suite) -> Data:
         made = [again[d["a"], d["b"]] if d.get("bound") else d for d in told]
         new, places = settled(made, names, alpha)
         duels, ranks = duels + new, ranks | places
-    entries = [entry | {"rank": ranks[entry["defence"]]} if entry["defence"] in ranks else entry for entry in board["entries"]]
-    return board | {"entries": entries, "comparisons": duels}
+    return amended(board, {name: {"rank": rank} for name, rank in ranks.items()}, comparisons=duels)
 
 
 def same(a: Any, b: Any) -> bool:

@@ -19,11 +19,11 @@ from tailgate.base.version import VERSION
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import Suite
 
-from .board_format import load, read_board, save
 from .check import VERDICTS, agree, drawn, known, refused, suite_of
 from .consistency import same
 from .detection import EFFORT, Effort, Progress, detection, plants, stealth_impact
 from .false_alarms import false_alarms
+from .files import amended, load, read_board, save
 
 Data = dict[str, Any]
 LINES = ("entries", "without", "alarms")  # of a detection board: figures, why there are none, and false alarms at the thresholds
@@ -133,8 +133,7 @@ def _with(board: Data, guard: str, found: Data, effort: Effort, suite: Suite) ->
     apart = {guard, *(e["defence"] for e in board["entries"] if not _takes_part(e))}
     lines = {part: [line for line in held.get(part, ()) if line["defence"] not in apart] + found[part] for part in LINES}
     lines = {part: sorted(mine, key=lambda line: order.index(line["defence"])) for part, mine in lines.items()}
-    entries = [entry | {"stealth": found["stealth"]} if entry["defence"] == guard else entry for entry in board["entries"]]
-    return board | {"entries": entries, "detection": held | _said(effort, suite) | lines}
+    return amended(board, {guard: {"stealth": found["stealth"]}}, detection=held | _said(effort, suite) | lines)
 
 
 def figures(

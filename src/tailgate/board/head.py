@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from .board_format import read_board
+from .files import read_board
 from .order import ordered
 from .words import at_least
 

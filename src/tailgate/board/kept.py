@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from .board_format import read_board
 from .cells import place_of
 from .check import compared
 from .detect import LINES
+from .files import amended, read_board
 from .schema import Board
 
 Data = dict[str, Any]
@@ -23,17 +23,12 @@ def with_kept(board: Data, old: Data) -> Data:
     before = read_board(old, "board.json")
     if any(old["suite"].get(key) != board["suite"][key] for key in SAME):
         return board
-    kept = _unchanged(board, before)
-    entries = {entry["defence"]: entry for entry in old["entries"] if entry["defence"] in kept}
-
-    def told(entry: Data) -> Data:
-        held = entries.get(entry["defence"])
-        if held is None:
-            return entry
-        checked = held.get("checked")
-        return entry | {"stealth": held.get("stealth")} | ({"checked": checked | {"cells": kept[entry["defence"]]}} if checked else {})
-
-    return board | {"entries": [told(entry) for entry in board["entries"]], "detection": _of(old.get("detection"), kept)}
+    kept, fields = _unchanged(board, before), dict[str, Data]()
+    for entry in (entry for entry in old["entries"] if entry["defence"] in kept):
+        checked = entry.get("checked")
+        again = {"checked": checked | {"cells": kept[entry["defence"]]}} if checked else {}
+        fields[entry["defence"]] = {"stealth": entry.get("stealth")} | again
+    return amended(board, fields, detection=_of(old.get("detection"), kept))
 
 
 def _unchanged(board: Data, old: Board) -> dict[str, int]:

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from typing import Any
 
 from .entry import CLAIMED
-from .schema import LEVELS, Critical, EntryPart
+from .schema import LEVELS, Critical, Entry
 
 GROUPS = (  # status, title, what it means
     ("ranked", "Ranked", "with figures against every black-box attack, and through every gate"),
@@ -16,7 +16,7 @@ GROUPS = (  # status, title, what it means
 )
 
 
-def ordered(entries: Iterable[EntryPart]) -> list[EntryPart]:
+def ordered(entries: Iterable[Entry]) -> list[Entry]:
     """By group, classes that claim their figures first, then class, rank and critical dose."""
     return sorted(entries, key=place_of)
 
@@ -28,7 +28,7 @@ def sort_dose(critical: Critical | None) -> float:
     return math.inf if critical.value is None else critical.value
 
 
-def place_of(entry: EntryPart) -> tuple[Any, ...]:
+def place_of(entry: Entry) -> tuple[Any, ...]:
     """Key to sort by."""
     status = [name for name, *_ in GROUPS].index(entry.status)
     rank = (entry.rank.best, entry.rank.worst) if entry.rank else (math.inf, math.inf)

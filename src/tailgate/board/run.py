@@ -18,10 +18,10 @@ from tailgate.evaluation.cells import evaluate
 from tailgate.evaluation.rows import CLEAN, read_rows
 from tailgate.trust.run import REPORT, with_trust
 
-from .board_format import load, read_board, save
 from .card import with_cards
 from .cells import shared_of
 from .check import agree, refused
+from .files import load, read_board, save
 from .kept import with_kept
 from .score import score
 from .verified import digest, with_verified

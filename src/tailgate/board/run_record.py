@@ -1,29 +1,24 @@
-"""What it took to play a board: run.json beside it. Of clocks and machines board.json, a pure function of rows, says nothing.
+"""The writer of run.json (`tailgate.board.attachments.Run`): what it took to play a board.
 
-    {"format": "tailgate-run-1", "suite", "hash", "seconds", "processor_seconds", "rows": {"played", "kept"}, "commands": [..]}
-
-Each command that played rows has its seconds (of the clock), processor_seconds (with those of its workers), played, workers, processor,
-cores, version and commit. Resumed, a run adds up; where no rows are left it begins anew. `kept`: rows of the board that none of them
-played; null while they are being played. Where more was played than the board has rows (`again`), newer sources played some of them once
-more.
+A resumed run adds up its commands; where no rows are left it begins again. `kept` is null while rows are being played. More rows played
+than the board has (`again`) means that newer sources played some of them once more.
 """
 
 from __future__ import annotations
 
-import json
 import resource
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from tailgate.base.files import sweep, write_atomic
+from tailgate.base.files import sweep
 from tailgate.base.provenance import commit, cores, processor
 from tailgate.base.version import VERSION
 from tailgate.core.scenario import Suite
 from tailgate.sandbox.guard import TICK, descendants
 
-from .run_time import FILE, RunTime, run_of
+from .attachments import Command, Rows, Run
 
 EVERY = 10.0  # [s] between two writes while rows are played: what a killed command loses
 
@@ -39,13 +34,13 @@ class Record:
     """The clock and the counts of one command that plays a suite into a folder; both begin when it is made."""
 
     def __init__(self, suite: Suite, folder: Path, workers: int) -> None:
-        self.suite, self.path = suite, folder / FILE
+        self.suite, self.path = suite, folder / Run.FILE
         sweep(self.path)
         left = any(any(folder.glob(pattern)) for pattern in ("rows*.jsonl*", ".rows*.parts"))
-        held = run_of(self.path) if left else None
-        self.before = [command.model_dump() for command in held.commands] if held and held.hash == suite.hash else []
+        held = Run.of(self.path) if left else None
+        self.before = held.commands if held is not None and held.hash == suite.hash else []
         self.began, self.used, self.written, self.played = time.perf_counter(), processor_time(), time.perf_counter(), 0
-        self.about = {
+        self.about: dict[str, Any] = {
             "workers": workers, "processor": processor(), "cores": cores(), "version": VERSION, "commit": commit(),
         }  # fmt: skip
 
@@ -61,27 +56,28 @@ class Record:
         return counted
 
     def finish(self, rows: int) -> str:
-        """The record written, and told in a line. rows: of the board. A command that played nothing changes no record."""
+        """Write the record and return a line that tells it. rows: of the board. A command that played nothing changes no record."""
         if not self.played:
             return "run: no row was played anew"
         held = self._write(rows)
-        counts, commands = held["rows"], len(held["commands"])
+        commands = len(held.commands)
         return (
-            f"run: {counts['played']} rows played, {counts['kept']} kept; {held['seconds']:.0f} s, {held['processor_seconds']:.0f} s of "
+            f"run: {held.rows.played} rows played, {held.rows.kept} kept; {held.seconds:.0f} s, {held.processor_seconds:.0f} s of "
             f"processor time, {commands} command{'s' * (commands > 1)} ({self.path})"
         )
 
-    def _write(self, rows: int | None) -> dict[str, Any]:
-        now = {"seconds": time.perf_counter() - self.began, "processor_seconds": processor_time() - self.used}
-        commands = [*self.before, {key: round(value, 2) for key, value in now.items()} | {"played": self.played} | self.about]
-        sums = {key: round(sum(command[key] for command in commands), 2) for key in ("seconds", "processor_seconds", "played")}
-        played = int(sums.pop("played"))
-        held = {
-            "format": RunTime.model_fields["format"].default, "suite": self.suite.name, "hash": self.suite.hash, **sums,
-            "rows": {"played": played, "kept": None if rows is None else max(0, rows - played)}, "commands": commands,
-        }  # fmt: skip
+    def _write(self, rows: int | None) -> Run:
+        seconds, used = time.perf_counter() - self.began, processor_time() - self.used
+        this = Command(seconds=round(seconds, 2), processor_seconds=round(used, 2), played=self.played, **self.about)
+        commands = [*self.before, this]
+        played = sum(command.played for command in commands)
+        counts = Rows(played=played, kept=None if rows is None else max(0, rows - played))
         if rows is not None and played > rows:
-            held["rows"]["again"] = played - rows
-        write_atomic(self.path, json.dumps(held, indent=1, allow_nan=False).encode() + b"\n")
+            counts.again = played - rows
+        held = Run(
+            suite=self.suite.name, hash=self.suite.hash, seconds=round(sum(c.seconds for c in commands), 2),
+            processor_seconds=round(sum(c.processor_seconds for c in commands), 2), rows=counts, commands=commands,
+        )  # fmt: skip
+        held.write(self.path.parent)
         self.written = time.perf_counter()
         return held

@@ -1,6 +1,7 @@
-"""The parts of the format `tailgate-board-1`, as the page reads them: docs/decisions/0014-boards.md says what the fields mean.
+"""The nouns of the format `tailgate-board-1`: docs/decisions/0014-boards.md says what the fields mean.
 
-Fields that are not named here are let through: a board may hold more than a page shows.
+`tailgate.board.files` reads, checks and writes them. Fields that are not named here are let through: a board may hold more than a page
+shows.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+FORMAT: Literal["tailgate-board-1"] = "tailgate-board-1"
 Level = Literal["black", "grey", "white"]
 LEVELS: tuple[Level, ...] = ("black", "grey", "white")  # what an attacker knows, from the least
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
@@ -16,20 +18,21 @@ Share = Annotated[float, Field(strict=True, ge=0.0, le=1.0)]
 Text = Annotated[str, Field(strict=True)]
 Count = Annotated[int, Field(strict=True, ge=0)]
 Dose = Count | None  # None: the scenario's own budget
+Data = dict[str, Any]  # JSON data of a board, or of a part of it
 
 
 class Part(BaseModel):
     model_config = ConfigDict(extra="allow", strict=True)
 
 
-class ScenarioPart(Part):
+class ScenarioLine(Part):
     name: Text
     about: Text = ""
     robustness: bool = False
     hash: Text = ""
 
 
-class SuitePart(Part):
+class SuiteLine(Part):
     name: Text
     about: Text = ""
     version: Text | int = ""
@@ -39,7 +42,7 @@ class SuitePart(Part):
     limit: Share = 0.1
     bound: Number | None = None
     alpha: Share = 0.05
-    scenarios: list[ScenarioPart]
+    scenarios: list[ScenarioLine]
     episodes: Count | None = None
     purpose: Text = ""
     beacon: Text | None = None  # empty: public seeds; None: not stated
@@ -47,7 +50,7 @@ class SuitePart(Part):
     require_adaptive: bool = True  # only what met attackers that were trained against it is ranked
 
 
-class AttackPart(Part):
+class AttackLine(Part):
     attack: Text
     knowledge: Level
     learned: bool = False
@@ -178,7 +181,7 @@ class Checked(Part):
     unchecked: Count
 
 
-class EntryPart(Part):
+class Entry(Part):
     defence: Text
     card: dict[str, Any] | None = None
     uses: list[Text] = []
@@ -199,7 +202,7 @@ class EntryPart(Part):
     checked: Checked | None = None
 
 
-class CellPart(Part):
+class CellLine(Part):
     scenario: Text
     dose: Dose
     defence: Text
@@ -225,7 +228,7 @@ class Point(Part):
     attack: Text = ""
 
 
-class CurvePart(Part):
+class Curve(Part):
     defence: Text
     knowledge: Level
     points: list[Point]
@@ -264,7 +267,7 @@ class Detected(AtThreshold):
     delay: Number | None = None
 
 
-class AlarmPart(AtThreshold):
+class Alarms(AtThreshold):
     """False alarms on fresh clean runs of a scenario."""
 
     threshold: Number
@@ -284,7 +287,7 @@ class Detection(Part):
     hours: list[Number]
     plants: list[list[Text]] | None = None  # scenarios that share a threshold
     entries: list[Detected]
-    alarms: list[AlarmPart] = []
+    alarms: list[Alarms] = []
 
 
 class TrustAttack(Part):
@@ -299,7 +302,7 @@ class TrustProperty(Part):
     safety: bool
 
 
-class TrustPart(Part):
+class Trust(Part):
     """What the bounds of all entries are about."""
 
     alpha: Share
@@ -315,12 +318,14 @@ class TrustPart(Part):
 
 
 class Board(Part):
+    """A suite's ranked results. `entries` are its defences; `cells` are what their figures are made of."""
+
     format: Literal["tailgate-board-1"]
-    suite: SuitePart
-    attacks: list[AttackPart] = []
-    entries: list[EntryPart] = []
-    cells: list[CellPart] = []
-    curves: list[CurvePart] = []
+    suite: SuiteLine
+    attacks: list[AttackLine] = []
+    entries: list[Entry] = []
+    cells: list[CellLine] = []
+    curves: list[Curve] = []
     comparisons: list[Comparison] = []
     detection: Detection | None = None
-    trust: TrustPart | None = None
+    trust: Trust | None = None

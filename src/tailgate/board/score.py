@@ -17,10 +17,9 @@ from .cells import cells_of, ordered
 from .damage import SKIPPED, Column, Row, Table, tabulate
 from .entry import Data, Levels, curves, entry_of, extended, middle
 from .ranks import rank
+from .schema import FORMAT
 from .update import Beside, beside
 from .worst import Worst
-
-FORMAT = "tailgate-board-1"
 
 
 def score(

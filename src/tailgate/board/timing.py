@@ -11,18 +11,14 @@ its own times, and at those of its twins (tailgate.studies.timing). Rows cannot 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from pathlib import Path
-from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field
 
 from tailgate.base import sizes
 from tailgate.base.errors import InputError, NotApplicable
 from tailgate.base.version import VERSION
 from tailgate.core import Array, draws
 from tailgate.core.scenario import Suite
-from tailgate.core.schema import read_model
 from tailgate.evaluation.paired import mcnemar
 from tailgate.evaluation.rounds import numbered
 from tailgate.evaluation.stats import holm, paired_difference, proportion
@@ -31,87 +27,14 @@ from tailgate.play.trace import Trace
 from tailgate.studies.policies import loop_for, trained
 from tailgate.studies.timing import TWINS, played, schedules
 
-from .board_format import read_board
+from .attachments import Gain, Shown, Timed, Timing, Untimed
 from .cells import hits_of, vague
 from .check import agree, known, refused
 from .damage import damaged
-from .schema import LEVELS, Count, Dose, Interval, Limited, Part, Share
+from .files import read_board
+from .schema import LEVELS, Data
 
-FILE = "timing.json"
-ALPHA = 0.05  # of all entries of a board together
-LITTLE = 0.1  # an advantage that surely stays below this is as good as none
-Data = dict[str, Any]
 Progress = Callable[[int, int], None]
-
-
-class Shown(Limited):
-    """A share of damaged episodes with its exact limits, 95 %."""
-
-    high: Share
-
-
-class Gain(Interval):
-    """Own over yoked: the difference with limits, 95 %, the episodes that only one of them damages, and McNemar's exact two-sided p."""
-
-    only_own: Count
-    only_yoked: Count
-    p: Share
-    adjusted: Share = 1.0  # after Holm, for all entries
-
-
-class Timed(Part):
-    """A trained attacker of an entry, and its twins."""
-
-    defence: str
-    attack: str
-    scenario: str
-    dose: Dose
-    knowledge: str
-    board: Share  # its damage on the board
-    most: Share  # that of all attackers that were trained against the entry, at this dose
-    episodes: Annotated[int, Field(ge=2)]  # fresh ones
-    schedules: Annotated[int, Field(ge=1)]  # different ones in them
-    own: Shown
-    yoked: Shown
-    shuffled: Shown
-    periodic: Shown
-    advantage: Gain
-
-    @property
-    def verdict(self) -> Literal["more", "equal", "unknown"]:
-        """Whether its own times surely do more than another episode's, surely no more than a little, or neither can be said.
-
-        Nothing can where it attacks at the same times in every episode: its yoked twin is itself.
-        """
-        gain = self.advantage
-        if gain.adjusted <= ALPHA and gain.only_own > gain.only_yoked:
-            return "more"
-        saturated = max(self.own.value, self.yoked.value) <= LITTLE or min(self.own.value, self.yoked.value) >= 1.0 - LITTLE
-        return "equal" if gain.high < LITTLE and self.schedules > 1 and not saturated else "unknown"
-
-    @property
-    def outdone(self) -> bool:
-        """Whether as many steps at random, or evenly spread, surely do more."""
-        return max(self.shuffled.low, self.periodic.low) > self.own.high
-
-
-class Untimed(Part):
-    """An entry of which nothing can be said, and why."""
-
-    defence: str
-    why: str
-
-
-class Timing(Part):
-    """A file of timing advantages."""
-
-    format: Literal["tailgate-board-timing-1"] = "tailgate-board-timing-1"
-    suite: str
-    hash: str
-    beacon: str
-    version: str
-    entries: list[Timed]
-    without: list[Untimed]
 
 
 def telling(board: Data, defence: str) -> Data | str:
@@ -222,14 +145,3 @@ def _same(cell: Data, harm: Array) -> bool:
     if vague(cell):
         return bool(harm.sum() == round(cell["damage"]["value"] * cell["n"]))
     return bool(np.array_equal(hits_of(cell), harm))
-
-
-def read_timing(path: Path) -> Timing:
-    """Raises InputError that names the file and the field for anything else than timing advantages."""
-    return read_model(Timing, path, "timing advantages", "leaderboard timing")
-
-
-def timing_of(board: Path) -> Timing | None:
-    """The timing advantages that lie beside a board's file; none where there are none."""
-    path = board.parent / FILE
-    return read_timing(path) if path.is_file() else None

@@ -5,13 +5,14 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict
 
 from tailgate.core.schema import read_model
 
-Count = Annotated[int, Field(strict=True, ge=0)]
+from .files import amended
+from .schema import Count, Data
 
 
 class Again(BaseModel):
@@ -54,7 +55,7 @@ def read_report(path: Path) -> Report:
     return read_model(Report, path, "verified", "leaderboard verify")
 
 
-def with_verified(board: dict[str, Any], folder: Path, files: Mapping[str, Mapping[str, int]]) -> dict[str, Any]:
+def with_verified(board: Data, folder: Path, files: Mapping[str, Mapping[str, int]]) -> Data:
     """The board with `verified` in each entry: {"rows", "verified", "differs", "unchecked"}, or null where nobody has played any again.
 
     files: SHA-256 of each file of rows that the board is made of, and how many rows of each defence it has. What a report says of any
@@ -69,14 +70,12 @@ def with_verified(board: dict[str, Any], folder: Path, files: Mapping[str, Mappi
                 if key not in looked or again.asked > looked[key].asked:
                     looked[key] = again
 
-    def told(entry: dict[str, Any]) -> dict[str, Any]:
-        name = entry["defence"]
-        if "verified" in entry:
-            return entry
+    changes: dict[str, Data] = {}
+    for name in (entry["defence"] for entry in board["entries"] if "verified" not in entry):
         mine = {(sha, name): rows[name] for sha, rows in files.items() if name in rows}
-        if not set(mine) <= set(looked):
-            return entry | {"verified": None}
-        counts = {key: sum(getattr(looked[place], key) for place in mine) for key in ("verified", "differs", "unchecked")}
-        return entry | {"verified": {"rows": sum(mine.values())} | counts}
-
-    return board | {"entries": [told(entry) for entry in board["entries"]]}
+        counts = None
+        if set(mine) <= set(looked):
+            verdicts = {key: sum(getattr(looked[place], key) for place in mine) for key in ("verified", "differs", "unchecked")}
+            counts = {"rows": sum(mine.values())} | verdicts
+        changes[name] = {"verified": counts}
+    return amended(board, changes)

@@ -59,9 +59,9 @@ def add(actions: Any) -> None:
 
 def _run(options: argparse.Namespace) -> int:
     sys.path.insert(0, "")  # module:Class is looked for in the working directory, as `tailgate evaluate` does
+    from tailgate.board.attachments import Attachments
     from tailgate.board.attacked import attack
     from tailgate.board.detect import detect
-    from tailgate.board.measured import measured_of
     from tailgate.board.run import BOARD, board_of, kept_board, play
     from tailgate.board.run_record import Record
     from tailgate.core.scenario import load_suite
@@ -76,7 +76,7 @@ def _run(options: argparse.Namespace) -> int:
     out, started = Path(options.out), time.perf_counter()
     suites = [load_suite(name) for name in options.suites]
     for suite in suites:
-        measured_of(out / suite.name / BOARD)  # refuses what is no such file before anything is played
+        Attachments.of(out / suite.name / BOARD)  # refuses what is no such file before anything is played
     kept = {suite.name: kept_board(out / suite.name / BOARD, suite, options.beacon) for suite in suites if options.keep_entries}
     boards = []
     with contextlib.ExitStack() as locks, progress(Console(stderr=True)) as update:
@@ -105,7 +105,7 @@ def _run(options: argparse.Namespace) -> int:
                 board = board_of(suite, folder, beacon=options.beacon or None, keep=options.keep_entries)
             print(record.finish(board["suite"]["rows"]), file=sys.stderr)
             boards.append(detect(folder / BOARD, suite, workers=options.workers, progress=update) if options.detection else board)
-    measured = [measured_of(out / suite.name / BOARD) for suite in suites]
+    measured = [Attachments.of(out / suite.name / BOARD) for suite in suites]
     page = build_site(boards, out / "page", replays=not options.no_replays, measured=measured)
     if options.json:
         print(json.dumps([{"suite": b["suite"]["name"], "entries": b["entries"]} for b in boards], indent=1, allow_nan=False))
@@ -129,7 +129,7 @@ def _print_board(board: dict[str, Any]) -> None:
 
 
 def _head(options: argparse.Namespace) -> int:
-    from tailgate.board.board_format import load
+    from tailgate.board.files import load
     from tailgate.board.head import markdown
 
     board = load(Path(options.board))
@@ -140,12 +140,12 @@ def _head(options: argparse.Namespace) -> int:
 
 
 def _page(options: argparse.Namespace) -> int:
-    from tailgate.board.board_format import load
-    from tailgate.board.measured import measured_of
+    from tailgate.board.attachments import Attachments
+    from tailgate.board.files import load
     from tailgate.site.build import build_site
 
     boards = [load(Path(name)) for name in options.boards]
-    measured = [measured_of(Path(name)) for name in options.boards]
+    measured = [Attachments.of(Path(name)) for name in options.boards]
     page = build_site(boards, Path(options.out), title=options.title, replays=not options.no_replays, measured=measured)
     print(page)
     return 0

@@ -43,9 +43,9 @@ def add(actions: Any) -> None:
 
 
 def _check(options: argparse.Namespace) -> int:
-    from tailgate.board.board_format import load, save
     from tailgate.board.check import check, with_check
     from tailgate.board.detect import check_detection
+    from tailgate.board.files import load, save
 
     if options.detection and options.write:
         raise InputError("--write", True, "the cells of a board, without --detection")

@@ -30,23 +30,21 @@ def add(actions: Any) -> None:
 
 
 def _clock(options: argparse.Namespace) -> int:
-    from tailgate.base.files import writable_directory, write_atomic
-    from tailgate.board.clock import FILE, measure
+    from tailgate.base.files import writable_directory
+    from tailgate.board.clock import measure
     from tailgate.core.scenario import load_suite
 
     sizes.check("rounds", options.rounds)
     suite = load_suite(options.suite)
-    path = None if options.defence else writable_directory(Path(options.out) / suite.name) / FILE  # part of a file would lose the rest
+    folder = None if options.defence else writable_directory(Path(options.out) / suite.name)  # part of a file would lose the rest
     with progress(Console(stderr=True)) as update:
         clock = measure(
             suite, options.defence, rounds=options.rounds,
             progress=lambda done, total: update("timing", done, total, cells(done, total)),
         )  # fmt: skip
-    held = clock.model_dump_json(indent=1) + "\n"
-    if path is not None:
-        write_atomic(path, held.encode())
+    path = None if folder is None else clock.write(folder)
     if options.json:
-        print(held, end="")
+        print(clock.text(), end="")
         return 0
     of = "one car" if clock.agents == 1 else f"{clock.agents} agents"
     table = Table(title=escape(f"a step in {clock.scenario}, one episode of {of}, {clock.processor} [us]"))

@@ -36,9 +36,9 @@ def add(actions: Any) -> None:
 
 
 def _detect(options: argparse.Namespace) -> int:
-    from tailgate.board.board_format import load
     from tailgate.board.detect import detect
     from tailgate.board.detection import Effort
+    from tailgate.board.files import load
     from tailgate.board.run import BOARD
     from tailgate.core.scenario import load_suite
 

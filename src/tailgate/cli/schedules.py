@@ -32,10 +32,9 @@ def add(actions: Any) -> None:
 
 
 def _timing(options: argparse.Namespace) -> int:
-    from tailgate.base.files import write_atomic
-    from tailgate.board.board_format import load
+    from tailgate.board.files import load
     from tailgate.board.run import BOARD
-    from tailgate.board.timing import FILE, measure_timing
+    from tailgate.board.timing import measure_timing
     from tailgate.core.scenario import load_suite
     from tailgate.site.timing import points
 
@@ -47,11 +46,9 @@ def _timing(options: argparse.Namespace) -> int:
             board, suite, options.defence, episodes=options.episodes,
             progress=lambda done, total: update("schedules", done, total, f"{done} of {total} entries"),
         )  # fmt: skip
-    held = timing.model_dump_json(indent=1) + "\n"
-    if not options.defence:  # part of a file would lose the rest
-        write_atomic(folder / FILE, held.encode())
+    path = None if options.defence else timing.write(folder)  # part of a file would lose the rest
     if options.json:
-        print(held, end="")
+        print(timing.text(), end="")
         return 0
     title = f"{suite.name}: damage [%] at own times, and at those of twins"
     table = Table(title=escape(title), caption="on fresh episodes; 95 %, p after Holm")
@@ -67,5 +64,5 @@ def _timing(options: argparse.Namespace) -> int:
     console().print(table)
     for missing in timing.without:
         print(f"{missing.defence}: {missing.why}")
-    print("figures of some entries are not written" if options.defence else folder / FILE)
+    print(path or "figures of some entries are not written")
     return 0

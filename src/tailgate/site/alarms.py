@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from tailgate.board.schema import AlarmPart
+from tailgate.board.schema import Alarms
 from tailgate.board.words import percent
 from tailgate.evaluation.stats import mean_time
 
@@ -13,7 +13,7 @@ APART = 0.75  # of the drives with more false alarms in one half than in the oth
 LEVEL = 0.05  # of each of the three, for all scenarios of an entry together
 
 
-def alarms_of(suite: Suite) -> list[AlarmPart]:
+def alarms_of(suite: Suite) -> list[Alarms]:
     """All lines of a board that says so."""
     return suite.board.detection.alarms if suite.board.detection else []
 
@@ -75,7 +75,7 @@ def drifts_of(suite: Suite, defence: str) -> list[str]:
     return out + [f"alarm drift: {said}" for line in told if (said := _aside(line, LEVEL / len(told)))]
 
 
-def _aside(line: AlarmPart, level: float) -> str:
+def _aside(line: Alarms, level: float) -> str:
     """Of drives, which are independent: onsets of one drive come in clusters."""
     from scipy import stats
 
@@ -86,15 +86,15 @@ def _aside(line: AlarmPart, level: float) -> str:
     return f"its false alarms on {line.scenario} come in the {half} half of the drive, in {most} of {drives} drives with more in one half"
 
 
-def _rarely(line: AlarmPart) -> str:
+def _rarely(line: Alarms) -> str:
     return f"none in {time_text(line.running)}" if line.mean is None else f"one in {_mean(line)}"
 
 
-def _mean(line: AlarmPart) -> str:
+def _mean(line: Alarms) -> str:
     return "" if line.mean is None else time_text(line.mean)
 
 
-def _cell(line: AlarmPart | None) -> Data:
+def _cell(line: Alarms | None) -> Data:
     if line is None:
         return {"text": "\N{EN DASH}", "span": "", "rarer": False, "sort": ""}
     span = f"{time_text(line.low)} or more" if line.high is None else f"{time_text(line.low)} to {time_text(line.high)}"

@@ -18,8 +18,8 @@ from jinja2 import DictLoader, Environment, StrictUndefined
 from tailgate.base.assets import asset, embedded, inline
 from tailgate.base.errors import InputError
 from tailgate.base.files import writable_directory, write_atomic
-from tailgate.board.board_format import read_board
-from tailgate.board.measured import Measured
+from tailgate.board.attachments import Attachments
+from tailgate.board.files import read_board
 from tailgate.board.order import GROUPS, ordered
 from tailgate.board.words import HERE, TITLE, breakable
 
@@ -72,18 +72,18 @@ def _environment() -> Environment:
 
 
 def build_site(
-    boards: Sequence[dict[str, Any]], out: Path, *, title: str | None = None, replays: bool = True, measured: Sequence[Measured] = (),
+    boards: Sequence[dict[str, Any]], out: Path, *, title: str | None = None, replays: bool = True, measured: Sequence[Attachments] = (),
 ) -> Path:  # fmt: skip
     """Writes the site of `boards` (format tailgate-board-1) to the folder `out` and returns the path of its first page.
 
     replays: play each entry's worst episode again and write its page; without, the entries' pages say that it was not done.
-    measured: what lies beside each board.
+    measured: the attachments of each board.
     Raises InputError, before anything is written, for no board, two of a suite, one that is not of the format (names the field), and for
     what was measured of another suite.
     """
     suites = _suites(boards)
-    given = list(measured) or [Measured()] * len(suites)
-    found = [beside.belongs(suite.board) for suite, beside in zip(suites, given, strict=True)]
+    given = list(measured) or [Attachments()] * len(suites)
+    found = [held.belonging(suite.board) for suite, held in zip(suites, given, strict=True)]
     held = [_encoded(data, "board") for data in boards]
     heading = title or TITLE
     environment = _environment()

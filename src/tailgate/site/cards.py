@@ -12,9 +12,10 @@ from collections.abc import Mapping
 from typing import Any
 
 from tailgate.agents.zoo import zoo_card, zoo_names
-from tailgate.board.schema import EntryPart
+from tailgate.board.schema import Entry
 from tailgate.board.words import Name
-from tailgate.core.registry import Entry, Family, built_in
+from tailgate.core.registry import Entry as Registered
+from tailgate.core.registry import Family, built_in
 from tailgate.core.scenario import Suite as Played
 from tailgate.core.scenario import list_suites, load_scenario, load_suite
 from tailgate.core.threat import ThreatModel
@@ -32,7 +33,7 @@ BOUNDS = {  # of a threat model, and the kinds of attack that they bound
 
 
 @functools.cache
-def _registered(family: Family) -> dict[str, Entry]:
+def _registered(family: Family) -> dict[str, Registered]:
     return built_in(family)
 
 
@@ -118,7 +119,7 @@ def _drawn(card: Data) -> Data:
     return {"known": bool(card), "summary": plain(card.get("summary", "")), "fields": fields, "parameters": parameters}
 
 
-def card_of(suite: Suite, entry: EntryPart) -> Data:
+def card_of(suite: Suite, entry: Entry) -> Data:
     """The card of an entry: what the board says of it, over what is known of a defence that comes with the package."""
     card = own_card(suite, "defence", suite.defences[entry.defence]) | (entry.card or {})
     drawn = _drawn(card)

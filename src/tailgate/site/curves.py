@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from tailgate.board.order import ordered
-from tailgate.board.schema import LEVELS, CurvePart, EntryPart, Stealth
+from tailgate.board.schema import LEVELS, Curve, Entry, Stealth
 
 from .charts import STYLES, Axis, Dot, Line, chart, nice, path_of, ticks_at
 from .suite import Data, Suite, figure
@@ -15,7 +15,7 @@ SCALES = ("log", "linear")
 BLANK = {"text": figure(None), "span": "", "reason": "", "rarer": False}  # of a figure that a board has not
 
 
-def dots_of(curve: CurvePart) -> Line:
+def dots_of(curve: Curve) -> Line:
     kept = [(p, i) for i, p in enumerate(curve.points) if p.dose is not None]
     kept.sort(key=lambda item: item[0].dose or 0)
     fitted = [curve.fitted[i] for _, i in kept] if curve.fitted else []
@@ -24,7 +24,7 @@ def dots_of(curve: CurvePart) -> Line:
     return Line(curve.knowledge, style, dots, fitted)
 
 
-def curves_of(suite: Suite, wanted: Sequence[EntryPart] | None = None, gap: float = 14.0) -> list[Data]:
+def curves_of(suite: Suite, wanted: Sequence[Entry] | None = None, gap: float = 14.0) -> list[Data]:
     """One chart per defence on each scale, with a line per knowledge."""
     out = []
     for entry in ordered(suite.board.entries) if wanted is None else wanted:
@@ -60,7 +60,7 @@ def together_of(suite: Suite) -> Data | None:
     return {"charts": charts, "named": len(named), "of": len(there)}
 
 
-def stealth_of(suite: Suite, wanted: Sequence[EntryPart] | None = None) -> Data | None:
+def stealth_of(suite: Suite, wanted: Sequence[Entry] | None = None) -> Data | None:
     """Deviation that a stealthy attacker reaches against the mean time between false alarms, of some or all entries: chart and table."""
     entries = ordered(suite.board.entries) if wanted is None else wanted
     there = [(e, sorted(e.stealth, key=lambda s: s.hours)) for e in entries if e.stealth]

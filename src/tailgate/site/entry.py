@@ -9,9 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from tailgate.base.errors import InputError
-from tailgate.board.clock import Clock
-from tailgate.board.measured import Measured
-from tailgate.board.schema import LEVELS, CellPart, EntryPart, Robust
+from tailgate.board.attachments import Attachments, Clock
+from tailgate.board.schema import LEVELS, CellLine, Entry, Robust
 from tailgate.board.words import names_of, percent
 from tailgate.core.registry import Spec
 from tailgate.play.metrics import ERRORS, METRICS, UNITS
@@ -70,7 +69,7 @@ def _reason(error: Exception, row: Mapping[str, Any]) -> str:
     return text[:1].upper() + text[1:] + "."
 
 
-def _episode(suite: Suite, entry: EntryPart) -> str:
+def _episode(suite: Suite, entry: Entry) -> str:
     """Which episode is the worst one, in words; empty where the board does not say."""
     row = entry.worst_episode or {}
     scenario, attack, dose = (row.get(key) for key in ("scenario", "attack", "dose"))
@@ -81,7 +80,7 @@ def _episode(suite: Suite, entry: EntryPart) -> str:
     return f"{suite.where(scenario, attack)}, at a dose of {dose} steps.{near}"
 
 
-def _rates(suite: Suite, entry: EntryPart) -> list[Data]:
+def _rates(suite: Suite, entry: Entry) -> list[Data]:
     kept = {(r.dose, r.knowledge): r for r in entry.rates}
     out = []
     for dose in dict.fromkeys(r.dose for r in entry.rates):
@@ -95,7 +94,7 @@ def _rates(suite: Suite, entry: EntryPart) -> list[Data]:
     return out
 
 
-def _worst(suite: Suite, entry: EntryPart) -> list[Data]:
+def _worst(suite: Suite, entry: Entry) -> list[Data]:
     """Per scenario and shown dose the attack that did most damage; computed optima do not count."""
     mine = [c for c in suite.board.cells if c.defence == entry.defence and not c.optimal and c.attack != "none"]
     out = []
@@ -107,7 +106,7 @@ def _worst(suite: Suite, entry: EntryPart) -> list[Data]:
     return out
 
 
-def _cell(suite: Suite, cell: CellPart) -> Data:
+def _cell(suite: Suite, cell: CellLine) -> Data:
     damage = cell.damage
     return {
         "scenario": cell.scenario, "dose": dose_text(cell.dose), "dose_sort": "" if cell.dose is None else cell.dose,
@@ -118,9 +117,9 @@ def _cell(suite: Suite, cell: CellPart) -> Data:
     }  # fmt: skip
 
 
-def _every(suite: Suite, mine: Sequence[CellPart]) -> list[Data]:
+def _every(suite: Suite, mine: Sequence[CellLine]) -> list[Data]:
     """All cells of a defence: a row per scenario and attack, a column per dose."""
-    rows: dict[tuple[str, str, str], dict[Any, CellPart]] = {}
+    rows: dict[tuple[str, str, str], dict[Any, CellLine]] = {}
     for cell in mine:
         rows.setdefault((cell.scenario, cell.attack, cell.knowledge), {})[cell.dose] = cell
     out = []
@@ -143,7 +142,7 @@ def _robust(suite: Suite, item: Robust) -> Data:
     return {"scenario": item.scenario, "undamaged": share, "change": change, "worst": worst}
 
 
-def _clean(suite: Suite, entry: EntryPart) -> list[Data]:
+def _clean(suite: Suite, entry: Entry) -> list[Data]:
     road, out = suite.board.suite.bound is None, []
     for name, spread in entry.clean.items():
         about = " ".join((METRICS[name].__doc__ or "").split()) if name in METRICS else ""
@@ -153,7 +152,7 @@ def _clean(suite: Suite, entry: EntryPart) -> list[Data]:
     return out
 
 
-def _replayed(entry: EntryPart) -> str:
+def _replayed(entry: Entry) -> str:
     """What came of the rows that were played again; empty where nobody has said anything of them."""
     held = entry.verified
     if held is None:
@@ -167,7 +166,7 @@ def _replayed(entry: EntryPart) -> str:
     return f"Replayed: {which} played again; {' and '.join(parts)}." if asked else "Not replayed: no row was played again."
 
 
-def _checked(entry: EntryPart) -> str:
+def _checked(entry: Entry) -> str:
     """What came of the cells that were played again from the board alone; empty where none was."""
     held = entry.checked
     if held is None:
@@ -176,7 +175,7 @@ def _checked(entry: EntryPart) -> str:
     return f"Played again from this board alone, without its rows: {said}."
 
 
-def _rank(suite: Suite, entry: EntryPart) -> str:
+def _rank(suite: Suite, entry: Entry) -> str:
     if entry.rank is None:
         return ""
     of = sum(e.class_ == entry.class_ and e.rank is not None for e in suite.board.entries)
@@ -206,7 +205,7 @@ def _clocked(clock: Clock | None, defence: str) -> str:
 
 
 def entry_page(
-    suite: Suite, entry: EntryPart, replayed: Replayed | None, also: list[tuple[str, str]], measured: Measured
+    suite: Suite, entry: Entry, replayed: Replayed | None, also: list[tuple[str, str]], measured: Attachments
 ) -> Data:
     """All that an entry's page shows. also: names of other suites with an entry of the same text, and their pages."""
     curves = curves_of(suite, [entry], gap=7.0)

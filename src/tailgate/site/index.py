@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections import Counter
 
-from tailgate.board.measured import Measured
+from tailgate.board.attachments import Attachments
 from tailgate.board.order import GROUPS, ordered
-from tailgate.board.schema import LEVELS, CellPart, Dose, Level
+from tailgate.board.schema import LEVELS, CellLine, Dose, Level
 from tailgate.board.words import Name, at_least, percent
 from tailgate.training import adaptive
 
@@ -21,7 +21,7 @@ OWN = ""  # in place of an attack: all that were trained against the row's defen
 TRAINED = Name("trained against it", ("the worst",))
 
 
-def _lines(suite: Suite, measured: Measured) -> list[Data]:
+def _lines(suite: Suite, measured: Attachments) -> list[Data]:
     ranked = [e for e in suite.board.entries if e.rank]
     out = []
     for i, entry in enumerate(ordered(suite.board.entries)):
@@ -66,7 +66,7 @@ def heat_of(suite: Suite) -> Data | None:
     entries = ordered(suite.board.entries)
     first = None if len(scenarios) > 1 else scenarios[0]  # None: the worst of all
 
-    def look(where: list[str], dose: Dose, defence: str, column: tuple[str, Level]) -> CellPart | None:
+    def look(where: list[str], dose: Dose, defence: str, column: tuple[str, Level]) -> CellLine | None:
         mine = [a for a, d in own.items() if d == defence and a not in withdrawn] if column[0] == OWN else [column[0]]
         return worse(kept.get((s, dose, defence, a, column[1])) for s in where for a in mine)
 
@@ -103,7 +103,7 @@ def _trained_for(suite: Suite) -> dict[str, str]:
     return {a.attack: a.trained_on for a in suite.board.attacks if a.trained_on and met.get(a.attack) == {a.trained_on}}
 
 
-def _packed(cell: CellPart | None, reasons: dict[str, int]) -> int | list[float | int | None]:
+def _packed(cell: CellLine | None, reasons: dict[str, int]) -> int | list[float | int | None]:
     """0 for no cell, else [share, low, high, episodes, failed, index of the reason]; the share is null where there are no figures."""
     if cell is None:
         return 0
@@ -265,7 +265,7 @@ def _group(title: str, about: str, rows: list[Data]) -> Data:
     return {"title": title, "about": about, "rows": rows, "shared": shared, "scope": "all" if n == len(rows) else "unless said otherwise"}
 
 
-def section(suite: Suite, measured: Measured) -> Data:
+def section(suite: Suite, measured: Attachments) -> Data:
     """All that index.html shows of a suite."""
     board = suite.board
     rows = _lines(suite, measured)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from tailgate.board.order import sort_dose
-from tailgate.board.schema import LEVELS, Board, CellPart, Dose, EntryPart, Level, Limited
+from tailgate.board.schema import LEVELS, Board, CellLine, Dose, Entry, Level, Limited
 from tailgate.board.words import Name, at_least, names_of, percent, shade
 
 from .charts import Axis
@@ -104,7 +104,7 @@ class Suite:
         return f"{name}, {scenario}" if scenario else name
 
 
-def critical_of(suite: Suite, entry: EntryPart, level: Level) -> Data:
+def critical_of(suite: Suite, entry: Entry, level: Level) -> Data:
     """An entry's critical dose in words, and its interval as places on the dose axis."""
     critical = entry.critical_dose.get(level)
     if critical is None:
@@ -142,7 +142,7 @@ def share_of(share: Limited | None) -> Data:
     return {"text": percent(share.value), "low": at_least(share.low), "sort": f"{share.value:.6g}"}
 
 
-def gates_of(entry: EntryPart) -> Data:
+def gates_of(entry: Entry) -> Data:
     failed = [g for g in entry.gates if not g.passed]
     names = ", ".join(dict.fromkeys(g.gate.replace("_", " ") for g in failed))
     if not entry.gates:
@@ -150,7 +150,7 @@ def gates_of(entry: EntryPart) -> Data:
     return {"text": f"{len(entry.gates) - len(failed)} of {len(entry.gates)}", "failed": names, "sort": len(failed)}
 
 
-def cell_of(cell: CellPart | None, limit: float) -> Data:
+def cell_of(cell: CellLine | None, limit: float) -> Data:
     """A cell of the heat map: what stands in it, its shade, and the words for those who do not see it."""
     if cell is None or cell.damage is None:
         what = "not played" if cell is None or not (cell.reason or cell.failed) else "failed" if cell.failed else "skipped"
@@ -164,7 +164,7 @@ def cell_of(cell: CellPart | None, limit: float) -> Data:
     return {"text": percent(damage.value), "shade": shade(damage.value), "label": label, "over": over, "lost": cell.failed > 0}
 
 
-def worse(cells: Iterable[CellPart | None]) -> CellPart | None:
+def worse(cells: Iterable[CellLine | None]) -> CellLine | None:
     """The cell with the most damage; of equal ones the first. One without figures only where no other is."""
     there = [c for c in cells if c is not None]
     known = [c for c in there if c.damage is not None]

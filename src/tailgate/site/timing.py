@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from tailgate.board.timing import Timing
+from tailgate.board.attachments import Timing
 from tailgate.board.words import names_of, percent
 
 from .suite import Data, dose_text

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from tailgate.board.schema import LEVELS, Bound, EntryPart, Level, TrustPart
+from tailgate.board.schema import LEVELS, Bound, Entry, Level, Trust
 from tailgate.board.words import at_least
 from tailgate.evaluation.rows import CLEAN
 
@@ -34,7 +34,7 @@ def trust_of(suite: Suite) -> Data | None:
     }  # fmt: skip
 
 
-def trust_cell(suite: Suite, entry: EntryPart) -> Data:
+def trust_cell(suite: Suite, entry: Entry) -> Data:
     """The bound of safety against black boxes in the table, and the one of all properties in its title."""
     bound = entry.trust.safety.get("black") if entry.trust else None
     if entry.trust is None or bound is None:
@@ -45,7 +45,7 @@ def trust_cell(suite: Suite, entry: EntryPart) -> Data:
     return {"text": at_least(bound.lower, 1), "sort": f"{bound.lower:.6g}", "about": "; ".join(about)}
 
 
-def trust_page(suite: Suite, entry: EntryPart) -> Data | None:
+def trust_page(suite: Suite, entry: Entry) -> Data | None:
     """The section of an entry: a line per conjunction and knowledge."""
     head, trust = suite.board.trust, entry.trust
     if head is None:
@@ -76,7 +76,7 @@ def _against(suite: Suite, level: Level) -> int:
     return sum(a.attack != CLEAN and a.knowledge in allowed for a in (suite.board.trust.attacks if suite.board.trust else ()))
 
 
-def _members(head: TrustPart, bound: Bound | None, safety: bool) -> str:
+def _members(head: Trust, bound: Bound | None, safety: bool) -> str:
     names = bound.of if bound else [p.name for p in head.properties if p.safety or not safety]
     return ", ".join(_plain(name) for name in names)
 
@@ -86,7 +86,7 @@ def _worst(suite: Suite, bound: Bound) -> str:
     return f"{place}, dose {dose_text(bound.dose)}"
 
 
-def _why(suite: Suite, entry: EntryPart) -> str:
+def _why(suite: Suite, entry: Entry) -> str:
     """Why an entry has no bound, or not all; attacks by their names, without the places of files."""
     if entry.trust is None:
         return "not among the defences that were checked"
