@@ -12,9 +12,6 @@ from markupsafe import Markup, escape
 
 from tailgate.core.registry import split_text
 
-HERE = "tailgate.site"  # where the files of its pages lie
-TITLE = "Tailgate leaderboard"
-
 
 @dataclass(frozen=True)
 class Name:

@@ -1,26 +1,23 @@
-"""Builds the leaderboard: one self-contained HTML page, and the aggregated figures beside it as JSON."""
+"""The page of rows, without gates and limits of a board: index.html, and its figures in summary.json."""
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from jinja2 import Environment, StrictUndefined
-
-from tailgate.base.assets import asset, inline
 from tailgate.base.errors import InputError
 from tailgate.base.files import writable_directory, write_atomic
 from tailgate.board.entry import reference
-from tailgate.board.words import HERE, TITLE, Name, breakable, names_of, percent, shade, spans, steps, ticks
+from tailgate.board.words import Name, names_of, percent, shade, spans, steps, ticks
 from tailgate.core.registry import Entry, entries
 from tailgate.evaluation.summary import summarise
 from tailgate.play.metrics import METRICS
 
-Data = dict[str, Any]
+from .pages import Data, Pages, encoded
+
 COLUMNS = (  # of the table of every cell, after the crash share: key of the summary, heading
     ("min_gap", "Min. gap [m]"), ("max_error", "Max. error [m]"), ("alarm_onsets", "Alarm onsets"),
     ("attack_steps", "Attack steps"),
@@ -183,7 +180,7 @@ def _curve(data: Sequence[Data] | None) -> Data | None:
 def build(
     rows: Sequence[Data], out: Path, *, title: str | None = None, curve: list[Data] | None = None, headline: Data | None = None
 ) -> Path:
-    """Writes out/index.html and out/summary.json from evaluation rows, and returns the path of the page.
+    """Write out/index.html and out/summary.json from evaluation rows, and return the path of the page.
 
     curve: [{steps, seed, crash}] of a training run; headline: {text, items: [{label, value, low, high, note}]}; shares are 0 to 1.
     Raises InputError for no rows, and for a curve or headline that cannot be drawn.
@@ -200,17 +197,15 @@ def build(
         "rows": len(rows), "played": sum(row["status"] == "ok" for row in rows), "seeds": spans(row["seed"] for row in rows),
         "purposes": _distinct(rows, "purpose"), "versions": _distinct(rows, "version"), "engines": _distinct(rows, "engine"),
     }  # fmt: skip
-    heading = title or TITLE
-    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    environment.filters["breakable"] = breakable
+    pages = Pages(title)
     columns = [(key, text, METRICS[key].__doc__ or "") for key, text in COLUMNS]
-    page = environment.from_string(asset(HERE, "rows_page.html")).render(
-        title=heading, css=inline(HERE, "page.css"), js=inline(HERE, "page.js"), columns=columns, facts=facts, headline=_headline(headline),
-        curve=_curve(curve), sections=[_section(key, *group, words) for key, group in groups.items()],
+    page = pages.render(
+        "rows_page.html", columns=columns, facts=facts, headline=_headline(headline), curve=_curve(curve),
+        sections=[_section(key, *group, words) for key, group in groups.items()],
         families=[("Defences", _cards(words, "defence")), ("Attacks", _cards(words, "attack"))],
     )  # fmt: skip
-    figures = {"title": heading, **facts, "cells": cells, "curve": curve, "headline": headline}
+    summary = {"title": pages.title, **facts, "cells": cells, "curve": curve, "headline": headline}
     folder = writable_directory(Path(out))
-    write_atomic(folder / "summary.json", (json.dumps(figures, indent=1, allow_nan=False) + "\n").encode())
-    write_atomic(folder / "index.html", page.encode("utf-8", "replace"))  # a lone surrogate in a row must not stop the page
+    write_atomic(folder / "summary.json", encoded(summary, "summary"))
+    write_atomic(folder / "index.html", page)
     return folder / "index.html"
