@@ -7,46 +7,34 @@ of the board were played.
 
 from __future__ import annotations
 
+import itertools
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
-from tailgate.base import sizes
-from tailgate.base.errors import InputError, unknown
+from tailgate.base.errors import InputError
 from tailgate.base.version import VERSION
-from tailgate.core.draws import constants
 from tailgate.core.registry import Family, Spec
-from tailgate.core.scenario import Suite, list_suites, load_suite
+from tailgate.core.scenario import Suite
 from tailgate.core.schema import build
 from tailgate.evaluation.attack_list import Admitted
 from tailgate.evaluation.cells import Cell, run
+from tailgate.evaluation.checks import LAST_BITS, Finding, Unplayable, again, counts, drawn, refused, sampling
 from tailgate.evaluation.paired import CLOSE, PAIR
-from tailgate.evaluation.verify import files_of
 
 from .cells import figures, shared_of
 from .consistency import same, sharpened, strays, untold
 from .damage import Row
-from .files import amended, read_board
-from .schema import Board, CellLine
+from .files import amended, known, read_board, suite_of
+from .schema import Board, CellLine, Data
 from .score import score
 
-Data = dict[str, Any]
 VERDICTS = ("equal", "differs", "unchecked")
 PRINTS = ("hits", "decisions", "trace")  # which a board of before they were made lacks
 SCORED = ("class", "uses", "status", "why", "gates", "critical_dose", "rates", "rank", "clean", "flags", "robustness")  # of an entry
 COMPARED = ("n", "failed", "damage", *PRINTS)
 EPISODES = 20_000  # whose rows are held at a time
-
-
-@dataclass(frozen=True)
-class Seen:
-    """What became of a cell; `here`: what came out, None where it was not played."""
-
-    verdict: Literal["equal", "differs", "unchecked"]
-    why: str = ""
-    here: Data | None = None
 
 
 def check(
@@ -68,36 +56,31 @@ def check(
     suite = suite_of(board)
     known(defences, [entry.defence for entry in board.entries])
     mine = [i for i, cell in enumerate(board.cells) if not defences or cell.defence in defences]
-    asked = drawn(mine, sample, sample_seed)
-    seen: dict[int, Seen] = {}
+    asked = drawn(mine, sample, sample_seed, "check")
+    held: list[Row] = []  # of all cells of the board, if all are played
+
+    def play(cells: Mapping[int, Cell]) -> Iterator[tuple[int, Data]]:
+        before = len(asked) - len(cells)
+
+        def tell(done: int, _: int) -> None:
+            if progress is not None:
+                progress(before + done, len(asked))
+
+        for some in _slices(cells):
+            rows = run([cells[i] for i in some], workers=workers, progress=tell)
+            before += len(some)
+            if len(cells) == len(board.cells):
+                held.extend(rows)
+            each = iter(rows)
+            yield from ((i, figures(list(itertools.islice(each, cells[i].seeds)), suite)) for i in some)
+
     files = {attack.attack: attack.digest for attack in board.attacks}
-    cells: dict[int, Cell] = {}
-    for i in asked:
-        cell = _cell(board.cells[i], board, suite)
-        if isinstance(cell, str):
-            seen[i] = Seen("unchecked", cell)
-        else:
-            cells[i] = cell
-
-    def told(done: int, _: int) -> None:
-        if progress is not None:
-            progress(len(seen) + done, len(asked))
-
-    whole = len(cells) == len(board.cells)
-    held: list[Row] = []
-    for some in _slices(cells):
-        rows = run([cells[i] for i in some], workers=workers, progress=told)
-        held += rows if whole else []
-        each = iter(rows)
-        for i in some:
-            found = compared(board.cells[i], figures([next(each) for _ in range(cells[i].seeds)], suite))
-            if found.verdict == "differs" and files.get(cells[i].attack) not in (None, Spec("attack", cells[i].attack).digest):
-                found = replace(found, why=f"the attack's file here is another one than that of the board; {found.why}")
-            seen[i] = found
+    seen = again(asked, lambda i: _cell(board.cells[i], board, suite), play, lambda i, here: _compared(board.cells[i], here, files))
     off = strays(data, suite)
     listed = {(stray["defence"], stray["field"]) for stray in off}
     off += [stray for stray in _scored(data, held, suite) if (stray["defence"], stray["field"]) not in listed]
-    return _report(board, asked, seen, sample, sample_seed) | {"strays": off, "untold": untold(data, suite), "scored": bool(held)}
+    more = {"strays": off, "untold": untold(data, suite), "scored": bool(held)}
+    return _report(board, seen, sampling(sample, sample_seed)) | more
 
 
 def _scored(data: Data, rows: list[Row], suite: Suite) -> Iterator[Data]:
@@ -143,72 +126,25 @@ def _same_pairs(board: list[Data], here: list[Data]) -> bool:
     return True
 
 
-def suite_of(board: Board) -> Suite:
-    """The suite of the package that the board is of. Raises InputError where there is none."""
-    if board.suite.name not in list_suites():
-        raise unknown("board: suite.name", board.suite.name, list_suites())
-    suite = load_suite(board.suite.name)
-    agree(board, suite)
-    return suite
-
-
-def agree(board: Board, suite: Suite) -> None:
-    """Raise InputError for a board of another suite or version than is here."""
-    held = board.suite
-    if held.version != VERSION:
-        raise InputError("board: suite.version", held.version, f"{VERSION}, which is here")
-    if held.hash != suite.hash:
-        raise InputError("board: suite.hash", held.hash, f"{suite.hash}, which the suite {suite.name} has here")
-    if held.episodes is None or not 1 <= held.episodes <= 4096:
-        raise InputError("board: suite.episodes", held.episodes, "1 to 4096 episodes of a cell")
-
-
-def known(names: Sequence[str], entries: Sequence[str]) -> None:
-    """Raise InputError for a name that is none of the entries'."""
-    for name in names:
-        if name not in entries:
-            raise unknown("defence", name, entries)
-
-
-def drawn(places: list[int], sample: int | None, seed: int) -> list[int]:
-    """So many of the places, ascending; all where no number is asked for, or a larger one. Raises InputError for one below 1."""
-    if sample is not None:
-        sizes.check("sample", sample)
-    if sample is None or sample >= len(places):
-        return places
-    order = constants("check", seed).uniform((len(places),))[0].argsort()
-    return sorted(places[int(i)] for i in order[:sample])
-
-
-def _cell(part: CellLine, board: Board, suite: Suite) -> Cell | str:
-    """The cell to play; or why it cannot be played here."""
-    try:
-        for family, text in (("defence", part.defence), ("attack", part.attack)):
-            if why := refused(family, text):  # type: ignore[arg-type]
-                return why
-        cell = Cell(
-            suite.name, part.scenario, part.dose, part.defence, part.attack, board.suite.episodes or 0, board.suite.purpose or "report",
-            threat=suite.granted, beacon=board.suite.beacon or "",
-        )  # fmt: skip
-        spec = Spec("attack", part.attack)
-        knowledge = cell.place(spec.make(), spec.entry.knowledge).threat_model.knowledge
-        _ = Spec("defence", part.defence).make(), cell.episodes
-    except Exception as error:  # a board can hold anything
-        return str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
+def _cell(part: CellLine, board: Board, suite: Suite) -> Cell:
+    """Return the cell to play. Raises the reason why it cannot be played here."""
+    families: tuple[tuple[Family, str], ...] = (("defence", part.defence), ("attack", part.attack))
+    for family, text in families:
+        if why := refused(family, text):
+            raise Unplayable(why)
+    cell = Cell(
+        suite.name, part.scenario, part.dose, part.defence, part.attack, board.suite.episodes or 0, board.suite.purpose or "report",
+        threat=suite.granted, beacon=board.suite.beacon or "",
+    )  # fmt: skip
+    spec = Spec("attack", part.attack)
+    knowledge = cell.place(spec.make(), spec.entry.knowledge).threat_model.knowledge
+    _ = Spec("defence", part.defence).make(), cell.episodes
     if knowledge != part.knowledge:
-        return f"the attack {part.attack!r} is granted the knowledge {knowledge} here"
+        raise Unplayable(f"the attack {part.attack!r} is granted the knowledge {knowledge} here")
     return cell
 
 
-def refused(family: Family, text: str) -> str:
-    """Why a component that a board names is not played here; empty where it is."""
-    spec = Spec(family, text)
-    if spec.foreign or spec.sandboxed:
-        return f"the {family} {text!r} is code to import, which a board may not make us do"
-    return f"the {family}'s file is not here" if any(not path.is_file() for path in files_of(spec)) else ""
-
-
-def _slices(cells: dict[int, Cell]) -> Iterator[list[int]]:
+def _slices(cells: Mapping[int, Cell]) -> Iterator[list[int]]:
     """Places of cells whose rows are held together."""
     some: list[int] = []
     for i in cells:
@@ -220,15 +156,21 @@ def _slices(cells: dict[int, Cell]) -> Iterator[list[int]]:
         yield some
 
 
-def compared(part: CellLine, here: Data) -> Seen:
-    """What the figures of a cell, as `scoring.cells.figures` makes them, say of the cell of a board."""
-    says = {name: value for name, value in part.model_dump(include=set(COMPARED)).items() if name not in PRINTS or value is not None}
-    off = [name for name in COMPARED if name in says and says[name] != here[name]]
-    parts = [part for name in off for part in _parts(name, says[name], here[name])]
-    why = ", ".join(f"{name}: board {one}, here {other}" for name, one, other in parts)
-    if off == ["trace"]:
-        why = "trace only: decisions and figures agree, as between two platforms whose last bits differ"
-    return Seen("differs", why, here) if off else Seen("equal", "", here)
+def compared(part: CellLine, here: Data) -> Finding:
+    """Compare a cell of a board with its figures here, as `board.cells.figures` makes them. What the board does not say counts as equal."""
+    said = {name: value for name, value in part.model_dump(include=set(COMPARED)).items() if name not in PRINTS or value is not None}
+    off = [name for name in COMPARED if name in said and said[name] != here[name]]
+    parts = [part for name in off for part in _parts(name, said[name], here[name])]
+    why = f"trace {LAST_BITS}" if off == ["trace"] else ", ".join(f"{name}: board {one}, here {other}" for name, one, other in parts)
+    return Finding("differs" if off else "equal", why, here=here)
+
+
+def _compared(part: CellLine, here: Data, files: Mapping[str, str | None]) -> Finding:
+    """Compare, and say where the attack's file is another one than the board's."""
+    found = compared(part, here)
+    if found.verdict == "differs" and files.get(part.attack) not in (None, Spec("attack", part.attack).digest):
+        found.why = f"the attack's file here is another one than that of the board; {found.why}"
+    return found
 
 
 def _parts(name: str, says: Any, here: Any) -> list[tuple[str, Any, Any]]:
@@ -238,29 +180,25 @@ def _parts(name: str, says: Any, here: Any) -> list[tuple[str, Any, Any]]:
     return [(name if key == "value" else f"{name}.{key}", value, here.get(key)) for key, value in says.items() if value != here.get(key)]
 
 
-def _report(board: Board, asked: list[int], seen: dict[int, Seen], sample: int | None, sample_seed: int) -> Data:
-    total = Counter(cell.defence for cell in board.cells)
-    by_defence: dict[str, Counter[str]] = {}
-    for i in asked:
-        by_defence.setdefault(board.cells[i].defence, Counter())[seen[i].verdict] += 1
-    reasons = Counter(seen[i].why for i in asked if seen[i].verdict == "unchecked")
-    counts: Counter[str] = Counter(seen[i].verdict for i in asked)
+def _report(board: Board, seen: dict[int, Finding], sample: Data) -> Data:
+    total, by_defence = Counter(cell.defence for cell in board.cells), dict[str, list[Finding]]()
+    for i, finding in seen.items():
+        by_defence.setdefault(board.cells[i].defence, []).append(finding)
+    unchecked = [i for i, finding in seen.items() if finding.verdict == "unchecked"]
+    reasons = Counter(seen[i].why for i in unchecked)
     return {
-        "format": "tailgate-check-1", "suite": board.suite.name, "version": VERSION, "cells": len(board.cells),
-        "asked": len(asked), "sample": sample, **({} if sample is None else {"sample_seed": sample_seed}),
-        "counts": {verdict: counts[verdict] for verdict in VERDICTS},
-        "entries": [
-            {"defence": name, "cells": total[name], **{verdict: held[verdict] for verdict in VERDICTS}} for name, held in by_defence.items()
-        ],
+        "format": "tailgate-check-1", "suite": board.suite.name, "version": VERSION, "cells": len(board.cells), "asked": len(seen),
+        **sample, "counts": counts(seen.values(), VERDICTS),
+        "entries": [{"defence": name, "cells": total[name], **counts(held, VERDICTS)} for name, held in by_defence.items()],
         "reasons": [{"why": why, "cells": n} for why, n in reasons.most_common()],
-        "untrained": _untrained(board, [i for i in asked if seen[i].verdict == "unchecked"]),
+        "untrained": _untrained(board, unchecked),
         "findings": [
             {**board.cells[i].model_dump(include={"scenario", "dose", "defence", "attack", "knowledge"}),
-             "verdict": seen[i].verdict, "why": seen[i].why}
-            for i in asked if seen[i].verdict != "equal"
+             "verdict": finding.verdict, "why": finding.why}
+            for i, finding in seen.items() if finding.verdict != "equal"
         ],
         "prints": {
-            str(i): {name: held.here[name] for name in PRINTS} for i in asked if (held := seen[i]).verdict == "equal" and held.here
+            str(i): {name: finding.here[name] for name in PRINTS} for i, finding in seen.items() if finding.verdict == "equal"
         },
     }  # fmt: skip
 

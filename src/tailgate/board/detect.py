@@ -6,7 +6,6 @@ import contextlib
 import dataclasses
 import functools
 import itertools
-from collections import Counter
 from collections.abc import Generator, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -18,12 +17,13 @@ from tailgate.base.pool import each
 from tailgate.base.version import VERSION
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import Suite
+from tailgate.evaluation.checks import Finding, Unplayable, again, differences, drawn, refused, sampling
 
-from .check import VERDICTS, agree, drawn, known, refused, suite_of
+from .check import VERDICTS
 from .consistency import same
 from .detection import EFFORT, Effort, Progress, detection, plants, stealth_impact
 from .false_alarms import false_alarms
-from .files import amended, load, read_board, save
+from .files import agree, amended, known, load, read_board, save, suite_of
 
 Data = dict[str, Any]
 LINES = ("entries", "without", "alarms")  # of a detection board: figures, why there are none, and false alarms at the thresholds
@@ -192,31 +192,37 @@ def check_detection(
     part = {entry["defence"] for entry in data["entries"] if _takes_part(entry)}
     names = list(dict.fromkeys(line["defence"] for key in LINES for line in held.get(key, ()) if line["defence"] in part))
     known(defences, names)
-    mine = list(defences) or names
-    asked = [mine[i] for i in drawn(list(range(len(mine))), sample, sample_seed)]
     attacks = list(dict.fromkeys(line["attack"] for line in held["entries"]))
-    away = {name: why for name in asked if (why := refused("defence", name))}
-    if why := next(filter(None, (refused("attack", attack) for attack in attacks)), ""):
-        away = dict.fromkeys(asked, why)
-    effort, counts, findings = _effort(held), {name: Counter[str]() for name in asked}, []
-    stealth = {entry["defence"]: entry.get("stealth") for entry in data["entries"]}
-    guards = [name for name in asked if name not in away]
-    for guard, here in _play(suite, guards, attacks, effort, board.suite.beacon or "", workers, progress):
+    lost = next(filter(None, (refused("attack", attack) for attack in attacks)), "")
+    effort, stealth = _effort(held), {entry["defence"]: entry.get("stealth") for entry in data["entries"]}
+
+    def prepare(name: str) -> str:
+        if why := lost or refused("defence", name):
+            raise Unplayable(why)
+        return name
+
+    def compare(name: str, here: Data) -> Finding:
+        """Compare an entry; `here` counts its figures."""
         told = {part: lines for part, lines in here.items() if part not in LINES or part in held}
-        says, made = _by_place(held | {"stealth": stealth.get(guard)}, guard), _by_place(told, guard)
-        for place in dict.fromkeys((*says, *made)):
-            off = _differences(says.get(place), made.get(place))
-            counts[guard]["differs" if off else "equal"] += 1
-            findings += [dict(zip((*PLACE, "of"), place, strict=True)) | {"defence": guard} | one for one in off]
-    for name in away:
-        counts[name]["unchecked"] = len(_by_place(held | {"stealth": stealth.get(name)}, name))
-    total: Counter[str] = sum(counts.values(), Counter())
+        says, made = _by_place(held | {"stealth": stealth.get(name)}, name), _by_place(told, name)
+        off = {place: _differences(says.get(place), made.get(place)) for place in dict.fromkeys((*says, *made))}
+        lines = [dict(zip((*PLACE, "of"), place, strict=True)) | {"defence": name} | one for place, some in off.items() for one in some]
+        wrong = sum(map(bool, off.values()))
+        return Finding("differs" if wrong else "equal", "", lines, {"equal": len(off) - wrong, "differs": wrong, "unchecked": 0})
+
+    asked = drawn(list(defences) or names, sample, sample_seed, "check")
+    found = again(asked, prepare, lambda jobs: _play(suite, [*jobs], attacks, effort, board.suite.beacon or "", workers, progress), compare)
+    counts = {
+        name: finding.here or dict.fromkeys(VERDICTS, 0) | {"unchecked": len(_by_place(held | {"stealth": stealth.get(name)}, name))}
+        for name, finding in found.items()
+    }
     return {
-        "format": "tailgate-check-detection-1", "suite": board.suite.name, "version": VERSION, "of": len(names),
-        "asked": len(asked), "sample": sample, **({} if sample is None else {"sample_seed": sample_seed}),
-        "counts": {verdict: total[verdict] for verdict in VERDICTS},
-        "entries": [{"defence": name, **{verdict: counts[name][verdict] for verdict in VERDICTS}} for name in asked],
-        "findings": findings, "reasons": [{"defence": name, "why": why} for name, why in away.items()],
+        "format": "tailgate-check-detection-1", "suite": board.suite.name, "version": VERSION, "of": len(names), "asked": len(asked),
+        **sampling(sample, sample_seed),
+        "counts": {verdict: sum(one[verdict] for one in counts.values()) for verdict in VERDICTS},
+        "entries": [{"defence": name, **one} for name, one in counts.items()],
+        "findings": [line for finding in found.values() for line in finding.differences],
+        "reasons": [{"defence": name, "why": finding.why} for name, finding in found.items() if finding.verdict == "unchecked"],
     }  # fmt: skip
 
 
@@ -231,5 +237,4 @@ def _differences(says: Data | None, here: Data | None) -> list[Data]:
     """Field by field; a board of before the limits of stealth were there says nothing of them."""
     if says is None or here is None:
         return [{"field": "", "board": says, "here": here}]
-    keys = [*says, *(key for key in here if key not in says and key not in YOUNG)]
-    return [{"field": key, "board": says.get(key), "here": here.get(key)} for key in keys if not same(says.get(key), here.get(key))]
+    return differences([*says, *(key for key in here if key not in says and key not in YOUNG)], says, here, same, "board")

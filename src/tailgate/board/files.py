@@ -10,9 +10,11 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from tailgate.base.errors import InputError, said, wanted
+from tailgate.base.errors import InputError, said, unknown, wanted
 from tailgate.base.files import sweep, write_atomic
 from tailgate.base.reading import load_json
+from tailgate.base.version import VERSION
+from tailgate.core.scenario import Suite, list_suites, load_suite
 from tailgate.evaluation.stats import mean_time
 
 from .schema import FORMAT, AtThreshold, Board, Data, Detection, EntryTrust, Part
@@ -138,3 +140,30 @@ class _Agreement:
                     raise InputError(f"{where}.{name}.{level}.k", bound.k, f"at most {bound.n}, the number of runs")
                 if bound is not None and (missing := {bound.attack, *bound.attacks} - known):
                     raise InputError(f"{where}.{name}.{level}.attacks", min(missing), "one of the attacks in the board's trust")
+
+
+def suite_of(board: Board) -> Suite:
+    """Return the suite of the package that the board is of. Raises InputError where there is none."""
+    if board.suite.name not in list_suites():
+        raise unknown("board: suite.name", board.suite.name, list_suites())
+    suite = load_suite(board.suite.name)
+    agree(board, suite)
+    return suite
+
+
+def agree(board: Board, suite: Suite) -> None:
+    """Raise InputError for a board of another suite or version than is here."""
+    held = board.suite
+    if held.version != VERSION:
+        raise InputError("board: suite.version", held.version, f"{VERSION}, which is here")
+    if held.hash != suite.hash:
+        raise InputError("board: suite.hash", held.hash, f"{suite.hash}, which the suite {suite.name} has here")
+    if held.episodes is None or not 1 <= held.episodes <= 4096:
+        raise InputError("board: suite.episodes", held.episodes, "1 to 4096 episodes of a cell")
+
+
+def known(names: Sequence[str], entries: Sequence[str]) -> None:
+    """Raise InputError for a name that is none of the entries'."""
+    for name in names:
+        if name not in entries:
+            raise unknown("defence", name, entries)

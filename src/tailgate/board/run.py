@@ -15,13 +15,13 @@ from tailgate.base.version import VERSION
 from tailgate.core.scenario import Suite
 from tailgate.evaluation.attack_list import attacks_of, list_of
 from tailgate.evaluation.cells import evaluate
+from tailgate.evaluation.checks import refused
 from tailgate.evaluation.rows import CLEAN, read_rows
 from tailgate.trust.run import REPORT, with_trust
 
 from .card import with_cards
 from .cells import shared_of
-from .check import agree, refused
-from .files import load, read_board, save
+from .files import agree, load, read_board, save
 from .kept import with_kept
 from .score import score
 from .verified import digest, with_verified

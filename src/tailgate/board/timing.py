@@ -19,6 +19,7 @@ from tailgate.base.errors import InputError, NotApplicable
 from tailgate.base.version import VERSION
 from tailgate.core import Array, draws
 from tailgate.core.scenario import Suite
+from tailgate.evaluation.checks import refused
 from tailgate.evaluation.paired import mcnemar
 from tailgate.evaluation.rounds import numbered
 from tailgate.evaluation.stats import holm, paired_difference, proportion
@@ -29,9 +30,8 @@ from tailgate.studies.timing import TWINS, played, schedules
 
 from .attachments import Gain, Shown, Timed, Timing, Untimed
 from .cells import hits_of, vague
-from .check import agree, known, refused
 from .damage import damaged
-from .files import read_board
+from .files import agree, known, read_board
 from .schema import LEVELS, Data
 
 Progress = Callable[[int, int], None]
