@@ -4,20 +4,18 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import json
 import sys
 import time
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
 
 from tailgate.base import sizes
 from tailgate.base.errors import InputError
 from tailgate.base.locks import alone
-from tailgate.base.progress import cells, console, progress
+from tailgate.base.progress import cells, progress
+from tailgate.cli.shared import add_options, own_classes, print_json, table
 
 
 def add(actions: Any) -> None:
@@ -28,7 +26,7 @@ def add(actions: Any) -> None:
         "put below OUT/SUITE count as well. Interrupted, the same command goes on.",
     )  # fmt: skip
     command.add_argument("suites", nargs="+", metavar="SUITE", help="suites by name or YAML file")
-    command.add_argument("--out", required=True, metavar="DIR", help="folder of the boards")
+    add_options(command, "--out")
     command.add_argument("--defence", action="append", metavar="NAME", help="only these defences (repeatable)")
     command.add_argument("--attack", action="append", metavar="TEXT",
                          help="only these attacks, which the entries that --keep-entries keeps have not met (repeatable)")  # fmt: skip
@@ -42,14 +40,13 @@ def add(actions: Any) -> None:
                          help="then train the suite's attackers against every defence that passes the gates, and play them")  # fmt: skip
     command.add_argument("--detection", action="store_true", help="then play detection as `leaderboard detect` does: slow")
     command.add_argument("--unattacked", action="store_true", help="also rank defences that no attack was trained against")
-    command.add_argument("--no-replays", action="store_true", help="leave out the replays of the worst episodes")
+    add_options(command, "--no-replays")
     command.add_argument("--json", action="store_true", help="print the entries as JSON")
     command.set_defaults(run=_run, kept="the same command goes on")
     page = actions.add_parser("page", help="build the page of boards")
     page.add_argument("boards", nargs="+", metavar="FILE", help="board.json files")
     page.add_argument("--out", required=True, metavar="DIR", help="directory of the page")
-    page.add_argument("--title", help="title of the page")
-    page.add_argument("--no-replays", action="store_true", help="leave out the replays of the worst episodes")
+    add_options(page, "--title", "--no-replays")
     page.set_defaults(run=_page)
     head = actions.add_parser("head", help="print the head of a board as a Markdown table")
     head.add_argument("board", metavar="FILE", help="board.json")
@@ -58,7 +55,7 @@ def add(actions: Any) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
-    sys.path.insert(0, "")  # module:Class is looked for in the working directory, as `tailgate evaluate` does
+    own_classes()
     from tailgate.board.attachments import Attachments
     from tailgate.board.attacked import attack
     from tailgate.board.detect import detect
@@ -108,10 +105,9 @@ def _run(options: argparse.Namespace) -> int:
     measured = [Attachments.of(out / suite.name / BOARD) for suite in suites]
     page = build_site(boards, out / "page", replays=not options.no_replays, measured=measured)
     if options.json:
-        print(json.dumps([{"suite": b["suite"]["name"], "entries": b["entries"]} for b in boards], indent=1, allow_nan=False))
-    else:
-        for board in boards:
-            _print_board(board)
+        print_json([{"suite": b["suite"]["name"], "entries": b["entries"]} for b in boards])
+    for board in () if options.json else boards:
+        _print_board(board)
     print(f"page: {page} ({(time.perf_counter() - started) / 60:.1f} min)", file=sys.stderr)
     return 0
 
@@ -120,12 +116,7 @@ def _print_board(board: dict[str, Any]) -> None:
     from tailgate.board.head import lines, title
 
     headings, *rows = lines(board)
-    table = Table(title=escape(title(board)))
-    for heading in headings:
-        table.add_column(heading, overflow="fold")
-    for row in rows:
-        table.add_row(*map(escape, row))
-    console().print(table)
+    table(headings, rows, title(board))
 
 
 def _head(options: argparse.Namespace) -> int:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 
 from tailgate.base.progress import progress
+from tailgate.cli.shared import add_options, own_classes
 
 
 def add(actions: Any) -> None:
@@ -20,8 +20,7 @@ def add(actions: Any) -> None:
         "OUT/SUITE/board.json and the stealth attack at it, and count false alarms in every scenario. The board is written as soon as an "
         "entry is done, and an entry that it has is not played again: interrupted, the same command goes on.",
     )  # fmt: skip
-    command.add_argument("suite", metavar="SUITE", help="suite by name or YAML file")
-    command.add_argument("--out", required=True, metavar="DIR", help="folder of the boards")
+    add_options(command, "suite", "--out")
     command.add_argument("--defence", action="append", default=[], metavar="NAME",
                          help="only these entries (repeatable); module:Class of the board is imported when it is named here")  # fmt: skip
     command.add_argument("--workers", type=int, default=2, metavar="N", help="processes, an entry each (default 2); change no result")
@@ -42,7 +41,7 @@ def _detect(options: argparse.Namespace) -> int:
     from tailgate.board.run import BOARD
     from tailgate.core.scenario import load_suite
 
-    sys.path.insert(0, "")  # module:Class is looked for in the working directory, as `tailgate evaluate` does
+    own_classes()
     suite = load_suite(options.suite)
     path = Path(options.out) / suite.name / BOARD
     hours = None if options.hours is None else tuple(options.hours)

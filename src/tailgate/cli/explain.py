@@ -3,14 +3,9 @@
 from __future__ import annotations
 
 import argparse
-import json
-import sys
 from typing import Any
 
-from rich.markup import escape
-from rich.table import Table
-
-from tailgate.base.progress import console
+from tailgate.cli.shared import own_classes, show, table
 
 
 def add(commands: Any) -> None:
@@ -28,15 +23,10 @@ def add(commands: Any) -> None:
 
 
 def _explain(options: argparse.Namespace) -> int:
-    sys.path.insert(0, "")  # module:Class is looked for in the working directory, as `tailgate evaluate` does
+    own_classes()
     found = explanation(options.scenario, options.defence, options.attack)
-    if options.json:
-        print(json.dumps(found, indent=1))
-        return 0
-    table = Table("what", "traced", "why not, or how large")
-    for what, said in found.items():
-        table.add_row(what, "no" if "why" in said else "yes", escape(said.get("why") or said["size"]))
-    console().print(table)
+    rows = [(what, "no" if "why" in said else "yes", said.get("why") or said["size"]) for what, said in found.items()]
+    show(options, found, lambda _: table(("what", "traced", "why not, or how large"), rows))
     return 0
 
 

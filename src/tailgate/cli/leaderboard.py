@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from tailgate.cli import admit, attack, board, check, clock, detect, retrain, schedules, submit, verify
+from tailgate.cli.shared import add_options
 
 
 def add(commands: Any) -> None:
@@ -25,7 +26,7 @@ def add(commands: Any) -> None:
     build = actions.add_parser("build", help="one self-contained HTML page from rows files, without gates and limits of a board")
     build.add_argument("--rows", nargs="+", required=True, metavar="FILE", help="JSON Lines files of `tailgate evaluate`")
     build.add_argument("--out", required=True, metavar="DIR", help="directory of the page")
-    build.add_argument("--title", help="title of the page")
+    add_options(build, "--title")
     build.set_defaults(run=_build)
 
 

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 from typing import Any
 
 from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
 
 from tailgate.base import sizes
-from tailgate.base.progress import console, progress
+from tailgate.base.progress import progress
+from tailgate.cli.shared import add_options, show, table, tell
 
 
 def add(commands: Any) -> None:
@@ -28,7 +26,7 @@ def add(commands: Any) -> None:
     command.add_argument("--episodes", type=int, default=400, metavar="N", help="episodes that a trial is measured on (default 400)")
     command.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the search itself (default 0)")
     command.add_argument("--workers", type=int, default=1, metavar="N", help="trials at a time (default 1); more change what is proposed")
-    command.add_argument("--json", action="store_true", help="print the report as JSON")
+    add_options(command, "--json")
     command.add_argument("overrides", nargs="*", metavar="key=value", help="change a field of the configuration, as for `tailgate train`")
     command.set_defaults(run=_tune, kept="the same command goes on")
 
@@ -51,28 +49,24 @@ def _tune(options: argparse.Namespace) -> int:
                 update(f"trial {ordinal}", min(now.steps, search.base.steps), search.base.steps, train.figures(now))
 
         report = tuning.tune(search, options.workers, trained)
-    if options.json:
-        print(json.dumps(report, indent=1, allow_nan=False))
-    else:
-        _print(report)
+    show(options, report, _print)
     if report["best"] is None:
-        print("tailgate: no trial succeeded; their reasons are above", file=sys.stderr)
+        tell("no trial succeeded; their reasons are above")
         return 1
     errors.print(f"train with it: tailgate train --config {report['config']}")
     return 0
 
 
 def _print(report: dict[str, Any]) -> None:
-    table = Table(title=f"{report['learner']} against {report['defence']} on {report['scenario']}, {report['outcome']} on tune seeds")
-    for heading in ("trial", "outcome", "values", "note"):
-        table.add_column(heading, overflow="fold")
+    rows = []
     for entry in report["trials"]:
         values = ", ".join(f"{key.rpartition('.')[2]} {_short(value)}" for key, value in entry["parameters"].items())
         best = report["best"] is not None and entry["ordinal"] == report["best"]["ordinal"]
         outcome = "-" if entry["value"] is None else f"{entry['value']:.4g}"
-        table.add_row(str(entry["ordinal"]), outcome, values, "best" if best else escape(entry["reason"]))
-    console().print(table)
+        rows.append((str(entry["ordinal"]), outcome, values, "best" if best else entry["reason"]))
+    title = f"{report['learner']} against {report['defence']} on {report['scenario']}, {report['outcome']} on tune seeds"
+    table(("trial", "outcome", "values", "note"), rows, title)
 
 
 def _short(value: Any) -> str:
-    return f"{value:.3g}" if isinstance(value, float) else escape(json.dumps(value))
+    return f"{value:.3g}" if isinstance(value, float) else json.dumps(value)
