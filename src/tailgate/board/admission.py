@@ -28,7 +28,7 @@ from .worst import Worst
 
 
 def withdraw(attack: str, path: Path, date: str, reason: str) -> Admitted:
-    """An erratum: the attack counts no longer. Raises InputError for one that the list does not hold."""
+    """Take an attack back by an erratum: it no longer counts. Raises InputError for one that the list does not hold."""
     held = standing(read(path))
     line = held.get(attack)
     if line is None:
@@ -39,7 +39,7 @@ def withdraw(attack: str, path: Path, date: str, reason: str) -> Admitted:
 
 
 def knowledge_of(text: str, suite: Suite) -> str:
-    """What an attack is granted in a suite."""
+    """Return the knowledge that a suite grants an attack."""
     spec = Spec("attack", text)
     return suite.knowledge or str(getattr(spec.make(), "knowledge", spec.entry.knowledge))
 

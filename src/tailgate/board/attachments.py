@@ -229,7 +229,7 @@ class Rows(BaseModel):
 
 
 class Run(Attachment):
-    """What it took to play a board: commands that add up (`tailgate.board.run_record` writes them)."""
+    """The record of playing a board: commands that add up (`tailgate.board.run_record` writes them)."""
 
     FILE, WHAT, MADE_BY = "run.json", "run", "`tailgate leaderboard run`"
     format: Literal["tailgate-run-1"] = "tailgate-run-1"
@@ -256,7 +256,7 @@ class Run(Attachment):
         return self if (self.suite, self.hash) == (board.suite.name, board.suite.hash) else None
 
     def said(self, rows: int) -> str:
-        """In a sentence. rows: of the board, which may have met more attacks since."""
+        """Return a sentence. rows: of the board, which may have met more attacks since."""
         count, machines = len(self.commands), dict.fromkeys((c.workers, c.processor) for c in self.commands)
         how = "one command" if count == 1 else f"{count} commands"
         where = ", ".join(f"{workers} worker{'s' * (workers > 1)}, {name}" for workers, name in machines)
@@ -266,7 +266,7 @@ class Run(Attachment):
 
 
 def lasting(seconds: float) -> str:
-    """A time as people say it."""
+    """Return a time as people say it."""
     unit, name = next((u, n) for u, n in ((3600.0, "h"), (60.0, "min"), (1.0, "s")) if seconds >= 2 * u or u == 1.0)
     return f"{seconds / unit:.2g} {name}" if seconds < 100 * unit else f"{seconds / unit:.0f} {name}"
 

@@ -18,7 +18,7 @@ Progress = Callable[[str, int, int, str], None]  # label, done, total, figures
 
 
 class Attacked(NamedTuple):
-    """What came of it."""
+    """The policies that were trained, and the files and number of the rows that were played."""
 
     policies: list[Path]
     files: list[Path]  # of rows: one, or one for each kind of system that was trained on
@@ -29,10 +29,10 @@ def attack(
     suite: Suite, defence: str, out: Path, *, seeds: int | None = None, episodes: int | None = None, beacon: str = "", workers: int = 1,
     changes: tuple[str, ...] = (), progress: Progress, counting: Callable[[Progress], Progress] = lambda told: told,
 ) -> Attacked:  # fmt: skip
-    """Policies go to out/policies, rows to out/DEFENCE*.jsonl; what is there already is neither trained nor played again.
+    """Train a suite's attackers against a defence, and play them on it. Finished work is neither trained nor played again.
 
-    seeds, episodes: instead of the suite's; beacon: the round; changes: key=value of the training; counting: of the cells that are played.
-    Raises InputError for a suite without a plan.
+    Policies go to out/policies, rows to out/DEFENCE*.jsonl. seeds, episodes: instead of the suite's; beacon: the round; changes: key=value
+    of the training; counting: of the cells that are played. Raises InputError for a suite without a plan.
     """
     configs = configs_of(suite, defence, out / "policies", seeds=seeds, extra=(*changes, f"workers={workers}"))
     policies = train_against(configs, progress)

@@ -44,7 +44,7 @@ class Card:
 
 
 def read_card(path: Path) -> Card:
-    """A card, checked. Raises InputError that names the field."""
+    """Return a card, checked. Raises InputError that names the field."""
     where = f"card {path.name}"
     try:
         data = load_json(path)

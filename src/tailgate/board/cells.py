@@ -1,4 +1,4 @@
-"""The cells of a board: what became of the episodes of one scenario, dose, defence and attack; made of rows, and read back into a table."""
+"""The cells of a board, one for each scenario, dose, defence and attack: made of rows, and read back into a table."""
 
 from __future__ import annotations
 
@@ -13,18 +13,21 @@ import numpy as np
 from tailgate.base.errors import InputError
 from tailgate.core import Array
 from tailgate.core.scenario import Suite, load_scenario
+from tailgate.evaluation.checks import LAST_BITS, Finding
 from tailgate.evaluation.rounds import numbered
 from tailgate.evaluation.rows import CLEAN
 from tailgate.evaluation.stats import proportion
 
 from .damage import FAILED, MISSING, PLAYED, SKIPPED, Column, Key, Row, Table, columns_of, damaged, doses_of, in_order
+from .schema import CellLine, Data
 
-Data = dict[str, Any]
+PRINTS = ("hits", "decisions", "trace")  # which older boards lack
+COMPARED = ("n", "failed", "damage", *PRINTS)
 share = functools.cache(proportion)  # a board has few different counts
 
 
 def figures(rows: Sequence[Row], suite: Suite) -> Data:
-    """Of the rows of a cell: how many were played and failed, why, the share that came to damage and which, and two fingerprints."""
+    """Return a cell's figures: how many rows were played and failed, why, the damaged share and which episodes, and two fingerprints."""
     rows = sorted(rows, key=lambda row: int(row["seed"]))  # a round's seeds are not played in ascending order
     good = [damaged(row, suite) for row in rows if row["status"] == "ok"]
     return {
@@ -36,30 +39,46 @@ def figures(rows: Sequence[Row], suite: Suite) -> Data:
 
 
 def _fingerprint(rows: Sequence[Row], name: str) -> str:
-    """Of one hash of every row of a cell. That of decisions is the same on every platform, that of traces on one."""
+    """Return a hash of one hash of every row. Decisions have the same on every platform, traces on one."""
     told = "\n".join(f"{row['seed']} {row['status']} {row.get(name) or ''}" for row in rows)
     return hashlib.blake2b(told.encode(), digest_size=8).hexdigest()
 
 
+def compared(part: CellLine, here: Data) -> Finding:
+    """Compare a cell of a board with its figures here, as `figures` makes them. A print that the board lacks counts as equal."""
+    said = {name: value for name, value in part.model_dump(include=set(COMPARED)).items() if name not in PRINTS or value is not None}
+    off = [name for name in COMPARED if name in said and said[name] != here[name]]
+    parts = [part for name in off for part in _parts(name, said[name], here[name])]
+    why = f"trace {LAST_BITS}" if off == ["trace"] else ", ".join(f"{name}: board {one}, here {other}" for name, one, other in parts)
+    return Finding("differs" if off else "equal", why, here=here)
+
+
+def _parts(name: str, says: Any, here: Any) -> list[tuple[str, Any, Any]]:
+    """Return the parts of a figure that differ: a share with limits part by part."""
+    if not isinstance(says, dict) or not isinstance(here, dict):
+        return [(name, says, here)]
+    return [(name if key == "value" else f"{name}.{key}", value, here.get(key)) for key, value in says.items() if value != here.get(key)]
+
+
 def digits(hits: Sequence[bool]) -> str:
-    """Which episodes came to damage as hexadecimal digits: a bit for each, by seed ascending, the first one the highest of its byte."""
+    """Return damaged episodes as hexadecimal digits: a bit for each, by seed ascending, the first one the highest of its byte."""
     return np.packbits(np.asarray(hits, bool)).tobytes().hex()
 
 
 def hits_of(cell: Data) -> Array:
-    """(n,) bool of a cell: which episodes came to damage; as many as did, the first ones, where the board does not say which."""
+    """Return (n,) bool: the damaged episodes of a cell. Where the board gives their number only, the first ones count as damaged."""
     if (told := cell.get("hits")) is not None:
         return np.unpackbits(np.frombuffer(bytes.fromhex(told), np.uint8), count=cell["n"]).astype(bool)
     return np.arange(cell["n"]) < (round(cell["damage"]["value"] * cell["n"]) if cell["damage"] else 0)
 
 
 def vague(cell: Data) -> bool:
-    """Whether nobody can tell from a cell which of its episodes came to damage."""
+    """Return if a cell tells how many episodes came to damage, but not which."""
     return cell.get("hits") is None and cell["damage"] is not None and 0.0 < cell["damage"]["value"] < 1.0
 
 
 def ordered(cells: Sequence[Data], table: Table) -> list[Data]:
-    """Cells in the order of the suite, clean runs first."""
+    """Return cells in the order of the suite, clean runs first."""
     places, slots = list(table.scenarios), {dose: slot for slot, dose in enumerate(table.doses)}
     attacks = {column.attack: at for at, column in reversed(list(enumerate(table.columns)))}
     return sorted(cells, key=lambda cell: (
@@ -69,7 +88,7 @@ def ordered(cells: Sequence[Data], table: Table) -> list[Data]:
 
 
 def cells_of(table: Table) -> list[Data]:
-    """Every cell that has rows, in the order of the suite, clean runs first."""
+    """Return every cell that has rows, in the order of the suite, clean runs first."""
     return ordered([
         {
             "scenario": key.scenario, "dose": table.doses[key.slot], "defence": key.defence, "attack": key.column.attack,
@@ -80,14 +99,14 @@ def cells_of(table: Table) -> list[Data]:
 
 
 def place_of(cell: Data) -> tuple[Any, ...]:
-    """What tells a cell from the others of its board."""
+    """Return the key that tells a cell from the others of its board."""
     return cell["scenario"], cell["dose"], cell["defence"], cell["attack"], cell["knowledge"]
 
 
 def shared_of(board: Data) -> tuple[str, ...]:
-    """Attacks that all entries of a board have met in each of its cells, or had when somebody joined: who joins has to meet them too.
+    """Return the attacks that every newcomer has to meet: all entries have met them in each cell, or had when somebody joined.
 
-    Files of policies are left out, as they were trained against one of the entries, and what counts nowhere.
+    Files of policies are left out, as each was trained against one of the entries. So are attacks that do not count.
     """
     idle = {attack["attack"] for attack in board["attacks"] if attack.get("withdrawn") or attack.get("optimal")}
     places = {(cell["defence"], cell["scenario"], cell["dose"]) for cell in board["cells"]}
@@ -100,7 +119,7 @@ def shared_of(board: Data) -> tuple[str, ...]:
 
 
 def table_of(board: Data, suite: Suite) -> Table:
-    """The table that a board's cells come from, without rows: clean runs know their damage alone.
+    """Return the table of a board's cells, without rows: clean runs know their damage alone.
 
     Raises InputError for a cell that is there twice, and for one of another suite.
     """
@@ -148,10 +167,9 @@ def table_of(board: Data, suite: Suite) -> Table:
 
 
 def joined(table: Table, held: Table, kept: Collection[str], added: Mapping[str, Collection[str]]) -> Table:
-    """The table of rows, and beside it what another one knows of the defences that are kept.
+    """Return the table of rows, joined with another one's defences that are kept. Both are of the same episodes.
 
-    Both are of the same episodes. Of a defence that is kept rows say what it does when nobody attacks, and against attacks that it had
-    not met (`added`).
+    A kept defence has rows for clean runs, and for attacks that it had not met (`added`).
     """
     fresh = {key: rows for key, rows in table.cells.items() if key.defence not in kept or key.column.attack in added.get(key.defence, ())}
     parts = [(table, [name for name in table.defences if name not in kept]), (held, [name for name in held.defences if name in kept])]

@@ -1,8 +1,8 @@
-"""A board's cells played again from the board alone: a figure can be checked by who has none of its rows.
+"""Check of a board from the board alone, without its rows: its cells are played again and compared.
 
 A cell names a scenario, a dose, a defence and an attack of a suite that is here; its seeds are those of the suite's round. As with rows,
-nothing is imported that the board names. Figures of entries are made again: what follows from cells always, and all else where all cells
-of the board were played.
+nothing is imported that the board names. Figures of entries are made again: those that follow from cells always, and all others where all
+cells of the board were played.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ import itertools
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 from tailgate.base.errors import InputError
 from tailgate.base.version import VERSION
@@ -20,10 +19,10 @@ from tailgate.core.scenario import Suite
 from tailgate.core.schema import build
 from tailgate.evaluation.attack_list import Admitted
 from tailgate.evaluation.cells import Cell, run
-from tailgate.evaluation.checks import LAST_BITS, Finding, Unplayable, again, counts, drawn, refused, sampling
+from tailgate.evaluation.checks import Finding, Unplayable, again, counts, drawn, refused, sampling
 from tailgate.evaluation.paired import CLOSE, PAIR
 
-from .cells import figures, shared_of
+from .cells import PRINTS, compared, figures, shared_of
 from .consistency import same, sharpened, strays, untold
 from .damage import Row
 from .files import amended, known, read_board, suite_of
@@ -31,9 +30,7 @@ from .schema import Board, CellLine, Data
 from .score import score
 
 VERDICTS = ("equal", "differs", "unchecked")
-PRINTS = ("hits", "decisions", "trace")  # which a board of before they were made lacks
 SCORED = ("class", "uses", "status", "why", "gates", "critical_dose", "rates", "rank", "clean", "flags", "robustness")  # of an entry
-COMPARED = ("n", "failed", "damage", *PRINTS)
 EPISODES = 20_000  # whose rows are held at a time
 
 
@@ -84,7 +81,7 @@ def check(
 
 
 def _scored(data: Data, rows: list[Row], suite: Suite) -> Iterator[Data]:
-    """How the board differs from the one that these rows make; nothing without rows."""
+    """Yield how the board differs from the one that these rows make; nothing without rows."""
     if not rows:
         return
     said = data["suite"]
@@ -108,12 +105,12 @@ def _scored(data: Data, rows: list[Row], suite: Suite) -> Iterator[Data]:
 
 
 def _within(rank: Data | None, wider: Data | None) -> bool:
-    """Whether a rank set lies in one that was made of bounds, of which fewer are significant."""
+    """Return if a rank set lies in one that was made of bounds, fewer of which are significant."""
     return rank is not None and wider is not None and bool(wider["best"] <= rank["best"] and rank["worst"] <= wider["worst"])
 
 
 def _same_pairs(board: list[Data], here: list[Data]) -> bool:
-    """Whether all pairs came out as a board has them, those that it has as bounds within these."""
+    """Return if all pairs came out as a board has them, those that it has as bounds within these."""
     if [(duel["a"], duel["b"]) for duel in board] != [(duel["a"], duel["b"]) for duel in here]:
         return False
     for told, made in zip(board, here, strict=True):
@@ -145,7 +142,7 @@ def _cell(part: CellLine, board: Board, suite: Suite) -> Cell:
 
 
 def _slices(cells: Mapping[int, Cell]) -> Iterator[list[int]]:
-    """Places of cells whose rows are held together."""
+    """Yield places of cells whose rows are held together."""
     some: list[int] = []
     for i in cells:
         some.append(i)
@@ -156,28 +153,12 @@ def _slices(cells: Mapping[int, Cell]) -> Iterator[list[int]]:
         yield some
 
 
-def compared(part: CellLine, here: Data) -> Finding:
-    """Compare a cell of a board with its figures here, as `board.cells.figures` makes them. What the board does not say counts as equal."""
-    said = {name: value for name, value in part.model_dump(include=set(COMPARED)).items() if name not in PRINTS or value is not None}
-    off = [name for name in COMPARED if name in said and said[name] != here[name]]
-    parts = [part for name in off for part in _parts(name, said[name], here[name])]
-    why = f"trace {LAST_BITS}" if off == ["trace"] else ", ".join(f"{name}: board {one}, here {other}" for name, one, other in parts)
-    return Finding("differs" if off else "equal", why, here=here)
-
-
 def _compared(part: CellLine, here: Data, files: Mapping[str, str | None]) -> Finding:
     """Compare, and say where the attack's file is another one than the board's."""
     found = compared(part, here)
     if found.verdict == "differs" and files.get(part.attack) not in (None, Spec("attack", part.attack).digest):
         found.why = f"the attack's file here is another one than that of the board; {found.why}"
     return found
-
-
-def _parts(name: str, says: Any, here: Any) -> list[tuple[str, Any, Any]]:
-    """What of a figure differs: of a share with limits each by itself."""
-    if not isinstance(says, dict) or not isinstance(here, dict):
-        return [(name, says, here)]
-    return [(name if key == "value" else f"{name}.{key}", value, here.get(key)) for key, value in says.items() if value != here.get(key)]
 
 
 def _report(board: Board, seen: dict[int, Finding], sample: Data) -> Data:
@@ -204,7 +185,7 @@ def _report(board: Board, seen: dict[int, Finding], sample: Data) -> Data:
 
 
 def _untrained(board: Board, places: list[int]) -> list[Data]:
-    """Of each defence the policies that lie where `leaderboard attack DEFENCE --out FOLDER` puts them, and are not here."""
+    """Return for each defence the policies that are not here and lie where `leaderboard attack DEFENCE --out FOLDER` puts them."""
     cells: Counter[tuple[str, str]] = Counter()
     files: dict[tuple[str, str], set[Path]] = {}
     for cell in (board.cells[i] for i in places):
@@ -217,15 +198,15 @@ def _untrained(board: Board, places: list[int]) -> list[Data]:
 
 
 def _played(found: Data) -> int:
-    """How many cells a check has played."""
+    """Return how many cells a check has played."""
     return int(found["equal"] + found["differs"])
 
 
 def with_check(data: Data, report: Data) -> Data:
-    """The board with what a check found: `checked` in the entries that it looked into, fingerprints in cells that came out equal.
+    """Return the board with a check: `checked` in the entries that were looked into, fingerprints in cells that came out equal.
 
-    Of two checks of an entry the one stays that played more cells; one that was of another number of cells is of another board.
-    Comparisons that were bounds are made again of cells that tell now which episodes came to damage, and ranks with them.
+    An entry keeps the check that played more cells; one of another number of cells is of another board. Comparisons that were bounds are
+    made again of cells that now say which episodes came to damage, and ranks with them.
     """
     before = {entry["defence"]: entry.get("checked") for entry in data["entries"]}
     checked: dict[str, Data] = {}

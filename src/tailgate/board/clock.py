@@ -1,10 +1,7 @@
-"""What a step of each defence costs: step_time.json beside a board, which, as a pure function of rows, says nothing of clocks.
+"""Step times of defences: step_time.json of a board, which as a pure function of rows says nothing of clocks.
 
-    {"format": "tailgate-step-time-1", "suite", "scenario", "agents", "rounds", "processor", "version", "commit", "entries": [..]}
-
-Each entry has its defence and the `median`, `low` and `high` of its rounds [us]: of one step of the defence alone, for one episode with
-all its agents, without an attack, in the plain loop. A round is the first 200 steps of an episode, the first round is not counted, and
-rounds of all defences are played in turn, so that a busy moment meets them all.
+A round is the first 200 steps of an episode, for all its agents, without an attack, in the plain loop. The first round is not counted.
+Rounds of all defences are played in turn, so that a busy moment meets them all.
 """
 
 from __future__ import annotations
@@ -49,7 +46,7 @@ class _Timed:
 
 
 def _round(loop: Loop, timed: _Timed, seed: int) -> float:
-    """The median of the first steps of a clean episode [us]."""
+    """Return the median time of the first steps of a clean episode [us]."""
     timed.taken.clear()
     state, nothing = loop.start(draws.keys("calibrate", [seed])), no_command(1, loop.model.agents, len(loop.model.wires))
     for _ in range(min(loop.horizon, MOST)):
@@ -60,7 +57,7 @@ def _round(loop: Loop, timed: _Timed, seed: int) -> float:
 
 
 def measure(suite: Suite, defences: Sequence[str] = (), *, rounds: int = ROUNDS, progress: Progress | None = None) -> Clock:
-    """Step times of a suite's registered defences in its first scenario, those left out that mean nothing there.
+    """Measure step times of a suite's registered defences in its first scenario. Those that mean nothing there are left out.
 
     The first round of each loads what the defence needs. Raises InputError for a defence that does not exist, that fails, or is a class of
     somebody's own, for a named one that means nothing there, and where none is left.

@@ -1,6 +1,6 @@
-"""What follows from the cells of a board, without any row.
+"""Consistency of a board: the figures that follow from its cells, without any row.
 
-Shares of damage decide its rates, critical doses, curves and robustness; which episodes came to damage decides its comparisons and ranks.
+Shares of damage decide its rates, critical doses, curves and robustness. Damaged episodes decide its comparisons and ranks.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ Data = dict[str, Any]
 
 
 def strays(board: Data, suite: Suite) -> list[Data]:
-    """Figures that do not follow from the board's cells: `defence` (empty: of the board), `field`, what the `board` says, what is `here`.
+    """Return figures that do not follow from the board's cells: `defence` (empty: of the board), `field`, the `board`'s value, and `here`.
 
-    A cell that is missing is one that was not played: an entry with figures or a rank needs all.
-    The board has been read by `read_board`; raises InputError for a cell that is there twice.
+    A cell that is missing is one that was not played: an entry with figures or a rank needs all. The board has been read by `read_board`;
+    raises InputError for a cell that is there twice.
     """
     table, out = table_of(board, suite), []
     held, slots = board["suite"], shown(suite)
@@ -53,8 +53,7 @@ def strays(board: Data, suite: Suite) -> list[Data]:
 
 
 def untold(board: Data, suite: Suite) -> list[str]:
-    """Ranked entries some of whose cells at the dose of the ranks do not say which episodes came to damage: of their comparisons, cells
-    tell within which limits p lies."""
+    """Return ranked entries whose cells at the dose of the ranks do not all say which episodes came to damage: their p has limits only."""
     withdrawn = {attack["attack"] for attack in board["attacks"] if attack.get("withdrawn")}
     dose = doses_of(suite)[middle(suite)]
     asked = (c for c in board["cells"] if c["dose"] == dose and c["knowledge"] == "black" and not c.get("optimal"))
@@ -63,7 +62,7 @@ def untold(board: Data, suite: Suite) -> list[str]:
 
 
 def _ranks(board: Data, levels: Levels, slot: int, alpha: float) -> list[Data]:
-    """Who is in which class, comparisons of its pairs, and the ranks that follow from these."""
+    """Return strays among the classes of entries, the comparisons of their pairs, and the ranks that follow."""
     out: list[Data] = []
     groups: dict[str, dict[str, Data]] = {}
     for entry in board["entries"]:
@@ -93,7 +92,7 @@ def _ranks(board: Data, levels: Levels, slot: int, alpha: float) -> list[Data]:
 
 
 def sharpened(board: Data, suite: Suite) -> Data:
-    """The board with bounds made again of its cells, which may tell more by now, and the ranks that follow."""
+    """Return the board with its bounds made again of its cells, which may tell more by now, and with the ranks that follow."""
     before = board.get("comparisons", [])
     if not any(duel.get("bound") for duel in before):
         return board
@@ -112,7 +111,7 @@ def sharpened(board: Data, suite: Suite) -> Data:
 
 
 def same(a: Any, b: Any) -> bool:
-    """Whether two pieces of JSON say the same, numbers to six digits."""
+    """Return if two pieces of JSON say the same, numbers to six digits."""
     if isinstance(a, dict) and isinstance(b, dict):
         return all(same(a.get(key), b.get(key)) for key in {*a, *b})
     if isinstance(a, list) and isinstance(b, list):

@@ -36,17 +36,17 @@ class Key(NamedTuple):
 
 
 def order(knowledge: str) -> int:
-    """0 for black box, and more for those who know more."""
+    """Return 0 for black box, and more for those who know more."""
     return KNOWLEDGE.index(knowledge)
 
 
 def has_road(row: Row) -> bool:
-    """Whether somebody follows another in the episode of a row that was played."""
+    """Return if somebody follows another in the episode of a row that was played."""
     return row["distance_travelled"] is not None
 
 
 def damaged(row: Row, suite: Suite) -> bool:
-    """A collision in front or behind; without a road, an error above the suite's bound. Of a row that was played."""
+    """Return if a row that was played ended in a collision, in front or behind; without a road, in an error above the suite's bound."""
     if has_road(row):
         return bool(row["crashed"])
     if suite.bound is None:
@@ -84,22 +84,24 @@ class Table:
 
     @property
     def asked(self) -> frozenset[str]:
-        """Attacks that every defence has to have met."""
+        """Return the attacks that every defence has to have met."""
         return self.shared.union(self.listed)
 
     def known(self, knowledge: str) -> list[int]:
-        """Columns of attacks that know no more than this. Computed optima are ceilings, and count nowhere."""
+        """Return columns of attacks that know no more than this. Computed optima are ceilings, and count nowhere."""
         return [
             i for i, column in enumerate(self.columns)
             if order(column.knowledge) <= order(knowledge) and not self.optimal[column] and column.attack not in self.withdrawn
         ]  # fmt: skip
 
     def nominal(self) -> list[str]:
-        """Scenarios whose plant is the one that a defence is told."""
+        """Return scenarios with the plant that a defence is told."""
         return list(self.suite.nominal)
 
     def applies(self, scenario: str) -> Array:
-        """(columns,) bool: not left out in this scenario. One that has no meaning against any defence is, and one that nobody owes."""
+        """Return (columns,) bool: counts in this scenario. An attack without a meaning against any defence does not, nor one nobody
+        owes.
+        """
         state = self.state[scenario]
         played = ~np.isin(state, (SKIPPED, MISSING)).all(axis=(0, 2))
         owed = np.array([column.attack in self.asked for column in self.columns], bool)
@@ -107,9 +109,9 @@ class Table:
 
 
 def tabulate(rows: Iterable[Row], suite: Suite, added: Sequence[str] = (), withdrawn: Iterable[str] = ()) -> Table:
-    """The table. A seed of a cell counts once, however often it was played; `added` are attacks that joined the suite's later.
+    """Return the table of rows. A seed of a cell counts once, however often it was played.
 
-    Raises InputError for rows that do not belong together.
+    added: attacks that joined the suite's later. Raises InputError for rows that do not belong together.
     """
     rows = list(rows)
     if not rows:
@@ -175,19 +177,19 @@ def tabulate(rows: Iterable[Row], suite: Suite, added: Sequence[str] = (), withd
 
 
 def hashes_of(place: Scenario, suite: Suite, dose: int | None, knowledge: str) -> tuple[str, ...]:
-    """What `config_hash` may be: of the scenario under the suite's threat model, with and without the readings in the attacker's sight."""
+    """Return the possible values of `config_hash` under the suite's threat model: without and with readings in the attacker's sight."""
     threat = suite.threat | {"knowledge": knowledge} | ({} if dose is None else {"budget": dose})
     found = [place.with_threat(**threat | sight).config_hash for sight in ({}, {"sees_measurement": True})]
     return tuple(dict.fromkeys(found))
 
 
 def doses_of(suite: Suite) -> tuple[int | None, ...]:
-    """The suite's doses, ascending, the scenario's own last."""
+    """Return the suite's doses, ascending, the scenario's own last."""
     return tuple(sorted(set(suite.doses), key=lambda dose: (dose is None, dose or 0)))
 
 
 def columns_of(played: Iterable[Column], listed: Sequence[str]) -> tuple[Column, ...]:
-    """What was played and what is listed, in the order of the list and then by name, the least knowing first; clean runs have none."""
+    """Return columns of played and listed attacks: by the list, then by name, the least knowing first. Clean runs have none."""
     granted: dict[str, set[str]] = {name: set() for name in listed}
     for column in played:
         granted.setdefault(column.attack, set()).add(column.knowledge)
@@ -198,7 +200,7 @@ def columns_of(played: Iterable[Column], listed: Sequence[str]) -> tuple[Column,
 
 
 def in_order(names: set[str], first: Sequence[str]) -> tuple[str, ...]:
-    """The names in the order of the suite; those that it does not know come last, by name."""
+    """Return the names in the order of the suite; those that it does not know come last, by name."""
     return (*(name for name in dict.fromkeys(first) if name in names), *sorted(names - set(first)))
 
 
@@ -225,7 +227,7 @@ def _same_result(key: Key, one: Row, other: Row) -> None:
 
 
 def named(key: Key) -> str:
-    """A cell as people read it, without its dose."""
+    """Return a cell as people read it, without its dose."""
     return f"{key.scenario}, {key.defence}, {key.column.attack} ({key.column.knowledge})"
 
 
@@ -240,7 +242,7 @@ def _same_component(rows: Sequence[Row]) -> None:
 
 
 def _seeds(cells: dict[Key, list[Row]]) -> dict[str, tuple[int, ...]]:
-    """The seeds of each scenario, which all cells share: without that no comparison is paired."""
+    """Return the seeds of each scenario, which all cells share: without that no comparison is paired."""
     out: dict[str, tuple[tuple[int, ...], Key]] = {}
     for key in sorted(cells, key=lambda key: (-len(cells[key]), key)):  # whoever has fewer is the odd one
         mine = tuple(row["seed"] for row in cells[key])

@@ -24,9 +24,8 @@ from .consistency import same
 from .detection import EFFORT, Effort, Progress, detection, plants, stealth_impact
 from .false_alarms import false_alarms
 from .files import agree, amended, known, load, read_board, save, suite_of
+from .schema import DETECTION, Data
 
-Data = dict[str, Any]
-LINES = ("entries", "without", "alarms")  # of a detection board: figures, why there are none, and false alarms at the thresholds
 PARTS = 4  # of the longest clean run: what one scenario may take of it when a threshold is checked
 YOUNG = ("low", "high")  # fields of stealth that older boards lack
 PLACE = ("plant", "scenario", "attack", "hours")  # what a figure is of
@@ -35,11 +34,12 @@ PLACE = ("plant", "scenario", "attack", "hours")  # what a figure is of
 def detect(
     path: Path, suite: Suite, *, defences: Sequence[str] = (), effort: Effort = EFFORT, workers: int = 1, progress: Progress | None = None
 ) -> Data:
-    """Play detection and stealth impact of the board in a file; returns it. It is written as soon as an entry is done, and resumes.
+    """Play detection and stealth impact of the board in a file, and return it. It is written after each entry, and resumes.
 
-    defences: only these entries; classes of somebody's own are imported where they are named here. Of all, those that come with it;
-    not `none`, sentinels, or who is told the truth. Attacks are the black-box scripts of the board's list that can be played here. Raises
-    InputError for a board of another suite or version, or with figures of another effort, and for a defence that takes no place here.
+    defences: only these entries; classes of somebody's own are imported where they are named here. By default those that come with the
+    package; not `none`, sentinels, or who is told the truth. Attacks are the black-box scripts of the board's list that can be played here.
+    Raises InputError for a board of another suite or version, or with figures of another effort, and for a defence that takes no place
+    here.
     """
     with alone(path.parent):
         return _detected(path, suite, defences, effort, workers, progress)
@@ -75,12 +75,12 @@ def _detected(path: Path, suite: Suite, defences: Sequence[str], effort: Effort,
 
 
 def _takes_part(entry: Data) -> bool:
-    """Not the undefended car, nor who is told the truth, nor a sentinel."""
+    """Return if an entry is neither the undefended car, nor told the truth, nor a sentinel."""
     return entry["defence"] != "none" and "truth" not in entry["uses"] and not (entry.get("card") or {}).get("sentinel")
 
 
 def _nothing(effort: Effort, suite: Suite) -> Data:
-    return _said(effort, suite) | {key: [] for key in LINES}
+    return _said(effort, suite) | {key: [] for key in DETECTION}
 
 
 def _said(effort: Effort, suite: Suite) -> Data:
@@ -88,20 +88,20 @@ def _said(effort: Effort, suite: Suite) -> Data:
 
 
 def _shared(suite: Suite) -> list[list[str]]:
-    """Scenarios that share a threshold."""
+    """Return scenarios that share a threshold."""
     return [list(names) for names in plants(suite.nominal).values()]
 
 
 def _effort(held: Data, effort: Effort = EFFORT) -> Effort:
-    """With which the figures of a board were made; boards of before do not say, and had the usual one. A number that none is of is free."""
+    """Return the effort of a board's figures; older boards do not say, and had the usual one. A number that no figure needs is free."""
     given = {f.name: held[f.name] for f in dataclasses.fields(Effort) if f.name in held}
     free = {} if held.get("alarms") else {"checked": effort.checked}
     return dataclasses.replace(EFFORT, **given | free | {"hours": tuple(map(float, held["hours"]))})
 
 
 def _whole(held: Data, guard: str, suite: Suite, attacks: Sequence[str], effort: Effort) -> bool:
-    """Whether an entry has all figures, or the reasons why it has none."""
-    lines = [line for part in LINES for line in held.get(part, ()) if line["defence"] == guard and not _outdated(line)]
+    """Return if an entry has all figures, or the reasons why it has none."""
+    lines = [line for part in DETECTION for line in held.get(part, ()) if line["defence"] == guard and not _outdated(line)]
     there = {tuple(line[key] for key in PLACE if key in line) for line in lines}
     return all(
         (plant, h) in there or all((name, attack, h) in there for name in names for attack in attacks)
@@ -110,28 +110,28 @@ def _whole(held: Data, guard: str, suite: Suite, attacks: Sequence[str], effort:
 
 
 def _of(board: Data, held: Data, guard: str) -> Data:
-    """What a board says of the detection of one entry."""
+    """Return the lines of one entry in the detection of a board."""
     stealth = next(entry.get("stealth") for entry in board["entries"] if entry["defence"] == guard)
-    return {part: [line for line in held.get(part, ()) if line["defence"] == guard] for part in LINES} | {"stealth": stealth}
+    return {part: [line for line in held.get(part, ()) if line["defence"] == guard] for part in DETECTION} | {"stealth": stealth}
 
 
 def _checked(held: Data, guard: str, suite: Suite) -> bool:
-    """Whether false alarms at all thresholds of an entry are there, or nothing is."""
+    """Return if false alarms at all thresholds of an entry are there, or nothing is."""
     wanted = {(line["scenario"], line["hours"]) for line in held["entries"] if line["defence"] == guard}
     return wanted <= {(line["scenario"], line["hours"]) for line in held.get("alarms", ()) if line["defence"] == guard}
 
 
 def _outdated(line: Data) -> bool:
-    """Whether a line says that an entry has no threshold, of when only one of its own was looked for."""
+    """Return if a line says that an entry has no threshold, from when only a defence's own one was looked for."""
     return str(line.get("reason", "")).startswith("defence: ")
 
 
 def _with(board: Data, guard: str, found: Data, effort: Effort, suite: Suite) -> Data:
-    """The board with the figures of one entry, in the order of its entries."""
+    """Return the board with the figures of one entry, in the order of its entries."""
     order = [entry["defence"] for entry in board["entries"]]
     held = board.get("detection") or _nothing(effort, suite)
     apart = {guard, *(e["defence"] for e in board["entries"] if not _takes_part(e))}
-    lines = {part: [line for line in held.get(part, ()) if line["defence"] not in apart] + found[part] for part in LINES}
+    lines = {part: [line for line in held.get(part, ()) if line["defence"] not in apart] + found[part] for part in DETECTION}
     lines = {part: sorted(mine, key=lambda line: order.index(line["defence"])) for part, mine in lines.items()}
     return amended(board, {guard: {"stealth": found["stealth"]}}, detection=held | _said(effort, suite) | lines)
 
@@ -140,7 +140,7 @@ def figures(
     suite: Suite, guard: str, attacks: Sequence[str], effort: Effort, beacon: str, there: Data | None = None,
     progress: Progress | None = None,
 ) -> Data:  # fmt: skip
-    """`entries`, `without` and `alarms` of the detection board of one defence, and its `stealth`. there: of these all but the alarms."""
+    """Return `entries`, `without`, `alarms` and `stealth` of one defence. there: all of these but the alarms, if they are there."""
     found = there or detection(suite, [guard], attacks, effort, beacon=beacon, progress=progress)
     if there is None:
         found = found | {"stealth": stealth_impact(suite, guard, effort, beacon=beacon, progress=progress)}
@@ -152,7 +152,7 @@ def _play(
     suite: Suite, asked: Sequence[str], attacks: Sequence[str], effort: Effort, beacon: str, workers: int, progress: Progress | None,
     there: Mapping[str, Data] | None = None,
 ) -> Generator[tuple[str, Data]]:  # fmt: skip
-    """Figures of each defence, as they are done; of those that are there in part, what is missing."""
+    """Yield figures of each defence, as they are done; of those that are there in part, the missing ones."""
     have = there or {}
     guards = [*asked, *have]
     sizes.check("workers", workers)
@@ -190,7 +190,7 @@ def check_detection(
     if not (held := data.get("detection")):
         raise InputError("board: detection", None, "figures of `leaderboard detect`")
     part = {entry["defence"] for entry in data["entries"] if _takes_part(entry)}
-    names = list(dict.fromkeys(line["defence"] for key in LINES for line in held.get(key, ()) if line["defence"] in part))
+    names = list(dict.fromkeys(line["defence"] for key in DETECTION for line in held.get(key, ()) if line["defence"] in part))
     known(defences, names)
     attacks = list(dict.fromkeys(line["attack"] for line in held["entries"]))
     lost = next(filter(None, (refused("attack", attack) for attack in attacks)), "")
@@ -203,7 +203,7 @@ def check_detection(
 
     def compare(name: str, here: Data) -> Finding:
         """Compare an entry; `here` counts its figures."""
-        told = {part: lines for part, lines in here.items() if part not in LINES or part in held}
+        told = {part: lines for part, lines in here.items() if part not in DETECTION or part in held}
         says, made = _by_place(held | {"stealth": stealth.get(name)}, name), _by_place(told, name)
         off = {place: _differences(says.get(place), made.get(place)) for place in dict.fromkeys((*says, *made))}
         lines = [dict(zip((*PLACE, "of"), place, strict=True)) | {"defence": name} | one for place, some in off.items() for one in some]
@@ -227,14 +227,14 @@ def check_detection(
 
 
 def _by_place(held: Data, guard: str) -> dict[tuple[Any, ...], Data]:
-    """The figures of an entry by what they are of."""
-    lines = [(part, line) for part in LINES for line in held.get(part, ()) if line["defence"] == guard]
+    """Return the figures of an entry by plant, scenario, attack, hours and part."""
+    lines = [(part, line) for part in DETECTION for line in held.get(part, ()) if line["defence"] == guard]
     lines += [("stealth", item) for item in held["stealth"] or ()]
     return {(*(line.get(key) for key in PLACE), part): line for part, line in lines}
 
 
 def _differences(says: Data | None, here: Data | None) -> list[Data]:
-    """Field by field; a board of before the limits of stealth were there says nothing of them."""
+    """Return the fields that differ; a board from before stealth had limits says nothing of them."""
     if says is None or here is None:
         return [{"field": "", "board": says, "here": here}]
     return differences([*says, *(key for key in here if key not in says and key not in YOUNG)], says, here, same, "board")

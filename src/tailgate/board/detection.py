@@ -38,7 +38,7 @@ Data = dict[str, Any]
 
 @dataclass(frozen=True)
 class Effort:
-    """What decides the figures beside a suite and its round."""
+    """The numbers that decide the figures, besides a suite and its round."""
 
     hours: tuple[float, ...] = (0.1, 1.0, 10.0)  # wanted mean times between false alarms
     episodes: int = 100  # of a scenario and an attack
@@ -59,7 +59,7 @@ EFFORT = Effort()
 
 
 def plants(scenarios: Sequence[str]) -> dict[str, tuple[str, ...]]:
-    """Scenarios by the plant that is driven, and as many agents, states and readings: those of one plant share a threshold.
+    """Return scenarios by plant, with as many agents, states and readings: those of one plant share a threshold.
 
     A score of fourteen readings is another than one of two; where a plant has several shapes, its name says which.
     """
@@ -75,9 +75,9 @@ def plants(scenarios: Sequence[str]) -> dict[str, tuple[str, ...]]:
 
 @functools.lru_cache(maxsize=256)
 def threshold(defence: str, scenarios: tuple[str, ...], hours: float, onsets: int, most_steps: int) -> Calibration:
-    """The threshold of a defence for a mean time between false alarms [h] on these clean runs, and what it gave.
+    """Return the threshold of a defence for a mean time between false alarms [h] on these clean runs, and its measured time.
 
-    Raises InputError where the time cannot be had: in so many steps, or as the score does not climb that often.
+    Raises InputError where the time cannot be had: in that many steps, or as the score does not climb that often.
     """
     return calibrate(defence, hours, scenarios=scenarios, onsets=onsets, most_steps=most_steps)
 
@@ -107,11 +107,12 @@ def detection(
     suite: Suite, defences: Sequence[str], attacks: Sequence[str], effort: Effort = EFFORT, *, dose: int | None = None, beacon: str = "",
     progress: Progress | None = None,
 ) -> Data:  # fmt: skip
-    """The field `detection` of a board: the share of attacked episodes with an alarm within the deadline, and the median delay [steps].
+    """Return the field `detection` of a board: the share of attacked episodes with an alarm within the deadline, and the median delay
+    [steps].
 
-    In the suite's scenarios of the told plant, under its threat model, at its middle dose unless given; thresholds are found on the clean
-    runs of all scenarios of a plant together. `watched`: the threshold is held against the score of a defence that has none; `rarer`: no
-    threshold alarms as often as wanted, lower ones do more often and this one more rarely. `without` lists what takes no place here, and
+    Played are the suite's scenarios of the told plant, under its threat model, at its middle dose unless given; thresholds are found on the
+    clean runs of all scenarios of a plant together. `watched`: the threshold is held against the score of a defence that has none; `rarer`:
+    no threshold alarms as often as wanted, lower ones do more often and this one more rarely. `without` lists defences without figures, and
     why: a mean time that is out of reach.
     """
     update = progress or (lambda *_: None)
@@ -136,13 +137,13 @@ def detection(
 
 
 def _cell(suite: Suite, scenario: str, dose: int | None, defence: str, attack: str, episodes: int, beacon: str) -> Cell:
-    """The suite's own cell, played with another threshold."""
+    """Return the suite's own cell, to be played with another threshold."""
     budget = suite.middle_dose if dose is None else dose
     return Cell(suite.name, scenario, budget, defence, attack, episodes, threat=suite.granted, beacon=beacon)
 
 
 def _detected(rows: Sequence[Data]) -> Data:
-    """Of the episodes in which an attack took effect."""
+    """Return the detected share among the episodes in which an attack took effect."""
     met = [row for row in rows if row["status"] == "ok" and row["missed_deadline"] is not None]
     if not met or any(row["status"] == "error" for row in rows):
         reason = next((row["reason"] for row in rows if row["status"] != "ok"), UNTOUCHED)
@@ -156,11 +157,11 @@ def stealth_impact(
     suite: Suite, defence: str, effort: Effort = EFFORT, *, attack: str = "stealth", dose: int | None = None, beacon: str = "",
     progress: Progress | None = None,
 ) -> list[Data] | None:  # fmt: skip
-    """The field `stealth` of an entry: by the mean time between false alarms, the error that the stealth attack reaches per time.
+    """Return the field `stealth` of an entry: the error that the stealth attack reaches per time, by the time between false alarms.
 
-    `deviation` [m/s] is the median of episodes, the most of scenarios; `low` and `high` its limits of 95 %, which hold together for all
-    scenarios, null for few episodes; `reason` says why there is none. `threshold` is that of the plant where the deviation is.
-    None where no threshold was found. In the scenarios, under the threat model and at the dose of `detection`.
+    `deviation` [m/s] is the median of episodes, the most of scenarios; `low` and `high` are its limits of 95 %, which hold together for all
+    scenarios, null for few episodes; `reason` says why there is none. `threshold` is that of the plant where the deviation is. None where
+    no threshold was found. Scenarios, threat model and dose are those of `detection`.
     """
     update = progress or (lambda *_: None)
     out: list[Data] = []
@@ -176,7 +177,7 @@ def stealth_impact(
 
 
 def _impact(found: Sequence[tuple[Found, Array | str]]) -> Data:
-    """Of the deviations in each scenario, or why there are none, the largest median, with limits that hold for all together."""
+    """Return the largest median of the deviations in each scenario, with limits that hold for all together, or why there is none."""
     reached = [(held, values) for held, values in found if not isinstance(values, str)]
     if not reached:
         held, why = next(((held, why) for held, why in found if held.level is not None), found[0])
@@ -192,7 +193,7 @@ def _level(found: Found) -> Data:
 
 
 def _reached(level: float, cell: Cell) -> Array | str:
-    """(n,) deviations of the episodes that were attacked, or why there are none."""
+    """Return (n,) deviations of the episodes that were attacked, or why there are none."""
     made, rival = Bench.of(cell.defence, [cell.scenario], cell.seeds, None).at(level), Spec("attack", cell.attack)
     attack, guard = rival.make(), Spec("defence", cell.defence)
     if isinstance(made, Watched):
@@ -210,9 +211,9 @@ def _reached(level: float, cell: Cell) -> Array | str:
 
 
 def deviation(trace: Trace) -> Array:
-    """(B,) the largest error of an estimated gap while an episode is attacked, over the time of the attack [m/s]; NaN without one.
+    """Return (B,) the largest error of an estimated gap while an episode is attacked, over the time of the attack [m/s]; NaN without one.
 
-    What comes after the attack does not count: a gate that stays shut on honest readings loses a car for good, however little was injected.
+    Errors after the attack do not count: a gate that stays shut on honest readings loses a car for good, however little was injected.
     """
     attacked = (trace.kind != 0) & trace.live
     error = np.max(trace.model.error(trace.estimate, trace.truth), axis=2)

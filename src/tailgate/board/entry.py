@@ -1,4 +1,4 @@
-"""An entry of a board: what a defence's rows come to, and whether it takes a rank."""
+"""An entry of a board: a defence's figures from its rows, and if it takes a rank."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ Levels = dict[str, dict[str, Worst]]  # by defence and knowledge
 
 
 def middle(suite: Suite) -> int:
-    """Slot of the middle one of the doses that are shown; of all where none is named."""
+    """Return the slot of the middle one of the doses that are shown; of all where none is named."""
     chosen = shown(suite)
     return chosen[len(chosen) // 2]
 
 
 def shown(suite: Suite) -> list[int]:
-    """Slots of the doses that rates are shown at."""
+    """Return slots of the doses that rates are shown at."""
     doses = doses_of(suite)
     return [slot for slot, dose in enumerate(doses) if dose in suite.shown] or list(range(len(doses)))
 
@@ -63,10 +63,10 @@ def entry_of(table: Table, defence: str, levels: dict[str, Worst], slot: int, or
 
 
 def extended(entry: Data, table: Table, levels: dict[str, Worst], slot: int, trained: dict[str, str], added: Collection[str]) -> Data:
-    """An entry of a board that has met more attacks, of which there are rows: shares of damage, status, flags and worst episode.
+    """Return an entry of a board with more attacks, which have rows: shares of damage, status, flags and worst episode.
 
-    What it does without an attack, its gates among that, and which of the suite's trainings it stood stay as they are; so does what only
-    rows can say of the attacks that it had met. trained: the defence that each learned attack was trained on.
+    Its clean runs and gates stay as they are, and so do the suite's trainings that it met, and all that only rows can say of attacks that
+    it had met. trained: the defence that each learned attack was trained on.
     """
     out = entry | of_worst(table, levels, slot)
     if entry["status"] != "unranked" and (why := _incomplete(table, levels["black"])):
@@ -84,7 +84,7 @@ def extended(entry: Data, table: Table, levels: dict[str, Worst], slot: int, tra
 
 
 def of_worst(table: Table, levels: dict[str, Worst], slot: int) -> Data:
-    """The figures of an entry that are shares of damage: critical doses, rates and robustness."""
+    """Return the figures of an entry that are shares of damage: critical doses, rates and robustness."""
     whole = {k: worst for k, worst in levels.items() if worst.complete}
     critical: dict[tuple[tuple[str, int], ...], Data | None] = {}
     for worst in whole.values():
@@ -98,12 +98,12 @@ def of_worst(table: Table, levels: dict[str, Worst], slot: int) -> Data:
 
 
 def curves(levels: dict[str, Worst]) -> list[Data]:
-    """Dose-response curves of an entry, by knowledge."""
+    """Return dose-response curves of an entry, by knowledge."""
     return [worst.curve() for worst in levels.values() if worst.complete and worst.numbers]
 
 
 def _card(defence: str) -> Entry | None:
-    """The card of a built-in defence; a plug-in is somebody else's class like any other. A board must not import what a row names."""
+    """Return the card of a built-in defence; a plug-in has none, as a board must not import the class that a row names."""
     return _built_in().get(split_text(defence)[0])
 
 
@@ -113,7 +113,7 @@ def _built_in() -> dict[str, Entry]:
 
 
 def reference(defence: str, uses: Collection[str], card: Entry | None) -> str:
-    """Why a defence takes no rank whatever it does; empty where it may."""
+    """Return why a defence takes no rank whatever it does; empty where it may."""
     if split_text(defence)[0] == CLEAN:
         return "baseline: no defence"
     if "truth" in uses:
@@ -122,7 +122,7 @@ def reference(defence: str, uses: Collection[str], card: Entry | None) -> str:
 
 
 def _incomplete(table: Table, worst: Worst) -> str:
-    """Else a defence would gain by failing, or by not being attackable, where it is weak."""
+    """Return which figures are missing: else a defence would gain by failing, or by not being attackable, where it is weak."""
     if worst.complete:
         return ""
     if not worst.pairs:
@@ -137,7 +137,7 @@ def _incomplete(table: Table, worst: Worst) -> str:
 
 
 def _draft(table: Table) -> str:
-    """Why rows are too few, or of seeds that anybody may tune on; empty where they are not."""
+    """Return why rows are too few, or of seeds that anybody may tune on; empty where they are not."""
     fewest = min(len(seeds) for seeds in table.seeds.values())
     if table.purpose != "report":
         return f"draft: seeds of the purpose {table.purpose}"
@@ -151,18 +151,19 @@ def _draft(table: Table) -> str:
 
 
 def _claimed(rows: list[Row]) -> str:
-    """Why rows of somebody else's class stand for nothing yet: who made them could have tuned on the episodes, or have run free."""
+    """Return why rows of somebody else's class count for nothing yet: its author could have tuned on the episodes, or run it free."""
     if not all((row.get("submission") or {}).get("sandbox") for row in rows):
         return f"{CLAIMED}: not played by leaderboard submit in a sandbox"
     return "" if all(row.get("beacon") for row in rows) else f"{CLAIMED}: played on public seeds"
 
 
 def _unmet(table: Table, defence: str, origins: dict[str, Row], asked: list[Asked]) -> str:
-    """What is missing of the attackers that the suite trains against a defence; empty where nothing is.
+    """Return the suite's own trainings against a defence that are missing; empty where none is.
 
-    asked: of a suite with a plan (`adaptive`) every scenario that is trained on, learner, knowledge and training seed, trained as the plan
-    says, against these very files and this version of the defence, and played wherever the policy fits. Of a suite without one it is
-    empty, and any policy will do that was trained against the defence and played everywhere. All this is what the policies' files say.
+    asked: every scenario that is trained on, learner, knowledge and training seed of a suite with a plan (`adaptive`). Each has to be
+    trained as the plan says, against these very files and this version of the defence, and played wherever the policy fits. A suite without
+    a plan asks for nothing: any policy will do that was trained against the defence and played everywhere. The policies' files say all
+    this.
     """
     guard = table.defences.index(defence)
     row = next(rows[0] for key, rows in table.cells.items() if key.defence == defence)
@@ -185,7 +186,7 @@ def _unmet(table: Table, defence: str, origins: dict[str, Row], asked: list[Aske
 
 
 def _clean(table: Table, defence: str) -> dict[str, Data]:
-    """Medians and quartiles of the clean runs, of all nominal scenarios together."""
+    """Return medians and quartiles of the clean runs, of all nominal scenarios together."""
     rows = [row for name in table.nominal() for row in table.clean.get((name, defence), ())]
     out = {}
     for metric in CLEAN_METRICS:
@@ -197,8 +198,10 @@ def _clean(table: Table, defence: str) -> dict[str, Data]:
 
 
 def _episode(table: Table, whole: dict[str, Worst], slot: int) -> Row | None:
-    """The worst episode: a damaged one of the worst attack at the middle dose, else at the smallest shown one at which there is damage,
-    the least knowing attacker first. Where nothing is damaged, the one of all attacks and shown doses that came nearest to it."""
+    """Return the worst episode: a damaged one of the worst attack at the middle dose, else at the smallest shown dose with damage.
+
+    The least knowing attacker comes first. Where nothing is damaged, it is the episode of all attacks and shown doses that came nearest.
+    """
     for at in (slot, *shown(table.suite)):
         for worst in whole.values():
             pair, share = worst.at(at)
@@ -211,12 +214,12 @@ def _episode(table: Table, whole: dict[str, Worst], slot: int) -> Row | None:
 
 
 def _margin(row: Row) -> float:
-    """How far an episode was from damage: its smallest gap; without a road the largest error counts."""
+    """Return how far an episode was from damage: its smallest gap; without a road the largest error counts."""
     return float(row["min_gap"] if has_road(row) else -row["max_error"])
 
 
 def _robustness(table: Table, worst: Worst | None, slot: int) -> list[Data]:
-    """The share of undamaged episodes where the plant is another one, and how it differs from the worst of the nominal scenarios."""
+    """Return the undamaged share where the plant is another one, and its change from the worst of the nominal scenarios."""
     if worst is None:
         return []
     base = worst.undamaged(worst.at(slot, table.nominal())[0], slot)

@@ -1,4 +1,4 @@
-"""What a threshold of the detection board gives: false alarms on fresh clean runs of every scenario of a suite, robustness rows among them.
+"""False alarms at a threshold of the detection board, on fresh clean runs of every scenario of a suite.
 
 A threshold is found on all scenarios of a plant together, whose vehicle and sensors are as the defence is told. Elsewhere the alarm may
 come more often, and within a drive it may come early or late: a filter with a constant gain alarms while it settles.
@@ -47,12 +47,12 @@ class Drives:
 
 
 def false_alarms(suite: Suite, detected: Sequence[Data], wanted: int, most_steps: int, *, beacon: str = "") -> list[Data]:
-    """The field `alarms` of a detection board: for each threshold in the lines `detected`, what it gives in each scenario of its plant.
+    """Return the field `alarms` of a detection board: false alarms of each threshold in `detected`, in each scenario of its plant.
 
-    Each line has the `onsets` in so many hours of `running`, their `dispersion` by drives, the mean time between them with its limits [h]
-    (`mean`, None without any, `low`, `high`), how many of them came in the `first` half of the drive, and how many drives had more of
-    them `early` and `late`. A run lasts as long as `wanted` false alarms should take, or `most_steps` steps if that is less. No two
-    scenarios of a plant share a seed: a filter that knows its input sees the noise alone, and would see it twice.
+    Each line has the `onsets` in `running` hours, their `dispersion` by drives, the mean time between them with its limits [h] (`mean`,
+    None without any, `low`, `high`), how many of them came in the `first` half of the drive, and how many drives had more of them `early`
+    and `late`. A run lasts as long as `wanted` false alarms should take, or `most_steps` steps if that is less. No two scenarios of a plant
+    share a seed: a filter that knows its input sees the noise alone, and would see it twice.
     """
     out, done = [], set[tuple[str, tuple[str, ...], float]]()
     for line in detected:
@@ -82,9 +82,9 @@ def _drive(suite: str, scenario: str, line: Mapping[str, Any], wanted: int, most
 
 
 def dispersion(drives: Sequence[Drives]) -> float:
-    """Variance over mean of the onsets of a drive, within scenarios, of all together; 1 without any.
+    """Return variance over mean of the onsets of a drive, within scenarios, of all together; 1 without any.
 
-    What is set for several scenarios together may be silent in one, which then says nothing of its clusters.
+    A threshold for several scenarios together may be silent in one, which then says nothing of its clusters.
     """
     each = [one.halves.sum(axis=1) for one in drives]
     mean = math.fsum(float(x.sum()) for x in each)

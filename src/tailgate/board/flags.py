@@ -21,13 +21,13 @@ SPREAD = 0.2  # between the training seeds of one plan, of the share of damage
 
 
 def flags(table: Table, defence: str, levels: dict[str, Worst], slot: int, origins: dict[str, Row]) -> list[str]:
-    """Of one entry; `origins` says how each learned attack was trained, as far as that is known."""
+    """Return the flags of one entry; `origins` says how each learned attack was trained, as far as that is known."""
     trained = {attack: str(origin["defence"]) for attack, origin in origins.items()}
     return [*of_attacks(table, defence, levels, slot, trained), *_trainings(table, defence, slot, origins)]
 
 
 def of_attacks(table: Table, defence: str, levels: dict[str, Worst], slot: int, trained: dict[str, str]) -> list[str]:
-    """All but what they say of training; `trained`: the defence that each learned attack was trained on."""
+    """Return all flags but those of training; `trained`: the defence that each learned attack was trained on."""
     out = [*_failures(table, defence), *_unspent(table, levels, slot)]
     for knowledge in levels:
         out += _transferred(table, defence, levels[knowledge], slot, trained)
@@ -35,8 +35,11 @@ def of_attacks(table: Table, defence: str, levels: dict[str, Worst], slot: int, 
 
 
 def standing(told: Sequence[str], levels: dict[str, Worst], slot: int, added: Collection[str], own: bool) -> list[str]:
-    """Flags of an entry that hold when it has met more attacks: those of a worst attack where that is still the same one, and, unless the
-    entry's own attackers are among them (`own`), that others do more than these."""
+    """Return the flags of an entry that hold when it has met more attacks.
+
+    Those of a worst attack hold where that is still the same one. Those that others do more than the entry's own attackers hold unless some
+    of these are among the new ones (`own`).
+    """
     worst = [one.named(one.at(slot)[0]) for one in levels.values() if one.complete]
     same = not any(one["attack"] in added for one in worst)
     kept = tuple(f"{UNSPENT}, {one['attack']} on {one['scenario']}," for one in worst)
@@ -45,7 +48,7 @@ def standing(told: Sequence[str], levels: dict[str, Worst], slot: int, added: Co
 
 
 def _trainings(table: Table, defence: str, slot: int, origins: dict[str, Row]) -> list[str]:
-    """What the attackers that were trained on this defence say of their training: unfinished, or a matter of the seed's luck."""
+    """Return flags of the trainings against this defence: unfinished, or a matter of the seed's luck."""
     guard = table.defences.index(defence)
     met = [any((state[guard, i] != MISSING).any() for state in table.state.values()) for i in range(len(table.columns))]
     mine = [i for i, column in enumerate(table.columns) if met[i] and origins.get(column.attack, {}).get("defence") == defence]
@@ -64,7 +67,7 @@ def _trainings(table: Table, defence: str, slot: int, origins: dict[str, Row]) -
 
 
 def _failures(table: Table, defence: str) -> list[str]:
-    """Cells of which some rows failed: the reason says whether a batch's rows depended on one another."""
+    """Return flags of cells with failed rows: the reason says if a batch's rows depended on one another."""
     reasons: dict[str, int] = {}
     for key, rows in sorted(table.cells.items()):
         if key.defence == defence:
@@ -75,7 +78,7 @@ def _failures(table: Table, defence: str) -> list[str]:
 
 
 def _unspent(table: Table, levels: dict[str, Worst], slot: int) -> list[str]:
-    """The worst attack kept some of its budget back in episodes that it did not win, as far as there are rows of it."""
+    """Return a flag where the worst attack kept budget back in episodes that it did not win, as far as it has rows."""
     dose, out = table.doses[slot], []
     for worst in levels.values():
         if not dose or not worst.complete:
@@ -92,7 +95,7 @@ def _unspent(table: Table, levels: dict[str, Worst], slot: int) -> list[str]:
 
 
 def _transferred(table: Table, defence: str, worst: Worst, slot: int, trained: dict[str, str]) -> list[str]:
-    """A policy trained on another defence does surely more damage than every one that was trained on this one knowing as much."""
+    """Return flags of policies trained on another defence that surely do more damage than every own one that knows as much."""
     out = []
     guard = table.defences.index(defence)
     for name in table.scenarios:
@@ -116,13 +119,13 @@ def _transferred(table: Table, defence: str, worst: Worst, slot: int, trained: d
 
 
 def surely(x: Array, y: Array, vague: bool) -> tuple[int, int]:
-    """In how many episodes x alone and y alone show damage; as many as can be where only numbers are known."""
+    """Return in how many episodes x alone and y alone show damage; as many as can be where only numbers are known."""
     more, less = apart(x, y[None], np.array([vague]))
     return int(more[0]), int(less[0])
 
 
 def _weaker(levels: dict[str, Worst], slot: int) -> list[str]:
-    """Attackers that know more do surely less than those of black box alone: they were not looked for."""
+    """Return a flag where attackers that know more surely do less than black boxes alone: they were not looked for."""
     black, white = levels["black"], levels["white"]
     if not (black.complete and white.complete):
         return []

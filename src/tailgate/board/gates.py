@@ -1,7 +1,7 @@
-"""Gates of the safety board: what a defence may cost when nobody attacks, paired by episode with the undefended car.
+"""Gates of the safety board: the cost of a defence when nobody attacks, paired by episode with the undefended car.
 
-Of gap, jerk and distance both the median and the mean of the ratios count, whichever is worse: a median alone would allow a defence to ruin
-almost half of its episodes. And nearly all episodes have to get nearly as far.
+For gap, jerk and distance both the median and the mean of the ratios count, whichever is worse: a median alone would allow a defence to
+ruin almost half of its episodes. And nearly all episodes have to get nearly as far.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ Gate = dict[str, Any]
 
 
 def gates(table: Table, defence: str) -> list[Gate]:
-    """Every gate of a defence: {gate, scenario, value, limit, passed}; `value` is null where a figure cannot be had, and not passed.
+    """Return every gate of a defence: {gate, scenario, value, limit, passed}; a figure that cannot be had is null, and not passed.
 
     Raises InputError for a clean run that lacks a figure which its road has.
     """
@@ -65,7 +65,7 @@ def _of(table: Table, defence: str, scenario: str) -> list[Gate]:
 
 
 def _false_alarms(table: Table, scenario: str, own: list[Row]) -> Gate:
-    """Fails an alarm that is on more than it is off, and that no threshold of the detection board stands for."""
+    """Return the gate that fails an alarm which is on more than off, if the detection board has no threshold for it."""
     share = float(np.mean([row["alarm_rate"] for row in own]))
     place = table.scenarios[scenario]
     onsets = sum(row["alarm_onsets"] for row in own)
@@ -74,7 +74,7 @@ def _false_alarms(table: Table, scenario: str, own: list[Row]) -> Gate:
 
 
 def _worse(of: Callable[[float, float], float], values: list[float]) -> float | None:
-    """The worse of median and mean."""
+    """Return the worse of median and mean."""
     return of(float(np.median(values)), float(np.mean(values))) if values else None
 
 
@@ -83,7 +83,7 @@ def _gate(name: str, scenario: str, value: float | None, limit: float | None, pa
 
 
 def failure(found: list[Gate]) -> str:
-    """The first gate that is not passed, with its figure; empty where all are."""
+    """Return the first gate that is not passed, with its figure; empty where all are."""
     gate = next((gate for gate in found if not gate["passed"]), None)
     if gate is None:
         return ""

@@ -12,7 +12,7 @@ Board = dict[str, Any]
 
 
 def title(board: Board) -> str:
-    """Suite, episodes, and whose seeds they are."""
+    """Return suite, episodes, and whose seeds they are."""
     suite = board["suite"]
     seeds = f"seeds of the beacon {suite['beacon']}" if suite["beacon"] else "public seeds: for development"
     free = "" if suite.get("require_adaptive", True) else ", ranked without attackers that were trained against each"
@@ -20,7 +20,7 @@ def title(board: Board) -> str:
 
 
 def lines(board: Board) -> list[tuple[str, ...]]:
-    """Headings, then the defences in the order of the page: rank, critical dose, least share of undamaged episodes at the shown doses.
+    """Return headings, then the defences in the order of the page: rank, critical dose, least undamaged share at the shown doses.
 
     Raises InputError for what is no board.
     """
@@ -45,7 +45,7 @@ def lines(board: Board) -> list[tuple[str, ...]]:
 
 
 def markdown(board: Board, most: int | None = None) -> str:
-    """The head as a Markdown table, of so many defences at most; a column with nothing in it is left out."""
+    """Return the head as a Markdown table of at most this many defences; a column with nothing in it is left out."""
     heading, *body = lines(board)
     heading = tuple(f"{text}, black box" if text.startswith(("critical", "undamaged")) else text for text in heading)
     told = [i for i in range(len(heading)) if any(line[i] for line in body[:most])]

@@ -17,19 +17,19 @@ GROUPS = (  # status, title, what it means
 
 
 def ordered(entries: Iterable[Entry]) -> list[Entry]:
-    """By group, classes that claim their figures first, then class, rank and critical dose."""
+    """Return entries by group, classes that claim their figures first, then by class, rank and critical dose."""
     return sorted(entries, key=place_of)
 
 
 def sort_dose(critical: Critical | None) -> float:
-    """A critical dose as a number: above every dose where it was not reached, below every one where there is none."""
+    """Return a critical dose as a number: above every dose where it was not reached, below every one where there is none."""
     if critical is None:
         return -1.0
     return math.inf if critical.value is None else critical.value
 
 
 def place_of(entry: Entry) -> tuple[Any, ...]:
-    """Key to sort by."""
+    """Return the key to sort by."""
     status = [name for name, *_ in GROUPS].index(entry.status)
     rank = (entry.rank.best, entry.rank.worst) if entry.rank else (math.inf, math.inf)
     doses = [-sort_dose(entry.critical_dose.get(level)) for level in LEVELS]

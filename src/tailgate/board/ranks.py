@@ -63,7 +63,7 @@ def _still_bound(held: Beside, levels: Levels, harm: Mapping[str, Harm], slot: i
 
 
 def outgrown(told: Data, weak: Harm, strong: Harm, tried: int, new: Array) -> float:
-    """The largest p of a pair that was compared, once both have met more attacks and the weaker one's worst is still the same.
+    """Return the largest p of a pair once both have met more attacks, if the weaker one's worst is still the same.
 
     tried: attacks that the weaker one had met; new (attacks,) bool: those that the other one had not.
     """

@@ -22,8 +22,8 @@ from tailgate.trust.run import REPORT, with_trust
 from .card import with_cards
 from .cells import shared_of
 from .files import agree, load, read_board, save
-from .kept import with_kept
 from .score import score
+from .update import with_kept
 from .verified import digest, with_verified
 
 OWN = "rows.jsonl.xz"  # what `run` plays; other files of rows beside it come from `attack` and `submit`
@@ -39,9 +39,9 @@ def play(
     suite: Suite, folder: Path, *, defences: Sequence[str] | None = None, attacks: Sequence[str] | None = None, workers: int = 1,
     board: Any = None, beacon: str = "", progress: Progress | None = None,
 ) -> Path:  # fmt: skip
-    """The rows of a suite and of the attacks that were admitted since, or of some, against its defences; returns their file. It resumes.
+    """Play the rows of a suite and of the attacks admitted since, or of some, against its defences; return their file. It resumes.
 
-    board: JSON of the one that they join: what all of its entries have met is played too. Raises InputError where that cannot be.
+    board: JSON of the one that they join: attacks that all of its entries have met are played too. Raises InputError where that cannot be.
     """
     if attacks is None and defences is not None:
         defences = list(dict.fromkeys([CLEAN, *defences]))  # the undefended car is what gates measure against
@@ -58,7 +58,7 @@ def play(
 
 
 def _met_by_all(board: Any, listed: Sequence[str]) -> list[str]:
-    """Attacks on no list that all entries of a board have met. Raises InputError for one that is code to import, or is not here."""
+    """Return attacks on no list that all entries of a board have met. Raises InputError for one to import, or one that is not here."""
     found = [text for text in shared_of(board) if text not in listed]
     for text in found:
         if why := refused("attack", text):
@@ -67,7 +67,7 @@ def _met_by_all(board: Any, listed: Sequence[str]) -> list[str]:
 
 
 def files_of_rows(folder: Path) -> list[Path]:
-    """Files of rows in a suite's folder; those of policies, of trust and hidden ones are others."""
+    """Return files of rows in a suite's folder, without those of policies, of trust and hidden ones."""
     found = sorted(path for path in folder.glob("**/*") if path.name.endswith((".jsonl", ".jsonl.xz")) and path.name != LIST)
     within = [(path, path.relative_to(folder).parts) for path in found]
     others = {"policies", TRUST}
@@ -86,11 +86,11 @@ def _one_round(folder: Path, beacon: str) -> None:
 
 
 def board_of(suite: Suite, folder: Path, beacon: str | None = None, keep: bool = False, **options: Any) -> dict[str, Any]:
-    """The board of all rows in a folder, with what verified/*.json says of them and the bounds of trust/trust.json; written as board.json.
+    """Score all rows in a folder, with verified/*.json and the bounds of trust/trust.json, and write board.json. Returns the board.
 
-    Of the board.json that is there it keeps what does not come from rows (`with_kept`); with `keep` also the entries that have none, or
+    It keeps what does not come from rows of the board.json that is there (`with_kept`); with `keep` also the entries that have no rows, or
     not those of all their cells. Raises InputError where there are no rows, or rows of another round than `beacon`, for a report that
-    cannot be read or is of something else, and for rows that do not fit beside the board.
+    cannot be read or is of something else, and for rows that do not fit the board.
     """
     files = files_of_rows(folder)
     if not files:
@@ -116,7 +116,7 @@ def board_of(suite: Suite, folder: Path, beacon: str | None = None, keep: bool =
 
 
 def kept_board(path: Path, suite: Suite, beacon: str) -> Any:
-    """The JSON of a board whose entries are to stay. Raises InputError where there is none, and for another suite, version or round."""
+    """Return the JSON of a board whose entries stay. Raises InputError for none, and for another suite, version or round."""
     if not path.is_file():
         raise InputError("--keep-entries", str(path), "a board whose entries can stay")
     data = load(path)

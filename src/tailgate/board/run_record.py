@@ -24,7 +24,7 @@ EVERY = 10.0  # [s] between two writes while rows are played: what a killed comm
 
 
 def processor_time() -> float:
-    """Seconds of this process and of all below it, those that have ended among them."""
+    """Return seconds of this process and of all below it, those that have ended among them."""
     ended = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
     running = sum(int(fields[11]) + int(fields[12]) for fields in descendants().values())
     return sum(used.ru_utime + used.ru_stime for used in ended) + running * TICK
@@ -45,7 +45,7 @@ class Record:
         }  # fmt: skip
 
     def counting(self, told: Callable[..., None]) -> Callable[..., None]:
-        """A progress that is called after each cell that was played."""
+        """Return a progress that is called after each cell that was played."""
 
         def counted(*now: Any) -> None:
             told(*now)

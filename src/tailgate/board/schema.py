@@ -168,7 +168,7 @@ class Verified(Part):
 
     @property
     def sound(self) -> bool:
-        """Whether rows were played again and all of them came out equal."""
+        """Return if rows were played again and all of them came out equal."""
         return self.verified > 0 and self.differs == self.unchecked == 0
 
 
@@ -250,6 +250,9 @@ class Comparison(Part):
     bound: bool = False
 
 
+DETECTION = ("entries", "without", "alarms")  # lines of a detection board: figures, why there are none, and false alarms
+
+
 class AtThreshold(Part):
     """A figure of an entry at its threshold for a wanted mean time between false alarms [h]."""
 
@@ -303,7 +306,7 @@ class TrustProperty(Part):
 
 
 class Trust(Part):
-    """What the bounds of all entries are about."""
+    """The setting of all entries' bounds."""
 
     alpha: Share
     runs: Count

@@ -26,13 +26,12 @@ def score(
     rows: Iterable[Row], suite: Suite, *, attacks: Sequence[Admitted] | None = None, alpha: float = 0.05, require_adaptive: bool = True,
     board: Data | None = None, shared: Sequence[str] = (),
 ) -> Data:  # fmt: skip
-    """The board of a suite from its rows, in the format of decision record 14. The order of the rows changes nothing.
+    """Return the board of a suite from its rows, in the format of decision record 14. The order of the rows changes nothing.
 
-    attacks: what joined the suite's attacks after it was published (`attacks.read`); every defence has to have met these too.
-    require_adaptive: rank only defences that met an attack which was trained against them.
-    board: of the same suite; what it says of other defences stands beside these rows (`beside`), and ranks are made of both.
-    shared: what every defence has to have met though it is on no list; of a board it is known (`cells.shared_of`).
-    Raises InputError for rows that do not belong together, or not beside the board.
+    attacks: attacks that joined the suite's after it was published (`attack_list.read`); every defence has to have met these too.
+    require_adaptive: rank only defences that met an attack which was trained against them. board: of the same suite; its other entries stay
+    (`update.beside`), and ranks are made of both. shared: attacks on no list that every defence has to have met (`cells.shared_of`). Raises
+    InputError for rows that do not belong together, or do not fit the board.
     """
     if not 0.0 < alpha < 1.0:
         raise InputError("alpha", alpha, "a number above 0 and below 1")
@@ -105,12 +104,12 @@ def _attacks(
 
 
 def _reason(cells: list[Data], column: Column) -> str:
-    """Why an attack was left out."""
+    """Return why an attack was left out."""
     mine = (c for c in cells if (c["attack"], c["knowledge"]) == column)
     return next((str(c["reason"]) for c in mine if c["reason"] and not c["failed"]), "")
 
 
 def _origins(table: Table) -> dict[str, Row]:
-    """How each learned attack of the table was trained: the rows' `trained`."""
+    """Return how each learned attack of the table was trained: the rows' `trained`."""
     found = ((key.column.attack, table.cells[key][0].get("trained")) for key in sorted(table.cells))
     return {attack: origin for attack, origin in found if isinstance(origin, dict)}

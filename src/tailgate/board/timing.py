@@ -1,11 +1,11 @@
-"""What the timing of the attackers is worth that were trained against the entries of a board: timing.json beside it.
+"""Timing advantage of the attackers that were trained against the entries of a board: timing.json.
 
     timing advantage = P(damage | own schedule) - P(damage | yoked schedule)
 
-Of each entry a trained attacker is looked at: the one that does most damage among those whose files are here, at the dose where that is
-nearest to half of the board's episodes, since where all come to damage, or none, no schedule is better than another. On the board's
-episodes it has to do what the board's cell says. It was chosen on them, so what is measured is measured on the next ones of the round: at
-its own times, and at those of its twins (tailgate.studies.timing). Rows cannot tell it: a twin is no attack of the board.
+For each entry one trained attacker is measured: the one that does most damage among those whose files are here, at the dose where that is
+nearest to half of the board's episodes. Where all come to damage, or none, no schedule is better than another. On the board's episodes it
+has to do the damage that the board's cell says. It was chosen on them, so it is measured on the next ones of the round: at its own times,
+and at those of its twins (tailgate.studies.timing). Rows cannot tell it: a twin is no attack of the board.
 """
 
 from __future__ import annotations
@@ -38,8 +38,11 @@ Progress = Callable[[int, int], None]
 
 
 def telling(board: Data, defence: str) -> Data | str:
-    """The cell to look at of an entry, or why there is none: of the attackers that do most damage at each dose, the least knowing and first
-    of equal ones, whose files are here, the one whose share of damage is nearest to a half."""
+    """Return the cell to look at for an entry, or why there is none.
+
+    At each dose the attacker counts that does most damage, the least knowing and first of equal ones, whose file is here. The cell is the
+    one whose damaged share is nearest to a half.
+    """
     if why := refused("defence", defence):
         return why
     mine = _trained(board, defence)
@@ -58,7 +61,7 @@ def telling(board: Data, defence: str) -> Data | str:
 
 
 def _trained(board: Data, defence: str) -> list[Data]:
-    """Whole cells of the attackers that were trained against an entry."""
+    """Return whole cells of the attackers that were trained against an entry."""
     lines = (a for a in board["attacks"] if a.get("trained_on") == defence and a["attack"].endswith(".json") and not a.get("withdrawn"))
     own = {line["attack"] for line in lines}
     return [c for c in board["cells"] if c["defence"] == defence and c["attack"] in own and c["damage"] and not c["failed"]]
@@ -71,7 +74,7 @@ def _harmful(cell: Data) -> tuple[float, int]:
 def measure_timing(
     board: Data, suite: Suite, defences: Sequence[str] = (), *, episodes: int | None = None, progress: Progress | None = None
 ) -> Timing:
-    """Timing advantages of trained attackers of the board's ranked entries, or of those that are named.
+    """Measure timing advantages of trained attackers of the board's ranked entries, or of those that are named.
 
     episodes: fresh ones for each schedule (default: four times as many as a cell of the board has). Raises InputError for a board of
     another suite or version, and a defence that is not on it. An attacker that cannot be played here, or does not do here what the board's
@@ -105,7 +108,7 @@ def measure_timing(
 
 
 def _timed(cell: Data, board: Data, suite: Suite, episodes: int | None) -> Timed | str:
-    """The figures of a cell's attacker and its twins, or why there are none."""
+    """Return the figures of a cell's attacker and its twins, or why there are none."""
     who, n = trained(cell["attack"]), cell["n"]
     loop = loop_for(who, cell["scenario"], cell["defence"], suite.granted, cell["dose"])
     beacon, purpose = board["suite"].get("beacon") or "", board["suite"].get("purpose") or "report"
@@ -135,7 +138,7 @@ def _timed(cell: Data, board: Data, suite: Suite, episodes: int | None) -> Timed
 
 
 def _harm(trace: Trace, suite: Suite) -> Array:
-    """(B,) whether an episode is damaged, as rows say it."""
+    """Return (B,) the damaged episodes, as rows say it."""
     values = {name: held for name, held in measure(trace).items() if name in ("crashed", "distance_travelled", "max_error")}
     rows = [{name: None if np.isnan(held[i]) else float(held[i]) for name, held in values.items()} for i in range(trace.batch)]
     return np.array([damaged(row, suite) for row in rows], np.float64)

@@ -1,4 +1,4 @@
-"""Rows of some defences beside the cells that a board has of the others: what is played anew is what changed, and not the whole board."""
+"""Update of a board: score the defences whose rows changed, and keep what the board says of the others."""
 
 from __future__ import annotations
 
@@ -12,17 +12,20 @@ from tailgate.core.scenario import Suite
 from tailgate.core.threat import KNOWLEDGE
 from tailgate.evaluation.rows import CLEAN
 
-from .cells import cells_of, joined, place_of, table_of
+from .cells import cells_of, compared, joined, place_of, table_of
 from .damage import Column, Table
+from .files import amended, read_board
+from .schema import DETECTION, Board, Data
 from .worst import Worst
 
-Data = dict[str, Any]
 SAME = ("n", "failed", "damage", "hits", "decisions")  # of a cell that was played again
 
 
 @dataclass(frozen=True)
 class Beside:
-    """What a board keeps: its entries that were not played whole, their cells, and the table that these and the rows make together."""
+    """The part of a board that stays: entries that were not played whole, their cells, and the table that these and the rows make
+    together.
+    """
 
     board: Data
     table: Table
@@ -33,17 +36,18 @@ class Beside:
     steady: frozenset[str]  # defences that met no more than they had: of two of them the board's comparison stands
 
     def of(self, part: str, defence: str) -> list[Data]:
-        """The board's lines of a defence: of `curves`, say."""
+        """Return the board's lines of a defence: of `curves`, say."""
         return [line for line in self.board[part] if line["defence"] == defence]
 
 
 def beside(table: Table, board: Data, suite: Suite, alpha: float, require_adaptive: bool, digests: Mapping[str, str]) -> Beside:
-    """A defence whose rows cover all cells that the board has of it is made of rows, others stay as the board has them, or meet in rows
-    what they had not met. Cells that both have must come out equal; which of their episodes came to damage is then known, if it was not.
+    """Return what stays of a board next to a table of rows.
 
-    board: JSON that `read_board` has read; digests: of the files of the attacks that joined the list. Raises InputError for a board of
-    another suite, round, purpose, alpha, list of attacks or rule of who is ranked, for rows that differ from it, for new cells of an attack
-    that a defence has met already, and where which attacks count against an entry that stays changes by anything else than its own rows.
+    A defence whose rows cover all cells that the board has of it is made of rows. Others stay as the board has them, or meet in rows
+    attacks that they had not met. Cells that both have must come out equal; their damaged episodes are then known, if they were not. board:
+    JSON that `read_board` has read; digests: of the files of the attacks that joined the list. Raises InputError for a board of another
+    suite, round, purpose, alpha, list of attacks or rule of who is ranked, for rows that differ from it, for new cells of an attack that a
+    defence has met already, and where an entry that stays would change by anything but its own rows.
     """
     said = {"beacon": "", "require_adaptive": True} | {key: value for key, value in board["suite"].items() if value is not None}
     mine = {"hash": suite.hash, "purpose": table.purpose, "beacon": table.beacon, "alpha": alpha, "require_adaptive": require_adaptive}
@@ -104,7 +108,7 @@ def beside(table: Table, board: Data, suite: Suite, alpha: float, require_adapti
 
 
 def _counted(table: Table, defence: str) -> set[tuple[str, Column, bool]]:
-    """Scenario and column of every attack that counts against a defence, and whether its figures are whole."""
+    """Return scenario and column of every attack that counts against a defence, and if its figures are whole."""
     if defence not in table.defences:
         return set()
     worst = Worst(table, defence, KNOWLEDGE[-1], 0.05)
@@ -115,3 +119,37 @@ def _said(places: list[tuple[Any, ...]]) -> str:
     scenario, dose, defence, attack, _ = places[0]
     more = f", and {len(places) - 1} more" if len(places) > 1 else ""
     return f"{scenario}, {defence}, {attack}, dose {dose}{more}"
+
+
+def with_kept(board: Data, old: Data) -> Data:
+    """Return the board with `detection`, `stealth` and `checked` of an older one, for entries whose cells came out as they are there.
+
+    Cells may have come in since. Nothing is kept of a board of another suite, version or round. Raises InputError for an older one that is
+    not of the format.
+    """
+    before = read_board(old, "board.json")
+    if any(old["suite"].get(key) != board["suite"][key] for key in ("hash", "version", "beacon")):
+        return board
+    kept, fields = _unchanged(board, before), dict[str, Data]()
+    for entry in (entry for entry in old["entries"] if entry["defence"] in kept):
+        checked = entry.get("checked")
+        again = {"checked": checked | {"cells": kept[entry["defence"]]}} if checked else {}
+        fields[entry["defence"]] = {"stealth": entry.get("stealth")} | again
+    return amended(board, fields, detection=_detection_of(old.get("detection"), kept))
+
+
+def _unchanged(board: Data, old: Board) -> dict[str, int]:
+    """Return defences whose old cells are all on the board as they were, and how many cells they have there."""
+    cells = {place_of(cell): cell for cell in board["cells"]}
+    moved = {part.defence for part in old.cells if (here := cells.get(place_of(part.model_dump()))) is None or compared(part, here).why}
+    names = [entry.defence for entry in old.entries if entry.defence not in moved]
+    counts = {name: sum(cell["defence"] == name for cell in board["cells"]) for name in names}
+    return {name: n for name, n in counts.items() if n}
+
+
+def _detection_of(detection: Data | None, defences: dict[str, int]) -> Data | None:
+    """Return the figures of some defences; None where nothing is left."""
+    if not detection:
+        return None
+    parts = {key: [line for line in detection[key] if line["defence"] in defences] for key in DETECTION if key in detection}
+    return detection | parts if any(parts.values()) else None

@@ -1,4 +1,4 @@
-"""Which entries of a board are verified: reports of `leaderboard verify` beside its rows say what came of playing them again."""
+"""Verified entries of a board: reports of `leaderboard verify` in its folder say how many rows came out equal."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from .schema import Count, Data
 
 
 class Again(BaseModel):
-    """What became of the rows of one defence that were asked for."""
+    """The verdicts on those rows of one defence that were asked for."""
 
     model_config = ConfigDict(strict=True)
     defence: str
@@ -38,7 +38,7 @@ class File(BaseModel):
 
 
 class Report(BaseModel):
-    """Of a report of `leaderboard verify` what a board needs."""
+    """The part of a report of `leaderboard verify` that a board needs."""
 
     model_config = ConfigDict(strict=True)
     format: Literal["tailgate-verify-1"]
@@ -46,21 +46,21 @@ class Report(BaseModel):
 
 
 def digest(path: Path) -> str:
-    """SHA-256 of a file of rows as it lies on the disk."""
+    """Return the SHA-256 of a file of rows."""
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def read_report(path: Path) -> Report:
-    """Raises InputError that names the file for anything else than a report of `leaderboard verify`."""
+    """Return a report. Raises InputError that names the file for anything else than one of `leaderboard verify`."""
     return read_model(Report, path, "verified", "leaderboard verify")
 
 
 def with_verified(board: Data, folder: Path, files: Mapping[str, Mapping[str, int]]) -> Data:
-    """The board with `verified` in each entry: {"rows", "verified", "differs", "unchecked"}, or null where nobody has played any again.
+    """Return the board with `verified` in each entry: {"rows", "verified", "differs", "unchecked"}, or null where nobody has looked.
 
-    files: SHA-256 of each file of rows that the board is made of, and how many rows of each defence it has. What a report says of any
-    other file, or of one that has changed since, counts for nothing; of two reports on one file the one counts that asked for more rows.
-    A defence has figures only where rows of every file that it is in were played again.
+    files: SHA-256 of each file of rows that the board is made of, and how many rows of each defence it has. A report on any other file, or
+    on one that has changed since, counts for nothing; of two reports on one file the one counts that asked for more rows. A defence has
+    figures only where rows of every file that it is in were played again.
     """
     looked: dict[tuple[str, str], Again] = {}
     for path in sorted(folder.glob("*.json")):

@@ -28,7 +28,7 @@ class Name:
 
 
 def names_of(texts: Iterable[str]) -> dict[str, Name]:
-    """Text to name. Policies go by as many folders of their path as tell them apart: one where that is enough."""
+    """Return the name of each text. Policies go by as many folders of their path as tell them apart."""
     split = {text: _split(text) for text in texts}
     paths = {text: tuple(p for p in re.split(r"[\\/]", head.removesuffix(".json")) if p) for text, (head, _) in split.items()}
     out = {}
@@ -50,7 +50,7 @@ def names_of(texts: Iterable[str]) -> dict[str, Name]:
 
 
 def _split(text: str) -> tuple[str, tuple[str, ...]]:
-    """Head and parameters. The text is never resolved: a page must not import what a row names."""
+    """Return head and parameters. The text is never resolved: a page must not import what a row names."""
     head, tail = split_text(text)
     if not tail or text.endswith(")"):
         return text, ()
@@ -60,7 +60,7 @@ def _split(text: str) -> tuple[str, tuple[str, ...]]:
 
 
 def percent(value: float) -> str:
-    """Whole percents, but never 0 % or 100 % for a share that is not."""
+    """Return whole percents, but never 0 % or 100 % for a share that is not."""
     if value < 0:
         return f"\N{MINUS SIGN}{percent(-value)}"
     if value in (0, 1) or 0.005 <= value < 0.995:
@@ -71,7 +71,7 @@ def percent(value: float) -> str:
 
 
 def at_least(share: float, digits: int = 0) -> str:
-    """A lower limit in percent, never rounded up; of less than one percent a tenth is told, if there is one."""
+    """Return a lower limit in percent, never rounded up; below one percent with one decimal, if it is not 0."""
     if digits == 0 and 0.001 <= share < 0.01:
         digits = 1
     unit = 10**digits
@@ -79,12 +79,12 @@ def at_least(share: float, digits: int = 0) -> str:
 
 
 def shade(value: float) -> str:
-    """Class of the colour scale: s0 for none at all, then one per ten percent."""
+    """Return the class of the colour scale: s0 for none at all, then one per ten percent."""
     return f"s{math.ceil(min(max(value, 0.0), 1.0) * 10 - 1e-9)}"
 
 
 def steps(value: float) -> str:
-    """A number of decisions, short."""
+    """Return a number of decisions, short."""
     for size, unit in ((1_000_000, "M"), (1_000, "k")):
         if value >= size:
             return f"{value / size:.4g}{unit}"
@@ -92,19 +92,19 @@ def steps(value: float) -> str:
 
 
 def ticks(end: float) -> list[dict[str, Any]]:
-    """Round places on an axis from 0 to end, at most six."""
+    """Return round places on an axis from 0 to end, at most six."""
     unit = 10.0 ** math.floor(math.log10(end))
     size = next(unit * m for m in (0.2, 0.5, 1, 2) if end <= 5 * unit * m)
     return [{"x": round(100 * i * size / end, 2), "text": steps(i * size)} for i in range(math.floor(end / size + 1e-9) + 1)]
 
 
 def breakable(text: str) -> Markup:
-    """Escaped, with places where a narrow column may break it."""
+    """Return escaped text, with places where a narrow column may break it."""
     return Markup(re.sub(r"([=_/:,])", r"\1<wbr>", str(escape(text))))
 
 
 def spans(numbers: Iterable[int]) -> str:
-    """Whole numbers as ranges: 0-49, 100."""
+    """Return whole numbers as ranges: 0-49, 100."""
     out: list[list[int]] = []
     for number in sorted(set(numbers)):
         if out and number == out[-1][1] + 1:

@@ -35,8 +35,10 @@ class Worst:
 
     @cached_property
     def pairs(self) -> list[tuple[str, int]]:
-        """(scenario, column) of every attack that has a meaning there. One that is not asked of everybody counts against
-        the defences that it was played against."""
+        """Return (scenario, column) of every attack that has a meaning there.
+
+        An attack that is not asked of everybody counts against the defences that it was played against.
+        """
         guard = self.table.defences.index(self.defence)
         out: list[tuple[str, int]] = []
         for name in self.table.scenarios:
@@ -48,25 +50,25 @@ class Worst:
 
     @cached_property
     def lost(self) -> list[tuple[str, int]]:
-        """The pairs without full figures."""
+        """Return the pairs without full figures."""
         guard = self.table.defences.index(self.defence)
         return [(name, i) for name, i in self.pairs if (self.table.state[name][guard, i] != PLAYED).any()]
 
     @property
     def complete(self) -> bool:
-        """Whether every figure of this class can be had, and somebody who knows just this was met: else it would be a lower one's."""
+        """Return if every figure of this class can be had, and an attacker who knows just this was met: else it would be a lower one's."""
         return any(self.table.columns[i].knowledge == self.knowledge for _, i in self.pairs) and not self.lost
 
     @cached_property
     def shares(self) -> Array:
-        """(pairs, slots) share of damaged episodes."""
+        """Return (pairs, slots) share of damaged episodes."""
         return np.array([self._harm(name, i).mean(axis=-1) for name, i in self.pairs])
 
     def _harm(self, name: str, i: int) -> Array:
         return np.asarray(self.table.harm[name][self.table.defences.index(self.defence), i])
 
     def at(self, slot: int, scenarios: list[str] | None = None) -> tuple[int, float]:
-        """(pair, share of damaged episodes) of the worst attack at a dose, in some scenarios or all; the first of equal ones."""
+        """Return (pair, damaged share) of the worst attack at a dose, in some scenarios or all; the first of equal ones."""
         shares = self.shares[:, slot].copy()
         if scenarios is not None:
             shares[[name not in scenarios for name, _ in self.pairs]] = -1.0
@@ -74,7 +76,7 @@ class Worst:
         return worst, float(shares[worst])
 
     def undamaged(self, pair: int, slot: int) -> float:
-        """Share of undamaged episodes of a pair, as a quotient of whole numbers."""
+        """Return the undamaged share of a pair, as a quotient of whole numbers."""
         _, harm = self.harm(pair, slot)
         return float((len(harm) - harm.sum()) / len(harm))
 
@@ -83,22 +85,22 @@ class Worst:
         return {"scenario": name, "attack": self.table.columns[i].attack}
 
     def harm(self, pair: int, slot: int) -> tuple[tuple[int, ...], Array]:
-        """Seeds and damage (episodes,) of a pair."""
+        """Return seeds and damage (episodes,) of a pair."""
         name, i = self.pairs[pair]
         return self.table.seeds[name], self._harm(name, i)[slot]
 
     def vague(self, pair: int, slot: int) -> bool:
-        """Whether nobody knows which episodes of a pair came to damage."""
+        """Return if nobody knows which episodes of a pair came to damage."""
         name, i = self.pairs[pair]
         return Key(name, slot, self.defence, self.table.columns[i]) in self.table.vague
 
     def rows(self, pair: int, slot: int) -> list[Row]:
-        """The rows of a pair at a dose, by seed; none of those that a board alone knows of."""
+        """Return the rows of a pair at a dose, by seed; none of those that a board alone knows of."""
         name, i = self.pairs[pair]
         return self.table.cells.get(Key(name, slot, self.defence, self.table.columns[i]), [])
 
     def all_harm(self, slot: int) -> Harm:
-        """Of all pairs at a dose. Raises InputError where the scenarios have not the same seeds: nothing would be paired."""
+        """Return the damage of all pairs at a dose. Raises InputError for scenarios with other seeds: nothing would be paired."""
         found = {self.table.seeds[name] for name, _ in self.pairs}
         if len(found) != 1:
             raise InputError(f"rows of {self.defence}: seeds", f"{len(found)} sets of them", "the same seeds in every scenario")
@@ -108,7 +110,7 @@ class Worst:
         return Harm(found.pop(), harm, self.at(slot)[0], np.array([self.vague(k, slot) for k in range(len(self.pairs))], bool))
 
     def bounds(self, slot: int, scenarios: list[str] | None = None, sides: int = 1) -> tuple[float, float]:
-        """Limits of the worst share of damage that hold together for all pairs: alpha over their number, and over the sides."""
+        """Return limits of the worst damaged share that hold together for all pairs: alpha over their number, and over the sides."""
         chosen = [k for k, (name, _) in enumerate(self.pairs) if scenarios is None or name in scenarios]
         n = np.array([len(self.table.seeds[self.pairs[k][0]]) for k in chosen])
         hits = np.round(self.shares[chosen, slot] * n)
@@ -116,7 +118,7 @@ class Worst:
         return float(low.max()), float(high.max())
 
     def rate(self, slot: int) -> Data:
-        """Share of undamaged episodes against the worst, with its lower limit."""
+        """Return the undamaged share against the worst, with its lower limit."""
         pair, _ = self.at(slot)
         return {
             "dose": self.table.doses[slot], "knowledge": self.knowledge,
@@ -126,12 +128,12 @@ class Worst:
 
     @cached_property
     def numbers(self) -> list[int]:
-        """Slots of doses that are numbers."""
+        """Return slots of doses that are numbers."""
         return [slot for slot, dose in enumerate(self.table.doses) if dose is not None]
 
     @cached_property
     def _clean(self) -> list[tuple[str, Array]]:
-        """Damage of the clean runs by scenario: dose 0, where the suite has none of its own."""
+        """Return damage of the clean runs by scenario: dose 0, where the suite has none itself."""
         if 0 in self.table.doses:
             return []
         found = ((name, self.table.clean.get((name, self.defence))) for name in self.table.scenarios)
@@ -139,7 +141,7 @@ class Worst:
 
     @cached_property
     def points(self) -> list[Data]:
-        """The worst at each dose that is a number, dose 0 being no attack, with limits that hold together for all attacks."""
+        """Return the worst at each dose that is a number, dose 0 being no attack, with limits that hold together for all attacks."""
         out = []
         if self._clean:
             hits, n = (np.array([f(x) for _, x in self._clean], np.float64) for f in (np.sum, len))
@@ -156,16 +158,16 @@ class Worst:
         return out
 
     def curve(self) -> Data:
-        """The dose-response of the worst, and its monotone regression."""
+        """Return the dose-response of the worst, and its monotone regression."""
         line = fitted(np.array([point["value"] for point in self.points])).tolist()
         return {"defence": self.defence, "knowledge": self.knowledge, "points": self.points, "fitted": line}
 
     def critical(self) -> Data | None:
-        """The critical dose with its interval. None where no dose is a number.
+        """Return the critical dose with its interval. None where no dose is a number.
 
         The interval is where the lower and the upper limits cross that hold together for all pairs and doses. A bootstrap of the worst
-        would not cover: the largest of many shares is biased upwards, and that of a resample once more (decision record 23).
-        Values are null beyond the largest dose; the smallest dose stands for any up to it, and 0 for damage that needs no attack.
+        would not cover: the largest of many shares is biased upwards, and that of a resample once more (decision record 23). Values are
+        null beyond the largest dose; the smallest dose is given for any up to it, and 0 for damage that needs no attack.
         """
         if not self.numbers:
             return None

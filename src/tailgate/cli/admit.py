@@ -11,7 +11,7 @@ from tailgate.cli.shared import add_options, counted, own_classes, print_json, s
 
 
 def add(actions: Any) -> None:
-    """Adds `admit` to the actions of a command."""
+    """Add `admit` to the actions of a command."""
     command = actions.add_parser(
         "admit", help="put an attack on a suite's list if it beats the worst that is there",
         description="Play an attack on select seeds against the worst of its knowledge, and append it to OUT/SUITE/attacks.jsonl if a "
@@ -60,7 +60,7 @@ def _admit(options: argparse.Namespace) -> int:
 
 
 def _print(attack: str, admitted: bool, tests: list[dict[str, Any]]) -> None:
-    """A line for each defence and scenario in which the attack did something that the worst did not, what speaks most for it first."""
+    """Print a line for each defence and scenario where the attack did more than the worst in some episode, the most telling first."""
     telling, rows = [test for test in tests if test["only_new"] > 0], []
     for test in sorted(telling, key=lambda test: (test["only_new"] <= test["only_worst"], test["adjusted"])):
         does_more = test["only_new"] > test["only_worst"]

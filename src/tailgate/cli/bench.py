@@ -12,7 +12,7 @@ from tailgate.cli.shared import print_json, working
 
 
 def add(commands: Any) -> None:
-    """Adds `bench` to the commands."""
+    """Add `bench` to the commands."""
     command = commands.add_parser(
         "bench", help="measure the speed of this package and of the peers that are installed, side by side",
         description="Measure environments, estimators and solvers beside their peers, interleaved in one run, and judge the ratios by "

@@ -47,7 +47,7 @@ def _calibrate(options: argparse.Namespace) -> int:
 
 
 def _command(options: argparse.Namespace) -> str:
-    """What to type for this record."""
+    """Return the command line of this record."""
     words = ["tailgate", "calibrate"]
     for name in ("defence", "scenario", "hours"):
         words += [word for value in getattr(options, name) or () for word in (f"--{name}", f"{value:g}" if name == "hours" else value)]

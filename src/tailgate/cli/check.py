@@ -16,7 +16,7 @@ LONGEST = 160  # characters of a figure that are shown
 
 
 def add(actions: Any) -> None:
-    """Adds `check` to the actions of a command."""
+    """Add `check` to the actions of a command."""
     command = actions.add_parser(
         "check", help="play cells of a published board again, without its rows",
         description="Play cells of a board again and compare how many episodes came to damage, and the fingerprint of all decisions. "
@@ -119,7 +119,7 @@ def _print(report: dict[str, Any]) -> None:
 
 
 def _first(board: Any, here: Any) -> tuple[str, Any, Any]:
-    """Where two pieces of JSON first differ, and what stands there: a list may be long, and its difference at the end."""
+    """Return where two pieces of JSON first differ, and both values: a list may be long, and its difference at the end."""
     from tailgate.board.consistency import same
 
     pairs: list[tuple[str, Any, Any]] = []

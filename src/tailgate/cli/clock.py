@@ -11,7 +11,7 @@ from tailgate.cli.shared import add_options, counted, table, working
 
 
 def add(actions: Any) -> None:
-    """Adds `clock` to the actions of a command."""
+    """Add `clock` to the actions of a command."""
     command = actions.add_parser(
         "clock", help="measure what a step of each defence costs",
         description="Time the defences of a suite alone, step by step in one episode, in turn, and write OUT/SUITE/step_time.json, which "

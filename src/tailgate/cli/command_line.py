@@ -53,7 +53,7 @@ def _done(arguments: Sequence[str] | None, chosen: argparse.Namespace, ending: E
 
 
 def _kept(chosen: argparse.Namespace) -> str:
-    """What is left of a command that ended before its time."""
+    """Return what is left of a command that ended before its time."""
     return getattr(chosen, "kept", "nothing of it is kept")
 
 

@@ -13,7 +13,7 @@ from tailgate.cli.shared import add_options, own_classes
 
 
 def add(actions: Any) -> None:
-    """Adds `detect` to the actions of a command."""
+    """Add `detect` to the actions of a command."""
     command = actions.add_parser(
         "detect", help="play detection and stealth impact of a board, without its rows",
         description="Find each defence's threshold for the wanted mean times between false alarms, play the black-box scripts of "

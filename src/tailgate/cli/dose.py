@@ -85,7 +85,7 @@ def _nothing(report: dict[str, Any]) -> bool:
 
 
 def _critical(found: dict[str, float | None], doses: list[int]) -> str:
-    """A critical dose, its interval, and the played doses that it lies between; beyond the last it is only known to be larger."""
+    """Return a critical dose, its interval, and the played doses that it lies between; beyond the last it is only known to be larger."""
     value, low, high = (f"> {doses[-1]}" if found[key] is None else f"{found[key]:.1f}" for key in ("value", "low", "high"))
     text = f"{value} ({low} to {high})" if value != low or low != high else value
     at = found["value"]

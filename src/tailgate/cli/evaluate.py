@@ -79,7 +79,7 @@ def _evaluate(options: argparse.Namespace) -> int:
 
 
 def _dependent(rows: list[dict[str, Any]]) -> list[str]:
-    """What is to be said of somebody's own defences: of a cell of each a few rows are played again, by themselves or, if they were, not."""
+    """Return warnings on somebody's own defences, whose rows are played again: alone if they had companions, else with companions."""
     from tailgate.core.registry import Spec
     from tailgate.evaluation.verify import verify
 

@@ -31,7 +31,7 @@ def _explain(options: argparse.Namespace) -> int:
 
 
 def explanation(scenario: str | None, defence: str | None, attack: str | None) -> dict[str, dict[str, str]]:
-    """By what is played: `why` it cannot be traced, or the `size` of its code."""
+    """Return for each thing that is played `why` it cannot be traced, or the `size` of its code."""
     from tailgate.core.registry import Spec
     from tailgate.engine.agreement import Untraced
     from tailgate.envs.seat import Seat

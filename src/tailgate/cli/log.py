@@ -10,7 +10,7 @@ from tailgate.core.schema import scalar
 
 
 def add(commands: Any) -> None:
-    """Adds `log` to the commands."""
+    """Add `log` to the commands."""
     command = commands.add_parser(
         "log", help="write clean and attacked episodes as Parquet, for learning a detector (needs tailgate[log])",
         description="Write episodes of a suite as Parquet, one row per step and agent, with labels: training and development episodes, "

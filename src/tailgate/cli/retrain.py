@@ -9,7 +9,7 @@ from tailgate.cli.shared import add_options, show, table, working
 
 
 def add(actions: Any) -> None:
-    """Adds `retrain` to the actions of a command."""
+    """Add `retrain` to the actions of a command."""
     command = actions.add_parser(
         "retrain", help="train policies again and compare their weights",
         description="Train policies again, as their files say that they were trained, and compare the weights bit by bit. Exit code 1 when "

@@ -12,7 +12,7 @@ WORDS = {"more": "do more", "equal": "yoked equals own", "unknown": "cannot be t
 
 
 def add(actions: Any) -> None:
-    """Adds `timing` to the actions of a command."""
+    """Add `timing` to the actions of a command."""
     command = actions.add_parser(
         "timing", help="measure what the timing of a board's trained attackers is worth",
         description="Play a trained attacker of each ranked entry again, at its own times and at those of its twins (another episode's, "

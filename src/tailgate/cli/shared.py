@@ -1,4 +1,4 @@
-"""What commands share: options, progress, tables, and how results are printed: for people, or with --json for machines."""
+"""Shared parts of commands: options, progress, tables, and results for people, or with --json for machines."""
 
 from __future__ import annotations
 

@@ -96,7 +96,7 @@ def _print_report(report: dict[str, Any]) -> None:
 
 
 def _page(config: Any, report: dict[str, Any]) -> Any:
-    """The page of a finished run."""
+    """Write the page of a finished run."""
     from tailgate.evaluation.rows import read_rows
     from tailgate.site.rows_page import build as build_page
     from tailgate.training.comparison import ROWS, headline

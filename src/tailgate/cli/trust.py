@@ -47,7 +47,7 @@ def add(commands: Any) -> None:
 
 
 def _suite(options: argparse.Namespace) -> Any:
-    """The suite, or the part of it that the options name."""
+    """Return the suite, or the part of it that the options name."""
     from tailgate.core.scenario import load_suite
     from tailgate.evaluation.attack_list import attacks_of
 
@@ -137,7 +137,7 @@ def _print(found: dict[str, Any], folder: str | None) -> None:
 
 
 def _print_bounds(found: dict[str, Any]) -> None:
-    """The lower bounds of every defence, at the least and at the most knowledge of the attackers."""
+    """Print the lower bounds of every defence, at the least and at the most knowledge of the attackers."""
     from tailgate.board.words import at_least
 
     names = [name for name in ("safety", "trust") if any(name in entry for entry in found["defences"])]
@@ -204,7 +204,7 @@ def _print_failures(found: dict[str, Any], folder: str | None) -> None:
 
 
 def _print_cells(found: dict[str, Any]) -> None:
-    """What a rule that stops early found out."""
+    """Print the findings of a rule that stops early."""
     rule = found["rule"]
     why, rows = any(cell["trust"] is None for cell in found["cells"]), []
     for cell in found["cells"]:
@@ -219,5 +219,5 @@ def _print_cells(found: dict[str, Any]) -> None:
 
 
 def _bracketed(formula: str) -> str:
-    """As a part of a conjunction; names of properties stand by themselves."""
+    """Return a part of a conjunction; names of properties need no brackets."""
     return f"({formula})" if " " in formula else formula

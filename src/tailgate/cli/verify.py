@@ -13,7 +13,7 @@ from tailgate.cli.shared import MORE, SHOWN, add_options, counted, own_classes, 
 
 
 def add(actions: Any) -> None:
-    """Adds `verify` to the actions of a command."""
+    """Add `verify` to the actions of a command."""
     command = actions.add_parser(
         "verify", help="play rows again and compare their hashes and figures",
         description="Play rows again and compare hashes, metrics and all else that they record. Exit code 1 when a row differs, or when "

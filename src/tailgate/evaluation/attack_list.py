@@ -41,19 +41,19 @@ class Admitted:
     beacon: str = ""  # the round of the seeds that it was tried on; empty: the public ones, on which it may have been tuned
 
     def as_data(self) -> dict[str, Any]:
-        """JSON data of the line; lines of before there were beacons say none."""
+        """Return JSON data of the line; lines from before there were beacons have none."""
         data = dataclasses.asdict(self) | {"evidence": list(self.evidence)}
         return data if self.beacon else {key: value for key, value in data.items() if key != "beacon"}
 
     def sealed(self, before: str) -> Admitted:
-        """The same line behind another, with the hashes that it has there."""
+        """Return the same line behind another, with the hashes that it has there."""
         bare = dataclasses.replace(self, before=before, hash="")
         text = json.dumps(bare.as_data(), sort_keys=True, separators=(",", ":"), allow_nan=False)
         return dataclasses.replace(bare, hash=hashlib.blake2b(text.encode(), digest_size=16).hexdigest())
 
 
 def read(path: Path) -> list[Admitted]:
-    """The lines, checked; none where there is no file. Raises InputError that names the first line that is not as it was written."""
+    """Return the lines, checked; none where there is no file. Raises InputError that names the first line that was changed."""
     if not path.is_file():
         return []
     out: list[Admitted] = []
@@ -77,7 +77,7 @@ def read(path: Path) -> list[Admitted]:
 
 
 def published(suite: Suite) -> Path | None:
-    """The list of a suite of the package, which holds where no folder of boards has one of its own; None for a suite that has none."""
+    """Return the list of a suite of the package, which holds where no folder of boards has one; None for a suite that has none."""
     if suite.name not in list_suites():
         return None
     path = config_path("suites", suite.name, "suite").with_suffix(".attacks.jsonl")
@@ -85,7 +85,7 @@ def published(suite: Suite) -> Path | None:
 
 
 def list_of(suite: Suite, path: Path | None = None) -> list[Admitted]:
-    """What has joined a suite's attacks: by a folder's list, else by that of the package."""
+    """Return the lines of a folder's list, else of the package's."""
     if path is not None and path.is_file():
         return read(path)
     shipped = published(suite)
@@ -93,7 +93,7 @@ def list_of(suite: Suite, path: Path | None = None) -> list[Admitted]:
 
 
 def attacks_of(suite: Suite, path: Path | None = None) -> tuple[str, ...]:
-    """The attacks of a suite, and those that have joined them."""
+    """Return the attacks of a suite, and those that have joined them."""
     joined = (text for text, line in standing(list_of(suite, path)).items() if line is not None)
     return tuple(dict.fromkeys([*suite.attacks, *joined]))
 
@@ -115,7 +115,7 @@ def append(path: Path, line: Admitted) -> Admitted:
 
 @contextlib.contextmanager
 def _alone(folder: Path) -> Iterator[None]:
-    """Two writers at a time would lose the line of one."""
+    """Lock a folder: two writers at a time would lose the line of one."""
     handle = os.open(folder, os.O_RDONLY)
     try:
         fcntl.flock(handle, fcntl.LOCK_EX)
@@ -125,17 +125,17 @@ def _alone(folder: Path) -> Iterator[None]:
 
 
 def standing(lines: Sequence[Admitted]) -> dict[str, Admitted | None]:
-    """What holds of each attack that the list names: its line, or None where it was refused or the last word is an erratum."""
+    """Return the line that holds of each attack of the list, or None where it was refused or the last word is an erratum."""
     return {line.attack: None if line.erratum or line.refused else line for line in lines}
 
 
 def taken_back(lines: Sequence[Admitted]) -> list[str]:
-    """Attacks whose last line is an erratum: they count nowhere. One that was refused is on no list, and counts where it was played."""
+    """Return attacks whose last line is an erratum: they count nowhere. A refused one is on no list, and counts where it was played."""
     last = {line.attack: line for line in lines}
     return [attack for attack, line in last.items() if line.erratum]
 
 
 def next_level(lines: Sequence[Admitted], alpha: float) -> float:
-    """At which the next try is tested."""
+    """Return the level of the next try."""
     tries = 1 + sum(not line.erratum for line in lines)
     return alpha / (tries * (tries + 1))

@@ -1,8 +1,8 @@
 """One act: play something again and compare.
 
-Rows (`leaderboard verify`), cells of a board (`check`), figures of detection (`check --detection`) and policies (`retrain`) share it.
-What a claim names is read and never run: registered names, the zoo, and files.
-What cannot be played here is `unchecked`, which is neither equal nor wrong.
+Rows (`leaderboard verify`), cells of a board (`check`), figures of detection (`check --detection`) and policies (`retrain`) share it. Names
+in a claim are read and never run: registered names, the zoo, and files. A claim that cannot be played here is `unchecked`, which is neither
+equal nor wrong.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class Unplayable(Exception):
 
 @dataclass
 class Finding:
-    """What became of one thing. `differences`: field, what the claim says, what is here; `here`: what came out, if it was played."""
+    """The verdict on one thing. `differences`: field, the claim's value, and the value here; `here`: the result, if it was played."""
 
     verdict: str
     why: str = ""

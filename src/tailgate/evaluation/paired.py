@@ -28,17 +28,17 @@ class Harm(NamedTuple):
 
     @property
     def of_worst(self) -> Array:
-        """(episodes,) what the worst attack does."""
+        """Return (episodes,) the damage of the worst attack."""
         return np.asarray(self.damage[self.worst])
 
 
 def class_of(uses: Sequence[str]) -> str:
-    """The class of a defence: what it uses, in the registry's order."""
+    """Return the class of a defence: what it uses, in the registry's order."""
     return " + ".join(use for use in USES if use in uses)
 
 
 def mcnemar(only_a: int, only_b: int) -> float:
-    """Exact two-sided p of McNemar's test: of the pairs that differ, each side has half under the null hypothesis."""
+    """Return the exact two-sided p of McNemar's test: of the pairs that differ, each side has half under the null hypothesis."""
     from scipy.stats import binomtest
 
     n = only_a + only_b
@@ -46,7 +46,7 @@ def mcnemar(only_a: int, only_b: int) -> float:
 
 
 def outdone(a: Harm, b: Harm, least: bool = False) -> float:
-    """p of the null hypothesis that some attack harms b at least as much as a's worst harms a: small where a is surely the weaker one.
+    """Return p of the null hypothesis that some attack harms b at least as much as a's worst harms a: small where a is surely weaker.
 
     a's worst attack is tested against every attack of b, one-sided, and the largest p counts (an intersection-union test, which needs no
     correction). That a's worst was chosen on these very episodes costs the factor of its attacks (Bonferroni). Where nobody knows which
@@ -62,10 +62,10 @@ def outdone(a: Harm, b: Harm, least: bool = False) -> float:
 
 
 def apart(mine: Array, others: Array, vague: Array, least: bool = False) -> tuple[Array, Array]:
-    """(attacks,) each: episodes in which `mine` (episodes,) alone shows damage, and in which `others` (attacks, episodes) alone do.
+    """Return (attacks,) each: episodes in which `mine` (episodes,) alone shows damage, and in which `others` (attacks, episodes) alone do.
 
-    Of vague pairs as many as their numbers allow, or as few: the difference being given, a p below one half rises with the number of pairs
-    that differ.
+    Vague pairs count as many as their numbers allow, or as few: the difference being given, a p below one half rises with the number of
+    pairs that differ.
     """
     only, other = np.sum(mine > others, axis=1), np.sum(others > mine, axis=1)
     most = np.minimum(others.sum(axis=1), len(mine) - mine.sum()).astype(int)
@@ -74,9 +74,12 @@ def apart(mine: Array, others: Array, vague: Array, least: bool = False) -> tupl
 
 
 def duel(group: str, a: str, b: str, x: Harm, y: Harm) -> Data:
-    """Two defences of a class. only_a counts the episodes in which a alone came to damage, each against its worst attack; p is twice the
-    smaller of the two sides of `outdone`; `weaker` is the side that it speaks of. `bound`: some cell does not say which of its episodes
-    came to damage, so that p, and what counts episodes, are as large as they can be. Raises InputError for other seeds."""
+    """Compare two defences of a class.
+
+    only_a counts the episodes in which a alone came to damage, each against its worst attack; p is twice the smaller of the two sides of
+    `outdone`; `weaker` is the side that it speaks of. `bound`: some cell does not say which of its episodes came to damage, so that p, and
+    all counts of episodes, are as large as they can be. Raises InputError for other seeds.
+    """
     if x.seeds != y.seeds:
         raise InputError(f"rows of {a} and {b}: seeds", f"{len(x.seeds)} and {len(y.seeds)}", "the same seeds in every scenario")
     worst = np.array([x.vague[x.worst] | y.vague[y.worst]])
@@ -87,7 +90,7 @@ def duel(group: str, a: str, b: str, x: Harm, y: Harm) -> Data:
 
 
 def credible(told: Data, here: Data, x: Harm, y: Harm) -> bool:
-    """Whether a pair can have been found like that when more episodes were known, of which cells tell no more than the bound `here`."""
+    """Return if a pair can have been found like that when more episodes were known than cells tell now, which give the bound `here`."""
     from scipy.stats import binom
 
     if told.get("weaker") not in (told["a"], told["b"]):
@@ -106,8 +109,10 @@ def credible(told: Data, here: Data, x: Harm, y: Harm) -> bool:
 
 
 def settled(duels: Sequence[Data], names: Sequence[str], alpha: float) -> tuple[list[Data], dict[str, dict[str, int]]]:
-    """Duels of all pairs of a class, with p adjusted after Holm, and each one's rank set: best, 1 + those that are surely better, and
-    worst."""
+    """Return duels of all pairs of a class, with p adjusted after Holm, and each one's rank set.
+
+    Its best rank is 1 + those that are surely better; its worst leaves out those that are surely worse.
+    """
     out = [made | {"adjusted": adjusted} for made, adjusted in zip(duels, holm([made["p"] for made in duels]), strict=True)]
     better, worse = dict.fromkeys(names, 0), dict.fromkeys(names, 0)
     for made in out:
@@ -120,7 +125,7 @@ def settled(duels: Sequence[Data], names: Sequence[str], alpha: float) -> tuple[
 def compare(
     harm: Mapping[str, Harm], group: str, alpha: float, found: Sequence[Data] = ()
 ) -> tuple[list[Data], dict[str, dict[str, int]]]:  # fmt: skip
-    """Comparisons of all pairs of a class, and the rank set of each.
+    """Return comparisons of all pairs of a class, and the rank set of each.
 
     found: pairs that were compared when more episodes were known; they count where that is no longer so, if numbers allow it (`credible`).
     """

@@ -1,8 +1,8 @@
 """Rows played again: a claim becomes verified when every field comes out as the row says.
 
-A row names all that is needed to play it. What it names is read and never run: registered names, the zoo, and files whose digest is
-the one in the row. A row that names code to import is refused, unless the caller trusts it. Whatever cannot be looked into here (another
-version, a file that is not here) is said to be so: it is neither verified nor wrong.
+A row names all that is needed to play it. It is read and never run: registered names, the zoo, and files whose digest is the one in the
+row. A row that names code to import is refused, unless the caller trusts it. Another version, or a file that is not here, is said: such a
+row is neither verified nor wrong.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def verify(
 
 
 def _target(text: str) -> str:
-    """The class that stands behind a sandbox. Raises InputError for any other text."""
+    """Return the class in a sandbox. Raises InputError for any other text."""
     spec = Spec("defence", text)
     if spec.sandboxed is None:
         raise InputError("submission", text, f"a class in a sandbox: {' or '.join(f'{name}/module:Class' for name in SANDBOXES)}")
@@ -108,7 +108,7 @@ def _play(
 
 
 def position(row: Row) -> int:
-    """Number of a row's episode: its seed, or the seed's place in the round of a beacon."""
+    """Return the number of a row's episode: its seed, or the seed's place in the round of a beacon."""
     return _places_of(row)[row["seed"]] if row.get("beacon") else int(row["seed"])
 
 
@@ -122,7 +122,7 @@ def _places(beacon: str, suite: str, purpose: str) -> dict[int, int]:
 
 
 def _key(row: Row) -> str:
-    """What rows of one cell share."""
+    """Return what rows of one cell share."""
     names = ("suite", "scenario", "scenario_file", "threat_model", "defence", "attack", "purpose", "config_hash", "version", "engine",
              "defence_digest", "attack_digest", "versions", "batch", "beacon", "submission")  # fmt: skip
     return canonical([row.get(name) for name in names])
@@ -214,7 +214,7 @@ def _readable(path: Path) -> bool:
 
 
 def _unlike(row: Row, apart: dict[str, str]) -> str:
-    """Why a submission is not played; empty where its files are here, in a sandbox."""
+    """Return why a submission is not played; empty where its files are here, in a sandbox."""
     text = apart.get(row["defence"])
     if text is None:
         return f"{row['defence']!r} is a submission: give --submission bwrap/{row['defence']} with its files"
@@ -225,7 +225,7 @@ def _unlike(row: Row, apart: dict[str, str]) -> str:
 
 
 def _spans(cell: Cell, members: list[int], rows: Sequence[Row]) -> list[tuple[Cell, list[int]]]:
-    """Cells of neighbouring seeds that cover the rows. Seeds between two of them are played along: side by side they cost little."""
+    """Return cells of neighbouring seeds that cover the rows. Seeds between two of them are played along: they cost little."""
     out: list[tuple[Cell, list[int]]] = []
     for i in sorted(members, key=lambda i: position(rows[i])):
         seed = position(rows[i])

@@ -1,4 +1,4 @@
-"""What the pages of a board say of false alarms at the thresholds of its detection: by scenario, and the flag `alarm drift`."""
+"""False alarms on the pages of a board, at the thresholds of its detection: by scenario, and the flag `alarm drift`."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ LEVEL = 0.05  # of each of the three, for all scenarios of an entry together
 
 
 def alarms_of(suite: Suite) -> list[Alarms]:
-    """All lines of a board that says so."""
+    """Return all lines of a board that has them."""
     return suite.board.detection.alarms if suite.board.detection else []
 
 
 def robust(suite: Suite) -> set[str]:
-    """Scenarios that are not as a defence is told."""
+    """Return scenarios that are not as a defence is told."""
     return {scenario.name for scenario in suite.board.suite.scenarios if scenario.robustness}
 
 
@@ -29,7 +29,7 @@ def middle(suite: Suite) -> float:
 
 
 def table_of(suite: Suite, defence: str) -> Data | None:
-    """Of an entry: a row for each scenario, a column for each wanted mean time, and when in the drive they come at the middle one."""
+    """Return an entry's table: a row per scenario, a column per wanted mean time, and when in the drive alarms come at the middle one."""
     lines = [line for line in alarms_of(suite) if line.defence == defence]
     if not lines:
         return None
@@ -45,7 +45,7 @@ def table_of(suite: Suite, defence: str) -> Data | None:
 
 
 def together_of(suite: Suite) -> Data | None:
-    """Of all entries at the middle mean time: a column for each scenario."""
+    """Return the table of all entries at the middle mean time: a column for each scenario."""
     hour, lines = middle(suite), [line for line in alarms_of(suite) if line.hours == middle(suite)]
     if not lines:
         return None
@@ -60,7 +60,7 @@ def together_of(suite: Suite) -> Data | None:
 
 
 def drifts_of(suite: Suite, defence: str) -> list[str]:
-    """The flag of an entry whose false alarms surely come far more often or rarely than its threshold was set for, or in one half alone."""
+    """Return flags of an entry: false alarms surely far more or less often than its threshold was set for, or in one half alone."""
     hour = middle(suite)
     lines = [line for line in alarms_of(suite) if line.defence == defence and line.hours == hour]
     told = [line for line in lines if line.scenario not in robust(suite)]
@@ -76,7 +76,7 @@ def drifts_of(suite: Suite, defence: str) -> list[str]:
 
 
 def _aside(line: Alarms, level: float) -> str:
-    """Of drives, which are independent: onsets of one drive come in clusters."""
+    """Return a flag for alarms in one half of the drive. It counts drives, which are independent: onsets come in clusters."""
     from scipy import stats
 
     drives, most = line.early + line.late, max(line.early, line.late)
@@ -103,7 +103,7 @@ def _cell(line: Alarms | None) -> Data:
 
 
 def time_text(hours: float) -> str:
-    """A time in the unit that fits: 11 s, 4.2 min, 1.3 h."""
+    """Return a time in the unit that fits: 11 s, 4.2 min, 1.3 h."""
     for unit, scale in (("h", 1.0), ("min", 60.0)):
         if hours * scale >= 1.0 - 1e-9:
             return f"{hours * scale:.3g} {unit}" if hours * scale < 1000.0 else f"{hours * scale:.0f} {unit}"

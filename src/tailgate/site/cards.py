@@ -1,7 +1,7 @@
-"""Cards as the pages show them: what authors say, over what is known of components that come with the package.
+"""Cards on the pages: the authors' words, over what is known of components that come with the package.
 
-A published board holds no copy of what can be told from the registry and the suite: description, reference and uses, the file of the
-class, its licence, what attackers are granted, and what was trained.
+A published board holds no copy of what can be told from the registry and the suite: description, reference and uses, the file of the class,
+its licence, what attackers are granted, and what was trained.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def _registered(family: Family) -> dict[str, Registered]:
 
 
 def plain(value: Any) -> str:
-    """JSON data in a line."""
+    """Return JSON data in a line."""
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, Mapping):
@@ -49,7 +49,7 @@ def plain(value: Any) -> str:
 
 
 def _granted(threat: ThreatModel) -> str:
-    """What an attacker may do, in a line; dose and knowledge stand beside every figure."""
+    """Return what an attacker may do, in a line; every figure names its dose and knowledge."""
     blank, words = ThreatModel(), [f"{plain(threat.kinds)} of {plain(threat.targets) or 'every sensor'}"]
     for field in dataclasses.fields(threat):
         value, kinds = getattr(threat, field.name), BOUNDS.get(field.name)
@@ -61,14 +61,14 @@ def _granted(threat: ThreatModel) -> str:
 
 @functools.cache
 def suite_of(name: str, digest: str) -> Played | None:
-    """The suite of a board, if it is one of the package as it is here."""
+    """Return the suite of a board, if it is one of the package as it is here."""
     held = load_suite(name) if name in list_suites() else None
     return held if held is not None and held.hash == digest else None
 
 
 @functools.cache
 def threat_of(name: str, digest: str) -> str:
-    """What a suite of the package, named with its hash, grants an attacker; empty for any other."""
+    """Return what a suite of the package, named with its hash, grants an attacker; empty for any other."""
     suite = suite_of(name, digest)
     if suite is None:
         return ""
@@ -79,7 +79,7 @@ def threat_of(name: str, digest: str) -> str:
 
 
 def _training(family: Family, name: Name, suite: Played | None) -> str:
-    """What was trained: nothing, a policy of the zoo, or one after the suite's plan."""
+    """Return what was trained: nothing, a policy of the zoo, or one after the suite's plan."""
     if family == "defence":
         return "as the file of its policy says" if any(p.startswith("policy=") for p in name.params) else "none"
     if name.base == "zoo" and name.label in zoo_names():
@@ -95,7 +95,7 @@ def _training(family: Family, name: Name, suite: Played | None) -> str:
 
 
 def own_card(suite: Suite, family: Family, name: Name) -> Data:
-    """The card of what comes with the package, made of the registry, the file of the class and the suite; empty for anything else."""
+    """Return the card of what comes with the package, from registry, file of the class and suite; empty for anything else."""
     base = "program" if name.base.endswith((".yaml", ".yml")) else name.base
     entry = _registered(family).get(base)
     if entry is None:
@@ -108,7 +108,7 @@ def own_card(suite: Suite, family: Family, name: Name) -> Data:
 
 
 def _drawn(card: Data) -> Data:
-    """A card's fields in order: those that are known first, then the others as they stand."""
+    """Return a card's fields in order: those that are known first, then the others as they come."""
     keys = [*(k for k in ORDER if k in card), *(k for k in card if k not in ORDER and k not in SHOWN)]
     fields = [(key.replace("_", " ").capitalize(), plain(card[key])) for key in keys if card[key] not in (None, "", [], {})]
     given = card.get("parameters")
@@ -120,7 +120,7 @@ def _drawn(card: Data) -> Data:
 
 
 def card_of(suite: Suite, entry: Entry) -> Data:
-    """The card of an entry: what the board says of it, over what is known of a defence that comes with the package."""
+    """Return the card of an entry: the board's, over what is known of a defence that comes with the package."""
     card = own_card(suite, "defence", suite.defences[entry.defence]) | (entry.card or {})
     drawn = _drawn(card)
     if "uses" not in card and entry.uses:
@@ -129,7 +129,7 @@ def card_of(suite: Suite, entry: Entry) -> Data:
 
 
 def attack_cards(suite: Suite) -> list[Data]:
-    """One card for all attacks of a board that it holds for, with their names; those without a card are left out."""
+    """Return one card for all attacks of a board that it holds for, with their names; those without a card are left out."""
     found: list[tuple[Data, list[Name]]] = []
     for attack in suite.board.attacks:
         name = suite.attacks[attack.attack]

@@ -1,4 +1,4 @@
-"""Where lines, labels and ticks of a chart stand, in percent of its field: the templates draw them as inline SVG.
+"""Places of lines, labels and ticks of a chart, in percent of its field: the templates draw them as inline SVG.
 
 Places in percent keep text at its size whatever the width of the page is.
 """
@@ -48,13 +48,13 @@ class Axis:
         return math.log10(max(x, 1e-12)) if self.scale == "decades" else x
 
     def at(self, x: float) -> float:
-        """Percent from the left; 50 where the axis has no length."""
+        """Return percent from the left; 50 where the axis has no length."""
         a, b = self._turned(self.low), self._turned(self.high)
         return round(100 * (self._turned(x) - a) / (b - a), 2) if b > a else 50.0
 
 
 def ticks_at(axis: Axis, places: Sequence[float], gap: float = 8.0) -> list[Data]:
-    """Ticks at the given places; of those closer than `gap` percent the later ones lose their text, the last never."""
+    """Return ticks at the given places; of those closer than `gap` percent the later ones lose their text, the last never."""
     out: list[Data] = []
     where = sorted(set(places))
     last = axis.at(where[-1]) if where else 0.0
@@ -68,9 +68,9 @@ def ticks_at(axis: Axis, places: Sequence[float], gap: float = 8.0) -> list[Data
 
 
 def spread(heights: Sequence[float], gap: float, ties: Sequence[float] = ()) -> list[float]:
-    """Heights (percent from the top) moved apart until neighbours are `gap` apart, within 0 to 100 where they fit; order is kept.
+    """Return heights (percent from the top) moved apart to a distance of `gap`, within 0 to 100 where they fit; order is kept.
 
-    ties: what the order of equal heights goes by.
+    ties: the order of equal heights.
     """
     order = sorted(range(len(heights)), key=lambda i: (round(heights[i]), ties[i] if ties else 0.0))
     gap = min(gap, 100 / max(len(order) - 1, 1))
@@ -89,7 +89,7 @@ def shorten(text: str, most: int = LABEL) -> str:
 
 
 def nice(top: float) -> float:
-    """The next round number that is not below."""
+    """Return the next round number that is not below."""
     if not top > 0 or not math.isfinite(top):
         return 1.0
     unit = 10.0 ** math.floor(math.log10(top))
@@ -97,14 +97,14 @@ def nice(top: float) -> float:
 
 
 def path_of(axis: Axis, points: Sequence[tuple[float, float]], top: float = 1.0) -> str:
-    """Points of a polyline on a 1000 x 1000 field."""
+    """Return points of a polyline on a 1000 x 1000 field."""
     return " ".join(f"{10 * axis.at(x):.1f},{1000 - 1000 * min(max(y / top, 0.0), 1.0):.1f}" for x, y in points)
 
 
 def chart(
     lines: Sequence[Line], axis: Axis, ticks: Sequence[Data], *, top: float = 1.0, gap: float = 6.0, limit: float | None = None
 ) -> Data:
-    """A chart's lines with bands, whiskers and labels at their right ends. gap: least distance of two labels [percent]."""
+    """Return a chart's lines with bands, whiskers and labels at their right ends. gap: least distance of two labels [percent]."""
 
     def up(y: float) -> float:
         return round(100 - 100 * min(max(y / top, 0.0), 1.0), 2)

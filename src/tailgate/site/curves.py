@@ -25,7 +25,7 @@ def dots_of(curve: Curve) -> Line:
 
 
 def curves_of(suite: Suite, wanted: Sequence[Entry] | None = None, gap: float = 14.0) -> list[Data]:
-    """One chart per defence on each scale, with a line per knowledge."""
+    """Return one chart per defence on each scale, with a line per knowledge."""
     out = []
     for entry in ordered(suite.board.entries) if wanted is None else wanted:
         lines = [line for c in suite.board.curves if c.defence == entry.defence and (line := dots_of(c)).dots]
@@ -41,7 +41,7 @@ def curves_of(suite: Suite, wanted: Sequence[Entry] | None = None, gap: float = 
 
 
 def together_of(suite: Suite) -> Data | None:
-    """The black-box curves of all defences on one field: the first in the table with a line each, the others faint."""
+    """Return the black-box curves of all defences on one field: the first in the table with a line each, the others faint."""
     by_defence = {c.defence: dots_of(c) for c in suite.board.curves if c.knowledge == "black"}
     there = [(e, by_defence[e.defence]) for e in ordered(suite.board.entries) if e.defence in by_defence and by_defence[e.defence].dots]
     if not there:
@@ -61,7 +61,7 @@ def together_of(suite: Suite) -> Data | None:
 
 
 def stealth_of(suite: Suite, wanted: Sequence[Entry] | None = None) -> Data | None:
-    """Deviation that a stealthy attacker reaches against the mean time between false alarms, of some or all entries: chart and table."""
+    """Return chart and table of the deviation that a stealthy attacker reaches, by the mean time between false alarms."""
     entries = ordered(suite.board.entries) if wanted is None else wanted
     there = [(e, sorted(e.stealth, key=lambda s: s.hours)) for e in entries if e.stealth]
     hours = sorted({s.hours for _, held in there for s in held})
@@ -85,7 +85,7 @@ def stealth_of(suite: Suite, wanted: Sequence[Entry] | None = None) -> Data | No
 
 
 def reached_of(item: Stealth) -> Data:
-    """One figure of stealth impact in words."""
+    """Return one figure of stealth impact in words."""
     span = "" if item.low is None or item.high is None else f"{figure(item.low, 3)} to {figure(item.high, 3)}"
     return BLANK | {
         "hours": figure(item.hours), "threshold": figure(item.threshold), "text": figure(item.deviation, 3), "span": span,

@@ -1,4 +1,4 @@
-"""What the page of one entry shows: its card, gates, flags, worst attacks, curves, robustness and the replay of its worst episode."""
+"""The page of one entry: its card, gates, flags, worst attacks, curves, robustness and the replay of its worst episode."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ WAYS = ("\N{LESS-THAN OR EQUAL TO}", "\N{GREATER-THAN OR EQUAL TO}")
 
 @dataclass(frozen=True)
 class Replayed:
-    """What came of playing the worst episode again: a page, or why there is none."""
+    """The replay of the worst episode: a page, or why there is none."""
 
     page: str = ""
     outcome: str = ""
@@ -41,10 +41,10 @@ class Replayed:
 
 
 def replay_of(row: Mapping[str, Any] | None, out: Path, source: str) -> Replayed:
-    """Plays the row and writes its page to `out`.
+    """Play the row and write its page to `out`.
 
     A board may come from anybody: its row may be of another version, incomplete, or name a file or a class that is not here. Then the
-    reason is what is returned: one row must not cost the site.
+    reason is returned: one row must not cost the site.
     """
     if row is None:
         return Replayed(why="The board holds no worst episode of this defence.")
@@ -58,7 +58,7 @@ def replay_of(row: Mapping[str, Any] | None, out: Path, source: str) -> Replayed
 
 
 def _reason(error: Exception, row: Mapping[str, Any]) -> str:
-    """The error in words, without the places of files on somebody's machine."""
+    """Return the error in words, without the places of files on somebody's machine."""
     if isinstance(error, KeyError):
         return f"The row lacks the field {error}."
     text = str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
@@ -70,7 +70,7 @@ def _reason(error: Exception, row: Mapping[str, Any]) -> str:
 
 
 def _episode(suite: Suite, entry: Entry) -> str:
-    """Which episode is the worst one, in words; empty where the board does not say."""
+    """Return which episode is the worst one, in words; empty where the board does not say."""
     row = entry.worst_episode or {}
     scenario, attack, dose = (row.get(key) for key in ("scenario", "attack", "dose"))
     if not (isinstance(scenario, str) and isinstance(attack, str) and isinstance(dose, int)):
@@ -95,7 +95,7 @@ def _rates(suite: Suite, entry: Entry) -> list[Data]:
 
 
 def _worst(suite: Suite, entry: Entry) -> list[Data]:
-    """Per scenario and shown dose the attack that did most damage; computed optima do not count."""
+    """Return the attack that did most damage per scenario and shown dose; computed optima do not count."""
     mine = [c for c in suite.board.cells if c.defence == entry.defence and not c.optimal and c.attack != "none"]
     out = []
     for scenario in suite.board.suite.scenarios:
@@ -118,7 +118,7 @@ def _cell(suite: Suite, cell: CellLine) -> Data:
 
 
 def _every(suite: Suite, mine: Sequence[CellLine]) -> list[Data]:
-    """All cells of a defence: a row per scenario and attack, a column per dose."""
+    """Return all cells of a defence: a row per scenario and attack, a column per dose."""
     rows: dict[tuple[str, str, str], dict[Any, CellLine]] = {}
     for cell in mine:
         rows.setdefault((cell.scenario, cell.attack, cell.knowledge), {})[cell.dose] = cell
@@ -153,7 +153,7 @@ def _clean(suite: Suite, entry: Entry) -> list[Data]:
 
 
 def _replayed(entry: Entry) -> str:
-    """What came of the rows that were played again; empty where nobody has said anything of them."""
+    """Return the result of playing rows again; empty where nobody has said anything of them."""
     held = entry.verified
     if held is None:
         return ""
@@ -167,7 +167,7 @@ def _replayed(entry: Entry) -> str:
 
 
 def _checked(entry: Entry) -> str:
-    """What came of the cells that were played again from the board alone; empty where none was."""
+    """Return the result of playing cells again from the board alone; empty where none was."""
     held = entry.checked
     if held is None:
         return ""
@@ -186,7 +186,7 @@ def _rank(suite: Suite, entry: Entry) -> str:
 
 
 def _imported(defence: str) -> bool:
-    """Whether a check of the board would have to import it, and so does not."""
+    """Return if a check of the board would have to import it, and so does not."""
     try:
         spec = Spec("defence", defence)
         return spec.foreign or bool(spec.sandboxed)
@@ -195,7 +195,7 @@ def _imported(defence: str) -> bool:
 
 
 def _clocked(clock: Clock | None, defence: str) -> str:
-    """What a step costs; empty where nobody has measured it."""
+    """Return the cost of a step; empty where nobody has measured it."""
     found = next((entry for entry in clock.entries if entry.defence == defence), None) if clock else None
     if clock is None or found is None:
         return ""
@@ -207,7 +207,7 @@ def _clocked(clock: Clock | None, defence: str) -> str:
 def entry_page(
     suite: Suite, entry: Entry, replayed: Replayed | None, also: list[tuple[str, str]], measured: Attachments
 ) -> Data:
-    """All that an entry's page shows. also: names of other suites with an entry of the same text, and their pages."""
+    """Return all that an entry's page shows. also: names of other suites with an entry of the same text, and their pages."""
     curves = curves_of(suite, [entry], gap=7.0)
     mine = [c for c in suite.board.cells if c.defence == entry.defence]
     stealth = stealth_of(suite, [entry])

@@ -1,4 +1,4 @@
-"""What the first page of a board's site shows of one suite: headline table, heat map, detection and comparisons."""
+"""One suite on the first page of a board's site: headline table, heat map, detection and comparisons."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def _lines(suite: Suite, measured: Attachments) -> list[Data]:
 
 
 def heat_of(suite: Suite) -> Data | None:
-    """The heat map: its heads and rows at the middle dose, and all figures for the menus."""
+    """Return the heat map: its heads and rows at the middle dose, and all figures for the menus."""
     board = suite.board
     if not board.cells:
         return None
@@ -96,7 +96,7 @@ def heat_of(suite: Suite) -> Data | None:
 
 
 def _trained_for(suite: Suite) -> dict[str, str]:
-    """Learned attacks that only the defence has met that they were trained against, and this defence: one column stands for them all."""
+    """Return learned attacks that only their own defence has met, and this defence: one column shows them all."""
     met: dict[str, set[str]] = {}
     for cell in suite.board.cells:
         met.setdefault(cell.attack, set()).add(cell.defence)
@@ -104,7 +104,7 @@ def _trained_for(suite: Suite) -> dict[str, str]:
 
 
 def _packed(cell: CellLine | None, reasons: dict[str, int]) -> int | list[float | int | None]:
-    """0 for no cell, else [share, low, high, episodes, failed, index of the reason]; the share is null where there are no figures."""
+    """Return 0 for no cell, else [share, low, high, episodes, failed, index of the reason]; the share is null without figures."""
     if cell is None:
         return 0
     reason = reasons.setdefault(cell.reason, len(reasons))
@@ -114,7 +114,7 @@ def _packed(cell: CellLine | None, reasons: dict[str, int]) -> int | list[float 
 
 
 def detection_of(suite: Suite) -> Data | None:
-    """The second board: per defence and time between false alarms the share detected of the attack that it detects least."""
+    """Return the second board: the detected share of the attack that each defence detects least, by time between false alarms."""
     if suite.board.detection is None or not suite.board.detection.entries:
         return None
     hours, cases = suite.board.detection.hours, suite.board.detection.entries
@@ -141,7 +141,7 @@ def detection_of(suite: Suite) -> Data | None:
 
 
 def _each_attack(suite: Suite, hour: float) -> Data:
-    """At one time between false alarms the share of each attack that each defence detects, in the scenario where it detects least."""
+    """Return the share of each attack that each defence detects, in its worst scenario, at one time between false alarms."""
     assert suite.board.detection is not None
     cases = [c for c in suite.board.detection.entries if c.hours == hour]
     names = list(dict.fromkeys(c.attack for c in cases))
@@ -160,7 +160,7 @@ def _each_attack(suite: Suite, hour: float) -> Data:
 
 
 def comparisons_of(suite: Suite, defence: str | None = None) -> list[Data]:
-    """Pairs of a class, and which of the two is surely weaker; of one defence only, those that it is in."""
+    """Return pairs of a class, and which of the two is surely weaker; for one defence only its own pairs."""
     out = []
     wide = {duel.class_ for duel in suite.board.comparisons if duel.bound}  # whose corrected p are no smaller than of all that is known
     for duel in suite.board.comparisons:
@@ -184,7 +184,7 @@ BOUND = (
 
 
 def compared_how(suite: Suite) -> str:
-    """The test of the comparisons in a sentence; boards that do not say who is weaker were made with a simpler one."""
+    """Return the test of the comparisons in a sentence; boards that do not say who is weaker were made with a simpler one."""
     alpha = figure(suite.board.suite.alpha)
     if not any(duel.weaker for duel in suite.board.comparisons):
         return f"Each at its own worst case at the middle dose, on the same seeds: McNemar's exact test, corrected after Holm, at {alpha}."
@@ -206,7 +206,7 @@ WHOLE = ({"ppo", "cem"}, {"black", "grey"}, 5)  # learners, knowledge and traini
 
 
 def ranked_against(suite: Suite) -> str:
-    """Which attackers a rank asks for; empty where nobody can tell."""
+    """Return which attackers a rank asks for; empty where nobody can tell."""
     own = suite_of(suite.board.suite.name, suite.board.suite.hash)
     if own is None or not own.adaptive:
         return ""
@@ -231,7 +231,7 @@ def attacks_of(suite: Suite) -> list[Data]:
 
 
 def _admitted(line: Data) -> str:
-    """When, and by which test: of those that it wins the one with the smallest p."""
+    """Return when, and by which test an attack was admitted: of those that it wins the one with the smallest p."""
     tests = [test for test in line.get("evidence", ()) if isinstance(test, dict) and isinstance(test.get("adjusted"), int | float)]
     won = [test for test in tests if (test.get("only_new") or 0) > (test.get("only_worst") or 0)]
     best = min(won, key=lambda test: test["adjusted"], default=None)
@@ -243,7 +243,7 @@ def _admitted(line: Data) -> str:
 
 
 def checked_of(suite: Suite) -> str:
-    """Of how many entries the rows that were played again came out equal, and how many cells from the board alone; empty for none."""
+    """Return how many entries' rows, and how many cells of the board alone, came out equal when played again; empty for none."""
     entries, said = suite.board.entries, []
     if told := [entry.verified for entry in entries if entry.verified is not None]:
         equal, differs, unchecked = sum(v.verified for v in told), sum(v.differs for v in told), sum(v.unchecked for v in told)
@@ -257,7 +257,7 @@ def checked_of(suite: Suite) -> str:
 
 
 def _group(title: str, about: str, rows: list[Data]) -> Data:
-    """Entries of one status. A reason that most of them have stands once, above them."""
+    """Return entries of one status. A reason that most of them share is given once, above them."""
     reasons = Counter(row["why"] for row in rows if row["why"])
     shared, n = reasons.most_common(1)[0] if reasons else ("", 0)
     if n < 2 or 2 * n <= len(rows):
@@ -266,7 +266,7 @@ def _group(title: str, about: str, rows: list[Data]) -> Data:
 
 
 def section(suite: Suite, measured: Attachments) -> Data:
-    """All that index.html shows of a suite."""
+    """Return all that index.html shows of a suite."""
     board = suite.board
     rows = _lines(suite, measured)
     groups = [_group(t, about, [r for r in rows if r["status"] == s]) for s, t, about in GROUPS]

@@ -27,7 +27,7 @@ STYLES = 8  # line styles of the learning curve
 
 @dataclass(frozen=True)
 class _Words:
-    """What the page knows of components: the names in the rows, and the cards of registered ones."""
+    """Names of components in the rows, and the cards of registered ones."""
 
     defence: dict[str, Name]
     attack: dict[str, Name]
@@ -52,7 +52,7 @@ def _cell(entry: Data, words: _Words) -> Data:
 
 
 def _line(text: str, cells: list[Data], uses: set[str], words: _Words) -> Data:
-    """A defence's row of the heat map. Its worst case is over attacks that do not know the best answer beforehand."""
+    """Return a defence's row of the heat map. Its worst case is over attacks that do not know the best answer beforehand."""
     name = words.defence[text]
     against = [c for c in cells if not c["optimal"]]
     known = [c for c in against if c["crash"]]
@@ -69,7 +69,7 @@ def _line(text: str, cells: list[Data], uses: set[str], words: _Words) -> Data:
 
 
 def _section(key: tuple[Any, ...], group: Sequence[Data], rows: Sequence[Data], words: _Words) -> Data:
-    """One suite, scenario and dose: a row per defence; a column per attack, twice where its knowledge differs."""
+    """Return one suite, scenario and dose: a row per defence; a column per attack, twice where its knowledge differs."""
     kept = {(e["defence"], e["attack"], e["knowledge"]): e for e in group}
     columns = list(dict.fromkeys((e["attack"], e["knowledge"]) for e in group))
     marks = {c: {k: any(e[k] for e in group if e["attack"] == c[0]) for k in ("learned", "optimal")} for c in columns}
@@ -102,7 +102,7 @@ def _section(key: tuple[Any, ...], group: Sequence[Data], rows: Sequence[Data], 
 
 
 def _cards(words: _Words, family: str) -> list[Data]:
-    """One card per component in the rows, with the variants that were played."""
+    """Return one card per component in the rows, with the variants that were played."""
     used, known = (words.defence, words.defences) if family == "defence" else (words.attack, words.attacks)
     out: dict[str, Data] = {}
     for name in used.values():
@@ -130,7 +130,7 @@ def _numbers(where: str, item: Any, keys: Sequence[str]) -> list[float]:
 
 
 def _headline(data: Data | None) -> Data | None:
-    """Dots and intervals as places on an axis in percent; the axis has a negative half where a value needs it."""
+    """Return dots and intervals as places on an axis in percent; the axis has a negative half where a value needs it."""
     if data is None:
         return None
     points = []
@@ -156,7 +156,7 @@ def _headline(data: Data | None) -> Data | None:
 
 
 def _curve(data: Sequence[Data] | None) -> Data | None:
-    """One polyline per seed on a 1000 x 1000 field, and its figures in words."""
+    """Return one polyline per seed on a 1000 x 1000 field, and its figures in words."""
     runs: dict[int, list[tuple[float, float]]] = {}
     for i, point in enumerate(data or ()):
         seed, at, crash = _numbers(f"curve[{i}]", point, ("seed", "steps", "crash"))

@@ -18,7 +18,7 @@ SPREAD = 16  # ratio of the largest dose to the smallest above which doses are d
 
 
 def figure(value: float | None, digits: int = 4) -> str:
-    """A number, short; an en dash for none."""
+    """Return a number, short; an en dash for none."""
     if value is None:
         return "\N{EN DASH}"
     text = f"{value:.6f}".rstrip("0") if 1e-5 <= abs(value) < 1e-3 else f"{value:.{digits}g}"
@@ -53,7 +53,7 @@ class Suite:
         self.attacks = names_of(dict.fromkeys([*own, *worst, *points, *heard, *robust, *trusted]))
 
     def harmless(self, defence: str, level: Level) -> bool:
-        """Whether no attack that knows at most so much did damage to a defence, at any dose and in any scenario."""
+        """Return if no attack that knows at most this did damage to a defence, at any dose and in any scenario."""
         known = LEVELS[: LEVELS.index(level) + 1]
         mine = [c.damage.value for c in self.board.cells if c.defence == defence and c.knowledge in known and not c.optimal and c.damage]
         return bool(mine) and not any(mine)
@@ -64,7 +64,7 @@ class Suite:
 
     @property
     def shown(self) -> list[Dose]:
-        """The doses with a column in the headline table: those that the suite gives a reason for, else up to three."""
+        """Return the doses with a column in the headline table: those that the suite gives a reason for, else up to three."""
         doses = self.board.suite.doses
         named = [d for d in doses if str(d) in self.board.suite.shown]
         return named or sorted({doses[0], doses[len(doses) // 2], doses[-1]}, key=doses.index)
@@ -85,7 +85,7 @@ class Suite:
 
     @property
     def places(self) -> list[float]:
-        """Doses with a tick on the axis of the curves, which may begin without an attack."""
+        """Return doses with a tick on the axis of the curves, which may begin without an attack."""
         doses = [*self.board.suite.doses, *(p.dose for c in self.board.curves for p in c.points)]
         return sorted({float(d) for d in doses if d is not None})
 
@@ -95,7 +95,7 @@ class Suite:
 
     @property
     def round(self) -> str:
-        """Whose seeds the episodes are of; empty where the board does not say."""
+        """Return whose seeds the episodes are of; empty where the board does not say."""
         beacon = self.board.suite.beacon
         return "" if beacon is None else f"seeds of the beacon {beacon}" if beacon else "public seeds: for development"
 
@@ -105,7 +105,7 @@ class Suite:
 
 
 def critical_of(suite: Suite, entry: Entry, level: Level) -> Data:
-    """An entry's critical dose in words, and its interval as places on the dose axis."""
+    """Return an entry's critical dose in words, and its interval as places on the dose axis."""
     critical = entry.critical_dose.get(level)
     if critical is None:
         met = any(c.knowledge == level for c in suite.board.cells if c.defence == entry.defence)
@@ -151,7 +151,7 @@ def gates_of(entry: Entry) -> Data:
 
 
 def cell_of(cell: CellLine | None, limit: float) -> Data:
-    """A cell of the heat map: what stands in it, its shade, and the words for those who do not see it."""
+    """Return a cell of the heat map: its text, its shade, and the words for those who do not see it."""
     if cell is None or cell.damage is None:
         what = "not played" if cell is None or not (cell.reason or cell.failed) else "failed" if cell.failed else "skipped"
         why = ": ".join(filter(None, (what, cell.reason if cell else "")))
@@ -165,14 +165,14 @@ def cell_of(cell: CellLine | None, limit: float) -> Data:
 
 
 def worse(cells: Iterable[CellLine | None]) -> CellLine | None:
-    """The cell with the most damage; of equal ones the first. One without figures only where no other is."""
+    """Return the cell with the most damage; of equal ones the first. One without figures only where no other is."""
     there = [c for c in cells if c is not None]
     known = [c for c in there if c.damage is not None]
     return max(known, key=lambda c: c.damage.value if c.damage else 0.0) if known else next(iter(there), None)
 
 
 def played(there: int, equal: int, differs: int, unchecked: int, noun: str) -> str:
-    """What came of rows or cells of which some were played again."""
+    """Return the result of playing rows or cells again, in words."""
     again = equal + differs
     said = f"{again} of {there} {noun}" if again < there else f"all {there} {noun}"
     said += f", {differs} of them differ" if differs else ", all equal" if equal else ""

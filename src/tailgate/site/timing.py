@@ -1,4 +1,4 @@
-"""What the pages of a board say of the timing of its trained attackers."""
+"""Timing of trained attackers on the pages of a board."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ VERDICTS = {
 
 
 def timed_of(timing: Timing | None, defence: str) -> Data | None:
-    """An entry's figures, or why there are none; None where nobody has looked."""
+    """Return an entry's figures, or why there are none; None where nobody has looked."""
     if timing is None:
         return None
     if (found := next((entry for entry in timing.entries if entry.defence == defence), None)) is None:
@@ -37,13 +37,13 @@ def timed_of(timing: Timing | None, defence: str) -> Data | None:
 
 
 def points(change: float) -> str:
-    """A change of a share in points, with its sign."""
+    """Return a change of a share in points, with its sign."""
     text = f"{100 * change:+.0f}"
     return "0" if text in ("+0", "-0") else text.replace("-", "\N{MINUS SIGN}")
 
 
 def flags_of(timing: Timing | None, defence: str) -> list[str]:
-    """What its schedule says against the worth of an entry's attacker."""
+    """Return flags of an entry whose attacker gains nothing by its schedule."""
     out = []
     for entry in (entry for entry in timing.entries if entry.defence == defence) if timing else ():
         who = f"{names_of([entry.attack])[entry.attack].full} on {entry.scenario}"

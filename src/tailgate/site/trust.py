@@ -16,7 +16,7 @@ UNITS = {
 
 
 def trust_of(suite: Suite) -> Data | None:
-    """What all bounds of a suite are about; None where nobody has any."""
+    """Return the setting of all bounds of a suite; None where nobody has any."""
     head = suite.board.trust
     if head is None:
         return None
@@ -35,7 +35,7 @@ def trust_of(suite: Suite) -> Data | None:
 
 
 def trust_cell(suite: Suite, entry: Entry) -> Data:
-    """The bound of safety against black boxes in the table, and the one of all properties in its title."""
+    """Return the bound of safety against black boxes in the table, and the one of all properties in its title."""
     bound = entry.trust.safety.get("black") if entry.trust else None
     if entry.trust is None or bound is None:
         return {"text": "\N{EN DASH}", "sort": "", "about": _why(suite, entry)}
@@ -46,7 +46,7 @@ def trust_cell(suite: Suite, entry: Entry) -> Data:
 
 
 def trust_page(suite: Suite, entry: Entry) -> Data | None:
-    """The section of an entry: a line per conjunction and knowledge."""
+    """Return the section of an entry: a line per conjunction and knowledge."""
     head, trust = suite.board.trust, entry.trust
     if head is None:
         return None
@@ -67,7 +67,7 @@ def trust_page(suite: Suite, entry: Entry) -> Data | None:
 
 
 def _against(suite: Suite, level: Level) -> int:
-    """How many attacks the bounds of a knowledge are against: of a bound, or where nobody has one, of the list."""
+    """Return how many attacks the bounds of a knowledge are against: of a bound, or where nobody has one, of the list."""
     for entry in suite.board.entries:
         for held in (entry.trust.safety, entry.trust.all) if entry.trust else ():
             if bound := held.get(level):
@@ -87,7 +87,7 @@ def _worst(suite: Suite, bound: Bound) -> str:
 
 
 def _why(suite: Suite, entry: Entry) -> str:
-    """Why an entry has no bound, or not all; attacks by their names, without the places of files."""
+    """Return why an entry has no bound, or not all; attacks by their names, without the places of files."""
     if entry.trust is None:
         return "not among the defences that were checked"
     text = entry.trust.why

@@ -22,7 +22,7 @@ Verdict = Literal["same", "differs", "unchecked"]
 
 
 class Again(NamedTuple):
-    """What became of one policy; `sha256` of its weights as they are shared, and of those that came out here."""
+    """The verdict on one policy; `sha256` of its weights as they are shared, and of those that came out here."""
 
     policy: str
     verdict: Verdict
@@ -77,7 +77,7 @@ def _trained_again(who: Trained, config: train.TrainConfig, progress: Callable[[
 
 
 def _unlike(who: Trained) -> str:
-    """In which versions the training of a policy's file was another than one here is, in words."""
+    """Return in which versions the training of a policy's file was another than one here is, in words."""
     held, here = who.header.training.get("made_with"), made_with(who.learner)
     if not isinstance(held, dict):
         return "not recorded what it was trained with"
@@ -86,7 +86,7 @@ def _unlike(who: Trained) -> str:
 
 
 def _config(who: Trained) -> train.TrainConfig:
-    """The training as the policy's file records it, of the one seed. Raises InputError where it cannot be repeated here."""
+    """Return the training as the policy's file records it, of the one seed. Raises InputError where it cannot be repeated here."""
     where, record = f"policy {who.name}: training", who.header.training
     held = record.get("config")
     if not isinstance(held, dict) or who.seed is None:
@@ -102,6 +102,6 @@ def _config(who: Trained) -> train.TrainConfig:
 
 
 def _teacher(record: dict[str, Any], config: train.TrainConfig) -> str | None:
-    """The script that was shown: where the best of the rivals was, the record names it, which saves choosing it again."""
+    """Return the script that was shown: where the best of the rivals was, the record names it, which saves choosing it again."""
     held = record.get("teacher", config.teacher)
     return held if held is None or isinstance(held, str) else config.teacher
