@@ -53,7 +53,7 @@ def compared(part: CellLine, here: Data) -> Finding:
     return Finding("differs" if off else "equal", why, here=here)
 
 
-def _parts(name: str, says: Any, here: Any) -> list[tuple[str, Any, Any]]:
+def _parts(name: str, says: object, here: object) -> list[tuple[str, object, object]]:
     """Return the parts of a figure that differ: a share with limits part by part."""
     if not isinstance(says, dict) or not isinstance(here, dict):
         return [(name, says, here)]

@@ -6,7 +6,6 @@ Shares of damage decide its rates, critical doses, curves and robustness. Damage
 from __future__ import annotations
 
 import math
-from typing import Any
 
 from tailgate.core.scenario import Suite
 from tailgate.core.threat import KNOWLEDGE
@@ -16,9 +15,8 @@ from .cells import hits_of, share, table_of, vague
 from .damage import doses_of
 from .entry import Levels, curves, middle, of_worst, shown
 from .files import amended
+from .schema import Data
 from .worst import Worst
-
-Data = dict[str, Any]
 
 
 def strays(board: Data, suite: Suite) -> list[Data]:
@@ -110,7 +108,7 @@ def sharpened(board: Data, suite: Suite) -> Data:
     return amended(board, {name: {"rank": rank} for name, rank in ranks.items()}, comparisons=duels)
 
 
-def same(a: Any, b: Any) -> bool:
+def same(a: object, b: object) -> bool:
     """Return if two pieces of JSON say the same, numbers to six digits."""
     if isinstance(a, dict) and isinstance(b, dict):
         return all(same(a.get(key), b.get(key)) for key in {*a, *b})
@@ -121,5 +119,5 @@ def same(a: Any, b: Any) -> bool:
     return bool(a == b)
 
 
-def _stray(defence: str, field: str, board: Any, here: Any) -> Data:
+def _stray(defence: str, field: str, board: object, here: object) -> Data:
     return {"defence": defence, "field": field, "board": board, "here": here}

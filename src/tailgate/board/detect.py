@@ -170,7 +170,7 @@ def _play(
         update("detection", done, len(guards), guards[i])
 
 
-def _tick(update: Progress, steps: Iterator[int], total: int, guard: str, *_: Any) -> None:
+def _tick(update: Progress, steps: Iterator[int], total: int, guard: str, *_: object) -> None:
     update("detection", next(steps), total, guard)
 
 

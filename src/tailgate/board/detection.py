@@ -13,7 +13,7 @@ import functools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -29,11 +29,12 @@ from tailgate.evaluation.cells import Cell, run_cell
 from tailgate.evaluation.stats import median_limits, proportion
 from tailgate.play.trace import Trace, episodes_at_once, rollout
 
+from .schema import Data
+
 LEVEL = 0.95  # of intervals
 UNTOUCHED = "no attack took effect"
 NO_GATE = "the alarm is the scorer's, on a score with no gate that one could stay below"
 Progress = Callable[[str, int, int, str], None]  # label, done, total, figures
-Data = dict[str, Any]
 
 
 @dataclass(frozen=True)

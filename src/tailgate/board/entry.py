@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Collection
-from typing import Any
 
 import numpy as np
 
@@ -18,6 +17,7 @@ from tailgate.training.adaptive import Asked
 from .damage import PLAYED, Key, Row, Table, doses_of, has_road, named
 from .flags import flags, of_attacks, standing
 from .gates import failure, gates
+from .schema import Data
 from .worst import Worst
 
 CLEAN_METRICS = (
@@ -25,7 +25,6 @@ CLEAN_METRICS = (
     "alarm_rate", "alarm_onsets", "muted_steps",
 )  # fmt: skip
 CLAIMED = "claimed"  # how the reason begins of an entry whose figures nobody but its author has seen come about
-Data = dict[str, Any]
 Levels = dict[str, dict[str, Worst]]  # by defence and knowledge
 
 

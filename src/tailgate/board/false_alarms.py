@@ -19,11 +19,11 @@ from tailgate.evaluation.attack_free import HOUR, Bench, Count, count_onsets, si
 from tailgate.evaluation.rounds import numbered
 
 from .detection import plants
+from .schema import Data
 
 PURPOSE = "report"
 FIRST = 4096  # number of the first seed: cells of a board and detection have no more episodes, which are numbered from 0
 BATCH = 4096  # episodes at once; changes no figure
-Data = dict[str, Any]
 
 
 @dataclass(frozen=True)

@@ -35,12 +35,12 @@ def save(board: Data, path: Path) -> None:
     sweep(path)
 
 
-def amended(board: Data, fields: Mapping[str, Data], **parts: Any) -> Data:
+def amended(board: Data, fields: Mapping[str, Data], **parts: object) -> Data:
     """Return a board with these fields put into its entries, by defence, and these parts put into the board."""
     return board | {"entries": [entry | fields.get(entry["defence"], {}) for entry in board["entries"]]} | parts
 
 
-def read_board(data: Any, where: str = "board") -> Board:
+def read_board(data: object, where: str = "board") -> Board:
     """Return a board from JSON data; raises InputError that names the first field that is not of the format."""
     if not isinstance(data, dict):
         raise InputError(where, data, f"a mapping in the format {FORMAT}")

@@ -11,7 +11,8 @@ from tailgate.core import Array
 from tailgate.core.threat import KNOWLEDGE
 from tailgate.evaluation.paired import Harm, compare, duel, outdone
 
-from .entry import Data, Levels
+from .entry import Levels
+from .schema import Data
 from .update import Beside
 from .worst import Worst
 

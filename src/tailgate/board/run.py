@@ -22,6 +22,7 @@ from tailgate.trust.run import REPORT, with_trust
 from .card import with_cards
 from .cells import shared_of
 from .files import agree, load, read_board, save
+from .schema import Data
 from .score import score
 from .update import with_kept
 from .verified import digest, with_verified
@@ -37,7 +38,7 @@ Progress = Callable[[str, int, int], None]  # suite, done, total
 
 def play(
     suite: Suite, folder: Path, *, defences: Sequence[str] | None = None, attacks: Sequence[str] | None = None, workers: int = 1,
-    board: Any = None, beacon: str = "", progress: Progress | None = None,
+    board: Data | None = None, beacon: str = "", progress: Progress | None = None,
 ) -> Path:  # fmt: skip
     """Play the rows of a suite and of the attacks admitted since, or of some, against its defences; return their file. It resumes.
 
@@ -57,7 +58,7 @@ def play(
     return file
 
 
-def _met_by_all(board: Any, listed: Sequence[str]) -> list[str]:
+def _met_by_all(board: Data, listed: Sequence[str]) -> list[str]:
     """Return attacks on no list that all entries of a board have met. Raises InputError for one to import, or one that is not here."""
     found = [text for text in shared_of(board) if text not in listed]
     for text in found:
@@ -85,7 +86,7 @@ def _one_round(folder: Path, beacon: str) -> None:
             raise InputError(f"beacon of {path}", held, f"{beacon!r}, as asked for now: another round needs a folder of its own")
 
 
-def board_of(suite: Suite, folder: Path, beacon: str | None = None, keep: bool = False, **options: Any) -> dict[str, Any]:
+def board_of(suite: Suite, folder: Path, beacon: str | None = None, keep: bool = False, **options: Any) -> Data:
     """Score all rows in a folder, with verified/*.json and the bounds of trust/trust.json, and write board.json. Returns the board.
 
     It keeps what does not come from rows of the board.json that is there (`with_kept`); with `keep` also the entries that have no rows, or
@@ -115,11 +116,11 @@ def board_of(suite: Suite, folder: Path, beacon: str | None = None, keep: bool =
     return board
 
 
-def kept_board(path: Path, suite: Suite, beacon: str) -> Any:
+def kept_board(path: Path, suite: Suite, beacon: str) -> Data:
     """Return the JSON of a board whose entries stay. Raises InputError for none, and for another suite, version or round."""
     if not path.is_file():
         raise InputError("--keep-entries", str(path), "a board whose entries can stay")
-    data = load(path)
+    data: Data = load(path)
     board = read_board(data, str(path))
     agree(board, suite)
     if (board.suite.beacon or "") != beacon:

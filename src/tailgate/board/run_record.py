@@ -47,7 +47,7 @@ class Record:
     def counting(self, told: Callable[..., None]) -> Callable[..., None]:
         """Return a progress that is called after each cell that was played."""
 
-        def counted(*now: Any) -> None:
+        def counted(*now: object) -> None:
             told(*now)
             self.played += self.suite.seeds
             if time.perf_counter() - self.written > EVERY:

@@ -15,9 +15,9 @@ from tailgate.training.adaptive import asked_of
 
 from .cells import cells_of, ordered
 from .damage import SKIPPED, Column, Row, Table, tabulate
-from .entry import Data, Levels, curves, entry_of, extended, middle
+from .entry import Levels, curves, entry_of, extended, middle
 from .ranks import rank
-from .schema import FORMAT
+from .schema import FORMAT, Data
 from .update import Beside, beside
 from .worst import Worst
 

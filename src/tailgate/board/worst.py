@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
@@ -20,8 +19,7 @@ from tailgate.evaluation.stats import limits
 from tailgate.studies.dose import CRITICAL, critical_dose, fitted
 
 from .damage import MISSING, PLAYED, Key, Row, Table, damaged
-
-Data = dict[str, Any]
+from .schema import Data
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,10 +7,10 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from tailgate.cli.shared import add_options, counted, own_classes, print_json, say, show, table, tell, working
+from tailgate.cli.shared import Commands, add_options, counted, own_classes, print_json, say, show, table, tell, working
 
 
-def add(actions: Any) -> None:
+def add(actions: Commands) -> None:
     """Add `admit` to the actions of a command."""
     command = actions.add_parser(
         "admit", help="put an attack on a suite's list if it beats the worst that is there",

@@ -5,13 +5,12 @@ from __future__ import annotations
 import argparse
 import sys
 from pathlib import Path
-from typing import Any
 
 from tailgate.base import sizes
-from tailgate.cli.shared import own_classes, working
+from tailgate.cli.shared import Commands, own_classes, working
 
 
-def add(actions: Any) -> None:
+def add(actions: Commands) -> None:
     command = actions.add_parser(
         "attack", help="train a suite's attackers against a defence, and play them on it",
         description="Train the learners that the suite names against the defence itself, black and grey box, and play their policies at "

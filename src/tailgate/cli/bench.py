@@ -5,13 +5,12 @@ from __future__ import annotations
 import argparse
 import sys
 from pathlib import Path
-from typing import Any
 
 from tailgate.base.progress import console
-from tailgate.cli.shared import print_json, working
+from tailgate.cli.shared import Commands, print_json, working
 
 
-def add(commands: Any) -> None:
+def add(commands: Commands) -> None:
     """Add `bench` to the commands."""
     command = commands.add_parser(
         "bench", help="measure the speed of this package and of the peers that are installed, side by side",

@@ -15,10 +15,10 @@ from tailgate.base import sizes
 from tailgate.base.errors import InputError
 from tailgate.base.locks import alone
 from tailgate.base.progress import cells, progress
-from tailgate.cli.shared import add_options, own_classes, print_json, table
+from tailgate.cli.shared import Commands, add_options, own_classes, print_json, table
 
 
-def add(actions: Any) -> None:
+def add(actions: Commands) -> None:
     command = actions.add_parser(
         "run", help="play suites, score them, and build the page of their boards",
         description="Play every defence of the suites against every attack, score the rows, and build the page: OUT/SUITE/rows.jsonl.xz "

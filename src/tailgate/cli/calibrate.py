@@ -7,10 +7,10 @@ import shlex
 from typing import Any
 
 from tailgate.base.version import VERSION
-from tailgate.cli.shared import own_classes, show, table, working
+from tailgate.cli.shared import Commands, own_classes, show, table, working
 
 
-def add(commands: Any) -> None:
+def add(commands: Commands) -> None:
     command = commands.add_parser(
         "calibrate", help="find the threshold of a defence for a wanted mean time between false alarms",
         description="Play clean runs (no attack) and find the threshold at which the alarm goes on once in a wanted time. Alarms act on "

@@ -10,12 +10,12 @@ from pathlib import Path
 from typing import Any
 
 from tailgate.base.errors import InputError
-from tailgate.cli.shared import add_options, counted, say, say_most, show, table, working
+from tailgate.cli.shared import Commands, add_options, counted, say, say_most, show, table, working
 
 LONGEST = 160  # characters of a figure that are shown
 
 
-def add(actions: Any) -> None:
+def add(actions: Commands) -> None:
     """Add `check` to the actions of a command."""
     command = actions.add_parser(
         "check", help="play cells of a published board again, without its rows",
@@ -118,7 +118,7 @@ def _print(report: dict[str, Any]) -> None:
     say_most([f"{f['scenario']}, {f['defence']}, {f['attack']}, dose {f['dose']}: {f['why']}" for f in wrong])
 
 
-def _first(board: Any, here: Any) -> tuple[str, Any, Any]:
+def _first(board: object, here: object) -> tuple[str, object, object]:
     """Return where two pieces of JSON first differ, and both values: a list may be long, and its difference at the end."""
     from tailgate.board.consistency import same
 
@@ -134,6 +134,6 @@ def _first(board: Any, here: Any) -> tuple[str, Any, Any]:
     return "", board, here
 
 
-def _words(value: Any) -> str:
+def _words(value: object) -> str:
     text = json.dumps(value)
     return text if len(text) <= LONGEST else text[:LONGEST] + "..."

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
 
 from tailgate.base import sizes
-from tailgate.cli.shared import add_options, counted, table, working
+from tailgate.cli.shared import Commands, add_options, counted, table, working
 
 
-def add(actions: Any) -> None:
+def add(actions: Commands) -> None:
     """Add `clock` to the actions of a command."""
     command = actions.add_parser(
         "clock", help="measure what a step of each defence costs",

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console
 
 from tailgate.base.progress import progress
-from tailgate.cli.shared import add_options, own_classes
+from tailgate.cli.shared import Commands, add_options, own_classes
 
 
-def add(actions: Any) -> None:
+def add(actions: Commands) -> None:
     """Add `detect` to the actions of a command."""
     command = actions.add_parser(
         "detect", help="play detection and stealth impact of a board, without its rows",

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from tailgate.base.errors import InputError
-from tailgate.cli.shared import add_options, counted, own_classes, say, show, table, working
+from tailgate.cli.shared import Commands, add_options, counted, own_classes, say, show, table, working
 
 
-def add(commands: Any) -> None:
+def add(commands: Commands) -> None:
     command = commands.add_parser(
         "dose-response", help="outcome against attack budget, and the dose at which an attack becomes critical",
         description="Play attacks at several budgets. The curve is a monotone regression; the critical dose is where it first exceeds the "

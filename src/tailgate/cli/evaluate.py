@@ -9,14 +9,14 @@ from pathlib import Path
 from typing import Any
 
 from tailgate.base.files import aside, writable_directory
-from tailgate.cli.shared import add_options, counted, own_classes, show, table, tell, values, working
+from tailgate.cli.shared import Commands, add_options, counted, own_classes, show, table, tell, values, working
 from tailgate.core.schema import scalar
 
 AGAIN = 3  # rows of a defence that are played again
 REFUSED = "refused: the scenario does not grant it"
 
 
-def add(commands: Any) -> None:
+def add(commands: Commands) -> None:
     command = commands.add_parser(
         "evaluate", help="play defences against attacks and write one row per episode",
         description="Play a suite, or the part of it that the options name. NAME: a registered component, NAME:key=value,key=value, "

@@ -5,10 +5,10 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from tailgate.cli.shared import own_classes, show, table
+from tailgate.cli.shared import Commands, own_classes, show, table
 
 
-def add(commands: Any) -> None:
+def add(commands: Commands) -> None:
     command = commands.add_parser(
         "explain", help="whether a scenario, a defence and an attack are traced, and if not, why",
         description="Say whether the engine can trace environments of a scenario and a defence, and, with an attack, whole episodes. "

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
 
 from tailgate.cli import admit, attack, board, check, clock, detect, retrain, schedules, submit, verify
-from tailgate.cli.shared import add_options
+from tailgate.cli.shared import Commands, add_options
 
 
-def add(commands: Any) -> None:
+def add(commands: Commands) -> None:
     command = commands.add_parser("leaderboard", help="score suites, attack and submit defences, verify rows, build pages")
     actions = command.add_subparsers(required=True, metavar="ACTION")
     board.add(actions)

@@ -12,10 +12,10 @@ from rich.table import Table
 
 from tailgate.base.errors import InputError
 from tailgate.base.progress import console
-from tailgate.cli.shared import print_json
+from tailgate.cli.shared import Commands, print_json
 
 
-def add(commands: Any) -> None:
+def add(commands: Commands) -> None:
     command = commands.add_parser("list", help="what there is: defences and their parts, attacks, the zoo, scenarios, suites; or a graph")
     groups = ["defences", "filters", "detectors", "mitigations", "attacks", "zoo", "scenarios", "suites"]
     command.add_argument("what", nargs="?", choices=groups, help="only these; attacks: with the zoo of trained policies")

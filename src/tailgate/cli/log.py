@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import argparse
-from typing import Any
 
-from tailgate.cli.shared import add_options, counted, own_classes, print_json, say, table, working
+from tailgate.cli.shared import Commands, add_options, counted, own_classes, print_json, say, table, working
 from tailgate.core.schema import scalar
 
 
-def add(commands: Any) -> None:
+def add(commands: Commands) -> None:
     """Add `log` to the commands."""
     command = commands.add_parser(
         "log", help="write clean and attacked episodes as Parquet, for learning a detector (needs tailgate[log])",

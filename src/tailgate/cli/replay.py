@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 from tailgate.base.errors import InputError
-from tailgate.cli.shared import print_json, say
+from tailgate.cli.shared import Commands, print_json, say
 
 
-def add(commands: Any) -> None:
+def add(commands: Commands) -> None:
     command = commands.add_parser(
         "replay", help="play one episode again from its row and write a page of it",
         description="Play one episode again from its row, check its hash, and write one HTML page. Of the rows that the options leave, the "

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console
 from rich.markup import escape
@@ -12,10 +12,10 @@ from rich.table import Table
 
 from tailgate.base.locks import alone
 from tailgate.base.progress import console
-from tailgate.cli.shared import print_json, say, table
+from tailgate.cli.shared import Commands, print_json, say, table
 
 
-def add(commands: Any) -> None:
+def add(commands: Commands) -> None:
     from tailgate.thesis import CHAPTERS
 
     command = commands.add_parser(
@@ -61,7 +61,7 @@ def _reproduce(options: argparse.Namespace) -> int:
     return 0
 
 
-def _whole(options: argparse.Namespace, tick: Any) -> int:
+def _whole(options: argparse.Namespace, tick: Callable[[str], None]) -> int:
     from tailgate.thesis.run import as_json, check_seeds, summary
     from tailgate.thesis.whole import counts, covered, facts, reproduce_whole, write_whole
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from tailgate.cli.shared import add_options, show, table, working
+from tailgate.cli.shared import Commands, add_options, show, table, working
 
 
-def add(actions: Any) -> None:
+def add(actions: Commands) -> None:
     """Add `retrain` to the actions of a command."""
     command = actions.add_parser(
         "retrain", help="train policies again and compare their weights",

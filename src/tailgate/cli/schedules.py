@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
 
-from tailgate.cli.shared import add_options, counted, table, working
+from tailgate.cli.shared import Commands, add_options, counted, table, working
 
 WORDS = {"more": "do more", "equal": "yoked equals own", "unknown": "cannot be told"}
 
 
-def add(actions: Any) -> None:
+def add(actions: Commands) -> None:
     """Add `timing` to the actions of a command."""
     command = actions.add_parser(
         "timing", help="measure what the timing of a board's trained attackers is worth",

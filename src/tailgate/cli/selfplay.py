@@ -9,10 +9,10 @@ from typing import Any
 from rich.console import Console
 
 from tailgate.base.progress import progress
-from tailgate.cli.shared import add_options, say, show, table
+from tailgate.cli.shared import Commands, add_options, say, show, table
 
 
-def add(commands: Any) -> None:
+def add(commands: Commands) -> None:
     from tailgate.training.selfplay import parameters
 
     fields = "\n".join(f"  {p['name']:<12} {p['doc']} (default: {json.dumps(p['default'])})" for p in parameters())

@@ -7,7 +7,7 @@ import json
 import sys
 from collections.abc import Callable, Container, Iterable, Sequence
 from contextlib import AbstractContextManager
-from typing import Any
+from typing import Any, TypeAlias
 
 from rich.console import Console
 from rich.markup import escape
@@ -17,6 +17,7 @@ from tailgate.base.errors import InputError
 from tailgate.base.progress import Update, console, progress
 from tailgate.core.schema import scalar
 
+Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"  # that a command is added to
 SHOWN = 20  # lines of one kind that are listed, at most
 MORE = "; --json lists them all"
 OPTIONS: dict[str, dict[str, Any]] = {  # that several commands have in the same words
@@ -77,7 +78,7 @@ def tell(text: str) -> None:
     print(f"tailgate: {text}", file=sys.stderr)
 
 
-def print_json(data: Any) -> None:
+def print_json(data: object) -> None:
     """Print data as JSON."""
     print(json.dumps(data, indent=1, allow_nan=False))
 

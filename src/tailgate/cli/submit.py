@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-from typing import Any
 
-from tailgate.cli.shared import add_options, counted, own_classes, show, tell, values, working
+from tailgate.cli.shared import Commands, add_options, counted, own_classes, show, tell, values, working
 from tailgate.core.schema import build
 
 
-def add(actions: Any) -> None:
+def add(actions: Commands) -> None:
     command = actions.add_parser(
         "submit", help="play a stranger's defence in processes of its own and write one row per episode",
         description="Play one class on a suite: in a process of its own, under limits, its rows mixed in secret with those of other "

@@ -9,10 +9,10 @@ from typing import Any
 
 from tailgate.base import sizes
 from tailgate.base.files import writable_directory
-from tailgate.cli.shared import add_options, counted, own_classes, say, show, table, working
+from tailgate.cli.shared import Commands, add_options, counted, own_classes, say, show, table, working
 
 
-def add(commands: Any) -> None:
+def add(commands: Commands) -> None:
     command = commands.add_parser(
         "timing", help="timing advantage of trained policies: their own times against those of another episode",
         description="Play policies at their own times and at those of their twins: yoked (the times of another episode of the policy), "

@@ -10,10 +10,10 @@ from rich.console import Console
 
 from tailgate.base.locks import alone
 from tailgate.base.progress import cells, progress
-from tailgate.cli.shared import add_options, own_classes, print_json, say, table
+from tailgate.cli.shared import Commands, add_options, own_classes, print_json, say, table
 
 
-def add(commands: Any) -> None:
+def add(commands: Commands) -> None:
     from tailgate.training.train import parameters
 
     fields = "\n".join(f"  {p['name']:<18} {p['doc']} (default: {json.dumps(p['default'])})" for p in parameters())

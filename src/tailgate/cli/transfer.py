@@ -7,12 +7,12 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from tailgate.cli.shared import add_options, counted, own_classes, say, show, table, working
+from tailgate.cli.shared import Commands, add_options, counted, own_classes, say, show, table, working
 
 MANY = 8  # defences, above which each has a line of its own, without intervals
 
 
-def add(commands: Any) -> None:
+def add(commands: Commands) -> None:
     command = commands.add_parser(
         "transfer", help="the matrix trained on x played on of trained policies",
         description="Play policies against defences that they were not trained on. Scenario and threat model are those of the training "

@@ -10,11 +10,11 @@ from typing import Any
 
 from tailgate.base.errors import InputError
 from tailgate.base.files import aside
-from tailgate.cli.shared import add_options, counted, own_classes, say, show, table, tell, values, working
+from tailgate.cli.shared import Commands, add_options, counted, own_classes, say, show, table, tell, values, working
 from tailgate.core.schema import scalar
 
 
-def add(commands: Any) -> None:
+def add(commands: Commands) -> None:
     command = commands.add_parser(
         "trust", help="how surely a defence keeps to temporal properties: statistical model checking",
         description="Play a suite, or the part of it that the options name, and decide temporal properties of every run. Of each defence a "

@@ -10,10 +10,10 @@ from rich.console import Console
 
 from tailgate.base import sizes
 from tailgate.base.progress import progress
-from tailgate.cli.shared import add_options, show, table, tell
+from tailgate.cli.shared import Commands, add_options, show, table, tell
 
 
-def add(commands: Any) -> None:
+def add(commands: Commands) -> None:
     command = commands.add_parser(
         "tune", help="search a learner's hyper-parameters (needs tailgate[tune])",
         description="Train one policy per trial and keep the values whose policy does most damage on `tune` seeds. The same command goes "
@@ -68,5 +68,5 @@ def _print(report: dict[str, Any]) -> None:
     table(("trial", "outcome", "values", "note"), rows, title)
 
 
-def _short(value: Any) -> str:
+def _short(value: object) -> str:
     return f"{value:.3g}" if isinstance(value, float) else json.dumps(value)

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from tailgate.base.errors import InputError
-from tailgate.cli.shared import MORE, SHOWN, add_options, counted, own_classes, say, show, table, working
+from tailgate.cli.shared import MORE, SHOWN, Commands, add_options, counted, own_classes, say, show, table, working
 
 
-def add(actions: Any) -> None:
+def add(actions: Commands) -> None:
     """Add `verify` to the actions of a command."""
     command = actions.add_parser(
         "verify", help="play rows again and compare their hashes and figures",

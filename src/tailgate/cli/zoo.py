@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
 
-from tailgate.cli.shared import show, table
+from tailgate.cli.shared import Commands, show, table
 
 
-def add(commands: Any) -> None:
+def add(commands: Commands) -> None:
     command = commands.add_parser("zoo", help="put trained policies into the package's zoo (`tailgate list zoo` shows it)")
     actions = command.add_subparsers(required=True, metavar="ACTION")
     more = actions.add_parser(

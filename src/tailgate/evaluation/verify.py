@@ -205,7 +205,7 @@ class _Cells:
         return f"the {family} {row[family]!r} has version {here} here and {version} in the row" if version != here else ""
 
 
-def _batch(held: Any) -> int:
+def _batch(held: object) -> int:
     return held if isinstance(held, int) and not isinstance(held, bool) and 1 <= held <= 4096 else 256
 
 
@@ -248,7 +248,7 @@ def _compared(row: Row, here: Row) -> Finding:
     return Finding("differs", f"trace_hash {LAST_BITS}" if fields == ["trace_hash"] else ", ".join(fields), off)
 
 
-def _same(row: Any, here: Any) -> bool:
+def _same(row: object, here: object) -> bool:
     if isinstance(here, bool) or isinstance(row, bool):
         return row is here
     return canonical(row) == canonical(here) if isinstance(here, dict | list) else bool(row == here)

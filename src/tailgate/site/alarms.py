@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from tailgate.board.schema import Alarms
+from tailgate.board.schema import Alarms, Data
 from tailgate.board.words import percent
 from tailgate.evaluation.stats import mean_time
 
-from .suite import Data, Suite
+from .suite import Suite
 
 FACTOR = 2.0  # times as often as wanted, or as rarely, from which on it is a flag
 APART = 0.75  # of the drives with more false alarms in one half than in the other, from which on it is a flag

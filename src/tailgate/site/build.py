@@ -16,10 +16,11 @@ from tailgate.base.files import writable_directory, write_atomic
 from tailgate.board.attachments import Attachments
 from tailgate.board.files import read_board
 from tailgate.board.order import GROUPS, ordered
+from tailgate.board.schema import Data
 
 from .entry import Replayed, entry_page, replay_of
 from .index import section
-from .pages import Data, Pages, encoded
+from .pages import Pages, encoded
 from .suite import Suite
 
 SUMMARY = "tailgate-site-1"

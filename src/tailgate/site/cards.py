@@ -9,10 +9,9 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Mapping
-from typing import Any
 
 from tailgate.agents.zoo import zoo_card, zoo_names
-from tailgate.board.schema import Entry
+from tailgate.board.schema import Data, Entry
 from tailgate.board.words import Name
 from tailgate.core.registry import Entry as Registered
 from tailgate.core.registry import Family, built_in
@@ -20,7 +19,7 @@ from tailgate.core.scenario import Suite as Played
 from tailgate.core.scenario import list_suites, load_scenario, load_suite
 from tailgate.core.threat import ThreatModel
 
-from .suite import Data, Suite
+from .suite import Suite
 
 LICENCE = "MIT"  # of the package
 SHOWN = ("name", "summary", "parameters", "knowledge", "learned", "optimal")  # of a card: shown in a place of their own
@@ -37,7 +36,7 @@ def _registered(family: Family) -> dict[str, Registered]:
     return built_in(family)
 
 
-def plain(value: Any) -> str:
+def plain(value: object) -> str:
     """Return JSON data in a line."""
     if isinstance(value, bool):
         return "yes" if value else "no"

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from tailgate.board.order import ordered
-from tailgate.board.schema import LEVELS, Curve, Entry, Stealth
+from tailgate.board.schema import LEVELS, Curve, Data, Entry, Stealth
 
 from .charts import STYLES, Axis, Dot, Line, chart, nice, path_of, ticks_at
-from .suite import Data, Suite, figure
+from .suite import Suite, figure
 
 TOGETHER = STYLES  # defences with a line each in the chart of all: as many as there are line styles
 SCALES = ("log", "linear")

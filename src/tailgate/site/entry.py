@@ -10,7 +10,7 @@ from typing import Any
 
 from tailgate.base.errors import InputError
 from tailgate.board.attachments import Attachments, Clock
-from tailgate.board.schema import LEVELS, CellLine, Entry, Robust
+from tailgate.board.schema import LEVELS, CellLine, Data, Entry, Robust
 from tailgate.board.words import names_of, percent
 from tailgate.core.registry import Spec
 from tailgate.play.metrics import ERRORS, METRICS, UNITS
@@ -21,7 +21,7 @@ from . import alarms
 from .cards import card_of
 from .curves import curves_of, reached_of, stealth_of
 from .index import compared_how, comparisons_of
-from .suite import Data, Suite, critical_of, dose_text, figure, played, share_of, worse
+from .suite import Suite, critical_of, dose_text, figure, played, share_of, worse
 from .timing import flags_of, timed_of
 from .trust import trust_of, trust_page
 

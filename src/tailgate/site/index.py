@@ -6,14 +6,14 @@ from collections import Counter
 
 from tailgate.board.attachments import Attachments
 from tailgate.board.order import GROUPS, ordered
-from tailgate.board.schema import LEVELS, CellLine, Dose, Level
+from tailgate.board.schema import LEVELS, CellLine, Data, Dose, Level
 from tailgate.board.words import Name, at_least, percent
 from tailgate.training import adaptive
 
 from . import alarms
 from .cards import attack_cards, suite_of
 from .curves import curves_of, stealth_of, together_of
-from .suite import Data, Suite, cell_of, critical_of, dose_text, figure, gates_of, played, share_of, worse
+from .suite import Suite, cell_of, critical_of, dose_text, figure, gates_of, played, share_of, worse
 from .timing import flags_of
 from .trust import trust_cell, trust_of
 

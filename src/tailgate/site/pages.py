@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import json
-from typing import Any
 
 from jinja2 import Environment, FunctionLoader, StrictUndefined
 
 from tailgate.base.assets import asset, embedded, inline
 from tailgate.base.errors import InputError
+from tailgate.board.schema import Data
 from tailgate.board.words import breakable
 
 HERE = "tailgate.site"
 TITLE = "Tailgate leaderboard"
-Data = dict[str, Any]
 
 
 class Pages:
@@ -28,7 +27,7 @@ class Pages:
         self.environment.filters |= {"breakable": breakable, "embedded": embedded}
         self.environment.globals |= {"css": inline(HERE, "page.css"), "js": inline(HERE, "page.js"), "title": self.title}
 
-    def render(self, template: str, **values: Any) -> bytes:
+    def render(self, template: str, **values: object) -> bytes:
         """Return a page. A lone surrogate in the values does not stop it."""
         return self.environment.get_template(template).render(**values).encode("utf-8", "replace")
 

@@ -11,12 +11,13 @@ from typing import Any
 from tailgate.base.errors import InputError
 from tailgate.base.files import writable_directory, write_atomic
 from tailgate.board.entry import reference
+from tailgate.board.schema import Data
 from tailgate.board.words import Name, names_of, percent, shade, spans, steps, ticks
 from tailgate.core.registry import Entry, entries
 from tailgate.evaluation.summary import summarise
 from tailgate.play.metrics import METRICS
 
-from .pages import Data, Pages, encoded
+from .pages import Pages, encoded
 
 COLUMNS = (  # of the table of every cell, after the crash share: key of the summary, heading
     ("min_gap", "Min. gap [m]"), ("max_error", "Max. error [m]"), ("alarm_onsets", "Alarm onsets"),
@@ -117,7 +118,7 @@ def _distinct(rows: Sequence[Data], key: str) -> list[str]:
     return sorted({str(row[key]) for row in rows if row.get(key) not in (None, "")})
 
 
-def _numbers(where: str, item: Any, keys: Sequence[str]) -> list[float]:
+def _numbers(where: str, item: object, keys: Sequence[str]) -> list[float]:
     if not isinstance(item, Mapping):
         raise InputError(where, item, f"a mapping with {', '.join(keys)}")
     out = []

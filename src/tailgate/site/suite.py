@@ -5,15 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import Any
 
 from tailgate.board.order import sort_dose
-from tailgate.board.schema import LEVELS, Board, CellLine, Dose, Entry, Level, Limited
+from tailgate.board.schema import LEVELS, Board, CellLine, Data, Dose, Entry, Level, Limited
 from tailgate.board.words import Name, at_least, names_of, percent, shade
 
 from .charts import Axis
 
-Data = dict[str, Any]
 SPREAD = 16  # ratio of the largest dose to the smallest above which doses are drawn on a logarithmic axis at first
 
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from tailgate.board.attachments import Timing
+from tailgate.board.schema import Data
 from tailgate.board.words import names_of, percent
 
-from .suite import Data, dose_text
+from .suite import dose_text
 
 TIMES = (  # as the twins of tailgate.studies.timing
     "its own times", "those of another of its episodes (yoked)", "as many steps at random (shuffled)", "as many, evenly spread (periodic)",

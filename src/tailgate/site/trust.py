@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from tailgate.board.schema import LEVELS, Bound, Entry, Level, Trust
+from tailgate.board.schema import LEVELS, Bound, Data, Entry, Level, Trust
 from tailgate.board.words import at_least
 from tailgate.evaluation.rows import CLEAN
 
-from .suite import Data, Suite, dose_text, figure
+from .suite import Suite, dose_text, figure
 
 SPEED, ACCEL = "m/s", "m/s\N{SUPERSCRIPT TWO}"
 UNITS = {
