@@ -15,10 +15,10 @@ from tailgate.core import Array
 from tailgate.core.scenario import Suite, load_scenario
 from tailgate.evaluation.checks import LAST_BITS, Finding
 from tailgate.evaluation.rounds import numbered
-from tailgate.evaluation.rows import CLEAN
+from tailgate.evaluation.rows import CLEAN, Row
 from tailgate.evaluation.stats import proportion
 
-from .damage import FAILED, MISSING, PLAYED, SKIPPED, Column, Key, Row, Table, columns_of, damaged, doses_of, in_order
+from .damage import FAILED, MISSING, PLAYED, SKIPPED, Column, Key, Table, columns_of, damaged, doses_of, in_order
 from .schema import CellLine, Data
 
 PRINTS = ("hits", "decisions", "trace")  # which older boards lack

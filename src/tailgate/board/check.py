@@ -21,10 +21,10 @@ from tailgate.evaluation.attack_list import Admitted
 from tailgate.evaluation.cells import Cell, run
 from tailgate.evaluation.checks import Finding, Unplayable, again, counts, drawn, refused, sampling
 from tailgate.evaluation.paired import CLOSE, PAIR
+from tailgate.evaluation.rows import Row
 
 from .cells import PRINTS, compared, figures, shared_of
 from .consistency import same, sharpened, strays, untold
-from .damage import Row
 from .files import amended, known, read_board, suite_of
 from .schema import Board, CellLine, Data
 from .score import score

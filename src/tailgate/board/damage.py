@@ -12,10 +12,9 @@ from tailgate.base.errors import InputError
 from tailgate.core import Array
 from tailgate.core.scenario import Scenario, Suite, load_scenario
 from tailgate.core.threat import KNOWLEDGE
-from tailgate.evaluation.rows import CLEAN
+from tailgate.evaluation.rows import CLEAN, Row
 from tailgate.play.metrics import METRICS
 
-Row = dict[str, Any]
 PLAYED, MISSING, SKIPPED, FAILED = range(4)  # what became of a cell
 
 

@@ -11,10 +11,10 @@ from tailgate.core.registry import Entry, built_in, split_text
 from tailgate.core.scenario import Suite
 from tailgate.evaluation.paired import class_of
 from tailgate.evaluation.rounds import numbered
-from tailgate.evaluation.rows import CLEAN
+from tailgate.evaluation.rows import CLEAN, Row
 from tailgate.training.adaptive import Asked
 
-from .damage import PLAYED, Key, Row, Table, doses_of, has_road, named
+from .damage import PLAYED, Key, Table, doses_of, has_road, named
 from .flags import flags, of_attacks, standing
 from .gates import failure, gates
 from .schema import Data

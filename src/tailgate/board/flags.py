@@ -8,8 +8,9 @@ import numpy as np
 
 from tailgate.core import Array
 from tailgate.evaluation.paired import apart, mcnemar
+from tailgate.evaluation.rows import Row
 
-from .damage import MISSING, PLAYED, Key, Row, Table
+from .damage import MISSING, PLAYED, Key, Table
 from .worst import Worst
 
 SPENT = 0.9  # of the budget, by the mean of the episodes without damage: those that end early leave some

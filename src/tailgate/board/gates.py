@@ -13,9 +13,9 @@ import numpy as np
 
 from tailgate.base.errors import InputError
 from tailgate.evaluation.attack_free import HOUR, HOURS
-from tailgate.evaluation.rows import CLEAN
+from tailgate.evaluation.rows import CLEAN, Row
 
-from .damage import Row, Table, damaged, has_road
+from .damage import Table, damaged, has_road
 
 GAP = 0.10  # mean gap above that of the undefended car, as a share of it
 JERK = 1.2  # of the undefended car's

@@ -10,11 +10,12 @@ from tailgate.base.version import VERSION
 from tailgate.core.scenario import Suite
 from tailgate.core.threat import KNOWLEDGE
 from tailgate.evaluation.attack_list import Admitted, standing, taken_back
+from tailgate.evaluation.rows import Row
 from tailgate.studies.dose import CRITICAL
 from tailgate.training.adaptive import asked_of
 
 from .cells import cells_of, ordered
-from .damage import SKIPPED, Column, Row, Table, tabulate
+from .damage import SKIPPED, Column, Table, tabulate
 from .entry import Levels, curves, entry_of, extended, middle
 from .ranks import rank
 from .schema import FORMAT, Data

@@ -15,10 +15,11 @@ import numpy as np
 from tailgate.base.errors import InputError
 from tailgate.core import Array
 from tailgate.evaluation.paired import Harm
+from tailgate.evaluation.rows import Row
 from tailgate.evaluation.stats import limits
 from tailgate.studies.dose import CRITICAL, critical_dose, fitted
 
-from .damage import MISSING, PLAYED, Key, Row, Table, damaged
+from .damage import MISSING, PLAYED, Key, Table, damaged
 from .schema import Data
 
 

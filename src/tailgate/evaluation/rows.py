@@ -19,6 +19,7 @@ KEYS = (
     "suite", "scenario", "dose", "knowledge", "defence", "attack", "purpose", "config_hash", "version", "defence_digest", "attack_digest",
 )  # fmt: skip
 
+Row = dict[str, Any]  # one episode: KEYS, every metric, and all that is needed to play it again
 CLEAN = "none"  # the attack that does nothing, and the defence that does nothing
 AGAIN = "the command that wrote it makes it whole, given once more"
 _Text = Annotated[str, Field(strict=True)]
@@ -32,9 +33,9 @@ _FIELDS: dict[str, Any] = {
 _Row = create_model("Row", __config__=ConfigDict(extra="allow"), **_FIELDS)
 
 
-def read_rows(path: Path) -> list[dict[str, Any]]:
+def read_rows(path: Path) -> list[Row]:
     """Rows of a JSON Lines file, checked; raises InputError that names the line."""
-    rows: list[dict[str, Any]] = []
+    rows: list[Row] = []
     lines, number, ahead = lines_of(path), 1, b""
     try:
         line = next(lines, b"")
@@ -50,7 +51,7 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
     return rows
 
 
-def _row(line: bytes, where: str, damage: str, first: bool) -> dict[str, Any]:
+def _row(line: bytes, where: str, damage: str, first: bool) -> Row:
     """A line, checked. damage: what became of its file, if it is no JSON object. first: it is the first one."""
     try:
         row = parse_json(line)
@@ -83,11 +84,11 @@ def _check(row: Any, where: str) -> None:
         raise InputError(f"{where}: {field}", held, wanted(found)) from None
 
 
-def packed(rows: Sequence[dict[str, Any]], path: Path) -> bytes:
+def packed(rows: Sequence[Row], path: Path) -> bytes:
     """What a file of rows holds: JSON Lines, compressed where its name ends in .xz. The same rows give the same bytes."""
     return lzma.compress(encode(rows), preset=2) if path.suffix == ".xz" else encode(rows)
 
 
-def encode(rows: Sequence[dict[str, Any]]) -> bytes:
+def encode(rows: Sequence[Row]) -> bytes:
     """Rows as JSON Lines; NaN and infinity are refused."""
     return "".join(json.dumps(row, allow_nan=False) + "\n" for row in rows).encode()

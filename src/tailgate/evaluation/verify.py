@@ -26,6 +26,7 @@ from tailgate.core.threat import ThreatModel
 from tailgate.evaluation.cells import ENGINE, Cell, run
 from tailgate.evaluation.checks import LAST_BITS, YAML, Finding, Unplayable, again, counts, differences, drawn, files_of, sampling
 from tailgate.evaluation.rounds import seeds_of
+from tailgate.evaluation.rows import Row
 
 HASHES = ("trace_hash", "decision_hash")
 # What a row says of itself that is not compared: who its companions were, the words of a failure, and what the row alone can say.
@@ -33,7 +34,6 @@ FREE = frozenset({"batch", "cell", "reason", "seed", "suite", "purpose"})
 BYTES = 10_000_000  # of a file that a row names, at most
 ROUND = 4096  # episodes of a round that are looked through for a seed
 VERDICTS = ("verified", "differs", "unchecked")
-Row = dict[str, Any]
 Found = dict[int, Finding]  # by the place of a row
 Job = tuple[str, Cell]  # what rows of one cell share, and the cell
 
