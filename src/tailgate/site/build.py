@@ -83,7 +83,7 @@ def build_site(
                 done = replay_of(entry.worst_episode, folder / replay, f"worst episode of suite {name}")
             if done.page:
                 hashes[replay] = hashlib.sha256((folder / replay).read_bytes()).hexdigest()
-            files[page] = pages.render("entry.html", entry=entry_page(suite, entry, done, also, one))
+            files[page] = pages.render("entry.html", of=entry, suite=suite, entry=entry_page(suite, entry, done, also, one))
             listed.append({
                 "suite": name, "defence": entry.defence, "status": entry.status, "class": entry.class_, "page": page,
                 "rank": entry.rank.model_dump() if entry.rank else None, "replay": done.page and replay, "replay_missing": done.why,

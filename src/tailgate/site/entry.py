@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from tailgate.base.errors import InputError
 from tailgate.board.attachments import Attachments, Clock
-from tailgate.board.schema import LEVELS, CellLine, Data, Entry, Robust
+from tailgate.board.schema import LEVELS, CellLine, Data, Dose, Entry
 from tailgate.board.words import names_of, percent
 from tailgate.core.registry import Spec
 from tailgate.play.metrics import ERRORS, METRICS, UNITS
@@ -21,12 +21,9 @@ from . import alarms
 from .cards import card_of
 from .curves import curves_of, reached_of, stealth_of
 from .index import compared_how, comparisons_of
-from .suite import Suite, critical_of, dose_text, figure, played, share_of, worse
+from .suite import Suite, critical_of, dose_text, figure, interval_of, played, share_of, worse
 from .timing import flags_of, timed_of
 from .trust import trust_of, trust_page
-
-LEAST = ("progress", "every episode")  # gates whose limit is one from below
-WAYS = ("\N{LESS-THAN OR EQUAL TO}", "\N{GREATER-THAN OR EQUAL TO}")
 
 
 @dataclass(frozen=True)
@@ -95,51 +92,28 @@ def _rates(suite: Suite, entry: Entry) -> list[Data]:
 
 
 def _worst(suite: Suite, entry: Entry) -> list[Data]:
-    """Return the attack that did most damage per scenario and shown dose; computed optima do not count."""
+    """Return the cell of the attack that did most damage per scenario and shown dose; computed optima do not count."""
     mine = [c for c in suite.board.cells if c.defence == entry.defence and not c.optimal and c.attack != "none"]
     out = []
     for scenario in suite.board.suite.scenarios:
         for dose in suite.shown:
             cell = worse(c for c in mine if c.scenario == scenario.name and c.dose == dose)
             if cell is not None:
-                out.append(_cell(suite, cell) | {"robustness": scenario.robustness})
+                out.append({"cell": cell, "robustness": scenario.robustness} | interval_of(cell.damage))
     return out
 
 
-def _cell(suite: Suite, cell: CellLine) -> Data:
-    damage = cell.damage
-    return {
-        "scenario": cell.scenario, "dose": dose_text(cell.dose), "dose_sort": "" if cell.dose is None else cell.dose,
-        "attack": suite.attacks[cell.attack], "knowledge": cell.knowledge, "n": cell.n, "failed": cell.failed, "reason": cell.reason,
-        "learned": cell.learned, "optimal": cell.optimal, "robustness": False,
-        "text": percent(damage.value) if damage else "n/a", "sort": f"{damage.value:.6g}" if damage else "",
-        "span": f"{percent(damage.low)} to {percent(damage.high)}" if damage else "",
-    }  # fmt: skip
-
-
-def _every(suite: Suite, mine: Sequence[CellLine]) -> list[Data]:
+def _every(suite: Suite, entry: Entry) -> list[Data]:
     """Return all cells of a defence: a row per scenario and attack, a column per dose."""
-    rows: dict[tuple[str, str, str], dict[Any, CellLine]] = {}
-    for cell in mine:
+    rows: dict[tuple[str, str, str], dict[Dose, CellLine]] = {}
+    for cell in (cell for cell in suite.board.cells if cell.defence == entry.defence):
         rows.setdefault((cell.scenario, cell.attack, cell.knowledge), {})[cell.dose] = cell
     out = []
-    for (scenario, attack, knowledge), by_dose in rows.items():
-        first = next(iter(by_dose.values()))
-        cells = [_cell(suite, by_dose[dose]) if dose in by_dose else None for dose in suite.board.suite.doses]
-        reason = next((c.reason for c in by_dose.values() if c.reason), "")
-        row = {"scenario": scenario, "attack": suite.attacks[attack], "knowledge": knowledge, "reason": reason, "cells": cells}
-        out.append(row | {"learned": first.learned, "optimal": first.optimal})
+    for by_dose in rows.values():
+        row = [by_dose.get(dose) for dose in suite.board.suite.doses]
+        cells = [{"cell": cell} | interval_of(cell.damage) if cell else None for cell in row]
+        out.append({"first": next(iter(by_dose.values())), "reason": next((c.reason for c in row if c and c.reason), ""), "cells": cells})
     return out
-
-
-def _robust(suite: Suite, item: Robust) -> Data:
-    if isinstance(item.undamaged, float | int):
-        share: Data = {"text": percent(item.undamaged), "low": "", "sort": item.undamaged}
-    else:
-        share = share_of(item.undamaged)
-    change = "\N{EN DASH}" if item.change is None else f"{100 * item.change:+.0f}".replace("-", "\N{MINUS SIGN}")
-    worst = suite.where("", item.worst.attack) if item.worst else ""
-    return {"scenario": item.scenario, "undamaged": share, "change": change, "worst": worst}
 
 
 def _clean(suite: Suite, entry: Entry) -> list[Data]:
@@ -208,40 +182,20 @@ def entry_page(
     suite: Suite, entry: Entry, replayed: Replayed | None, also: list[tuple[str, str]], measured: Attachments
 ) -> Data:
     """Return all that an entry's page shows. also: names of other suites with an entry of the same text, and their pages."""
-    curves = curves_of(suite, [entry], gap=7.0)
-    mine = [c for c in suite.board.cells if c.defence == entry.defence]
-    stealth = stealth_of(suite, [entry])
+    curves, stealth = curves_of(suite, [entry], gap=7.0), stealth_of(suite, [entry])
     found = [d for d in (suite.board.detection.entries if suite.board.detection else ()) if d.defence == entry.defence]
-    detection = [
-        {"attack": suite.attacks[d.attack], "scenario": d.scenario, "hours": figure(d.hours), "threshold": figure(d.threshold),
-         "rarer": d.rarer,
-         "text": percent(d.detected.value) if d.detected else "n/a", "sort": f"{d.detected.value:.6g}" if d.detected else "",
-         "span": f"{percent(d.detected.low)} to {percent(d.detected.high)}" if d.detected else "", "delay": figure(d.delay, 3)}
-        for d in found
-    ]  # fmt: skip
     return {
-        "suite": suite.board.suite, "damage": suite.damage, "limit": percent(suite.board.suite.limit), "scale": suite.scale,
-        "name": suite.defences[entry.defence], "status": entry.status, "why": entry.why,
+        "name": suite.defences[entry.defence], "rank": _rank(suite, entry), "also": also, "card": card_of(suite, entry),
         "replayed": _replayed(entry), "checked": _checked(entry), "clocked": _clocked(measured.clock, entry.defence),
-        "timed": timed_of(measured.timing, entry.defence),
+        "timed": timed_of(measured.timing, entry.defence), "imported": _imported(entry.defence),
         "typed": shlex.quote(entry.defence), "target": shlex.quote(Spec("defence", entry.defence).target),
-        "board": f"OUT/{suite.folder}/board.json", "road": suite.board.suite.bound is None,
-        "imported": _imported(entry.defence),
-        "class": entry.class_ or "not stated",
-        "rank": _rank(suite, entry), "also": also, "card": card_of(suite, entry), "levels": LEVELS,
         "flags": [*entry.flags, *flags_of(measured.timing, entry.defence), *alarms.drifts_of(suite, entry.defence)],
         "alarms": alarms.table_of(suite, entry.defence), "errata": measured.superseded(entry.defence),
         "critical": [(level, critical_of(suite, entry, level)) for level in LEVELS],
-        "rates": _rates(suite, entry), "worst": _worst(suite, entry), "cells": _every(suite, mine),
-        "doses": [dose_text(d) for d in suite.board.suite.doses],
-        "gates": [{"gate": g.gate.replace("_", " "), "scenario": g.scenario, "value": figure(g.value), "limit": figure(g.limit),
-                   "way": WAYS[g.gate in LEAST],
-                   "passed": g.passed} for g in entry.gates],
+        "rates": _rates(suite, entry), "worst": _worst(suite, entry), "cells": _every(suite, entry),
         "charts": curves[0]["charts"] if curves else [], "clean": _clean(suite, entry),
-        "robustness": [_robust(suite, r) for r in entry.robustness],
         "stealth": [reached_of(s) for s in entry.stealth or ()], "stealth_chart": stealth["chart"] if stealth else None,
-        "detection": detection, "watched": any(d.watched for d in found), "rarer": any(d.rarer for d in found),
+        "detection": [(d, interval_of(d.detected)) for d in found],
         "comparisons": comparisons_of(suite, entry.defence), "how": compared_how(suite),
-        "round": suite.round, "about_trust": trust_of(suite), "trust": trust_page(suite, entry), "replay": replayed,
-        "episode": _episode(suite, entry),
+        "about_trust": trust_of(suite), "trust": trust_page(suite, entry), "replay": replayed, "episode": _episode(suite, entry),
     }  # fmt: skip

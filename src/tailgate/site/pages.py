@@ -8,8 +8,10 @@ from jinja2 import Environment, FunctionLoader, StrictUndefined
 
 from tailgate.base.assets import asset, embedded, inline
 from tailgate.base.errors import InputError
-from tailgate.board.schema import Data
-from tailgate.board.words import breakable
+from tailgate.board.schema import LEVELS, Data
+from tailgate.board.words import breakable, percent
+
+from .suite import dose_text, figure, share_of
 
 HERE = "tailgate.site"
 TITLE = "Tailgate leaderboard"
@@ -24,8 +26,12 @@ class Pages:
             autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True,
             loader=FunctionLoader(lambda name: asset(HERE, name)),
         )  # fmt: skip
-        self.environment.filters |= {"breakable": breakable, "embedded": embedded}
-        self.environment.globals |= {"css": inline(HERE, "page.css"), "js": inline(HERE, "page.js"), "title": self.title}
+        self.environment.filters |= {
+            "breakable": breakable, "embedded": embedded, "percent": percent, "figure": figure, "dose": dose_text,
+        }  # fmt: skip
+        self.environment.globals |= {
+            "css": inline(HERE, "page.css"), "js": inline(HERE, "page.js"), "title": self.title, "levels": LEVELS, "share_of": share_of,
+        }  # fmt: skip
 
     def render(self, template: str, **values: object) -> bytes:
         """Return a page. A lone surrogate in the values does not stop it."""

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 from tailgate.board.order import sort_dose
-from tailgate.board.schema import LEVELS, Board, CellLine, Data, Dose, Entry, Level, Limited
+from tailgate.board.schema import LEVELS, Board, CellLine, Data, Dose, Entry, Interval, Level, Limited
 from tailgate.board.words import Name, at_least, names_of, percent, shade
 
 from .charts import Axis
@@ -134,9 +134,19 @@ def critical_of(suite: Suite, entry: Entry, level: Level) -> Data:
     }  # fmt: skip
 
 
-def share_of(share: Limited | None) -> Data:
+def interval_of(held: Interval | None) -> Data:
+    """Return a share of damaged or detected episodes, and its interval."""
+    if held is None:
+        return {"text": "n/a", "sort": "", "span": ""}
+    return {"text": percent(held.value), "sort": f"{held.value:.6g}", "span": f"{percent(held.low)} to {percent(held.high)}"}
+
+
+def share_of(share: Limited | float | None) -> Data:
+    """Return a share and its lower limit, if it has one."""
     if share is None:
         return {"text": "\N{EN DASH}", "low": "", "sort": ""}
+    if isinstance(share, float | int):
+        return {"text": percent(share), "low": "", "sort": share}
     return {"text": percent(share.value), "low": at_least(share.low), "sort": f"{share.value:.6g}"}
 
 
