@@ -57,7 +57,7 @@ def admit(
     """
     asked, listed = next_level(list_of(suite, path), alpha), list(attacks_of(suite, path))
     spec = Spec("attack", attack)
-    spec.refuse_imports("the list of attacks")  # it would run with the rights of whoever scores
+    spec.refuse_imports("the list of attacks")  # it would run with the rights of the scoring process
     if attack in listed:
         raise InputError("attack", attack, "one that is not on the list")
     if spec.entry.optimal:

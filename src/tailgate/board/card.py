@@ -1,4 +1,4 @@
-"""The card of an entry: what its authors say of it, beside the figures that they do not say."""
+"""The card of an entry: its authors' words, next to the figures that they do not choose."""
 
 from __future__ import annotations
 

@@ -41,7 +41,7 @@ def check(
     """Play the cells of a board again, and compare how many episodes were played, failed and came to damage, which these
     were, and the fingerprints of all.
 
-    data: a board, as JSON; sample: so many cells, drawn by sample_seed (default: all); defences: only the cells of these.
+    data: a board, as JSON; sample: number of cells, drawn by sample_seed (default: all); defences: only the cells of these.
     The report has `counts`, `entries` (the same for each defence), `reasons` and `findings`, cells that differ or could not be checked;
     `untrained`: attackers whose files are not here, though `leaderboard attack` would train them again, to the same weights;
     `strays`: figures that do not follow from the cells, by `defence` and `field`; `untold`: ranked entries of whose comparisons cells tell

@@ -94,7 +94,7 @@ class Table:
         ]  # fmt: skip
 
     def nominal(self) -> list[str]:
-        """Return scenarios with the plant that a defence is told."""
+        """Return scenarios with the plant that the defence knows."""
         return list(self.suite.nominal)
 
     def applies(self, scenario: str) -> Array:
@@ -243,7 +243,7 @@ def _same_component(rows: Sequence[Row]) -> None:
 def _seeds(cells: dict[Key, list[Row]]) -> dict[str, tuple[int, ...]]:
     """Return the seeds of each scenario, which all cells share: without that no comparison is paired."""
     out: dict[str, tuple[tuple[int, ...], Key]] = {}
-    for key in sorted(cells, key=lambda key: (-len(cells[key]), key)):  # whoever has fewer is the odd one
+    for key in sorted(cells, key=lambda key: (-len(cells[key]), key)):  # the one with fewer is the odd one
         mine = tuple(row["seed"] for row in cells[key])
         seeds, first = out.setdefault(key.scenario, (mine, key))
         if mine != seeds:

@@ -37,7 +37,7 @@ def detect(
     """Play detection and stealth impact of the board in a file, and return it. It is written after each entry, and resumes.
 
     defences: only these entries; classes of somebody's own are imported where they are named here. By default those that come with the
-    package; not `none`, sentinels, or who is told the truth. Attacks are the black-box scripts of the board's list that can be played here.
+    package; not `none`, sentinels, or the oracle. Attacks are the black-box scripts of the board's list that can be played here.
     Raises InputError for a board of another suite or version, or with figures of another effort, and for a defence that takes no place
     here.
     """
@@ -75,7 +75,7 @@ def _detected(path: Path, suite: Suite, defences: Sequence[str], effort: Effort,
 
 
 def _takes_part(entry: Data) -> bool:
-    """Return if an entry is neither the undefended car, nor told the truth, nor a sentinel."""
+    """Return if an entry is neither the undefended car, nor the oracle, nor a sentinel."""
     return entry["defence"] != "none" and "truth" not in entry["uses"] and not (entry.get("card") or {}).get("sentinel")
 
 
@@ -180,7 +180,7 @@ def check_detection(
 ) -> Data:  # fmt: skip
     """Play detection and stealth impact of entries of a board again, and compare them figure by figure, numbers to six digits.
 
-    data: a board, as JSON; sample: so many entries, drawn by sample_seed (default: all that have figures); defences: only of these.
+    data: a board, as JSON; sample: number of entries, drawn by sample_seed (default: all that have figures); defences: only of these.
     The report has `counts` of figures, `entries` (the same for each defence) and `findings`: figures that differ, by `field`, with what the
     `board` says and what is `here`; `reasons`: why entries could not be played. Raises InputError for a board without such figures, and as
     `check.check` does.

@@ -1,9 +1,9 @@
-"""The detection board, and what a stealthy attacker reaches: figures that need thresholds of their own, and so rows of their own.
+"""The detection board and stealth impact: figures that need thresholds, and so rows that no board has.
 
-One threshold per defence, plant and wanted mean time between false alarms, found on clean runs of the plant's scenarios (calibrate).
-At that threshold attacks are played: what counts is whether the alarm comes within the metrics' deadline. The stealth attack aims just
-below the same threshold, so that a looser one lets it through with more. A defence without a threshold is watched: its score is held
-against one, which is the standard chi-square on its innovation for those that only filter (tailgate.core.score_threshold).
+One threshold per defence, plant and wanted mean time between false alarms, found on clean runs of the plant's scenarios (calibrate). At
+that threshold attacks are played, and an alarm counts that comes within the metrics' deadline. The stealth attack aims just below the same
+threshold, so that a looser one lets it through with more. A defence without a threshold is watched: its score is held against one, which is
+the standard chi-square on its innovation for those that only filter (tailgate.core.score_threshold).
 """
 
 from __future__ import annotations
@@ -111,7 +111,7 @@ def detection(
     """Return the field `detection` of a board: the share of attacked episodes with an alarm within the deadline, and the median delay
     [steps].
 
-    Played are the suite's scenarios of the told plant, under its threat model, at its middle dose unless given; thresholds are found on the
+    Played are the suite's nominal scenarios, under its threat model, at its middle dose unless given; thresholds are found on the
     clean runs of all scenarios of a plant together. `watched`: the threshold is held against the score of a defence that has none; `rarer`:
     no threshold alarms as often as wanted, lower ones do more often and this one more rarely. `without` lists defences without figures, and
     why: a mean time that is out of reach.

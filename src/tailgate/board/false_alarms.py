@@ -1,6 +1,6 @@
 """False alarms at a threshold of the detection board, on fresh clean runs of every scenario of a suite.
 
-A threshold is found on all scenarios of a plant together, whose vehicle and sensors are as the defence is told. Elsewhere the alarm may
+A threshold is found on all scenarios of a plant together, whose vehicle and sensors the defence knows. Elsewhere the alarm may
 come more often, and within a drive it may come early or late: a filter with a constant gain alarms while it settles.
 """
 

@@ -27,7 +27,7 @@ from .score import score
 from .update import with_kept
 from .verified import digest, with_verified
 
-OWN = "rows.jsonl.xz"  # what `run` plays; other files of rows beside it come from `attack` and `submit`
+OWN = "rows.jsonl.xz"  # rows of `run`; other files of rows come from `attack` and `submit`
 BOARD = "board.json"
 LIST = "attacks.jsonl"
 CARDS = "cards"  # folder of what authors say of their entries

@@ -214,7 +214,7 @@ class CellLine(Part):
     failed: Count = 0
     reason: Text = ""
     damage: Interval | None
-    hits: Annotated[str, Field(strict=True, pattern="^([0-9a-f]{2})*$")] | None = None  # a bit for each episode, by seed; None: not told
+    hits: Annotated[str, Field(strict=True, pattern="^([0-9a-f]{2})*$")] | None = None  # a bit for each episode, by seed; None: not stated
     decisions: Text | None = None
     trace: Text | None = None
 

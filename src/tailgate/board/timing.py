@@ -116,7 +116,7 @@ def _timed(cell: Data, board: Data, suite: Suite, episodes: int | None) -> Timed
     def harm(keys: draws.Keys, schedule: Array | None) -> Array:
         return played(loop, who.policy, keys, schedule, [lambda trace: _harm(trace, suite)])[0].astype(bool)
 
-    here = harm(draws.keys(purpose, sorted(numbered(beacon, suite.name, purpose, 0, n))), None)  # as `hits` are told
+    here = harm(draws.keys(purpose, sorted(numbered(beacon, suite.name, purpose, 0, n))), None)  # in the order of `hits`
     if not _same(cell, here):
         return f"{cell['attack']} does damage to {int(here.sum())} of {n} episodes here, which is not what the board's cell says"
     keys = draws.keys(purpose, numbered(beacon, suite.name, purpose, n, max(2, 4 * n if episodes is None else episodes)))

@@ -33,7 +33,7 @@ class Beside:
     cells: list[Data]
     before: Table  # of the board alone
     added: dict[str, frozenset[str]]  # attacks that entries which stay have met in rows, and had not met
-    steady: frozenset[str]  # defences that met no more than they had: of two of them the board's comparison stands
+    steady: frozenset[str]  # defences that met no more than they had: a comparison of two of them holds
 
     def of(self, part: str, defence: str) -> list[Data]:
         """Return the board's lines of a defence: of `curves`, say."""

@@ -1,4 +1,4 @@
-"""tailgate bench: how fast this is, beside others, in one run."""
+"""tailgate bench: the speed of this package and of others, in one run."""
 
 from __future__ import annotations
 

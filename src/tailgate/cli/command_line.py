@@ -58,7 +58,7 @@ def _kept(chosen: argparse.Namespace) -> str:
 
 
 class _Parser(argparse.ArgumentParser):
-    """Says in one line what is wrong with the arguments, and where the command is told; argparse shows the whole usage, or that of all."""
+    """Says in one line what is wrong with the arguments, and which --help explains it; argparse shows the whole usage."""
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         found, rest = super().parse_known_args(args, namespace)

@@ -9,7 +9,7 @@ from typing import Any
 
 from tailgate.cli.shared import Commands, add_options, counted, own_classes, say, show, table, working
 
-MANY = 8  # defences, above which each has a line of its own, without intervals
+MANY = 8  # defences, above which each has its line, without intervals
 
 
 def add(commands: Commands) -> None:

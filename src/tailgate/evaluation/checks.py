@@ -69,7 +69,7 @@ def again(
 
 
 def drawn(things: Sequence[Thing], sample: int | None, seed: int, act: str) -> list[Thing]:
-    """Return so many of the things, in their order; all where no number is asked for, or a larger one. `act` names the random stream."""
+    """Return a number of the things, in their order; all where no number is asked for, or a larger one. `act` names the random stream."""
     if sample is not None:
         sizes.check("sample", sample)
     if sample is None or sample >= len(things):

@@ -52,7 +52,7 @@ def verify(
 ) -> dict[str, Any]:
     """Play rows again and compare hashes, metrics and everything else that they record.
 
-    `sample`: so many rows, drawn by `sample_seed`; None: all. `batch`: episodes side by side instead of the row's own number, which
+    `sample`: number of rows, drawn by `sample_seed`; None: all. `batch`: episodes side by side instead of the row's own number, which
     changes no result. The report has `status` (verified: every row that was asked for agrees; else claimed), `counts`, `entries` (the
     same for each defence), `findings` (rows that differ or could not be checked, lines counted from 1) and `reasons`. `submissions`:
     classes that rows of `leaderboard submit` are about, each in a sandbox, "bwrap/module:Class". `files`: the file that each row is from;

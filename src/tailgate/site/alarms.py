@@ -19,7 +19,7 @@ def alarms_of(suite: Suite) -> list[Alarms]:
 
 
 def robust(suite: Suite) -> set[str]:
-    """Return scenarios that are not as a defence is told."""
+    """Return scenarios whose plant or sensor a defence does not know."""
     return {scenario.name for scenario in suite.board.suite.scenarios if scenario.robustness}
 
 

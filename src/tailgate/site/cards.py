@@ -1,7 +1,7 @@
 """Cards on the pages: the authors' words, over what is known of components that come with the package.
 
-A published board holds no copy of what can be told from the registry and the suite: description, reference and uses, the file of the class,
-its licence, what attackers are granted, and what was trained.
+A published board holds no copy of what registry and suite say: description, reference and uses, the file of the class, its licence, what
+attackers are granted, and what was trained.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from tailgate.core.threat import ThreatModel
 from .suite import Suite
 
 LICENCE = "MIT"  # of the package
-SHOWN = ("name", "summary", "parameters", "knowledge", "learned", "optimal")  # of a card: shown in a place of their own
+SHOWN = ("name", "summary", "parameters", "knowledge", "learned", "optimal")  # of a card: shown elsewhere
 ORDER = ("reference", "code", "licence", "uses", "authors", "threat_model", "training", "digest", "sentinel", "version")
 NAMED = 4  # attacks of one card that are named
 BOUNDS = {  # of a threat model, and the kinds of attack that they bound
