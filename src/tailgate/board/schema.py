@@ -332,3 +332,17 @@ class Board(Part):
     comparisons: list[Comparison] = []
     detection: Detection | None = None
     trust: Trust | None = None
+
+    def cells_of(self, defence: str) -> list[CellLine]:
+        """Return the cells of an entry."""
+        return [cell for cell in self.cells if cell.defence == defence]
+
+    def detected(self, defence: str | None = None) -> list[Detected]:
+        """Return the figures of detection, of all entries or of one; none where nobody has played it."""
+        lines = self.detection.entries if self.detection else []
+        return [line for line in lines if defence in (None, line.defence)]
+
+    def alarms(self, defence: str | None = None) -> list[Alarms]:
+        """Return the false alarms at the thresholds of detection, of all entries or of one."""
+        lines = self.detection.alarms if self.detection else []
+        return [line for line in lines if defence in (None, line.defence)]

@@ -13,11 +13,6 @@ APART = 0.75  # of the drives with more false alarms in one half than in the oth
 LEVEL = 0.05  # of each of the three, for all scenarios of an entry together
 
 
-def alarms_of(suite: Suite) -> list[Alarms]:
-    """Return all lines of a board that has them."""
-    return suite.board.detection.alarms if suite.board.detection else []
-
-
 def robust(suite: Suite) -> set[str]:
     """Return scenarios whose plant or sensor a defence does not know."""
     return {scenario.name for scenario in suite.board.suite.scenarios if scenario.robustness}
@@ -30,7 +25,7 @@ def middle(suite: Suite) -> float:
 
 def table_of(suite: Suite, defence: str) -> Data | None:
     """Return an entry's table: a row per scenario, a column per wanted mean time, and when in the drive alarms come at the middle one."""
-    lines = [line for line in alarms_of(suite) if line.defence == defence]
+    lines = suite.board.alarms(defence)
     if not lines:
         return None
     hours = list(dict.fromkeys(line.hours for line in lines))
@@ -46,7 +41,7 @@ def table_of(suite: Suite, defence: str) -> Data | None:
 
 def together_of(suite: Suite) -> Data | None:
     """Return the table of all entries at the middle mean time: a column for each scenario."""
-    hour, lines = middle(suite), [line for line in alarms_of(suite) if line.hours == middle(suite)]
+    hour, lines = middle(suite), [line for line in suite.board.alarms() if line.hours == middle(suite)]
     if not lines:
         return None
     names = [scenario.name for scenario in suite.board.suite.scenarios if any(line.scenario == scenario.name for line in lines)]
@@ -62,7 +57,7 @@ def together_of(suite: Suite) -> Data | None:
 def drifts_of(suite: Suite, defence: str) -> list[str]:
     """Return flags of an entry: false alarms surely far more or less often than its threshold was set for, or in one half alone."""
     hour = middle(suite)
-    lines = [line for line in alarms_of(suite) if line.defence == defence and line.hours == hour]
+    lines = [line for line in suite.board.alarms(defence) if line.hours == hour]
     told = [line for line in lines if line.scenario not in robust(suite)]
     ends = {line.scenario: mean_time(line.onsets, line.running, line.dispersion, 1.0 - LEVEL / len(lines)) for line in lines}
     often = [line for line in lines if (most := ends[line.scenario][1]) is not None and most < hour / FACTOR]

@@ -93,7 +93,7 @@ def _rates(suite: Suite, entry: Entry) -> list[Data]:
 
 def _worst(suite: Suite, entry: Entry) -> list[Data]:
     """Return the cell of the attack that did most damage per scenario and shown dose; computed optima do not count."""
-    mine = [c for c in suite.board.cells if c.defence == entry.defence and not c.optimal and c.attack != "none"]
+    mine = [c for c in suite.board.cells_of(entry.defence) if not c.optimal and c.attack != "none"]
     out = []
     for scenario in suite.board.suite.scenarios:
         for dose in suite.shown:
@@ -106,7 +106,7 @@ def _worst(suite: Suite, entry: Entry) -> list[Data]:
 def _every(suite: Suite, entry: Entry) -> list[Data]:
     """Return all cells of a defence: a row per scenario and attack, a column per dose."""
     rows: dict[tuple[str, str, str], dict[Dose, CellLine]] = {}
-    for cell in (cell for cell in suite.board.cells if cell.defence == entry.defence):
+    for cell in suite.board.cells_of(entry.defence):
         rows.setdefault((cell.scenario, cell.attack, cell.knowledge), {})[cell.dose] = cell
     out = []
     for by_dose in rows.values():
@@ -183,7 +183,6 @@ def entry_page(
 ) -> Data:
     """Return all that an entry's page shows. also: names of other suites with an entry of the same text, and their pages."""
     curves, stealth = curves_of(suite, [entry], gap=7.0), stealth_of(suite, [entry])
-    found = [d for d in (suite.board.detection.entries if suite.board.detection else ()) if d.defence == entry.defence]
     return {
         "name": suite.defences[entry.defence], "rank": _rank(suite, entry), "also": also, "card": card_of(suite, entry),
         "replayed": _replayed(entry), "checked": _checked(entry), "clocked": _clocked(measured.clock, entry.defence),
@@ -195,7 +194,7 @@ def entry_page(
         "rates": _rates(suite, entry), "worst": _worst(suite, entry), "cells": _every(suite, entry),
         "charts": curves[0]["charts"] if curves else [], "clean": _clean(suite, entry),
         "stealth": [reached_of(s) for s in entry.stealth or ()], "stealth_chart": stealth["chart"] if stealth else None,
-        "detection": [(d, interval_of(d.detected)) for d in found],
+        "detection": [(line, interval_of(line.detected)) for line in suite.board.detected(entry.defence)],
         "comparisons": comparisons_of(suite, entry.defence), "how": compared_how(suite),
         "about_trust": trust_of(suite), "trust": trust_page(suite, entry), "replay": replayed, "episode": _episode(suite, entry),
     }  # fmt: skip

@@ -39,13 +39,12 @@ class Suite:
 
     def __post_init__(self) -> None:
         b = self.board
-        duels = [d for e in (b.detection.entries if b.detection else ()) for d in (e.defence,)]
         taught = [a.trained_on for a in b.attacks if a.trained_on]
-        self.defences = names_of(dict.fromkeys([*(e.defence for e in b.entries), *duels, *taught]))
+        self.defences = names_of(dict.fromkeys([*(e.defence for e in b.entries), *(line.defence for line in b.detected()), *taught]))
         worst = [w.attack for e in b.entries for c in (*e.critical_dose.values(), *e.rates) if c and (w := c.worst)]
         points = [p.attack for c in b.curves for p in c.points]
         robust = [r.worst.attack for e in b.entries for r in e.robustness if r.worst]
-        heard = [e.attack for e in (b.detection.entries if b.detection else ())]
+        heard = [line.attack for line in b.detected()]
         own = [*(a.attack for a in b.attacks), *(c.attack for c in b.cells)]
         trusted = [a.attack for a in b.trust.attacks] if b.trust else []
         self.attacks = names_of(dict.fromkeys([*own, *worst, *points, *heard, *robust, *trusted]))
@@ -53,7 +52,7 @@ class Suite:
     def harmless(self, defence: str, level: Level) -> bool:
         """Return if no attack that knows at most this did damage to a defence, at any dose and in any scenario."""
         known = LEVELS[: LEVELS.index(level) + 1]
-        mine = [c.damage.value for c in self.board.cells if c.defence == defence and c.knowledge in known and not c.optimal and c.damage]
+        mine = [c.damage.value for c in self.board.cells_of(defence) if c.knowledge in known and not c.optimal and c.damage]
         return bool(mine) and not any(mine)
 
     @property
