@@ -189,13 +189,13 @@ def _beside(module: str, function: str, *, file: str) -> Callable[[Path], Any]:
 
 def _trust(folder: Path) -> Any:
     import tailgate
-    from tailgate.board.run import _report
+    from tailgate.board.files import read_json
     from tailgate.trust.run import with_trust
 
     if "board" not in _held:
         _held["board"] = json.loads(_board()[0])
         _held["board"]["suite"]["version"] = tailgate.__version__
-    return with_trust(_held["board"], _report(folder / "trust.json"))
+    return with_trust(_held["board"], read_json(folder / "trust.json", "trust"))
 
 
 def _trust_files() -> list[bytes]:

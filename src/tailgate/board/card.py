@@ -6,12 +6,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from tailgate.base.errors import InputError, said, unknown
-from tailgate.base.reading import load_json
+from tailgate.base.errors import InputError, unknown
 from tailgate.core import param
 from tailgate.core.registry import USES
 from tailgate.core.schema import as_data, build
 
+from .files import read_json
 from .schema import Data
 
 
@@ -46,10 +46,7 @@ class Card:
 def read_card(path: Path) -> Card:
     """Return a card, checked. Raises InputError that names the field."""
     where = f"card {path.name}"
-    try:
-        data = load_json(path)
-    except (OSError, ValueError) as error:
-        raise InputError(where, str(path), f"a readable JSON file ({said(error)})") from None
+    data = read_json(path, where)
     if not isinstance(data, dict):
         raise InputError(where, data, "a mapping of fields")
     card = build(Card, data, where)

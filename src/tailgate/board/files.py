@@ -21,12 +21,17 @@ from .schema import FORMAT, AtThreshold, Board, Data, Detection, EntryTrust, Par
 
 
 def load(path: Path) -> Any:
-    """Return the JSON data of a file, to be read by `read_board`; raises InputError for a file that is none."""
+    """Return the JSON data of a board's file, to be read by `read_board`."""
+    rows = "; rows are played again by `tailgate leaderboard verify`" if ".jsonl" in path.suffixes else ""
+    return read_json(path, "board", "board.json", rows)
+
+
+def read_json(path: Path, where: str, what: str = "JSON file", hint: str = "") -> Any:
+    """Return the JSON data of a file. Raises InputError for a file that is none."""
     try:
         return load_json(path)
     except (OSError, ValueError) as error:
-        rows = "; rows are played again by `tailgate leaderboard verify`" if ".jsonl" in path.suffixes else ""
-        raise InputError("board", str(path), f"a readable board.json ({said(error)}){rows}") from None
+        raise InputError(where, str(path), f"a readable {what} ({said(error)}){hint}") from None
 
 
 def save(board: Data, path: Path) -> None:

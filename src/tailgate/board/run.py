@@ -9,8 +9,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from tailgate.base.errors import InputError, said
-from tailgate.base.reading import lines_of, load_json, parse_json
+from tailgate.base.errors import InputError
+from tailgate.base.reading import lines_of, parse_json
 from tailgate.base.version import VERSION
 from tailgate.core.scenario import Suite
 from tailgate.evaluation.attack_list import attacks_of, list_of
@@ -21,7 +21,7 @@ from tailgate.trust.run import REPORT, with_trust
 
 from .card import with_cards
 from .cells import shared_of
-from .files import agree, load, read_board, save
+from .files import agree, load, read_board, read_json, save
 from .schema import Data
 from .score import score
 from .update import with_kept
@@ -109,7 +109,7 @@ def board_of(suite: Suite, folder: Path, beacon: str | None = None, keep: bool =
     held = {digest(path): Counter(row["defence"] for row in rows) for path, rows in parts.items()}
     board = with_verified(with_cards(board, folder / CARDS), folder / VERIFIED, held)
     if (report := folder / TRUST / REPORT).is_file():
-        board = with_trust(board, _report(report), f"trust {report}", suite)
+        board = with_trust(board, read_json(report, "trust"), f"trust {report}", suite)
     if before is not None:
         board = with_kept(board, before)
     save(board, folder / BOARD)
@@ -126,10 +126,3 @@ def kept_board(path: Path, suite: Suite, beacon: str) -> Data:
     if (board.suite.beacon or "") != beacon:
         raise InputError("beacon", beacon, f"that of the board, {board.suite.beacon or 'whose seeds are public ones'}")
     return data
-
-
-def _report(path: Path) -> Any:
-    try:
-        return load_json(path)
-    except (OSError, ValueError) as error:
-        raise InputError("trust", str(path), f"a readable JSON file ({said(error)})") from None

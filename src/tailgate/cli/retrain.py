@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import argparse
-from typing import Any
+from typing import TYPE_CHECKING
 
 from tailgate.cli.shared import Commands, add_options, show, table, working
+
+if TYPE_CHECKING:
+    from tailgate.agents.learning import Progress
+    from tailgate.training.train import TrainConfig
 
 
 def add(actions: Commands) -> None:
@@ -28,7 +32,7 @@ def _retrain(options: argparse.Namespace) -> int:
     with working() as update:
         for text in options.policies:
 
-            def told(config: Any, now: Any, label: str = text) -> None:
+            def told(config: TrainConfig, now: Progress, label: str = text) -> None:
                 update(label, min(now.steps, config.steps), config.steps, figures(now))
 
             found.append(retrain(text, told))

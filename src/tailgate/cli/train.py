@@ -4,13 +4,18 @@ from __future__ import annotations
 
 import argparse
 import json
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
 from tailgate.base.locks import alone
 from tailgate.base.progress import cells, progress
 from tailgate.cli.shared import Commands, add_options, own_classes, print_json, say, table
+
+if TYPE_CHECKING:
+    from tailgate.agents.learning import Progress
+    from tailgate.training.train import TrainConfig
 
 
 def add(commands: Commands) -> None:
@@ -48,7 +53,7 @@ def _train(options: argparse.Namespace) -> int:
 
         decisions: dict[int, int] = {}
 
-        def trained(seed: int, now: Any) -> None:
+        def trained(seed: int, now: Progress) -> None:
             decisions[seed] = now.steps
             update(f"training, seed {seed}", min(now.steps, config.steps), config.steps, train.figures(now))
 
@@ -95,7 +100,7 @@ def _print_report(report: dict[str, Any]) -> None:
         say(f"learned against {name}: {value}{points}, 95 % interval {low} to {high} ({verdict})")
 
 
-def _page(config: Any, report: dict[str, Any]) -> Any:
+def _page(config: TrainConfig, report: dict[str, Any]) -> Path:
     """Write the page of a finished run."""
     from tailgate.evaluation.rows import read_rows
     from tailgate.site.rows_page import build as build_page

@@ -6,12 +6,16 @@ import argparse
 import dataclasses
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from tailgate.base.errors import InputError
 from tailgate.base.files import aside
 from tailgate.cli.shared import Commands, add_options, counted, own_classes, say, show, table, tell, values, working
 from tailgate.core.schema import scalar
+
+if TYPE_CHECKING:
+    from tailgate.core.scenario import Suite
+    from tailgate.trust.statistics import Sequential, Sprt
 
 
 def add(commands: Commands) -> None:
@@ -46,7 +50,7 @@ def add(commands: Commands) -> None:
     command.set_defaults(run=_trust)
 
 
-def _suite(options: argparse.Namespace) -> Any:
+def _suite(options: argparse.Namespace) -> Suite:
     """Return the suite, or the part of it that the options name."""
     from tailgate.core.scenario import load_suite
     from tailgate.evaluation.attack_list import attacks_of
@@ -64,7 +68,7 @@ def _suite(options: argparse.Namespace) -> Any:
     return dataclasses.replace(suite, **changes)
 
 
-def _rule(options: argparse.Namespace) -> Any:
+def _rule(options: argparse.Namespace) -> Sequential | Sprt | None:
     from tailgate.trust.statistics import Sequential, Sprt
 
     for name in ("width", "test"):

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import argparse
 import json
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
 from tailgate.base import sizes
 from tailgate.base.progress import progress
 from tailgate.cli.shared import Commands, add_options, show, table, tell
+
+if TYPE_CHECKING:
+    from tailgate.agents.learning import Progress
 
 
 def add(commands: Commands) -> None:
@@ -42,7 +45,7 @@ def _tune(options: argparse.Namespace) -> int:
     errors.print(f"[bold]{search.base.name}[/]: {search.trials} trials of {search.base.steps:,} decisions, files in {search.directory}")
     with progress(errors) as update:
 
-        def trained(ordinal: int, now: Any) -> None:
+        def trained(ordinal: int, now: Progress | None) -> None:
             if now is None:
                 update(f"trial {ordinal}", 1, 1, "")
             else:
