@@ -66,10 +66,10 @@ def admit(
     if dose is not None and dose not in suite.doses:
         raise InputError("dose", dose, f"one of the doses of {suite.name}: {', '.join(map(str, suite.doses))}")
     level = knowledge_of(attack, suite)
-    rivals = [text for text in listed if text != CLEAN and not Spec("attack", text).entry.optimal]
-    rivals = [text for text in rivals if order(knowledge_of(text, suite)) <= order(level)]
+    peers = [text for text in listed if text != CLEAN and not Spec("attack", text).entry.optimal]
+    peers = [text for text in peers if order(knowledge_of(text, suite)) <= order(level)]
     part = dataclasses.replace(
-        suite, doses=(at,), shown={}, defences=tuple(defences), attacks=(*rivals, attack), seeds=episodes or suite.seeds
+        suite, doses=(at,), shown={}, defences=tuple(defences), attacks=(*peers, attack), seeds=episodes or suite.seeds
     )  # fmt: skip
     work = cells_of(part, purpose="select", beacon=beacon)
     writable_directory(path.parent)  # before anything is played

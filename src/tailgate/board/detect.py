@@ -48,7 +48,7 @@ def detect(
 def _detected(path: Path, suite: Suite, defences: Sequence[str], effort: Effort, workers: int, progress: Progress | None) -> Data:
     board = load(path)
     agree(read_board(board), suite)
-    guards = [e["defence"] for e in board["entries"] if e.get("card") and _takes_part(e)]
+    own = [e["defence"] for e in board["entries"] if e.get("card") and _takes_part(e)]
     known(defences, [e["defence"] for e in board["entries"] if _takes_part(e)])
     for entry in (e for e in board["entries"] if e["defence"] in defences):
         told, here = (entry.get("worst_episode") or {}).get("defence_digest"), Spec("defence", entry["defence"]).digest
@@ -65,11 +65,13 @@ def _detected(path: Path, suite: Suite, defences: Sequence[str], effort: Effort,
     if (told := held.get("plants")) != _shared(suite):
         wanted = f"{_shared(suite)}, scenarios that share a threshold; without its field `detection` a board is played again"
         raise InputError("detection: plants", told, wanted)
-    asked = [guard for guard in defences or guards if not _whole(held, guard, suite, attacks, effort)]
-    there = {guard: _of(board, held, guard) for guard in defences or guards if guard not in asked and not _checked(held, guard, suite)}
+    names = list(defences) or own
+    asked = [defence for defence in names if not _whole(held, defence, suite, attacks, effort)]
+    part = [defence for defence in names if defence not in asked and not _checked(held, defence, suite)]
+    there = {defence: _of(board, held, defence) for defence in part}
     with contextlib.closing(_play(suite, asked, attacks, effort, board["suite"].get("beacon") or "", workers, progress, there)) as played:
-        for guard, found in played:
-            board = _with(load(path), guard, found, effort, suite)  # read again: it may have been marked in the meantime
+        for defence, found in played:
+            board = _with(load(path), defence, found, effort, suite)  # read again: it may have been marked in the meantime
             save(board, path)
     return dict(board)
 
@@ -99,9 +101,9 @@ def _effort(held: Data, effort: Effort = EFFORT) -> Effort:
     return dataclasses.replace(EFFORT, **given | free | {"hours": tuple(map(float, held["hours"]))})
 
 
-def _whole(held: Data, guard: str, suite: Suite, attacks: Sequence[str], effort: Effort) -> bool:
+def _whole(held: Data, defence: str, suite: Suite, attacks: Sequence[str], effort: Effort) -> bool:
     """Return if an entry has all figures, or the reasons why it has none."""
-    lines = [line for part in DETECTION for line in held.get(part, ()) if line["defence"] == guard and not _outdated(line)]
+    lines = [line for part in DETECTION for line in held.get(part, ()) if line["defence"] == defence and not _outdated(line)]
     there = {tuple(line[key] for key in PLACE if key in line) for line in lines}
     return all(
         (plant, h) in there or all((name, attack, h) in there for name in names for attack in attacks)
@@ -109,16 +111,16 @@ def _whole(held: Data, guard: str, suite: Suite, attacks: Sequence[str], effort:
     )  # fmt: skip
 
 
-def _of(board: Data, held: Data, guard: str) -> Data:
+def _of(board: Data, held: Data, defence: str) -> Data:
     """Return the lines of one entry in the detection of a board."""
-    stealth = next(entry.get("stealth") for entry in board["entries"] if entry["defence"] == guard)
-    return {part: [line for line in held.get(part, ()) if line["defence"] == guard] for part in DETECTION} | {"stealth": stealth}
+    stealth = next(entry.get("stealth") for entry in board["entries"] if entry["defence"] == defence)
+    return {part: [line for line in held.get(part, ()) if line["defence"] == defence] for part in DETECTION} | {"stealth": stealth}
 
 
-def _checked(held: Data, guard: str, suite: Suite) -> bool:
+def _checked(held: Data, defence: str, suite: Suite) -> bool:
     """Return if false alarms at all thresholds of an entry are there, or nothing is."""
-    wanted = {(line["scenario"], line["hours"]) for line in held["entries"] if line["defence"] == guard}
-    return wanted <= {(line["scenario"], line["hours"]) for line in held.get("alarms", ()) if line["defence"] == guard}
+    wanted = {(line["scenario"], line["hours"]) for line in held["entries"] if line["defence"] == defence}
+    return wanted <= {(line["scenario"], line["hours"]) for line in held.get("alarms", ()) if line["defence"] == defence}
 
 
 def _outdated(line: Data) -> bool:
@@ -126,24 +128,24 @@ def _outdated(line: Data) -> bool:
     return str(line.get("reason", "")).startswith("defence: ")
 
 
-def _with(board: Data, guard: str, found: Data, effort: Effort, suite: Suite) -> Data:
+def _with(board: Data, defence: str, found: Data, effort: Effort, suite: Suite) -> Data:
     """Return the board with the figures of one entry, in the order of its entries."""
     order = [entry["defence"] for entry in board["entries"]]
     held = board.get("detection") or _nothing(effort, suite)
-    apart = {guard, *(e["defence"] for e in board["entries"] if not _takes_part(e))}
+    apart = {defence, *(e["defence"] for e in board["entries"] if not _takes_part(e))}
     lines = {part: [line for line in held.get(part, ()) if line["defence"] not in apart] + found[part] for part in DETECTION}
     lines = {part: sorted(mine, key=lambda line: order.index(line["defence"])) for part, mine in lines.items()}
-    return amended(board, {guard: {"stealth": found["stealth"]}}, detection=held | _said(effort, suite) | lines)
+    return amended(board, {defence: {"stealth": found["stealth"]}}, detection=held | _said(effort, suite) | lines)
 
 
 def figures(
-    suite: Suite, guard: str, attacks: Sequence[str], effort: Effort, beacon: str, there: Data | None = None,
+    suite: Suite, defence: str, attacks: Sequence[str], effort: Effort, beacon: str, there: Data | None = None,
     progress: Progress | None = None,
 ) -> Data:  # fmt: skip
     """Return `entries`, `without`, `alarms` and `stealth` of one defence. there: all of these but the alarms, if they are there."""
-    found = there or detection(suite, [guard], attacks, effort, beacon=beacon, progress=progress)
+    found = there or detection(suite, [defence], attacks, effort, beacon=beacon, progress=progress)
     if there is None:
-        found = found | {"stealth": stealth_impact(suite, guard, effort, beacon=beacon, progress=progress)}
+        found = found | {"stealth": stealth_impact(suite, defence, effort, beacon=beacon, progress=progress)}
     most = max(1, effort.most_steps // PARTS)
     return found | {"alarms": false_alarms(suite, found["entries"], effort.checked, most, beacon=beacon)}
 
@@ -154,24 +156,24 @@ def _play(
 ) -> Generator[tuple[str, Data]]:  # fmt: skip
     """Yield figures of each defence, as they are done; of those that are there in part, the missing ones."""
     have = there or {}
-    guards = [*asked, *have]
+    every = [*asked, *have]
     sizes.check("workers", workers)
     update, rest = progress or (lambda *_: None), (attacks, effort, beacon)
-    if workers == 1 or len(guards) < 2:
+    if workers == 1 or len(every) < 2:
         ticks = 2 * len(effort.hours)  # of an entry: the stealth attack and the others at each threshold
-        for i, guard in enumerate(guards):
+        for i, defence in enumerate(every):
             steps = itertools.count(i * ticks + 1)
-            tick = functools.partial(_tick, update, steps, ticks * len(guards), guard)
-            yield guard, figures(suite, guard, *rest, have.get(guard), tick)
+            tick = functools.partial(_tick, update, steps, ticks * len(every), defence)
+            yield defence, figures(suite, defence, *rest, have.get(defence), tick)
         return
-    jobs = [(suite, guard, *rest, have.get(guard)) for guard in guards]
+    jobs = [(suite, defence, *rest, have.get(defence)) for defence in every]
     for done, (i, found) in enumerate(each(figures, jobs, workers), start=1):
-        yield guards[i], found
-        update("detection", done, len(guards), guards[i])
+        yield every[i], found
+        update("detection", done, len(every), every[i])
 
 
-def _tick(update: Progress, steps: Iterator[int], total: int, guard: str, *_: object) -> None:
-    update("detection", next(steps), total, guard)
+def _tick(update: Progress, steps: Iterator[int], total: int, defence: str, *_: object) -> None:
+    update("detection", next(steps), total, defence)
 
 
 def check_detection(
@@ -226,9 +228,9 @@ def check_detection(
     }  # fmt: skip
 
 
-def _by_place(held: Data, guard: str) -> dict[tuple[Any, ...], Data]:
+def _by_place(held: Data, defence: str) -> dict[tuple[Any, ...], Data]:
     """Return the figures of an entry by plant, scenario, attack, hours and part."""
-    lines = [(part, line) for part in DETECTION for line in held.get(part, ()) if line["defence"] == guard]
+    lines = [(part, line) for part in DETECTION for line in held.get(part, ()) if line["defence"] == defence]
     lines += [("stealth", item) for item in held["stealth"] or ()]
     return {(*(line.get(key) for key in PLACE), part): line for part, line in lines}
 

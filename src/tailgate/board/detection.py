@@ -119,21 +119,21 @@ def detection(
     update = progress or (lambda *_: None)
     found: list[Data] = []
     without: list[Data] = []
-    work = [(guard, plant, names, h) for plant, names in plants(suite.nominal).items() for guard in defences for h in effort.hours]
-    for done, (guard, plant, names, h) in enumerate(work, start=1):
-        level, why, rarer = _found(guard, names, h, effort)
+    work = [(defence, plant, names, h) for plant, names in plants(suite.nominal).items() for defence in defences for h in effort.hours]
+    for done, (defence, plant, names, h) in enumerate(work, start=1):
+        level, why, rarer = _found(defence, names, h, effort)
         if level is None:
-            without.append({"defence": guard, "plant": plant, "hours": h, "reason": why})
+            without.append({"defence": defence, "plant": plant, "hours": h, "reason": why})
         else:
             for name in names:
-                bench = Bench.of(guard, [name], effort.episodes, None)
+                bench = Bench.of(defence, [name], effort.episodes, None)
                 made = bench.at(level)
                 for attack in attacks:
-                    rows = run_cell(_cell(suite, name, dose, guard, attack, effort.episodes, beacon), made, uses=bench.uses)
-                    head = {"defence": guard, "scenario": name, "attack": attack, "hours": h, "threshold": level}
+                    rows = run_cell(_cell(suite, name, dose, defence, attack, effort.episodes, beacon), made, uses=bench.uses)
+                    head = {"defence": defence, "scenario": name, "attack": attack, "hours": h, "threshold": level}
                     head |= {name: True for name, holds in (("watched", not bench.field), ("rarer", rarer)) if holds}
                     found.append(head | _detected(rows))
-        update("detection", done, len(work), guard)
+        update("detection", done, len(work), defence)
     return dataclasses.asdict(effort) | {"hours": list(effort.hours), "entries": found, "without": without}
 
 
@@ -195,13 +195,13 @@ def _level(found: Found) -> Data:
 
 def _reached(level: float, cell: Cell) -> Array | str:
     """Return (n,) deviations of the episodes that were attacked, or why there are none."""
-    made, rival = Bench.of(cell.defence, [cell.scenario], cell.seeds, None).at(level), Spec("attack", cell.attack)
-    attack, guard = rival.make(), Spec("defence", cell.defence)
+    made, spec = Bench.of(cell.defence, [cell.scenario], cell.seeds, None).at(level), Spec("attack", cell.attack)
+    attack, defence = spec.make(), Spec("defence", cell.defence)
     if isinstance(made, Watched):
         return NO_GATE
     values: list[Array] = []
     try:
-        loop = cell.place(attack, rival.entry.knowledge).loop(made, guard.entry.uses)
+        loop = cell.place(attack, spec.entry.knowledge).loop(made, defence.entry.uses)
         size = episodes_at_once(loop.model, loop.horizon, cell.batch)
         for first in range(0, cell.seeds, size):
             values.append(deviation(rollout(loop, attack, draws.keys(cell.purpose, cell.episodes[first : first + size]))))

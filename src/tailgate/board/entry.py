@@ -127,8 +127,8 @@ def _incomplete(table: Table, worst: Worst) -> str:
     if not worst.pairs:
         return "incomplete: no attack was played"
     name, i = worst.lost[0]
-    guard = table.defences.index(worst.defence)
-    slot = int(np.argmax(table.state[name][guard, i] != PLAYED))
+    index = table.defences.index(worst.defence)
+    slot = int(np.argmax(table.state[name][index, i] != PLAYED))
     key = Key(name, slot, worst.defence, table.columns[i])
     reason = next((row["reason"] for row in table.cells.get(key, ()) if row["status"] != "ok"), "not played")
     attacks = len({i for _, i in worst.lost})
@@ -164,11 +164,11 @@ def _unmet(table: Table, defence: str, origins: dict[str, Row], asked: list[Aske
     a plan asks for nothing: any policy will do that was trained against the defence and played everywhere. The policies' files say all
     this.
     """
-    guard = table.defences.index(defence)
+    index = table.defences.index(defence)
     row = next(rows[0] for key, rows in table.cells.items() if key.defence == defence)
     own = defence, row["defence_digest"], row.get("versions", {}).get("defence", 1)
     met = [
-        (origins[column.attack], {name for name in table.scenarios if (table.state[name][guard, i] == PLAYED).all()})
+        (origins[column.attack], {name for name in table.scenarios if (table.state[name][index, i] == PLAYED).all()})
         for i, column in enumerate(table.columns)
         if column.attack in origins and column.attack not in table.withdrawn
         and tuple(origins[column.attack].get(key, 1) for key in ("defence", "digest", "version")) == own

@@ -50,16 +50,16 @@ def standing(told: Sequence[str], levels: dict[str, Worst], slot: int, added: Co
 
 def _trainings(table: Table, defence: str, slot: int, origins: dict[str, Row]) -> list[str]:
     """Return flags of the trainings against this defence: unfinished, or a matter of the seed's luck."""
-    guard = table.defences.index(defence)
-    met = [any((state[guard, i] != MISSING).any() for state in table.state.values()) for i in range(len(table.columns))]
+    index = table.defences.index(defence)
+    met = [any((state[index, i] != MISSING).any() for state in table.state.values()) for i in range(len(table.columns))]
     mine = [i for i, column in enumerate(table.columns) if met[i] and origins.get(column.attack, {}).get("defence") == defence]
     rising = sum(bool(origins[table.columns[i].attack].get("rising")) for i in mine)
     out = [f"still learning: the curves of {rising} of {len(mine)} attackers rose when training ended"] if rising else []
     plans = dict.fromkeys(origins[table.columns[i].attack].get("plan") for i in mine)
     for name in table.nominal()[:1]:
         for plan in plans:
-            same = [i for i in mine if origins[table.columns[i].attack].get("plan") == plan and table.state[name][guard, i, slot] == PLAYED]
-            shares = [float(table.harm[name][guard, i, slot].mean()) for i in same]
+            same = [i for i in mine if origins[table.columns[i].attack].get("plan") == plan and table.state[name][index, i, slot] == PLAYED]
+            shares = [float(table.harm[name][index, i, slot].mean()) for i in same]
             if len(shares) > 1 and max(shares) - min(shares) > SPREAD:
                 span = f"{100 * min(shares):.0f} to {100 * max(shares):.0f} %"
                 level = table.columns[same[0]].knowledge
@@ -98,15 +98,15 @@ def _unspent(table: Table, levels: dict[str, Worst], slot: int) -> list[str]:
 def _transferred(table: Table, defence: str, worst: Worst, slot: int, trained: dict[str, str]) -> list[str]:
     """Return flags of policies trained on another defence that surely do more damage than every own one that knows as much."""
     out = []
-    guard = table.defences.index(defence)
+    index = table.defences.index(defence)
     for name in table.scenarios:
         mine: list[tuple[str, Array]] = []
         others: list[tuple[str, Array]] = []
         for i in (i for scenario, i in worst.pairs if scenario == name):
             column = table.columns[i]
-            if column.knowledge != worst.knowledge or column.attack not in trained or table.state[name][guard, i, slot] != PLAYED:
+            if column.knowledge != worst.knowledge or column.attack not in trained or table.state[name][index, i, slot] != PLAYED:
                 continue
-            (mine if trained[column.attack] == defence else others).append((column.attack, table.harm[name][guard, i, slot]))
+            (mine if trained[column.attack] == defence else others).append((column.attack, table.harm[name][index, i, slot]))
         if not mine or not others:
             continue
         best, own = max(mine, key=lambda held: float(held[1].mean()))

@@ -36,8 +36,8 @@ def lines(board: Board) -> list[tuple[str, ...]]:
         rank, critical = entry["rank"], entry["critical_dose"]["black"]
         rates = {str(rate["dose"]): rate["undamaged"] for rate in entry["rates"] if rate["knowledge"] == "black"}
         shown = [_share(rates[d]) if d in rates else "-" for d in doses]
-        rivals = sum(e["rank"] is not None and e["class"] == entry["class"] for e in board["entries"])
-        place = "-" if rank is None else "alone" if rivals == 1 else " to ".join(map(str, dict.fromkeys([rank["best"], rank["worst"]])))
+        ranked = sum(e["rank"] is not None and e["class"] == entry["class"] for e in board["entries"])
+        place = "-" if rank is None else "alone" if ranked == 1 else " to ".join(map(str, dict.fromkeys([rank["best"], rank["worst"]])))
         dose = "-" if critical is None else _dose(critical, suite["doses"])
         bound = [_trust(entry.get("trust"))] * trusted
         out.append((entry["defence"], entry["class"], place, dose, *shown, *bound, entry["why"]))

@@ -34,9 +34,9 @@ def names_of(texts: Iterable[str]) -> dict[str, Name]:
     out = {}
     for text, (head, params) in split.items():
         if head.endswith(".json"):
-            rivals = {paths[t] for t, (h, _) in split.items() if h.endswith(".json")} - {paths[text]}
+            others = {paths[t] for t, (h, _) in split.items() if h.endswith(".json")} - {paths[text]}
             depth = 2
-            while depth < len(paths[text]) and any(p[-depth:] == paths[text][-depth:] for p in rivals):
+            while depth < len(paths[text]) and any(p[-depth:] == paths[text][-depth:] for p in others):
                 depth += 1
             out[text] = Name("/".join(paths[text][-depth:]), params, "policy", True)
         elif head == "zoo":

@@ -38,10 +38,10 @@ class Worst:
 
         An attack that is not asked of everybody counts against the defences that it was played against.
         """
-        guard = self.table.defences.index(self.defence)
+        index = self.table.defences.index(self.defence)
         out: list[tuple[str, int]] = []
         for name in self.table.scenarios:
-            applies, mine = self.table.applies(name), self.table.state[name][guard]
+            applies, mine = self.table.applies(name), self.table.state[name][index]
             for i in self.table.known(self.knowledge):
                 if applies[i] and (self.table.columns[i].attack in self.table.asked or (mine[i] != MISSING).any()):
                     out.append((name, i))
@@ -50,8 +50,8 @@ class Worst:
     @cached_property
     def lost(self) -> list[tuple[str, int]]:
         """Return the pairs without full figures."""
-        guard = self.table.defences.index(self.defence)
-        return [(name, i) for name, i in self.pairs if (self.table.state[name][guard, i] != PLAYED).any()]
+        index = self.table.defences.index(self.defence)
+        return [(name, i) for name, i in self.pairs if (self.table.state[name][index, i] != PLAYED).any()]
 
     @property
     def complete(self) -> bool:

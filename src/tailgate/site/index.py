@@ -150,11 +150,11 @@ def _each_attack(suite: Suite, hour: float) -> Data:
         if case.detected is not None:
             key = case.defence, case.attack
             least[key] = min(least.get(key, 1.0), case.detected.value)
-    guards = list(dict.fromkeys(c.defence for c in cases))
+    defences = list(dict.fromkeys(c.defence for c in cases))
     rows = [
-        {"name": suite.attacks[a], "cells": [percent(least[g, a]) if (g, a) in least else "\N{EN DASH}" for g in guards]} for a in names
+        {"name": suite.attacks[a], "cells": [percent(least[g, a]) if (g, a) in least else "\N{EN DASH}" for g in defences]} for a in names
     ]
-    heads = [{"name": suite.defences[g], "page": suite.pages.get(g, "")} for g in guards]
+    heads = [{"name": suite.defences[g], "page": suite.pages.get(g, "")} for g in defences]
     silent = any(suite.attacks[a].base == "dropout" for a in names)
     return {"hour": figure(hour), "heads": heads, "rows": rows, "silent": silent}
 

@@ -20,9 +20,9 @@ def trust_of(suite: Suite) -> Data | None:
     head = suite.board.trust
     if head is None:
         return None
-    rivals = sorted((a for a in head.attacks if a.attack != CLEAN), key=lambda a: LEVELS.index(a.knowledge))
-    attacks = [{"name": suite.attacks[a.attack], "knowledge": a.knowledge, "note": a.note} for a in rivals]
-    counts = [(level, sum(a.knowledge == level for a in rivals)) for level in LEVELS]
+    listed = sorted((a for a in head.attacks if a.attack != CLEAN), key=lambda a: LEVELS.index(a.knowledge))
+    attacks = [{"name": suite.attacks[a.attack], "knowledge": a.knowledge, "note": a.note} for a in listed]
+    counts = [(level, sum(a.knowledge == level for a in listed)) for level in LEVELS]
     purpose = f" ({head.purpose})" if head.purpose else ""
     return {
         "black": _against(suite, "black"), "attacks": attacks, "listed": ", ".join(f"{n} {level} box" for level, n in counts if n),
