@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import argparse
 import json
-import secrets
 import shlex
 from pathlib import Path
 from typing import Any
 
 from tailgate.base.errors import InputError
-from tailgate.cli.shared import Commands, add_options, counted, say, say_most, show, table, working
+from tailgate.cli.shared import Commands, add_options, counted, drawn_by, sample_seed, say, say_most, show, table, working
 
 LONGEST = 160  # characters of a figure that are shown
 
@@ -46,8 +45,7 @@ def _check(options: argparse.Namespace) -> int:
         raise InputError("--write", True, "the cells of a board, without --detection")
     path = Path(options.board)
     board = load(path)
-    seed = secrets.randbits(32) if options.sample_seed is None else options.sample_seed
-    asked = {"sample": options.sample, "sample_seed": seed, "defences": options.defence, "workers": options.workers}
+    asked = {"sample": options.sample, "sample_seed": sample_seed(options), "defences": options.defence, "workers": options.workers}
     with working() as update:
         if options.detection:
             report = check_detection(board, **asked, progress=update)
@@ -65,7 +63,7 @@ def _entries(report: dict[str, Any], title: str, columns: tuple[str, ...]) -> No
 
 
 def _print_detection(report: dict[str, Any]) -> None:
-    title = f"{report['suite']}: detection of {report['asked']} of {report['of']} entries played again{_seed(report)}; figures"
+    title = f"{report['suite']}: detection of {report['asked']} of {report['of']} entries played again{drawn_by(report)}; figures"
     _entries(report, title, ("defence", "equal", "differs", "unchecked"))
     for reason in report["reasons"]:
         say(f"{reason['defence']} unchecked: {reason['why']}")
@@ -77,14 +75,10 @@ def _print_detection(report: dict[str, Any]) -> None:
     say_most(lines, soft_wrap=True)
 
 
-def _seed(report: dict[str, Any]) -> str:
-    return "" if report["sample"] is None else f", drawn by the seed {report['sample_seed']}"
-
-
 def _print(report: dict[str, Any]) -> None:
     counts, untrained, strays = report["counts"], report["untrained"], report["strays"]
     title = f"{report['suite']}: {counts['equal'] + counts['differs']} of {report['cells']} cells played again, {report['asked']} asked for"
-    _entries(report, title + _seed(report), ("defence", "cells", "equal", "differs", "unchecked"))
+    _entries(report, title + drawn_by(report), ("defence", "cells", "equal", "differs", "unchecked"))
     say_most([f"{r['cells']} cell{'s' * (r['cells'] != 1)} unchecked: {r['why']}" for r in report["reasons"]],
              " more reasons; --json lists all cells")  # fmt: skip
     if untrained:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from tailgate.base.errors import InputError
-from tailgate.cli.shared import Commands, add_options, counted, own_classes, say, show, table, working
+from tailgate.cli.shared import Commands, add_options, counted, own_classes, say, show, table, threat_of, working
 
 
 def add(commands: Commands) -> None:
@@ -34,7 +34,7 @@ def add(commands: Commands) -> None:
 
 def _dose(options: argparse.Namespace) -> int:
     from tailgate.studies.dose import dose_response
-    from tailgate.studies.policies import changes, write_report
+    from tailgate.studies.policies import write_report
 
     own_classes()
     try:
@@ -44,7 +44,7 @@ def _dose(options: argparse.Namespace) -> int:
     options.kept = "the same command goes on" if options.out else "nothing is kept: --out DIR would"
     with working() as update:
         report = dose_response(
-            options.attacks, options.defence, options.scenario, doses, episodes=options.episodes, threat=changes(options.threat),
+            options.attacks, options.defence, options.scenario, doses, episodes=options.episodes, threat=threat_of(options),
             outcome=options.outcome, exceeds=options.exceeds, limit=options.limit, purpose=options.purpose, workers=options.workers,
             rows_file=Path(options.out) / "rows.jsonl" if options.out else None,
             progress=counted(update, "playing"),

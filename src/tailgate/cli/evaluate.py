@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from tailgate.base.files import aside, writable_directory
-from tailgate.cli.shared import Commands, add_options, counted, own_classes, show, table, tell, values, working
+from tailgate.cli.shared import Commands, add_options, counted, own_classes, show, table, tell, threat_of, working
 from tailgate.core.schema import scalar
 
 AGAIN = 3  # rows of a defence that are played again
@@ -40,7 +40,7 @@ def _evaluate(options: argparse.Namespace) -> int:
     from tailgate.evaluation.summary import summarise
 
     own_classes()
-    threat = values("--threat", options.threat, ", for example fdi_bound=10")
+    threat = threat_of(options)
     doses = None if options.dose is None else [scalar(d) for d in options.dose]
     suite: Any = options.suite or "quick-v0"
     if options.suite is None and options.scenario:  # a scenario by itself: what is not named is quick-v0's, but for the dose

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import secrets
 import sys
 from collections.abc import Callable, Container, Iterable, Sequence
 from contextlib import AbstractContextManager
@@ -47,6 +48,16 @@ def add_options(command: argparse.ArgumentParser, *names: str) -> None:
         command.add_argument(name, **OPTIONS[name])
 
 
+def sample_seed(options: argparse.Namespace) -> int:
+    """Return the seed of a sample: a new secret unless given, since who could foresee the sample would forge all else."""
+    return secrets.randbits(32) if options.sample_seed is None else int(options.sample_seed)
+
+
+def drawn_by(report: dict[str, Any]) -> str:
+    """Return the seed of a report's sample, in words; empty where all was asked for."""
+    return "" if report["sample"] is None else f", drawn by the seed {report['sample_seed']}"
+
+
 def own_classes() -> None:
     """Look for module:Class in the working directory, as `python -m` does."""
     sys.path.insert(0, "")
@@ -61,6 +72,11 @@ def values(option: str, texts: Iterable[str], example: str = "") -> dict[str, An
             raise InputError(option, text, f"key=value{example}")
         out[key] = scalar(value)
     return out
+
+
+def threat_of(options: argparse.Namespace) -> dict[str, Any]:
+    """Return the changes of a threat model that --threat gives."""
+    return values("--threat", options.threat, ", for example fdi_bound=10")
 
 
 def working() -> AbstractContextManager[Update]:

@@ -9,7 +9,7 @@ from typing import Any
 
 from tailgate.base import sizes
 from tailgate.base.files import writable_directory
-from tailgate.cli.shared import Commands, add_options, counted, own_classes, say, show, table, working
+from tailgate.cli.shared import Commands, add_options, counted, own_classes, say, show, table, threat_of, working
 
 
 def add(commands: Commands) -> None:
@@ -32,7 +32,7 @@ def add(commands: Commands) -> None:
 
 
 def _timing(options: argparse.Namespace) -> int:
-    from tailgate.studies.policies import changes, trained, write_report
+    from tailgate.studies.policies import trained, write_report
     from tailgate.studies.timing import timing
 
     sizes.check("episodes", options.episodes)
@@ -43,7 +43,7 @@ def _timing(options: argparse.Namespace) -> int:
     own_classes()
     with working() as update:
         report = timing(
-            options.policies, scenario=options.scenario, defence=options.defence, threat=changes(options.threat), dose=options.dose,
+            options.policies, scenario=options.scenario, defence=options.defence, threat=threat_of(options), dose=options.dose,
             episodes=options.episodes, outcome=options.outcome, purpose=options.purpose,
             progress=counted(update, "playing", "policies"),
         )  # fmt: skip

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from tailgate.cli.shared import Commands, add_options, counted, own_classes, say, show, table, working
+from tailgate.cli.shared import Commands, add_options, counted, own_classes, say, show, table, threat_of, working
 
 MANY = 8  # defences, above which each has its line, without intervals
 
@@ -33,11 +33,11 @@ def add(commands: Commands) -> None:
 
 
 def _transfer(options: argparse.Namespace) -> int:
-    from tailgate.studies.policies import changes, write_report
+    from tailgate.studies.policies import write_report
     from tailgate.studies.transfer import transfer
 
     own_classes()
-    threat = None if options.threat is None else changes(options.threat)
+    threat = None if options.threat is None else threat_of(options)
     options.kept = "the same command goes on" if options.out else "nothing is kept: --out DIR would"
     with working() as update:
         report = transfer(

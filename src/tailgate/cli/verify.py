@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import argparse
 import json
-import secrets
 from pathlib import Path
 from typing import Any
 
 from tailgate.base.errors import InputError
-from tailgate.cli.shared import MORE, SHOWN, Commands, add_options, counted, own_classes, say, show, table, working
+from tailgate.cli.shared import MORE, SHOWN, Commands, add_options, counted, drawn_by, own_classes, sample_seed, say, show, table, working
 
 
 def add(actions: Commands) -> None:
@@ -43,7 +42,6 @@ def _verify(options: argparse.Namespace) -> int:
     if options.out is not None:  # before anything is played
         writable_directory(Path(options.out).parent)
 
-    seed = secrets.randbits(32) if options.sample_seed is None else options.sample_seed  # who could foresee it would forge the others
     rows, origin, held_in = [], [], []
     for name in options.rows:
         held = read_rows(Path(name))
@@ -56,7 +54,7 @@ def _verify(options: argparse.Namespace) -> int:
         own_classes()
     with working() as update:
         report = verify(
-            rows, sample=options.sample, sample_seed=seed, workers=options.workers, batch=options.batch,
+            rows, sample=options.sample, sample_seed=sample_seed(options), workers=options.workers, batch=options.batch,
             trust_code=options.trust_code,
             submissions=options.submission, files=held_in,
             progress=counted(update, "playing"),
@@ -71,11 +69,10 @@ def _verify(options: argparse.Namespace) -> int:
 
 def _print(report: dict[str, Any]) -> None:
     counts = report["counts"]
-    drawn = "" if report["sample"] is None else f", drawn by the seed {report['sample_seed']}"
     played = f"{counts['verified'] + counts['differs']} of {report['rows']} rows played again"
     columns = ("defence", "status", "verified", "differs", "unchecked")
     rows = [[str(entry[key]) for key in columns] for entry in report["entries"]]
-    table(columns, rows, f"{report['status']}: {played}, {report['asked']} asked for{drawn}")
+    table(columns, rows, f"{report['status']}: {played}, {report['asked']} asked for{drawn_by(report)}")
     for reason in report["reasons"][:SHOWN]:
         say(f"{reason['rows']} rows {reason['why']}")
     wrong = [finding for finding in report["findings"] if finding["verdict"] == "differs"]
