@@ -1,4 +1,4 @@
-"""Scoring: from rows to a board, the list of admitted attacks, and the figures of detection."""
+"""Boards: from rows to ranked results, the list of admitted attacks, and the figures of detection."""
 
 from tailgate.evaluation.attack_list import Admitted
 from tailgate.evaluation.attack_list import read as read_attacks
