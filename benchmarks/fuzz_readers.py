@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import operator
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -51,7 +52,7 @@ def _call(module: str, function: str, file: str, *more: Any, text: bool = False)
     def read(folder: Path) -> Any:
         path: Path | str = str(folder / file) if text else folder / file
         rest = [[part.format(folder) for part in value] if isinstance(value, list) else value for value in more]
-        return getattr(import_module(f"tailgate.{module}"), function)(path, *rest)
+        return operator.attrgetter(function)(import_module(f"tailgate.{module}"))(path, *rest)
 
     return read
 
@@ -133,8 +134,8 @@ def _profile(folder: Path) -> Any:
 
 def _read_rows(name: str) -> Callable[[Path], Any]:
     def read(folder: Path) -> Any:
+        from tailgate.board import run
         from tailgate.evaluation.rows import read_rows
-        from tailgate.leaderboard import run
 
         run._one_round(folder, "")
         return read_rows(folder / name)
@@ -143,20 +144,20 @@ def _read_rows(name: str) -> Callable[[Path], Any]:
 
 
 def _read_board(folder: Path) -> Any:
-    from tailgate.leaderboard.board_format import load, read_board
+    from tailgate.board.files import load, read_board
 
     return read_board(load(folder / "board.json"))
 
 
 def _trust(folder: Path) -> Any:
     import tailgate
-    from tailgate.leaderboard.run import _report
+    from tailgate.board.files import read_json
     from tailgate.trust.run import with_trust
 
     if "board" not in _held:
         _held["board"] = json.loads(_board()[0])
         _held["board"]["suite"]["version"] = tailgate.__version__
-    return with_trust(_held["board"], _report(folder / "trust.json"))
+    return with_trust(_held["board"], read_json(folder / "trust.json", "trust"))
 
 
 def _trust_files() -> list[bytes]:
@@ -362,7 +363,7 @@ def readers() -> dict[str, Reader]:
         Reader("rows", "jsonl", "rows.jsonl", _rows, _read_rows("rows.jsonl"), command=("leaderboard", "build", "--rows", "{}", "--out", "page")),
         Reader("compressed rows", "xz", "rows.jsonl.xz", _rows, _read_rows("rows.jsonl.xz"),
                command=("leaderboard", "build", "--rows", "{}", "--out", "page")),
-        Reader("list of attacks", "jsonl", "attacks.jsonl", _files("configs/suites/*.jsonl"), _call("scoring.attacks", "read", "attacks.jsonl")),
+        Reader("list of attacks", "jsonl", "attacks.jsonl", _files("configs/suites/*.jsonl"), _call("evaluation.attack_list", "read", "attacks.jsonl")),
         Reader("board", "json", "board.json", _board, _read_board, command=("leaderboard", "page", "{}", "--out", "page"), slow=2.0),
         Reader("policy", "json", "p.json", lambda: [_sealed(tensors[0].read_bytes())], _policy,
                lambda folder: shutil.copyfile(tensors[0], folder / "p.safetensors"), ("timing", "{}", "--out", "report")),
@@ -372,15 +373,15 @@ def readers() -> dict[str, Reader]:
         Reader("checkpoint of ppo", "tensors", "checkpoint.safetensors", *ppo, slow=2.0),
         Reader("run's configuration", "json", "config.json", _started, _resumed),
         Reader("run's curve", "json", "curve-0.json", lambda: [b'{"curve": [], "seconds": 12.5}'], _call("training.trainings", "spent", "curve-0.json")),
-        Reader("card", "json", "card.json", lambda: [json.dumps(CARD).encode()], _call("leaderboard.card", "read_card", "card.json")),
+        Reader("card", "json", "card.json", lambda: [json.dumps(CARD).encode()], _call("board.card", "read_card", "card.json")),
         Reader("step times", "json", "step_time.json", _files("results/quick-v0/step_time.json"),
-               _call("leaderboard.clock", "read_clock", "step_time.json")),
+               _call("board.attachments", "Clock.read", "step_time.json")),
         Reader("timing advantages", "json", "timing.json", _files("results/quick-v0/timing.json"),
-               _call("leaderboard.timing", "read_timing", "timing.json")),
+               _call("board.attachments", "Timing.read", "timing.json")),
         Reader("verification", "json", "verified.json", _files("results/quick-v0/verified/*.json"),
-               _call("leaderboard.verified", "read_report", "verified.json")),
-        Reader("errata", "json", "errata.json", _files("results/quick-v0/errata.json"), _call("leaderboard.errata", "errata_of", "board.json")),
-        Reader("record of a run", "json", "run.json", _files("results/quick-v0/run.json"), _call("leaderboard.run_time", "run_of", "board.json")),
+               _call("board.verified", "read_report", "verified.json")),
+        Reader("errata", "json", "errata.json", _files("results/quick-v0/errata.json"), _call("board.attachments", "Errata.of", "board.json")),
+        Reader("record of a run", "json", "run.json", _files("results/quick-v0/run.json"), _call("board.attachments", "Run.of", "board.json")),
         Reader("trust report", "json", "trust.json", _trust_files, _trust),
         Reader("trust cells", "jsonl", "cells.jsonl", lambda: [b'{"cell": "a", "status": "ok", "properties": [], "conjunctions": {}}\n' * 3],
                _call("trust.run", "_read", "cells.jsonl")),

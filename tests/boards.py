@@ -6,7 +6,7 @@ from html.parser import HTMLParser
 
 from tailgate.evaluation.cells import evaluate
 from tailgate.evaluation.stats import mean_time
-from tailgate.leaderboard.site import build_site, slug
+from tailgate.site.build import build_site, slug
 
 LEVELS = ("black", "grey", "white")
 DOSES = [5, 10, 20, 40, 200]

@@ -11,10 +11,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 from tailgate.base import files
+from tailgate.board.run import board_of, play
+from tailgate.board.run_record import Record
 from tailgate.core.scenario import Suite, load_suite
 from tailgate.evaluation.cells import cells_of, run
-from tailgate.leaderboard.run import board_of, play
-from tailgate.leaderboard.run_record import Record
 
 SUITE = Suite("small", "", ("thesis-ch4-v0",), (5,), ("kf",), ("none", "fdi:value=5"), 3)
 FILE = "about: s\nscenarios: [thesis-ch4-v0]\ndoses: [5]\ndefences: [none, kf]\nattacks: [none, 'fdi:value=5']\nseeds: 3\n"

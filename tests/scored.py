@@ -2,11 +2,11 @@
 
 import functools
 
+from tailgate.board import score
+from tailgate.board.damage import hashes_of
 from tailgate.core.scenario import Suite, load_scenario
 from tailgate.evaluation.rounds import seeds_of
 from tailgate.play.metrics import METRICS
-from tailgate.scoring import score
-from tailgate.scoring.damage import hashes_of
 
 BEACON = "0123456789abcdef"
 ROAD, OTHER, NETWORK = "stop-and-go-v0", "gusty-stop-and-go-v0", "thesis-ch5-v0"

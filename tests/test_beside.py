@@ -13,16 +13,16 @@ import numpy as np
 import pytest
 
 from tailgate.base.errors import InputError
+from tailgate.board.cells import digits, hits_of, shared_of
+from tailgate.board.check import _scored
+from tailgate.board.consistency import sharpened, strays, untold
+from tailgate.board.files import read_board
 from tailgate.cli import board as command
 from tailgate.core.scenario import load_suite
+from tailgate.evaluation.attack_list import Admitted
 from tailgate.evaluation.cells import cells_of, run
+from tailgate.evaluation.paired import Harm, credible, duel, settled
 from tailgate.evaluation.rows import encode
-from tailgate.leaderboard.board_format import read_board
-from tailgate.leaderboard.check import _scored
-from tailgate.scoring.attacks import Admitted
-from tailgate.scoring.cells import digits, hits_of, shared_of
-from tailgate.scoring.follow import sharpened, strays, untold
-from tailgate.scoring.ranks import Harm, credible, duel, settled
 
 spec = importlib.util.spec_from_file_location("scored", Path(__file__).with_name("scored.py"))
 assert spec is not None and spec.loader is not None

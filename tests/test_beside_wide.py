@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from tailgate.base.errors import InputError
-from tailgate.leaderboard.board_format import read_board
-from tailgate.scoring.attacks import Admitted
-from tailgate.scoring.follow import strays
+from tailgate.board.consistency import strays
+from tailgate.board.files import read_board
+from tailgate.evaluation.attack_list import Admitted
 
 spec = importlib.util.spec_from_file_location("scored", Path(__file__).with_name("scored.py"))
 assert spec is not None and spec.loader is not None

@@ -13,15 +13,15 @@ from scipy import stats
 
 from tailgate.agents.policy.network_policy import Yoked
 from tailgate.base.errors import InputError
+from tailgate.board.attachments import Attachments, Gain, Shown, Timed, Timing
+from tailgate.board.cells import hits_of
+from tailgate.board.timing import measure_timing, telling
 from tailgate.cli import main
 from tailgate.core import draws
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import load_scenario, load_suite
-from tailgate.leaderboard.measured import Measured
-from tailgate.leaderboard.site import build_site
-from tailgate.leaderboard.timing import Gain, Shown, Timed, Timing, measure_timing, read_timing, telling
 from tailgate.play.trace import Trace, rollout
-from tailgate.scoring.cells import hits_of
+from tailgate.site.build import build_site
 
 Data = dict[str, Any]
 ROOT = Path(__file__).parents[1]
@@ -153,7 +153,7 @@ def test_the_command_writes_the_file_and_the_pages_show_it(board: Data, tmp_path
     assert not (folder / "timing.json").exists() and "cannot be told" in capsys.readouterr().out
     assert main(["leaderboard", "timing", "quick-v0", "--out", str(tmp_path), "--json", "--episodes", "60"]) == 0
     held = json.loads(capsys.readouterr().out)
-    made = read_timing(folder / "timing.json")
+    made = Timing.read(folder / "timing.json")
     assert made == Timing.model_validate_json(json.dumps(held)) and [e.defence for e in made.entries] == ranked[:2] and made.without[0].defence == ranked[2]
     assert main(["leaderboard", "page", str(folder / "board.json"), "--out", str(tmp_path / "page"), "--no-replays"]) == 0
     pages = {name: (tmp_path / f"page/quick-v0/{name}.html").read_text() for name in (*ranked, "kf")}
@@ -180,23 +180,23 @@ def test_what_is_no_timing_of_the_board_is_refused(board: Data, tmp_path: Path) 
     boards = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(boards)
     with pytest.raises(InputError, match="timing advantages: suite"):
-        build_site([boards.make_board()], tmp_path / "page", measured=[Measured(timing=read_timing(ROOT / "results/quick-v0/timing.json"))])
+        build_site([boards.make_board()], tmp_path / "page", measured=[Attachments(timing=Timing.read(ROOT / "results/quick-v0/timing.json"))])
     mine = json.loads(PLACE.read_text())
     for change in ({"hash": "0"}, {"beacon": "0123456789abcdef"}):
         with pytest.raises(InputError, match=f"timing advantages: {next(iter(change))}"):
-            build_site([mine | {"suite": mine["suite"] | change}], tmp_path / "page", measured=[Measured(timing=read_timing(ROOT / "results/quick-v0/timing.json"))])
+            build_site([mine | {"suite": mine["suite"] | change}], tmp_path / "page", measured=[Attachments(timing=Timing.read(ROOT / "results/quick-v0/timing.json"))])
     shutil.copy(PLACE, tmp_path / "board.json")
     for text in ("{", "{}", json.dumps({"format": "tailgate-step-time-1"})):
         (tmp_path / "timing.json").write_text(text)
         with pytest.raises(InputError, match=r"timing advantages.*timing\.json"):
-            read_timing(tmp_path / "timing.json")
+            Timing.read(tmp_path / "timing.json")
         assert main(["leaderboard", "page", str(tmp_path / "board.json"), "--out", str(tmp_path / "page")]) == 2 and not (tmp_path / "page").exists()
 
 
 @pytest.mark.parametrize("path", MADE, ids=lambda path: path.parent.name)
 def test_published_timings_are_of_their_boards(path: Path) -> None:
     """Every ranked entry is there once, its attacker's cell says the same share of damage, and it is the one that would be looked at today."""
-    made, held = read_timing(path), json.loads(path.with_name("board.json").read_text())
+    made, held = Timing.read(path), json.loads(path.with_name("board.json").read_text())
     assert made.suite == held["suite"]["name"] == path.parent.name and made.hash == held["suite"]["hash"]
     assert sorted(entry.defence for entry in [*made.entries, *made.without]) == sorted(e["defence"] for e in held["entries"] if e["rank"])
     for entry in made.entries:
@@ -211,7 +211,7 @@ def test_published_timings_are_of_their_boards(path: Path) -> None:
 def test_a_published_timing_comes_out_again(suite: str, defence: str) -> None:
     path = ROOT / f"results/{suite}/board.json"
     (again,) = measure_timing(json.loads(path.read_text()), load_suite(suite), [defence]).entries
-    (told,) = (entry for entry in read_timing(path.with_name("timing.json")).entries if entry.defence == defence)
+    (told,) = (entry for entry in Timing.read(path.with_name("timing.json")).entries if entry.defence == defence)
     assert again.model_dump(exclude={"advantage": {"adjusted"}}) == told.model_dump(exclude={"advantage": {"adjusted"}})
 
 

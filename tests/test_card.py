@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from tailgate.base.errors import InputError
-from tailgate.leaderboard.card import read_card, with_cards
+from tailgate.board.card import read_card, with_cards
 
 ROOT = Path(__file__).parent.parent
 GOOD = {"text": "kf", "name": "Kalman filter", "licence": "MIT", "threat_model": "None.", "training": "none", "uses": ["measurements"]}

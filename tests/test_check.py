@@ -13,14 +13,14 @@ import pytest
 
 import tailgate
 from tailgate.base.errors import InputError
+from tailgate.board.check import check, with_check
+from tailgate.board.consistency import strays
+from tailgate.board.score import score
 from tailgate.cli import check as command
 from tailgate.core.scenario import load_suite
 from tailgate.evaluation.cells import cells_of, run
 from tailgate.evaluation.rows import encode
-from tailgate.leaderboard.check import check, with_check
-from tailgate.leaderboard.site import build_site
-from tailgate.scoring.board import score
-from tailgate.scoring.follow import strays
+from tailgate.site.build import build_site
 
 ROOT = Path(__file__).parents[1]
 SUITE = dataclasses.replace(

@@ -9,14 +9,15 @@ from pathlib import Path
 import pytest
 
 from tailgate.base.errors import InputError
+from tailgate.board.attachments import Clock, StepTime
+from tailgate.board.clock import _round, _Timed, measure
+from tailgate.board.run import board_of
 from tailgate.cli import main
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import Suite, load_scenario
 from tailgate.evaluation.cells import cells_of, run
 from tailgate.evaluation.rows import encode
-from tailgate.leaderboard.clock import Clock, StepTime, _round, _Timed, clock_of, measure, read_clock
-from tailgate.leaderboard.run import board_of
-from tailgate.leaderboard.site import build_site
+from tailgate.site.build import build_site
 
 SUITE = Suite("small", "", ("thesis-ch4-v0",), (5,), ("none", "kf"), ("none",), 4)
 
@@ -82,7 +83,7 @@ def test_a_page_says_what_a_step_costs(tmp_path: Path, capsys: pytest.CaptureFix
     (tmp_path / "rows.jsonl").write_bytes(encode(run(cells_of(SUITE))))
     board_of(SUITE, tmp_path, require_adaptive=False)
     board, path = tmp_path / "board.json", tmp_path / "step_time.json"
-    assert clock_of(board) is None
+    assert Clock.of(board) is None
     assert main(["leaderboard", "page", str(board), "--out", str(tmp_path / "page"), "--no-replays"]) == 0
     assert "A step takes" not in (tmp_path / "page/small/kf.html").read_text()
     held = Clock(suite="small", scenario="thesis-ch4-v0", agents=1, rounds=3, processor="A <chip>", version="1", commit=None,
@@ -110,13 +111,13 @@ def test_anything_else_than_step_times_is_refused(tmp_path: Path, change: dict, 
             "commit": None, "entries": []}  # fmt: skip
     path = tmp_path / "step_time.json"
     path.write_text(json.dumps(good))
-    assert read_clock(path).suite == "s"
+    assert Clock.read(path).suite == "s"
     path.write_text(json.dumps(good | change))
     with pytest.raises(InputError, match=f"step_time.json: {field}"):
-        read_clock(path)
+        Clock.read(path)
     path.write_text("{")
     with pytest.raises(InputError, match="which is a JSON object"):
-        read_clock(path)
+        Clock.read(path)
 
 
 def test_the_command_writes_a_table_and_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -141,6 +142,6 @@ def test_a_defence_that_fails_is_not_left_out(monkeypatch: pytest.MonkeyPatch) -
     def broken(*arguments):
         raise InputError("defence output x", "NaN or infinity", "finite numbers")
 
-    monkeypatch.setattr("tailgate.leaderboard.clock._round", broken)
+    monkeypatch.setattr("tailgate.board.clock._round", broken)
     with pytest.raises(InputError, match="defence output x"):
         measure(SUITE, rounds=1)

@@ -12,14 +12,14 @@ from typing import Any
 import pytest
 
 from tailgate.base.errors import InputError
+from tailgate.board import detect as module
+from tailgate.board.detect import check_detection, detect
+from tailgate.board.detection import Effort
+from tailgate.board.files import read_board
+from tailgate.board.score import score
 from tailgate.cli import main
 from tailgate.core.scenario import load_scenario, load_suite
 from tailgate.evaluation.cells import cells_of, run
-from tailgate.leaderboard import detect as module
-from tailgate.leaderboard.board_format import read_board
-from tailgate.leaderboard.detect import check_detection, detect
-from tailgate.scoring.board import score
-from tailgate.scoring.detection import Effort
 
 Data = dict[str, Any]
 QUICK = load_suite("quick-v0")

@@ -179,7 +179,7 @@ def test_the_kalman_filter_of_the_documentation_is_the_built_in_one(package: Pat
 
 def test_the_published_head_is_that_of_the_published_board() -> None:
     """Figure for figure; and no board speaks of another machine's directories."""
-    from tailgate.leaderboard.head import markdown
+    from tailgate.board.head import markdown
 
     text = (ROOT / "README.md").read_text(encoding="utf-8")
     found = re.findall(r"<!-- head: (\S+) -->\n(.*?)<!-- end -->", text, flags=re.S)

@@ -7,9 +7,8 @@ from pathlib import Path
 import pytest
 
 from tailgate.base.errors import InputError
-from tailgate.leaderboard.errata import Errata, errata_of
-from tailgate.leaderboard.measured import Measured, measured_of
-from tailgate.leaderboard.site import build_site
+from tailgate.board.attachments import Attachments, Errata
+from tailgate.site.build import build_site
 
 ROOT = Path(__file__).resolve().parents[1]
 spec = importlib.util.spec_from_file_location("boards", Path(__file__).with_name("boards.py"))
@@ -26,9 +25,9 @@ def _beside(folder, *lines, **more):
 
 def test_they_stand_on_the_board_and_on_the_pages_of_whom_they_are_about(tmp_path):
     """The latest first; text is text; who is not named has only what is of all."""
-    beside = measured_of(_beside(tmp_path, LINE, ALL))
+    beside = Attachments.of(_beside(tmp_path, LINE, ALL))
     assert [one.date for one in beside.superseded()] == ["2026-11-26", "2026-11-25"]
-    assert [len(beside.superseded(name)) for name in ("kf", "rkf")] == [2, 1] and Measured().superseded() == []
+    assert [len(beside.superseded(name)) for name in ("kf", "rkf")] == [2, 1] and Attachments().superseded() == []
     board = boards.make_board("quick-v0")
     build_site([board], tmp_path / "page", replays=False, measured=[beside])
     pages = {path.name: path.read_text(encoding="utf-8") for path in (tmp_path / "page").rglob("*.html")}
@@ -46,16 +45,16 @@ def test_they_stand_on_the_board_and_on_the_pages_of_whom_they_are_about(tmp_pat
 ])  # fmt: skip
 def test_a_line_that_is_none_is_named(tmp_path, change, field):
     with pytest.raises(InputError, match=rf"errata.json: errata\.0\.{field}"):
-        errata_of(_beside(tmp_path, LINE | change))
+        Errata.of(_beside(tmp_path, LINE | change))
 
 
 def test_those_of_another_suite_and_what_is_no_file_are_refused(tmp_path):
-    beside = measured_of(_beside(tmp_path, LINE, suite="radar-v0"))
+    beside = Attachments.of(_beside(tmp_path, LINE, suite="radar-v0"))
     with pytest.raises(InputError, match=r"errata: suite.*radar-v0.*quick-v0"):
         build_site([boards.make_board("quick-v0")], tmp_path / "page", replays=False, measured=[beside])
     (tmp_path / "errata.json").write_text("[]")
     with pytest.raises(InputError, match="errata"):
-        errata_of(tmp_path / "board.json")
+        Errata.of(tmp_path / "board.json")
 
 
 @pytest.mark.parametrize("path", sorted(ROOT.glob("results/*/errata.json")), ids=lambda path: path.parent.name)

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from tailgate.base.errors import InputError
+from tailgate.board import false_alarms as module
+from tailgate.board.false_alarms import FIRST, Drives, dispersion, false_alarms
+from tailgate.board.files import read_board
 from tailgate.core.scenario import load_scenario, load_suite
 from tailgate.evaluation.attack_free import Bench
 from tailgate.evaluation.cells import Cell, run_cell
-from tailgate.leaderboard.board_format import read_board
-from tailgate.leaderboard.site_alarms import drifts_of, table_of, time_text, together_of
-from tailgate.leaderboard.site_suite import Suite
-from tailgate.scoring import false_alarms as module
-from tailgate.scoring.false_alarms import FIRST, Drives, dispersion, false_alarms
+from tailgate.site.alarms import drifts_of, table_of, time_text, together_of
+from tailgate.site.suite import Suite
 
 spec = importlib.util.spec_from_file_location("boards", Path(__file__).with_name("boards.py"))
 boards = importlib.util.module_from_spec(spec)

@@ -16,12 +16,12 @@ from typing import Any
 import pytest
 
 from tailgate.base import files
+from tailgate.board import read_attacks
 from tailgate.core.scenario import Suite
 from tailgate.evaluation import cells as evaluation
+from tailgate.evaluation.attack_list import Admitted, append
 from tailgate.evaluation.cells import Cell, cells_of, run, run_cell
 from tailgate.evaluation.rows import encode, read_rows
-from tailgate.scoring import read_attacks
-from tailgate.scoring.attacks import Admitted, append
 
 spec = importlib.util.spec_from_file_location("dying", Path(__file__).with_name("dying.py"))
 assert spec is not None and spec.loader is not None

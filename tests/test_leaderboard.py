@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 
 from tailgate.base.errors import InputError
-from tailgate.leaderboard.build import build
+from tailgate.board.words import at_least, breakable, names_of, percent, shade, spans, steps, ticks
 from tailgate.play.metrics import METRICS
-from tailgate.scoring.words import at_least, breakable, names_of, percent, shade, spans, steps, ticks
+from tailgate.site.rows_page import build
 
 spec = importlib.util.spec_from_file_location("boards", Path(__file__).with_name("boards.py"))
 boards = importlib.util.module_from_spec(spec)
@@ -216,7 +216,7 @@ def luminance(colour):
 
 @pytest.mark.parametrize("mode", [0, 1])
 def test_text_stands_out_on_every_shade_and_shades_are_in_order(mode):
-    css = files("tailgate.leaderboard").joinpath("page.css").read_text(encoding="utf-8")
+    css = files("tailgate.site").joinpath("page.css").read_text(encoding="utf-8")
     colours = dict(re.findall(r"--(\w+): (#\w+)", css.split(":root {")[1 + mode]))
     shades = [luminance(colours[f"s{i}"]) for i in range(11)]
     assert shades == sorted(shades, reverse=mode == 0)

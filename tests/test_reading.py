@@ -139,7 +139,7 @@ def test_profiles(tmp_path, text, words):
 
 
 def test_a_list_of_attacks_that_is_no_text_is_refused(tmp_path):
-    from tailgate.scoring.attacks import read
+    from tailgate.evaluation.attack_list import read
 
     (tmp_path / "attacks.jsonl").write_bytes(b"\xff\n")
     with pytest.raises(InputError, match="line 1"):

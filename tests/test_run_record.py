@@ -11,16 +11,15 @@ import pytest
 
 from tailgate.base import sources
 from tailgate.base.provenance import cores, processor
+from tailgate.board import run_record
+from tailgate.board.attachments import Attachments, Run, lasting
+from tailgate.board.files import load
+from tailgate.board.run_record import Record, processor_time
 from tailgate.cli import board as command
 from tailgate.core.scenario import load_suite
 from tailgate.evaluation import cells as evaluation
-from tailgate.leaderboard import run_record
-from tailgate.leaderboard.board_format import load
-from tailgate.leaderboard.measured import measured_of
-from tailgate.leaderboard.run_record import Record, processor_time
-from tailgate.leaderboard.run_time import FILE, RunTime, lasting, run_of
-from tailgate.leaderboard.site import build_site
-from tailgate.scoring.attacks import attacks_of
+from tailgate.evaluation.attack_list import attacks_of
+from tailgate.site.build import build_site
 
 SUITE = "name: mine\nscenarios: [gusty-stop-and-go-v0]\ndoses: [12]\ndefences: [none, kf]\nattacks: [none, dropout, 'fdi:value=5']\nseeds: 3\n"
 
@@ -41,7 +40,7 @@ def _run(suite: Path | str, out: Path, *more: str) -> Path:
 
 
 def _held(folder: Path) -> dict[str, Any]:
-    held: dict[str, Any] = json.loads((folder / FILE).read_text())
+    held: dict[str, Any] = json.loads((folder / Run.FILE).read_text())
     return held
 
 
@@ -102,12 +101,12 @@ def test_a_damaged_record_stops_nothing(suite: Path, tmp_path: Path, text: str) 
     """A record decides nothing: another begins."""
     played = load_suite(str(suite))
     (tmp_path / "rows.jsonl").touch()
-    (tmp_path / FILE).write_text(text.replace("HASH", played.hash))
+    (tmp_path / Run.FILE).write_text(text.replace("HASH", played.hash))
     assert Record(played, tmp_path, 2).before == []
     good = _record("mine", played.hash)
-    (tmp_path / FILE).write_text(json.dumps(good))
-    assert Record(played, tmp_path, 2).before == good["commands"]
-    (tmp_path / FILE).write_text(json.dumps(good | {"hash": "0" * 16}))
+    (tmp_path / Run.FILE).write_text(json.dumps(good))
+    assert [command.model_dump() for command in Record(played, tmp_path, 2).before] == good["commands"]
+    (tmp_path / Run.FILE).write_text(json.dumps(good | {"hash": "0" * 16}))
     assert Record(played, tmp_path, 2).before == []
 
 
@@ -121,24 +120,24 @@ def _record(suite: str, identity: str, count: int = 1) -> dict[str, Any]:
 
 def test_a_page_says_what_playing_its_board_took(tmp_path: Path) -> None:
     """In a sentence, of the record beside the board; one of another suite, or another version of it, is left out."""
-    once, twice = (RunTime.model_validate(_record("mine", "0" * 16, count)) for count in (1, 2))
+    once, twice = (Run.model_validate(_record("mine", "0" * 16, count)) for count in (1, 2))
     assert once.said(30) == "all 30 rows by one command in 104 s, 3 min of processor time (2 workers, A)"
     assert twice.said(90) == "60 of 90 rows by 2 commands in 3.5 min, 6 min of processor time (2 workers, A)"
-    more = RunTime.model_validate(_record("mine", "0" * 16) | {"rows": {"played": 30, "kept": 0, "again": 12}})
+    more = Run.model_validate(_record("mine", "0" * 16) | {"rows": {"played": 30, "kept": 0, "again": 12}})
     assert more.said(90) == "18 of 90 rows (12 played twice) by one command in 104 s, 3 min of processor time (2 workers, A)"
     assert [lasting(seconds) for seconds in (0.0, 1.5, 119.0, 120.0, 7199.0, 7200.0, 12_803.0, 720_000.0)] == [
         "0 s", "1.5 s", "119 s", "2 min", "120 min", "2 h", "3.6 h", "200 h",
     ]  # fmt: skip
-    assert run_of(tmp_path / "board.json") is None
+    assert Run.of(tmp_path / "board.json") is None
     source = Path("results/quick-v0/board.json")
     board = tmp_path / "quick-v0" / source.name
     board.parent.mkdir()
     shutil.copy(source, board)
     identity = json.loads(board.read_bytes())["suite"]["hash"]
     for suite, mark, shown in (("quick-v0", identity, True), ("quick-v0", "0" * 16, False), ("radar-v0", identity, False)):
-        (board.parent / FILE).write_text(json.dumps(_record(suite, mark)))
-        assert run_of(board)
-        page = build_site([load(board)], tmp_path / "page", replays=False, measured=[measured_of(board)]).read_text()
+        (board.parent / Run.FILE).write_text(json.dumps(_record(suite, mark)))
+        assert Run.of(board)
+        page = build_site([load(board)], tmp_path / "page", replays=False, measured=[Attachments.of(board)]).read_text()
         assert ("rows by one command in 104 s" in page) == shown, (suite, mark)
 
 

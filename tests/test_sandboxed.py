@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from tailgate.base.errors import InputError
+from tailgate.board import score
 from tailgate.core.draws import Draws
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import Suite, load_suite
@@ -16,7 +17,6 @@ from tailgate.evaluation.rounds import seeds_of
 from tailgate.evaluation.verify import verify
 from tailgate.sandbox import play_submission
 from tailgate.sandbox.isolated import IsolatedPlan, _shown, veiled
-from tailgate.scoring import score
 from tailgate.training.adaptive import configs_of, train_against
 
 pytestmark = pytest.mark.skipif(shutil.which("bwrap") is None, reason="bubblewrap is not installed")

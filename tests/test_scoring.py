@@ -14,10 +14,10 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from tailgate.base.errors import InputError
-from tailgate.leaderboard.board_format import read_board
-from tailgate.scoring import score
-from tailgate.scoring.doses import limits
-from tailgate.scoring.ranks import mcnemar
+from tailgate.board import score
+from tailgate.board.files import read_board
+from tailgate.evaluation.paired import mcnemar
+from tailgate.evaluation.stats import limits
 from tailgate.studies.policies import rising
 
 spec = importlib.util.spec_from_file_location("scored", Path(__file__).with_name("scored.py"))

@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 
 from tailgate.base.errors import InputError
+from tailgate.board import admit, read_attacks, score, withdraw
 from tailgate.cli import main
 from tailgate.core.scenario import load_suite
+from tailgate.evaluation.attack_list import Admitted, append, attacks_of, next_level, published, standing
 from tailgate.evaluation.rows import read_rows
-from tailgate.scoring import admit, read_attacks, score, withdraw
-from tailgate.scoring.attacks import Admitted, append, attacks_of, next_level, published, standing
 
 ROOT = Path(__file__).parents[1]
 LINE = Admitted("fdi:value=-4", "", "black", "2026-11-22", ({"defence": "kf", "p": 0.01},))

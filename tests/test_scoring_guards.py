@@ -9,17 +9,17 @@ import pytest
 import yaml
 
 from tailgate.base.errors import InputError
+from tailgate.board import Admitted, score
+from tailgate.board.admission import admit
+from tailgate.board.consistency import strays
+from tailgate.board.head import lines, title
+from tailgate.board.run import OWN, board_of, play
 from tailgate.cli import main
 from tailgate.core import registry
 from tailgate.core.scenario import Suite, load_suite
 from tailgate.estimators import Kalman
 from tailgate.evaluation.cells import evaluate
 from tailgate.evaluation.rows import packed, read_rows
-from tailgate.leaderboard.head import lines, title
-from tailgate.leaderboard.run import OWN, board_of, play
-from tailgate.scoring import Admitted, score
-from tailgate.scoring.attacks import admit
-from tailgate.scoring.follow import strays
 from tailgate.training.adaptive import configs_of, train_against
 
 spec = importlib.util.spec_from_file_location("scored", Path(__file__).with_name("scored.py"))

@@ -11,15 +11,15 @@ import pytest
 from tailgate import make_attack, make_defence
 from tailgate.agents.policy.zoo import zoo_names
 from tailgate.base.errors import InputError, NotApplicable
+from tailgate.board import score
+from tailgate.board.detection import Effort, detection, deviation, plants, stealth_impact, threshold
+from tailgate.board.files import read_board
 from tailgate.core.draws import keys
 from tailgate.core.registry import Spec, entries
 from tailgate.core.scenario import Suite, list_suites, load_scenario, load_suite
 from tailgate.evaluation.cells import evaluate
-from tailgate.leaderboard.board_format import read_board
 from tailgate.play.metrics import max_error
 from tailgate.play.trace import rollout
-from tailgate.scoring import score
-from tailgate.scoring.detection import Effort, detection, deviation, plants, stealth_impact, threshold
 from tailgate.training.adaptive import asked_of
 
 ROOT = Path(__file__).parents[1]

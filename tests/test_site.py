@@ -11,12 +11,12 @@ from urllib.parse import unquote, urlsplit
 
 import pytest
 
-from tailgate.leaderboard.board_format import read_board
-from tailgate.leaderboard.site import build_site
-from tailgate.leaderboard.site_cards import LICENCE
-from tailgate.leaderboard.site_entry import _imported, replay_of
-from tailgate.leaderboard.site_suite import Suite, critical_of
-from tailgate.scoring.words import at_least, percent
+from tailgate.board.files import read_board
+from tailgate.board.words import at_least, percent
+from tailgate.site.build import build_site
+from tailgate.site.cards import LICENCE
+from tailgate.site.entry import _imported, replay_of
+from tailgate.site.suite import Suite, critical_of
 
 ROOT = Path(__file__).parent.parent
 spec = importlib.util.spec_from_file_location("boards", Path(__file__).with_name("boards.py"))

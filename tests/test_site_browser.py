@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tailgate.scoring.words import percent
+from tailgate.board.words import percent
 
 spec = importlib.util.spec_from_file_location("boards", Path(__file__).with_name("boards.py"))
 boards = importlib.util.module_from_spec(spec)

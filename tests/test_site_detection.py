@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from tailgate.leaderboard.board_format import read_board
-from tailgate.leaderboard.order import ordered
-from tailgate.leaderboard.site_index import attacks_of, detection_of, ranked_against
-from tailgate.leaderboard.site_suite import Suite
-from tailgate.scoring.words import at_least, percent
+from tailgate.board.files import read_board
+from tailgate.board.order import ordered
+from tailgate.board.words import at_least, percent
+from tailgate.site.index import attacks_of, detection_of, ranked_against
+from tailgate.site.suite import Suite
 
 ROOT = Path(__file__).parents[1]
 spec = importlib.util.spec_from_file_location("boards", Path(__file__).with_name("boards.py"))

@@ -9,12 +9,12 @@ from pathlib import Path
 import pytest
 
 from tailgate.base.errors import InputError
-from tailgate.leaderboard import head
-from tailgate.leaderboard.board_format import read_board
-from tailgate.leaderboard.charts import Axis, Dot, Line, chart, nice, spread, ticks_at
-from tailgate.leaderboard.order import ordered
-from tailgate.leaderboard.site import build_site, slug
-from tailgate.leaderboard.site_suite import figure
+from tailgate.board import head
+from tailgate.board.files import read_board
+from tailgate.board.order import ordered
+from tailgate.site.build import build_site, slug
+from tailgate.site.charts import Axis, Dot, Line, chart, nice, spread, ticks_at
+from tailgate.site.suite import figure
 
 spec = importlib.util.spec_from_file_location("boards", Path(__file__).with_name("boards.py"))
 boards = importlib.util.module_from_spec(spec)

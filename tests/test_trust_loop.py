@@ -15,18 +15,18 @@ import pytest
 
 from tailgate import cli
 from tailgate.base.errors import InputError
+from tailgate.board.files import read_board
+from tailgate.board.run import board_of
+from tailgate.board.words import at_least
 from tailgate.cli.board import _print_board
 from tailgate.core import draws
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import Suite, load_scenario, load_suite
 from tailgate.evaluation.cells import evaluate, run_cell
+from tailgate.evaluation.paired import mcnemar
 from tailgate.evaluation.rounds import seeds_of
-from tailgate.leaderboard.board_format import read_board
-from tailgate.leaderboard.run import board_of
 from tailgate.play.metrics import measure
 from tailgate.play.trace import rollout
-from tailgate.scoring.ranks import mcnemar
-from tailgate.scoring.words import at_least
 from tailgate.trust import run as trust_run
 from tailgate.trust.cells import Job, check_cell, outcome, runs_of, single
 from tailgate.trust.false_alarms import false_alarms

@@ -9,14 +9,14 @@ from typing import Any
 import pytest
 
 from tailgate.base.errors import InputError
+from tailgate.board.files import read_board
+from tailgate.board.run import VERIFIED, board_of
 from tailgate.cli import verify as command
 from tailgate.core.scenario import Suite, list_suites, load_suite
 from tailgate.core.schema import as_data
 from tailgate.evaluation.cells import cells_of, run
 from tailgate.evaluation.rows import encode
-from tailgate.leaderboard.board_format import read_board
-from tailgate.leaderboard.run import VERIFIED, board_of
-from tailgate.leaderboard.site import build_site
+from tailgate.site.build import build_site
 from tailgate.training.adaptive import asked_of
 from tailgate.training.train import TrainConfig, plan_key
 

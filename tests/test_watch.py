@@ -10,6 +10,7 @@ import pytest
 import tailgate
 from tailgate.agents.scripts.scripted import NoAttack
 from tailgate.base.errors import NotApplicable
+from tailgate.board.detection import Effort, detection, stealth_impact
 from tailgate.core import Model
 from tailgate.core.draws import Role, keys
 from tailgate.core.registry import Spec
@@ -20,7 +21,6 @@ from tailgate.estimators.watched import watched
 from tailgate.evaluation.attack_free import Bench
 from tailgate.num import inverse, quadratic
 from tailgate.play.trace import Trace, rollout
-from tailgate.scoring.detection import Effort, detection, stealth_impact
 
 BIAS = "fdi:value=-3,start_step=40,length=20"
 ECHO = "echo_delay:start_step=30,delay=60"

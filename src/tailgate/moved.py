@@ -41,7 +41,9 @@ SUBROOMS = {  # of the folders envs, estimators and agents
     "agents.policy": "zoo",
     "agents.learners": "cem dqn ppo recurrent_ppo maskable_ppo sac tqc stable learning selfplay teacher finished",
 }
-PACKAGES = {"commands": "cli", "reproduce": "thesis", "strength": "studies", "submission": "sandbox"}
+PACKAGES = {
+    "commands": "cli", "reproduce": "thesis", "strength": "studies", "submission": "sandbox", "leaderboard": "board", "scoring": "board",
+}  # fmt: skip
 OTHERS = {
     "agents.codec": "envs.gym.actions",
     "agents.observation": "envs.gym.observations",
@@ -58,6 +60,14 @@ PROMOTED = {  # modules whose name a folder has today: the folder gives what the
     "estimators.challenge": "estimators.challenge.challenge_response",
     "agents.policy": "agents.policy.network_policy",
 }
+WITHIN = {  # rooms whose modules are in several rooms today, or have other names
+    "leaderboard": "attacked card check clock detect head order run run_record timing verified kept=update errata=attachments "
+    "measured=attachments run_time=attachments board_format=files board_parts=schema build=site.rows_page charts=site.charts "
+    "site=site.build site_alarms=site.alarms site_cards=site.cards site_curves=site.curves site_entry=site.entry "
+    "site_index=site.index site_suite=site.suite site_timing=site.timing site_trust=site.trust",
+    "scoring": "cells damage detection entry false_alarms flags gates words attacks=admission beside=update board=score doses=worst "
+    "follow=consistency ranks=evaluation.paired",
+}
 
 
 def _table() -> dict[str, str]:
@@ -67,6 +77,10 @@ def _table() -> dict[str, str]:
         for name in names.split():
             old, _, new = name.partition("=")
             out[top + old] = f"{room}.{new or old}"
+    for package, names in WITHIN.items():
+        for name in names.split():
+            old, _, new = name.partition("=")
+            out[f"{package}.{old}"] = new if "." in new else f"board.{new or old}"
     return {f"tailgate.{old}": f"tailgate.{new}" for old, new in out.items()}
 
 

@@ -3,21 +3,15 @@
 from __future__ import annotations
 
 import argparse
-import json
-import sys
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
-
-from tailgate.base.progress import cells, console, progress
+from tailgate.cli.shared import Commands, add_options, counted, own_classes, print_json, say, show, table, tell, working
 
 
-def add(actions: Any) -> None:
-    """Adds `admit` to the actions of a command."""
+def add(actions: Commands) -> None:
+    """Add `admit` to the actions of a command."""
     command = actions.add_parser(
         "admit", help="put an attack on a suite's list if it beats the worst that is there",
         description="Play an attack on select seeds against the worst of its knowledge, and append it to OUT/SUITE/attacks.jsonl if a "
@@ -26,7 +20,7 @@ def add(actions: Any) -> None:
     )  # fmt: skip
     command.add_argument("attack", metavar="ATTACK", help="attack, as on any command line")
     command.add_argument("--suite", required=True, metavar="NAME", help="suite by name or YAML file")
-    command.add_argument("--out", required=True, metavar="DIR", help="folder of the boards")
+    add_options(command, "--out")
     command.add_argument("--defence", action="append", metavar="NAME", help="only these defences (repeatable; default: the suite's)")
     command.add_argument("--dose", type=int, metavar="N", help="one of the suite's doses (default: its middle one)")
     command.add_argument("--beacon", default="", metavar="TEXT", help="random text of after the attack was handed in: its seeds are played")
@@ -38,27 +32,27 @@ def add(actions: Any) -> None:
 
 
 def _admit(options: argparse.Namespace) -> int:
+    from tailgate.board.admission import admit, withdraw
+    from tailgate.board.run import LIST
     from tailgate.core.scenario import load_suite
-    from tailgate.leaderboard.run import LIST
-    from tailgate.scoring.attacks import admit, withdraw
 
-    sys.path.insert(0, "")  # a defence module:Class is looked for in the working directory, as `tailgate evaluate` does
+    own_classes()
     suite = load_suite(options.suite)
     path = Path(options.out) / suite.name / LIST
     date = options.date or datetime.now(UTC).date().isoformat()
     if options.erratum is not None:
         line = withdraw(options.attack, path, date, options.erratum)
-        print(json.dumps(line.as_data(), indent=1) if options.json else f"{path}: {options.attack} is taken back")
+        show(options, line.as_data(), lambda _: print(f"{path}: {options.attack} is taken back"))
         return 0
     if not options.beacon:
-        print("tailgate: without --beacon the select seeds are public ones, on which the attack may have been tuned", file=sys.stderr)
-    with progress(Console(stderr=True)) as update:
+        tell("without --beacon the select seeds are public ones, on which the attack may have been tuned")
+    with working() as update:
         admitted, tests = admit(
             options.attack, suite, options.defence or suite.defences, path, date, dose=options.dose, beacon=options.beacon,
-            workers=options.workers, progress=lambda done, total: update("playing", done, total, cells(done, total)),
+            workers=options.workers, progress=counted(update, "playing"),
         )  # fmt: skip
     if options.json:
-        print(json.dumps({"admitted": admitted is not None, "evidence": tests}, indent=1))
+        print_json({"admitted": admitted is not None, "evidence": tests})
     else:
         _print(options.attack, admitted is not None, tests)
         print(path)
@@ -66,24 +60,20 @@ def _admit(options: argparse.Namespace) -> int:
 
 
 def _print(attack: str, admitted: bool, tests: list[dict[str, Any]]) -> None:
-    """A line for each defence and scenario in which the attack did something that the worst did not, what speaks most for it first."""
-    out = console()
-    title = f"{attack} beside the worst on the list, at dose {tests[0]['dose']}: episodes that only one of them damages"
-    table = Table(title=escape(title))
-    for heading in ("defence", "scenario", "worst so far", "this alone", "that alone", "of", "p (Holm)", "more"):
-        table.add_column(heading, overflow="fold")
-    telling = [test for test in tests if test["only_new"] > 0]
+    """Print a line for each defence and scenario where the attack did more than the worst in some episode, the most telling first."""
+    telling, rows = [test for test in tests if test["only_new"] > 0], []
     for test in sorted(telling, key=lambda test: (test["only_new"] <= test["only_worst"], test["adjusted"])):
-        worst = test["worst"]["attack"] if test["worst"] else "-"
-        more = test["only_new"] > test["only_worst"] and test["adjusted"] <= test["level"]
+        does_more = test["only_new"] > test["only_worst"]
         counts = (str(test[key]) for key in ("only_new", "only_worst", "episodes"))
-        names = (escape(name) for name in (test["defence"], test["scenario"], worst))
-        p = f"{test['adjusted']:.2g}" if test["only_new"] > test["only_worst"] else "-"  # two-sided: of one that does less it says nothing
-        table.add_row(*names, *counts, p, "yes" if more else "")
+        p = f"{test['adjusted']:.2g}" if does_more else "-"  # two-sided: of one that does less it says nothing
+        sure = "yes" if does_more and test["adjusted"] <= test["level"] else ""
+        rows.append((test["defence"], test["scenario"], test["worst"]["attack"] if test["worst"] else "-", *counts, p, sure))
     if telling:
-        out.print(table)
+        columns = ("defence", "scenario", "worst so far", "this alone", "that alone", "of", "p (Holm)", "more")
+        title = f"{attack} beside the worst on the list, at dose {tests[0]['dose']}: episodes that only one of them damages"
+        table(columns, rows, title)
     if silent := len(tests) - len(telling):
         pairs = f"in {silent} of {len(tests)} pairs of a defence and a scenario"
-        out.print(f"{attack} damages no episode that the worst does not {pairs} (--json has them)", markup=False, highlight=False)
+        say(f"{attack} damages no episode that the worst does not {pairs} (--json has them)")
     verdict = "admitted: it does surely more to at least one defence" if admitted else "refused: it does surely more to no defence"
-    out.print(f"{verdict} (level {tests[0]['level']:.2g})", markup=False, highlight=False)
+    say(f"{verdict} (level {tests[0]['level']:.2g})")

@@ -5,15 +5,12 @@ from __future__ import annotations
 import argparse
 import sys
 from pathlib import Path
-from typing import Any
-
-from rich.console import Console
 
 from tailgate.base import sizes
-from tailgate.base.progress import progress
+from tailgate.cli.shared import Commands, own_classes, working
 
 
-def add(actions: Any) -> None:
+def add(actions: Commands) -> None:
     command = actions.add_parser(
         "attack", help="train a suite's attackers against a defence, and play them on it",
         description="Train the learners that the suite names against the defence itself, black and grey box, and play their policies at "
@@ -31,15 +28,15 @@ def add(actions: Any) -> None:
 
 
 def _attack(options: argparse.Namespace) -> int:
+    from tailgate.board.attacked import attack
     from tailgate.core.scenario import load_suite
-    from tailgate.leaderboard.attacked import attack
 
-    sys.path.insert(0, "")  # module:Class is looked for in the working directory, as `leaderboard submit` does
+    own_classes()
 
     sizes.check("workers", options.workers)
     if options.episodes is not None:  # before anything is trained
         sizes.check("episodes", options.episodes)
-    with progress(Console(stderr=True)) as update:
+    with working() as update:
         made = attack(
             load_suite(options.suite), options.defence, Path(options.out), seeds=options.seeds, episodes=options.episodes,
             beacon=options.beacon, workers=options.workers, changes=tuple(options.set), progress=update,

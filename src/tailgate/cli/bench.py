@@ -1,20 +1,17 @@
-"""tailgate bench: how fast this is, beside others, in one run."""
+"""tailgate bench: the speed of this package and of others, in one run."""
 
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from pathlib import Path
-from typing import Any
 
-from rich.console import Console
-
-from tailgate.base.progress import console, progress
+from tailgate.base.progress import console
+from tailgate.cli.shared import Commands, print_json, working
 
 
-def add(commands: Any) -> None:
-    """Adds `bench` to the commands."""
+def add(commands: Commands) -> None:
+    """Add `bench` to the commands."""
     command = commands.add_parser(
         "bench", help="measure the speed of this package and of the peers that are installed, side by side",
         description="Measure environments, estimators and solvers beside their peers, interleaved in one run, and judge the ratios by "
@@ -42,7 +39,7 @@ def _bench(options: argparse.Namespace) -> int:
             "scalings": {plot.name: plot.what for plot in plots},
         }  # fmt: skip
         if options.json:
-            print(json.dumps(listed, indent=1))
+            print_json(listed)
         else:
             for kind, entries in listed.items():
                 print(f"{kind}:")
@@ -51,10 +48,10 @@ def _bench(options: argparse.Namespace) -> int:
         return 0
     if options.out:
         check_place(Path(options.out), {line.name for line in lines} | {plot.name for plot in plots})
-    with progress(Console(stderr=True)) as update:
+    with working() as update:
         record = bench(options.only, options.rounds, options.seconds, update)
     if options.json:
-        print(json.dumps(record, indent=1, allow_nan=False))
+        print_json(record)
     else:
         print_tables(record, console())
     if options.out:

@@ -4,23 +4,21 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import json
 import sys
 import time
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
 
 from tailgate.base import sizes
 from tailgate.base.errors import InputError
 from tailgate.base.locks import alone
-from tailgate.base.progress import cells, console, progress
+from tailgate.base.progress import cells, progress
+from tailgate.cli.shared import Commands, add_options, own_classes, print_json, table
 
 
-def add(actions: Any) -> None:
+def add(actions: Commands) -> None:
     command = actions.add_parser(
         "run", help="play suites, score them, and build the page of their boards",
         description="Play every defence of the suites against every attack, score the rows, and build the page: OUT/SUITE/rows.jsonl.xz "
@@ -28,7 +26,7 @@ def add(actions: Any) -> None:
         "put below OUT/SUITE count as well. Interrupted, the same command goes on.",
     )  # fmt: skip
     command.add_argument("suites", nargs="+", metavar="SUITE", help="suites by name or YAML file")
-    command.add_argument("--out", required=True, metavar="DIR", help="folder of the boards")
+    add_options(command, "--out")
     command.add_argument("--defence", action="append", metavar="NAME", help="only these defences (repeatable)")
     command.add_argument("--attack", action="append", metavar="TEXT",
                          help="only these attacks, which the entries that --keep-entries keeps have not met (repeatable)")  # fmt: skip
@@ -42,14 +40,13 @@ def add(actions: Any) -> None:
                          help="then train the suite's attackers against every defence that passes the gates, and play them")  # fmt: skip
     command.add_argument("--detection", action="store_true", help="then play detection as `leaderboard detect` does: slow")
     command.add_argument("--unattacked", action="store_true", help="also rank defences that no attack was trained against")
-    command.add_argument("--no-replays", action="store_true", help="leave out the replays of the worst episodes")
+    add_options(command, "--no-replays")
     command.add_argument("--json", action="store_true", help="print the entries as JSON")
     command.set_defaults(run=_run, kept="the same command goes on")
     page = actions.add_parser("page", help="build the page of boards")
     page.add_argument("boards", nargs="+", metavar="FILE", help="board.json files")
     page.add_argument("--out", required=True, metavar="DIR", help="directory of the page")
-    page.add_argument("--title", help="title of the page")
-    page.add_argument("--no-replays", action="store_true", help="leave out the replays of the worst episodes")
+    add_options(page, "--title", "--no-replays")
     page.set_defaults(run=_page)
     head = actions.add_parser("head", help="print the head of a board as a Markdown table")
     head.add_argument("board", metavar="FILE", help="board.json")
@@ -58,14 +55,14 @@ def add(actions: Any) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
-    sys.path.insert(0, "")  # module:Class is looked for in the working directory, as `tailgate evaluate` does
+    own_classes()
+    from tailgate.board.attachments import Attachments
+    from tailgate.board.attacked import attack
+    from tailgate.board.detect import detect
+    from tailgate.board.run import BOARD, board_of, kept_board, play
+    from tailgate.board.run_record import Record
     from tailgate.core.scenario import load_suite
-    from tailgate.leaderboard.attacked import attack
-    from tailgate.leaderboard.detect import detect
-    from tailgate.leaderboard.measured import measured_of
-    from tailgate.leaderboard.run import BOARD, board_of, kept_board, play
-    from tailgate.leaderboard.run_record import Record
-    from tailgate.leaderboard.site import build_site
+    from tailgate.site.build import build_site
 
     if options.attack and not options.keep_entries:
         raise InputError("--attack", options.attack[0], "--keep-entries too: a board of some attacks alone would say too little")
@@ -76,7 +73,7 @@ def _run(options: argparse.Namespace) -> int:
     out, started = Path(options.out), time.perf_counter()
     suites = [load_suite(name) for name in options.suites]
     for suite in suites:
-        measured_of(out / suite.name / BOARD)  # refuses what is no such file before anything is played
+        Attachments.of(out / suite.name / BOARD)  # refuses what is no such file before anything is played
     kept = {suite.name: kept_board(out / suite.name / BOARD, suite, options.beacon) for suite in suites if options.keep_entries}
     boards = []
     with contextlib.ExitStack() as locks, progress(Console(stderr=True)) as update:
@@ -105,32 +102,26 @@ def _run(options: argparse.Namespace) -> int:
                 board = board_of(suite, folder, beacon=options.beacon or None, keep=options.keep_entries)
             print(record.finish(board["suite"]["rows"]), file=sys.stderr)
             boards.append(detect(folder / BOARD, suite, workers=options.workers, progress=update) if options.detection else board)
-    measured = [measured_of(out / suite.name / BOARD) for suite in suites]
+    measured = [Attachments.of(out / suite.name / BOARD) for suite in suites]
     page = build_site(boards, out / "page", replays=not options.no_replays, measured=measured)
     if options.json:
-        print(json.dumps([{"suite": b["suite"]["name"], "entries": b["entries"]} for b in boards], indent=1, allow_nan=False))
-    else:
-        for board in boards:
-            _print_board(board)
+        print_json([{"suite": b["suite"]["name"], "entries": b["entries"]} for b in boards])
+    for board in () if options.json else boards:
+        _print_board(board)
     print(f"page: {page} ({(time.perf_counter() - started) / 60:.1f} min)", file=sys.stderr)
     return 0
 
 
 def _print_board(board: dict[str, Any]) -> None:
-    from tailgate.leaderboard.head import lines, title
+    from tailgate.board.head import lines, title
 
     headings, *rows = lines(board)
-    table = Table(title=escape(title(board)))
-    for heading in headings:
-        table.add_column(heading, overflow="fold")
-    for row in rows:
-        table.add_row(*map(escape, row))
-    console().print(table)
+    table(headings, rows, title(board))
 
 
 def _head(options: argparse.Namespace) -> int:
-    from tailgate.leaderboard.board_format import load
-    from tailgate.leaderboard.head import markdown
+    from tailgate.board.files import load
+    from tailgate.board.head import markdown
 
     board = load(Path(options.board))
     if options.most is not None:
@@ -140,12 +131,12 @@ def _head(options: argparse.Namespace) -> int:
 
 
 def _page(options: argparse.Namespace) -> int:
-    from tailgate.leaderboard.board_format import load
-    from tailgate.leaderboard.measured import measured_of
-    from tailgate.leaderboard.site import build_site
+    from tailgate.board.attachments import Attachments
+    from tailgate.board.files import load
+    from tailgate.site.build import build_site
 
     boards = [load(Path(name)) for name in options.boards]
-    measured = [measured_of(Path(name)) for name in options.boards]
+    measured = [Attachments.of(Path(name)) for name in options.boards]
     page = build_site(boards, Path(options.out), title=options.title, replays=not options.no_replays, measured=measured)
     print(page)
     return 0

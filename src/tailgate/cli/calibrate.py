@@ -3,19 +3,14 @@
 from __future__ import annotations
 
 import argparse
-import json
 import shlex
-import sys
 from typing import Any
 
-from rich.console import Console
-from rich.table import Table
-
-from tailgate.base.progress import console, progress
 from tailgate.base.version import VERSION
+from tailgate.cli.shared import Commands, own_classes, show, table, working
 
 
-def add(commands: Any) -> None:
+def add(commands: Commands) -> None:
     command = commands.add_parser(
         "calibrate", help="find the threshold of a defence for a wanted mean time between false alarms",
         description="Play clean runs (no attack) and find the threshold at which the alarm goes on once in a wanted time. Alarms act on "
@@ -38,8 +33,8 @@ def add(commands: Any) -> None:
 def _calibrate(options: argparse.Namespace) -> int:
     from tailgate.evaluation.calibrate import MIXTURE, calibrate
 
-    sys.path.insert(0, "")  # module:Class is looked for in the working directory, as `python -m` does
-    with progress(Console(stderr=True)) as update:
+    own_classes()
+    with working() as update:
         results = [
             calibrate(
                 defence, hours, scenarios=options.scenario or MIXTURE, onsets=options.onsets, most_steps=options.steps,
@@ -47,15 +42,12 @@ def _calibrate(options: argparse.Namespace) -> int:
             ).as_data()
             for defence in options.defence for hours in options.hours
         ]  # fmt: skip
-    if options.json:
-        print(json.dumps({"command": _command(options), "version": VERSION, "results": results}, indent=1, allow_nan=False))
-    else:
-        _print_results(results)
+    show(options, {"command": _command(options), "version": VERSION, "results": results}, lambda _: _print_results(results))
     return 0
 
 
 def _command(options: argparse.Namespace) -> str:
-    """What to type for this record."""
+    """Return the command line of this record."""
     words = ["tailgate", "calibrate"]
     for name in ("defence", "scenario", "hours"):
         words += [word for value in getattr(options, name) or () for word in (f"--{name}", f"{value:g}" if name == "hours" else value)]
@@ -65,18 +57,16 @@ def _command(options: argparse.Namespace) -> str:
 
 def _print_results(results: list[dict[str, Any]]) -> None:
     caption = "mean times in hours; 95 % intervals (Poisson)" + _words(results)
-    table = Table(title=f"Thresholds on {', '.join(results[0]['seeds'])}", caption=caption)
-    for heading in ("defence", "parameter", "threshold", "wanted", "measured", "interval", "alarms", "fresh runs"):
-        table.add_column(heading, overflow="fold")
+    columns, rows = ("defence", "parameter", "threshold", "wanted", "measured", "interval", "alarms", "fresh runs"), []
     for result in results:
         measured, fresh = result["measured"], result["fresh"]
         note = "" if result["settled"] else " (rarer)" if result["rarer"] else " (not settled)"
-        table.add_row(
+        rows.append((
             result["defence"], result["field"] or "watched", f"{result['threshold']:g}{note}", f"{result['wanted_hours']:g}",
             _hours(measured["hours"]), _between(measured), str(measured["onsets"]),
             f"{_hours(fresh['hours'])} ({_between(fresh)})" if fresh else "-",
-        )  # fmt: skip
-    console().print(table)
+        ))  # fmt: skip
+    table(columns, rows, f"Thresholds on {', '.join(results[0]['seeds'])}", caption)
 
 
 def _words(results: list[dict[str, Any]]) -> str:

@@ -53,12 +53,12 @@ def _done(arguments: Sequence[str] | None, chosen: argparse.Namespace, ending: E
 
 
 def _kept(chosen: argparse.Namespace) -> str:
-    """What is left of a command that ended before its time."""
+    """Return what is left of a command that ended before its time."""
     return getattr(chosen, "kept", "nothing of it is kept")
 
 
 class _Parser(argparse.ArgumentParser):
-    """Says in one line what is wrong with the arguments, and where the command is told; argparse shows the whole usage, or that of all."""
+    """Says in one line what is wrong with the arguments, and which --help explains it; argparse shows the whole usage."""
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         found, rest = super().parse_known_args(args, namespace)

@@ -3,25 +3,23 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console
 
 from tailgate.base.progress import progress
+from tailgate.cli.shared import Commands, add_options, own_classes
 
 
-def add(actions: Any) -> None:
-    """Adds `detect` to the actions of a command."""
+def add(actions: Commands) -> None:
+    """Add `detect` to the actions of a command."""
     command = actions.add_parser(
         "detect", help="play detection and stealth impact of a board, without its rows",
         description="Find each defence's threshold for the wanted mean times between false alarms, play the black-box scripts of "
         "OUT/SUITE/board.json and the stealth attack at it, and count false alarms in every scenario. The board is written as soon as an "
         "entry is done, and an entry that it has is not played again: interrupted, the same command goes on.",
     )  # fmt: skip
-    command.add_argument("suite", metavar="SUITE", help="suite by name or YAML file")
-    command.add_argument("--out", required=True, metavar="DIR", help="folder of the boards")
+    add_options(command, "suite", "--out")
     command.add_argument("--defence", action="append", default=[], metavar="NAME",
                          help="only these entries (repeatable); module:Class of the board is imported when it is named here")  # fmt: skip
     command.add_argument("--workers", type=int, default=2, metavar="N", help="processes, an entry each (default 2); change no result")
@@ -36,13 +34,13 @@ def add(actions: Any) -> None:
 
 
 def _detect(options: argparse.Namespace) -> int:
+    from tailgate.board.detect import detect
+    from tailgate.board.detection import Effort
+    from tailgate.board.files import load
+    from tailgate.board.run import BOARD
     from tailgate.core.scenario import load_suite
-    from tailgate.leaderboard.board_format import load
-    from tailgate.leaderboard.detect import detect
-    from tailgate.leaderboard.run import BOARD
-    from tailgate.scoring.detection import Effort
 
-    sys.path.insert(0, "")  # module:Class is looked for in the working directory, as `tailgate evaluate` does
+    own_classes()
     suite = load_suite(options.suite)
     path = Path(options.out) / suite.name / BOARD
     hours = None if options.hours is None else tuple(options.hours)

@@ -4,42 +4,29 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
 import sys
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
-
-from tailgate.base.errors import InputError
 from tailgate.base.files import aside, writable_directory
-from tailgate.base.progress import cells, console, progress
+from tailgate.cli.shared import Commands, add_options, counted, own_classes, show, table, tell, threat_of, working
 from tailgate.core.schema import scalar
 
 AGAIN = 3  # rows of a defence that are played again
 REFUSED = "refused: the scenario does not grant it"
 
 
-def add(commands: Any) -> None:
+def add(commands: Commands) -> None:
     command = commands.add_parser(
         "evaluate", help="play defences against attacks and write one row per episode",
         description="Play a suite, or the part of it that the options name. NAME: a registered component, NAME:key=value,key=value, "
         "module:Class, or (attacks) the JSON file of an exported policy or the YAML file of a program.",
     )  # fmt: skip
-    command.add_argument(
-        "--suite", metavar="NAME", help="suite by name or YAML file (default: quick-v0; with --scenario at the scenario's own dose)"
-    )
-    command.add_argument("--defence", action="append", metavar="NAME", help="a defence instead of the suite's (repeatable)")
-    command.add_argument("--attack", action="append", metavar="NAME", help="an attack instead of the suite's (repeatable)")
-    command.add_argument("--scenario", action="append", metavar="NAME", help="a scenario instead of the suite's (repeatable)")
-    command.add_argument("--dose", action="append", metavar="STEPS", help="attack budget; none: the scenario's own (repeatable)")
-    command.add_argument("--threat", action="append", metavar="key=value", default=[], help="change the threat model (repeatable)")
+    add_options(command, "--suite", "--defence", "--attack", "--scenario", "--dose", "--threat")
     command.add_argument("--seeds", type=int, metavar="N", help="episodes per cell instead of the suite's")
-    command.add_argument("--purpose", default="report", help="which seeds: train, tune, calibrate, select or report (default)")
+    add_options(command, "--purpose")
     command.add_argument("--batch", type=int, default=256, metavar="N", help="episodes side by side (default 256); changes no result")
-    command.add_argument("--workers", type=int, default=1, metavar="N", help="processes (default 1); changes no result")
+    add_options(command, "--workers")
     command.add_argument("--engine", default="local", choices=["local"], help="where workers run")
     command.add_argument("--out", metavar="FILE", help="write rows here (JSON Lines); an interrupted run resumes, other rows are set aside")
     command.add_argument("--plot", metavar="DIR", help="draw defences x attacks: error, smallest gap, collisions (needs tailgate[viz])")
@@ -52,13 +39,8 @@ def _evaluate(options: argparse.Namespace) -> int:
     from tailgate.evaluation.cells import evaluate
     from tailgate.evaluation.summary import summarise
 
-    sys.path.insert(0, "")  # module:Class is looked for in the working directory, as `python -m` does
-    threat = {}
-    for text in options.threat:
-        key, sep, value = text.partition("=")
-        if not sep:
-            raise InputError("--threat", text, "key=value, for example fdi_bound=10")
-        threat[key] = scalar(value)
+    own_classes()
+    threat = threat_of(options)
     doses = None if options.dose is None else [scalar(d) for d in options.dose]
     suite: Any = options.suite or "quick-v0"
     if options.suite is None and options.scenario:  # a scenario by itself: what is not named is quick-v0's, but for the dose
@@ -67,19 +49,16 @@ def _evaluate(options: argparse.Namespace) -> int:
         writable_directory(Path(options.plot), "plot")
     options.kept = f"the same command goes on with the rows of {options.out}" if options.out else "nothing is kept: --out FILE would"
     before = aside(options.out)
-    with progress(Console(stderr=True)) as update:
+    with working() as update:
         rows = evaluate(
             suite, defences=options.defence, attacks=options.attack, scenarios=options.scenario, doses=doses,
             seeds=options.seeds, purpose=options.purpose, batch=options.batch, workers=options.workers,
-            out=options.out, threat=threat, progress=lambda done, total: update("playing", done, total, cells(done, total)),
+            out=options.out, threat=threat, progress=counted(update, "playing"),
         )  # fmt: skip
     for earlier in sorted(aside(options.out) - before):
-        print(f"tailgate: {options.out} held something else than these rows; it is in {earlier}", file=sys.stderr)
+        tell(f"{options.out} held something else than these rows; it is in {earlier}")
     table = summarise(rows)
-    if options.json:
-        print(json.dumps(table, indent=1, allow_nan=False))
-    else:
-        _print_summary(table)
+    show(options, table, _print_summary)
     if options.plot:
         from tailgate.base.plots import write_overview
 
@@ -87,20 +66,20 @@ def _evaluate(options: argparse.Namespace) -> int:
             print(f"picture: {path}", file=sys.stderr)
     failed = sum(entry["failed"] for entry in table)
     if failed:
-        print(f"tailgate: {failed} of {len(rows)} rows failed; their reasons are in the rows", file=sys.stderr)
+        tell(f"{failed} of {len(rows)} rows failed; their reasons are in the rows")
     attacked = [row for row in rows if row["attack"] != "none" and row["status"] == "ok"]
     if attacked and not any(row["attack_steps"] for row in attacked):
-        print("tailgate: no attack took place in any episode: --attack names others, --threat grants more", file=sys.stderr)
+        tell("no attack took place in any episode: --attack names others, --threat grants more")
     for warning in _dependent(rows):
-        print(f"tailgate: warning: {warning}", file=sys.stderr)
+        tell(f"warning: {warning}")
     idle = bool(rows) and all(entry["crash"] is None for entry in table)
     if idle and not failed:
-        print(f"tailgate: nothing was played: {table[0]['reason']}", file=sys.stderr)
+        tell(f"nothing was played: {table[0]['reason']}")
     return 1 if failed or idle else 0
 
 
 def _dependent(rows: list[dict[str, Any]]) -> list[str]:
-    """What is to be said of somebody's own defences: of a cell of each a few rows are played again, by themselves or, if they were, not."""
+    """Return warnings on somebody's own defences, whose rows are played again: alone if they had companions, else with companions."""
     from tailgate.core.registry import Spec
     from tailgate.evaluation.verify import verify
 
@@ -122,29 +101,22 @@ def _dependent(rows: list[dict[str, Any]]) -> list[str]:
     return out
 
 
-def _print_summary(table: list[dict[str, Any]]) -> None:
-    out = console()
-    for place in dict.fromkeys((e["scenario"], e["dose"]) for e in table):
+def _print_summary(summary: list[dict[str, Any]]) -> None:
+    for place in dict.fromkeys((e["scenario"], e["dose"]) for e in summary):
         scenario, dose = place
-        here = [entry for entry in table if (entry["scenario"], entry["dose"]) == place]
+        here = [entry for entry in summary if (entry["scenario"], entry["dose"]) == place]
         road = any(entry["crash"] and entry["min_gap"] for entry in here)  # else nothing drives, and an error has no unit
-        shown = Table(title=f"{scenario}, budget {'unlimited' if dose is None else f'{dose} steps'}")
         errors = ("min gap [m]", "max error [m]") if road else ("RMS error", "max error")
         measures = ("n", *(("collisions", "95 % interval") if road else ()), *errors, "alarm onsets")
         why = any(entry["crash"] is None or entry["refused_all"] for entry in here)
-        for heading in ("defence", "attack", "knowledge", *measures, *(("why not",) if why else ())):
-            shown.add_column(heading, overflow="fold")
+        rows = []
         for entry in here:
-            head = [escape(entry["defence"]), escape(entry["attack"]), entry["knowledge"], str(entry["n"])]
-            crash = entry["crash"]
-            if crash is None:
-                shown.add_row(*head, *["-"] * (len(measures) - 1), escape(entry["reason"]))
-                continue
-            if entry["refused_all"]:
-                shown.add_row(*head, *["-"] * (len(measures) - 1), escape(REFUSED))
+            head, crash = [entry["defence"], entry["attack"], entry["knowledge"], str(entry["n"])], entry["crash"]
+            if crash is None or entry["refused_all"]:
+                rows.append([*head, *["-"] * (len(measures) - 1), entry["reason"] if crash is None else REFUSED])
                 continue
             figures = [f"{100 * crash['value']:.1f} %", f"{100 * crash['low']:.1f} to {100 * crash['high']:.1f} %"] if road else []
             keys = ("min_gap" if road else "rmse_position", "max_error", "alarm_onsets")
-            figures += [f"{entry[k]['median']:.2f}" if entry[k] else "-" for k in keys]
-            shown.add_row(*head, *figures)
-        out.print(shown)
+            rows.append([*head, *figures, *(f"{entry[k]['median']:.2f}" if entry[k] else "-" for k in keys)])
+        columns = ("defence", "attack", "knowledge", *measures, *(("why not",) if why else ()))
+        table(columns, rows, f"{scenario}, budget {'unlimited' if dose is None else f'{dose} steps'}")

@@ -3,17 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import json
-import sys
 from typing import Any
 
-from rich.markup import escape
-from rich.table import Table
-
-from tailgate.base.progress import console
+from tailgate.cli.shared import Commands, own_classes, show, table
 
 
-def add(commands: Any) -> None:
+def add(commands: Commands) -> None:
     command = commands.add_parser(
         "explain", help="whether a scenario, a defence and an attack are traced, and if not, why",
         description="Say whether the engine can trace environments of a scenario and a defence, and, with an attack, whole episodes. "
@@ -28,20 +23,15 @@ def add(commands: Any) -> None:
 
 
 def _explain(options: argparse.Namespace) -> int:
-    sys.path.insert(0, "")  # module:Class is looked for in the working directory, as `tailgate evaluate` does
+    own_classes()
     found = explanation(options.scenario, options.defence, options.attack)
-    if options.json:
-        print(json.dumps(found, indent=1))
-        return 0
-    table = Table("what", "traced", "why not, or how large")
-    for what, said in found.items():
-        table.add_row(what, "no" if "why" in said else "yes", escape(said.get("why") or said["size"]))
-    console().print(table)
+    rows = [(what, "no" if "why" in said else "yes", said.get("why") or said["size"]) for what, said in found.items()]
+    show(options, found, lambda _: table(("what", "traced", "why not, or how large"), rows))
     return 0
 
 
 def explanation(scenario: str | None, defence: str | None, attack: str | None) -> dict[str, dict[str, str]]:
-    """By what is played: `why` it cannot be traced, or the `size` of its code."""
+    """Return for each thing that is played `why` it cannot be traced, or the `size` of its code."""
     from tailgate.core.registry import Spec
     from tailgate.engine.agreement import Untraced
     from tailgate.envs.gym.attacker_mdp import Seat

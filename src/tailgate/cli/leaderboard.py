@@ -4,35 +4,27 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
 
 from tailgate.cli import admit, attack, board, check, clock, detect, retrain, schedules, submit, verify
+from tailgate.cli.shared import Commands, add_options
 
 
-def add(commands: Any) -> None:
+def add(commands: Commands) -> None:
     command = commands.add_parser("leaderboard", help="score suites, attack and submit defences, verify rows, build pages")
     actions = command.add_subparsers(required=True, metavar="ACTION")
-    board.add(actions)
-    attack.add(actions)
-    submit.add(actions)
-    verify.add(actions)
-    check.add(actions)
-    detect.add(actions)
-    clock.add(actions)
-    schedules.add(actions)
-    retrain.add(actions)
-    admit.add(actions)
+    for action in (board, attack, submit, verify, check, detect, clock, schedules, retrain, admit):
+        action.add(actions)
     build = actions.add_parser("build", help="one self-contained HTML page from rows files, without gates and limits of a board")
     build.add_argument("--rows", nargs="+", required=True, metavar="FILE", help="JSON Lines files of `tailgate evaluate`")
     build.add_argument("--out", required=True, metavar="DIR", help="directory of the page")
-    build.add_argument("--title", help="title of the page")
+    add_options(build, "--title")
     build.set_defaults(run=_build)
 
 
 def _build(options: argparse.Namespace) -> int:
     from tailgate.base.errors import InputError
     from tailgate.evaluation.rows import read_rows
-    from tailgate.leaderboard.build import build
+    from tailgate.site.rows_page import build
 
     rows = [row for name in options.rows for row in read_rows(Path(name))]
     if not rows:

@@ -12,9 +12,10 @@ from rich.table import Table
 
 from tailgate.base.errors import InputError
 from tailgate.base.progress import console
+from tailgate.cli.shared import Commands, print_json
 
 
-def add(commands: Any) -> None:
+def add(commands: Commands) -> None:
     command = commands.add_parser("list", help="what there is: defences and their parts, attacks, the zoo, scenarios, suites; or a graph")
     groups = ["defences", "filters", "detectors", "mitigations", "attacks", "zoo", "scenarios", "suites"]
     command.add_argument("what", nargs="?", choices=groups, help="only these; attacks: with the zoo of trained policies")
@@ -46,7 +47,7 @@ def _list(options: argparse.Namespace) -> int:
     wanted = ("attacks", "zoo") if options.what == "attacks" else (options.what,)
     chosen = {key: value for key, value in cards.items() if options.what is None or key in wanted}
     if options.json:
-        print(json.dumps(chosen, indent=1))
+        print_json(chosen)
         return 0
     out = console()
     for title, group in chosen.items():
@@ -95,7 +96,7 @@ def _draw(options: argparse.Namespace) -> int:
     draw_graph(model, path, attacked, title)
     facts = {"scenario": place.name, "agents": model.agents, "edges": len(edges(model.graph)), "attacked": attacked, "drawing": str(path)}
     if options.json:
-        print(json.dumps(facts, indent=1))
+        print_json(facts)
     else:
         whom = ", ".join(map(str, attacked))
         print(f"{place.name}: {model.agents} agents, {facts['edges']} edges, open to attack: {whom}; drawn in {path}")

@@ -3,20 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import json
-import sys
-from typing import Any
 
-from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
-
-from tailgate.base.progress import cells, console, progress
+from tailgate.cli.shared import Commands, add_options, counted, own_classes, print_json, say, table, working
 from tailgate.core.schema import scalar
 
 
-def add(commands: Any) -> None:
-    """Adds `log` to the commands."""
+def add(commands: Commands) -> None:
+    """Add `log` to the commands."""
     command = commands.add_parser(
         "log", help="write clean and attacked episodes as Parquet, for learning a detector (needs tailgate[log])",
         description="Write episodes of a suite as Parquet, one row per step and agent, with labels: training and development episodes, "
@@ -26,7 +19,7 @@ def add(commands: Any) -> None:
     command.add_argument("--out", required=True, metavar="DIR", help="directory of the log: new, or with this log")
     command.add_argument("--episodes", type=int, default=100, metavar="N", help="training episodes per cell (default 100)")
     command.add_argument("--dev-episodes", type=int, default=25, metavar="N", help="development episodes per cell (default 25)")
-    command.add_argument("--scenario", action="append", metavar="NAME", help="a scenario instead of the suite's (repeatable)")
+    add_options(command, "--scenario")
     command.add_argument("--defence", action="append", metavar="NAME", help="a defence instead of the suite's standard one (repeatable)")
     command.add_argument("--attack", action="append", metavar="NAME", help="an attack instead of the suite's (repeatable), beside none")
     command.add_argument("--dose", action="append", metavar="STEPS", help="attack budget instead of the suite's middle one (repeatable)")
@@ -37,24 +30,19 @@ def add(commands: Any) -> None:
 def _log(options: argparse.Namespace) -> int:
     from tailgate.studies.log import write_log
 
-    sys.path.insert(0, "")  # module:Class is looked for in the working directory, as `tailgate evaluate` does
-    with progress(Console(stderr=True)) as update:
+    own_classes()
+    with working() as update:
         held = write_log(
             options.suite, options.out, episodes=options.episodes, dev_episodes=options.dev_episodes, scenarios=options.scenario,
             doses=None if options.dose is None else [scalar(dose) for dose in options.dose], defences=options.defence,
-            attacks=options.attack, progress=lambda done, total: update("playing", done, total, cells(done, total)),
+            attacks=options.attack, progress=counted(update, "playing"),
         )  # fmt: skip
     if options.json:
-        print(json.dumps(held, indent=1, allow_nan=False))
+        print_json(held)
         return 0
-    out = console()
-    table = Table(title=f"episodes of {held['suite']} in {options.out}")
-    for heading in ("file", "rows", "megabytes", "SHA-256"):
-        table.add_column(heading, overflow="fold")
-    for file in held["files"]:
-        table.add_row(escape(file["path"]), str(file["rows"]), f"{file['bytes'] / 1e6:.1f}", file["sha256"][:16])
-    out.print(table)
-    out.print(f"held out: {', '.join(held['held_out']) or 'nothing'}", highlight=False)
+    rows = [(file["path"], str(file["rows"]), f"{file['bytes'] / 1e6:.1f}", file["sha256"][:16]) for file in held["files"]]
+    table(("file", "rows", "megabytes", "SHA-256"), rows, f"episodes of {held['suite']} in {options.out}")
+    say(f"held out: {', '.join(held['held_out']) or 'nothing'}")
     if held["skipped"]:
-        out.print(f"{len(held['skipped'])} pairings have no meaning and are left out; README.md names them", highlight=False)
+        say(f"{len(held['skipped'])} pairings have no meaning and are left out; README.md names them")
     return 0

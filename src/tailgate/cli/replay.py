@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from pathlib import Path
 from typing import Any, Literal
 
 from tailgate.base.errors import InputError
-from tailgate.base.progress import console
+from tailgate.cli.shared import Commands, print_json, say
 
 
-def add(commands: Any) -> None:
+def add(commands: Commands) -> None:
     command = commands.add_parser(
         "replay", help="play one episode again from its row and write a page of it",
         description="Play one episode again from its row, check its hash, and write one HTML page. Of the rows that the options leave, the "
@@ -87,7 +86,7 @@ def _replay(options: argparse.Namespace) -> int:
         "metrics": replay.metrics, "page": str(page), "video": str(video) if video is not None else None,
     }  # fmt: skip
     if options.json:
-        print(json.dumps(report, indent=1, allow_nan=False))
+        print_json(report)
     else:
         _print(report, film)
     return 1 if replay.verdict == "different" else 0
@@ -109,6 +108,5 @@ def _print(report: dict[str, Any], film: str | None) -> None:
     ]  # fmt: skip
     if film is not None:
         lines.append(("video", film))
-    out = console()
     for name, words in lines:
-        out.print(f"{name:<8}{words}", markup=False, highlight=False, soft_wrap=True)
+        say(f"{name:<8}{words}", soft_wrap=True)

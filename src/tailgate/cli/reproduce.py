@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import argparse
-import json
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console
 from rich.markup import escape
@@ -13,9 +12,10 @@ from rich.table import Table
 
 from tailgate.base.locks import alone
 from tailgate.base.progress import console
+from tailgate.cli.shared import Commands, print_json, say, table
 
 
-def add(commands: Any) -> None:
+def add(commands: Commands) -> None:
     from tailgate.thesis import CHAPTERS
 
     command = commands.add_parser(
@@ -47,22 +47,21 @@ def _reproduce(options: argparse.Namespace) -> int:
     report = chapter(options.chapter, options.seeds, place, tick)[0]
     page = place / "index.html"
     if options.json:
-        print(json.dumps(as_json(report), indent=1, allow_nan=False))
+        print_json(as_json(report))
     else:
-        table = Table(title=report.title)
+        made = Table(title=report.title)
         for heading in ("claim", "thesis", "measured", "holds", "why"):
-            table.add_column(heading, overflow="fold")
+            made.add_column(heading, overflow="fold")
         for claim in report.claims:
             head = f"{escape(claim.claim)}\n[dim]{escape(claim.id)}[/]"
-            table.add_row(head, escape(flat(claim.thesis)), escape(flat(claim.measured)), claim.holds, escape(claim.why), end_section=True)
-        out = console()
-        out.print(table)
-        out.print(summary(report), highlight=False)
+            made.add_row(head, escape(flat(claim.thesis)), escape(flat(claim.measured)), claim.holds, escape(claim.why), end_section=True)
+        console().print(made)
+        say(summary(report))
     tick(f"report: {page}")
     return 0
 
 
-def _whole(options: argparse.Namespace, tick: Any) -> int:
+def _whole(options: argparse.Namespace, tick: Callable[[str], None]) -> int:
     from tailgate.thesis.run import as_json, check_seeds, summary
     from tailgate.thesis.whole import counts, covered, facts, reproduce_whole, write_whole
 
@@ -72,15 +71,9 @@ def _whole(options: argparse.Namespace, tick: Any) -> int:
         whole = reproduce_whole(options.seeds, out, tick)
         page = write_whole(whole, out)
     if options.json:
-        print(json.dumps([claim for report in whole.reports for claim in as_json(report)], indent=1, allow_nan=False))
+        print_json([claim for report in whole.reports for claim in as_json(report)])
     else:
-        table = Table(title="The thesis, claim by claim")
-        for heading in ("chapter", "claims", "hold", "partly", "do not", "seconds"):
-            table.add_column(heading, overflow="fold")
-        for row in counts(whole):
-            table.add_row(*map(escape, row))
-        shown = console()
-        shown.print(table)
-        shown.print(f"{summary(*whole.reports)}. {covered(whole.coverage)}. Run time: {facts(whole)['run time']}.", highlight=False)
+        table(("chapter", "claims", "hold", "partly", "do not", "seconds"), counts(whole), "The thesis, claim by claim")
+        say(f"{summary(*whole.reports)}. {covered(whole.coverage)}. Run time: {facts(whole)['run time']}.")
     tick(f"report: {page}")
     return 0

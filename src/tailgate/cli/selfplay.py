@@ -7,13 +7,12 @@ import json
 from typing import Any
 
 from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
 
-from tailgate.base.progress import console, progress
+from tailgate.base.progress import progress
+from tailgate.cli.shared import Commands, add_options, say, show, table
 
 
-def add(commands: Any) -> None:
+def add(commands: Commands) -> None:
     from tailgate.training.selfplay import parameters
 
     fields = "\n".join(f"  {p['name']:<12} {p['doc']} (default: {json.dumps(p['default'])})" for p in parameters())
@@ -28,8 +27,7 @@ def add(commands: Any) -> None:
         "--resume", action="store_true",
         help="continue: what is finished is not trained again, unless its opponents are others now; rounds may grow",
     )  # fmt: skip
-    command.add_argument("--json", action="store_true", help="print the report as JSON")
-    command.add_argument("overrides", nargs="*", metavar="key=value", help="change a field of the configuration")
+    add_options(command, "--json", "overrides")
     command.set_defaults(run=_selfplay, kept="what was finished is kept")
 
 
@@ -43,10 +41,7 @@ def _selfplay(options: argparse.Namespace) -> int:
     options.kept = f"what was finished is kept, go on with: tailgate selfplay --resume name={config.name}{place}"
     with progress(errors) as update:
         report = Game(config, update, options.resume).run()
-    if options.json:
-        print(json.dumps(report, indent=1))
-    else:
-        _print_report(report)
+    show(options, report, _print_report)
     errors.print(f"defender: {report['defender']}\nreport:   {config.directory / 'report.json'}")
     return 0
 
@@ -55,26 +50,23 @@ def _print_report(report: dict[str, Any]) -> None:
     guards = list(dict.fromkeys(row["defender"] for row in report["table"]))
     fixed = ", ".join(f"{name}={value:g}" for name, value in report["fixed"].items() if name != "setting")
     title = f"{report['episodes']} fresh episodes on {report['scenario']}: collisions [95 % interval], cost of care"
-    table = Table(title=title, caption=f"best fixed setting: {fixed}")
-    for heading in ("attack", *guards):
-        table.add_column(heading, overflow="fold")
+    rows = []
     for name in dict.fromkeys(row["attack"] for row in report["table"]):
         cells = [row for row in report["table"] if row["attack"] == name]
-        table.add_row(escape(name), *(f"{_share(row['collisions'])}, {row['cost']:.3f}" for row in cells))
-    out = console()
-    out.print(table, highlight=False)
+        rows.append((name, *(f"{_share(row['collisions'])}, {row['cost']:.3f}" for row in cells)))
+    table(("attack", *guards), rows, title, f"best fixed setting: {fixed}")
     for guard, gain in report["exploitability"].items():
         found = gain["fresh"]["collisions"]
         weak = f"; the search was too weak: its fresh attacker does {_share(found)}, less than known ones" if gain["weak_search"] else ""
-        told = f"{escape(gain['attack'])} less self-play's last attacker"
-        out.print(f"exploitability, {guard}: at least {_points(gain)} ({told}){weak}", highlight=False)
+        told = f"{gain['attack']} less self-play's last attacker"
+        say(f"exploitability, {guard}: at least {_points(gain)} ({told}){weak}")
     for guard, most in report["worst"].items():
-        out.print(f"worst known attack, {guard}: {_share(most['collisions'])} by {escape(most['attack'])}", highlight=False)
-    out.print(f"worst known attacks, fixed less trained: {_points(report['worst_fixed_minus_trained'])}", highlight=False)
+        say(f"worst known attack, {guard}: {_share(most['collisions'])} by {most['attack']}")
+    say(f"worst known attacks, fixed less trained: {_points(report['worst_fixed_minus_trained'])}")
 
 
 def _share(interval: dict[str, float]) -> str:
-    return f"{100 * interval['value']:.1f} % \\[{100 * interval['low']:.1f}, {100 * interval['high']:.1f}]"
+    return f"{100 * interval['value']:.1f} % [{100 * interval['low']:.1f}, {100 * interval['high']:.1f}]"
 
 
 def _points(gain: dict[str, float]) -> str:

@@ -4,18 +4,12 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
-import sys
-from typing import Any
 
-from rich.console import Console
-
-from tailgate.base.errors import InputError
-from tailgate.base.progress import progress
-from tailgate.core.schema import build, scalar
+from tailgate.cli.shared import Commands, add_options, counted, own_classes, show, tell, values, working
+from tailgate.core.schema import build
 
 
-def add(actions: Any) -> None:
+def add(actions: Commands) -> None:
     command = actions.add_parser(
         "submit", help="play a stranger's defence in processes of its own and write one row per episode",
         description="Play one class on a suite: in a process of its own, under limits, its rows mixed in secret with those of other "
@@ -24,11 +18,11 @@ def add(actions: Any) -> None:
     command.add_argument("defence", metavar="module:Class", help="class to play, module:Class:key=value, or the name of an entry point")
     command.add_argument("--suite", metavar="NAME", help="suite by name or YAML file (default: quick-v0)")
     command.add_argument("--out", metavar="FILE", help="write rows here (JSON Lines); an interrupted run resumes after a finished scenario")
-    command.add_argument("--scenario", action="append", metavar="NAME", help="a scenario instead of the suite's (repeatable)")
+    add_options(command, "--scenario")
     command.add_argument("--episodes", type=int, metavar="N", help="episodes per cell instead of the suite's")
     command.add_argument("--sandbox", metavar="PROGRAM", help="bwrap, docker or docker:IMAGE: what a row needs to count as verified")
     command.add_argument("--beacon", default="", metavar="TEXT", help="random text of after the submission, of which the seeds are made")
-    command.add_argument("--purpose", default="report", help="which seeds: train, tune, calibrate, select or report (default)")
+    add_options(command, "--purpose")
     command.add_argument("--limit", action="append", metavar="key=value", default=[], help="change a limit, such as memory or step_time")
     command.add_argument("--workers", type=int, default=1, metavar="N", help="scenarios side by side (default 1); changes no result")
     command.add_argument("--digest", action="store_true", help="print the submission's digest, which fixes it, and play nothing")
@@ -42,37 +36,30 @@ def _submit(options: argparse.Namespace) -> int:
     from tailgate.sandbox import Limits, play_submission
     from tailgate.sandbox.source import staged
 
-    sys.path.insert(0, "")  # module:Class is looked for in the working directory, as `python -m` does
+    own_classes()
     if options.digest:
         with staged(options.defence) as source:
             print(source.digest or f"{source.text} is built in: its version stands for it")
         return 0
-    changes = {}
-    for text in options.limit:
-        key, sep, value = text.partition("=")
-        if not sep:
-            raise InputError("--limit", text, "key=value, for example memory=1e9")
-        changes[key] = scalar(value)
+    changes = values("--limit", options.limit, ", for example memory=1e9")
     limits = build(Limits, dataclasses.asdict(Limits()) | changes, "limit")
     if not options.beacon:
-        print("tailgate: without --beacon the seeds are public ones: for development, not for a board", file=sys.stderr)
+        tell("without --beacon the seeds are public ones: for development, not for a board")
     goes_on = "the same command goes on after the scenarios that are finished"
     options.kept = goes_on if options.out else "nothing is kept: --out FILE would"
-    with progress(Console(stderr=True)) as update:
+    with working() as update:
         rows = play_submission(
             options.defence, options.suite or "quick-v0", limits=limits, sandbox=options.sandbox, beacon=options.beacon,
             workers=options.workers, out=options.out, scenarios=options.scenario, episodes=options.episodes, purpose=options.purpose,
-            progress=lambda done, total: update("playing", done, total, f"{done} of {total} scenarios"),
+            progress=counted(update, "playing", "scenarios"),
         )  # fmt: skip
     table = summarise(rows)
     failed = [row for row in rows if row["status"] == "error"]
     reasons = list(dict.fromkeys(row["reason"] for row in failed))
-    if options.json:
-        first = rows[0]
-        head = {key: first[key] for key in ("defence", "uses", "beacon")} | {"digest": first["defence_digest"], **first["submission"]}
-        print(json.dumps(head | {"rows": len(rows), "failed": len(failed), "reasons": reasons, "table": table}, indent=1, allow_nan=False))
-    else:
-        _print_summary(table)
+    first = rows[0]
+    head = {key: first[key] for key in ("defence", "uses", "beacon")} | {"digest": first["defence_digest"], **first["submission"]}
+    report = head | {"rows": len(rows), "failed": len(failed), "reasons": reasons, "table": table}
+    show(options, report, lambda _: _print_summary(table))
     for reason in reasons:
-        print(f"tailgate: {sum(row['reason'] == reason for row in failed)} of {len(rows)} rows failed: {reason}", file=sys.stderr)
+        tell(f"{sum(row['reason'] == reason for row in failed)} of {len(rows)} rows failed: {reason}")
     return 1 if failed else 0

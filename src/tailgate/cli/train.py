@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
 
 from tailgate.base.locks import alone
-from tailgate.base.progress import cells, console, progress
+from tailgate.base.progress import cells, progress
+from tailgate.cli.shared import Commands, add_options, own_classes, print_json, say, table
+
+if TYPE_CHECKING:
+    from tailgate.agents.learners.learning import Progress
+    from tailgate.training.train import TrainConfig
 
 
-def add(commands: Any) -> None:
+def add(commands: Commands) -> None:
     from tailgate.training.train import parameters
 
     fields = "\n".join(f"  {p['name']:<18} {p['doc']} (default: {json.dumps(p['default'])})" for p in parameters())
@@ -28,15 +31,14 @@ def add(commands: Any) -> None:
     command.add_argument("--config", metavar="FILE", help="preset by name, or YAML file")
     command.add_argument("--seed", type=int, help="first training seed (the same as first_seed=N)")
     command.add_argument("--resume", action="store_true", help="continue, with the run's own configuration; steps may change")
-    command.add_argument("--json", action="store_true", help="print the report as JSON")
-    command.add_argument("overrides", nargs="*", metavar="key=value", help="change a field of the configuration")
+    add_options(command, "--json", "overrides")
     command.set_defaults(run=_train, kept="what was finished is kept")
 
 
 def _train(options: argparse.Namespace) -> int:
     from tailgate.training import comparison, train
 
-    sys.path.insert(0, "")  # a sandbox's module:Class is looked for in the working directory, as `leaderboard attack` does
+    own_classes()
     overrides = list(options.overrides) + ([f"first_seed={options.seed}"] if options.seed is not None else [])
     config = train.load_config(options.config, overrides, options.resume)
     train.check(config)  # before a word of what is done
@@ -51,7 +53,7 @@ def _train(options: argparse.Namespace) -> int:
 
         decisions: dict[int, int] = {}
 
-        def trained(seed: int, now: Any) -> None:
+        def trained(seed: int, now: Progress) -> None:
             decisions[seed] = now.steps
             update(f"training, seed {seed}", min(now.steps, config.steps), config.steps, train.figures(now))
 
@@ -70,7 +72,7 @@ def _train(options: argparse.Namespace) -> int:
             report = comparison.compare(config, policies, played)
         page = _page(config, report)
     if options.json:
-        print(json.dumps(report | {"page": str(page)}, indent=1))
+        print_json(report | {"page": str(page)})
     else:
         _print_report(report)
     errors.print(f"policy: {', '.join(str(p) for p in policies)}\npage:   {page}")
@@ -82,28 +84,26 @@ def _print_report(report: dict[str, Any]) -> None:
 
     threat = report["threat"]
     budget = "unlimited budget" if threat["budget"] is None else f"budget {threat['budget']} steps"
-    table = Table(title=f"{report['episodes']} fresh episodes, {report['defence']}, {report['scenario']}, {budget}")
     what = {"crashed": "collisions"}.get(report["outcome"], f"mean {report['outcome']}")
-    for heading in ("attack", what, "95 % interval", "note"):
-        table.add_column(heading, overflow="fold")
+    rows = []
     for row in report["attacks"]:
         value, low, high = (shown(report, row[key]) for key in ("value", "low", "high"))
-        table.add_row(escape(row["label"]), value, f"{low} to {high}", row["note"])
-    out = console()
-    out.print(table)
+        rows.append((row["label"], value, f"{low} to {high}", row["note"]))
+    title = f"{report['episodes']} fresh episodes, {report['defence']}, {report['scenario']}, {budget}"
+    table(("attack", what, "95 % interval", "note"), rows, title)
     for name, why in report["left_out"].items():
-        out.print(f"left out: {name} ({why})", markup=False, highlight=False)
+        say(f"left out: {name} ({why})")
     for name, gain in report["advantage"].items():
         verdict = "wins" if gain["low"] > 0 else "loses" if gain["high"] < 0 else "undecided"
         scale, points = (100.0, " points") if report["unit"] == SHARE else (1.0, "")
         value, low, high = (f"{scale * gain[key]:+.{1 if points else 3}f}" for key in ("value", "low", "high"))
-        out.print(f"learned against {name}: {value}{points}, 95 % interval {low} to {high} ({verdict})")
+        say(f"learned against {name}: {value}{points}, 95 % interval {low} to {high} ({verdict})")
 
 
-def _page(config: Any, report: dict[str, Any]) -> Any:
-    """The page of a finished run."""
+def _page(config: TrainConfig, report: dict[str, Any]) -> Path:
+    """Write the page of a finished run."""
     from tailgate.evaluation.rows import read_rows
-    from tailgate.leaderboard.build import build as build_page
+    from tailgate.site.rows_page import build as build_page
     from tailgate.training.comparison import ROWS, headline
     from tailgate.training.train import training_seeds
     from tailgate.training.trainings import curve_of

@@ -3,27 +3,22 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
+from tailgate.cli.shared import Commands, add_options, counted, own_classes, say, show, table, threat_of, working
 
-from tailgate.base.progress import cells, console, progress
-
-MANY = 8  # defences, above which each has a line of its own, without intervals
+MANY = 8  # defences, above which each has its line, without intervals
 
 
-def add(commands: Any) -> None:
+def add(commands: Commands) -> None:
     command = commands.add_parser(
         "transfer", help="the matrix trained on x played on of trained policies",
         description="Play policies against defences that they were not trained on. Scenario and threat model are those of the training "
         "unless given. An entry is the mean over the training seeds of what was trained on one defence.",
     )  # fmt: skip
-    command.add_argument("policies", nargs="+", metavar="POLICY", help="JSON file of an exported policy, or zoo:name=NAME")
+    add_options(command, "policies")
     command.add_argument("--defence", action="append", metavar="NAME", default=[],
                          help="a defence to play on (repeatable; default: those that the policies were trained on); all: every "
                          "registered one that has a meaning in the scenario")  # fmt: skip
@@ -31,32 +26,27 @@ def add(commands: Any) -> None:
     command.add_argument("--threat", action="append", metavar="key=value", help="the threat model's changes instead of the training's")
     command.add_argument("--dose", type=int, metavar="STEPS", help="attack budget instead of the training's")
     command.add_argument("--episodes", type=int, default=400, metavar="N", help="episodes per policy and defence (default 400)")
-    command.add_argument("--outcome", metavar="METRIC", help="metric that is counted (default: the training's)")
-    command.add_argument("--purpose", default="report", help="which seeds: train, tune, calibrate, select or report (default)")
-    command.add_argument("--workers", type=int, default=1, metavar="N", help="processes (default 1); changes no result")
+    add_options(command, "--outcome", "--purpose", "--workers")
     command.add_argument("--out", metavar="DIR", help="write rows.jsonl, transfer.json and transfer.png here; resumes")
-    command.add_argument("--json", action="store_true", help="print the report as JSON")
+    add_options(command, "--json")
     command.set_defaults(run=_transfer)
 
 
 def _transfer(options: argparse.Namespace) -> int:
-    from tailgate.studies.policies import changes, write_report
+    from tailgate.studies.policies import write_report
     from tailgate.studies.transfer import transfer
 
-    sys.path.insert(0, "")  # module:Class is looked for in the working directory, as `tailgate evaluate` does
-    threat = None if options.threat is None else changes(options.threat)
+    own_classes()
+    threat = None if options.threat is None else threat_of(options)
     options.kept = "the same command goes on" if options.out else "nothing is kept: --out DIR would"
-    with progress(Console(stderr=True)) as update:
+    with working() as update:
         report = transfer(
             options.policies, options.defence, scenario=options.scenario, threat=threat, dose=options.dose,
             episodes=options.episodes, outcome=options.outcome, purpose=options.purpose, workers=options.workers,
             rows_file=Path(options.out) / "rows.jsonl" if options.out else None,
-            progress=lambda done, total: update("playing", done, total, cells(done, total)),
+            progress=counted(update, "playing"),
         )  # fmt: skip
-    if options.json:
-        print(json.dumps(report, indent=1, allow_nan=False))
-    else:
-        _print(report)
+    show(options, report, _print)
     if options.out:
         from tailgate.studies.figures import transfer_figure
 
@@ -68,7 +58,7 @@ def _transfer(options: argparse.Namespace) -> int:
 def _print(report: dict[str, Any]) -> None:
     from tailgate.studies.policies import between, shown
 
-    share, out = report["unit"] == "0/1", console()
+    share = report["unit"] == "0/1"
     held = {(entry["trained_on"], entry["played_on"]): entry for entry in report["entries"]}
     seeds = {entry["trained_on"]: entry["seeds"] for entry in report["entries"]}
     wide = len(report["played_on"]) > MANY
@@ -79,25 +69,20 @@ def _print(report: dict[str, Any]) -> None:
             return "-"
         return shown(entry["value"], share) + ("" if wide else f" ({between(entry, share)})")
 
-    trained = [f"{escape(name)}, {seeds.get(name, 0)} seed{'' if seeds.get(name) == 1 else 's'}" for name in report["trained_on"]]
+    trained = [f"{name}, {seeds.get(name, 0)} seed{'' if seeds.get(name) == 1 else 's'}" for name in report["trained_on"]]
     played, none = report["played_on"], report["no_attack"]
     lines = [["(no attack)", *(shown(none[name], share) if name in none else "-" for name in played)]]
     lines += [[label, *(figure(name, at) for at in played)] for label, name in zip(trained, report["trained_on"], strict=True)]
-    head = ["trained on", *(f"on {escape(name)}" for name in played)]
+    head = ["trained on", *(f"on {name}" for name in played)]
     if wide:  # many defences: a line each
-        head, *lines = [list(line) for line in zip(["played on", *map(escape, played)], *lines, strict=True)]
+        head, *lines = [list(line) for line in zip(["played on", *played], *lines, strict=True)]
     caption = "95 % intervals: --json, or --out" if wide else "95 % intervals"
-    table = Table(title=f"{report['scenario']}: {report['outcome']}, {report['episodes']} episodes", caption=caption)
-    for heading in head:
-        table.add_column(heading, overflow="fold")
-    for line in lines:
-        table.add_row(*line)
-    out.print(table)
+    table(head, lines, f"{report['scenario']}: {report['outcome']}, {report['episodes']} episodes", caption)
     for entry in report["entries"]:
         for flag in entry.get("flags", ()):
             gain = entry["over_own"]
-            out.print(f"flag: {flag}: {entry['trained_on']} on {entry['played_on']}, {shown(gain['value'], share, '+')} "
-                      f"({between(gain, share, '+')})", markup=False)  # fmt: skip
+            figures = f"{shown(gain['value'], share, '+')} ({between(gain, share, '+')})"
+            say(f"flag: {flag}: {entry['trained_on']} on {entry['played_on']}, {figures}")
     for reason in dict.fromkeys(item["reason"] for item in report["skipped"]):
         names = ", ".join(item.get("policy", item.get("defence")) for item in report["skipped"] if item["reason"] == reason)
-        out.print(f"skipped: {names}: {reason}", markup=False)
+        say(f"skipped: {names}: {reason}")

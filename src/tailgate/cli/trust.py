@@ -4,36 +4,28 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
-import sys
+from functools import partial
 from pathlib import Path
-from typing import Any
-
-from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
+from typing import TYPE_CHECKING, Any
 
 from tailgate.base.errors import InputError
 from tailgate.base.files import aside
-from tailgate.base.progress import cells, console, progress
+from tailgate.cli.shared import Commands, add_options, counted, own_classes, say, show, table, tell, values, working
 from tailgate.core.schema import scalar
 
+if TYPE_CHECKING:
+    from tailgate.core.scenario import Suite
+    from tailgate.trust.statistics import Sequential, Sprt
 
-def add(commands: Any) -> None:
+
+def add(commands: Commands) -> None:
     command = commands.add_parser(
         "trust", help="how surely a defence keeps to temporal properties: statistical model checking",
         description="Play a suite, or the part of it that the options name, and decide temporal properties of every run. Of each defence a "
         "lower bound is shown of the probability that a run satisfies them together, in the worst of these scenarios, doses and attacks. "
         "docs/trust.md lists the built-in properties, the signals and the language of formulas.",
     )  # fmt: skip
-    command.add_argument(
-        "--suite", metavar="NAME", help="suite by name or YAML file (default: quick-v0; with --scenario at the scenario's own dose)"
-    )
-    command.add_argument("--defence", action="append", metavar="NAME", help="a defence instead of the suite's (repeatable)")
-    command.add_argument("--attack", action="append", metavar="NAME", help="an attack instead of the suite's (repeatable)")
-    command.add_argument("--scenario", action="append", metavar="NAME", help="a scenario instead of the suite's (repeatable)")
-    command.add_argument("--dose", action="append", metavar="STEPS", help="attack budget; none: the scenario's own (repeatable)")
-    command.add_argument("--threat", action="append", metavar="key=value", default=[], help="change the threat model (repeatable)")
+    add_options(command, "--suite", "--defence", "--attack", "--scenario", "--dose", "--threat")
     command.add_argument(
         "--property", action="append", metavar="FORMULA", default=[],
         help="a formula instead of the built-in properties, such as 'G[0,60] gap > 2' (repeatable)",
@@ -50,28 +42,18 @@ def add(commands: Any) -> None:
     early.add_argument("--test", type=float, metavar="P", help="explore: stop a cell when a sequential test of P >= this is decided")
     command.add_argument("--indifference", type=float, default=0.05, metavar="D", help="the test's other hypothesis lies so far below")
     command.add_argument("--beacon", default="", metavar="TEXT", help="the round of a board: its seeds are played")
-    command.add_argument("--purpose", default="report", help="which seeds: train, tune, calibrate, select or report (default)")
+    add_options(command, "--purpose")
     command.add_argument("--batch", type=int, default=2048, metavar="N", help="episodes side by side (default 2048); changes no result")
-    command.add_argument("--workers", type=int, default=1, metavar="N", help="processes (default 1); changes no result")
+    add_options(command, "--workers")
     command.add_argument("--out", metavar="DIR", help="write cells.jsonl, trust.json and the worst failing runs here; resumes")
-    command.add_argument("--json", action="store_true", help="print the report as JSON")
+    add_options(command, "--json")
     command.set_defaults(run=_trust)
 
 
-def _values(option: str, texts: list[str]) -> dict[str, Any]:
-    out = {}
-    for text in texts:
-        key, sep, value = text.partition("=")
-        if not sep:
-            raise InputError(option, text, "key=value")
-        out[key] = scalar(value)
-    return out
-
-
-def _suite(options: argparse.Namespace) -> Any:
-    """The suite, or the part of it that the options name."""
+def _suite(options: argparse.Namespace) -> Suite:
+    """Return the suite, or the part of it that the options name."""
     from tailgate.core.scenario import load_suite
-    from tailgate.scoring.attacks import attacks_of
+    from tailgate.evaluation.attack_list import attacks_of
 
     suite = load_suite(options.suite or "quick-v0")
     suite = dataclasses.replace(suite, attacks=attacks_of(suite))
@@ -86,7 +68,7 @@ def _suite(options: argparse.Namespace) -> Any:
     return dataclasses.replace(suite, **changes)
 
 
-def _rule(options: argparse.Namespace) -> Any:
+def _rule(options: argparse.Namespace) -> Sequential | Sprt | None:
     from tailgate.trust.statistics import Sequential, Sprt
 
     for name in ("width", "test"):
@@ -109,7 +91,7 @@ def _trust(options: argparse.Namespace) -> int:
     from tailgate.trust.signals import SafeDistance
     from tailgate.trust.statistics import runs_for
 
-    sys.path.insert(0, "")  # module:Class is looked for in the working directory, as `python -m` does
+    own_classes()
     suite, rule = _suite(options), _rule(options)
     runs = runs_for(options.precision, options.confidence) if options.precision is not None else options.runs
     if runs is None and rule is not None:
@@ -117,31 +99,24 @@ def _trust(options: argparse.Namespace) -> int:
     place = Path(options.out) / ROWS if options.out else None
     before = aside(place)
     options.kept = "the same command goes on" if options.out else "nothing is kept: --out DIR would"
-    with progress(Console(stderr=True)) as update:
+    with working() as update:
         found = check(
             suite, runs=runs, formulas=options.property, alpha=options.alpha, purpose=options.purpose, beacon=options.beacon,
             batch=options.batch,
-            workers=options.workers, folder=Path(options.out) if options.out else None, threat=_values("--threat", options.threat),
-            safe=build(SafeDistance, _values("--unsafe", options.unsafe), "--unsafe"),
-            asked=build(Demands, _values("--demand", options.demand), "--demand"), rule=rule,
-            progress=lambda done, total: update("model checking", done, total, cells(done, total)),
+            workers=options.workers, folder=Path(options.out) if options.out else None, threat=values("--threat", options.threat),
+            safe=build(SafeDistance, values("--unsafe", options.unsafe), "--unsafe"),
+            asked=build(Demands, values("--demand", options.demand), "--demand"), rule=rule,
+            progress=counted(update, "model checking"),
         )  # fmt: skip
     for earlier in sorted(aside(place) - before):
-        print(f"tailgate: {options.out} held other cells; they are in {earlier}", file=sys.stderr)
-    if options.json:
-        print(json.dumps(found, indent=1, allow_nan=False))
-    elif rule is None:
-        _print_bounds(found)
-        _print_properties(found)
-        _print_failures(found, options.out)
-    else:
-        _print_cells(found)
+        tell(f"{options.out} held other cells; they are in {earlier}")
+    show(options, found, partial(_print, folder=options.out) if rule is None else _print_cells)
     lost = [cell for cell in found["cells"] if cell["status"] == "error"]
     for cell in lost:
-        print(f"tailgate: {cell['defence']} against {cell['attack']} on {cell['scenario']} failed: {cell['reason']}", file=sys.stderr)
+        tell(f"{cell['defence']} against {cell['attack']} on {cell['scenario']} failed: {cell['reason']}")
     idle = not any(cell["trust"] for cell in found["cells"])
     if idle and not lost:
-        print(f"tailgate: nothing was decided: {_why_nothing(found)}", file=sys.stderr)
+        tell(f"nothing was decided: {_why_nothing(found)}")
     return 1 if lost or idle else 0
 
 
@@ -156,21 +131,22 @@ def _percent(value: float) -> str:
 
 def _place(held: dict[str, Any]) -> str:
     dose = "" if held["dose"] is None else f", dose {held['dose']}"
-    return escape(f"{held['attack']} on {held['scenario']}{dose}")
+    return f"{held['attack']} on {held['scenario']}{dose}"
+
+
+def _print(found: dict[str, Any], folder: str | None) -> None:
+    _print_bounds(found)
+    _print_properties(found)
+    _print_failures(found, folder)
 
 
 def _print_bounds(found: dict[str, Any]) -> None:
-    """The lower bounds of every defence, at the least and at the most knowledge of the attackers."""
-    from tailgate.scoring.words import at_least
+    """Print the lower bounds of every defence, at the least and at the most knowledge of the attackers."""
+    from tailgate.board.words import at_least
 
-    out, names = console(), [name for name in ("safety", "trust") if any(name in entry for entry in found["defences"])]
+    names = [name for name in ("safety", "trust") if any(name in entry for entry in found["defences"])]
     attacks = [a for a in found["attacks"] if a["attack"] != "none"]
-    table = Table(
-        title=f"{found['suite']['name']}: lower bounds against these {len(attacks)} attacks, {found['runs']} runs a cell",
-        caption=f"one-sided, alpha {found['alpha']:g} over all cells of a line together",
-    )
-    for heading in ("defence", "attackers", *(h for name in names for h in (name, "runs", "worst")), "why not"):
-        table.add_column(heading, overflow="fold")
+    rows = []
     for entry in found["defences"]:
         for level in ("black", "white"):
             if level == "white" and not any(a["knowledge"] != "black" for a in attacks):
@@ -180,34 +156,35 @@ def _print_bounds(found: dict[str, Any]) -> None:
                 held = entry[name][level]
                 told = [] if held is None else [at_least(held["lower"], 1), f"{held['k']} of {held['n']}", _place(held)]
                 figures += told or ["-", "-", "-"]
-            table.add_row(escape(entry["defence"]), level, *figures, escape(entry["why"]) if "-" in figures else "")
-    out.print(table)
+            rows.append((entry["defence"], level, *figures, entry["why"] if "-" in figures else ""))
+    columns = ("defence", "attackers", *(heading for name in names for heading in (name, "runs", "worst")), "why not")
+    title = f"{found['suite']['name']}: lower bounds against these {len(attacks)} attacks, {found['runs']} runs a cell"
+    table(columns, rows, title, f"one-sided, alpha {found['alpha']:g} over all cells of a line together")
     for name in names:
         members = sorted({p for entry in found["defences"] for held in entry[name].values() if held for p in held["of"]})
         parts = " and ".join(map(_bracketed, members)) or "nothing is defined here"
-        out.print(f"{name}: {parts}, in one run", markup=False, highlight=False)
+        say(f"{name}: {parts}, in one run")
     against = ", ".join(f"{a['attack']} ({a['knowledge']}{'; ' + a['note'] if a['note'] else ''})" for a in attacks)
-    out.print(f"attacks: {against or 'none'}", markup=False, highlight=False)
-    out.print(f"scenarios: {', '.join(found['scenarios'])}", markup=False, highlight=False)
+    say(f"attacks: {against or 'none'}")
+    say(f"scenarios: {', '.join(found['scenarios'])}")
 
 
 def _print_properties(found: dict[str, Any]) -> None:
-    table = Table(title="each property in its worst cell", caption="intervals hold for all cells of a property together")
+    rows = []
     why = any(p["share"] is None for entry in found["defences"] for p in entry["properties"])
-    for heading in ("defence", "property", "share", "runs", "interval", "worst", "antecedent", *(("why not",) if why else ())):
-        table.add_column(heading, overflow="fold")
     for entry in found["defences"]:
         for p in entry["properties"]:
             share, when = p["share"], p["antecedent"]
             if share is None:
-                table.add_row(escape(entry["defence"]), escape(p["name"]), *["-"] * 5, escape(p["reason"]))
+                rows.append((entry["defence"], p["name"], *["-"] * 5, p["reason"]))
                 continue
             often = "-" if when is None else f"in {when['runs']} of {when['of']} runs, {_percent(when['instants'])} of the steps"
             often += _alarms(p.get("false_alarms", []))
             span = f"{_percent(share['low'])} to {_percent(share['high'])}"
             figures = _percent(share["value"]), f"{share['k']} of {share['n']}", span, _place(share), often
-            table.add_row(escape(entry["defence"]), escape(p["name"]), *figures)
-    console().print(table)
+            rows.append((entry["defence"], p["name"], *figures))
+    columns = ("defence", "property", "share", "runs", "interval", "worst", "antecedent", *(("why not",) if why else ()))
+    table(columns, rows, "each property in its worst cell", "intervals hold for all cells of a property together")
 
 
 def _alarms(prices: list[dict[str, Any]]) -> str:
@@ -217,38 +194,34 @@ def _alarms(prices: list[dict[str, Any]]) -> str:
     worst = min(prices, key=lambda price: float("inf") if price["hours"] is None else price["hours"])
     if worst["hours"] is None:
         return f"; no false alarm in {min(price['running_hours'] for price in prices):.3g} h"
-    return f"; a false alarm in {worst['hours']:.3g} h on {escape(worst['scenario'])}"
+    return f"; a false alarm in {worst['hours']:.3g} h on {worst['scenario']}"
 
 
 def _print_failures(found: dict[str, Any], folder: str | None) -> None:
-    out = console()
     failing = [entry for entry in found["defences"] if entry["worst"]]
     for entry in failing:
         worst = entry["worst"]
         words = f"{entry['defence']} fails {worst['property']} against {worst['attack']} on {worst['scenario']}, seed {worst['seed']}"
-        out.print(f"{words}: {worst['replay']}" if "replay" in worst else words, markup=False, highlight=False, soft_wrap=True)
+        say(f"{words}: {worst['replay']}" if "replay" in worst else words, soft_wrap=True)
     if failing and folder is None:
-        out.print("with --out DIR these runs are kept for tailgate replay", markup=False, highlight=False)
+        say("with --out DIR these runs are kept for tailgate replay")
 
 
 def _print_cells(found: dict[str, Any]) -> None:
-    """What a rule that stops early found out."""
+    """Print the findings of a rule that stops early."""
     rule = found["rule"]
-    table = Table(title=f"{found['suite']['name']}: rule {rule['name']}, for exploring: these intervals miss more often than they say")
-    why = any(cell["trust"] is None for cell in found["cells"])
-    for heading in ("defence", "attack", "scenario", "runs", "hold", "interval", "verdict", *(("why not",) if why else ())):
-        table.add_column(heading, overflow="fold")
+    why, rows = any(cell["trust"] is None for cell in found["cells"]), []
     for cell in found["cells"]:
-        head = [escape(cell["defence"]), escape(cell["attack"]), escape(cell["scenario"])]
-        held = cell["trust"]
+        head, held = (cell["defence"], cell["attack"], cell["scenario"]), cell["trust"]
         if held is None:
-            table.add_row(*head, *["-"] * 4, escape(cell["reason"]))
+            rows.append((*head, *["-"] * 4, cell["reason"]))
             continue
         verdict = {None: "-", True: f"P >= {rule.get('high', 0):g}", False: f"P <= {rule.get('low', 0):g}"}[cell["verdict"]]
-        table.add_row(*head, str(cell["n"]), str(held["k"]), f"{_percent(held['low'])} to {_percent(held['high'])}", verdict)
-    console().print(table)
+        rows.append((*head, str(cell["n"]), str(held["k"]), f"{_percent(held['low'])} to {_percent(held['high'])}", verdict))
+    title = f"{found['suite']['name']}: rule {rule['name']}, for exploring: these intervals miss more often than they say"
+    table(("defence", "attack", "scenario", "runs", "hold", "interval", "verdict", *(("why not",) if why else ())), rows, title)
 
 
 def _bracketed(formula: str) -> str:
-    """As a part of a conjunction; names of properties stand by themselves."""
+    """Return a part of a conjunction; names of properties need no brackets."""
     return f"({formula})" if " " in formula else formula

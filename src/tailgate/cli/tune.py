@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
 
 from tailgate.base import sizes
-from tailgate.base.progress import console, progress
+from tailgate.base.progress import progress
+from tailgate.cli.shared import Commands, add_options, show, table, tell
+
+if TYPE_CHECKING:
+    from tailgate.agents.learners.learning import Progress
 
 
-def add(commands: Any) -> None:
+def add(commands: Commands) -> None:
     command = commands.add_parser(
         "tune", help="search a learner's hyper-parameters (needs tailgate[tune])",
         description="Train one policy per trial and keep the values whose policy does most damage on `tune` seeds. The same command goes "
@@ -28,7 +29,7 @@ def add(commands: Any) -> None:
     command.add_argument("--episodes", type=int, default=400, metavar="N", help="episodes that a trial is measured on (default 400)")
     command.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the search itself (default 0)")
     command.add_argument("--workers", type=int, default=1, metavar="N", help="trials at a time (default 1); more change what is proposed")
-    command.add_argument("--json", action="store_true", help="print the report as JSON")
+    add_options(command, "--json")
     command.add_argument("overrides", nargs="*", metavar="key=value", help="change a field of the configuration, as for `tailgate train`")
     command.set_defaults(run=_tune, kept="the same command goes on")
 
@@ -44,35 +45,31 @@ def _tune(options: argparse.Namespace) -> int:
     errors.print(f"[bold]{search.base.name}[/]: {search.trials} trials of {search.base.steps:,} decisions, files in {search.directory}")
     with progress(errors) as update:
 
-        def trained(ordinal: int, now: Any) -> None:
+        def trained(ordinal: int, now: Progress | None) -> None:
             if now is None:
                 update(f"trial {ordinal}", 1, 1, "")
             else:
                 update(f"trial {ordinal}", min(now.steps, search.base.steps), search.base.steps, train.figures(now))
 
         report = tuning.tune(search, options.workers, trained)
-    if options.json:
-        print(json.dumps(report, indent=1, allow_nan=False))
-    else:
-        _print(report)
+    show(options, report, _print)
     if report["best"] is None:
-        print("tailgate: no trial succeeded; their reasons are above", file=sys.stderr)
+        tell("no trial succeeded; their reasons are above")
         return 1
     errors.print(f"train with it: tailgate train --config {report['config']}")
     return 0
 
 
 def _print(report: dict[str, Any]) -> None:
-    table = Table(title=f"{report['learner']} against {report['defence']} on {report['scenario']}, {report['outcome']} on tune seeds")
-    for heading in ("trial", "outcome", "values", "note"):
-        table.add_column(heading, overflow="fold")
+    rows = []
     for entry in report["trials"]:
         values = ", ".join(f"{key.rpartition('.')[2]} {_short(value)}" for key, value in entry["parameters"].items())
         best = report["best"] is not None and entry["ordinal"] == report["best"]["ordinal"]
         outcome = "-" if entry["value"] is None else f"{entry['value']:.4g}"
-        table.add_row(str(entry["ordinal"]), outcome, values, "best" if best else escape(entry["reason"]))
-    console().print(table)
+        rows.append((str(entry["ordinal"]), outcome, values, "best" if best else entry["reason"]))
+    title = f"{report['learner']} against {report['defence']} on {report['scenario']}, {report['outcome']} on tune seeds"
+    table(("trial", "outcome", "values", "note"), rows, title)
 
 
-def _short(value: Any) -> str:
-    return f"{value:.3g}" if isinstance(value, float) else escape(json.dumps(value))
+def _short(value: object) -> str:
+    return f"{value:.3g}" if isinstance(value, float) else json.dumps(value)

@@ -4,23 +4,15 @@ from __future__ import annotations
 
 import argparse
 import json
-import secrets
-import sys
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
-
 from tailgate.base.errors import InputError
-from tailgate.base.progress import cells, console, progress
-
-SHOWN = 20  # rows that are listed, at most
+from tailgate.cli.shared import MORE, SHOWN, Commands, add_options, counted, drawn_by, own_classes, sample_seed, say, show, table, working
 
 
-def add(actions: Any) -> None:
-    """Adds `verify` to the actions of a command."""
+def add(actions: Commands) -> None:
+    """Add `verify` to the actions of a command."""
     command = actions.add_parser(
         "verify", help="play rows again and compare their hashes and figures",
         description="Play rows again and compare hashes, metrics and all else that they record. Exit code 1 when a row differs, or when "
@@ -29,8 +21,7 @@ def add(actions: Any) -> None:
     )  # fmt: skip
     command.add_argument("--rows", nargs="+", required=True, metavar="FILE", help="JSON Lines files of `tailgate evaluate`")
     command.add_argument("--sample", type=int, metavar="N", help="so many rows, drawn at random (default: all)")
-    command.add_argument("--sample-seed", type=int, metavar="N", help="which ones (default: a new secret each time; the report names it)")
-    command.add_argument("--workers", type=int, default=1, metavar="N", help="processes (default 1); changes no result")
+    add_options(command, "--sample-seed", "--workers")
     command.add_argument("--batch", type=int, metavar="N", help="episodes side by side instead of the rows' number; changes no result")
     command.add_argument("--trust-code", action="store_true", help="also import the classes that rows name; they run with your rights")
     command.add_argument(
@@ -38,20 +29,19 @@ def add(actions: Any) -> None:
         help="class that rows of `leaderboard submit` are about, played again in a sandbox: bwrap/mydefence:Saturated (repeatable)",
     )  # fmt: skip
     command.add_argument("--out", metavar="FILE", help="also write the report here: OUT/SUITE/verified/NAME.json for the next board")
-    command.add_argument("--json", action="store_true", help="print the report as JSON")
+    add_options(command, "--json")
     command.set_defaults(run=_verify)
 
 
 def _verify(options: argparse.Namespace) -> int:
     from tailgate.base.files import writable_directory, write_atomic
+    from tailgate.board.verified import digest
     from tailgate.evaluation.rows import read_rows
     from tailgate.evaluation.verify import verify
-    from tailgate.leaderboard.verified import digest
 
     if options.out is not None:  # before anything is played
         writable_directory(Path(options.out).parent)
 
-    seed = secrets.randbits(32) if options.sample_seed is None else options.sample_seed  # who could foresee it would forge the others
     rows, origin, held_in = [], [], []
     for name in options.rows:
         held = read_rows(Path(name))
@@ -61,43 +51,35 @@ def _verify(options: argparse.Namespace) -> int:
     if not rows:
         raise InputError("--rows", options.rows, "at least one row of an evaluation in them")
     if options.trust_code or options.submission:
-        sys.path.insert(0, "")  # module:Class is looked for in the working directory, as `tailgate evaluate` does
-    with progress(Console(stderr=True)) as update:
+        own_classes()
+    with working() as update:
         report = verify(
-            rows, sample=options.sample, sample_seed=seed, workers=options.workers, batch=options.batch,
+            rows, sample=options.sample, sample_seed=sample_seed(options), workers=options.workers, batch=options.batch,
             trust_code=options.trust_code,
             submissions=options.submission, files=held_in,
-            progress=lambda done, total: update("playing", done, total, cells(done, total)),
+            progress=counted(update, "playing"),
         )  # fmt: skip
     for finding in report["findings"]:
         finding["file"], finding["line"] = origin[finding["line"] - 1]
-    text = json.dumps(report, indent=1, allow_nan=False)
     if options.out is not None:
-        write_atomic(Path(options.out), text.encode() + b"\n")
-    if options.json:
-        print(text)
-    else:
-        _print(report)
+        write_atomic(Path(options.out), json.dumps(report, indent=1, allow_nan=False).encode() + b"\n")
+    show(options, report, _print)
     return 1 if report["counts"]["differs"] or not report["counts"]["verified"] else 0
 
 
 def _print(report: dict[str, Any]) -> None:
-    out = console()
-    drawn = "" if report["sample"] is None else f", drawn by the seed {report['sample_seed']}"
-    played = report["counts"]["verified"] + report["counts"]["differs"]
-    table = Table(title=f"{report['status']}: {played} of {report['rows']} rows played again, {report['asked']} asked for{drawn}")
-    for heading in ("defence", "status", "verified", "differs", "unchecked"):
-        table.add_column(heading, overflow="fold")
-    for entry in report["entries"]:
-        table.add_row(escape(entry["defence"]), entry["status"], *(str(entry[key]) for key in ("verified", "differs", "unchecked")))
-    out.print(table)
+    counts = report["counts"]
+    played = f"{counts['verified'] + counts['differs']} of {report['rows']} rows played again"
+    columns = ("defence", "status", "verified", "differs", "unchecked")
+    rows = [[str(entry[key]) for key in columns] for entry in report["entries"]]
+    table(columns, rows, f"{report['status']}: {played}, {report['asked']} asked for{drawn_by(report)}")
     for reason in report["reasons"][:SHOWN]:
-        out.print(f"{reason['rows']} rows {reason['why']}", markup=False, highlight=False)
+        say(f"{reason['rows']} rows {reason['why']}")
     wrong = [finding for finding in report["findings"] if finding["verdict"] == "differs"]
     for finding in wrong[:SHOWN]:
         named = f"{finding['scenario']}, {finding['defence']}, {finding['attack']}, dose {finding['dose']}, seed {finding['seed']}"
-        out.print(f"{finding['file']}, line {finding['line']}: {named}", markup=False, highlight=False)
+        say(f"{finding['file']}, line {finding['line']}: {named}")
         for part in finding["differences"]:
-            out.print(f"    {part['field']}: row {part['row']!r}, here {part['here']!r}", markup=False, highlight=False)
+            say(f"    {part['field']}: row {part['row']!r}, here {part['here']!r}")
     if len(wrong) > SHOWN:
-        out.print(f"and {len(wrong) - SHOWN} more; --json lists them all", highlight=False)
+        say(f"and {len(wrong) - SHOWN} more{MORE}")

@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
-from typing import Any
 
-from rich.table import Table
-
-from tailgate.base.progress import console
+from tailgate.cli.shared import Commands, show, table
 
 
-def add(commands: Any) -> None:
+def add(commands: Commands) -> None:
     command = commands.add_parser("zoo", help="put trained policies into the package's zoo (`tailgate list zoo` shows it)")
     actions = command.add_subparsers(required=True, metavar="ACTION")
     more = actions.add_parser(
@@ -35,16 +31,14 @@ def _add(options: argparse.Namespace) -> int:
 
     paths = add_run(Path(options.run_directory), options.name, options.summary, episodes=options.episodes, replace=options.replace)
     added = [facts(path) for path in paths]
-    if options.json:
-        print(json.dumps(added, indent=1))
-        return 0
-    table = Table("name", "outcome", "on report seeds", "no attack", "bytes", "sha256", title="added to the zoo")
+    rows = []
     for item in added:
         measured = item["measured"]
         share = measured["unit"] == "0/1"
-        table.add_row(
+        rows.append((
             item["name"], measured["outcome"], f"{shown(measured['value'], share)} ({between(measured, share)})",
             shown(measured["no_attack"]["value"], share), str(item["bytes"]), item["sha256"][:12],
-        )  # fmt: skip
-    console().print(table)
+        ))  # fmt: skip
+    columns = ("name", "outcome", "on report seeds", "no attack", "bytes", "sha256")
+    show(options, added, lambda _: table(columns, rows, "added to the zoo"))
     return 0

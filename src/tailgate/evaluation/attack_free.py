@@ -31,7 +31,8 @@ SILENT = 1e12  # a threshold that no score reaches
 MOST_DIGITS = 7  # of a threshold
 RECORDED = 512  # episodes that are recorded together
 NOTHING = NoAttack()
-HOUR = 3600.0
+HOUR = 3600.0  # [s]
+HOURS = 0.1  # mean time between alarm onsets [h]: the shortest that thresholds are calibrated to
 
 Progress = Callable[[str, int, int, str], None]  # label, done, total, figures
 

@@ -19,6 +19,8 @@ KEYS = (
     "suite", "scenario", "dose", "knowledge", "defence", "attack", "purpose", "config_hash", "version", "defence_digest", "attack_digest",
 )  # fmt: skip
 
+Row = dict[str, Any]  # one episode: KEYS, every metric, and all that is needed to play it again
+CLEAN = "none"  # the attack that does nothing, and the defence that does nothing
 AGAIN = "run the command that wrote it again to complete it"
 _Text = Annotated[str, Field(strict=True)]
 _Number = Annotated[float, Field(strict=True, allow_inf_nan=False)] | None
@@ -31,9 +33,9 @@ _FIELDS: dict[str, Any] = {
 _Row = create_model("Row", __config__=ConfigDict(extra="allow"), **_FIELDS)
 
 
-def read_rows(path: Path) -> list[dict[str, Any]]:
+def read_rows(path: Path) -> list[Row]:
     """Read and check the rows of a JSON Lines file; raise InputError that names the line."""
-    rows: list[dict[str, Any]] = []
+    rows: list[Row] = []
     lines, number, ahead = lines_of(path), 1, b""
     try:
         line = next(lines, b"")
@@ -49,7 +51,7 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
     return rows
 
 
-def _row(line: bytes, where: str, damage: str, first: bool) -> dict[str, Any]:
+def _row(line: bytes, where: str, damage: str, first: bool) -> Row:
     """Check and return one line. `damage` says what happened to the file if the line is not JSON; `first`: it is the first line."""
     try:
         row = parse_json(line)
@@ -82,11 +84,11 @@ def _check(row: object, where: str) -> None:
         raise InputError(f"{where}: {field}", held, wanted(found)) from None
 
 
-def packed(rows: Sequence[dict[str, Any]], path: Path) -> bytes:
+def packed(rows: Sequence[Row], path: Path) -> bytes:
     """Return the content of a file of rows: JSON Lines, compressed if it is named *.xz. Equal rows give equal bytes."""
     return lzma.compress(encode(rows), preset=2) if path.suffix == ".xz" else encode(rows)
 
 
-def encode(rows: Sequence[dict[str, Any]]) -> bytes:
+def encode(rows: Sequence[Row]) -> bytes:
     """Return rows as JSON Lines; refuse NaN and infinity."""
     return "".join(json.dumps(row, allow_nan=False) + "\n" for row in rows).encode()

@@ -24,6 +24,15 @@ def proportion(successes: int, n: int, level: float = 0.95) -> Interval:
     return Interval(successes / n, float(ci.low), float(ci.high))
 
 
+def limits(successes: Array, n: Array, alpha: float) -> tuple[Array, Array]:
+    """One-sided Clopper-Pearson limits of shares, lower and upper, each missed with a chance of at most alpha."""
+    from scipy import stats
+
+    low = np.where(successes > 0, stats.beta.ppf(alpha, np.maximum(successes, 1), n - successes + 1), 0.0)
+    high = np.where(successes < n, stats.beta.isf(alpha, successes + 1, np.maximum(n - successes, 1)), 1.0)
+    return low, high
+
+
 def mean_time(events: int, time: float, dispersion: float = 1.0, level: float = 0.95) -> tuple[float, float | None]:
     """Return limits of the mean time between `events` in a span of time: a Poisson interval, exact for independent events.
 

@@ -14,8 +14,8 @@ from jinja2 import Environment, StrictUndefined
 
 from tailgate.base.assets import asset, embedded, inline
 from tailgate.base.files import writable_directory, write_atomic
+from tailgate.board.words import names_of
 from tailgate.play.metrics import METRICS, unit_in
-from tailgate.scoring.words import names_of
 
 from .episode import Data, episode_of, first_step, noun
 from .replay import Replay

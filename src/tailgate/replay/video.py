@@ -14,9 +14,9 @@ from typing import Any
 
 from tailgate.base.errors import InputError
 from tailgate.base.files import replacing, writable_directory, write_atomic
+from tailgate.board.words import names_of
 from tailgate.core import Array
 from tailgate.envs.render.viewer import Viewer
-from tailgate.scoring.words import names_of
 
 from .replay import Replay, episode
 

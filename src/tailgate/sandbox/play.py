@@ -12,6 +12,7 @@ from tailgate.base import sizes
 from tailgate.base.errors import InputError
 from tailgate.base.pool import each
 from tailgate.core.scenario import Suite, load_suite
+from tailgate.evaluation.attack_list import attacks_of
 from tailgate.evaluation.cells import Cell, cells_of
 from tailgate.evaluation.resume import Parts, complete
 from tailgate.sandbox.limits import Limits, Lost
@@ -19,7 +20,6 @@ from tailgate.sandbox.mixed import Submission, part_of, play_mixed
 from tailgate.sandbox.process import Process
 from tailgate.sandbox.sandbox import Sandbox, sandbox_of
 from tailgate.sandbox.source import staged
-from tailgate.scoring.attacks import attacks_of
 
 Rows = list[dict[str, Any]]
 

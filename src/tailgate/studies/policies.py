@@ -226,19 +226,6 @@ def label(text: str, width: int = 30) -> str:
     return textwrap.fill(text.replace(",", ", "), width, break_long_words=False, break_on_hyphens=False)
 
 
-def changes(pairs: Sequence[str]) -> dict[str, Any]:
-    """Return the changes of a threat model that --threat key=value names."""
-    from tailgate.core.schema import scalar
-
-    out = {}
-    for text in pairs:
-        key, sep, value = text.partition("=")
-        if not sep:
-            raise InputError("--threat", text, "key=value, for example fdi_bound=10")
-        out[key] = scalar(value)
-    return out
-
-
 def write_report(directory: Path, name: str, report: dict[str, Any], picture: bytes | None) -> list[Path]:
     """Write NAME.json and NAME.png; returns their paths."""
     import json

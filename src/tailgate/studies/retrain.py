@@ -5,13 +5,14 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Literal, NamedTuple
 
 from tailgate.agents.learners.learning import Progress, made_with
 from tailgate.agents.policy.network_policy import load_policy
 from tailgate.base.errors import InputError
 from tailgate.core.registry import Spec
+from tailgate.evaluation.checks import Finding, again
 from tailgate.training import train
 
 from .collect import packed
@@ -21,7 +22,7 @@ Verdict = Literal["same", "differs", "unchecked"]
 
 
 class Again(NamedTuple):
-    """The result for one policy; `sha256` of its weights as they are shared, and of those that came out here."""
+    """The verdict on one policy; `sha256` of its weights as they are shared, and of those that came out here."""
 
     policy: str
     verdict: Verdict
@@ -38,11 +39,22 @@ def retrain(text: str, progress: Callable[[train.TrainConfig, Progress], None] |
     another version than here cannot be checked, and the reason is returned. Weights are the same to the last bit on one machine type
     with the versions of constraints.txt; PPO and what else rests on torch may differ elsewhere, and `why` names what is another here.
     """
-    try:
-        who = trained(text)
-        config = _config(who)
-    except InputError as error:
-        return Again(text, "unchecked", str(error))
+    def play(jobs: Mapping[str, tuple[Trained, train.TrainConfig]]) -> Iterator[tuple[str, Again]]:
+        for name, (who, config) in jobs.items():
+            yield name, _trained_again(who, config, progress)
+
+    finding = again([text], _prepared, play, lambda _, made: Finding(made.verdict, made.why, here=made))[text]
+    return finding.here or Again(text, "unchecked", finding.why)
+
+
+def _prepared(text: str) -> tuple[Trained, train.TrainConfig]:
+    who = trained(text)
+    return who, _config(who)
+
+
+def _trained_again(who: Trained, config: train.TrainConfig, progress: Callable[[train.TrainConfig, Progress], None] | None) -> Again:
+    """Train a policy in a temporary folder, and compare its weights with those of its file."""
+    text, there = who.text, who.header.sha256
     with tempfile.TemporaryDirectory(prefix="tailgate-retrain-") as folder:
         config = dataclasses.replace(config, out=folder)
 
@@ -53,9 +65,9 @@ def retrain(text: str, progress: Callable[[train.TrainConfig, Progress], None] |
         try:
             (path,) = train.train(config, told)
         except (InputError, ImportError) as error:  # a learner that is not installed, a field that this version does not know
-            return Again(text, "unchecked", str(error), who.header.sha256)
+            return Again(text, "unchecked", str(error), there)
         made, _ = load_policy(path)
-        here, there = made.sha256, who.header.sha256
+        here = made.sha256
         if "source_sha256" in who.header.training:  # of the zoo, whose weights are packed: these, as the record might claim any hash
             here = hashlib.sha256(packed(path.with_name(made.tensors))).hexdigest()
     steps = int(made.training["steps"])

@@ -20,8 +20,8 @@ from tailgate.core.registry import Spec
 from tailgate.core.scenario import Scenario, load_scenario
 from tailgate.core.schema import canonical
 from tailgate.evaluation.cells import Cell, _head, _why, cell_id
+from tailgate.evaluation.rows import CLEAN
 from tailgate.play.trace import Trace, episodes_at_once, rollout
-from tailgate.scoring.damage import CLEAN
 
 from .false_alarms import DETECTS, false_alarms
 from .logic import Eventually, Interval, along, holds, robustness

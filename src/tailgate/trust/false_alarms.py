@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tailgate.core import Array
+from tailgate.evaluation.rows import CLEAN
 from tailgate.play.trace import Trace
-from tailgate.scoring.damage import CLEAN
 
 HOUR = 3600.0  # [s]
 DETECTS = "detects"  # the property that has this price

@@ -22,8 +22,8 @@ from tailgate.base.errors import InputError, NotApplicable
 from tailgate.core import Model, Positive, PositiveCount, param
 from tailgate.core.scenario import Scenario
 from tailgate.envs.controllers.adaptive_cruise import BRAKE_ACCEL
+from tailgate.evaluation.attack_free import HOURS
 from tailgate.play.metrics import DETECTION_DEADLINE
-from tailgate.scoring.gates import HOURS
 
 from .formula import parse
 from .logic import Always, And, Atom, Eventually, Formula, Interval, Not, Or, implies, response

@@ -10,8 +10,8 @@ import numpy as np
 from tailgate.base.version import VERSION
 from tailgate.core.scenario import Suite, list_suites, load_suite
 from tailgate.core.threat import KNOWLEDGE
-from tailgate.scoring.damage import CLEAN, order
-from tailgate.scoring.ranks import Harm, class_of, compare
+from tailgate.evaluation.paired import Harm, class_of, compare
+from tailgate.evaluation.rows import CLEAN
 
 from .cells import Row, runs_of
 from .false_alarms import DETECTS, Price, prices, unpaid
@@ -91,7 +91,7 @@ def _entry(
     free = next(filter(None, (unpaid(row, paid) for row in mine)), "")
     out["why"] = "; ".join(filter(None, (out["why"], free)))
     for name in names:
-        known = {level: [row for row in mine if order(row["knowledge"]) <= order(level)] for level in KNOWLEDGE}
+        known = {level: [row for row in mine if KNOWLEDGE.index(row["knowledge"]) <= KNOWLEDGE.index(level)] for level in KNOWLEDGE}
         out[name] = {level: _bound(known[level], name, alpha, fixed, paid) for level in KNOWLEDGE}
     whole = [row for row in mine if row["status"] == "ok"]
     return out | {"properties": _properties(whole, alpha, paid), "worst": _failure(whole, names)}

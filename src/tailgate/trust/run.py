@@ -26,8 +26,7 @@ from tailgate.core.registry import Spec
 from tailgate.core.scenario import Suite, load_scenario
 from tailgate.core.schema import as_data
 from tailgate.evaluation.cells import cells_of, run_cell
-from tailgate.evaluation.rows import encode
-from tailgate.scoring.damage import CLEAN
+from tailgate.evaluation.rows import CLEAN, encode
 
 from .cells import Job, Row, check_cell, failed, single
 from .properties import CONJUNCTIONS, Demands, own

@@ -15,8 +15,7 @@ import numpy as np
 
 from tailgate.base.errors import InputError
 from tailgate.core import Array
-from tailgate.evaluation.stats import Interval, proportion
-from tailgate.scoring.doses import limits
+from tailgate.evaluation.stats import Interval, limits, proportion
 
 MOST = 1_000_000  # runs of a rule that stops by itself
 

@@ -1,0 +1,103 @@
+"""Admission of an attack to the list of a suite (`tailgate.evaluation.attack_list`), and its withdrawal.
+
+An attack is admitted when it surely does more damage than the worst of those that know as much, on the same select seeds.
+Who tries often enough wins once by chance, so the j-th try of a list is tested at alpha / (j (j + 1)), which adds up to alpha.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tailgate.base.errors import InputError, unknown
+from tailgate.base.files import writable_directory, write_atomic
+from tailgate.core.registry import Spec
+from tailgate.core.scenario import Suite
+from tailgate.evaluation.attack_list import Admitted, append, attacks_of, list_of, next_level, published, read, standing
+from tailgate.evaluation.cells import cells_of, run
+from tailgate.evaluation.paired import mcnemar
+from tailgate.evaluation.rows import CLEAN
+from tailgate.evaluation.stats import holm
+
+from .damage import order, tabulate
+from .worst import Worst
+
+
+def withdraw(attack: str, path: Path, date: str, reason: str) -> Admitted:
+    """Take an attack back by an erratum: it no longer counts. Raises InputError for one that the list does not hold."""
+    held = standing(read(path))
+    line = held.get(attack)
+    if line is None:
+        raise unknown("attack", attack, [text for text, kept in held.items() if kept is not None])
+    if not reason.strip():
+        raise InputError("reason", reason, "a sentence")
+    return append(path, dataclasses.replace(line, date=date, evidence=(), erratum=reason))
+
+
+def knowledge_of(text: str, suite: Suite) -> str:
+    """Return the knowledge that a suite grants an attack."""
+    spec = Spec("attack", text)
+    return suite.knowledge or str(getattr(spec.make(), "knowledge", spec.entry.knowledge))
+
+
+def admit(
+    attack: str, suite: Suite, defences: Sequence[str], path: Path, date: str, *, dose: int | None = None, alpha: float = 0.05,
+    episodes: int | None = None, workers: int = 1, rows_file: Path | None = None, beacon: str = "",
+    progress: Callable[[int, int], None] | None = None,
+) -> tuple[Admitted | None, list[dict[str, Any]]]:  # fmt: skip
+    """Play an attack and all that are listed and know as much, on select seeds; append what came of it. -> line (None: refused), tests.
+
+    It wins where it does more damage in some scenario than the worst of the others in any, against at least one defence, by the exact
+    paired test, adjusted after Holm for all defences and scenarios, at `next_level` of alpha. dose: the middle one of those that the suite
+    shows unless given. beacon: of whose round the seeds are.
+    """
+    asked, listed = next_level(list_of(suite, path), alpha), list(attacks_of(suite, path))
+    spec = Spec("attack", attack)
+    spec.refuse_imports("the list of attacks")  # it would run with the rights of the scoring process
+    if attack in listed:
+        raise InputError("attack", attack, "one that is not on the list")
+    if spec.entry.optimal:
+        raise InputError("attack", attack, "a rival: a computed optimum is a ceiling")
+    at = suite.middle_dose if dose is None else dose
+    if dose is not None and dose not in suite.doses:
+        raise InputError("dose", dose, f"one of the doses of {suite.name}: {', '.join(map(str, suite.doses))}")
+    level = knowledge_of(attack, suite)
+    peers = [text for text in listed if text != CLEAN and not Spec("attack", text).entry.optimal]
+    peers = [text for text in peers if order(knowledge_of(text, suite)) <= order(level)]
+    part = dataclasses.replace(
+        suite, doses=(at,), shown={}, defences=tuple(defences), attacks=(*peers, attack), seeds=episodes or suite.seeds
+    )  # fmt: skip
+    work = cells_of(part, purpose="select", beacon=beacon)
+    writable_directory(path.parent)  # before anything is played
+    rows = run(work, rows_file, workers, progress)
+    table = tabulate(rows, part)
+    tests: list[dict[str, Any]] = []
+    for defence in defences:
+        worst = Worst(table, defence, level, alpha)
+        played = [k for k, pair in enumerate(worst.pairs) if pair not in worst.lost]
+        mine = [k for k in played if table.columns[worst.pairs[k][1]].attack == attack]
+        others = [k for k in played if k not in mine]
+        best = max(others, key=lambda k: float(worst.shares[k, 0]), default=None)
+        for k in mine:
+            seeds, x = worst.harm(k, 0)
+            held, y = worst.harm(best, 0) if best is not None else (seeds, np.zeros_like(x))
+            if held != seeds:
+                raise InputError(f"scenarios of {suite.name}", len(held), "the same seeds in each")
+            new, old = int(np.sum(x > y)), int(np.sum(y > x))
+            tests.append({
+                "defence": defence, "scenario": worst.pairs[k][0], "dose": at, "worst": None if best is None else worst.named(best),
+                "episodes": len(x), "only_new": new, "only_worst": old, "p": mcnemar(new, old),
+            })  # fmt: skip
+    if not tests:
+        raise InputError("attack", attack, "one that can be played against some of the defences")
+    for test, adjusted in zip(tests, holm([test["p"] for test in tests]), strict=True):
+        test["adjusted"], test["level"] = adjusted, asked
+    if not path.is_file() and (shipped := published(suite)) is not None:  # a folder's list goes on from the package's
+        write_atomic(path, shipped.read_bytes())
+    wins = any(test["only_new"] > test["only_worst"] and test["adjusted"] <= asked for test in tests)
+    line = append(path, Admitted(attack, spec.digest, level, date, tuple(tests), refused=not wins, beacon=beacon))
+    return line if wins else None, tests

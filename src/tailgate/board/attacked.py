@@ -1,0 +1,57 @@
+"""Attackers of a suite's plan trained against a defence, and played on it: what a board asks for before it ranks."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+from tailgate.base.progress import cells
+from tailgate.core.registry import Spec
+from tailgate.core.scenario import Suite
+from tailgate.evaluation.cells import evaluate
+from tailgate.sandbox import play_submission
+from tailgate.training.adaptive import configs_of, fitting, policies_of, stem, train_against
+
+Progress = Callable[[str, int, int, str], None]  # label, done, total, figures
+
+
+class Attacked(NamedTuple):
+    """The policies that were trained, and the files and number of the rows that were played."""
+
+    policies: list[Path]
+    files: list[Path]  # of rows: one, or one for each kind of system that was trained on
+    rows: int
+
+
+def attack(
+    suite: Suite, defence: str, out: Path, *, seeds: int | None = None, episodes: int | None = None, beacon: str = "", workers: int = 1,
+    changes: tuple[str, ...] = (), progress: Progress, counting: Callable[[Progress], Progress] = lambda told: told,
+) -> Attacked:  # fmt: skip
+    """Train a suite's attackers against a defence, and play them on it. Finished work is neither trained nor played again.
+
+    Policies go to out/policies, rows to out/DEFENCE*.jsonl. seeds, episodes: instead of the suite's; beacon: the round; changes: key=value
+    of the training; counting: of the cells that are played. Raises InputError for a suite without a plan.
+    """
+    configs = configs_of(suite, defence, out / "policies", seeds=seeds, extra=(*changes, f"workers={workers}"))
+    policies = train_against(configs, progress)
+    groups: dict[tuple[str, ...], list[str]] = {}  # a policy plays where the attacker sees and may do what it learned with
+    for config in configs:
+        groups.setdefault(fitting(suite, config), []).extend(map(str, policies_of(config)))
+    files, count, counted = [], 0, counting(progress)
+    for scenarios, attacks in groups.items():
+        files.append(out / f"{stem(defence)}{f'-{scenarios[0]}' if len(groups) > 1 else ''}.jsonl")
+        part = dataclasses.replace(suite, scenarios=scenarios, attacks=tuple(attacks))
+
+        def told(done: int, total: int) -> None:
+            counted(f"playing {defence}", done, total, cells(done, total))
+
+        if apart := Spec("defence", defence).sandboxed:
+            rows = play_submission(
+                apart[1], part, sandbox=apart[0], beacon=beacon, episodes=episodes, workers=workers, out=files[-1], progress=told,
+            )  # fmt: skip
+        else:
+            rows = evaluate(part, defences=[defence], seeds=episodes, workers=workers, out=files[-1], beacon=beacon, progress=told)
+        count += len(rows)
+    return Attacked(policies, files, count)

@@ -1,0 +1,174 @@
+"""Reading, checking and writing a board in the format `tailgate-board-1` (`tailgate.board.schema`)."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from tailgate.base.errors import InputError, said, unknown, wanted
+from tailgate.base.files import sweep, write_atomic
+from tailgate.base.reading import load_json
+from tailgate.base.version import VERSION
+from tailgate.core.scenario import Suite, list_suites, load_suite
+from tailgate.evaluation.stats import mean_time
+
+from .schema import FORMAT, AtThreshold, Board, Data, Detection, EntryTrust, Part
+
+
+def load(path: Path) -> Any:
+    """Return the JSON data of a board's file, to be read by `read_board`."""
+    rows = "; rows are played again by `tailgate leaderboard verify`" if ".jsonl" in path.suffixes else ""
+    return read_json(path, "board", "board.json", rows)
+
+
+def read_json(path: Path, where: str, what: str = "JSON file", hint: str = "") -> Any:
+    """Return the JSON data of a file. Raises InputError for a file that is none."""
+    try:
+        return load_json(path)
+    except (OSError, ValueError) as error:
+        raise InputError(where, str(path), f"a readable {what} ({said(error)}){hint}") from None
+
+
+def save(board: Data, path: Path) -> None:
+    """Put a board, as JSON data, into a file, in one step, and remove what a killed writer of it left."""
+    write_atomic(path, json.dumps(board, indent=1, allow_nan=False).encode() + b"\n")
+    sweep(path)
+
+
+def amended(board: Data, fields: Mapping[str, Data], **parts: object) -> Data:
+    """Return a board with these fields put into its entries, by defence, and these parts put into the board."""
+    return board | {"entries": [entry | fields.get(entry["defence"], {}) for entry in board["entries"]]} | parts
+
+
+def read_board(data: object, where: str = "board") -> Board:
+    """Return a board from JSON data; raises InputError that names the first field that is not of the format."""
+    if not isinstance(data, dict):
+        raise InputError(where, data, f"a mapping in the format {FORMAT}")
+    if data.get("format") != FORMAT:
+        raise InputError(f"{where}.format", data.get("format"), FORMAT)
+    try:
+        board = Board.model_validate(data)
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in first["loc"])
+        raise InputError(where + place, None if first["type"] == "missing" else first["input"], wanted(first)) from None
+    _Agreement(board).check(where)
+    return board
+
+
+class _Agreement:
+    """The checks of one part of a board against another."""
+
+    def __init__(self, board: Board) -> None:
+        self.board, doses = board, board.suite.doses
+        self.defences = {entry.defence for entry in board.entries}
+        self.known: dict[str, tuple[Iterable[object], str]] = {
+            "defence": (self.defences, "one of the entries' defences"),
+            "scenario": ({s.name for s in board.suite.scenarios}, "one of the suite's scenarios"),
+            "dose": (doses, f"one of the suite's doses {doses}"),
+        }
+
+    def check(self, where: str) -> None:
+        """Raise InputError that names the first field that does not agree with the rest of the board."""
+        board, met = self.board, set[str]()
+        for i, entry in enumerate(board.entries):
+            if entry.defence in met:
+                raise InputError(f"{where}.entries[{i}].defence", entry.defence, "a defence that is named once")
+            met.add(entry.defence)
+        for i, cell in enumerate(board.cells):
+            self._refer(f"{where}.cells[{i}]", cell, "defence", "scenario", "dose")
+            if cell.hits is not None and (len(cell.hits) != 2 * -(-cell.n // 8) or int(cell.hits or "0", 16) % (1 << -cell.n % 8)):
+                expected = f"{2 * -(-cell.n // 8)} hexadecimal digits, for {cell.n} episodes, and zeros after the last"
+                raise InputError(f"{where}.cells[{i}].hits", cell.hits, expected)
+        for i, curve in enumerate(board.curves):
+            self._refer(f"{where}.curves[{i}]", curve, "defence")
+            if curve.fitted and len(curve.fitted) != len(curve.points):
+                raise InputError(f"{where}.curves[{i}].fitted", curve.fitted, "a value per point, or none")
+        for i, duel in enumerate(board.comparisons):
+            for side, name in (("a", duel.a), ("b", duel.b)):
+                if name not in self.defences:
+                    raise InputError(f"{where}.comparisons[{i}].{side}", name, "one of the entries' defences")
+            if duel.weaker not in (None, duel.a, duel.b):
+                raise InputError(f"{where}.comparisons[{i}].weaker", duel.weaker, f"{duel.a} or {duel.b}")
+        if board.detection is not None:
+            self._detection(board.detection, f"{where}.detection")
+        for i, entry in enumerate(board.entries):
+            if entry.trust is not None:
+                self._bounds(entry.trust, f"{where}.entries[{i}].trust")
+        for key in board.suite.shown:
+            if key not in map(str, board.suite.doses):
+                raise InputError(f"{where}.suite.shown", key, self.known["dose"][1])
+
+    def _refer(self, where: str, line: Part, *fields: str) -> None:
+        for name in fields:
+            known, expected = self.known[name]
+            if (value := getattr(line, name)) not in known:
+                raise InputError(f"{where}.{name}", value, expected)
+
+    def _detection(self, held: Detection, where: str) -> None:
+        """Check that figures are there once each, and that false alarms and their mean times fit each other."""
+        parts: dict[str, Sequence[AtThreshold]] = {"entries": held.entries, "alarms": held.alarms}
+        for part, lines in parts.items():
+            met = set[tuple[object, ...]]()
+            for i, line in enumerate(lines):
+                self._refer(f"{where}.{part}[{i}]", line, "defence", "scenario")
+                if (key := (line.defence, line.scenario, line.hours, getattr(line, "attack", ""))) in met:
+                    raise InputError(f"{where}.{part}[{i}]", " ".join(map(str, key)).strip(), "figures that are there once")
+                met.add(key)
+        for i, alarms in enumerate(held.alarms):
+            place = f"{where}.alarms[{i}]"
+            low, high = mean_time(alarms.onsets, alarms.running, alarms.dispersion)
+            follows = {"mean": alarms.running / alarms.onsets if alarms.onsets else None, "low": low, "high": high}
+            for name, value in follows.items():
+                given = getattr(alarms, name)
+                same = given is value if given is None or value is None else math.isclose(given, value, rel_tol=1e-6)
+                if not same:
+                    raise InputError(f"{place}.{name}", given, f"{value}, which follows from onsets, running and dispersion")
+            if alarms.first > alarms.onsets:
+                raise InputError(f"{place}.first", alarms.first, f"at most {alarms.onsets}, the onsets")
+            if alarms.early + alarms.late > alarms.onsets:
+                raise InputError(f"{place}.early", alarms.early, f"at most {alarms.onsets} drives with late, as many as onsets")
+
+    def _bounds(self, trust: EntryTrust, where: str) -> None:
+        """Check that bounds are of attacks that the board names, and of no more successes than runs."""
+        if self.board.trust is None:
+            raise InputError(where, "bounds", "null, as the board has no field trust")
+        known = {a.attack for a in self.board.trust.attacks}
+        for name, held in (("all", trust.all), ("safety", trust.safety)):
+            for level, bound in held.items():
+                if bound is not None and bound.k > bound.n:
+                    raise InputError(f"{where}.{name}.{level}.k", bound.k, f"at most {bound.n}, the number of runs")
+                if bound is not None and (missing := {bound.attack, *bound.attacks} - known):
+                    raise InputError(f"{where}.{name}.{level}.attacks", min(missing), "one of the attacks in the board's trust")
+
+
+def suite_of(board: Board) -> Suite:
+    """Return the suite of the package that the board is of. Raises InputError where there is none."""
+    if board.suite.name not in list_suites():
+        raise unknown("board: suite.name", board.suite.name, list_suites())
+    suite = load_suite(board.suite.name)
+    agree(board, suite)
+    return suite
+
+
+def agree(board: Board, suite: Suite) -> None:
+    """Raise InputError for a board of another suite or version than is here."""
+    held = board.suite
+    if held.version != VERSION:
+        raise InputError("board: suite.version", held.version, f"{VERSION}, which is here")
+    if held.hash != suite.hash:
+        raise InputError("board: suite.hash", held.hash, f"{suite.hash}, which the suite {suite.name} has here")
+    if held.episodes is None or not 1 <= held.episodes <= 4096:
+        raise InputError("board: suite.episodes", held.episodes, "1 to 4096 episodes of a cell")
+
+
+def known(names: Sequence[str], entries: Sequence[str]) -> None:
+    """Raise InputError for a name that is none of the entries'."""
+    for name in names:
+        if name not in entries:
+            raise unknown("defence", name, entries)

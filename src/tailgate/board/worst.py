@@ -1,0 +1,188 @@
+"""The worst over attacks and scenarios at each dose: rates, curves and the critical dose.
+
+Every value here falls or stays when an attack or a scenario is added: values are maxima of damage, and limits are corrected for their
+number.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from tailgate.base.errors import InputError
+from tailgate.core import Array
+from tailgate.evaluation.paired import Harm
+from tailgate.evaluation.rows import Row
+from tailgate.evaluation.stats import limits
+from tailgate.studies.dose import CRITICAL, critical_dose, fitted
+
+from .damage import MISSING, PLAYED, Key, Table, damaged
+from .schema import Data
+
+
+@dataclass(frozen=True, eq=False)
+class Worst:
+    """A defence against all attacks that know no more than `knowledge`, in all scenarios."""
+
+    table: Table
+    defence: str
+    knowledge: str
+    alpha: float
+
+    @cached_property
+    def pairs(self) -> list[tuple[str, int]]:
+        """Return (scenario, column) of every attack that has a meaning there.
+
+        An attack that is not asked of everybody counts against the defences that it was played against.
+        """
+        index = self.table.defences.index(self.defence)
+        out: list[tuple[str, int]] = []
+        for name in self.table.scenarios:
+            applies, mine = self.table.applies(name), self.table.state[name][index]
+            for i in self.table.known(self.knowledge):
+                if applies[i] and (self.table.columns[i].attack in self.table.asked or (mine[i] != MISSING).any()):
+                    out.append((name, i))
+        return out
+
+    @cached_property
+    def lost(self) -> list[tuple[str, int]]:
+        """Return the pairs without full figures."""
+        index = self.table.defences.index(self.defence)
+        return [(name, i) for name, i in self.pairs if (self.table.state[name][index, i] != PLAYED).any()]
+
+    @property
+    def complete(self) -> bool:
+        """Return if every figure of this class can be had, and an attacker who knows just this was met: else it would be a lower one's."""
+        return any(self.table.columns[i].knowledge == self.knowledge for _, i in self.pairs) and not self.lost
+
+    @cached_property
+    def shares(self) -> Array:
+        """Return (pairs, slots) share of damaged episodes."""
+        return np.array([self._harm(name, i).mean(axis=-1) for name, i in self.pairs])
+
+    def _harm(self, name: str, i: int) -> Array:
+        return np.asarray(self.table.harm[name][self.table.defences.index(self.defence), i])
+
+    def at(self, slot: int, scenarios: list[str] | None = None) -> tuple[int, float]:
+        """Return (pair, damaged share) of the worst attack at a dose, in some scenarios or all; the first of equal ones."""
+        shares = self.shares[:, slot].copy()
+        if scenarios is not None:
+            shares[[name not in scenarios for name, _ in self.pairs]] = -1.0
+        worst = int(np.argmax(shares))
+        return worst, float(shares[worst])
+
+    def undamaged(self, pair: int, slot: int) -> float:
+        """Return the undamaged share of a pair, as a quotient of whole numbers."""
+        _, harm = self.harm(pair, slot)
+        return float((len(harm) - harm.sum()) / len(harm))
+
+    def named(self, pair: int) -> Data:
+        name, i = self.pairs[pair]
+        return {"scenario": name, "attack": self.table.columns[i].attack}
+
+    def harm(self, pair: int, slot: int) -> tuple[tuple[int, ...], Array]:
+        """Return seeds and damage (episodes,) of a pair."""
+        name, i = self.pairs[pair]
+        return self.table.seeds[name], self._harm(name, i)[slot]
+
+    def vague(self, pair: int, slot: int) -> bool:
+        """Return if nobody knows which episodes of a pair came to damage."""
+        name, i = self.pairs[pair]
+        return Key(name, slot, self.defence, self.table.columns[i]) in self.table.vague
+
+    def rows(self, pair: int, slot: int) -> list[Row]:
+        """Return the rows of a pair at a dose, by seed; none of those that a board alone knows of."""
+        name, i = self.pairs[pair]
+        return self.table.cells.get(Key(name, slot, self.defence, self.table.columns[i]), [])
+
+    def all_harm(self, slot: int) -> Harm:
+        """Return the damage of all pairs at a dose. Raises InputError for scenarios with other seeds: nothing would be paired."""
+        found = {self.table.seeds[name] for name, _ in self.pairs}
+        if len(found) != 1:
+            raise InputError(f"rows of {self.defence}: seeds", f"{len(found)} sets of them", "the same seeds in every scenario")
+        harm = np.stack([self._harm(name, i)[slot] for name, i in self.pairs])
+        if np.isnan(harm).any():
+            raise InputError(f"rows of {self.defence}", "attacks without full figures", "all episodes of every attack that counts")
+        return Harm(found.pop(), harm, self.at(slot)[0], np.array([self.vague(k, slot) for k in range(len(self.pairs))], bool))
+
+    def bounds(self, slot: int, scenarios: list[str] | None = None, sides: int = 1) -> tuple[float, float]:
+        """Return limits of the worst damaged share that hold together for all pairs: alpha over their number, and over the sides."""
+        chosen = [k for k, (name, _) in enumerate(self.pairs) if scenarios is None or name in scenarios]
+        n = np.array([len(self.table.seeds[self.pairs[k][0]]) for k in chosen])
+        hits = np.round(self.shares[chosen, slot] * n)
+        low, high = limits(hits, n, self.alpha / (len(self.pairs) * sides))
+        return float(low.max()), float(high.max())
+
+    def rate(self, slot: int) -> Data:
+        """Return the undamaged share against the worst, with its lower limit."""
+        pair, _ = self.at(slot)
+        return {
+            "dose": self.table.doses[slot], "knowledge": self.knowledge,
+            "undamaged": {"value": self.undamaged(pair, slot), "low": 1.0 - self.bounds(slot)[1]},
+            "worst": self.named(pair), "attacks": len({i for _, i in self.pairs}),
+        }  # fmt: skip
+
+    @cached_property
+    def numbers(self) -> list[int]:
+        """Return slots of doses that are numbers."""
+        return [slot for slot, dose in enumerate(self.table.doses) if dose is not None]
+
+    @cached_property
+    def _clean(self) -> list[tuple[str, Array]]:
+        """Return damage of the clean runs by scenario: dose 0, where the suite has none itself."""
+        if 0 in self.table.doses:
+            return []
+        found = ((name, self.table.clean.get((name, self.defence))) for name in self.table.scenarios)
+        return [(name, np.array([damaged(row, self.table.suite) for row in rows], np.float64)) for name, rows in found if rows is not None]
+
+    @cached_property
+    def points(self) -> list[Data]:
+        """Return the worst at each dose that is a number, dose 0 being no attack, with limits that hold together for all attacks."""
+        out = []
+        if self._clean:
+            hits, n = (np.array([f(x) for _, x in self._clean], np.float64) for f in (np.sum, len))
+            low, high = limits(hits, n, self.alpha / (2 * len(n)))
+            worst = int(np.argmax(hits / n))
+            out.append({
+                "dose": 0, "value": float(hits[worst] / n[worst]), "low": float(low.max()), "high": float(high.max()),
+                "scenario": self._clean[worst][0], "attack": "none",
+            })  # fmt: skip
+        for slot in self.numbers:
+            pair, share = self.at(slot)
+            low_, high_ = self.bounds(slot, sides=2)
+            out.append({"dose": self.table.doses[slot], "value": share, "low": low_, "high": high_, **self.named(pair)})
+        return out
+
+    def curve(self) -> Data:
+        """Return the dose-response of the worst, and its monotone regression."""
+        line = fitted(np.array([point["value"] for point in self.points])).tolist()
+        return {"defence": self.defence, "knowledge": self.knowledge, "points": self.points, "fitted": line}
+
+    def critical(self) -> Data | None:
+        """Return the critical dose with its interval. None where no dose is a number.
+
+        The interval is where the lower and the upper limits cross that hold together for all pairs and doses. A bootstrap of the worst
+        would not cover: the largest of many shares is biased upwards, and that of a resample once more (decision record 23). Values are
+        null beyond the largest dose; the smallest dose is given for any up to it, and 0 for damage that needs no attack.
+        """
+        if not self.numbers:
+            return None
+        doses = np.array([self.table.doses[slot] for slot in self.numbers], np.float64)
+        first = len(self.points) - len(doses)  # below the smallest dose nothing was played: a line down to no attack would be a guess
+        line = fitted(np.array([point["value"] for point in self.points]))
+        low, high = np.array([self.bounds(slot, sides=2 * len(doses)) for slot in self.numbers]).T
+        found = {
+            "value": critical_dose(doses, line[first:], CRITICAL),
+            "low": critical_dose(doses, np.minimum.accumulate(high[::-1])[::-1], CRITICAL),  # damage only rises with the dose
+            "high": critical_dose(doses, np.maximum.accumulate(low), CRITICAL),
+        }
+        if line[:first].max(initial=0.0) > CRITICAL:
+            found = dict.fromkeys(found, 0.0)
+        at = next((point for point in self.points if point["value"] > CRITICAL), self.points[-1])
+        found |= {"low": min(found["low"], found["value"]), "high": max(found["high"], found["value"])}  # the regression may leave them
+        return {key: x if math.isfinite(x) else None for key, x in found.items()} | {
+            "worst": {"scenario": at["scenario"], "attack": at["attack"]}
+        }

@@ -1,0 +1,130 @@
+"""Shared parts of commands: options, progress, tables, and results for people, or with --json for machines."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import secrets
+import sys
+from collections.abc import Callable, Container, Iterable, Sequence
+from contextlib import AbstractContextManager
+from typing import Any, TypeAlias
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from tailgate.base.errors import InputError
+from tailgate.base.progress import Update, console, progress
+from tailgate.core.schema import scalar
+
+Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"  # that a command is added to
+SHOWN = 20  # lines of one kind that are listed, at most
+MORE = "; --json lists them all"
+OPTIONS: dict[str, dict[str, Any]] = {  # that several commands have in the same words
+    "suite": {"metavar": "SUITE", "help": "suite by name or YAML file"},
+    "policies": {"nargs": "+", "metavar": "POLICY", "help": "JSON file of an exported policy, or zoo:name=NAME"},
+    "overrides": {"nargs": "*", "metavar": "key=value", "help": "change a field of the configuration"},
+    "--suite": {"metavar": "NAME", "help": "suite by name or YAML file (default: quick-v0; with --scenario at the scenario's own dose)"},
+    "--defence": {"action": "append", "metavar": "NAME", "help": "a defence instead of the suite's (repeatable)"},
+    "--attack": {"action": "append", "metavar": "NAME", "help": "an attack instead of the suite's (repeatable)"},
+    "--scenario": {"action": "append", "metavar": "NAME", "help": "a scenario instead of the suite's (repeatable)"},
+    "--dose": {"action": "append", "metavar": "STEPS", "help": "attack budget; none: the scenario's own (repeatable)"},
+    "--threat": {"action": "append", "metavar": "key=value", "default": [], "help": "change the threat model (repeatable)"},
+    "--purpose": {"default": "report", "help": "which seeds: train, tune, calibrate, select or report (default)"},
+    "--outcome": {"metavar": "METRIC", "help": "metric that is counted (default: the training's)"},
+    "--workers": {"type": int, "default": 1, "metavar": "N", "help": "processes (default 1); changes no result"},
+    "--sample-seed": {"type": int, "metavar": "N", "help": "which ones (default: a new secret each time; the report names it)"},
+    "--out": {"required": True, "metavar": "DIR", "help": "folder of the boards"},
+    "--title": {"help": "title of the page"},
+    "--no-replays": {"action": "store_true", "help": "leave out the replays of the worst episodes"},
+    "--json": {"action": "store_true", "help": "print the report as JSON"},
+}
+
+
+def add_options(command: argparse.ArgumentParser, *names: str) -> None:
+    """Add shared options to a command."""
+    for name in names:
+        command.add_argument(name, **OPTIONS[name])
+
+
+def sample_seed(options: argparse.Namespace) -> int:
+    """Return the seed of a sample: a new secret unless given, since who could foresee the sample would forge all else."""
+    return secrets.randbits(32) if options.sample_seed is None else int(options.sample_seed)
+
+
+def drawn_by(report: dict[str, Any]) -> str:
+    """Return the seed of a report's sample, in words; empty where all was asked for."""
+    return "" if report["sample"] is None else f", drawn by the seed {report['sample_seed']}"
+
+
+def own_classes() -> None:
+    """Look for module:Class in the working directory, as `python -m` does."""
+    sys.path.insert(0, "")
+
+
+def values(option: str, texts: Iterable[str], example: str = "") -> dict[str, Any]:
+    """Return what a repeatable option of key=value gives. Raises InputError for a text without `=`."""
+    out = {}
+    for text in texts:
+        key, sep, value = text.partition("=")
+        if not sep:
+            raise InputError(option, text, f"key=value{example}")
+        out[key] = scalar(value)
+    return out
+
+
+def threat_of(options: argparse.Namespace) -> dict[str, Any]:
+    """Return the changes of a threat model that --threat gives."""
+    return values("--threat", options.threat, ", for example fdi_bound=10")
+
+
+def working() -> AbstractContextManager[Update]:
+    """Show progress on standard error."""
+    return progress(Console(stderr=True))
+
+
+def counted(update: Update, label: str, of: str = "cells") -> Callable[[int, int], None]:
+    """Return a progress that counts under a label."""
+    return lambda done, total: update(label, done, total, f"{done} of {total} {of}")
+
+
+def tell(text: str) -> None:
+    """Print a line for people on standard error."""
+    print(f"tailgate: {text}", file=sys.stderr)
+
+
+def print_json(data: object) -> None:
+    """Print data as JSON."""
+    print(json.dumps(data, indent=1, allow_nan=False))
+
+
+def show(options: argparse.Namespace, data: Any, tables: Callable[[Any], None]) -> None:
+    """Print data as JSON with --json, else as tables."""
+    (print_json if options.json else tables)(data)
+
+
+def table(
+    columns: Sequence[str], rows: Iterable[Sequence[str]], title: str | None = None, caption: str | None = None, *,
+    numbers: Container[int] = (),
+) -> None:  # fmt: skip
+    """Print a table of texts. numbers: the columns that are set to the right."""
+    made = Table(title=title and escape(title), caption=caption and escape(caption))
+    for i, heading in enumerate(columns):
+        made.add_column(escape(heading), overflow="fold", justify="right" if i in numbers else "left")
+    for row in rows:
+        made.add_row(*map(escape, row))
+    console().print(made)
+
+
+def say(text: str, soft_wrap: bool = False) -> None:
+    """Print a line on standard output, as it is."""
+    console().print(text, markup=False, highlight=False, soft_wrap=soft_wrap)
+
+
+def say_most(lines: Sequence[str], more: str = MORE, soft_wrap: bool = False) -> None:
+    """Print the first lines, and how many there are beyond."""
+    for line in lines[:SHOWN]:
+        say(line, soft_wrap)
+    if len(lines) > SHOWN:
+        say(f"and {len(lines) - SHOWN} more{more}")

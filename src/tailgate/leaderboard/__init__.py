@@ -1,1 +1,0 @@
-"""The static leaderboard: rows in, one HTML page out."""
