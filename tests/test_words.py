@@ -10,7 +10,7 @@ import pytest
 
 SOURCE = Path(__file__).parents[1] / "src/tailgate"
 DONE = ("*.py", "base/*.py", "engine/*.py", "play/*.py", "evaluation/*.py", "sandbox/*.py", "replay/*.py")  # grows room by room
-LATER = {"evaluation/verify.py"}
+LATER = {"evaluation/verify.py", "moved.py"}  # moved.py holds earlier names
 OPENINGS = re.compile(r"(What|Of|Whose|Whether|Whoever)\b")
 DIALECT = re.compile(r"\b(beside|anew|so many|whoever|told|stands|of (its|his|their) own)\b", re.IGNORECASE)
 WORD = re.compile(r"(?<!\S)[A-Za-z'`-]+[,;:.]*(?!\S)")  # parts of formulas do not count

@@ -46,11 +46,12 @@ def mcnemar(only_a: int, only_b: int) -> float:
 
 
 def outdone(a: Harm, b: Harm, least: bool = False) -> float:
-    """Return p of the null hypothesis that some attack harms b at least as much as a's worst harms a: small where a is surely weaker.
+    """Return p of the null hypothesis that some attack harms b at least as much as a's worst harms a.
 
-    a's worst attack is tested against every attack of b, one-sided, and the largest p counts (an intersection-union test, which needs no
-    correction). That a's worst was chosen on these very episodes costs the factor of its attacks (Bonferroni). Where nobody knows which
-    episodes came to damage, p is the largest that their numbers allow, or the least, and 1 where b came to damage as often.
+    a's worst attack is tested against every attack of b, one-sided. The largest p counts: an intersection-union test needs no correction.
+    a's worst was chosen on these very episodes, which costs the factor of its attacks (Bonferroni).
+    It is small where a is surely weaker. Where nobody knows which episodes were damaged, p is the largest that their numbers allow,
+    or the least; it is 1 where b has as many.
     """
     from scipy.stats import binom
 
