@@ -4,7 +4,7 @@ import csv
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -62,13 +62,13 @@ class Constant:
 
     value: Accel = param(-0.108, "acceleration [m/s^2]")
 
-    def prepare(self, dt: float) -> Any:
+    def prepare(self, dt: float) -> None:
         return None
 
-    def start(self, plan: Any, draws: Draws) -> Any:
+    def start(self, plan: None, draws: Draws) -> None:
         return None
 
-    def accel(self, plan: Any, state: Any, k: Array, speed: Array, draws: Draws) -> tuple[Any, Array]:
+    def accel(self, plan: None, state: None, k: Array, speed: Array, draws: Draws) -> tuple[None, Array]:
         return None, np.full(len(k), self.value)
 
 

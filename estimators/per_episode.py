@@ -88,15 +88,17 @@ class EpisodeByEpisode:
         x, score = num.zeros((batch, agents, plan.models[0].states)), np.zeros((batch, agents))
         filters, memory = np.empty((batch, agents), object), _Memory(batch, agents)
         for b, i in np.ndindex(batch, agents):
-            if state.filters is None:
-                played: Any = plan.players[i]
-                played.recall(tuple(_own(array[b, i]) for array in state.memory))
+            played: EpisodeFilter
+            if state.filters is not None:
+                copied: EpisodeFilter = copy.deepcopy(state.filters[b, i], _shared(plan.models[i]))  # type: ignore[assignment]
+                played = copied
             else:
-                played = copy.deepcopy(state.filters[b, i], _shared(plan.models[i]))
+                played = plan.players[i]
+                played.recall(tuple(_own(array[b, i]) for array in state.memory))
             filters[b, i] = played
             x[b, i], score[b, i] = played.step(_own(received.y[b, i]), _own(received.valid[b, i]), _own(known_u[b, i]))
             if state.filters is None:
-                memory.put(b, i, played.memory())
+                memory.put(b, i, plan.players[i].memory())
         quiet = np.zeros_like(score, bool)
         state = EpisodeState(None if state.filters is None else filters, memory.arrays)
         return state, Estimate(x, score, quiet, num.full(score.shape, Mode.NORMAL, np.int8), ~quiet)
@@ -145,14 +147,14 @@ def factory_of(name: str) -> Callable[[], Any]:
     """What module:name names. Raises InputError where that is nothing to call."""
     module, _, path = name.partition(":")
     try:
-        found: Any = importlib.import_module(module)
+        found: object = importlib.import_module(module)
         for part in path.split("."):
             found = getattr(found, part)
     except (ImportError, AttributeError, ValueError) as error:
         raise InputError("per_episode", name, f"module:name of a class or function that can be imported ({error})") from None
     if not callable(found):
         raise InputError("per_episode", name, "a class or a function")
-    return found  # type: ignore[no-any-return]
+    return found
 
 
 def per_episode(factory: Callable[[], EpisodeFilter] | str) -> PerEpisode:

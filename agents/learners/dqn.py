@@ -13,6 +13,7 @@ import numpy as np
 
 try:
     from stable_baselines3 import DQN
+    from stable_baselines3.common.noise import ActionNoise
 except ImportError as error:
     raise ImportError("torch or Stable-Baselines3 is missing: pip install 'tailgate[train]'") from error
 
@@ -42,7 +43,7 @@ class _DQN(DQN):
     explore: int
     epsilon: float
 
-    def _sample_action(self, learning_starts: int, action_noise: Any = None, n_envs: int = 1) -> tuple[Array, Array]:
+    def _sample_action(self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1) -> tuple[Array, Array]:
         action = self.explorer.actions(n_envs)
         if self.num_timesteps >= learning_starts:
             rate = max(self.epsilon, 1.0 - (1.0 - self.epsilon) * self.num_timesteps / self.explore)

@@ -76,7 +76,7 @@ class Learner(StableLearner):
 
     def imitate(self, shown: Demonstration) -> None:
         """Fit the policy to the actions shown and the critic to their returns (behaviour cloning), by its own optimiser's method."""
-        policy: Any = self.model.policy
+        policy = self.model.policy
         size = len(shown.action)
         seen, action = torch.as_tensor(shown.observation), torch.as_tensor(shown.action)
         gained = torch.as_tensor(shown.gained, dtype=torch.float32)
@@ -97,6 +97,6 @@ class Learner(StableLearner):
         return self.config.envs * self.config.rollout
 
     def network(self) -> Network:
-        policy: Any = self.model.policy
+        policy = self.model.policy
         log_std = None if self.seat.action.discrete else policy.log_std.detach().numpy().astype(np.float64)
         return Network(*perceptron(policy.mlp_extractor.policy_net, policy.action_net), log_std)

@@ -14,7 +14,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 
@@ -22,6 +22,7 @@ try:
     import torch
     from stable_baselines3.common.callbacks import BaseCallback
     from stable_baselines3.common.logger import Logger
+    from stable_baselines3.common.noise import ActionNoise
     from stable_baselines3.common.save_util import recursive_getattr
 except ImportError as error:
     raise ImportError("torch or Stable-Baselines3 is missing: pip install 'tailgate[train]'") from error
@@ -46,6 +47,17 @@ SPOILT = ("found invalid values", "probability tensor contains", "without overfl
 COUNTERS = ("_n_updates", "_n_calls", "_episode_num")  # of the algorithms, those that they have
 
 
+class StableConfig(Protocol):
+    """The hyper-parameters that every learner has."""
+
+    @property
+    def envs(self) -> int: ...
+    @property
+    def learning_rate(self) -> float: ...
+    def check(self) -> None:
+        """Raise InputError when the fields do not fit each other."""
+
+
 class StableLearner:
     """One training run of one seed. A subclass makes `model` and says what its policy is."""
 
@@ -54,7 +66,7 @@ class StableLearner:
     packages: ClassVar[tuple[str, ...]] = ("torch", "stable-baselines3")
     traits: ClassVar[dict[str, bool]] = {}  # what the policy's header says besides
 
-    def __init__(self, seed: int, gamma: float, config: Any, environment: dict[str, Any], tensorboard: Path | None = None) -> None:
+    def __init__(self, seed: int, gamma: float, config: StableConfig, environment: dict[str, Any], tensorboard: Path | None = None) -> None:
         torch.set_num_threads(1)  # more threads gain nothing on networks of this size
         config.check()
         if config.envs > SEED_STRIDE:
@@ -223,9 +235,10 @@ class StableLearner:
     def _restore_batch(self, tensors: dict[str, Any]) -> None:
         batch, model = self.env.batch, self.model
 
-        def restored(name: str, like: Any) -> Any:
-            raw = tensors[name].numpy()
-            return raw.view(like.dtype).reshape(like.shape).copy() if like.dtype.kind == "u" else raw.reshape(like.shape).copy()
+        def restored(name: str, like: Array) -> Array:
+            raw: Array = tensors[name].numpy()
+            raw = raw.view(like.dtype) if like.dtype.kind == "u" else raw
+            return raw.reshape(like.shape).copy()
 
         batch.episodes.put({name: restored(f"batch.{name}", value) for name, value in batch.episodes.held().items()})
         self.env._returns[:] = tensors["env.returns"].numpy()
@@ -271,14 +284,14 @@ class _Reporter(BaseCallback):
         self.report(Progress(self.num_timesteps, crash, reward))
 
 
-def perceptron(*layers: Any) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
+def perceptron(*layers: torch.nn.Module) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
     """Weights (i, o) and biases (o,) in float64 of the linear layers among these modules and the modules inside of them."""
     flat = [m for layer in layers for m in layer.modules() if isinstance(m, torch.nn.Linear)]
     weights = tuple(layer.weight.detach().numpy().T.astype(np.float64) for layer in flat)
     return weights, tuple(layer.bias.detach().numpy().astype(np.float64) for layer in flat)
 
 
-def rest_first(layer: Any, probability: float, discrete: bool, log_std: float) -> None:
+def rest_first(layer: torch.nn.Linear, probability: float, discrete: bool, log_std: float) -> None:
     """Set the first bias of an output layer so that a fresh policy attacks with this probability in a step."""
     p = min(max(probability, 1e-6), 1.0 - 1e-6)
     with torch.no_grad():
@@ -335,7 +348,7 @@ class Exploring:
 
     explorer: Explorer
 
-    def _sample_action(self, learning_starts: int, action_noise: Any = None, n_envs: int = 1) -> tuple[Array, Array]:
+    def _sample_action(self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1) -> tuple[Array, Array]:
         algorithm: Any = super()
         if self.num_timesteps >= learning_starts:  # type: ignore[attr-defined]
             return algorithm._sample_action(learning_starts, action_noise, n_envs)  # type: ignore[no-any-return]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -46,7 +46,7 @@ def demonstrate(seat: Seat, attack: Attack, seed: int, episodes: int) -> Demonst
     loop = seat.loop
     keys = draws.keys("train", range(seed * SEED_STRIDE + FIRST, seed * SEED_STRIDE + FIRST + episodes))
     state, plan = loop.start(keys), attack.prepare(loop.brief)
-    memory: Any = attack.start(plan, episodes, keys.at(Role.ATTACK, np.zeros(episodes, np.int64)))
+    memory = attack.start(plan, episodes, keys.at(Role.ATTACK, np.zeros(episodes, np.int64)))
     tally, seen = seat.begin(state), None
     observations, actions, rewards, live = [], [], [], []
     for _ in range(seat.decisions):

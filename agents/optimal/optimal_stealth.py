@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import product
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -93,7 +93,7 @@ class OptimalStealth(Script):
         return plan.brief.command(on & (view.k >= aim.begin) & found[:, 0], Kind.FDI, target, full)
 
 
-def farthest_inside(r: Array, W: Array, gain: Array, gate: Any, wires: Array, bound: float) -> tuple[Array, Array]:
+def farthest_inside(r: Array, W: Array, gain: Array, gate: Array | float, wires: Array, bound: float) -> tuple[Array, Array]:
     """a (B, N, q), and whether there is one (B, N): the largest gain' a with (r + a)' W (r + a) <= gate and |a| <= bound.
 
     a is 0 off `wires`; r, gain (B, N, q), W (B, N, q, q). A wire of a solution is at its bound or free, and the free ones are in closed
@@ -120,7 +120,7 @@ def farthest_inside(r: Array, W: Array, gain: Array, gate: Any, wires: Array, bo
     return best, found
 
 
-def _free_inside(r: Array, W: Array, gain: Array, gate: Any, free: Array) -> tuple[Array, Array]:
+def _free_inside(r: Array, W: Array, gain: Array, gate: Array | float, free: Array) -> tuple[Array, Array]:
     """As `farthest_inside`, without bounds."""
     a = num.zeros(r.shape)
     if not len(free):

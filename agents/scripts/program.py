@@ -6,7 +6,7 @@ import dataclasses
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from tailgate.base.pytree import map_leaves
 from tailgate.core import AIRED, Array, Command, Count, Kind, PositiveCount, Probability, View, no_command, param
 from tailgate.core.draws import Draws
 from tailgate.core.kinds import EFFECTS, KindName
+from tailgate.core.quantities import Unchecked
 from tailgate.core.registry import register
 from tailgate.core.scenario import config_path
 from tailgate.core.schema import build, read_yaml
@@ -35,8 +36,8 @@ class Phase:
     kind: KindName = param("fdi", "what is done; the threat model has to grant it")
     targets: tuple[str, ...] = param((), "wires to attack; empty: those that `value` names, or all that are granted")
     agents: tuple[Count, ...] = param((), "agents to attack, by number from 0; empty: all that are granted")
-    value: Any = param(None, "law of the values, for the kinds that have one: of one wire or of each")
-    trigger: Any = param("time", "when it is on: a trigger's name, or a mapping with name and parameters")
+    value: Annotated[Law | None, Unchecked] = param(None, "law of the values, for the kinds that have one: of one wire or of each")
+    trigger: Annotated[Trigger, Unchecked] = param("time", "when it is on: a trigger's name, or a mapping with name and parameters")
     probability: Probability | dict[str, Probability] = param(
         1.0, "probability of a hit per step and wire: one number, or one by name for each wire [-]"
     )
@@ -72,7 +73,7 @@ def read_program(path: Path) -> Sheet:
     return Sheet(phases, sheet.about, sheet.repeat)
 
 
-def _phase(data: Any, where: str) -> Phase:
+def _phase(data: object, where: str) -> Phase:
     if not isinstance(data, dict):
         raise InputError(where, data, "a mapping of fields")
     phase = build(Phase, data, where)

@@ -41,7 +41,7 @@ class ScriptPlan(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Script:
+class Timed:
     """When: a window that opens at step `start`, or at the first later step at which a condition of the road holds."""
 
     targets: tuple[str, ...] = param((), "wires to attack; empty: all that are granted")
@@ -76,15 +76,13 @@ class Script:
     def prepare(self, brief: Brief) -> ScriptPlan:
         return self.plan(brief, chosen(brief, self.targets, brief.granted, self.agents))
 
-    def plan(self, brief: Brief, target: Array, extra: Any = None) -> ScriptPlan:
+    def plan(self, brief: Brief, target: Array, extra: object = None) -> ScriptPlan:
         """A plan, where the threat model shows what the trigger looks at."""
         self.when.prepare(brief)
         return ScriptPlan(brief, target, extra)
 
-    def start(self, plan: ScriptPlan, batch: int, draws: Draws) -> TriggerState:
-        return idle(batch, plan.brief.model.agents)
-
-    def decide(self, plan: ScriptPlan, state: TriggerState, view: View, draws: Draws) -> tuple[TriggerState, Command]:
+    def timed(self, plan: ScriptPlan, state: TriggerState, view: View, draws: Draws) -> tuple[TriggerState, Command]:
+        """Return the next state of the trigger, and the command of this step."""
         timing = self.when.prepare(plan.brief)
         after, on, count = self.when.step(timing, state, view, draws)
         on = on & view.allowed  # a script that knows its budget does not ask for more
@@ -100,6 +98,17 @@ class Script:
     def command(self, plan: ScriptPlan, on: Array, count: Array, view: View, draws: Draws) -> Command:
         """What is sent in the rows `on` (B,), `count` (B,) steps after the window opened."""
         raise TypeError(f"{type(self).__name__} must define command()")
+
+
+@dataclass(frozen=True)
+class Script(Timed):
+    """A timed attack that remembers nothing but its trigger."""
+
+    def start(self, plan: ScriptPlan, batch: int, draws: Draws) -> TriggerState:
+        return idle(batch, plan.brief.model.agents)
+
+    def decide(self, plan: ScriptPlan, state: TriggerState, view: View, draws: Draws) -> tuple[TriggerState, Command]:
+        return self.timed(plan, state, view, draws)
 
 
 def inject(plan: ScriptPlan, on: Array, law: Law, count: Array, draws: Draws, tag: int = 0, hit: Array | None = None) -> Command:
@@ -260,7 +269,7 @@ class InjectSparse(Script):
     probability: Probability | tuple[Probability, ...] = param(
         0.2, "probability of a hit per step: one number, or one for each of `targets` in their order [-]"
     )
-    value: Any = param(-4.0, f"law of the values: a number, or one of {', '.join(LAWS)}; value.mean=... and so on set its parameters")
+    value: object = param(-4.0, f"law of the values: a number, or one of {', '.join(LAWS)}; value.mean=... and so on set its parameters")
 
     def __post_init__(self) -> None:
         _ = self.law  # a wrong law shall fail here

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, NamedTuple, TypeVar
 
 import numpy as np
 from pydantic import Field
@@ -286,7 +286,10 @@ TRIGGERS: dict[str, type[Trigger]] = {
 }  # fmt: skip
 
 
-def part(known: Mapping[str, type[Any]], data: Any, where: str) -> Any:
+T = TypeVar("T")
+
+
+def part(known: Mapping[str, type[T]], data: object, where: str) -> T:
     """One of the `known` classes from data: a name, or a mapping with `name` and parameters; InputErrors name `where` and the field."""
     if isinstance(data, str):
         data = {"name": data}

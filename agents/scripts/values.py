@@ -125,7 +125,7 @@ class PerWire:
         return out
 
 
-def law_of(data: Any, where: str) -> Law:
+def law_of(data: object, where: str) -> Law:
     """A law from data: a number, a name, a mapping with `name` and parameters, or a mapping from wires to any of these."""
     if isinstance(data, (int, float)) and not isinstance(data, bool):
         data = {"name": "constant", "value": data}

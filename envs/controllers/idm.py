@@ -4,7 +4,7 @@
 """
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -90,20 +90,20 @@ class IntelligentDriver:
     decel: Rate = param(2.0, "comfortable deceleration b [m/s^2]")
     brake: Rate = param(5.0, "largest deceleration [m/s^2]")
 
-    def prepare(self, model: Model) -> Any:
+    def prepare(self, model: Model) -> None:
         check_radar_car(model, "controller idm")
 
-    def start(self, plan: Any, batch: int) -> None:
+    def start(self, plan: None, batch: int) -> None:
         return None
 
-    def step(self, plan: Any, state: None, estimate: Estimate, v2v: Array, odometry: Array) -> tuple[None, Array]:
+    def step(self, plan: None, state: None, estimate: Estimate, v2v: Array, odometry: Array) -> tuple[None, Array]:
         """estimate.x (B, N, 4) = [gap, relative speed, ...] and the own odometry to the acceleration (B, N, 1) [m/s^2]."""
         gap, v, mode = estimate.x[..., GAP], odometry[..., 1], estimate.mode
         lead, headway = v + estimate.x[..., RELATIVE_SPEED], widened(self.headway, mode)
         a = idm(gap, v, lead, self.set_speed, headway, self.standstill, self.accel, self.decel)
         return None, limited(obeyed(a, mode), -self.brake, self.accel)[..., None]
 
-    def held(self, plan: Any, state: None, batch: int) -> Array:
+    def held(self, plan: None, state: None, batch: int) -> Array:
         return np.zeros((batch, 1, 0))
 
     def desired_gap(self, speed: Array) -> Array:

@@ -1,7 +1,6 @@
 """What a car with a radar estimates, and the controllers that drive it."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -74,20 +73,20 @@ class RadarCruise:
     def __post_init__(self) -> None:
         check_order("controller acc_radar.accel_min, accel_max", (self.accel_min, self.accel_max))
 
-    def prepare(self, model: Model) -> Any:
+    def prepare(self, model: Model) -> None:
         check_radar_car(model, "controller acc_radar")
 
-    def start(self, plan: Any, batch: int) -> None:
+    def start(self, plan: None, batch: int) -> None:
         return None
 
-    def step(self, plan: Any, state: None, estimate: Estimate, v2v: Array, odometry: Array) -> tuple[None, Array]:
+    def step(self, plan: None, state: None, estimate: Estimate, v2v: Array, odometry: Array) -> tuple[None, Array]:
         """estimate.x (B, N, 4) = [d, dv, ...] and odometry (B, N, 2) = [x_F, v_F] to the command a_des (B, N, 1) [m/s^2]."""
         d, dv, v = estimate.x[..., GAP], estimate.x[..., RELATIVE_SPEED], odometry[..., 1]
         headway = widened(self.headway, estimate.mode)
         a = (wanted(d, dv, v, headway, self.standstill, self.g, self.tau, self.gain, self.set_speed) - v) / self.sample
         return None, limited(obeyed(a, estimate.mode), self.accel_min, self.accel_max)[..., None]
 
-    def held(self, plan: Any, state: None, batch: int) -> Array:
+    def held(self, plan: None, state: None, batch: int) -> Array:
         return np.zeros((batch, 1, 0))
 
     def desired_gap(self, speed: Array) -> Array:

@@ -11,7 +11,7 @@ import numpy as np
 
 from tailgate.base import sizes
 from tailgate.base.errors import InputError, UnknownArgument, unknown
-from tailgate.core import Array, Command, Frame, Kind, View
+from tailgate.core import Array, Command, Defence, Frame, Kind, View
 from tailgate.core.loop import Loop, LoopState
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import load_scenario
@@ -89,7 +89,9 @@ class Seat:
         return sizes.ENVIRONMENT + 8 * model.agents * model.states**2 * 4 + 8 * len(self.observation.names)
 
     @classmethod
-    def make(cls, scenario: Any = None, defence: Any = None, threat: dict[str, Any] | None = None, **options: Any) -> Seat:
+    def make(
+        cls, scenario: str | None = None, defence: str | Defence | None = None, threat: dict[str, Any] | None = None, **options: Any
+    ) -> Seat:
         """scenario: name or YAML file. defence: name (`chi2_kf:eta=15`) or object. threat: changes of the scenario's threat model.
 
         options: the fields of ActionSpec and Reward, `knowledge`, and `frames`: how many decisions the observation shows at once. Scenario

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from tailgate.base import sizes
 from tailgate.base.errors import InputError, unknown
@@ -200,7 +201,7 @@ class TracedEpisodes:
         brought = self._rows.brought
         return Outcome(*(brought[name] for name in Outcome._fields))
 
-    def decide_alone(self, action: Any) -> tuple[Any, ...]:
+    def decide_alone(self, action: ArrayLike) -> tuple[Any, ...]:
         return self._rows.decide_alone(action)
 
     def again_alone(self) -> tuple[Any, ...]:

@@ -12,10 +12,11 @@ from typing import Any, Literal, NamedTuple
 
 import gymnasium
 import numpy as np
+from numpy.typing import ArrayLike
 
 from tailgate.base.errors import InputError, unknown
 from tailgate.base.pytree import put_rows
-from tailgate.core import Array, Attack, Command, Frame, NonNegative, View, draws, param
+from tailgate.core import Array, Attack, Command, Defence, Frame, NonNegative, View, draws, param
 from tailgate.core.draws import Keys, Role
 from tailgate.core.loop import LoopState
 from tailgate.core.registry import Spec, entry_for
@@ -65,7 +66,7 @@ class Rival:
         return command
 
 
-def steered(defence: Any, menu: Menu) -> Steered:
+def steered(defence: str | Defence, menu: Menu) -> Steered:
     """The defence with its knobs in the defender's hands: a registered one by text, or one that is steered already."""
     if isinstance(defence, str):
         Spec("defence", defence).refuse_imports("duel")
@@ -93,8 +94,8 @@ class Duel:
 
     @classmethod
     def make(
-        cls, scenario: Any = None, defence: Any = None, menu: dict[str, Any] | Menu | None = None, defender_action: Any = "menu",
-        **arguments: Any,
+        cls, scenario: str | None = None, defence: str | Defence | None = None, menu: dict[str, Any] | Menu | None = None,
+        defender_action: Literal["menu", "box"] = "menu", **arguments: Any,
     ) -> Duel:  # fmt: skip
         """defence: whose knobs are turned. menu: their settings. defender_action: menu (a number) or box ([-1, 1] per knob).
 
@@ -111,7 +112,7 @@ class Duel:
         guard = steered(defence, dataclasses.replace(menu, interval=interval))
         return cls(Seat.make(scenario=scenario, defence=guard, **arguments), guard, payoff, defender_action)
 
-    def card(self, **more: Any) -> dict[str, Any]:
+    def card(self, **more: object) -> dict[str, Any]:
         """JSON data that names this game completely: the seat's card, the defender's side and what is added, with a hash of all."""
         side = as_data({"payoff": self.payoff, "defender_action": self.action, **more})
         return {"seat": self.seat.card(), **side, "hash": digest({"seat": self.seat.config, **side})}
@@ -205,7 +206,7 @@ class Duel:
         return {"step": state.loop.k[0], **knobs}
 
 
-def checked(space: Any, action: Any, who: str) -> Array:
+def checked(space: gymnasium.Space[Any], action: ArrayLike, who: str) -> Array:
     """One row's action as a batch of one. Raises InputError for one outside of its space."""
     given = np.asarray(action)
     fits = given.shape == space.shape
@@ -218,7 +219,7 @@ def checked(space: Any, action: Any, who: str) -> Array:
     return given[None]
 
 
-def next_game(duel: Duel, held: DuelState | None, seed: int | None, rng: Any) -> DuelState:
+def next_game(duel: Duel, held: DuelState | None, seed: int | None, rng: np.random.Generator) -> DuelState:
     """A batch of one: the game of `seed`, or without one the next of the episodes that were running."""
     if held is not None and seed is None:
         return duel.restart(held, np.ones(1, bool))
@@ -262,7 +263,7 @@ class DefenderEnv(Specified, gymnasium.Env[Array, Any]):
         self.rival, self.over = Rival(self.attack, self.duel.seat, self.state.loop.keys), np.zeros(1, bool)
         return self.duel.defender_sees(self.state)[0].copy(), self.duel.told(self.state)
 
-    def step(self, action: Any) -> tuple[Array, float, bool, bool, dict[str, Any]]:
+    def step(self, action: ArrayLike) -> tuple[Array, float, bool, bool, dict[str, Any]]:
         if self.state is None or self.rival is None or self.over.any():
             raise InputError("step", "no episode", "reset() first")
         self.state, outcome, paid, _ = self.duel.step(self.state, self.rival, checked(self.action_space, action, "defender"), self.over)

@@ -13,6 +13,7 @@ import gymnasium
 import numpy as np
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
+from numpy.typing import ArrayLike
 
 from tailgate.base import sizes
 from tailgate.base.errors import InputError, unknown
@@ -289,21 +290,21 @@ class AdversaryEnv(Specified, gymnasium.Env[Array, Any]):
         super().reset(seed=seed)
         if not self.batch.begun and seed is None:
             seed = int(self.np_random.integers(2**31))
-        played: Any = self.batch.episodes
         self._over, self._moves = False, self._moves + 1
         if seed is None and self._alone is not None:
             _, damage, step, _, _, illegal, collided, rear, allowed, seen, mask = self._alone.again_alone()
-            if played.shadow is not None:
-                played.shadow.add(Begun(np.ones(1, bool), None, True))
+            if self._alone.shadow is not None:
+                self._alone.shadow.add(Begun(np.ones(1, bool), None, True))
             return seen, self._told(illegal, collided, rear, allowed, step, damage, mask)
         observation, info = self.batch.reset(seed=seed)
         if self._direct:
-            self._alone = played
+            assert isinstance(self.batch.episodes, TracedEpisodes)
+            self._alone = self.batch.episodes
         if self.render_mode == "human":
             self.render()
         return observation[0], self.row(info)
 
-    def step(self, action: Any) -> tuple[Array, float, bool, bool, dict[str, Any]]:
+    def step(self, action: ArrayLike) -> tuple[Array, float, bool, bool, dict[str, Any]]:
         if self._alone is None:
             return self._step_as_batch(action)
         if self._over:
@@ -326,7 +327,7 @@ class AdversaryEnv(Specified, gymnasium.Env[Array, Any]):
             info["action_mask"] = mask
         return info
 
-    def _step_as_batch(self, action: Any) -> tuple[Array, float, bool, bool, dict[str, Any]]:
+    def _step_as_batch(self, action: ArrayLike) -> tuple[Array, float, bool, bool, dict[str, Any]]:
         observation, reward, terminated, truncated, info = self.batch.step(np.asarray(action)[None])
         self._moves += 1
         if self.render_mode == "human":

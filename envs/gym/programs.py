@@ -13,25 +13,36 @@ import copy
 import dataclasses
 from collections.abc import Callable
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypedDict
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from tailgate.base.pytree import leaves, map_leaves
 from tailgate.core import draws
 from tailgate.core.draws import Keys
 from tailgate.engine.agreement import ROWS, TRIED, Untraced, check_open, raised, same
+from tailgate.engine.array import Traced
 from tailgate.engine.operations import Array
 from tailgate.engine.parameters import lifted
 from tailgate.engine.program import Call, Program, State, Trace, traced
 from tailgate.engine.remembered import Remembered
 
 if TYPE_CHECKING:
-    from tailgate.envs.gym.attacker_mdp import Seat
+    from tailgate.core.loop import LoopState
+    from tailgate.envs.gym.attacker_mdp import Seat, Sums, Tally
 
 
 # what a step of a single row tells
 ALONE = ("reward", "damage", "k", "terminated", "truncated", "illegal", "collided", "rear_collided", "allowed")
+
+
+class Held(TypedDict, total=False):
+    """The state that is traced; it has sums only where a decision has several steps."""
+
+    loop: LoopState
+    tally: Tally
+    sums: Sums
 
 
 class SeatPrograms:
@@ -45,7 +56,7 @@ class SeatPrograms:
         for name, leaf in leaves(self.example).items():
             if leaf.dtype == object:
                 raise TypeError(f"state {name} holds objects")
-        state = self.example | ({"sums": seat.opened(self.example["tally"])} if _several(seat) else {})
+        state = self._opened(seat, self.example)
         flags = np.zeros(1, bool)
         action = np.zeros(1, np.int64) if seat.action.discrete else np.zeros((1, seat.action.size))
         decide = traced(self._decide, state, {"action": action, "over": flags, "again": flags})
@@ -69,37 +80,39 @@ class SeatPrograms:
         out.seat, out.loop, out.values = seat, seat.loop, values
         return out
 
-    def _decide(self, held: Any, given: Any) -> tuple[Any, Any]:
+    def _decide(self, held: Held, given: dict[str, Array]) -> tuple[Held, dict[str, Array]]:
         seat, over = self._lifted(held), given["over"]
         loop, tally, sums = held["loop"], held["tally"], held["sums"] if _several(seat) else seat.opened(held["tally"])
         loop, tally, sums, _ = seat.advanced(loop, tally, sums, given["action"], over)
         outcome = seat.closed(loop, tally, sums, over)
-        state = _renewed(seat, {"loop": loop, "tally": tally}, held["loop"].keys, given["again"])
+        state = _renewed(seat, Held(loop=loop, tally=tally), held["loop"].keys, given["again"])
         return self._opened(seat, state), outcome._asdict() | _shown(seat, state)
 
-    def _advance(self, held: Any, given: Any) -> tuple[Any, Any]:
+    def _advance(self, held: Held, given: dict[str, Array]) -> tuple[Held, dict[str, Array]]:
         seat = self._lifted(held)
-        *state, _ = seat.advanced(held["loop"], held["tally"], held["sums"], given["action"], given["over"])
-        return dict(zip(("loop", "tally", "sums"), state, strict=True)), {}
+        loop, tally, sums, _ = seat.advanced(held["loop"], held["tally"], held["sums"], given["action"], given["over"])
+        return Held(loop=loop, tally=tally, sums=sums), {}
 
-    def _begin(self, held: Any, given: Any) -> tuple[Any, Any]:
+    def _begin(self, held: Held, given: dict[str, Array]) -> tuple[Held, dict[str, Array]]:
         seat = self._lifted(held)
-        state = _renewed(seat, {"loop": held["loop"], "tally": held["tally"]}, held["loop"].keys, given["again"])
+        state = _renewed(seat, Held(loop=held["loop"], tally=held["tally"]), held["loop"].keys, given["again"])
         return self._opened(seat, state), _shown(seat, state)
 
-    def _opened(self, seat: Seat, state: Any) -> Any:
-        """With the sums of the next decision, where a decision has several steps."""
-        return state | {"sums": seat.opened(state["tally"])} if _several(seat) else state
+    def _opened(self, seat: Seat, state: Held) -> Held:
+        """Return the state with the sums of the next decision, where a decision has several steps."""
+        return Held(loop=state["loop"], tally=state["tally"], sums=seat.opened(state["tally"])) if _several(seat) else state
 
-    def _lifted(self, held: Any) -> Seat:
-        seat: Seat = lifted(held["loop"].k.graph, self.shown)
+    def _lifted(self, held: Held) -> Seat:
+        k = held["loop"].k
+        assert isinstance(k, Traced)
+        seat: Seat = lifted(k.graph, self.shown)
         return seat
 
 
-def _example(seat: Seat) -> dict[str, Any]:
-    """The state of an episode that begins."""
+def _example(seat: Seat) -> Held:
+    """Return the state of an episode that begins."""
     start = seat.loop.start(draws.keys("tune", [0]))
-    return {"loop": start, "tally": seat.begin(start)}
+    return Held(loop=start, tally=seat.begin(start))
 
 
 def _several(seat: Seat) -> bool:
@@ -134,14 +147,15 @@ def _after(trace: Trace, name: str) -> tuple[int, ...]:
     return (trace.large[name][1].id,) if name in trace.large else tuple(node.id for node in trace.state[name][1].flat)
 
 
-def _renewed(seat: Seat, state: Any, keys: Keys, again: Any) -> Any:
-    """The state with the next episode in the rows `again`."""
+def _renewed(seat: Seat, state: Held, keys: Keys, again: Array) -> Held:
+    """Return the state with the next episode in the rows `again`."""
     loop = seat.loop.start(Keys(keys.key, keys.episode + np.uint32(1)))
-    fresh = {"loop": loop, "tally": seat.begin(loop)}
-    return map_leaves(lambda old, new: np.where(again.reshape(len(again), *(1,) * (old.ndim - 1)), new, old), state, fresh)
+    fresh = Held(loop=loop, tally=seat.begin(loop))
+    out: Held = map_leaves(lambda old, new: np.where(again.reshape(len(again), *(1,) * (old.ndim - 1)), new, old), state, fresh)
+    return out
 
 
-def _shown(seat: Seat, state: Any) -> dict[str, Any]:
+def _shown(seat: Seat, state: Held) -> dict[str, Array]:
     """What is to be seen of a state, and what may be decided next."""
     view = seat.loop.sense(state["loop"])
     damage = np.min(view.scene.gap, axis=1) if seat.road else state["tally"].error
@@ -246,7 +260,7 @@ class Rows:
         given["action"][...], given["over"][...], given["again"][...] = actions, over, again
         self._play(self._decide)
 
-    def decide_alone(self, action: Any) -> tuple[Any, ...]:
+    def decide_alone(self, action: ArrayLike) -> tuple[Any, ...]:
         """The decision of a single row; -> what ALONE names, as Python's numbers, its observation and its mask."""
         call, advance, play, given, numbers, seen, mask = self._alone
         given[0] = action

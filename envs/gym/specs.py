@@ -26,7 +26,7 @@ def in_box(actions: Array) -> bool:
     return actions.dtype.kind in "fiu" and bool((np.abs(actions) <= 1.0 + ROUNDING).all())
 
 
-def check_options(options: Any, known: Iterable[str] = ()) -> None:
+def check_options(options: object, known: Iterable[str] = ()) -> None:
     """Raise InputError for options of reset() that nobody reads."""
     if options is None:
         return
@@ -45,7 +45,7 @@ def limit_of(name: str, given: int | None) -> int:
     return int(given or 0)
 
 
-def named(family: Family, value: Any, imports: bool = True) -> str:
+def named(family: Family, value: object, imports: bool = True) -> str:
     """The text from which another process makes the same object. Raises InputError where there is none."""
     cls, why = type(value), "its parameters are no plain data"
     try:
@@ -77,7 +77,7 @@ class TextSpec(EnvSpec):
         return EnvSpec(**plain, kwargs=kwargs).to_json()
 
 
-def _plain(key: str, value: Any, imports: bool) -> Any:
+def _plain(key: str, value: object, imports: bool) -> Any:
     """An argument as JSON data."""
     if isinstance(value, np.generic | np.ndarray):
         return value.tolist()
@@ -92,7 +92,7 @@ def _plain(key: str, value: Any, imports: bool) -> Any:
     raise InputError(f"spec: {key}", value, "numbers, text, lists and mappings of them: anything else cannot be written as JSON")
 
 
-def _is_plain(value: Any) -> bool:
+def _is_plain(value: object) -> bool:
     try:
         json.dumps(value)
     except (TypeError, ValueError):

@@ -57,7 +57,7 @@ class _Undrawn:
 class _Lane(SineLane):  # type: ignore[misc]
     """A lane along x that winds as a sine; the same coordinates as its base, on plain numbers."""
 
-    def local_coordinates(self, position: Any) -> tuple[float, float]:
+    def local_coordinates(self, position: Array) -> tuple[float, float]:
         x, y = float(position[0]), float(position[1])
         return x, y - float(self.start[1]) - self.amplitude * math.sin(self.pulsation * x)
 
@@ -65,7 +65,7 @@ class _Lane(SineLane):  # type: ignore[misc]
 class _Network(RoadNetwork):  # type: ignore[misc]
     """Lanes side by side, of one shape: the nearest is that of the least lateral offset, as the base finds with all lanes' headings."""
 
-    def get_closest_lane_index(self, position: Any, heading: float | None = None) -> tuple[str, str, int]:
+    def get_closest_lane_index(self, position: Array, heading: float | None = None) -> tuple[str, str, int]:
         offsets = [abs(lane.local_coordinates(position)[1]) for lane in self.graph["0"]["1"]]
         return "0", "1", offsets.index(min(offsets))
 
@@ -73,7 +73,7 @@ class _Network(RoadNetwork):  # type: ignore[misc]
 class _Road(Road):  # type: ignore[misc]
     """The base's answers on one road without obstacles, in fewer words: asked for some ten times a step."""
 
-    def neighbour_vehicles(self, vehicle: Any, lane_index: Any = None) -> tuple[Any, Any]:
+    def neighbour_vehicles(self, vehicle: ControlledVehicle, lane_index: tuple[str, str, int] | None = None) -> tuple[Any, Any]:
         lane, s = self.network.get_lane(lane_index or vehicle.lane_index), float(vehicle.position[0])
         front, rear, s_front, s_rear = None, None, math.inf, -math.inf
         for car in self.vehicles:
@@ -90,9 +90,12 @@ class _Road(Road):  # type: ignore[misc]
 class _Near:
     """Asks HighwayEnv for a collision only where the cars are near enough for its own first check to pass."""
 
-    def handle_collisions(self, other: Any, dt: float = 0.0) -> None:
-        me: Any = self
-        if abs(float(me.position[0]) - float(other.position[0])) <= me.diagonal + abs(me.speed) * dt:
+    position: Array
+    speed: float
+    diagonal: float
+
+    def handle_collisions(self, other: ControlledVehicle, dt: float = 0.0) -> None:
+        if abs(float(self.position[0]) - float(other.position[0])) <= self.diagonal + abs(self.speed) * dt:
             super().handle_collisions(other, dt)  # type: ignore[misc]
 
 
@@ -101,7 +104,7 @@ class _Ego(_Near, ControlledVehicle):  # type: ignore[misc]
 
     pull = 0.0
 
-    def act(self, action: Any = None) -> None:
+    def act(self, action: dict[str, float] | str | None = None) -> None:
         self.action = {"steering": self.steering_control(self.target_lane_index), "acceleration": self.pull}
 
 
@@ -112,7 +115,7 @@ class _Driver(_Near, IDMVehicle):  # type: ignore[misc]
     decel, pace = 6.0, 0.1  # of a hard braking [m/s^2], and the step [s]
     changes = True  # lanes, of itself
 
-    def act(self, action: Any = None) -> None:
+    def act(self, action: dict[str, float] | str | None = None) -> None:
         self.enable_lane_change = self.changes and self.committed <= 0.0
         super().act(action)
         if not self.crashed:
@@ -138,7 +141,7 @@ class Bench:
         self.indices = [("0", "1", lane) for lane in range(lanes)]
         self.lanes = [network.get_lane(index) for index in self.indices]
         self.road = _Road(network, np_random=_Undrawn())
-        self.ego: Any = _Ego(self.road, self.lanes[0].position(0.0, 0.0))
+        self.ego = _Ego(self.road, self.lanes[0].position(0.0, 0.0))
         self.traffic: list[Any] = [_Driver(self.road, self.lanes[0].position(0.0, 0.0), timer=1.0) for _ in range(cars - 1)]
         for car in self.traffic:
             car.decel, car.pace, car.changes = decel, dt, lane_changes

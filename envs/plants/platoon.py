@@ -13,7 +13,7 @@ dropped.
 """
 
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -154,14 +154,14 @@ class String:
         mean = truth + self.initial_sd * draws.normal(truth.shape[1:], 16)
         return Prior(mean, np.broadcast_to(self.prior_var * np.eye(shape[-1]), shape))
 
-    def known(self, plan: Any, u: Array, exo: Array, state: Any) -> Array:
+    def known(self, plan: object, u: Array, exo: Array, state: object) -> Array:
         """The leader knows its command; the others where the scenario says so."""
         out = num.zeros(u.shape)
         out[:, :, 0] = exo[:, None] if self.leader_input_known else 0.0
         out[:, 0, 0] = exo
         return out
 
-    def odometry(self, plan: Any, state: Any) -> Array:
+    def odometry(self, plan: object, state: tuple[Array, ...]) -> Array:
         return np.zeros((len(state[0]), self.size[0], 0))
 
 

@@ -15,7 +15,7 @@ a false alarm a challenge.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple
+from typing import Annotated, ClassVar, Generic, Literal, NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -25,10 +25,11 @@ from tailgate.base.errors import InputError, NotApplicable
 from tailgate.base.pytree import map_leaves
 from tailgate.core import Array, Estimate, Model, NonNegative, Positive, PositiveCount, Prior, Probability, Received, param
 from tailgate.core.draws import Draws
+from tailgate.core.nouns import P, S
 from tailgate.core.registry import imported, make_from, register
 from tailgate.core.schema import build
 from tailgate.envs.sensors.fmcw import false_alarm_threshold, from_db
-from tailgate.estimators.compose import AcceptAll, Look, ModeName
+from tailgate.estimators.compose import AcceptAll, Look, ModeName, ReactionPlan, ReactionState
 from tailgate.estimators.filters.predictors import read_states
 from tailgate.estimators.parts import Filter, Verdict
 
@@ -51,34 +52,35 @@ class Response(NamedTuple):
     rolls_back: bool  # it forgets those since the last challenge that passed when an alarm begins
 
 
-class ChallengePlan(NamedTuple):
-    filter: Filter
-    filter_plan: Any
+class ChallengePlan(NamedTuple, Generic[P, S]):
+    filter: Filter[P, S]
+    filter_plan: P
     reaction: AcceptAll
-    reaction_plan: Any
+    reaction_plan: ReactionPlan
     response: Response
     threshold: float  # on the energy over that of the noise
     state: Array  # (N, q) which state each sensor reads
     times: Array  # (T,) challenges that are fixed
 
 
-class ChallengeState(NamedTuple):
+class ChallengeState(NamedTuple, Generic[S]):
     """Every leaf has B first."""
 
-    live: Any  # the filter's belief
-    safe: Any  # that at the last challenge that passed, predicted since
-    reaction: Any
+    live: S  # the filter's belief
+    safe: S  # that at the last challenge that passed, predicted since
+    reaction: ReactionState
     k: Array  # (B,) steps done
     probe: Array  # (B, N) bool: what the last step asked for
     heard: Array  # (B, N) energy at the last challenge
     owed: Array  # (B, N) int64: challenges that have yet to pass before the alarm ends; 0 without an alarm
 
 
-def pick(mask: Array, chosen: Any, other: Any) -> Any:
-    """The state `chosen` in the rows of `mask` (B, 1), else `other`."""
+def pick(mask: Array, chosen: S, other: S) -> S:
+    """Return the state `chosen` in the rows of `mask` (B, 1), else `other`."""
     if not num.some(mask):
         return other
-    return map_leaves(lambda a, b: np.where(mask.reshape(-1, *[1] * (a.ndim - 1)), a, b), chosen, other)
+    out: S = map_leaves(lambda a, b: np.where(mask.reshape(-1, *[1] * (a.ndim - 1)), a, b), chosen, other)
+    return out
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -186,15 +188,14 @@ def _used(plan: ChallengePlan, received: Received, muted: Array, alarm: Array) -
     return used, shown & plan.response.passes
 
 
-def named_filter(data: Any, where: str) -> Filter:
+def named_filter(data: object, where: str) -> Filter:
     """A filter by its name, or a mapping with name and parameters; module:Class names somebody else's."""
-    data = data if isinstance(data, dict) else {"name": data}
-    data = {"name": PREDICTOR, **data}  # a mapping without a name changes the default one
-    name = data["name"]
+    params = {"name": PREDICTOR, **(data if isinstance(data, dict) else {"name": data})}  # a mapping without a name changes the default one
+    name = params["name"]
     if isinstance(name, str) and ":" in name:
-        made: Filter = build(imported("filter", name).cls, {key: value for key, value in data.items() if key != "name"}, where)
+        made: Filter = build(imported("filter", name).cls, {key: value for key, value in params.items() if key != "name"}, where)
         return made
-    found: Filter = make_from("filter", data, where)
+    found: Filter = make_from("filter", params, where)
     return found
 
 
@@ -208,7 +209,7 @@ class ChallengeResponse(Challenger):
 
     label = "cra"
 
-    filter: Any = param(PREDICTOR, FILTER)
+    filter: object = param(PREDICTOR, FILTER)
     passes: bool = param(True, "without an attack the controller drives on the readings as they are, else on the filter's estimate")
     rollback: bool = param(True, "an alarm takes back what was used since the last challenge that passed")
     freeze: bool = param(True, "the filter uses no reading during an alarm")
@@ -232,7 +233,7 @@ class PyCra(Challenger):
 
     watch: Probability | None = param(None, WATCH)
     quiet: PositiveCount = param(1, QUIET)
-    filter: Any = param(PREDICTOR, FILTER)
+    filter: object = param(PREDICTOR, FILTER)
 
     def predictor(self) -> Filter:
         return named_filter(self.filter, "defence pycra.filter")

@@ -27,7 +27,7 @@ from tailgate.core.draws import Draws
 from tailgate.core.neural import Network, perceptron, read_trained
 from tailgate.core.registry import entries, entry_for, register
 from tailgate.core.schema import as_data, build
-from tailgate.estimators.challenge.steering import Hand, Memory, Menu, Sight, settings
+from tailgate.estimators.challenge.steering import Hand, HandPlan, HandState, Memory, Menu, Sight, settings
 from tailgate.estimators.compose import Look
 
 FORMAT = "tailgate-defender-1"
@@ -72,17 +72,17 @@ def load_defender(path: Path) -> tuple[Header, Network]:
 
 class SteeredPlan(NamedTuple):
     hand: Hand
-    inner: Any
+    inner: HandPlan
     sight: Sight
     settings: Array  # (S, K) the menu
     start: Array  # (K,) where the knobs stand first
-    networks: tuple[Any, ...]
+    networks: tuple[Network, ...]
 
 
 class SteeredState(NamedTuple):
     """Every leaf has B first."""
 
-    inner: Any
+    inner: HandState
     knobs: Array  # (B, K) where they stand
     k: Array  # (B,) int64: steps done
     member: Array  # (B,) int64: whose policy turns them; -1 before the first step
@@ -90,7 +90,7 @@ class SteeredState(NamedTuple):
     seen: Array  # (B, d) float32: what was seen in the last step
 
 
-def _imports(data: Any) -> bool:
+def _imports(data: object) -> bool:
     """Whether any text in the data names a class to import."""
     if isinstance(data, (dict, list, tuple)):
         return any(_imports(value) for value in (data.values() if isinstance(data, dict) else data))
@@ -104,7 +104,7 @@ class Steered:
 
     uses: ClassVar[tuple[str, ...]] = ("measurements", "v2v")
 
-    defence: Any = param("chi2_kf", "defence whose knobs are turned: a registered name, or a mapping with name and parameters")
+    defence: object = param("chi2_kf", "defence whose knobs are turned: a registered name, or a mapping with name and parameters")
     menu: Menu = param(Menu(), "settings of the knobs")
     setting: Count | None = param(None, "number of the menu's combination that is held throughout; none: the defence's own values")
     policy: Path | tuple[Path, ...] | None = param(None, f"{POLICY}. It brings its own defence and menu")
@@ -186,7 +186,7 @@ class Steered:
     def start(self, plan: SteeredPlan, prior: Prior) -> SteeredState:
         batch = len(prior.mean)
         knobs = np.repeat(plan.start[None], batch, axis=0)
-        inner = plan.hand.defence.start(plan.inner, prior)
+        inner = plan.hand.start(plan.inner, prior)
         k = np.zeros(batch, np.int64)
         return SteeredState(inner, knobs, k, k - 1, plan.sight.begin(batch), plan.sight.blank(knobs))
 
@@ -239,4 +239,4 @@ class SteeredChallenge(Steered):
 
     uses: ClassVar[tuple[str, ...]] = ("measurements", "odometry", "probe")
 
-    defence: Any = param("cra", "defence whose knobs are turned: a registered name, or a mapping with name and parameters")
+    defence: object = param("cra", "defence whose knobs are turned: a registered name, or a mapping with name and parameters")

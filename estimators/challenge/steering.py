@@ -13,21 +13,25 @@ import copy
 import dataclasses
 import itertools
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
 from tailgate import num
 from tailgate.base.errors import InputError, NotApplicable
-from tailgate.core import Array, Defence, Estimate, Mode, Model, Positive, PositiveCount, Probability, Received, param
-from tailgate.estimators.challenge.challenge_response import CHANCE, Challenger, ChallengeState
-from tailgate.estimators.compose import Composed, ModeName, Reaction
+from tailgate.core import Array, Defence, Estimate, Mode, Model, Positive, PositiveCount, Prior, Probability, Received, param
+from tailgate.core.draws import Draws
+from tailgate.estimators.challenge.challenge_response import CHANCE, ChallengePlan, Challenger, ChallengeState
+from tailgate.estimators.compose import Composed, ComposedPlan, ComposedState, ModeName, Reaction, threshold_field
 from tailgate.estimators.detectors.chi_square import ChiSquare
 from tailgate.estimators.detectors.sequential import Cusum, Mewma, WindowedChiSquare
 
 TURNED = (ChiSquare, WindowedChiSquare, Cusum, Mewma)  # detectors whose threshold enters by comparison in `step`, and nowhere else
 LEADER = ("leader_position", "leader_velocity")
 LIMIT = 10.0  # observations are clipped to +-LIMIT
+T = TypeVar("T")
+HandPlan = ComposedPlan | ChallengePlan
+HandState = ComposedState | ChallengeState
 FADE = 0.95  # of the running means, per step
 CALM = 50.0  # steps since an alarm are counted up to this
 
@@ -90,11 +94,11 @@ def _place(knob: Knob, value: float) -> float:
 class Hand:
     """A defence with its knobs: `step` plays it with the values of each row (B, K)."""
 
-    defence: Any
+    defence: Composed | Challenger
     knobs: tuple[Knob, ...]
 
     @classmethod
-    def on(cls, defence: Any, menu: Menu) -> Hand:
+    def on(cls, defence: Defence, menu: Menu) -> Hand:
         """Raises NotApplicable for a defence without a knob."""
         mode = tuple(float(Mode[name.upper()]) for name in menu.modes)
         if isinstance(defence, Composed) and type(defence).step is Composed.step:
@@ -116,28 +120,35 @@ class Hand:
         wanted = f"a challenge-response defence, or a filter under one of the detectors {named}, made by `compose` or its subclasses"
         raise NotApplicable("steered defence", type(defence).__name__, wanted)
 
-    def prepare(self, model: Model) -> Any:
-        plan = self.defence.prepare(model)
-        if isinstance(self.defence, Composed) and isinstance(plan.mitigation, Reaction) and plan.mitigation.mode == "normal":
+    def prepare(self, model: Model) -> HandPlan:
+        plan: HandPlan = self.defence.prepare(model)
+        if isinstance(plan, ComposedPlan) and isinstance(plan.mitigation, Reaction) and plan.mitigation.mode == "normal":
             plan = plan._replace(mitigation=_with(plan.mitigation, mode="widen"))
         return plan
+
+    def start(self, plan: HandPlan, prior: Prior) -> HandState:
+        defence: Defence = self.defence
+        state: HandState = defence.start(plan, prior)
+        return state
 
     @property
     def own(self) -> Array:
         """(K,) the defence's own values."""
         return np.array([knob.own for knob in self.knobs])
 
-    def turned(self, plan: Any, values: Array) -> tuple[Defence, Any]:
+    def turned(self, plan: HandPlan, values: Array) -> tuple[Defence, HandPlan]:
         """The defence and its plan with the knobs at `values` (B, K)."""
-        defence = self.defence
+        defence: Defence = self.defence
         for i, knob in enumerate(self.knobs):
-            if knob.name == "threshold":
-                plan = plan._replace(detector=_with(plan.detector, **{plan.detector.threshold_field: values[:, i, None]}))
+            if knob.name == "threshold" and isinstance(plan, ComposedPlan):
+                plan = plan._replace(detector=_with(plan.detector, **{threshold_field(plan.detector): values[:, i, None]}))
             elif knob.name == "challenge":
                 defence = _with(defence, probability=values[:, i, None])
         return defence, plan
 
-    def step(self, plan: Any, state: Any, values: Array, received: Received, known_u: Array, draws: Any) -> tuple[Any, Estimate]:
+    def step(
+        self, plan: HandPlan, state: HandState, values: Array, received: Received, known_u: Array, draws: Draws
+    ) -> tuple[HandState, Estimate]:
         """The defence's step with the knobs at `values` (B, K)."""
         defence, plan = self.turned(plan, values)
         state, estimate = defence.step(plan, state, received, known_u, draws)
@@ -148,7 +159,7 @@ class Hand:
         return state, estimate
 
 
-def _with(part: Any, **fields: Any) -> Any:
+def _with(part: T, **fields: object) -> T:
     """A frozen dataclass with other values, its checks not run: they know numbers, not one value per row."""
     out = copy.copy(part)
     for name, value in fields.items():
@@ -207,7 +218,7 @@ class Sight:
         out[:, len(self.names) - len(self.knobs) :] = self._places(values)
         return out
 
-    def look(self, memory: Memory, estimate: Estimate, received: Received, inner: Any, values: Array) -> tuple[Memory, Array]:
+    def look(self, memory: Memory, estimate: Estimate, received: Received, inner: HandState, values: Array) -> tuple[Memory, Array]:
         """The memory and the observation (B, d) after a step."""
         alarm = np.asarray(estimate.alarm.any(axis=1))
         score = num.log(1.0 + np.maximum(np.max(estimate.score, axis=1), 0.0))

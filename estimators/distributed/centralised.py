@@ -6,7 +6,7 @@ platoon the leader's own command. It hears more than any agent of the network do
 """
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from tailgate import num
 from tailgate.core import Array, Estimate, Model, Prior, Received
 from tailgate.core.draws import Draws
 from tailgate.core.registry import register
-from tailgate.estimators.compose import AcceptAll, Composed, Score, compose
+from tailgate.estimators.compose import AcceptAll, Composed, ComposedPlan, ComposedState, Score, compose
 from tailgate.estimators.distributed.distributed_kalman import DistributedKalmanFilter
 from tailgate.estimators.distributed.lasso import Lasso, LassoFilter
 from tailgate.estimators.parts import Filter
@@ -24,7 +24,7 @@ USES = ("measurements", "redundant", "leader_input")
 
 class CentralPlan(NamedTuple):
     one: Composed
-    plan: Any  # of the one
+    plan: ComposedPlan  # of the one
     agents: int
 
 
@@ -54,13 +54,15 @@ class Central:
         one = compose(self.filter(), Score(), AcceptAll())
         return CentralPlan(one, one.prepare(stacked(model)), model.agents)
 
-    def start(self, plan: CentralPlan, prior: Prior) -> Any:
+    def start(self, plan: CentralPlan, prior: Prior) -> ComposedState:
         mean = prior.mean[:, :1]
         for i in range(1, plan.agents):
             mean = mean + prior.mean[:, i : i + 1]
         return plan.one.start(plan.plan, Prior(mean / plan.agents, prior.cov[:, :1]))
 
-    def step(self, plan: CentralPlan, state: Any, received: Received, known_u: Array, draws: Draws) -> tuple[Any, Estimate]:
+    def step(
+        self, plan: CentralPlan, state: ComposedState, received: Received, known_u: Array, draws: Draws
+    ) -> tuple[ComposedState, Estimate]:
         heard = Received(together(received.y), together(received.valid), received.energy[:, :1])
         state, told = plan.one.step(plan.plan, state, heard, known_u[:, :1], draws)
         return state, Estimate(*(None if x is None else np.repeat(x, plan.agents, axis=1) for x in told))  # type: ignore[arg-type]

@@ -13,7 +13,7 @@ ones: the threshold is in sigma, and conservative.
 """
 
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from tailgate.core import Array, Positive, param
 from tailgate.core.registry import register
 from tailgate.estimators.compose import Composed, GateOut
 from tailgate.estimators.distributed.distributed_kalman import ETA, DistributedFilter, FusionPlan, gate_of
-from tailgate.estimators.filters.kalman import GAIN, Gain
+from tailgate.estimators.filters.kalman import GAIN, Gain, KalmanState
 from tailgate.estimators.parts import Detector, Filter, Mitigation
 
 REFERENCE = "U. A. Khan, A. M. Stankovic, Secure Distributed Estimation in Cyber-Physical Systems, ICASSP 2013"
@@ -62,7 +62,7 @@ class DisagreementFilter(DistributedFilter):
     centre: Centre = param("own", CENTRE)
     steady: bool = param(False, "hold gain and covariance where they settle when nothing is missed")
 
-    def predict(self, plan: FusionPlan, state: Any, known_u: Array) -> Any:
+    def predict(self, plan: FusionPlan, state: KalmanState, known_u: Array) -> KalmanState:
         x, M = self.forecast(plan, state, known_u), self.spread(plan, state)
         return self.fuse(plan, x, M, self.weights(plan, x, M))
 

@@ -15,7 +15,7 @@ and d_i Sw; it is solved by doubling, node after node, until nothing moves, and 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
@@ -136,7 +136,7 @@ def _change(new: Array, old: Array) -> float:
     return float(np.max(np.abs(new - old) / (size[:, None] * size)))
 
 
-class DistributedFilter(LinearFilter):
+class DistributedFilter(LinearFilter[FusionPlan]):
     """The recursion. A subclass says in `steady` whether P is held, and may change what is fused, and the update."""
 
     steady: bool
@@ -161,26 +161,26 @@ class DistributedFilter(LinearFilter):
     def start(self, plan: FusionPlan, prior: Prior) -> KalmanState:
         return KalmanState(prior.mean, shared(prior.cov) if plan.held is None else None)
 
-    def predict(self, plan: FusionPlan, state: Any, known_u: Array) -> Any:
+    def predict(self, plan: FusionPlan, state: KalmanState, known_u: Array) -> KalmanState:
         """xb_i, and Q_i^-1 as the predicted covariance."""
         if plan.held is not None:
             assert plan.L is not None and plan.merge is not None
             return KalmanState(num.predicted(plan.A, plan.B, plan.c, plan.L, plan.merge, plan.hears, state.x, known_u), None)
-        x, P = self.forecast(plan, state, known_u), one_row(state.P)
+        x, P = self.forecast(plan, state, known_u), self._predicted(plan, state)
         if len(P) < len(x):
             return self.fuse(plan, x, self.spread(plan, state))
         return KalmanState(*num.fused(plan.hears, x, P, step=(plan.A, plan.Q)))
 
-    def forecast(self, plan: FusionPlan, state: Any, known_u: Array) -> Array:
+    def forecast(self, plan: FusionPlan, state: KalmanState, known_u: Array) -> Array:
         """A xh_j + B u_j + c (B, N, n): what each agent sends."""
         return num.apply(plan.A[None], state.x) + num.matvec(plan.B, known_u) + plan.c
 
-    def spread(self, plan: FusionPlan, state: Any) -> Array:
+    def spread(self, plan: FusionPlan, state: KalmanState) -> Array:
         """L_j^-1 = A P_j A' + Sw (B or 1, N, n, n): the covariance that each agent gives what it sends."""
         if plan.held is not None:
             assert plan.M is not None
             return plan.M[None]
-        return num.congruent(plan.A, one_row(state.P), plan.Q)
+        return num.congruent(plan.A, self._predicted(plan, state), plan.Q)
 
     def fuse(self, plan: FusionPlan, x: Array, M: Array, weight: Array | None = None) -> KalmanState:
         """xb_i and Q_i^-1 of what is sent, x (B, N, n) with its `spread` M.
@@ -224,30 +224,32 @@ class DistributedFilter(LinearFilter):
             x[:, i] = np.where(rows[:, None], num.matvec(Qinv, y / total[:, None]), x[:, i])
         return out if P is None else KalmanState(x, P)
 
-    def innovation(self, plan: FusionPlan, state: Any, received: Received) -> Innovation:
+    def innovation(self, plan: FusionPlan, state: KalmanState, received: Received) -> Innovation:
         r = np.where(received.valid, received.y - num.apply(plan.C, state.x), 0.0)
         S = plan.S
         if S is None or state.P is not None:
             S = num.matmul(plan.C, num.transpose(self._cross(plan, state))) + plan.R
         return Innovation(r, alone(np.broadcast_to(S, (*r.shape, r.shape[-1])), received.valid))
 
-    def update(self, plan: FusionPlan, state: Any, innovation: Innovation, accept: Array) -> Any:
+    def update(self, plan: FusionPlan, state: KalmanState, innovation: Innovation, accept: Array) -> KalmanState:
         """As the Kalman filter's. Constant gains, and a covariance that all rows share, save the work but change no bit."""
         r, S = innovation
         if plan.held is not None and state.P is None:
             assert plan.K is not None and plan.cross is not None
             x = num.apply(plan.K, r, state.x)
             return KalmanState(num.elsewhere(accept.all(axis=-1), x, _corrected, state.x, r, S, plan.cross[None], accept), None)
-        if len(one_row(state.P)) < len(r) and num.every(accept) and len(one_row(S)) == 1:
-            cross = num.matmul(plan.C, state.P[:1])
+        assert state.P is not None
+        known = one_row(state.P)
+        if len(known) < len(r) and num.every(accept) and len(one_row(S)) == 1:
+            cross = num.matmul(plan.C, known)
             K = gain_of(S[:1], cross)
-            P = state.P[:1] - num.matmul(K, cross)
+            P = known - num.matmul(K, cross)
             P = np.broadcast_to(0.5 * (P + num.transpose(P)), state.P.shape)
             return KalmanState(state.x + num.matvec(K, r), P if plan.held is None else None)
-        x, P = num.corrected(plan.C, num.inverse(alone(S, accept)), state.x, one_row(state.P), r, accept)
+        x, P = num.corrected(plan.C, num.inverse(alone(S, accept)), state.x, known, r, accept)
         return KalmanState(x, P if plan.held is None else None)
 
-    def _predicted(self, plan: FusionPlan, state: Any) -> Array:
+    def _predicted(self, plan: FusionPlan, state: KalmanState) -> Array:
         return one_row(super()._predicted(plan, state))
 
 
@@ -321,11 +323,11 @@ class TailChiSquare(Memoryless):
 
         return float(stats.chi2.isf(self.tail, len(model.sensors)))
 
-    def step(self, plan: float, state: Any, innovation: Innovation) -> tuple[Any, Verdict]:
+    def step(self, plan: float, state: None, innovation: Innovation) -> tuple[None, Verdict]:
         score = num.quadratic(innovation.r, num.inverse(innovation.S))
         return None, blame_all(score, score > plan, innovation)
 
-    def gate(self, plan: float, state: Any) -> float:
+    def gate(self, plan: float, state: None) -> float:
         return plan
 
 

@@ -17,14 +17,14 @@ noise of 1, has 0.1. With 0.1 the braking platoon cannot follow its brakes: half
 """
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 from tailgate import num
 from tailgate.core import Array, Innovation, Positive, param
 from tailgate.core.registry import register
 from tailgate.estimators.compose import AcceptAll, Composed, Score
-from tailgate.estimators.distributed.distributed_kalman import DistributedFilter
-from tailgate.estimators.filters.kalman import GAIN, Gain, alone
+from tailgate.estimators.distributed.distributed_kalman import DistributedFilter, FusionPlan
+from tailgate.estimators.filters.kalman import GAIN, Gain, KalmanState, alone
 from tailgate.estimators.filters.robust import Solved, believed, believed_by_cvxpy
 from tailgate.estimators.parts import Detector, Filter, Mitigation
 
@@ -46,7 +46,7 @@ class LassoFilter(Lasso, DistributedFilter):
 
     steady: bool = param(True, "hold gain and covariance where they settle when nothing is missed")
 
-    def update(self, plan: Any, state: Any, innovation: Innovation, accept: Array) -> Any:
+    def update(self, plan: FusionPlan, state: KalmanState, innovation: Innovation, accept: Array) -> KalmanState:
         r, S = innovation
         if not num.every(accept):
             r, S = r * accept, alone(S, accept)

@@ -25,7 +25,7 @@ from tailgate import num
 from tailgate.core import Array, Innovation, Model, Positive, Prior, Received, param
 from tailgate.core.registry import register
 from tailgate.estimators.compose import AcceptAll, Composed, Score
-from tailgate.estimators.distributed.distributed_kalman import DistributedFilter, FusionPlan, one_row
+from tailgate.estimators.distributed.distributed_kalman import DistributedKalmanFilter, FusionPlan, one_row
 from tailgate.estimators.filters.kalman import GAIN, Gain, KalmanState, alone
 from tailgate.estimators.filters.robust import ACCURACY, load_cvxpy
 from tailgate.estimators.parts import Detector, Filter, Mitigation
@@ -146,40 +146,48 @@ class Norm:
 
 @register("filter", "norm_resilient", reference="Dutta 2018, (5.8)")
 @dataclass(frozen=True)
-class NormResilientFilter(Norm, DistributedFilter):
+class NormResilientFilter(Norm):
     """Distributed filter whose correction weighs the norm of the whitened innovation, so that no attack moves it far."""
 
     steady: bool = param(True, "hold the covariance where it settles when nothing is missed; else each row solves its own problem, slowly")
 
-    def prepare(self, model: Model) -> Any:
-        linear = super().prepare(model)
+    @property
+    def linear(self) -> DistributedKalmanFilter:
+        """The distributed Kalman filter that predicts, and whose correction the norm replaces."""
+        return DistributedKalmanFilter(self.steady)
+
+    def prepare(self, model: Model) -> NormPlan:
+        linear = self.linear.prepare(model)
         if linear.held is None:
             return NormPlan(linear, None, None)
         spread, _ = num.root(linear.held)
         return NormPlan(linear, spread, axes(linear.C, linear.R, spread))
 
-    def start(self, plan: Any, prior: Prior) -> KalmanState:
-        return super().start(plan.linear, prior)
+    def start(self, plan: NormPlan, prior: Prior) -> KalmanState:
+        return self.linear.start(plan.linear, prior)
 
-    def predict(self, plan: Any, state: Any, known_u: Array) -> Any:
-        return super().predict(plan.linear, state, known_u)
+    def predict(self, plan: NormPlan, state: KalmanState, known_u: Array) -> KalmanState:
+        return self.linear.predict(plan.linear, state, known_u)
 
-    def innovation(self, plan: Any, state: Any, received: Received) -> Innovation:
-        return super().innovation(plan.linear, state, received)
+    def innovation(self, plan: NormPlan, state: KalmanState, received: Received) -> Innovation:
+        return self.linear.innovation(plan.linear, state, received)
 
-    def gain(self, plan: Any, state: Any, innovation: Innovation) -> Array:
+    def gain(self, plan: NormPlan, state: KalmanState, innovation: Innovation) -> Array:
         """That of the linear filter; the correction itself is not linear."""
-        return super().gain(plan.linear, state, innovation)
+        return self.linear.gain(plan.linear, state, innovation)
 
-    def forget(self, plan: Any, state: Any, where: Array) -> KalmanState:
-        return super().forget(plan.linear, state, where)
+    def forget(self, plan: NormPlan, state: KalmanState, where: Array) -> KalmanState:
+        return self.linear.forget(plan.linear, state, where)
 
-    def update(self, plan: Any, state: Any, innovation: Innovation, accept: Array) -> Any:
+    def estimate(self, state: KalmanState) -> Array:
+        return state.x
+
+    def update(self, plan: NormPlan, state: KalmanState, innovation: Innovation, accept: Array) -> KalmanState:
         linear, r = plan.linear, np.where(accept, innovation.r, 0.0)
         x = state.x + self._move(plan, state.P, r, accept)
         if linear.held is not None:
             return KalmanState(x, None)
-        return KalmanState(x, super().update(linear, state, Innovation(np.zeros_like(r), innovation.S), accept).P)
+        return KalmanState(x, self.linear.update(linear, state, Innovation(np.zeros_like(r), innovation.S), accept).P)
 
     def _move(self, plan: NormPlan, P: Array | None, r: Array, accept: Array) -> Array:
         """xh - xb (B, N, n)."""

@@ -20,7 +20,7 @@ gamma sqrt(q lambda_max(K_i S_i K_i')).
 """
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
@@ -29,7 +29,7 @@ from tailgate.core import Array, Innovation, Positive, param
 from tailgate.core.registry import register
 from tailgate.estimators.compose import AcceptAll, Composed
 from tailgate.estimators.distributed.distributed_kalman import ALARM, DistributedFilter, FusionPlan, gate_of
-from tailgate.estimators.filters.kalman import GAIN, Gain, alone
+from tailgate.estimators.filters.kalman import GAIN, Gain, KalmanState, alone
 from tailgate.estimators.parts import Detector, Filter, Mitigation
 
 REFERENCE = "Y. Chen, S. Kar, J. M. F. Moura, Resilient Distributed Estimation: Sensor Attacks, arXiv 1709.06156, 2017"
@@ -44,7 +44,7 @@ class SaturatedFilter(DistributedFilter):
     gamma: Positive = param(1.0, GAMMA)
     steady: bool = param(True, "hold gain and covariance where they settle when nothing is missed")
 
-    def update(self, plan: FusionPlan, state: Any, innovation: Innovation, accept: Array) -> Any:
+    def update(self, plan: FusionPlan, state: KalmanState, innovation: Innovation, accept: Array) -> KalmanState:
         r, S = innovation
         if not num.every(accept):
             r, S = r * accept, alone(S, accept)

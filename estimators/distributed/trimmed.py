@@ -188,12 +188,10 @@ def trimmed_mean(z: Array, faulty: int) -> Array:
 
 @register("filter", "trimmed_consensus", reference=REFERENCE)
 @dataclass(frozen=True)
-class TrimmedFilter(LinearFilter):
+class TrimmedFilter(LinearFilter[TrimmedPlan]):
     """Local filters for what an agent detects, and a trimmed mean of its parents for every other mode."""
 
     faulty: Count = param(1, FAULTY)
-
-    steady = True
 
     def prepare(self, model: Model) -> TrimmedPlan:
         lasting, rest = split(model.A)

@@ -16,7 +16,7 @@ whose own sensors are attacked distrusts the honest. With a gate it is `composed
 """
 
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar
 
 import numpy as np
 
@@ -26,20 +26,12 @@ from tailgate.core.registry import register
 from tailgate.estimators.compose import AcceptAll, Composed
 from tailgate.estimators.distributed.disagreement import THRESHOLD, disagreement
 from tailgate.estimators.distributed.distributed_kalman import ALARM, DistributedFilter, FusionPlan, gate_of
-from tailgate.estimators.filters.kalman import GAIN, Gain
+from tailgate.estimators.filters.kalman import GAIN, Gain, KalmanState
 from tailgate.estimators.parts import Detector, Filter, Mitigation
 
 REFERENCE = "I. Matei, J. S. Baras, V. Srinivasan, Trust-Based Multi-Agent Filtering for Increased Smart Grid Security, MED 2012"
 RATE = "share of the lost trust that is regained in a step without disagreement [-]"
 CUTOFF = "trust below which a neighbour is disregarded [-]"
-
-
-class TrustState(NamedTuple):
-    """x (B, N, n) and P (B, N, n, n) as in KalmanState; trust (B, N, N), [i, j] that of i in j."""
-
-    x: Array
-    P: Array | None
-    trust: Array
 
 
 @register("filter", "trust_dkf", reference=REFERENCE)
@@ -52,24 +44,23 @@ class TrustFilter(DistributedFilter):
     cutoff: Probability = param(0.1, CUTOFF)
     steady: bool = param(False, "hold gain and covariance where they settle when nothing is missed")
 
-    def start(self, plan: FusionPlan, prior: Prior) -> Any:
+    def start(self, plan: FusionPlan, prior: Prior) -> KalmanState:
         agents = prior.mean.shape[1]
-        return TrustState(*super().start(plan, prior), num.full((len(prior.mean), agents, agents), 1.0))
+        return super().start(plan, prior)._replace(trust=num.full((len(prior.mean), agents, agents), 1.0))
 
-    def predict(self, plan: FusionPlan, state: Any, known_u: Array) -> Any:
+    def predict(self, plan: FusionPlan, state: KalmanState, known_u: Array) -> KalmanState:
+        assert state.trust is not None
         x, M = self.forecast(plan, state, known_u), self.spread(plan, state)
         z = np.maximum(disagreement(plan.heard, x, M) / self.threshold, 1.0)
         trust = np.minimum(1.0 / (z * z), state.trust + self.rate * (1.0 - state.trust))
         weight = np.where(trust < self.cutoff, 0.0, trust)
-        return TrustState(*self.fuse(plan, x, M, weight), trust)
+        return self.fuse(plan, x, M, weight)._replace(trust=trust)
 
-    def update(self, plan: FusionPlan, state: Any, innovation: Innovation, accept: Array) -> Any:
-        new = super().update(plan, state, innovation, accept)
-        return TrustState(new.x, new.P, state.trust)
+    def update(self, plan: FusionPlan, state: KalmanState, innovation: Innovation, accept: Array) -> KalmanState:
+        return super().update(plan, state, innovation, accept)._replace(trust=state.trust)
 
-    def forget(self, plan: FusionPlan, state: Any, where: Array) -> Any:
-        new = super().forget(plan, state, where)
-        return TrustState(new.x, new.P, state.trust)
+    def forget(self, plan: FusionPlan, state: KalmanState, where: Array) -> KalmanState:
+        return super().forget(plan, state, where)._replace(trust=state.trust)
 
 
 @register("defence", "trust_dkf", reference=REFERENCE)

@@ -11,9 +11,10 @@ left out, the others correct with the gain that they have alone at the same P-. 
 """
 
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple, cast
+from typing import Generic, Literal, NamedTuple, Protocol, cast
 
 import numpy as np
+from typing_extensions import TypeVar
 
 from tailgate import num
 from tailgate.base.errors import NotApplicable
@@ -41,11 +42,36 @@ class KalmanPlan(NamedTuple):
     held: Array | None = None  # (N, n, n) P- of the steady filter
 
 
+class LinearPlan(Protocol):
+    """The constants that the recursion reads; see KalmanPlan for their shapes."""
+
+    @property
+    def A(self) -> Array: ...
+    @property
+    def B(self) -> Array: ...
+    @property
+    def c(self) -> Array: ...
+    @property
+    def C(self) -> Array: ...
+    @property
+    def R(self) -> Array: ...
+    @property
+    def Q(self) -> Array: ...
+    @property
+    def broad(self) -> Array: ...
+    @property
+    def held(self) -> Array | None: ...
+
+
+L = TypeVar("L", bound=LinearPlan, default=KalmanPlan)
+
+
 class KalmanState(NamedTuple):
     """x (B, N, n) and P (B, N, n, n), predicted or updated. P is None in a steady filter: its plan holds it."""
 
     x: Array
     P: Array | None
+    trust: Array | None = None  # (B, N, N) in [0, 1], [i, j] that of i in j; of a filter that weighs its neighbours by it
 
 
 def alone(S: Array, keep: Array) -> Array:
@@ -136,19 +162,19 @@ def steady_state(model: Model) -> Array:
     return np.stack(out)
 
 
-class LinearFilter:
-    """The recursion, on a KalmanPlan or what has its fields. A subclass says in `steady` whether P- is held."""
+def kalman_plan(model: Model, steady: bool) -> KalmanPlan:
+    """Return the constants of the recursion; a steady one holds P- where it settles."""
+    held = steady_state(model) if steady else None
+    return KalmanPlan(model.A, model.B, model.c, model.C, model.Q, model.R, broad(model), held)
 
-    steady: bool
 
-    def prepare(self, model: Model) -> Any:
-        held = steady_state(model) if self.steady else None
-        return KalmanPlan(model.A, model.B, model.c, model.C, model.Q, model.R, broad(model), held)
+class LinearFilter(Generic[L]):
+    """The recursion. A subclass makes the plan, a KalmanPlan or another type with its fields."""
 
-    def start(self, plan: Any, prior: Prior) -> KalmanState:
+    def start(self, plan: L, prior: Prior) -> KalmanState:
         return KalmanState(prior.mean, prior.cov if plan.held is None else None)
 
-    def predict(self, plan: Any, state: KalmanState, known_u: Array) -> KalmanState:
+    def predict(self, plan: L, state: KalmanState, known_u: Array) -> KalmanState:
         x = num.matvec(plan.A, state.x) + num.matvec(plan.B, known_u) + plan.c
         if state.P is None:
             return KalmanState(x, None)
@@ -157,16 +183,16 @@ class LinearFilter:
         half = num.matmul(plan.A, state.P)
         return KalmanState(x, num.matmul(plan.A, num.transpose(half)) + plan.Q)
 
-    def innovation(self, plan: Any, state: KalmanState, received: Received) -> Innovation:
+    def innovation(self, plan: L, state: KalmanState, received: Received) -> Innovation:
         r = np.where(received.valid, received.y - num.matvec(plan.C, state.x), 0.0)
         S = num.matmul(plan.C, num.transpose(self._cross(plan, state))) + plan.R
         return Innovation(r, alone(np.broadcast_to(S, (*r.shape, r.shape[-1])), received.valid))
 
-    def gain(self, plan: Any, state: KalmanState, innovation: Innovation) -> Array:
+    def gain(self, plan: L, state: KalmanState, innovation: Innovation) -> Array:
         cross = num.transpose(self._cross(plan, state))  # P- C'
         return num.matmul(cross, num.inverse(innovation.S))
 
-    def update(self, plan: Any, state: KalmanState, innovation: Innovation, accept: Array) -> KalmanState:
+    def update(self, plan: L, state: KalmanState, innovation: Innovation, accept: Array) -> KalmanState:
         S, r = innovation.S, innovation.r
         if len(plan.A) > SMALL and state.P is not None and plan.held is None:
             return KalmanState(*num.corrected(plan.C, num.inverse(alone(S, accept)), state.x, state.P, r, accept))
@@ -183,19 +209,19 @@ class LinearFilter:
         P = state.P - num.matmul(K, cross)
         return KalmanState(x, 0.5 * (P + num.transpose(P)))
 
-    def forget(self, plan: Any, state: KalmanState, where: Array) -> KalmanState:
+    def forget(self, plan: L, state: KalmanState, where: Array) -> KalmanState:
         """A steady filter forgets for this one step."""
         return KalmanState(state.x, np.where(where[..., None, None], np.diag(plan.broad), self._predicted(plan, state)))
 
     def estimate(self, state: KalmanState) -> Array:
         return state.x
 
-    def _predicted(self, plan: Any, state: KalmanState) -> Array:
+    def _predicted(self, plan: L, state: KalmanState) -> Array:
         P = plan.held if state.P is None else state.P
         assert P is not None
         return P
 
-    def _cross(self, plan: Any, state: KalmanState) -> Array:
+    def _cross(self, plan: L, state: KalmanState) -> Array:
         """C P- (B, N, q, n), or (N, q, n) where it is the same for all."""
         return num.matmul(plan.C, self._predicted(plan, state))
 
@@ -206,6 +232,9 @@ class KalmanFilter(LinearFilter):
     """The textbook filter, with a time-varying gain or in steady state."""
 
     steady: bool = param(False, "hold gain and covariance where they settle when nothing is missed")
+
+    def prepare(self, model: Model) -> KalmanPlan:
+        return kalman_plan(model, self.steady)
 
 
 @register("defence", "kf", reference="R. E. Kalman, A New Approach to Linear Filtering and Prediction Problems, 1960")

@@ -101,7 +101,7 @@ class JointRegression:
         return LINE.gain(_at_stop(plan, state), state.fit, innovation)
 
     def update(self, plan: RegressionPlan, state: RegressionState, innovation: Innovation, accept: Array) -> RegressionState:
-        line, x, P = _at_stop(plan, state), *state.fit
+        line, x, P = _at_stop(plan, state), state.fit.x, state.fit.P
         assert P is not None
         y = innovation.r + num.matvec(line.C, x)
         H = np.where(accept[..., None], line.C, 0.0)

@@ -12,7 +12,7 @@ nothing had to be learned.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Generic, NamedTuple, TypeVar
 
 import numpy as np
 from pydantic import Field
@@ -38,6 +38,9 @@ def read_states(model: Model, where: str) -> Array:
     return np.asarray(state)
 
 
+M = TypeVar("M")  # what a predictor keeps of each sensor
+
+
 class PredictorPlan(NamedTuple):
     C: Array  # (N, q, n)
     R: Array  # (N, q) variances
@@ -47,27 +50,27 @@ class PredictorPlan(NamedTuple):
     by_input: Array  # (n,) bool: these states
 
 
-class PredictorState(NamedTuple):
+class PredictorState(NamedTuple, Generic[M]):
     """Every leaf has B first."""
 
     x: Array  # (B, N, n)
     spread: Array  # (B, N, q) variance of the next reading about its prediction
-    past: Any  # what the predictor keeps of each sensor
+    past: M
 
 
 @dataclass(frozen=True)
-class Predictor:
+class Predictor(Generic[M]):
     """Base: a subclass says what it keeps (`begin`), what follows from it (`ahead`) and what it learns (`learn`)."""
 
-    def begin(self, plan: PredictorPlan, y: Array) -> Any:
+    def begin(self, plan: PredictorPlan, y: Array) -> M:
         """What is kept before the first reading; y (B, N, q) are the readings that the prior predicts."""
         raise TypeError(f"{type(self).__name__} must define begin()")
 
-    def ahead(self, plan: PredictorPlan, past: Any) -> tuple[Any, Array, Array]:
+    def ahead(self, plan: PredictorPlan, past: M) -> tuple[M, Array, Array]:
         """One step later: what is kept, the predicted readings (B, N, q), and their variance."""
         raise TypeError(f"{type(self).__name__} must define ahead()")
 
-    def learn(self, plan: PredictorPlan, past: Any, y: Array, accept: Array) -> Any:
+    def learn(self, plan: PredictorPlan, past: M, y: Array, accept: Array) -> M:
         """What is kept after the readings y (B, N, q) of `accept` (B, N, q)."""
         raise TypeError(f"{type(self).__name__} must define learn()")
 
@@ -78,37 +81,37 @@ class Predictor:
         state = read_states(model, f"filter {type(self).__name__}")
         return PredictorPlan(model.C, R, agent, state, model.B * by_input[:, None], by_input)
 
-    def start(self, plan: PredictorPlan, prior: Prior) -> PredictorState:
+    def start(self, plan: PredictorPlan, prior: Prior) -> PredictorState[M]:
         y = num.matvec(plan.C, prior.mean)
         return PredictorState(prior.mean, num.full(y.shape, plan.R), self.begin(plan, y))
 
-    def predict(self, plan: PredictorPlan, state: PredictorState, known_u: Array) -> PredictorState:
+    def predict(self, plan: PredictorPlan, state: PredictorState[M], known_u: Array) -> PredictorState[M]:
         past, y, spread = self.ahead(plan, state.past)
         x = np.where(plan.by_input, num.matvec(plan.inputs, known_u), state.x)
         x[:, plan.agent, plan.state] = np.clip(y, -LARGEST, LARGEST)
         return PredictorState(x, spread, past)
 
-    def innovation(self, plan: PredictorPlan, state: PredictorState, received: Received) -> Innovation:
+    def innovation(self, plan: PredictorPlan, state: PredictorState[M], received: Received) -> Innovation:
         r = np.where(received.valid, received.y - num.matvec(plan.C, state.x), 0.0)
         S = num.zeros((*r.shape, r.shape[-1]))
         for i in range(r.shape[-1]):
             S[..., i, i] = state.spread[..., i]
         return Innovation(r, S)
 
-    def update(self, plan: PredictorPlan, state: PredictorState, innovation: Innovation, accept: Array) -> PredictorState:
+    def update(self, plan: PredictorPlan, state: PredictorState[M], innovation: Innovation, accept: Array) -> PredictorState[M]:
         y = num.matvec(plan.C, state.x) + np.where(accept, innovation.r, 0.0)
         x = state.x.copy(order="K")
         x[:, plan.agent, plan.state] = y
         return PredictorState(x, state.spread, self.learn(plan, state.past, y, accept))
 
-    def forget(self, plan: PredictorPlan, state: PredictorState, where: Array) -> PredictorState:
+    def forget(self, plan: PredictorPlan, state: PredictorState[M], where: Array) -> PredictorState[M]:
         """Nothing to forget: the next reading is believed entirely."""
         return state
 
-    def gain(self, plan: PredictorPlan, state: PredictorState, innovation: Innovation) -> Array:
+    def gain(self, plan: PredictorPlan, state: PredictorState[M], innovation: Innovation) -> Array:
         return np.broadcast_to(num.transpose(plan.C), (*innovation.r.shape[:2], *plan.C.shape[:0:-1]))
 
-    def estimate(self, state: PredictorState) -> Array:
+    def estimate(self, state: PredictorState[M]) -> Array:
         return state.x
 
 
@@ -118,7 +121,7 @@ class Last(NamedTuple):
 
 @register("filter", "hold_last")
 @dataclass(frozen=True)
-class HoldLast(Predictor):
+class HoldLast(Predictor[Last]):
     """Holds the last reading."""
 
     def begin(self, plan: PredictorPlan, y: Array) -> Last:
@@ -140,7 +143,7 @@ class Lags(NamedTuple):
 
 @register("filter", "autoregressive", reference="S. Haykin, Adaptive Filter Theory, 2002: recursive least squares")
 @dataclass(frozen=True)
-class Autoregressive(Predictor):
+class Autoregressive(Predictor[Lags]):
     """Autoregression of each reading on its own last ones, by recursive least squares; it holds the last one at first."""
 
     order: Order = param(4, "readings that the next one is regressed on")
@@ -175,7 +178,7 @@ class Ring(NamedTuple):
 
 @register("filter", "polynomial", reference="W. S. Cleveland, Robust locally weighted regression, 1979: local least squares, unweighted")
 @dataclass(frozen=True)
-class Polynomial(Predictor):
+class Polynomial(Predictor[Ring]):
     """Least-squares polynomial through the last readings of each sensor, extrapolated."""
 
     degree: Degree = param(2, "degree of the polynomial")

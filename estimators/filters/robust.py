@@ -23,7 +23,7 @@ from tailgate.core import Array, Innovation, Model, Positive, param
 from tailgate.core.registry import register
 from tailgate.estimators.compose import AcceptAll, Composed
 from tailgate.estimators.detectors.chi_square import ChiSquare
-from tailgate.estimators.filters.kalman import KalmanPlan, KalmanState, LinearFilter, alone, steady_state
+from tailgate.estimators.filters.kalman import KalmanPlan, KalmanState, LinearFilter, alone, kalman_plan, steady_state
 from tailgate.estimators.parts import Detector, Filter, Memoryless, Mitigation, Verdict
 
 ROUNDS = 1000  # far above what was ever seen: a guard against rounding
@@ -210,7 +210,8 @@ class Solved(Penalty):
 class RobustKalmanFilter(Solved, LinearFilter):
     """Steady-state filter that first takes sparse outliers out of the innovation."""
 
-    steady = True
+    def prepare(self, model: Model) -> Any:  # a KalmanPlan whose `held` is an array
+        return kalman_plan(model, steady=True)
 
     def update(self, plan: KalmanPlan, state: KalmanState, innovation: Innovation, accept: Array) -> KalmanState:
         r, S = innovation

@@ -9,7 +9,7 @@ They protect from false messages and from what neighbours believe, not from fals
 """
 
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from tailgate import num
 from tailgate.base.errors import InputError, NotApplicable
 from tailgate.core import Array, Finite, Model, NonNegative, Positive, Received, param
 from tailgate.core.registry import register
-from tailgate.estimators.compose import GateOut, ModeName, quiet
+from tailgate.estimators.compose import Gate, M, ModeName, ReactionPlan, X, quiet
 from tailgate.estimators.parts import Decision, Verdict
 
 OWN = ("distance", "velocity", "acceleration")
@@ -32,33 +32,36 @@ def require_string(model: Model, name: str) -> None:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Choice(GateOut):
+class Choice(Gate[M, X]):
     """Base: uses all readings, or with `gate` those that are not suspected."""
 
     gate: bool = param(False, "ignore the suspected sensors, as gate_out does")
 
-    def choose(self, plan: Any, state: Any, verdict: Verdict, received: Received) -> tuple[Any, Decision]:
-        return super().choose(plan, state, verdict, received) if self.gate else (state, Decision(received.valid, quiet(verdict)))
+    def gated(self, state: Array | None, verdict: Verdict, received: Received) -> tuple[Array | None, Decision]:
+        return super().gated(state, verdict, received) if self.gate else (state, Decision(received.valid, quiet(verdict)))
 
 
 @register("mitigation", "acc_fallback")
 @dataclass(frozen=True, kw_only=True)
-class AccFallback(Choice):
+class AccFallback(Choice[Array]):
     """Uses no messages while alarmed and for some time after: the cars' controllers fall back to their own sensors and estimates."""
 
     mode: ModeName = param("acc", "what is asked of the controller while alarmed: normal, widen, brake, stop or acc")
 
-    def prepare(self, model: Model) -> Any:
+    def prepare(self, model: Model) -> ReactionPlan:
         require_string(model, "acc_fallback")
         return super().prepare(model)
 
+    def begin(self, plan: ReactionPlan, batch: int) -> Array | None:
+        return self.gates(plan, batch)
+
+    def choose(self, plan: ReactionPlan, state: Array | None, verdict: Verdict, received: Received) -> tuple[Array | None, Decision]:
+        return self.gated(state, verdict, received)
+
 
 class LocalPlan(NamedTuple):
-    """What Reaction reads, and the car's own loop."""
+    """Constants of a car's own loop."""
 
-    agents: int
-    sensors: int
-    linger: int
     follows: Array  # (N,) bool
     place: tuple[int, ...]  # of distance, velocity and acceleration among the sensors
     smooth: float  # h
@@ -67,7 +70,7 @@ class LocalPlan(NamedTuple):
 
 
 class LocalState(NamedTuple):
-    shut: Any  # what gate_out keeps
+    shut: Array | None  # (B, N, q) steps that the gate stays shut
     y: Array  # (B, N, 3) the last readings of the own sensors
     known: Array  # (B, N, 3) bool: there is one
     g: Array  # (B, N) smoothed gap
@@ -75,7 +78,7 @@ class LocalState(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class OwnSensors(Choice):
+class OwnSensors(Choice[LocalState, LocalPlan]):
     """Base of the control defences that compute a command from a car's own sensors: a subclass's `bounds` makes limits of it."""
 
     headway: Positive = param(3.0, "time headway tau_h of the own law, best the controller's [s]")
@@ -89,7 +92,7 @@ class OwnSensors(Choice):
         """The least and the largest command (B, N) for own readings y (B, N, 3) and the gap's rate; `on` (B, N): an alarm lasts."""
         raise TypeError(f"{type(self).__name__} must define bounds()")
 
-    def prepare(self, model: Model) -> Any:
+    def constants(self, model: Model) -> LocalPlan:
         name = f"mitigation {type(self).__name__}"
         require_string(model, type(self).__name__)
         missing = [sensor for sensor in OWN if sensor not in model.sensors]
@@ -97,31 +100,34 @@ class OwnSensors(Choice):
             raise NotApplicable(name, list(model.sensors), f"cars that measure {', '.join(OWN)} and command an acceleration")
         if self.accel_min > self.accel_max:
             raise InputError(f"{name}.accel_min", self.accel_min, f"at most accel_max ({self.accel_max})")
-        plan, place = super().prepare(model), tuple(model.sensors.index(sensor) for sensor in OWN)
-        return LocalPlan(plan.agents, plan.sensors, plan.linger, model.followers, place, self.smooth(model.dt), model.dt)
+        return LocalPlan(model.followers, tuple(model.sensors.index(sensor) for sensor in OWN), self.smooth(model.dt), model.dt)
 
     def smooth(self, dt: float) -> float:
         """The share h of a new reading in the smoothed gap."""
         return 1.0 - float(num.exp(-dt / self.smoothing))
 
-    def begin(self, plan: Any, batch: int) -> Any:
+    def begin(self, plan: ReactionPlan[LocalPlan], batch: int) -> LocalState:
         shape = (batch, plan.agents)
         own = num.zeros((*shape, len(OWN)))
-        return LocalState(super().begin(plan, batch), own, own != 0.0, num.zeros(shape), num.zeros(shape, np.int64))
+        return LocalState(self.gates(plan, batch), own, own != 0.0, num.zeros(shape), num.zeros(shape, np.int64))
 
-    def choose(self, plan: Any, state: Any, verdict: Verdict, received: Received) -> tuple[Any, Decision]:
-        shut, decision = super().choose(plan, state.shut, verdict, received)
-        place = list(plan.place)
+    def choose(
+        self, plan: ReactionPlan[LocalPlan], state: LocalState | None, verdict: Verdict, received: Received
+    ) -> tuple[LocalState, Decision]:
+        loop = plan.own
+        assert state is not None and loop is not None
+        shut, decision = self.gated(state.shut, verdict, received)
+        place = list(loop.place)
         heard = received.valid[..., place]
         y, known = np.where(heard, received.y[..., place], state.y), state.known | heard
         g = np.where(state.known[..., 0], state.g, y[..., 0])
-        rate = (y[..., 0] - g) * (plan.smooth / plan.dt)
+        rate = (y[..., 0] - g) * (loop.smooth / loop.dt)
         left = np.where(verdict.alarm, plan.linger + 1, np.maximum(state.left - 1, 0))
-        low, high = self.bounds(plan, y, rate, left > 0)
-        sure = plan.follows & known.all(axis=-1)
+        low, high = self.bounds(loop, y, rate, left > 0)
+        sure = loop.follows & known.all(axis=-1)
         limits = num.zeros((*low.shape, 1, 2))
         limits[..., 0, 0], limits[..., 0, 1] = np.where(sure, low, -np.inf), np.where(sure, high, np.inf)
-        g = g + plan.smooth * (y[..., 0] - g)
+        g = g + loop.smooth * (y[..., 0] - g)
         return LocalState(shut, y, known, g, left), decision._replace(limits=limits)
 
     def within(self, u: Array) -> Array:
@@ -263,9 +269,8 @@ class InputClip(OwnSensors):
             raise InputError("mitigation input_clip.clearance", self.clearance, f"less: it leaves {left:.2f} m for a deviation")
         return left / width
 
-    def prepare(self, model: Model) -> Any:
-        plan: LocalPlan = super().prepare(model)
-        return plan._replace(bound=self.bound(model))
+    def constants(self, model: Model) -> LocalPlan:
+        return super().constants(model)._replace(bound=self.bound(model))
 
     def bounds(self, plan: LocalPlan, y: Array, rate: Array, on: Array) -> tuple[Array, Array]:
         d, v, a = (y[..., s] for s in range(len(OWN)))

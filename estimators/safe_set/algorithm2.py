@@ -32,7 +32,7 @@ class Weights(NamedTuple):
 
 
 @dataclass(frozen=True)
-class PrintedRegression(Predictor):
+class PrintedRegression(Predictor[Weights]):
     """Algorithm 1: recursive least squares of each reading on [1, t/100]."""
 
     forgetting: float
@@ -55,7 +55,9 @@ class PrintedRegression(Predictor):
         P = np.where(accept[..., None, None], (P - j[..., :, None] * g[..., None, :]) / self.forgetting, P)
         return Weights(w, P, h)
 
-    def update(self, plan: PredictorPlan, state: PredictorState, innovation: Innovation, accept: Array) -> PredictorState:
+    def update(
+        self, plan: PredictorPlan, state: PredictorState[Weights], innovation: Innovation, accept: Array
+    ) -> PredictorState[Weights]:
         state = super().update(plan, state, innovation, accept)
         x = state.x.copy(order="K")
         x[:, plan.agent, plan.state] = num.dot(state.past.w, state.past.h)

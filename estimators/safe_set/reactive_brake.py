@@ -15,7 +15,7 @@ stop(v, a) is the way to a standstill of a first-order lag tau whose command is 
 """
 
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Any, Generic, Literal, NamedTuple
 
 import numpy as np
 
@@ -23,7 +23,9 @@ from tailgate import num
 from tailgate.base.errors import NotApplicable
 from tailgate.core import Array, Estimate, Mode, Model, NonNegative, Positive, Prior, Received, param
 from tailgate.core.draws import Draws
+from tailgate.core.nouns import P, S
 from tailgate.core.registry import make_from, register
+from tailgate.estimators.parts import Filter
 from tailgate.estimators.safe_set.safe_state import ACCEL, GAP, LEAD, SPEED, Finding, OwnCommand, SafeSet, SetPlan, SetState
 
 RSS = "S. Shalev-Shwartz, S. Shammah, A. Shashua, On a Formal Model of Safe and Scalable Self-driving Cars, 2017"
@@ -55,9 +57,9 @@ def way_until(t: Array, e: Array, v: Array, c: Array, brake: float, tau: float) 
     return out
 
 
-class SafePlan(NamedTuple):
-    filter: Any
-    filter_plan: Any
+class SafePlan(NamedTuple, Generic[P, S]):
+    filter: Filter[P, S]
+    filter_plan: P
     set_plan: SetPlan
     actuators: int
     follows: Array  # (N,) bool
@@ -68,10 +70,10 @@ class SafePlan(NamedTuple):
     watch: int  # steps for which the brake stays armed
 
 
-class SafeMemory(NamedTuple):
+class SafeMemory(NamedTuple, Generic[S]):
     """Every leaf has B first."""
 
-    filter: Any
+    filter: S
     set: SetState
     armed: Array  # (B, N) int64: steps for which the brake still acts though nothing is distrusted
 
@@ -81,15 +83,16 @@ class SafeMemory(NamedTuple):
 class SafeState(SafeSet):
     """Filter that uses only readings in the safe set: intervals of what the sensors' accuracy and the dynamics allow; never brakes."""
 
-    filter: Any = param("kf", "filter: a name, or a mapping with name and parameters")
+    filter: object = param("kf", "filter: a name, or a mapping with name and parameters")
 
     def __post_init__(self) -> None:
         super().__post_init__()
         self._filter()  # a wrong name shall fail here
 
-    def _filter(self) -> Any:
+    def _filter(self) -> Filter:
         data = {"name": "kf", **self.filter} if isinstance(self.filter, dict) else self.filter
-        return make_from("filter", data, "defence safe_state.filter")
+        made: Filter = make_from("filter", data, "defence safe_state.filter")
+        return made
 
     def prepare(self, model: Model) -> SafePlan:
         f, limits = self._filter(), self.limits_of(model)

@@ -16,7 +16,7 @@ Where nobody tells w it is told by the gaps. With h_j = d - j dt w,
 
 import math
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, NamedTuple, Protocol
+from typing import Annotated, Literal, NamedTuple, Protocol
 
 import numpy as np
 from pydantic import Field
@@ -53,7 +53,7 @@ class Span(NamedTuple):
     def column(self, i: int) -> "Span":
         return Span(self.lo[..., i], self.hi[..., i])
 
-    def padded(self, by: Any) -> "Span":
+    def padded(self, by: Array | float) -> "Span":
         return Span(self.lo - by, self.hi + by)
 
     def within(self, low: float, high: float) -> "Span":
@@ -157,7 +157,7 @@ class OwnOdometry:
 
 
 class SetPlan(NamedTuple):
-    road: Any  # Road
+    road: Road
     columns: Array  # (q,) column of each sensor
     accuracy: Array  # (N, 4) e
     loose: Array  # (N,) bound of the gap's disturbance in a step [m]

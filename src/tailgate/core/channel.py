@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,6 +18,7 @@ NONE, DOS_JAM, DROPOUT, REPLAY, NOISE_JAM, ECHO_DELAY = map(  # plain numbers: n
 _VALUED, _ON_AIR, _RADIATED = (
     np.array([kind in EFFECTS and getattr(EFFECTS[kind], trait) for kind in map(int, Kind)]) for trait in ("valued", "over_air", "radiated")
 )
+Number = Array | float
 
 
 class ChannelPlan(NamedTuple):
@@ -54,7 +55,9 @@ class ChannelState(NamedTuple):
     last: Command
 
 
-def accepts(k: Any, steps: Any, left: Any, burst: Any, cooldown: Any, onset: Any, last: Any, longest: Any, pause: Any) -> Any:
+def accepts(
+    k: Number, steps: Number, left: Number, burst: Number, cooldown: Number, onset: Number, last: Number, longest: Number, pause: Number
+) -> Array:
     """Whether a command that is legal in itself, given in each of the `steps` steps from k on, is accepted in at least one; elementwise.
 
     left: attack steps in the budget. burst, cooldown: lengths so far and still [steps]. onset, last, longest, pause: of the threat model.

@@ -135,15 +135,15 @@ def _bend(a: int, b: int) -> float:
     return 0.0 if abs(a - b) < 2 else 0.5 * 0.34 * abs(a - b)
 
 
-def draw_graph(source: Any, path: Path, attacked: Collection[int] = (), title: str = "") -> Path:
+def draw_graph(source: object, path: Path, attacked: Collection[int] = (), title: str = "") -> Path:
     """Writes the graph of a Model, or of a plant whose agents hear each other, to a .png, .svg or .pdf file; returns its path."""
     form = path.suffix.lower().removeprefix(".")
     if form not in FORMATS:
         raise InputError("out", str(path), f"a file that ends in {', '.join('.' + name for name in FORMATS)}")
     if isinstance(source, Model):
         graph, row = source.graph, bool(source.followers.any())
-    elif callable(getattr(source, "hears", None)):
-        graph, row = source.hears(), hasattr(source, "topology")
+    elif callable(hears := getattr(source, "hears", None)):
+        graph, row = hears(), hasattr(source, "topology")
     else:
         raise InputError("graph", type(source).__name__, "a model, or a plant whose agents hear each other")
     figure, out = graph_figure(graph, None, attacked, row, title), io.BytesIO()

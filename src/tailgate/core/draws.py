@@ -7,7 +7,7 @@ parties have unrelated keys: what a defence or an attack holds tells nothing of 
 
 import hashlib
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from enum import IntEnum
 from functools import cache
 from typing import Any, NamedTuple, cast
@@ -23,6 +23,7 @@ from tailgate.engine.compiled import Code
 
 Array = NDArray[Any]
 
+Pair = Callable[..., tuple[Array, Array]]  # a function of key, episode, step, stream and block that gives two numbers
 PURPOSES = ("train", "tune", "calibrate", "select", "report")
 _PARTIES = ("world", "attack", "defence")
 
@@ -70,7 +71,7 @@ def keys(purpose: str, seeds: Sequence[int]) -> Keys:
 
 
 @cache
-def _code(pair: Any) -> Code:
+def _code(pair: Pair) -> Code:
     return Code(pair, np.uint64, 5)
 
 
@@ -82,14 +83,14 @@ class Draws(NamedTuple):
     step: Array
     stream: int
 
-    def _numbers(self, pair: Any, shape: tuple[int, ...], tag: int) -> Array:
+    def _numbers(self, pair: Pair, shape: tuple[int, ...], tag: int) -> Array:
         """(B, *shape) numbers of a function that gives two for each block."""
         size, batch = math.prod(shape), len(self.key)
         blocks, stream = (size + 1) // 2, np.uint64(self.stream << 16 | tag)
         if isinstance(self.key, Traced):
             counters = self.key, self.episode.astype(np.uint64), self.step.astype(np.uint64), stream
-            out: Any = [number for block in range(blocks) for number in pair(*counters, np.uint64(block))][:size]
-            held: Any = np.stack(out, axis=-1) if out else np.zeros((batch, 0))
+            out = [number for block in range(blocks) for number in pair(*counters, np.uint64(block))][:size]
+            held = np.stack(out, axis=-1) if out else np.zeros((batch, 0))
             return cast(Array, held.reshape(batch, *shape))
         given = np.empty((5, blocks, batch), np.uint64)
         given[0], given[1], given[2], given[3], given[4] = self.key, self.episode, self.step, stream, np.arange(blocks)[:, None]

@@ -43,6 +43,7 @@ from tailgate.core import (
 from tailgate.core.channel import Channel, ChannelPlan, ChannelState
 from tailgate.core.draws import Keys, Role
 from tailgate.core.lossy_link import Link, LinkState
+from tailgate.core.nouns import P, S
 from tailgate.core.score_threshold import Watched
 from tailgate.core.threat import Brief, ThreatModel
 from tailgate.engine.array import Traced
@@ -75,10 +76,10 @@ def check_estimate(estimate: Estimate, model: Model, batch: int, k: Array) -> No
 
 
 class LoopPlan(NamedTuple):
-    plant: Any
-    sensor: Any
-    controller: Any
-    manoeuvre: Any
+    plant: object
+    sensor: object
+    controller: object
+    manoeuvre: object
     defence: Any
     channel: ChannelPlan
 
@@ -89,8 +90,8 @@ class LoopState(NamedTuple):
     keys: Keys
     k: Array  # (B,) int64
     plant: Any
-    manoeuvre: Any
-    controller: Any
+    manoeuvre: object
+    controller: object
     defence: Any
     channel: ChannelState
     estimate: Estimate
@@ -274,13 +275,13 @@ class Loop:
         )  # fmt: skip
         return state, frame
 
-    def step(self, state: LoopState, attack: Attack, plan: Any, memory: Any) -> tuple[LoopState, Any, Frame]:
+    def step(self, state: LoopState, attack: Attack[P, S], plan: P, memory: S) -> tuple[LoopState, S, Frame]:
         """sense, decide, advance. `plan` and `memory` are the attack's plan and state."""
         memory, command = attack.decide(plan, memory, self.sense(state), state.keys.at(Role.ATTACK, state.k))
         state, frame = self.advance(state, command)
         return state, memory, frame
 
-    def _truth(self, plant: Any, controller: Any) -> Array:
+    def _truth(self, plant: object, controller: object) -> Array:
         held = self.controller.held(self.plan.controller, controller, len(self.plant.lead_speed_of(plant)))
         return self.plant.truth(self.plan.plant, plant, held)
 
@@ -291,15 +292,17 @@ class Loop:
         sensor, draws = cast(Receiver, self.sensor), state.keys.at(Role.SENSOR, state.k)
         return lambda air: sensor.disturbed(self.plan.sensor, truth, state.estimate.probe, draws, air)
 
-    def _measure(self, keys: Keys, k: Array, plant: Any, controller: Any, estimate: Estimate) -> tuple[Array, Received]:
+    def _measure(self, keys: Keys, k: Array, plant: object, controller: object, estimate: Estimate) -> tuple[Array, Received]:
         truth = self._truth(plant, controller)
         received = self.sensor.measure(self.plan.sensor, truth, estimate.probe, keys.at(Role.SENSOR, k))
         columns = [received.y[..., i] for i in range(received.y.shape[-1])]
         v2v = self.plant.v2v(self.plan.plant, plant)
         return num.stack(columns + [v2v[..., i] for i in range(v2v.shape[-1])]), received
 
-    def _move(self, keys: Keys, k: Array, manoeuvre: Any, plant: Any, applied: Array, u: Array | None = None) -> tuple[Any, Any, Array]:
-        """-> manoeuvre, plant, and what is known of the input; u is what was commanded, where that is not what is applied."""
+    def _move(
+        self, keys: Keys, k: Array, manoeuvre: object, plant: object, applied: Array, u: Array | None = None
+    ) -> tuple[object, object, Array]:
+        """Return the next states of manoeuvre and plant, and the known input; u is the command where it differs from what is applied."""
         plan = self.plan
         manoeuvre, exo = self.manoeuvre.accel(
             plan.manoeuvre, manoeuvre, k, self.plant.lead_speed_of(plant), keys.at(Role.MANOEUVRE, k)

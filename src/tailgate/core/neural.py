@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, Protocol, TypeVar
 
 import numpy as np
 from safetensors.numpy import load as load_tensors
@@ -21,7 +21,17 @@ from tailgate.base.reading import TENSORS, load_json, read_bytes, tensors_of
 from tailgate.core.nouns import Array
 from tailgate.core.schema import build
 
-T = TypeVar("T")
+
+class Trained(Protocol):
+    """The header of a file of trained weights."""
+
+    @property
+    def tensors(self) -> str: ...
+    @property
+    def sha256(self) -> str: ...
+
+
+T = TypeVar("T", bound=Trained)
 
 
 class Memory(NamedTuple):
@@ -98,7 +108,7 @@ def read_trained(kind: type[T], form: str, path: Path, field: str, where: str) -
     if not isinstance(data, dict) or data.get("format") != form:
         shown = data.get("format") if isinstance(data, dict) else type(data).__name__
         raise InputError(where, shown, f"a JSON object of format {form!r}")
-    header: Any = build(kind, data, where)
+    header = build(kind, data, where)
     if not header.tensors or Path(header.tensors).name != header.tensors:
         raise InputError(f"{where}.tensors", header.tensors, "the name of a file beside the JSON file")
     try:

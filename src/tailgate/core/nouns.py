@@ -13,10 +13,11 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Generic, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from typing_extensions import TypeVar
 
 from tailgate.base.errors import InputError
 from tailgate.core.kinds import AIRED as AIRED
@@ -35,9 +36,11 @@ if TYPE_CHECKING:
     from tailgate.core.components import Defence
 
 Array = NDArray[Any]
+P = TypeVar("P", default=Any)  # type of a component's plan
+S = TypeVar("S", default=Any)  # type of its state
 
 
-def param(default: Any, doc: str, if_any: bool = False) -> Any:
+def param(default: object, doc: str, if_any: bool = False) -> Any:
     """A dataclass field with its default, unit and one sentence; with `if_any` its data is written only where it is not empty."""
     return dataclasses.field(default=default, metadata={"doc": doc, "if_any": if_any})
 
@@ -198,12 +201,12 @@ class Estimate(NamedTuple):
     limits: Array | None = None
 
 
-def pair_of(answer: Any) -> tuple[Any, Estimate]:
+def pair_of(answer: object) -> tuple[Any, Estimate]:
     """What a defence's step has to return; raises InputError for anything else."""
     if not isinstance(answer, tuple) or len(answer) != 2 or not isinstance(answer[1], Estimate):
         got = f"({', '.join(type(part).__name__ for part in answer)})" if type(answer) is tuple else type(answer).__name__
         raise InputError("defence output", got, "a pair (state, Estimate), which its step returns")
-    return answer
+    return answer[0], answer[1]
 
 
 class Innovation(NamedTuple):
@@ -233,12 +236,12 @@ class View(NamedTuple):
     truth: Array | None = None  # white: (B, N, n)
 
 
-class WhiteBox(NamedTuple):
+class WhiteBox(NamedTuple, Generic[P, S]):
     """The defence as a white-box attacker holds it. Its step is pure on the given state: look ahead at will."""
 
-    defence: Defence
-    plan: Any
-    state: Any
+    defence: Defence[P, S]
+    plan: P
+    state: S
     known_u: Array  # (B, N, m) the known input since the last step
 
 

@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from importlib import import_module
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -219,7 +219,7 @@ def stealth_programme(model: Model, P: Array, direction: Array, gate: float, bou
     together. P (n, n) is the predicted covariance at the first step.
     """
     try:
-        cvxpy: Any = import_module("cvxpy")
+        cvxpy = import_module("cvxpy")
     except ImportError as error:
         raise ImportError("cvxpy is missing: pip install 'tailgate[cvxpy]'") from error
     C, R = model.C[0], model.R[0]

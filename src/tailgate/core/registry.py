@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, TypedDict, TypeVar, Unpack
 
 from tailgate.base.errors import InputError, unknown
 from tailgate.base.lazy import components, loaded
@@ -45,6 +45,17 @@ PARTS: tuple[Family, ...] = ("filter", "detector", "mitigation")  # of the defen
 _entries: dict[str, dict[str, "Entry"]] = {family: {} for family in _MODULES}
 _plugins_loaded: set[str] = set()
 T = TypeVar("T", bound=type)
+
+
+class Card(TypedDict, total=False):
+    """The fields of `Entry` that a component gives at its registration."""
+
+    version: int
+    reference: str
+    uses: tuple[str, ...]
+    knowledge: str
+    optimal: bool
+    sentinel: str
 
 
 @dataclass(frozen=True)
@@ -88,7 +99,7 @@ class Entry:
         return out | {"parameters": params}
 
 
-def register(family: Family, name: str, **card: Any) -> Callable[[T], T]:
+def register(family: Family, name: str, **card: Unpack[Card]) -> Callable[[T], T]:
     """Class decorator. Reusing a name is an error."""
 
     def add(cls: T) -> T:
@@ -159,7 +170,7 @@ def entry_for(family: Family, cls: type) -> Entry:
     return entry_of(family, cls.__name__, cls)
 
 
-def text_of(entry: Entry, value: Any) -> str:
+def text_of(entry: Entry, value: object) -> str:
     """The text that names this object on a command line, as far as one can."""
     cls = type(value)
     name = entry.name if _entries[entry.family].get(entry.name) is entry else f"{cls.__module__}:{cls.__qualname__}"
@@ -184,7 +195,7 @@ def find(family: Family, name: str) -> Entry:
     return known[name]
 
 
-def make(family: Family, name: str, /, **params: Any) -> Any:
+def make(family: Family, name: str, /, **params: object) -> Any:
     """A component by name, its parameters validated."""
     if not isinstance(name, str):
         raise InputError(f"{family}.name", name, "the name of a registered component")
@@ -192,7 +203,7 @@ def make(family: Family, name: str, /, **params: Any) -> Any:
     return build(entry.cls, params, f"{family} {name}")
 
 
-def make_from(family: Family, data: Any, where: str) -> Any:
+def make_from(family: Family, data: object, where: str) -> Any:
     """A component from configuration data: a name, or a mapping with `name` and parameters."""
     if isinstance(data, str):
         data = {"name": data}
@@ -369,7 +380,7 @@ def _takes(function: Callable[..., Any]) -> float:
     return float("inf") if inspect.Parameter.VAR_POSITIONAL in kinds else len(kinds)
 
 
-def _put(params: dict[str, Any], key: str, value: Any) -> None:
+def _put(params: dict[str, Any], key: str, value: object) -> None:
     """params[key] = value; `part.key` goes into the mapping of the part, whose name may stand there already."""
     part, dot, inner = key.partition(".")
     held = params.get(part)

@@ -6,7 +6,7 @@ import dataclasses
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from tailgate.base.errors import InputError, unknown
 from tailgate.base.sizes import Episodes
@@ -18,6 +18,7 @@ from tailgate.core.registry import Spec, make_from
 from tailgate.core.schema import build, digest, fields_of, read_yaml
 from tailgate.core.threat import Brief, ThreatModel
 
+T = TypeVar("T")
 LINK = ("loss", "latency")
 WORDS = ("about", "shown")  # of a suite: what is read, not played; of `shown` the doses count
 _COMPONENTS = ("plant", "sensor", "controller", "manoeuvre")
@@ -32,7 +33,7 @@ class Scenario:
     """
 
     name: str
-    plant: Any
+    plant: Any  # a Plant, and so on; readers know the class of what they load
     sensor: Any
     controller: Any
     manoeuvre: Any
@@ -64,7 +65,7 @@ class Scenario:
         """What an attacker knows before the episode."""
         return Brief(self.plant.model(self.sensor, self.controller), self.threat_model, self.horizon)
 
-    def with_threat(self, **changes: Any) -> Scenario:
+    def with_threat(self, **changes: object) -> Scenario:
         """The same scenario under a changed threat model."""
         data = dataclasses.asdict(self.threat_model) | changes
         return dataclasses.replace(self, threat_model=build(ThreatModel, data, "threat_model"))
@@ -74,14 +75,14 @@ class Scenario:
         return digest(self)
 
 
-def _changed(part: Any, changes: Any, where: str) -> Any:
+def _changed(part: T, changes: object, where: str) -> T:
     """A component with other values of some fields."""
     if not isinstance(changes, dict):
         raise InputError(where, changes, "a mapping of fields")
     for key in changes:
         if key not in fields_of(type(part)):
             raise unknown(f"{where}: unknown field", key, fields_of(type(part)))
-    held = {f.name: getattr(part, f.name) for f in dataclasses.fields(part) if f.init}
+    held = {name: getattr(part, name) for name in fields_of(type(part))}
     return build(type(part), held | changes, where) if changes else part
 
 

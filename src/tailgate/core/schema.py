@@ -65,7 +65,7 @@ def fields_of(cls: type) -> dict[str, Any]:
 
 
 @cache
-def _adapter(cls: Any) -> TypeAdapter[Any]:
+def _adapter(cls: type) -> TypeAdapter[Any]:
     try:
         return TypeAdapter(cls, config=ConfigDict(extra="forbid"))
     except PydanticUserError:  # the class carries its own configuration
@@ -102,7 +102,7 @@ def _made(cls: type[T], data: dict[str, Any], where: str) -> T:
         raise InputError(where, data or None, f"parameters that its constructor takes ({error})") from None
 
 
-def as_data(value: Any) -> Any:
+def as_data(value: object) -> Any:
     """Parameters as plain JSON data: the class, and every default written out, but for empty ones of fields marked `if_any`."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         kind = type(value)
@@ -121,12 +121,12 @@ def as_data(value: Any) -> Any:
     return published(named)
 
 
-def canonical(value: Any) -> str:
+def canonical(value: object) -> str:
     """JSON text that is the same for the same parameters: what hashes are taken of."""
     return json.dumps(as_data(value), sort_keys=True, separators=(",", ":"))
 
 
-def digest(value: Any) -> str:
+def digest(value: object) -> str:
     """Sixteen hexadecimal digits that are the same for the same parameters."""
     return hashlib.blake2b(canonical(value).encode(), digest_size=8).hexdigest()
 

@@ -8,19 +8,20 @@ energy that was heard while the probe was muted; of a safe set how far a reading
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Generic
 
 import numpy as np
 
 from tailgate.core import Array, Defence, Estimate, Model, Prior, Received
 from tailgate.core.draws import Draws
+from tailgate.core.nouns import P, S
 
 
 @dataclass(frozen=True)
-class Watched:
+class Watched(Generic[P, S]):
     """A defence with an alarm where its score is above a threshold [of the score], in place of its own alarm, which acts as before."""
 
-    defence: Defence
+    defence: Defence[P, S]
     threshold: float
 
     @property
@@ -33,13 +34,13 @@ class Watched:
         """Why the defence cannot be traced."""
         return str(getattr(self.defence, "untraced", ""))
 
-    def prepare(self, model: Model) -> Any:
+    def prepare(self, model: Model) -> P:
         return self.defence.prepare(model)
 
-    def start(self, plan: Any, prior: Prior) -> Any:
+    def start(self, plan: P, prior: Prior) -> S:
         return self.defence.start(plan, prior)
 
-    def step(self, plan: Any, state: Any, received: Received, known_u: Array, draws: Draws) -> tuple[Any, Estimate]:
+    def step(self, plan: P, state: S, received: Received, known_u: Array, draws: Draws) -> tuple[S, Estimate]:
         state, told = self.defence.step(plan, state, received, known_u, draws)
         return state, told._replace(alarm=self.alarms(told.score))
 
