@@ -45,7 +45,7 @@ class ComposedState(NamedTuple, Generic[FS, DS, MS]):
 
 
 class Look(NamedTuple):
-    """What the defence would see of a measurement: the white-box attacker's look ahead."""
+    """The defence's view of a measurement, which a white-box attacker computes in advance."""
 
     innovation: Innovation
     gain: Array  # (B, N, n, q)
@@ -56,11 +56,11 @@ class Composed:
     """A defence made of three parts. A named one subclasses it as a dataclass and returns its parts."""
 
     def parts(self) -> tuple[Filter, Detector, Mitigation]:
-        """The filter, detector and mitigation, made from this defence's parameters."""
+        """Return the filter, detector and mitigation, made from this defence's parameters."""
         raise TypeError(f"{type(self).__name__} must define parts()")
 
     def with_threshold(self, value: float) -> Composed:
-        """This defence with its alarm threshold, or its detector's, at `value`. Raises NotApplicable where neither has one."""
+        """Return this defence with its alarm threshold, or its detector's, at `value`. Raise NotApplicable where neither has one."""
         own = getattr(self, "threshold_field", None)
         if own is not None:
             changed: Composed = dataclasses.replace(self, **{own: value})  # type: ignore[type-var]
@@ -100,7 +100,7 @@ class Composed:
         return ComposedState(belief, detector, mitigation), estimate
 
     def look(self, plan: ComposedPlan, state: ComposedState, received: Received, known_u: Array) -> Look:
-        """The innovation, gain and gate that `received` would meet; changes nothing."""
+        """Return the innovation, gain and gate that `received` would meet; change nothing."""
         belief = plan.filter.predict(plan.filter_plan, state.filter, known_u)
         innovation = plan.filter.innovation(plan.filter_plan, belief, received)
         gain = plan.filter.gain(plan.filter_plan, belief, innovation)
@@ -118,7 +118,7 @@ class _Parts(Composed):
 
 
 def compose(filter: Filter, detector: Detector, mitigation: Mitigation) -> Composed:
-    """A defence from three parts."""
+    """Return a defence from three parts."""
     return _Parts(filter, detector, mitigation)
 
 
@@ -154,7 +154,7 @@ class NamedParts(Composed):
 
 
 def threshold_field(detector: Detector) -> str:
-    """The name of a detector's threshold. Raises NotApplicable where it has none."""
+    """Return the name of a detector's threshold. Raise NotApplicable where it has none."""
     name = getattr(detector, "threshold_field", None)
     if name is None:
         raise NotApplicable("threshold", type(detector).__name__, "a detector that alarms at a threshold")
@@ -231,7 +231,7 @@ class Reaction(Generic[M, X]):
 
 
 def quiet(verdict: Verdict) -> Array:
-    """Mode.NORMAL for everybody."""
+    """Return Mode.NORMAL for everybody."""
     return np.full_like(verdict.alarm, Mode.NORMAL, np.int8)
 
 

@@ -9,9 +9,10 @@ OWN = ("prepare", "start", "step", "look")  # what a composed defence does as it
 
 
 def watched(defence: Defence, threshold: float) -> Composed | Watched:
-    """The defence with an alarm at a threshold on its score.
+    """Return the defence with an alarm at a threshold on its score.
 
-    What only filters is composed with the chi-square test, whose alarm then changes nothing: a white box has a gate to stay below.
+    A defence that only filters is composed with the chi-square test, whose alarm then changes nothing: a white-box attacker has a gate to
+    stay below.
     """
     if isinstance(defence, Composed) and all(getattr(type(defence), name) is getattr(Composed, name) for name in OWN):
         filter_, detector, mitigation = defence.parts()

@@ -71,11 +71,11 @@ class Learner(StableLearner):
         return model
 
     def architecture(self) -> dict[str, Any]:
-        """Arguments of this policy alone."""
+        """Return arguments of this policy alone."""
         return {}
 
     def imitate(self, shown: Demonstration) -> None:
-        """Fit the policy to the actions shown and the critic to their returns (behaviour cloning), by its own optimiser's method."""
+        """Fit the policy to the shown actions and the critic to their returns (behaviour cloning), by its own optimiser's method."""
         policy = self.model.policy
         size = len(shown.action)
         seen, action = torch.as_tensor(shown.observation), torch.as_tensor(shown.action)

@@ -20,7 +20,7 @@ from tailgate.estimators.challenge.steering import nearest
 
 
 class Played(NamedTuple):
-    """What came of some games, (B,) each."""
+    """The results of some games, (B,) each."""
 
     paid: Array  # discounted, to the defender
     crashed: Array  # bool
@@ -29,7 +29,7 @@ class Played(NamedTuple):
 
 
 def play(duel: Duel, attack: Attack, keys: Keys, choose: Callable[[Array], Array] | None = None, gamma: float = 1.0) -> Played:
-    """Play a game per key. choose: from what the defenders see (B, d) to their actions; None leaves the knobs to the defence."""
+    """Play a game per key. choose: from the defenders' view (B, d) to their actions; None leaves the knobs to the defence."""
     state, rival = duel.begin(keys), Rival(attack, duel.seat, keys)
     paid, cost, crashed = (np.zeros(len(keys.key)) for _ in range(3))
     decisions, weight = 0, 1.0
@@ -87,7 +87,7 @@ def export(path: Path, duel: Duel, network: Network, training: dict[str, Any]) -
 
 
 def constant(duel: Duel, setting: int) -> Network:
-    """The network of a defender that always chooses one setting."""
+    """Return the network of a defender that always chooses one setting."""
     inputs, actions = len(duel.plan.sight.names), len(duel.settings)
     bias = np.zeros(actions)
     bias[setting] = 1.0

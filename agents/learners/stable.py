@@ -1,4 +1,4 @@
-"""What the learners from Stable-Baselines3 and sb3-contrib share: seeds, curve, checkpoints, export (extra: train).
+"""The common part of the learners from Stable-Baselines3 and sb3-contrib: seeds, curve, checkpoints, export (extra: train).
 
 A checkpoint is one safetensors file that holds everything the next update depends on: networks, optimisers, replay buffer, memory of
 recurrent networks, environments with their episodes in flight, and random generators. An interrupted run that resumes gives the policy of
@@ -59,7 +59,7 @@ class StableConfig(Protocol):
 
 
 class StableLearner:
-    """One training run of one seed. A subclass makes `model` and says what its policy is."""
+    """One training run of one seed. A subclass makes `model` and exports its policy."""
 
     name: ClassVar[str]
     actions: ClassVar[tuple[str, ...]] = (*DISCRETE, *CONTINUOUS)
@@ -87,11 +87,11 @@ class StableLearner:
 
     @abstractmethod
     def make_model(self, tensorboard: str | None) -> Any:
-        """The algorithm of Stable-Baselines3, on `env`."""
+        """Return the algorithm of Stable-Baselines3, on `env`."""
 
     @abstractmethod
     def network(self) -> Network:
-        """What is exported of the model."""
+        """Return the network that is exported."""
 
     @property
     @abstractmethod
@@ -99,11 +99,11 @@ class StableLearner:
         """Decisions between two reports."""
 
     def held(self) -> dict[str, Array]:
-        """Arrays that the next update depends on, besides those of every algorithm."""
+        """Return arrays that the next update depends on, besides those of every algorithm."""
         return {}
 
     def restore(self, arrays: dict[str, Array]) -> None:
-        """Take back what `held` gave."""
+        """Restore what `held` returned."""
 
     # -- the learner
 
@@ -117,7 +117,7 @@ class StableLearner:
         return int(self.model.num_timesteps)
 
     def learn(self, steps: int, report: Callable[[Progress], None], checkpoint: Path | None = None, every: int = 1_000_000) -> None:
-        """Train until `steps` decisions in total; calls `report` after each round. Raises InputError when the policy diverges."""
+        """Train until `steps` decisions in total; call `report` after each round. Raise InputError when the policy diverges."""
         remaining = steps - self.model.num_timesteps
         if remaining <= 0:
             return
@@ -136,7 +136,7 @@ class StableLearner:
             self.save(checkpoint)
 
     def logging(self) -> dict[str, Any]:
-        """Further arguments of the algorithm's own `learn`."""
+        """Return further arguments of the algorithm's own `learn`."""
         return {}
 
     def _finite(self) -> bool:
@@ -157,12 +157,12 @@ class StableLearner:
     # -- checkpoints
 
     def _facts(self) -> dict[str, Any]:
-        """What a checkpoint and the run that loads it must agree on."""
+        """Return the facts on which a checkpoint and the run that loads it must agree."""
         form = f"tailgate-{self.name}-checkpoint-2"
         return {"format": form, "seed": self.seed, "card": self.env.batch.card()["hash"], "learner": self.identity}
 
     def _parts(self) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
-        """Modules, optimisers and single tensors of the algorithm, by name."""
+        """Return modules, optimisers and single tensors of the algorithm, by name."""
         parts, single = self.model._get_torch_save_params()
         every = {name: recursive_getattr(self.model, name) for name in parts}
         optimisers = {name: part for name, part in every.items() if isinstance(part, torch.optim.Optimizer)}
@@ -196,7 +196,7 @@ class StableLearner:
         write_atomic(path, save_tensors(tensors, {"facts": json.dumps(facts)}))
 
     def load(self, path: Path) -> None:
-        """Continue from a checkpoint; raises InputError when it is damaged or of another run."""
+        """Continue from a checkpoint; raise InputError when it is damaged or of another run."""
         tensors, facts = open_checkpoint(path, self._facts(), load_tensors)
         try:
             self.env.reset()
@@ -285,7 +285,7 @@ class _Reporter(BaseCallback):
 
 
 def perceptron(*layers: torch.nn.Module) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
-    """Weights (i, o) and biases (o,) in float64 of the linear layers among these modules and the modules inside of them."""
+    """Return weights (i, o) and biases (o,) in float64 of the linear layers among these modules and the modules inside of them."""
     flat = [m for layer in layers for m in layer.modules() if isinstance(m, torch.nn.Linear)]
     weights = tuple(layer.weight.detach().numpy().T.astype(np.float64) for layer in flat)
     return weights, tuple(layer.bias.detach().numpy().astype(np.float64) for layer in flat)
@@ -334,7 +334,7 @@ class Explorer:
         self.codec, self.attack, self.rng = codec, attack, np.random.default_rng(seed)
 
     def actions(self, rows: int) -> Array:
-        """(rows,) int64 or (rows, size) float32."""
+        """Return random actions, (rows,) int64 or (rows, size) float32."""
         attacks = self.rng.random(rows) < self.attack
         if self.codec.discrete:
             return np.where(attacks, self.rng.integers(1, self.codec.size, rows), 0)
@@ -375,11 +375,11 @@ class OffPolicyLearner(StableLearner):
         return model
 
     def arguments(self) -> dict[str, Any]:
-        """Arguments of this algorithm alone."""
+        """Return arguments of this algorithm alone."""
         return {}
 
     def architecture(self) -> dict[str, Any]:
-        """Arguments of its policy alone."""
+        """Return arguments of its policy alone."""
         return {}
 
     @property

@@ -1,4 +1,4 @@
-"""What a learner may be shown before it learns: the decisions of a scripted attack, and what they brought."""
+"""Demonstrations for a learner before it learns: the decisions of a scripted attack, and their returns."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Demonstration(NamedTuple):
 
 
 def nearest(codec: ActionCodec, command: Command) -> Array:
-    """(B,) the discrete action that comes nearest to a command: of its kind, with the fewest other targets, then the nearest values.
+    """Return the discrete action (B,) nearest to a command: of its kind, with the fewest other targets, then the nearest values.
 
     Rest where no action has that kind.
     """

@@ -24,7 +24,7 @@ WIRES = 4  # wires of which every combination at its bound is tried
 
 
 class Aim(NamedTuple):
-    """Where the estimate is pushed."""
+    """The direction in which the estimate is pushed."""
 
     begin: int  # first step of the window
     last: int
@@ -64,7 +64,7 @@ class OptimalStealth(Script):
         return ScriptPlan(brief, target, Aim(begin, last, np.array(rows[::-1])))
 
     def _farthest(self, brief: Brief, steps: int) -> Array:
-        """(n,) the direction of the largest reach within `steps`."""
+        """Return the direction (n,) of the largest reach within `steps`."""
         model = brief.model
         return np.ones(1) if model.states == 1 else farthest(model, steady_state(model)[0], steps)
 
@@ -94,7 +94,7 @@ class OptimalStealth(Script):
 
 
 def farthest_inside(r: Array, W: Array, gain: Array, gate: Array | float, wires: Array, bound: float) -> tuple[Array, Array]:
-    """a (B, N, q), and whether there is one (B, N): the largest gain' a with (r + a)' W (r + a) <= gate and |a| <= bound.
+    """Return a (B, N, q), the largest gain' a with (r + a)' W (r + a) <= gate and |a| <= bound, and (B, N) bool if there is one.
 
     a is 0 off `wires`; r, gain (B, N, q), W (B, N, q, q). A wire of a solution is at its bound or free, and the free ones are in closed
     form: every combination is tried. Of more than WIRES wires the solution without bounds is shortened towards 0.
@@ -121,7 +121,7 @@ def farthest_inside(r: Array, W: Array, gain: Array, gate: Array | float, wires:
 
 
 def _free_inside(r: Array, W: Array, gain: Array, gate: Array | float, free: Array) -> tuple[Array, Array]:
-    """As `farthest_inside`, without bounds."""
+    """Return what `farthest_inside` returns, without bounds."""
     a = num.zeros(r.shape)
     if not len(free):
         return a, np.asarray(num.quadratic(r, W) <= gate)

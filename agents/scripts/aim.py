@@ -1,4 +1,4 @@
-"""Which wires of which agents an attack goes for, and whether the threat model grants them."""
+"""The wires and agents that an attack aims at, and the check that the threat model grants them."""
 
 from collections.abc import Iterable
 
@@ -10,7 +10,7 @@ from tailgate.core.threat import Brief
 
 
 def chosen(brief: Brief, names: tuple[str, ...], default: Array, agents: tuple[int, ...] = (), where: str = "attack ") -> Array:
-    """(N, w) bool: the wires that `names` lists, or else `default` (w,) or (N, w), of `agents`, or else of all that are granted.
+    """Return (N, w) bool: the wires in `names`, or else `default` (w,) or (N, w), of `agents`, or else of all that are granted.
 
     Raises InputError for a wire that the model has not, NotApplicable for an agent; `where` is what the fields' names begin with.
     """

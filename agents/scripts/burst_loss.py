@@ -31,7 +31,7 @@ class BurstState(NamedTuple):
 
 
 def groups(brief: Brief) -> Array:
-    """(w,) the channel that each wire comes over: V2V fields of one sender share one, every other wire has its own.
+    """Return the channel (w,) that each wire comes over: V2V fields of one sender share one, every other wire has its own.
 
     The sender is the first word of a field: predecessor_acceleration and predecessor_command come in one message.
     """
@@ -60,7 +60,7 @@ class BurstLoss(Timed):
             raise InputError("attack burst_loss.recover", self.recover, "fail or recover above 0")
 
     def prepare(self, brief: Brief) -> ScriptPlan:
-        """Without `targets`: the V2V fields that are granted, or where none is, the sensors."""
+        """Return the plan. Without `targets` it aims at the V2V fields that are granted, or where none is, at the sensors."""
         q, p = len(brief.model.sensors), len(brief.model.v2v)
         wire = np.arange(len(brief.model.wires))
         messages = brief.granted & ((wire >= q) & (wire < q + p))

@@ -59,7 +59,7 @@ class Sheet:
 
 
 def read_program(path: Path) -> Sheet:
-    """A program from its YAML file, every part checked; raises InputError that names the file, the phase and the field."""
+    """Return a program from its YAML file, every part checked; raise InputError that names the file, the phase and the field."""
     where = f"program {path.name}"
     data = read_yaml(path, where)
     sheet = build(Sheet, data, where)
@@ -133,7 +133,7 @@ class Program:
 
     @property
     def sees_measurement(self) -> bool:
-        """Whether a phase has to see what is read."""
+        """True if a phase has to see the readings."""
         return any(phase.trigger.sees_measurement for phase in self.sheet.phases)
 
     def prepare(self, brief: Brief) -> ProgramPlan:
@@ -173,7 +173,7 @@ class Program:
         return self._move_on(plan, ProgramState(state.phase, state.rounds, attacked, trigger), over), command
 
     def _move_on(self, plan: ProgramPlan, state: ProgramState, over: Array) -> ProgramState:
-        """The state in which the rows `over` (B,) have armed their next phase."""
+        """Return the state in which the rows `over` (B,) have armed their next phase."""
         phase = state.phase + over
         rounds = state.rounds + (over & (phase == len(plan.phases)))
         again = over & (phase == len(plan.phases)) & (rounds < plan.repeat)
@@ -181,12 +181,12 @@ class Program:
 
 
 def _rows(mask: Array, leaf: Array) -> Array:
-    """mask (B,) against a leaf (B, ...)."""
+    """Return mask (B,) in the shape of a leaf (B, ...)."""
     return mask.reshape(-1, *(1,) * (leaf.ndim - 1))
 
 
 def _ready(phase: Phase, brief: Brief, where: str) -> Ready:
-    """A phase under a threat model; raises NotApplicable where it needs what is not granted."""
+    """Return a phase under a threat model; raise NotApplicable where it needs something that is not granted."""
     law: Law | None = phase.value
     names = phase.targets or (law.wires if isinstance(law, PerWire) else ())
     wires = brief.model.wires

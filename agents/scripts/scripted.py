@@ -1,4 +1,4 @@
-"""Scripted attacks: what to inject is fixed, when is a window that opens at a step or on a condition of the road."""
+"""Scripted attacks: fixed values, in a window that opens at a step or on a condition of the road."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -61,7 +61,7 @@ class Timed:
 
     @property
     def sees_measurement(self) -> bool:
-        """Whether it has to see what is read."""
+        """True if it has to see the readings."""
         return self.when.sees_measurement
 
     @cached_property
@@ -77,7 +77,7 @@ class Timed:
         return self.plan(brief, chosen(brief, self.targets, brief.granted, self.agents))
 
     def plan(self, brief: Brief, target: Array, extra: object = None) -> ScriptPlan:
-        """A plan, where the threat model shows what the trigger looks at."""
+        """Return a plan, where the threat model shows what the trigger looks at."""
         self.when.prepare(brief)
         return ScriptPlan(brief, target, extra)
 
@@ -96,7 +96,7 @@ class Timed:
         return after, command
 
     def command(self, plan: ScriptPlan, on: Array, count: Array, view: View, draws: Draws) -> Command:
-        """What is sent in the rows `on` (B,), `count` (B,) steps after the window opened."""
+        """Return the command in the rows `on` (B,), `count` (B,) steps after the window opened."""
         raise TypeError(f"{type(self).__name__} must define command()")
 
 
@@ -112,7 +112,7 @@ class Script(Timed):
 
 
 def inject(plan: ScriptPlan, on: Array, law: Law, count: Array, draws: Draws, tag: int = 0, hit: Array | None = None) -> Command:
-    """False data injection of a law's values, cut at the bounds; with `hit` (B, N, w), on these of the targets only."""
+    """Return false data of a law's values, cut at the bounds; with `hit` (B, N, w), on these of the targets only."""
     brief = plan.brief
     value = fit(brief, Kind.FDI, law.sample(brief, count, draws, tag))
     if hit is None:
@@ -122,7 +122,7 @@ def inject(plan: ScriptPlan, on: Array, law: Law, count: Array, draws: Draws, ta
 
 
 def wires_hit(plan: ScriptPlan, probability: float | Array, draws: Draws) -> Array:
-    """(B, N, w) bool: each wire by itself with its probability."""
+    """Return (B, N, w) bool: each wire by itself with its probability."""
     return np.asarray(draws.uniform(plan.target.shape) < probability)
 
 
@@ -345,7 +345,7 @@ class Replay(Script):
 
 
 def _old(plan: ScriptPlan, kind: str, field: str, steps: int) -> ScriptPlan:
-    """The plan of an attack with old samples, where the threat model grants them."""
+    """Return the plan of an attack with old samples, where the threat model grants them."""
     require(plan.brief, f"attack {kind}", [kind], plan.target)
     memory = plan.brief.threat.memory
     if steps > memory:

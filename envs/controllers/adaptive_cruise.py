@@ -1,4 +1,4 @@
-"""What drives: adaptive cruise control with a constant time headway (thesis 4.6.1)."""
+"""Adaptive cruise control with a constant time headway (thesis 4.6.1)."""
 
 from dataclasses import dataclass
 
@@ -16,26 +16,26 @@ STOP_ACCEL = -5.0  # Mode.STOP [m/s^2], the braking limit of the thesis's follow
 
 
 def widened(headway: float, mode: Array) -> Array:
-    """The time headway [s] under a mode that the defence asks for."""
+    """Return the time headway [s] under a mode that the defence asks for."""
     out: Array = np.where(mode == Mode.WIDEN, WIDEN_FACTOR * headway, headway)
     return out
 
 
 def obeyed(a: Array, mode: Array) -> Array:
-    """The command [m/s^2] under a mode that the defence asks for."""
+    """Return the command [m/s^2] under a mode that the defence asks for."""
     a = np.where(mode == Mode.BRAKE, np.minimum(a, BRAKE_ACCEL), a)
     out: Array = np.where(mode == Mode.STOP, STOP_ACCEL, a)
     return out
 
 
 def limited(a: Array, low: float | None, high: float | None) -> Array:
-    """The command within its limits; none: unlimited."""
+    """Return the command within its limits; none: unlimited."""
     a = a if low is None else np.maximum(a, low)
     return a if high is None else np.minimum(a, high)
 
 
 def spaced(x: Array, v: Array, lead_x: Array, lead_v: Array, headway: Array, standstill: float, gamma: float) -> Array:
-    """(4.14): the acceleration [m/s^2] that keeps the gap d_r + h v, elementwise."""
+    """Return (4.14): the acceleration [m/s^2] that keeps the gap d_r + h v, elementwise."""
     gap_error = lead_x - x - standstill - headway * v
     out: Array = ((lead_v - v) + gamma * gap_error) / headway
     return out
@@ -70,7 +70,7 @@ class AdaptiveCruise:
         return None
 
     def step(self, plan: None, state: None, estimate: Estimate, v2v: Array, odometry: Array) -> tuple[None, Array]:
-        """estimate.x (B, N, 3) = [x, v, a] and v2v (B, N, 2) = [x_l, v_l] to the command a_des (B, N, 1) [m/s^2]."""
+        """Return the command a_des (B, N, 1) [m/s^2] for estimate.x (B, N, 3) = [x, v, a] and v2v (B, N, 2) = [x_l, v_l]."""
         x, v, mode = estimate.x[..., 0], estimate.x[..., 1], estimate.mode
         headway = widened(self.headway, mode)
         a = spaced(x, v, v2v[..., 0], v2v[..., 1], headway, self.standstill, self.gamma)
@@ -82,5 +82,5 @@ class AdaptiveCruise:
         return np.zeros((batch, 1, 0))
 
     def desired_gap(self, speed: Array) -> Array:
-        """d_r + h v [m] (4.13)."""
+        """Return d_r + h v [m] (4.13)."""
         return np.asarray(self.standstill + self.headway * speed)

@@ -26,7 +26,7 @@ IDM_BRAKE = 8.0  # physical limit [m/s^2]
 
 
 def idm(gap: Array, v: Array, lead: Array, v0: float, headway: Array | float, s0: float, accel: float, decel: float) -> Array:
-    """The model's acceleration [m/s^2] for gap [m] and speeds [m/s], elementwise, without its physical limits."""
+    """Return the model's acceleration [m/s^2] for gap [m] and speeds [m/s], elementwise, without its physical limits."""
     closing = v * (v - lead) / (2.0 * np.sqrt(accel * decel))
     wanted = s0 + np.maximum(0.0, v * headway + closing)
     free = (v / v0) * (v / v0)
@@ -36,7 +36,7 @@ def idm(gap: Array, v: Array, lead: Array, v0: float, headway: Array | float, s0
 
 
 def idm_accel(gap: Array, speed: Array, lead_speed: Array) -> Array:
-    """Acceleration [m/s^2] of the driver behind for gap [m] and speeds [m/s], elementwise."""
+    """Return the acceleration [m/s^2] of the driver behind for gap [m] and speeds [m/s], elementwise."""
     out: Array = num.clip(idm(gap, speed, lead_speed, IDM_SPEED, IDM_HEADWAY, IDM_GAP, IDM_ACCEL, IDM_DECEL), -IDM_BRAKE, IDM_ACCEL)
     return out
 
@@ -58,13 +58,13 @@ class Behind:
     reaction: int
 
     def start(self, x: Array, speed: float) -> BehindState:
-        """Behind a car at x (B,) [m], at its speed and at the gap that it wants there."""
+        """Return a driver behind a car at x (B,) [m], at its speed and at the gap that it wants there."""
         batch = len(x)
         gap = IDM_GAP + IDM_HEADWAY * speed
         return BehindState(x - gap, np.full(batch, speed), num.zeros((batch, self.reaction)), np.zeros(batch, np.int64))
 
     def step(self, state: BehindState, x: Array, v: Array) -> BehindState:
-        """One step later; x [m] and v [m/s] (B,) of the car ahead at its beginning."""
+        """Return the state one step later; x [m] and v [m/s] (B,) of the car ahead at the beginning of the step."""
         decided = idm_accel(x - state.x, state.v, v)
         intent, slot = state.intent, state.slot
         if self.reaction:
@@ -97,7 +97,7 @@ class IntelligentDriver:
         return None
 
     def step(self, plan: None, state: None, estimate: Estimate, v2v: Array, odometry: Array) -> tuple[None, Array]:
-        """estimate.x (B, N, 4) = [gap, relative speed, ...] and the own odometry to the acceleration (B, N, 1) [m/s^2]."""
+        """Return the acceleration (B, N, 1) [m/s^2] for estimate.x (B, N, 4) = [gap, relative speed, ...] and the own odometry."""
         gap, v, mode = estimate.x[..., GAP], odometry[..., 1], estimate.mode
         lead, headway = v + estimate.x[..., RELATIVE_SPEED], widened(self.headway, mode)
         a = idm(gap, v, lead, self.set_speed, headway, self.standstill, self.accel, self.decel)
@@ -107,6 +107,6 @@ class IntelligentDriver:
         return np.zeros((batch, 1, 0))
 
     def desired_gap(self, speed: Array) -> Array:
-        """The gap at which it keeps a speed below v0 [m]."""
+        """Return the gap at which it keeps a speed below v0 [m]."""
         ratio = np.minimum(speed / self.set_speed, 0.99)
         return np.asarray((self.standstill + self.headway * speed) / np.sqrt(1.0 - ratio * ratio * ratio * ratio))

@@ -1,4 +1,4 @@
-"""What a car with a radar estimates, and the controllers that drive it."""
+"""The model of a car with a radar, and the controllers that drive it."""
 
 from dataclasses import dataclass
 
@@ -15,13 +15,13 @@ STATES = 4
 
 
 def kinematic(T: float) -> tuple[Array, Array]:
-    """A (4, 4) and B (4, 1) of x = [d, dv, a_L, v_F] for a step T [s], the input being the own speed at its end."""
+    """Return A (4, 4) and B (4, 1) of x = [d, dv, a_L, v_F] for a step T [s]; the input is the own speed at its end."""
     A = np.array([[1.0, T, T * T / 2.0, T / 2.0], [0.0, 1.0, T, 1.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 0.0]])
     return A, np.array([[-T / 2.0], [-1.0], [0.0], [1.0]])
 
 
 def radar_model(plant: Plant, sensor: Sensor, T: float, process_var: tuple[float, ...]) -> Model:
-    """What a defence of a car with a radar is told, of steps of T [s] and variances of the process noise (4,)."""
+    """Return the public model of a car with a radar, for steps of T [s] and variances of the process noise (4,)."""
     (sensors, C, R), (A, B), rows = sensor.matrices(plant), kinematic(T), np.eye(STATES)
     return Model(
         A=A, B=B, c=np.zeros(STATES), C=C, Q=np.diag(process_var), R=R, graph=np.eye(1, dtype=bool), dt=T, sensors=sensors,
@@ -39,7 +39,7 @@ def check_radar_car(model: Model, where: str) -> None:
 def wanted(
     d: Array, dv: Array, v: Array, headway: Array, standstill: float, g: float, tau: float, gain: float, set_speed: float
 ) -> Array:  # fmt: skip
-    """v_des [m/s] of a gap d [m], a relative speed dv and the own speed v [m/s], elementwise: (3.12), (3.13)."""
+    """Return v_des [m/s] for a gap d [m], a relative speed dv and the own speed v [m/s], elementwise: (3.12), (3.13)."""
     off = d - (standstill + headway * v)
     spacing = v / gain + tau / (headway * gain) * (dv + g * off)
     free = d > standstill + headway * set_speed
@@ -80,7 +80,7 @@ class RadarCruise:
         return None
 
     def step(self, plan: None, state: None, estimate: Estimate, v2v: Array, odometry: Array) -> tuple[None, Array]:
-        """estimate.x (B, N, 4) = [d, dv, ...] and odometry (B, N, 2) = [x_F, v_F] to the command a_des (B, N, 1) [m/s^2]."""
+        """Return the command a_des (B, N, 1) [m/s^2] for estimate.x (B, N, 4) = [d, dv, ...] and odometry (B, N, 2) = [x_F, v_F]."""
         d, dv, v = estimate.x[..., GAP], estimate.x[..., RELATIVE_SPEED], odometry[..., 1]
         headway = widened(self.headway, estimate.mode)
         a = (wanted(d, dv, v, headway, self.standstill, self.g, self.tau, self.gain, self.set_speed) - v) / self.sample
@@ -90,5 +90,5 @@ class RadarCruise:
         return np.zeros((batch, 1, 0))
 
     def desired_gap(self, speed: Array) -> Array:
-        """d0 + tau_h v [m] (3.12)."""
+        """Return d0 + tau_h v [m] (3.12)."""
         return np.asarray(self.standstill + self.headway * speed)

@@ -33,7 +33,7 @@ DEFENDER = "tailgate/Defender-v0"
 
 @dataclass(frozen=True)
 class Payoff:
-    """What the defender is paid for. Scores never use it.
+    """The defender's payment. Scores never use it.
 
     safety: -1 at a collision, and the costs of being careful. zero_sum: minus what the attacker is paid, which forgives any care. The costs
     are no potentials: they say how much driving is worth.
@@ -67,7 +67,7 @@ class Rival:
 
 
 def steered(defence: str | Defence, menu: Menu) -> Steered:
-    """The defence with its knobs in the defender's hands: a registered one by text, or one that is steered already."""
+    """Return the defence with its knobs in the defender's hands: from a registered name, or a steered defence."""
     if isinstance(defence, str):
         Spec("defence", defence).refuse_imports("duel")
         defence = Spec("defence", defence).make()
@@ -97,7 +97,9 @@ class Duel:
         cls, scenario: str | None = None, defence: str | Defence | None = None, menu: dict[str, Any] | Menu | None = None,
         defender_action: Literal["menu", "box"] = "menu", **arguments: Any,
     ) -> Duel:  # fmt: skip
-        """defence: whose knobs are turned. menu: their settings. defender_action: menu (a number) or box ([-1, 1] per knob).
+        """Return a game.
+
+        defence: the defence with the knobs. menu: their settings. defender_action: menu (a number) or box ([-1, 1] per knob).
 
         arguments: the fields of Payoff, and those of `Seat.make`; both players decide every `interval` steps.
         """
@@ -113,7 +115,7 @@ class Duel:
         return cls(Seat.make(scenario=scenario, defence=guard, **arguments), guard, payoff, defender_action)
 
     def card(self, **more: object) -> dict[str, Any]:
-        """JSON data that names this game completely: the seat's card, the defender's side and what is added, with a hash of all."""
+        """Return JSON data that names this game completely: the seat's card, the defender's side and additions, with a hash of all."""
         side = as_data({"payoff": self.payoff, "defender_action": self.action, **more})
         return {"seat": self.seat.card(), **side, "hash": digest({"seat": self.seat.config, **side})}
 
@@ -133,7 +135,7 @@ class Duel:
         return self._started(self.seat.loop.start(keys))
 
     def restart(self, state: DuelState, rows: Array) -> DuelState:
-        """The next games of `rows` (B,) bool."""
+        """Return the next games of `rows` (B,) bool."""
         again = self._started(self.seat.loop.restart(state.loop, rows))
         held = np.flatnonzero(~rows)
         if not len(held):
@@ -145,18 +147,20 @@ class Duel:
         return DuelState(state, self.seat.begin(state), self.seat.observation.observe(self.seat.loop.sense(state)))
 
     def defender_sees(self, state: DuelState) -> Array:
-        """(B, d) float32."""
+        """Return the defender's observation (B, d) float32."""
         held: SteeredState = state.loop.defence
         return held.seen
 
     def mask(self, state: DuelState) -> Array:
-        """(B, actions) bool: the attacker's discrete actions that the channel would accept in a step of the next decision."""
+        """Return (B, actions) bool: the attacker's discrete actions that the channel would accept in a step of the next decision."""
         return self.seat.action.mask(self.seat.loop.sense(state.loop))
 
     def step(
         self, state: DuelState, attack: Array | Rival, defend: Array | None, over: Array
     ) -> tuple[DuelState, Outcome, Array, Frame]:
-        """Play one decision of both; rows that are `over` (B,) count for nothing. -> state, outcome, the defender's reward, last step.
+        """Play one decision of both; return state, outcome, the defender's reward and the last step.
+
+        Rows that are `over` (B,) do not count.
 
         attack: actions as the seat takes them, or an attack that plays. defend: numbers of the menu (B,), or vectors (B, K); None leaves
         the knobs where they are.
@@ -170,13 +174,13 @@ class Duel:
         return DuelState(loop, tally, seen), outcome, self._paid(before, loop, outcome, over), frame
 
     def values(self, defend: Array) -> Array:
-        """(B, K) the knobs' values of the defender's actions."""
+        """Return the knobs' values (B, K) of the defender's actions."""
         if self.action == "menu":
             return np.asarray(self.settings[np.asarray(defend, np.int64)])
         return np.stack([knob.at(np.asarray(defend, np.float64)[:, i]) for i, knob in enumerate(self.guard.hand.knobs)], axis=1)
 
     def _paid(self, before: LoopState, after: LoopState, outcome: Outcome, over: Array) -> Array:
-        """(B,) the defender's reward of a decision."""
+        """Return the defender's reward (B,) of a decision."""
         if self.payoff.payoff == "zero_sum":
             return np.asarray(0.0 - outcome.reward)
         pay, dt, model = self.payoff, self.seat.loop.model.dt, self.seat.loop.model
@@ -194,20 +198,20 @@ class Duel:
     # -- spaces
 
     def defender_spaces(self) -> tuple[Any, Any]:
-        """Gymnasium's spaces of one defender: what it sees, and what it does."""
+        """Return Gymnasium's spaces of one defender: its observation and its action."""
         sight = gymnasium.spaces.Box(-LIMIT, LIMIT, (len(self.plan.sight.names),), np.float32)
         if self.action == "menu":
             return sight, gymnasium.spaces.Discrete(len(self.settings))
         return sight, gymnasium.spaces.Box(-1.0, 1.0, (len(self.guard.hand.knobs),), np.float32)
 
     def told(self, state: DuelState) -> dict[str, Any]:
-        """What a defender is told beside its observation, of the first row: the step, and where its knobs stand."""
+        """Return the defender's information about the first row: the step, and the values of its knobs."""
         knobs = {knob.name: state.loop.defence.knobs[0, i] for i, knob in enumerate(self.guard.hand.knobs)}
         return {"step": state.loop.k[0], **knobs}
 
 
 def checked(space: gymnasium.Space[Any], action: ArrayLike, who: str) -> Array:
-    """One row's action as a batch of one. Raises InputError for one outside of its space."""
+    """Return one row's action as a batch of one. Raise InputError for one outside of its space."""
     given = np.asarray(action)
     fits = given.shape == space.shape
     if fits and isinstance(space, gymnasium.spaces.Discrete):
@@ -220,7 +224,7 @@ def checked(space: gymnasium.Space[Any], action: ArrayLike, who: str) -> Array:
 
 
 def next_game(duel: Duel, held: DuelState | None, seed: int | None, rng: np.random.Generator) -> DuelState:
-    """A batch of one: the game of `seed`, or without one the next of the episodes that were running."""
+    """Return a batch of one: the game of `seed`, or without one the next of the episodes that were running."""
     if held is not None and seed is None:
         return duel.restart(held, np.ones(1, bool))
     return duel.begin(draws.keys("train", [int(rng.integers(2**31)) if seed is None else int(seed)]))
@@ -253,7 +257,7 @@ class DefenderEnv(Specified, gymnasium.Env[Array, Any]):
         self.over = np.zeros(1, bool)
 
     def card(self) -> dict[str, Any]:
-        """JSON data that names this environment completely, its attacks among them, with a hash."""
+        """Return JSON data that names this environment completely, its attacks among them, with a hash."""
         return self.duel.card(attack=self.attack)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Array, dict[str, Any]]:

@@ -59,13 +59,13 @@ class DuelEnv(ParallelEnv[str, Array, Any]):  # type: ignore[misc]
         return self.action_spaces[agent]
 
     def card(self) -> dict[str, Any]:
-        """JSON data that names this game completely, with a hash."""
+        """Return JSON data that names this game completely, with a hash."""
         return self.duel.card()
 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Array], dict[str, dict[str, Any]]]:
-        """The game of a seed; without one the next of the running row, or a random one at first."""
+        """Begin the game of a seed; without one the next of the running row, or a random one at first."""
         check_options(options, ("options",))  # of no meaning: PettingZoo's own tests give it
         if seed is not None:
             self._rng, _ = seeding.np_random(seed)
@@ -77,7 +77,7 @@ class DuelEnv(ParallelEnv[str, Array, Any]):  # type: ignore[misc]
     def step(
         self, actions: dict[str, Any]
     ) -> tuple[dict[str, Array], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]:
-        """One decision of both: dictionaries of what each sees and is paid, and how the game stands."""
+        """Play one decision of both; return observations, rewards and ends by agent."""
         if self.game is None or not self.agents:
             raise InputError("step", "no episode", "reset() first")
         if set(actions) != set(self.agents):
@@ -95,13 +95,13 @@ class DuelEnv(ParallelEnv[str, Array, Any]):  # type: ignore[misc]
         return out
 
     def state(self) -> Array:
-        """(d,) float32: what the attacker sees, then what the defender sees, for a critic that is trained on both."""
+        """Return (d,) float32: the attacker's observation, then the defender's, for a critic that is trained on both."""
         if self.game is None:
             raise InputError("state", "no episode", "reset() first")
         return np.concatenate([seen for seen in self._observed().values()])
 
     def render(self) -> Any:
-        """The picture (H, W, 3) uint8; None without `render_mode`, and in human mode: reset() and step() show it in a window."""
+        """Return the picture (H, W, 3) uint8; None without `render_mode`, and in human mode: reset() and step() show it in a window."""
         if self.render_mode is None or self.game is None:
             return None
         if self.render_mode == "human":
@@ -128,7 +128,7 @@ class DuelEnv(ParallelEnv[str, Array, Any]):  # type: ignore[misc]
         return {ATTACKER: self.game.seen[0].copy(), GUARD: self.duel.defender_sees(self.game)[0].copy()}
 
     def _infos(self, illegal: np.bool_, collided: np.bool_, rear: np.bool_) -> dict[str, dict[str, Any]]:
-        """What happened is told to the attacker alone: the defender learns of it by its own means."""
+        """Return the information by agent: the attacker learns what happened, the defender has only its own means."""
         assert self.game is not None
         told: dict[str, Any] = {"illegal": illegal, "collided": collided, "rear_collided": rear, "step": self.game.loop.k[0]}
         guard = self.duel.told(self.game)
@@ -140,5 +140,5 @@ class DuelEnv(ParallelEnv[str, Array, Any]):  # type: ignore[misc]
 
 
 def parallel_env(**arguments: Any) -> DuelEnv:
-    """A game of attacker and defender as PettingZoo plays it: scenario, defence, menu and the other arguments of `Duel.make`."""
+    """Return a game of attacker and defender as PettingZoo plays it; for the arguments see `Duel.make`."""
     return DuelEnv(**arguments)

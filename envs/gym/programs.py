@@ -75,7 +75,7 @@ class SeatPrograms:
         return self.seat.action.spec.interval - 1
 
     def of(self, seat: Seat, values: list[Array]) -> SeatPrograms:
-        """The same programs for a seat of other parameters."""
+        """Return the same programs for a seat of other parameters."""
         out = copy.copy(self)
         out.seat, out.loop, out.values = seat, seat.loop, values
         return out
@@ -116,17 +116,17 @@ def _example(seat: Seat) -> Held:
 
 
 def _several(seat: Seat) -> bool:
-    """Has a decision several steps? Traced code asks, so that a program is found again for both kinds apart."""
+    """Return True if a decision has several steps. Traced code asks, so that programs of both kinds are kept apart."""
     return bool(seat.action.spec.interval > 1)
 
 
 def _shown_once(seat: Seat) -> Seat:
-    """The seat as it is traced: it shows one frame."""
+    """Return the seat as it is traced: it shows one frame."""
     return dataclasses.replace(seat, observation=type(seat.observation)(seat.loop.brief), config={})
 
 
 def _twins(decide: Trace, begin: Trace, *others: Trace) -> dict[str, str]:
-    """Leaves of the state that equal others after each decision and each beginning, and these."""
+    """Return leaves of the state that equal others after each decision and each beginning, and these."""
     first: dict[Any, str] = {}
     out = {}
     for name, (here, _) in decide.state.items():
@@ -143,7 +143,7 @@ def _twins(decide: Trace, begin: Trace, *others: Trace) -> dict[str, str]:
 
 
 def _after(trace: Trace, name: str) -> tuple[int, ...]:
-    """Numbers of what a leaf is in the next state."""
+    """Return the numbers of a leaf's nodes in the next state."""
     return (trace.large[name][1].id,) if name in trace.large else tuple(node.id for node in trace.state[name][1].flat)
 
 
@@ -156,7 +156,7 @@ def _renewed(seat: Seat, state: Held, keys: Keys, again: Array) -> Held:
 
 
 def _shown(seat: Seat, state: Held) -> dict[str, Array]:
-    """What is to be seen of a state, and what may be decided next."""
+    """Return the observation of a state, and the decisions that are allowed next."""
     view = seat.loop.sense(state["loop"])
     damage = np.min(view.scene.gap, axis=1) if seat.road else state["tally"].error
     shown = {"seen": seat.observation.observe(view), "allowed": view.allowed, "k": view.k, "damage": damage}
@@ -167,7 +167,7 @@ _made: Remembered[SeatPrograms] = Remembered()
 
 
 def programs_of(seat: Seat) -> SeatPrograms | Untraced:
-    """The programs of a seat, once they have been found equal to the plain loop on this machine; or why there are none."""
+    """Return the programs of a seat, once they have been found equal to the plain loop on this machine; or why there are none."""
     shown = _shown_once(seat)
     return _made.proved(
         shown,
@@ -179,7 +179,7 @@ def programs_of(seat: Seat) -> SeatPrograms | Untraced:
 
 
 def difference(programs: SeatPrograms, batch: int = ROWS, steps: int = TRIED) -> str:
-    """Play some decisions in both engines, resets among them; -> what differs first, or nothing."""
+    """Play some decisions in both engines, resets among them; return the name of the first difference, or nothing."""
     from tailgate.envs.gym.batches import PlainEpisodes
 
     decisions = max(4, steps // (programs.between + 1))
@@ -216,7 +216,7 @@ class _Alone(NamedTuple):
 
 
 class Rows:
-    """B rows of a seat's episodes, and what the last call brought (see `SeatPrograms`)."""
+    """B rows of a seat's episodes, and the results of the last call (see `SeatPrograms`)."""
 
     def __init__(self, programs: SeatPrograms, batch: int, threads: int = 1) -> None:
         self.programs, self.batch, self.threads = programs, batch, threads
@@ -255,13 +255,13 @@ class Rows:
         self._brought = results
 
     def decide(self, actions: Array, over: Array, again: Array) -> None:
-        """One decision of each row: actions (B,) or (B, size), over and again (B,) bool."""
+        """Play one decision of each row: actions (B,) or (B, size), over and again (B,) bool."""
         given = self._decide.arguments
         given["action"][...], given["over"][...], given["again"][...] = actions, over, again
         self._play(self._decide)
 
     def decide_alone(self, action: ArrayLike) -> tuple[Any, ...]:
-        """The decision of a single row; -> what ALONE names, as Python's numbers, its observation and its mask."""
+        """Play the decision of a single row; return the values that ALONE names, as Python's numbers, its observation and its mask."""
         call, advance, play, given, numbers, seen, mask = self._alone
         given[0] = action
         if advance is not None:
@@ -276,11 +276,11 @@ class Rows:
         return *told, seen.copy(), None if mask is None else mask.copy()
 
     def _step(self) -> Array:
-        """The step before the decision of a single row."""
+        """Return the step before the decision of a single row."""
         return np.array([self._k]) if self._last is self._alone.call else self._last.results()["k"]
 
     def again_alone(self) -> tuple[Any, ...]:
-        """The next episode of a single row; -> as `decide_alone`, of a decision that brought nothing."""
+        """Begin the next episode of a single row; return what `decide_alone` returns, with nothing gained."""
         self.begin(np.ones(1, bool))
         new = self.brought
         mask = new["mask"][0].view(np.int8).copy() if "mask" in new else None  # the caller may write to it
@@ -312,11 +312,11 @@ class Rows:
         self._play(self._begin)
 
     def held(self) -> dict[str, Array]:
-        """All that changes from step to step, by name: copies."""
+        """Return copies of all that changes from step to step, by name."""
         return {name: self.state.get_leaf(name) for name in leaves(self.programs.example)}
 
     def put(self, held: dict[str, Array]) -> None:
-        """What `held` gave, of the same number of rows."""
+        """Restore what `held` returned, of the same number of rows."""
         for name in leaves(self.programs.example):
             self.state.put_leaf(name, held[name])
         self.begin(np.zeros(self.batch, bool))

@@ -33,7 +33,7 @@ class Begun(NamedTuple):
 
 
 class Shadow:
-    """What was decided since the last episode but one of each row began, and the rows of the plain loop that were looked at.
+    """The decisions since the last episode but one of each row began, and the rows of the plain loop that were looked at.
 
     A row that nobody looks at costs the list of its decisions. Two episodes are kept because a picture of an episode that has
     just begun tells how the one before it ended.
@@ -72,7 +72,7 @@ class Shadow:
         return self.dropped + len(self.events)
 
     def look(self, row: int, make: Callable[[Seat], PlainEpisodes]) -> tuple[LoopState, Frame | None]:
-        """The plain loop's state (of a batch of one) and last step of a row; `make` gives a plain loop of the seat."""
+        """Return the plain loop's state (of a batch of one) and last step of a row; `make` gives a plain loop of the seat."""
         one = slice(row, row + 1)
         plain, played = self.rows.get(row, (None, -1))
         if plain is None or played < self.dropped:

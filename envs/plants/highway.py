@@ -50,7 +50,7 @@ class HighwayPlan(NamedTuple):
 
 
 class Seen(NamedTuple):
-    """What is ahead and behind in the lane, (B,) each, as `Scene` has it; lead_a [m/s^2] over the last step."""
+    """The cars ahead and behind in the lane, (B,) each, as `Scene` has them; lead_a [m/s^2] over the last step."""
 
     gap: Array
     lead_v: Array
@@ -60,7 +60,7 @@ class Seen(NamedTuple):
 
 
 class HighwayState(NamedTuple):
-    """Every leaf has B first; (B,) where nothing is said. After the car has crashed all stands still as it was then."""
+    """The state; every leaf has B first, (B,) where nothing is noted. After the car has crashed everything keeps its place."""
 
     cars: Array  # (B, V, features) all cars, as highway_scene numbers them; the first is the car
     accel: Array  # own [m/s^2]
@@ -117,7 +117,7 @@ class Highway:
         return 1 + self.lanes * (self.ahead + self.behind)
 
     def prepare(self, model: Model) -> HighwayPlan:
-        """Raises ImportError where highway-env is missing."""
+        """Return the plan. Raise ImportError where highway-env is missing."""
         from tailgate.envs.plants.highway_scene import Bench
 
         bench = Bench(self.cars, self.lanes, SPEED_LIMIT, self.dt, self.decel, self.bend, self.period, self.lane_changes)
@@ -143,7 +143,7 @@ class Highway:
         return HighwayState(cars, np.zeros(batch), clock, Seen._make(seen.T.copy()), np.zeros(batch, bool))
 
     def _place(self, bench: Bench, cars: Array, u: Array) -> None:
-        """The cars (V, features) at the beginning, from uniforms u (V, 5)."""
+        """Return the cars (V, features) at the beginning, from uniforms u (V, 5)."""
         from tailgate.envs.plants.highway_scene import DELTA, HEADING, LANE, SPEED, TARGET, TIMER, WANTED, X, Y
 
         def put(i: int, lane: int, x: float, speed: float) -> None:
@@ -193,7 +193,7 @@ class Highway:
         return HighwayState(cars, a, clock, Seen._make(seen.T.copy()), over)
 
     def _seen(self, sight: Sight, v: float, a: float, before: Array, after: Array | None = None) -> tuple[float, ...]:
-        """gap, lead_v, lead_a, rear_gap and rear_v of what is seen at the own speed v and acceleration a."""
+        """Return gap, lead_v, lead_a, rear_gap and rear_v as seen at the own speed v and acceleration a."""
         from tailgate.envs.plants.highway_scene import SPEED
 
         rear = (np.inf, v) if sight.rear_gap is None else (sight.rear_gap, sight.rear_speed)
@@ -203,7 +203,7 @@ class Highway:
         return sight.gap, sight.lead_speed, gained / self.dt, *rear
 
     def known(self, plan: HighwayPlan, u: Array, exo: Array, state: HighwayState) -> Array:
-        """The own speed, by odometry."""
+        """Return the own speed, by odometry."""
         return self.odometry(plan, state)[..., 1:]
 
     def truth(self, plan: HighwayPlan, state: HighwayState, held: Array) -> Array:
@@ -211,7 +211,7 @@ class Highway:
         return num.stack([seen.gap[:, None], (seen.lead_v - v)[:, None], seen.lead_a[:, None], v[:, None]])
 
     def _own(self, state: HighwayState) -> tuple[Array, Array]:
-        """The car's position along the road [m] and its speed [m/s], (B,) each."""
+        """Return the car's position along the road [m] and its speed [m/s], (B,) each."""
         from tailgate.envs.plants.highway_scene import SPEED, X
 
         return state.cars[:, 0, X], state.cars[:, 0, SPEED]

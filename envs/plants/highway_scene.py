@@ -35,7 +35,7 @@ ROOM = 15.0  # what a car that cuts in leaves to the next ahead, bumper to bumpe
 
 
 class Sight(NamedTuple):
-    """What the first car has ahead and behind in its lane, bumper to bumper [m, m/s]; None where nobody is."""
+    """The cars that the first car has ahead and behind in its lane, bumper to bumper [m, m/s]; None where nobody is."""
 
     gap: float | None
     lead: int | None  # number of the car ahead
@@ -46,7 +46,7 @@ class Sight(NamedTuple):
 
 
 class _Undrawn:
-    """In place of a scene's random source: whoever draws from it is told that a scene draws nothing."""
+    """A replacement of a scene's random source: drawing from it is an error, as a scene draws nothing."""
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__"):  # what Python itself asks for, as when a scene is copied
@@ -149,12 +149,12 @@ class Bench:
         self.road.vehicles = self.cars
 
     def place(self, lane: int, x: float) -> tuple[float, float, float]:
-        """x, y [m] and heading [rad] of a car in the middle of a lane."""
+        """Return x, y [m] and heading [rad] of a car in the middle of a lane."""
         y = self.lanes[lane].position(x, 0.0)[1]
         return x, float(y), float(self.lanes[lane].heading_at(x))
 
     def put(self, numbers: Array) -> None:
-        """The scene is now that of `numbers` (V, FEATURES)."""
+        """Set the scene to `numbers` (V, FEATURES)."""
         for car, n in zip(self.cars, numbers.tolist(), strict=True):
             car.position = np.array([n[X], n[Y]])
             car.heading, car.speed, car.target_speed, car.crashed = n[HEADING], n[SPEED], n[WANTED], n[CRASHED] != 0.0
@@ -164,7 +164,7 @@ class Bench:
             car.timer, car.DELTA, car.braking, car.committed = n[TIMER], n[DELTA], n[BRAKING], n[COMMITTED]
 
     def take(self) -> Iterable[list[float]]:
-        """The numbers of all cars, as `put` takes them."""
+        """Return the numbers of all cars, as `put` takes them."""
         for car in self.cars:
             push = (1.0, *car.impact) if car.impact is not None else (0.0, 0.0, 0.0)
             yield [
@@ -173,7 +173,7 @@ class Bench:
             ]  # fmt: skip
 
     def look(self) -> Sight:
-        """Of the scene as it is. A car counts from when a part of it is in the first one's lane and all of it is ahead, or behind."""
+        """Look at the present scene. A car counts when a part of it is in the first one's lane and all of it is ahead, or behind."""
         lane = self.lanes[self.ego.target_lane_index[2]]
         here = lane.local_coordinates(self.ego.position)[0]
         gap, lead, rear_gap, rear = math.inf, None, math.inf, None
@@ -200,7 +200,7 @@ class Bench:
         )  # fmt: skip
 
     def step(self, pull: float) -> None:
-        """One step of everybody; the first car accelerates at `pull` [m/s^2]."""
+        """Move everybody by one step; the first car accelerates at `pull` [m/s^2]."""
         self.ego.pull = pull
         self.road.act()
         self.road.step(self.dt)
@@ -210,7 +210,7 @@ class Bench:
     # -- events
 
     def brake(self, lasting: float, within: float) -> bool:
-        """Whether there is a car ahead, nearer than `within` [m]: it brakes hard for `lasting` seconds."""
+        """Let the car ahead, if it is nearer than `within` [m], brake hard for `lasting` seconds; return if there is one."""
         sight = self.look()
         if sight.lead is None or sight.gap is None or sight.gap > within or self.cars[sight.lead].crashed:
             return False
@@ -220,7 +220,7 @@ class Bench:
         return True
 
     def cut_in(self, least: float, most: float) -> bool:
-        """Whether a car beside could cut in with a gap [m] from least to most: the nearest such car begins to."""
+        """Let the nearest car in another lane cut in with a gap [m] from least to most; return if there is one."""
         sight = self.look()
         mine, here = self.ego.target_lane_index[2], float(self.ego.position[0])
         free = math.inf if sight.gap is None else sight.gap - LENGTH - ROOM  # the largest gap that leaves room ahead

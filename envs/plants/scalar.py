@@ -88,7 +88,7 @@ class ScalarLoop:
         return np.zeros(len(state.x))
 
     def scene(self, plan: float, state: ScalarState) -> Scene:
-        """Nothing drives."""
+        """Return an empty road: nothing drives."""
         still = num.zeros((len(state.x), 1))
         nobody = num.full(still.shape, np.inf)
         return Scene(nobody, still, still, still, nobody, still, still)

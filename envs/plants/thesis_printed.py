@@ -37,7 +37,7 @@ class CarFollowingLiteral(CarFollowing):
         return A, B
 
     def move(self, plan: FollowingPlan, ego: Array, u: Array, noise: Array) -> Array:
-        """The follower (B, 1, 3) one step later, under u (B, 1, 1) [m] and noise (3, B)."""
+        """Return the follower (B, 1, 3) one step later, under u (B, 1, 1) [m] and noise (3, B)."""
         fixed = num.matvec(plan.A, ego) + num.matvec(plan.B, u)
         switch = np.where(ego[..., 2] > 0.0, 2.0 * (1.0 - plan.A[2, 2]), 0.0) * ego[..., 2]  # from A_d to A_a
         moved = [fixed[..., i] + noise[i][:, None] for i in range(3)]
@@ -59,12 +59,12 @@ class RelativeDistance:
         return None
 
     def step(self, plan: None, state: None, estimate: Estimate, v2v: Array, odometry: Array) -> tuple[None, Array]:
-        """estimate.x (B, N, 3) and v2v (B, N, 2) = [x_l, v_l] to u (B, N, 1) [m]."""
+        """Return u (B, N, 1) [m] for estimate.x (B, N, 3) and v2v (B, N, 2) = [x_l, v_l]."""
         return None, (v2v[..., 0] - estimate.x[..., 0])[..., None]
 
     def held(self, plan: None, state: None, batch: int) -> Array:
         return np.zeros((batch, 1, 0))
 
     def desired_gap(self, speed: Array) -> Array:
-        """d_r + h v [m] (4.13)."""
+        """Return d_r + h v [m] (4.13)."""
         return np.asarray(self.standstill + self.headway * speed)

@@ -1,4 +1,4 @@
-"""Challenge-response authentication (thesis 3.4.2; Shoukry et al., PyCRA, 2015): fall silent, and listen.
+"""Challenge-response authentication (thesis 3.4.2; Shoukry et al., PyCRA, 2015): mute the radar's probe, and listen.
 
 A sensor that mutes its own probe hears noise alone; whoever answers then is an attacker. At a muted step
 
@@ -44,7 +44,7 @@ WATCH = "probability of a challenge a step while alarmed, in place of the random
 
 
 class Response(NamedTuple):
-    """What is done with the readings of a step that is no challenge."""
+    """The use of readings in a step that is no challenge."""
 
     passes: bool  # the controller drives on them as they are; else on what the filter makes of them
     stops: bool  # not so during an alarm
@@ -85,7 +85,7 @@ def pick(mask: Array, chosen: S, other: S) -> S:
 
 @dataclass(frozen=True, kw_only=True)
 class Challenger:
-    """Base: when to challenge, and what is heard. A subclass says which filter predicts and what an alarm changes."""
+    """Base class: when to challenge, and what is heard. A subclass chooses the filter that predicts, and what an alarm changes."""
 
     label: ClassVar[str]  # its registered name
 
@@ -111,11 +111,11 @@ class Challenger:
         self.predictor()  # a wrong name shall fail here
 
     def predictor(self) -> Filter:
-        """The filter that predicts the readings."""
+        """Return the filter that predicts the readings."""
         raise TypeError(f"{type(self).__name__} must define predictor()")
 
     def response(self) -> Response:
-        """What is done with the readings."""
+        """Return the use of the readings."""
         raise TypeError(f"{type(self).__name__} must define response()")
 
     def prepare(self, model: Model) -> ChallengePlan:
@@ -130,7 +130,7 @@ class Challenger:
         )  # fmt: skip
 
     def start(self, plan: ChallengePlan, prior: Prior) -> ChallengeState:
-        """Before the first challenge the belief to roll back to is the prior."""
+        """Return the state at step 1; before the first challenge the belief to roll back to is the prior."""
         batch, belief = len(prior.mean), plan.filter.start(plan.filter_plan, prior)
         nothing = num.zeros((batch, 1))
         reaction = plan.reaction.start(plan.reaction_plan, batch)
@@ -163,7 +163,7 @@ class Challenger:
         return ChallengeState(live, safe, reaction, state.k + 1, probe, heard, owed), Estimate(x, heard, alarm, decision.mode, probe)
 
     def look(self, plan: ChallengePlan, state: ChallengeState, received: Received, known_u: Array) -> Look:
-        """The innovation that `received` would meet, and how far it would move what the controller drives on; there is no gate on it."""
+        """Return the innovation that `received` would meet, and how far it would move the controller's input; it meets no gate."""
         live = plan.filter.predict(plan.filter_plan, state.live, known_u)
         innovation = plan.filter.innovation(plan.filter_plan, live, received)
         used, shown = _used(plan, received, ~state.probe, state.owed > 0)
@@ -173,7 +173,7 @@ class Challenger:
         return Look(innovation, gain, None)
 
     def _due(self, plan: ChallengePlan, k: Array, alarm: Array, draws: Draws) -> Array:
-        """(B, N) bool: step k (B,) is a challenge by the schedule, or by the watch that is kept during an alarm."""
+        """Return (B, N) bool: step k (B,) is a challenge by the schedule, or by the closer watch during an alarm."""
         chance = CHANCE if self.probability is None else self.probability
         u, usual = draws.uniform((1,)), chance if self.challenge == "random" else 0.0
         due = u < (usual if self.watch is None else np.where(alarm, self.watch, usual))
@@ -181,7 +181,7 @@ class Challenger:
 
 
 def _used(plan: ChallengePlan, received: Received, muted: Array, alarm: Array) -> tuple[Array, Array]:
-    """(B, N, q) bool each: the readings that the filter uses, and those that the controller is shown as they are."""
+    """Return (B, N, q) bool each: the readings that the filter uses, and those that the controller gets as they are."""
     there = received.valid & ~muted[..., None]
     calm = there & ~alarm[..., None]
     used, shown = (calm if until else there for until in (plan.response.freezes, plan.response.stops))
@@ -189,7 +189,7 @@ def _used(plan: ChallengePlan, received: Received, muted: Array, alarm: Array) -
 
 
 def named_filter(data: object, where: str) -> Filter:
-    """A filter by its name, or a mapping with name and parameters; module:Class names somebody else's."""
+    """Return a filter from its name, or a mapping with name and parameters; module:Class names somebody else's."""
     params = {"name": PREDICTOR, **(data if isinstance(data, dict) else {"name": data})}  # a mapping without a name changes the default one
     name = params["name"]
     if isinstance(name, str) and ":" in name:

@@ -91,7 +91,7 @@ class SteeredState(NamedTuple):
 
 
 def _imports(data: object) -> bool:
-    """Whether any text in the data names a class to import."""
+    """Return True if any text in the data names a class to import."""
     if isinstance(data, (dict, list, tuple)):
         return any(_imports(value) for value in (data.values() if isinstance(data, dict) else data))
     return isinstance(data, str) and ":" in data
@@ -200,7 +200,7 @@ class Steered:
         return SteeredState(inner, state.knobs, state.k + 1, state.member, memory, seen), estimate
 
     def look(self, plan: SteeredPlan, state: SteeredState, received: Received, known_u: Array) -> Look:
-        """What the defence would see of a measurement, with its knobs where they stand."""
+        """Return what the defence would see of a measurement, with its knobs at their present values."""
         if plan.networks and (state.member >= 0).all():
             state = self._chosen(plan, state)
         defence, inner = plan.hand.turned(plan.inner, state.knobs)
@@ -208,7 +208,7 @@ class Steered:
         return out
 
     def steer(self, plan: SteeredPlan, state: SteeredState, values: Array) -> SteeredState:
-        """The state with the knobs at `values` (B, K)."""
+        """Return the state with the knobs at `values` (B, K)."""
         return state._replace(knobs=np.array(values, np.float64))
 
     def _consider(self, plan: SteeredPlan, state: SteeredState, draws: Draws) -> SteeredState:
@@ -220,7 +220,7 @@ class Steered:
         return self._chosen(plan, state)
 
     def _chosen(self, plan: SteeredPlan, state: SteeredState) -> SteeredState:
-        """The knobs after a decision, in the rows where one is due."""
+        """Return the state with the knobs after a decision, in the rows where one is due."""
         due = state.k % self.menu_used.interval == 0
         if not num.some(due):
             return state

@@ -1,4 +1,4 @@
-"""The knobs of a defence: what may be turned while it runs, each row of a batch by its own hand, and what a hand sees that turns them.
+"""The knobs of a defence, which are parameters that change while it runs, in each row separately; and the view of who turns them.
 
 A knob is a parameter of a defence that is left as it is: the alarm threshold, the probability of a challenge, the mode that is asked of the
 controller while alarmed. Turning one puts an array with one value per row in the place of the parameter, which enters by elementwise
@@ -38,7 +38,7 @@ CALM = 50.0  # steps since an alarm are counted up to this
 
 @dataclass(frozen=True)
 class Menu:
-    """What a hand may choose from: every combination of the settings of those knobs that the defence has."""
+    """The settings that a player may choose from: every combination for those knobs that the defence has."""
 
     thresholds: tuple[Positive, ...] = param((5.0, 8.0, 12.0, 20.0, 40.0), "alarm thresholds [unit of the detector's score]")
     challenges: tuple[Probability, ...] = param((0.02, 0.1, 0.3), "probabilities of a challenge a step, without an alarm [-]")
@@ -61,7 +61,7 @@ class Knob(NamedTuple):
     log: bool = False  # between its ends the settings are even in the logarithm
 
     def at(self, share: Array) -> Array:
-        """The value at `share` (B,) in [-1, 1] of the way between the least and the largest setting; of a mode the nearest in the list."""
+        """Return the value at `share` (B,) in [-1, 1] of the way from the least to the largest setting; the nearest listed mode."""
         part = 0.5 + 0.5 * np.clip(share, -1.0, 1.0)
         if self.name == "mode":
             index = np.minimum((part * len(self.levels)).astype(np.int64), len(self.levels) - 1)
@@ -73,12 +73,12 @@ class Knob(NamedTuple):
 
 
 def settings(knobs: tuple[Knob, ...]) -> Array:
-    """(S, K): every combination of the knobs' settings, the last knob's running fastest."""
+    """Return (S, K): every combination of the knobs' settings, the last knob's running fastest."""
     return np.array(list(itertools.product(*(knob.levels for knob in knobs))))
 
 
 def nearest(knobs: tuple[Knob, ...]) -> int:
-    """The number of the combination that is nearest to the defence as it is; of thresholds and probabilities by their ratio."""
+    """Return the number of the combination that is nearest to the defence as it is; thresholds and probabilities compare by their ratio."""
     best = [min(range(len(k.levels)), key=lambda i, k=k: abs(_place(k, k.levels[i]) - _place(k, k.own))) for k in knobs]  # type: ignore[misc]
     out = 0
     for i, knob in zip(best, knobs, strict=True):
@@ -99,7 +99,7 @@ class Hand:
 
     @classmethod
     def on(cls, defence: Defence, menu: Menu) -> Hand:
-        """Raises NotApplicable for a defence without a knob."""
+        """Return a defence with its knobs. Raise NotApplicable for a defence without a knob."""
         mode = tuple(float(Mode[name.upper()]) for name in menu.modes)
         if isinstance(defence, Composed) and type(defence).step is Composed.step:
             _, detector, mitigation = defence.parts()
@@ -137,7 +137,7 @@ class Hand:
         return np.array([knob.own for knob in self.knobs])
 
     def turned(self, plan: HandPlan, values: Array) -> tuple[Defence, HandPlan]:
-        """The defence and its plan with the knobs at `values` (B, K)."""
+        """Return the defence and its plan with the knobs at `values` (B, K)."""
         defence: Defence = self.defence
         for i, knob in enumerate(self.knobs):
             if knob.name == "threshold" and isinstance(plan, ComposedPlan):
@@ -149,7 +149,7 @@ class Hand:
     def step(
         self, plan: HandPlan, state: HandState, values: Array, received: Received, known_u: Array, draws: Draws
     ) -> tuple[HandState, Estimate]:
-        """The defence's step with the knobs at `values` (B, K)."""
+        """Return the defence's step with the knobs at `values` (B, K)."""
         defence, plan = self.turned(plan, values)
         state, estimate = defence.step(plan, state, received, known_u, draws)
         for i, knob in enumerate(self.knobs):
@@ -160,7 +160,7 @@ class Hand:
 
 
 def _with(part: T, **fields: object) -> T:
-    """A frozen dataclass with other values, its checks not run: they know numbers, not one value per row."""
+    """Return a frozen dataclass with other values. Its checks do not run: they know numbers, not one value per row."""
     out = copy.copy(part)
     for name, value in fields.items():
         object.__setattr__(out, name, value)
@@ -168,7 +168,7 @@ def _with(part: T, **fields: object) -> T:
 
 
 class Memory(NamedTuple):
-    """What the observation remembers of an episode, (B,) each."""
+    """The memory of the observation over an episode, (B,) each."""
 
     score: Array  # running mean of log(1 + score)
     alarm: Array  # running share of alarms
@@ -179,7 +179,7 @@ class Memory(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Sight:
-    """What a hand sees of the defence, as a vector (B, d) float32 scaled to about one; of many agents the one nearest to its leader."""
+    """The player's view of the defence: a vector (B, d) float32 scaled to about one; of many agents, the nearest to its leader."""
 
     model: Model
     knobs: tuple[Knob, ...]
@@ -199,7 +199,7 @@ class Sight:
 
     @property
     def _road(self) -> bool:
-        """Whether the gap can be told from the estimate, and the message where the state holds a position."""
+        """True if the estimate, with the message where the state holds a position, gives the gap."""
         gap = self.model.gap
         assert gap is not None
         return bool(self.model.followers.any()) and (self._leader or not (gap < 0.0).any())
@@ -213,13 +213,13 @@ class Sight:
         return Memory(zero, zero.copy(), np.full(batch, CALM), zero.copy(), zero.copy())
 
     def blank(self, values: Array) -> Array:
-        """The observation before the first measurement: nothing but the knobs (B, K)."""
+        """Return the observation before the first measurement: nothing but the knobs (B, K)."""
         out = np.zeros((len(values), len(self.names)), np.float32)
         out[:, len(self.names) - len(self.knobs) :] = self._places(values)
         return out
 
     def look(self, memory: Memory, estimate: Estimate, received: Received, inner: HandState, values: Array) -> tuple[Memory, Array]:
-        """The memory and the observation (B, d) after a step."""
+        """Return the memory and the observation (B, d) after a step."""
         alarm = np.asarray(estimate.alarm.any(axis=1))
         score = num.log(1.0 + np.maximum(np.max(estimate.score, axis=1), 0.0))
         asked = np.max(estimate.mode, axis=1) != Mode.NORMAL
@@ -238,7 +238,7 @@ class Sight:
         return memory, out
 
     def _residuals(self, estimate: Estimate, received: Received) -> list[Array]:
-        """By how much the readings differ from the estimate, in standard deviations of the noise; 0 where nothing was received."""
+        """Return readings less estimate, in standard deviations of the noise; 0 where nothing was received."""
         model = self.model
         off = received.y - num.apply(model.C, estimate.x)
         sd = np.sqrt(np.maximum(model.R.diagonal(axis1=1, axis2=2), 1e-12))
@@ -248,7 +248,7 @@ class Sight:
         return [np.max(np.abs(off), axis=(1, 2))]
 
     def _driving(self, estimate: Estimate, received: Received) -> list[Array]:
-        """Believed gap, own speed, time headway and, where it can be told, how fast the gap closes, of the follower with the least gap."""
+        """Return believed gap, own speed, time headway and, where it is known, the closing speed, of the follower with the least gap."""
         model, cars = self.model, np.flatnonzero(self.model.followers)
         assert model.gap is not None and model.speed is not None
         gaps, speeds, closing = [], [], []
@@ -270,7 +270,7 @@ class Sight:
         return [*out, num.pick(np.stack(closing, axis=1), near) / 5.0] if closing else out
 
     def _places(self, values: Array) -> Array:
-        """(B, K) where the knobs stand, in [-1, 1] between the ends of the menu."""
+        """Return the places (B, K) of the knobs, in [-1, 1] between the ends of the menu."""
         out = np.zeros(values.shape)
         for i, knob in enumerate(self.knobs):
             ends = [_place(knob, end) for end in (min(knob.levels), max(knob.levels))]
@@ -280,7 +280,7 @@ class Sight:
 
 
 def _row(weights: Array, x: Array) -> Array:
-    """weights (n,) times x (B, n), in fixed order."""
+    """Return weights (n,) times x (B, n), in fixed order."""
     out = np.zeros(len(x))
     for j in np.flatnonzero(weights).tolist():
         out += weights[j] * x[:, j]

@@ -1,4 +1,4 @@
-"""Centralised references: one estimator reads the sensors of all agents, and tells everybody what it believes.
+"""Centralised references: one estimator reads the sensors of all agents, and everybody gets its estimate.
 
 The sensors of all N agents are stacked to the N q sensors of one agent, for which (5.7) is the Kalman filter and (6.26) the robust one, in
 steady state. It begins at the mean of what the agents are told of the initial state, and knows of the input what agent 0 knows: in a
@@ -29,7 +29,7 @@ class CentralPlan(NamedTuple):
 
 
 def stacked(model: Model) -> Model:
-    """The same system with a single agent, which has the sensors of all in the order of the agents."""
+    """Return the same system with a single agent, which has the sensors of all in the order of the agents."""
     N, q, n = model.C.shape
     R = np.zeros((1, N * q, N * q))
     for i in range(N):
@@ -39,7 +39,7 @@ def stacked(model: Model) -> Model:
 
 
 def together(x: Array) -> Array:
-    """(B, N, q) to (B, 1, N q)."""
+    """Reshape (B, N, q) to (B, 1, N q)."""
     return num.stack([x[:, i, j] for i in range(x.shape[1]) for j in range(x.shape[2])])[:, None]
 
 
@@ -47,7 +47,7 @@ class Central:
     """Base of the centralised defences: a subclass gives the one agent's filter. It shows no innovation (look), being nobody's own."""
 
     def filter(self) -> Filter:
-        """The filter of the stacked system."""
+        """Return the filter of the stacked system."""
         raise TypeError(f"{type(self).__name__} must define filter()")
 
     def prepare(self, model: Model) -> CentralPlan:

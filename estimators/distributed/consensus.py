@@ -75,7 +75,7 @@ class ConsensusFilter(DistributedFilter):
         return KalmanState(corrected.x + gain[..., None] * num.matvec(M, pull), corrected.P)
 
     def _shared(self, plan: FusionPlan, state: KalmanState, innovation: Innovation, accept: Array) -> KalmanState:
-        """The Kalman update with the accepted sensors of N(i), one neighbour after the other: their noises are independent."""
+        """Return the Kalman update with the accepted sensors of N(i), one neighbour after the other: their noises are independent."""
         assert state.P is not None
         known = one_row(state.P) if num.every(accept) else state.P
         x, P = state.x.copy(order="K"), num.zeros(known.shape)
@@ -95,7 +95,7 @@ class ConsensusFilter(DistributedFilter):
 
 
 def _seen(model: Model, agents: tuple[int, ...]) -> Model:
-    """The model of one agent that has the sensors of these."""
+    """Return the model of one agent that has the sensors of these."""
     q, some = model.C.shape[1] * len(agents), list(agents)
     return dataclasses.replace(
         model, C=model.C[some].reshape(1, q, -1), R=np.eye(q)[None], graph=np.eye(1, dtype=bool), gap=None, speed=None,

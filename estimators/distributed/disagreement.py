@@ -33,7 +33,7 @@ Centre = Literal["own", "median"]
 
 
 def disagreement(heard: tuple[tuple[int, ...], ...], x: Array, M: Array, centre: Centre = "own") -> Array:
-    """z (B, N, N): how far what j sends is from what i compares it with, for j in N(i), in sigma; 0 elsewhere.
+    """Return z (B, N, N): the distance in sigma of what j sends from what i compares it with, for j in N(i); 0 elsewhere.
 
     x (B, N, n) is what is sent, M (B or 1, N, n, n) its covariance.
     """
@@ -48,7 +48,7 @@ def disagreement(heard: tuple[tuple[int, ...], ...], x: Array, M: Array, centre:
 
 
 def _median(x: Array) -> Array:
-    """The median over the middle axis of (B, d, n)."""
+    """Return the median over the middle axis of (B, d, n)."""
     ranked, half = np.sort(x, axis=1), x.shape[1] // 2
     return np.asarray(ranked[:, half] if x.shape[1] % 2 else 0.5 * (ranked[:, half - 1] + ranked[:, half]))
 
@@ -67,7 +67,7 @@ class DisagreementFilter(DistributedFilter):
         return self.fuse(plan, x, M, self.weights(plan, x, M))
 
     def weights(self, plan: FusionPlan, x: Array, M: Array) -> Array:
-        """(B, N, N): 1 for those whom an agent uses, 0 for the others."""
+        """Return (B, N, N): 1 for the agents that an agent uses, 0 for the others."""
         use = disagreement(plan.heard, x, M, self.centre) <= self.threshold
         nobody = num.zeros(use.shape[:2], bool)
         for i, near in enumerate(plan.heard):

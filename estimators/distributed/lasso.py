@@ -31,7 +31,7 @@ from tailgate.estimators.parts import Detector, Filter, Mitigation
 
 @dataclass(frozen=True)
 class Lasso(Solved):
-    """The price of an attack, and who solves."""
+    """The price of an attack, and the solver."""
 
     lam: Positive = param(5.0, "price of an attack on a sensor: 5 fits a noise of 0.1 units, the thesis's case has 0.1 at a noise of 1")
     unit: Literal["sigma", "sensor"] = param(

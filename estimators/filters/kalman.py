@@ -75,7 +75,7 @@ class KalmanState(NamedTuple):
 
 
 def alone(S: Array, keep: Array) -> Array:
-    """S with the covariances of the sensors that `keep` (B, N, q) leaves out set to zero: those that stay see their own marginal."""
+    """Return S with the covariances of the sensors outside `keep` (B, N, q) set to zero: the others keep their own marginal."""
     return cast(Array, num.elsewhere(keep.all(axis=-1), S, _marginal, S, keep))
 
 
@@ -87,7 +87,7 @@ def _marginal(S: Array, keep: Array) -> Array:
 
 
 def precision(R: Array) -> Array:
-    """R^-1 (q, q). Raises NotApplicable where a reading has no noise: the filter that asks divides by it."""
+    """Return R^-1 (q, q). Raise NotApplicable where a reading has no noise: the filter divides by it."""
     told = R.diagonal()
     if (told < LEAST).any():
         raise NotApplicable("sensor: noise variance", told.tolist(), f"{LEAST:g} or more in every reading: this filter divides by it")
@@ -96,7 +96,7 @@ def precision(R: Array) -> Array:
 
 @remembered("A", "C", "Q", "R")
 def broad(model: Model) -> Array:
-    """(n,) variances so large that the next measurement decides: a million times those after 100 steps of the filter."""
+    """Return variances (n,) so large that the next measurement decides: a million times those after 100 steps of the filter."""
     P = np.array(model.Q)
     if (model.R.diagonal(axis1=1, axis2=2) < LEAST).any():  # then the process has to be noisy
         unsure = (num.matmul(num.matmul(model.C, P), num.transpose(model.C)) + model.R).diagonal(axis1=1, axis2=2)
@@ -113,7 +113,7 @@ def broad(model: Model) -> Array:
 
 
 def riccati(A: Array, G: Array, Q: Array) -> Array | None:
-    """The predicted covariance P = A (P^-1 + G)^-1 A' + Q (n, n) of one agent, G being the information C' R^-1 C; None where it grows.
+    """Return P = A (P^-1 + G)^-1 A' + Q (n, n), predicted for one agent with the information G = C' R^-1 C; None where it grows.
 
     By structured doubling (Anderson 1978): round j gives what 2^j steps of the filter give.
     """
@@ -133,7 +133,7 @@ def riccati(A: Array, G: Array, Q: Array) -> Array | None:
 
 
 def _settle(A: Array, C: Array, Q: Array, R: Array, P: Array) -> Array:
-    """P- (n, n) after 64 more steps of the filter in Joseph's form, which wash out the rounding of the doubling."""
+    """Return P- (n, n) after 64 more steps of the filter in Joseph's form, which wash out the rounding of the doubling."""
     for _ in range(64):
         S = num.matmul(num.matmul(C, P), C.T) + R
         K = num.matmul(num.matmul(P, C.T), num.inverse(S))
@@ -146,7 +146,7 @@ def _settle(A: Array, C: Array, Q: Array, R: Array, P: Array) -> Array:
 
 @remembered("A", "C", "Q", "R")
 def steady_state(model: Model) -> Array:
-    """P- (N, n, n) at which the predicted covariances settle. Raises NotApplicable, naming the agents, where they do not."""
+    """Return P- (N, n, n) at which the predicted covariances settle. Raise NotApplicable, naming the agents, where they do not."""
     lost = blind(model, np.eye(model.agents, dtype=bool))  # the doubling may take a mode that nobody sees for one that settles
     out = []
     for i in range(0 if lost else model.agents):
@@ -210,7 +210,7 @@ class LinearFilter(Generic[L]):
         return KalmanState(x, 0.5 * (P + num.transpose(P)))
 
     def forget(self, plan: L, state: KalmanState, where: Array) -> KalmanState:
-        """A steady filter forgets for this one step."""
+        """Return the state with the broad covariance in the rows of `where` (B, N); a steady filter forgets for this one step."""
         return KalmanState(state.x, np.where(where[..., None, None], np.diag(plan.broad), self._predicted(plan, state)))
 
     def estimate(self, state: KalmanState) -> Array:
@@ -222,7 +222,7 @@ class LinearFilter(Generic[L]):
         return P
 
     def _cross(self, plan: L, state: KalmanState) -> Array:
-        """C P- (B, N, q, n), or (N, q, n) where it is the same for all."""
+        """Return C P- (B, N, q, n), or (N, q, n) where it is the same for all."""
         return num.matmul(plan.C, self._predicted(plan, state))
 
 

@@ -80,7 +80,7 @@ class JointRegression:
         return RegressionPlan(line, model.dt, rows, 1.0 / model.R[0].diagonal())
 
     def start(self, plan: RegressionPlan, prior: Prior) -> RegressionState:
-        """The ridge is centred on the prior's mean."""
+        """Return the state at step 1; the ridge is centred on the prior's mean."""
         shape = prior.mean.shape[:2]
         fit = KalmanState(prior.mean, num.full((*shape, STATES, STATES), np.diag(plan.line.broad)))
         past = num.zeros((*shape, self.window, 2))
@@ -130,14 +130,14 @@ class JointRegression:
         return state._replace(fit=LINE.forget(plan.line, state.fit, where))
 
     def estimate(self, state: RegressionState) -> Array:
-        """x (B, N, 4), the leader standing where the fit has stopped."""
+        """Return x (B, N, 4); a fitted leader that has stopped does not move."""
         x, (s, stopped) = state.fit.x.copy(order="K"), _stop(state)
         x[..., :2] = num.matvec(_rows(s, stopped), state.fit.x)
         x[..., LEAD_ACCEL] = np.where(stopped, 0.0, x[..., LEAD_ACCEL])
         return x
 
     def _restart(self, plan: RegressionPlan, state: RegressionState, where: Array) -> RegressionState:
-        """Least squares on the samples kept, with the ridge around the present fit, in the rows of `where` (B, N)."""
+        """Return least squares on the kept samples, with the ridge around the present fit, in the rows of `where` (B, N)."""
         x = state.fit.x
         theta = num.stack([x[..., GAP], x[..., RELATIVE_SPEED] + x[..., OWN_SPEED], x[..., LEAD_ACCEL]])
         M, b = num.full((*where.shape, 3, 3), np.eye(3) / self.delta), num.zeros((*where.shape, 3))
@@ -161,16 +161,17 @@ class JointRegression:
 
 
 def stop_time(speed: Array, a: Array, age: Array) -> Array:
-    """Time [s] to the instant at which a leader's fitted speed [m/s] passed zero, elementwise; `_stop` says of which ones."""
+    """Return the time [s] to the instant at which a leader's fitted speed [m/s] passed zero, elementwise; `_stop` selects the rows."""
     slowing = (speed < 0.0) & (a < 0.0)
     out: Array = np.where(slowing, np.maximum(-speed / np.where(slowing, a, -1.0), -age), 0.0)
     return out
 
 
 def _stop(state: RegressionState) -> tuple[Array, Array]:
-    """Time (B, N) from now to the instant at which the fitted leader's speed passed zero [s], 0 while it moves; and whether it did.
+    """Return the time (B, N) [s] from now to the instant at which the fitted leader's speed passed zero, 0 while it moves; and if it did.
 
-    Not before the first instant of the fit; nor where it is not slowing down, as one that stands may seem to do by noise.
+    It lies never before the first instant of the fit. A leader that does not slow down does not stop: noise may make one that is at rest
+    seem so.
     """
     x = state.fit.x
     speed = x[..., RELATIVE_SPEED] + x[..., OWN_SPEED]
@@ -178,7 +179,7 @@ def _stop(state: RegressionState) -> tuple[Array, Array]:
 
 
 def _rows(s: Array, stopped: Array) -> Array:
-    """(B, N, 2, 4): the readings that x predicts, those of a stopped leader as they were at the stop."""
+    """Return (B, N, 2, 4): the readings that x predicts; those of a stopped leader as they were at the stop."""
     H = num.zeros((*s.shape, 2, STATES))
     H[..., 0, GAP], H[..., 0, RELATIVE_SPEED], H[..., 0, LEAD_ACCEL], H[..., 0, OWN_SPEED] = 1.0, s, 0.5 * s * s, s
     H[..., 1, RELATIVE_SPEED], H[..., 1, OWN_SPEED] = ~stopped, np.where(stopped, -1.0, 0.0)
@@ -186,5 +187,5 @@ def _rows(s: Array, stopped: Array) -> Array:
 
 
 def _at_stop(plan: RegressionPlan, state: RegressionState) -> KalmanPlan:
-    """The fit's plan with the rows of the present step."""
+    """Return the fit's plan with the rows of the present step."""
     return plan.line._replace(C=_rows(*_stop(state)))

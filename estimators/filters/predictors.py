@@ -30,7 +30,10 @@ Samples = Annotated[int, Field(ge=2, le=1000)]
 
 
 def read_states(model: Model, where: str) -> Array:
-    """(N, q) which state each sensor reads. Raises NotApplicable unless each reads one state itself, and no two of an agent the same."""
+    """Return the state (N, q) that each sensor reads.
+
+    Raise NotApplicable unless each reads one state itself, all different within an agent.
+    """
     direct = np.isin(model.C, (0.0, 1.0)).all() and (np.count_nonzero(model.C, axis=2) == 1).all()
     state = np.argmax(model.C, axis=2)
     if not direct or any(len(set(row)) < len(row) for row in state.tolist()):
@@ -60,18 +63,18 @@ class PredictorState(NamedTuple, Generic[M]):
 
 @dataclass(frozen=True)
 class Predictor(Generic[M]):
-    """Base: a subclass says what it keeps (`begin`), what follows from it (`ahead`) and what it learns (`learn`)."""
+    """Base class: a subclass chooses what it keeps (`begin`), what follows from it (`ahead`) and what it learns (`learn`)."""
 
     def begin(self, plan: PredictorPlan, y: Array) -> M:
-        """What is kept before the first reading; y (B, N, q) are the readings that the prior predicts."""
+        """Return the memory before the first reading; y (B, N, q) are the readings that the prior predicts."""
         raise TypeError(f"{type(self).__name__} must define begin()")
 
     def ahead(self, plan: PredictorPlan, past: M) -> tuple[M, Array, Array]:
-        """One step later: what is kept, the predicted readings (B, N, q), and their variance."""
+        """Return one step later: the memory, the predicted readings (B, N, q), and their variance."""
         raise TypeError(f"{type(self).__name__} must define ahead()")
 
     def learn(self, plan: PredictorPlan, past: M, y: Array, accept: Array) -> M:
-        """What is kept after the readings y (B, N, q) of `accept` (B, N, q)."""
+        """Return the memory after the readings y (B, N, q) of `accept` (B, N, q)."""
         raise TypeError(f"{type(self).__name__} must define learn()")
 
     def prepare(self, model: Model) -> PredictorPlan:
@@ -105,7 +108,7 @@ class Predictor(Generic[M]):
         return PredictorState(x, state.spread, self.learn(plan, state.past, y, accept))
 
     def forget(self, plan: PredictorPlan, state: PredictorState[M], where: Array) -> PredictorState[M]:
-        """Nothing to forget: the next reading is believed entirely."""
+        """Return the state: the next reading is believed entirely anyway."""
         return state
 
     def gain(self, plan: PredictorPlan, state: PredictorState[M], innovation: Innovation) -> Array:
@@ -214,7 +217,7 @@ class Polynomial(Predictor[Ring]):
 
 
 def _powers(t: Array, size: int) -> Array:
-    """(..., size): 1, t, t^2, ..."""
+    """Return (..., size): 1, t, t^2, ..."""
     out = [np.ones_like(t)]
     for _ in range(size - 1):
         out.append(out[-1] * t)

@@ -34,7 +34,7 @@ ROUNDING = 8 * float(np.finfo(np.float64).eps)  # of a sum, relative to its larg
 
 
 def believed(r: Array, S: Array, lam: Array) -> Array:
-    """y = r - z (B, N, q) for r and lam (B, N, q) and S (B, N, q, q). A sensor without outlier keeps every bit of its r."""
+    """Return y = r - z (B, N, q) for r and lam (B, N, q) and S (B, N, q, q). A sensor without outlier keeps every bit of its r."""
     W = num.inverse(S)
     if r.shape[-1] == 2:
         return _pair(r, S, W, 0.5 * lam)
@@ -45,7 +45,7 @@ def believed(r: Array, S: Array, lam: Array) -> Array:
 
 
 def _pair(r: Array, S: Array, W: Array, half: Array) -> Array:
-    """Two sensors in closed form: r and lam/2 (B, N, 2), S and W (B, N, 2, 2).
+    """Solve for two sensors in closed form: r and lam/2 (B, N, 2), S and W (B, N, 2, 2).
 
     Nothing is an outlier, or both are, with one of four pairs of signs s and y = S (s lam) / 2, or one is.
     """
@@ -77,7 +77,7 @@ def _within(x: Array, low: Array, high: Array) -> Array:
 
 
 def _pivot(r: Array, W: Array, half: Array, size: Array) -> Array:
-    """Any number of sensors: block principal pivoting (Judice and Pires 1992), which ends in a finite number of rounds.
+    """Solve for any number of sensors: block principal pivoting (Judice and Pires 1992), which ends in a finite number of rounds.
 
     A round solves for the outliers of presumed signs, and changes the presumptions that its solution contradicts: all of them while they
     grow fewer, else the last one alone. (Coordinate descent is simpler, and takes thousands of sweeps where sensors are correlated.)
@@ -116,7 +116,7 @@ def _pivot(r: Array, W: Array, half: Array, size: Array) -> Array:
 
 
 def _solved(sign: Array, r: Array, W: Array, half: Array) -> Array:
-    """y (B, N, q) for presumed signs: an outlier is where its price is met, any other sensor is believed."""
+    """Return y (B, N, q) for presumed signs: an outlier is at its price, any other sensor is believed."""
     q = r.shape[-1]
     out = [sign[..., i] != 0.0 for i in range(q)]
     y = [np.where(out[i], 0.0, r[..., i]) for i in range(q)]
@@ -148,7 +148,7 @@ def _solved(sign: Array, r: Array, W: Array, half: Array) -> Array:
 
 @cache
 def _problem(q: int) -> tuple[Any, dict[str, Any], Any]:
-    """The cvxpy problem of q sensors, its parameters and its variable. W = F'F, d = F r."""
+    """Return the cvxpy problem of q sensors, its parameters and its variable. W = F'F, d = F r."""
     cp = load_cvxpy()
     z, known = cp.Variable(q), {"F": cp.Parameter((q, q)), "d": cp.Parameter(q), "lam": cp.Parameter(q, nonneg=True)}
     price = cp.sum_squares(known["d"] - cp.matmul(known["F"], z)) + cp.norm1(cp.multiply(known["lam"], z))
@@ -156,7 +156,7 @@ def _problem(q: int) -> tuple[Any, dict[str, Any], Any]:
 
 
 def load_cvxpy() -> Any:
-    """The package cvxpy. Raises ImportError with the command that installs it."""
+    """Return the package cvxpy. Raise ImportError with the command that installs it."""
     try:
         return import_module("cvxpy")
     except ImportError as error:
@@ -164,7 +164,7 @@ def load_cvxpy() -> Any:
 
 
 def believed_by_cvxpy(r: Array, S: Array, lam: Array) -> Array:
-    """What `believed` computes, by an interior-point solver (Clarabel), row by row, to the solver's tolerance."""
+    """Return what `believed` returns, from an interior-point solver (Clarabel), row by row, to the solver's tolerance."""
     from scipy.linalg import cholesky
 
     problem, known, z = _problem(r.shape[-1])
@@ -189,14 +189,14 @@ class Penalty:
     )
 
     def price(self, S: Array) -> Array:
-        """lam_i (..., q) for S (..., q, q) [1/unit of the sensor]."""
+        """Return lam_i (..., q) for S (..., q, q) [1/unit of the sensor]."""
         variance = S.diagonal(axis1=-2, axis2=-1)
         return self.lam / np.sqrt(variance) if self.unit == "sigma" else np.full(variance.shape, self.lam)
 
 
 @dataclass(frozen=True)
 class Solved(Penalty):
-    """The price, and who solves."""
+    """The price, and the solver."""
 
     solver: Literal["exact", "cvxpy"] = param("exact", "exact: closed form or block pivoting; cvxpy: an interior-point solver, slow")
 
@@ -227,7 +227,7 @@ class Outlier(Penalty, Memoryless):
     """Alarms, and blames the sensor, where the robust Kalman filter of the same lam would find an outlier."""
 
     def prepare(self, model: Model) -> Array:
-        """(N,) the gate in steady state."""
+        """Return the gate (N,) in steady state."""
         P = steady_state(model)
         S = num.matmul(model.C, num.matmul(P, num.transpose(model.C))) + model.R
         lam, W = self.price(S), num.inverse(S).diagonal(axis1=-2, axis2=-1)
@@ -239,7 +239,10 @@ class Outlier(Penalty, Memoryless):
         return None, Verdict(num.quadratic(r, num.inverse(S)), suspect.any(axis=-1), suspect)
 
     def gate(self, plan: Array, state: None) -> Array:
-        """The largest ellipsoid r' S^-1 r inside of |2 S^-1 r|_i <= lam_i, for the steady S. Outside of it some raise none either."""
+        """Return the largest ellipsoid r' S^-1 r inside |2 S^-1 r|_i <= lam_i, for the steady S.
+
+        Some innovations outside raise no alarm either.
+        """
         return plan
 
 

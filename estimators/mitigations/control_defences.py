@@ -33,7 +33,7 @@ def require_string(model: Model, name: str) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class Choice(Gate[M, X]):
-    """Base: uses all readings, or with `gate` those that are not suspected."""
+    """Base class: uses all readings, or with `gate` those that are not suspected."""
 
     gate: bool = param(False, "ignore the suspected sensors, as gate_out does")
 
@@ -89,7 +89,7 @@ class OwnSensors(Choice[LocalState, LocalPlan]):
     accel_max: Finite = param(3.0, "largest command of the own law [m/s^2]")
 
     def bounds(self, plan: LocalPlan, y: Array, rate: Array, on: Array) -> tuple[Array, Array]:
-        """The least and the largest command (B, N) for own readings y (B, N, 3) and the gap's rate; `on` (B, N): an alarm lasts."""
+        """Return the least and the largest command (B, N) for own readings y (B, N, 3) and the gap's rate; `on` (B, N): an alarm lasts."""
         raise TypeError(f"{type(self).__name__} must define bounds()")
 
     def constants(self, model: Model) -> LocalPlan:
@@ -103,7 +103,7 @@ class OwnSensors(Choice[LocalState, LocalPlan]):
         return LocalPlan(model.followers, tuple(model.sensors.index(sensor) for sensor in OWN), self.smooth(model.dt), model.dt)
 
     def smooth(self, dt: float) -> float:
-        """The share h of a new reading in the smoothed gap."""
+        """Return the share h of a new reading in the smoothed gap."""
         return 1.0 - float(num.exp(-dt / self.smoothing))
 
     def begin(self, plan: ReactionPlan[LocalPlan], batch: int) -> LocalState:
@@ -131,7 +131,7 @@ class OwnSensors(Choice[LocalState, LocalPlan]):
         return LocalState(shut, y, known, g, left), decision._replace(limits=limits)
 
     def within(self, u: Array) -> Array:
-        """The command cut at the own law's limits."""
+        """Return the command cut at the own law's limits."""
         return np.asarray(np.minimum(np.maximum(u, self.accel_min), self.accel_max))
 
 
@@ -143,7 +143,7 @@ class Reach(NamedTuple):
 
 
 def reachable(A: Array, b: Array) -> Reach:
-    """The ellipsoid of this kind that is narrowest along the first state, for a stable A (n, n) and b (n,).
+    """Return the ellipsoid of this kind that is narrowest along the first state, for a stable A (n, n) and b (n,).
 
     V = z' P z satisfies V+ <= a V + (1 - a) w^2 for all z, w where P^-1 = Q solves the linear matrix inequality
 
@@ -180,7 +180,7 @@ def _between(radius: float, share: float) -> float:
 
 
 def response(A: Array, b: Array) -> Array:
-    """The first state after an impulse: (K,) of A^k b, until it has died out."""
+    """Return the first state after an impulse: (K,) of A^k b, until it has died out."""
     x, out = np.array(b), []
     size = float(np.max(np.abs(b)))
     for _ in range(STEPS):
@@ -192,7 +192,7 @@ def response(A: Array, b: Array) -> Array:
 
 
 def peak(A: Array, b: Array) -> float:
-    """The largest first state that an input of at most 1 can reach."""
+    """Return the largest first state that an input of at most 1 can reach."""
     return float(sum(abs(value) for value in response(A, b).tolist()))
 
 
@@ -237,7 +237,7 @@ class InputClip(OwnSensors):
     sides: Literal["above", "both"] = param("above", "above: the command is bounded from above only; both: on both sides of the own law's")
 
     def loop(self, dt: float) -> OwnLoop:
-        """The car's own loop for a step dt [s]."""
+        """Return the car's own loop for a step dt [s]."""
         E, smooth = float(num.exp(-dt / self.lag)), self.smooth(dt)
         s1 = self.lag * (1.0 - E)
         A, u = np.eye(4), np.array([-(dt * dt / 2.0 - self.lag * (dt - s1)), dt - s1, 1.0 - E, 0.0])
@@ -251,12 +251,12 @@ class InputClip(OwnSensors):
         return OwnLoop(A + u[:, None] * feedback, u, np.array([1.0, 0.0, 0.0, 0.0]), noisy, feedback)
 
     def slack(self, own: OwnLoop, dt: float) -> float:
-        """By how much [m] the gap can fall below d_r behind a car with any speed in [0, speed_max], without noise and deviation."""
+        """Return how far [m] the gap can fall below d_r behind a car with any speed in [0, speed_max], without noise and deviation."""
         kernel = (dt * response(own.A, own.ahead)).tolist()  # of the speed ahead; its sum is tau_h
         return self.speed_max * -float(sum(value for value in kernel if value < 0.0))
 
     def bound(self, model: Model) -> float:
-        """The largest deviation [m/s^2] from the own law."""
+        """Return the largest deviation [m/s^2] from the own law."""
         own = self.loop(model.dt)
         width = reachable(own.A, own.forced).width  # refuses a loop that is not stable
         if self.sides == "above" and (response(own.A, own.forced) > DECAYED).any():

@@ -34,7 +34,7 @@ ROUNDS = 6  # of Newton's method for the time of the stop
 
 
 def stopping_distance(v: Array, a: Array, brake: float, tau: float) -> Array:
-    """Way [m] to a standstill from v [m/s] and a [m/s^2] under the command -brake through a lag tau [s], elementwise.
+    """Return the way [m] to a standstill from v [m/s] and a [m/s^2] under the command -brake through a lag tau [s], elementwise.
 
     v(t) is concave and falls from right of its root on, so that Newton's method from there stays right of it.
     """
@@ -46,13 +46,13 @@ def stopping_distance(v: Array, a: Array, brake: float, tau: float) -> Array:
 
 
 def sooner(t: Array, e: Array, v: Array, c: Array, brake: float, tau: float) -> Array:
-    """A step of Newton's method for the time of the stop, elementwise."""
+    """Return a step of Newton's method for the time of the stop, elementwise."""
     out: Array = t - (v - brake * t + c * tau * (1.0 - e)) / (c * e - brake)
     return out
 
 
 def way_until(t: Array, e: Array, v: Array, c: Array, brake: float, tau: float) -> Array:
-    """way(t), elementwise."""
+    """Return way(t), elementwise."""
     out: Array = v * t - 0.5 * brake * t * t + c * tau * t - c * tau * tau * (1.0 - e)
     return out
 
@@ -117,7 +117,7 @@ class SafeState(SafeSet):
         return SafeMemory(belief, held, armed), estimate._replace(limits=limits)
 
     def _inside(self, plan: SafePlan, belief: Any, found: Finding) -> Any:
-        """A filter's state with the own speeds in the set: a linear one that knows of a hard brake would reverse a car that stands."""
+        """Return a filter's state with the own speeds in the set: a linear filter would let a hard brake reverse a stopped car."""
         x = getattr(belief, "x", None)
         if x is None:
             return belief
@@ -127,7 +127,7 @@ class SafeState(SafeSet):
         return belief._replace(x=x)
 
     def limits(self, plan: SafePlan, found: Finding, armed: Array) -> tuple[Array, Array | None]:
-        """`armed` for the next step, and the least and largest command (B, N, m, 2); None where the controller may do as it likes."""
+        """Return `armed` for the next step, and the least and largest command (B, N, m, 2); None where the controller is not limited."""
         return armed, None
 
 
@@ -158,7 +158,7 @@ class SafeStateBrake(SafeState):
         return plan._replace(reaction=max(self.reaction, model.dt), lag=self.lag or plan.lag, watch=round(self.watch / model.dt))
 
     def needed(self, plan: SafePlan, found: Finding) -> Array:
-        """The smallest safe gap (B, N) [m] for the worst of the box."""
+        """Return the smallest safe gap (B, N) [m] for the worst of the box."""
         worst, rho = found.worst, plan.reaction
         v, a, w = worst.hi[..., SPEED], worst.hi[..., ACCEL] + plan.off, np.maximum(worst.lo[..., LEAD], 0.0)
         a = a + (1.0 - float(num.exp(-rho / plan.lag))) * np.maximum(self.response - a, 0.0)  # while it does not brake yet

@@ -49,7 +49,7 @@ corrected: Callable[..., tuple[Array, Array]] = matrices.corrected
 
 
 def clip(x: Any, low: Any, high: Any) -> Any:
-    """x within [low, high], elementwise."""
+    """Return x within [low, high], elementwise."""
     return np.minimum(np.maximum(x, low), high)
 
 
@@ -58,39 +58,39 @@ _TO_FIRST = [(n - 1, *range(n - 1)) if n else () for n in range(12)]
 
 
 def first_to_last(x: Array) -> Array:
-    """(B, ...) to (..., B), a view."""
+    """Return (B, ...) as (..., B), a view."""
     return x.transpose(_TO_LAST[x.ndim])
 
 
 def last_to_first(x: Array) -> Array:
-    """(..., B) to (B, ...), a view."""
+    """Return (..., B) as (B, ...), a view."""
     return x.transpose(_TO_FIRST[x.ndim])
 
 
 def batch_last(x: Array) -> Array:
-    """The same (B, ...) array with B contiguous in memory."""
+    """Return the same (B, ...) array with B contiguous in memory."""
     return last_to_first(np.ascontiguousarray(first_to_last(x)))
 
 
 def zeros(shape: Sequence[int], dtype: Any = np.float64) -> Array:
-    """A (B, ...) array of zeros, B contiguous in memory."""
+    """Return a (B, ...) array of zeros, B contiguous in memory."""
     return last_to_first(np.zeros((*shape[1:], shape[0]), dtype))
 
 
 def full(shape: Sequence[int], value: Any, dtype: Any = np.float64) -> Array:
-    """A (B, ...) array that holds `value` (broadcast over the trailing axes), B contiguous in memory."""
+    """Return a (B, ...) array that holds `value` (broadcast over the trailing axes), B contiguous in memory."""
     out = zeros(shape, dtype)
     out[...] = value
     return out
 
 
 def stack(columns: Sequence[Array]) -> Array:
-    """F arrays (B, ...) to (B, ..., F), B contiguous in memory."""
+    """Stack F arrays (B, ...) to (B, ..., F), B contiguous in memory."""
     return last_to_first(np.stack([first_to_last(c) for c in columns], axis=-2))
 
 
 def matmul(x: Array, y: Array) -> Array:
-    """(..., i, k) times (..., k, j), summed over k in ascending order.
+    """Return (..., i, k) times (..., k, j), summed over k in ascending order.
 
     One matrix x for a whole batch, or one (N, i, k) for each agent of it: its structural zeros count for nothing, whatever y holds there.
     """
@@ -103,12 +103,12 @@ def matmul(x: Array, y: Array) -> Array:
 
 
 def matvec(x: Array, v: Array) -> Array:
-    """(..., i, k) times (..., k), summed over k in ascending order, as `matmul` does."""
+    """Return (..., i, k) times (..., k), summed over k in ascending order, as `matmul` does."""
     return np.asarray(matmul(x, v[..., None])[..., 0])
 
 
 def dot(x: Array, y: Array) -> Array:
-    """(..., k) and (..., k) to (...), summed in ascending order."""
+    """Return (..., k) times (..., k), (...), summed in ascending order."""
     out = x[..., 0] * y[..., 0]
     for k in range(1, x.shape[-1]):
         out = out + x[..., k] * y[..., k]
@@ -121,27 +121,28 @@ def transpose(x: Array) -> Array:
 
 
 def quadratic(x: Array, weight: Array) -> Array:
-    """x' W x for x (..., k) and W (..., k, k)."""
+    """Return x' W x for x (..., k) and W (..., k, k)."""
     return dot(x, matvec(weight, x))
 
 
 def inverse(s: Array) -> Array:
-    """Inverse of symmetric positive definite (..., q, q), see `matrices.inverse`."""
+    """Return the inverse of a symmetric positive definite (..., q, q), see `matrices.inverse`."""
     if s.ndim > 2 and len(s) > 1 and s.strides[0] == 0:  # the same for the whole batch
         return np.broadcast_to(inverse(s[:1]), s.shape)
     return cast(Array, matrices.inverse(s))
 
 
 def apply(matrix: Array, x: Array, base: Array | None = None) -> Array:
-    """Each agent's own matrix (N, i, k), or one (1, i, k) for all, times its vector in x (B, N, k), and base (B, N, i) with it: (B, N, i).
+    """Return each agent's matrix times its vector, plus `base`: (B, N, i).
 
-    Sums run over k in ascending order, and structural zeros of the matrices count for nothing.
+    The matrices are (N, i, k), or one (1, i, k) for all; x (B, N, k), base (B, N, i). Sums run over k in ascending order; structural zeros
+    of the matrices are skipped.
     """
     return cast(Array, matrices.applied(matrix, x, base))
 
 
 def fused(heard: Array, x: Array, M: Array, shares: Shares | None = None, step: tuple[Array, Array] | None = None) -> tuple[Array, Array]:
-    """xb (B, N, n) and Q^-1 (B, N, n, n) of x (B, N, n) and M (B or 1, N, n, n), see `matrices.spreads` and `matrices.means`.
+    """Return xb (B, N, n) and Q^-1 (B, N, n, n) of x (B, N, n) and M (B or 1, N, n, n), see `matrices.spreads` and `matrices.means`.
 
     shares: its weight, total and begin, (B or 1, ...); none: all weigh the same. step: its A and Q.
     """
@@ -152,17 +153,17 @@ def fused(heard: Array, x: Array, M: Array, shares: Shares | None = None, step: 
 
 
 def product(x: Array, y: Array) -> Array:
-    """One (i, k) times one (k, j): summed over k in ascending order, without the zeros of x."""
+    """Return one (i, k) times one (k, j), summed over k in ascending order, without the zeros of x."""
     return cast(Array, matrices.constant_times(x, y))
 
 
 def solve(m: Array, y: Array) -> Array:
-    """M^-1 Y for one (n, n) and one (n, k), by elimination with row pivots in fixed order."""
+    """Return M^-1 Y for one (n, n) and one (n, k), by elimination with row pivots in fixed order."""
     return cast(Array, matrices.solve(m, y))
 
 
 def expm(m: Array) -> Array:
-    """The exponential of one square matrix: Taylor's series of M / 2^s, squared s times."""
+    """Return the exponential of one square matrix: Taylor's series of M / 2^s, squared s times."""
     size = float(np.max(np.abs(m)) * len(m))
     halvings = max(0, math.frexp(size)[1] + 4) if size > 0.0 else 0
     small, term = np.array(m) / 2.0**halvings, np.eye(len(m))
@@ -176,7 +177,7 @@ def expm(m: Array) -> Array:
 
 
 def spectral_radius(m: Array) -> float:
-    """The largest |eigenvalue| of one square matrix, as the limit of |M^(2^k)|^(1 / 2^k)."""
+    """Return the largest |eigenvalue| of one square matrix, as the limit of |M^(2^k)|^(1 / 2^k)."""
     power, size = np.array(m, np.float64), 0.0
     for k in range(60):
         scale = float(np.max(np.abs(power)))
@@ -189,6 +190,6 @@ def spectral_radius(m: Array) -> float:
 
 
 def dense(x: Array, weight: Array, bias: Array, squash: bool) -> Array:
-    """One network layer (B, i) -> (B, o) in float64 and fixed order, with tanh if `squash`."""
+    """Return one network layer (B, i) -> (B, o) in float64 and fixed order, with tanh if `squash`."""
     out = matrices.dense(x, weight, bias)
     return cast(Array, tanh(out) if squash else out)

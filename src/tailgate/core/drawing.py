@@ -1,4 +1,4 @@
-"""Who hears whom, drawn: the graph of a network, or the cars of a platoon in a row (thesis figures 5.1 and 6.2; extra: viz)."""
+"""Drawings of who hears whom: the graph of a network, or the cars of a platoon in a row (thesis figures 5.1 and 6.2; extra: viz)."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ INK, EDGE, NODE, ATTACKED = "#1a1a1a", "#6b7076", "#dcebf5", "#b34700"
 
 
 def hops(graph: Array) -> Array:
-    """(N, N) edges between two agents, whichever way they are heard; infinite where nothing joins them."""
+    """Return the edges (N, N) between two agents, whichever way they are heard; infinite where nothing joins them."""
     linked = np.array(graph, bool) | np.array(graph, bool).T
     count = len(linked)
     out = np.where(np.eye(count, dtype=bool), 0.0, np.where(linked, 1.0, np.inf))
@@ -32,7 +32,7 @@ def hops(graph: Array) -> Array:
 
 
 def layout(graph: Array, row: bool = False) -> Array:
-    """(N, 2) places of agents: distances as the hops say (stress majorisation from classical scaling), the same at every call.
+    """Return places (N, 2) of agents whose distances follow the hops (stress majorisation from classical scaling), the same at every call.
 
     row: side by side, agent 0 on the right, as a platoon drives.
     """
@@ -64,7 +64,7 @@ def layout(graph: Array, row: bool = False) -> Array:
 
 
 def edges(graph: Array) -> list[tuple[int, int, bool]]:
-    """(from, to, both ways) of each pair of agents that hear each other, or of which one hears the other."""
+    """Return (from, to, both ways) of each pair of agents where at least one hears the other."""
     heard, out = np.array(graph, bool), []
     for i, j in zip(*np.nonzero(heard), strict=True):
         if i < j or (i > j and not heard[j, i]):
@@ -75,7 +75,9 @@ def edges(graph: Array) -> list[tuple[int, int, bool]]:
 def graph_figure(
     graph: Array, labels: Sequence[str] | None = None, attacked: Collection[int] = (), row: bool = False, title: str = ""
 ) -> Any:
-    """A matplotlib Figure of a graph (N, N) bool, [i, j] when i hears j: lines where two hear each other, else arrows to who hears.
+    """Return a matplotlib Figure of a graph (N, N) bool, [i, j] when i hears j.
+
+    Lines join two that hear each other; arrows point to an agent that hears and is not heard.
 
     labels: of the agents; none: their numbers. attacked: numbers of agents to mark. row: a platoon, the leader on the right.
     Raises InputError for labels or agents that do not fit.
@@ -126,17 +128,17 @@ def graph_figure(
 
 
 def _edge(radius: float, hit: bool) -> float:
-    """Where the edges end: at the second ring of an attacked agent."""
+    """Return the radius at which edges end: at the second ring of an attacked agent."""
     return 1.32 * radius if hit else radius
 
 
 def _bend(a: int, b: int) -> float:
-    """Height of the arc between two cars of a row."""
+    """Return the height of the arc between two cars of a row."""
     return 0.0 if abs(a - b) < 2 else 0.5 * 0.34 * abs(a - b)
 
 
 def draw_graph(source: object, path: Path, attacked: Collection[int] = (), title: str = "") -> Path:
-    """Writes the graph of a Model, or of a plant whose agents hear each other, to a .png, .svg or .pdf file; returns its path."""
+    """Write the graph of a Model, or of a plant whose agents hear each other, to a .png, .svg or .pdf file; return its path."""
     form = path.suffix.lower().removeprefix(".")
     if form not in FORMATS:
         raise InputError("out", str(path), f"a file that ends in {', '.join('.' + name for name in FORMATS)}")

@@ -53,7 +53,7 @@ _START = np.uint32(0xFFFFFFFF)  # the step under which start() draws: no episode
 
 
 def check_estimate(estimate: Estimate, model: Model, batch: int, k: Array) -> None:
-    """Raise InputError when a defence's output, of step k (B,), has not the type, shape or finiteness that the loop needs."""
+    """Raise InputError when a defence's output at step k (B,) lacks the type, shape or finite values that the loop needs."""
     shape = (batch, model.agents)
     wanted = {
         "x": ((*shape, model.states), "f"), "score": (shape, "f"), "alarm": (shape, "b"), "mode": (shape, "iu"), "probe": (shape, "b"),
@@ -108,8 +108,8 @@ class LoopState(NamedTuple):
 class Loop:
     """A closed loop of one plant under one defence, for B independent episodes.
 
-    `told`: the model that defence, controller, channel and attacker go by, where the plant's and the sensor's own is another; `load`: the
-    vehicle's mass over the nominal one, by which a commanded acceleration is divided [-]; `link`: readings that are lost or late.
+    `told`: the model that defence, controller, channel and attacker use, where it differs from the model of plant and sensor; `load`: the
+    vehicle's mass over the nominal one, which divides a commanded acceleration [-]; `link`: readings that are lost or late.
     """
 
     plant: Plant
@@ -161,7 +161,7 @@ class Loop:
         return lock(copy.deepcopy(self.plan.defence))
 
     def start(self, keys: Keys) -> LoopState:
-        """States of B fresh episodes at k = 1, measured."""
+        """Return the states of B fresh episodes at k = 1, measured."""
         plan, model = self.plan, self.model
         batch = len(keys.key)
         at_start = np.full(batch, _START)
@@ -189,7 +189,7 @@ class Loop:
         )  # fmt: skip
 
     def restart(self, state: LoopState, mask: Array) -> LoopState:
-        """New episodes in the rows of `mask` (B,) bool, the next of their own counter; the other rows keep every bit."""
+        """Return the state with new episodes in the rows of `mask` (B,) bool, each with its next counter; the other rows keep every bit."""
         rows = np.flatnonzero(mask)
         if not len(rows):
             return state
@@ -197,13 +197,13 @@ class Loop:
         return self.reseed(state, rows, keys)
 
     def reseed(self, state: LoopState, rows: Array, keys: Keys) -> LoopState:
-        """New episodes in `rows` (R,) with the given keys of R rows."""
+        """Return the state with new episodes in `rows` (R,), from the given keys of R rows."""
         fresh = self.start(keys)
         out: LoopState = put_rows(state, rows, fresh)
         return out
 
     def sense(self, state: LoopState) -> View:
-        """What the threat model lets the attacker see now."""
+        """Return the part of the state that the threat model lets the attacker see now."""
         plan, channel = self.plan, state.channel
         threat = self.threat
         budget_left = Channel().budget_left(plan.channel, channel)
@@ -232,7 +232,7 @@ class Loop:
         return shown._replace(defence=view.defence)
 
     def advance(self, state: LoopState, command: Command) -> tuple[LoopState, Frame]:
-        """The rest of the step: channel, defence, controller, plant, and the next measurement."""
+        """Play the rest of the step: channel, defence, controller, plant, and the next measurement."""
         plan = self.plan
         truth, odometry = self._truth(state.plant, state.controller), self.plant.odometry(plan.plant, state.plant)
         channel, received, arrived, refused = Channel().apply(
@@ -276,7 +276,7 @@ class Loop:
         return state, frame
 
     def step(self, state: LoopState, attack: Attack[P, S], plan: P, memory: S) -> tuple[LoopState, S, Frame]:
-        """sense, decide, advance. `plan` and `memory` are the attack's plan and state."""
+        """Sense, decide and advance once. `plan` and `memory` are the attack's plan and state."""
         memory, command = attack.decide(plan, memory, self.sense(state), state.keys.at(Role.ATTACK, state.k))
         state, frame = self.advance(state, command)
         return state, memory, frame
@@ -286,7 +286,7 @@ class Loop:
         return self.plant.truth(self.plan.plant, plant, held)
 
     def _again(self, state: LoopState, truth: Array) -> Callable[[Air], Received] | None:
-        """This step's measurement under what is radiated; None of sensors that receive nothing over the air."""
+        """Return this step's measurement as a function of what is radiated; None for sensors that receive nothing over the air."""
         if not self.model.air:
             return None
         sensor, draws = cast(Receiver, self.sensor), state.keys.at(Role.SENSOR, state.k)

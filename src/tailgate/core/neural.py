@@ -35,7 +35,7 @@ T = TypeVar("T", bound=Trained)
 
 
 class Memory(NamedTuple):
-    """What an LSTM remembers, (B, H) each."""
+    """The memory of an LSTM, (B, H) each."""
 
     hidden: Array
     cell: Array
@@ -57,11 +57,11 @@ class Lstm:
         return len(self.bias) // 4
 
     def blank(self, batch: int) -> Memory:
-        """The memory of episodes that begin."""
+        """Return the memory of episodes that begin."""
         return Memory(np.zeros((batch, self.size)), np.zeros((batch, self.size)))
 
     def __call__(self, observation: Array, memory: Memory) -> Memory:
-        """(B, d) float32 and the memory before it, to the memory after it."""
+        """Return the memory after an observation (B, d) float32 and the memory before it."""
         read = np.concatenate([np.asarray(observation, np.float64), memory.hidden], axis=1)
         gates = num.dense(read, self.weight, self.bias, squash=False)
         admit, keep, new, show = (np.ascontiguousarray(gates[:, n * self.size : (n + 1) * self.size]) for n in range(4))
@@ -87,7 +87,7 @@ class Network:
     squashed: bool = False
 
     def __call__(self, observation: Array) -> Array:
-        """What the perceptron reads, (B, d), to (B, o): logits or values of discrete actions, or the mean of a continuous action."""
+        """Return the output (B, o) for an input (B, d): logits or values of discrete actions, or the mean of a continuous action."""
         x: Array = np.asarray(observation, np.float64)
         for i, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
             x = num.dense(x, weight, bias, squash=self.squashed or i + 1 < len(self.weights))
@@ -95,9 +95,10 @@ class Network:
 
 
 def read_trained(kind: type[T], form: str, path: Path, field: str, where: str) -> tuple[T, dict[str, Array]]:
-    """Header, of dataclass `kind` with `tensors` and `sha256`, and tensors of what was trained: a policy or a defender.
+    """Return the header and the tensors of a trained policy or defender.
 
-    Reads data and runs nothing. Raises InputError, which names `where`, the field and its value, for whatever else may stand in the files.
+    kind: the header's dataclass. Reads data and runs nothing. Raises InputError, which names `where`, the field and its value, for any
+    other content.
     """
     try:
         data = load_json(path, strict=False)
@@ -124,7 +125,10 @@ def read_trained(kind: type[T], form: str, path: Path, field: str, where: str) -
 
 
 def perceptron(tensors: dict[str, Array], layers: int, width: int, where: str) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
-    """Weights and biases of the layers in a file; raises InputError where one is missing, not finite, or does not fit the one before."""
+    """Return weights and biases of the layers in a file.
+
+    Raise InputError where one is missing, not finite, or does not fit the one before.
+    """
     weights, biases = [], []
     for i in range(layers):
         weight, bias = pair(tensors, f"layer{i}", where, f"{width}, outputs", partial(_takes, width))

@@ -1,4 +1,4 @@
-"""What a parameter may be, by what it measures. A value outside is refused where a component is built, by the field's name.
+"""Types of parameters, by what they measure. A value outside is refused where a component is built, by the field's name.
 
 The widest limits, 1e30, keep products of several parameters finite; those of lengths, times and speeds are far outside of any road.
 """

@@ -1,8 +1,8 @@
-"""A threshold of the scorer's on the score of a defence that has none of its own: it tells, and changes nothing of what is done.
+"""A threshold on the score of a defence that has no threshold. It is reported only; the defence behaves as before.
 
-Of a filter without a test the score is r' S^-1 r, so that a watch is the standard chi-square test on its innovation; of challenges the
-energy that was heard while the probe was muted; of a safe set how far a reading lies from what was predicted, 1 being the edge.
-`tailgate.estimators.watched` makes one.
+The score of a filter without a test is r' S^-1 r: the threshold makes it the standard chi-square test. The score of a challenge is the
+energy heard while the probe was muted. The score of a safe set is the distance of a reading from its prediction; 1 is the edge.
+`tailgate.estimators.watched` adds the threshold.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from tailgate.core.nouns import P, S
 
 @dataclass(frozen=True)
 class Watched(Generic[P, S]):
-    """A defence with an alarm where its score is above a threshold [of the score], in place of its own alarm, which acts as before."""
+    """A defence whose reported alarm is `score > threshold`; its own alarm still acts as before."""
 
     defence: Defence[P, S]
     threshold: float
 
     @property
     def opaque(self) -> str:
-        """Why no white box looks into the defence; of the watch it sees nothing."""
+        """Why no white box looks into the defence; empty where one may."""
         return str(getattr(self.defence, "opaque", ""))
 
     @property
@@ -45,5 +45,5 @@ class Watched(Generic[P, S]):
         return state, told._replace(alarm=self.alarms(told.score))
 
     def alarms(self, score: Array) -> Array:
-        """Of the same shape, bool."""
+        """Return the alarms, bool, in the shape of the scores."""
         return np.asarray(score > self.threshold)
