@@ -114,7 +114,7 @@ class Switched:
 
 
 class SinePlan(NamedTuple):
-    cos: float  # of the angle of one step
+    cos: float  # cosine of the angle of one step
     sin: float
 
 

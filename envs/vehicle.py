@@ -38,7 +38,7 @@ def drive(A: Array, B: Array, x: Array, v: Array, a: Array, u: Array, noise: Arr
     x_next = x + A[0][1] * v + A[0][2] * a + B[0][0] * u + noise[0]
     v_next = v + A[1][2] * a + B[1][0] * u + noise[1]
     a_next = A[2][2] * a + B[2][0] * u + noise[2]
-    halted = v_next <= 0.0  # a car that stands neither rolls back nor decelerates
+    halted = v_next <= 0.0  # a stopped car neither rolls back nor decelerates
     v_next = np.maximum(v_next, 0.0)
     a_next = np.where(halted, np.maximum(a_next, 0.0), a_next)
     x_next = np.where(halted, np.maximum(x_next, x), x_next)

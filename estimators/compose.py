@@ -147,7 +147,7 @@ class NamedParts(Composed):
         if isinstance(data, dict):  # a mapping without a name changes the default part
             data = {"name": fields_of(type(self))[family].default, **data}
         name = data.get("name") if isinstance(data, dict) else data
-        if isinstance(name, str) and ":" in name:  # Spec.imports tells those who read files and rows that it is one
+        if isinstance(name, str) and ":" in name:  # Spec.imports lets readers of files and rows refuse it
             params = {key: value for key, value in data.items() if key != "name"} if isinstance(data, dict) else {}
             return build(imported(family, name).cls, params, f"defence composed.{family}")
         return make_from(family, data, f"defence composed.{family}")
@@ -177,7 +177,7 @@ class Score(Stateless):
 ModeName = Literal["normal", "widen", "brake", "stop", "acc"]
 
 
-M = TypeVar("M", default=None)  # what a mitigation remembers to choose the readings
+M = TypeVar("M", default=None)  # memory by which a mitigation chooses the readings
 X = TypeVar("X", default=None)  # its constants besides those of every mitigation
 
 

@@ -40,7 +40,7 @@ class Recalling(EpisodeFilter, Protocol):
 
 
 class EpisodePlan(NamedTuple):
-    models: tuple[Model, ...]  # of each agent alone
+    models: tuple[Model, ...]  # model of each agent alone
     players: tuple[Recalling, ...]  # one for each agent; empty where every episode has its own
 
 

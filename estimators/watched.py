@@ -5,7 +5,7 @@ from tailgate.core.score_threshold import Watched
 from tailgate.estimators.compose import AcceptAll, Composed, Score, compose
 from tailgate.estimators.detectors.chi_square import ChiSquare
 
-OWN = ("prepare", "start", "step", "look")  # what a composed defence does as its parts say, unless it is written anew
+OWN = ("prepare", "start", "step", "look")  # methods that a composed defence inherits, unless it overrides them
 
 
 def watched(defence: Defence, threshold: float) -> Composed | Watched:

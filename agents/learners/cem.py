@@ -123,7 +123,7 @@ class Search:
 
     @property
     def road(self) -> bool:
-        """Whether anybody can collide."""
+        """True if somebody can collide."""
         raise TypeError(f"{type(self).__name__} must define road")
 
     def episodes(self, layers: list[tuple[Array, Array]], members: int, keys: draws.Keys) -> tuple[Array, Array]:

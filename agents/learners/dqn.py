@@ -1,7 +1,7 @@
 """Deep Q-learning (Mnih et al. 2015) with returns over several decisions, from Stable-Baselines3 (extra: train). Discrete actions only.
 
-Exploration is epsilon-greedy in each row of the batch by itself, and a random action rests most of the time. Epsilon falls with the
-decisions taken and does not depend on how long the run will be, so that a resumed run explores as an uninterrupted one.
+Exploration is epsilon-greedy in each row of the batch, and most random actions do nothing. Epsilon falls with the number of decisions, not
+with the length of the run, so that a resumed run explores as an uninterrupted one.
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ from tailgate.core.registry import Spec
 def finished(folder: Path, seed: int, defence: str, same: Callable[[Any], bool]) -> Path | None:
     """Return the policy of a seed whose training against a defence is over; None where there is something to train, or to go on with.
 
-    same: tells if the configuration that a policy names is of the same training. Raises InputError where the policy is of another one and
+    same: tests if a policy's configuration is of the same training. Raises InputError where the policy is of another one and
     has no checkpoint to go on from: it would be written over.
     """
     path, spec = folder / f"policy-{seed}.json", Spec("defence", defence)

@@ -21,9 +21,9 @@ from tailgate.core import NonNegative, Positive, Probability, param
 from tailgate.core.neural import Network
 from tailgate.core.registry import register
 
-LOG_STD = -0.5  # of the first policy's continuous actions
+LOG_STD = -0.5  # log of the standard deviation of the first policy's continuous actions
 IMITATION_EPOCHS, IMITATION_BATCH, IMITATION_RATE = 6, 1024, 2e-3
-IMITATION_ENTROPY = 0.003  # what is imitated to the letter explores nothing
+IMITATION_ENTROPY = 0.003  # an exact imitation would explore nothing
 
 
 @dataclass(frozen=True)

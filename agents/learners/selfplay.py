@@ -24,8 +24,8 @@ class Played(NamedTuple):
 
     paid: Array  # discounted, to the defender
     crashed: Array  # bool
-    cost: Array  # of care: minus what the defender was paid, undiscounted and without the collision
-    decisions: int  # of all games together
+    cost: Array  # cost of care: minus the defender's reward, undiscounted and without the collision
+    decisions: int  # decisions of all games together
 
 
 def play(duel: Duel, attack: Attack, keys: Keys, choose: Callable[[Array], Array] | None = None, gamma: float = 1.0) -> Played:

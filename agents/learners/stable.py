@@ -44,7 +44,7 @@ from tailgate.envs.gym.sb3 import BatchVecEnv
 
 # torch's words for a distribution whose parameters are not finite, for probabilities that are not, and for a step beyond single precision
 SPOILT = ("found invalid values", "probability tensor contains", "without overflow")
-COUNTERS = ("_n_updates", "_n_calls", "_episode_num")  # of the algorithms, those that they have
+COUNTERS = ("_n_updates", "_n_calls", "_episode_num")  # counters of the algorithms, where they have them
 
 
 class StableConfig(Protocol):
@@ -64,7 +64,7 @@ class StableLearner:
     name: ClassVar[str]
     actions: ClassVar[tuple[str, ...]] = (*DISCRETE, *CONTINUOUS)
     packages: ClassVar[tuple[str, ...]] = ("torch", "stable-baselines3")
-    traits: ClassVar[dict[str, bool]] = {}  # what the policy's header says besides
+    traits: ClassVar[dict[str, bool]] = {}  # further fields of the policy's header
 
     def __init__(self, seed: int, gamma: float, config: StableConfig, environment: dict[str, Any], tensorboard: Path | None = None) -> None:
         torch.set_num_threads(1)  # more threads gain nothing on networks of this size
@@ -268,7 +268,7 @@ class _Reporter(BaseCallback):
             self.learner.save(self.checkpoint)
 
     def _on_rollout_end(self) -> None:
-        due = self.num_timesteps // self.learner.round > self.before // self.learner.round  # of rollouts that are short
+        due = self.num_timesteps // self.learner.round > self.before // self.learner.round  # several short rollouts make one round
         self.before = self.num_timesteps
         if not due:
             return

@@ -13,7 +13,7 @@ from tailgate.core.draws import Role
 from tailgate.envs.gym.actions import ActionCodec
 from tailgate.envs.gym.attacker_mdp import Seat
 
-FIRST = SEED_STRIDE // 2  # of them, among the episodes of a training seed
+FIRST = SEED_STRIDE // 2  # number of the first demonstration among the episodes of a training seed
 
 
 class Demonstration(NamedTuple):

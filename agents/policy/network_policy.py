@@ -50,10 +50,10 @@ class Header:
     knowledge: Literal["black", "grey", "white"]
     sees_measurement: bool = False
     frames: PositiveCount = 1
-    agents: PositiveCount | None = None  # of the system that it was trained on; files from before there were several have none
+    agents: PositiveCount | None = None  # agents of the system that it was trained on; older files have none
     squashed: bool = False  # the outputs go through tanh
     masked: bool = False  # chooses among the actions that the channel would accept
-    recurrent: bool = False  # an LSTM stands before the perceptron
+    recurrent: bool = False  # an LSTM comes before the perceptron
     greedy: bool = False  # its outputs are no distribution that actions could be drawn from
     training: dict[str, Any] = dataclasses.field(default_factory=dict)
 
@@ -121,7 +121,7 @@ def load_policy(path: Path) -> tuple[Header, Network]:
 class PolicyState(NamedTuple):
     action: Array  # (B,) or (B, size): the decision that holds
     seen: Array  # (B, d) the observation that it was taken on
-    memory: Memory | None = None  # of a network with an LSTM, after that observation
+    memory: Memory | None = None  # memory of an LSTM after that observation
 
 
 class PolicyPlan(NamedTuple):

@@ -61,7 +61,7 @@ class ZooAttack:
 
     @property
     def sources(self) -> list[Path]:
-        """The file that the name stands for, which holds the digest of the tensors: a row records its digest."""
+        """The policy's file, which holds the digest of the tensors: a row records its digest."""
         return [zoo_path(self.name)]
 
     @cached_property

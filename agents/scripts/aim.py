@@ -22,7 +22,7 @@ def chosen(brief: Brief, names: tuple[str, ...], default: Array, agents: tuple[i
         if i >= model.agents:
             raise NotApplicable(f"{where}agents", i, f"an agent's number, from 0 to {model.agents - 1}")
     some = np.asarray(np.isin(np.arange(model.agents), agents) if agents else np.any(brief.granted, axis=1))
-    if agents and default.ndim == 2:  # of agents that are named, also where it is not granted: the channel refuses, and `require` says so
+    if agents and default.ndim == 2:  # named agents are aimed at even where not granted: `require` then raises
         default = np.any(default, axis=0)
     return np.asarray(some[:, None] & (np.array([w in names for w in model.wires]) if names else default))
 

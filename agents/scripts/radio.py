@@ -15,7 +15,7 @@ from tailgate.core.draws import Draws
 from tailgate.core.registry import register
 from tailgate.core.threat import Brief, fit, receivers
 
-WIRES = ("distance", "relative_speed")  # of a radar
+WIRES = ("distance", "relative_speed")  # wires of a radar
 Span = Annotated[tuple[Finite, Finite], Field(min_length=2, max_length=2)]
 
 

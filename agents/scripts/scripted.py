@@ -37,7 +37,7 @@ class NoAttack:
 class ScriptPlan(NamedTuple):
     brief: Brief
     target: Array  # (N, w) bool
-    extra: Any = None  # what a script computes before the episode
+    extra: Any = None  # a script's results before the episode
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from tailgate.core.draws import Draws
 from tailgate.core.schema import build
 from tailgate.core.threat import Brief
 
-TAG = 0x4000  # of the draws of triggers; what is injected draws below it
+TAG = 0x4000  # first tag of the draws of triggers; injected values draw below it
 
 Interval = Annotated[tuple[PositiveCount, PositiveCount], Field(min_length=2, max_length=2)]
 Share = Annotated[float, Field(gt=0, lt=1)]
@@ -179,7 +179,7 @@ class Bursts(Trigger):
         return min(dt / pause, 1.0), min(dt / self.duration, 1.0), share
 
     def prepare(self, brief: Brief) -> Timing:
-        self.chain(brief.model.dt)  # what cannot be met shall fail here
+        self.chain(brief.model.dt)  # fail here where it cannot be met
         return super().prepare(brief)
 
     def fires(self, timing: Timing, state: TriggerState, view: View, ready: Array, draws: Draws) -> tuple[Array, Array]:

@@ -1,4 +1,4 @@
-"""A ghost: the readings of a second state are added to the true ones. Where every sensor lies, no reading tells them apart."""
+"""A ghost: the readings of a second state are added to the true ones. Where every sensor lies, no reading can separate the two."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ class Schedule(NamedTuple):
     """The values added to the wires, step by step from the opening of the window."""
 
     value: Array  # (K, N, w); the last row holds from then on
-    scale: float  # of the plan, which the bounds shrink
+    scale: float  # factor by which the bounds shrink the plan
 
 
 def consistent(brief: Brief, inputs: Array, actuators: Array, lied: Array, steps: int) -> Array:

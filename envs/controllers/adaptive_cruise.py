@@ -9,7 +9,7 @@ from tailgate.core import Array, Estimate, Mode, Model, param
 from tailgate.core.quantities import Accel, Lag, Length, PositiveGain, PositiveSpeed, check_order
 from tailgate.core.registry import register
 
-LEADER = ("leader_position", "leader_velocity")  # what the leader sends
+LEADER = ("leader_position", "leader_velocity")  # the leader's message
 WIDEN_FACTOR = 1.5  # Mode.WIDEN: time headway times this
 BRAKE_ACCEL = -2.0  # Mode.BRAKE: at most this acceleration [m/s^2]
 STOP_ACCEL = -5.0  # Mode.STOP [m/s^2], the braking limit of the thesis's follower (section 3.5)

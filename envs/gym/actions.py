@@ -123,7 +123,7 @@ class ActionCodec:
     def modes(self) -> list[Mode]:
         """Discrete meanings, in the order of the action's number."""
         granted, value = self.brief.granted, self.spec.value
-        groups = [("", granted)]  # of single wires: their names begin with a colon
+        groups = [("", granted)]  # names of single wires begin with a colon
         named = [(":" + self.brief.model.wires[w], np.arange(granted.shape[1]) == w) for w in self.wires] if self.spec.per_sensor else []
         agents = [(f"[{i}]", (np.arange(granted.shape[0]) == i)[:, None]) for i in self.victims] if self.spec.per_agent else []
         if len(named) > 1:
@@ -144,7 +144,7 @@ class ActionCodec:
                     for share, mark in self._shares:
                         sent = share * np.minimum(abs(value), bounds)
                         out += [Mode(f"fdi{t}{mark}{suffix}", kind, target, sign * sent, sign) for t, sign in signs.items()]
-                elif kind in (Kind.FDI, Kind.DOS_JAM):  # what is too much for an actuator is cut
+                elif kind in (Kind.FDI, Kind.DOS_JAM):  # too large a value for an actuator is cut
                     cut = np.clip(value, -bounds, bounds)
                     sent = cut if kind == Kind.FDI else np.where(self.brief.is_actuator, cut, value)
                     out.append(Mode(name + suffix, kind, target, sent))

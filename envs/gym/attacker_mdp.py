@@ -22,7 +22,7 @@ from tailgate.envs.gym.observations import FRAMES, ObservationCodec
 from tailgate.envs.gym.rewards import Reward
 
 CAR_FOLLOWING = "tailgate/CarFollowing-v0"
-FACES: dict[str, dict[str, Any]] = {  # what each id is where nothing else is said: the one place of these defaults
+FACES: dict[str, dict[str, Any]] = {  # defaults of each id
     CAR_FOLLOWING: {"scenario": "stop-and-go-v0", "defence": "chi2_kf"},
     "tailgate/RadarFollowing-v0": {"scenario": "radar-following-v0", "defence": "cra"},
     "tailgate/Platoon-v0": {"scenario": "platoon-braking-v0", "defence": "lasso_dkf"},
@@ -34,7 +34,7 @@ FACES: dict[str, dict[str, Any]] = {  # what each id is where nothing else is sa
 class Tally(NamedTuple):
     """The reward's memory of each episode, (B,) each."""
 
-    potential: Array  # of the shaping
+    potential: Array  # shaping potential
     least: Array  # smallest gap so far, within the reward's reach [m]
     error: Array  # largest error of an agent, where there is no road
     peak: Array  # the largest of the episode so far, where the reward is for that

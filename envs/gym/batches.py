@@ -222,7 +222,7 @@ class TracedEpisodes:
 
     def put(self, held: dict[str, Array]) -> None:
         self._rows.put(held)
-        self.shadow = None  # nobody knows what was decided before
+        self.shadow = None  # the earlier decisions are not known
 
     def drawn(self, row: int) -> tuple[LoopState, Frame | None, int]:
         if self.shadow is None:

@@ -1,7 +1,7 @@
 """The game of two: an attacker and a defender decide at the same time, every `interval` steps of one loop (docs/two-players.md).
 
-The attacker sits where it always does (`Seat`). The defender turns the knobs of its defence (`Steered`); it sees what the defence has, and
-is told nothing of the road or of the attack. `Duel` is the batched core: the PettingZoo environment is a batch of one of it.
+The attacker acts as in the one-player environments (`Seat`). The defender turns the knobs of its defence (`Steered`). It sees what the
+defence sees, and nothing else of the road or of the attack. `Duel` is the batched core: the PettingZoo environment is a batch of one.
 """
 
 from __future__ import annotations
@@ -162,7 +162,7 @@ class Duel:
 
         Rows that are `over` (B,) do not count.
 
-        attack: actions as the seat takes them, or an attack that plays. defend: numbers of the menu (B,), or vectors (B, K); None leaves
+        attack: actions as `Seat` takes them, or an attack that plays. defend: numbers of the menu (B,), or vectors (B, K); None leaves
         the knobs where they are.
         """
         loop = state.loop
@@ -187,7 +187,7 @@ class Duel:
         then, now = before.defence.memory, after.defence.memory
         quiet = after.channel.used == before.channel.used
         cost = pay.mode_cost * (now.asked - then.asked) + pay.alarm_cost * np.where(quiet, now.alarmed - then.alarmed, 0.0)
-        if self.seat.road:  # as it stands at the end of the decision, for the whole of it
+        if self.seat.road:  # the view at the end of the decision counts for the whole of it
             scene, cars = self.seat.loop.plant.scene(self.seat.loop.plan.plant, after.plant), np.flatnonzero(model.followers)
             wanted = self.seat.loop.controller.desired_gap(scene.speed[:, cars])
             wide = np.max(np.clip(scene.gap[:, cars] / np.maximum(wanted, 1.0) - 1.0, 0.0, 1.0), axis=1)
@@ -231,7 +231,7 @@ def next_game(duel: Duel, held: DuelState | None, seed: int | None, rng: np.rand
 
 
 class DefenderEnv(Specified, gymnasium.Env[Array, Any]):
-    """The defender's seat against given attacks: an action sets the knobs for `interval` steps.
+    """An environment in which the agent is the defender, against given attacks: an action sets the knobs for `interval` steps.
 
     attack: one as on the command line, an object, or a list of them, of which each episode draws one. Other arguments: see `Duel.make`.
     """
@@ -249,7 +249,7 @@ class DefenderEnv(Specified, gymnasium.Env[Array, Any]):
         arguments.setdefault("knowledge", max(known, key=("black", "grey", "white").index))
         self.duel = Duel.make(**arguments)
         self.attack: Attack = made[0] if len(made) == 1 else Mixture(tuple(made))
-        self.attack.prepare(self.duel.seat.loop.brief)  # what does not fit shall fail here
+        self.attack.prepare(self.duel.seat.loop.brief)  # fail here, not in the first step
         self.observation_space, self.action_space = self.duel.defender_spaces()
         self.horizon = self.duel.seat.decisions
         self.state: DuelState | None = None

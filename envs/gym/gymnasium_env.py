@@ -1,6 +1,6 @@
-"""The Gymnasium faces: the loop with the attack's seat left open, under one id for each kind of system.
+"""The Gymnasium environments: the loop in which the agent is the attacker, under one id for each kind of system.
 
-The core is a vector environment without autoreset; NEXT_STEP and SAME_STEP are thin faces over it, and the single environment is
+The core is a vector environment without autoreset; NEXT_STEP and SAME_STEP are thin layers over it, and the single environment is
 a batch of one. reset(seed=s): row i equals gymnasium.make(...).reset(seed=s + i); each further episode of a row adds 1 to its
 episode counter.
 """
@@ -29,7 +29,7 @@ from tailgate.envs.render.viewer import Screen, Viewer
 
 _WHOLE = (int, np.int64)  # an action's usual types
 _BOOL = (np.False_, np.True_)
-_GOES_ON = np.zeros(1, bool)  # of a single row: it is not over
+_GOES_ON = np.zeros(1, bool)  # `over` of a single running row
 _AUTORESET = {"next_step": AutoresetMode.NEXT_STEP, "same_step": AutoresetMode.SAME_STEP, "disabled": AutoresetMode.DISABLED}
 
 
@@ -74,7 +74,7 @@ class AdversaryVectorEnv(Specified, gymnasium.vector.VectorEnv[Array, Array, Arr
         self._modes = self.seat.action.size if self.seat.action.discrete else 0  # discrete actions, 0 where there are none
         self._facts = ("illegal", "collided", "rear_collided", "allowed", "step", "gap" if self.seat.road else "error")
         self._present = self._presence()
-        self.observed = np.zeros((num_envs, features if self._frames > 1 else 0), np.float32)  # of several frames
+        self.observed = np.zeros((num_envs, features if self._frames > 1 else 0), np.float32)  # the last one, where it has several frames
 
     @property
     def engine(self) -> str:

@@ -16,7 +16,7 @@ from tailgate.core.threat import Brief, receivers
 
 LIMIT = 10.0  # observations are clipped to +-LIMIT
 FRAMES = 64  # decisions that an observation shows, at most
-SHOWN = 24  # agents with components of their own in an observation, at most
+SHOWN = 24  # agents with separate components in an observation, at most
 RADIATED = {Kind.NOISE_JAM: ("power", "jam_power"), Kind.ECHO_DELAY: ("delay", "delay_bound")}  # their component, and their bound
 SCALES = {  # what is about 1: steps, metres, metres per second, metres per second squared
     "burst": 50.0, "cooldown": 50.0, "gap": 50.0, "speed": 15.0, "lead_speed": 15.0, "closing": 5.0, "accel": 3.0, "rear_gap": 50.0,
@@ -50,7 +50,7 @@ class ObservationCodec:
     """The learner's observation, scaled to about one and clipped.
 
     A road shows gaps, speeds and accelerations of the cars; without one there is nothing to see from outside. Of many agents the SHOWN
-    that are nearest to the attacked ones have components of their own, tagged with their number; all count in the smallest gap.
+    that are nearest to the attacked ones have separate components, tagged with their number; all count in the smallest gap.
 
     With several `frames` the observation also shows what was seen at the last decisions, the newest first; `@1` is that of one before.
     """
@@ -77,7 +77,7 @@ class ObservationCodec:
 
     @cached_property
     def shown(self) -> list[int]:
-        """The agents with components of their own: all, or of many those with the fewest hops to an attacked one."""
+        """The agents with separate components: all, or of many those with the fewest hops to an attacked one."""
         model = self.brief.model
         near, hops = set(self.victims), dict.fromkeys(self.victims, 0)
         linked = model.graph | model.graph.T
@@ -117,7 +117,7 @@ class ObservationCodec:
             return speed + accel if model.speed is not None and model.speed[i].any() else []
         gap: list[Column] = [("gap", lambda s: s.view.scene.gap[:, i] / SCALES["gap"])]
         closing: list[Column] = [("closing", lambda s: (s.view.scene.speed[:, i] - s.view.scene.lead_speed[:, i]) / SCALES["closing"])]
-        if not self.alone:  # the car ahead and the one behind have components of their own
+        if not self.alone:  # the car ahead and the one behind have separate components
             return gap + speed + closing + accel
         lead: list[Column] = [("lead_speed", lambda s: s.view.scene.lead_speed[:, i] / SCALES["lead_speed"])]
         rear: list[Column] = [

@@ -66,7 +66,7 @@ class DuelEnv(ParallelEnv[str, Array, Any]):  # type: ignore[misc]
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Array], dict[str, dict[str, Any]]]:
         """Begin the game of a seed; without one the next of the running row, or a random one at first."""
-        check_options(options, ("options",))  # of no meaning: PettingZoo's own tests give it
+        check_options(options, ("options",))  # "options" has no meaning: PettingZoo's own tests give it
         if seed is not None:
             self._rng, _ = seeding.np_random(seed)
         self.game, self.frame, self.agents = next_game(self.duel, self.game, seed, self._rng), None, list(self.possible_agents)

@@ -1,10 +1,10 @@
-"""The attacker's seat as a program: what `tailgate.envs.gym.attacker_mdp.Seat` plays, traced as it stands.
+"""The attacker's decision process (`tailgate.envs.gym.attacker_mdp.Seat`) as traced programs of the engine.
 
     advance  a step of a decision of several, but the last
     decide   a decision of every row, or its last step; rows `again` begin their next episode instead
     begin    the next episode of the rows `again`, or their first
 
-The last two leave what is to be seen, and what may be decided next.
+The last two return the next observation and the decisions that are allowed next.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from tailgate.envs.gym.attacker_mdp import Seat, Sums, Tally
 
 
-# what a step of a single row tells
+# values that a step of a single row returns
 ALONE = ("reward", "damage", "k", "terminated", "truncated", "illegal", "collided", "rear_collided", "allowed")
 
 
@@ -51,7 +51,7 @@ class SeatPrograms:
     def __init__(self, seat: Seat, shown: Seat | None = None) -> None:
         check_open(seat.loop)
         self.seat, self.loop, self.shown = seat, seat.loop, shown or _shown_once(seat)
-        self.values: list[Array] | None = None  # of the parameters, if others than those it was traced with
+        self.values: list[Array] | None = None  # parameters that differ from the traced ones
         self.example = _example(seat)
         for name, leaf in leaves(self.example).items():
             if leaf.dtype == object:
@@ -223,7 +223,7 @@ class Rows:
         self.state = State(programs.decide, batch)
         self._decide = self._last = Call(programs.decide, self.state, values=programs.values, threads=threads)
         self._brought: dict[str, Array] | None = {}
-        self._k = 0  # of a single row, after its last decision
+        self._k = 0  # step of a single row after its last decision
 
     @cached_property
     def _begin(self) -> Call:
@@ -303,7 +303,7 @@ class Rows:
             raise call.program.broken(demands[step], k() + step + (self.programs.between if call.program is self.programs.decide else 0))
 
     def begin(self, rows: Array, keys: Keys | None = None) -> None:
-        """Begin episodes in the rows (B,) bool: the next of their own, or those of keys, of as many rows."""
+        """Begin episodes in the rows (B,) bool: the next of each row, or those of as many keys."""
         if keys is not None:
             where, state = np.flatnonzero(rows), self.state
             state.put_leaf("loop.keys.key", keys.key, where)

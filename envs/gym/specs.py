@@ -74,7 +74,7 @@ class TextSpec(EnvSpec):
     """A spec whose JSON writes defences, attacks and menus as text; its own arguments stay the objects that they are."""
 
     def to_json(self) -> str:
-        imports = "Defender" not in self.id  # whose defence is a registered one
+        imports = "Defender" not in self.id  # a defender's environment names a registered defence
         kwargs = {key: _plain(key, value, imports) for key, value in self.kwargs.items()}
         plain = {f.name: getattr(self, f.name) for f in dataclasses.fields(EnvSpec) if f.init and f.name != "kwargs"}
         return EnvSpec(**plain, kwargs=kwargs).to_json()

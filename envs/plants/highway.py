@@ -1,7 +1,7 @@
 """A road scene: an ACC car with a radar among traffic that follows IDM and MOBIL, cuts in and brakes hard (HighwayEnv).
 
-The plant is not linear: cars steer (a bicycle model on a winding road), change lanes, and react to each other and to the car. What a
-defence is told is the radar car's model (radar_following.py), x = [d, dv, a_L, v_F]:
+The plant is not linear: cars steer (a bicycle model on a winding road), change lanes, and react to each other and to the car. The
+defence's model is the radar car's (radar_following.py), x = [d, dv, a_L, v_F]:
 
     d+ = d + T (dv + dv+)/2        dv+ = dv + T a_L - (v_F+ - v_F)        a_L+ = a_L + w        v_F+ = input
 
@@ -38,7 +38,7 @@ Behind = Annotated[int, Field(ge=0, le=50)]
 Speeds = Annotated[tuple[PositiveSpeed, PositiveSpeed], Field(min_length=2, max_length=2)]
 Gaps = Annotated[tuple[Gap, Gap], Field(min_length=2, max_length=2)]
 START = 1000.0  # where the car begins [m]
-SPEED_LIMIT = 30.0  # of the road [m/s]
+SPEED_LIMIT = 30.0  # speed limit of the road [m/s]
 DELTAS = (3.5, 4.5)  # exponents of IDM among the drivers, HighwayEnv's range
 _PLACES, _CLOCKS = 0, 1  # tags of the draws
 
@@ -154,7 +154,7 @@ class Highway:
         put(0, self.lane, START, self.speed)
         i = 1
         for lane in range(self.lanes):
-            shift = 0.0 if lane == self.lane else -self.spacing[1] * u[i, 4]  # beside the car somebody may be anywhere
+            shift = 0.0 if lane == self.lane else -self.spacing[1] * u[i, 4]  # in other lanes somebody may be anywhere
             for way, count in ((1.0, self.ahead), (-1.0, self.behind)):
                 x = START + shift
                 for _ in range(count):

@@ -2,7 +2,7 @@
 
 Traffic follows the Intelligent Driver Model and changes lanes by MOBIL. The objects of HighwayEnv are a workbench: every step puts all that
 they remember into them and takes it out again, so that nothing of one episode reaches another. The first car is the one with the
-controller; the scene steers it along its lane and accelerates it as told.
+controller; the scene steers it along its lane and accelerates it by the given command.
 """
 
 import math
@@ -24,14 +24,14 @@ except ImportError as error:
 # Columns of a car: all that it remembers from step to step.
 X, Y, HEADING, SPEED, LANE, TARGET, WANTED, TIMER, DELTA, CRASHED, HIT, PUSH_X, PUSH_Y, BRAKING, COMMITTED = range(15)
 FEATURES = 15
-LENGTH = float(IDMVehicle.LENGTH)  # of every car [m]
+LENGTH = float(IDMVehicle.LENGTH)  # length of every car [m]
 WIDTH = float(IDMVehicle.WIDTH)
 LANE_WIDTH = float(SineLane.DEFAULT_WIDTH)
 TOUCHES = 0.5 * (LANE_WIDTH + WIDTH)  # a car whose middle is nearer to a lane's middle has a part in the lane [m]
 ROAD = 1e6  # length of the road [m]
 COMMITMENT = 6.0  # time for which a car that cuts in, or has just braked, keeps to its lane [s]
 SLOWER, FASTER = 5.0, 6.0  # by how much a car that cuts in may be slower or faster than the one that it cuts in on [m/s]
-ROOM = 15.0  # what a car that cuts in leaves to the next ahead, bumper to bumper [m]
+ROOM = 15.0  # gap that a car that cuts in leaves to the next ahead [m]
 
 
 class Sight(NamedTuple):
@@ -49,7 +49,7 @@ class _Undrawn:
     """A replacement of a scene's random source: drawing from it is an error, as a scene draws nothing."""
 
     def __getattr__(self, name: str) -> Any:
-        if name.startswith("__"):  # what Python itself asks for, as when a scene is copied
+        if name.startswith("__"):  # Python's own requests, as when a scene is copied
             raise AttributeError(name)
         raise RuntimeError(f"a road scene drew {name}: all its randomness comes with its numbers")
 
@@ -112,7 +112,7 @@ class _Driver(_Near, IDMVehicle):  # type: ignore[misc]
     """Drives by IDM and MOBIL, brakes hard while `braking` [s] is left, and does not roll back."""
 
     braking, committed = 0.0, 0.0  # [s]
-    decel, pace = 6.0, 0.1  # of a hard braking [m/s^2], and the step [s]
+    decel, pace = 6.0, 0.1  # deceleration of a hard braking [m/s^2], and the step [s]
     changes = True  # lanes, of itself
 
     def act(self, action: dict[str, float] | str | None = None) -> None:

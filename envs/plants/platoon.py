@@ -178,7 +178,7 @@ class PlatoonState(NamedTuple):
     x: Array
     v: Array
     a: Array
-    u: Array  # what the actuators got last
+    u: Array  # last commands of the actuators
 
 
 @register("plant", "platoon", reference="Dutta 2018, (6.4), (6.8)-(6.16)")

@@ -30,7 +30,7 @@ from tailgate.core.quantities import PositiveVariance, Spread, Step
 from tailgate.core.registry import register
 
 Factor = Annotated[float, Field(ge=-10.0, le=10.0, allow_inf_nan=False)]
-GROWTH = 1.5  # of the state in a step, at most: 1000 steps of it are still a number
+GROWTH = 1.5  # largest growth of the state in a step: 1000 steps still give a finite number
 WIRE, ACTUATOR = "y", "u"
 
 

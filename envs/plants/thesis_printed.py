@@ -7,7 +7,7 @@
             | 0  -k gamma  +-k |   k = (1+1/h)/tau      | 0                                       |
 
 A_a (with +k) while the car accelerates, A_d (with -k) while it does not. A_a is unstable, the velocity falls when the gap opens, and the
-car does not keep its distance: nothing here may stand for a car. `car_following` holds the corrected equations.
+car does not keep its distance: do not use it as a car. `car_following` holds the corrected equations.
 """
 
 from dataclasses import dataclass

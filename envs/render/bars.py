@@ -8,7 +8,7 @@ from tailgate.envs.render.canvas import ATTACK, COMMANDS, EGO, GREY, INK, PALE, 
 from tailgate.envs.render.sheet import Sheet
 from tailgate.envs.render.stage import Stage
 
-NOISE_FLOOR = -90.0  # what is heard below it is nothing [dB]
+NOISE_FLOOR = -90.0  # lower powers are shown as silence [dB]
 
 
 def _signed(value: float) -> str:

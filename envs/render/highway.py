@@ -1,7 +1,7 @@
 """A picture on HighwayEnv's road: over it what the defence believes, the attack, the alarm and the challenge (extras: highway, viz).
 
-White and solid is what is true, purple and dashed what is believed. Every mark has a shape or a word: nothing is told by colour alone.
-No word covers another, a mark or a car: what finds no place is left out, the least important first.
+White and solid is what is true, purple and dashed what is believed. Every mark has a shape or a word: colour is never the only sign.
+No word covers another, a mark or a car: a word without a place is left out, the least important first.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from tailgate.envs.render.viewer import SIZE
 
 SHADE = "#464646"  # under words among the cars
 SMALL_CAR = 24.0  # [px]: an outline would hide a car that is shorter
-RIM = 4.0  # of an attacked car's outline [px]
+RIM = 4.0  # width of an attacked car's outline [px]
 
 
 class Ruler(NamedTuple):

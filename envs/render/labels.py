@@ -1,6 +1,6 @@
 """The places of words in a picture: next to what they name, clear of each other, of the cars and of the marks.
 
-Whoever asks first has the choice, so the important ask first; what finds no place is left out.
+The first to ask has the choice, so that the important ask first; a word without a place is left out.
 """
 
 from __future__ import annotations

@@ -28,7 +28,7 @@ from tailgate.envs.render.canvas import (
 )
 
 SPLIT = 560.0  # column [px] between the graph and the bars
-DECADES = (-3, 4)  # of the shade and the bars
+DECADES = (-3, 4)  # range of the shade and the bars
 PALE, DEEP = (0xEE, 0xF4, 0xFA), (0x08, 0x30, 0x6B)  # no error, the largest: from light to dark
 MOST_BARS = 20  # agents: of more the worst
 

@@ -1,6 +1,6 @@
 """One picture of one episode for render_mode "rgb_array", and the window that shows it for "human" (extra: viz).
 
-Nothing is told by colour alone, the same state always gives the same picture, and no picture changes a state.
+Colour is never the only sign, the same state always gives the same picture, and no picture changes a state.
 """
 
 from __future__ import annotations

@@ -38,7 +38,7 @@ SPANS = (20.0, 40.0, 80.0, 160.0, 320.0, 640.0, 1280.0, 2560.0, 5120.0, 10240.0)
 LONGEST, SHORTEST, SHARE = 56.0, 3.0, 0.4  # length of a car [px], and the most of the width that all of them take
 TRUE_LINE, WHEELS, STRIP, BELIEVED_LINE, GHOST_WHEELS = 98.0, 146.0, 202.0, 228.0, 288.0  # rows [px]
 ROAD = 12.0
-DASHES = 24  # of the lane
+DASHES = 24  # dashes of the lane's line
 
 
 class Place:

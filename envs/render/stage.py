@@ -14,7 +14,7 @@ from tailgate.core import Array, Frame
 from tailgate.core.loop import Loop, LoopState
 from tailgate.envs.plants.highway import Highway
 
-START = 10_000.0  # where a road without a place of its own begins [m]: nobody drives back as far as its end
+START = 10_000.0  # where a road without a given place begins [m]: nobody drives back as far as its end
 LENGTH, LANE = 5.0, 4.0  # a car and the width of a lane, as HighwayEnv has them [m]
 
 
@@ -49,7 +49,7 @@ class Follower(NamedTuple):
     free: bool  # nobody ahead in reach
     attacked: bool
     alarm: bool
-    muted: bool | None  # the radar was silent; None where it tells nothing
+    muted: bool | None  # the radar was silent; None where that is not known
     heard: float  # at a challenge, over the receiver's own noise [dB]
     hit: str  # "", "COLLISION" or "REAR COLLISION"
 

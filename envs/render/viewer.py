@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from tailgate.envs.render.picture import Window
 
 VIEWERS = ("auto", "plain", "highway")
-SIZE = (960, 240)  # of a picture on HighwayEnv's road [px]
+SIZE = (960, 240)  # size of a picture on HighwayEnv's road [px]
 SMALLEST, LARGEST = (400, 144), (3840, 2160)
 
 

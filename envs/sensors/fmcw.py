@@ -31,7 +31,7 @@ KT0 = 1.380649e-23 * 290.0  # thermal noise density at the reference temperature
 _LN10 = 2.302585092994046
 
 Share = Annotated[float, Field(gt=0, le=1)]
-Radio = Annotated[float, Field(ge=1e-9, le=1e15, allow_inf_nan=False)]  # of a radar or a jammer [its unit]
+Radio = Annotated[float, Field(ge=1e-9, le=1e15, allow_inf_nan=False)]  # a value of a radar or a jammer [its unit]
 
 
 def from_db(value: float) -> float:

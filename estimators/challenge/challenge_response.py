@@ -1,6 +1,6 @@
 """Challenge-response authentication (thesis 3.4.2; Shoukry et al., PyCRA, 2015): mute the radar's probe, and listen.
 
-A sensor that mutes its own probe hears noise alone; whoever answers then is an attacker. At a muted step
+A sensor that mutes its own probe hears noise alone; an answer then comes from an attacker. At a muted step
 
     energy > threshold        alarm; the belief rolls back to the one at the last challenge that passed, with the odometry since replayed
     else                      the alarm ends, at once or after a few such steps; without one, this belief is the one to roll back to

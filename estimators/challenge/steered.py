@@ -1,7 +1,7 @@
 """A defence whose knobs are turned while it runs: by a trained policy, by a fixed hand, or from outside (docs/two-players.md).
 
 A trained defender is a small tanh perceptron over `Sight` whose largest output names the setting of the knobs that holds for the next
-`interval` steps. It is a JSON file with safetensors beside it; loading it executes nothing. Played through `steered` it is a defence like
+`interval` steps. It is a JSON file and a safetensors file; loading them executes nothing. Played through `steered` it is a defence like
 any other: every evaluation, learner and page takes it.
 """
 
@@ -32,7 +32,7 @@ from tailgate.estimators.compose import Look
 
 FORMAT = "tailgate-defender-1"
 SETTINGS = 1024  # that a menu has in all, at most
-TAG = 255  # of the draw that picks a policy: the steered defence draws with others
+TAG = 255  # tag of the draw that picks a policy: the steered defence draws with others
 POLICY = "JSON file of a trained defender, or several, of which each episode draws one; none: a fixed setting"
 
 

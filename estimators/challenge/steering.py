@@ -1,10 +1,10 @@
 """The knobs of a defence, which are parameters that change while it runs, in each row separately; and the view of who turns them.
 
-A knob is a parameter of a defence that is left as it is: the alarm threshold, the probability of a challenge, the mode that is asked of the
-controller while alarmed. Turning one puts an array with one value per row in the place of the parameter, which enters by elementwise
-comparisons alone; a knob that stands at the defence's own value changes no bit.
+A knob is a parameter of an unchanged defence: the alarm threshold, the probability of a challenge, or the mode that the controller is asked
+for while alarmed. Turning a knob replaces the parameter by an array with one value per row. The parameter enters elementwise comparisons
+only; a knob at the defence's own value changes no bit.
 
-Who turns them sees what the defence has, nothing else: its score, alarms, residuals, estimate, the message and odometry that it hears.
+The player who turns the knobs sees only what the defence has: score, alarms, residuals, estimate, message and odometry.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ LIMIT = 10.0  # observations are clipped to +-LIMIT
 T = TypeVar("T")
 HandPlan = ComposedPlan | ChallengePlan
 HandState = ComposedState | ChallengeState
-FADE = 0.95  # of the running means, per step
+FADE = 0.95  # factor of the running means, per step
 CALM = 50.0  # steps since an alarm are counted up to this
 
 
@@ -183,7 +183,7 @@ class Sight:
 
     model: Model
     knobs: tuple[Knob, ...]
-    heard: bool  # the defence is told what the car ahead sends
+    heard: bool  # the defence receives the messages of the car ahead
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -23,7 +23,7 @@ from tailgate.estimators.parts import Verdict, blame_all
 
 Allowance = Annotated[float, Field(gt=1, le=1e30, allow_inf_nan=False)]
 Weight = Annotated[float, Field(ge=1e-6, le=1)]
-INSIDE = 1.0 - 1e-12  # of a bound that went through square roots: their rounding shall not raise an alarm
+INSIDE = 1.0 - 1e-12  # factor on a bound: the rounding of square roots must not raise an alarm
 
 
 def whiten(innovation: Innovation) -> Array:

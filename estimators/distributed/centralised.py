@@ -1,8 +1,8 @@
 """Centralised references: one estimator reads the sensors of all agents, and everybody gets its estimate.
 
 The sensors of all N agents are stacked to the N q sensors of one agent, for which (5.7) is the Kalman filter and (6.26) the robust one, in
-steady state. It begins at the mean of what the agents are told of the initial state, and knows of the input what agent 0 knows: in a
-platoon the leader's own command. It hears more than any agent of the network does: a reference from above, not a rival.
+steady state. It begins at the mean of the agents' priors, and knows the input of agent 0: in a platoon the leader's own command. It hears
+more than any agent of the network does: it is a reference, not a competitor.
 """
 
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ USES = ("measurements", "redundant", "leader_input")
 
 class CentralPlan(NamedTuple):
     one: Composed
-    plan: ComposedPlan  # of the one
+    plan: ComposedPlan  # plan of the one
     agents: int
 
 

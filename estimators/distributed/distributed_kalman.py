@@ -88,9 +88,9 @@ def fixed_point(model: Model) -> Fusion:
     """Return P_i (N, n, n) of (5.5), with L_j and Q_i^-1. Raise InputError, naming the agents, where there is none."""
     require_detectable(model, "model")
     heard, G = neighbours(model.graph), information(model)
-    L = np.stack([_inverse(model.Q)] * model.agents)  # of P = 0
+    L = np.stack([_inverse(model.Q)] * model.agents)  # L for P = 0
     P = np.zeros_like(L)
-    due = np.ones(model.agents, bool)  # whose neighbours have moved since: where everybody hears cars ahead only, one sweep does
+    due = np.ones(model.agents, bool)  # their neighbours have moved since; one sweep is enough where everybody hears cars ahead only
     for _ in range(SWEEPS):
         moved = 0.0
         for i, near in enumerate(heard):

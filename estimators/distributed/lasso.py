@@ -12,7 +12,7 @@ problem.
 
 Price: lam is in 1/unit of the sensor, one number for all sensors, as in (6.26): a reading off by less than lam Sv / 2 counts as noise. A
 small one is resilient, and slow to follow what the model does not foresee. The default 5 was tuned on platoon-braking, where it cuts at a
-quarter of a standard deviation of the gap's noise: most honest readings pay a little. The thesis's own case, which tells the filter a
+quarter of a standard deviation of the gap's noise: most honest readings pay a little. The thesis's own case, whose filter expects a
 noise of 1, has 0.1. With 0.1 the braking platoon cannot follow its brakes: half of the runs without any attack collide.
 """
 

@@ -30,7 +30,7 @@ from tailgate.estimators.filters.kalman import GAIN, Gain, KalmanState, alone
 from tailgate.estimators.filters.robust import ACCURACY, load_cvxpy
 from tailgate.estimators.parts import Detector, Filter, Mitigation
 
-ROUNDS = 100  # of Newton's iteration; some five are enough
+ROUNDS = 100  # largest number of Newton's rounds; about five are enough
 
 
 class Axes(NamedTuple):

@@ -5,8 +5,8 @@ The state is split into the modes of A, and each agent estimates each mode in on
     a mode that it detects with its own sensors: by itself, whatever the others say (here with the steady Kalman filter of what it detects);
     a mode that it does not: z_i+ = J (mean of what is left of its parents' z_l without the F highest and the F lowest), number by number.
 
-Parents are agreed upon beforehand: those who detect the mode know it; then, round after round, whoever hears 2F + 1 who know it learns it
-from these. No F agents in a neighbourhood can then pull an honest agent out of the range of the honest ones, whatever they send. Modes that
+Parents are agreed upon beforehand. The agents that detect a mode know it. Then, round after round, each agent that hears 2F + 1 agents who
+know it learns it from these. No F agents in a neighbourhood can then pull an honest agent out of the range of the honest ones. Modes that
 die out need no consensus: every agent predicts them, and corrects what it sees of them.
 
 It protects the agents that are not attacked from those that are. An agent whose own sensors are attacked is as wrong as its own filter.
@@ -33,8 +33,8 @@ from tailgate.estimators.parts import Detector, Filter, Mitigation
 REFERENCE = "A. Mitra, S. Sundaram, Byzantine-Resilient Distributed Observers for LTI Systems, Automatica 108, 2019"
 FAULTY = "F: attacked neighbours of an agent that are tolerated, of each mode"
 CLUSTER = 1e-4  # eigenvalues this close are one
-SHIFT = 1e-6  # from an eigenvalue, at which the inverse iteration stands
-ROUNDS = 40  # of it
+SHIFT = 1e-6  # distance of the inverse iteration's shift from the eigenvalue
+ROUNDS = 40  # rounds of the inverse iteration
 GOLDEN = 0.6180339887498949
 
 

@@ -147,7 +147,7 @@ def _settle(A: Array, C: Array, Q: Array, R: Array, P: Array) -> Array:
 @remembered("A", "C", "Q", "R")
 def steady_state(model: Model) -> Array:
     """Return P- (N, n, n) at which the predicted covariances settle. Raise NotApplicable, naming the agents, where they do not."""
-    lost = blind(model, np.eye(model.agents, dtype=bool))  # the doubling may take a mode that nobody sees for one that settles
+    lost = blind(model, np.eye(model.agents, dtype=bool))  # the doubling may let an unseen mode settle
     out = []
     for i in range(0 if lost else model.agents):
         C = model.C[i]

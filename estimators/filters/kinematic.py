@@ -42,7 +42,7 @@ def require_kinematic(model: Model, where: str) -> None:
 
 
 class RegressionPlan(NamedTuple):
-    line: KalmanPlan  # of the fit, without process noise
+    line: KalmanPlan  # plan of the fit, without process noise
     T: float  # [s]
     rows: Array  # (W, 2, 3): of the present [d, v_L, a_L], the readings that are j steps old, j = 0, 1, ..., W - 1
     weight: Array  # (2,) of a reading [1/unit^2]
@@ -107,7 +107,7 @@ class JointRegression:
         H = np.where(accept[..., None], line.C, 0.0)
         K = num.transpose(num.matmul(num.inverse(alone(innovation.S, accept)), num.matmul(H, P)))
         left = np.eye(STATES) - num.matmul(K, H)
-        # Joseph's form: beside delta the usual difference would lose a variance, and its sign
+        # Joseph's form: next to delta the usual difference would lose a variance, and its sign
         P = num.matmul(left, num.transpose(num.matmul(left, P))) + num.matmul(K, num.matmul(line.R, num.transpose(K)))
         if self.forgetting < 1.0:
             some = np.asarray(accept.any(axis=-1))

@@ -1,4 +1,4 @@
-"""Predictors that know no motion: each reading is extrapolated from its own past. They are here to be compared with.
+"""Predictors that know no motion: each reading is extrapolated from its own past. They are baselines.
 
     hold_last          y(k) = the last reading
     autoregressive     y(k) = w1 y(k-1) + ... + wp y(k-p), w by least squares; a prediction stands in for a missing one
@@ -41,7 +41,7 @@ def read_states(model: Model, where: str) -> Array:
     return np.asarray(state)
 
 
-M = TypeVar("M")  # what a predictor keeps of each sensor
+M = TypeVar("M")  # memory of a predictor
 
 
 class PredictorPlan(NamedTuple):
@@ -163,7 +163,7 @@ class Autoregressive(Predictor[Lags]):
 
     def learn(self, plan: PredictorPlan, past: Lags, y: Array, accept: Array) -> Lags:
         h, w, P, seen = past
-        known = accept & (seen >= self.order)  # what stands for readings before the first would be learned for good
+        known = accept & (seen >= self.order)  # the values before the first reading would be learned for good
         g = num.matvec(P, h)
         j = g / (1.0 + num.dot(h, g))[..., None]
         error = y - np.clip(num.dot(w, h), -LARGEST, LARGEST)

@@ -29,8 +29,8 @@ from tailgate.estimators.parts import Detector, Filter, Memoryless, Mitigation, 
 ROUNDS = 1000  # far above what was ever seen: a guard against rounding
 ACCURACY = 1e-9  # asked of the interior-point solver
 PATIENCE = 3  # rounds of block changes without progress
-TOLERANCE = 1e-12  # of the optimality conditions, relative to lam
-ROUNDING = 8 * float(np.finfo(np.float64).eps)  # of a sum, relative to its largest term
+TOLERANCE = 1e-12  # error of the optimality conditions, relative to lam
+ROUNDING = 8 * float(np.finfo(np.float64).eps)  # error of a sum, relative to its largest term
 
 
 def believed(r: Array, S: Array, lam: Array) -> Array:
@@ -105,7 +105,7 @@ def _pivot(r: Array, W: Array, half: Array, size: Array) -> Array:
         changed = [np.where(wrong[i] & ((left >= 0) | (last == i)), toward[i], sign[..., i]) for i in sensors]
         return count > 0, [num.stack(changed), y, fewest, left]
 
-    alone = np.where(np.abs(r) > half * size, np.copysign(1.0, r), 0.0)  # what each sensor alone would say
+    alone = np.where(np.abs(r) > half * size, np.copysign(1.0, r), 0.0)  # sign that each sensor alone would have
     whole = np.zeros(r.shape[:-1], np.int64)
     begin = [alone, r, whole + (q + 1), whole + PATIENCE]
     _, y, fewest, _ = num.until(step, begin, whole == 0, ROUNDS)

@@ -1,11 +1,11 @@
-"""Control defences: mitigations that bound the command, whatever the filter believes and the messages say (docs/platoon.md).
+"""Control defences: mitigations that bound the command, whatever filter and messages say (docs/platoon.md).
 
 `input_clip` and `sliding_mode` compute a command from a car's own three sensors, its gap d, speed v and acceleration a, as they were
 received. The gap's rate is that of a gap smoothed with the time constant T, exact where the rate is constant:
 
     s = h (d - g) / dt          g+ = g + h (d - g)          h = 1 - exp(-dt / T)                       (g = d at the first reading)
 
-They protect from false messages and from what neighbours believe, not from false readings of the own sensors.
+They protect from false messages and wrong neighbours, not from false readings of the own sensors.
 """
 
 from dataclasses import dataclass
@@ -63,7 +63,7 @@ class LocalPlan(NamedTuple):
     """Constants of a car's own loop."""
 
     follows: Array  # (N,) bool
-    place: tuple[int, ...]  # of distance, velocity and acceleration among the sensors
+    place: tuple[int, ...]  # indices of distance, velocity and acceleration among the sensors
     smooth: float  # h
     dt: float
     bound: float = np.inf  # [m/s^2]
@@ -164,7 +164,7 @@ def reachable(A: Array, b: Array) -> Reach:
                 break
         return Q
 
-    ratio, low, high = (5.0**0.5 - 1.0) / 2.0, 1e-3, 1.0 - 1e-3  # of the way from radius^2 to 1
+    ratio, low, high = (5.0**0.5 - 1.0) / 2.0, 1e-3, 1.0 - 1e-3  # shares of the way from radius^2 to 1
     for _ in range(60):
         left, right = high - ratio * (high - low), low + ratio * (high - low)
         if solved(_between(radius, left))[0, 0] < solved(_between(radius, right))[0, 0]:
@@ -252,7 +252,7 @@ class InputClip(OwnSensors):
 
     def slack(self, own: OwnLoop, dt: float) -> float:
         """Return how far [m] the gap can fall below d_r behind a car with any speed in [0, speed_max], without noise and deviation."""
-        kernel = (dt * response(own.A, own.ahead)).tolist()  # of the speed ahead; its sum is tau_h
+        kernel = (dt * response(own.A, own.ahead)).tolist()  # response to the speed ahead; its sum is tau_h
         return self.speed_max * -float(sum(value for value in kernel if value < 0.0))
 
     def bound(self, model: Model) -> float:

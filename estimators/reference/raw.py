@@ -43,7 +43,7 @@ def readings(model: Model) -> tuple[Reading, ...]:
     state = np.argmax(model.C, axis=2)
     rounds: list[list[tuple[int, int, int, int]]] = []
     for i in range(model.agents):
-        told: dict[int, int] = {}  # how often each state was told
+        told: dict[int, int] = {}  # how often each state was read
         tellers = [j for j in np.flatnonzero(model.graph[i]).tolist() if j != i]
         for j in (*tellers, i):
             for s, column in enumerate(state[j].tolist()):

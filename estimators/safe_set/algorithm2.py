@@ -22,7 +22,7 @@ from tailgate.estimators.filters.predictors import Predictor, PredictorPlan, Pre
 from tailgate.estimators.parts import Filter
 
 Factor = Annotated[float, Field(ge=0.01, lt=1)]
-UNIT = 100.0  # of time in h [steps]
+UNIT = 100.0  # unit of time in h [steps]
 
 
 class Weights(NamedTuple):

@@ -29,8 +29,8 @@ from tailgate.estimators.parts import Filter
 from tailgate.estimators.safe_set.safe_state import ACCEL, GAP, LEAD, SPEED, Finding, OwnCommand, SafeSet, SetPlan, SetState
 
 RSS = "S. Shalev-Shwartz, S. Shammah, A. Shashua, On a Formal Model of Safe and Scalable Self-driving Cars, 2017"
-LAG = 1.008  # of the thesis's vehicles [s]
-ROUNDS = 6  # of Newton's method for the time of the stop
+LAG = 1.008  # lag of the thesis's vehicles [s]
+ROUNDS = 6  # rounds of Newton's method for the time of the stop
 
 
 def stopping_distance(v: Array, a: Array, brake: float, tau: float) -> Array:

@@ -9,7 +9,7 @@ s is the way of the own car in the step: its exact average speed, times dt. With
 the truth whenever the car brakes. A reading that passes is intersected with P; one that does not is not, nor are those of its sensor after
 it, until `recover` seconds of them passed in a row. Until then the box grows as the dynamics allow.
 
-Where nobody tells w it is told by the gaps. With h_j = d - j dt w,
+Where no message gives w, the gaps do. With h_j = d - j dt w,
 
     h_{j+1}+ = h_j - s - (j alpha + beta / 2) dt^2,  alpha, beta in [a_min, a_max]        w = (d - h_j) / (j dt)
 """
@@ -31,7 +31,7 @@ from tailgate.envs.controllers.radar_car import kinematic
 
 GAP, LEAD, SPEED, ACCEL = range(4)  # columns of the box
 FAR = 1e4  # limit of a gap that nothing limits [m]
-EXACT = 1e-6  # accuracy of what is told without noise [m/s]
+EXACT = 1e-6  # accuracy of values known without noise [m/s]
 ROUNDING = 1e-9
 BACK = 1.0  # how far back gaps tell the speed of the car ahead [s]
 Limits = Annotated[tuple[Accel, Accel], Field(min_length=2, max_length=2)]
@@ -116,7 +116,7 @@ class OwnAccelerometer:
 
     dt: float
     follows: Array  # (N,) bool
-    limits: tuple[float, float]  # of accelerations
+    limits: tuple[float, float]  # least and largest acceleration
     gust: Array  # (N,) bound of the disturbance of the speed in a step
 
     def told(self, received: Received, known_u: Array) -> Told:
@@ -164,7 +164,7 @@ class SetPlan(NamedTuple):
     gust: Array  # (N,) of the disturbance of the speed ahead [m/s]
     dt: float
     recover: int  # steps
-    back: int  # steps of gaps that tell the speed ahead; 0 where it is told
+    back: int  # steps of gaps that give the speed ahead; 0 where it is known
     least: Array  # (4,) physical limits
     most: Array
 

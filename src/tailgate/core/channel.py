@@ -37,7 +37,7 @@ class Memory(NamedTuple):
 
     held: Array  # last good sample before the first attack, or before the onset
     fresh: Array  # last good sample of each wire
-    history: Array  # what was sent in the last steps
+    history: Array  # samples sent in the last steps
     tape: Array  # the history as it was when the running replay began
 
 
@@ -50,8 +50,8 @@ class ChannelState(NamedTuple):
     played: Array  # (B,) steps that the running replay has lasted
     taped: Array  # (B,) samples recorded so far
     anchor: Array  # (B,) samples recorded before the running replay began
-    links: Memory  # of sensors and V2V fields
-    drives: Memory  # of actuators
+    links: Memory  # memory of sensors and V2V fields
+    drives: Memory  # memory of actuators
     last: Command
 
 
@@ -132,7 +132,7 @@ class Channel:
         hit = command.target & charged[:, None, None]
         kind = np.where(charged, kind, 0).astype(np.int8)
         q, value = plan.sensors, command.value
-        if plan.air and num.some(aired := num.take(_ON_AIR, kind)):  # who reaches a receiver over the air reaches all that it reads
+        if plan.air and num.some(aired := num.take(_ON_AIR, kind)):  # over the air a command hits all readings of a receiver
             strength = np.max(np.where(hit, value, 0.0), axis=2, keepdims=True)
             whole = aired[:, None, None] & hit.any(axis=2, keepdims=True) & (np.arange(hit.shape[2]) < q)
             hit, value = hit | whole, np.where(whole, strength, value)
@@ -162,7 +162,7 @@ class Channel:
             y=links[..., :q], valid=under.valid & ~lost[..., :q], v2v=links[..., q:], attacked=hit[..., :q]
         )
         good = sent
-        if not num.every(received.valid):  # a muted sensor's nothing is no sample: the last one stands for it
+        if not num.every(received.valid):  # a muted sensor gives no sample: the last one takes its place
             good = sent.copy(order="K")
             good[..., :q] = np.where(received.valid, sent[..., :q], state.links.fresh[..., :q])
         return state._replace(links=self._keep(plan, state, state.links, good, hit[..., : sent.shape[-1]])), out, links, refused

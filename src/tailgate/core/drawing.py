@@ -15,7 +15,7 @@ from tailgate.base.plots import canvas
 from tailgate.core import Array, Model
 
 MANY = 60  # agents: more are drawn on a circle
-ROUNDS = 300  # of the layout
+ROUNDS = 300  # rounds of the layout
 DPI = 160
 FORMATS = ("png", "svg", "pdf")
 INK, EDGE, NODE, ATTACKED = "#1a1a1a", "#6b7076", "#dcebf5", "#b34700"
@@ -113,7 +113,7 @@ def graph_figure(
     for i, place in enumerate(places):
         hit = i in attacked
         fill, line = ("#ffffff", ATTACKED) if hit else (NODE, INK)
-        if hit:  # a second ring: nothing is told by colour alone
+        if hit:  # a second ring: colour is never the only sign
             ax.add_patch(Circle(place, _edge(radius, hit), fill=False, edgecolor=ATTACKED, linewidth=1.8, zorder=2))
         ax.add_patch(Circle(place, radius, facecolor=fill, edgecolor=line, linewidth=1.6, zorder=3))
         size = 72.0 * scale * radius * (1.0 if len(labels[i]) < 3 else 2.2 / len(labels[i]))

@@ -2,7 +2,7 @@
 
 key = 64 bits of BLAKE2b(purpose, party, seed); counter = (episode, block, step, stream). A stream belongs to a ROLE, so
 swapping the defence or the attack leaves every other draw identical, and comparisons are paired. The three
-parties have unrelated keys: what a defence or an attack holds tells nothing of the sensor noise.
+parties have unrelated keys: the draws of a defence or an attack say nothing about the sensor noise.
 """
 
 import hashlib

@@ -1,9 +1,9 @@
 """The loop: the arrows between the nouns, pure on its state.
 
-    each k:  plant -> sensors -> [seat: the attack's command] -> channel -> defence -> controller -> channel -> plant
+    each k:  plant -> sensors -> [the attack's command] -> channel -> defence -> controller -> channel -> plant
 
 Time runs k = 1, 2, ..., horizon. At k = 0 the prior is the estimate and the controller drives the first step on it, so that every
-measured step is a predict and an update. `sense` and `advance` are the two halves of a step, with the attack's seat between them.
+measured step is a predict and an update. `sense` and `advance` are the two halves of a step; the attack decides between them.
 """
 
 from __future__ import annotations
@@ -219,7 +219,7 @@ class Loop:
             allowed=Channel().allowed(plan.channel, channel, state.k),
             last=channel.last,
         )
-        if self.model.air:  # a radio signal: whoever is near hears it
+        if self.model.air:  # a radio signal: everybody near hears it
             view = view._replace(probed=state.probed)
         if threat.knowledge in ("grey", "white"):
             view = view._replace(control=state.control)
@@ -248,7 +248,7 @@ class Loop:
         )
         defence, estimate = pair_of(answer)
         check_estimate(estimate, self.model, len(state.k), state.k)
-        if "probe" not in self.uses:  # who does not say that it switches the probe off cannot
+        if "probe" not in self.uses:  # only a defence that declares `probe` may mute it
             estimate = estimate._replace(probe=num.full(estimate.probe.shape, True, bool))
         assert received.v2v is not None
         controller, u = self.controller.step(plan.controller, state.controller, estimate, received.v2v, odometry)

@@ -1,7 +1,7 @@
 """A lossy link between a sensor and its readers, which nobody is told of: readings are lost, or come late.
 
-Nobody attacks here. A reading that is lost is known to be lost (`valid`), and its wire keeps the last value that arrived, as in an attack
-of that kind; one that is late is not known to be.
+Nobody attacks here. The receiver knows of a lost reading (`valid`), and its wire keeps the last value that arrived, as in an attack of kind
+dropout. It does not know that a reading is late.
 """
 
 from __future__ import annotations

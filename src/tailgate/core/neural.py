@@ -1,6 +1,6 @@
 """A small neural network, computed in float64 with a fixed order of summation, and its files: safetensors with a JSON header.
 
-A trace does not depend on the batch, because no sum does. Reading a file executes nothing.
+No sum depends on the batch, and so no trace does. Reading a file executes nothing.
 """
 
 from __future__ import annotations

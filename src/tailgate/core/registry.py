@@ -300,7 +300,7 @@ class Spec:
             paths += [Path(str(path)) for path in (held if isinstance(held, list) else [held])]
         if not paths and not self.entry.built_in:
             paths = [Path(inspect.getfile(self.entry.cls))]
-        if not paths and hasattr(self.entry.cls, "sources"):  # a name that stands for a file
+        if not paths and hasattr(self.entry.cls, "sources"):  # a name of a file
             paths = list(self.make().sources)
         if self.family == "defence" and len(paths) == 1 and (":" in head or not self.entry.built_in):
             from tailgate.sandbox import source

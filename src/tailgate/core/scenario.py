@@ -127,7 +127,7 @@ class Suite:
 
     @property
     def nominal(self) -> tuple[str, ...]:
-        """Scenarios whose plant is the one that a defence is told; all of them where none is."""
+        """Scenarios whose plant is the public model's; all of them where none is."""
         return tuple(name for name in self.scenarios if name not in self.robustness) or self.scenarios
 
     @property
