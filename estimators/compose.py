@@ -17,7 +17,7 @@ from tailgate import num
 from tailgate.base.errors import NotApplicable
 from tailgate.core import Array, Count, Estimate, Innovation, Mode, Model, NonNegative, Prior, Received, param
 from tailgate.core.draws import Draws
-from tailgate.core.registry import Family, imported, make_from, register
+from tailgate.core.registry import PARTS, Family, imported, make_from, register
 from tailgate.core.schema import build, fields_of
 from tailgate.estimators.parts import Decision, Detector, Filter, Mitigation, Stateless, Verdict, blame_all
 
@@ -140,17 +140,23 @@ class NamedParts(Composed):
         return dataclasses.replace(self, detector=held | {name: value})
 
     def parts(self) -> tuple[Filter, Detector, Mitigation]:
-        return self._part("filter"), self._part("detector"), self._part("mitigation")
+        held = {"filter": self.filter, "detector": self.detector, "mitigation": self.mitigation}
+        f, d, m = (part_from(family, held[family], fields_of(type(self))[family].default, f"defence composed.{family}") for family in PARTS)
+        return f, d, m
 
-    def _part(self, family: Family) -> Any:
-        data = getattr(self, family)
-        if isinstance(data, dict):  # a mapping without a name changes the default part
-            data = {"name": fields_of(type(self))[family].default, **data}
-        name = data.get("name") if isinstance(data, dict) else data
-        if isinstance(name, str) and ":" in name:  # Spec.imports lets readers of files and rows refuse it
-            params = {key: value for key, value in data.items() if key != "name"} if isinstance(data, dict) else {}
-            return build(imported(family, name).cls, params, f"defence composed.{family}")
-        return make_from(family, data, f"defence composed.{family}")
+
+def part_from(family: Family, data: object, default: str, where: str) -> Any:
+    """Return a part of a defence from its name, or a mapping with name and parameters; a name module:Class is imported.
+
+    A mapping without a name changes parameters of the part `default`.
+    """
+    if isinstance(data, dict):
+        data = {"name": default, **data}
+    name = data["name"] if isinstance(data, dict) else data
+    if isinstance(name, str) and ":" in name:  # Spec.imports lets readers of files and rows refuse it
+        params = {key: value for key, value in data.items() if key != "name"} if isinstance(data, dict) else {}
+        return build(imported(family, name).cls, params, where)
+    return make_from(family, data, where)
 
 
 def threshold_field(detector: Detector) -> str:

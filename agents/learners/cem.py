@@ -1,14 +1,14 @@
 """The cross-entropy method (Rubinstein 1999) on the weights of a small policy: no gradient, no torch.
 
-A generation draws `population` weight vectors from a normal distribution with a diagonal covariance, plays each of them on the same
-`episodes` fresh episodes, and moves the distribution to the best of them:
+A generation draws `population` weight vectors from a normal distribution with a diagonal covariance. It plays each of them on the same
+`episodes` fresh episodes. Then it moves the distribution to the best of them:
 
     mean+ = mean + a (mean of the elite - mean)        sd+^2 = variance of the elite + extra^2
 
 where `extra` falls to 0 over the first generations (Szita and Lorincz 2006), so that the search does not narrow too early. Member 0 is the
-mean itself. All members of a generation meet the same episodes: what differs is the policy.
+mean itself. All members of a generation meet the same episodes; only the policy differs.
 
-Where a search may end in one of several places, `starts` of them are begun, each for `trial` generations on the same episodes, and the one
+A search may end in one of several places. So `starts` searches are begun, each for `trial` generations on the same episodes; the one
 whose mean did best goes on.
 
 Random numbers are a function of (seed, generation, start), so that a resumed run gives the policy of an uninterrupted one.

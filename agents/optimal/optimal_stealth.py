@@ -70,7 +70,7 @@ class OptimalStealth(Script):
 
     def command(self, plan: ScriptPlan, on: Array, count: Array, view: View, draws: Draws) -> Command:
         if view.defence is None or view.received is None or view.estimate is None or view.truth is None:
-            raise InputError("threat_model.knowledge", plan.brief.threat.knowledge, "white, which attack optimal_stealth needs")
+            raise InputError("threat_model.knowledge", plan.brief.threat.knowledge, "white: attack optimal_stealth needs it")
         box, model, aim = view.defence, plan.brief.model, plan.extra
         if not hasattr(box.defence, "look"):
             raise NotApplicable("attack optimal_stealth", type(box.defence).__name__, "a defence that shows its innovation (look)")

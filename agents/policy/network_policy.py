@@ -1,7 +1,7 @@
 """A learned policy as an attack: safetensors + JSON, played without torch, Stable-Baselines3 or pickle.
 
 The network is a tanh perceptron in float64 with a fixed order of summation, so that a trace does not depend on the batch. An LSTM, which
-remembers the episode, may stand before it. The JSON file names the tensor file, its SHA-256, the action and observation codecs, and how
+remembers the episode, may come before it. The JSON file names the tensor file, its SHA-256, the action and observation codecs, and how
 the policy was made.
 """
 

@@ -271,7 +271,7 @@ class Reading(Condition):
     def prepare(self, brief: Brief) -> Timing:
         threat = brief.threat
         if not threat.sees_measurement and threat.knowledge != "white":
-            raise NotApplicable("threat_model.sees_measurement", False, "true: the trigger `reading` waits for what is read")
+            raise NotApplicable("threat_model.sees_measurement", False, "true: the trigger `reading` waits for a reading")
         return super().prepare(brief)._replace(reach=brief.granted[:, : len(brief.model.sensors)])
 
     def holds(self, timing: Timing, state: TriggerState, view: View) -> Array:

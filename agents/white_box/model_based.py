@@ -230,7 +230,7 @@ class Stealth(Script):
 
     def command(self, plan: ScriptPlan, on: Array, count: Array, view: View, draws: Draws) -> Command:
         if view.defence is None or view.received is None:
-            raise InputError("threat_model.knowledge", plan.brief.threat.knowledge, "white, which attack stealth needs")
+            raise InputError("threat_model.knowledge", plan.brief.threat.knowledge, "white: attack stealth needs it")
         box = view.defence
         if not hasattr(box.defence, "look"):
             raise NotApplicable("attack stealth", type(box.defence).__name__, "a defence that shows its innovation (look)")

@@ -41,9 +41,19 @@ def spaced(x: Array, v: Array, lead_x: Array, lead_v: Array, headway: Array, sta
     return out
 
 
+class OneCar:
+    """Base class of controllers that drive one car and remember nothing."""
+
+    def start(self, plan: None, batch: int) -> None:
+        return None
+
+    def held(self, plan: None, state: None, batch: int) -> Array:
+        return np.zeros((batch, 1, 0))
+
+
 @register("controller", "acc", reference="Dutta 2018, (4.13) and (4.14), corrected")
 @dataclass(frozen=True)
-class AdaptiveCruise:
+class AdaptiveCruise(OneCar):
     """Constant-time-headway ACC on the estimated own state and the received state of the leader.
 
         a_des = ((v_l - v_f) + gamma (x_l - x_f - d_r - h v_f)) / h
@@ -66,9 +76,6 @@ class AdaptiveCruise:
         if model.v2v[:2] != LEADER:
             raise InputError("controller acc", list(model.v2v), "a car-following plant, whose leader sends its position and velocity")
 
-    def start(self, plan: None, batch: int) -> None:
-        return None
-
     def step(self, plan: None, state: None, estimate: Estimate, v2v: Array, odometry: Array) -> tuple[None, Array]:
         """Return the command a_des (B, N, 1) [m/s^2] for estimate.x (B, N, 3) = [x, v, a] and v2v (B, N, 2) = [x_l, v_l]."""
         x, v, mode = estimate.x[..., 0], estimate.x[..., 1], estimate.mode
@@ -77,9 +84,6 @@ class AdaptiveCruise:
         if self.set_speed is not None:
             a = np.minimum(a, (self.set_speed - v) / headway)
         return None, limited(obeyed(a, mode), self.accel_min, self.accel_max)[..., None]
-
-    def held(self, plan: None, state: None, batch: int) -> Array:
-        return np.zeros((batch, 1, 0))
 
     def desired_gap(self, speed: Array) -> Array:
         """Return d_r + h v [m] (4.13)."""

@@ -12,7 +12,7 @@ from tailgate import num
 from tailgate.core import Array, Estimate, Model, param
 from tailgate.core.quantities import Lag, Length, PositiveSpeed, Rate
 from tailgate.core.registry import register
-from tailgate.envs.controllers.adaptive_cruise import limited, obeyed, widened
+from tailgate.envs.controllers.adaptive_cruise import OneCar, limited, obeyed, widened
 from tailgate.envs.controllers.radar_car import GAP, RELATIVE_SPEED, check_radar_car
 from tailgate.envs.vehicle import roll
 
@@ -77,7 +77,7 @@ class Behind:
 
 @register("controller", "idm", reference="Treiber, Hennecke, Helbing, Congested traffic states in empirical observations, 2000")
 @dataclass(frozen=True)
-class IntelligentDriver:
+class IntelligentDriver(OneCar):
     """The Intelligent Driver Model on a radar's estimates and the trusted own speed.
 
     The thesis speaks of a "modified IDM" (3.5.1) and never writes it down: this is the published model, for comparison with its ACC.
@@ -93,18 +93,12 @@ class IntelligentDriver:
     def prepare(self, model: Model) -> None:
         check_radar_car(model, "controller idm")
 
-    def start(self, plan: None, batch: int) -> None:
-        return None
-
     def step(self, plan: None, state: None, estimate: Estimate, v2v: Array, odometry: Array) -> tuple[None, Array]:
         """Return the acceleration (B, N, 1) [m/s^2] for estimate.x (B, N, 4) = [gap, relative speed, ...] and the own odometry."""
         gap, v, mode = estimate.x[..., GAP], odometry[..., 1], estimate.mode
         lead, headway = v + estimate.x[..., RELATIVE_SPEED], widened(self.headway, mode)
         a = idm(gap, v, lead, self.set_speed, headway, self.standstill, self.accel, self.decel)
         return None, limited(obeyed(a, mode), -self.brake, self.accel)[..., None]
-
-    def held(self, plan: None, state: None, batch: int) -> Array:
-        return np.zeros((batch, 1, 0))
 
     def desired_gap(self, speed: Array) -> Array:
         """Return the gap at which it keeps a speed below v0 [m]."""

@@ -8,7 +8,7 @@ from tailgate.base.errors import InputError
 from tailgate.core import Array, Estimate, Model, Plant, Receiver, Sensor, param
 from tailgate.core.quantities import Accel, Lag, Length, PositiveGain, PositiveSpeed, check_order
 from tailgate.core.registry import register
-from tailgate.envs.controllers.adaptive_cruise import limited, obeyed, widened
+from tailgate.envs.controllers.adaptive_cruise import OneCar, limited, obeyed, widened
 
 GAP, RELATIVE_SPEED, LEAD_ACCEL, OWN_SPEED = range(4)
 STATES = 4
@@ -49,7 +49,7 @@ def wanted(
 
 @register("controller", "acc_radar", reference="Dutta 2018, (3.12), (3.13), (3.16), corrected")
 @dataclass(frozen=True)
-class RadarCruise:
+class RadarCruise(OneCar):
     """Adaptive cruise control with a speed and a spacing mode, on a radar's estimates and the trusted own speed.
 
         d_des = d0 + tau_h v_F                                                                                    (3.12)
@@ -76,18 +76,12 @@ class RadarCruise:
     def prepare(self, model: Model) -> None:
         check_radar_car(model, "controller acc_radar")
 
-    def start(self, plan: None, batch: int) -> None:
-        return None
-
     def step(self, plan: None, state: None, estimate: Estimate, v2v: Array, odometry: Array) -> tuple[None, Array]:
         """Return the command a_des (B, N, 1) [m/s^2] for estimate.x (B, N, 4) = [d, dv, ...] and odometry (B, N, 2) = [x_F, v_F]."""
         d, dv, v = estimate.x[..., GAP], estimate.x[..., RELATIVE_SPEED], odometry[..., 1]
         headway = widened(self.headway, estimate.mode)
         a = (wanted(d, dv, v, headway, self.standstill, self.g, self.tau, self.gain, self.set_speed) - v) / self.sample
         return None, limited(obeyed(a, estimate.mode), self.accel_min, self.accel_max)[..., None]
-
-    def held(self, plan: None, state: None, batch: int) -> Array:
-        return np.zeros((batch, 1, 0))
 
     def desired_gap(self, speed: Array) -> Array:
         """Return d0 + tau_h v [m] (3.12)."""

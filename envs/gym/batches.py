@@ -226,7 +226,7 @@ class TracedEpisodes:
 
     def drawn(self, row: int) -> tuple[LoopState, Frame | None, int]:
         if self.shadow is None:
-            raise InputError("render", "episodes that were put back", "reset() first")
+            raise InputError("render", "restored episodes", "reset() first")
         return *self.shadow.look(row, PlainEpisodes), 0
 
     def __getstate__(self) -> dict[str, Any]:

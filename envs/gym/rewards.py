@@ -105,7 +105,7 @@ class Stealth(Error):
 
 @register("reward", "peak")
 class Peak(Payment):
-    """By how much the largest error of the episode rises, over `error_scale`: in all, the metric `max_error`."""
+    """The rise of the largest error of the episode, over `error_scale`: in all, the metric `max_error`."""
 
     peak = True
 

@@ -258,7 +258,7 @@ class PlatoonSensors:
             C[i, range(3), [Column.gap(i), Column.speed(i), Column.accel(i)]] = 1.0
         told = np.array(self.noise_sd if self.told_sd is None else self.told_sd)
         if (told <= 0.0).any():
-            raise InputError("sensor platoon_sensors.told_sd", self.told_sd, "standard deviations above 0, where noise_sd is not")
+            raise InputError("sensor platoon_sensors.told_sd", self.told_sd, "standard deviations above 0; needed where noise_sd has a 0")
         return ("distance", "velocity", "acceleration"), C, np.repeat(np.diag(told * told)[None], cars, axis=0)
 
     def prepare(self, model: Model) -> tuple[Array, Array]:

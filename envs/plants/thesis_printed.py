@@ -18,6 +18,7 @@ from tailgate import num
 from tailgate.core import Array, Estimate, Model, param
 from tailgate.core.quantities import Lag, Length, PositiveGain
 from tailgate.core.registry import register
+from tailgate.envs.controllers.adaptive_cruise import OneCar
 from tailgate.envs.plants.car_following import CarFollowing, FollowingPlan
 
 
@@ -46,7 +47,7 @@ class CarFollowingLiteral(CarFollowing):
 
 @register("controller", "relative_distance", reference="Dutta 2018, (4.16): the input u of the printed model")
 @dataclass(frozen=True)
-class RelativeDistance:
+class RelativeDistance(OneCar):
     """Feeds the printed model: u = x_l - x_f [m], the follower's position as estimated."""
 
     headway: Lag = param(3.0, "time headway h of the spacing policy (4.13) [s]")
@@ -55,15 +56,9 @@ class RelativeDistance:
     def prepare(self, model: Model) -> None:
         return None
 
-    def start(self, plan: None, batch: int) -> None:
-        return None
-
     def step(self, plan: None, state: None, estimate: Estimate, v2v: Array, odometry: Array) -> tuple[None, Array]:
         """Return u (B, N, 1) [m] for estimate.x (B, N, 3) and v2v (B, N, 2) = [x_l, v_l]."""
         return None, (v2v[..., 0] - estimate.x[..., 0])[..., None]
-
-    def held(self, plan: None, state: None, batch: int) -> Array:
-        return np.zeros((batch, 1, 0))
 
     def desired_gap(self, speed: Array) -> Array:
         """Return d_r + h v [m] (4.13)."""

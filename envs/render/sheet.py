@@ -12,7 +12,7 @@ from tailgate.envs.render.stage import LANE, LENGTH, Car, Stage
 from tailgate.envs.render.viewer import SIZE
 
 SPANS = (60.0, 90.0, 130.0, 190.0, 280.0, 420.0, 630.0, 950.0)  # metres from left to right: few and fixed, so that the scale rests
-STRING = (60.0, 90.0, 130.0, 190.0, 240.0, 300.0, 360.0, 430.0, 520.0, 630.0, 780.0, 950.0)  # spans for platoons: their length varies little
+STRING = (60.0, 90.0, 130.0, 190.0, 240.0, 300.0, 360.0, 430.0, 520.0, 630.0, 780.0, 950.0)  # for platoons: their length varies little
 FORE = 0.64  # share of them that lies ahead of the car
 TRAFFIC = 130.0  # the least span of a road with others on it [m]
 LEAST = 1.6  # pixels a metre: a car is 8 px long

@@ -9,7 +9,7 @@ Erratum: with dv positive when the gap opens, the printed signs of (3.5), (3.6) 
 simulated chirp (fmcw_signal.py).
 
 A ratio (3.11) below 1 does not by itself deny service. The jammer must also beat the IF filter, which passes B_if/B of a noise that fills
-the swept band (`in_band`), and the integration of the M samples of a sweep. What decides is the SNR after both,
+the swept band (`in_band`). And it must beat the integration of the M samples of a sweep. The SNR after both decides:
 
     x = M Pr/(k T0 F B_if + in_band PJ,rx)
 """

@@ -26,10 +26,9 @@ from tailgate.base.pytree import map_leaves
 from tailgate.core import Array, Estimate, Model, NonNegative, Positive, PositiveCount, Prior, Probability, Received, param
 from tailgate.core.draws import Draws
 from tailgate.core.nouns import P, S
-from tailgate.core.registry import imported, make_from, register
-from tailgate.core.schema import build
+from tailgate.core.registry import register
 from tailgate.envs.sensors.fmcw import false_alarm_threshold, from_db
-from tailgate.estimators.compose import AcceptAll, Look, ModeName, ReactionPlan, ReactionState
+from tailgate.estimators.compose import AcceptAll, Look, ModeName, ReactionPlan, ReactionState, part_from
 from tailgate.estimators.filters.predictors import read_states
 from tailgate.estimators.parts import Filter, Verdict
 
@@ -107,7 +106,7 @@ class Challenger:
         if getattr(self, unused) is not None:
             raise InputError(f"defence {self.label}.{unused}", getattr(self, unused), f"none: challenges are {self.challenge}")
         if self.times is not None and (1 in self.times or not self.times):
-            raise InputError(f"defence {self.label}.times", self.times, "at least one step, from 2 on: nobody is asked before the first")
+            raise InputError(f"defence {self.label}.times", self.times, "at least one step, from 2 on: the first step has no challenge")
         self.predictor()  # a wrong name shall fail here
 
     def predictor(self) -> Filter:
@@ -188,17 +187,6 @@ def _used(plan: ChallengePlan, received: Received, muted: Array, alarm: Array) -
     return used, shown & plan.response.passes
 
 
-def named_filter(data: object, where: str) -> Filter:
-    """Return a filter from its name, or a mapping with name and parameters; module:Class names somebody else's."""
-    params = {"name": PREDICTOR, **(data if isinstance(data, dict) else {"name": data})}  # a mapping without a name changes the default one
-    name = params["name"]
-    if isinstance(name, str) and ":" in name:
-        made: Filter = build(imported("filter", name).cls, {key: value for key, value in params.items() if key != "name"}, where)
-        return made
-    found: Filter = make_from("filter", params, where)
-    return found
-
-
 @register(
     "defence", "cra", uses=("measurements", "odometry", "probe"),
     reference="Dutta 2018, Algorithms 1 and 2, corrected; Shoukry, Martin, Yona, Diggavi, Srivastava, PyCRA, CCS 2015",
@@ -215,7 +203,8 @@ class ChallengeResponse(Challenger):
     freeze: bool = param(True, "the filter uses no reading during an alarm")
 
     def predictor(self) -> Filter:
-        return named_filter(self.filter, "defence cra.filter")
+        predictor: Filter = part_from("filter", self.filter, PREDICTOR, "defence cra.filter")
+        return predictor
 
     def response(self) -> Response:
         return Response(self.passes, True, self.freeze, self.rollback)
@@ -236,7 +225,8 @@ class PyCra(Challenger):
     filter: object = param(PREDICTOR, FILTER)
 
     def predictor(self) -> Filter:
-        return named_filter(self.filter, "defence pycra.filter")
+        predictor: Filter = part_from("filter", self.filter, PREDICTOR, "defence pycra.filter")
+        return predictor
 
     def response(self) -> Response:
         return Response(passes=True, stops=False, freezes=False, rolls_back=False)

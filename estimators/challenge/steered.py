@@ -178,7 +178,7 @@ class Steered:
         for path, (header, network) in zip(self.paths, self._loaded, strict=True):
             if header.observation != sight.names:
                 differing = sorted(set(header.observation) ^ set(sight.names)) or ["in another order"]
-                raise InputError(f"defender {path.name}", f"observation {', '.join(differing)}", "what this defence sees on this plant")
+                raise InputError(f"defender {path.name}", f"observation {', '.join(differing)}", "this defence's own observation")
             if network.weights[-1].shape[1] != len(menu):
                 raise InputError(f"defender {path.name}", f"{network.weights[-1].shape[1]} settings", f"{len(menu)}, as its menu has")
         return SteeredPlan(hand, hand.prepare(model), sight, menu, start, tuple(network for _, network in self._loaded))

@@ -1,4 +1,4 @@
-"""Detectors with memory: they see what one step at a time hides, and an attacker who knows them spends less (docs/detectors.md).
+"""Detectors with memory: they see attacks that no single step shows (docs/detectors.md).
 
 With g = r' S^-1 r, which without an attack is chi-square with q degrees of freedom, and h the threshold:
 

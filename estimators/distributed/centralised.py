@@ -1,6 +1,6 @@
 """Centralised references: one estimator reads the sensors of all agents, and everybody gets its estimate.
 
-The sensors of all N agents are stacked to the N q sensors of one agent, for which (5.7) is the Kalman filter and (6.26) the robust one, in
+The sensors of all N agents are stacked to the N q sensors of one agent. For it (5.7) is the Kalman filter and (6.26) the robust one, in
 steady state. It begins at the mean of the agents' priors, and knows the input of agent 0: in a platoon the leader's own command. It hears
 more than any agent of the network does: it is a reference, not a competitor.
 """

@@ -4,12 +4,12 @@
     K_i  = M_i C_i' (Sv_i + C_i M_i C_i')^-1          M_i = A P_i A' + Sw          P_i = M_i - K_i C_i M_i
     Cons_i = eps / (1 + ||M_i||_F) M_i
 
-Each agent is a Kalman filter on its own sensors, and pulls its estimate towards the predictions of its neighbours, the harder the less it
-knows; the covariance takes no notice of that. With `share` the neighbours send their readings too (the paper's second algorithm), and K_i
+Each agent is a Kalman filter on its own sensors. It pulls its estimate towards the predictions of its neighbours, the harder the less it
+knows; the covariance ignores that. With `share` the neighbours send their readings too (the paper's second algorithm), and K_i
 uses them as if they were the agent's own; an agent sends what its own gate let pass.
 
-Two things differ from the paper: the sum over the neighbours is taken as their mean, so that one gain suits every graph (for a gain up to 1
-the pull alone is then a contraction), and the gain is called `consensus`, not eps.
+Two things differ from the paper. The sum over the neighbours is their mean, so that one gain suits every graph: for a gain up to 1 the pull
+alone is then a contraction. The gain is called `consensus`, not eps.
 
 An agent that cannot see a mode by itself has a covariance that grows with it, linearly where the mode lasts. The pull then works on just
 this mode. Where such a mode grows the covariance overflows in time: NotApplicable.

@@ -1,15 +1,15 @@
 """Gate and neighbour disagreement (U. A. Khan, A. M. Stankovic, Secure Distributed Estimation in Cyber-Physical Systems, ICASSP 2013).
 
-The paper tests twice before an agent uses anything: what it measures against what it expects (local), and what a neighbour sends against
-what the agent itself holds (nodal); what fails is left out. Here, on the distributed Kalman filter:
+In the paper an agent tests every input before it uses it: its measurement against its prediction (local), and a neighbour's message
+against its own estimate (nodal). An input that fails is left out. Here, on the distributed Kalman filter:
 
     own readings      left out where r' S^-1 r > eta
     neighbour j       left out of N(i) where  z_ij = max_k |xb_j,k - c_i,k| / sqrt(M_i,kk + M_j,kk)  > threshold
 
-xb_j is what j sends, with the covariance M_j = A P_j A' + Sw that it gives it. c_i is what i itself predicts, or the median, state by
-state, of all that it hears and its own: then an agent can also find that it is itself the one who is wrong. Among two there is no
-majority. Where nobody is left, the agent keeps its own. Errors of neighbours are correlated, so that z is smaller than that of independent
-ones: the threshold is in sigma, and conservative.
+Agent j sends xb_j with its covariance M_j = A P_j A' + Sw. c_i is the own prediction of i, or the median, state by state, of it and all
+that i hears; with the median an agent can also find that it is wrong itself. Two agents have no majority. An agent without neighbours left
+keeps its own prediction. Errors of neighbours are correlated, so that z is smaller than for independent ones: the threshold, in sigma, is
+conservative.
 """
 
 from dataclasses import dataclass

@@ -137,7 +137,7 @@ def split(A: Array) -> tuple[list[Block], Block]:
     V = [_eigenspace(A, value, size) for value, size in found]
     for (value, size), basis in zip(found, V, strict=True):
         if not basis.any(axis=0).all():
-            wanted = "modes whose generalised eigenvectors rounding lets apart"
+            wanted = "modes whose generalised eigenvectors differ by more than rounding"
             raise NotApplicable("defence trimmed_consensus", f"a chain of {size} states at the eigenvalue {value:g}", wanted)
     V.append(_complement(np.concatenate([*dual, np.zeros((len(A), 0))], axis=1)))
     W, first, out = num.solve(np.concatenate(V, axis=1), np.eye(len(A))), 0, []

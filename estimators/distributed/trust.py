@@ -2,9 +2,9 @@
 
 I. Matei, J. S. Baras, V. Srinivasan, Trust-Based Multi-Agent Filtering for Increased Smart Grid Security, MED 2012.
 
-The paper's idea: an agent mixes its neighbours' estimates with its own, weighed by its trust in them; who departs much from what is
-expected loses trust, and who has little is disregarded. Here the weights enter the fusion of the distributed Kalman filter (thesis
-(6.19)-(6.25)), what is expected of a neighbour is the own prediction, and the law by which trust moves is ours:
+The paper's idea: an agent mixes its neighbours' estimates with its own, weighed by its trust in them. A neighbour that departs much from
+the expected value loses trust; one with little trust is disregarded. Here the weights enter the fusion of the distributed Kalman filter
+(thesis (6.19)-(6.25)). The expected value is the own prediction; the law by which trust moves is ours:
 
     z_ij  = max_k |xb_j,k - xb_i,k| / sqrt(M_i,kk + M_j,kk)          M_j = A P_j A' + Sw, the covariance that j gives what it sends
     T_ij  = min( (threshold / z_ij)^2,  T_ij + rate (1 - T_ij) )      T_ii = 1, and T_ij = 1 at the start: lost at once, regained slowly

@@ -108,7 +108,7 @@ class HInfinityAdapter(KalmanAdapter):
 
     filterpy's class warns that it is likely wrong: it scales the correction by F once too often, predicts no covariance, and its gain is
     the one-step predictor's, which overshoots where P-^-1 > gamma C'R^-1 C fails. So its update is used with F = I and W = 0, with gamma
-    for the covariance and without for the gain, and the prediction is made here (Hassibi, Sayed and Kailath 1996):
+    for the covariance and without for the gain. The prediction is made here (Hassibi, Sayed and Kailath 1996):
 
         K = P- C' S^-1          P^-1 = P-^-1 + C'R^-1 C - gamma C'R^-1 C
 

@@ -7,7 +7,7 @@
 A sensor that is not accepted has its row of C, and its covariances in S, set to zero: no sensor at all gives x = x-, P = P-.
 
 The steady filter holds P- at the solution of P- = A (P- - K S K') A' + Q. Its gain is constant for each set of sensors: where some are
-left out, the others correct with the gain that they have alone at the same P-. What it misses does not widen its S.
+left out, the others correct with the gain that they have alone at the same P-. Missing readings do not widen its S.
 """
 
 from dataclasses import dataclass

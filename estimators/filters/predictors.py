@@ -4,9 +4,9 @@
     autoregressive     y(k) = w1 y(k-1) + ... + wp y(k-p), w by least squares; a prediction stands in for a missing one
     polynomial         y(k) = the polynomial that fits the last W readings best, at k
 
-The state that a sensor reads is its reading where that is used, else the prediction; a state that the known input alone decides, such as
-an own speed by odometry, follows that input; any other keeps its prior. S is that of a regression whose noise is the sensor's: R where
-nothing had to be learned.
+A state that a sensor reads equals the reading where that is used, else the prediction. A state that the known input alone decides, such as
+an own speed by odometry, follows that input. Any other keeps its prior. S is that of a regression with the sensor's noise: R where nothing
+had to be learned.
 """
 
 from __future__ import annotations

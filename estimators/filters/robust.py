@@ -3,8 +3,8 @@
     y = C x + v + z, z sparse:      z = argmin (r - z)' W (r - z) + sum_i lam_i |z_i|,      W = S^-1
                                     x = x- + K (r - z),      with the steady P-, S and K
 
-The problem is strictly convex, so that z is unique, and r' W r is the price of z = 0. What is computed is y = r - z, the part of the
-innovation that is believed: it is the fixed point of
+The problem is strictly convex, so that z is unique, and r' W r is the price of z = 0. The code computes y = r - z, the believed part of
+the innovation. It is the fixed point of
 
     y_i = clip(r_i, (-lam_i/2 - b_i) / W_ii, (lam_i/2 - b_i) / W_ii),      b_i = sum_{j != i} W_ij y_j
 

@@ -154,7 +154,7 @@ def reachable(A: Array, b: Array) -> Reach:
     """
     radius = num.spectral_radius(A)
     if radius >= 1.0:
-        raise InputError("mitigation input_clip", radius, "gains with which a car's own loop is stable")
+        raise InputError("mitigation input_clip", radius, "gains that make a car's own loop stable")
 
     def solved(a: float) -> Array:
         Q, F = b[:, None] * b / (1.0 - a), A / np.sqrt(a)

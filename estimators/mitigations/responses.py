@@ -1,7 +1,7 @@
-"""Mitigations: which readings to use after a verdict, and what to ask of the controller (docs/detectors.md).
+"""Mitigations: the readings to use after a verdict, and the mode asked of the controller (docs/detectors.md).
 
-Two choices that have nothing to do with each other: the readings (`gate_out`, `latch`, `hold`, `reacquire`, `accept_all`), and the mode
-(`mode`, `linger`), which every one of them takes. `widen` and `brake` are `gate_out` with a mode.
+Two independent choices: the readings (`gate_out`, `latch`, `hold`, `reacquire`, `accept_all`), and the mode (`mode`, `linger`), which
+every one of them takes. `widen` and `brake` are `gate_out` with a mode.
 """
 
 from dataclasses import dataclass

@@ -2,8 +2,8 @@
 
     g = h' P        gamma = lambda + g h        j = g' / gamma        e = y' - w' h        w = w + j e        P = (P - j g) / lambda
 
-for d and dv apart, h = [1, t/100], lambda = 0.95, w = 0 and P = delta I at first, delta = 1. Since the attack is detected the controller
-drives on w' h; but y', on which w goes on being adapted, is what the attacker sends. The list of challenges is fixed, and known.
+for d and dv apart, h = [1, t/100], lambda = 0.95, w = 0 and P = delta I at first, delta = 1. From the detection on the controller drives on
+w' h; but the attacker sends y', to which w is still adapted. The list of challenges is fixed, and known.
 """
 
 from __future__ import annotations

@@ -1,15 +1,15 @@
-"""Safe states as a defence: a filter that gets the readings which fit the safe set, and a brake that acts on the set (docs/safe-state.md).
+"""Safe states as a defence: a filter that gets only readings in the safe set, and a brake that acts on the set (docs/safe-state.md).
 
-The brake reckons with the worst of the set: the smallest gap d, the slowest car ahead w, the fastest own speed v and acceleration a. It
-overrides the command in the step in which the gap is no longer enough to stop behind a car that brakes at `lead_brake`, after a time rho in
-which the own car still speeds up (the distance of responsibility-sensitive safety, RSS, with the actuator's lag):
+The brake assumes the worst of the set: the smallest gap d, the slowest car ahead w, the fastest own speed v and acceleration a. It
+overrides the command when the gap is too short to stop behind a car that brakes at `lead_brake`. For a time rho the own car still speeds
+up. This is the distance of responsibility-sensitive safety (RSS), with the actuator's lag:
 
     d < clearance + v rho + a' rho^2 / 2 + stop(v + a' rho, a') - w^2 / (2 b_lead)
 
-It does so while a reading is distrusted or missing, and for `watch` seconds after: what slowed the car down left it where its controller,
-which accelerates to close the gap while the car ahead stops, may be unsafe by itself.
+It does so while a reading is distrusted or missing, and for `watch` seconds after. A car that was slowed down has a large gap: its
+controller accelerates to close it while the car ahead may stop, and may be unsafe by itself.
 
-stop(v, a) is the way to a standstill of a first-order lag tau whose command is -b from now on, with c = a + b:
+stop(v, a) is the way to a standstill through a first-order lag tau under the constant command -b, with c = a + b:
 
     v(t) = v - b t + c tau (1 - e),        way(t) = v t - b t^2 / 2 + c tau t - c tau^2 (1 - e),        e = exp(-t / tau)
 """

@@ -5,9 +5,9 @@ reading y, accurate to e, is tested on its own against the box P that was predic
 
     w+ in w + [a_min, a_max] dt        d+ in d + (w + w+) dt / 2 - s        |y - mid P| <= e + half P, else an attack
 
-s is the way of the own car in the step: its exact average speed, times dt. With the speed at the end of the step in its place the box loses
-the truth whenever the car brakes. A reading that passes is intersected with P; one that does not is not, nor are those of its sensor after
-it, until `recover` seconds of them passed in a row. Until then the box grows as the dynamics allow.
+s is the way of the own car in the step: its exact average speed, times dt. With the speed at the end of the step, the box would lose the
+truth whenever the car brakes. A reading that passes is intersected with P. After one that fails, the sensor's readings are ignored
+until `recover` seconds of them passed in a row; meanwhile the box grows as the dynamics allow.
 
 Where no message gives w, the gaps do. With h_j = d - j dt w,
 

@@ -205,7 +205,7 @@ def pair_of(answer: object) -> tuple[Any, Estimate]:
     """Return the pair (state, Estimate) of a defence's step; raise InputError for anything else."""
     if not isinstance(answer, tuple) or len(answer) != 2 or not isinstance(answer[1], Estimate):
         got = f"({', '.join(type(part).__name__ for part in answer)})" if type(answer) is tuple else type(answer).__name__
-        raise InputError("defence output", got, "a pair (state, Estimate), which its step returns")
+        raise InputError("defence output", got, "a pair (state, Estimate) as the result of its step")
     return answer[0], answer[1]
 
 

@@ -1,9 +1,9 @@
 """Optimal attackers where they can be computed: a budget of losses against a Kalman filter, and a held reading in a scalar loop.
 
 Lost readings. The covariance of the filter follows P+ = F(P) where the readings come and P+ = A P A' + Q where they are lost. Both maps are
-monotone in the Loewner order, and a loss is never below a reading. So of two attackers with the same steps left, the one with the larger
-covariance is never worse off, whatever follows, and the other can be dropped: dynamic programming over sets of covariances. Both maps are
-also concave, so that F((1 + s) P) <= (1 + s) F(P): dropping what is below (1 + s) times another costs at most that factor in each step.
+monotone in the Loewner order, and a loss is never below a reading. Compare two attackers with the same steps left: the one with the larger
+covariance is never worse off, so that the other can be dropped. This is dynamic programming over sets of covariances. Both maps are also
+concave, so that F((1 + s) P) <= (1 + s) F(P): dropping what is below (1 + s) times another costs at most that factor in each step.
 
 One state has one covariance per number of steps left. With |a| >= 1 the whole budget in one block at the end is then the best for the last
 covariance: exchanging a loss and a later reading never helps. It is the answer of H. Zhang, P. Cheng, L. Shi and J. Chen (Optimal
