@@ -17,8 +17,9 @@ try:
 except ImportError as error:
     raise ImportError("torch or Stable-Baselines3 is missing: pip install 'tailgate[train]'") from error
 
+from tailgate.agents.learners.exploring import Explorer
 from tailgate.agents.learners.learning import DISCRETE
-from tailgate.agents.learners.stable import Explorer, OffPolicyConfig, OffPolicyLearner, perceptron
+from tailgate.agents.learners.stable import OffPolicyConfig, OffPolicyLearner, perceptron
 from tailgate.core import Array, Positive, PositiveCount, Probability, param
 from tailgate.core.neural import Network
 from tailgate.core.registry import register

@@ -39,6 +39,15 @@ class Config(Protocol):
         """Raise InputError when the fields do not fit each other."""
 
 
+class BatchConfig(Config, Protocol):
+    """Hyper-parameters of a learner that plays a batch of environments."""
+
+    @property
+    def envs(self) -> int: ...
+    @property
+    def learning_rate(self) -> float: ...
+
+
 class Learner(Protocol):
     """One training run of one seed. Resumed from a checkpoint it gives the policy of an uninterrupted one.
 

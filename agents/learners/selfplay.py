@@ -13,7 +13,7 @@ from tailgate.core import Array, Attack
 from tailgate.core.draws import Keys
 from tailgate.core.neural import Network
 from tailgate.core.schema import digest
-from tailgate.envs.gym.duel import Duel, Rival
+from tailgate.envs.gym.duel import Attacker, Duel
 from tailgate.envs.gym.mixture import Mixture
 from tailgate.estimators.challenge.steered import save_defender
 from tailgate.estimators.challenge.steering import nearest
@@ -30,7 +30,7 @@ class Played(NamedTuple):
 
 def play(duel: Duel, attack: Attack, keys: Keys, choose: Callable[[Array], Array] | None = None, gamma: float = 1.0) -> Played:
     """Play a game per key. choose: from the defenders' view (B, d) to their actions; None leaves the knobs to the defence."""
-    state, rival = duel.begin(keys), Rival(attack, duel.seat, keys)
+    state, attacker = duel.begin(keys), Attacker(attack, duel.seat, keys)
     paid, cost, crashed = (np.zeros(len(keys.key)) for _ in range(3))
     decisions, weight = 0, 1.0
     for _ in range(duel.seat.decisions):
@@ -39,7 +39,7 @@ def play(duel: Duel, attack: Attack, keys: Keys, choose: Callable[[Array], Array
             break
         decisions += int(np.count_nonzero(~over))
         action = None if choose is None else choose(duel.defender_sees(state))
-        state, outcome, gained, _ = duel.step(state, rival, action, over)
+        state, outcome, gained, _ = duel.step(state, attacker, action, over)
         hit = (outcome.collided | outcome.rear_collided) & ~over
         paid += weight * gained
         cost -= gained + hit

@@ -14,7 +14,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -22,7 +22,6 @@ try:
     import torch
     from stable_baselines3.common.callbacks import BaseCallback
     from stable_baselines3.common.logger import Logger
-    from stable_baselines3.common.noise import ActionNoise
     from stable_baselines3.common.save_util import recursive_getattr
 except ImportError as error:
     raise ImportError("torch or Stable-Baselines3 is missing: pip install 'tailgate[train]'") from error
@@ -30,7 +29,17 @@ from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
 from scipy.stats import norm
 
-from tailgate.agents.learners.learning import CONTINUOUS, DISCRETE, SEED_STRIDE, Progress, check_action, header_of, open_checkpoint
+from tailgate.agents.learners.exploring import Explorer
+from tailgate.agents.learners.learning import (
+    CONTINUOUS,
+    DISCRETE,
+    SEED_STRIDE,
+    BatchConfig,
+    Progress,
+    check_action,
+    header_of,
+    open_checkpoint,
+)  # fmt: skip
 from tailgate.agents.policy.network_policy import save_policy
 from tailgate.base.errors import InputError
 from tailgate.base.files import write_atomic
@@ -38,24 +47,12 @@ from tailgate.base.sizes import Episodes, Passes, Rows, Width
 from tailgate.core import Array, Positive, PositiveCount, Probability, param
 from tailgate.core.neural import Network
 from tailgate.core.schema import canonical
-from tailgate.envs.gym.actions import ActionCodec
 from tailgate.envs.gym.attacker_mdp import Seat
 from tailgate.envs.gym.sb3 import BatchVecEnv
 
 # torch's words for a distribution whose parameters are not finite, for probabilities that are not, and for a step beyond single precision
 SPOILT = ("found invalid values", "probability tensor contains", "without overflow")
 COUNTERS = ("_n_updates", "_n_calls", "_episode_num")  # counters of the algorithms, where they have them
-
-
-class StableConfig(Protocol):
-    """The hyper-parameters that every learner has."""
-
-    @property
-    def envs(self) -> int: ...
-    @property
-    def learning_rate(self) -> float: ...
-    def check(self) -> None:
-        """Raise InputError when the fields do not fit each other."""
 
 
 class StableLearner:
@@ -66,7 +63,7 @@ class StableLearner:
     packages: ClassVar[tuple[str, ...]] = ("torch", "stable-baselines3")
     traits: ClassVar[dict[str, bool]] = {}  # further fields of the policy's header
 
-    def __init__(self, seed: int, gamma: float, config: StableConfig, environment: dict[str, Any], tensorboard: Path | None = None) -> None:
+    def __init__(self, seed: int, gamma: float, config: BatchConfig, environment: dict[str, Any], tensorboard: Path | None = None) -> None:
         torch.set_num_threads(1)  # more threads gain nothing on networks of this size
         config.check()
         if config.envs > SEED_STRIDE:
@@ -82,8 +79,6 @@ class StableLearner:
         self.curve: list[dict[str, Any]] = []
         # rows start together and end together: a window of two batches of episodes is steady, one rollout's are not
         self.ended: deque[tuple[bool, float]] = deque(maxlen=2 * config.envs)
-
-    # -- what a subclass says
 
     @abstractmethod
     def make_model(self, tensorboard: str | None) -> Any:
@@ -104,8 +99,6 @@ class StableLearner:
 
     def restore(self, arrays: dict[str, Array]) -> None:
         """Restore what `held` returned."""
-
-    # -- the learner
 
     @property
     def seat(self) -> Seat:
@@ -325,35 +318,6 @@ class OffPolicyConfig:
             raise InputError(f"{self.name}.buffer_size", self.buffer_size, f"at least envs x (n_steps + 1) ({least})")
         if self.batch_size < 2:
             raise InputError(f"{self.name}.batch_size", self.batch_size, "at least 2")
-
-
-class Explorer:
-    """Random actions that attack with probability `attack`, independently in each row."""
-
-    def __init__(self, codec: ActionCodec, attack: float, seed: int) -> None:
-        self.codec, self.attack, self.rng = codec, attack, np.random.default_rng(seed)
-
-    def actions(self, rows: int) -> Array:
-        """Return random actions, (rows,) int64 or (rows, size) float32."""
-        attacks = self.rng.random(rows) < self.attack
-        if self.codec.discrete:
-            return np.where(attacks, self.rng.integers(1, self.codec.size, rows), 0)
-        out = self.rng.uniform(-1.0, 1.0, (rows, self.codec.size)).astype(np.float32)
-        out[:, 0] = np.where(attacks, 1.0, -1.0) * np.abs(out[:, 0])
-        return out
-
-
-class Exploring:
-    """Mixed into an algorithm with a replay buffer: before learning starts its actions are the explorer's."""
-
-    explorer: Explorer
-
-    def _sample_action(self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1) -> tuple[Array, Array]:
-        algorithm: Any = super()
-        if self.num_timesteps >= learning_starts:  # type: ignore[attr-defined]
-            return algorithm._sample_action(learning_starts, action_noise, n_envs)  # type: ignore[no-any-return]
-        action = self.explorer.actions(n_envs)
-        return action, action
 
 
 class OffPolicyLearner(StableLearner):

@@ -53,7 +53,7 @@ class DuelState(NamedTuple):
     seen: Array  # (B, d) float32: the attacker's observation
 
 
-class Rival:
+class Attacker:
     """An attack with its memory over B episodes."""
 
     def __init__(self, attack: Attack, seat: Seat, keys: Keys) -> None:
@@ -156,7 +156,7 @@ class Duel:
         return self.seat.action.mask(self.seat.loop.sense(state.loop))
 
     def step(
-        self, state: DuelState, attack: Array | Rival, defend: Array | None, over: Array
+        self, state: DuelState, attack: Array | Attacker, defend: Array | None, over: Array
     ) -> tuple[DuelState, Outcome, Array, Frame]:
         """Play one decision of both; return state, outcome, the defender's reward and the last step.
 
@@ -168,7 +168,7 @@ class Duel:
         loop = state.loop
         if defend is not None:
             loop = loop._replace(defence=self.guard.steer(self.plan, loop.defence, self.values(defend)))
-        before, decision = loop, attack.decide if isinstance(attack, Rival) else attack
+        before, decision = loop, attack.decide if isinstance(attack, Attacker) else attack
         loop, tally, outcome, frame = self.seat.step(loop, state.tally, decision, over)
         seen = self.seat.observation.observe(self.seat.loop.sense(loop), state.seen)
         return DuelState(loop, tally, seen), outcome, self._paid(before, loop, outcome, over), frame
@@ -243,9 +243,9 @@ class DefenderEnv(Specified, gymnasium.Env[Array, Any]):
         if not some:
             raise InputError("attack", attack, "at least one attack")
         made = [Spec("attack", held).make() if isinstance(held, str) else held for held in some]
-        if not all(callable(getattr(rival, name, None)) for rival in made for name in ("prepare", "start", "decide")):
+        if not all(callable(getattr(player, name, None)) for player in made for name in ("prepare", "start", "decide")):
             raise InputError("attack", attack, "a registered name, a policy's file, or an object with prepare, start and decide")
-        known = [getattr(rival, "knowledge", entry_for("attack", type(rival)).knowledge) for rival in made]
+        known = [getattr(player, "knowledge", entry_for("attack", type(player)).knowledge) for player in made]
         arguments.setdefault("knowledge", max(known, key=("black", "grey", "white").index))
         self.duel = Duel.make(**arguments)
         self.attack: Attack = made[0] if len(made) == 1 else Mixture(tuple(made))
@@ -253,7 +253,7 @@ class DefenderEnv(Specified, gymnasium.Env[Array, Any]):
         self.observation_space, self.action_space = self.duel.defender_spaces()
         self.horizon = self.duel.seat.decisions
         self.state: DuelState | None = None
-        self.rival: Rival | None = None
+        self.attacker: Attacker | None = None
         self.over = np.zeros(1, bool)
 
     def card(self) -> dict[str, Any]:
@@ -264,13 +264,13 @@ class DefenderEnv(Specified, gymnasium.Env[Array, Any]):
         check_options(options)
         super().reset(seed=seed)
         self.state = next_game(self.duel, self.state, seed, self.np_random)
-        self.rival, self.over = Rival(self.attack, self.duel.seat, self.state.loop.keys), np.zeros(1, bool)
+        self.attacker, self.over = Attacker(self.attack, self.duel.seat, self.state.loop.keys), np.zeros(1, bool)
         return self.duel.defender_sees(self.state)[0].copy(), self.duel.told(self.state)
 
     def step(self, action: ArrayLike) -> tuple[Array, float, bool, bool, dict[str, Any]]:
-        if self.state is None or self.rival is None or self.over.any():
+        if self.state is None or self.attacker is None or self.over.any():
             raise InputError("step", "no episode", "reset() first")
-        self.state, outcome, paid, _ = self.duel.step(self.state, self.rival, checked(self.action_space, action, "defender"), self.over)
+        self.state, outcome, paid, _ = self.duel.step(self.state, self.attacker, checked(self.action_space, action, "defender"), self.over)
         self.over = outcome.terminated | outcome.truncated
         seen = self.duel.defender_sees(self.state)[0].copy()
         return seen, float(paid[0]), bool(outcome.terminated[0]), bool(outcome.truncated[0]), self.duel.told(self.state)

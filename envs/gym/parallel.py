@@ -21,7 +21,7 @@ from tailgate.envs.gym.observations import LIMIT
 from tailgate.envs.gym.specs import check_options, limit_of
 from tailgate.envs.render.viewer import Screen, Viewer
 
-ATTACKER, GUARD = "attacker", "defender"
+ATTACKER, DEFENDER = "attacker", "defender"
 
 
 class DuelEnv(ParallelEnv[str, Array, Any]):  # type: ignore[misc]
@@ -39,12 +39,12 @@ class DuelEnv(ParallelEnv[str, Array, Any]):  # type: ignore[misc]
             raise InputError("render_mode", render_mode, "None, 'rgb_array' or 'human'")
         self.max_cycles, self.cycles = limit_of("max_cycles", max_cycles), 0  # decisions of a game at most, and of the present one so far
         self.duel, self.render_mode, self.viewer = Duel.make(**arguments), render_mode, Viewer(viewer, size)
-        self.possible_agents = [ATTACKER, GUARD]
+        self.possible_agents = [ATTACKER, DEFENDER]
         self.agents: list[str] = []
         sight, act = self.duel.defender_spaces()
         seen = gymnasium.spaces.Box(-LIMIT, LIMIT, (len(self.duel.seat.observation.names),), np.float32)
-        self.observation_spaces = {ATTACKER: seen, GUARD: sight}
-        self.action_spaces = {ATTACKER: action_space(self.duel.seat.action), GUARD: act}
+        self.observation_spaces = {ATTACKER: seen, DEFENDER: sight}
+        self.action_spaces = {ATTACKER: action_space(self.duel.seat.action), DEFENDER: act}
         self.state_space = gymnasium.spaces.Box(-LIMIT, LIMIT, (seen.shape[0] + sight.shape[0],), np.float32)
         self.metadata = self.metadata | {"render_fps": round(1.0 / self.duel.seat.loop.model.dt)}
         self._screen, self._moves = Screen(), 0  # the second: resets and steps so far
@@ -87,7 +87,7 @@ class DuelEnv(ParallelEnv[str, Array, Any]):  # type: ignore[misc]
         self.cycles += 1
         terminated, truncated = bool(outcome.terminated[0]), bool(outcome.truncated[0]) or self.cycles == self.max_cycles
         infos = self._infos(*(part[0] for part in (outcome.illegal, outcome.collided, outcome.rear_collided)))
-        rewards = {ATTACKER: float(outcome.reward[0]), GUARD: float(paid[0])}
+        rewards = {ATTACKER: float(outcome.reward[0]), DEFENDER: float(paid[0])}
         out = self._observed(), rewards, dict.fromkeys(self.agents, terminated), dict.fromkeys(self.agents, truncated), infos
         if terminated or truncated:
             self.agents = []
@@ -125,18 +125,18 @@ class DuelEnv(ParallelEnv[str, Array, Any]):  # type: ignore[misc]
 
     def _observed(self) -> dict[str, Array]:
         assert self.game is not None
-        return {ATTACKER: self.game.seen[0].copy(), GUARD: self.duel.defender_sees(self.game)[0].copy()}
+        return {ATTACKER: self.game.seen[0].copy(), DEFENDER: self.duel.defender_sees(self.game)[0].copy()}
 
     def _infos(self, illegal: np.bool_, collided: np.bool_, rear: np.bool_) -> dict[str, dict[str, Any]]:
         """Return the information by agent: the attacker learns what happened, the defender has only its own means."""
         assert self.game is not None
-        told: dict[str, Any] = {"illegal": illegal, "collided": collided, "rear_collided": rear, "step": self.game.loop.k[0]}
-        guard = self.duel.told(self.game)
+        attacker: dict[str, Any] = {"illegal": illegal, "collided": collided, "rear_collided": rear, "step": self.game.loop.k[0]}
+        defender = self.duel.told(self.game)
         if self.duel.seat.action.discrete:
-            told["action_mask"] = self.duel.mask(self.game)[0].astype(np.int8)
+            attacker["action_mask"] = self.duel.mask(self.game)[0].astype(np.int8)
         if self.duel.action == "menu":
-            guard["action_mask"] = np.ones(len(self.duel.settings), np.int8)  # each setting may be chosen at any time
-        return {ATTACKER: told, GUARD: guard}
+            defender["action_mask"] = np.ones(len(self.duel.settings), np.int8)  # each setting may be chosen at any time
+        return {ATTACKER: attacker, DEFENDER: defender}
 
 
 def parallel_env(**arguments: Any) -> DuelEnv:

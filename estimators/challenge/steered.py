@@ -134,7 +134,7 @@ class Steered:
         return first.menu
 
     @cached_property
-    def guarded(self) -> Any:
+    def inner_defence(self) -> Any:
         """The defence whose knobs are turned."""
         data, where = (self._loaded[0][0].defence, f"defender {self.paths[0].name}") if self._loaded else (self.defence, "defence steered")
         where = f"{where}.defence"
@@ -154,7 +154,7 @@ class Steered:
     @cached_property
     def hand(self) -> Hand:
         """The defence with its knobs."""
-        hand = Hand.on(self.guarded, self.menu_used)
+        hand = Hand.on(self.inner_defence, self.menu_used)
         count = math.prod(len(knob.levels) for knob in hand.knobs)
         if count > SETTINGS:
             where = f"defender {self.paths[0].name}" if self._loaded else "defence steered"
@@ -164,8 +164,8 @@ class Steered:
     @property
     def described(self) -> dict[str, Any]:
         """The defence whose knobs are turned, as a mapping with name and parameters."""
-        params = {key: value for key, value in as_data(self.guarded).items() if key != "class"}
-        return {"name": entry_for("defence", type(self.guarded)).name, **params}
+        params = {key: value for key, value in as_data(self.inner_defence).items() if key != "class"}
+        return {"name": entry_for("defence", type(self.inner_defence)).name, **params}
 
     def prepare(self, model: Model) -> SteeredPlan:
         hand = self.hand

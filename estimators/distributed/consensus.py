@@ -28,7 +28,7 @@ from tailgate.core.reach import MARGIN, blind
 from tailgate.core.registry import register
 from tailgate.estimators.compose import AcceptAll, Composed
 from tailgate.estimators.distributed.distributed_kalman import ALARM, DistributedFilter, FusionPlan, gate_of, neighbours, one_row
-from tailgate.estimators.filters.kalman import KalmanState, alone
+from tailgate.estimators.filters.kalman import KalmanState, alone, updated
 from tailgate.estimators.parts import Detector, Filter, Mitigation
 
 REFERENCE = "R. Olfati-Saber, Kalman-Consensus Filter: Optimality, Stability, and Performance, CDC 2009"
@@ -85,11 +85,8 @@ class ConsensusFilter(DistributedFilter):
                 keep = accept[:, j] if len(known) > 1 else accept[:1, j]
                 cross = num.matmul(plan.C[j], P_i) * keep[..., None]
                 S = alone(num.matmul(cross, plan.C[j].T) + plan.R[j], keep)
-                K = num.transpose(num.matmul(num.inverse(S), cross))
                 r = innovation.r[:, j] + num.matvec(plan.C[j][None], state.x[:, j] - x[:, i])
-                x[:, i] += num.matvec(K, r * accept[:, j])
-                P_i = P_i - num.matmul(K, cross)
-                P_i = 0.5 * (P_i + num.transpose(P_i))
+                x[:, i], P_i = updated(x[:, i], P_i, r * accept[:, j], S, cross)
             P[:, i] = P_i
         return KalmanState(x, np.broadcast_to(P, state.P.shape))
 

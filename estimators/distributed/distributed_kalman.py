@@ -27,7 +27,7 @@ from tailgate.core.reach import require_detectable
 from tailgate.core.registry import register
 from tailgate.estimators.compose import AcceptAll, Composed, GateOut, Score
 from tailgate.estimators.detectors.chi_square import ChiSquare
-from tailgate.estimators.filters.kalman import GAIN, Gain, KalmanState, LinearFilter, alone, broad, precision, riccati
+from tailgate.estimators.filters.kalman import GAIN, Gain, KalmanState, LinearFilter, alone, broad, gain_of, precision, riccati, updated
 from tailgate.estimators.parts import Detector, Filter, Memoryless, Mitigation, Verdict, blame_all
 
 SWEEPS = 200
@@ -241,12 +241,10 @@ class DistributedFilter(LinearFilter[FusionPlan]):
         assert state.P is not None
         known = one_row(state.P)
         if len(known) < len(r) and num.every(accept) and len(one_row(S)) == 1:
-            cross = num.matmul(plan.C, known)
-            K = gain_of(S[:1], cross)
-            P = known - num.matmul(K, cross)
-            P = np.broadcast_to(0.5 * (P + num.transpose(P)), state.P.shape)
-            return KalmanState(state.x + num.matvec(K, r), P if plan.held is None else None)
-        x, P = num.corrected(plan.C, num.inverse(alone(S, accept)), state.x, known, r, accept)
+            x, P = updated(state.x, known, r, S[:1], num.matmul(plan.C, known))
+            P = np.broadcast_to(P, state.P.shape)
+        else:
+            x, P = num.corrected(plan.C, num.inverse(alone(S, accept)), state.x, known, r, accept)
         return KalmanState(x, P if plan.held is None else None)
 
     def _predicted(self, plan: FusionPlan, state: KalmanState) -> Array:
@@ -261,11 +259,6 @@ def one_row(P: Array) -> Array:
 def shared(P: Array) -> Array:
     """Return P (B, ...) with its rows shared in memory where they are all equal."""
     return np.broadcast_to(P[:1], P.shape) if len(P) > 1 and (P[:1] == P).all() else P
-
-
-def gain_of(S: Array, cross: Array) -> Array:
-    """Return P- C' S^-1 (..., n, q) from C P- (..., q, n), in the order of the Kalman filter's update, to the last bit."""
-    return num.transpose(num.matmul(num.inverse(S), cross))
 
 
 def _corrected(x: Array, r: Array, S: Array, cross: Array, accept: Array) -> Array:

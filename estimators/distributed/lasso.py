@@ -19,13 +19,12 @@ noise of 1, has 0.1. With 0.1 the braking platoon cannot follow its brakes: half
 from dataclasses import dataclass
 from typing import Literal
 
-from tailgate import num
 from tailgate.core import Array, Innovation, Positive, param
 from tailgate.core.registry import register
 from tailgate.estimators.compose import AcceptAll, Composed, Score
 from tailgate.estimators.distributed.distributed_kalman import DistributedFilter, FusionPlan
-from tailgate.estimators.filters.kalman import GAIN, Gain, KalmanState, alone
-from tailgate.estimators.filters.robust import Solved, believed, believed_by_cvxpy
+from tailgate.estimators.filters.kalman import GAIN, Gain, KalmanState
+from tailgate.estimators.filters.robust import Solved
 from tailgate.estimators.parts import Detector, Filter, Mitigation
 
 
@@ -47,11 +46,7 @@ class LassoFilter(Lasso, DistributedFilter):
     steady: bool = param(True, "hold gain and covariance where they settle when nothing is missed")
 
     def update(self, plan: FusionPlan, state: KalmanState, innovation: Innovation, accept: Array) -> KalmanState:
-        r, S = innovation
-        if not num.every(accept):
-            r, S = r * accept, alone(S, accept)
-        solve = believed if self.solver == "exact" else believed_by_cvxpy
-        return super().update(plan, state, Innovation(solve(r, S, self.price(S)), S), accept)
+        return super().update(plan, state, self.cleaned(innovation, accept), accept)
 
 
 @register("defence", "lasso_dkf", reference="Dutta 2018, (6.26)")

@@ -138,10 +138,10 @@ def weigh(logs: Sequence[Array]) -> tuple[Array, Array]:
     total = _total(weights)
     if len(logs) == 1:
         return num.stack([weights[0] / total]), np.zeros_like(total)
-    rival = logs[1]
+    other = logs[1]
     for log in logs[2:]:
-        rival = np.maximum(rival, log)
-    odds = rival + num.log(_total([num.exp(log - rival) for log in logs[1:]])) - logs[0]
+        other = np.maximum(other, log)
+    odds = other + num.log(_total([num.exp(log - other) for log in logs[1:]])) - logs[0]
     return num.stack([w / total for w in weights]), odds
 
 

@@ -86,6 +86,18 @@ def _marginal(S: Array, keep: Array) -> Array:
     return out
 
 
+def gain_of(S: Array, cross: Array) -> Array:
+    """Return the gain P- C' S^-1 (..., n, q) from S (..., q, q) and C P- (..., q, n)."""
+    return num.transpose(num.matmul(num.inverse(S), cross))
+
+
+def updated(x: Array, P: Array, r: Array, S: Array, cross: Array) -> tuple[Array, Array]:
+    """Return x (..., n) and P (..., n, n) after the update (4.7) with the innovation r (..., q), from S and `cross` = C P-."""
+    K = gain_of(S, cross)
+    P = P - num.matmul(K, cross)
+    return x + num.matvec(K, r), 0.5 * (P + num.transpose(P))
+
+
 def precision(R: Array) -> Array:
     """Return R^-1 (q, q). Raise NotApplicable where a reading has no noise: the filter divides by it."""
     told = R.diagonal()
@@ -202,12 +214,9 @@ class LinearFilter(Generic[L]):
             cross = cross * keep[..., None]
             S = alone(S, accept)
             r = r * keep
-        K = num.transpose(num.matmul(num.inverse(S), cross))
-        x = state.x + num.matvec(K, r)
         if state.P is None or plan.held is not None:
-            return KalmanState(x, None)
-        P = state.P - num.matmul(K, cross)
-        return KalmanState(x, 0.5 * (P + num.transpose(P)))
+            return KalmanState(state.x + num.matvec(gain_of(S, cross), r), None)
+        return KalmanState(*updated(state.x, state.P, r, S, cross))
 
     def forget(self, plan: L, state: KalmanState, where: Array) -> KalmanState:
         """Return the state with the broad covariance in the rows of `where` (B, N); a steady filter forgets for this one step."""

@@ -204,6 +204,14 @@ class Solved(Penalty):
         if self.solver == "cvxpy":
             load_cvxpy()  # missing: say so here, not in the first step
 
+    def cleaned(self, innovation: Innovation, accept: Array) -> Innovation:
+        """Return the innovation of the sensors in `accept` (B, N, q), less its outliers."""
+        r, S = innovation
+        if not num.every(accept):
+            r, S = r * accept, alone(S, accept)
+        solve = believed if self.solver == "exact" else believed_by_cvxpy
+        return Innovation(solve(r, S, self.price(S)), S)
+
 
 @register("filter", "rkf", reference="Mattingley and Boyd, Real-time convex optimization in signal processing, 2010; Dutta 2018, [29]")
 @dataclass(frozen=True)
@@ -214,11 +222,7 @@ class RobustKalmanFilter(Solved, LinearFilter):
         return kalman_plan(model, steady=True)
 
     def update(self, plan: KalmanPlan, state: KalmanState, innovation: Innovation, accept: Array) -> KalmanState:
-        r, S = innovation
-        if not num.every(accept):
-            r, S = r * accept, alone(S, accept)
-        solve = believed if self.solver == "exact" else believed_by_cvxpy
-        return super().update(plan, state, Innovation(solve(r, S, self.price(S)), S), accept)
+        return super().update(plan, state, self.cleaned(innovation, accept), accept)
 
 
 @register("detector", "outlier", reference="Mattingley and Boyd 2010: the optimality condition of z = 0")

@@ -17,7 +17,7 @@ from tailgate import num
 from tailgate.base.errors import InputError, NotApplicable
 from tailgate.core import Array, Finite, Model, NonNegative, Positive, Received, param
 from tailgate.core.registry import register
-from tailgate.estimators.compose import Gate, M, ModeName, ReactionPlan, X, quiet
+from tailgate.estimators.compose import Gate, GateOut, M, ModeName, ReactionPlan, X, quiet
 from tailgate.estimators.parts import Decision, Verdict
 
 OWN = ("distance", "velocity", "acceleration")
@@ -43,7 +43,7 @@ class Choice(Gate[M, X]):
 
 @register("mitigation", "acc_fallback")
 @dataclass(frozen=True, kw_only=True)
-class AccFallback(Choice[Array]):
+class AccFallback(Choice[Array], GateOut):
     """Uses no messages while alarmed and for some time after: the cars' controllers fall back to their own sensors and estimates."""
 
     mode: ModeName = param("acc", "what is asked of the controller while alarmed: normal, widen, brake, stop or acc")
@@ -51,12 +51,6 @@ class AccFallback(Choice[Array]):
     def prepare(self, model: Model) -> ReactionPlan:
         require_string(model, "acc_fallback")
         return super().prepare(model)
-
-    def begin(self, plan: ReactionPlan, batch: int) -> Array | None:
-        return self.gates(plan, batch)
-
-    def choose(self, plan: ReactionPlan, state: Array | None, verdict: Verdict, received: Received) -> tuple[Array | None, Decision]:
-        return self.gated(state, verdict, received)
 
 
 class LocalPlan(NamedTuple):

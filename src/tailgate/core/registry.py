@@ -216,9 +216,8 @@ def make_from(family: Family, data: object, where: str) -> Any:
 class Spec:
     """A component as a user names it: text that a row can record and another process can rebuild.
 
-    `name`, `name:key=value,key=value`, `module:Class`, `module:Class:key=value`, or (attacks) the JSON file of an exported policy or the
-    YAML file of a program. `part.key=value` is a parameter of the part that another
-    parameter names. A defence may stand behind a sandbox: `bwrap/module:Class`.
+    `name`, `name:key=value,key=value`, `module:Class`, `module:Class:key=value`, or (attacks) the JSON file of a policy or the YAML file of
+    a program. `part.key=value` is a parameter of a part that another parameter names. `bwrap/module:Class` is a defence in a sandbox.
     """
 
     family: Family
