@@ -1,10 +1,10 @@
-"""What the leader does: its acceleration [m/s^2] at each step."""
+"""Manoeuvres of the leader: its acceleration [m/s^2] at each step."""
 
 import csv
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,13 +22,13 @@ def _within(span: tuple[float, float], u: Array) -> Array:
 
 
 def between(t: Array, begin: float, end: float, value: float, otherwise: float) -> Array:
-    """`value` [m/s^2] from the time `begin` until `end` [s], `otherwise` before and after, elementwise."""
+    """Return `value` [m/s^2] from the time `begin` until `end` [s], `otherwise` before and after, elementwise."""
     out: Array = np.where((t >= begin) & (t < end), value, otherwise)
     return out
 
 
 def halt(t: Array, onset: Array, decel: float, speed: Array, dt: float) -> Array:
-    """Braking with `decel` from the time `onset` [s] until the vehicle stands, elementwise [m/s^2]."""
+    """Return a braking with `decel` from the time `onset` [s] until the vehicle stops, elementwise [m/s^2]."""
     out: Array = np.where(t >= onset, np.maximum(-decel, -speed / dt), 0.0)
     return out
 
@@ -37,20 +37,20 @@ CRUISE, BRAKE, DWELL, SPEED_UP = 0, 1, 2, 3  # phases of stop and go, in this or
 
 
 def phase_over(phase: Array, clock: Array, speed: Array, low: float, high: float) -> Array:
-    """Whether a phase of stop and go ends, elementwise: braking and speeding up at a speed [m/s], the others by the clock."""
+    """Return if a phase of stop and go ends, elementwise: braking and speeding up at a speed [m/s], the others by the clock."""
     out: Array = np.where(phase == BRAKE, speed <= low, np.where(phase == SPEED_UP, speed >= high, clock <= 0.0))
     return out
 
 
 def stop_and_go(phase: Array, speed: Array, low: float, high: float, decel: float, rate: float, dt: float) -> Array:
-    """Acceleration in a phase of stop and go [m/s^2], elementwise; no more than it takes to the speed at which the phase ends."""
+    """Return the acceleration in a phase of stop and go [m/s^2], elementwise; no more than the phase's last speed needs."""
     slow, fast = np.maximum(-decel, (low - speed) / dt), np.minimum(rate, (high - speed) / dt)
     out: Array = np.where(phase == BRAKE, slow, np.where(phase == SPEED_UP, fast, 0.0))
     return out
 
 
 def drawn_back(a: Array, speed: Array, mean_speed: float, pull: float, limit: float) -> Array:
-    """A random acceleration a and the return to the mean speed, within the limit [m/s^2], elementwise."""
+    """Return a random acceleration a plus the return to the mean speed, within the limit [m/s^2], elementwise."""
     out: Array = num.clip(a + pull * (mean_speed - speed), -limit, limit)
     return out
 
@@ -62,13 +62,13 @@ class Constant:
 
     value: Accel = param(-0.108, "acceleration [m/s^2]")
 
-    def prepare(self, dt: float) -> Any:
+    def prepare(self, dt: float) -> None:
         return None
 
-    def start(self, plan: Any, draws: Draws) -> Any:
+    def start(self, plan: None, draws: Draws) -> None:
         return None
 
-    def accel(self, plan: Any, state: Any, k: Array, speed: Array, draws: Draws) -> tuple[Any, Array]:
+    def accel(self, plan: None, state: None, k: Array, speed: Array, draws: Draws) -> tuple[None, Array]:
         return None, np.full(len(k), self.value)
 
 
@@ -114,7 +114,7 @@ class Switched:
 
 
 class SinePlan(NamedTuple):
-    cos: float  # of the angle of one step
+    cos: float  # cosine of the angle of one step
     sin: float
 
 
@@ -141,7 +141,7 @@ class Sine:
         return SineState(np.ones(batch), np.zeros(batch))
 
     def accel(self, plan: SinePlan, state: SineState, k: Array, speed: Array, draws: Draws) -> tuple[SineState, Array]:
-        """The angle is turned from step to step: no library's cosine, whose last bits may depend on the batch."""
+        """Turn the angle from step to step: the last bits of a library's cosine may depend on the batch."""
         after = SineState(plan.cos * state.cos - plan.sin * state.sin, plan.sin * state.cos + plan.cos * state.sin)
         return after, self.amplitude * state.cos
 
@@ -257,7 +257,7 @@ class ProfilePlan(NamedTuple):
 
 
 def read_profile(path: Path) -> tuple[Array, Array]:
-    """Times [s] and speeds [m/s] of a CSV file with the header `t,v`, validated."""
+    """Return times [s] and speeds [m/s] of a CSV file with the header `t,v`, validated."""
     where = "manoeuvre profile.path"
     try:
         rows = list(csv.reader(read_bytes(path).decode("utf-8-sig").splitlines()))

@@ -26,7 +26,7 @@ def check_reaction(field: str, reaction: float, dt: float) -> None:
 
 
 def lag(dt: float, tau: float) -> tuple[Array, Array]:
-    """A (3, 3) and B (3, 1) of one vehicle's [x m, v m/s, a m/s^2] for a step dt [s] and a lag tau [s]."""
+    """Return A (3, 3) and B (3, 1) of one vehicle's [x m, v m/s, a m/s^2] for a step dt [s] and a lag tau [s]."""
     E = float(num.exp(-dt / tau))
     s1 = tau * (1.0 - E)
     A = np.array([[1.0, dt, tau * (dt - s1)], [0.0, 1.0, s1], [0.0, 0.0, E]])
@@ -34,11 +34,11 @@ def lag(dt: float, tau: float) -> tuple[Array, Array]:
 
 
 def drive(A: Array, B: Array, x: Array, v: Array, a: Array, u: Array, noise: Array) -> tuple[Array, Array, Array]:
-    """x, v, a one step later, under u [m/s^2] and noise (3, ...), elementwise."""
+    """Return x, v, a one step later, under u [m/s^2] and noise (3, ...), elementwise."""
     x_next = x + A[0][1] * v + A[0][2] * a + B[0][0] * u + noise[0]
     v_next = v + A[1][2] * a + B[1][0] * u + noise[1]
     a_next = A[2][2] * a + B[2][0] * u + noise[2]
-    halted = v_next <= 0.0  # a car that stands neither rolls back nor decelerates
+    halted = v_next <= 0.0  # a stopped car neither rolls back nor decelerates
     v_next = np.maximum(v_next, 0.0)
     a_next = np.where(halted, np.maximum(a_next, 0.0), a_next)
     x_next = np.where(halted, np.maximum(x_next, x), x_next)
@@ -46,6 +46,6 @@ def drive(A: Array, B: Array, x: Array, v: Array, a: Array, u: Array, noise: Arr
 
 
 def roll(x: Array, v: Array, a: Array, dt: float) -> tuple[Array, Array]:
-    """x and v one step later of a vehicle without lag, under its acceleration a [m/s^2], elementwise; it does not drive backwards."""
+    """Return x and v one step later of a vehicle without lag, under its acceleration a [m/s^2], elementwise; it never reverses."""
     v_next = np.maximum(0.0, v + a * dt)
     return x + 0.5 * dt * (v + v_next), v_next

@@ -2,7 +2,7 @@
 
 from tailgate.base.lazy import discovered
 
-from .compose import compose as compose  # which stands here in place of the module of its name
+from .compose import compose as compose  # the function, not the module of the same name
 from .per_episode import per_episode as per_episode  # likewise
 
 __getattr__, __dir__ = discovered(

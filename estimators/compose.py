@@ -8,36 +8,44 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Any, Generic, Literal, NamedTuple
 
 import numpy as np
+from typing_extensions import TypeVar
 
 from tailgate import num
 from tailgate.base.errors import NotApplicable
 from tailgate.core import Array, Count, Estimate, Innovation, Mode, Model, NonNegative, Prior, Received, param
 from tailgate.core.draws import Draws
-from tailgate.core.registry import imported, make_from, register
+from tailgate.core.registry import PARTS, Family, imported, make_from, register
 from tailgate.core.schema import build, fields_of
 from tailgate.estimators.parts import Decision, Detector, Filter, Mitigation, Stateless, Verdict, blame_all
 
-
-class ComposedPlan(NamedTuple):
-    filter: Filter
-    detector: Detector
-    mitigation: Mitigation
-    filter_plan: Any
-    detector_plan: Any
-    mitigation_plan: Any
+FP = TypeVar("FP", default=Any)  # the filter's plan
+FS = TypeVar("FS", default=Any)  # and state
+DP = TypeVar("DP", default=Any)  # the detector's
+DS = TypeVar("DS", default=Any)
+MP = TypeVar("MP", default=Any)  # the mitigation's
+MS = TypeVar("MS", default=Any)
 
 
-class ComposedState(NamedTuple):
-    filter: Any
-    detector: Any
-    mitigation: Any
+class ComposedPlan(NamedTuple, Generic[FP, FS, DP, DS, MP, MS]):
+    filter: Filter[FP, FS]
+    detector: Detector[DP, DS]
+    mitigation: Mitigation[MP, MS]
+    filter_plan: FP
+    detector_plan: DP
+    mitigation_plan: MP
+
+
+class ComposedState(NamedTuple, Generic[FS, DS, MS]):
+    filter: FS
+    detector: DS
+    mitigation: MS
 
 
 class Look(NamedTuple):
-    """What the defence would see of a measurement: the white-box attacker's look ahead."""
+    """The defence's view of a measurement, which a white-box attacker computes in advance."""
 
     innovation: Innovation
     gain: Array  # (B, N, n, q)
@@ -48,11 +56,11 @@ class Composed:
     """A defence made of three parts. A named one subclasses it as a dataclass and returns its parts."""
 
     def parts(self) -> tuple[Filter, Detector, Mitigation]:
-        """The filter, detector and mitigation, made from this defence's parameters."""
+        """Return the filter, detector and mitigation, made from this defence's parameters."""
         raise TypeError(f"{type(self).__name__} must define parts()")
 
     def with_threshold(self, value: float) -> Composed:
-        """This defence with its alarm threshold, or its detector's, at `value`. Raises NotApplicable where neither has one."""
+        """Return this defence with its alarm threshold, or its detector's, at `value`. Raise NotApplicable where neither has one."""
         own = getattr(self, "threshold_field", None)
         if own is not None:
             changed: Composed = dataclasses.replace(self, **{own: value})  # type: ignore[type-var]
@@ -92,7 +100,7 @@ class Composed:
         return ComposedState(belief, detector, mitigation), estimate
 
     def look(self, plan: ComposedPlan, state: ComposedState, received: Received, known_u: Array) -> Look:
-        """The innovation, gain and gate that `received` would meet; changes nothing."""
+        """Return the innovation, gain and gate that `received` would meet; change nothing."""
         belief = plan.filter.predict(plan.filter_plan, state.filter, known_u)
         innovation = plan.filter.innovation(plan.filter_plan, belief, received)
         gain = plan.filter.gain(plan.filter_plan, belief, innovation)
@@ -110,7 +118,7 @@ class _Parts(Composed):
 
 
 def compose(filter: Filter, detector: Detector, mitigation: Mitigation) -> Composed:
-    """A defence from three parts."""
+    """Return a defence from three parts."""
     return _Parts(filter, detector, mitigation)
 
 
@@ -119,9 +127,9 @@ def compose(filter: Filter, detector: Detector, mitigation: Mitigation) -> Compo
 class NamedParts(Composed):
     """A defence from three registered parts, each a name or a name with parameters: `composed:detector=cusum,detector.threshold=30`."""
 
-    filter: Any = param("kf", "filter: a name, or a mapping with name and parameters")
-    detector: Any = param("chi2", "detector: a name, or a mapping with name and parameters")
-    mitigation: Any = param("gate_out", "mitigation: a name, or a mapping with name and parameters")
+    filter: object = param("kf", "filter: a name, or a mapping with name and parameters")
+    detector: object = param("chi2", "detector: a name, or a mapping with name and parameters")
+    mitigation: object = param("gate_out", "mitigation: a name, or a mapping with name and parameters")
 
     def __post_init__(self) -> None:
         self.parts()  # a wrong name shall fail here
@@ -132,21 +140,27 @@ class NamedParts(Composed):
         return dataclasses.replace(self, detector=held | {name: value})
 
     def parts(self) -> tuple[Filter, Detector, Mitigation]:
-        return self._part("filter"), self._part("detector"), self._part("mitigation")
-
-    def _part(self, family: Any) -> Any:
-        data = getattr(self, family)
-        if isinstance(data, dict):  # a mapping without a name changes the default part
-            data = {"name": fields_of(type(self))[family].default, **data}
-        name = data.get("name") if isinstance(data, dict) else data
-        if isinstance(name, str) and ":" in name:  # Spec.imports tells those who read files and rows that it is one
-            params = {key: value for key, value in data.items() if key != "name"} if isinstance(data, dict) else {}
-            return build(imported(family, name).cls, params, f"defence composed.{family}")
-        return make_from(family, data, f"defence composed.{family}")
+        held = {"filter": self.filter, "detector": self.detector, "mitigation": self.mitigation}
+        f, d, m = (part_from(family, held[family], fields_of(type(self))[family].default, f"defence composed.{family}") for family in PARTS)
+        return f, d, m
 
 
-def threshold_field(detector: Any) -> str:
-    """The name of a detector's threshold. Raises NotApplicable where it has none."""
+def part_from(family: Family, data: object, default: str, where: str) -> Any:
+    """Return a part of a defence from its name, or a mapping with name and parameters; a name module:Class is imported.
+
+    A mapping without a name changes parameters of the part `default`.
+    """
+    if isinstance(data, dict):
+        data = {"name": default, **data}
+    name = data["name"] if isinstance(data, dict) else data
+    if isinstance(name, str) and ":" in name:  # Spec.imports lets readers of files and rows refuse it
+        params = {key: value for key, value in data.items() if key != "name"} if isinstance(data, dict) else {}
+        return build(imported(family, name).cls, params, where)
+    return make_from(family, data, where)
+
+
+def threshold_field(detector: Detector) -> str:
+    """Return the name of a detector's threshold. Raise NotApplicable where it has none."""
     name = getattr(detector, "threshold_field", None)
     if name is None:
         raise NotApplicable("threshold", type(detector).__name__, "a detector that alarms at a threshold")
@@ -158,51 +172,62 @@ def threshold_field(detector: Any) -> str:
 class Score(Stateless):
     """The normalised innovation squared r' S^-1 r as a score; never alarms."""
 
-    def step(self, plan: Any, state: Any, innovation: Innovation) -> tuple[Any, Verdict]:
+    def step(self, plan: None, state: None, innovation: Innovation) -> tuple[None, Verdict]:
         score = num.quadratic(innovation.r, num.inverse(innovation.S))
         return None, blame_all(score, np.zeros_like(score, bool), innovation)
 
-    def gate(self, plan: Any, state: Any) -> None:
+    def gate(self, plan: None, state: None) -> None:
         return None
 
 
 ModeName = Literal["normal", "widen", "brake", "stop", "acc"]
 
 
-class ReactionPlan(NamedTuple):
+M = TypeVar("M", default=None)  # memory by which a mitigation chooses the readings
+X = TypeVar("X", default=None)  # its constants besides those of every mitigation
+
+
+class ReactionPlan(NamedTuple, Generic[X]):
     agents: int
     sensors: int
     linger: int  # steps that a mode outlasts its alarm
+    own: X | None = None
 
 
-class ReactionState(NamedTuple):
+class ReactionState(NamedTuple, Generic[M]):
     left: Array | None  # (B, N) int64: steps that the mode still lasts; none where no mode is ever asked for
-    readings: Any  # what the subclass keeps to choose the readings
+    readings: M | None
 
 
 @dataclass(frozen=True, kw_only=True)
-class Reaction:
+class Reaction(Generic[M, X]):
     """Base of mitigations: a subclass's `choose` says which readings to use; the mode asked of the controller is the same for all."""
 
     mode: ModeName = param("normal", "what is asked of the controller while alarmed: normal, widen, brake, stop or acc")
     linger: NonNegative = param(2.0, "time that the mode outlasts the last alarm [s]")
 
-    def prepare(self, model: Model) -> ReactionPlan:
-        return ReactionPlan(model.agents, len(model.sensors), round(self.linger / model.dt))
+    def prepare(self, model: Model) -> ReactionPlan[X]:
+        return ReactionPlan(model.agents, len(model.sensors), round(self.linger / model.dt), self.constants(model))
 
-    def start(self, plan: ReactionPlan, batch: int) -> ReactionState:
+    def constants(self, model: Model) -> X | None:
+        """Return what `choose` reads in `plan.own`."""
+        return None
+
+    def start(self, plan: ReactionPlan[X], batch: int) -> ReactionState[M]:
         left = None if self.mode == "normal" else num.zeros((batch, plan.agents), np.int64)
         return ReactionState(left, self.begin(plan, batch))
 
-    def begin(self, plan: ReactionPlan, batch: int) -> Any:
-        """What `choose` keeps, every leaf with B first; None where it keeps nothing."""
+    def begin(self, plan: ReactionPlan[X], batch: int) -> M | None:
+        """Return the memory of `choose` at the start, every leaf with B first; None where it keeps nothing."""
         return None
 
-    def choose(self, plan: ReactionPlan, state: Any, verdict: Verdict, received: Received) -> tuple[Any, Decision]:
-        """The readings to use."""
+    def choose(self, plan: ReactionPlan[X], state: M | None, verdict: Verdict, received: Received) -> tuple[M | None, Decision]:
+        """Return the next memory and the readings to use."""
         raise TypeError(f"{type(self).__name__} must define choose()")
 
-    def step(self, plan: ReactionPlan, state: ReactionState, verdict: Verdict, received: Received) -> tuple[ReactionState, Decision]:
+    def step(
+        self, plan: ReactionPlan[X], state: ReactionState[M], verdict: Verdict, received: Received
+    ) -> tuple[ReactionState[M], Decision]:
         readings, decision = self.choose(plan, state.readings, verdict, received)
         if state.left is None:
             return ReactionState(None, readings), decision
@@ -212,7 +237,7 @@ class Reaction:
 
 
 def quiet(verdict: Verdict) -> Array:
-    """Mode.NORMAL for everybody."""
+    """Return Mode.NORMAL for everybody."""
     return np.full_like(verdict.alarm, Mode.NORMAL, np.int8)
 
 
@@ -221,28 +246,40 @@ def quiet(verdict: Verdict) -> Array:
 class AcceptAll(Reaction):
     """Uses whatever was received."""
 
-    def choose(self, plan: ReactionPlan, state: Any, verdict: Verdict, received: Received) -> tuple[Any, Decision]:
+    def choose(self, plan: ReactionPlan, state: None, verdict: Verdict, received: Received) -> tuple[None, Decision]:
         return None, Decision(received.valid, quiet(verdict))
 
 
-@register("mitigation", "gate_out", reference="Dutta 2018, Algorithm 3")
 @dataclass(frozen=True)
-class GateOut(Reaction):
-    """Ignores the suspected sensors: without any, the filter predicts open loop."""
+class Gate(Reaction[M, X]):
+    """Base of mitigations that shut out the suspected sensors, and keep them out for `latch` steps."""
 
     latch: Count = param(0, "steps that the gate stays shut after the last suspicion")
 
-    def begin(self, plan: ReactionPlan, batch: int) -> Array | None:
-        """(B, N, q) int64: steps that the gate of each sensor stays shut."""
+    def gates(self, plan: ReactionPlan[X], batch: int) -> Array | None:
+        """Return the steps (B, N, q) int64 that the gate of each sensor stays shut; None without a latch."""
         return num.zeros((batch, plan.agents, plan.sensors), np.int64) if self.latch else None
 
     def shut(self, state: Array | None, verdict: Verdict) -> tuple[Array | None, Array]:
-        """The next state, and (B, N, q) bool: the sensors whose readings are not to be used."""
+        """Return the next steps of the gates, and (B, N, q) bool: the sensors whose readings are not to be used."""
         if state is None:
             return None, verdict.suspect
         state = np.where(verdict.suspect, self.latch + 1, np.maximum(state - 1, 0))
         return state, state > 0
 
-    def choose(self, plan: ReactionPlan, state: Any, verdict: Verdict, received: Received) -> tuple[Any, Decision]:
+    def gated(self, state: Array | None, verdict: Verdict, received: Received) -> tuple[Array | None, Decision]:
+        """Return the next steps of the gates, and the decision to use what was received and is not shut out."""
         state, shut = self.shut(state, verdict)
         return state, Decision(received.valid & ~shut, quiet(verdict))
+
+
+@register("mitigation", "gate_out", reference="Dutta 2018, Algorithm 3")
+@dataclass(frozen=True)
+class GateOut(Gate[Array]):
+    """Ignores the suspected sensors: without any, the filter predicts open loop."""
+
+    def begin(self, plan: ReactionPlan, batch: int) -> Array | None:
+        return self.gates(plan, batch)
+
+    def choose(self, plan: ReactionPlan, state: Array | None, verdict: Verdict, received: Received) -> tuple[Array | None, Decision]:
+        return self.gated(state, verdict, received)

@@ -7,15 +7,12 @@ P is the type of a part's plan, S that of its state (see `tailgate.core.componen
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
-from typing_extensions import TypeVar
 
 from tailgate.core import Array, Innovation, Model, Prior, Received
-
-P = TypeVar("P", default=Any)
-S = TypeVar("S", default=Any)
+from tailgate.core.nouns import P, S
 
 
 class Verdict(NamedTuple):

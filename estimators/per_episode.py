@@ -16,31 +16,31 @@ from tailgate.core.draws import Draws
 
 
 class EpisodeFilter(Protocol):
-    """What `per_episode` adapts."""
+    """The filter of one episode that `per_episode` adapts."""
 
     def reset(self, model: Model, prior: Prior) -> None:
-        """A new episode of one agent: model.C (1, q, n), prior.mean (n,), prior.cov (n, n)."""
+        """Begin an episode of one agent: model.C (1, q, n), prior.mean (n,), prior.cov (n, n)."""
 
     def step(self, y: Array, valid: Array, u: Array) -> tuple[Array, float]:
-        """Readings y (q,), valid (q,) bool, known input u (m,) since the last step -> estimate x (n,), score."""
+        """Return the estimate x (n,) and the score after y (q,), valid (q,) bool and the known input u (m,) since the last step."""
 
 
 @runtime_checkable
 class Recalling(EpisodeFilter, Protocol):
-    """A filter that can say what it remembers: one object then plays every episode, and a state is plain numbers.
+    """A filter that can return its memory: one object then plays every episode, and a state is plain numbers.
 
     Any other is copied whole in every step, so that states stay independent of each other.
     """
 
     def memory(self) -> tuple[Array, ...]:
-        """Everything that a step changes and needs, as float arrays of fixed shapes."""
+        """Return everything that a step changes and needs, as float arrays of fixed shapes."""
 
     def recall(self, memory: tuple[Array, ...]) -> None:
         """Go on from a memory; the arrays are the filter's own."""
 
 
 class EpisodePlan(NamedTuple):
-    models: tuple[Model, ...]  # of each agent alone
+    models: tuple[Model, ...]  # model of each agent alone
     players: tuple[Recalling, ...]  # one for each agent; empty where every episode has its own
 
 
@@ -57,7 +57,7 @@ class EpisodeByEpisode:
     untraced = "it plays one episode after the other"  # why the engine leaves it to the plain loop
 
     def make(self) -> EpisodeFilter:
-        """A filter, before its first reset."""
+        """Return a filter, before its first reset."""
         raise TypeError(f"{type(self).__name__} must define make()")
 
     def prepare(self, model: Model) -> EpisodePlan:
@@ -88,15 +88,17 @@ class EpisodeByEpisode:
         x, score = num.zeros((batch, agents, plan.models[0].states)), np.zeros((batch, agents))
         filters, memory = np.empty((batch, agents), object), _Memory(batch, agents)
         for b, i in np.ndindex(batch, agents):
-            if state.filters is None:
-                played: Any = plan.players[i]
-                played.recall(tuple(_own(array[b, i]) for array in state.memory))
+            played: EpisodeFilter
+            if state.filters is not None:
+                copied: EpisodeFilter = copy.deepcopy(state.filters[b, i], _shared(plan.models[i]))  # type: ignore[assignment]
+                played = copied
             else:
-                played = copy.deepcopy(state.filters[b, i], _shared(plan.models[i]))
+                played = plan.players[i]
+                played.recall(tuple(_own(array[b, i]) for array in state.memory))
             filters[b, i] = played
             x[b, i], score[b, i] = played.step(_own(received.y[b, i]), _own(received.valid[b, i]), _own(known_u[b, i]))
             if state.filters is None:
-                memory.put(b, i, played.memory())
+                memory.put(b, i, plan.players[i].memory())
         quiet = np.zeros_like(score, bool)
         state = EpisodeState(None if state.filters is None else filters, memory.arrays)
         return state, Estimate(x, score, quiet, num.full(score.shape, Mode.NORMAL, np.int8), ~quiet)
@@ -117,12 +119,12 @@ class _Memory:
 
 
 def _own(x: Array) -> Array:
-    """A copy in one layout whatever the batch: a library may add up in the order of the memory."""
+    """Return a copy in one layout whatever the batch: a library may add up in the order of the memory."""
     return np.array(x, order="C")
 
 
 def _shared(model: Model) -> dict[int, Any]:
-    """What copies of a filter have in common: the model, and its read-only matrices."""
+    """Return the objects that copies of a filter share: the model, and its read-only matrices."""
     parts = (model, model.A, model.B, model.c, model.C, model.Q, model.R)
     return {id(part): part for part in parts}
 
@@ -142,23 +144,23 @@ class PerEpisode(EpisodeByEpisode):
 
 
 def factory_of(name: str) -> Callable[[], Any]:
-    """What module:name names. Raises InputError where that is nothing to call."""
+    """Return the class or function that module:name names. Raise InputError where it names nothing to call."""
     module, _, path = name.partition(":")
     try:
-        found: Any = importlib.import_module(module)
+        found: object = importlib.import_module(module)
         for part in path.split("."):
             found = getattr(found, part)
     except (ImportError, AttributeError, ValueError) as error:
         raise InputError("per_episode", name, f"module:name of a class or function that can be imported ({error})") from None
     if not callable(found):
         raise InputError("per_episode", name, "a class or a function")
-    return found  # type: ignore[no-any-return]
+    return found
 
 
 def per_episode(factory: Callable[[], EpisodeFilter] | str) -> PerEpisode:
-    """A defence from a filter that knows one episode only: its class, a function that makes one, or module:name of either.
+    """Return a defence from a filter that knows one episode only: its class, a function that makes one, or module:name of either.
 
-    Raises InputError for what has no name in a module, such as a lambda: no row or card could say it.
+    Raises InputError for a function without a name in a module, such as a lambda: no row or card could name it.
     """
     if isinstance(factory, str):
         return PerEpisode(factory)

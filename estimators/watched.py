@@ -5,13 +5,14 @@ from tailgate.core.score_threshold import Watched
 from tailgate.estimators.compose import AcceptAll, Composed, Score, compose
 from tailgate.estimators.detectors.chi_square import ChiSquare
 
-OWN = ("prepare", "start", "step", "look")  # what a composed defence does as its parts say, unless it is written anew
+OWN = ("prepare", "start", "step", "look")  # methods that a composed defence inherits, unless it overrides them
 
 
 def watched(defence: Defence, threshold: float) -> Composed | Watched:
-    """The defence with an alarm at a threshold on its score.
+    """Return the defence with an alarm at a threshold on its score.
 
-    What only filters is composed with the chi-square test, whose alarm then changes nothing: a white box has a gate to stay below.
+    A defence that only filters is composed with the chi-square test, whose alarm then changes nothing: a white-box attacker has a gate to
+    stay below.
     """
     if isinstance(defence, Composed) and all(getattr(type(defence), name) is getattr(Composed, name) for name in OWN):
         filter_, detector, mitigation = defence.parts()

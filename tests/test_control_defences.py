@@ -151,7 +151,7 @@ def test_what_drives_ahead_takes_nothing_of_the_standstill_gap():
 def test_the_guarantee_in_the_worst_case(sides):
     """Whatever the car ahead does with its speed in [0, 40] m/s, with the worst noise and deviation, `clearance` is kept, and nearly reached."""
     clip = InputClip(sides=sides)
-    own, bound, steps = clip.loop(DT), clip.prepare(MODEL).bound, 700
+    own, bound, steps = clip.loop(DT), clip.bound(MODEL), 700
     sd = clip.sigmas * np.sqrt(np.diag(MODEL.R[1]))
     kernels = [np.resize(np.append(response(own.A, own.noisy[:, s]), np.zeros(steps)), steps) for s in range(3)]
     noise = np.sign(kernels)
@@ -205,7 +205,7 @@ def test_falsified_accelerations_collide_without_the_clip_and_not_with_it():
 def test_the_command_stays_within_the_bound_of_the_own_law(sides):
     """Recomputed from what was received: at most `bound` above, and with both sides below, within the own law's limits."""
     clip = InputClip(sides=sides)
-    bound = clip.prepare(MODEL).bound
+    bound = clip.bound(MODEL)
     for lie in (LIE, LIE.replace("=10", "=-10")):
         trace = play(guarded(clip), lie, seeds=range(2))
         u, own = trace.control[:, :, 1:, 0], baseline(clip, trace.wires[:, :, 1:, :3])

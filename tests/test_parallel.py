@@ -18,7 +18,7 @@ from tailgate.core import Kind, Mode
 from tailgate.core.draws import keys
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import load_scenario
-from tailgate.envs.gym.duel import DefenderEnv, Duel, Rival
+from tailgate.envs.gym.duel import Attacker, DefenderEnv, Duel
 from tailgate.estimators import Steered, SteeredChallenge, compose
 from tailgate.estimators.challenge.steered import load_defender
 from tailgate.estimators.challenge.steering import Hand, Knob, Menu, nearest, settings
@@ -93,7 +93,7 @@ def test_rows_are_steered_on_their_own():
 
     def run(rows):
         held = keys("train", [5 + i for i in rows])
-        state, rival = duel.begin(held), Rival(attack, duel.seat, held)
+        state, rival = duel.begin(held), Attacker(attack, duel.seat, held)
         for _ in range(12):
             state, _, paid, _ = duel.step(state, rival, chosen[rows], state.loop.ended)
         return paid, duel.defender_sees(state), state.loop.estimate.x
@@ -131,7 +131,7 @@ def test_the_defender_sees_the_attack_only_through_what_arrives():
     for value in (None, 0.0, -4.0):
         held = keys("train", range(8))
         attack = tailgate.make_attack("none") if value is None else tailgate.make_attack("fdi", start_step=50, value=value)
-        state, rival = duel.begin(held), Rival(attack, duel.seat, held)
+        state, rival = duel.begin(held), Attacker(attack, duel.seat, held)
         seen[value] = []
         for _ in range(6):
             state, _, _, frame = duel.step(state, rival, np.full(8, 9), state.loop.ended)
@@ -147,7 +147,7 @@ def test_what_the_defender_sees_is_what_it_has():
     duel = Duel.make(scenario="gusty-stop-and-go-v0", interval=1)
     names = duel.plan.sight.names
     held = keys("train", range(5))
-    state, rival = duel.begin(held), Rival(tailgate.make_attack("fdi", start_step=50, value=3.0), duel.seat, held)
+    state, rival = duel.begin(held), Attacker(tailgate.make_attack("fdi", start_step=50, value=3.0), duel.seat, held)
     for _ in range(70):
         before = state
         state, _, _, frame = duel.step(state, rival, None, state.loop.ended)
@@ -333,7 +333,7 @@ def test_a_bad_field_of_a_defender_is_one_clear_error(tmp_path, monkeypatch, cha
     path = export(tmp_path / "bad", duel, constant(duel, 1), {})
     path.write_text(json.dumps(json.loads(path.read_text()) | change))
     if not words:
-        assert Steered(policy=path).guarded
+        assert Steered(policy=path).inner_defence
         return
     with pytest.raises(InputError, match=rf"bad\.json.*{words}"):
         Steered(policy=path)

@@ -1,14 +1,14 @@
 """The cross-entropy method (Rubinstein 1999) on the weights of a small policy: no gradient, no torch.
 
-A generation draws `population` weight vectors from a normal distribution with a diagonal covariance, plays each of them on the same
-`episodes` fresh episodes, and moves the distribution to the best of them:
+A generation draws `population` weight vectors from a normal distribution with a diagonal covariance. It plays each of them on the same
+`episodes` fresh episodes. Then it moves the distribution to the best of them:
 
     mean+ = mean + a (mean of the elite - mean)        sd+^2 = variance of the elite + extra^2
 
 where `extra` falls to 0 over the first generations (Szita and Lorincz 2006), so that the search does not narrow too early. Member 0 is the
-mean itself. All members of a generation meet the same episodes: what differs is the policy.
+mean itself. All members of a generation meet the same episodes; only the policy differs.
 
-Where a search may end in one of several places, `starts` of them are begun, each for `trial` generations on the same episodes, and the one
+A search may end in one of several places. So `starts` searches are begun, each for `trial` generations on the same episodes; the one
 whose mean did best goes on.
 
 Random numbers are a function of (seed, generation, start), so that a resumed run gives the policy of an uninterrupted one.
@@ -74,7 +74,7 @@ class Config:
 
 
 class Shape(NamedTuple):
-    """Where each layer's weights and biases stand in a weight vector."""
+    """The places of each layer's weights and biases in a weight vector."""
 
     sizes: tuple[tuple[int, int], ...]
 
@@ -83,7 +83,7 @@ class Shape(NamedTuple):
         return sum((i + 1) * o for i, o in self.sizes)
 
     def layers(self, theta: Array) -> list[tuple[Array, Array]]:
-        """(..., length) to weights (..., i, o) and biases (..., o)."""
+        """Return (..., length) as weights (..., i, o) and biases (..., o)."""
         out, at = [], 0
         for i, o in self.sizes:
             weight = theta[..., at : at + i * o].reshape(*theta.shape[:-1], i, o)
@@ -93,7 +93,7 @@ class Shape(NamedTuple):
 
 
 class Trial(NamedTuple):
-    """A start after its trial: its number, the distribution, and what its mean gained in the last third of the generations."""
+    """A start after its trial: its number, the distribution, and the gain of its mean in the last third of the generations."""
 
     start: int
     mean: Array
@@ -102,7 +102,7 @@ class Trial(NamedTuple):
 
 
 class Search:
-    """The method, whoever's policy it is: a subclass says what is played. `lean`: an output of the first mean, and its bias."""
+    """The method, for any policy: a subclass chooses the game. `lean`: an output of the first mean, and its bias."""
 
     def __init__(self, seed: int, gamma: float, config: Config, sizes: tuple[int, ...], lean: tuple[int, float]) -> None:
         self.seed, self.config = seed, config
@@ -123,11 +123,11 @@ class Search:
 
     @property
     def road(self) -> bool:
-        """Whether anybody can collide."""
+        """True if somebody can collide."""
         raise TypeError(f"{type(self).__name__} must define road")
 
     def episodes(self, layers: list[tuple[Array, Array]], members: int, keys: draws.Keys) -> tuple[Array, Array]:
-        """Reward and collision, (members x E,) each, of the policies in `layers` (members, ...) on the episodes of `keys`."""
+        """Return reward and collision, (members x E,) each, of the policies in `layers` (members, ...) on the episodes of `keys`."""
         raise TypeError(f"{type(self).__name__} must define episodes()")
 
     def learn(self, steps: int, report: Callable[[Progress], None], checkpoint: Path | None = None, every: int = 1_000_000) -> None:
@@ -150,7 +150,7 @@ class Search:
         return Network(weights, biases)
 
     def close(self) -> None:
-        """Nothing is held."""
+        """Do nothing: no resource is held."""
 
     # -- one generation
 
@@ -173,7 +173,7 @@ class Search:
         return Progress(self.steps, crash, float(reward[0]))
 
     def _next(self) -> None:
-        """A trial is over: begin the next start, or go on with the best."""
+        """End a trial: begin the next start, or go on with the best."""
         assert self._first is not None
         score = float(np.mean([point["reward"] for point in self.curve[-max(self.config.trial // 3, 1) :]]))
         if self.best is None or score > self.best.score:
@@ -186,7 +186,7 @@ class Search:
             self.start, self.mean, self.sd, _ = self.best
 
     def _play(self, theta: Array) -> tuple[Array, Array]:
-        """Mean reward of an episode and share of collisions, (P,) each, of the weight vectors (P, length) on the generation's episodes."""
+        """Return mean reward and share of collisions, (P,) each, of the weight vectors (P, length) on the generation's episodes."""
         members, episodes = len(theta), self.config.episodes
         first = self.seed * SEED_STRIDE + self.generation * episodes
         keys = draws.keys("train", list(range(first, first + episodes)) * members)
@@ -208,7 +208,7 @@ class Search:
         write_atomic(path, save_tensors(tensors, {"facts": json.dumps(facts)}))
 
     def load(self, path: Path) -> None:
-        """Continue from a checkpoint; raises InputError when it is damaged or of another run."""
+        """Continue from a checkpoint; raise InputError when it is damaged or of another run."""
         wanted = {"format": FORMAT, "seed": self.seed, "card": self.card, "learner": self.identity}
         tensors, facts = open_checkpoint(path, wanted, load_tensors)
         try:
@@ -225,7 +225,7 @@ class Search:
 
 
 def outputs(layers: list[tuple[Array, Array]], observation: Array) -> Array:
-    """(P x E, o) of each policy's network, members first, from observations (P, E, d)."""
+    """Return the outputs (P x E, o) of each policy's network, members first, from observations (P, E, d)."""
     x = np.asarray(observation, np.float64)
     for i, (weight, bias) in enumerate(layers):
         x = np.matmul(x, weight) + bias[:, None]
@@ -262,8 +262,8 @@ class Learner(Search):
     def imitate(self, shown: Demonstration) -> None:
         """Make the first mean one that decides as shown (behaviour cloning: softmax regression through all layers, by Adam).
 
-        Only the largest output counts, so that the last layer has no scale of its own: it is given the root mean square 1, which makes
-        `sd` the size of a change relative to it.
+        Only the largest output counts, so that the scale of the last layer is free. Its root mean square is set to 1: `sd` is then the size
+        of a change relative to it.
         """
         rng = np.random.default_rng([self.seed, 0, len(shown.action)])
         theta = rng.standard_normal(self.shape.length)
@@ -304,7 +304,7 @@ class Learner(Search):
 
 
 def _slope(shape: Shape, theta: Array, seen: Array, action: Array) -> Array:
-    """Gradient (length,) of the mean cross-entropy of the actions (D,) under a softmax of the outputs for seen (D, d)."""
+    """Return the gradient (length,) of the mean cross-entropy of the actions (D,) under a softmax of the outputs for seen (D, d)."""
     layers, inputs, out = shape.layers(theta), [seen], np.empty_like(theta)
     for weight, bias in layers[:-1]:
         inputs.append(np.tanh(inputs[-1] @ weight + bias))
@@ -320,7 +320,7 @@ def _slope(shape: Shape, theta: Array, seen: Array, action: Array) -> Array:
 
 
 def lean(probability: float, actions: int) -> float:
-    """Bias of one of `actions` outputs that gives it this probability in a softmax with all others at 0."""
+    """Return the bias of one of `actions` outputs that gives it this probability in a softmax with all others at 0."""
     p = _inside(probability)
     return float(np.log((actions - 1) * p / (1.0 - p)))
 

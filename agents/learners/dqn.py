@@ -1,7 +1,7 @@
 """Deep Q-learning (Mnih et al. 2015) with returns over several decisions, from Stable-Baselines3 (extra: train). Discrete actions only.
 
-Exploration is epsilon-greedy in each row of the batch by itself, and a random action rests most of the time. Epsilon falls with the
-decisions taken and does not depend on how long the run will be, so that a resumed run explores as an uninterrupted one.
+Exploration is epsilon-greedy in each row of the batch, and most random actions do nothing. Epsilon falls with the number of decisions, not
+with the length of the run, so that a resumed run explores as an uninterrupted one.
 """
 
 from __future__ import annotations
@@ -13,11 +13,13 @@ import numpy as np
 
 try:
     from stable_baselines3 import DQN
+    from stable_baselines3.common.noise import ActionNoise
 except ImportError as error:
     raise ImportError("torch or Stable-Baselines3 is missing: pip install 'tailgate[train]'") from error
 
+from tailgate.agents.learners.exploring import Explorer
 from tailgate.agents.learners.learning import DISCRETE
-from tailgate.agents.learners.stable import Explorer, OffPolicyConfig, OffPolicyLearner, perceptron
+from tailgate.agents.learners.stable import OffPolicyConfig, OffPolicyLearner, perceptron
 from tailgate.core import Array, Positive, PositiveCount, Probability, param
 from tailgate.core.neural import Network
 from tailgate.core.registry import register
@@ -42,7 +44,7 @@ class _DQN(DQN):
     explore: int
     epsilon: float
 
-    def _sample_action(self, learning_starts: int, action_noise: Any = None, n_envs: int = 1) -> tuple[Array, Array]:
+    def _sample_action(self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1) -> tuple[Array, Array]:
         action = self.explorer.actions(n_envs)
         if self.num_timesteps >= learning_starts:
             rate = max(self.epsilon, 1.0 - (1.0 - self.epsilon) * self.num_timesteps / self.explore)

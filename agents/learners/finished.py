@@ -1,4 +1,4 @@
-"""Whether the training of a seed is over: its policy is then kept, and neither trained again nor written over."""
+"""Finished trainings: the policy of such a seed is kept, and neither trained again nor written over."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from tailgate.core.registry import Spec
 
 
 def finished(folder: Path, seed: int, defence: str, same: Callable[[Any], bool]) -> Path | None:
-    """The policy of a seed whose training against a defence is over; None where there is something to train, or to go on with.
+    """Return the policy of a seed whose training against a defence is over; None where there is something to train, or to go on with.
 
-    same: whether the configuration that a policy names is of the same training. Raises InputError where the policy is of another one and
+    same: tests if a policy's configuration is of the same training. Raises InputError where the policy is of another one and
     has no checkpoint to go on from: it would be written over.
     """
     path, spec = folder / f"policy-{seed}.json", Spec("defence", defence)

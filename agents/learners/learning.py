@@ -1,4 +1,4 @@
-"""What every learner has in common: its configuration's name, what it reports, and how its policy is written."""
+"""The common part of all learners: the configuration's name, the reports, and the file of the policy."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ DISCRETE, CONTINUOUS = ("timing", "mode", "ramp"), ("continuous", "increment")  
 
 @dataclass(frozen=True)
 class Progress:
-    """What a training run reports after each round."""
+    """The report of a training run after each round."""
 
     steps: int
     crash: float | None  # share of collisions in the latest episodes; none also where there is no road
@@ -37,6 +37,15 @@ class Config(Protocol):
 
     def check(self) -> None:
         """Raise InputError when the fields do not fit each other."""
+
+
+class BatchConfig(Config, Protocol):
+    """Hyper-parameters of a learner that plays a batch of environments."""
+
+    @property
+    def envs(self) -> int: ...
+    @property
+    def learning_rate(self) -> float: ...
 
 
 class Learner(Protocol):
@@ -58,10 +67,10 @@ class Learner(Protocol):
         """Continue from a checkpoint. Raises InputError when it is damaged or of another run."""
 
     def export(self, path: Path, training: dict[str, Any]) -> Path:
-        """Write the policy as safetensors + JSON; `training` says how it was made."""
+        """Write the policy as safetensors + JSON; `training` describes how it was made."""
 
     def close(self) -> None:
-        """Free what it holds."""
+        """Free all resources."""
 
 
 @runtime_checkable
@@ -98,7 +107,7 @@ def check_action(name: str, seat: Seat) -> None:
 
 
 def open_checkpoint(path: Path, wanted: dict[str, Any], load_tensors: Callable[[bytes], Any]) -> tuple[Any, dict[str, Any]]:
-    """Tensors and facts of a checkpoint. Raises InputError when it is damaged, or when its facts are not the `wanted` ones."""
+    """Return tensors and facts of a checkpoint. Raise InputError when it is damaged, or when its facts are not the `wanted` ones."""
     try:
         tensors, about = tensors_of(read_bytes(path, TENSORS), load_tensors)
         facts = parse_json(about["facts"], strict=False)
@@ -111,7 +120,7 @@ def open_checkpoint(path: Path, wanted: dict[str, Any], load_tensors: Callable[[
 
 
 def header_of(seat: Seat, training: dict[str, Any]) -> dict[str, Any]:
-    """The JSON of a policy that was trained in this seat, apart from its tensors."""
+    """Return the JSON of a policy that was trained in this seat, apart from its tensors."""
     threat = seat.loop.threat
     return {
         "action": seat.action.spec, "observation": seat.observation.names, "knowledge": threat.knowledge,

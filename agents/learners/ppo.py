@@ -21,9 +21,9 @@ from tailgate.core import NonNegative, Positive, Probability, param
 from tailgate.core.neural import Network
 from tailgate.core.registry import register
 
-LOG_STD = -0.5  # of the first policy's continuous actions
+LOG_STD = -0.5  # log of the standard deviation of the first policy's continuous actions
 IMITATION_EPOCHS, IMITATION_BATCH, IMITATION_RATE = 6, 1024, 2e-3
-IMITATION_ENTROPY = 0.003  # what is imitated to the letter explores nothing
+IMITATION_ENTROPY = 0.003  # an exact imitation would explore nothing
 
 
 @dataclass(frozen=True)
@@ -71,12 +71,12 @@ class Learner(StableLearner):
         return model
 
     def architecture(self) -> dict[str, Any]:
-        """Arguments of this policy alone."""
+        """Return arguments of this policy alone."""
         return {}
 
     def imitate(self, shown: Demonstration) -> None:
-        """Fit the policy to the actions shown and the critic to their returns (behaviour cloning), by its own optimiser's method."""
-        policy: Any = self.model.policy
+        """Fit the policy to the shown actions and the critic to their returns (behaviour cloning), by its own optimiser's method."""
+        policy = self.model.policy
         size = len(shown.action)
         seen, action = torch.as_tensor(shown.observation), torch.as_tensor(shown.action)
         gained = torch.as_tensor(shown.gained, dtype=torch.float32)
@@ -97,6 +97,6 @@ class Learner(StableLearner):
         return self.config.envs * self.config.rollout
 
     def network(self) -> Network:
-        policy: Any = self.model.policy
+        policy = self.model.policy
         log_std = None if self.seat.action.discrete else policy.log_std.detach().numpy().astype(np.float64)
         return Network(*perceptron(policy.mlp_extractor.policy_net, policy.action_net), log_std)

@@ -13,8 +13,9 @@ try:
 except ImportError as error:
     raise ImportError("torch or Stable-Baselines3 is missing: pip install 'tailgate[train]'") from error
 
+from tailgate.agents.learners.exploring import Exploring
 from tailgate.agents.learners.learning import CONTINUOUS
-from tailgate.agents.learners.stable import Exploring, OffPolicyConfig, OffPolicyLearner, perceptron, rest_first
+from tailgate.agents.learners.stable import OffPolicyConfig, OffPolicyLearner, perceptron, rest_first
 from tailgate.core import Positive, param
 from tailgate.core.neural import Network
 from tailgate.core.registry import register

@@ -13,24 +13,24 @@ from tailgate.core import Array, Attack
 from tailgate.core.draws import Keys
 from tailgate.core.neural import Network
 from tailgate.core.schema import digest
-from tailgate.envs.gym.duel import Duel, Rival
+from tailgate.envs.gym.duel import Attacker, Duel
 from tailgate.envs.gym.mixture import Mixture
 from tailgate.estimators.challenge.steered import save_defender
 from tailgate.estimators.challenge.steering import nearest
 
 
 class Played(NamedTuple):
-    """What came of some games, (B,) each."""
+    """The results of some games, (B,) each."""
 
     paid: Array  # discounted, to the defender
     crashed: Array  # bool
-    cost: Array  # of care: minus what the defender was paid, undiscounted and without the collision
-    decisions: int  # of all games together
+    cost: Array  # cost of care: minus the defender's reward, undiscounted and without the collision
+    decisions: int  # decisions of all games together
 
 
 def play(duel: Duel, attack: Attack, keys: Keys, choose: Callable[[Array], Array] | None = None, gamma: float = 1.0) -> Played:
-    """Play a game per key. choose: from what the defenders see (B, d) to their actions; None leaves the knobs to the defence."""
-    state, rival = duel.begin(keys), Rival(attack, duel.seat, keys)
+    """Play a game per key. choose: from the defenders' view (B, d) to their actions; None leaves the knobs to the defence."""
+    state, attacker = duel.begin(keys), Attacker(attack, duel.seat, keys)
     paid, cost, crashed = (np.zeros(len(keys.key)) for _ in range(3))
     decisions, weight = 0, 1.0
     for _ in range(duel.seat.decisions):
@@ -39,7 +39,7 @@ def play(duel: Duel, attack: Attack, keys: Keys, choose: Callable[[Array], Array
             break
         decisions += int(np.count_nonzero(~over))
         action = None if choose is None else choose(duel.defender_sees(state))
-        state, outcome, gained, _ = duel.step(state, rival, action, over)
+        state, outcome, gained, _ = duel.step(state, attacker, action, over)
         hit = (outcome.collided | outcome.rear_collided) & ~over
         paid += weight * gained
         cost -= gained + hit
@@ -87,7 +87,7 @@ def export(path: Path, duel: Duel, network: Network, training: dict[str, Any]) -
 
 
 def constant(duel: Duel, setting: int) -> Network:
-    """The network of a defender that always chooses one setting."""
+    """Return the network of a defender that always chooses one setting."""
     inputs, actions = len(duel.plan.sight.names), len(duel.settings)
     bias = np.zeros(actions)
     bias[setting] = 1.0

@@ -1,4 +1,4 @@
-"""What the learners from Stable-Baselines3 and sb3-contrib share: seeds, curve, checkpoints, export (extra: train).
+"""The common part of the learners from Stable-Baselines3 and sb3-contrib: seeds, curve, checkpoints, export (extra: train).
 
 A checkpoint is one safetensors file that holds everything the next update depends on: networks, optimisers, replay buffer, memory of
 recurrent networks, environments with their episodes in flight, and random generators. An interrupted run that resumes gives the policy of
@@ -29,7 +29,17 @@ from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
 from scipy.stats import norm
 
-from tailgate.agents.learners.learning import CONTINUOUS, DISCRETE, SEED_STRIDE, Progress, check_action, header_of, open_checkpoint
+from tailgate.agents.learners.exploring import Explorer
+from tailgate.agents.learners.learning import (
+    CONTINUOUS,
+    DISCRETE,
+    SEED_STRIDE,
+    BatchConfig,
+    Progress,
+    check_action,
+    header_of,
+    open_checkpoint,
+)  # fmt: skip
 from tailgate.agents.policy.network_policy import save_policy
 from tailgate.base.errors import InputError
 from tailgate.base.files import write_atomic
@@ -37,24 +47,23 @@ from tailgate.base.sizes import Episodes, Passes, Rows, Width
 from tailgate.core import Array, Positive, PositiveCount, Probability, param
 from tailgate.core.neural import Network
 from tailgate.core.schema import canonical
-from tailgate.envs.gym.actions import ActionCodec
 from tailgate.envs.gym.attacker_mdp import Seat
 from tailgate.envs.gym.sb3 import BatchVecEnv
 
 # torch's words for a distribution whose parameters are not finite, for probabilities that are not, and for a step beyond single precision
 SPOILT = ("found invalid values", "probability tensor contains", "without overflow")
-COUNTERS = ("_n_updates", "_n_calls", "_episode_num")  # of the algorithms, those that they have
+COUNTERS = ("_n_updates", "_n_calls", "_episode_num")  # counters of the algorithms, where they have them
 
 
 class StableLearner:
-    """One training run of one seed. A subclass makes `model` and says what its policy is."""
+    """One training run of one seed. A subclass makes `model` and exports its policy."""
 
     name: ClassVar[str]
     actions: ClassVar[tuple[str, ...]] = (*DISCRETE, *CONTINUOUS)
     packages: ClassVar[tuple[str, ...]] = ("torch", "stable-baselines3")
-    traits: ClassVar[dict[str, bool]] = {}  # what the policy's header says besides
+    traits: ClassVar[dict[str, bool]] = {}  # further fields of the policy's header
 
-    def __init__(self, seed: int, gamma: float, config: Any, environment: dict[str, Any], tensorboard: Path | None = None) -> None:
+    def __init__(self, seed: int, gamma: float, config: BatchConfig, environment: dict[str, Any], tensorboard: Path | None = None) -> None:
         torch.set_num_threads(1)  # more threads gain nothing on networks of this size
         config.check()
         if config.envs > SEED_STRIDE:
@@ -71,15 +80,13 @@ class StableLearner:
         # rows start together and end together: a window of two batches of episodes is steady, one rollout's are not
         self.ended: deque[tuple[bool, float]] = deque(maxlen=2 * config.envs)
 
-    # -- what a subclass says
-
     @abstractmethod
     def make_model(self, tensorboard: str | None) -> Any:
-        """The algorithm of Stable-Baselines3, on `env`."""
+        """Return the algorithm of Stable-Baselines3, on `env`."""
 
     @abstractmethod
     def network(self) -> Network:
-        """What is exported of the model."""
+        """Return the network that is exported."""
 
     @property
     @abstractmethod
@@ -87,13 +94,11 @@ class StableLearner:
         """Decisions between two reports."""
 
     def held(self) -> dict[str, Array]:
-        """Arrays that the next update depends on, besides those of every algorithm."""
+        """Return arrays that the next update depends on, besides those of every algorithm."""
         return {}
 
     def restore(self, arrays: dict[str, Array]) -> None:
-        """Take back what `held` gave."""
-
-    # -- the learner
+        """Restore what `held` returned."""
 
     @property
     def seat(self) -> Seat:
@@ -105,7 +110,7 @@ class StableLearner:
         return int(self.model.num_timesteps)
 
     def learn(self, steps: int, report: Callable[[Progress], None], checkpoint: Path | None = None, every: int = 1_000_000) -> None:
-        """Train until `steps` decisions in total; calls `report` after each round. Raises InputError when the policy diverges."""
+        """Train until `steps` decisions in total; call `report` after each round. Raise InputError when the policy diverges."""
         remaining = steps - self.model.num_timesteps
         if remaining <= 0:
             return
@@ -124,7 +129,7 @@ class StableLearner:
             self.save(checkpoint)
 
     def logging(self) -> dict[str, Any]:
-        """Further arguments of the algorithm's own `learn`."""
+        """Return further arguments of the algorithm's own `learn`."""
         return {}
 
     def _finite(self) -> bool:
@@ -145,12 +150,12 @@ class StableLearner:
     # -- checkpoints
 
     def _facts(self) -> dict[str, Any]:
-        """What a checkpoint and the run that loads it must agree on."""
+        """Return the facts on which a checkpoint and the run that loads it must agree."""
         form = f"tailgate-{self.name}-checkpoint-2"
         return {"format": form, "seed": self.seed, "card": self.env.batch.card()["hash"], "learner": self.identity}
 
     def _parts(self) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
-        """Modules, optimisers and single tensors of the algorithm, by name."""
+        """Return modules, optimisers and single tensors of the algorithm, by name."""
         parts, single = self.model._get_torch_save_params()
         every = {name: recursive_getattr(self.model, name) for name in parts}
         optimisers = {name: part for name, part in every.items() if isinstance(part, torch.optim.Optimizer)}
@@ -184,7 +189,7 @@ class StableLearner:
         write_atomic(path, save_tensors(tensors, {"facts": json.dumps(facts)}))
 
     def load(self, path: Path) -> None:
-        """Continue from a checkpoint; raises InputError when it is damaged or of another run."""
+        """Continue from a checkpoint; raise InputError when it is damaged or of another run."""
         tensors, facts = open_checkpoint(path, self._facts(), load_tensors)
         try:
             self.env.reset()
@@ -223,9 +228,10 @@ class StableLearner:
     def _restore_batch(self, tensors: dict[str, Any]) -> None:
         batch, model = self.env.batch, self.model
 
-        def restored(name: str, like: Any) -> Any:
-            raw = tensors[name].numpy()
-            return raw.view(like.dtype).reshape(like.shape).copy() if like.dtype.kind == "u" else raw.reshape(like.shape).copy()
+        def restored(name: str, like: Array) -> Array:
+            raw: Array = tensors[name].numpy()
+            raw = raw.view(like.dtype) if like.dtype.kind == "u" else raw
+            return raw.reshape(like.shape).copy()
 
         batch.episodes.put({name: restored(f"batch.{name}", value) for name, value in batch.episodes.held().items()})
         self.env._returns[:] = tensors["env.returns"].numpy()
@@ -255,7 +261,7 @@ class _Reporter(BaseCallback):
             self.learner.save(self.checkpoint)
 
     def _on_rollout_end(self) -> None:
-        due = self.num_timesteps // self.learner.round > self.before // self.learner.round  # of rollouts that are short
+        due = self.num_timesteps // self.learner.round > self.before // self.learner.round  # several short rollouts make one round
         self.before = self.num_timesteps
         if not due:
             return
@@ -271,14 +277,14 @@ class _Reporter(BaseCallback):
         self.report(Progress(self.num_timesteps, crash, reward))
 
 
-def perceptron(*layers: Any) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
-    """Weights (i, o) and biases (o,) in float64 of the linear layers among these modules and the modules inside of them."""
+def perceptron(*layers: torch.nn.Module) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
+    """Return weights (i, o) and biases (o,) in float64 of the linear layers among these modules and the modules inside of them."""
     flat = [m for layer in layers for m in layer.modules() if isinstance(m, torch.nn.Linear)]
     weights = tuple(layer.weight.detach().numpy().T.astype(np.float64) for layer in flat)
     return weights, tuple(layer.bias.detach().numpy().astype(np.float64) for layer in flat)
 
 
-def rest_first(layer: Any, probability: float, discrete: bool, log_std: float) -> None:
+def rest_first(layer: torch.nn.Linear, probability: float, discrete: bool, log_std: float) -> None:
     """Set the first bias of an output layer so that a fresh policy attacks with this probability in a step."""
     p = min(max(probability, 1e-6), 1.0 - 1e-6)
     with torch.no_grad():
@@ -314,35 +320,6 @@ class OffPolicyConfig:
             raise InputError(f"{self.name}.batch_size", self.batch_size, "at least 2")
 
 
-class Explorer:
-    """Random actions that attack with probability `attack`, independently in each row."""
-
-    def __init__(self, codec: ActionCodec, attack: float, seed: int) -> None:
-        self.codec, self.attack, self.rng = codec, attack, np.random.default_rng(seed)
-
-    def actions(self, rows: int) -> Array:
-        """(rows,) int64 or (rows, size) float32."""
-        attacks = self.rng.random(rows) < self.attack
-        if self.codec.discrete:
-            return np.where(attacks, self.rng.integers(1, self.codec.size, rows), 0)
-        out = self.rng.uniform(-1.0, 1.0, (rows, self.codec.size)).astype(np.float32)
-        out[:, 0] = np.where(attacks, 1.0, -1.0) * np.abs(out[:, 0])
-        return out
-
-
-class Exploring:
-    """Mixed into an algorithm with a replay buffer: before learning starts its actions are the explorer's."""
-
-    explorer: Explorer
-
-    def _sample_action(self, learning_starts: int, action_noise: Any = None, n_envs: int = 1) -> tuple[Array, Array]:
-        algorithm: Any = super()
-        if self.num_timesteps >= learning_starts:  # type: ignore[attr-defined]
-            return algorithm._sample_action(learning_starts, action_noise, n_envs)  # type: ignore[no-any-return]
-        action = self.explorer.actions(n_envs)
-        return action, action
-
-
 class OffPolicyLearner(StableLearner):
     """A learner with a replay buffer. The horizon ends an episode for good: the observation shows it coming."""
 
@@ -362,11 +339,11 @@ class OffPolicyLearner(StableLearner):
         return model
 
     def arguments(self) -> dict[str, Any]:
-        """Arguments of this algorithm alone."""
+        """Return arguments of this algorithm alone."""
         return {}
 
     def architecture(self) -> dict[str, Any]:
-        """Arguments of its policy alone."""
+        """Return arguments of its policy alone."""
         return {}
 
     @property

@@ -1,8 +1,8 @@
-"""What a learner may be shown before it learns: the decisions of a scripted attack, and what they brought."""
+"""Demonstrations for a learner before it learns: the decisions of a scripted attack, and their returns."""
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from tailgate.core.draws import Role
 from tailgate.envs.gym.actions import ActionCodec
 from tailgate.envs.gym.attacker_mdp import Seat
 
-FIRST = SEED_STRIDE // 2  # of them, among the episodes of a training seed
+FIRST = SEED_STRIDE // 2  # number of the first demonstration among the episodes of a training seed
 
 
 class Demonstration(NamedTuple):
@@ -25,7 +25,7 @@ class Demonstration(NamedTuple):
 
 
 def nearest(codec: ActionCodec, command: Command) -> Array:
-    """(B,) the discrete action that comes nearest to a command: of its kind, with the fewest other targets, then the nearest values.
+    """Return the discrete action (B,) nearest to a command: of its kind, with the fewest other targets, then the nearest values.
 
     Rest where no action has that kind.
     """
@@ -46,7 +46,7 @@ def demonstrate(seat: Seat, attack: Attack, seed: int, episodes: int) -> Demonst
     loop = seat.loop
     keys = draws.keys("train", range(seed * SEED_STRIDE + FIRST, seed * SEED_STRIDE + FIRST + episodes))
     state, plan = loop.start(keys), attack.prepare(loop.brief)
-    memory: Any = attack.start(plan, episodes, keys.at(Role.ATTACK, np.zeros(episodes, np.int64)))
+    memory = attack.start(plan, episodes, keys.at(Role.ATTACK, np.zeros(episodes, np.int64)))
     tally, seen = seat.begin(state), None
     observations, actions, rewards, live = [], [], [], []
     for _ in range(seat.decisions):

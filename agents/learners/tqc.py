@@ -14,7 +14,7 @@ except ImportError as error:
     raise ImportError("torch or sb3-contrib is missing: pip install 'tailgate[train]'") from error
 
 from tailgate.agents.learners import sac
-from tailgate.agents.learners.stable import Exploring
+from tailgate.agents.learners.exploring import Exploring
 from tailgate.base.errors import InputError
 from tailgate.base.sizes import Width
 from tailgate.core import Count, param

@@ -51,7 +51,7 @@ class OptimalDos(Script):
         return ScriptPlan(brief, target, schedule)
 
     def _before(self, model: Model, system: Filtering) -> Array:
-        """(n, n) the covariance before the first step."""
+        """Return the covariance (n, n) before the first step."""
         if self.prior_var is not None:
             return np.diag(np.full(model.states, self.prior_var))
         return np.asarray(system.updated(steady_state(model), np.ones_like(system.lost))[0])

@@ -65,7 +65,7 @@ class OptimalHold:
 
     def decide(self, plan: HoldPlan, state: HoldState, view: View, draws: Draws) -> tuple[HoldState, Command]:
         if view.received is None:
-            raise InputError("threat_model.sees_measurement", False, "true, which attack optimal_hold needs")
+            raise InputError("threat_model.sees_measurement", False, "true: attack optimal_hold needs it")
         x = view.received.y[:, 0, 0]
         good = np.where(view.last.kind == Kind.NONE, state.latest, state.good)
         on = plan.table.decide(view.k, view.budget_left, x, good) & view.allowed

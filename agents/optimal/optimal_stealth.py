@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import product
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -24,7 +24,7 @@ WIRES = 4  # wires of which every combination at its bound is tried
 
 
 class Aim(NamedTuple):
-    """Where the estimate is pushed."""
+    """The direction in which the estimate is pushed."""
 
     begin: int  # first step of the window
     last: int
@@ -64,13 +64,13 @@ class OptimalStealth(Script):
         return ScriptPlan(brief, target, Aim(begin, last, np.array(rows[::-1])))
 
     def _farthest(self, brief: Brief, steps: int) -> Array:
-        """(n,) the direction of the largest reach within `steps`."""
+        """Return the direction (n,) of the largest reach within `steps`."""
         model = brief.model
         return np.ones(1) if model.states == 1 else farthest(model, steady_state(model)[0], steps)
 
     def command(self, plan: ScriptPlan, on: Array, count: Array, view: View, draws: Draws) -> Command:
         if view.defence is None or view.received is None or view.estimate is None or view.truth is None:
-            raise InputError("threat_model.knowledge", plan.brief.threat.knowledge, "white, which attack optimal_stealth needs")
+            raise InputError("threat_model.knowledge", plan.brief.threat.knowledge, "white: attack optimal_stealth needs it")
         box, model, aim = view.defence, plan.brief.model, plan.extra
         if not hasattr(box.defence, "look"):
             raise NotApplicable("attack optimal_stealth", type(box.defence).__name__, "a defence that shows its innovation (look)")
@@ -93,8 +93,8 @@ class OptimalStealth(Script):
         return plan.brief.command(on & (view.k >= aim.begin) & found[:, 0], Kind.FDI, target, full)
 
 
-def farthest_inside(r: Array, W: Array, gain: Array, gate: Any, wires: Array, bound: float) -> tuple[Array, Array]:
-    """a (B, N, q), and whether there is one (B, N): the largest gain' a with (r + a)' W (r + a) <= gate and |a| <= bound.
+def farthest_inside(r: Array, W: Array, gain: Array, gate: Array | float, wires: Array, bound: float) -> tuple[Array, Array]:
+    """Return a (B, N, q), the largest gain' a with (r + a)' W (r + a) <= gate and |a| <= bound, and (B, N) bool if there is one.
 
     a is 0 off `wires`; r, gain (B, N, q), W (B, N, q, q). A wire of a solution is at its bound or free, and the free ones are in closed
     form: every combination is tried. Of more than WIRES wires the solution without bounds is shortened towards 0.
@@ -120,8 +120,8 @@ def farthest_inside(r: Array, W: Array, gain: Array, gate: Any, wires: Array, bo
     return best, found
 
 
-def _free_inside(r: Array, W: Array, gain: Array, gate: Any, free: Array) -> tuple[Array, Array]:
-    """As `farthest_inside`, without bounds."""
+def _free_inside(r: Array, W: Array, gain: Array, gate: Array | float, free: Array) -> tuple[Array, Array]:
+    """Return what `farthest_inside` returns, without bounds."""
     a = num.zeros(r.shape)
     if not len(free):
         return a, np.asarray(num.quadratic(r, W) <= gate)

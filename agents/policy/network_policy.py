@@ -1,7 +1,7 @@
 """A learned policy as an attack: safetensors + JSON, played without torch, Stable-Baselines3 or pickle.
 
 The network is a tanh perceptron in float64 with a fixed order of summation, so that a trace does not depend on the batch. An LSTM, which
-remembers the episode, may stand before it. The JSON file names the tensor file, its SHA-256, the action and observation codecs, and how
+remembers the episode, may come before it. The JSON file names the tensor file, its SHA-256, the action and observation codecs, and how
 the policy was made.
 """
 
@@ -50,10 +50,10 @@ class Header:
     knowledge: Literal["black", "grey", "white"]
     sees_measurement: bool = False
     frames: PositiveCount = 1
-    agents: PositiveCount | None = None  # of the system that it was trained on; files from before there were several have none
+    agents: PositiveCount | None = None  # agents of the system that it was trained on; older files have none
     squashed: bool = False  # the outputs go through tanh
     masked: bool = False  # chooses among the actions that the channel would accept
-    recurrent: bool = False  # an LSTM stands before the perceptron
+    recurrent: bool = False  # an LSTM comes before the perceptron
     greedy: bool = False  # its outputs are no distribution that actions could be drawn from
     training: dict[str, Any] = dataclasses.field(default_factory=dict)
 
@@ -61,7 +61,7 @@ class Header:
 def choose(
     network: Network, codec: ActionCodec, observation: Array, draws: Draws | None = None, always: bool = False, mask: Array | None = None
 ) -> Array:
-    """Actions (B,) or (B, size): the likeliest, or drawn when `draws` is given. With `always`, the best one that attacks.
+    """Return actions (B,) or (B, size): the likeliest, or drawn when `draws` is given. With `always`, the best one that attacks.
 
     observation: what the perceptron reads, the hidden state of a network with an LSTM. mask (B, size) bool: the discrete actions that are
     to be chosen from; `always` has none, as all attacks are allowed or none is.
@@ -100,7 +100,7 @@ def save_policy(path: Path, network: Network, header: dict[str, Any]) -> Path:
 
 
 def load_policy(path: Path) -> tuple[Header, Network]:
-    """Read a policy; raises InputError when a file is missing, damaged, or does not fit its header."""
+    """Return a policy from its files; raise InputError when one is missing, damaged, or does not fit its header."""
     where = f"policy {path.name}"
     header, tensors = read_trained(Header, FORMAT, path, "policy", where)
     if header.frames > FRAMES:
@@ -121,7 +121,7 @@ def load_policy(path: Path) -> tuple[Header, Network]:
 class PolicyState(NamedTuple):
     action: Array  # (B,) or (B, size): the decision that holds
     seen: Array  # (B, d) the observation that it was taken on
-    memory: Memory | None = None  # of a network with an LSTM, after that observation
+    memory: Memory | None = None  # memory of an LSTM after that observation
 
 
 class PolicyPlan(NamedTuple):
@@ -146,7 +146,7 @@ class PolicyAttack:
 
     @property
     def knowledge(self) -> str:
-        """What the policy was trained to see."""
+        """The knowledge that the policy was trained with."""
         return self._loaded[0].knowledge
 
     @property
@@ -155,7 +155,7 @@ class PolicyAttack:
 
     @property
     def action(self) -> ActionSpec:
-        """Which decisions it takes."""
+        """The decisions that it takes."""
         return self._loaded[0].action
 
     def prepare(self, brief: Brief) -> PolicyPlan:
@@ -191,7 +191,7 @@ class PolicyAttack:
         return state, plan.action.decode(state.action, view)
 
     def consider(self, plan: PolicyPlan, state: PolicyState, view: View, draws: Draws, always: bool = False) -> PolicyState:
-        """A new decision in the rows where one is due; the others hold theirs."""
+        """Take a new decision in the rows where one is due; the others hold theirs."""
         due = (view.k - 1) % plan.action.spec.interval == 0
         if not num.some(due):
             return state
@@ -210,7 +210,7 @@ class PolicyAttack:
 
 
 def _trained_with(header: Header) -> str:
-    """The options that stand for the scenario and the threat model of its training, as far as a policy's file knows them."""
+    """Return the options that describe the scenario and the threat model of its training, as far as a policy's file holds them."""
     config = header.training.get("config")
     config = config if isinstance(config, dict) else {}
     scenario, threat = config.get("scenario"), config.get("threat")
@@ -227,7 +227,7 @@ def _count(agents: int) -> str:
 
 
 def policy_draws(draws: Draws) -> Draws:
-    """The POLICY stream that belongs to the ATTACK stream given to `decide`."""
+    """Return the POLICY stream that belongs to the ATTACK stream given to `decide`."""
     return draws._replace(stream=int(Role.POLICY))
 
 

@@ -19,12 +19,12 @@ FOLDER = Path(str(files("tailgate.agents").joinpath("policies")))
 
 
 def zoo_names() -> list[str]:
-    """Names of the packaged policies."""
+    """Return names of the packaged policies."""
     return sorted(path.stem for path in FOLDER.glob("*.json"))
 
 
 def zoo_path(name: str) -> Path:
-    """The JSON file of a packaged policy. Raises InputError for a name that is none, so that a name never is a path."""
+    """Return the JSON file of a packaged policy. Raise InputError for any other name, so that a name never is a path."""
     known = zoo_names()
     if name not in known:
         raise unknown("zoo.name", name, known)
@@ -32,7 +32,7 @@ def zoo_path(name: str) -> Path:
 
 
 def zoo_card(name: str) -> dict[str, Any]:
-    """JSON data of a packaged policy: how it was made, what it may do, and what it did on report seeds."""
+    """Return JSON data of a packaged policy: how it was made, its actions, and its results on report seeds."""
     path = zoo_path(name)
     header, _ = load_policy(path)
     record = header.training
@@ -61,7 +61,7 @@ class ZooAttack:
 
     @property
     def sources(self) -> list[Path]:
-        """The file that the name stands for, which holds the digest of the tensors: a row records its digest."""
+        """The policy's file, which holds the digest of the tensors: a row records its digest."""
         return [zoo_path(self.name)]
 
     @cached_property
@@ -71,7 +71,7 @@ class ZooAttack:
 
     @property
     def knowledge(self) -> str:
-        """What the policy was trained to see."""
+        """The knowledge that the policy was trained with."""
         return self.policy.knowledge
 
     @property

@@ -1,4 +1,4 @@
-"""Which wires of which agents an attack goes for, and whether the threat model grants them."""
+"""The wires and agents that an attack aims at, and the check that the threat model grants them."""
 
 from collections.abc import Iterable
 
@@ -10,7 +10,7 @@ from tailgate.core.threat import Brief
 
 
 def chosen(brief: Brief, names: tuple[str, ...], default: Array, agents: tuple[int, ...] = (), where: str = "attack ") -> Array:
-    """(N, w) bool: the wires that `names` lists, or else `default` (w,) or (N, w), of `agents`, or else of all that are granted.
+    """Return (N, w) bool: the wires in `names`, or else `default` (w,) or (N, w), of `agents`, or else of all that are granted.
 
     Raises InputError for a wire that the model has not, NotApplicable for an agent; `where` is what the fields' names begin with.
     """
@@ -22,7 +22,7 @@ def chosen(brief: Brief, names: tuple[str, ...], default: Array, agents: tuple[i
         if i >= model.agents:
             raise NotApplicable(f"{where}agents", i, f"an agent's number, from 0 to {model.agents - 1}")
     some = np.asarray(np.isin(np.arange(model.agents), agents) if agents else np.any(brief.granted, axis=1))
-    if agents and default.ndim == 2:  # of agents that are named, also where it is not granted: the channel refuses, and `require` says so
+    if agents and default.ndim == 2:  # named agents are aimed at even where not granted: `require` then raises
         default = np.any(default, axis=0)
     return np.asarray(some[:, None] & (np.array([w in names for w in model.wires]) if names else default))
 

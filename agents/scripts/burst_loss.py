@@ -7,13 +7,13 @@ Lost are the fields that a controller hears; the predictions that estimators exc
 """
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from tailgate.agents.scripts.aim import chosen, require
-from tailgate.agents.scripts.scripted import Script, ScriptPlan
-from tailgate.agents.scripts.triggers import TriggerState
+from tailgate.agents.scripts.scripted import ScriptPlan, Timed
+from tailgate.agents.scripts.triggers import TriggerState, idle
 from tailgate.base.errors import InputError
 from tailgate.core import Array, Command, Kind, Probability, View, param
 from tailgate.core.draws import Draws
@@ -31,7 +31,7 @@ class BurstState(NamedTuple):
 
 
 def groups(brief: Brief) -> Array:
-    """(w,) the channel that each wire comes over: V2V fields of one sender share one, every other wire has its own.
+    """Return the channel (w,) that each wire comes over: V2V fields of one sender share one, every other wire has its own.
 
     The sender is the first word of a field: predecessor_acceleration and predecessor_command come in one message.
     """
@@ -43,7 +43,7 @@ def groups(brief: Brief) -> Array:
 
 @register("attack", "burst_loss", reference="E. N. Gilbert, Capacity of a Burst-Noise Channel, 1960; E. O. Elliott, 1963")
 @dataclass(frozen=True)
-class BurstLoss(Script):
+class BurstLoss(Timed):
     """Denial of service: messages are lost in bursts, and the receiver keeps their last values.
 
     Each car's channel from each sender is good or bad by a Markov chain, which starts in its steady state and runs whether the window is
@@ -60,7 +60,7 @@ class BurstLoss(Script):
             raise InputError("attack burst_loss.recover", self.recover, "fail or recover above 0")
 
     def prepare(self, brief: Brief) -> ScriptPlan:
-        """Without `targets`: the V2V fields that are granted, or where none is, the sensors."""
+        """Return the plan. Without `targets` it aims at the V2V fields that are granted, or where none is, at the sensors."""
         q, p = len(brief.model.sensors), len(brief.model.v2v)
         wire = np.arange(len(brief.model.wires))
         messages = brief.granted & ((wire >= q) & (wire < q + p))
@@ -68,15 +68,15 @@ class BurstLoss(Script):
         require(brief, "attack burst_loss", ["dropout"], target)
         return ScriptPlan(brief, target, groups(brief))
 
-    def start(self, plan: ScriptPlan, batch: int, draws: Draws) -> Any:
+    def start(self, plan: ScriptPlan, batch: int, draws: Draws) -> BurstState:
         share = self.fail / (self.fail + self.recover)
-        return BurstState(super().start(plan, batch, draws), draws.uniform(self._channels(plan), MOVE) < share)
+        return BurstState(idle(batch, plan.brief.model.agents), draws.uniform(self._channels(plan), MOVE) < share)
 
-    def decide(self, plan: ScriptPlan, state: Any, view: View, draws: Draws) -> tuple[Any, Command]:
+    def decide(self, plan: ScriptPlan, state: BurstState, view: View, draws: Draws) -> tuple[BurstState, Command]:
         u = draws.uniform(self._channels(plan), MOVE)
         bad = np.where(state.bad, u >= self.recover, u < self.fail)
         lost = draws.uniform(self._channels(plan), LOSE) < np.where(bad, self.loss_bad, self.loss_good)
-        trigger, command = super().decide(plan._replace(extra=lost[..., plan.extra]), state.trigger, view, draws)
+        trigger, command = self.timed(plan._replace(extra=lost[..., plan.extra]), state.trigger, view, draws)
         return BurstState(trigger, bad), command
 
     def command(self, plan: ScriptPlan, on: Array, count: Array, view: View, draws: Draws) -> Command:

@@ -6,7 +6,7 @@ import dataclasses
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from tailgate.base.pytree import map_leaves
 from tailgate.core import AIRED, Array, Command, Count, Kind, PositiveCount, Probability, View, no_command, param
 from tailgate.core.draws import Draws
 from tailgate.core.kinds import EFFECTS, KindName
+from tailgate.core.quantities import Unchecked
 from tailgate.core.registry import register
 from tailgate.core.scenario import config_path
 from tailgate.core.schema import build, read_yaml
@@ -35,8 +36,8 @@ class Phase:
     kind: KindName = param("fdi", "what is done; the threat model has to grant it")
     targets: tuple[str, ...] = param((), "wires to attack; empty: those that `value` names, or all that are granted")
     agents: tuple[Count, ...] = param((), "agents to attack, by number from 0; empty: all that are granted")
-    value: Any = param(None, "law of the values, for the kinds that have one: of one wire or of each")
-    trigger: Any = param("time", "when it is on: a trigger's name, or a mapping with name and parameters")
+    value: Annotated[Law | None, Unchecked] = param(None, "law of the values, for the kinds that have one: of one wire or of each")
+    trigger: Annotated[Trigger, Unchecked] = param("time", "when it is on: a trigger's name, or a mapping with name and parameters")
     probability: Probability | dict[str, Probability] = param(
         1.0, "probability of a hit per step and wire: one number, or one by name for each wire [-]"
     )
@@ -58,7 +59,7 @@ class Sheet:
 
 
 def read_program(path: Path) -> Sheet:
-    """A program from its YAML file, every part checked; raises InputError that names the file, the phase and the field."""
+    """Return a program from its YAML file, every part checked; raise InputError that names the file, the phase and the field."""
     where = f"program {path.name}"
     data = read_yaml(path, where)
     sheet = build(Sheet, data, where)
@@ -72,7 +73,7 @@ def read_program(path: Path) -> Sheet:
     return Sheet(phases, sheet.about, sheet.repeat)
 
 
-def _phase(data: Any, where: str) -> Phase:
+def _phase(data: object, where: str) -> Phase:
     if not isinstance(data, dict):
         raise InputError(where, data, "a mapping of fields")
     phase = build(Phase, data, where)
@@ -132,7 +133,7 @@ class Program:
 
     @property
     def sees_measurement(self) -> bool:
-        """Whether a phase has to see what is read."""
+        """True if a phase has to see the readings."""
         return any(phase.trigger.sees_measurement for phase in self.sheet.phases)
 
     def prepare(self, brief: Brief) -> ProgramPlan:
@@ -172,7 +173,7 @@ class Program:
         return self._move_on(plan, ProgramState(state.phase, state.rounds, attacked, trigger), over), command
 
     def _move_on(self, plan: ProgramPlan, state: ProgramState, over: Array) -> ProgramState:
-        """The state in which the rows `over` (B,) have armed their next phase."""
+        """Return the state in which the rows `over` (B,) have armed their next phase."""
         phase = state.phase + over
         rounds = state.rounds + (over & (phase == len(plan.phases)))
         again = over & (phase == len(plan.phases)) & (rounds < plan.repeat)
@@ -180,12 +181,12 @@ class Program:
 
 
 def _rows(mask: Array, leaf: Array) -> Array:
-    """mask (B,) against a leaf (B, ...)."""
+    """Return mask (B,) in the shape of a leaf (B, ...)."""
     return mask.reshape(-1, *(1,) * (leaf.ndim - 1))
 
 
 def _ready(phase: Phase, brief: Brief, where: str) -> Ready:
-    """A phase under a threat model; raises NotApplicable where it needs what is not granted."""
+    """Return a phase under a threat model; raise NotApplicable where it needs something that is not granted."""
     law: Law | None = phase.value
     names = phase.targets or (law.wires if isinstance(law, PerWire) else ())
     wires = brief.model.wires

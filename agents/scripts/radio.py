@@ -1,4 +1,4 @@
-"""Scripted attacks over the air: a jammer's noise, a late echo, and the values that the thesis has a jammed radar read."""
+"""Scripted attacks over the air: a jammer's noise, a late echo, and the thesis's readings of a jammed radar."""
 
 from dataclasses import dataclass
 from typing import Annotated
@@ -15,12 +15,12 @@ from tailgate.core.draws import Draws
 from tailgate.core.registry import register
 from tailgate.core.threat import Brief, fit, receivers
 
-WIRES = ("distance", "relative_speed")  # of a radar
+WIRES = ("distance", "relative_speed")  # wires of a radar
 Span = Annotated[tuple[Finite, Finite], Field(min_length=2, max_length=2)]
 
 
 def on_receivers(brief: Brief, attack: str, target: Array, named: bool) -> Array:
-    """(N, w) bool: the receivers of `target`. Raises NotApplicable without one, InputError where another wire is `named`."""
+    """Return (N, w) bool: the receivers of `target`. Raise NotApplicable without one, InputError where another wire is `named`."""
     if not brief.model.air:
         raise NotApplicable(attack, "sensors without an echo", "a plant whose sensors listen to the echo of their own probe")
     reached = receivers(brief)
@@ -39,7 +39,7 @@ class OverTheAir(Script):
     hop: bool = param(False, "radiate only after a step in which the probe was heard: silent where a muted probe is likely to stay so")
 
     def radiate(self, plan: ScriptPlan, on: Array, kind: Kind, law: Law, count: Array, view: View, draws: Draws) -> Command:
-        """A law's values, in the rows `on` (B,)."""
+        """Return the command to radiate a law's values, in the rows `on` (B,)."""
         if self.hop:
             assert view.probed is not None
             on = on & view.probed.any(axis=1)
@@ -47,7 +47,7 @@ class OverTheAir(Script):
 
 
 def _aimed(script: Script, brief: Brief, kind: str) -> ScriptPlan:
-    """The plan of a script over the air, where the threat model grants it."""
+    """Return the plan of a script over the air, where the threat model grants it."""
     attack = f"attack {kind}"
     target = on_receivers(brief, attack, chosen(brief, script.targets, brief.granted, script.agents), bool(script.targets))
     require(brief, attack, [kind], target)

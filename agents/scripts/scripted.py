@@ -1,4 +1,4 @@
-"""Scripted attacks: what to inject is fixed, when is a window that opens at a step or on a condition of the road."""
+"""Scripted attacks: fixed values, in a window that opens at a step or on a condition of the road."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -37,11 +37,11 @@ class NoAttack:
 class ScriptPlan(NamedTuple):
     brief: Brief
     target: Array  # (N, w) bool
-    extra: Any = None  # what a script computes before the episode
+    extra: Any = None  # a script's results before the episode
 
 
 @dataclass(frozen=True)
-class Script:
+class Timed:
     """When: a window that opens at step `start`, or at the first later step at which a condition of the road holds."""
 
     targets: tuple[str, ...] = param((), "wires to attack; empty: all that are granted")
@@ -61,7 +61,7 @@ class Script:
 
     @property
     def sees_measurement(self) -> bool:
-        """Whether it has to see what is read."""
+        """True if it has to see the readings."""
         return self.when.sees_measurement
 
     @cached_property
@@ -76,15 +76,13 @@ class Script:
     def prepare(self, brief: Brief) -> ScriptPlan:
         return self.plan(brief, chosen(brief, self.targets, brief.granted, self.agents))
 
-    def plan(self, brief: Brief, target: Array, extra: Any = None) -> ScriptPlan:
-        """A plan, where the threat model shows what the trigger looks at."""
+    def plan(self, brief: Brief, target: Array, extra: object = None) -> ScriptPlan:
+        """Return a plan, where the threat model shows what the trigger looks at."""
         self.when.prepare(brief)
         return ScriptPlan(brief, target, extra)
 
-    def start(self, plan: ScriptPlan, batch: int, draws: Draws) -> TriggerState:
-        return idle(batch, plan.brief.model.agents)
-
-    def decide(self, plan: ScriptPlan, state: TriggerState, view: View, draws: Draws) -> tuple[TriggerState, Command]:
+    def timed(self, plan: ScriptPlan, state: TriggerState, view: View, draws: Draws) -> tuple[TriggerState, Command]:
+        """Return the next state of the trigger, and the command of this step."""
         timing = self.when.prepare(plan.brief)
         after, on, count = self.when.step(timing, state, view, draws)
         on = on & view.allowed  # a script that knows its budget does not ask for more
@@ -98,12 +96,23 @@ class Script:
         return after, command
 
     def command(self, plan: ScriptPlan, on: Array, count: Array, view: View, draws: Draws) -> Command:
-        """What is sent in the rows `on` (B,), `count` (B,) steps after the window opened."""
+        """Return the command in the rows `on` (B,), `count` (B,) steps after the window opened."""
         raise TypeError(f"{type(self).__name__} must define command()")
 
 
+@dataclass(frozen=True)
+class Script(Timed):
+    """A timed attack that remembers nothing but its trigger."""
+
+    def start(self, plan: ScriptPlan, batch: int, draws: Draws) -> TriggerState:
+        return idle(batch, plan.brief.model.agents)
+
+    def decide(self, plan: ScriptPlan, state: TriggerState, view: View, draws: Draws) -> tuple[TriggerState, Command]:
+        return self.timed(plan, state, view, draws)
+
+
 def inject(plan: ScriptPlan, on: Array, law: Law, count: Array, draws: Draws, tag: int = 0, hit: Array | None = None) -> Command:
-    """False data injection of a law's values, cut at the bounds; with `hit` (B, N, w), on these of the targets only."""
+    """Return false data of a law's values, cut at the bounds; with `hit` (B, N, w), on these of the targets only."""
     brief = plan.brief
     value = fit(brief, Kind.FDI, law.sample(brief, count, draws, tag))
     if hit is None:
@@ -113,7 +122,7 @@ def inject(plan: ScriptPlan, on: Array, law: Law, count: Array, draws: Draws, ta
 
 
 def wires_hit(plan: ScriptPlan, probability: float | Array, draws: Draws) -> Array:
-    """(B, N, w) bool: each wire by itself with its probability."""
+    """Return (B, N, w) bool: each wire by itself with its probability."""
     return np.asarray(draws.uniform(plan.target.shape) < probability)
 
 
@@ -260,7 +269,7 @@ class InjectSparse(Script):
     probability: Probability | tuple[Probability, ...] = param(
         0.2, "probability of a hit per step: one number, or one for each of `targets` in their order [-]"
     )
-    value: Any = param(-4.0, f"law of the values: a number, or one of {', '.join(LAWS)}; value.mean=... and so on set its parameters")
+    value: object = param(-4.0, f"law of the values: a number, or one of {', '.join(LAWS)}; value.mean=... and so on set its parameters")
 
     def __post_init__(self) -> None:
         _ = self.law  # a wrong law shall fail here
@@ -336,7 +345,7 @@ class Replay(Script):
 
 
 def _old(plan: ScriptPlan, kind: str, field: str, steps: int) -> ScriptPlan:
-    """The plan of an attack with old samples, where the threat model grants them."""
+    """Return the plan of an attack with old samples, where the threat model grants them."""
     require(plan.brief, f"attack {kind}", [kind], plan.target)
     memory = plan.brief.threat.memory
     if steps > memory:

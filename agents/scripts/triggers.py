@@ -1,4 +1,4 @@
-"""When an attack is on: triggers, the same for scripts and for programs.
+"""Triggers: the times at which an attack is on, the same for scripts and for programs.
 
 A trigger is armed at the start of an episode, or in a program when the phase before has ended. From then on it fires or does not, step by
 step. One that latches opens at its first firing and stays open, another is on only while it fires; both close `window` steps after the
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, NamedTuple, TypeVar
 
 import numpy as np
 from pydantic import Field
@@ -20,14 +20,14 @@ from tailgate.core.draws import Draws
 from tailgate.core.schema import build
 from tailgate.core.threat import Brief
 
-TAG = 0x4000  # of the draws of triggers; what is injected draws below it
+TAG = 0x4000  # first tag of the draws of triggers; injected values draw below it
 
 Interval = Annotated[tuple[PositiveCount, PositiveCount], Field(min_length=2, max_length=2)]
 Share = Annotated[float, Field(gt=0, lt=1)]
 
 
 class Timing(NamedTuple):
-    """What a trigger is told of an episode: the first step that is granted, and the length of a step [s]."""
+    """The trigger's knowledge of an episode: the first step that is granted, and the length of a step [s]."""
 
     onset: int
     dt: float
@@ -45,13 +45,13 @@ class TriggerState(NamedTuple):
 
 
 def idle(batch: int, agents: int) -> TriggerState:
-    """The memory of triggers that have just been armed."""
+    """Return the memory of triggers that have just been armed."""
     count = np.zeros(batch, np.int64)
     return TriggerState(count, np.zeros(batch, bool), count.copy(), np.full(batch, -1, np.int8), np.full((batch, agents), -np.inf))
 
 
 def rearm(state: TriggerState, where: Array) -> TriggerState:
-    """The memory in which the triggers of the rows `where` (B,) have just been armed; what was seen of the road is kept."""
+    """Return the memory in which the triggers of the rows `where` (B,) have just been armed; the view of the road is kept."""
     fresh = idle(*state.lead_speed.shape)
     armed, opened, elapsed, burst = (np.where(where, new, old) for new, old in zip(fresh[:4], state[:4], strict=True))
     return TriggerState(armed, opened, elapsed, burst, state.lead_speed)
@@ -67,24 +67,24 @@ class Trigger:
 
     @property
     def latches(self) -> bool:
-        """Whether it stays open after its first firing."""
+        """True if it stays open after its first firing."""
         return False
 
     @property
     def ends(self) -> bool:
-        """Whether it ends by itself."""
+        """True if it ends by itself."""
         return self.window is not None
 
     @property
     def sees_measurement(self) -> bool:
-        """Whether it has to see what is read."""
+        """True if it has to see the readings."""
         return False
 
     def prepare(self, brief: Brief) -> Timing:
         return Timing(brief.threat.onset, brief.model.dt)
 
     def step(self, timing: Timing, state: TriggerState, view: View, draws: Draws) -> tuple[TriggerState, Array, Array]:
-        """-> state, on (B,) bool, count (B,): steps since the first firing."""
+        """Return the next state, on (B,) bool, and count (B,): steps since the first firing."""
         ready = (view.k >= self.start) & (view.k >= timing.onset) & (state.armed >= self.after)
         burst, hit = self.fires(timing, state, view, ready, draws)
         fired = ready & hit
@@ -96,11 +96,11 @@ class Trigger:
         return after, on, state.elapsed
 
     def fires(self, timing: Timing, state: TriggerState, view: View, ready: Array, draws: Draws) -> tuple[Array, Array]:
-        """-> the burst state after this step, and whether it fires (B,) bool, in the rows that are `ready`."""
+        """Return the burst state after this step, and (B,) bool if it fires, in the rows that are `ready`."""
         return state.burst, ready
 
     def over(self, state: TriggerState, k: Array) -> Array:
-        """(B,) bool: after step k (B,), the last one played, it will not be on again."""
+        """Return (B,) bool: after step k (B,), the last one played, it will not be on again."""
         never = np.zeros(len(k), bool)
         return never if self.window is None else never | (state.opened & (state.elapsed >= self.window))
 
@@ -170,7 +170,7 @@ class Bursts(Trigger):
             raise InputError("frequency", self.frequency, f"less than 1 / duration ({1.0 / self.duration:g} 1/s)")
 
     def chain(self, dt: float) -> tuple[float, float, float]:
-        """-> probabilities per step of entering and of leaving a burst, and the share of time in bursts."""
+        """Return probabilities per step of entering and of leaving a burst, and the share of time in bursts."""
         share = self.frequency * self.duration if self.frequency is not None else self.share or 0.0
         pause = self.duration * (1.0 - share) / share
         for name, mean in (("duration", self.duration), ("frequency" if self.share is None else "share", pause)):
@@ -179,7 +179,7 @@ class Bursts(Trigger):
         return min(dt / pause, 1.0), min(dt / self.duration, 1.0), share
 
     def prepare(self, brief: Brief) -> Timing:
-        self.chain(brief.model.dt)  # what cannot be met shall fail here
+        self.chain(brief.model.dt)  # fail here where it cannot be met
         return super().prepare(brief)
 
     def fires(self, timing: Timing, state: TriggerState, view: View, ready: Array, draws: Draws) -> tuple[Array, Array]:
@@ -203,7 +203,7 @@ class Condition(Trigger):
         return state.burst, np.asarray(self.holds(timing, state, view).any(axis=1))
 
     def holds(self, timing: Timing, state: TriggerState, view: View) -> Array:
-        """(B, N) bool."""
+        """Return (B, N) bool: the vehicle meets the condition."""
         raise TypeError(f"{type(self).__name__} must define holds()")
 
 
@@ -271,7 +271,7 @@ class Reading(Condition):
     def prepare(self, brief: Brief) -> Timing:
         threat = brief.threat
         if not threat.sees_measurement and threat.knowledge != "white":
-            raise NotApplicable("threat_model.sees_measurement", False, "true: the trigger `reading` waits for what is read")
+            raise NotApplicable("threat_model.sees_measurement", False, "true: the trigger `reading` waits for a reading")
         return super().prepare(brief)._replace(reach=brief.granted[:, : len(brief.model.sensors)])
 
     def holds(self, timing: Timing, state: TriggerState, view: View) -> Array:
@@ -286,8 +286,11 @@ TRIGGERS: dict[str, type[Trigger]] = {
 }  # fmt: skip
 
 
-def part(known: Mapping[str, type[Any]], data: Any, where: str) -> Any:
-    """One of the `known` classes from data: a name, or a mapping with `name` and parameters; InputErrors name `where` and the field."""
+T = TypeVar("T")
+
+
+def part(known: Mapping[str, type[T]], data: object, where: str) -> T:
+    """Return one of the `known` classes from data: a name, or a mapping with `name` and parameters; errors name `where` and field."""
     if isinstance(data, str):
         data = {"name": data}
     if not isinstance(data, dict) or "name" not in data:

@@ -1,4 +1,4 @@
-"""What is injected: value laws, the same for scripts and for programs."""
+"""Laws of the values that are injected, the same for scripts and for programs."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Law(Protocol):
     """A law of the values that are sent."""
 
     def sample(self, brief: Brief, count: Array, draws: Draws, tag: int = 0) -> Array:
-        """Values that broadcast to (B, N, w), `count` (B,) steps after the attack began; draws under the tags from `tag` on."""
+        """Return values that broadcast to (B, N, w), `count` (B,) steps after the attack began; it draws under the tags from `tag` on."""
 
 
 def _wires(brief: Brief) -> tuple[int, int]:
@@ -125,8 +125,8 @@ class PerWire:
         return out
 
 
-def law_of(data: Any, where: str) -> Law:
-    """A law from data: a number, a name, a mapping with `name` and parameters, or a mapping from wires to any of these."""
+def law_of(data: object, where: str) -> Law:
+    """Return a law from data: a number, a name, a mapping with `name` and parameters, or a mapping from wires to any of these."""
     if isinstance(data, (int, float)) and not isinstance(data, bool):
         data = {"name": "constant", "value": data}
     if isinstance(data, dict) and data and "name" not in data:

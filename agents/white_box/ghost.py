@@ -1,4 +1,4 @@
-"""A ghost: the readings of a second state are added to the true ones. Where every sensor lies, no reading tells them apart."""
+"""A ghost: the readings of a second state are added to the true ones. Where every sensor lies, no reading can separate the two."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tailgate.core.threat import Brief
 
 
 class Ghost(NamedTuple):
-    """What is added to the readings, by the step of the window; the last one that the bounds admit is the end."""
+    """The values added to the readings, by the step of the window; the last one that the bounds admit is the end."""
 
     value: Array  # (K, N, w)
 
@@ -60,7 +60,7 @@ class GhostState(Script):
         return ScriptPlan(brief, target, Ghost(values[:last]))
 
     def _direction(self, A: Array) -> Array:
-        """(n,) of norm `size`, after many steps of A from a random direction."""
+        """Return a direction (n,) of norm `size`, after many steps of A from a random direction."""
         g = constants("ghost", self.mode).normal((len(A),))[0]
         for _ in range(self.settle):
             g = num.matvec(A, g)

@@ -20,14 +20,14 @@ from tailgate.core.threat import Brief
 
 
 class Schedule(NamedTuple):
-    """What is added to the wires, step by step from the opening of the window."""
+    """The values added to the wires, step by step from the opening of the window."""
 
     value: Array  # (K, N, w); the last row holds from then on
-    scale: float  # of the plan, which the bounds shrink
+    scale: float  # factor by which the bounds shrink the plan
 
 
 def consistent(brief: Brief, inputs: Array, actuators: Array, lied: Array, steps: int) -> Array:
-    """(steps, N, w): inputs (T, actuators) on the actuators, and -C x on the wires `lied` (w,), where x is what the inputs cause.
+    """Return (steps, N, w): inputs (T, actuators) on the actuators, and -C x on the wires `lied` (w,), where x is what the inputs cause.
 
     x+ = A x + B a from x = 0: by linearity the readings with the lie are those of a plant that nobody touches.
     """
@@ -54,12 +54,12 @@ def _driver(brief: Brief, where: str) -> None:
 
 
 def _share_of_bounds(brief: Brief, value: Array) -> float:
-    """The largest |value| (..., w) in units of its wire's bound."""
+    """Return the largest |value| (..., w) in units of its wire's bound."""
     return float(np.max(np.abs(value) / brief.bounds))
 
 
 def _play(plan: ScriptPlan, on: Array, count: Array) -> Command:
-    """The step of a schedule that is due."""
+    """Return the command of the schedule's present step."""
     schedule: Schedule = plan.extra
     value = num.take(schedule.value, np.minimum(count, len(schedule.value) - 1))
     return plan.brief.command(on, Kind.FDI, plan.target, np.clip(value, -plan.brief.bounds, plan.brief.bounds))
@@ -101,7 +101,7 @@ class Covert(Script):
         return ScriptPlan(brief, target[None], Schedule(scale * value, scale))
 
     def _cheapest(self, brief: Brief, actuators: Array, goal: Array) -> Array:
-        """(T, actuators) inputs of least energy from rest to `goal`: a = W' (W W')^-1 goal, with W = [.., A B, B]."""
+        """Return inputs (T, actuators) of least energy from rest to `goal`: a = W' (W W')^-1 goal, with W = [.., A B, B]."""
         model = brief.model
         steps = max(round(self.rise / model.dt), model.states)
         columns = [np.array(model.B[:, actuators])]
@@ -133,7 +133,7 @@ class Zero(NamedTuple):
 
 
 def invariant_zeros(A: Array, B: Array, C: Array) -> list[Zero]:
-    """Finite invariant zeros of (A, B, C) with |z| < 100, C (p, n) with at least as many rows as B (n, m) has columns.
+    """Return finite invariant zeros of (A, B, C) with |z| < 100; C (p, n) has at least as many rows as B (n, m) has columns.
 
     Where the Rosenbrock pencil [A - z I, B; C, 0] loses rank. With more outputs than inputs, zeros of m of them are candidates, and those
     that silence the others as well are kept.
@@ -230,7 +230,7 @@ class Stealth(Script):
 
     def command(self, plan: ScriptPlan, on: Array, count: Array, view: View, draws: Draws) -> Command:
         if view.defence is None or view.received is None:
-            raise InputError("threat_model.knowledge", plan.brief.threat.knowledge, "white, which attack stealth needs")
+            raise InputError("threat_model.knowledge", plan.brief.threat.knowledge, "white: attack stealth needs it")
         box = view.defence
         if not hasattr(box.defence, "look"):
             raise NotApplicable("attack stealth", type(box.defence).__name__, "a defence that shows its innovation (look)")
@@ -275,13 +275,13 @@ class Stealth(Script):
         return plan
 
     def _rows(self, model: Model) -> Array | None:
-        """(N, n) what is pushed of each car, where several drive behind each other; else state `state_index` itself."""
+        """Return the pushed direction (N, n): gap or speed of each car of a string; None where state `state_index` itself is pushed."""
         if model.agents == 1 or not model.followers.any():
             return None
         return model.speed if self.state_index else model.gap
 
     def _gain(self, brief: Brief, gain: Array) -> Array:
-        """(B, N, q): how much the state that is pushed moves with each sensor, from the gain (B, N, n, q)."""
+        """Return how much the pushed state moves with each sensor (B, N, q), from the gain (B, N, n, q)."""
         rows = self._rows(brief.model)
         if rows is None:
             return gain[..., self.state_index, :]

@@ -27,7 +27,7 @@ PER_CAR = 4  # states of a follower
 
 
 class Column:
-    """Where a string's states stand in X: `gap(i)`, `controller(i)` of followers i >= 1, `speed(i)`, `accel(i)` of every car."""
+    """Indices of a string's states in X: `gap(i)`, `controller(i)` of followers i >= 1, `speed(i)`, `accel(i)` of every car."""
 
     @staticmethod
     def gap(i: int) -> int:
@@ -58,13 +58,13 @@ class Gains(NamedTuple):
 
 
 def no_gains(cars: int, tau_f: float) -> Gains:
-    """Gains of zero for `cars` cars, to be filled in."""
+    """Return gains of zero for `cars` cars, to be filled in."""
     n = 3 + PER_CAR * (cars - 1)
     return Gains(np.zeros((cars, n)), np.zeros(cars), np.zeros((cars, n)), np.zeros(cars), np.zeros((cars, 3)), tau_f)
 
 
 class Tuned(NamedTuple):
-    """Gains and what f keeps of itself in a step, exp(-dt / tau_f)."""
+    """Gains, and the share of itself that f keeps in a step, exp(-dt / tau_f)."""
 
     gains: Gains
     keep: float
@@ -93,7 +93,7 @@ class Law:
         check_order("controller: accel_min, accel_max", (self.accel_min, self.accel_max))
 
     def gains(self, graph: Array, headway: float, local: bool = False) -> Gains:
-        """The law's matrices for a graph (N, N), a time headway [s], and without V2V messages where `local`."""
+        """Return the law's matrices for a graph (N, N), a time headway [s], and without V2V messages where `local`."""
         raise TypeError(f"{type(self).__name__} must define gains()")
 
     def prepare(self, model: Model) -> LawPlan:
@@ -109,11 +109,11 @@ class Law:
         return LawState(num.zeros((batch, len(plan.normal.gains.k0))))
 
     def held(self, plan: LawPlan, state: LawState, batch: int) -> Array:
-        """(B, N, 1) f of each car."""
+        """Return f of each car, (B, N, 1)."""
         return state.f[..., None]
 
     def step(self, plan: LawPlan, state: LawState, estimate: Estimate, v2v: Array, odometry: Array) -> tuple[LawState, Array]:
-        """estimate.x (B, N, n), row i being what car i believes, and v2v (B, N, 3) to the commands u (B, N, 1) [m/s^2]."""
+        """Return the commands u (B, N, 1) [m/s^2] for estimate.x (B, N, n), whose row i is car i's estimate, and v2v (B, N, 3)."""
         mode = estimate.mode
         u, f = self._act(plan.normal, estimate.x, state.f, v2v)
         for other, tuned in ((Mode.WIDEN, plan.wide), (Mode.ACC, plan.local)):
@@ -125,7 +125,7 @@ class Law:
         return LawState(f), u[..., None]
 
     def _act(self, tuned: Tuned, x: Array, f: Array, v2v: Array) -> tuple[Array, Array]:
-        """u and the next f, each (B, N). A car knows its own f."""
+        """Return u and the next f, each (B, N). A car knows its own f."""
         gains, keep = tuned
         u, g = num.full(f.shape, gains.k0), num.full(f.shape, gains.g0)
         for out, rows in ((u, gains.K), (g, gains.G)):
@@ -136,12 +136,12 @@ class Law:
         return u, keep * f + (1.0 - keep) * g
 
     def desired_gap(self, speed: Array) -> Array:
-        """d_r + tau_h v [m] (6.1)."""
+        """Return d_r + tau_h v [m] (6.1)."""
         return np.asarray(self.standstill + self.headway * speed)
 
 
 def spacing(K: Array, i: int, kp: float, kd: float, headway: float) -> None:
-    """Adds kp (d_i - tau_h v_i) + kd (v_{i-1} - v_i - tau_h a_i) to row i (6.2), (6.3); -kp d_r belongs to the constants."""
+    """Add kp (d_i - tau_h v_i) + kd (v_{i-1} - v_i - tau_h a_i) to row i (6.2), (6.3); -kp d_r belongs to the constants."""
     K[i, Column.gap(i)] += kp
     K[i, Column.speed(i)] += -kp * headway - kd
     K[i, Column.speed(i - 1)] += kd

@@ -4,7 +4,7 @@
 """
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from tailgate import num
 from tailgate.core import Array, Estimate, Model, param
 from tailgate.core.quantities import Lag, Length, PositiveSpeed, Rate
 from tailgate.core.registry import register
-from tailgate.envs.controllers.adaptive_cruise import limited, obeyed, widened
+from tailgate.envs.controllers.adaptive_cruise import OneCar, limited, obeyed, widened
 from tailgate.envs.controllers.radar_car import GAP, RELATIVE_SPEED, check_radar_car
 from tailgate.envs.vehicle import roll
 
@@ -26,7 +26,7 @@ IDM_BRAKE = 8.0  # physical limit [m/s^2]
 
 
 def idm(gap: Array, v: Array, lead: Array, v0: float, headway: Array | float, s0: float, accel: float, decel: float) -> Array:
-    """The model's acceleration [m/s^2] for gap [m] and speeds [m/s], elementwise, without its physical limits."""
+    """Return the model's acceleration [m/s^2] for gap [m] and speeds [m/s], elementwise, without its physical limits."""
     closing = v * (v - lead) / (2.0 * np.sqrt(accel * decel))
     wanted = s0 + np.maximum(0.0, v * headway + closing)
     free = (v / v0) * (v / v0)
@@ -36,7 +36,7 @@ def idm(gap: Array, v: Array, lead: Array, v0: float, headway: Array | float, s0
 
 
 def idm_accel(gap: Array, speed: Array, lead_speed: Array) -> Array:
-    """Acceleration [m/s^2] of the driver behind for gap [m] and speeds [m/s], elementwise."""
+    """Return the acceleration [m/s^2] of the driver behind for gap [m] and speeds [m/s], elementwise."""
     out: Array = num.clip(idm(gap, speed, lead_speed, IDM_SPEED, IDM_HEADWAY, IDM_GAP, IDM_ACCEL, IDM_DECEL), -IDM_BRAKE, IDM_ACCEL)
     return out
 
@@ -58,13 +58,13 @@ class Behind:
     reaction: int
 
     def start(self, x: Array, speed: float) -> BehindState:
-        """Behind a car at x (B,) [m], at its speed and at the gap that it wants there."""
+        """Return a driver behind a car at x (B,) [m], at its speed and at the gap that it wants there."""
         batch = len(x)
         gap = IDM_GAP + IDM_HEADWAY * speed
         return BehindState(x - gap, np.full(batch, speed), num.zeros((batch, self.reaction)), np.zeros(batch, np.int64))
 
     def step(self, state: BehindState, x: Array, v: Array) -> BehindState:
-        """One step later; x [m] and v [m/s] (B,) of the car ahead at its beginning."""
+        """Return the state one step later; x [m] and v [m/s] (B,) of the car ahead at the beginning of the step."""
         decided = idm_accel(x - state.x, state.v, v)
         intent, slot = state.intent, state.slot
         if self.reaction:
@@ -77,7 +77,7 @@ class Behind:
 
 @register("controller", "idm", reference="Treiber, Hennecke, Helbing, Congested traffic states in empirical observations, 2000")
 @dataclass(frozen=True)
-class IntelligentDriver:
+class IntelligentDriver(OneCar):
     """The Intelligent Driver Model on a radar's estimates and the trusted own speed.
 
     The thesis speaks of a "modified IDM" (3.5.1) and never writes it down: this is the published model, for comparison with its ACC.
@@ -90,23 +90,17 @@ class IntelligentDriver:
     decel: Rate = param(2.0, "comfortable deceleration b [m/s^2]")
     brake: Rate = param(5.0, "largest deceleration [m/s^2]")
 
-    def prepare(self, model: Model) -> Any:
+    def prepare(self, model: Model) -> None:
         check_radar_car(model, "controller idm")
 
-    def start(self, plan: Any, batch: int) -> None:
-        return None
-
-    def step(self, plan: Any, state: None, estimate: Estimate, v2v: Array, odometry: Array) -> tuple[None, Array]:
-        """estimate.x (B, N, 4) = [gap, relative speed, ...] and the own odometry to the acceleration (B, N, 1) [m/s^2]."""
+    def step(self, plan: None, state: None, estimate: Estimate, v2v: Array, odometry: Array) -> tuple[None, Array]:
+        """Return the acceleration (B, N, 1) [m/s^2] for estimate.x (B, N, 4) = [gap, relative speed, ...] and the own odometry."""
         gap, v, mode = estimate.x[..., GAP], odometry[..., 1], estimate.mode
         lead, headway = v + estimate.x[..., RELATIVE_SPEED], widened(self.headway, mode)
         a = idm(gap, v, lead, self.set_speed, headway, self.standstill, self.accel, self.decel)
         return None, limited(obeyed(a, mode), -self.brake, self.accel)[..., None]
 
-    def held(self, plan: Any, state: None, batch: int) -> Array:
-        return np.zeros((batch, 1, 0))
-
     def desired_gap(self, speed: Array) -> Array:
-        """The gap at which it keeps a speed below v0 [m]."""
+        """Return the gap at which it keeps a speed below v0 [m]."""
         ratio = np.minimum(speed / self.set_speed, 0.99)
         return np.asarray((self.standstill + self.headway * speed) / np.sqrt(1.0 - ratio * ratio * ratio * ratio))

@@ -1,7 +1,6 @@
-"""What a car with a radar estimates, and the controllers that drive it."""
+"""The model of a car with a radar, and the controllers that drive it."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -9,20 +8,20 @@ from tailgate.base.errors import InputError
 from tailgate.core import Array, Estimate, Model, Plant, Receiver, Sensor, param
 from tailgate.core.quantities import Accel, Lag, Length, PositiveGain, PositiveSpeed, check_order
 from tailgate.core.registry import register
-from tailgate.envs.controllers.adaptive_cruise import limited, obeyed, widened
+from tailgate.envs.controllers.adaptive_cruise import OneCar, limited, obeyed, widened
 
 GAP, RELATIVE_SPEED, LEAD_ACCEL, OWN_SPEED = range(4)
 STATES = 4
 
 
 def kinematic(T: float) -> tuple[Array, Array]:
-    """A (4, 4) and B (4, 1) of x = [d, dv, a_L, v_F] for a step T [s], the input being the own speed at its end."""
+    """Return A (4, 4) and B (4, 1) of x = [d, dv, a_L, v_F] for a step T [s]; the input is the own speed at its end."""
     A = np.array([[1.0, T, T * T / 2.0, T / 2.0], [0.0, 1.0, T, 1.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 0.0]])
     return A, np.array([[-T / 2.0], [-1.0], [0.0], [1.0]])
 
 
 def radar_model(plant: Plant, sensor: Sensor, T: float, process_var: tuple[float, ...]) -> Model:
-    """What a defence of a car with a radar is told, of steps of T [s] and variances of the process noise (4,)."""
+    """Return the public model of a car with a radar, for steps of T [s] and variances of the process noise (4,)."""
     (sensors, C, R), (A, B), rows = sensor.matrices(plant), kinematic(T), np.eye(STATES)
     return Model(
         A=A, B=B, c=np.zeros(STATES), C=C, Q=np.diag(process_var), R=R, graph=np.eye(1, dtype=bool), dt=T, sensors=sensors,
@@ -40,7 +39,7 @@ def check_radar_car(model: Model, where: str) -> None:
 def wanted(
     d: Array, dv: Array, v: Array, headway: Array, standstill: float, g: float, tau: float, gain: float, set_speed: float
 ) -> Array:  # fmt: skip
-    """v_des [m/s] of a gap d [m], a relative speed dv and the own speed v [m/s], elementwise: (3.12), (3.13)."""
+    """Return v_des [m/s] for a gap d [m], a relative speed dv and the own speed v [m/s], elementwise: (3.12), (3.13)."""
     off = d - (standstill + headway * v)
     spacing = v / gain + tau / (headway * gain) * (dv + g * off)
     free = d > standstill + headway * set_speed
@@ -50,7 +49,7 @@ def wanted(
 
 @register("controller", "acc_radar", reference="Dutta 2018, (3.12), (3.13), (3.16), corrected")
 @dataclass(frozen=True)
-class RadarCruise:
+class RadarCruise(OneCar):
     """Adaptive cruise control with a speed and a spacing mode, on a radar's estimates and the trusted own speed.
 
         d_des = d0 + tau_h v_F                                                                                    (3.12)
@@ -74,22 +73,16 @@ class RadarCruise:
     def __post_init__(self) -> None:
         check_order("controller acc_radar.accel_min, accel_max", (self.accel_min, self.accel_max))
 
-    def prepare(self, model: Model) -> Any:
+    def prepare(self, model: Model) -> None:
         check_radar_car(model, "controller acc_radar")
 
-    def start(self, plan: Any, batch: int) -> None:
-        return None
-
-    def step(self, plan: Any, state: None, estimate: Estimate, v2v: Array, odometry: Array) -> tuple[None, Array]:
-        """estimate.x (B, N, 4) = [d, dv, ...] and odometry (B, N, 2) = [x_F, v_F] to the command a_des (B, N, 1) [m/s^2]."""
+    def step(self, plan: None, state: None, estimate: Estimate, v2v: Array, odometry: Array) -> tuple[None, Array]:
+        """Return the command a_des (B, N, 1) [m/s^2] for estimate.x (B, N, 4) = [d, dv, ...] and odometry (B, N, 2) = [x_F, v_F]."""
         d, dv, v = estimate.x[..., GAP], estimate.x[..., RELATIVE_SPEED], odometry[..., 1]
         headway = widened(self.headway, estimate.mode)
         a = (wanted(d, dv, v, headway, self.standstill, self.g, self.tau, self.gain, self.set_speed) - v) / self.sample
         return None, limited(obeyed(a, estimate.mode), self.accel_min, self.accel_max)[..., None]
 
-    def held(self, plan: Any, state: None, batch: int) -> Array:
-        return np.zeros((batch, 1, 0))
-
     def desired_gap(self, speed: Array) -> Array:
-        """d0 + tau_h v [m] (3.12)."""
+        """Return d0 + tau_h v [m] (3.12)."""
         return np.asarray(self.standstill + self.headway * speed)

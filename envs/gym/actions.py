@@ -21,7 +21,7 @@ VECTOR = (Kind.FDI, Kind.ECHO_DELAY, Kind.NOISE_JAM)  # kinds that a vector of v
 
 @dataclass(frozen=True)
 class ActionSpec:
-    """Which decisions the learner takes.
+    """The decisions that the learner takes.
 
     timing: {none, attack}, the attack is `kind` with its value. mode: {none, then one per granted kind, +value and -value for fdi}, and
     fdi and echo_delay once for each of `shares`, so that an attacker chooses the size too.
@@ -106,7 +106,7 @@ class ActionCodec:
 
     @cached_property
     def channel(self) -> ChannelPlan:
-        """What the channel makes of the brief."""
+        """The channel's plan under the brief."""
         return Channel().prepare(self.brief)
 
     @cached_property
@@ -123,7 +123,7 @@ class ActionCodec:
     def modes(self) -> list[Mode]:
         """Discrete meanings, in the order of the action's number."""
         granted, value = self.brief.granted, self.spec.value
-        groups = [("", granted)]  # of single wires: their names begin with a colon
+        groups = [("", granted)]  # names of single wires begin with a colon
         named = [(":" + self.brief.model.wires[w], np.arange(granted.shape[1]) == w) for w in self.wires] if self.spec.per_sensor else []
         agents = [(f"[{i}]", (np.arange(granted.shape[0]) == i)[:, None]) for i in self.victims] if self.spec.per_agent else []
         if len(named) > 1:
@@ -144,7 +144,7 @@ class ActionCodec:
                     for share, mark in self._shares:
                         sent = share * np.minimum(abs(value), bounds)
                         out += [Mode(f"fdi{t}{mark}{suffix}", kind, target, sign * sent, sign) for t, sign in signs.items()]
-                elif kind in (Kind.FDI, Kind.DOS_JAM):  # what is too much for an actuator is cut
+                elif kind in (Kind.FDI, Kind.DOS_JAM):  # too large a value for an actuator is cut
                     cut = np.clip(value, -bounds, bounds)
                     sent = cut if kind == Kind.FDI else np.where(self.brief.is_actuator, cut, value)
                     out.append(Mode(name + suffix, kind, target, sent))
@@ -154,7 +154,7 @@ class ActionCodec:
         return out
 
     def _aired(self, kind: Kind, suffix: str, target: Array) -> list[Mode]:
-        """The modes of a kind over the air, which reaches all that a receiver reads; none where `target` has no receiver."""
+        """Return the modes of a kind over the air, which reaches all that a receiver reads; none where `target` has no receiver."""
         if not target.any():
             return []
         name = kind.name.lower()
@@ -167,7 +167,7 @@ class ActionCodec:
 
     @cached_property
     def _shares(self) -> list[tuple[float, str]]:
-        """What is sent of a value, and what a mode's name says of it: nothing where it is all."""
+        """Return the shares of a value that may be sent, and how a mode's name shows each: empty for the whole value."""
         return [(share, "" if share == 1.0 else f"*{share!r}") for share in self.spec.shares or (1.0,)]
 
     @property
@@ -179,7 +179,7 @@ class ActionCodec:
         return 1 + len(self.victims) * (len(self.wires) * (Kind.FDI in self.carried) + radiates)
 
     def decode(self, action: Array, view: View) -> Command:
-        """Discrete (B,) int or continuous (B, size) in [-1, 1] to a command."""
+        """Return the command of discrete actions (B,) int, or of continuous ones (B, size) in [-1, 1]."""
         brief = self.brief
         if self.discrete:
             index = np.asarray(action).reshape(-1)
@@ -204,11 +204,11 @@ class ActionCodec:
         return brief.command(on, kinds, target, value)
 
     def _changed(self, kind: Kind, last: Array, change: Array) -> Array:
-        """The value sent last and a change of it, within the bounds of the kind."""
+        """Return the value sent last plus a change, within the bounds of the kind."""
         return fit(self.brief, kind, last + self.spec.rate * change)
 
     def _sent(self, kind: Kind, action: Array, view: View) -> Array:
-        """(B, N, w) the values of `kind` in a vector (B, size - 1) in [-1, 1]."""
+        """Return the values of `kind` (B, N, w) in a vector (B, size - 1) in [-1, 1]."""
         brief, batch, agents = self.brief, len(action), len(self.victims)
         share = num.zeros((batch, *brief.granted.shape))
         if kind == Kind.FDI:
@@ -224,7 +224,7 @@ class ActionCodec:
         return fit(brief, kind, most * (0.5 + 0.5 * share))
 
     def mask(self, view: View) -> Array:
-        """(B, size) bool of the discrete actions that the channel would accept in at least one step of the decision that is due."""
+        """Return (B, size) bool: the discrete actions that the channel would accept in at least one step of the decision that is due."""
         free = Channel().open(self.channel, view.k, view.budget_left, view.burst, view.cooldown, self.spec.interval)
         out = np.repeat(free[:, None], self.size, axis=1)
         out[:, 0] = True
@@ -232,7 +232,7 @@ class ActionCodec:
 
 
 def action_space(codec: ActionCodec) -> Any:
-    """The Gymnasium space of one row's action."""
+    """Return the Gymnasium space of one row's action."""
     from gymnasium import spaces
 
     if codec.discrete:

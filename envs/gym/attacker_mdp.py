@@ -1,4 +1,4 @@
-"""The attacker's seat: the loop with the attack left open, from checked arguments. Environments, learners and games sit on it."""
+"""The attacker's decision process: the loop with the attack left open, from checked arguments. Environments, learners and games use it."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from tailgate.base import sizes
 from tailgate.base.errors import InputError, UnknownArgument, unknown
-from tailgate.core import Array, Command, Frame, Kind, View
+from tailgate.core import Array, Command, Defence, Frame, Kind, View
 from tailgate.core.loop import Loop, LoopState
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import load_scenario
@@ -22,7 +22,7 @@ from tailgate.envs.gym.observations import FRAMES, ObservationCodec
 from tailgate.envs.gym.rewards import Reward
 
 CAR_FOLLOWING = "tailgate/CarFollowing-v0"
-FACES: dict[str, dict[str, Any]] = {  # what each id is where nothing else is said: the one place of these defaults
+FACES: dict[str, dict[str, Any]] = {  # defaults of each id
     CAR_FOLLOWING: {"scenario": "stop-and-go-v0", "defence": "chi2_kf"},
     "tailgate/RadarFollowing-v0": {"scenario": "radar-following-v0", "defence": "cra"},
     "tailgate/Platoon-v0": {"scenario": "platoon-braking-v0", "defence": "lasso_dkf"},
@@ -32,9 +32,9 @@ FACES: dict[str, dict[str, Any]] = {  # what each id is where nothing else is sa
 
 
 class Tally(NamedTuple):
-    """What the reward remembers of each episode, (B,) each."""
+    """The reward's memory of each episode, (B,) each."""
 
-    potential: Array  # of the shaping
+    potential: Array  # shaping potential
     least: Array  # smallest gap so far, within the reward's reach [m]
     error: Array  # largest error of an agent, where there is no road
     peak: Array  # the largest of the episode so far, where the reward is for that
@@ -52,7 +52,7 @@ class Sums(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """What a decision of the attacker brought, (B,) each; of rows that were over before it nothing."""
+    """The result of a decision of the attacker, (B,) each; zero for rows that were over before it."""
 
     reward: Array
     collided: Array
@@ -63,7 +63,7 @@ class Outcome(NamedTuple):
 
 
 def _reward(options: dict[str, Any]) -> Reward:
-    """The reward from its options, or the object that stands for it."""
+    """Return the reward from its options, or the object given in their place."""
     own = options.get("reward")
     if not isinstance(own, Reward):
         return build(Reward, options, "reward")
@@ -74,7 +74,7 @@ def _reward(options: dict[str, Any]) -> Reward:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Seat:
-    """Everything that an adversary environment is, apart from its episodes: loop, codecs and reward, from checked arguments."""
+    """An adversary environment apart from its episodes: loop, codecs and reward, from checked arguments."""
 
     loop: Loop
     action: ActionCodec
@@ -89,11 +89,15 @@ class Seat:
         return sizes.ENVIRONMENT + 8 * model.agents * model.states**2 * 4 + 8 * len(self.observation.names)
 
     @classmethod
-    def make(cls, scenario: Any = None, defence: Any = None, threat: dict[str, Any] | None = None, **options: Any) -> Seat:
-        """scenario: name or YAML file. defence: name (`chi2_kf:eta=15`) or object. threat: changes of the scenario's threat model.
+    def make(
+        cls, scenario: str | None = None, defence: str | Defence | None = None, threat: dict[str, Any] | None = None, **options: Any
+    ) -> Seat:
+        """Return the environment's core.
+
+        scenario: name or YAML file. defence: name (`chi2_kf:eta=15`) or object. threat: changes of the scenario's threat model.
 
         options: the fields of ActionSpec and Reward, `knowledge`, and `frames`: how many decisions the observation shows at once. Scenario
-        and defence are those of car following where they are None. `reward` may be an object of a subclass of Reward.
+        and defence default to those of car following. `reward` may be an object of a subclass of Reward.
         """
         scenario = FACES[CAR_FOLLOWING]["scenario"] if scenario is None else scenario
         defence = FACES[CAR_FOLLOWING]["defence"] if defence is None else defence
@@ -133,7 +137,7 @@ class Seat:
         return cls(loop, ActionCodec(action, loop.brief), ObservationCodec(loop.brief, frames), reward, config)
 
     def card(self) -> dict[str, Any]:
-        """What papers and rows cite: the whole configuration, and its hash."""
+        """Return the whole configuration with its hash, which papers and rows cite."""
         from tailgate.base.version import VERSION
 
         features, actions = list(self.observation.names), [mode.name for mode in self.action.modes] if self.action.discrete else None
@@ -144,7 +148,7 @@ class Seat:
 
     @property
     def road(self) -> bool:
-        """Whether anybody drives here, and can collide."""
+        """True if somebody drives here, and can collide."""
         return bool(self.loop.model.followers.any())
 
     @property
@@ -153,16 +157,16 @@ class Seat:
         return -(-self.loop.horizon // self.action.spec.interval)
 
     def begin(self, state: LoopState) -> Tally:
-        """The reward's memory of episodes that have just begun."""
+        """Return the reward's memory of episodes that have just begun."""
         gap = self.loop.plant.scene(self.loop.plan.plant, state.plant).gap
         return Tally(self.reward.potential(gap), self.reward.least(gap), np.zeros(len(gap)), np.zeros(len(gap)))
 
     def step(
         self, state: LoopState, tally: Tally, action: Array | Callable[[View], Command], over: Array
     ) -> tuple[LoopState, Tally, Outcome, Frame]:
-        """Play one decision, `interval` steps of the loop; rows that are `over` (B,) count for nothing. -> its last step as well.
+        """Play one decision, `interval` steps of the loop; also return its last step. Rows that are `over` (B,) do not count.
 
-        action: as `ActionCodec.decode` takes it, or somebody who decides in every step.
+        action: as `ActionCodec.decode` takes it, or a function that decides in every step.
         """
         sums = self.opened(tally)
         for _ in range(self.action.spec.interval):
@@ -170,14 +174,14 @@ class Seat:
         return state, tally, self.closed(state, tally, sums, over), frame
 
     def opened(self, tally: Tally) -> Sums:
-        """The sums before the first step of a decision."""
+        """Return the sums before the first step of a decision."""
         no = np.zeros(len(tally.potential), bool)
         return Sums(np.zeros(len(no)), tally.potential, no, no, no, no)
 
     def advanced(
         self, state: LoopState, tally: Tally, sums: Sums, action: Array | Callable[[View], Command], over: Array
     ) -> tuple[LoopState, Tally, Sums, Frame]:
-        """One step of a decision."""
+        """Play one step of a decision."""
         loop, reward = self.loop, self.reward
         live = ~over & ~state.ended & (state.k <= loop.horizon)
         view = loop.sense(state)
@@ -198,7 +202,7 @@ class Seat:
         return state, Tally(potential, least, largest, peak), sums, frame
 
     def closed(self, state: LoopState, tally: Tally, sums: Sums, over: Array) -> Outcome:
-        """The outcome of a decision, after its last step."""
+        """Return the outcome of a decision, after its last step."""
         illegal = sums.refused & ~sums.accepted
         terminated = state.ended & ~over
         truncated = ~terminated & ~over & (state.k > self.loop.horizon)

@@ -1,10 +1,11 @@
-"""Episodes that an environment plays side by side, in any engine: the same decisions, rewards and observations to the last bit."""
+"""The episodes of a batch, in any engine: the same decisions, rewards and observations to the last bit."""
 
 from __future__ import annotations
 
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from tailgate.base import sizes
 from tailgate.base.errors import InputError, unknown
@@ -21,7 +22,7 @@ ENGINES = ("auto", "traced", "plain")
 
 
 class Facts(NamedTuple):
-    """What the information of a step says of the state that it led to, (B,) each."""
+    """The part of a step's information that describes the state after it, (B,) each."""
 
     allowed: Array  # bool
     step: Array  # int64
@@ -38,34 +39,34 @@ class Episodes(Protocol):
         """(B,) uint32: the episode of each row under its key."""
 
     def begin(self, keys: Keys) -> None:
-        """All rows begin."""
+        """Begin an episode in every row."""
 
     def again(self, rows: Array, keys: Keys | None = None, reset: bool = False) -> None:
         """Begin the next episode in `rows` (B,) bool, or that of the keys, of as many rows. reset: the user asked, between two steps."""
 
     def decide(self, actions: Array, over: Array, restart: bool) -> Outcome:
-        """One decision; rows that are `over` (B,) bool count for nothing, and with `restart` begin their next episode instead."""
+        """Play one decision; rows that are `over` (B,) bool do not count, and with `restart` begin their next episode instead."""
 
     def seen(self) -> Array:
-        """(B, d) float32: what is to be seen now, of one frame."""
+        """Return the present observation (B, d) float32, of one frame."""
 
     def facts(self) -> Facts: ...
 
     def mask(self) -> Array:
-        """(B, actions) bool: the discrete actions that the channel would accept in a step of the next decision."""
+        """Return (B, actions) bool: the discrete actions that the channel would accept in a step of the next decision."""
 
     def held(self) -> dict[str, Array]:
-        """All that changes from step to step, by name."""
+        """Return all that changes from step to step, by name."""
 
     def put(self, held: dict[str, Array]) -> None:
-        """What `held` gave, of the same number of rows."""
+        """Restore what `held` returned, of the same number of rows."""
 
     def drawn(self, row: int) -> tuple[LoopState, Frame | None, int]:
         """Return what a picture of a row shows: a state of the plain loop, its last step (None after a reset), and the row of both."""
 
 
 def framed(now: Array, before: Array | None, frames: int) -> Array:
-    """(B, frames d) what is seen now (B, d) on top of what was seen before (B, frames d); none before: the first of an episode."""
+    """Return the present frame (B, d) on top of the earlier frames (B, frames d); none before: the first of an episode."""
     return np.tile(now, frames) if before is None else np.concatenate([now, before[:, : -now.shape[1]]], axis=1)
 
 
@@ -200,7 +201,7 @@ class TracedEpisodes:
         brought = self._rows.brought
         return Outcome(*(brought[name] for name in Outcome._fields))
 
-    def decide_alone(self, action: Any) -> tuple[Any, ...]:
+    def decide_alone(self, action: ArrayLike) -> tuple[Any, ...]:
         return self._rows.decide_alone(action)
 
     def again_alone(self) -> tuple[Any, ...]:
@@ -221,11 +222,11 @@ class TracedEpisodes:
 
     def put(self, held: dict[str, Array]) -> None:
         self._rows.put(held)
-        self.shadow = None  # nobody knows what was decided before
+        self.shadow = None  # the earlier decisions are not known
 
     def drawn(self, row: int) -> tuple[LoopState, Frame | None, int]:
         if self.shadow is None:
-            raise InputError("render", "episodes that were put back", "reset() first")
+            raise InputError("render", "restored episodes", "reset() first")
         return *self.shadow.look(row, PlainEpisodes), 0
 
     def __getstate__(self) -> dict[str, Any]:

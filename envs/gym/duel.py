@@ -1,7 +1,7 @@
 """The game of two: an attacker and a defender decide at the same time, every `interval` steps of one loop (docs/two-players.md).
 
-The attacker sits where it always does (`Seat`). The defender turns the knobs of its defence (`Steered`); it sees what the defence has, and
-is told nothing of the road or of the attack. `Duel` is the batched core: the PettingZoo environment is a batch of one of it.
+The attacker acts as in the one-player environments (`Seat`). The defender turns the knobs of its defence (`Steered`). It sees what the
+defence sees, and nothing else of the road or of the attack. `Duel` is the batched core: the PettingZoo environment is a batch of one.
 """
 
 from __future__ import annotations
@@ -12,10 +12,11 @@ from typing import Any, Literal, NamedTuple
 
 import gymnasium
 import numpy as np
+from numpy.typing import ArrayLike
 
 from tailgate.base.errors import InputError, unknown
 from tailgate.base.pytree import put_rows
-from tailgate.core import Array, Attack, Command, Frame, NonNegative, View, draws, param
+from tailgate.core import Array, Attack, Command, Defence, Frame, NonNegative, View, draws, param
 from tailgate.core.draws import Keys, Role
 from tailgate.core.loop import LoopState
 from tailgate.core.registry import Spec, entry_for
@@ -32,7 +33,7 @@ DEFENDER = "tailgate/Defender-v0"
 
 @dataclass(frozen=True)
 class Payoff:
-    """What the defender is paid for. Scores never use it.
+    """The defender's payment. Scores never use it.
 
     safety: -1 at a collision, and the costs of being careful. zero_sum: minus what the attacker is paid, which forgives any care. The costs
     are no potentials: they say how much driving is worth.
@@ -52,7 +53,7 @@ class DuelState(NamedTuple):
     seen: Array  # (B, d) float32: the attacker's observation
 
 
-class Rival:
+class Attacker:
     """An attack with its memory over B episodes."""
 
     def __init__(self, attack: Attack, seat: Seat, keys: Keys) -> None:
@@ -65,8 +66,8 @@ class Rival:
         return command
 
 
-def steered(defence: Any, menu: Menu) -> Steered:
-    """The defence with its knobs in the defender's hands: a registered one by text, or one that is steered already."""
+def steered(defence: str | Defence, menu: Menu) -> Steered:
+    """Return the defence with its knobs in the defender's hands: from a registered name, or a steered defence."""
     if isinstance(defence, str):
         Spec("defence", defence).refuse_imports("duel")
         defence = Spec("defence", defence).make()
@@ -93,10 +94,12 @@ class Duel:
 
     @classmethod
     def make(
-        cls, scenario: Any = None, defence: Any = None, menu: dict[str, Any] | Menu | None = None, defender_action: Any = "menu",
-        **arguments: Any,
+        cls, scenario: str | None = None, defence: str | Defence | None = None, menu: dict[str, Any] | Menu | None = None,
+        defender_action: Literal["menu", "box"] = "menu", **arguments: Any,
     ) -> Duel:  # fmt: skip
-        """defence: whose knobs are turned. menu: their settings. defender_action: menu (a number) or box ([-1, 1] per knob).
+        """Return a game.
+
+        defence: the defence with the knobs. menu: their settings. defender_action: menu (a number) or box ([-1, 1] per knob).
 
         arguments: the fields of Payoff, and those of `Seat.make`; both players decide every `interval` steps.
         """
@@ -111,8 +114,8 @@ class Duel:
         guard = steered(defence, dataclasses.replace(menu, interval=interval))
         return cls(Seat.make(scenario=scenario, defence=guard, **arguments), guard, payoff, defender_action)
 
-    def card(self, **more: Any) -> dict[str, Any]:
-        """JSON data that names this game completely: the seat's card, the defender's side and what is added, with a hash of all."""
+    def card(self, **more: object) -> dict[str, Any]:
+        """Return JSON data that names this game completely: the seat's card, the defender's side and additions, with a hash of all."""
         side = as_data({"payoff": self.payoff, "defender_action": self.action, **more})
         return {"seat": self.seat.card(), **side, "hash": digest({"seat": self.seat.config, **side})}
 
@@ -132,7 +135,7 @@ class Duel:
         return self._started(self.seat.loop.start(keys))
 
     def restart(self, state: DuelState, rows: Array) -> DuelState:
-        """The next games of `rows` (B,) bool."""
+        """Return the next games of `rows` (B,) bool."""
         again = self._started(self.seat.loop.restart(state.loop, rows))
         held = np.flatnonzero(~rows)
         if not len(held):
@@ -144,45 +147,47 @@ class Duel:
         return DuelState(state, self.seat.begin(state), self.seat.observation.observe(self.seat.loop.sense(state)))
 
     def defender_sees(self, state: DuelState) -> Array:
-        """(B, d) float32."""
+        """Return the defender's observation (B, d) float32."""
         held: SteeredState = state.loop.defence
         return held.seen
 
     def mask(self, state: DuelState) -> Array:
-        """(B, actions) bool: the attacker's discrete actions that the channel would accept in a step of the next decision."""
+        """Return (B, actions) bool: the attacker's discrete actions that the channel would accept in a step of the next decision."""
         return self.seat.action.mask(self.seat.loop.sense(state.loop))
 
     def step(
-        self, state: DuelState, attack: Array | Rival, defend: Array | None, over: Array
+        self, state: DuelState, attack: Array | Attacker, defend: Array | None, over: Array
     ) -> tuple[DuelState, Outcome, Array, Frame]:
-        """Play one decision of both; rows that are `over` (B,) count for nothing. -> state, outcome, the defender's reward, last step.
+        """Play one decision of both; return state, outcome, the defender's reward and the last step.
 
-        attack: actions as the seat takes them, or an attack that plays. defend: numbers of the menu (B,), or vectors (B, K); None leaves
+        Rows that are `over` (B,) do not count.
+
+        attack: actions as `Seat` takes them, or an attack that plays. defend: numbers of the menu (B,), or vectors (B, K); None leaves
         the knobs where they are.
         """
         loop = state.loop
         if defend is not None:
             loop = loop._replace(defence=self.guard.steer(self.plan, loop.defence, self.values(defend)))
-        before, decision = loop, attack.decide if isinstance(attack, Rival) else attack
+        before, decision = loop, attack.decide if isinstance(attack, Attacker) else attack
         loop, tally, outcome, frame = self.seat.step(loop, state.tally, decision, over)
         seen = self.seat.observation.observe(self.seat.loop.sense(loop), state.seen)
         return DuelState(loop, tally, seen), outcome, self._paid(before, loop, outcome, over), frame
 
     def values(self, defend: Array) -> Array:
-        """(B, K) the knobs' values of the defender's actions."""
+        """Return the knobs' values (B, K) of the defender's actions."""
         if self.action == "menu":
             return np.asarray(self.settings[np.asarray(defend, np.int64)])
         return np.stack([knob.at(np.asarray(defend, np.float64)[:, i]) for i, knob in enumerate(self.guard.hand.knobs)], axis=1)
 
     def _paid(self, before: LoopState, after: LoopState, outcome: Outcome, over: Array) -> Array:
-        """(B,) the defender's reward of a decision."""
+        """Return the defender's reward (B,) of a decision."""
         if self.payoff.payoff == "zero_sum":
             return np.asarray(0.0 - outcome.reward)
         pay, dt, model = self.payoff, self.seat.loop.model.dt, self.seat.loop.model
         then, now = before.defence.memory, after.defence.memory
         quiet = after.channel.used == before.channel.used
         cost = pay.mode_cost * (now.asked - then.asked) + pay.alarm_cost * np.where(quiet, now.alarmed - then.alarmed, 0.0)
-        if self.seat.road:  # as it stands at the end of the decision, for the whole of it
+        if self.seat.road:  # the view at the end of the decision counts for the whole of it
             scene, cars = self.seat.loop.plant.scene(self.seat.loop.plan.plant, after.plant), np.flatnonzero(model.followers)
             wanted = self.seat.loop.controller.desired_gap(scene.speed[:, cars])
             wide = np.max(np.clip(scene.gap[:, cars] / np.maximum(wanted, 1.0) - 1.0, 0.0, 1.0), axis=1)
@@ -193,20 +198,20 @@ class Duel:
     # -- spaces
 
     def defender_spaces(self) -> tuple[Any, Any]:
-        """Gymnasium's spaces of one defender: what it sees, and what it does."""
+        """Return Gymnasium's spaces of one defender: its observation and its action."""
         sight = gymnasium.spaces.Box(-LIMIT, LIMIT, (len(self.plan.sight.names),), np.float32)
         if self.action == "menu":
             return sight, gymnasium.spaces.Discrete(len(self.settings))
         return sight, gymnasium.spaces.Box(-1.0, 1.0, (len(self.guard.hand.knobs),), np.float32)
 
     def told(self, state: DuelState) -> dict[str, Any]:
-        """What a defender is told beside its observation, of the first row: the step, and where its knobs stand."""
+        """Return the defender's information about the first row: the step, and the values of its knobs."""
         knobs = {knob.name: state.loop.defence.knobs[0, i] for i, knob in enumerate(self.guard.hand.knobs)}
         return {"step": state.loop.k[0], **knobs}
 
 
-def checked(space: Any, action: Any, who: str) -> Array:
-    """One row's action as a batch of one. Raises InputError for one outside of its space."""
+def checked(space: gymnasium.Space[Any], action: ArrayLike, who: str) -> Array:
+    """Return one row's action as a batch of one. Raise InputError for one outside of its space."""
     given = np.asarray(action)
     fits = given.shape == space.shape
     if fits and isinstance(space, gymnasium.spaces.Discrete):
@@ -218,15 +223,15 @@ def checked(space: Any, action: Any, who: str) -> Array:
     return given[None]
 
 
-def next_game(duel: Duel, held: DuelState | None, seed: int | None, rng: Any) -> DuelState:
-    """A batch of one: the game of `seed`, or without one the next of the episodes that were running."""
+def next_game(duel: Duel, held: DuelState | None, seed: int | None, rng: np.random.Generator) -> DuelState:
+    """Return a batch of one: the game of `seed`, or without one the next of the episodes that were running."""
     if held is not None and seed is None:
         return duel.restart(held, np.ones(1, bool))
     return duel.begin(draws.keys("train", [int(rng.integers(2**31)) if seed is None else int(seed)]))
 
 
 class DefenderEnv(Specified, gymnasium.Env[Array, Any]):
-    """The defender's seat against given attacks: an action sets the knobs for `interval` steps.
+    """An environment in which the agent is the defender, against given attacks: an action sets the knobs for `interval` steps.
 
     attack: one as on the command line, an object, or a list of them, of which each episode draws one. Other arguments: see `Duel.make`.
     """
@@ -238,34 +243,34 @@ class DefenderEnv(Specified, gymnasium.Env[Array, Any]):
         if not some:
             raise InputError("attack", attack, "at least one attack")
         made = [Spec("attack", held).make() if isinstance(held, str) else held for held in some]
-        if not all(callable(getattr(rival, name, None)) for rival in made for name in ("prepare", "start", "decide")):
+        if not all(callable(getattr(player, name, None)) for player in made for name in ("prepare", "start", "decide")):
             raise InputError("attack", attack, "a registered name, a policy's file, or an object with prepare, start and decide")
-        known = [getattr(rival, "knowledge", entry_for("attack", type(rival)).knowledge) for rival in made]
+        known = [getattr(player, "knowledge", entry_for("attack", type(player)).knowledge) for player in made]
         arguments.setdefault("knowledge", max(known, key=("black", "grey", "white").index))
         self.duel = Duel.make(**arguments)
         self.attack: Attack = made[0] if len(made) == 1 else Mixture(tuple(made))
-        self.attack.prepare(self.duel.seat.loop.brief)  # what does not fit shall fail here
+        self.attack.prepare(self.duel.seat.loop.brief)  # fail here, not in the first step
         self.observation_space, self.action_space = self.duel.defender_spaces()
         self.horizon = self.duel.seat.decisions
         self.state: DuelState | None = None
-        self.rival: Rival | None = None
+        self.attacker: Attacker | None = None
         self.over = np.zeros(1, bool)
 
     def card(self) -> dict[str, Any]:
-        """JSON data that names this environment completely, its attacks among them, with a hash."""
+        """Return JSON data that names this environment completely, its attacks among them, with a hash."""
         return self.duel.card(attack=self.attack)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Array, dict[str, Any]]:
         check_options(options)
         super().reset(seed=seed)
         self.state = next_game(self.duel, self.state, seed, self.np_random)
-        self.rival, self.over = Rival(self.attack, self.duel.seat, self.state.loop.keys), np.zeros(1, bool)
+        self.attacker, self.over = Attacker(self.attack, self.duel.seat, self.state.loop.keys), np.zeros(1, bool)
         return self.duel.defender_sees(self.state)[0].copy(), self.duel.told(self.state)
 
-    def step(self, action: Any) -> tuple[Array, float, bool, bool, dict[str, Any]]:
-        if self.state is None or self.rival is None or self.over.any():
+    def step(self, action: ArrayLike) -> tuple[Array, float, bool, bool, dict[str, Any]]:
+        if self.state is None or self.attacker is None or self.over.any():
             raise InputError("step", "no episode", "reset() first")
-        self.state, outcome, paid, _ = self.duel.step(self.state, self.rival, checked(self.action_space, action, "defender"), self.over)
+        self.state, outcome, paid, _ = self.duel.step(self.state, self.attacker, checked(self.action_space, action, "defender"), self.over)
         self.over = outcome.terminated | outcome.truncated
         seen = self.duel.defender_sees(self.state)[0].copy()
         return seen, float(paid[0]), bool(outcome.terminated[0]), bool(outcome.truncated[0]), self.duel.told(self.state)

@@ -1,6 +1,6 @@
-"""The Gymnasium faces: the loop with the attack's seat left open, under one id for each kind of system.
+"""The Gymnasium environments: the loop in which the agent is the attacker, under one id for each kind of system.
 
-The core is a vector environment without autoreset; NEXT_STEP and SAME_STEP are thin faces over it, and the single environment is
+The core is a vector environment without autoreset; NEXT_STEP and SAME_STEP are thin layers over it, and the single environment is
 a batch of one. reset(seed=s): row i equals gymnasium.make(...).reset(seed=s + i); each further episode of a row adds 1 to its
 episode counter.
 """
@@ -13,6 +13,7 @@ import gymnasium
 import numpy as np
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
+from numpy.typing import ArrayLike
 
 from tailgate.base import sizes
 from tailgate.base.errors import InputError, unknown
@@ -28,7 +29,7 @@ from tailgate.envs.render.viewer import Screen, Viewer
 
 _WHOLE = (int, np.int64)  # an action's usual types
 _BOOL = (np.False_, np.True_)
-_GOES_ON = np.zeros(1, bool)  # of a single row: it is not over
+_GOES_ON = np.zeros(1, bool)  # `over` of a single running row
 _AUTORESET = {"next_step": AutoresetMode.NEXT_STEP, "same_step": AutoresetMode.SAME_STEP, "disabled": AutoresetMode.DISABLED}
 
 
@@ -73,21 +74,21 @@ class AdversaryVectorEnv(Specified, gymnasium.vector.VectorEnv[Array, Array, Arr
         self._modes = self.seat.action.size if self.seat.action.discrete else 0  # discrete actions, 0 where there are none
         self._facts = ("illegal", "collided", "rear_collided", "allowed", "step", "gap" if self.seat.road else "error")
         self._present = self._presence()
-        self.observed = np.zeros((num_envs, features if self._frames > 1 else 0), np.float32)  # of several frames
+        self.observed = np.zeros((num_envs, features if self._frames > 1 else 0), np.float32)  # the last one, where it has several frames
 
     @property
     def engine(self) -> str:
-        """Who plays: traced or plain. What is played is the same."""
+        """The engine that plays: traced or plain. Both play the same episodes."""
         return self.episodes.engine
 
     @property
     def engine_why(self) -> str:
-        """Why the plain loop plays unasked: the line that cannot be traced, and what to write. Empty where it does not."""
+        """Why the plain loop plays although nobody asked for it: the line that cannot be traced, and how to write it. Else empty."""
         return self.episodes.why if isinstance(self.episodes, PlainEpisodes) else ""
 
     @property
     def direct(self) -> bool:
-        """No plain loop plays, and the environment adds nothing to what the engine tells."""
+        """True if no plain loop plays, and the environment adds nothing to the engine's results."""
         return not isinstance(self.episodes, PlainEpisodes) and self._frames == 1 and not self._limit
 
     @property
@@ -102,7 +103,7 @@ class AdversaryVectorEnv(Specified, gymnasium.vector.VectorEnv[Array, Array, Arr
 
     @property
     def tally(self) -> Tally | None:
-        """What the plain loop's reward remembers; None before the first episode, and where a traced loop plays."""
+        """The memory of the plain loop's reward; None before the first episode, and where a traced loop plays."""
         return self.episodes.tally if isinstance(self.episodes, PlainEpisodes) else None
 
     @property
@@ -111,13 +112,13 @@ class AdversaryVectorEnv(Specified, gymnasium.vector.VectorEnv[Array, Array, Arr
         return self.episodes.frame if isinstance(self.episodes, PlainEpisodes) else None
 
     def card(self) -> dict[str, Any]:
-        """JSON data that names this environment completely, with a hash."""
+        """Return JSON data that names this environment completely, with a hash."""
         return self.seat.card()
 
     # -- episodes
 
     def reset(self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None) -> tuple[Array, dict[str, Any]]:
-        """seed s or one per row. options["reset_mask"] (B,) bool restarts those rows only."""
+        """Begin episodes: seed s or one per row. options["reset_mask"] (B,) bool restarts those rows only."""
         check_options(options, ("reset_mask",))
         mask = None if options is None else options.get("reset_mask")
         if isinstance(seed, (list, tuple, np.ndarray)):
@@ -151,7 +152,7 @@ class AdversaryVectorEnv(Specified, gymnasium.vector.VectorEnv[Array, Array, Arr
         return self._shown(), self._info(*np.zeros((3, self.num_envs), bool))
 
     def step(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
-        """actions (B,) for discrete spaces, (B, size) for Box -> the Gymnasium five."""
+        """Play actions (B,) for discrete spaces, (B, size) for Box; return the five values of Gymnasium."""
         if not self.begun:
             raise InputError("step", "no episode", "reset() first")
         actions = self.checked(actions)
@@ -181,13 +182,16 @@ class AdversaryVectorEnv(Specified, gymnasium.vector.VectorEnv[Array, Array, Arr
         return observation, outcome.reward, terminated, truncated, info
 
     def action_masks(self) -> Array:
-        """(B, actions) bool: what the channel would accept in a step of the next decision. Discrete action spaces only."""
+        """Return (B, actions) bool: the actions that the channel would accept in a step of the next decision.
+
+        Discrete action spaces only.
+        """
         if not self.begun or not self.seat.action.discrete:
             raise InputError("action_masks", self.seat.action.spec.action, "a running episode with a discrete action space")
         return self.episodes.mask().copy()
 
     def render(self) -> tuple[Array, ...] | None:
-        """One (H, W, 3) uint8 picture per row: the road or the graph, what is believed, attack, alarm."""
+        """Return one (H, W, 3) uint8 picture per row: the road or the graph, the beliefs, attack, alarm."""
         if self.render_mode is None or not self.begun:
             return None
         from tailgate.envs.render.picture import draw
@@ -197,13 +201,13 @@ class AdversaryVectorEnv(Specified, gymnasium.vector.VectorEnv[Array, Array, Arr
     # -- inside
 
     def _limited(self, truncated: Array, over: Array) -> Array:
-        """(B,) bool truncated, also at `max_episode_steps`: as Gymnasium's TimeLimit, even in a step that ends in a collision."""
+        """Return truncated (B,) bool, also at `max_episode_steps`: as Gymnasium's TimeLimit, even in a step that ends in a collision."""
         self._elapsed = np.where(over, 0, self._elapsed + 1)
         late = self._elapsed >= self._limit
         return truncated | late
 
     def _presence(self) -> dict[str, Array]:
-        """Which rows have each piece of information: all, in one array that nobody can change."""
+        """Return the rows that have each piece of information: all, in one array that nobody can change."""
         everyone = np.ones(self.num_envs, bool)
         everyone.flags.writeable = False
         return {f"_{key}": everyone for key in (*self._facts, *(("action_mask",) if self._modes else ()))}
@@ -213,16 +217,16 @@ class AdversaryVectorEnv(Specified, gymnasium.vector.VectorEnv[Array, Array, Arr
         self._present = self._presence()  # a copied array can be changed
 
     def _begin(self, rows: Array) -> None:
-        """What is seen of episodes that have just begun in `rows` (B,) bool: every frame shows their first."""
+        """Return the observation of episodes that have just begun in `rows` (B,) bool: every frame shows their first."""
         if self._frames > 1:
             self.observed = np.where(rows[:, None], framed(self.episodes.seen(), None, self._frames), self.observed)
 
     def _shown(self) -> Array:
-        """The observation as its reader's own."""
+        """Return the observation as its reader's own."""
         return self.episodes.seen() if self._frames == 1 else self.observed.copy()
 
     def checked(self, actions: Array) -> Array:
-        """Actions of the right shape, kind and size; raises InputError."""
+        """Return actions of the right shape, kind and size; raise InputError for others."""
         actions = np.asarray(actions)
         shape = self.action_space.shape
         if actions.shape != shape:
@@ -272,16 +276,16 @@ class AdversaryEnv(Specified, gymnasium.Env[Array, Any]):
 
     @property
     def engine(self) -> str:
-        """Who plays: traced or plain."""
+        """The engine that plays: traced or plain."""
         return self.batch.engine
 
     @property
     def engine_why(self) -> str:
-        """Why the plain loop plays unasked; empty where it does not."""
+        """Why the plain loop plays although nobody asked for it; else empty."""
         return self.batch.engine_why
 
     def card(self) -> dict[str, Any]:
-        """JSON data that names this environment completely, with a hash."""
+        """Return JSON data that names this environment completely, with a hash."""
         return self.batch.card()
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Array, dict[str, Any]]:
@@ -289,21 +293,21 @@ class AdversaryEnv(Specified, gymnasium.Env[Array, Any]):
         super().reset(seed=seed)
         if not self.batch.begun and seed is None:
             seed = int(self.np_random.integers(2**31))
-        played: Any = self.batch.episodes
         self._over, self._moves = False, self._moves + 1
         if seed is None and self._alone is not None:
             _, damage, step, _, _, illegal, collided, rear, allowed, seen, mask = self._alone.again_alone()
-            if played.shadow is not None:
-                played.shadow.add(Begun(np.ones(1, bool), None, True))
+            if self._alone.shadow is not None:
+                self._alone.shadow.add(Begun(np.ones(1, bool), None, True))
             return seen, self._told(illegal, collided, rear, allowed, step, damage, mask)
         observation, info = self.batch.reset(seed=seed)
         if self._direct:
-            self._alone = played
+            assert isinstance(self.batch.episodes, TracedEpisodes)
+            self._alone = self.batch.episodes
         if self.render_mode == "human":
             self.render()
         return observation[0], self.row(info)
 
-    def step(self, action: Any) -> tuple[Array, float, bool, bool, dict[str, Any]]:
+    def step(self, action: ArrayLike) -> tuple[Array, float, bool, bool, dict[str, Any]]:
         if self._alone is None:
             return self._step_as_batch(action)
         if self._over:
@@ -326,7 +330,7 @@ class AdversaryEnv(Specified, gymnasium.Env[Array, Any]):
             info["action_mask"] = mask
         return info
 
-    def _step_as_batch(self, action: Any) -> tuple[Array, float, bool, bool, dict[str, Any]]:
+    def _step_as_batch(self, action: ArrayLike) -> tuple[Array, float, bool, bool, dict[str, Any]]:
         observation, reward, terminated, truncated, info = self.batch.step(np.asarray(action)[None])
         self._moves += 1
         if self.render_mode == "human":
@@ -334,11 +338,11 @@ class AdversaryEnv(Specified, gymnasium.Env[Array, Any]):
         return observation[0], float(reward[0]), bool(terminated[0]), bool(truncated[0]), self.row(info)
 
     def action_masks(self) -> Array:
-        """(actions,) bool: what the channel would accept in a step of the next decision. Discrete action spaces only."""
+        """Return (actions,) bool: the actions that the channel would accept in a step of the next decision. Discrete action spaces only."""
         return np.asarray(self.batch.action_masks()[0])
 
     def render(self) -> Any:
-        """The picture (H, W, 3) uint8; in human mode None: reset() and step() show it in a window by themselves."""
+        """Return the picture (H, W, 3) uint8; in human mode None: reset() and step() show it in a window by themselves."""
         if self.render_mode is None or not self.batch.begun:
             return None
         if self.render_mode == "human":
@@ -356,7 +360,7 @@ class AdversaryEnv(Specified, gymnasium.Env[Array, Any]):
 
     @staticmethod
     def row(info: dict[str, Any], i: int = 0) -> dict[str, Any]:
-        """The info of row i of a batch's."""
+        """Return the info of row i of a batch's."""
         return {k: v[i].copy() for k, v in info.items() if not k.startswith("_")}
 
 

@@ -11,7 +11,7 @@ from tailgate.core import Array, Attack, Command, View
 from tailgate.core.draws import Draws
 from tailgate.core.threat import Brief
 
-TAG = 255  # of the draw that picks the attacker: the attacks draw with others
+TAG = 255  # tag of the draw that picks the attacker: the attacks draw with others
 
 
 class MixtureState(NamedTuple):

@@ -16,7 +16,7 @@ from tailgate.core.threat import Brief, receivers
 
 LIMIT = 10.0  # observations are clipped to +-LIMIT
 FRAMES = 64  # decisions that an observation shows, at most
-SHOWN = 24  # agents with components of their own in an observation, at most
+SHOWN = 24  # agents with separate components in an observation, at most
 RADIATED = {Kind.NOISE_JAM: ("power", "jam_power"), Kind.ECHO_DELAY: ("delay", "delay_bound")}  # their component, and their bound
 SCALES = {  # what is about 1: steps, metres, metres per second, metres per second squared
     "burst": 50.0, "cooldown": 50.0, "gap": 50.0, "speed": 15.0, "lead_speed": 15.0, "closing": 5.0, "accel": 3.0, "rear_gap": 50.0,
@@ -27,7 +27,7 @@ T = TypeVar("T")
 
 
 class Sight(NamedTuple):
-    """A view, and what is computed of it once for all agents, each (B, N); None where it is not granted."""
+    """A view, and results of it that all agents share, each (B, N); None where it is not granted."""
 
     view: View
     gap_error: Array | None = None
@@ -38,7 +38,7 @@ class Sight(NamedTuple):
 
 
 def spread(model: Model) -> float:
-    """The standard deviation of all that moves the state in a step, as the defence is told it."""
+    """Return the standard deviation of all that moves the state in a step, from the public model."""
     return math.sqrt(sum(model.Q.diagonal().tolist()))
 
 
@@ -47,10 +47,10 @@ Column = tuple[str, Callable[[Sight], Array]]  # a component of the observation:
 
 @dataclass(frozen=True, eq=False)
 class ObservationCodec:
-    """What the learner sees, scaled to about one and clipped.
+    """The learner's observation, scaled to about one and clipped.
 
     A road shows gaps, speeds and accelerations of the cars; without one there is nothing to see from outside. Of many agents the SHOWN
-    that are nearest to the attacked ones have components of their own, tagged with their number; all count in the smallest gap.
+    that are nearest to the attacked ones have separate components, tagged with their number; all count in the smallest gap.
 
     With several `frames` the observation also shows what was seen at the last decisions, the newest first; `@1` is that of one before.
     """
@@ -77,7 +77,7 @@ class ObservationCodec:
 
     @cached_property
     def shown(self) -> list[int]:
-        """The agents with components of their own: all, or of many those with the fewest hops to an attacked one."""
+        """The agents with separate components: all, or of many those with the fewest hops to an attacked one."""
         model = self.brief.model
         near, hops = set(self.victims), dict.fromkeys(self.victims, 0)
         linked = model.graph | model.graph.T
@@ -89,7 +89,7 @@ class ObservationCodec:
 
     @cached_property
     def spread(self) -> float:
-        """How far the state goes in a step that nobody can foresee, as the defence is told: the scale of a state's error."""
+        """The distance that the state goes unforeseen in a step, by the public model: the scale of a state's error."""
         return spread(self.brief.model)
 
     @cached_property
@@ -109,7 +109,7 @@ class ObservationCodec:
         return tuple(out)
 
     def _road(self, i: int) -> list[Column]:
-        """What anyone beside the road sees of car i."""
+        """Return what anyone near the road sees of car i."""
         model = self.brief.model
         speed: list[Column] = [("speed", lambda s: s.view.scene.speed[:, i] / SCALES["speed"])]
         accel: list[Column] = [("accel", lambda s: s.view.scene.accel[:, i] / SCALES["accel"])]
@@ -117,7 +117,7 @@ class ObservationCodec:
             return speed + accel if model.speed is not None and model.speed[i].any() else []
         gap: list[Column] = [("gap", lambda s: s.view.scene.gap[:, i] / SCALES["gap"])]
         closing: list[Column] = [("closing", lambda s: (s.view.scene.speed[:, i] - s.view.scene.lead_speed[:, i]) / SCALES["closing"])]
-        if not self.alone:  # the car ahead and the one behind have components of their own
+        if not self.alone:  # the car ahead and the one behind have separate components
             return gap + speed + closing + accel
         lead: list[Column] = [("lead_speed", lambda s: s.view.scene.lead_speed[:, i] / SCALES["lead_speed"])]
         rear: list[Column] = [
@@ -127,7 +127,7 @@ class ObservationCodec:
         return gap + speed + lead + closing + accel + rear
 
     def _commands(self, i: int) -> list[Column]:
-        """What the attacker did last to agent i, and (grey) what was commanded."""
+        """Return the attacker's last command to agent i, and (grey) the agent's own last command."""
         model, bounds = self.brief.model, self.brief.bounds
         scale = np.minimum(bounds, LAST_SCALE) if model.followers.any() else bounds
         kinds = {Kind[name.upper()] for name in self.brief.threat.kinds}
@@ -148,7 +148,7 @@ class ObservationCodec:
         return out
 
     def _errors(self, i: int) -> list[Column]:
-        """White: how wrong agent i is, and what its defence says."""
+        """Return (white) the error of agent i, and the outputs of its defence."""
         model = self.brief.model
         if self.brief.threat.knowledge != "white":
             return []
@@ -164,7 +164,7 @@ class ObservationCodec:
         return [*out, score, ("alarm", lambda s: _given(s.view.estimate).alarm[:, i])]
 
     def _foreseen(self) -> list[Column]:
-        """White, one agent alone: by how much the reading would surprise the model; of a closed loop also what is read, believed, between.
+        """Return (white, one agent) how far the reading would surprise the model; of a closed loop also reading, belief, difference.
 
         The surprise is y - C (A x + B u + c) with the value sent last on top, in the standard deviations of a step: what the defence's
         innovation would be near, were that value sent again.
@@ -191,7 +191,7 @@ class ObservationCodec:
         return out + [(name, partial(size, name=name)) for name in ("reading", "moved", "believed") if model.inputs]
 
     def _noise(self, i: int) -> list[Column]:
-        """Where the measurement is granted: by how much agent i's readings of gap and speed are off; without a road sizes only."""
+        """Return (granted measurement) the errors of agent i's readings of gap and speed; without a road sizes only."""
         model, threat = self.brief.model, self.brief.threat
         if not (threat.sees_measurement or threat.knowledge == "white"):
             return []
@@ -207,7 +207,7 @@ class ObservationCodec:
         return out
 
     def _read(self, i: int, j: int) -> str:
-        """The part of the scene that sensor j of agent i reads: gap, speed, position or relative speed; empty where it is none of them."""
+        """Return the part of the scene that sensor j of agent i reads: gap, speed, position or relative speed; empty for any other."""
         model = self.brief.model
         if model.air and model.sensors[j] == "relative_speed":
             return "relative_speed"
@@ -216,7 +216,7 @@ class ObservationCodec:
         return next((name for name, row in rows.items() if row.any() and np.array_equal(row, model.C[i, j])), "")
 
     def _all(self) -> list[Column]:
-        """Of all agents together, where not every one is shown."""
+        """Return components of all agents together, where not every one is shown."""
         road, white = bool(self.brief.model.followers.any()), self.brief.threat.knowledge == "white"
         out: list[Column] = [("least_gap", lambda s: np.min(s.view.scene.gap, axis=1) / 50.0)] if road else []
         if white and road:
@@ -226,7 +226,7 @@ class ObservationCodec:
         return out
 
     def observe(self, view: View, before: Array | None = None) -> Array:
-        """(B, d) float32, d = len(names); `before` (B, d) is the observation of the last decision, none at the first of an episode."""
+        """Return (B, d) float32, d = len(names); `before` (B, d) is the last decision's observation, none at the first of an episode."""
         sight, width = self._sight(view), len(self.columns)
         out = np.empty((len(view.k), width * self.frames), np.float32)
         for j, (_, column) in enumerate(self.columns):
@@ -254,13 +254,13 @@ class ObservationCodec:
 
 
 def _given(value: T | None) -> T:
-    """What the threat model grants."""
+    """Return the grants of the threat model."""
     assert value is not None
     return value
 
 
 def _left(sight: Sight) -> Array:
-    """Share of the budget that is left; 1 where it is unlimited."""
+    """Return the share of the budget that is left; 1 where it is unlimited."""
     view = sight.view
     bounded = np.isfinite(view.budget)
     return np.where(bounded, view.budget_left / np.where(bounded & (view.budget > 0), view.budget, 1.0), 1.0)
@@ -271,12 +271,12 @@ def _last(i: int, w: int, scale: float) -> Callable[[Sight], Array]:
 
 
 def _last_wire(i: int, w: int, scale: float) -> Callable[[Sight], Array]:
-    """As `_last`; 0 where the last command was one over the air."""
+    """Return what `_last` returns, but 0 where the last command was one over the air."""
     return lambda s: np.where(np.isin(s.view.last.kind, AIRED), 0.0, s.view.last.value[:, i, w] / scale)
 
 
 def _radiated(i: int, kind: Kind, most: float) -> Callable[[Sight], Array]:
-    """The power or the delay last sent to agent i, in units of its bound."""
+    """Return the power or the delay last sent to agent i, in units of its bound."""
     return lambda s: np.where(s.view.last.kind == kind, np.max(s.view.last.value[:, i], axis=1) / most, 0.0)
 
 
@@ -289,7 +289,7 @@ def _state_error(i: int, j: int) -> Callable[[Sight], Array]:
 
 
 def _off(i: int, j: int, truth: str, sd: float) -> Callable[[Sight], Array]:
-    """By how much sensor j of agent i is off the part `truth` of the scene, in standard deviations; 0 without a reading."""
+    """Return sensor j of agent i less the part `truth` of the scene, in standard deviations; 0 without a reading."""
 
     def off(s: Sight) -> Array:
         scene, received = s.view.scene, _given(s.view.received)

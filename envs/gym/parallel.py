@@ -21,7 +21,7 @@ from tailgate.envs.gym.observations import LIMIT
 from tailgate.envs.gym.specs import check_options, limit_of
 from tailgate.envs.render.viewer import Screen, Viewer
 
-ATTACKER, GUARD = "attacker", "defender"
+ATTACKER, DEFENDER = "attacker", "defender"
 
 
 class DuelEnv(ParallelEnv[str, Array, Any]):  # type: ignore[misc]
@@ -39,12 +39,12 @@ class DuelEnv(ParallelEnv[str, Array, Any]):  # type: ignore[misc]
             raise InputError("render_mode", render_mode, "None, 'rgb_array' or 'human'")
         self.max_cycles, self.cycles = limit_of("max_cycles", max_cycles), 0  # decisions of a game at most, and of the present one so far
         self.duel, self.render_mode, self.viewer = Duel.make(**arguments), render_mode, Viewer(viewer, size)
-        self.possible_agents = [ATTACKER, GUARD]
+        self.possible_agents = [ATTACKER, DEFENDER]
         self.agents: list[str] = []
         sight, act = self.duel.defender_spaces()
         seen = gymnasium.spaces.Box(-LIMIT, LIMIT, (len(self.duel.seat.observation.names),), np.float32)
-        self.observation_spaces = {ATTACKER: seen, GUARD: sight}
-        self.action_spaces = {ATTACKER: action_space(self.duel.seat.action), GUARD: act}
+        self.observation_spaces = {ATTACKER: seen, DEFENDER: sight}
+        self.action_spaces = {ATTACKER: action_space(self.duel.seat.action), DEFENDER: act}
         self.state_space = gymnasium.spaces.Box(-LIMIT, LIMIT, (seen.shape[0] + sight.shape[0],), np.float32)
         self.metadata = self.metadata | {"render_fps": round(1.0 / self.duel.seat.loop.model.dt)}
         self._screen, self._moves = Screen(), 0  # the second: resets and steps so far
@@ -59,14 +59,14 @@ class DuelEnv(ParallelEnv[str, Array, Any]):  # type: ignore[misc]
         return self.action_spaces[agent]
 
     def card(self) -> dict[str, Any]:
-        """JSON data that names this game completely, with a hash."""
+        """Return JSON data that names this game completely, with a hash."""
         return self.duel.card()
 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Array], dict[str, dict[str, Any]]]:
-        """The game of a seed; without one the next of the running row, or a random one at first."""
-        check_options(options, ("options",))  # of no meaning: PettingZoo's own tests give it
+        """Begin the game of a seed; without one the next of the running row, or a random one at first."""
+        check_options(options, ("options",))  # "options" has no meaning: PettingZoo's own tests give it
         if seed is not None:
             self._rng, _ = seeding.np_random(seed)
         self.game, self.frame, self.agents = next_game(self.duel, self.game, seed, self._rng), None, list(self.possible_agents)
@@ -77,7 +77,7 @@ class DuelEnv(ParallelEnv[str, Array, Any]):  # type: ignore[misc]
     def step(
         self, actions: dict[str, Any]
     ) -> tuple[dict[str, Array], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]:
-        """One decision of both: dictionaries of what each sees and is paid, and how the game stands."""
+        """Play one decision of both; return observations, rewards and ends by agent."""
         if self.game is None or not self.agents:
             raise InputError("step", "no episode", "reset() first")
         if set(actions) != set(self.agents):
@@ -87,7 +87,7 @@ class DuelEnv(ParallelEnv[str, Array, Any]):  # type: ignore[misc]
         self.cycles += 1
         terminated, truncated = bool(outcome.terminated[0]), bool(outcome.truncated[0]) or self.cycles == self.max_cycles
         infos = self._infos(*(part[0] for part in (outcome.illegal, outcome.collided, outcome.rear_collided)))
-        rewards = {ATTACKER: float(outcome.reward[0]), GUARD: float(paid[0])}
+        rewards = {ATTACKER: float(outcome.reward[0]), DEFENDER: float(paid[0])}
         out = self._observed(), rewards, dict.fromkeys(self.agents, terminated), dict.fromkeys(self.agents, truncated), infos
         if terminated or truncated:
             self.agents = []
@@ -95,13 +95,13 @@ class DuelEnv(ParallelEnv[str, Array, Any]):  # type: ignore[misc]
         return out
 
     def state(self) -> Array:
-        """(d,) float32: what the attacker sees, then what the defender sees, for a critic that is trained on both."""
+        """Return (d,) float32: the attacker's observation, then the defender's, for a critic that is trained on both."""
         if self.game is None:
             raise InputError("state", "no episode", "reset() first")
         return np.concatenate([seen for seen in self._observed().values()])
 
     def render(self) -> Any:
-        """The picture (H, W, 3) uint8; None without `render_mode`, and in human mode: reset() and step() show it in a window."""
+        """Return the picture (H, W, 3) uint8; None without `render_mode`, and in human mode: reset() and step() show it in a window."""
         if self.render_mode is None or self.game is None:
             return None
         if self.render_mode == "human":
@@ -125,20 +125,20 @@ class DuelEnv(ParallelEnv[str, Array, Any]):  # type: ignore[misc]
 
     def _observed(self) -> dict[str, Array]:
         assert self.game is not None
-        return {ATTACKER: self.game.seen[0].copy(), GUARD: self.duel.defender_sees(self.game)[0].copy()}
+        return {ATTACKER: self.game.seen[0].copy(), DEFENDER: self.duel.defender_sees(self.game)[0].copy()}
 
     def _infos(self, illegal: np.bool_, collided: np.bool_, rear: np.bool_) -> dict[str, dict[str, Any]]:
-        """What happened is told to the attacker alone: the defender learns of it by its own means."""
+        """Return the information by agent: the attacker learns what happened, the defender has only its own means."""
         assert self.game is not None
-        told: dict[str, Any] = {"illegal": illegal, "collided": collided, "rear_collided": rear, "step": self.game.loop.k[0]}
-        guard = self.duel.told(self.game)
+        attacker: dict[str, Any] = {"illegal": illegal, "collided": collided, "rear_collided": rear, "step": self.game.loop.k[0]}
+        defender = self.duel.told(self.game)
         if self.duel.seat.action.discrete:
-            told["action_mask"] = self.duel.mask(self.game)[0].astype(np.int8)
+            attacker["action_mask"] = self.duel.mask(self.game)[0].astype(np.int8)
         if self.duel.action == "menu":
-            guard["action_mask"] = np.ones(len(self.duel.settings), np.int8)  # each setting may be chosen at any time
-        return {ATTACKER: told, GUARD: guard}
+            defender["action_mask"] = np.ones(len(self.duel.settings), np.int8)  # each setting may be chosen at any time
+        return {ATTACKER: attacker, DEFENDER: defender}
 
 
 def parallel_env(**arguments: Any) -> DuelEnv:
-    """A game of attacker and defender as PettingZoo plays it: scenario, defence, menu and the other arguments of `Duel.make`."""
+    """Return a game of attacker and defender as PettingZoo plays it; for the arguments see `Duel.make`."""
     return DuelEnv(**arguments)

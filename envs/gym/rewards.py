@@ -1,4 +1,4 @@
-"""What the learner is paid for. Scores never use it."""
+"""Payments of the learner. Scores never use them."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ NEAR = 20.0  # min_gap: a smaller gap than this counts [m]
 
 
 def closeness(gap: Array) -> Array:
-    """How near the car ahead is, elementwise: 0 from 100 m on, 1 at a gap of 0."""
+    """Return how near the car ahead is, elementwise: 0 from 100 m on, 1 at a gap of 0."""
     out: Array = 1.0 - clip(gap, 0.0, 100.0) / 100.0
     return out
 
 
 def fooled(belief: Array) -> Array:
-    """What a car believes that it has on top of its gap [m], elementwise: in units of 10 m, 2 at most."""
+    """Return the believed gap less the true one [m], elementwise: in units of 10 m, 2 at most."""
     out: Array = clip(belief, 0.0, 20.0) / 10.0
     return out
 
 
 def small(gap: Array) -> Array:
-    """The gap [m] within what `min_gap` pays for, elementwise."""
+    """Return the gap [m] within the range that `min_gap` pays for, elementwise."""
     out: Array = clip(gap, 0.0, NEAR)
     return out
 
@@ -56,7 +56,7 @@ class Step:
 
 
 class Payment:
-    """Base class of what a step is paid. Register a subclass with `@register("reward", NAME)`, in any module of `envs`."""
+    """Base class of the payment of a step. Register a subclass with `@register("reward", NAME)`, in any module of `envs`."""
 
     road: ClassVar[bool] = False  # only collisions earn something
     peak: ClassVar[bool] = False  # asks for `Step.rise`
@@ -105,7 +105,7 @@ class Stealth(Error):
 
 @register("reward", "peak")
 class Peak(Payment):
-    """By how much the largest error of the episode rises, over `error_scale`: in all, the metric `max_error`."""
+    """The rise of the largest error of the episode, over `error_scale`: in all, the metric `max_error`."""
 
     peak = True
 
@@ -148,12 +148,12 @@ class Reward:
         return find("reward", self.reward).cls()  # type: ignore[no-any-return]
 
     def potential(self, gap: Array, belief: Array | float = 0.0) -> Array:
-        """(B,) potential of a gap (B, N) [m], infinite where nobody is ahead, and of what a car believes it has on top of it (B, N) [m]."""
+        """Return the potential (B,) of a gap (B, N) [m], infinite where nobody is ahead, and of its believed excess (B, N) [m]."""
         most = np.max(fooled(np.asarray(belief)) + np.zeros_like(gap), axis=1)
         return np.asarray(self.gap_shaping * closeness(np.min(gap, axis=1)) + self.error_shaping * most)
 
     def least(self, gap: Array, before: Array | float = NEAR) -> Array:
-        """(B,) smallest gap so far, within [0, NEAR], from a gap (B, N) and the smallest one before [m]."""
+        """Return the smallest gap so far (B,), within [0, NEAR], from a gap (B, N) and the smallest one before [m]."""
         return np.asarray(np.minimum(small(np.min(gap, axis=1)), before))
 
     def check(self, model: Model) -> None:
@@ -162,7 +162,7 @@ class Reward:
             raise InputError("reward", self.reward, "error, peak, stealth or final: nobody drives in this scenario, so nobody collides")
 
     def __call__(self, model: Model, frame: Frame, fall: Array, last: Array, rise: Array | float = 0.0) -> Array:
-        """(B,) reward of one step of the loop; last (B,) bool: the horizon's last step.
+        """Return the reward (B,) of one step of the loop; last (B,) bool: the horizon's last step.
 
         fall (B,) of the smallest gap [m]; rise (B,) of the largest error, which only `peak` asks for.
         """
@@ -172,5 +172,5 @@ class Reward:
         return np.asarray(out)
 
     def decided(self, raw: Array, illegal: Array, before: Array, after: Array, terminated: Array) -> Array:
-        """(B,) reward of a decision from that of its steps, whether it was illegal, and the potentials (B,) before and after it."""
+        """Return the reward (B,) of a decision from its steps' rewards, if it was illegal, and the potentials (B,) before and after it."""
         return np.asarray(raw - self.illegal_penalty * illegal + self.gamma * np.where(terminated, 0.0, after) - before)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 try:
-    from stable_baselines3.common.vec_env.base_vec_env import VecEnv
+    from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices
 except ImportError as error:
     raise ImportError("Stable-Baselines3 is missing: pip install 'tailgate[train]'") from error
 
@@ -63,16 +63,16 @@ class BatchVecEnv(VecEnv):
     def action_masks(self) -> Array:
         return self.batch.action_masks()
 
-    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         return [getattr(self.batch if hasattr(self.batch, attr_name) else self, attr_name)] * len(list(self._get_indices(indices)))
 
-    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
         raise AttributeError(f"{attr_name}: the rows of a batch have no attributes of their own")
 
-    def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
+    def env_method(self, method_name: str, *args: Any, indices: VecEnvIndices = None, **kwargs: Any) -> list[Any]:
         rows: Sequence[int] = list(self._get_indices(indices))
         result = getattr(self.batch, method_name)(*args, **kwargs)
         return [result[i] for i in rows]
 
-    def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:
+    def env_is_wrapped(self, wrapper_class: type, indices: VecEnvIndices = None) -> list[bool]:
         return [False] * len(list(self._get_indices(indices)))

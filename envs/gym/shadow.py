@@ -25,7 +25,7 @@ class Decided(NamedTuple):
 
 
 class Begun(NamedTuple):
-    """Episodes that began in rows (B,) bool at a reset, under keys of as many rows; None: the next of their own."""
+    """Episodes that began in rows (B,) bool at a reset, under keys of as many rows; None: the next of each row."""
 
     rows: Array
     keys: Keys | None
@@ -33,18 +33,18 @@ class Begun(NamedTuple):
 
 
 class Shadow:
-    """What was decided since the last episode but one of each row began, and the rows of the plain loop that were looked at.
+    """The decisions since the last episode but one of each row began, and the rows of the plain loop that were looked at.
 
     A row that nobody looks at costs the list of its decisions. Two episodes are kept because a picture of an episode that has
-    just begun tells how the one before it ended.
+    just begun shows how the one before it ended.
     """
 
     def __init__(self, seat: Seat, keys: Keys) -> None:
         batch = len(keys.key)
-        self.seat, self.keys = seat, keys  # of the present episodes
+        self.seat, self.keys = seat, keys  # keys of the present episodes
         self.events: list[Decided | Begun] = []
         self.dropped = 0  # events that are not kept any more
-        self.earlier = keys  # of the episodes before those
+        self.earlier = keys  # keys of the episodes before those
         self.began, self.before = np.zeros(batch, np.int64), np.zeros(batch, np.int64)  # at which event either began
         self.rows: dict[int, tuple[PlainEpisodes, int]] = {}  # the plain loop of a row, and how many events it has played
 
@@ -72,7 +72,7 @@ class Shadow:
         return self.dropped + len(self.events)
 
     def look(self, row: int, make: Callable[[Seat], PlainEpisodes]) -> tuple[LoopState, Frame | None]:
-        """The plain loop's state (of a batch of one) and last step of a row; `make` gives a plain loop of the seat."""
+        """Return the plain loop's state (of a batch of one) and last step of a row; `make` gives a plain loop of the seat."""
         one = slice(row, row + 1)
         plain, played = self.rows.get(row, (None, -1))
         if plain is None or played < self.dropped:

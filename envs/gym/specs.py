@@ -1,4 +1,4 @@
-"""What a reader gives at the door of an environment, checked in one place; and specs of Gymnasium that say objects as text."""
+"""Checks of an environment's arguments, in one place; and specs of Gymnasium that write objects as text."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ _FAMILIES: dict[str, Family] = {"defence": "defence", "attack": "attack"}  # arg
 
 
 def in_box(actions: Array) -> bool:
-    """Whether all values are numbers in [-1, 1], rounding aside: NaN and infinity are not."""
+    """Return True if all values are numbers in [-1, 1], rounding aside: NaN and infinity are not."""
     return actions.dtype.kind in "fiu" and bool((np.abs(actions) <= 1.0 + ROUNDING).all())
 
 
-def check_options(options: Any, known: Iterable[str] = ()) -> None:
+def check_options(options: object, known: Iterable[str] = ()) -> None:
     """Raise InputError for options of reset() that nobody reads."""
     if options is None:
         return
@@ -39,14 +39,17 @@ def check_options(options: Any, known: Iterable[str] = ()) -> None:
 
 
 def limit_of(name: str, given: int | None) -> int:
-    """The argument of this name: decisions of an episode at most, 0 where there is no limit. Raises InputError."""
+    """Return the argument of this name: decisions of an episode at most, 0 where there is no limit.
+
+    Raise InputError for any other value.
+    """
     if given is not None and (not isinstance(given, (int, np.integer)) or isinstance(given, bool) or given < 1):
         raise InputError(name, given, "a whole number of decisions not below 1, or None")
     return int(given or 0)
 
 
-def named(family: Family, value: Any, imports: bool = True) -> str:
-    """The text from which another process makes the same object. Raises InputError where there is none."""
+def named(family: Family, value: object, imports: bool = True) -> str:
+    """Return the text from which another process makes the same object. Raise InputError where there is none."""
     cls, why = type(value), "its parameters are no plain data"
     try:
         if "<locals>" in cls.__qualname__ or cls.__module__ == "__main__":
@@ -68,17 +71,17 @@ def named(family: Family, value: Any, imports: bool = True) -> str:
 
 
 class TextSpec(EnvSpec):
-    """A spec whose JSON says defences, attacks and menus as text; its own arguments stay the objects that they are."""
+    """A spec whose JSON writes defences, attacks and menus as text; its own arguments stay the objects that they are."""
 
     def to_json(self) -> str:
-        imports = "Defender" not in self.id  # whose defence is a registered one
+        imports = "Defender" not in self.id  # a defender's environment names a registered defence
         kwargs = {key: _plain(key, value, imports) for key, value in self.kwargs.items()}
         plain = {f.name: getattr(self, f.name) for f in dataclasses.fields(EnvSpec) if f.init and f.name != "kwargs"}
         return EnvSpec(**plain, kwargs=kwargs).to_json()
 
 
-def _plain(key: str, value: Any, imports: bool) -> Any:
-    """An argument as JSON data."""
+def _plain(key: str, value: object, imports: bool) -> Any:
+    """Return an argument as JSON data."""
     if isinstance(value, np.generic | np.ndarray):
         return value.tolist()
     if _is_plain(value):
@@ -92,7 +95,7 @@ def _plain(key: str, value: Any, imports: bool) -> Any:
     raise InputError(f"spec: {key}", value, "numbers, text, lists and mappings of them: anything else cannot be written as JSON")
 
 
-def _is_plain(value: Any) -> bool:
+def _is_plain(value: object) -> bool:
     try:
         json.dumps(value)
     except (TypeError, ValueError):
@@ -101,7 +104,7 @@ def _is_plain(value: Any) -> bool:
 
 
 class Specified:
-    """A face whose spec, as Gymnasium's `make` sets it, says its horizon, and can be written as JSON or says in one line why not."""
+    """Base of environments: the spec that Gymnasium's `make` sets gets their horizon, and can be written as JSON or explains why not."""
 
     horizon: int  # decisions of an episode that nothing ends early
     _spec: EnvSpec | None = None

@@ -1,1 +1,1 @@
-"""Plants: what moves, one file each."""
+"""Plants: the moving systems, one file each."""

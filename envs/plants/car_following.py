@@ -74,7 +74,7 @@ class CarFollowing:
         return 1, 3
 
     def dynamics(self) -> tuple[Array, Array]:
-        """A (3, 3) and B (3, 1)."""
+        """Return A (3, 3) and B (3, 1)."""
         return lag(self.dt, self.tau)
 
     def prepare(self, model: Model) -> FollowingPlan:
@@ -110,7 +110,7 @@ class CarFollowing:
         return FollowingState(lead_x, lead_v, ego, behind)
 
     def move(self, plan: FollowingPlan, ego: Array, u: Array, noise: Array) -> Array:
-        """The follower (B, 1, 3) one step later, under u (B, 1, 1) [m/s^2] and noise (3, B)."""
+        """Return the follower (B, 1, 3) one step later, under u (B, 1, 1) [m/s^2] and noise (3, B)."""
         x, v, a = drive(plan.A, plan.B, ego[:, 0, 0], ego[:, 0, 1], ego[:, 0, 2], u[:, 0, 0], noise)
         return num.stack([x[:, None], v[:, None], a[:, None]])
 

@@ -1,7 +1,7 @@
 """A road scene: an ACC car with a radar among traffic that follows IDM and MOBIL, cuts in and brakes hard (HighwayEnv).
 
-The plant is not linear: cars steer (a bicycle model on a winding road), change lanes, and react to each other and to the car. What a
-defence is told is the radar car's model (radar_following.py), x = [d, dv, a_L, v_F]:
+The plant is not linear: cars steer (a bicycle model on a winding road), change lanes, and react to each other and to the car. The
+defence's model is the radar car's (radar_following.py), x = [d, dv, a_L, v_F]:
 
     d+ = d + T (dv + dv+)/2        dv+ = dv + T a_L - (v_F+ - v_F)        a_L+ = a_L + w        v_F+ = input
 
@@ -38,7 +38,7 @@ Behind = Annotated[int, Field(ge=0, le=50)]
 Speeds = Annotated[tuple[PositiveSpeed, PositiveSpeed], Field(min_length=2, max_length=2)]
 Gaps = Annotated[tuple[Gap, Gap], Field(min_length=2, max_length=2)]
 START = 1000.0  # where the car begins [m]
-SPEED_LIMIT = 30.0  # of the road [m/s]
+SPEED_LIMIT = 30.0  # speed limit of the road [m/s]
 DELTAS = (3.5, 4.5)  # exponents of IDM among the drivers, HighwayEnv's range
 _PLACES, _CLOCKS = 0, 1  # tags of the draws
 
@@ -50,7 +50,7 @@ class HighwayPlan(NamedTuple):
 
 
 class Seen(NamedTuple):
-    """What is ahead and behind in the lane, (B,) each, as `Scene` has it; lead_a [m/s^2] over the last step."""
+    """The cars ahead and behind in the lane, (B,) each, as `Scene` has them; lead_a [m/s^2] over the last step."""
 
     gap: Array
     lead_v: Array
@@ -60,7 +60,7 @@ class Seen(NamedTuple):
 
 
 class HighwayState(NamedTuple):
-    """Every leaf has B first; (B,) where nothing is said. After the car has crashed all stands still as it was then."""
+    """The state; every leaf has B first, (B,) where nothing is noted. After the car has crashed everything keeps its place."""
 
     cars: Array  # (B, V, features) all cars, as highway_scene numbers them; the first is the car
     accel: Array  # own [m/s^2]
@@ -117,7 +117,7 @@ class Highway:
         return 1 + self.lanes * (self.ahead + self.behind)
 
     def prepare(self, model: Model) -> HighwayPlan:
-        """Raises ImportError where highway-env is missing."""
+        """Return the plan. Raise ImportError where highway-env is missing."""
         from tailgate.envs.plants.highway_scene import Bench
 
         bench = Bench(self.cars, self.lanes, SPEED_LIMIT, self.dt, self.decel, self.bend, self.period, self.lane_changes)
@@ -143,7 +143,7 @@ class Highway:
         return HighwayState(cars, np.zeros(batch), clock, Seen._make(seen.T.copy()), np.zeros(batch, bool))
 
     def _place(self, bench: Bench, cars: Array, u: Array) -> None:
-        """The cars (V, features) at the beginning, from uniforms u (V, 5)."""
+        """Return the cars (V, features) at the beginning, from uniforms u (V, 5)."""
         from tailgate.envs.plants.highway_scene import DELTA, HEADING, LANE, SPEED, TARGET, TIMER, WANTED, X, Y
 
         def put(i: int, lane: int, x: float, speed: float) -> None:
@@ -154,7 +154,7 @@ class Highway:
         put(0, self.lane, START, self.speed)
         i = 1
         for lane in range(self.lanes):
-            shift = 0.0 if lane == self.lane else -self.spacing[1] * u[i, 4]  # beside the car somebody may be anywhere
+            shift = 0.0 if lane == self.lane else -self.spacing[1] * u[i, 4]  # in other lanes somebody may be anywhere
             for way, count in ((1.0, self.ahead), (-1.0, self.behind)):
                 x = START + shift
                 for _ in range(count):
@@ -193,7 +193,7 @@ class Highway:
         return HighwayState(cars, a, clock, Seen._make(seen.T.copy()), over)
 
     def _seen(self, sight: Sight, v: float, a: float, before: Array, after: Array | None = None) -> tuple[float, ...]:
-        """gap, lead_v, lead_a, rear_gap and rear_v of what is seen at the own speed v and acceleration a."""
+        """Return gap, lead_v, lead_a, rear_gap and rear_v as seen at the own speed v and acceleration a."""
         from tailgate.envs.plants.highway_scene import SPEED
 
         rear = (np.inf, v) if sight.rear_gap is None else (sight.rear_gap, sight.rear_speed)
@@ -203,7 +203,7 @@ class Highway:
         return sight.gap, sight.lead_speed, gained / self.dt, *rear
 
     def known(self, plan: HighwayPlan, u: Array, exo: Array, state: HighwayState) -> Array:
-        """The own speed, by odometry."""
+        """Return the own speed, by odometry."""
         return self.odometry(plan, state)[..., 1:]
 
     def truth(self, plan: HighwayPlan, state: HighwayState, held: Array) -> Array:
@@ -211,7 +211,7 @@ class Highway:
         return num.stack([seen.gap[:, None], (seen.lead_v - v)[:, None], seen.lead_a[:, None], v[:, None]])
 
     def _own(self, state: HighwayState) -> tuple[Array, Array]:
-        """The car's position along the road [m] and its speed [m/s], (B,) each."""
+        """Return the car's position along the road [m] and its speed [m/s], (B,) each."""
         from tailgate.envs.plants.highway_scene import SPEED, X
 
         return state.cars[:, 0, X], state.cars[:, 0, SPEED]

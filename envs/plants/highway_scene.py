@@ -2,7 +2,7 @@
 
 Traffic follows the Intelligent Driver Model and changes lanes by MOBIL. The objects of HighwayEnv are a workbench: every step puts all that
 they remember into them and takes it out again, so that nothing of one episode reaches another. The first car is the one with the
-controller; the scene steers it along its lane and accelerates it as told.
+controller; the scene steers it along its lane and accelerates it by the given command.
 """
 
 import math
@@ -24,18 +24,18 @@ except ImportError as error:
 # Columns of a car: all that it remembers from step to step.
 X, Y, HEADING, SPEED, LANE, TARGET, WANTED, TIMER, DELTA, CRASHED, HIT, PUSH_X, PUSH_Y, BRAKING, COMMITTED = range(15)
 FEATURES = 15
-LENGTH = float(IDMVehicle.LENGTH)  # of every car [m]
+LENGTH = float(IDMVehicle.LENGTH)  # length of every car [m]
 WIDTH = float(IDMVehicle.WIDTH)
 LANE_WIDTH = float(SineLane.DEFAULT_WIDTH)
 TOUCHES = 0.5 * (LANE_WIDTH + WIDTH)  # a car whose middle is nearer to a lane's middle has a part in the lane [m]
 ROAD = 1e6  # length of the road [m]
 COMMITMENT = 6.0  # time for which a car that cuts in, or has just braked, keeps to its lane [s]
 SLOWER, FASTER = 5.0, 6.0  # by how much a car that cuts in may be slower or faster than the one that it cuts in on [m/s]
-ROOM = 15.0  # what a car that cuts in leaves to the next ahead, bumper to bumper [m]
+ROOM = 15.0  # gap that a car that cuts in leaves to the next ahead [m]
 
 
 class Sight(NamedTuple):
-    """What the first car has ahead and behind in its lane, bumper to bumper [m, m/s]; None where nobody is."""
+    """The cars that the first car has ahead and behind in its lane, bumper to bumper [m, m/s]; None where nobody is."""
 
     gap: float | None
     lead: int | None  # number of the car ahead
@@ -46,10 +46,10 @@ class Sight(NamedTuple):
 
 
 class _Undrawn:
-    """In place of a scene's random source: whoever draws from it is told that a scene draws nothing."""
+    """A replacement of a scene's random source: drawing from it is an error, as a scene draws nothing."""
 
     def __getattr__(self, name: str) -> Any:
-        if name.startswith("__"):  # what Python itself asks for, as when a scene is copied
+        if name.startswith("__"):  # Python's own requests, as when a scene is copied
             raise AttributeError(name)
         raise RuntimeError(f"a road scene drew {name}: all its randomness comes with its numbers")
 
@@ -57,7 +57,7 @@ class _Undrawn:
 class _Lane(SineLane):  # type: ignore[misc]
     """A lane along x that winds as a sine; the same coordinates as its base, on plain numbers."""
 
-    def local_coordinates(self, position: Any) -> tuple[float, float]:
+    def local_coordinates(self, position: Array) -> tuple[float, float]:
         x, y = float(position[0]), float(position[1])
         return x, y - float(self.start[1]) - self.amplitude * math.sin(self.pulsation * x)
 
@@ -65,7 +65,7 @@ class _Lane(SineLane):  # type: ignore[misc]
 class _Network(RoadNetwork):  # type: ignore[misc]
     """Lanes side by side, of one shape: the nearest is that of the least lateral offset, as the base finds with all lanes' headings."""
 
-    def get_closest_lane_index(self, position: Any, heading: float | None = None) -> tuple[str, str, int]:
+    def get_closest_lane_index(self, position: Array, heading: float | None = None) -> tuple[str, str, int]:
         offsets = [abs(lane.local_coordinates(position)[1]) for lane in self.graph["0"]["1"]]
         return "0", "1", offsets.index(min(offsets))
 
@@ -73,7 +73,7 @@ class _Network(RoadNetwork):  # type: ignore[misc]
 class _Road(Road):  # type: ignore[misc]
     """The base's answers on one road without obstacles, in fewer words: asked for some ten times a step."""
 
-    def neighbour_vehicles(self, vehicle: Any, lane_index: Any = None) -> tuple[Any, Any]:
+    def neighbour_vehicles(self, vehicle: ControlledVehicle, lane_index: tuple[str, str, int] | None = None) -> tuple[Any, Any]:
         lane, s = self.network.get_lane(lane_index or vehicle.lane_index), float(vehicle.position[0])
         front, rear, s_front, s_rear = None, None, math.inf, -math.inf
         for car in self.vehicles:
@@ -90,9 +90,12 @@ class _Road(Road):  # type: ignore[misc]
 class _Near:
     """Asks HighwayEnv for a collision only where the cars are near enough for its own first check to pass."""
 
-    def handle_collisions(self, other: Any, dt: float = 0.0) -> None:
-        me: Any = self
-        if abs(float(me.position[0]) - float(other.position[0])) <= me.diagonal + abs(me.speed) * dt:
+    position: Array
+    speed: float
+    diagonal: float
+
+    def handle_collisions(self, other: ControlledVehicle, dt: float = 0.0) -> None:
+        if abs(float(self.position[0]) - float(other.position[0])) <= self.diagonal + abs(self.speed) * dt:
             super().handle_collisions(other, dt)  # type: ignore[misc]
 
 
@@ -101,7 +104,7 @@ class _Ego(_Near, ControlledVehicle):  # type: ignore[misc]
 
     pull = 0.0
 
-    def act(self, action: Any = None) -> None:
+    def act(self, action: dict[str, float] | str | None = None) -> None:
         self.action = {"steering": self.steering_control(self.target_lane_index), "acceleration": self.pull}
 
 
@@ -109,10 +112,10 @@ class _Driver(_Near, IDMVehicle):  # type: ignore[misc]
     """Drives by IDM and MOBIL, brakes hard while `braking` [s] is left, and does not roll back."""
 
     braking, committed = 0.0, 0.0  # [s]
-    decel, pace = 6.0, 0.1  # of a hard braking [m/s^2], and the step [s]
+    decel, pace = 6.0, 0.1  # deceleration of a hard braking [m/s^2], and the step [s]
     changes = True  # lanes, of itself
 
-    def act(self, action: Any = None) -> None:
+    def act(self, action: dict[str, float] | str | None = None) -> None:
         self.enable_lane_change = self.changes and self.committed <= 0.0
         super().act(action)
         if not self.crashed:
@@ -138,7 +141,7 @@ class Bench:
         self.indices = [("0", "1", lane) for lane in range(lanes)]
         self.lanes = [network.get_lane(index) for index in self.indices]
         self.road = _Road(network, np_random=_Undrawn())
-        self.ego: Any = _Ego(self.road, self.lanes[0].position(0.0, 0.0))
+        self.ego = _Ego(self.road, self.lanes[0].position(0.0, 0.0))
         self.traffic: list[Any] = [_Driver(self.road, self.lanes[0].position(0.0, 0.0), timer=1.0) for _ in range(cars - 1)]
         for car in self.traffic:
             car.decel, car.pace, car.changes = decel, dt, lane_changes
@@ -146,12 +149,12 @@ class Bench:
         self.road.vehicles = self.cars
 
     def place(self, lane: int, x: float) -> tuple[float, float, float]:
-        """x, y [m] and heading [rad] of a car in the middle of a lane."""
+        """Return x, y [m] and heading [rad] of a car in the middle of a lane."""
         y = self.lanes[lane].position(x, 0.0)[1]
         return x, float(y), float(self.lanes[lane].heading_at(x))
 
     def put(self, numbers: Array) -> None:
-        """The scene is now that of `numbers` (V, FEATURES)."""
+        """Set the scene to `numbers` (V, FEATURES)."""
         for car, n in zip(self.cars, numbers.tolist(), strict=True):
             car.position = np.array([n[X], n[Y]])
             car.heading, car.speed, car.target_speed, car.crashed = n[HEADING], n[SPEED], n[WANTED], n[CRASHED] != 0.0
@@ -161,7 +164,7 @@ class Bench:
             car.timer, car.DELTA, car.braking, car.committed = n[TIMER], n[DELTA], n[BRAKING], n[COMMITTED]
 
     def take(self) -> Iterable[list[float]]:
-        """The numbers of all cars, as `put` takes them."""
+        """Return the numbers of all cars, as `put` takes them."""
         for car in self.cars:
             push = (1.0, *car.impact) if car.impact is not None else (0.0, 0.0, 0.0)
             yield [
@@ -170,7 +173,7 @@ class Bench:
             ]  # fmt: skip
 
     def look(self) -> Sight:
-        """Of the scene as it is. A car counts from when a part of it is in the first one's lane and all of it is ahead, or behind."""
+        """Look at the present scene. A car counts when a part of it is in the first one's lane and all of it is ahead, or behind."""
         lane = self.lanes[self.ego.target_lane_index[2]]
         here = lane.local_coordinates(self.ego.position)[0]
         gap, lead, rear_gap, rear = math.inf, None, math.inf, None
@@ -197,7 +200,7 @@ class Bench:
         )  # fmt: skip
 
     def step(self, pull: float) -> None:
-        """One step of everybody; the first car accelerates at `pull` [m/s^2]."""
+        """Move everybody by one step; the first car accelerates at `pull` [m/s^2]."""
         self.ego.pull = pull
         self.road.act()
         self.road.step(self.dt)
@@ -207,7 +210,7 @@ class Bench:
     # -- events
 
     def brake(self, lasting: float, within: float) -> bool:
-        """Whether there is a car ahead, nearer than `within` [m]: it brakes hard for `lasting` seconds."""
+        """Let the car ahead, if it is nearer than `within` [m], brake hard for `lasting` seconds; return if there is one."""
         sight = self.look()
         if sight.lead is None or sight.gap is None or sight.gap > within or self.cars[sight.lead].crashed:
             return False
@@ -217,7 +220,7 @@ class Bench:
         return True
 
     def cut_in(self, least: float, most: float) -> bool:
-        """Whether a car beside could cut in with a gap [m] from least to most: the nearest such car begins to."""
+        """Let the nearest car in another lane cut in with a gap [m] from least to most; return if there is one."""
         sight = self.look()
         mine, here = self.ego.target_lane_index[2], float(self.ego.position[0])
         free = math.inf if sight.gap is None else sight.gap - LENGTH - ROOM  # the largest gap that leaves room ahead

@@ -55,7 +55,7 @@ class LinearPlatoon(String):
         return state.X[:, 1]
 
     def _cars(self, state: LinearState) -> tuple[Array, Array, Array]:
-        """Positions, speeds and accelerations (B, N)."""
+        """Return positions, speeds and accelerations (B, N)."""
         cars = range(self.size[0])
         v, a = (state.X[:, [place(i) for i in cars]] for place in (Column.speed, Column.accel))
         x = np.repeat(state.X[:, :1], self.size[0], axis=1)
@@ -69,7 +69,7 @@ class LinearPlatoon(String):
         return Scene(gap, v, a, ahead, num.full(x.shape, np.inf), num.zeros(x.shape), x)
 
     def v2v(self, plan: LinearPlan, state: LinearState) -> Array:
-        """(B, N, 3) accelerations, for the record: the controllers are in the model. It has no commands."""
+        """Return accelerations (B, N, 3), for the record: the controllers are in the model. It has no commands."""
         _, _, a = self._cars(state)
         out = num.zeros((*a.shape, 3))
         out[:, 1:, 0], out[:, 1:, 1] = a[:, :-1], plan.leader_heard[1:] * a[:, :1]

@@ -13,7 +13,7 @@ dropped.
 """
 
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -35,7 +35,7 @@ Variances = Annotated[tuple[Variance, Variance, Variance], Field(min_length=3, m
 
 
 def hears(topology: Topology, cars: int) -> Array:
-    """graph (N, N) bool of a topology: who receives the messages and estimates of whom."""
+    """Return the graph (N, N) bool of a topology, [i, j] when car i receives messages and estimates of car j."""
     i, j = np.indices((cars, cars))
     heard = (i == j) | (i == j + 1)
     if topology == "predecessor_leader":
@@ -48,7 +48,7 @@ def hears(topology: Topology, cars: int) -> Array:
 
 
 def closed_loop(gains: Gains, tau: float) -> tuple[Array, Array, Array]:
-    """Ac (n, n), Br (n,) of the leader's input, and cc (n,) of a string of cars with actuator lag tau [s], in continuous time."""
+    """Return Ac (n, n), Br (n,) of the leader's input, and cc (n,) of a string of cars with actuator lag tau [s], in continuous time."""
     cars, n = gains.K.shape
     A, B, c, col = np.zeros((n, n)), np.zeros(n), np.zeros(n), Column
     A[0, 1] = A[1, 2] = 1.0
@@ -72,7 +72,7 @@ def closed_loop(gains: Gains, tau: float) -> tuple[Array, Array, Array]:
 
 
 def hold(A: Array, B: Array, c: Array, dt: float) -> tuple[Array, Array, Array]:
-    """The zero-order hold of x' = A x + B u + c for a step dt: Ad (n, n), Bd (n,), cd (n,)."""
+    """Return the zero-order hold of x' = A x + B u + c for a step dt: Ad (n, n), Bd (n,), cd (n,)."""
     n = len(A)
     whole = np.zeros((n + 2, n + 2))
     whole[:n, :n], whole[:n, n], whole[:n, n + 1] = A * dt, B * dt, c * dt
@@ -116,18 +116,18 @@ class String:
         return self.speed
 
     def hears(self) -> Array:
-        """graph (N, N) bool, [i, j] when car i hears car j."""
+        """Return the graph (N, N) bool, [i, j] when car i hears car j."""
         return hears(self.topology, self.size[0])
 
     def gains(self, controller: Controller) -> Gains:
-        """The matrices of the law that drives this string."""
+        """Return the matrices of the law that drives this string."""
         if not isinstance(controller, Law):
             wanted = "a law of cooperative adaptive cruise control: cacc, ploeg_cacc or consensus_cacc"
             raise InputError("plant platoon: controller", type(controller).__name__, wanted)
         return controller.gains(self.hears(), controller.headway)
 
     def model(self, sensor: Sensor, controller: Controller) -> Model:
-        """The public model: the closed loop. Raises InputError, naming the cars, where it is not detectable."""
+        """Return the public model: the closed loop. Raise InputError, naming the cars, where it is not detectable."""
         (cars, n), (names, C, R) = self.size, sensor.matrices(self)
         A, B, c = hold(*closed_loop(self.gains(controller), self.tau), self.dt)
         told, gap, speed = np.full(n, self.process_var), np.zeros((cars, n)), np.zeros((cars, n))
@@ -144,24 +144,24 @@ class String:
         return model
 
     def initial_gaps(self, draws: Draws) -> Array:
-        """(B, F) gaps [m] at the start."""
+        """Return the gaps (B, F) [m] at the start."""
         behind = (self.followers,)
         return np.asarray(self.gap + self.gap_sd * draws.normal(behind) + self.gap_range * (2.0 * draws.uniform(behind, 1) - 1.0))
 
     def told(self, truth: Array, draws: Draws) -> Prior:
-        """What each car is told of the initial state (B, N, n)."""
+        """Return each car's prior knowledge of the initial state (B, N, n)."""
         shape = (*truth.shape, truth.shape[2])
         mean = truth + self.initial_sd * draws.normal(truth.shape[1:], 16)
         return Prior(mean, np.broadcast_to(self.prior_var * np.eye(shape[-1]), shape))
 
-    def known(self, plan: Any, u: Array, exo: Array, state: Any) -> Array:
-        """The leader knows its command; the others where the scenario says so."""
+    def known(self, plan: object, u: Array, exo: Array, state: object) -> Array:
+        """Return the known inputs: the leader knows its command; the others where the scenario grants it."""
         out = num.zeros(u.shape)
         out[:, :, 0] = exo[:, None] if self.leader_input_known else 0.0
         out[:, 0, 0] = exo
         return out
 
-    def odometry(self, plan: Any, state: Any) -> Array:
+    def odometry(self, plan: object, state: tuple[Array, ...]) -> Array:
         return np.zeros((len(state[0]), self.size[0], 0))
 
 
@@ -178,7 +178,7 @@ class PlatoonState(NamedTuple):
     x: Array
     v: Array
     a: Array
-    u: Array  # what the actuators got last
+    u: Array  # last commands of the actuators
 
 
 @register("plant", "platoon", reference="Dutta 2018, (6.4), (6.8)-(6.16)")
@@ -209,7 +209,7 @@ class Platoon(String):
         return PlatoonState(x, v, a, applied)
 
     def truth(self, plan: PlatoonPlan, state: PlatoonState, held: Array) -> Array:
-        """X (B, N, n), the same for all cars; the f_i are those that the controllers hold."""
+        """Return X (B, N, n), the same for all cars; the f_i are those that the controllers hold."""
         cars, n = self.size
         X = num.zeros((len(state.x), n))
         X[:, 0] = state.x[:, 0]
@@ -230,9 +230,9 @@ class Platoon(String):
         return Scene(gap, state.v, state.a, ahead, nobody, num.zeros(gap.shape), state.x)
 
     def v2v(self, plan: PlatoonPlan, state: PlatoonState) -> Array:
-        """(B, N, 3) what each car hears: its predecessor's and the leader's acceleration, and what drove its predecessor in the last step.
+        """Return the message (B, N, 3) to each car: accelerations of predecessor and leader, and the predecessor's last command.
 
-        The leader's is 0 for those who do not hear it.
+        The leader's acceleration is 0 for cars that do not hear the leader.
         """
         out = num.zeros((*state.x.shape, 3))
         out[:, 1:, 0], out[:, 1:, 2] = state.a[:, :-1], state.u[:, :-1]
@@ -258,7 +258,7 @@ class PlatoonSensors:
             C[i, range(3), [Column.gap(i), Column.speed(i), Column.accel(i)]] = 1.0
         told = np.array(self.noise_sd if self.told_sd is None else self.told_sd)
         if (told <= 0.0).any():
-            raise InputError("sensor platoon_sensors.told_sd", self.told_sd, "standard deviations above 0, where noise_sd is not")
+            raise InputError("sensor platoon_sensors.told_sd", self.told_sd, "standard deviations above 0; needed where noise_sd has a 0")
         return ("distance", "velocity", "acceleration"), C, np.repeat(np.diag(told * told)[None], cars, axis=0)
 
     def prepare(self, model: Model) -> tuple[Array, Array]:

@@ -44,7 +44,7 @@ class RadarState(NamedTuple):
 
 
 def lagged(a: Array, u: Array, keep: float, gain: float) -> Array:
-    """The acceleration [m/s^2] one step later, under the command u, elementwise."""
+    """Return the acceleration [m/s^2] one step later, under the command u, elementwise."""
     out: Array = keep * a + gain * u
     return out
 
@@ -99,7 +99,7 @@ class RadarFollowing:
         return RadarState(lead_x, lead_v, (lead_v - state.lead_v) / self.dt, own, behind)
 
     def known(self, plan: RadarPlan, u: Array, exo: Array, state: RadarState) -> Array:
-        """The own speed, by odometry."""
+        """Return the own speed, by odometry."""
         return state.own[..., 1:2]
 
     def truth(self, plan: RadarPlan, state: RadarState, held: Array) -> Array:

@@ -2,7 +2,7 @@
 
     x+ = a x + b u + w          y = x          u = -g x^
 
-The reading is exact, so that a defence that believes it knows the state, and an attacker who holds it decides what the loop acts on.
+The reading is exact: a defence that believes it knows the state. An attacker who holds the reading decides what the loop acts on.
 """
 
 from dataclasses import dataclass
@@ -28,9 +28,10 @@ from tailgate.core import (
 from tailgate.core.draws import Draws
 from tailgate.core.quantities import PositiveVariance, Spread, Step
 from tailgate.core.registry import register
+from tailgate.envs.controllers.adaptive_cruise import OneCar
 
 Factor = Annotated[float, Field(ge=-10.0, le=10.0, allow_inf_nan=False)]
-GROWTH = 1.5  # of the state in a step, at most: 1000 steps of it are still a number
+GROWTH = 1.5  # largest growth of the state in a step: 1000 steps still give a finite number
 WIRE, ACTUATOR = "y", "u"
 
 
@@ -88,7 +89,7 @@ class ScalarLoop:
         return np.zeros(len(state.x))
 
     def scene(self, plan: float, state: ScalarState) -> Scene:
-        """Nothing drives."""
+        """Return an empty road: nothing drives."""
         still = num.zeros((len(state.x), 1))
         nobody = num.full(still.shape, np.inf)
         return Scene(nobody, still, still, still, nobody, still, still)
@@ -118,7 +119,7 @@ class ExactReading:
 
 @register("controller", "state_feedback")
 @dataclass(frozen=True)
-class StateFeedback:
+class StateFeedback(OneCar):
     """u = -g x^ on the estimate of the one state."""
 
     gain: Factor = param(0.25, "feedback gain g [-]")
@@ -129,14 +130,8 @@ class StateFeedback:
         if abs(model.A[0, 0] - model.B[0, 0] * self.gain) > GROWTH:
             raise InputError("controller state_feedback.gain", self.gain, f"at most {GROWTH:g} as |a - b gain|, by which the loop grows")
 
-    def start(self, plan: None, batch: int) -> None:
-        return None
-
     def step(self, plan: None, state: None, estimate: Estimate, v2v: Array, odometry: Array) -> tuple[None, Array]:
         return None, -self.gain * estimate.x
-
-    def held(self, plan: None, state: None, batch: int) -> Array:
-        return np.zeros((batch, 1, 0))
 
     def desired_gap(self, speed: Array) -> Array:
         return np.zeros_like(speed)

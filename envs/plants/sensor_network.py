@@ -58,7 +58,7 @@ class NetworkState(NamedTuple):
 
 @lru_cache(maxsize=64)
 def modes(states: int, seed: int) -> tuple[Array, Array]:
-    """T and D, each (n, n): an orthogonal matrix, and rotations by different angles on the diagonal (1 for the odd one out)."""
+    """Return T and D, each (n, n): an orthogonal matrix, and rotations by different angles on the diagonal (1 for an odd state)."""
     draws = constants("sensor_network", seed)
     T = draws.normal((states, states), 1)[0]
     for i in range(states):  # Gram and Schmidt, twice against rounding
@@ -75,7 +75,7 @@ def modes(states: int, seed: int) -> tuple[Array, Array]:
 
 
 def blocks(states: int) -> list[slice]:
-    """The modes' places on the diagonal of D: pairs, and one alone where the number of states is odd."""
+    """Return the modes' places on the diagonal of D: pairs, and one alone where the number of states is odd."""
     return [slice(p, min(p + 2, states)) for p in range(0, states, 2)]
 
 
@@ -108,7 +108,7 @@ class SensorNetwork:
         return self.agents, self.states
 
     def matrix(self) -> Array:
-        """A (n, n)."""
+        """Return A (n, n)."""
         if self.system == "modal":
             T, D = modes(self.states, self.system_seed)
             return self.spectral_radius * num.product(num.product(T, D), T.T)
@@ -116,7 +116,7 @@ class SensorNetwork:
         return np.asarray(raw * (self.spectral_radius / num.spectral_radius(raw)))
 
     def hears(self) -> Array:
-        """graph (N, N) bool, [i, j] when i hears j; everybody hears itself."""
+        """Return the graph (N, N) bool, [i, j] when i hears j; everybody hears itself."""
         n, where = self.agents, "plant sensor_network"
         pairs = self._pairs()
         out = np.eye(n, dtype=bool)
@@ -152,7 +152,7 @@ class SensorNetwork:
         return NetworkPlan(model.A[None], float(np.sqrt(self.noise_var)))
 
     def model(self, sensor: Sensor, controller: Controller) -> Model:
-        """The public model. Raises InputError, naming the agents, where it is not detectable."""
+        """Return the public model. Raise InputError, naming the agents, where it is not detectable."""
         n, (names, C, R) = self.states, sensor.matrices(self)
         model = Model(
             A=self.matrix(), B=np.zeros((n, 0)), c=np.zeros(n), C=C, Q=self.process_var * np.eye(n), R=R, graph=self.hears(), dt=self.dt,
@@ -185,7 +185,7 @@ class SensorNetwork:
         return np.zeros(len(state.x))
 
     def scene(self, plan: NetworkPlan, state: NetworkState) -> Scene:
-        """Nothing drives."""
+        """Return an empty road: nothing drives."""
         still = num.zeros((len(state.x), self.agents))
         nobody = num.full(still.shape, np.inf)
         return Scene(nobody, still, still, still, nobody, still, still)
@@ -225,7 +225,7 @@ class LinearSensors:
         return names, C, np.repeat(self.told_var * np.eye(self.sensors)[None], agents, axis=0)
 
     def _of_modes(self, plant: SensorNetwork, raw: Array) -> Array:
-        """C_i that see modes i, i + N, ... and those after them, as many as `modes_seen`."""
+        """Return C_i that see modes i, i + N, ... and those after them, as many as `modes_seen`."""
         places, where = blocks(plant.states), "sensor linear_sensors"
         if plant.system != "modal":
             raise InputError(f"{where}.pattern", self.pattern, "the plant's system to be modal")

@@ -7,7 +7,7 @@
             | 0  -k gamma  +-k |   k = (1+1/h)/tau      | 0                                       |
 
 A_a (with +k) while the car accelerates, A_d (with -k) while it does not. A_a is unstable, the velocity falls when the gap opens, and the
-car does not keep its distance: nothing here may stand for a car. `car_following` holds the corrected equations.
+car does not keep its distance: do not use it as a car. `car_following` holds the corrected equations.
 """
 
 from dataclasses import dataclass
@@ -18,6 +18,7 @@ from tailgate import num
 from tailgate.core import Array, Estimate, Model, param
 from tailgate.core.quantities import Lag, Length, PositiveGain
 from tailgate.core.registry import register
+from tailgate.envs.controllers.adaptive_cruise import OneCar
 from tailgate.envs.plants.car_following import CarFollowing, FollowingPlan
 
 
@@ -37,7 +38,7 @@ class CarFollowingLiteral(CarFollowing):
         return A, B
 
     def move(self, plan: FollowingPlan, ego: Array, u: Array, noise: Array) -> Array:
-        """The follower (B, 1, 3) one step later, under u (B, 1, 1) [m] and noise (3, B)."""
+        """Return the follower (B, 1, 3) one step later, under u (B, 1, 1) [m] and noise (3, B)."""
         fixed = num.matvec(plan.A, ego) + num.matvec(plan.B, u)
         switch = np.where(ego[..., 2] > 0.0, 2.0 * (1.0 - plan.A[2, 2]), 0.0) * ego[..., 2]  # from A_d to A_a
         moved = [fixed[..., i] + noise[i][:, None] for i in range(3)]
@@ -46,7 +47,7 @@ class CarFollowingLiteral(CarFollowing):
 
 @register("controller", "relative_distance", reference="Dutta 2018, (4.16): the input u of the printed model")
 @dataclass(frozen=True)
-class RelativeDistance:
+class RelativeDistance(OneCar):
     """Feeds the printed model: u = x_l - x_f [m], the follower's position as estimated."""
 
     headway: Lag = param(3.0, "time headway h of the spacing policy (4.13) [s]")
@@ -55,16 +56,10 @@ class RelativeDistance:
     def prepare(self, model: Model) -> None:
         return None
 
-    def start(self, plan: None, batch: int) -> None:
-        return None
-
     def step(self, plan: None, state: None, estimate: Estimate, v2v: Array, odometry: Array) -> tuple[None, Array]:
-        """estimate.x (B, N, 3) and v2v (B, N, 2) = [x_l, v_l] to u (B, N, 1) [m]."""
+        """Return u (B, N, 1) [m] for estimate.x (B, N, 3) and v2v (B, N, 2) = [x_l, v_l]."""
         return None, (v2v[..., 0] - estimate.x[..., 0])[..., None]
 
-    def held(self, plan: None, state: None, batch: int) -> Array:
-        return np.zeros((batch, 1, 0))
-
     def desired_gap(self, speed: Array) -> Array:
-        """d_r + h v [m] (4.13)."""
+        """Return d_r + h v [m] (4.13)."""
         return np.asarray(self.standstill + self.headway * speed)

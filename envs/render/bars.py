@@ -8,16 +8,16 @@ from tailgate.envs.render.canvas import ATTACK, COMMANDS, EGO, GREY, INK, PALE, 
 from tailgate.envs.render.sheet import Sheet
 from tailgate.envs.render.stage import Stage
 
-NOISE_FLOOR = -90.0  # what is heard below it is nothing [dB]
+NOISE_FLOOR = -90.0  # lower powers are shown as silence [dB]
 
 
 def _signed(value: float) -> str:
-    """One decimal place with its sign; what rounds to nothing is +0.0."""
+    """Return one decimal place with its sign; a value that rounds to nothing is +0.0."""
     return f"{round(value, 1) + 0.0:+,.1f}"
 
 
 def upper(sheet: Sheet, loop: Loop, state: LoopState, frame: Frame | None, row: int) -> None:
-    """Time, attack, attack steps left, alarm."""
+    """Draw time, attack, attack steps left, alarm."""
     width, dt, steps, last = sheet.width, loop.model.dt, int(state.k[row]) - 1, state.channel.last
     fresh = frame is not None and frame.k[row] + 1 == state.k[row]
     refused = frame is not None and fresh and bool(frame.refused[row])
@@ -46,7 +46,7 @@ def upper(sheet: Sheet, loop: Loop, state: LoopState, frame: Frame | None, row: 
 
 
 def lower(sheet: Sheet, stage: Stage, caption: str, note: str) -> None:
-    """The figures of the car that is watched, the caption, and what the radar did."""
+    """Draw the figures of the watched car, the caption, and the radar's part in the step."""
     follower, width, right = stage.followers[stage.watched], float(sheet.width), sheet.width - 5.0
     sheet.box(0, sheet.below, width, sheet.height, PALE)
     if follower.muted is not None:

@@ -1,4 +1,4 @@
-"""What all pictures share: the canvas, its colours, cars, marks, and the header (extra: viz)."""
+"""The common parts of all pictures: the canvas, its colours, cars, marks, and the header (extra: viz)."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ class Canvas:
         self.pen.polygon([(x * ZOOM, y * ZOOM) for x, y in points], fill, edge, ZOOM)
 
     def line(self, x0: float, y0: float, x1: float, y1: float, ink: str, width: int = 2, dash: float = 0.0) -> None:
-        """Solid, or dashes of `dash` px with gaps as long."""
+        """Draw a line: solid, or dashes of `dash` px with gaps as long."""
         length = max(1.0, math.hypot(x1 - x0, y1 - y0))
         for start in np.arange(0.0, length, 2 * dash or length):
             ends = (start / length, min(1.0, (start + (dash or length)) / length))
@@ -91,7 +91,7 @@ class Canvas:
         self, x: float, y: float, words: str, ink: str = INK, size: int = NORMAL, anchor: str = "ls", bold: bool = False,
         room: tuple[float, float] = (-FAR, FAR), ground: str | None = None,
     ) -> None:  # fmt: skip
-        """Letters, shrunk to `room` (left, right) px and moved into it. ground: its colour, where lines pass beneath."""
+        """Draw letters, shrunk to `room` (left, right) px and moved into it. ground: its colour, where lines pass beneath."""
         while size > TINY and _font(size).getbbox(words)[2] > (room[1] - room[0]) * ZOOM:
             size -= 1
         while len(words) > 4 and _font(size).getbbox(words)[2] > (room[1] - room[0]) * ZOOM:
@@ -104,15 +104,15 @@ class Canvas:
         self.pen.text(at, words, ink, _font(size), anchor, stroke_width=ZOOM / 4 if bold else 0)  # the font has one weight
 
     def length(self, words: str, size: int) -> float:
-        """Width of letters [px]."""
+        """Return the width of letters [px]."""
         return float(_font(size).getbbox(words)[2]) / ZOOM
 
     def head(self, x: float, y: float, way: float, ink: str, size: float = 7.0) -> None:
-        """An arrow's head that points right (way 1) or left (-1)."""
+        """Draw an arrow's head that points right (way 1) or left (-1)."""
         self.shape([(x, y), (x - way * size, y - size * 0.6), (x - way * size, y + size * 0.6)], ink)
 
     def gap(self, x0: float, x1: float, y: float, ink: str, dash: float = 0.0) -> float:
-        """A dimension line between two bumpers, an arrow where it leaves the picture; returns the middle of what is seen."""
+        """Draw a dimension line between two bumpers, an arrow where it leaves the picture; return the middle of the visible part."""
         low, high = sorted((x0, x1))
         ends = [max(MARGIN / 2, min(end, WIDTH - MARGIN / 2)) for end in (low, high)]
         self.line(ends[0], y, ends[1], y, ink, dash=dash)
@@ -124,7 +124,7 @@ class Canvas:
         return sum(ends) / 2
 
     def car(self, nose: float, wheels: float, colour: str, ghost: bool = False, length: float = CAR) -> None:
-        """A car by the place of its nose and wheels; a ghost is a dashed outline."""
+        """Draw a car by the place of its nose and wheels; a ghost is a dashed outline."""
         height, wheel = CAR_SHAPE * length, WHEEL_SHAPE * length
         body, window = ([(nose - length + x * length, wheels - y * height) for x, y in part] for part in (BODY, WINDOW))
         if ghost:
@@ -137,36 +137,36 @@ class Canvas:
             self.disc(nose - length + axle * length, wheels - wheel, wheel, WHITE if ghost else INK, colour)
 
     def burst(self, x: float, y: float, size: float = 24.0) -> None:
-        """A star where two cars touch."""
+        """Draw a star where two cars touch."""
         turns = [(math.pi * i / 9, size * 10.0 / 24.0 if i % 2 else size) for i in range(18)]
         self.shape([(x + r * math.cos(a), y + r * math.sin(a)) for a, r in turns], WARNING, INK)
 
     def sign(self, left: float, top: float, words: str, size: int = LARGE) -> None:
-        """Large words on yellow, in a box of `sign_size`."""
+        """Draw large words on yellow, in a box of `sign_size`."""
         width, height = self.sign_size(words, size)
         self.box(left, top, left + width, top + height, WARNING, INK, 3)
         self.text(left + 0.6 * size, top + 1.05 * size, words, size=size, bold=True)
 
     def sign_size(self, words: str, size: int = LARGE) -> tuple[float, float]:
-        """Width and height of a sign [px]."""
+        """Return width and height of a sign [px]."""
         return self.length(words, size) + 1.2 * size, 1.4 * size
 
     def alarm(self, x: float, y: float, size: float = LAMP_SIZE, on: bool = True) -> None:
-        """A lamp: black with an exclamation mark where it is on."""
+        """Draw a lamp: black with an exclamation mark where it is on."""
         self.disc(x, y, size, INK if on else WHITE, INK if on else GREY)
         self.text(x, y, "!" if on else "", WARNING, round(size * 4 / 3), "mm", True)
 
     def bolt(self, x: float, y: float, size: float = 9.0) -> None:
-        """A lightning that marks an attacked agent, its tip at (x, y)."""
+        """Draw a lightning that marks an attacked agent, its tip at (x, y)."""
         points = ((0.0, 0.0), (0.75, -1.1), (0.2, -1.0), (0.6, -2.0), (-0.6, -0.85), (-0.05, -0.95))
         self.shape([(x + a * size, y + b * size) for a, b in points], ATTACK, INK)
 
     def paste(self, picture: Array, top: int) -> None:
-        """A picture (H ZOOM, W ZOOM, 3) uint8, as wide as the canvas, from row `top` [px] down."""
+        """Draw a picture (H ZOOM, W ZOOM, 3) uint8, as wide as the canvas, from row `top` [px] down."""
         self.image.paste(Image.fromarray(np.ascontiguousarray(picture)), (0, top * ZOOM))
 
     def done(self) -> Array:
-        """The picture (H, W, 3) uint8."""
+        """Return the picture (H, W, 3) uint8."""
         return np.array(self.image.reduce(ZOOM), np.uint8)
 
 
@@ -196,7 +196,7 @@ def header(canvas: Canvas, loop: Loop, state: LoopState, row: int, refused: bool
 
 
 def alarmed(loop: Loop, state: LoopState, row: int) -> str:
-    """Who alarms, and the modes that the defence asks for; nothing of a single calm agent."""
+    """Return the agents that alarm and the requested modes, in words; nothing for a single calm agent."""
     alarms, modes = np.flatnonzero(state.estimate.alarm[row]).tolist(), state.estimate.mode[row].tolist()
     asked = {mode: [i for i, held in enumerate(modes) if held == mode] for mode in Mode if mode and mode in modes}
     words = "; ".join(f"{mode.name}{_of(loop, asked[mode])}" for mode in asked)
@@ -205,7 +205,7 @@ def alarmed(loop: Loop, state: LoopState, row: int) -> str:
 
 
 def ended(loop: Loop, state: LoopState, frame: Frame | None, row: int) -> str:
-    """Words about the collision of the episode that an autoreset has just replaced; nothing where there was none."""
+    """Return words about the collision of the episode that an autoreset has just replaced; nothing where there was none."""
     if frame is None or frame.k[row] + 1 == state.k[row] or frame.k[row] > loop.horizon:
         return ""
     if not (frame.collided[row] | frame.rear_collided[row]):
@@ -214,18 +214,18 @@ def ended(loop: Loop, state: LoopState, frame: Frame | None, row: int) -> str:
 
 
 def ended_line(canvas: Canvas, loop: Loop, state: LoopState, frame: Frame | None, row: int) -> None:
-    """A line about the collision of the episode that an autoreset has just replaced, if there was one."""
+    """Draw a line about the collision of the episode that an autoreset has just replaced, if there was one."""
     if words := ended(loop, state, frame, row):
         canvas.text(WIDTH - MARGIN, HEADER + 17, words, INK, SMALL, "rs", True)
 
 
 def noun(loop: Loop) -> str:
-    """What an agent is."""
+    """Return the word for an agent."""
     return "car" if loop.model.followers.any() else "agent"
 
 
 def _of(loop: Loop, agents: list[int]) -> str:
-    """" of car 2", " of cars 1, 2", or nothing where there is only one agent."""
+    """Return " of car 2", " of cars 1, 2", or nothing where there is only one agent."""
     if loop.model.agents == 1:
         return ""
     listed = ", ".join(map(str, agents)) if len(agents) < 8 else f"{len(agents)} of {loop.model.agents}"
@@ -233,7 +233,7 @@ def _of(loop: Loop, agents: list[int]) -> str:
 
 
 def aimed(loop: Loop, last: Command, row: int) -> str:
-    """The wires that a command hits, each with its value; of many their number and the range of the values."""
+    """Return the wires that a command hits, each with its value; of many their number and the range of the values."""
     kind, wires = Kind(int(last.kind[row])), loop.model.wires
     if kind == Kind.NONE:
         return ""

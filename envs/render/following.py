@@ -49,20 +49,20 @@ ROAD, CAR_HEIGHT = 14.0, CAR_SHAPE * CAR
 
 
 def scale_of(gap: float, rear_gap: float) -> float:
-    """Pixels a metre: the least span that holds the leader, or the next one if that shows the car behind."""
+    """Return pixels a metre: the least span that holds the leader, or the next one if that shows the car behind."""
     first = next((i for i, span in enumerate(SPANS) if gap <= span), len(SPANS) - 1)
     scales = [AHEAD / span for span in SPANS[first : first + 2]]
     return next((scale for scale in scales if rear_gap * scale <= BEHIND), scales[0])
 
 
 def _crash(canvas: Canvas, x: float, left: float, words: str) -> None:
-    """A burst where two cars touch, and a sign above it."""
+    """Draw a burst where two cars touch, and a sign above it."""
     canvas.burst(x, WHEELS - CAR_HEIGHT / 2)
     canvas.sign(left, HEADER + 20, words)
 
 
 def _car(canvas: Canvas, nose: float, colour: str, name: str, speed: float, room: tuple[float, float]) -> None:
-    """A car with its name and speed, or an arrow at the edge that it is beyond."""
+    """Draw a car with its name and speed, or an arrow at the edge that it is beyond."""
     way = 1 if nose > WIDTH - MARGIN + 1 else -1 if nose < MARGIN + CAR - 1 else 0
     middle = (nose - CAR / 2, WIDTH - MARGIN, MARGIN)[way]
     if way:
@@ -74,7 +74,7 @@ def _car(canvas: Canvas, nose: float, colour: str, name: str, speed: float, room
 
 
 def truth(canvas: Canvas, road: dict[str, float], scale: float, ended: bool) -> None:
-    """The upper strip: the road as it is, from the leaves of a scene."""
+    """Draw the upper strip: the road as it is, from the leaves of a scene."""
     leader, rear = NOSE + road["gap"] * scale, TAIL - road["rear_gap"] * scale
     canvas.text(MARGIN, HEADER + 17, "THE ROAD AS IT IS", GREY, SMALL)
     canvas.box(0, WHEELS, WIDTH, WHEELS + ROAD, LEADER)
@@ -98,7 +98,7 @@ def truth(canvas: Canvas, road: dict[str, float], scale: float, ended: bool) -> 
 
 
 def belief(canvas: Canvas, gap: float, believed: float, scale: float, words: str) -> None:
-    """The lower strip: the car where it believes to be behind the leader, and `words` on the line between."""
+    """Draw the lower strip: the car at its believed place behind the leader, and `words` on the line between."""
     leader, off = NOSE + gap * scale, gap - believed
     ghost = max(-FAR, min(NOSE + off * scale, FAR))
     canvas.box(0, STRIP, WIDTH, HEIGHT, BELIEF_PALE)
@@ -120,7 +120,7 @@ def belief(canvas: Canvas, gap: float, believed: float, scale: float, words: str
 
 
 def draw(loop: Loop, state: LoopState, frame: Frame | None, row: int) -> Array:
-    """(H, W, 3) uint8: row `row` after `frame`. frame is None right after a reset, be it of other rows."""
+    """Return (H, W, 3) uint8: row `row` after `frame`. frame is None right after a reset, also of other rows."""
     at, model = (row, AGENT), loop.model
     road = {name: float(leaf[at]) for name, leaf in loop.plant.scene(loop.plan.plant, state.plant)._asdict().items()}
     # The belief that the controller acted on is one step older than the road, and so is the leader's position that goes with it.

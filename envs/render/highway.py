@@ -1,7 +1,7 @@
 """A picture on HighwayEnv's road: over it what the defence believes, the attack, the alarm and the challenge (extras: highway, viz).
 
-White and solid is what is true, purple and dashed what is believed. Every mark has a shape or a word: nothing is told by colour alone.
-No word covers another, a mark or a car: what finds no place is left out, the least important first.
+White and solid is what is true, purple and dashed what is believed. Every mark has a shape or a word: colour is never the only sign.
+No word covers another, a mark or a car: a word without a place is left out, the least important first.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from tailgate.envs.render.viewer import SIZE
 
 SHADE = "#464646"  # under words among the cars
 SMALL_CAR = 24.0  # [px]: an outline would hide a car that is shorter
-RIM = 4.0  # of an attacked car's outline [px]
+RIM = 4.0  # width of an attacked car's outline [px]
 
 
 class Ruler(NamedTuple):
@@ -40,7 +40,7 @@ class Ruler(NamedTuple):
 
 
 def _edges(sheet: Sheet, stage: Stage, x0: float, x1: float) -> tuple[float, float]:
-    """Rows [px] of the dimension lines: above and below the road from x0 to x1 [px]."""
+    """Return rows [px] of the dimension lines: above and below the road from x0 to x1 [px]."""
     ends = [max(0.0, min(x, sheet.width)) for x in (x0, x1)]
     places = [sheet.window.x + (ends[0] + (ends[1] - ends[0]) * i / 4 - sheet.width / 2) / sheet.window.scale for i in range(5)]
     rise, fall = (2.7, 3.65) if stage.lanes == 1 else (1.1, 1.2)  # room for the marks and names of one lane
@@ -50,7 +50,7 @@ def _edges(sheet: Sheet, stage: Stage, x0: float, x1: float) -> tuple[float, flo
 
 
 def _measure(sheet: Sheet, x0: float, x1: float, y: float, words: tuple[str, ...], believed: bool) -> Ruler:
-    """Draws a dimension line from bumper to bumper [px], an arrow where it leaves the picture."""
+    """Draw a dimension line from bumper to bumper [px], an arrow where it leaves the picture."""
     ink, halo, dash = (BELIEF_PALE, BELIEF, 4.0) if believed else (WHITE, INK, 0.0)
     ends = [max(4.0, min(x, sheet.width - 4.0)) for x in sorted((x0, x1))]
     sheet.ruled(ends[0], y, ends[1], y, ink, halo, dash)
@@ -63,7 +63,7 @@ def _measure(sheet: Sheet, x0: float, x1: float, y: float, words: tuple[str, ...
 
 
 def _levels(stage: Stage) -> list[int]:
-    """0 or 1 for each follower: the other row where its believed gap reaches over that of the car ahead."""
+    """Return 0 or 1 for each follower: the other row where its believed gap reaches over that of the car ahead."""
     out: list[int] = []
     for i, follower in enumerate(stage.followers):
         over = i and follower.believed is not None and follower.believed > follower.gap + LENGTH
@@ -72,7 +72,7 @@ def _levels(stage: Stage) -> list[int]:
 
 
 def _gaps(sheet: Sheet, places: Places, stage: Stage, follower: Follower, level: int) -> list[Ruler]:
-    """True gap above the road, believed gap below it, and the car ahead where the defence believes it to be."""
+    """Draw the true gap above the road, the believed gap below it, and the car ahead at its believed place."""
     car, alone = stage.cars[follower.car], len(stage.followers) == 1
     nose, tail = sheet.column(car.nose), sheet.column(car.nose + follower.gap)
     if (nose < 0.0 and tail < 0.0) or nose > sheet.width:
@@ -103,7 +103,7 @@ def _gaps(sheet: Sheet, places: Places, stage: Stage, follower: Follower, level:
 
 
 def _waves(sheet: Sheet, car: Car, muted: bool) -> Box:
-    """Arcs before the nose where the radar transmits; a crossed-out circle where it is silent to listen. Returns their place."""
+    """Draw arcs before the nose where the radar transmits, a crossed-out circle where it is silent to listen; return their place."""
     x, y, size = sheet.column(car.nose), sheet.row(car.y), 7.0 * sheet.unit
     if muted:
         sheet.disc(x + size + 4, y, size + 1, WHITE, EGO)
@@ -118,7 +118,7 @@ def _waves(sheet: Sheet, car: Car, muted: bool) -> Box:
 
 
 def _symbols(sheet: Sheet, places: Places, stage: Stage, follower: Follower) -> None:
-    """On the road at a car: an outline where it is attacked, the radar's waves, a star for a collision."""
+    """Draw on the road at a car: an outline where it is attacked, the radar's waves, a star for a collision."""
     car, size = stage.cars[follower.car], 14.0 * sheet.unit
     if follower.attacked:
         places.take(sheet.outline((car.x, car.y), ATTACK, WHITE, grow=RIM))
@@ -131,7 +131,7 @@ def _symbols(sheet: Sheet, places: Places, stage: Stage, follower: Follower) -> 
 
 
 def _marks(sheet: Sheet, places: Places, stage: Stage, follower: Follower) -> None:
-    """Beside the car: a lightning for an attack, a lamp for an alarm."""
+    """Draw next to the car: a lightning for an attack, a lamp for an alarm."""
     car, size = stage.cars[follower.car], 7.0 * sheet.unit
     marks = [on for on, shown in (("bolt", follower.attacked), ("lamp", follower.alarm)) if shown]
     if not marks or not -size < sheet.column(car.x) < sheet.width + size:
@@ -152,7 +152,7 @@ def _marks(sheet: Sheet, places: Places, stage: Stage, follower: Follower) -> No
 
 
 def _figure(sheet: Sheet, places: Places, ruler: Ruler) -> None:
-    """The words of a dimension line: on it where they fit, else beside it."""
+    """Draw the words of a dimension line: on it where they fit, else next to it."""
     ink, ground = (BELIEF, BELIEF_PALE) if ruler.believed else (INK, WHITE)
     for words in ruler.words:
         width, height = sheet.extent((words,), sheet.small)
@@ -162,7 +162,7 @@ def _figure(sheet: Sheet, places: Places, ruler: Ruler) -> None:
 
 
 def _said(stage: Stage, car: Car) -> list[tuple[str, ...]]:
-    """What a car's label may say, the best first: in one lane the speed below the name, among traffic beside it."""
+    """Return the possible texts of a car's label, the best first: in one lane the speed below the name, among traffic after it."""
     speed = f"{car.speed:.1f} m/s"
     if stage.lanes == 1:
         return [(car.name, speed), (car.name,), (car.name.removeprefix("car "),)]
@@ -173,7 +173,7 @@ def _said(stage: Stage, car: Car) -> list[tuple[str, ...]]:
 
 
 def _tie(seat: Box, top: float, bottom: float) -> Box | None:
-    """Where the line from a car to words above or below it is drawn; None where they are next to it."""
+    """Return the line from a car to words above or below it; None where they are next to it."""
     x = (seat.x0 + seat.x1) / 2
     if top > seat.y1 + 1.0:
         return Box(x - 1.0, seat.y1 - 5.0, x + 1.0, top)
@@ -185,7 +185,7 @@ def _crosses(tie: Box | None, cars: list[Box]) -> bool:
 
 
 def _name(sheet: Sheet, places: Places, stage: Stage, car: Car) -> None:
-    """Name and speed below a car, or wherever around it there is room; with a line to it if that is not next to it."""
+    """Draw name and speed below a car, or wherever around it there is room; with a line to it if that is not next to it."""
     if not (car.name or car.doing) or not 0.0 <= sheet.column(car.x) <= sheet.width:
         return
     seat, one, others = sheet.seat(car).grown(RIM + 2.0), stage.lanes == 1, [sheet.seat(other) for other in stage.cars if other is not car]
@@ -205,7 +205,7 @@ def _name(sheet: Sheet, places: Places, stage: Stage, car: Car) -> None:
 
 
 def _sign(sheet: Sheet, places: Places, stage: Stage) -> None:
-    """The word COLLISION where there is one, beside the star."""
+    """Draw the word COLLISION where there is one, next to the star."""
     hit = [follower for follower in stage.followers if follower.hit]
     if not hit:
         return
@@ -218,7 +218,7 @@ def _sign(sheet: Sheet, places: Places, stage: Stage) -> None:
 
 
 def draw(loop: Loop, state: LoopState, frame: Frame | None, row: int, size: tuple[int, int] | None = None, caption: str = "") -> Array:
-    """(H, W, 3) uint8: row `row` after `frame`, which is None right after a reset. caption: a line about who plays."""
+    """Return (H, W, 3) uint8: row `row` after `frame`, which is None right after a reset. caption: a line about who plays."""
     stage, sheet = stage_of(loop, state, frame, row), Sheet(*(size or SIZE))
     sheet.window = window_of(stage, sheet)
     height = round(sheet.below - sheet.above)

@@ -1,6 +1,6 @@
-"""Where words stand in a picture: beside what they name, clear of each other, of the cars and of the marks.
+"""The places of words in a picture: next to what they name, clear of each other, of the cars and of the marks.
 
-Whoever asks first has the choice, so the important ask first; what finds no place is left out.
+The first to ask has the choice, so that the important ask first; a word without a place is left out.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ class Box(NamedTuple):
     y1: float
 
     def meets(self, other: Box) -> bool:
-        """Whether they have an area in common."""
+        """Return if they have an area in common."""
         return self.x0 < other.x1 and other.x0 < self.x1 and self.y0 < other.y1 and other.y0 < self.y1
 
     def grown(self, by: float) -> Box:
-        """`by` px more to each side."""
+        """Return the box with `by` px more on each side."""
         return Box(self.x0 - by, self.y0 - by, self.x1 + by, self.y1 + by)
 
 
@@ -36,11 +36,11 @@ class Places:
         self.taken: list[Box] = []
 
     def take(self, *boxes: Box) -> None:
-        """Nothing is placed there any more."""
+        """Mark a box as taken: nothing is placed there any more."""
         self.taken += boxes
 
     def find(self, width: float, height: float, spots: Spots, own: Box | None = None) -> Box | None:
-        """The first free box of this size, which is taken from then on; None where there is none. own: taken, but not against this one."""
+        """Return and take the first free box of this size; None where there is none. own: taken, but not against this one."""
         room = self.room
         for left, top in spots:
             left = max(room.x0, min(left, room.x1 - width))
@@ -53,7 +53,7 @@ class Places:
 
 
 def around(thing: Box, width: float, height: float, reach: float, up: bool = False) -> Iterator[tuple[float, float]]:
-    """Below and above a thing (`up`: above first), then beside it, then up to `reach` px away from it."""
+    """Return boxes below and above a thing (`up`: above first), then at its sides, then up to `reach` px away from it."""
     middle = (thing.x0 + thing.x1 - width) / 2
     sides = (thing.y0 - height, thing.y1) if up else (thing.y1, thing.y0 - height)
     for top in sides:
@@ -68,14 +68,14 @@ def around(thing: Box, width: float, height: float, reach: float, up: bool = Fal
 
 
 def near(thing: Box, width: float, height: float, reach: float) -> list[tuple[float, float]]:
-    """Wherever within `reach` px of a thing's middle, the nearest first."""
+    """Return boxes within `reach` px of a thing's middle, the nearest first."""
     x, y = (thing.x0 + thing.x1 - width) / 2, (thing.y0 + thing.y1 - height) / 2
     steps = range(-int(reach), int(reach) + 1, 4)
     return sorted(((x + dx, y + dy) for dx in steps for dy in steps), key=lambda at: (at[0] - x) ** 2 + (at[1] - y) ** 2)
 
 
 def along(x0: float, x1: float, y: float, width: float, height: float) -> Iterator[tuple[float, float]]:
-    """On a line from x0 to x1, from its middle to its ends, then above, below, and beyond its ends."""
+    """Return boxes on a line from x0 to x1, from its middle to its ends, then above, below, and beyond its ends."""
     spare, middle = x1 - x0 - width, (x0 + x1 - width) / 2
     if spare >= 0.0:
         for part in (0.0, 0.25, -0.25, 0.5, -0.5):

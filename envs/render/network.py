@@ -28,21 +28,21 @@ from tailgate.envs.render.canvas import (
 )
 
 SPLIT = 560.0  # column [px] between the graph and the bars
-DECADES = (-3, 4)  # of the shade and the bars
+DECADES = (-3, 4)  # range of the shade and the bars
 PALE, DEEP = (0xEE, 0xF4, 0xFA), (0x08, 0x30, 0x6B)  # no error, the largest: from light to dark
 MOST_BARS = 20  # agents: of more the worst
 
 
 @lru_cache(maxsize=8)
 def _places(graph: bytes, count: int) -> Array:
-    """(N, 2) in [0, 1], the wider side filled."""
+    """Return places (N, 2) in [0, 1], the wider side filled."""
     places = layout(np.frombuffer(graph, bool).reshape(count, count))
     low, high = np.min(places, axis=0), np.max(places, axis=0)
     return np.asarray((places - low) / np.where(high > low, high - low, 1.0) + np.where(high > low, 0.0, 0.5))
 
 
 def share(error: float) -> float:
-    """Place of an error on the logarithmic scale, 0 to 1."""
+    """Return the place of an error on the logarithmic scale, 0 to 1."""
     low, high = DECADES
     if math.isnan(error):
         return 0.0
@@ -50,13 +50,13 @@ def share(error: float) -> float:
 
 
 def shade(error: float) -> str:
-    """Colour of an error: the darker, the larger."""
+    """Return the colour of an error: the larger, the darker."""
     part = share(error)
     return "#" + "".join(f"{round(a + (b - a) * part):02x}" for a, b in zip(PALE, DEEP, strict=True))
 
 
 def errors(loop: Loop, state: LoopState, frame: Frame | None, row: int) -> Array:
-    """(N,) error of each agent's last estimate; NaN right after a reset."""
+    """Return the error (N,) of each agent's last estimate; NaN right after a reset."""
     if frame is not None and frame.k[row] + 1 == state.k[row]:
         return np.asarray(loop.model.error(frame.estimate.x[row], frame.truth[row]))
     return np.full(loop.model.agents, np.nan)
@@ -90,7 +90,7 @@ def _graph(canvas: Canvas, loop: Loop, sizes: Array, attacked: Array, alarm: Arr
 
 
 def _bars(canvas: Canvas, sizes: Array, attacked: Array, alarm: Array) -> None:
-    """The errors on a logarithmic axis, one bar an agent; of many agents the worst."""
+    """Draw the errors on a logarithmic axis, one bar an agent; of many agents the worst."""
     left, right, top, low = SPLIT + 44.0, WIDTH - 74.0, HEADER + 38.0, HEIGHT - 24.0
     some = sorted(range(len(sizes)), key=lambda i: (-sizes[i], i))[:MOST_BARS]
     some = sorted(some) if len(sizes) <= MOST_BARS else some
@@ -124,7 +124,7 @@ def _short(error: float) -> str:
 
 
 def draw(loop: Loop, state: LoopState, frame: Frame | None, row: int) -> Array:
-    """(H, W, 3) uint8: row `row` after `frame`, or right after a reset."""
+    """Return (H, W, 3) uint8: row `row` after `frame`, or right after a reset."""
     here = frame is not None and bool(frame.k[row] + 1 == state.k[row])
     attacked = np.any(state.channel.last.target[row], axis=1)
     sizes, canvas = errors(loop, state, frame, row), Canvas()

@@ -1,6 +1,6 @@
 """One picture of one episode for render_mode "rgb_array", and the window that shows it for "human" (extra: viz).
 
-Nothing is told by colour alone, the same state always gives the same picture, and no picture changes a state.
+Colour is never the only sign, the same state always gives the same picture, and no picture changes a state.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ AUTO = Viewer()
 
 
 def plain(loop: Loop, state: LoopState, frame: Frame | None, row: int) -> Array:
-    """(HEIGHT, WIDTH, 3) uint8: the road from the side, or the graph of a network. Arguments as of `draw`."""
+    """Return (HEIGHT, WIDTH, 3) uint8: the road from the side, or the graph of a network. Arguments as of `draw`."""
     if not loop.model.followers.any():
         return render_network.draw(loop, state, frame, row)
     if loop.model.agents > 1:
@@ -36,7 +36,7 @@ def plain(loop: Loop, state: LoopState, frame: Frame | None, row: int) -> Array:
 
 
 def draw(loop: Loop, state: LoopState, frame: Frame | None, row: int, viewer: Viewer = AUTO, caption: str = "") -> Array:
-    """(H, W, 3) uint8: row `row` after `frame`. frame is None right after a reset, be it of other rows.
+    """Return (H, W, 3) uint8: row `row` after `frame`. frame is None right after a reset, also of other rows.
 
     caption: a line about who plays, on HighwayEnv's road; the defence's name where nothing is said.
     """

@@ -38,11 +38,11 @@ SPANS = (20.0, 40.0, 80.0, 160.0, 320.0, 640.0, 1280.0, 2560.0, 5120.0, 10240.0)
 LONGEST, SHORTEST, SHARE = 56.0, 3.0, 0.4  # length of a car [px], and the most of the width that all of them take
 TRUE_LINE, WHEELS, STRIP, BELIEVED_LINE, GHOST_WHEELS = 98.0, 146.0, 202.0, 228.0, 288.0  # rows [px]
 ROAD = 12.0
-DASHES = 24  # of the lane
+DASHES = 24  # dashes of the lane's line
 
 
 class Place:
-    """Where the cars are in the picture: noses and tails (N,) [px], a car's length [px] and the scale [px a metre]."""
+    """The places of the cars in the picture: noses and tails (N,) [px], a car's length [px] and the scale [px a metre]."""
 
     def __init__(self, gaps: Array) -> None:
         count = len(gaps)
@@ -60,7 +60,7 @@ class Place:
 
 
 def believed_gaps(loop: Loop, state: LoopState, row: int) -> Array:
-    """(N,) gap that each car believes in [m]; infinite at the leader."""
+    """Return the gap (N,) that each car believes in [m]; infinite at the leader."""
     model, x = loop.model, state.estimate.x[row]
     assert model.gap is not None
     own = [float(x[i][np.flatnonzero(model.gap[i])[0]]) if model.followers[i] else np.inf for i in range(model.agents)]
@@ -70,7 +70,7 @@ def believed_gaps(loop: Loop, state: LoopState, row: int) -> Array:
 def _gap(
     canvas: Canvas, x0: float, x1: float, y: float, words: str, ink: str, dash: float = 0.0, must: bool = False, up: bool = True
 ) -> None:
-    """A dimension line, and its words above it, or below, where they fit or must stand."""
+    """Draw a dimension line, and its words above it, or below, where they fit or must go."""
     middle, wide = canvas.gap(x0, x1, y, ink, dash), abs(x1 - x0) - 4.0
     size = next((size for size in (NORMAL, SMALL, TINY) if canvas.length(words, size) <= wide), SMALL if must else 0)
     if size:
@@ -78,7 +78,7 @@ def _gap(
 
 
 def _marks(canvas: Canvas, place: Place, attacked: Array, alarm: Array) -> None:
-    """What is over the cars: a lightning on an attacked one, a lamp on one that alarms."""
+    """Draw over the cars: a lightning on an attacked one, a lamp on one that alarms."""
     size = max(4.0, min(8.0, place.length / 5))
     top = WHEELS - CAR_SHAPE * place.length - 3.0
     for i in range(len(place.nose)):
@@ -139,7 +139,7 @@ def _belief(canvas: Canvas, place: Place, gaps: Array, believed: Array, attacked
 
 
 def draw(loop: Loop, state: LoopState, frame: Frame | None, row: int) -> Array:
-    """(H, W, 3) uint8: row `row` after `frame`, or right after a reset."""
+    """Return (H, W, 3) uint8: row `row` after `frame`, or right after a reset."""
     scene = loop.plant.scene(loop.plan.plant, state.plant)
     gaps, speeds = scene.gap[row], scene.speed[row]
     refused = frame is not None and bool(frame.k[row] + 1 == state.k[row]) and bool(frame.refused[row])

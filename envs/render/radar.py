@@ -20,7 +20,7 @@ WAVES = (10.0, 17.0, 24.0)  # radii of the arcs of a probe [px]
 
 
 def _probe(canvas: Canvas) -> None:
-    """Arcs in front of the nose: the radar transmits."""
+    """Draw arcs in front of the nose: the radar transmits."""
     turns = [math.radians(angle) for angle in range(-40, 41, 20)]
     for radius in WAVES:
         points = [(NOSE + radius * math.cos(a), WHEELS - CAR_HEIGHT / 2 + radius * math.sin(a)) for a in turns]
@@ -29,7 +29,7 @@ def _probe(canvas: Canvas) -> None:
 
 
 def _sign(canvas: Canvas, muted: bool, energy: float, alarmed: bool) -> None:
-    """What the radar did in the step, and at a challenge what it heard over its own noise."""
+    """Draw the radar's part in the step, and at a challenge the heard power over its own noise."""
     left, top = WIDTH - MARGIN - BOX, HEIGHT - RISE - 2
     words = f"CHALLENGE: radar silent, heard {10.0 * math.log10(max(energy, 1e-9)):+.1f} dB" if muted else "radar transmits"
     canvas.box(left, top, left + BOX, top + RISE, WARNING if muted and alarmed else WHITE, INK, 2 if muted else 1)
@@ -37,7 +37,7 @@ def _sign(canvas: Canvas, muted: bool, energy: float, alarmed: bool) -> None:
 
 
 def draw(loop: Loop, state: LoopState, frame: Frame | None, row: int) -> Array:
-    """(H, W, 3) uint8: row `row` after `frame`. frame is None right after a reset, be it of other rows."""
+    """Return (H, W, 3) uint8: row `row` after `frame`. frame is None right after a reset, also of other rows."""
     at = (row, AGENT)
     road = {name: float(leaf[at]) for name, leaf in loop.plant.scene(loop.plan.plant, state.plant)._asdict().items()}
     road["gap"], road["rear_gap"] = max(road["gap"], 0.0), max(road["rear_gap"], 0.0)  # a long step ends metres beyond a collision

@@ -54,7 +54,7 @@ def _vehicle(car: Car) -> Any:
 
 
 def paint(stage: Stage, window: Window, width: int, height: int) -> Array:
-    """(height, width, 3) uint8: road and cars as HighwayEnv draws them."""
+    """Return (height, width, 3) uint8: road and cars as HighwayEnv draws them."""
     surface = WorldSurface((width, height), 0, pygame.Surface((width, height)))
     surface.scaling = window.scale
     surface.centering_position = [0.5, 0.5]

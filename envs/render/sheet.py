@@ -12,15 +12,15 @@ from tailgate.envs.render.stage import LANE, LENGTH, Car, Stage
 from tailgate.envs.render.viewer import SIZE
 
 SPANS = (60.0, 90.0, 130.0, 190.0, 280.0, 420.0, 630.0, 950.0)  # metres from left to right: few and fixed, so that the scale rests
-STRING = (60.0, 90.0, 130.0, 190.0, 240.0, 300.0, 360.0, 430.0, 520.0, 630.0, 780.0, 950.0)  # of a platoon, whose length varies little
+STRING = (60.0, 90.0, 130.0, 190.0, 240.0, 300.0, 360.0, 430.0, 520.0, 630.0, 780.0, 950.0)  # for platoons: their length varies little
 FORE = 0.64  # share of them that lies ahead of the car
 TRAFFIC = 130.0  # the least span of a road with others on it [m]
 LEAST = 1.6  # pixels a metre: a car is 8 px long
 SEEN_OFF = 60.0  # a belief that is farther off than this is left out of view [m]
-LEVEL = 1.5  # lines of believed gaps that would lie on each other are so many letters apart
+LEVEL = 1.5  # lines of believed gaps that would lie on each other are that many letters apart
 EDGE = 8.0  # room beyond the first and the last car [m]
 CAR_WIDTH = 2.0  # as HighwayEnv has it [m]
-PITCH = 1.2  # of lines, in letters
+PITCH = 1.2  # distance of lines, in letters
 FAR = 1e5  # keeps wild beliefs drawable [px]
 
 
@@ -36,19 +36,19 @@ class Sheet(Canvas):
         self.window = Window(0.0, 0.0, 1.0)
 
     def column(self, x: float) -> float:
-        """Pixels from the left of x [m]."""
+        """Return pixels from the left of x [m]."""
         return max(-FAR, min(self.width / 2 + (x - self.window.x) * self.window.scale, FAR))
 
     def row(self, y: float) -> float:
-        """Pixels from the top of y [m]."""
+        """Return pixels from the top of y [m]."""
         return (self.above + self.below) / 2 + (y - self.window.y) * self.window.scale
 
     def lines(self, lanes: int) -> tuple[float, float]:
-        """Room [px] that the lines and words above and below the road need; in one lane the marks and names stand there as well."""
+        """Return the room [px] that lines and words above and below the road need; in one lane also that of marks and names."""
         return (3.4 * self.small, 4.3 * self.small) if lanes == 1 else (2.2 * self.small, 2.8 * self.small)
 
     def seat(self, car: Car) -> Box:
-        """Where a car is drawn, or its outline would be."""
+        """Return the box of a car, or of its outline."""
         a, b = abs(math.cos(car.heading)), abs(math.sin(car.heading))
         half = self.window.scale / 2
         wide, high = (LENGTH * a + CAR_WIDTH * b) * half, (LENGTH * b + CAR_WIDTH * a) * half
@@ -56,22 +56,22 @@ class Sheet(Canvas):
         return Box(x - wide, y - max(high, 3.0), x + wide, y + max(high, 3.0))
 
     def label(self, box: Box, lines: tuple[str, ...], ink: str, size: int, ground: str) -> None:
-        """Words that fill a box of `extent`, each line in its middle."""
+        """Draw words that fill a box of `extent`, each line in its middle."""
         self.box(*box, ground)
         for i, line in enumerate(lines, start=1):
             self.text((box.x0 + box.x1) / 2, box.y0 + PITCH * size * i - size / 4, line, ink, size, "ms", True)
 
     def extent(self, lines: tuple[str, ...], size: int) -> tuple[float, float]:
-        """Width and height [px] of words on a ground of their own."""
+        """Return width and height [px] of words on their ground."""
         return max(self.length(line, size) for line in lines) + 6.0, PITCH * size * len(lines)
 
     def ruled(self, x0: float, y0: float, x1: float, y1: float, ink: str, halo: str, dash: float = 0.0, width: int = 2) -> None:
-        """A line that is seen on any ground."""
+        """Draw a line that is visible on any ground."""
         self.line(x0, y0, x1, y1, halo, width + 2)
         self.line(x0, y0, x1, y1, ink, width, dash)
 
     def outline(self, car: tuple[float, float], ink: str, halo: str, dash: float = 0.0, grow: float = 0.0) -> Box:
-        """As large as a car and `grow` px more to each side, its middle at (x, y) [m]; returns what it covers."""
+        """Draw an outline `grow` px larger than a car on each side, its middle at (x, y) [m]; return the box that it covers."""
         x, y = self.column(car[0]), self.row(car[1])
         a, b = LENGTH / 2 * self.window.scale + grow, max(CAR_WIDTH / 2 * self.window.scale, 3.0) + grow
         corners = [(x - a, y - b), (x + a, y - b), (x + a, y + b), (x - a, y + b), (x - a, y - b)]
@@ -81,7 +81,7 @@ class Sheet(Canvas):
         return Box(x - a, y - b, x + a, y + b).grown(2.0)
 
     def chip(self, x0: float, x1: float, first: str, second: str, fill: str, ink: str, bold: bool, up: bool = True) -> None:
-        """Two lines of words in a box of the upper or the lower bar."""
+        """Draw two lines of words in a box of the upper or the lower bar."""
         top = 3.0 if up else self.below + 3.0
         self.box(x0, top, x1, top + self.bar - 6.0, fill, INK if bold else GREY, 2 if bold else 1)
         room, pad = (x0 + 6 * self.unit, x1 - 6 * self.unit), self.big if second else (self.bar - 6.0) / 2 + 0.36 * self.big
@@ -90,7 +90,7 @@ class Sheet(Canvas):
 
 
 def window_of(stage: Stage, sheet: Sheet) -> Window:
-    """The stretch that is seen: from a fixed set of spans the least that holds the cars of interest, and the road in height."""
+    """Return the visible stretch: the least of a fixed set of spans that holds the cars of interest, and the road in height."""
     above, below = sheet.lines(stage.lanes)
     below += LEVEL * sheet.small if len(stage.followers) > 1 else 0.0
     room = sheet.below - sheet.above - above - below

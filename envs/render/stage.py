@@ -1,4 +1,4 @@
-"""Who is where on the road, and what each defence believes of it: what a picture on HighwayEnv's road shows, as plain numbers.
+"""The cars on the road, and each defence's belief of them, as plain numbers: the content of a picture on HighwayEnv's road.
 
 The error of a belief is that of the measurement's time and is put on the road as it is now: `believed` is the true gap plus that error.
 """
@@ -14,7 +14,7 @@ from tailgate.core import Array, Frame
 from tailgate.core.loop import Loop, LoopState
 from tailgate.envs.plants.highway import Highway
 
-START = 10_000.0  # where a road without a place of its own begins [m]: nobody drives back as far as its end
+START = 10_000.0  # where a road without a given place begins [m]: nobody drives back as far as its end
 LENGTH, LANE = 5.0, 4.0  # a car and the width of a lane, as HighwayEnv has them [m]
 
 
@@ -40,7 +40,7 @@ class Car(NamedTuple):
 
 
 class Follower(NamedTuple):
-    """A car under a defence, its gap [m] and what the defence makes of it."""
+    """A car under a defence, its gap [m] and the defence's view of it."""
 
     agent: int
     car: int  # its number among the cars
@@ -49,7 +49,7 @@ class Follower(NamedTuple):
     free: bool  # nobody ahead in reach
     attacked: bool
     alarm: bool
-    muted: bool | None  # the radar was silent; None where it tells nothing
+    muted: bool | None  # the radar was silent; None where that is not known
     heard: float  # at a challenge, over the receiver's own noise [dB]
     hit: str  # "", "COLLISION" or "REAR COLLISION"
 
@@ -65,12 +65,12 @@ class Stage(NamedTuple):
     watched: int  # the follower that the figures are of, by its place among them
 
     def middle(self, x: float, lane: float) -> float:
-        """y [m] of a lane's middle at x [m]; lanes are counted from 0 at the top, their edges are half numbers."""
+        """Return y [m] of a lane's middle at x [m]; lanes are counted from 0 at the top, their edges are half numbers."""
         return lane * LANE + self.bend * math.sin(2.0 * math.pi * x / self.period)
 
 
 def _errors(loop: Loop, state: LoopState, frame: Frame | None, row: int) -> Array | None:
-    """(N,) [m] by how much each car overestimates its gap; None where the last step is not of this episode."""
+    """Return by how much each car overestimates its gap (N,) [m]; None where the last step is not of this episode."""
     if frame is None or frame.k[row] + 1 != state.k[row]:
         return None
     model = loop.model
@@ -95,7 +95,7 @@ def _follower(
 
 
 def _string(loop: Loop, state: LoopState, frame: Frame | None, row: int) -> Stage:
-    """A platoon: the leader first, bumper behind bumper."""
+    """Return a platoon: the leader first, bumper behind bumper."""
     scene = loop.plant.scene(loop.plan.plant, state.plant)
     gaps, speeds, nose, cars, followers = scene.gap[row], scene.speed[row], START + float(scene.position[row, 0]), [], []
     for i, v in enumerate(speeds.tolist()):
@@ -112,7 +112,7 @@ def _string(loop: Loop, state: LoopState, frame: Frame | None, row: int) -> Stag
 
 
 def _pair(loop: Loop, state: LoopState, frame: Frame | None, row: int) -> Stage:
-    """One car behind another, and perhaps a driver behind it."""
+    """Return one car behind another, and perhaps a driver behind it."""
     at = (row, 0)
     road = {name: float(leaf[at]) for name, leaf in loop.plant.scene(loop.plan.plant, state.plant)._asdict().items()}
     rear_hit = road["rear_gap"] <= 0.0
@@ -130,7 +130,7 @@ def _pair(loop: Loop, state: LoopState, frame: Frame | None, row: int) -> Stage:
 
 
 def _traffic(loop: Loop, state: LoopState, frame: Frame | None, row: int, plant: Highway) -> Stage:
-    """HighwayEnv's own scene, every car where it is."""
+    """Return HighwayEnv's own scene, every car where it is."""
     from tailgate.envs.plants.highway_scene import BRAKING, CRASHED, HEADING, HIT, LANE, SPEED, TARGET, X, Y
 
     seen, numbers = state.plant.seen, state.plant.cars[row].tolist()
@@ -158,7 +158,7 @@ def _traffic(loop: Loop, state: LoopState, frame: Frame | None, row: int, plant:
 
 
 def stage_of(loop: Loop, state: LoopState, frame: Frame | None, row: int) -> Stage:
-    """The road of row `row` after `frame`, which is None right after a reset."""
+    """Return the road of row `row` after `frame`, which is None right after a reset."""
     if isinstance(loop.plant, Highway):
         return _traffic(loop, state, frame, row, loop.plant)
     return _string(loop, state, frame, row) if loop.model.agents > 1 else _pair(loop, state, frame, row)

@@ -1,4 +1,4 @@
-"""Which picture of an episode is drawn, and how large: nothing heavy is imported to say so."""
+"""The choice of a picture and its size; nothing heavy is imported for it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from tailgate.envs.render.picture import Window
 
 VIEWERS = ("auto", "plain", "highway")
-SIZE = (960, 240)  # of a picture on HighwayEnv's road [px]
+SIZE = (960, 240)  # size of a picture on HighwayEnv's road [px]
 SMALLEST, LARGEST = (400, 144), (3840, 2160)
 
 
@@ -43,7 +43,7 @@ class Viewer:
             raise InputError("size", self.size, f"(width, height) in pixels, even whole numbers from {least} to {most}")
 
     def on_road(self, loop: Loop) -> bool:
-        """Whether this loop is drawn on HighwayEnv's road. Raises ImportError or NotApplicable where it is asked for and cannot be."""
+        """Return if this loop is drawn on HighwayEnv's road. Raise ImportError or NotApplicable where it is asked for and cannot be."""
         asked, drives = self.name == "highway" or self.size is not None, bool(loop.model.followers.any())
         if self.name == "plain" or not (drives or asked):
             return False
@@ -65,7 +65,7 @@ class Screen:
         self._shown = -1
 
     def show(self, moves: int, fps: int, draw: Callable[[], Any]) -> None:
-        """Show what `draw` gives, a picture (H, W, 3) uint8, unless the one after this number of resets and steps is shown already."""
+        """Show a picture (H, W, 3) uint8 of `draw`, unless the one after this number of resets and steps is shown already."""
         if moves == self._shown:
             return
         if self._window is None:

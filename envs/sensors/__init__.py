@@ -1,4 +1,4 @@
-"""Sensors: what a plant's agents measure."""
+"""Sensors: the measurements of a plant's agents."""
 
 from tailgate.moved import former
 

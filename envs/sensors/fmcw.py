@@ -9,7 +9,7 @@ Erratum: with dv positive when the gap opens, the printed signs of (3.5), (3.6) 
 simulated chirp (fmcw_signal.py).
 
 A ratio (3.11) below 1 does not by itself deny service. The jammer must also beat the IF filter, which passes B_if/B of a noise that fills
-the swept band (`in_band`), and the integration of the M samples of a sweep. What decides is the SNR after both,
+the swept band (`in_band`). And it must beat the integration of the M samples of a sweep. The SNR after both decides:
 
     x = M Pr/(k T0 F B_if + in_band PJ,rx)
 """
@@ -31,16 +31,16 @@ KT0 = 1.380649e-23 * 290.0  # thermal noise density at the reference temperature
 _LN10 = 2.302585092994046
 
 Share = Annotated[float, Field(gt=0, le=1)]
-Radio = Annotated[float, Field(ge=1e-9, le=1e15, allow_inf_nan=False)]  # of a radar or a jammer [its unit]
+Radio = Annotated[float, Field(ge=1e-9, le=1e15, allow_inf_nan=False)]  # a value of a radar or a jammer [its unit]
 
 
 def from_db(value: float) -> float:
-    """10^(value/10)."""
+    """Return 10^(value/10)."""
     return float(num.exp(value * (_LN10 / 10.0)))
 
 
 def to_db(ratio: Array | float) -> Array:
-    """10 log10(ratio)."""
+    """Return 10 log10(ratio)."""
     return np.asarray(num.log(np.asarray(ratio, np.float64)) * (10.0 / _LN10))
 
 
@@ -48,18 +48,18 @@ def to_db(ratio: Array | float) -> Array:
 
 
 def beats(d: Array, dv: Array, per_metre: float, per_speed: float) -> tuple[Array, Array]:
-    """fb+ and fb- [Hz] of a target at d [m] with relative speed dv [m/s]: (3.5), (3.6)."""
+    """Return fb+ and fb- [Hz] of a target at d [m] with relative speed dv [m/s]: (3.5), (3.6)."""
     by_range, by_speed = per_metre * d, per_speed * dv
     return by_range + by_speed, by_range - by_speed
 
 
 def range_speed(up: Array, down: Array, per_metre: float, per_speed: float) -> tuple[Array, Array]:
-    """d [m] and dv [m/s] of the beats fb+ and fb- [Hz]: (3.7), (3.8)."""
+    """Return d [m] and dv [m/s] of the beats fb+ and fb- [Hz]: (3.7), (3.8)."""
     return 0.5 * (up + down) / per_metre, 0.5 * (up - down) / per_speed
 
 
 def passes(up: Array, down: Array, low: float, high: float) -> Array:
-    """bool: the IF filter passes both beats [Hz]."""
+    """Return bool: the IF filter passes both beats [Hz]."""
     out: Array = (np.minimum(up, down) >= low) & (np.maximum(up, down) < high)
     return out
 
@@ -100,7 +100,7 @@ class Link:
 
     @property
     def hz_per_speed(self) -> float:
-        """Of either beat, per m/s of relative speed [Hz/(m/s)]."""
+        """Shift of either beat per m/s of relative speed [Hz/(m/s)]."""
         return 2.0 / self.wavelength
 
     @property
@@ -115,7 +115,7 @@ class Link:
 
     @property
     def noise_power(self) -> float:
-        """Of the receiver, k T0 F B_if [W]."""
+        """Power of the receiver's noise, k T0 F B_if [W]."""
         return KT0 * from_db(self.noise_figure_db) * self.bandwidth
 
     @property
@@ -128,19 +128,19 @@ class Link:
         return self.lowest + self.bandwidth
 
     def beats(self, d: Array, dv: Array) -> tuple[Array, Array]:
-        """fb+ and fb- [Hz] of a target at d [m] with relative speed dv [m/s]: (3.5), (3.6)."""
+        """Return fb+ and fb- [Hz] of a target at d [m] with relative speed dv [m/s]: (3.5), (3.6)."""
         return beats(d, dv, self.hz_per_metre, self.hz_per_speed)
 
     def range_speed(self, up: Array, down: Array) -> tuple[Array, Array]:
-        """d [m] and dv [m/s] of the beats fb+ and fb- [Hz]: (3.7), (3.8)."""
+        """Return d [m] and dv [m/s] of the beats fb+ and fb- [Hz]: (3.7), (3.8)."""
         return range_speed(up, down, self.hz_per_metre, self.hz_per_speed)
 
     def within_band(self, up: Array, down: Array) -> Array:
-        """bool: the IF filter passes both beats [Hz]."""
+        """Return bool: the IF filter passes both beats [Hz]."""
         return np.asarray(passes(up, down, self.lowest, self.highest))
 
     def echo_power(self, d: Array | float) -> Array:
-        """Pr [W] of the echo from d [m]: (3.9)."""
+        """Return Pr [W] of the echo from d [m]: (3.9)."""
         gain, four_pi = from_db(self.gain_db), 4.0 * math.pi
         at_1m = self.power * gain * gain * self.wavelength * self.wavelength * self.cross_section
         at_1m /= four_pi * four_pi * four_pi * from_db(self.loss_db)
@@ -148,20 +148,23 @@ class Link:
         return np.asarray(at_1m / (square * square))
 
     def jam_power(self, d: Array | float, radiated: Array | float) -> Array:
-        """PJ,rx [W] in the operating band B, of a jammer at d [m] that radiates PJ [W]: (3.10). `passed` of it reaches the IF samples."""
+        """Return PJ,rx [W] in the operating band B, of a jammer at d [m] that radiates PJ [W]: (3.10).
+
+        `passed` of it reaches the IF samples.
+        """
         four_pi = 4.0 * math.pi
         at_1m = from_db(self.jam_gain_db) * self.wavelength * self.wavelength * from_db(self.gain_db) * self.operating_band
         at_1m /= four_pi * four_pi * self.jam_band * from_db(self.jam_loss_db)
         return np.asarray(at_1m * radiated / np.square(d))
 
     def burn_through(self, radiated: float) -> float:
-        """Distance d_burn [m] at which echo and jammer, of PJ [W], are received equally strong: (3.11) = 1."""
+        """Return the distance d_burn [m] at which echo and jammer, of PJ [W], are received equally strong: (3.11) = 1."""
         square = self.power * from_db(self.gain_db) * self.cross_section * self.jam_band * from_db(self.jam_loss_db)
         square /= 4.0 * math.pi * radiated * from_db(self.jam_gain_db) * self.operating_band * from_db(self.loss_db)
         return math.sqrt(square)
 
     def snr(self, d: Array | float, radiated: Array | float = 0.0) -> Array:
-        """Echo over all noise in one IF sample, of a target at d [m] whose jammer radiates PJ [W]."""
+        """Return the echo over all noise in one IF sample, for a target at d [m] whose jammer radiates PJ [W]."""
         return np.asarray(self.echo_power(d) / (self.noise_power + self.passed * self.jam_power(d, radiated)))
 
 
@@ -172,21 +175,21 @@ _CELL = 4.0  # an outlier misses by more than _CELL/M cycles per sample, the res
 
 
 class Tone(NamedTuple):
-    """What the error of a beat is reckoned from."""
+    """The constants from which the error of a beat follows."""
 
     bound: float  # the Cramer-Rao bound at x = 1, of a beat in units of B_if
     widest: float  # variance of a beat that lies anywhere within a cell, in these units
 
 
 def tone_of(link: Link) -> Tone:
-    """6/((2 pi)^2 (M^2 - 1)), of one tone in M samples (Rife and Boorstyn 1974)."""
+    """Return 6/((2 pi)^2 (M^2 - 1)), of one tone in M samples (Rife and Boorstyn 1974)."""
     cell = _CELL / link.samples
     return Tone(6.0 / (4.0 * math.pi * math.pi * (link.samples * link.samples - 1)), cell * cell / 3.0)
 
 
 @np.errstate(over="ignore", divide="ignore")  # at no SNR it is the widest
 def tone_variance(x: Array, bound: float, widest: float) -> Array:
-    """Variance over B_if^2 of a beat that is no outlier, at the SNR x after integration, elementwise: a multiple of the bound."""
+    """Return the variance over B_if^2 of a beat that is no outlier, at the SNR x after integration, a multiple of the bound."""
     inverse, (e0, e1, e2) = 1.0 / x, _EFFICIENCY
     variance = bound * inverse * e0 * (1.0 + inverse * (e1 + inverse * e2))
     out: Array = np.minimum(variance, widest)
@@ -194,36 +197,39 @@ def tone_variance(x: Array, bound: float, widest: float) -> Array:
 
 
 def outlier_odds(x: Array, log_x: Array) -> Array:
-    """Logarithm of the odds that a beat is no outlier, cut where nothing would change, elementwise."""
+    """Return the logarithm of the odds that a beat is no outlier, cut where nothing would change, elementwise."""
     o0, o1, o2 = _OUTLIER
     out: Array = np.minimum(o1 * log_x + o2 * x - o0, 700.0)
     return out
 
 
 def tone_sd(link: Link, x: Array) -> Array:
-    """Standard deviation [Hz] of a beat that is no outlier, at the SNR x after integration."""
+    """Return the standard deviation [Hz] of a beat that is no outlier, at the SNR x after integration."""
     return np.asarray(link.bandwidth * np.sqrt(tone_variance(x, *tone_of(link))))
 
 
 def outlier_probability(x: Array) -> Array:
-    """Probability that the largest root is the noise's, at the SNR x after integration: the beat is then uniform over the band."""
+    """Return the probability that the largest root is the noise's, at the SNR x after integration; the beat is then uniform in the band."""
     return np.asarray(1.0 / (1.0 + num.exp(outlier_odds(x, num.log(x)))))
 
 
 def challenge_samples(window: float, bandwidth: float) -> int:
-    """Complex IF samples N_c that a challenge of `window` [s] yields."""
+    """Return the complex IF samples N_c of a challenge of `window` [s]."""
     return max(1, round(window * bandwidth))
 
 
 def false_alarm_threshold(p_fa: float, samples: int) -> float:
-    """Mean power E over the receiver's noise that noise alone exceeds with probability p_fa: 2 N_c E is chi-square with 2 N_c degrees."""
+    """Return the mean power E over the receiver's noise that noise alone exceeds with probability p_fa.
+
+    2 N_c E is chi-square with 2 N_c degrees of freedom.
+    """
     from scipy import special  # not loaded where no radar is
 
     return float(special.chdtri(2 * samples, p_fa) / (2 * samples))
 
 
 def miss_probability(threshold: float, samples: int, jam: float = 0.0, tone: float = 0.0) -> float:
-    """Probability that the energy of a challenge stays at or below the threshold, under noise of power `jam` and an answer of power `tone`.
+    """Return the probability that a challenge stays at or below the threshold, under noise of power `jam` and an answer of power `tone`.
 
     Both are over the receiver's noise, and last for the whole challenge: 2 N_c E/(1 + jam) is chi-square with 2 N_c degrees of freedom and
     noncentrality 2 N_c tone/(1 + jam). For an answer that stops after a share r of it, tone = r times its power is exact.
@@ -237,15 +243,16 @@ def miss_probability(threshold: float, samples: int, jam: float = 0.0, tone: flo
 
 
 def heard_energy(samples: int, heard: Array, jam: Array, tone: Array, z: Array) -> Array:
-    """Mean power E (B, N) over the receiver's noise, of N_c complex samples of which `heard` (B, N), at least 1, carry what is radiated.
+    """Return the mean power E (B, N) over the receiver's noise of N_c complex samples.
 
-    jam and tone (B, N): powers over the noise in those samples. z (B, N, 3): standard normals.
+    `heard` (B, N), at least 1, of them carry what is radiated. jam and tone (B, N): powers over the noise in those samples. z (B, N, 3):
+    standard normals.
     """
     return np.asarray(mean_power(samples, heard, jam, tone, z[..., 0], z[..., 1], z[..., 2]))
 
 
 def mean_power(samples: int, heard: Array, jam: Array, tone: Array, z0: Array, z1: Array, z2: Array) -> Array:
-    """`heard_energy`, elementwise.
+    """Return what `heard_energy` returns, elementwise.
 
     The tone adds to that part of the noise that is in phase with it, one normal; the other 2 N_c - 1 are two gamma variables by Wilson and
     Hilferty's cube (1931).
@@ -259,7 +266,7 @@ def mean_power(samples: int, heard: Array, jam: Array, tone: Array, z0: Array, z
 
 
 def gamma(shape: Array, z: Array) -> Array:
-    """A gamma variable of scale 1 from a standard normal, elementwise: Wilson and Hilferty's cube."""
+    """Return a gamma variable of scale 1 from a standard normal, elementwise: Wilson and Hilferty's cube."""
     root = np.maximum(1.0 - 1.0 / (9.0 * shape) + z / (3.0 * np.sqrt(shape)), 0.0)
     out: Array = shape * (root * root * root)
     return out

@@ -1,4 +1,4 @@
-"""The FMCW radar as a sensor: what it reads of the car ahead, and what a jammer and a late echo make of it."""
+"""The FMCW radar as a sensor: its readings of the car ahead, without an attack and under a jammer or a late echo."""
 
 from dataclasses import dataclass
 from typing import Annotated, Literal, NamedTuple
@@ -93,20 +93,20 @@ class FmcwRadar(Link):
         return Received(np.where(valid, y, 0.0), valid, self._energy(plan, probe, jam, tone, air, z[..., 4:7]))
 
     def _estimated(self, up: Array, down: Array, x: Array, z: Array, u: Array) -> tuple[Array, Array]:
-        """Beats [Hz] as root-MUSIC estimates them at the SNR x after integration, from normals z (B, N, 2) and uniforms u (B, N, 4)."""
+        """Return beats [Hz] as root-MUSIC estimates them at the SNR x after integration, from normals z (B, N, 2), uniforms u (B, N, 4)."""
         sd, lost = tone_sd(self, x), outlier_probability(x)
         up = np.where(u[..., 0] < lost, self.lowest + self.bandwidth * u[..., 1], up + sd * z[..., 0])
         down = np.where(u[..., 2] < lost, self.lowest + self.bandwidth * u[..., 3], down + sd * z[..., 1])
         return up, down
 
     def heard(self, reaction: float) -> tuple[float, float]:
-        """Samples of a challenge in which an attacker with this reaction time [s] is heard, and the share of its power in them."""
+        """Return the samples of a challenge in which an attacker with this reaction time [s] is heard, and its share of power in them."""
         part = min(reaction, self.window) / self.window * self.challenge  # samples, not always a whole number
         whole = max(1.0, float(np.ceil(part)))
         return whole, part / whole
 
     def _energy(self, plan: RadarSensorPlan, probe: Array, jam: Array, tone: Array, air: Air, z: Array) -> Array:
-        """(B, N) mean power over the receiver's noise, of a challenge; 0 where the probe is sent.
+        """Return the mean power (B, N) over the receiver's noise, of a challenge; 0 where the probe is sent.
 
         There it would be the echo's, of a target that does not fluctuate: a distance by the radar equation that no late echo changes.
         """

@@ -40,7 +40,7 @@ _TURN = 2.0 * math.pi
 
 
 def read(link: Link, d: Array, dv: Array, late: Array, snr: Array, noise: Array, normals: Array) -> tuple[Array, Array]:
-    """Distance [m] and relative speed [m/s] as the receiver estimates them from one up and one down sweep.
+    """Return distance [m] and relative speed [m/s] as the receiver estimates them from one up and one down sweep.
 
     d [m] and dv [m/s] of the target between the sweeps, the attacker's delay `late` as range [m], snr (echo over the receiver's noise) and
     noise (all noise over the receiver's): (B, N). normals (B, N, 2, M, 2): real and imaginary parts of the noise of the two sweeps.
@@ -60,16 +60,17 @@ def read(link: Link, d: Array, dv: Array, late: Array, snr: Array, noise: Array,
 
 
 def samples(link: Link, d: float, dv: float, late: float = 0.0, side: float = 1.0) -> Array:
-    """(M,) complex IF samples of one sweep without noise, of amplitude 1: up (side 1) or down (-1, conjugated, so that its beat is fb-).
+    """Return complex IF samples (M,) of one sweep without noise, of amplitude 1.
 
-    d [m] is the distance in the middle of the sweep, dv [m/s] its rate, `late` [m] the attacker's extra time of flight as range.
+    Up is side 1; down is -1, conjugated, so that its beat is fb-. d [m] is the distance in the middle of the sweep, dv [m/s] its rate,
+    `late` [m] the attacker's extra time of flight as range.
     """
     re, im = _chirp(link, *(np.array([v]) for v in (d, dv, late, side)))[0]
     return _complex(re, im)
 
 
 def root_music(x: Array) -> Array:
-    """(...) frequency of the tone in x (..., M) complex, in cycles per sample, in [-1/2, 1/2)."""
+    """Return the frequency (...) of the tone in x (..., M) complex, in cycles per sample, in [-1/2, 1/2)."""
     rows = x.reshape(-1, x.shape[-1])
     out = np.empty(len(rows))
     for part in _parts(len(rows)):
@@ -83,7 +84,7 @@ def _parts(rows: int) -> Iterator[Array]:
 
 
 def _chirp(link: Link, d: Array, dv: Array, late: Array, side: Array) -> Array:
-    """(R, 2, M) real and imaginary part of transmit x conj(delayed echo); the sweep's middle is t = 0, phases are counted in turns."""
+    """Return real and imaginary part (R, 2, M) of transmit x conj(delayed echo), in turns; the sweep's middle is t = 0."""
     d, dv, late, side = (v[:, None] for v in (d, dv, late, side))
     sent = (np.arange(link.samples) + 0.5 - 0.5 * link.samples) / link.bandwidth
     t = np.stack([np.broadcast_to(sent, (len(d), link.samples)), sent - 2.0 * (d + dv * sent + late) / LIGHT])
@@ -94,7 +95,10 @@ def _chirp(link: Link, d: Array, dv: Array, late: Array, side: Array) -> Array:
 
 @np.errstate(all="ignore")
 def _frequency(x: Array) -> Array:
-    """(R,) root-MUSIC's frequency of the tone in x (R, 2, M), in cycles per sample; large tables are made row by row, for the cache."""
+    """Return root-MUSIC's frequency (R,) of the tone in x (R, 2, M), in cycles per sample.
+
+    Large tables are made row by row, for the cache.
+    """
     m = 2 * (x.shape[-1] // (2 * _SPLIT))  # an even number
     u = _first_eigenvector(np.stack([_covariance(row, m) for row in x]))
     start = np.array([_deepest(row) for row in u])
@@ -104,7 +108,7 @@ def _frequency(x: Array) -> Array:
 
 
 def _lagged(x: Array, m: int) -> Array:
-    """(2, M, m): x_k conj(x_{k+l}) of x (2, M) and lags l < m, with zeros behind the last sample."""
+    """Return (2, M, m): x_k conj(x_{k+l}) of x (2, M) and lags l < m, with zeros behind the last sample."""
     re, im = x[..., None]
     later_re, later_im = sliding_window_view(np.concatenate([x, np.zeros((2, m - 1))], axis=1), m, axis=1)
     out_re, out_im, other = out = np.empty((3, *later_re.shape))  # one piece of memory: several would be handed back and fetched again
@@ -116,12 +120,12 @@ def _lagged(x: Array, m: int) -> Array:
 
 
 def _in_order(x: Array) -> Array:
-    """(..., k, n) summed over k in ascending order: over an axis that is not the last, numpy adds one row after the other."""
+    """Return (..., k, n) summed over k in ascending order: over an axis that is not the last, numpy adds one row after the other."""
     return np.asarray(np.add.reduce(x, axis=-2, initial=-0.0))
 
 
 def _covariance(x: Array, m: int) -> Array:
-    """The real (m, m) matrix that the forward-backward covariance of the windows of x (2, M) is unitarily similar to."""
+    """Return the real (m, m) matrix to which the forward-backward covariance of the windows of x (2, M) is unitarily similar."""
     span, half = x.shape[-1] - m + 1, m // 2
     products = _lagged(x, m)
     sums = np.empty((m, 2, m))  # by i and l: x_{k+i} conj(x_{k+i+l}) over the windows k; from i to i + 1 one product comes and one goes
@@ -139,14 +143,17 @@ def _covariance(x: Array, m: int) -> Array:
 
 @lru_cache(maxsize=4)
 def _places(m: int) -> tuple[Array, Array, Array]:
-    """Where the sums (m, m) by i and l have R's i, j and m-1-i, m-1-j, for i < m/2; the sign of the imaginary part below the diagonal."""
+    """Return the places of R's i, j and m-1-i, m-1-j in the sums (m, m) by i and l, for i < m/2.
+
+    Below the diagonal the imaginary part has the sign that is returned with them.
+    """
     i, j = np.indices((m // 2, m))
     lag = np.abs(i - j)
     return np.minimum(i, j) * m + lag, (m - 1 - np.maximum(i, j)) * m + lag, np.where(i > j, -1.0, 1.0)
 
 
 def _first_eigenvector(c: Array) -> Array:
-    """(R, m) of real symmetric, positive semidefinite (R, m, m)."""
+    """Return the first eigenvector (R, m) of real symmetric, positive semidefinite (R, m, m)."""
     diagonal = np.diagonal(c, axis1=1, axis2=2)
     level = np.cumsum(diagonal / c.shape[1], axis=1)[:, -1:]  # the mean of the eigenvalues
     return np.asarray(_powers(c, level, c[np.arange(len(c)), np.argmax(diagonal, axis=1)]))
@@ -154,7 +161,7 @@ def _first_eigenvector(c: Array) -> Array:
 
 @shaped(lambda c, level, u: len(c) > 1)  # the engine makes machine code of it
 def _powers(c: Array, level: Array, u: Array) -> Any:
-    """Power iteration from u (R, m), as far as 500 steps lead where two eigenvalues nearly tie.
+    """Iterate the power method from u (R, m), as far as 500 steps lead where two eigenvalues nearly tie.
 
     `level` (R, 1) is taken off the eigenvalues: most are then small.
     """
@@ -169,7 +176,7 @@ def _powers(c: Array, level: Array, u: Array) -> Any:
 
 
 def _deepest(u: Array) -> float:
-    """Turns at which D is least, of 8 m points of the circle: s* a(z) is largest there."""
+    """Return the turns at which D is least, of 8 m points of the circle: s* a(z) is largest there."""
     circle = _circle(len(u))
     place = int(np.argmax(np.square(_in_order(u[:, None] * circle))))
     return place / int(circle.shape[1])
@@ -177,7 +184,10 @@ def _deepest(u: Array) -> float:
 
 @lru_cache(maxsize=4)
 def _circle(m: int) -> Array:
-    """(m, 8 m): its rows times u, added up, are s* a(z) at 8 m points but for a phase. They are real, for s is conjugate symmetric."""
+    """Return (m, 8 m): its rows times u, added up, are s* a(z) at 8 m points but for a phase.
+
+    They are real, for s is conjugate symmetric.
+    """
     grid = 8 * m
     halves = (2 * np.arange(m // 2) - (m - 1))[:, None] * np.arange(grid) % (2 * grid)
     sine, cosine = sincos_turn(halves / (2 * grid))
@@ -185,7 +195,7 @@ def _circle(m: int) -> Array:
 
 
 def _root(lags: Array, start: Array) -> Array:
-    """(R,) turns of the root of D, by Cauchy's method from `start` (R,) on the circle; r_l = sum_k s_k conj(s_{k+l}) are `lags` (R, 2, m).
+    """Return the turns (R,) of the root of D, by Cauchy's method from `start` (R,); r_l = sum_k s_k conj(s_{k+l}) are `lags` (R, 2, m).
 
     g(nu) = D(z) = (m - 1) r_0 - sum_l (r_l z^l + (r_l)^c z^-l) with z = exp(2 pi i nu), and g1 and g2 are its derivatives.
     """
@@ -212,24 +222,24 @@ def _root(lags: Array, start: Array) -> Array:
 
 
 def _complex(re: Array, im: Array) -> Array:
-    """re + i im."""
+    """Return re + i im."""
     out = np.empty(re.shape, np.complex128)
     out.real, out.imag = re, im
     return out
 
 
 def _times(x: Array, y: Array) -> Array:
-    """x y, without the fused products that numpy's own has on some processors."""
+    """Return x y, without the fused products that numpy's own has on some processors."""
     return _complex(x.real * y.real - x.imag * y.imag, x.real * y.imag + x.imag * y.real)
 
 
 def _square(x: Array) -> Array:
-    """|x|^2."""
+    """Return |x|^2."""
     return np.asarray(x.real * x.real + x.imag * x.imag)
 
 
 def _sqrt(x: Array) -> Array:
-    """The root of x with a real part that is not negative."""
+    """Return the root of x with a real part that is not negative."""
     part = np.sqrt(0.5 * (np.abs(x.real) + np.sqrt(_square(x))))
     other = 0.5 * np.abs(x.imag) / np.where(part > 0.0, part, 1.0)
     right = x.real >= 0.0

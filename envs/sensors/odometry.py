@@ -1,4 +1,4 @@
-"""What measures."""
+"""Odometry: position and speed of the follower."""
 
 import dataclasses
 from dataclasses import dataclass
@@ -45,7 +45,7 @@ class Odometry:
         return OdometryPlan(model.C[0], np.sqrt(np.array(self.noise_var)))
 
     def measure(self, plan: OdometryPlan, truth: Array, probe: Array, draws: Draws) -> Received:
-        """y = C x + v (4.17). `probe` does not apply: odometry transmits nothing."""
+        """Return y = C x + v (4.17). `probe` does not apply: odometry transmits nothing."""
         shape = (1, len(plan.sd))
         noise = draws.normal(shape) if self.noise is None else 3.0**0.5 * (2.0 * draws.uniform(shape) - 1.0)
         y = num.matvec(plan.C, truth) + plan.sd * noise

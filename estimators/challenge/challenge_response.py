@@ -1,6 +1,6 @@
-"""Challenge-response authentication (thesis 3.4.2; Shoukry et al., PyCRA, 2015): fall silent, and listen.
+"""Challenge-response authentication (thesis 3.4.2; Shoukry et al., PyCRA, 2015): mute the radar's probe, and listen.
 
-A sensor that mutes its own probe hears noise alone; whoever answers then is an attacker. At a muted step
+A sensor that mutes its own probe hears noise alone; an answer then comes from an attacker. At a muted step
 
     energy > threshold        alarm; the belief rolls back to the one at the last challenge that passed, with the odometry since replayed
     else                      the alarm ends, at once or after a few such steps; without one, this belief is the one to roll back to
@@ -15,7 +15,7 @@ a false alarm a challenge.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple
+from typing import Annotated, ClassVar, Generic, Literal, NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -25,10 +25,10 @@ from tailgate.base.errors import InputError, NotApplicable
 from tailgate.base.pytree import map_leaves
 from tailgate.core import Array, Estimate, Model, NonNegative, Positive, PositiveCount, Prior, Probability, Received, param
 from tailgate.core.draws import Draws
-from tailgate.core.registry import imported, make_from, register
-from tailgate.core.schema import build
+from tailgate.core.nouns import P, S
+from tailgate.core.registry import register
 from tailgate.envs.sensors.fmcw import false_alarm_threshold, from_db
-from tailgate.estimators.compose import AcceptAll, Look, ModeName
+from tailgate.estimators.compose import AcceptAll, Look, ModeName, ReactionPlan, ReactionState, part_from
 from tailgate.estimators.filters.predictors import read_states
 from tailgate.estimators.parts import Filter, Verdict
 
@@ -43,7 +43,7 @@ WATCH = "probability of a challenge a step while alarmed, in place of the random
 
 
 class Response(NamedTuple):
-    """What is done with the readings of a step that is no challenge."""
+    """The use of readings in a step that is no challenge."""
 
     passes: bool  # the controller drives on them as they are; else on what the filter makes of them
     stops: bool  # not so during an alarm
@@ -51,39 +51,40 @@ class Response(NamedTuple):
     rolls_back: bool  # it forgets those since the last challenge that passed when an alarm begins
 
 
-class ChallengePlan(NamedTuple):
-    filter: Filter
-    filter_plan: Any
+class ChallengePlan(NamedTuple, Generic[P, S]):
+    filter: Filter[P, S]
+    filter_plan: P
     reaction: AcceptAll
-    reaction_plan: Any
+    reaction_plan: ReactionPlan
     response: Response
     threshold: float  # on the energy over that of the noise
     state: Array  # (N, q) which state each sensor reads
     times: Array  # (T,) challenges that are fixed
 
 
-class ChallengeState(NamedTuple):
+class ChallengeState(NamedTuple, Generic[S]):
     """Every leaf has B first."""
 
-    live: Any  # the filter's belief
-    safe: Any  # that at the last challenge that passed, predicted since
-    reaction: Any
+    live: S  # the filter's belief
+    safe: S  # that at the last challenge that passed, predicted since
+    reaction: ReactionState
     k: Array  # (B,) steps done
     probe: Array  # (B, N) bool: what the last step asked for
     heard: Array  # (B, N) energy at the last challenge
     owed: Array  # (B, N) int64: challenges that have yet to pass before the alarm ends; 0 without an alarm
 
 
-def pick(mask: Array, chosen: Any, other: Any) -> Any:
-    """The state `chosen` in the rows of `mask` (B, 1), else `other`."""
+def pick(mask: Array, chosen: S, other: S) -> S:
+    """Return the state `chosen` in the rows of `mask` (B, 1), else `other`."""
     if not num.some(mask):
         return other
-    return map_leaves(lambda a, b: np.where(mask.reshape(-1, *[1] * (a.ndim - 1)), a, b), chosen, other)
+    out: S = map_leaves(lambda a, b: np.where(mask.reshape(-1, *[1] * (a.ndim - 1)), a, b), chosen, other)
+    return out
 
 
 @dataclass(frozen=True, kw_only=True)
 class Challenger:
-    """Base: when to challenge, and what is heard. A subclass says which filter predicts and what an alarm changes."""
+    """Base class: when to challenge, and what is heard. A subclass chooses the filter that predicts, and what an alarm changes."""
 
     label: ClassVar[str]  # its registered name
 
@@ -105,15 +106,15 @@ class Challenger:
         if getattr(self, unused) is not None:
             raise InputError(f"defence {self.label}.{unused}", getattr(self, unused), f"none: challenges are {self.challenge}")
         if self.times is not None and (1 in self.times or not self.times):
-            raise InputError(f"defence {self.label}.times", self.times, "at least one step, from 2 on: nobody is asked before the first")
+            raise InputError(f"defence {self.label}.times", self.times, "at least one step, from 2 on: the first step has no challenge")
         self.predictor()  # a wrong name shall fail here
 
     def predictor(self) -> Filter:
-        """The filter that predicts the readings."""
+        """Return the filter that predicts the readings."""
         raise TypeError(f"{type(self).__name__} must define predictor()")
 
     def response(self) -> Response:
-        """What is done with the readings."""
+        """Return the use of the readings."""
         raise TypeError(f"{type(self).__name__} must define response()")
 
     def prepare(self, model: Model) -> ChallengePlan:
@@ -128,7 +129,7 @@ class Challenger:
         )  # fmt: skip
 
     def start(self, plan: ChallengePlan, prior: Prior) -> ChallengeState:
-        """Before the first challenge the belief to roll back to is the prior."""
+        """Return the state at step 1; before the first challenge the belief to roll back to is the prior."""
         batch, belief = len(prior.mean), plan.filter.start(plan.filter_plan, prior)
         nothing = num.zeros((batch, 1))
         reaction = plan.reaction.start(plan.reaction_plan, batch)
@@ -161,7 +162,7 @@ class Challenger:
         return ChallengeState(live, safe, reaction, state.k + 1, probe, heard, owed), Estimate(x, heard, alarm, decision.mode, probe)
 
     def look(self, plan: ChallengePlan, state: ChallengeState, received: Received, known_u: Array) -> Look:
-        """The innovation that `received` would meet, and how far it would move what the controller drives on; there is no gate on it."""
+        """Return the innovation that `received` would meet, and how far it would move the controller's input; it meets no gate."""
         live = plan.filter.predict(plan.filter_plan, state.live, known_u)
         innovation = plan.filter.innovation(plan.filter_plan, live, received)
         used, shown = _used(plan, received, ~state.probe, state.owed > 0)
@@ -171,7 +172,7 @@ class Challenger:
         return Look(innovation, gain, None)
 
     def _due(self, plan: ChallengePlan, k: Array, alarm: Array, draws: Draws) -> Array:
-        """(B, N) bool: step k (B,) is a challenge by the schedule, or by the watch that is kept during an alarm."""
+        """Return (B, N) bool: step k (B,) is a challenge by the schedule, or by the closer watch during an alarm."""
         chance = CHANCE if self.probability is None else self.probability
         u, usual = draws.uniform((1,)), chance if self.challenge == "random" else 0.0
         due = u < (usual if self.watch is None else np.where(alarm, self.watch, usual))
@@ -179,23 +180,11 @@ class Challenger:
 
 
 def _used(plan: ChallengePlan, received: Received, muted: Array, alarm: Array) -> tuple[Array, Array]:
-    """(B, N, q) bool each: the readings that the filter uses, and those that the controller is shown as they are."""
+    """Return (B, N, q) bool each: the readings that the filter uses, and those that the controller gets as they are."""
     there = received.valid & ~muted[..., None]
     calm = there & ~alarm[..., None]
     used, shown = (calm if until else there for until in (plan.response.freezes, plan.response.stops))
     return used, shown & plan.response.passes
-
-
-def named_filter(data: Any, where: str) -> Filter:
-    """A filter by its name, or a mapping with name and parameters; module:Class names somebody else's."""
-    data = data if isinstance(data, dict) else {"name": data}
-    data = {"name": PREDICTOR, **data}  # a mapping without a name changes the default one
-    name = data["name"]
-    if isinstance(name, str) and ":" in name:
-        made: Filter = build(imported("filter", name).cls, {key: value for key, value in data.items() if key != "name"}, where)
-        return made
-    found: Filter = make_from("filter", data, where)
-    return found
 
 
 @register(
@@ -208,13 +197,14 @@ class ChallengeResponse(Challenger):
 
     label = "cra"
 
-    filter: Any = param(PREDICTOR, FILTER)
+    filter: object = param(PREDICTOR, FILTER)
     passes: bool = param(True, "without an attack the controller drives on the readings as they are, else on the filter's estimate")
     rollback: bool = param(True, "an alarm takes back what was used since the last challenge that passed")
     freeze: bool = param(True, "the filter uses no reading during an alarm")
 
     def predictor(self) -> Filter:
-        return named_filter(self.filter, "defence cra.filter")
+        predictor: Filter = part_from("filter", self.filter, PREDICTOR, "defence cra.filter")
+        return predictor
 
     def response(self) -> Response:
         return Response(self.passes, True, self.freeze, self.rollback)
@@ -232,10 +222,11 @@ class PyCra(Challenger):
 
     watch: Probability | None = param(None, WATCH)
     quiet: PositiveCount = param(1, QUIET)
-    filter: Any = param(PREDICTOR, FILTER)
+    filter: object = param(PREDICTOR, FILTER)
 
     def predictor(self) -> Filter:
-        return named_filter(self.filter, "defence pycra.filter")
+        predictor: Filter = part_from("filter", self.filter, PREDICTOR, "defence pycra.filter")
+        return predictor
 
     def response(self) -> Response:
         return Response(passes=True, stops=False, freezes=False, rolls_back=False)

@@ -1,7 +1,7 @@
 """A defence whose knobs are turned while it runs: by a trained policy, by a fixed hand, or from outside (docs/two-players.md).
 
 A trained defender is a small tanh perceptron over `Sight` whose largest output names the setting of the knobs that holds for the next
-`interval` steps. It is a JSON file with safetensors beside it; loading it executes nothing. Played through `steered` it is a defence like
+`interval` steps. It is a JSON file and a safetensors file; loading them executes nothing. Played through `steered` it is a defence like
 any other: every evaluation, learner and page takes it.
 """
 
@@ -27,12 +27,12 @@ from tailgate.core.draws import Draws
 from tailgate.core.neural import Network, perceptron, read_trained
 from tailgate.core.registry import entries, entry_for, register
 from tailgate.core.schema import as_data, build
-from tailgate.estimators.challenge.steering import Hand, Memory, Menu, Sight, settings
+from tailgate.estimators.challenge.steering import Hand, HandPlan, HandState, Memory, Menu, Sight, settings
 from tailgate.estimators.compose import Look
 
 FORMAT = "tailgate-defender-1"
 SETTINGS = 1024  # that a menu has in all, at most
-TAG = 255  # of the draw that picks a policy: the steered defence draws with others
+TAG = 255  # tag of the draw that picks a policy: the steered defence draws with others
 POLICY = "JSON file of a trained defender, or several, of which each episode draws one; none: a fixed setting"
 
 
@@ -72,17 +72,17 @@ def load_defender(path: Path) -> tuple[Header, Network]:
 
 class SteeredPlan(NamedTuple):
     hand: Hand
-    inner: Any
+    inner: HandPlan
     sight: Sight
     settings: Array  # (S, K) the menu
     start: Array  # (K,) where the knobs stand first
-    networks: tuple[Any, ...]
+    networks: tuple[Network, ...]
 
 
 class SteeredState(NamedTuple):
     """Every leaf has B first."""
 
-    inner: Any
+    inner: HandState
     knobs: Array  # (B, K) where they stand
     k: Array  # (B,) int64: steps done
     member: Array  # (B,) int64: whose policy turns them; -1 before the first step
@@ -90,8 +90,8 @@ class SteeredState(NamedTuple):
     seen: Array  # (B, d) float32: what was seen in the last step
 
 
-def _imports(data: Any) -> bool:
-    """Whether any text in the data names a class to import."""
+def _imports(data: object) -> bool:
+    """Return True if any text in the data names a class to import."""
     if isinstance(data, (dict, list, tuple)):
         return any(_imports(value) for value in (data.values() if isinstance(data, dict) else data))
     return isinstance(data, str) and ":" in data
@@ -104,7 +104,7 @@ class Steered:
 
     uses: ClassVar[tuple[str, ...]] = ("measurements", "v2v")
 
-    defence: Any = param("chi2_kf", "defence whose knobs are turned: a registered name, or a mapping with name and parameters")
+    defence: object = param("chi2_kf", "defence whose knobs are turned: a registered name, or a mapping with name and parameters")
     menu: Menu = param(Menu(), "settings of the knobs")
     setting: Count | None = param(None, "number of the menu's combination that is held throughout; none: the defence's own values")
     policy: Path | tuple[Path, ...] | None = param(None, f"{POLICY}. It brings its own defence and menu")
@@ -134,7 +134,7 @@ class Steered:
         return first.menu
 
     @cached_property
-    def guarded(self) -> Any:
+    def inner_defence(self) -> Any:
         """The defence whose knobs are turned."""
         data, where = (self._loaded[0][0].defence, f"defender {self.paths[0].name}") if self._loaded else (self.defence, "defence steered")
         where = f"{where}.defence"
@@ -154,7 +154,7 @@ class Steered:
     @cached_property
     def hand(self) -> Hand:
         """The defence with its knobs."""
-        hand = Hand.on(self.guarded, self.menu_used)
+        hand = Hand.on(self.inner_defence, self.menu_used)
         count = math.prod(len(knob.levels) for knob in hand.knobs)
         if count > SETTINGS:
             where = f"defender {self.paths[0].name}" if self._loaded else "defence steered"
@@ -164,8 +164,8 @@ class Steered:
     @property
     def described(self) -> dict[str, Any]:
         """The defence whose knobs are turned, as a mapping with name and parameters."""
-        params = {key: value for key, value in as_data(self.guarded).items() if key != "class"}
-        return {"name": entry_for("defence", type(self.guarded)).name, **params}
+        params = {key: value for key, value in as_data(self.inner_defence).items() if key != "class"}
+        return {"name": entry_for("defence", type(self.inner_defence)).name, **params}
 
     def prepare(self, model: Model) -> SteeredPlan:
         hand = self.hand
@@ -178,7 +178,7 @@ class Steered:
         for path, (header, network) in zip(self.paths, self._loaded, strict=True):
             if header.observation != sight.names:
                 differing = sorted(set(header.observation) ^ set(sight.names)) or ["in another order"]
-                raise InputError(f"defender {path.name}", f"observation {', '.join(differing)}", "what this defence sees on this plant")
+                raise InputError(f"defender {path.name}", f"observation {', '.join(differing)}", "this defence's own observation")
             if network.weights[-1].shape[1] != len(menu):
                 raise InputError(f"defender {path.name}", f"{network.weights[-1].shape[1]} settings", f"{len(menu)}, as its menu has")
         return SteeredPlan(hand, hand.prepare(model), sight, menu, start, tuple(network for _, network in self._loaded))
@@ -186,7 +186,7 @@ class Steered:
     def start(self, plan: SteeredPlan, prior: Prior) -> SteeredState:
         batch = len(prior.mean)
         knobs = np.repeat(plan.start[None], batch, axis=0)
-        inner = plan.hand.defence.start(plan.inner, prior)
+        inner = plan.hand.start(plan.inner, prior)
         k = np.zeros(batch, np.int64)
         return SteeredState(inner, knobs, k, k - 1, plan.sight.begin(batch), plan.sight.blank(knobs))
 
@@ -200,7 +200,7 @@ class Steered:
         return SteeredState(inner, state.knobs, state.k + 1, state.member, memory, seen), estimate
 
     def look(self, plan: SteeredPlan, state: SteeredState, received: Received, known_u: Array) -> Look:
-        """What the defence would see of a measurement, with its knobs where they stand."""
+        """Return what the defence would see of a measurement, with its knobs at their present values."""
         if plan.networks and (state.member >= 0).all():
             state = self._chosen(plan, state)
         defence, inner = plan.hand.turned(plan.inner, state.knobs)
@@ -208,7 +208,7 @@ class Steered:
         return out
 
     def steer(self, plan: SteeredPlan, state: SteeredState, values: Array) -> SteeredState:
-        """The state with the knobs at `values` (B, K)."""
+        """Return the state with the knobs at `values` (B, K)."""
         return state._replace(knobs=np.array(values, np.float64))
 
     def _consider(self, plan: SteeredPlan, state: SteeredState, draws: Draws) -> SteeredState:
@@ -220,7 +220,7 @@ class Steered:
         return self._chosen(plan, state)
 
     def _chosen(self, plan: SteeredPlan, state: SteeredState) -> SteeredState:
-        """The knobs after a decision, in the rows where one is due."""
+        """Return the state with the knobs after a decision, in the rows where one is due."""
         due = state.k % self.menu_used.interval == 0
         if not num.some(due):
             return state
@@ -239,4 +239,4 @@ class SteeredChallenge(Steered):
 
     uses: ClassVar[tuple[str, ...]] = ("measurements", "odometry", "probe")
 
-    defence: Any = param("cra", "defence whose knobs are turned: a registered name, or a mapping with name and parameters")
+    defence: object = param("cra", "defence whose knobs are turned: a registered name, or a mapping with name and parameters")

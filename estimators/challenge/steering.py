@@ -1,10 +1,10 @@
-"""The knobs of a defence: what may be turned while it runs, each row of a batch by its own hand, and what a hand sees that turns them.
+"""The knobs of a defence, which are parameters that change while it runs, in each row separately; and the view of who turns them.
 
-A knob is a parameter of a defence that is left as it is: the alarm threshold, the probability of a challenge, the mode that is asked of the
-controller while alarmed. Turning one puts an array with one value per row in the place of the parameter, which enters by elementwise
-comparisons alone; a knob that stands at the defence's own value changes no bit.
+A knob is a parameter of an unchanged defence: the alarm threshold, the probability of a challenge, or the mode that the controller is asked
+for while alarmed. Turning a knob replaces the parameter by an array with one value per row. The parameter enters elementwise comparisons
+only; a knob at the defence's own value changes no bit.
 
-Who turns them sees what the defence has, nothing else: its score, alarms, residuals, estimate, the message and odometry that it hears.
+The player who turns the knobs sees only what the defence has: score, alarms, residuals, estimate, message and odometry.
 """
 
 from __future__ import annotations
@@ -13,28 +13,32 @@ import copy
 import dataclasses
 import itertools
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
 from tailgate import num
 from tailgate.base.errors import InputError, NotApplicable
-from tailgate.core import Array, Defence, Estimate, Mode, Model, Positive, PositiveCount, Probability, Received, param
-from tailgate.estimators.challenge.challenge_response import CHANCE, Challenger, ChallengeState
-from tailgate.estimators.compose import Composed, ModeName, Reaction
+from tailgate.core import Array, Defence, Estimate, Mode, Model, Positive, PositiveCount, Prior, Probability, Received, param
+from tailgate.core.draws import Draws
+from tailgate.estimators.challenge.challenge_response import CHANCE, ChallengePlan, Challenger, ChallengeState
+from tailgate.estimators.compose import Composed, ComposedPlan, ComposedState, ModeName, Reaction, threshold_field
 from tailgate.estimators.detectors.chi_square import ChiSquare
 from tailgate.estimators.detectors.sequential import Cusum, Mewma, WindowedChiSquare
 
 TURNED = (ChiSquare, WindowedChiSquare, Cusum, Mewma)  # detectors whose threshold enters by comparison in `step`, and nowhere else
 LEADER = ("leader_position", "leader_velocity")
 LIMIT = 10.0  # observations are clipped to +-LIMIT
-FADE = 0.95  # of the running means, per step
+T = TypeVar("T")
+HandPlan = ComposedPlan | ChallengePlan
+HandState = ComposedState | ChallengeState
+FADE = 0.95  # factor of the running means, per step
 CALM = 50.0  # steps since an alarm are counted up to this
 
 
 @dataclass(frozen=True)
 class Menu:
-    """What a hand may choose from: every combination of the settings of those knobs that the defence has."""
+    """The settings that a player may choose from: every combination for those knobs that the defence has."""
 
     thresholds: tuple[Positive, ...] = param((5.0, 8.0, 12.0, 20.0, 40.0), "alarm thresholds [unit of the detector's score]")
     challenges: tuple[Probability, ...] = param((0.02, 0.1, 0.3), "probabilities of a challenge a step, without an alarm [-]")
@@ -57,7 +61,7 @@ class Knob(NamedTuple):
     log: bool = False  # between its ends the settings are even in the logarithm
 
     def at(self, share: Array) -> Array:
-        """The value at `share` (B,) in [-1, 1] of the way between the least and the largest setting; of a mode the nearest in the list."""
+        """Return the value at `share` (B,) in [-1, 1] of the way from the least to the largest setting; the nearest listed mode."""
         part = 0.5 + 0.5 * np.clip(share, -1.0, 1.0)
         if self.name == "mode":
             index = np.minimum((part * len(self.levels)).astype(np.int64), len(self.levels) - 1)
@@ -69,12 +73,12 @@ class Knob(NamedTuple):
 
 
 def settings(knobs: tuple[Knob, ...]) -> Array:
-    """(S, K): every combination of the knobs' settings, the last knob's running fastest."""
+    """Return (S, K): every combination of the knobs' settings, the last knob's running fastest."""
     return np.array(list(itertools.product(*(knob.levels for knob in knobs))))
 
 
 def nearest(knobs: tuple[Knob, ...]) -> int:
-    """The number of the combination that is nearest to the defence as it is; of thresholds and probabilities by their ratio."""
+    """Return the number of the combination that is nearest to the defence as it is; thresholds and probabilities compare by their ratio."""
     best = [min(range(len(k.levels)), key=lambda i, k=k: abs(_place(k, k.levels[i]) - _place(k, k.own))) for k in knobs]  # type: ignore[misc]
     out = 0
     for i, knob in zip(best, knobs, strict=True):
@@ -90,12 +94,12 @@ def _place(knob: Knob, value: float) -> float:
 class Hand:
     """A defence with its knobs: `step` plays it with the values of each row (B, K)."""
 
-    defence: Any
+    defence: Composed | Challenger
     knobs: tuple[Knob, ...]
 
     @classmethod
-    def on(cls, defence: Any, menu: Menu) -> Hand:
-        """Raises NotApplicable for a defence without a knob."""
+    def on(cls, defence: Defence, menu: Menu) -> Hand:
+        """Return a defence with its knobs. Raise NotApplicable for a defence without a knob."""
         mode = tuple(float(Mode[name.upper()]) for name in menu.modes)
         if isinstance(defence, Composed) and type(defence).step is Composed.step:
             _, detector, mitigation = defence.parts()
@@ -116,29 +120,36 @@ class Hand:
         wanted = f"a challenge-response defence, or a filter under one of the detectors {named}, made by `compose` or its subclasses"
         raise NotApplicable("steered defence", type(defence).__name__, wanted)
 
-    def prepare(self, model: Model) -> Any:
-        plan = self.defence.prepare(model)
-        if isinstance(self.defence, Composed) and isinstance(plan.mitigation, Reaction) and plan.mitigation.mode == "normal":
+    def prepare(self, model: Model) -> HandPlan:
+        plan: HandPlan = self.defence.prepare(model)
+        if isinstance(plan, ComposedPlan) and isinstance(plan.mitigation, Reaction) and plan.mitigation.mode == "normal":
             plan = plan._replace(mitigation=_with(plan.mitigation, mode="widen"))
         return plan
+
+    def start(self, plan: HandPlan, prior: Prior) -> HandState:
+        defence: Defence = self.defence
+        state: HandState = defence.start(plan, prior)
+        return state
 
     @property
     def own(self) -> Array:
         """(K,) the defence's own values."""
         return np.array([knob.own for knob in self.knobs])
 
-    def turned(self, plan: Any, values: Array) -> tuple[Defence, Any]:
-        """The defence and its plan with the knobs at `values` (B, K)."""
-        defence = self.defence
+    def turned(self, plan: HandPlan, values: Array) -> tuple[Defence, HandPlan]:
+        """Return the defence and its plan with the knobs at `values` (B, K)."""
+        defence: Defence = self.defence
         for i, knob in enumerate(self.knobs):
-            if knob.name == "threshold":
-                plan = plan._replace(detector=_with(plan.detector, **{plan.detector.threshold_field: values[:, i, None]}))
+            if knob.name == "threshold" and isinstance(plan, ComposedPlan):
+                plan = plan._replace(detector=_with(plan.detector, **{threshold_field(plan.detector): values[:, i, None]}))
             elif knob.name == "challenge":
                 defence = _with(defence, probability=values[:, i, None])
         return defence, plan
 
-    def step(self, plan: Any, state: Any, values: Array, received: Received, known_u: Array, draws: Any) -> tuple[Any, Estimate]:
-        """The defence's step with the knobs at `values` (B, K)."""
+    def step(
+        self, plan: HandPlan, state: HandState, values: Array, received: Received, known_u: Array, draws: Draws
+    ) -> tuple[HandState, Estimate]:
+        """Return the defence's step with the knobs at `values` (B, K)."""
         defence, plan = self.turned(plan, values)
         state, estimate = defence.step(plan, state, received, known_u, draws)
         for i, knob in enumerate(self.knobs):
@@ -148,8 +159,8 @@ class Hand:
         return state, estimate
 
 
-def _with(part: Any, **fields: Any) -> Any:
-    """A frozen dataclass with other values, its checks not run: they know numbers, not one value per row."""
+def _with(part: T, **fields: object) -> T:
+    """Return a frozen dataclass with other values. Its checks do not run: they know numbers, not one value per row."""
     out = copy.copy(part)
     for name, value in fields.items():
         object.__setattr__(out, name, value)
@@ -157,7 +168,7 @@ def _with(part: Any, **fields: Any) -> Any:
 
 
 class Memory(NamedTuple):
-    """What the observation remembers of an episode, (B,) each."""
+    """The memory of the observation over an episode, (B,) each."""
 
     score: Array  # running mean of log(1 + score)
     alarm: Array  # running share of alarms
@@ -168,11 +179,11 @@ class Memory(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Sight:
-    """What a hand sees of the defence, as a vector (B, d) float32 scaled to about one; of many agents the one nearest to its leader."""
+    """The player's view of the defence: a vector (B, d) float32 scaled to about one; of many agents, the nearest to its leader."""
 
     model: Model
     knobs: tuple[Knob, ...]
-    heard: bool  # the defence is told what the car ahead sends
+    heard: bool  # the defence receives the messages of the car ahead
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -188,7 +199,7 @@ class Sight:
 
     @property
     def _road(self) -> bool:
-        """Whether the gap can be told from the estimate, and the message where the state holds a position."""
+        """True if the estimate, with the message where the state holds a position, gives the gap."""
         gap = self.model.gap
         assert gap is not None
         return bool(self.model.followers.any()) and (self._leader or not (gap < 0.0).any())
@@ -202,13 +213,13 @@ class Sight:
         return Memory(zero, zero.copy(), np.full(batch, CALM), zero.copy(), zero.copy())
 
     def blank(self, values: Array) -> Array:
-        """The observation before the first measurement: nothing but the knobs (B, K)."""
+        """Return the observation before the first measurement: nothing but the knobs (B, K)."""
         out = np.zeros((len(values), len(self.names)), np.float32)
         out[:, len(self.names) - len(self.knobs) :] = self._places(values)
         return out
 
-    def look(self, memory: Memory, estimate: Estimate, received: Received, inner: Any, values: Array) -> tuple[Memory, Array]:
-        """The memory and the observation (B, d) after a step."""
+    def look(self, memory: Memory, estimate: Estimate, received: Received, inner: HandState, values: Array) -> tuple[Memory, Array]:
+        """Return the memory and the observation (B, d) after a step."""
         alarm = np.asarray(estimate.alarm.any(axis=1))
         score = num.log(1.0 + np.maximum(np.max(estimate.score, axis=1), 0.0))
         asked = np.max(estimate.mode, axis=1) != Mode.NORMAL
@@ -227,7 +238,7 @@ class Sight:
         return memory, out
 
     def _residuals(self, estimate: Estimate, received: Received) -> list[Array]:
-        """By how much the readings differ from the estimate, in standard deviations of the noise; 0 where nothing was received."""
+        """Return readings less estimate, in standard deviations of the noise; 0 where nothing was received."""
         model = self.model
         off = received.y - num.apply(model.C, estimate.x)
         sd = np.sqrt(np.maximum(model.R.diagonal(axis1=1, axis2=2), 1e-12))
@@ -237,7 +248,7 @@ class Sight:
         return [np.max(np.abs(off), axis=(1, 2))]
 
     def _driving(self, estimate: Estimate, received: Received) -> list[Array]:
-        """Believed gap, own speed, time headway and, where it can be told, how fast the gap closes, of the follower with the least gap."""
+        """Return believed gap, own speed, time headway and, where it is known, the closing speed, of the follower with the least gap."""
         model, cars = self.model, np.flatnonzero(self.model.followers)
         assert model.gap is not None and model.speed is not None
         gaps, speeds, closing = [], [], []
@@ -259,7 +270,7 @@ class Sight:
         return [*out, num.pick(np.stack(closing, axis=1), near) / 5.0] if closing else out
 
     def _places(self, values: Array) -> Array:
-        """(B, K) where the knobs stand, in [-1, 1] between the ends of the menu."""
+        """Return the places (B, K) of the knobs, in [-1, 1] between the ends of the menu."""
         out = np.zeros(values.shape)
         for i, knob in enumerate(self.knobs):
             ends = [_place(knob, end) for end in (min(knob.levels), max(knob.levels))]
@@ -269,7 +280,7 @@ class Sight:
 
 
 def _row(weights: Array, x: Array) -> Array:
-    """weights (n,) times x (B, n), in fixed order."""
+    """Return weights (n,) times x (B, n), in fixed order."""
     out = np.zeros(len(x))
     for j in np.flatnonzero(weights).tolist():
         out += weights[j] * x[:, j]

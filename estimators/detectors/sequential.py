@@ -1,4 +1,4 @@
-"""Detectors with memory: they see what one step at a time hides, and an attacker who knows them spends less (docs/detectors.md).
+"""Detectors with memory: they see attacks that no single step shows (docs/detectors.md).
 
 With g = r' S^-1 r, which without an attack is chi-square with q degrees of freedom, and h the threshold:
 
@@ -23,11 +23,11 @@ from tailgate.estimators.parts import Verdict, blame_all
 
 Allowance = Annotated[float, Field(gt=1, le=1e30, allow_inf_nan=False)]
 Weight = Annotated[float, Field(ge=1e-6, le=1)]
-INSIDE = 1.0 - 1e-12  # of a bound that went through square roots: their rounding shall not raise an alarm
+INSIDE = 1.0 - 1e-12  # factor on a bound: the rounding of square roots must not raise an alarm
 
 
 def whiten(innovation: Innovation) -> Array:
-    """L^-1 r (B, N, q) with the Cholesky factor L of S: uncorrelated, of unit variance, and of length r' S^-1 r.
+    """Return L^-1 r (B, N, q) with the Cholesky factor L of S: uncorrelated, of unit variance, and of length r' S^-1 r.
 
     Which square root of S is taken turns the result and changes no length, but over time-varying S the sum of turned ones; S settles
     within seconds.
@@ -50,7 +50,7 @@ def whiten(innovation: Innovation) -> Array:
 
 
 def normalised(innovation: Innovation) -> Array:
-    """g = r' S^-1 r (B, N)."""
+    """Return g = r' S^-1 r (B, N)."""
     return num.quadratic(innovation.r, num.inverse(innovation.S))
 
 
@@ -83,7 +83,7 @@ class WindowedChiSquare:
         return state, blame_all(score, score > self.threshold, innovation)
 
     def _older(self, state: WindowState) -> Array | float:
-        """The part of the next sum that is known before the step."""
+        """Return the part of the next sum that is known before the step."""
         return state.sums[..., -1] if self.window > 1 else 0.0
 
     def gate(self, plan: int, state: WindowState) -> Array | float:
@@ -160,7 +160,7 @@ class Mewma:
         return MewmaState(z, faded), blame_all(score, alarm, innovation)
 
     def gate(self, plan: tuple[int, int], state: MewmaState) -> Array:
-        """Whatever the direction: |z+| <= l sqrt(g) + (1-l) |z|, with equality where the innovation points along z."""
+        """Return the gate for any direction: |z+| <= l sqrt(g) + (1-l) |z|, with equality where the innovation points along z."""
         longest = np.sqrt(self.threshold * self._variance(self._fade(state))) * INSIDE
         room = (longest - (1.0 - self.weight) * np.sqrt(num.dot(state.z, state.z))) / self.weight
         return np.asarray(room * np.abs(room))
@@ -169,6 +169,6 @@ class Mewma:
         return np.asarray(state.faded * ((1.0 - self.weight) * (1.0 - self.weight)))
 
     def _variance(self, faded: Array) -> Array | float:
-        """c, of each component of z."""
+        """Return c, the variance of each component of z."""
         limit = self.weight / (2.0 - self.weight)
         return limit * (1.0 - faded) if self.exact else limit

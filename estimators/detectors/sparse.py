@@ -32,7 +32,7 @@ class SparseChiSquare(Memoryless):
     eta: Positive = param(20.0, "threshold on r' S^-1 r of all sensors [-]")
 
     def prepare(self, model: Model) -> Array:
-        """(q + 1,) threshold on r' S^-1 r of m sensors, m = 0, ..., q."""
+        """Return thresholds (q + 1,) on r' S^-1 r of m sensors, m = 0, ..., q."""
         from scipy import stats  # takes as long to load as all the rest
 
         q = len(model.sensors)
@@ -49,7 +49,10 @@ class SparseChiSquare(Memoryless):
         return None, Verdict(score, alarm, suspect)
 
     def trusted(self, plan: Array, r: Array, S: Array) -> Array:
-        """(B, N, q) bool: who is left after alarms of r (B, N, q) and S (B, N, q, q). A reading that is missing has r = 0 and goes last."""
+        """Return (B, N, q) bool: the sensors left after alarms of r (B, N, q) and S (B, N, q, q).
+
+        A missing reading has r = 0 and goes last.
+        """
         keep, sensors = np.ones(r.shape, bool), np.arange(r.shape[-1])
         for _ in sensors:
             W = num.inverse(alone(S, keep))
@@ -61,7 +64,10 @@ class SparseChiSquare(Memoryless):
         return keep
 
     def gate(self, plan: Array, state: None) -> float:
-        """eta: nobody is suspected up to it. Beyond it the attacker pays with a sensor, not always its own (docs/filters.md)."""
+        """Return eta: nobody is suspected up to it.
+
+        Beyond it the attacker loses a sensor, not always the attacked one (docs/filters.md).
+        """
         return self.eta
 
 

@@ -1,12 +1,12 @@
-"""Centralised references: one estimator reads the sensors of all agents, and tells everybody what it believes.
+"""Centralised references: one estimator reads the sensors of all agents, and everybody gets its estimate.
 
-The sensors of all N agents are stacked to the N q sensors of one agent, for which (5.7) is the Kalman filter and (6.26) the robust one, in
-steady state. It begins at the mean of what the agents are told of the initial state, and knows of the input what agent 0 knows: in a
-platoon the leader's own command. It hears more than any agent of the network does: a reference from above, not a rival.
+The sensors of all N agents are stacked to the N q sensors of one agent. For it (5.7) is the Kalman filter and (6.26) the robust one, in
+steady state. It begins at the mean of the agents' priors, and knows the input of agent 0: in a platoon the leader's own command. It hears
+more than any agent of the network does: it is a reference, not a competitor.
 """
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from tailgate import num
 from tailgate.core import Array, Estimate, Model, Prior, Received
 from tailgate.core.draws import Draws
 from tailgate.core.registry import register
-from tailgate.estimators.compose import AcceptAll, Composed, Score, compose
+from tailgate.estimators.compose import AcceptAll, Composed, ComposedPlan, ComposedState, Score, compose
 from tailgate.estimators.distributed.distributed_kalman import DistributedKalmanFilter
 from tailgate.estimators.distributed.lasso import Lasso, LassoFilter
 from tailgate.estimators.parts import Filter
@@ -24,12 +24,12 @@ USES = ("measurements", "redundant", "leader_input")
 
 class CentralPlan(NamedTuple):
     one: Composed
-    plan: Any  # of the one
+    plan: ComposedPlan  # plan of the one
     agents: int
 
 
 def stacked(model: Model) -> Model:
-    """The same system with a single agent, which has the sensors of all in the order of the agents."""
+    """Return the same system with a single agent, which has the sensors of all in the order of the agents."""
     N, q, n = model.C.shape
     R = np.zeros((1, N * q, N * q))
     for i in range(N):
@@ -39,7 +39,7 @@ def stacked(model: Model) -> Model:
 
 
 def together(x: Array) -> Array:
-    """(B, N, q) to (B, 1, N q)."""
+    """Reshape (B, N, q) to (B, 1, N q)."""
     return num.stack([x[:, i, j] for i in range(x.shape[1]) for j in range(x.shape[2])])[:, None]
 
 
@@ -47,20 +47,22 @@ class Central:
     """Base of the centralised defences: a subclass gives the one agent's filter. It shows no innovation (look), being nobody's own."""
 
     def filter(self) -> Filter:
-        """The filter of the stacked system."""
+        """Return the filter of the stacked system."""
         raise TypeError(f"{type(self).__name__} must define filter()")
 
     def prepare(self, model: Model) -> CentralPlan:
         one = compose(self.filter(), Score(), AcceptAll())
         return CentralPlan(one, one.prepare(stacked(model)), model.agents)
 
-    def start(self, plan: CentralPlan, prior: Prior) -> Any:
+    def start(self, plan: CentralPlan, prior: Prior) -> ComposedState:
         mean = prior.mean[:, :1]
         for i in range(1, plan.agents):
             mean = mean + prior.mean[:, i : i + 1]
         return plan.one.start(plan.plan, Prior(mean / plan.agents, prior.cov[:, :1]))
 
-    def step(self, plan: CentralPlan, state: Any, received: Received, known_u: Array, draws: Draws) -> tuple[Any, Estimate]:
+    def step(
+        self, plan: CentralPlan, state: ComposedState, received: Received, known_u: Array, draws: Draws
+    ) -> tuple[ComposedState, Estimate]:
         heard = Received(together(received.y), together(received.valid), received.energy[:, :1])
         state, told = plan.one.step(plan.plan, state, heard, known_u[:, :1], draws)
         return state, Estimate(*(None if x is None else np.repeat(x, plan.agents, axis=1) for x in told))  # type: ignore[arg-type]

@@ -4,12 +4,12 @@
     K_i  = M_i C_i' (Sv_i + C_i M_i C_i')^-1          M_i = A P_i A' + Sw          P_i = M_i - K_i C_i M_i
     Cons_i = eps / (1 + ||M_i||_F) M_i
 
-Each agent is a Kalman filter on its own sensors, and pulls its estimate towards the predictions of its neighbours, the harder the less it
-knows; the covariance takes no notice of that. With `share` the neighbours send their readings too (the paper's second algorithm), and K_i
+Each agent is a Kalman filter on its own sensors. It pulls its estimate towards the predictions of its neighbours, the harder the less it
+knows; the covariance ignores that. With `share` the neighbours send their readings too (the paper's second algorithm), and K_i
 uses them as if they were the agent's own; an agent sends what its own gate let pass.
 
-Two things differ from the paper: the sum over the neighbours is taken as their mean, so that one gain suits every graph (for a gain up to 1
-the pull alone is then a contraction), and the gain is called `consensus`, not eps.
+Two things differ from the paper. The sum over the neighbours is their mean, so that one gain suits every graph: for a gain up to 1 the pull
+alone is then a contraction. The gain is called `consensus`, not eps.
 
 An agent that cannot see a mode by itself has a covariance that grows with it, linearly where the mode lasts. The pull then works on just
 this mode. Where such a mode grows the covariance overflows in time: NotApplicable.
@@ -28,7 +28,7 @@ from tailgate.core.reach import MARGIN, blind
 from tailgate.core.registry import register
 from tailgate.estimators.compose import AcceptAll, Composed
 from tailgate.estimators.distributed.distributed_kalman import ALARM, DistributedFilter, FusionPlan, gate_of, neighbours, one_row
-from tailgate.estimators.filters.kalman import KalmanState, alone
+from tailgate.estimators.filters.kalman import KalmanState, alone, updated
 from tailgate.estimators.parts import Detector, Filter, Mitigation
 
 REFERENCE = "R. Olfati-Saber, Kalman-Consensus Filter: Optimality, Stability, and Performance, CDC 2009"
@@ -75,7 +75,7 @@ class ConsensusFilter(DistributedFilter):
         return KalmanState(corrected.x + gain[..., None] * num.matvec(M, pull), corrected.P)
 
     def _shared(self, plan: FusionPlan, state: KalmanState, innovation: Innovation, accept: Array) -> KalmanState:
-        """The Kalman update with the accepted sensors of N(i), one neighbour after the other: their noises are independent."""
+        """Return the Kalman update with the accepted sensors of N(i), one neighbour after the other: their noises are independent."""
         assert state.P is not None
         known = one_row(state.P) if num.every(accept) else state.P
         x, P = state.x.copy(order="K"), num.zeros(known.shape)
@@ -85,17 +85,14 @@ class ConsensusFilter(DistributedFilter):
                 keep = accept[:, j] if len(known) > 1 else accept[:1, j]
                 cross = num.matmul(plan.C[j], P_i) * keep[..., None]
                 S = alone(num.matmul(cross, plan.C[j].T) + plan.R[j], keep)
-                K = num.transpose(num.matmul(num.inverse(S), cross))
                 r = innovation.r[:, j] + num.matvec(plan.C[j][None], state.x[:, j] - x[:, i])
-                x[:, i] += num.matvec(K, r * accept[:, j])
-                P_i = P_i - num.matmul(K, cross)
-                P_i = 0.5 * (P_i + num.transpose(P_i))
+                x[:, i], P_i = updated(x[:, i], P_i, r * accept[:, j], S, cross)
             P[:, i] = P_i
         return KalmanState(x, np.broadcast_to(P, state.P.shape))
 
 
 def _seen(model: Model, agents: tuple[int, ...]) -> Model:
-    """The model of one agent that has the sensors of these."""
+    """Return the model of one agent that has the sensors of these."""
     q, some = model.C.shape[1] * len(agents), list(agents)
     return dataclasses.replace(
         model, C=model.C[some].reshape(1, q, -1), R=np.eye(q)[None], graph=np.eye(1, dtype=bool), gap=None, speed=None,

@@ -1,19 +1,19 @@
 """Gate and neighbour disagreement (U. A. Khan, A. M. Stankovic, Secure Distributed Estimation in Cyber-Physical Systems, ICASSP 2013).
 
-The paper tests twice before an agent uses anything: what it measures against what it expects (local), and what a neighbour sends against
-what the agent itself holds (nodal); what fails is left out. Here, on the distributed Kalman filter:
+In the paper an agent tests every input before it uses it: its measurement against its prediction (local), and a neighbour's message
+against its own estimate (nodal). An input that fails is left out. Here, on the distributed Kalman filter:
 
     own readings      left out where r' S^-1 r > eta
     neighbour j       left out of N(i) where  z_ij = max_k |xb_j,k - c_i,k| / sqrt(M_i,kk + M_j,kk)  > threshold
 
-xb_j is what j sends, with the covariance M_j = A P_j A' + Sw that it gives it. c_i is what i itself predicts, or the median, state by
-state, of all that it hears and its own: then an agent can also find that it is itself the one who is wrong. Among two there is no
-majority. Where nobody is left, the agent keeps its own. Errors of neighbours are correlated, so that z is smaller than that of independent
-ones: the threshold is in sigma, and conservative.
+Agent j sends xb_j with its covariance M_j = A P_j A' + Sw. c_i is the own prediction of i, or the median, state by state, of it and all
+that i hears; with the median an agent can also find that it is wrong itself. Two agents have no majority. An agent without neighbours left
+keeps its own prediction. Errors of neighbours are correlated, so that z is smaller than for independent ones: the threshold, in sigma, is
+conservative.
 """
 
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from tailgate.core import Array, Positive, param
 from tailgate.core.registry import register
 from tailgate.estimators.compose import Composed, GateOut
 from tailgate.estimators.distributed.distributed_kalman import ETA, DistributedFilter, FusionPlan, gate_of
-from tailgate.estimators.filters.kalman import GAIN, Gain
+from tailgate.estimators.filters.kalman import GAIN, Gain, KalmanState
 from tailgate.estimators.parts import Detector, Filter, Mitigation
 
 REFERENCE = "U. A. Khan, A. M. Stankovic, Secure Distributed Estimation in Cyber-Physical Systems, ICASSP 2013"
@@ -33,7 +33,7 @@ Centre = Literal["own", "median"]
 
 
 def disagreement(heard: tuple[tuple[int, ...], ...], x: Array, M: Array, centre: Centre = "own") -> Array:
-    """z (B, N, N): how far what j sends is from what i compares it with, for j in N(i), in sigma; 0 elsewhere.
+    """Return z (B, N, N): the distance in sigma of what j sends from what i compares it with, for j in N(i); 0 elsewhere.
 
     x (B, N, n) is what is sent, M (B or 1, N, n, n) its covariance.
     """
@@ -48,7 +48,7 @@ def disagreement(heard: tuple[tuple[int, ...], ...], x: Array, M: Array, centre:
 
 
 def _median(x: Array) -> Array:
-    """The median over the middle axis of (B, d, n)."""
+    """Return the median over the middle axis of (B, d, n)."""
     ranked, half = np.sort(x, axis=1), x.shape[1] // 2
     return np.asarray(ranked[:, half] if x.shape[1] % 2 else 0.5 * (ranked[:, half - 1] + ranked[:, half]))
 
@@ -62,12 +62,12 @@ class DisagreementFilter(DistributedFilter):
     centre: Centre = param("own", CENTRE)
     steady: bool = param(False, "hold gain and covariance where they settle when nothing is missed")
 
-    def predict(self, plan: FusionPlan, state: Any, known_u: Array) -> Any:
+    def predict(self, plan: FusionPlan, state: KalmanState, known_u: Array) -> KalmanState:
         x, M = self.forecast(plan, state, known_u), self.spread(plan, state)
         return self.fuse(plan, x, M, self.weights(plan, x, M))
 
     def weights(self, plan: FusionPlan, x: Array, M: Array) -> Array:
-        """(B, N, N): 1 for those whom an agent uses, 0 for the others."""
+        """Return (B, N, N): 1 for the agents that an agent uses, 0 for the others."""
         use = disagreement(plan.heard, x, M, self.centre) <= self.threshold
         nobody = num.zeros(use.shape[:2], bool)
         for i, near in enumerate(plan.heard):

@@ -15,7 +15,7 @@ and d_i Sw; it is solved by doubling, node after node, until nothing moves, and 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
@@ -27,7 +27,7 @@ from tailgate.core.reach import require_detectable
 from tailgate.core.registry import register
 from tailgate.estimators.compose import AcceptAll, Composed, GateOut, Score
 from tailgate.estimators.detectors.chi_square import ChiSquare
-from tailgate.estimators.filters.kalman import GAIN, Gain, KalmanState, LinearFilter, alone, broad, precision, riccati
+from tailgate.estimators.filters.kalman import GAIN, Gain, KalmanState, LinearFilter, alone, broad, gain_of, precision, riccati, updated
 from tailgate.estimators.parts import Detector, Filter, Memoryless, Mitigation, Verdict, blame_all
 
 SWEEPS = 200
@@ -43,7 +43,7 @@ class Fusion(NamedTuple):
 
 
 class FusionPlan(NamedTuple):
-    """What LinearFilter reads, and the network."""
+    """The constants of LinearFilter, and the network."""
 
     A: Array
     B: Array
@@ -64,12 +64,12 @@ class FusionPlan(NamedTuple):
 
 
 def neighbours(graph: Array) -> tuple[tuple[int, ...], ...]:
-    """N(i) of each agent, itself included, in ascending order."""
+    """Return N(i) of each agent, itself included, in ascending order."""
     return tuple(tuple(np.flatnonzero(row).tolist()) for row in np.array(graph, bool) | np.eye(len(graph), dtype=bool))
 
 
 def information(model: Model) -> Array:
-    """C_i' Sv_i^-1 C_i (N, n, n)."""
+    """Return C_i' Sv_i^-1 C_i (N, n, n)."""
     return np.stack([num.product(num.product(C.T, precision(R)), C) for C, R in zip(model.C, model.R, strict=True)])
 
 
@@ -85,12 +85,12 @@ def _predicted(model: Model, P: Array) -> Array:
 
 @remembered("A", "C", "Q", "R", "graph")  # every cell of an evaluation asks again, and a long string takes minutes
 def fixed_point(model: Model) -> Fusion:
-    """P_i (N, n, n) of (5.5), with L_j and Q_i^-1. Raises InputError, naming the agents, where there is none."""
+    """Return P_i (N, n, n) of (5.5), with L_j and Q_i^-1. Raise InputError, naming the agents, where there is none."""
     require_detectable(model, "model")
     heard, G = neighbours(model.graph), information(model)
-    L = np.stack([_inverse(model.Q)] * model.agents)  # of P = 0
+    L = np.stack([_inverse(model.Q)] * model.agents)  # L for P = 0
     P = np.zeros_like(L)
-    due = np.ones(model.agents, bool)  # whose neighbours have moved since: where everybody hears cars ahead only, one sweep does
+    due = np.ones(model.agents, bool)  # their neighbours have moved since; one sweep is enough where everybody hears cars ahead only
     for _ in range(SWEEPS):
         moved = 0.0
         for i, near in enumerate(heard):
@@ -131,13 +131,13 @@ def _mean(L: Array, near: tuple[int, ...]) -> Array:
 
 
 def _change(new: Array, old: Array) -> float:
-    """The largest change of an element, relative to its row's and column's size."""
+    """Return the largest change of an element, relative to its row's and column's size."""
     size = np.sqrt(new.diagonal())
     return float(np.max(np.abs(new - old) / (size[:, None] * size)))
 
 
-class DistributedFilter(LinearFilter):
-    """The recursion. A subclass says in `steady` whether P is held, and may change what is fused, and the update."""
+class DistributedFilter(LinearFilter[FusionPlan]):
+    """The recursion. A subclass sets in `steady` if P is held, and may change what is fused, and the update."""
 
     steady: bool
 
@@ -161,29 +161,29 @@ class DistributedFilter(LinearFilter):
     def start(self, plan: FusionPlan, prior: Prior) -> KalmanState:
         return KalmanState(prior.mean, shared(prior.cov) if plan.held is None else None)
 
-    def predict(self, plan: FusionPlan, state: Any, known_u: Array) -> Any:
-        """xb_i, and Q_i^-1 as the predicted covariance."""
+    def predict(self, plan: FusionPlan, state: KalmanState, known_u: Array) -> KalmanState:
+        """Return xb_i, and Q_i^-1 as the predicted covariance."""
         if plan.held is not None:
             assert plan.L is not None and plan.merge is not None
             return KalmanState(num.predicted(plan.A, plan.B, plan.c, plan.L, plan.merge, plan.hears, state.x, known_u), None)
-        x, P = self.forecast(plan, state, known_u), one_row(state.P)
+        x, P = self.forecast(plan, state, known_u), self._predicted(plan, state)
         if len(P) < len(x):
             return self.fuse(plan, x, self.spread(plan, state))
         return KalmanState(*num.fused(plan.hears, x, P, step=(plan.A, plan.Q)))
 
-    def forecast(self, plan: FusionPlan, state: Any, known_u: Array) -> Array:
-        """A xh_j + B u_j + c (B, N, n): what each agent sends."""
+    def forecast(self, plan: FusionPlan, state: KalmanState, known_u: Array) -> Array:
+        """Return what each agent sends, A xh_j + B u_j + c (B, N, n)."""
         return num.apply(plan.A[None], state.x) + num.matvec(plan.B, known_u) + plan.c
 
-    def spread(self, plan: FusionPlan, state: Any) -> Array:
-        """L_j^-1 = A P_j A' + Sw (B or 1, N, n, n): the covariance that each agent gives what it sends."""
+    def spread(self, plan: FusionPlan, state: KalmanState) -> Array:
+        """Return L_j^-1 = A P_j A' + Sw (B or 1, N, n, n): the covariance that each agent gives what it sends."""
         if plan.held is not None:
             assert plan.M is not None
             return plan.M[None]
-        return num.congruent(plan.A, one_row(state.P), plan.Q)
+        return num.congruent(plan.A, self._predicted(plan, state), plan.Q)
 
     def fuse(self, plan: FusionPlan, x: Array, M: Array, weight: Array | None = None) -> KalmanState:
-        """xb_i and Q_i^-1 of what is sent, x (B, N, n) with its `spread` M.
+        """Return xb_i and Q_i^-1 of what is sent, x (B, N, n) with its `spread` M.
 
         With `weight` (B, N, N) the means are weighted: Q_i = sum_j w_ij L_j / sum_j w_ij over N(i), and xb_i with them. Where an agent's
         weights are all equal, every bit is that of the fusion without weights.
@@ -203,7 +203,7 @@ class DistributedFilter(LinearFilter):
         return KalmanState(*num.fused(plan.hears, x, M, (share, total, np.where(alike, -0.0, 0.0))))
 
     def _reweigh(self, plan: FusionPlan, out: KalmanState, z: Array, weight: Array) -> KalmanState:
-        """The steady fusion of z_j = L_j x_j (B, N, n) again where an agent's weights differ from each other."""
+        """Repeat the steady fusion of z_j = L_j x_j (B, N, n) where an agent's weights differ from each other."""
         assert plan.L is not None
         x, P, alike = out.x, None, even(plan.heard, weight)
         for i, near in enumerate(plan.heard):
@@ -224,46 +224,41 @@ class DistributedFilter(LinearFilter):
             x[:, i] = np.where(rows[:, None], num.matvec(Qinv, y / total[:, None]), x[:, i])
         return out if P is None else KalmanState(x, P)
 
-    def innovation(self, plan: FusionPlan, state: Any, received: Received) -> Innovation:
+    def innovation(self, plan: FusionPlan, state: KalmanState, received: Received) -> Innovation:
         r = np.where(received.valid, received.y - num.apply(plan.C, state.x), 0.0)
         S = plan.S
         if S is None or state.P is not None:
             S = num.matmul(plan.C, num.transpose(self._cross(plan, state))) + plan.R
         return Innovation(r, alone(np.broadcast_to(S, (*r.shape, r.shape[-1])), received.valid))
 
-    def update(self, plan: FusionPlan, state: Any, innovation: Innovation, accept: Array) -> Any:
-        """As the Kalman filter's. Constant gains, and a covariance that all rows share, save the work but change no bit."""
+    def update(self, plan: FusionPlan, state: KalmanState, innovation: Innovation, accept: Array) -> KalmanState:
+        """Return the Kalman filter's update. Constant gains, and a covariance that all rows share, save work and change no bit."""
         r, S = innovation
         if plan.held is not None and state.P is None:
             assert plan.K is not None and plan.cross is not None
             x = num.apply(plan.K, r, state.x)
             return KalmanState(num.elsewhere(accept.all(axis=-1), x, _corrected, state.x, r, S, plan.cross[None], accept), None)
-        if len(one_row(state.P)) < len(r) and num.every(accept) and len(one_row(S)) == 1:
-            cross = num.matmul(plan.C, state.P[:1])
-            K = gain_of(S[:1], cross)
-            P = state.P[:1] - num.matmul(K, cross)
-            P = np.broadcast_to(0.5 * (P + num.transpose(P)), state.P.shape)
-            return KalmanState(state.x + num.matvec(K, r), P if plan.held is None else None)
-        x, P = num.corrected(plan.C, num.inverse(alone(S, accept)), state.x, one_row(state.P), r, accept)
+        assert state.P is not None
+        known = one_row(state.P)
+        if len(known) < len(r) and num.every(accept) and len(one_row(S)) == 1:
+            x, P = updated(state.x, known, r, S[:1], num.matmul(plan.C, known))
+            P = np.broadcast_to(P, state.P.shape)
+        else:
+            x, P = num.corrected(plan.C, num.inverse(alone(S, accept)), state.x, known, r, accept)
         return KalmanState(x, P if plan.held is None else None)
 
-    def _predicted(self, plan: FusionPlan, state: Any) -> Array:
+    def _predicted(self, plan: FusionPlan, state: KalmanState) -> Array:
         return one_row(super()._predicted(plan, state))
 
 
 def one_row(P: Array) -> Array:
-    """The first row of a covariance that all rows of a batch share in memory, else all: what is computed of it is the same for all."""
+    """Return the first row of a covariance that all rows of a batch share in memory, else all rows."""
     return P[:1] if P.ndim == 4 and len(P) > 1 and P.strides[0] == 0 else P
 
 
 def shared(P: Array) -> Array:
-    """P (B, ...) with its rows shared in memory where they are all equal."""
+    """Return P (B, ...) with its rows shared in memory where they are all equal."""
     return np.broadcast_to(P[:1], P.shape) if len(P) > 1 and (P[:1] == P).all() else P
-
-
-def gain_of(S: Array, cross: Array) -> Array:
-    """P- C' S^-1 (..., n, q) from C P- (..., q, n), in the order of the Kalman filter's update, to the last bit."""
-    return num.transpose(num.matmul(num.inverse(S), cross))
 
 
 def _corrected(x: Array, r: Array, S: Array, cross: Array, accept: Array) -> Array:
@@ -271,12 +266,12 @@ def _corrected(x: Array, r: Array, S: Array, cross: Array, accept: Array) -> Arr
 
 
 def even(heard: tuple[tuple[int, ...], ...], weight: Array) -> Array:
-    """(B, N) bool: whether agent i weighs all j in N(i) alike, by weight (B, N, N)."""
+    """Return (B, N) bool: agent i weighs all j in N(i) alike, by weight (B, N, N)."""
     return np.stack([(weight[:, i, near] == weight[:, i, near[:1]]).all(axis=1) for i, near in enumerate(heard)], axis=1)
 
 
 def gather(heard: tuple[tuple[int, ...], ...], z: Array) -> Array:
-    """Row i: the sum of z_j (B, N, n) over N(i), in ascending order."""
+    """Return in row i the sum of z_j (B, N, n) over N(i), in ascending order."""
     out = num.zeros(z.shape)
     for i, near in enumerate(heard):
         for j in near:
@@ -314,18 +309,18 @@ class TailChiSquare(Memoryless):
     tail: Probability = param(4.54e-5, "probability of a false alarm per step and agent, above 0; exp(-10) is the thesis's [-]")
 
     def prepare(self, model: Model) -> float:
-        """eta."""
+        """Return the threshold eta."""
         if not 0.0 < self.tail < 1.0:
             raise InputError("detector chi2_tail.tail", self.tail, "a probability between 0 and 1")
         from scipy import stats  # takes as long to load as all the rest
 
         return float(stats.chi2.isf(self.tail, len(model.sensors)))
 
-    def step(self, plan: float, state: Any, innovation: Innovation) -> tuple[Any, Verdict]:
+    def step(self, plan: float, state: None, innovation: Innovation) -> tuple[None, Verdict]:
         score = num.quadratic(innovation.r, num.inverse(innovation.S))
         return None, blame_all(score, score > plan, innovation)
 
-    def gate(self, plan: float, state: Any) -> float:
+    def gate(self, plan: float, state: None) -> float:
         return plan
 
 
@@ -334,7 +329,7 @@ ETA, ALARM = (f"{what} above this r' S^-1 r; {QUANTILE}" for what in ("readings 
 
 
 def gate_of(eta: float | None) -> Detector:
-    """The gate of the distributed defences."""
+    """Return the gate of the distributed defences."""
     return TailChiSquare() if eta is None else ChiSquare(eta)
 
 

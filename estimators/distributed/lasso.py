@@ -12,26 +12,25 @@ problem.
 
 Price: lam is in 1/unit of the sensor, one number for all sensors, as in (6.26): a reading off by less than lam Sv / 2 counts as noise. A
 small one is resilient, and slow to follow what the model does not foresee. The default 5 was tuned on platoon-braking, where it cuts at a
-quarter of a standard deviation of the gap's noise: most honest readings pay a little. The thesis's own case, which tells the filter a
+quarter of a standard deviation of the gap's noise: most honest readings pay a little. The thesis's own case, whose filter expects a
 noise of 1, has 0.1. With 0.1 the braking platoon cannot follow its brakes: half of the runs without any attack collide.
 """
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
-from tailgate import num
 from tailgate.core import Array, Innovation, Positive, param
 from tailgate.core.registry import register
 from tailgate.estimators.compose import AcceptAll, Composed, Score
-from tailgate.estimators.distributed.distributed_kalman import DistributedFilter
-from tailgate.estimators.filters.kalman import GAIN, Gain, alone
-from tailgate.estimators.filters.robust import Solved, believed, believed_by_cvxpy
+from tailgate.estimators.distributed.distributed_kalman import DistributedFilter, FusionPlan
+from tailgate.estimators.filters.kalman import GAIN, Gain, KalmanState
+from tailgate.estimators.filters.robust import Solved
 from tailgate.estimators.parts import Detector, Filter, Mitigation
 
 
 @dataclass(frozen=True)
 class Lasso(Solved):
-    """The price of an attack, and who solves."""
+    """The price of an attack, and the solver."""
 
     lam: Positive = param(5.0, "price of an attack on a sensor: 5 fits a noise of 0.1 units, the thesis's case has 0.1 at a noise of 1")
     unit: Literal["sigma", "sensor"] = param(
@@ -46,12 +45,8 @@ class LassoFilter(Lasso, DistributedFilter):
 
     steady: bool = param(True, "hold gain and covariance where they settle when nothing is missed")
 
-    def update(self, plan: Any, state: Any, innovation: Innovation, accept: Array) -> Any:
-        r, S = innovation
-        if not num.every(accept):
-            r, S = r * accept, alone(S, accept)
-        solve = believed if self.solver == "exact" else believed_by_cvxpy
-        return super().update(plan, state, Innovation(solve(r, S, self.price(S)), S), accept)
+    def update(self, plan: FusionPlan, state: KalmanState, innovation: Innovation, accept: Array) -> KalmanState:
+        return super().update(plan, state, self.cleaned(innovation, accept), accept)
 
 
 @register("defence", "lasso_dkf", reference="Dutta 2018, (6.26)")

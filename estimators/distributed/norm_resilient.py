@@ -25,12 +25,12 @@ from tailgate import num
 from tailgate.core import Array, Innovation, Model, Positive, Prior, Received, param
 from tailgate.core.registry import register
 from tailgate.estimators.compose import AcceptAll, Composed, Score
-from tailgate.estimators.distributed.distributed_kalman import DistributedFilter, FusionPlan, one_row
+from tailgate.estimators.distributed.distributed_kalman import DistributedKalmanFilter, FusionPlan, one_row
 from tailgate.estimators.filters.kalman import GAIN, Gain, KalmanState, alone
 from tailgate.estimators.filters.robust import ACCURACY, load_cvxpy
 from tailgate.estimators.parts import Detector, Filter, Mitigation
 
-ROUNDS = 100  # of Newton's iteration; some five are enough
+ROUNDS = 100  # largest number of Newton's rounds; about five are enough
 
 
 class Axes(NamedTuple):
@@ -42,7 +42,9 @@ class Axes(NamedTuple):
 
 
 def axes(C: Array, R: Array, spread: Array) -> Axes:
-    """Of C (P, q, n), R (P, q, q) and a root of Q^-1, spread' spread (P, n, n). Any root of Sv^-1 gives the same norm.
+    """Return the constants for C (P, q, n), R (P, q, q) and a root of Q^-1, spread' spread (P, n, n).
+
+    Any root of Sv^-1 gives the same norm.
 
     V makes the rows of V' M Q^-1/2 orthogonal. G itself is not formed: its small eigenvalues would drown in the rounding of the large ones.
     """
@@ -53,7 +55,7 @@ def axes(C: Array, R: Array, spread: Array) -> Axes:
 
 @np.errstate(all="ignore")  # rows that have stopped, and prices beyond all measure
 def in_ball(w: Array, c: Array) -> Array:
-    """u_k = w_k / (c_k + mu) with the least mu >= 0 at which |u| <= 1, for w (B, P, q) and c (B or 1, P, q) >= 0. 0/0 counts as 0."""
+    """Return u_k = w_k / (c_k + mu), 0/0 = 0, with the least mu >= 0 at which |u| <= 1; w (B, P, q), c (B or 1, P, q) >= 0."""
     there, q = w != 0.0, range(w.shape[-1])
 
     def parts(mu: Array) -> Array:
@@ -80,26 +82,26 @@ def in_ball(w: Array, c: Array) -> Array:
 
 
 def _summed(x: Array, power: int) -> Array:
-    """Sums of x (..., q) or its squares, in ascending order."""
+    """Return sums of x (..., q) or its squares, in ascending order."""
     return num.dot(x, x if power == 2 else np.ones_like(x))
 
 
 def moved(problem: Axes, r: Array, lam: float) -> tuple[Array, Array]:
-    """xh - xb (B, P, n) and u (B, P, q), in the axes of V, for the innovations r = y - C xb (B, P, q)."""
+    """Return xh - xb (B, P, n) and u (B, P, q), in the axes of V, for the innovations r = y - C xb (B, P, q)."""
     u = in_ball(num.apply(problem.turn, r), lam * problem.half[None])
     return lam * num.apply(problem.push, u), u
 
 
 @cache
 def _problem(q: int, n: int) -> tuple[Any, Any, Any, Any]:
-    """The cvxpy problem of q sensors and n states: 2 |r - H z| + z'z, its parameters H and r, and z."""
+    """Return the cvxpy problem of q sensors and n states: 2 |r - H z| + z'z, its parameters H and r, and z."""
     cp = load_cvxpy()
     z, H, r = cp.Variable(n), cp.Parameter((q, n)), cp.Parameter(q)
     return cp.Problem(cp.Minimize(2.0 * cp.norm(r - cp.matmul(H, z), 2) + cp.sum_squares(z))), H, r, z
 
 
 def moved_by_cvxpy(C: Array, R: Array, Qinv: Array, r: Array, lam: float) -> Array:
-    """xh - xb (n,) of one problem by an interior-point solver (Clarabel), to the solver's tolerance. C (q, n), R (q, q), r (q,)."""
+    """Return xh - xb (n,) of one problem by an interior-point solver (Clarabel), to its tolerance. C (q, n), R (q, q), r (q,)."""
     from scipy.linalg import cholesky, solve_triangular
 
     if not C.any():  # no sensor, or one that sees nothing
@@ -114,7 +116,7 @@ def moved_by_cvxpy(C: Array, R: Array, Qinv: Array, r: Array, lam: float) -> Arr
 
 
 def _times(m: Array, v: Array) -> Array:
-    """m (M, i, k) times v (M, k), as `num.apply`: sums run from 0, and zeros of m count for nothing."""
+    """Return m (M, i, k) times v (M, k), as `num.apply`: sums run from 0, and zeros of m are skipped."""
     out = np.zeros(m.shape[:2])
     for k in range(m.shape[2]):
         out = np.where(m[..., k] != 0.0, out + m[..., k] * v[:, k, None], out)
@@ -131,7 +133,7 @@ class NormPlan(NamedTuple):
 
 @dataclass(frozen=True)
 class Norm:
-    """The price of the innovation, and who solves."""
+    """The price of the innovation, and the solver."""
 
     lam: Positive = param(
         0.4, "price of the norm of the whitened innovation [-]: two attacks differ in one step by at most lam |Q_i^-1 C_i' Sv_i^-1/2|; a "
@@ -146,43 +148,51 @@ class Norm:
 
 @register("filter", "norm_resilient", reference="Dutta 2018, (5.8)")
 @dataclass(frozen=True)
-class NormResilientFilter(Norm, DistributedFilter):
+class NormResilientFilter(Norm):
     """Distributed filter whose correction weighs the norm of the whitened innovation, so that no attack moves it far."""
 
     steady: bool = param(True, "hold the covariance where it settles when nothing is missed; else each row solves its own problem, slowly")
 
-    def prepare(self, model: Model) -> Any:
-        linear = super().prepare(model)
+    @property
+    def linear(self) -> DistributedKalmanFilter:
+        """The distributed Kalman filter that predicts, and whose correction the norm replaces."""
+        return DistributedKalmanFilter(self.steady)
+
+    def prepare(self, model: Model) -> NormPlan:
+        linear = self.linear.prepare(model)
         if linear.held is None:
             return NormPlan(linear, None, None)
         spread, _ = num.root(linear.held)
         return NormPlan(linear, spread, axes(linear.C, linear.R, spread))
 
-    def start(self, plan: Any, prior: Prior) -> KalmanState:
-        return super().start(plan.linear, prior)
+    def start(self, plan: NormPlan, prior: Prior) -> KalmanState:
+        return self.linear.start(plan.linear, prior)
 
-    def predict(self, plan: Any, state: Any, known_u: Array) -> Any:
-        return super().predict(plan.linear, state, known_u)
+    def predict(self, plan: NormPlan, state: KalmanState, known_u: Array) -> KalmanState:
+        return self.linear.predict(plan.linear, state, known_u)
 
-    def innovation(self, plan: Any, state: Any, received: Received) -> Innovation:
-        return super().innovation(plan.linear, state, received)
+    def innovation(self, plan: NormPlan, state: KalmanState, received: Received) -> Innovation:
+        return self.linear.innovation(plan.linear, state, received)
 
-    def gain(self, plan: Any, state: Any, innovation: Innovation) -> Array:
-        """That of the linear filter; the correction itself is not linear."""
-        return super().gain(plan.linear, state, innovation)
+    def gain(self, plan: NormPlan, state: KalmanState, innovation: Innovation) -> Array:
+        """Return the linear filter's gain; the correction itself is not linear."""
+        return self.linear.gain(plan.linear, state, innovation)
 
-    def forget(self, plan: Any, state: Any, where: Array) -> KalmanState:
-        return super().forget(plan.linear, state, where)
+    def forget(self, plan: NormPlan, state: KalmanState, where: Array) -> KalmanState:
+        return self.linear.forget(plan.linear, state, where)
 
-    def update(self, plan: Any, state: Any, innovation: Innovation, accept: Array) -> Any:
+    def estimate(self, state: KalmanState) -> Array:
+        return state.x
+
+    def update(self, plan: NormPlan, state: KalmanState, innovation: Innovation, accept: Array) -> KalmanState:
         linear, r = plan.linear, np.where(accept, innovation.r, 0.0)
         x = state.x + self._move(plan, state.P, r, accept)
         if linear.held is not None:
             return KalmanState(x, None)
-        return KalmanState(x, super().update(linear, state, Innovation(np.zeros_like(r), innovation.S), accept).P)
+        return KalmanState(x, self.linear.update(linear, state, Innovation(np.zeros_like(r), innovation.S), accept).P)
 
     def _move(self, plan: NormPlan, P: Array | None, r: Array, accept: Array) -> Array:
-        """xh - xb (B, N, n)."""
+        """Return xh - xb (B, N, n)."""
         linear, held = plan.linear, plan.linear.held if P is None else one_row(P)
         assert held is not None
         held = held.reshape(-1, *held.shape[-3:])  # (1, N, n, n), or (B, N, n, n) where the rows differ
@@ -201,7 +211,7 @@ class NormResilientFilter(Norm, DistributedFilter):
         return np.asarray(num.elsewhere(known, out, self._apart, r, accept, linear.C[None], linear.R[None], spread))
 
     def _apart(self, r: Array, accept: Array, C: Array, R: Array, spread: Array) -> Array:
-        """xh - xb (M, 1, n) of problems with a decomposition of their own: r and accept (M, 1, q), C, R and spread (M, 1, ...)."""
+        """Return xh - xb (M, 1, n) of problems that are decomposed one by one: r, accept (M, 1, q); C, R and spread (M, 1, ...)."""
         each = axes(C[:, 0] * accept[:, 0, :, None], alone(R, accept)[:, 0], spread[:, 0])
         u = in_ball(_times(each.turn, r[:, 0])[:, None], self.lam * each.half[:, None])
         return self.lam * _times(each.push, u[:, 0])[:, None]

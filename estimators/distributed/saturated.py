@@ -2,16 +2,16 @@
 
 Y. Chen, S. Kar, J. M. F. Moura, Resilient Distributed Estimation: Sensor Attacks, arXiv 1709.06156.
 
-The paper's: agents estimate a parameter that does not change, theta, from y_n = theta + noise. Each adds to its estimate a consensus term
+In the paper agents estimate a constant parameter theta from y_n = theta + noise. Each adds to its estimate a consensus term
 and its innovation, whose length is cut at a threshold; all three weights shrink in time:
 
     x_n+ = x_n - beta_t sum_{l ~ n} (x_n - x_l) + alpha_t k_n (y_n - x_n),          k_n = min(1, gamma_t / |y_n - x_n|)
 
 If fewer than half of the agents are attacked, all estimates converge to theta.
 
-The carry-over: a state that moves is never known for good, so that the weights cannot shrink to nothing. The fused prediction xb_i of the
-distributed Kalman filter takes the place of the consensus term, its gain K_i that of alpha_t, and the length is measured by the covariance
-S_i of the innovation, which with the varying gain shrinks from the prior's to the steady one, as gamma_t does:
+The carry-over: a moving state is never known for good, so that the weights cannot shrink to nothing. The fused prediction xb_i of the
+distributed Kalman filter replaces the consensus term; its gain K_i replaces alpha_t. The covariance S_i of the innovation measures the
+length. With the varying gain it shrinks from the prior's to the steady one, as gamma_t does:
 
     x_i = xb_i + k_i K_i r_i,          k_i = min(1, gamma / sqrt(r_i' S_i^-1 r_i / q))
 
@@ -20,7 +20,7 @@ gamma sqrt(q lambda_max(K_i S_i K_i')).
 """
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
@@ -29,7 +29,7 @@ from tailgate.core import Array, Innovation, Positive, param
 from tailgate.core.registry import register
 from tailgate.estimators.compose import AcceptAll, Composed
 from tailgate.estimators.distributed.distributed_kalman import ALARM, DistributedFilter, FusionPlan, gate_of
-from tailgate.estimators.filters.kalman import GAIN, Gain, alone
+from tailgate.estimators.filters.kalman import GAIN, Gain, KalmanState, alone
 from tailgate.estimators.parts import Detector, Filter, Mitigation
 
 REFERENCE = "Y. Chen, S. Kar, J. M. F. Moura, Resilient Distributed Estimation: Sensor Attacks, arXiv 1709.06156, 2017"
@@ -44,7 +44,7 @@ class SaturatedFilter(DistributedFilter):
     gamma: Positive = param(1.0, GAMMA)
     steady: bool = param(True, "hold gain and covariance where they settle when nothing is missed")
 
-    def update(self, plan: FusionPlan, state: Any, innovation: Innovation, accept: Array) -> Any:
+    def update(self, plan: FusionPlan, state: KalmanState, innovation: Innovation, accept: Array) -> KalmanState:
         r, S = innovation
         if not num.every(accept):
             r, S = r * accept, alone(S, accept)

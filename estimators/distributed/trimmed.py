@@ -5,8 +5,8 @@ The state is split into the modes of A, and each agent estimates each mode in on
     a mode that it detects with its own sensors: by itself, whatever the others say (here with the steady Kalman filter of what it detects);
     a mode that it does not: z_i+ = J (mean of what is left of its parents' z_l without the F highest and the F lowest), number by number.
 
-Parents are agreed upon beforehand: those who detect the mode know it; then, round after round, whoever hears 2F + 1 who know it learns it
-from these. No F agents in a neighbourhood can then pull an honest agent out of the range of the honest ones, whatever they send. Modes that
+Parents are agreed upon beforehand. The agents that detect a mode know it. Then, round after round, each agent that hears 2F + 1 agents who
+know it learns it from these. No F agents in a neighbourhood can then pull an honest agent out of the range of the honest ones. Modes that
 die out need no consensus: every agent predicts them, and corrects what it sees of them.
 
 It protects the agents that are not attacked from those that are. An agent whose own sensors are attacked is as wrong as its own filter.
@@ -33,8 +33,8 @@ from tailgate.estimators.parts import Detector, Filter, Mitigation
 REFERENCE = "A. Mitra, S. Sundaram, Byzantine-Resilient Distributed Observers for LTI Systems, Automatica 108, 2019"
 FAULTY = "F: attacked neighbours of an agent that are tolerated, of each mode"
 CLUSTER = 1e-4  # eigenvalues this close are one
-SHIFT = 1e-6  # from an eigenvalue, at which the inverse iteration stands
-ROUNDS = 40  # of it
+SHIFT = 1e-6  # distance of the inverse iteration's shift from the eigenvalue
+ROUNDS = 40  # rounds of the inverse iteration
 GOLDEN = 0.6180339887498949
 
 
@@ -47,7 +47,7 @@ class Block(NamedTuple):
 
 
 class Lesson(NamedTuple):
-    """Who learns a mode from whom."""
+    """A mode, and the agents that learn it, each with its parents."""
 
     V: Array  # (n, m)
     W: Array  # (m, n)
@@ -55,7 +55,7 @@ class Lesson(NamedTuple):
 
 
 class TrimmedPlan(NamedTuple):
-    """What LinearFilter reads, and the lessons."""
+    """The constants of LinearFilter, and the lessons."""
 
     A: Array
     B: Array
@@ -69,7 +69,7 @@ class TrimmedPlan(NamedTuple):
 
 
 def _orthonormal(X: Array) -> Array:
-    """The columns of X (n, m) made orthonormal from left to right, twice against rounding; those that depend on others become 0."""
+    """Return the columns of X (n, m) made orthonormal from left to right, twice against rounding; dependent ones become 0."""
     out = np.zeros_like(X)
     for j in range(X.shape[1]):
         v = X[:, j] / max(float(np.max(np.abs(X[:, j]))), 1e-300)
@@ -83,7 +83,7 @@ def _orthonormal(X: Array) -> Array:
 
 
 def _eigenspace(A: Array, value: complex, size: int) -> Array:
-    """Orthonormal columns (n, size) of the generalised eigenvectors of `value` and its conjugate, by inverse iteration."""
+    """Return orthonormal columns (n, size) of the generalised eigenvectors of `value` and its conjugate, by inverse iteration."""
     shifted, eye = value + SHIFT, np.eye(len(A))
     P = A - shifted.real * eye
     if value.imag:
@@ -95,7 +95,7 @@ def _eigenspace(A: Array, value: complex, size: int) -> Array:
 
 
 def _complement(X: Array) -> Array:
-    """Orthonormal columns (n, n - k) that complete the k columns of X to a basis."""
+    """Return orthonormal columns (n, n - k) that complete the k columns of X to a basis."""
     n, k = X.shape
     basis, out = _orthonormal(X), np.zeros((n, 0))
     for _ in range(n - k):
@@ -109,7 +109,7 @@ def _complement(X: Array) -> Array:
 
 
 def clusters(A: Array) -> list[tuple[complex, int]]:
-    """The eigenvalues of A that do not die out, with imaginary part >= 0, rounded; and how many states belong to each."""
+    """Return the eigenvalues of A that do not die out, with imaginary part >= 0, rounded; and the number of states of each."""
     from scipy import linalg  # takes long to import
 
     left = sorted((complex(v) for v in linalg.eigvals(A) if v.imag >= -CLUSTER), key=lambda v: (v.real, v.imag))
@@ -127,7 +127,7 @@ def clusters(A: Array) -> list[tuple[complex, int]]:
 
 
 def split(A: Array) -> tuple[list[Block], Block]:
-    """The lasting modes of A, and one block of all that dies out.
+    """Return the lasting modes of A, and one block of all that dies out.
 
     Only the rounded eigenvalues come from LAPACK; from them on the arithmetic is in fixed order. Raises NotApplicable for a chain of states
     that is too long for it.
@@ -137,7 +137,7 @@ def split(A: Array) -> tuple[list[Block], Block]:
     V = [_eigenspace(A, value, size) for value, size in found]
     for (value, size), basis in zip(found, V, strict=True):
         if not basis.any(axis=0).all():
-            wanted = "modes whose generalised eigenvectors rounding lets apart"
+            wanted = "modes whose generalised eigenvectors differ by more than rounding"
             raise NotApplicable("defence trimmed_consensus", f"a chain of {size} states at the eigenvalue {value:g}", wanted)
     V.append(_complement(np.concatenate([*dual, np.zeros((len(A), 0))], axis=1)))
     W, first, out = num.solve(np.concatenate(V, axis=1), np.eye(len(A))), 0, []
@@ -148,7 +148,7 @@ def split(A: Array) -> tuple[list[Block], Block]:
 
 
 def detects(A: Array, C: Array, block: Block) -> bool:
-    """Whether the readings C x (q, n) tell all states of a block: its observability matrix has full rank."""
+    """Return True if the readings C x (q, n) determine all states of a block: its observability matrix has full rank."""
     J, rows = num.product(num.product(block.W, A), block.V), [num.product(C, block.V)]
     for _ in range(J.shape[0] - 1):
         rows.append(num.product(rows[-1], J))
@@ -165,7 +165,7 @@ def detects(A: Array, C: Array, block: Block) -> bool:
 
 
 def lessons(graph: Array, sources: list[int], faulty: int) -> tuple[tuple[tuple[int, tuple[int, ...]], ...], list[int]]:
-    """(agent, parents) of those who can learn a mode that `sources` know, and those who cannot."""
+    """Return (agent, parents) of those who can learn a mode that `sources` know, and those who cannot."""
     heard, known = neighbours(graph), set(sources)
     out: list[tuple[int, tuple[int, ...]]] = []
     while True:
@@ -178,7 +178,7 @@ def lessons(graph: Array, sources: list[int], faulty: int) -> tuple[tuple[tuple[
 
 
 def trimmed_mean(z: Array, faulty: int) -> Array:
-    """Mean (B, m) of z (B, p, m) over p, without the `faulty` highest and lowest of each number."""
+    """Return the mean (B, m) of z (B, p, m) over p, without the `faulty` highest and lowest of each number."""
     ranked = np.sort(z, axis=1)[:, faulty : z.shape[1] - faulty]
     total = ranked[:, 0]
     for place in range(1, ranked.shape[1]):
@@ -188,12 +188,10 @@ def trimmed_mean(z: Array, faulty: int) -> Array:
 
 @register("filter", "trimmed_consensus", reference=REFERENCE)
 @dataclass(frozen=True)
-class TrimmedFilter(LinearFilter):
+class TrimmedFilter(LinearFilter[TrimmedPlan]):
     """Local filters for what an agent detects, and a trimmed mean of its parents for every other mode."""
 
     faulty: Count = param(1, FAULTY)
-
-    steady = True
 
     def prepare(self, model: Model) -> TrimmedPlan:
         lasting, rest = split(model.A)
@@ -218,7 +216,7 @@ class TrimmedFilter(LinearFilter):
         )
 
     def _local(self, model: Model, i: int, blocks: list[Block]) -> Array:
-        """P- (n, n) of the steady filter of agent i for these blocks alone."""
+        """Return P- (n, n) of the steady filter of agent i for these blocks alone."""
         V, W = np.concatenate([b.V for b in blocks], axis=1), np.concatenate([b.W for b in blocks])
         if not V.shape[1]:
             return np.zeros_like(model.A)

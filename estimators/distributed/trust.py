@@ -2,9 +2,9 @@
 
 I. Matei, J. S. Baras, V. Srinivasan, Trust-Based Multi-Agent Filtering for Increased Smart Grid Security, MED 2012.
 
-The paper's idea: an agent mixes its neighbours' estimates with its own, weighed by its trust in them; who departs much from what is
-expected loses trust, and who has little is disregarded. Here the weights enter the fusion of the distributed Kalman filter (thesis
-(6.19)-(6.25)), what is expected of a neighbour is the own prediction, and the law by which trust moves is ours:
+The paper's idea: an agent mixes its neighbours' estimates with its own, weighed by its trust in them. A neighbour that departs much from
+the expected value loses trust; one with little trust is disregarded. Here the weights enter the fusion of the distributed Kalman filter
+(thesis (6.19)-(6.25)). The expected value is the own prediction; the law by which trust moves is ours:
 
     z_ij  = max_k |xb_j,k - xb_i,k| / sqrt(M_i,kk + M_j,kk)          M_j = A P_j A' + Sw, the covariance that j gives what it sends
     T_ij  = min( (threshold / z_ij)^2,  T_ij + rate (1 - T_ij) )      T_ii = 1, and T_ij = 1 at the start: lost at once, regained slowly
@@ -16,7 +16,7 @@ whose own sensors are attacked distrusts the honest. With a gate it is `composed
 """
 
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar
 
 import numpy as np
 
@@ -26,20 +26,12 @@ from tailgate.core.registry import register
 from tailgate.estimators.compose import AcceptAll, Composed
 from tailgate.estimators.distributed.disagreement import THRESHOLD, disagreement
 from tailgate.estimators.distributed.distributed_kalman import ALARM, DistributedFilter, FusionPlan, gate_of
-from tailgate.estimators.filters.kalman import GAIN, Gain
+from tailgate.estimators.filters.kalman import GAIN, Gain, KalmanState
 from tailgate.estimators.parts import Detector, Filter, Mitigation
 
 REFERENCE = "I. Matei, J. S. Baras, V. Srinivasan, Trust-Based Multi-Agent Filtering for Increased Smart Grid Security, MED 2012"
 RATE = "share of the lost trust that is regained in a step without disagreement [-]"
 CUTOFF = "trust below which a neighbour is disregarded [-]"
-
-
-class TrustState(NamedTuple):
-    """x (B, N, n) and P (B, N, n, n) as in KalmanState; trust (B, N, N), [i, j] that of i in j."""
-
-    x: Array
-    P: Array | None
-    trust: Array
 
 
 @register("filter", "trust_dkf", reference=REFERENCE)
@@ -52,24 +44,23 @@ class TrustFilter(DistributedFilter):
     cutoff: Probability = param(0.1, CUTOFF)
     steady: bool = param(False, "hold gain and covariance where they settle when nothing is missed")
 
-    def start(self, plan: FusionPlan, prior: Prior) -> Any:
+    def start(self, plan: FusionPlan, prior: Prior) -> KalmanState:
         agents = prior.mean.shape[1]
-        return TrustState(*super().start(plan, prior), num.full((len(prior.mean), agents, agents), 1.0))
+        return super().start(plan, prior)._replace(trust=num.full((len(prior.mean), agents, agents), 1.0))
 
-    def predict(self, plan: FusionPlan, state: Any, known_u: Array) -> Any:
+    def predict(self, plan: FusionPlan, state: KalmanState, known_u: Array) -> KalmanState:
+        assert state.trust is not None
         x, M = self.forecast(plan, state, known_u), self.spread(plan, state)
         z = np.maximum(disagreement(plan.heard, x, M) / self.threshold, 1.0)
         trust = np.minimum(1.0 / (z * z), state.trust + self.rate * (1.0 - state.trust))
         weight = np.where(trust < self.cutoff, 0.0, trust)
-        return TrustState(*self.fuse(plan, x, M, weight), trust)
+        return self.fuse(plan, x, M, weight)._replace(trust=trust)
 
-    def update(self, plan: FusionPlan, state: Any, innovation: Innovation, accept: Array) -> Any:
-        new = super().update(plan, state, innovation, accept)
-        return TrustState(new.x, new.P, state.trust)
+    def update(self, plan: FusionPlan, state: KalmanState, innovation: Innovation, accept: Array) -> KalmanState:
+        return super().update(plan, state, innovation, accept)._replace(trust=state.trust)
 
-    def forget(self, plan: FusionPlan, state: Any, where: Array) -> Any:
-        new = super().forget(plan, state, where)
-        return TrustState(new.x, new.P, state.trust)
+    def forget(self, plan: FusionPlan, state: KalmanState, where: Array) -> KalmanState:
+        return super().forget(plan, state, where)._replace(trust=state.trust)
 
 
 @register("defence", "trust_dkf", reference=REFERENCE)

@@ -28,7 +28,7 @@ class KalmanAdapter:
     """filterpy.kalman.KalmanFilter; base of the adapters whose memory is x and P."""
 
     def build(self, n: int, q: int, m: int) -> Any:
-        """filterpy's object for n states, q sensors and m inputs."""
+        """Return filterpy's object for n states, q sensors and m inputs."""
         return import_module("filterpy.kalman").KalmanFilter(dim_x=n, dim_z=q, dim_u=m)
 
     def reset(self, model: Model, prior: Prior) -> None:
@@ -55,7 +55,7 @@ class KalmanAdapter:
         self.filter.predict(u=u)
 
     def update(self, y: Array, C: Array, R: Array) -> float:
-        """Use the readings y with matrix C and noise R; returns r' S^-1 r."""
+        """Use the readings y with matrix C and noise R; return r' S^-1 r."""
         self.filter.update(y, R=R, H=C)
         return float(num.quadratic(self.filter.y, self.filter.SI))
 
@@ -92,7 +92,7 @@ class UnscentedAdapter(KalmanAdapter):
 
 
 def root(P: Array) -> Array:
-    """Upper triangular U (n, n) with U' U = P, also where P is singular: what has no variance left gets a row of zeros."""
+    """Return upper triangular U (n, n) with U' U = P, also where P is singular: a state without variance gets a row of zeros."""
     U = np.zeros_like(P)
     for i in range(len(P)):
         rest = P[i, i:].copy()
@@ -108,7 +108,7 @@ class HInfinityAdapter(KalmanAdapter):
 
     filterpy's class warns that it is likely wrong: it scales the correction by F once too often, predicts no covariance, and its gain is
     the one-step predictor's, which overshoots where P-^-1 > gamma C'R^-1 C fails. So its update is used with F = I and W = 0, with gamma
-    for the covariance and without for the gain, and the prediction is made here (Hassibi, Sayed and Kailath 1996):
+    for the covariance and without for the gain. The prediction is made here (Hassibi, Sayed and Kailath 1996):
 
         K = P- C' S^-1          P^-1 = P-^-1 + C'R^-1 C - gamma C'R^-1 C
 
@@ -176,7 +176,7 @@ class InteractingAdapter(KalmanAdapter):
         return x, score
 
     def update(self, y: Array, C: Array, R: Array) -> float:
-        """The score is the nominal model's."""
+        """Update every model; return the nominal model's score."""
         for f, factor in zip(self.bank, self.modes.factors, strict=True):
             f.dim_z, f.H, f.R = len(y), C, factor * R
         with np.errstate(invalid="ignore"):  # it prepares the next step with probabilities of 0; ours are floored before that

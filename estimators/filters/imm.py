@@ -42,21 +42,21 @@ class ImmState(NamedTuple):
 
 @dataclass(frozen=True)
 class Modes:
-    """The models and how the world moves between them."""
+    """The models, and the chances of moving from one to another."""
 
     factors: Factors = param((1.0, 1e4), "factor on R in each model, the nominal one first [-]")
     leave: Inside = param(0.01, "probability a step of leaving the nominal model, shared among the others [-]")
     back: Inside = param(0.1, "probability a step of each other model to return to the nominal one [-]")
 
     def moves(self) -> Array:
-        """(M, M) transition probabilities, from row to column."""
+        """Return (M, M) transition probabilities, from row to column."""
         others = len(self.factors) - 1
         out = np.diag([1.0 - self.leave if others else 1.0, *[1.0 - self.back] * others])
         out[0, 1:], out[1:, 0] = self.leave / max(others, 1), self.back
         return out
 
     def share(self) -> Array:
-        """(M,) long-run share of each model: what holds before the first measurement."""
+        """Return the long-run share (M,) of each model: its probability before the first measurement."""
         others = len(self.factors) - 1
         if not others:
             return np.ones(1)
@@ -98,7 +98,7 @@ class InteractingModels(Modes):
 
 
 def mix(state: ImmState, moves: Array) -> list[tuple[KalmanState, Array]]:
-    """The mixed start of each model's step, and its probability c (B, N) before the measurement."""
+    """Return the mixed start of each model's step, and its probability c (B, N) before the measurement."""
     out = []
     for j in range(len(state.models)):
         parts = [moves[i, j] * state.mu[..., i] for i in range(len(state.models))]
@@ -110,14 +110,14 @@ def mix(state: ImmState, moves: Array) -> list[tuple[KalmanState, Array]]:
 
 
 def _spread(w: Sequence[Array], P: Sequence[Any], off: Sequence[Array]) -> Array:
-    """sum_i w_i (P_i + off_i off_i') (B, N, n, n)."""
+    """Return sum_i w_i (P_i + off_i off_i') (B, N, n, n)."""
     if off[0].shape[-1] > SMALL:
         return num.moment(w, P, off)
     return _total([a[..., None, None] * (p + d[..., :, None] * d[..., None, :]) for a, p, d in zip(w, P, off, strict=True)])
 
 
 def log_likelihood(innovation: Innovation, valid: Array) -> Array:
-    """log N(r; 0, S) (B, N) of the readings that were received."""
+    """Return log N(r; 0, S) (B, N) of the readings that were received."""
     r, S = innovation
     left = np.where(valid[..., :, None] & valid[..., None, :], S, np.eye(r.shape[-1]))  # a missing one weighs the same in every model
     out = -0.5 * (num.quadratic(r, num.inverse(left)) + np.count_nonzero(valid, axis=-1) * LOG_2_PI)
@@ -130,7 +130,7 @@ def log_likelihood(innovation: Innovation, valid: Array) -> Array:
 
 
 def weigh(logs: Sequence[Array]) -> tuple[Array, Array]:
-    """Mode probabilities (B, N, M) from their logarithms up to a constant, and the log odds (B, N) against the first; 0 if it is alone."""
+    """Return mode probabilities (B, N, M) from logarithms up to a constant, and the log odds (B, N) against the first; 0 if it is alone."""
     largest = logs[0]
     for log in logs[1:]:
         largest = np.maximum(largest, log)
@@ -138,15 +138,15 @@ def weigh(logs: Sequence[Array]) -> tuple[Array, Array]:
     total = _total(weights)
     if len(logs) == 1:
         return num.stack([weights[0] / total]), np.zeros_like(total)
-    rival = logs[1]
+    other = logs[1]
     for log in logs[2:]:
-        rival = np.maximum(rival, log)
-    odds = rival + num.log(_total([num.exp(log - rival) for log in logs[1:]])) - logs[0]
+        other = np.maximum(other, log)
+    odds = other + num.log(_total([num.exp(log - other) for log in logs[1:]])) - logs[0]
     return num.stack([w / total for w in weights]), odds
 
 
 def combine(columns: Sequence[Array], mu: Array) -> Array:
-    """sum_j mu_j x_j (B, N, n)."""
+    """Return sum_j mu_j x_j (B, N, n)."""
     return _total([mu[..., j, None] * x for j, x in enumerate(columns)])
 
 

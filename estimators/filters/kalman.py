@@ -7,13 +7,14 @@
 A sensor that is not accepted has its row of C, and its covariances in S, set to zero: no sensor at all gives x = x-, P = P-.
 
 The steady filter holds P- at the solution of P- = A (P- - K S K') A' + Q. Its gain is constant for each set of sensors: where some are
-left out, the others correct with the gain that they have alone at the same P-. What it misses does not widen its S.
+left out, the others correct with the gain that they have alone at the same P-. Missing readings do not widen its S.
 """
 
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple, cast
+from typing import Generic, Literal, NamedTuple, Protocol, cast
 
 import numpy as np
+from typing_extensions import TypeVar
 
 from tailgate import num
 from tailgate.base.errors import NotApplicable
@@ -41,15 +42,40 @@ class KalmanPlan(NamedTuple):
     held: Array | None = None  # (N, n, n) P- of the steady filter
 
 
+class LinearPlan(Protocol):
+    """The constants that the recursion reads; see KalmanPlan for their shapes."""
+
+    @property
+    def A(self) -> Array: ...
+    @property
+    def B(self) -> Array: ...
+    @property
+    def c(self) -> Array: ...
+    @property
+    def C(self) -> Array: ...
+    @property
+    def R(self) -> Array: ...
+    @property
+    def Q(self) -> Array: ...
+    @property
+    def broad(self) -> Array: ...
+    @property
+    def held(self) -> Array | None: ...
+
+
+L = TypeVar("L", bound=LinearPlan, default=KalmanPlan)
+
+
 class KalmanState(NamedTuple):
     """x (B, N, n) and P (B, N, n, n), predicted or updated. P is None in a steady filter: its plan holds it."""
 
     x: Array
     P: Array | None
+    trust: Array | None = None  # (B, N, N) in [0, 1], [i, j] that of i in j; of a filter that weighs its neighbours by it
 
 
 def alone(S: Array, keep: Array) -> Array:
-    """S with the covariances of the sensors that `keep` (B, N, q) leaves out set to zero: those that stay see their own marginal."""
+    """Return S with the covariances of the sensors outside `keep` (B, N, q) set to zero: the others keep their own marginal."""
     return cast(Array, num.elsewhere(keep.all(axis=-1), S, _marginal, S, keep))
 
 
@@ -60,8 +86,20 @@ def _marginal(S: Array, keep: Array) -> Array:
     return out
 
 
+def gain_of(S: Array, cross: Array) -> Array:
+    """Return the gain P- C' S^-1 (..., n, q) from S (..., q, q) and C P- (..., q, n)."""
+    return num.transpose(num.matmul(num.inverse(S), cross))
+
+
+def updated(x: Array, P: Array, r: Array, S: Array, cross: Array) -> tuple[Array, Array]:
+    """Return x (..., n) and P (..., n, n) after the update (4.7) with the innovation r (..., q), from S and `cross` = C P-."""
+    K = gain_of(S, cross)
+    P = P - num.matmul(K, cross)
+    return x + num.matvec(K, r), 0.5 * (P + num.transpose(P))
+
+
 def precision(R: Array) -> Array:
-    """R^-1 (q, q). Raises NotApplicable where a reading has no noise: the filter that asks divides by it."""
+    """Return R^-1 (q, q). Raise NotApplicable where a reading has no noise: the filter divides by it."""
     told = R.diagonal()
     if (told < LEAST).any():
         raise NotApplicable("sensor: noise variance", told.tolist(), f"{LEAST:g} or more in every reading: this filter divides by it")
@@ -70,7 +108,7 @@ def precision(R: Array) -> Array:
 
 @remembered("A", "C", "Q", "R")
 def broad(model: Model) -> Array:
-    """(n,) variances so large that the next measurement decides: a million times those after 100 steps of the filter."""
+    """Return variances (n,) so large that the next measurement decides: a million times those after 100 steps of the filter."""
     P = np.array(model.Q)
     if (model.R.diagonal(axis1=1, axis2=2) < LEAST).any():  # then the process has to be noisy
         unsure = (num.matmul(num.matmul(model.C, P), num.transpose(model.C)) + model.R).diagonal(axis1=1, axis2=2)
@@ -87,7 +125,7 @@ def broad(model: Model) -> Array:
 
 
 def riccati(A: Array, G: Array, Q: Array) -> Array | None:
-    """The predicted covariance P = A (P^-1 + G)^-1 A' + Q (n, n) of one agent, G being the information C' R^-1 C; None where it grows.
+    """Return P = A (P^-1 + G)^-1 A' + Q (n, n), predicted for one agent with the information G = C' R^-1 C; None where it grows.
 
     By structured doubling (Anderson 1978): round j gives what 2^j steps of the filter give.
     """
@@ -107,7 +145,7 @@ def riccati(A: Array, G: Array, Q: Array) -> Array | None:
 
 
 def _settle(A: Array, C: Array, Q: Array, R: Array, P: Array) -> Array:
-    """P- (n, n) after 64 more steps of the filter in Joseph's form, which wash out the rounding of the doubling."""
+    """Return P- (n, n) after 64 more steps of the filter in Joseph's form, which wash out the rounding of the doubling."""
     for _ in range(64):
         S = num.matmul(num.matmul(C, P), C.T) + R
         K = num.matmul(num.matmul(P, C.T), num.inverse(S))
@@ -120,8 +158,8 @@ def _settle(A: Array, C: Array, Q: Array, R: Array, P: Array) -> Array:
 
 @remembered("A", "C", "Q", "R")
 def steady_state(model: Model) -> Array:
-    """P- (N, n, n) at which the predicted covariances settle. Raises NotApplicable, naming the agents, where they do not."""
-    lost = blind(model, np.eye(model.agents, dtype=bool))  # the doubling may take a mode that nobody sees for one that settles
+    """Return P- (N, n, n) at which the predicted covariances settle. Raise NotApplicable, naming the agents, where they do not."""
+    lost = blind(model, np.eye(model.agents, dtype=bool))  # the doubling may let an unseen mode settle
     out = []
     for i in range(0 if lost else model.agents):
         C = model.C[i]
@@ -136,19 +174,19 @@ def steady_state(model: Model) -> Array:
     return np.stack(out)
 
 
-class LinearFilter:
-    """The recursion, on a KalmanPlan or what has its fields. A subclass says in `steady` whether P- is held."""
+def kalman_plan(model: Model, steady: bool) -> KalmanPlan:
+    """Return the constants of the recursion; a steady one holds P- where it settles."""
+    held = steady_state(model) if steady else None
+    return KalmanPlan(model.A, model.B, model.c, model.C, model.Q, model.R, broad(model), held)
 
-    steady: bool
 
-    def prepare(self, model: Model) -> Any:
-        held = steady_state(model) if self.steady else None
-        return KalmanPlan(model.A, model.B, model.c, model.C, model.Q, model.R, broad(model), held)
+class LinearFilter(Generic[L]):
+    """The recursion. A subclass makes the plan, a KalmanPlan or another type with its fields."""
 
-    def start(self, plan: Any, prior: Prior) -> KalmanState:
+    def start(self, plan: L, prior: Prior) -> KalmanState:
         return KalmanState(prior.mean, prior.cov if plan.held is None else None)
 
-    def predict(self, plan: Any, state: KalmanState, known_u: Array) -> KalmanState:
+    def predict(self, plan: L, state: KalmanState, known_u: Array) -> KalmanState:
         x = num.matvec(plan.A, state.x) + num.matvec(plan.B, known_u) + plan.c
         if state.P is None:
             return KalmanState(x, None)
@@ -157,16 +195,16 @@ class LinearFilter:
         half = num.matmul(plan.A, state.P)
         return KalmanState(x, num.matmul(plan.A, num.transpose(half)) + plan.Q)
 
-    def innovation(self, plan: Any, state: KalmanState, received: Received) -> Innovation:
+    def innovation(self, plan: L, state: KalmanState, received: Received) -> Innovation:
         r = np.where(received.valid, received.y - num.matvec(plan.C, state.x), 0.0)
         S = num.matmul(plan.C, num.transpose(self._cross(plan, state))) + plan.R
         return Innovation(r, alone(np.broadcast_to(S, (*r.shape, r.shape[-1])), received.valid))
 
-    def gain(self, plan: Any, state: KalmanState, innovation: Innovation) -> Array:
+    def gain(self, plan: L, state: KalmanState, innovation: Innovation) -> Array:
         cross = num.transpose(self._cross(plan, state))  # P- C'
         return num.matmul(cross, num.inverse(innovation.S))
 
-    def update(self, plan: Any, state: KalmanState, innovation: Innovation, accept: Array) -> KalmanState:
+    def update(self, plan: L, state: KalmanState, innovation: Innovation, accept: Array) -> KalmanState:
         S, r = innovation.S, innovation.r
         if len(plan.A) > SMALL and state.P is not None and plan.held is None:
             return KalmanState(*num.corrected(plan.C, num.inverse(alone(S, accept)), state.x, state.P, r, accept))
@@ -176,27 +214,24 @@ class LinearFilter:
             cross = cross * keep[..., None]
             S = alone(S, accept)
             r = r * keep
-        K = num.transpose(num.matmul(num.inverse(S), cross))
-        x = state.x + num.matvec(K, r)
         if state.P is None or plan.held is not None:
-            return KalmanState(x, None)
-        P = state.P - num.matmul(K, cross)
-        return KalmanState(x, 0.5 * (P + num.transpose(P)))
+            return KalmanState(state.x + num.matvec(gain_of(S, cross), r), None)
+        return KalmanState(*updated(state.x, state.P, r, S, cross))
 
-    def forget(self, plan: Any, state: KalmanState, where: Array) -> KalmanState:
-        """A steady filter forgets for this one step."""
+    def forget(self, plan: L, state: KalmanState, where: Array) -> KalmanState:
+        """Return the state with the broad covariance in the rows of `where` (B, N); a steady filter forgets for this one step."""
         return KalmanState(state.x, np.where(where[..., None, None], np.diag(plan.broad), self._predicted(plan, state)))
 
     def estimate(self, state: KalmanState) -> Array:
         return state.x
 
-    def _predicted(self, plan: Any, state: KalmanState) -> Array:
+    def _predicted(self, plan: L, state: KalmanState) -> Array:
         P = plan.held if state.P is None else state.P
         assert P is not None
         return P
 
-    def _cross(self, plan: Any, state: KalmanState) -> Array:
-        """C P- (B, N, q, n), or (N, q, n) where it is the same for all."""
+    def _cross(self, plan: L, state: KalmanState) -> Array:
+        """Return C P- (B, N, q, n), or (N, q, n) where it is the same for all."""
         return num.matmul(plan.C, self._predicted(plan, state))
 
 
@@ -206,6 +241,9 @@ class KalmanFilter(LinearFilter):
     """The textbook filter, with a time-varying gain or in steady state."""
 
     steady: bool = param(False, "hold gain and covariance where they settle when nothing is missed")
+
+    def prepare(self, model: Model) -> KalmanPlan:
+        return kalman_plan(model, self.steady)
 
 
 @register("defence", "kf", reference="R. E. Kalman, A New Approach to Linear Filtering and Prediction Problems, 1960")

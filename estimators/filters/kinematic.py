@@ -42,7 +42,7 @@ def require_kinematic(model: Model, where: str) -> None:
 
 
 class RegressionPlan(NamedTuple):
-    line: KalmanPlan  # of the fit, without process noise
+    line: KalmanPlan  # plan of the fit, without process noise
     T: float  # [s]
     rows: Array  # (W, 2, 3): of the present [d, v_L, a_L], the readings that are j steps old, j = 0, 1, ..., W - 1
     weight: Array  # (2,) of a reading [1/unit^2]
@@ -80,7 +80,7 @@ class JointRegression:
         return RegressionPlan(line, model.dt, rows, 1.0 / model.R[0].diagonal())
 
     def start(self, plan: RegressionPlan, prior: Prior) -> RegressionState:
-        """The ridge is centred on the prior's mean."""
+        """Return the state at step 1; the ridge is centred on the prior's mean."""
         shape = prior.mean.shape[:2]
         fit = KalmanState(prior.mean, num.full((*shape, STATES, STATES), np.diag(plan.line.broad)))
         past = num.zeros((*shape, self.window, 2))
@@ -101,13 +101,13 @@ class JointRegression:
         return LINE.gain(_at_stop(plan, state), state.fit, innovation)
 
     def update(self, plan: RegressionPlan, state: RegressionState, innovation: Innovation, accept: Array) -> RegressionState:
-        line, x, P = _at_stop(plan, state), *state.fit
+        line, x, P = _at_stop(plan, state), state.fit.x, state.fit.P
         assert P is not None
         y = innovation.r + num.matvec(line.C, x)
         H = np.where(accept[..., None], line.C, 0.0)
         K = num.transpose(num.matmul(num.inverse(alone(innovation.S, accept)), num.matmul(H, P)))
         left = np.eye(STATES) - num.matmul(K, H)
-        # Joseph's form: beside delta the usual difference would lose a variance, and its sign
+        # Joseph's form: next to delta the usual difference would lose a variance, and its sign
         P = num.matmul(left, num.transpose(num.matmul(left, P))) + num.matmul(K, num.matmul(line.R, num.transpose(K)))
         if self.forgetting < 1.0:
             some = np.asarray(accept.any(axis=-1))
@@ -130,14 +130,14 @@ class JointRegression:
         return state._replace(fit=LINE.forget(plan.line, state.fit, where))
 
     def estimate(self, state: RegressionState) -> Array:
-        """x (B, N, 4), the leader standing where the fit has stopped."""
+        """Return x (B, N, 4); a fitted leader that has stopped does not move."""
         x, (s, stopped) = state.fit.x.copy(order="K"), _stop(state)
         x[..., :2] = num.matvec(_rows(s, stopped), state.fit.x)
         x[..., LEAD_ACCEL] = np.where(stopped, 0.0, x[..., LEAD_ACCEL])
         return x
 
     def _restart(self, plan: RegressionPlan, state: RegressionState, where: Array) -> RegressionState:
-        """Least squares on the samples kept, with the ridge around the present fit, in the rows of `where` (B, N)."""
+        """Return least squares on the kept samples, with the ridge around the present fit, in the rows of `where` (B, N)."""
         x = state.fit.x
         theta = num.stack([x[..., GAP], x[..., RELATIVE_SPEED] + x[..., OWN_SPEED], x[..., LEAD_ACCEL]])
         M, b = num.full((*where.shape, 3, 3), np.eye(3) / self.delta), num.zeros((*where.shape, 3))
@@ -161,16 +161,17 @@ class JointRegression:
 
 
 def stop_time(speed: Array, a: Array, age: Array) -> Array:
-    """Time [s] to the instant at which a leader's fitted speed [m/s] passed zero, elementwise; `_stop` says of which ones."""
+    """Return the time [s] to the instant at which a leader's fitted speed [m/s] passed zero, elementwise; `_stop` selects the rows."""
     slowing = (speed < 0.0) & (a < 0.0)
     out: Array = np.where(slowing, np.maximum(-speed / np.where(slowing, a, -1.0), -age), 0.0)
     return out
 
 
 def _stop(state: RegressionState) -> tuple[Array, Array]:
-    """Time (B, N) from now to the instant at which the fitted leader's speed passed zero [s], 0 while it moves; and whether it did.
+    """Return the time (B, N) [s] from now to the instant at which the fitted leader's speed passed zero, 0 while it moves; and if it did.
 
-    Not before the first instant of the fit; nor where it is not slowing down, as one that stands may seem to do by noise.
+    It lies never before the first instant of the fit. A leader that does not slow down does not stop: noise may make one that is at rest
+    seem so.
     """
     x = state.fit.x
     speed = x[..., RELATIVE_SPEED] + x[..., OWN_SPEED]
@@ -178,7 +179,7 @@ def _stop(state: RegressionState) -> tuple[Array, Array]:
 
 
 def _rows(s: Array, stopped: Array) -> Array:
-    """(B, N, 2, 4): the readings that x predicts, those of a stopped leader as they were at the stop."""
+    """Return (B, N, 2, 4): the readings that x predicts; those of a stopped leader as they were at the stop."""
     H = num.zeros((*s.shape, 2, STATES))
     H[..., 0, GAP], H[..., 0, RELATIVE_SPEED], H[..., 0, LEAD_ACCEL], H[..., 0, OWN_SPEED] = 1.0, s, 0.5 * s * s, s
     H[..., 1, RELATIVE_SPEED], H[..., 1, OWN_SPEED] = ~stopped, np.where(stopped, -1.0, 0.0)
@@ -186,5 +187,5 @@ def _rows(s: Array, stopped: Array) -> Array:
 
 
 def _at_stop(plan: RegressionPlan, state: RegressionState) -> KalmanPlan:
-    """The fit's plan with the rows of the present step."""
+    """Return the fit's plan with the rows of the present step."""
     return plan.line._replace(C=_rows(*_stop(state)))

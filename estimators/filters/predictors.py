@@ -1,18 +1,18 @@
-"""Predictors that know no motion: each reading is extrapolated from its own past. They are here to be compared with.
+"""Predictors that know no motion: each reading is extrapolated from its own past. They are baselines.
 
     hold_last          y(k) = the last reading
     autoregressive     y(k) = w1 y(k-1) + ... + wp y(k-p), w by least squares; a prediction stands in for a missing one
     polynomial         y(k) = the polynomial that fits the last W readings best, at k
 
-The state that a sensor reads is its reading where that is used, else the prediction; a state that the known input alone decides, such as
-an own speed by odometry, follows that input; any other keeps its prior. S is that of a regression whose noise is the sensor's: R where
-nothing had to be learned.
+A state that a sensor reads equals the reading where that is used, else the prediction. A state that the known input alone decides, such as
+an own speed by odometry, follows that input. Any other keeps its prior. S is that of a regression with the sensor's noise: R where nothing
+had to be learned.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Generic, NamedTuple, TypeVar
 
 import numpy as np
 from pydantic import Field
@@ -30,12 +30,18 @@ Samples = Annotated[int, Field(ge=2, le=1000)]
 
 
 def read_states(model: Model, where: str) -> Array:
-    """(N, q) which state each sensor reads. Raises NotApplicable unless each reads one state itself, and no two of an agent the same."""
+    """Return the state (N, q) that each sensor reads.
+
+    Raise NotApplicable unless each reads one state itself, all different within an agent.
+    """
     direct = np.isin(model.C, (0.0, 1.0)).all() and (np.count_nonzero(model.C, axis=2) == 1).all()
     state = np.argmax(model.C, axis=2)
     if not direct or any(len(set(row)) < len(row) for row in state.tolist()):
         raise NotApplicable(where, "this sensor matrix", "sensors that each read one state directly, no two of an agent the same")
     return np.asarray(state)
+
+
+M = TypeVar("M")  # memory of a predictor
 
 
 class PredictorPlan(NamedTuple):
@@ -47,28 +53,28 @@ class PredictorPlan(NamedTuple):
     by_input: Array  # (n,) bool: these states
 
 
-class PredictorState(NamedTuple):
+class PredictorState(NamedTuple, Generic[M]):
     """Every leaf has B first."""
 
     x: Array  # (B, N, n)
     spread: Array  # (B, N, q) variance of the next reading about its prediction
-    past: Any  # what the predictor keeps of each sensor
+    past: M
 
 
 @dataclass(frozen=True)
-class Predictor:
-    """Base: a subclass says what it keeps (`begin`), what follows from it (`ahead`) and what it learns (`learn`)."""
+class Predictor(Generic[M]):
+    """Base class: a subclass chooses what it keeps (`begin`), what follows from it (`ahead`) and what it learns (`learn`)."""
 
-    def begin(self, plan: PredictorPlan, y: Array) -> Any:
-        """What is kept before the first reading; y (B, N, q) are the readings that the prior predicts."""
+    def begin(self, plan: PredictorPlan, y: Array) -> M:
+        """Return the memory before the first reading; y (B, N, q) are the readings that the prior predicts."""
         raise TypeError(f"{type(self).__name__} must define begin()")
 
-    def ahead(self, plan: PredictorPlan, past: Any) -> tuple[Any, Array, Array]:
-        """One step later: what is kept, the predicted readings (B, N, q), and their variance."""
+    def ahead(self, plan: PredictorPlan, past: M) -> tuple[M, Array, Array]:
+        """Return one step later: the memory, the predicted readings (B, N, q), and their variance."""
         raise TypeError(f"{type(self).__name__} must define ahead()")
 
-    def learn(self, plan: PredictorPlan, past: Any, y: Array, accept: Array) -> Any:
-        """What is kept after the readings y (B, N, q) of `accept` (B, N, q)."""
+    def learn(self, plan: PredictorPlan, past: M, y: Array, accept: Array) -> M:
+        """Return the memory after the readings y (B, N, q) of `accept` (B, N, q)."""
         raise TypeError(f"{type(self).__name__} must define learn()")
 
     def prepare(self, model: Model) -> PredictorPlan:
@@ -78,37 +84,37 @@ class Predictor:
         state = read_states(model, f"filter {type(self).__name__}")
         return PredictorPlan(model.C, R, agent, state, model.B * by_input[:, None], by_input)
 
-    def start(self, plan: PredictorPlan, prior: Prior) -> PredictorState:
+    def start(self, plan: PredictorPlan, prior: Prior) -> PredictorState[M]:
         y = num.matvec(plan.C, prior.mean)
         return PredictorState(prior.mean, num.full(y.shape, plan.R), self.begin(plan, y))
 
-    def predict(self, plan: PredictorPlan, state: PredictorState, known_u: Array) -> PredictorState:
+    def predict(self, plan: PredictorPlan, state: PredictorState[M], known_u: Array) -> PredictorState[M]:
         past, y, spread = self.ahead(plan, state.past)
         x = np.where(plan.by_input, num.matvec(plan.inputs, known_u), state.x)
         x[:, plan.agent, plan.state] = np.clip(y, -LARGEST, LARGEST)
         return PredictorState(x, spread, past)
 
-    def innovation(self, plan: PredictorPlan, state: PredictorState, received: Received) -> Innovation:
+    def innovation(self, plan: PredictorPlan, state: PredictorState[M], received: Received) -> Innovation:
         r = np.where(received.valid, received.y - num.matvec(plan.C, state.x), 0.0)
         S = num.zeros((*r.shape, r.shape[-1]))
         for i in range(r.shape[-1]):
             S[..., i, i] = state.spread[..., i]
         return Innovation(r, S)
 
-    def update(self, plan: PredictorPlan, state: PredictorState, innovation: Innovation, accept: Array) -> PredictorState:
+    def update(self, plan: PredictorPlan, state: PredictorState[M], innovation: Innovation, accept: Array) -> PredictorState[M]:
         y = num.matvec(plan.C, state.x) + np.where(accept, innovation.r, 0.0)
         x = state.x.copy(order="K")
         x[:, plan.agent, plan.state] = y
         return PredictorState(x, state.spread, self.learn(plan, state.past, y, accept))
 
-    def forget(self, plan: PredictorPlan, state: PredictorState, where: Array) -> PredictorState:
-        """Nothing to forget: the next reading is believed entirely."""
+    def forget(self, plan: PredictorPlan, state: PredictorState[M], where: Array) -> PredictorState[M]:
+        """Return the state: the next reading is believed entirely anyway."""
         return state
 
-    def gain(self, plan: PredictorPlan, state: PredictorState, innovation: Innovation) -> Array:
+    def gain(self, plan: PredictorPlan, state: PredictorState[M], innovation: Innovation) -> Array:
         return np.broadcast_to(num.transpose(plan.C), (*innovation.r.shape[:2], *plan.C.shape[:0:-1]))
 
-    def estimate(self, state: PredictorState) -> Array:
+    def estimate(self, state: PredictorState[M]) -> Array:
         return state.x
 
 
@@ -118,7 +124,7 @@ class Last(NamedTuple):
 
 @register("filter", "hold_last")
 @dataclass(frozen=True)
-class HoldLast(Predictor):
+class HoldLast(Predictor[Last]):
     """Holds the last reading."""
 
     def begin(self, plan: PredictorPlan, y: Array) -> Last:
@@ -140,7 +146,7 @@ class Lags(NamedTuple):
 
 @register("filter", "autoregressive", reference="S. Haykin, Adaptive Filter Theory, 2002: recursive least squares")
 @dataclass(frozen=True)
-class Autoregressive(Predictor):
+class Autoregressive(Predictor[Lags]):
     """Autoregression of each reading on its own last ones, by recursive least squares; it holds the last one at first."""
 
     order: Order = param(4, "readings that the next one is regressed on")
@@ -157,7 +163,7 @@ class Autoregressive(Predictor):
 
     def learn(self, plan: PredictorPlan, past: Lags, y: Array, accept: Array) -> Lags:
         h, w, P, seen = past
-        known = accept & (seen >= self.order)  # what stands for readings before the first would be learned for good
+        known = accept & (seen >= self.order)  # the values before the first reading would be learned for good
         g = num.matvec(P, h)
         j = g / (1.0 + num.dot(h, g))[..., None]
         error = y - np.clip(num.dot(w, h), -LARGEST, LARGEST)
@@ -175,7 +181,7 @@ class Ring(NamedTuple):
 
 @register("filter", "polynomial", reference="W. S. Cleveland, Robust locally weighted regression, 1979: local least squares, unweighted")
 @dataclass(frozen=True)
-class Polynomial(Predictor):
+class Polynomial(Predictor[Ring]):
     """Least-squares polynomial through the last readings of each sensor, extrapolated."""
 
     degree: Degree = param(2, "degree of the polynomial")
@@ -211,7 +217,7 @@ class Polynomial(Predictor):
 
 
 def _powers(t: Array, size: int) -> Array:
-    """(..., size): 1, t, t^2, ..."""
+    """Return (..., size): 1, t, t^2, ..."""
     out = [np.ones_like(t)]
     for _ in range(size - 1):
         out.append(out[-1] * t)

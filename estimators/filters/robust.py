@@ -3,8 +3,8 @@
     y = C x + v + z, z sparse:      z = argmin (r - z)' W (r - z) + sum_i lam_i |z_i|,      W = S^-1
                                     x = x- + K (r - z),      with the steady P-, S and K
 
-The problem is strictly convex, so that z is unique, and r' W r is the price of z = 0. What is computed is y = r - z, the part of the
-innovation that is believed: it is the fixed point of
+The problem is strictly convex, so that z is unique, and r' W r is the price of z = 0. The code computes y = r - z, the believed part of
+the innovation. It is the fixed point of
 
     y_i = clip(r_i, (-lam_i/2 - b_i) / W_ii, (lam_i/2 - b_i) / W_ii),      b_i = sum_{j != i} W_ij y_j
 
@@ -23,18 +23,18 @@ from tailgate.core import Array, Innovation, Model, Positive, param
 from tailgate.core.registry import register
 from tailgate.estimators.compose import AcceptAll, Composed
 from tailgate.estimators.detectors.chi_square import ChiSquare
-from tailgate.estimators.filters.kalman import KalmanPlan, KalmanState, LinearFilter, alone, steady_state
+from tailgate.estimators.filters.kalman import KalmanPlan, KalmanState, LinearFilter, alone, kalman_plan, steady_state
 from tailgate.estimators.parts import Detector, Filter, Memoryless, Mitigation, Verdict
 
 ROUNDS = 1000  # far above what was ever seen: a guard against rounding
 ACCURACY = 1e-9  # asked of the interior-point solver
 PATIENCE = 3  # rounds of block changes without progress
-TOLERANCE = 1e-12  # of the optimality conditions, relative to lam
-ROUNDING = 8 * float(np.finfo(np.float64).eps)  # of a sum, relative to its largest term
+TOLERANCE = 1e-12  # error of the optimality conditions, relative to lam
+ROUNDING = 8 * float(np.finfo(np.float64).eps)  # error of a sum, relative to its largest term
 
 
 def believed(r: Array, S: Array, lam: Array) -> Array:
-    """y = r - z (B, N, q) for r and lam (B, N, q) and S (B, N, q, q). A sensor without outlier keeps every bit of its r."""
+    """Return y = r - z (B, N, q) for r and lam (B, N, q) and S (B, N, q, q). A sensor without outlier keeps every bit of its r."""
     W = num.inverse(S)
     if r.shape[-1] == 2:
         return _pair(r, S, W, 0.5 * lam)
@@ -45,7 +45,7 @@ def believed(r: Array, S: Array, lam: Array) -> Array:
 
 
 def _pair(r: Array, S: Array, W: Array, half: Array) -> Array:
-    """Two sensors in closed form: r and lam/2 (B, N, 2), S and W (B, N, 2, 2).
+    """Solve for two sensors in closed form: r and lam/2 (B, N, 2), S and W (B, N, 2, 2).
 
     Nothing is an outlier, or both are, with one of four pairs of signs s and y = S (s lam) / 2, or one is.
     """
@@ -77,7 +77,7 @@ def _within(x: Array, low: Array, high: Array) -> Array:
 
 
 def _pivot(r: Array, W: Array, half: Array, size: Array) -> Array:
-    """Any number of sensors: block principal pivoting (Judice and Pires 1992), which ends in a finite number of rounds.
+    """Solve for any number of sensors: block principal pivoting (Judice and Pires 1992), which ends in a finite number of rounds.
 
     A round solves for the outliers of presumed signs, and changes the presumptions that its solution contradicts: all of them while they
     grow fewer, else the last one alone. (Coordinate descent is simpler, and takes thousands of sweeps where sensors are correlated.)
@@ -105,7 +105,7 @@ def _pivot(r: Array, W: Array, half: Array, size: Array) -> Array:
         changed = [np.where(wrong[i] & ((left >= 0) | (last == i)), toward[i], sign[..., i]) for i in sensors]
         return count > 0, [num.stack(changed), y, fewest, left]
 
-    alone = np.where(np.abs(r) > half * size, np.copysign(1.0, r), 0.0)  # what each sensor alone would say
+    alone = np.where(np.abs(r) > half * size, np.copysign(1.0, r), 0.0)  # sign that each sensor alone would have
     whole = np.zeros(r.shape[:-1], np.int64)
     begin = [alone, r, whole + (q + 1), whole + PATIENCE]
     _, y, fewest, _ = num.until(step, begin, whole == 0, ROUNDS)
@@ -116,7 +116,7 @@ def _pivot(r: Array, W: Array, half: Array, size: Array) -> Array:
 
 
 def _solved(sign: Array, r: Array, W: Array, half: Array) -> Array:
-    """y (B, N, q) for presumed signs: an outlier is where its price is met, any other sensor is believed."""
+    """Return y (B, N, q) for presumed signs: an outlier is at its price, any other sensor is believed."""
     q = r.shape[-1]
     out = [sign[..., i] != 0.0 for i in range(q)]
     y = [np.where(out[i], 0.0, r[..., i]) for i in range(q)]
@@ -148,7 +148,7 @@ def _solved(sign: Array, r: Array, W: Array, half: Array) -> Array:
 
 @cache
 def _problem(q: int) -> tuple[Any, dict[str, Any], Any]:
-    """The cvxpy problem of q sensors, its parameters and its variable. W = F'F, d = F r."""
+    """Return the cvxpy problem of q sensors, its parameters and its variable. W = F'F, d = F r."""
     cp = load_cvxpy()
     z, known = cp.Variable(q), {"F": cp.Parameter((q, q)), "d": cp.Parameter(q), "lam": cp.Parameter(q, nonneg=True)}
     price = cp.sum_squares(known["d"] - cp.matmul(known["F"], z)) + cp.norm1(cp.multiply(known["lam"], z))
@@ -156,7 +156,7 @@ def _problem(q: int) -> tuple[Any, dict[str, Any], Any]:
 
 
 def load_cvxpy() -> Any:
-    """The package cvxpy. Raises ImportError with the command that installs it."""
+    """Return the package cvxpy. Raise ImportError with the command that installs it."""
     try:
         return import_module("cvxpy")
     except ImportError as error:
@@ -164,7 +164,7 @@ def load_cvxpy() -> Any:
 
 
 def believed_by_cvxpy(r: Array, S: Array, lam: Array) -> Array:
-    """What `believed` computes, by an interior-point solver (Clarabel), row by row, to the solver's tolerance."""
+    """Return what `believed` returns, from an interior-point solver (Clarabel), row by row, to the solver's tolerance."""
     from scipy.linalg import cholesky
 
     problem, known, z = _problem(r.shape[-1])
@@ -189,14 +189,14 @@ class Penalty:
     )
 
     def price(self, S: Array) -> Array:
-        """lam_i (..., q) for S (..., q, q) [1/unit of the sensor]."""
+        """Return lam_i (..., q) for S (..., q, q) [1/unit of the sensor]."""
         variance = S.diagonal(axis1=-2, axis2=-1)
         return self.lam / np.sqrt(variance) if self.unit == "sigma" else np.full(variance.shape, self.lam)
 
 
 @dataclass(frozen=True)
 class Solved(Penalty):
-    """The price, and who solves."""
+    """The price, and the solver."""
 
     solver: Literal["exact", "cvxpy"] = param("exact", "exact: closed form or block pivoting; cvxpy: an interior-point solver, slow")
 
@@ -204,20 +204,25 @@ class Solved(Penalty):
         if self.solver == "cvxpy":
             load_cvxpy()  # missing: say so here, not in the first step
 
+    def cleaned(self, innovation: Innovation, accept: Array) -> Innovation:
+        """Return the innovation of the sensors in `accept` (B, N, q), less its outliers."""
+        r, S = innovation
+        if not num.every(accept):
+            r, S = r * accept, alone(S, accept)
+        solve = believed if self.solver == "exact" else believed_by_cvxpy
+        return Innovation(solve(r, S, self.price(S)), S)
+
 
 @register("filter", "rkf", reference="Mattingley and Boyd, Real-time convex optimization in signal processing, 2010; Dutta 2018, [29]")
 @dataclass(frozen=True)
 class RobustKalmanFilter(Solved, LinearFilter):
     """Steady-state filter that first takes sparse outliers out of the innovation."""
 
-    steady = True
+    def prepare(self, model: Model) -> Any:  # a KalmanPlan whose `held` is an array
+        return kalman_plan(model, steady=True)
 
     def update(self, plan: KalmanPlan, state: KalmanState, innovation: Innovation, accept: Array) -> KalmanState:
-        r, S = innovation
-        if not num.every(accept):
-            r, S = r * accept, alone(S, accept)
-        solve = believed if self.solver == "exact" else believed_by_cvxpy
-        return super().update(plan, state, Innovation(solve(r, S, self.price(S)), S), accept)
+        return super().update(plan, state, self.cleaned(innovation, accept), accept)
 
 
 @register("detector", "outlier", reference="Mattingley and Boyd 2010: the optimality condition of z = 0")
@@ -226,7 +231,7 @@ class Outlier(Penalty, Memoryless):
     """Alarms, and blames the sensor, where the robust Kalman filter of the same lam would find an outlier."""
 
     def prepare(self, model: Model) -> Array:
-        """(N,) the gate in steady state."""
+        """Return the gate (N,) in steady state."""
         P = steady_state(model)
         S = num.matmul(model.C, num.matmul(P, num.transpose(model.C))) + model.R
         lam, W = self.price(S), num.inverse(S).diagonal(axis1=-2, axis2=-1)
@@ -238,7 +243,10 @@ class Outlier(Penalty, Memoryless):
         return None, Verdict(num.quadratic(r, num.inverse(S)), suspect.any(axis=-1), suspect)
 
     def gate(self, plan: Array, state: None) -> Array:
-        """The largest ellipsoid r' S^-1 r inside of |2 S^-1 r|_i <= lam_i, for the steady S. Outside of it some raise none either."""
+        """Return the largest ellipsoid r' S^-1 r inside |2 S^-1 r|_i <= lam_i, for the steady S.
+
+        Some innovations outside raise no alarm either.
+        """
         return plan
 
 

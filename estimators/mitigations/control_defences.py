@@ -1,15 +1,15 @@
-"""Control defences: mitigations that bound the command, whatever the filter believes and the messages say (docs/platoon.md).
+"""Control defences: mitigations that bound the command, whatever filter and messages say (docs/platoon.md).
 
 `input_clip` and `sliding_mode` compute a command from a car's own three sensors, its gap d, speed v and acceleration a, as they were
 received. The gap's rate is that of a gap smoothed with the time constant T, exact where the rate is constant:
 
     s = h (d - g) / dt          g+ = g + h (d - g)          h = 1 - exp(-dt / T)                       (g = d at the first reading)
 
-They protect from false messages and from what neighbours believe, not from false readings of the own sensors.
+They protect from false messages and wrong neighbours, not from false readings of the own sensors.
 """
 
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from tailgate import num
 from tailgate.base.errors import InputError, NotApplicable
 from tailgate.core import Array, Finite, Model, NonNegative, Positive, Received, param
 from tailgate.core.registry import register
-from tailgate.estimators.compose import GateOut, ModeName, quiet
+from tailgate.estimators.compose import Gate, GateOut, M, ModeName, ReactionPlan, X, quiet
 from tailgate.estimators.parts import Decision, Verdict
 
 OWN = ("distance", "velocity", "acceleration")
@@ -32,42 +32,39 @@ def require_string(model: Model, name: str) -> None:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Choice(GateOut):
-    """Base: uses all readings, or with `gate` those that are not suspected."""
+class Choice(Gate[M, X]):
+    """Base class: uses all readings, or with `gate` those that are not suspected."""
 
     gate: bool = param(False, "ignore the suspected sensors, as gate_out does")
 
-    def choose(self, plan: Any, state: Any, verdict: Verdict, received: Received) -> tuple[Any, Decision]:
-        return super().choose(plan, state, verdict, received) if self.gate else (state, Decision(received.valid, quiet(verdict)))
+    def gated(self, state: Array | None, verdict: Verdict, received: Received) -> tuple[Array | None, Decision]:
+        return super().gated(state, verdict, received) if self.gate else (state, Decision(received.valid, quiet(verdict)))
 
 
 @register("mitigation", "acc_fallback")
 @dataclass(frozen=True, kw_only=True)
-class AccFallback(Choice):
+class AccFallback(Choice[Array], GateOut):
     """Uses no messages while alarmed and for some time after: the cars' controllers fall back to their own sensors and estimates."""
 
     mode: ModeName = param("acc", "what is asked of the controller while alarmed: normal, widen, brake, stop or acc")
 
-    def prepare(self, model: Model) -> Any:
+    def prepare(self, model: Model) -> ReactionPlan:
         require_string(model, "acc_fallback")
         return super().prepare(model)
 
 
 class LocalPlan(NamedTuple):
-    """What Reaction reads, and the car's own loop."""
+    """Constants of a car's own loop."""
 
-    agents: int
-    sensors: int
-    linger: int
     follows: Array  # (N,) bool
-    place: tuple[int, ...]  # of distance, velocity and acceleration among the sensors
+    place: tuple[int, ...]  # indices of distance, velocity and acceleration among the sensors
     smooth: float  # h
     dt: float
     bound: float = np.inf  # [m/s^2]
 
 
 class LocalState(NamedTuple):
-    shut: Any  # what gate_out keeps
+    shut: Array | None  # (B, N, q) steps that the gate stays shut
     y: Array  # (B, N, 3) the last readings of the own sensors
     known: Array  # (B, N, 3) bool: there is one
     g: Array  # (B, N) smoothed gap
@@ -75,7 +72,7 @@ class LocalState(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class OwnSensors(Choice):
+class OwnSensors(Choice[LocalState, LocalPlan]):
     """Base of the control defences that compute a command from a car's own sensors: a subclass's `bounds` makes limits of it."""
 
     headway: Positive = param(3.0, "time headway tau_h of the own law, best the controller's [s]")
@@ -86,10 +83,10 @@ class OwnSensors(Choice):
     accel_max: Finite = param(3.0, "largest command of the own law [m/s^2]")
 
     def bounds(self, plan: LocalPlan, y: Array, rate: Array, on: Array) -> tuple[Array, Array]:
-        """The least and the largest command (B, N) for own readings y (B, N, 3) and the gap's rate; `on` (B, N): an alarm lasts."""
+        """Return the least and the largest command (B, N) for own readings y (B, N, 3) and the gap's rate; `on` (B, N): an alarm lasts."""
         raise TypeError(f"{type(self).__name__} must define bounds()")
 
-    def prepare(self, model: Model) -> Any:
+    def constants(self, model: Model) -> LocalPlan:
         name = f"mitigation {type(self).__name__}"
         require_string(model, type(self).__name__)
         missing = [sensor for sensor in OWN if sensor not in model.sensors]
@@ -97,35 +94,38 @@ class OwnSensors(Choice):
             raise NotApplicable(name, list(model.sensors), f"cars that measure {', '.join(OWN)} and command an acceleration")
         if self.accel_min > self.accel_max:
             raise InputError(f"{name}.accel_min", self.accel_min, f"at most accel_max ({self.accel_max})")
-        plan, place = super().prepare(model), tuple(model.sensors.index(sensor) for sensor in OWN)
-        return LocalPlan(plan.agents, plan.sensors, plan.linger, model.followers, place, self.smooth(model.dt), model.dt)
+        return LocalPlan(model.followers, tuple(model.sensors.index(sensor) for sensor in OWN), self.smooth(model.dt), model.dt)
 
     def smooth(self, dt: float) -> float:
-        """The share h of a new reading in the smoothed gap."""
+        """Return the share h of a new reading in the smoothed gap."""
         return 1.0 - float(num.exp(-dt / self.smoothing))
 
-    def begin(self, plan: Any, batch: int) -> Any:
+    def begin(self, plan: ReactionPlan[LocalPlan], batch: int) -> LocalState:
         shape = (batch, plan.agents)
         own = num.zeros((*shape, len(OWN)))
-        return LocalState(super().begin(plan, batch), own, own != 0.0, num.zeros(shape), num.zeros(shape, np.int64))
+        return LocalState(self.gates(plan, batch), own, own != 0.0, num.zeros(shape), num.zeros(shape, np.int64))
 
-    def choose(self, plan: Any, state: Any, verdict: Verdict, received: Received) -> tuple[Any, Decision]:
-        shut, decision = super().choose(plan, state.shut, verdict, received)
-        place = list(plan.place)
+    def choose(
+        self, plan: ReactionPlan[LocalPlan], state: LocalState | None, verdict: Verdict, received: Received
+    ) -> tuple[LocalState, Decision]:
+        loop = plan.own
+        assert state is not None and loop is not None
+        shut, decision = self.gated(state.shut, verdict, received)
+        place = list(loop.place)
         heard = received.valid[..., place]
         y, known = np.where(heard, received.y[..., place], state.y), state.known | heard
         g = np.where(state.known[..., 0], state.g, y[..., 0])
-        rate = (y[..., 0] - g) * (plan.smooth / plan.dt)
+        rate = (y[..., 0] - g) * (loop.smooth / loop.dt)
         left = np.where(verdict.alarm, plan.linger + 1, np.maximum(state.left - 1, 0))
-        low, high = self.bounds(plan, y, rate, left > 0)
-        sure = plan.follows & known.all(axis=-1)
+        low, high = self.bounds(loop, y, rate, left > 0)
+        sure = loop.follows & known.all(axis=-1)
         limits = num.zeros((*low.shape, 1, 2))
         limits[..., 0, 0], limits[..., 0, 1] = np.where(sure, low, -np.inf), np.where(sure, high, np.inf)
-        g = g + plan.smooth * (y[..., 0] - g)
+        g = g + loop.smooth * (y[..., 0] - g)
         return LocalState(shut, y, known, g, left), decision._replace(limits=limits)
 
     def within(self, u: Array) -> Array:
-        """The command cut at the own law's limits."""
+        """Return the command cut at the own law's limits."""
         return np.asarray(np.minimum(np.maximum(u, self.accel_min), self.accel_max))
 
 
@@ -137,7 +137,7 @@ class Reach(NamedTuple):
 
 
 def reachable(A: Array, b: Array) -> Reach:
-    """The ellipsoid of this kind that is narrowest along the first state, for a stable A (n, n) and b (n,).
+    """Return the ellipsoid of this kind that is narrowest along the first state, for a stable A (n, n) and b (n,).
 
     V = z' P z satisfies V+ <= a V + (1 - a) w^2 for all z, w where P^-1 = Q solves the linear matrix inequality
 
@@ -148,7 +148,7 @@ def reachable(A: Array, b: Array) -> Reach:
     """
     radius = num.spectral_radius(A)
     if radius >= 1.0:
-        raise InputError("mitigation input_clip", radius, "gains with which a car's own loop is stable")
+        raise InputError("mitigation input_clip", radius, "gains that make a car's own loop stable")
 
     def solved(a: float) -> Array:
         Q, F = b[:, None] * b / (1.0 - a), A / np.sqrt(a)
@@ -158,7 +158,7 @@ def reachable(A: Array, b: Array) -> Reach:
                 break
         return Q
 
-    ratio, low, high = (5.0**0.5 - 1.0) / 2.0, 1e-3, 1.0 - 1e-3  # of the way from radius^2 to 1
+    ratio, low, high = (5.0**0.5 - 1.0) / 2.0, 1e-3, 1.0 - 1e-3  # shares of the way from radius^2 to 1
     for _ in range(60):
         left, right = high - ratio * (high - low), low + ratio * (high - low)
         if solved(_between(radius, left))[0, 0] < solved(_between(radius, right))[0, 0]:
@@ -174,7 +174,7 @@ def _between(radius: float, share: float) -> float:
 
 
 def response(A: Array, b: Array) -> Array:
-    """The first state after an impulse: (K,) of A^k b, until it has died out."""
+    """Return the first state after an impulse: (K,) of A^k b, until it has died out."""
     x, out = np.array(b), []
     size = float(np.max(np.abs(b)))
     for _ in range(STEPS):
@@ -186,7 +186,7 @@ def response(A: Array, b: Array) -> Array:
 
 
 def peak(A: Array, b: Array) -> float:
-    """The largest first state that an input of at most 1 can reach."""
+    """Return the largest first state that an input of at most 1 can reach."""
     return float(sum(abs(value) for value in response(A, b).tolist()))
 
 
@@ -231,7 +231,7 @@ class InputClip(OwnSensors):
     sides: Literal["above", "both"] = param("above", "above: the command is bounded from above only; both: on both sides of the own law's")
 
     def loop(self, dt: float) -> OwnLoop:
-        """The car's own loop for a step dt [s]."""
+        """Return the car's own loop for a step dt [s]."""
         E, smooth = float(num.exp(-dt / self.lag)), self.smooth(dt)
         s1 = self.lag * (1.0 - E)
         A, u = np.eye(4), np.array([-(dt * dt / 2.0 - self.lag * (dt - s1)), dt - s1, 1.0 - E, 0.0])
@@ -245,12 +245,12 @@ class InputClip(OwnSensors):
         return OwnLoop(A + u[:, None] * feedback, u, np.array([1.0, 0.0, 0.0, 0.0]), noisy, feedback)
 
     def slack(self, own: OwnLoop, dt: float) -> float:
-        """By how much [m] the gap can fall below d_r behind a car with any speed in [0, speed_max], without noise and deviation."""
-        kernel = (dt * response(own.A, own.ahead)).tolist()  # of the speed ahead; its sum is tau_h
+        """Return how far [m] the gap can fall below d_r behind a car with any speed in [0, speed_max], without noise and deviation."""
+        kernel = (dt * response(own.A, own.ahead)).tolist()  # response to the speed ahead; its sum is tau_h
         return self.speed_max * -float(sum(value for value in kernel if value < 0.0))
 
     def bound(self, model: Model) -> float:
-        """The largest deviation [m/s^2] from the own law."""
+        """Return the largest deviation [m/s^2] from the own law."""
         own = self.loop(model.dt)
         width = reachable(own.A, own.forced).width  # refuses a loop that is not stable
         if self.sides == "above" and (response(own.A, own.forced) > DECAYED).any():
@@ -263,9 +263,8 @@ class InputClip(OwnSensors):
             raise InputError("mitigation input_clip.clearance", self.clearance, f"less: it leaves {left:.2f} m for a deviation")
         return left / width
 
-    def prepare(self, model: Model) -> Any:
-        plan: LocalPlan = super().prepare(model)
-        return plan._replace(bound=self.bound(model))
+    def constants(self, model: Model) -> LocalPlan:
+        return super().constants(model)._replace(bound=self.bound(model))
 
     def bounds(self, plan: LocalPlan, y: Array, rate: Array, on: Array) -> tuple[Array, Array]:
         d, v, a = (y[..., s] for s in range(len(OWN)))

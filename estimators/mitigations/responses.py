@@ -1,18 +1,18 @@
-"""Mitigations: which readings to use after a verdict, and what to ask of the controller (docs/detectors.md).
+"""Mitigations: the readings to use after a verdict, and the mode asked of the controller (docs/detectors.md).
 
-Two choices that have nothing to do with each other: the readings (`gate_out`, `latch`, `hold`, `reacquire`, `accept_all`), and the mode
-(`mode`, `linger`), which every one of them takes. `widen` and `brake` are `gate_out` with a mode.
+Two independent choices: the readings (`gate_out`, `latch`, `hold`, `reacquire`, `accept_all`), and the mode (`mode`, `linger`), which
+every one of them takes. `widen` and `brake` are `gate_out` with a mode.
 """
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from tailgate import num
 from tailgate.core import Array, Count, PositiveCount, Received, param
 from tailgate.core.registry import register
-from tailgate.estimators.compose import GateOut, ModeName, ReactionPlan, quiet
+from tailgate.estimators.compose import Gate, GateOut, ModeName, ReactionPlan, quiet
 from tailgate.estimators.parts import Decision, Verdict
 
 
@@ -32,18 +32,21 @@ class HoldState(NamedTuple):
 
 @register("mitigation", "hold", reference="Dutta 2018, (6.18): Y_tau, the last good measurement")
 @dataclass(frozen=True)
-class Hold(GateOut):
+class Hold(Gate[HoldState]):
     """Uses the last accepted reading in place of one that is suspected or missing, as a receiver with a zero-order hold does.
 
     The filter takes the old reading for a new one: on a moving car the estimate falls behind. Before the first accepted reading the
     sensor is ignored.
     """
 
-    def begin(self, plan: ReactionPlan, batch: int) -> Any:
+    def begin(self, plan: ReactionPlan, batch: int) -> HoldState:
         shape = (batch, plan.agents, plan.sensors)
-        return HoldState(super().begin(plan, batch), num.zeros(shape), num.zeros(shape, bool))
+        return HoldState(self.gates(plan, batch), num.zeros(shape), num.zeros(shape, bool))
 
-    def choose(self, plan: ReactionPlan, state: Any, verdict: Verdict, received: Received) -> tuple[Any, Decision]:
+    def choose(
+        self, plan: ReactionPlan, state: HoldState | None, verdict: Verdict, received: Received
+    ) -> tuple[HoldState, Decision]:
+        assert state is not None
         left, shut = self.shut(state.shut, verdict)
         good = received.valid & ~shut
         held, known = np.where(good, received.y, state.held), good | state.known
@@ -57,7 +60,7 @@ class ReacquireState(NamedTuple):
 
 @register("mitigation", "reacquire")
 @dataclass(frozen=True)
-class Reacquire(GateOut):
+class Reacquire(Gate[ReacquireState]):
     """Ignores the suspected sensors, but after a number of rejections in a row starts again from what they say.
 
     It ends the lock-out, in which a wrong estimate shuts out the honest readings. An attacker who keeps lying for as long is believed as
@@ -66,10 +69,13 @@ class Reacquire(GateOut):
 
     after: PositiveCount = param(20, "readings of a sensor rejected in a row before the next one is believed")
 
-    def begin(self, plan: ReactionPlan, batch: int) -> Any:
-        return ReacquireState(super().begin(plan, batch), num.zeros((batch, plan.agents, plan.sensors), np.int64))
+    def begin(self, plan: ReactionPlan, batch: int) -> ReacquireState:
+        return ReacquireState(self.gates(plan, batch), num.zeros((batch, plan.agents, plan.sensors), np.int64))
 
-    def choose(self, plan: ReactionPlan, state: Any, verdict: Verdict, received: Received) -> tuple[Any, Decision]:
+    def choose(
+        self, plan: ReactionPlan, state: ReacquireState | None, verdict: Verdict, received: Received
+    ) -> tuple[ReacquireState, Decision]:
+        assert state is not None
         left, shut = self.shut(state.shut, verdict)
         rejected = np.where(received.valid, np.where(shut, state.rejected + 1, 0), state.rejected)
         due = received.valid & (rejected > self.after)

@@ -1,4 +1,4 @@
-"""The oracle: told which measurements are attacked. An upper yardstick, shown and never ranked."""
+"""The oracle: it knows which measurements are attacked. An upper yardstick, shown and never ranked."""
 
 from dataclasses import dataclass
 

@@ -13,7 +13,7 @@ from tailgate.core.registry import register
 
 
 class Reading(NamedTuple):
-    """Who learns which state from whose sensor: four indices of the same length, no state of an agent twice."""
+    """An index table of who learns which state from whose sensor: four arrays of the same length, no state of an agent twice."""
 
     agent: Array
     state: Array
@@ -32,7 +32,9 @@ class RawState(NamedTuple):
 
 
 def readings(model: Model) -> tuple[Reading, ...]:
-    """What each agent reads and hears, in rounds: where two sensors tell the same, the later round counts, the own sensors last.
+    """Return what each agent reads and hears, in rounds.
+
+    Where two sensors read the same state, the later round counts, the own sensors last.
 
     Raises NotApplicable where a sensor does not read one state directly.
     """
@@ -41,7 +43,7 @@ def readings(model: Model) -> tuple[Reading, ...]:
     state = np.argmax(model.C, axis=2)
     rounds: list[list[tuple[int, int, int, int]]] = []
     for i in range(model.agents):
-        told: dict[int, int] = {}  # how often each state was told
+        told: dict[int, int] = {}  # how often each state was read
         tellers = [j for j in np.flatnonzero(model.graph[i]).tolist() if j != i]
         for j in (*tellers, i):
             for s, column in enumerate(state[j].tolist()):

@@ -1,4 +1,4 @@
-"""Sentinels: degenerate defences that a sound score must fail. Each names the gate that it has to fail."""
+"""Sentinels: useless defences that a sound score must fail. Each names the gate that it has to fail."""
 
 from dataclasses import dataclass
 from typing import NamedTuple

@@ -2,8 +2,8 @@
 
     g = h' P        gamma = lambda + g h        j = g' / gamma        e = y' - w' h        w = w + j e        P = (P - j g) / lambda
 
-for d and dv apart, h = [1, t/100], lambda = 0.95, w = 0 and P = delta I at first, delta = 1. Since the attack is detected the controller
-drives on w' h; but y', on which w goes on being adapted, is what the attacker sends. The list of challenges is fixed, and known.
+for d and dv apart, h = [1, t/100], lambda = 0.95, w = 0 and P = delta I at first, delta = 1. From the detection on the controller drives on
+w' h; but the attacker sends y', to which w is still adapted. The list of challenges is fixed, and known.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from tailgate.estimators.filters.predictors import Predictor, PredictorPlan, Pre
 from tailgate.estimators.parts import Filter
 
 Factor = Annotated[float, Field(ge=0.01, lt=1)]
-UNIT = 100.0  # of time in h [steps]
+UNIT = 100.0  # unit of time in h [steps]
 
 
 class Weights(NamedTuple):
@@ -32,7 +32,7 @@ class Weights(NamedTuple):
 
 
 @dataclass(frozen=True)
-class PrintedRegression(Predictor):
+class PrintedRegression(Predictor[Weights]):
     """Algorithm 1: recursive least squares of each reading on [1, t/100]."""
 
     forgetting: float
@@ -55,7 +55,9 @@ class PrintedRegression(Predictor):
         P = np.where(accept[..., None, None], (P - j[..., :, None] * g[..., None, :]) / self.forgetting, P)
         return Weights(w, P, h)
 
-    def update(self, plan: PredictorPlan, state: PredictorState, innovation: Innovation, accept: Array) -> PredictorState:
+    def update(
+        self, plan: PredictorPlan, state: PredictorState[Weights], innovation: Innovation, accept: Array
+    ) -> PredictorState[Weights]:
         state = super().update(plan, state, innovation, accept)
         x = state.x.copy(order="K")
         x[:, plan.agent, plan.state] = num.dot(state.past.w, state.past.h)

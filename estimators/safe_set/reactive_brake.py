@@ -1,21 +1,21 @@
-"""Safe states as a defence: a filter that gets the readings which fit the safe set, and a brake that acts on the set (docs/safe-state.md).
+"""Safe states as a defence: a filter that gets only readings in the safe set, and a brake that acts on the set (docs/safe-state.md).
 
-The brake reckons with the worst of the set: the smallest gap d, the slowest car ahead w, the fastest own speed v and acceleration a. It
-overrides the command in the step in which the gap is no longer enough to stop behind a car that brakes at `lead_brake`, after a time rho in
-which the own car still speeds up (the distance of responsibility-sensitive safety, RSS, with the actuator's lag):
+The brake assumes the worst of the set: the smallest gap d, the slowest car ahead w, the fastest own speed v and acceleration a. It
+overrides the command when the gap is too short to stop behind a car that brakes at `lead_brake`. For a time rho the own car still speeds
+up. This is the distance of responsibility-sensitive safety (RSS), with the actuator's lag:
 
     d < clearance + v rho + a' rho^2 / 2 + stop(v + a' rho, a') - w^2 / (2 b_lead)
 
-It does so while a reading is distrusted or missing, and for `watch` seconds after: what slowed the car down left it where its controller,
-which accelerates to close the gap while the car ahead stops, may be unsafe by itself.
+It does so while a reading is distrusted or missing, and for `watch` seconds after. A car that was slowed down has a large gap: its
+controller accelerates to close it while the car ahead may stop, and may be unsafe by itself.
 
-stop(v, a) is the way to a standstill of a first-order lag tau whose command is -b from now on, with c = a + b:
+stop(v, a) is the way to a standstill through a first-order lag tau under the constant command -b, with c = a + b:
 
     v(t) = v - b t + c tau (1 - e),        way(t) = v t - b t^2 / 2 + c tau t - c tau^2 (1 - e),        e = exp(-t / tau)
 """
 
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Any, Generic, Literal, NamedTuple
 
 import numpy as np
 
@@ -23,16 +23,18 @@ from tailgate import num
 from tailgate.base.errors import NotApplicable
 from tailgate.core import Array, Estimate, Mode, Model, NonNegative, Positive, Prior, Received, param
 from tailgate.core.draws import Draws
+from tailgate.core.nouns import P, S
 from tailgate.core.registry import make_from, register
+from tailgate.estimators.parts import Filter
 from tailgate.estimators.safe_set.safe_state import ACCEL, GAP, LEAD, SPEED, Finding, OwnCommand, SafeSet, SetPlan, SetState
 
 RSS = "S. Shalev-Shwartz, S. Shammah, A. Shashua, On a Formal Model of Safe and Scalable Self-driving Cars, 2017"
-LAG = 1.008  # of the thesis's vehicles [s]
-ROUNDS = 6  # of Newton's method for the time of the stop
+LAG = 1.008  # lag of the thesis's vehicles [s]
+ROUNDS = 6  # rounds of Newton's method for the time of the stop
 
 
 def stopping_distance(v: Array, a: Array, brake: float, tau: float) -> Array:
-    """Way [m] to a standstill from v [m/s] and a [m/s^2] under the command -brake through a lag tau [s], elementwise.
+    """Return the way [m] to a standstill from v [m/s] and a [m/s^2] under the command -brake through a lag tau [s], elementwise.
 
     v(t) is concave and falls from right of its root on, so that Newton's method from there stays right of it.
     """
@@ -44,20 +46,20 @@ def stopping_distance(v: Array, a: Array, brake: float, tau: float) -> Array:
 
 
 def sooner(t: Array, e: Array, v: Array, c: Array, brake: float, tau: float) -> Array:
-    """A step of Newton's method for the time of the stop, elementwise."""
+    """Return a step of Newton's method for the time of the stop, elementwise."""
     out: Array = t - (v - brake * t + c * tau * (1.0 - e)) / (c * e - brake)
     return out
 
 
 def way_until(t: Array, e: Array, v: Array, c: Array, brake: float, tau: float) -> Array:
-    """way(t), elementwise."""
+    """Return way(t), elementwise."""
     out: Array = v * t - 0.5 * brake * t * t + c * tau * t - c * tau * tau * (1.0 - e)
     return out
 
 
-class SafePlan(NamedTuple):
-    filter: Any
-    filter_plan: Any
+class SafePlan(NamedTuple, Generic[P, S]):
+    filter: Filter[P, S]
+    filter_plan: P
     set_plan: SetPlan
     actuators: int
     follows: Array  # (N,) bool
@@ -68,10 +70,10 @@ class SafePlan(NamedTuple):
     watch: int  # steps for which the brake stays armed
 
 
-class SafeMemory(NamedTuple):
+class SafeMemory(NamedTuple, Generic[S]):
     """Every leaf has B first."""
 
-    filter: Any
+    filter: S
     set: SetState
     armed: Array  # (B, N) int64: steps for which the brake still acts though nothing is distrusted
 
@@ -81,15 +83,16 @@ class SafeMemory(NamedTuple):
 class SafeState(SafeSet):
     """Filter that uses only readings in the safe set: intervals of what the sensors' accuracy and the dynamics allow; never brakes."""
 
-    filter: Any = param("kf", "filter: a name, or a mapping with name and parameters")
+    filter: object = param("kf", "filter: a name, or a mapping with name and parameters")
 
     def __post_init__(self) -> None:
         super().__post_init__()
         self._filter()  # a wrong name shall fail here
 
-    def _filter(self) -> Any:
+    def _filter(self) -> Filter:
         data = {"name": "kf", **self.filter} if isinstance(self.filter, dict) else self.filter
-        return make_from("filter", data, "defence safe_state.filter")
+        made: Filter = make_from("filter", data, "defence safe_state.filter")
+        return made
 
     def prepare(self, model: Model) -> SafePlan:
         f, limits = self._filter(), self.limits_of(model)
@@ -114,7 +117,7 @@ class SafeState(SafeSet):
         return SafeMemory(belief, held, armed), estimate._replace(limits=limits)
 
     def _inside(self, plan: SafePlan, belief: Any, found: Finding) -> Any:
-        """A filter's state with the own speeds in the set: a linear one that knows of a hard brake would reverse a car that stands."""
+        """Return a filter's state with the own speeds in the set: a linear filter would let a hard brake reverse a stopped car."""
         x = getattr(belief, "x", None)
         if x is None:
             return belief
@@ -124,7 +127,7 @@ class SafeState(SafeSet):
         return belief._replace(x=x)
 
     def limits(self, plan: SafePlan, found: Finding, armed: Array) -> tuple[Array, Array | None]:
-        """`armed` for the next step, and the least and largest command (B, N, m, 2); None where the controller may do as it likes."""
+        """Return `armed` for the next step, and the least and largest command (B, N, m, 2); None where the controller is not limited."""
         return armed, None
 
 
@@ -155,7 +158,7 @@ class SafeStateBrake(SafeState):
         return plan._replace(reaction=max(self.reaction, model.dt), lag=self.lag or plan.lag, watch=round(self.watch / model.dt))
 
     def needed(self, plan: SafePlan, found: Finding) -> Array:
-        """The smallest safe gap (B, N) [m] for the worst of the box."""
+        """Return the smallest safe gap (B, N) [m] for the worst of the box."""
         worst, rho = found.worst, plan.reaction
         v, a, w = worst.hi[..., SPEED], worst.hi[..., ACCEL] + plan.off, np.maximum(worst.lo[..., LEAD], 0.0)
         a = a + (1.0 - float(num.exp(-rho / plan.lag))) * np.maximum(self.response - a, 0.0)  # while it does not brake yet

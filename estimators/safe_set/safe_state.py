@@ -5,18 +5,18 @@ reading y, accurate to e, is tested on its own against the box P that was predic
 
     w+ in w + [a_min, a_max] dt        d+ in d + (w + w+) dt / 2 - s        |y - mid P| <= e + half P, else an attack
 
-s is the way of the own car in the step: its exact average speed, times dt. With the speed at the end of the step in its place the box loses
-the truth whenever the car brakes. A reading that passes is intersected with P; one that does not is not, nor are those of its sensor after
-it, until `recover` seconds of them passed in a row. Until then the box grows as the dynamics allow.
+s is the way of the own car in the step: its exact average speed, times dt. With the speed at the end of the step, the box would lose the
+truth whenever the car brakes. A reading that passes is intersected with P. After one that fails, the sensor's readings are ignored
+until `recover` seconds of them passed in a row; meanwhile the box grows as the dynamics allow.
 
-Where nobody tells w it is told by the gaps. With h_j = d - j dt w,
+Where no message gives w, the gaps do. With h_j = d - j dt w,
 
     h_{j+1}+ = h_j - s - (j alpha + beta / 2) dt^2,  alpha, beta in [a_min, a_max]        w = (d - h_j) / (j dt)
 """
 
 import math
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, NamedTuple, Protocol
+from typing import Annotated, Literal, NamedTuple, Protocol
 
 import numpy as np
 from pydantic import Field
@@ -31,7 +31,7 @@ from tailgate.envs.controllers.radar_car import kinematic
 
 GAP, LEAD, SPEED, ACCEL = range(4)  # columns of the box
 FAR = 1e4  # limit of a gap that nothing limits [m]
-EXACT = 1e-6  # accuracy of what is told without noise [m/s]
+EXACT = 1e-6  # accuracy of values known without noise [m/s]
 ROUNDING = 1e-9
 BACK = 1.0  # how far back gaps tell the speed of the car ahead [s]
 Limits = Annotated[tuple[Accel, Accel], Field(min_length=2, max_length=2)]
@@ -53,7 +53,7 @@ class Span(NamedTuple):
     def column(self, i: int) -> "Span":
         return Span(self.lo[..., i], self.hi[..., i])
 
-    def padded(self, by: Any) -> "Span":
+    def padded(self, by: Array | float) -> "Span":
         return Span(self.lo - by, self.hi + by)
 
     def within(self, low: float, high: float) -> "Span":
@@ -61,15 +61,15 @@ class Span(NamedTuple):
 
 
 class Road(Protocol):
-    """What a kind of model tells of the own car and of the gap: columns of its sensors, and how the own car moves in a step."""
+    """The own car and the gap in one kind of model: columns of its sensors, and how the own car moves in a step."""
 
     def told(self, received: Received, known_u: Array) -> Told: ...
 
     def accel(self, box: Span, known_u: Array) -> Span:
-        """The own acceleration at the end of the step, before it is read."""
+        """Return the own acceleration at the end of the step, before it is read."""
 
     def travel(self, box: Span, after: Span, known_u: Array) -> tuple[Span, Span]:
-        """The own speed at the end of the step, before it is read, and the own way; `after`: the acceleration then."""
+        """Return the own speed at the end of the step, before it is read, and the own way; `after`: the acceleration then."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +94,7 @@ class OwnCommand:
         return Told(num.stack([x - y[..., 0], w, y[..., 1], nothing]), num.stack([valid[..., 0] & heard, ~off & heard, valid[..., 1], off]))
 
     def _next(self, box: Span, i: int, u: Array) -> Span:
-        """State i at the end of the step, without the standstill; of the position the way."""
+        """Return state i at the end of the step, without the standstill; for the position, the way."""
         v, a, B, A = box.column(SPEED), box.column(ACCEL), self.B[i, 0], self.A[i]
         ends = (A[1] * v_ + A[2] * a_ + B * u for v_, a_ in zip(v, a, strict=True))
         return Span(*ends).padded(self.noise[i] if i == 2 else self.noise[i] + A[2] * self.off)
@@ -116,7 +116,7 @@ class OwnAccelerometer:
 
     dt: float
     follows: Array  # (N,) bool
-    limits: tuple[float, float]  # of accelerations
+    limits: tuple[float, float]  # least and largest acceleration
     gust: Array  # (N,) bound of the disturbance of the speed in a step
 
     def told(self, received: Received, known_u: Array) -> Told:
@@ -128,7 +128,7 @@ class OwnAccelerometer:
         return Span(num.full(shape, self.limits[0]), num.full(shape, self.limits[1]))
 
     def travel(self, box: Span, after: Span, known_u: Array) -> tuple[Span, Span]:
-        """A lag under a constant command: the acceleration goes from one end of the step to the other without turning."""
+        """Return speed and way of a lag under a constant command: within the step the acceleration is monotone."""
         v, a = box.column(SPEED), box.column(ACCEL)
         lo, hi = np.minimum(a.lo, after.lo), np.maximum(a.hi, after.hi)
         speed, half = Span(v.lo + self.dt * lo, v.hi + self.dt * hi).padded(self.gust), 0.5 * self.dt * self.dt
@@ -157,14 +157,14 @@ class OwnOdometry:
 
 
 class SetPlan(NamedTuple):
-    road: Any  # Road
+    road: Road
     columns: Array  # (q,) column of each sensor
     accuracy: Array  # (N, 4) e
     loose: Array  # (N,) bound of the gap's disturbance in a step [m]
     gust: Array  # (N,) of the disturbance of the speed ahead [m/s]
     dt: float
     recover: int  # steps
-    back: int  # steps of gaps that tell the speed ahead; 0 where it is told
+    back: int  # steps of gaps that give the speed ahead; 0 where it is known
     least: Array  # (4,) physical limits
     most: Array
 
@@ -180,7 +180,7 @@ class SetState(NamedTuple):
 
 
 class Finding(NamedTuple):
-    """What a step found."""
+    """The result of a step."""
 
     box: Span  # (B, N, 4)
     worst: Span  # (B, N, 4) the box and the distrusted readings: where the two disagree, either may be wrong
@@ -192,7 +192,7 @@ class Finding(NamedTuple):
 
 @dataclass(frozen=True)
 class SafeSet:
-    """The box of each car. Bounds that nobody states are so many standard deviations of the model's noise."""
+    """The box of each car. Bounds that no parameter gives are multiples of the standard deviations of the model's noise."""
 
     sigmas: Positive = param(4.0, "a sensor is accurate to so many standard deviations; of uniform noise 3^0.5 [-]")
     accuracy: tuple[Positive, ...] | None = param(None, "accuracy e of each sensor [its unit]; none: by sigmas")
@@ -209,7 +209,7 @@ class SafeSet:
             raise InputError("accel_limits", self.accel_limits, "two accelerations, one below and one above 0")
 
     def limits_of(self, model: Model) -> SetPlan:
-        """Constants for a model. Raises NotApplicable where no gap and own speed are measured, or known."""
+        """Return constants for a model. Raise NotApplicable where gap or own speed are neither measured nor known."""
         sd = np.sqrt(np.diagonal(model.R, axis1=1, axis2=2))
         if self.accuracy is not None and len(self.accuracy) != sd.shape[1]:
             raise InputError("accuracy", self.accuracy, f"{sd.shape[1]} bounds, of {', '.join(model.sensors)}")
@@ -246,18 +246,18 @@ class SafeSet:
         raise NotApplicable("defence safe_state: sensors", list(model.sensors), wanted)
 
     def widest(self, plan: SetPlan, batch: int) -> SetState:
-        """The box of physical limits: nothing is known before the first reading."""
+        """Return the box of physical limits: nothing is known before the first reading."""
         shape = (batch, len(plan.accuracy))
         back = num.full((*shape, plan.back), FAR)
         return SetState(num.full((*shape, 4), plan.least), num.full((*shape, 4), plan.most), num.zeros((*shape, 4), np.int64), -back, back)
 
     def enclose(self, plan: SetPlan, state: SetState, received: Received, known_u: Array) -> tuple[SetState, Finding]:
-        """One step: the box moved, tested and, where readings pass, tightened."""
+        """Move the box by one step, test the readings, and tighten the box by those that pass."""
         told, old, low, high = plan.road.told(received, known_u), Span(state.lo, state.hi), plan.least, plan.most
         left, ratio, box = state.left.copy(order="K"), num.zeros(told.y.shape), [old.column(i) for i in range(4)]
 
         def read(i: int, predicted: Span) -> None:
-            """Tests a reading against what was predicted, and tightens the column where it is believed."""
+            """Test a reading against its prediction, and tighten the column where it is believed."""
             ratio[..., i], left[..., i] = self._tested(plan, told, left[..., i], i, predicted)
             box[i] = _met(predicted, told.y[..., i], plan.accuracy[:, i], told.valid[..., i] & (left[..., i] == 0))
 
@@ -292,7 +292,7 @@ class SafeSet:
         return SetState(out.lo, out.hi, left, back.lo, back.hi), Finding(out, worst, score, score > 1.0 + ROUNDING, trusted, missing)
 
     def _tested(self, plan: SetPlan, told: Told, left: Array, i: int, predicted: Span) -> tuple[Array, Array]:
-        """|y - mid| / (e + half) (B, N), 0 where nothing was read, and how many readings have still to pass."""
+        """Return |y - mid| / (e + half) (B, N), 0 where nothing was read, and how many readings have still to pass."""
         valid, e = told.valid[..., i], plan.accuracy[:, i]
         half = np.where(np.isfinite(e), e, 0.0) + 0.5 * (predicted.hi - predicted.lo)
         off = np.abs(told.y[..., i] - 0.5 * (predicted.lo + predicted.hi))
@@ -301,7 +301,7 @@ class SafeSet:
         return ratio, np.where(ratio > 1.0 + ROUNDING, plan.recover + 1, waiting)
 
     def _looked_back(self, plan: SetPlan, old: Span, back: Span, way: Span) -> Span:
-        """h_1, h_2, ... after the step: h_0 is the gap before it."""
+        """Return h_1, h_2, ... after the step: h_0 is the gap before it."""
         j, square = np.arange(plan.back), plan.dt * plan.dt
         lo, hi = np.empty_like(back.lo), np.empty_like(back.hi)
         lo[..., 0], hi[..., 0] = old.lo[..., GAP], old.hi[..., GAP]
@@ -313,13 +313,13 @@ class SafeSet:
 
 
 def _met(predicted: Span, y: Array, e: Array, use: Array) -> Span:
-    """The prediction, intersected with y +- e where `use` (B, N) holds."""
+    """Return the prediction, intersected with y +- e where `use` (B, N) holds."""
     lo, hi = np.where(use, np.maximum(predicted.lo, y - e), predicted.lo), np.where(use, np.minimum(predicted.hi, y + e), predicted.hi)
     return Span(np.minimum(lo, hi), np.maximum(lo, hi))  # two that touch may cross by rounding
 
 
 def _told_by_gaps(plan: SetPlan, gap: Span, back: Span, ahead: Span) -> Span:
-    """The speed of the car ahead, as far as the gaps tell it."""
+    """Return the speed of the car ahead, as far as the gaps give it."""
     j = plan.dt * np.arange(1, plan.back + 1)
     fastest, slowest = (gap.hi[..., None] - back.lo) / j, (gap.lo[..., None] - back.hi) / j
     return Span(np.maximum(ahead.lo, np.max(slowest, axis=-1)), np.minimum(ahead.hi, np.min(fastest, axis=-1)))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,6 +18,7 @@ NONE, DOS_JAM, DROPOUT, REPLAY, NOISE_JAM, ECHO_DELAY = map(  # plain numbers: n
 _VALUED, _ON_AIR, _RADIATED = (
     np.array([kind in EFFECTS and getattr(EFFECTS[kind], trait) for kind in map(int, Kind)]) for trait in ("valued", "over_air", "radiated")
 )
+Number = Array | float
 
 
 class ChannelPlan(NamedTuple):
@@ -32,11 +33,11 @@ class ChannelPlan(NamedTuple):
 
 
 class Memory(NamedTuple):
-    """What the channel keeps of some wires: held, fresh (B, N, .); history, tape (B, N, ., recorded), two rings."""
+    """The channel's memory of some wires: held, fresh (B, N, .); history, tape (B, N, ., recorded), two rings."""
 
     held: Array  # last good sample before the first attack, or before the onset
     fresh: Array  # last good sample of each wire
-    history: Array  # what was sent in the last steps
+    history: Array  # samples sent in the last steps
     tape: Array  # the history as it was when the running replay began
 
 
@@ -49,24 +50,28 @@ class ChannelState(NamedTuple):
     played: Array  # (B,) steps that the running replay has lasted
     taped: Array  # (B,) samples recorded so far
     anchor: Array  # (B,) samples recorded before the running replay began
-    links: Memory  # of sensors and V2V fields
-    drives: Memory  # of actuators
+    links: Memory  # memory of sensors and V2V fields
+    drives: Memory  # memory of actuators
     last: Command
 
 
-def accepts(k: Any, steps: Any, left: Any, burst: Any, cooldown: Any, onset: Any, last: Any, longest: Any, pause: Any) -> Any:
-    """Whether a command that is legal in itself, given in each of the `steps` steps from k on, is accepted in at least one; elementwise.
+def accepts(
+    k: Number, steps: Number, left: Number, burst: Number, cooldown: Number, onset: Number, last: Number, longest: Number, pause: Number
+) -> Array:
+    """Return elementwise if the channel accepts, in at least one of the `steps` steps from k on, a command that is legal in itself.
 
-    left: attack steps in the budget. burst, cooldown: lengths so far and still [steps]. onset, last, longest, pause: of the threat model.
-    Until the first step that is accepted nothing is charged: a cooldown counts down, a burst that is full ends and is followed by its
-    pause, of which the step that ends it is the first. So it is one moment that decides.
+    left: attack steps in the budget. burst, cooldown: lengths so far and to come [steps]. onset, last, longest, pause: from the threat
+    model.
+
+    Nothing is charged before the first accepted step. A cooldown counts down; a full burst ends, and the step that ends it is the first of
+    its pause. So the first open step alone decides.
     """
     first = np.maximum(k + np.where(burst < longest, cooldown, np.maximum(pause, 1)), onset)
     return (left > 0) & (first <= last) & (first < k + steps)
 
 
 class Channel:
-    """Applies commands to the wires and enforces the threat model, for scripts and learned policies alike.
+    """Apply commands to the wires and enforce the threat model, for scripts and learned policies alike.
 
     A step has two halves: `apply` decides on the command and changes what is measured and heard, `actuate` then changes what the
     controller commands.
@@ -82,7 +87,7 @@ class Channel:
         return ChannelPlan(threat, brief.granted, kinds, brief.limits, last, len(brief.model.sensors), brief.model.air, recorded)
 
     def start(self, plan: ChannelPlan, expected: Array, u: Array) -> ChannelState:
-        """expected (B, N, q+p) at the prior and the first input u (B, N, m): what is held if an attack comes first."""
+        """Return the memory at step 1; an early attack holds the expected links (B, N, q+p) and the first input u (B, N, m)."""
         batch, agents, links = expected.shape
         count = np.zeros(batch, np.int64)
         return ChannelState(
@@ -101,11 +106,11 @@ class Channel:
         return np.asarray(plan.threat.budget - state.used, np.float64)
 
     def allowed(self, plan: ChannelPlan, state: ChannelState, k: Array) -> Array:
-        """(B,) bool: a command of a granted kind, target and value would be accepted at step k (B,)."""
+        """Return (B,) bool: a command of a granted kind, target and value would be accepted at step k (B,)."""
         return self.open(plan, k, self.budget_left(plan, state), state.burst, state.cooldown)
 
     def open(self, plan: ChannelPlan, k: Array, left: Array, burst: Array, cooldown: Array, steps: int = 1) -> Array:
-        """(B,) bool: such a command would be accepted in at least one of so many steps from k on, if it were given in all (`accepts`)."""
+        """Return (B,) bool: such a command, given in each of `steps` steps from k on, would be accepted in at least one (`accepts`)."""
         threat = plan.threat
         longest = np.inf if threat.duration is None else threat.duration
         return np.asarray(accepts(k, steps, left, burst, cooldown, threat.onset, plan.last_step, longest, threat.cooldown))
@@ -114,7 +119,7 @@ class Channel:
         self, plan: ChannelPlan, state: ChannelState, sent: Array, received: Received, command: Command, k: Array,
         again: Callable[[Air], Received] | None = None,
     ) -> tuple[ChannelState, Received, Array, Array]:  # fmt: skip
-        """-> state, received, links (B, N, q+p) as they arrived, refused (B,) bool.
+        """Return the next state, what is received, the links (B, N, q+p) as they arrived, and refused (B,) bool.
 
         `sent` (B, N, q+p) holds the sensor readings and the V2V message before the attack; `again` measures under what is radiated.
         """
@@ -127,7 +132,7 @@ class Channel:
         hit = command.target & charged[:, None, None]
         kind = np.where(charged, kind, 0).astype(np.int8)
         q, value = plan.sensors, command.value
-        if plan.air and num.some(aired := num.take(_ON_AIR, kind)):  # who reaches a receiver over the air reaches all that it reads
+        if plan.air and num.some(aired := num.take(_ON_AIR, kind)):  # over the air a command hits all readings of a receiver
             strength = np.max(np.where(hit, value, 0.0), axis=2, keepdims=True)
             whole = aired[:, None, None] & hit.any(axis=2, keepdims=True) & (np.arange(hit.shape[2]) < q)
             hit, value = hit | whole, np.where(whole, strength, value)
@@ -157,13 +162,13 @@ class Channel:
             y=links[..., :q], valid=under.valid & ~lost[..., :q], v2v=links[..., q:], attacked=hit[..., :q]
         )
         good = sent
-        if not num.every(received.valid):  # a muted sensor's nothing is no sample: the last one stands for it
+        if not num.every(received.valid):  # a muted sensor gives no sample: the last one takes its place
             good = sent.copy(order="K")
             good[..., :q] = np.where(received.valid, sent[..., :q], state.links.fresh[..., :q])
         return state._replace(links=self._keep(plan, state, state.links, good, hit[..., : sent.shape[-1]])), out, links, refused
 
     def actuate(self, plan: ChannelPlan, state: ChannelState, u: Array) -> tuple[ChannelState, Array]:
-        """-> state, u (B, N, m) as the actuators get it."""
+        """Return the next state and u (B, N, m) as the actuators get it."""
         wires = slice(plan.granted.shape[1] - u.shape[-1], None)
         applied, drives = u, state.drives
         if plan.granted[:, wires].any():
@@ -173,7 +178,7 @@ class Channel:
         return state._replace(drives=drives, played=played, taped=state.taped + 1), applied
 
     def _legal(self, plan: ChannelPlan, command: Command) -> Array:
-        """(B,) bool: kind, targets and values are granted."""
+        """Return (B,) bool: the threat model grants kind, targets and values."""
         kind, value = command.kind, command.value
         known = (kind >= 0) & (kind < len(plan.kinds))
         legal = known & num.take(plan.kinds, np.where(known, kind, 0))
@@ -189,7 +194,7 @@ class Channel:
         return np.asarray(legal & ~(command.target & ~ok).any(axis=(1, 2)))
 
     def _radiated(self, plan: ChannelPlan, command: Command) -> Air:
-        """What a command in force radiates at each receiver."""
+        """Return the noise and delay that a command in force radiates at each receiver."""
         hit = command.target[..., : plan.sensors].any(axis=2)
         strength = np.max(command.value[..., : plan.sensors], axis=2)
         kind = command.kind[:, None]
@@ -198,7 +203,7 @@ class Channel:
         return Air(np.where(hit, power, 0.0), np.where(hit & (kind == ECHO_DELAY), strength, 0.0), reaction)
 
     def _arrive(self, plan: ChannelPlan, state: ChannelState, memory: Memory, sent: Array, wires: slice) -> Array:
-        """What arrives of `sent` (B, N, .), the part `wires` of all wires, under the command in force."""
+        """Return `sent` (B, N, .), the part `wires` of all wires, as it arrives under the command in force."""
         command, out = state.last, sent
         target, value = command.target[..., wires], command.value[..., wires]
         recording = Recording(plan.recorded, *(part[:, None, None] for part in (state.taped, state.anchor, state.played)))
@@ -210,7 +215,7 @@ class Channel:
         return out
 
     def _keep(self, plan: ChannelPlan, state: ChannelState, memory: Memory, sent: Array, hit: Array) -> Memory:
-        """The memory after this step's `sent` (B, N, .), of which `hit` was attacked."""
+        """Return the memory after this step's `sent` (B, N, .), of which `hit` was attacked."""
         history = memory.history
         if plan.recorded:
             history = num.put(history, (state.taped % plan.recorded)[:, None, None], sent)
@@ -218,10 +223,10 @@ class Channel:
 
 
 def _hold(memory: Memory, rows: Array) -> Memory:
-    """The memory with its held sample taken in `rows` (B,) bool."""
+    """Return the memory with its held sample taken in `rows` (B,) bool."""
     return memory._replace(held=np.where(rows[:, None, None], memory.fresh, memory.held))
 
 
 def _copy_tape(memory: Memory, rows: Array) -> Memory:
-    """The memory with the recording of `rows` (B,) bool copied for a replay: the recorder itself runs on."""
+    """Return the memory with the recording of `rows` (B,) bool copied for a replay: the recorder itself runs on."""
     return memory._replace(tape=np.where(rows[:, None, None, None], memory.history, memory.tape))

@@ -13,18 +13,13 @@ own role: the same seed gives the same numbers, whatever the batch.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
-
-from typing_extensions import TypeVar
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 from tailgate.core.draws import Draws
-from tailgate.core.nouns import Air, Array, Command, Estimate, Model, Prior, Received, Scene, View
+from tailgate.core.nouns import Air, Array, Command, Estimate, Model, P, Prior, Received, S, Scene, View
 
 if TYPE_CHECKING:
     from tailgate.core.threat import Brief
-
-P = TypeVar("P", default=Any)
-S = TypeVar("S", default=Any)
 
 
 class Sized(Protocol):

@@ -1,4 +1,4 @@
-"""Who hears whom, drawn: the graph of a network, or the cars of a platoon in a row (thesis figures 5.1 and 6.2; extra: viz)."""
+"""Drawings of who hears whom: the graph of a network, or the cars of a platoon in a row (thesis figures 5.1 and 6.2; extra: viz)."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from tailgate.base.plots import canvas
 from tailgate.core import Array, Model
 
 MANY = 60  # agents: more are drawn on a circle
-ROUNDS = 300  # of the layout
+ROUNDS = 300  # rounds of the layout
 DPI = 160
 FORMATS = ("png", "svg", "pdf")
 INK, EDGE, NODE, ATTACKED = "#1a1a1a", "#6b7076", "#dcebf5", "#b34700"
 
 
 def hops(graph: Array) -> Array:
-    """(N, N) edges between two agents, whichever way they are heard; infinite where nothing joins them."""
+    """Return the edges (N, N) between two agents, whichever way they are heard; infinite where nothing joins them."""
     linked = np.array(graph, bool) | np.array(graph, bool).T
     count = len(linked)
     out = np.where(np.eye(count, dtype=bool), 0.0, np.where(linked, 1.0, np.inf))
@@ -32,7 +32,7 @@ def hops(graph: Array) -> Array:
 
 
 def layout(graph: Array, row: bool = False) -> Array:
-    """(N, 2) places of agents: distances as the hops say (stress majorisation from classical scaling), the same at every call.
+    """Return places (N, 2) of agents whose distances follow the hops (stress majorisation from classical scaling), the same at every call.
 
     row: side by side, agent 0 on the right, as a platoon drives.
     """
@@ -64,7 +64,7 @@ def layout(graph: Array, row: bool = False) -> Array:
 
 
 def edges(graph: Array) -> list[tuple[int, int, bool]]:
-    """(from, to, both ways) of each pair of agents that hear each other, or of which one hears the other."""
+    """Return (from, to, both ways) of each pair of agents where at least one hears the other."""
     heard, out = np.array(graph, bool), []
     for i, j in zip(*np.nonzero(heard), strict=True):
         if i < j or (i > j and not heard[j, i]):
@@ -75,7 +75,9 @@ def edges(graph: Array) -> list[tuple[int, int, bool]]:
 def graph_figure(
     graph: Array, labels: Sequence[str] | None = None, attacked: Collection[int] = (), row: bool = False, title: str = ""
 ) -> Any:
-    """A matplotlib Figure of a graph (N, N) bool, [i, j] when i hears j: lines where two hear each other, else arrows to who hears.
+    """Return a matplotlib Figure of a graph (N, N) bool, [i, j] when i hears j.
+
+    Lines join two that hear each other; arrows point to an agent that hears and is not heard.
 
     labels: of the agents; none: their numbers. attacked: numbers of agents to mark. row: a platoon, the leader on the right.
     Raises InputError for labels or agents that do not fit.
@@ -111,7 +113,7 @@ def graph_figure(
     for i, place in enumerate(places):
         hit = i in attacked
         fill, line = ("#ffffff", ATTACKED) if hit else (NODE, INK)
-        if hit:  # a second ring: nothing is told by colour alone
+        if hit:  # a second ring: colour is never the only sign
             ax.add_patch(Circle(place, _edge(radius, hit), fill=False, edgecolor=ATTACKED, linewidth=1.8, zorder=2))
         ax.add_patch(Circle(place, radius, facecolor=fill, edgecolor=line, linewidth=1.6, zorder=3))
         size = 72.0 * scale * radius * (1.0 if len(labels[i]) < 3 else 2.2 / len(labels[i]))
@@ -126,24 +128,24 @@ def graph_figure(
 
 
 def _edge(radius: float, hit: bool) -> float:
-    """Where the edges end: at the second ring of an attacked agent."""
+    """Return the radius at which edges end: at the second ring of an attacked agent."""
     return 1.32 * radius if hit else radius
 
 
 def _bend(a: int, b: int) -> float:
-    """Height of the arc between two cars of a row."""
+    """Return the height of the arc between two cars of a row."""
     return 0.0 if abs(a - b) < 2 else 0.5 * 0.34 * abs(a - b)
 
 
-def draw_graph(source: Any, path: Path, attacked: Collection[int] = (), title: str = "") -> Path:
-    """Writes the graph of a Model, or of a plant whose agents hear each other, to a .png, .svg or .pdf file; returns its path."""
+def draw_graph(source: object, path: Path, attacked: Collection[int] = (), title: str = "") -> Path:
+    """Write the graph of a Model, or of a plant whose agents hear each other, to a .png, .svg or .pdf file; return its path."""
     form = path.suffix.lower().removeprefix(".")
     if form not in FORMATS:
         raise InputError("out", str(path), f"a file that ends in {', '.join('.' + name for name in FORMATS)}")
     if isinstance(source, Model):
         graph, row = source.graph, bool(source.followers.any())
-    elif callable(getattr(source, "hears", None)):
-        graph, row = source.hears(), hasattr(source, "topology")
+    elif callable(hears := getattr(source, "hears", None)):
+        graph, row = hears(), hasattr(source, "topology")
     else:
         raise InputError("graph", type(source).__name__, "a model, or a plant whose agents hear each other")
     figure, out = graph_figure(graph, None, attacked, row, title), io.BytesIO()

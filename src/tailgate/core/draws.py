@@ -2,12 +2,12 @@
 
 key = 64 bits of BLAKE2b(purpose, party, seed); counter = (episode, block, step, stream). A stream belongs to a ROLE, so
 swapping the defence or the attack leaves every other draw identical, and comparisons are paired. The three
-parties have unrelated keys: what a defence or an attack holds tells nothing of the sensor noise.
+parties have unrelated keys: the draws of a defence or an attack say nothing about the sensor noise.
 """
 
 import hashlib
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from enum import IntEnum
 from functools import cache
 from typing import Any, NamedTuple, cast
@@ -23,6 +23,7 @@ from tailgate.engine.compiled import Code
 
 Array = NDArray[Any]
 
+Pair = Callable[..., tuple[Array, Array]]  # a function of key, episode, step, stream and block that gives two numbers
 PURPOSES = ("train", "tune", "calibrate", "select", "report")
 _PARTIES = ("world", "attack", "defence")
 
@@ -47,18 +48,18 @@ def _party(role: Role) -> int:
 
 
 class Keys(NamedTuple):
-    """Who draws: party keys (B, 3) uint64 and the episode counter (B,) uint32 of each row."""
+    """The keys of the draws: party keys (B, 3) uint64 and the episode counter (B,) uint32 of each row."""
 
     key: Array
     episode: Array
 
     def at(self, role: Role, step: Array) -> "Draws":
-        """The draws of one role at each row's own step (B,)."""
+        """Return the draws of one role at each row's own step (B,)."""
         return Draws(self.key[:, _party(role)], self.episode, step.astype(np.uint32), int(role))
 
 
 def keys(purpose: str, seeds: Sequence[int]) -> Keys:
-    """Keys of B rows, one seed each, at episode 0. `purpose` keeps training and report seeds apart."""
+    """Return keys of B rows, one seed each, at episode 0. `purpose` keeps training and report seeds apart."""
     if purpose not in PURPOSES:
         raise InputError("purpose", purpose, f"one of {', '.join(PURPOSES)}")
     out = np.empty((3, len(seeds)), np.uint64)
@@ -70,7 +71,7 @@ def keys(purpose: str, seeds: Sequence[int]) -> Keys:
 
 
 @cache
-def _code(pair: Any) -> Code:
+def _code(pair: Pair) -> Code:
     return Code(pair, np.uint64, 5)
 
 
@@ -82,14 +83,14 @@ class Draws(NamedTuple):
     step: Array
     stream: int
 
-    def _numbers(self, pair: Any, shape: tuple[int, ...], tag: int) -> Array:
-        """(B, *shape) numbers of a function that gives two for each block."""
+    def _numbers(self, pair: Pair, shape: tuple[int, ...], tag: int) -> Array:
+        """Return numbers (B, *shape) of a function that gives two for each block."""
         size, batch = math.prod(shape), len(self.key)
         blocks, stream = (size + 1) // 2, np.uint64(self.stream << 16 | tag)
         if isinstance(self.key, Traced):
             counters = self.key, self.episode.astype(np.uint64), self.step.astype(np.uint64), stream
-            out: Any = [number for block in range(blocks) for number in pair(*counters, np.uint64(block))][:size]
-            held: Any = np.stack(out, axis=-1) if out else np.zeros((batch, 0))
+            out = [number for block in range(blocks) for number in pair(*counters, np.uint64(block))][:size]
+            held = np.stack(out, axis=-1) if out else np.zeros((batch, 0))
             return cast(Array, held.reshape(batch, *shape))
         given = np.empty((5, blocks, batch), np.uint64)
         given[0], given[1], given[2], given[3], given[4] = self.key, self.episode, self.step, stream, np.arange(blocks)[:, None]
@@ -98,15 +99,15 @@ class Draws(NamedTuple):
         return num.last_to_first(both[:size].reshape(*shape, batch))
 
     def normal(self, shape: tuple[int, ...] = (), tag: int = 0) -> Array:
-        """Standard normals (B, *shape)."""
+        """Return standard normals (B, *shape)."""
         return self._numbers(elementary.normal_pair, shape, tag)
 
     def uniform(self, shape: tuple[int, ...] = (), tag: int = 0) -> Array:
-        """Uniforms on (0, 1), ends excluded, (B, *shape)."""
+        """Return uniforms on (0, 1), ends excluded, (B, *shape)."""
         return self._numbers(elementary.uniform_pair, shape, tag)
 
 
 def constants(name: str, seed: int) -> Draws:
-    """Draws for the random constants of a component, such as the matrices of a random system: one row, the same for every episode."""
+    """Return draws for the random constants of a component, such as a random matrix: one row, the same for every episode."""
     digest = hashlib.blake2b(f"constants/{name}/{int(seed)}".encode(), digest_size=8).digest()
     return Draws(np.array([int.from_bytes(digest, "little")], np.uint64), np.zeros(1, np.uint32), np.zeros(1, np.uint32), 0)

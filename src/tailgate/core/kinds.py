@@ -72,7 +72,7 @@ class Effect:
         return np.zeros_like(value)
 
     def grants(self, limits: Limits, value: Array) -> Array:
-        """Return for each value (B, N, w), bool, if the threat model grants it."""
+        """Return (B, N, w) bool: the threat model grants the value."""
         return np.asarray(value == self.clip(limits, value))
 
     def reads(self, sent: Array, value: Array, memory: Memory, recording: Recording) -> Array:

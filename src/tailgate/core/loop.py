@@ -1,9 +1,9 @@
 """The loop: the arrows between the nouns, pure on its state.
 
-    each k:  plant -> sensors -> [seat: the attack's command] -> channel -> defence -> controller -> channel -> plant
+    each k:  plant -> sensors -> [the attack's command] -> channel -> defence -> controller -> channel -> plant
 
 Time runs k = 1, 2, ..., horizon. At k = 0 the prior is the estimate and the controller drives the first step on it, so that every
-measured step is a predict and an update. `sense` and `advance` are the two halves of a step, with the attack's seat between them.
+measured step is a predict and an update. `sense` and `advance` are the two halves of a step; the attack decides between them.
 """
 
 from __future__ import annotations
@@ -43,6 +43,7 @@ from tailgate.core import (
 from tailgate.core.channel import Channel, ChannelPlan, ChannelState
 from tailgate.core.draws import Keys, Role
 from tailgate.core.lossy_link import Link, LinkState
+from tailgate.core.nouns import P, S
 from tailgate.core.score_threshold import Watched
 from tailgate.core.threat import Brief, ThreatModel
 from tailgate.engine.array import Traced
@@ -52,7 +53,7 @@ _START = np.uint32(0xFFFFFFFF)  # the step under which start() draws: no episode
 
 
 def check_estimate(estimate: Estimate, model: Model, batch: int, k: Array) -> None:
-    """Raise InputError when a defence's output, of step k (B,), has not the type, shape or finiteness that the loop needs."""
+    """Raise InputError when a defence's output at step k (B,) lacks the type, shape or finite values that the loop needs."""
     shape = (batch, model.agents)
     wanted = {
         "x": ((*shape, model.states), "f"), "score": (shape, "f"), "alarm": (shape, "b"), "mode": (shape, "iu"), "probe": (shape, "b"),
@@ -75,10 +76,10 @@ def check_estimate(estimate: Estimate, model: Model, batch: int, k: Array) -> No
 
 
 class LoopPlan(NamedTuple):
-    plant: Any
-    sensor: Any
-    controller: Any
-    manoeuvre: Any
+    plant: object
+    sensor: object
+    controller: object
+    manoeuvre: object
     defence: Any
     channel: ChannelPlan
 
@@ -89,8 +90,8 @@ class LoopState(NamedTuple):
     keys: Keys
     k: Array  # (B,) int64
     plant: Any
-    manoeuvre: Any
-    controller: Any
+    manoeuvre: object
+    controller: object
     defence: Any
     channel: ChannelState
     estimate: Estimate
@@ -107,8 +108,8 @@ class LoopState(NamedTuple):
 class Loop:
     """A closed loop of one plant under one defence, for B independent episodes.
 
-    `told`: the model that defence, controller, channel and attacker go by, where the plant's and the sensor's own is another; `load`: the
-    vehicle's mass over the nominal one, by which a commanded acceleration is divided [-]; `link`: readings that are lost or late.
+    `told`: the model that defence, controller, channel and attacker use, where it differs from the model of plant and sensor; `load`: the
+    vehicle's mass over the nominal one, which divides a commanded acceleration [-]; `link`: readings that are lost or late.
     """
 
     plant: Plant
@@ -160,7 +161,7 @@ class Loop:
         return lock(copy.deepcopy(self.plan.defence))
 
     def start(self, keys: Keys) -> LoopState:
-        """States of B fresh episodes at k = 1, measured."""
+        """Return the states of B fresh episodes at k = 1, measured."""
         plan, model = self.plan, self.model
         batch = len(keys.key)
         at_start = np.full(batch, _START)
@@ -188,7 +189,7 @@ class Loop:
         )  # fmt: skip
 
     def restart(self, state: LoopState, mask: Array) -> LoopState:
-        """New episodes in the rows of `mask` (B,) bool, the next of their own counter; the other rows keep every bit."""
+        """Return the state with new episodes in the rows of `mask` (B,) bool, each with its next counter; the other rows keep every bit."""
         rows = np.flatnonzero(mask)
         if not len(rows):
             return state
@@ -196,13 +197,13 @@ class Loop:
         return self.reseed(state, rows, keys)
 
     def reseed(self, state: LoopState, rows: Array, keys: Keys) -> LoopState:
-        """New episodes in `rows` (R,) with the given keys of R rows."""
+        """Return the state with new episodes in `rows` (R,), from the given keys of R rows."""
         fresh = self.start(keys)
         out: LoopState = put_rows(state, rows, fresh)
         return out
 
     def sense(self, state: LoopState) -> View:
-        """What the threat model lets the attacker see now."""
+        """Return the part of the state that the threat model lets the attacker see now."""
         plan, channel = self.plan, state.channel
         threat = self.threat
         budget_left = Channel().budget_left(plan.channel, channel)
@@ -218,7 +219,7 @@ class Loop:
             allowed=Channel().allowed(plan.channel, channel, state.k),
             last=channel.last,
         )
-        if self.model.air:  # a radio signal: whoever is near hears it
+        if self.model.air:  # a radio signal: everybody near hears it
             view = view._replace(probed=state.probed)
         if threat.knowledge in ("grey", "white"):
             view = view._replace(control=state.control)
@@ -231,7 +232,7 @@ class Loop:
         return shown._replace(defence=view.defence)
 
     def advance(self, state: LoopState, command: Command) -> tuple[LoopState, Frame]:
-        """The rest of the step: channel, defence, controller, plant, and the next measurement."""
+        """Play the rest of the step: channel, defence, controller, plant, and the next measurement."""
         plan = self.plan
         truth, odometry = self._truth(state.plant, state.controller), self.plant.odometry(plan.plant, state.plant)
         channel, received, arrived, refused = Channel().apply(
@@ -247,7 +248,7 @@ class Loop:
         )
         defence, estimate = pair_of(answer)
         check_estimate(estimate, self.model, len(state.k), state.k)
-        if "probe" not in self.uses:  # who does not say that it switches the probe off cannot
+        if "probe" not in self.uses:  # only a defence that declares `probe` may mute it
             estimate = estimate._replace(probe=num.full(estimate.probe.shape, True, bool))
         assert received.v2v is not None
         controller, u = self.controller.step(plan.controller, state.controller, estimate, received.v2v, odometry)
@@ -274,32 +275,34 @@ class Loop:
         )  # fmt: skip
         return state, frame
 
-    def step(self, state: LoopState, attack: Attack, plan: Any, memory: Any) -> tuple[LoopState, Any, Frame]:
-        """sense, decide, advance. `plan` and `memory` are the attack's plan and state."""
+    def step(self, state: LoopState, attack: Attack[P, S], plan: P, memory: S) -> tuple[LoopState, S, Frame]:
+        """Sense, decide and advance once. `plan` and `memory` are the attack's plan and state."""
         memory, command = attack.decide(plan, memory, self.sense(state), state.keys.at(Role.ATTACK, state.k))
         state, frame = self.advance(state, command)
         return state, memory, frame
 
-    def _truth(self, plant: Any, controller: Any) -> Array:
+    def _truth(self, plant: object, controller: object) -> Array:
         held = self.controller.held(self.plan.controller, controller, len(self.plant.lead_speed_of(plant)))
         return self.plant.truth(self.plan.plant, plant, held)
 
     def _again(self, state: LoopState, truth: Array) -> Callable[[Air], Received] | None:
-        """This step's measurement under what is radiated; None of sensors that receive nothing over the air."""
+        """Return this step's measurement as a function of what is radiated; None for sensors that receive nothing over the air."""
         if not self.model.air:
             return None
         sensor, draws = cast(Receiver, self.sensor), state.keys.at(Role.SENSOR, state.k)
         return lambda air: sensor.disturbed(self.plan.sensor, truth, state.estimate.probe, draws, air)
 
-    def _measure(self, keys: Keys, k: Array, plant: Any, controller: Any, estimate: Estimate) -> tuple[Array, Received]:
+    def _measure(self, keys: Keys, k: Array, plant: object, controller: object, estimate: Estimate) -> tuple[Array, Received]:
         truth = self._truth(plant, controller)
         received = self.sensor.measure(self.plan.sensor, truth, estimate.probe, keys.at(Role.SENSOR, k))
         columns = [received.y[..., i] for i in range(received.y.shape[-1])]
         v2v = self.plant.v2v(self.plan.plant, plant)
         return num.stack(columns + [v2v[..., i] for i in range(v2v.shape[-1])]), received
 
-    def _move(self, keys: Keys, k: Array, manoeuvre: Any, plant: Any, applied: Array, u: Array | None = None) -> tuple[Any, Any, Array]:
-        """-> manoeuvre, plant, and what is known of the input; u is what was commanded, where that is not what is applied."""
+    def _move(
+        self, keys: Keys, k: Array, manoeuvre: object, plant: object, applied: Array, u: Array | None = None
+    ) -> tuple[object, object, Array]:
+        """Return the next states of manoeuvre and plant, and the known input; u is the command where it differs from what is applied."""
         plan = self.plan
         manoeuvre, exo = self.manoeuvre.accel(
             plan.manoeuvre, manoeuvre, k, self.plant.lead_speed_of(plant), keys.at(Role.MANOEUVRE, k)

@@ -1,7 +1,7 @@
-"""The link between a sensor and who reads it, where it is another than everyone is told: readings are lost, or come late.
+"""A lossy link between a sensor and its readers, which nobody is told of: readings are lost, or come late.
 
-Nobody attacks here. A reading that is lost is known to be lost (`valid`), and its wire keeps the last value that arrived, as in an attack
-of that kind; one that is late is not known to be.
+Nobody attacks here. The receiver knows of a lost reading (`valid`), and its wire keeps the last value that arrived, as in an attack of kind
+dropout. It does not know that a reading is late.
 """
 
 from __future__ import annotations
@@ -32,17 +32,17 @@ class Link:
 
     @property
     def perfect(self) -> bool:
-        """Whether what is sent arrives at once."""
+        """True if readings arrive at once."""
         return self.loss == 0.0 and self.latency == 0
 
     def start(self, sent: Array) -> LinkState:
-        """sent (B, N, wires): the first readings and messages, which arrive."""
+        """Return the state at the first readings and messages `sent` (B, N, wires), which arrive."""
         way = num.zeros((*sent.shape, self.latency))
         way[...] = sent[..., None]
         return LinkState(way, sent)
 
     def step(self, state: LinkState, sent: Array, received: Received, draws: Draws) -> tuple[LinkState, Array, Received]:
-        """-> state, and what arrives of `sent` (B, N, wires) and of the readings among it."""
+        """Return the next state, and what arrives of `sent` (B, N, wires) and of the readings in it."""
         way, q = state.way, received.y.shape[-1]
         if self.latency:
             whole = num.zeros((*sent.shape, self.latency + 1))

@@ -1,6 +1,6 @@
 """A small neural network, computed in float64 with a fixed order of summation, and its files: safetensors with a JSON header.
 
-A trace does not depend on the batch, because no sum does. Reading a file executes nothing.
+No sum depends on the batch, and so no trace does. Reading a file executes nothing.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, Protocol, TypeVar
 
 import numpy as np
 from safetensors.numpy import load as load_tensors
@@ -21,11 +21,21 @@ from tailgate.base.reading import TENSORS, load_json, read_bytes, tensors_of
 from tailgate.core.nouns import Array
 from tailgate.core.schema import build
 
-T = TypeVar("T")
+
+class Trained(Protocol):
+    """The header of a file of trained weights."""
+
+    @property
+    def tensors(self) -> str: ...
+    @property
+    def sha256(self) -> str: ...
+
+
+T = TypeVar("T", bound=Trained)
 
 
 class Memory(NamedTuple):
-    """What an LSTM remembers, (B, H) each."""
+    """The memory of an LSTM, (B, H) each."""
 
     hidden: Array
     cell: Array
@@ -47,11 +57,11 @@ class Lstm:
         return len(self.bias) // 4
 
     def blank(self, batch: int) -> Memory:
-        """The memory of episodes that begin."""
+        """Return the memory of episodes that begin."""
         return Memory(np.zeros((batch, self.size)), np.zeros((batch, self.size)))
 
     def __call__(self, observation: Array, memory: Memory) -> Memory:
-        """(B, d) float32 and the memory before it, to the memory after it."""
+        """Return the memory after an observation (B, d) float32 and the memory before it."""
         read = np.concatenate([np.asarray(observation, np.float64), memory.hidden], axis=1)
         gates = num.dense(read, self.weight, self.bias, squash=False)
         admit, keep, new, show = (np.ascontiguousarray(gates[:, n * self.size : (n + 1) * self.size]) for n in range(4))
@@ -77,7 +87,7 @@ class Network:
     squashed: bool = False
 
     def __call__(self, observation: Array) -> Array:
-        """What the perceptron reads, (B, d), to (B, o): logits or values of discrete actions, or the mean of a continuous action."""
+        """Return the output (B, o) for an input (B, d): logits or values of discrete actions, or the mean of a continuous action."""
         x: Array = np.asarray(observation, np.float64)
         for i, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
             x = num.dense(x, weight, bias, squash=self.squashed or i + 1 < len(self.weights))
@@ -85,9 +95,10 @@ class Network:
 
 
 def read_trained(kind: type[T], form: str, path: Path, field: str, where: str) -> tuple[T, dict[str, Array]]:
-    """Header, of dataclass `kind` with `tensors` and `sha256`, and tensors of what was trained: a policy or a defender.
+    """Return the header and the tensors of a trained policy or defender.
 
-    Reads data and runs nothing. Raises InputError, which names `where`, the field and its value, for whatever else may stand in the files.
+    kind: the header's dataclass. Reads data and runs nothing. Raises InputError, which names `where`, the field and its value, for any
+    other content.
     """
     try:
         data = load_json(path, strict=False)
@@ -98,7 +109,7 @@ def read_trained(kind: type[T], form: str, path: Path, field: str, where: str) -
     if not isinstance(data, dict) or data.get("format") != form:
         shown = data.get("format") if isinstance(data, dict) else type(data).__name__
         raise InputError(where, shown, f"a JSON object of format {form!r}")
-    header: Any = build(kind, data, where)
+    header = build(kind, data, where)
     if not header.tensors or Path(header.tensors).name != header.tensors:
         raise InputError(f"{where}.tensors", header.tensors, "the name of a file beside the JSON file")
     try:
@@ -114,7 +125,10 @@ def read_trained(kind: type[T], form: str, path: Path, field: str, where: str) -
 
 
 def perceptron(tensors: dict[str, Array], layers: int, width: int, where: str) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
-    """Weights and biases of the layers in a file; raises InputError where one is missing, not finite, or does not fit the one before."""
+    """Return weights and biases of the layers in a file.
+
+    Raise InputError where one is missing, not finite, or does not fit the one before.
+    """
     weights, biases = [], []
     for i in range(layers):
         weight, bias = pair(tensors, f"layer{i}", where, f"{width}, outputs", partial(_takes, width))

@@ -13,10 +13,11 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Generic, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from typing_extensions import TypeVar
 
 from tailgate.base.errors import InputError
 from tailgate.core.kinds import AIRED as AIRED
@@ -35,16 +36,18 @@ if TYPE_CHECKING:
     from tailgate.core.components import Defence
 
 Array = NDArray[Any]
+P = TypeVar("P", default=Any)  # type of a component's plan
+S = TypeVar("S", default=Any)  # type of its state
 
 
-def param(default: Any, doc: str, if_any: bool = False) -> Any:
-    """A dataclass field with its default, unit and one sentence; with `if_any` its data is written only where it is not empty."""
+def param(default: object, doc: str, if_any: bool = False) -> Any:
+    """Return a dataclass field with its default, unit and one sentence; with `if_any` its data is written only where it is not empty."""
     return dataclasses.field(default=default, metadata={"doc": doc, "if_any": if_any})
 
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """What is publicly known of the plant: x+ = A x + B u + c + w, y_i = C_i x + v_i, x being one state for all agents.
+    """The public model of the plant: x+ = A x + B u + c + w, y_i = C_i x + v_i, where x is one state for all agents.
 
     A (n, n), B (n, m), c (n,), C (N, q, n), Q = cov w (n, n), R = cov v (N, q, q); graph (N, N) bool, [i, j] when i hears j;
     dt [s]; `sensors` names the q rows of C, `v2v` the fields of the message that a controller hears, `actuators` what an agent commands.
@@ -96,7 +99,7 @@ class Model:
 
     @property
     def air(self) -> bool:
-        """Whether the sensors listen to their own echo."""
+        """True if the sensors listen to their own echo."""
         return self.challenge > 0
 
     @property
@@ -106,15 +109,15 @@ class Model:
         return np.asarray((self.gap != 0.0).any(axis=1))
 
     def gap_error(self, x: Array, truth: Array) -> Array:
-        """(..., N) [m] by how much each agent overestimates its gap, from (..., N, n); 0 without a road."""
+        """Return by how much each agent overestimates its gap [m] (..., N), from (..., N, n); 0 without a road."""
         return _rows(self.gap, x, truth)
 
     def speed_error(self, x: Array, truth: Array) -> Array:
-        """(..., N) [m/s] by how much each agent overestimates its speed, from (..., N, n); 0 without a road."""
+        """Return by how much each agent overestimates its speed [m/s] (..., N), from (..., N, n); 0 without a road."""
         return _rows(self.speed, x, truth)
 
     def error(self, x: Array, truth: Array) -> Array:
-        """(..., N) size of an estimate's error: of the gap [m] where some agent follows another, else the 2-norm of the whole state's."""
+        """Return the size of an estimate's error (..., N): of the gap [m] where an agent follows another, else of the whole state."""
         if self.followers.any():
             return np.abs(self.gap_error(x, truth))
         total = np.zeros(x.shape[:-1])
@@ -125,7 +128,7 @@ class Model:
 
 
 def _rows(rows: Array | None, x: Array, truth: Array) -> Array:
-    """(..., N): row i of `rows` (N, n) times the error x - truth (..., N, n) of agent i, in fixed order."""
+    """Return row i of `rows` (N, n) times the error x - truth (..., N, n) of agent i, (..., N), summed in fixed order."""
     assert rows is not None
     out = np.zeros(x.shape[:-1])
     for i, j in zip(*np.nonzero(rows), strict=True):
@@ -134,14 +137,14 @@ def _rows(rows: Array | None, x: Array, truth: Array) -> Array:
 
 
 class Prior(NamedTuple):
-    """What the defence is told before the first measurement: mean (B, N, n) and cov (B, N, n, n)."""
+    """The defence's knowledge before the first measurement: mean (B, N, n) and cov (B, N, n, n)."""
 
     mean: Array
     cov: Array
 
 
 class Scene(NamedTuple):
-    """The road as anyone beside it sees it, each (B, N). Gap [m] to the car ahead, bumper to bumper; speeds [m/s]."""
+    """The road as anyone near it sees it, each (B, N). Gap [m] to the car ahead, bumper to bumper; speeds [m/s]."""
 
     gap: Array  # inf where nobody drives ahead
     speed: Array
@@ -153,7 +156,7 @@ class Scene(NamedTuple):
 
 
 class Received(NamedTuple):
-    """What arrives over the wires in one step, each leaf (B, N, .).
+    """The readings and messages that arrive over the wires in one step, each leaf (B, N, .).
 
     The loop fills the last three only for a defence whose card declares them in `uses`.
     """
@@ -167,7 +170,7 @@ class Received(NamedTuple):
 
 
 class Air(NamedTuple):
-    """What an attacker radiates at each receiver in one step."""
+    """The noise and delays that an attacker radiates at each receiver in one step."""
 
     power: Array  # (B, N) noise [W]; 0 for none
     delay: Array  # (B, N) by how much an answered echo is too late, as range [m]; 0 where none is answered
@@ -198,12 +201,12 @@ class Estimate(NamedTuple):
     limits: Array | None = None
 
 
-def pair_of(answer: Any) -> tuple[Any, Estimate]:
-    """What a defence's step has to return; raises InputError for anything else."""
+def pair_of(answer: object) -> tuple[Any, Estimate]:
+    """Return the pair (state, Estimate) of a defence's step; raise InputError for anything else."""
     if not isinstance(answer, tuple) or len(answer) != 2 or not isinstance(answer[1], Estimate):
         got = f"({', '.join(type(part).__name__ for part in answer)})" if type(answer) is tuple else type(answer).__name__
-        raise InputError("defence output", got, "a pair (state, Estimate), which its step returns")
-    return answer
+        raise InputError("defence output", got, "a pair (state, Estimate) as the result of its step")
+    return answer[0], answer[1]
 
 
 class Innovation(NamedTuple):
@@ -214,7 +217,7 @@ class Innovation(NamedTuple):
 
 
 class View(NamedTuple):
-    """What the threat model lets an attacker see. None where it is not granted."""
+    """The part of an episode that the threat model lets an attacker see. None where it is not granted."""
 
     k: Array  # (B,) step, from 1
     progress: Array  # (B,) k / horizon
@@ -233,12 +236,12 @@ class View(NamedTuple):
     truth: Array | None = None  # white: (B, N, n)
 
 
-class WhiteBox(NamedTuple):
-    """The defence as a white-box attacker holds it. Its step is pure on the given state: look ahead at will."""
+class WhiteBox(NamedTuple, Generic[P, S]):
+    """The defence as a white-box attacker holds it. Its step is pure, so that the attacker may look ahead."""
 
-    defence: Defence
-    plan: Any
-    state: Any
+    defence: Defence[P, S]
+    plan: P
+    state: S
     known_u: Array  # (B, N, m) the known input since the last step
 
 
@@ -261,7 +264,7 @@ class Frame(NamedTuple):
 
 
 def no_command(batch: int, agents: int, wires: int) -> Command:
-    """The command that does nothing."""
+    """Return the command that does nothing."""
     return Command(
         np.zeros(batch, np.int8),
         np.zeros((agents, wires, batch), bool).transpose(2, 0, 1),

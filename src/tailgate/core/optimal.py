@@ -1,9 +1,9 @@
 """Optimal attackers where they can be computed: a budget of losses against a Kalman filter, and a held reading in a scalar loop.
 
 Lost readings. The covariance of the filter follows P+ = F(P) where the readings come and P+ = A P A' + Q where they are lost. Both maps are
-monotone in the Loewner order, and a loss is never below a reading. So of two attackers with the same steps left, the one with the larger
-covariance is never worse off, whatever follows, and the other can be dropped: dynamic programming over sets of covariances. Both maps are
-also concave, so that F((1 + s) P) <= (1 + s) F(P): dropping what is below (1 + s) times another costs at most that factor in each step.
+monotone in the Loewner order, and a loss is never below a reading. Compare two attackers with the same steps left: the one with the larger
+covariance is never worse off, so that the other can be dropped. This is dynamic programming over sets of covariances. Both maps are also
+concave, so that F((1 + s) P) <= (1 + s) F(P): dropping what is below (1 + s) times another costs at most that factor in each step.
 
 One state has one covariance per number of steps left. With |a| >= 1 the whole budget in one block at the end is then the best for the last
 covariance: exchanging a loss and a later reading never helps. It is the answer of H. Zhang, P. Cheng, L. Shi and J. Chen (Optimal
@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from importlib import import_module
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -30,7 +30,7 @@ MOST = 5_000  # covariances side by side: beyond, the exact answer takes too lon
 
 
 class Rules(NamedTuple):
-    """When a threat model accepts an attack step; the same as the channel's, with what is not limited at the horizon."""
+    """The rule by which a threat model accepts an attack step, as in the channel; limits that are not set equal the horizon."""
 
     onset: int
     last: int
@@ -45,7 +45,7 @@ class Rules(NamedTuple):
         return cls(threat.onset, last, min(budget, horizon), horizon if threat.duration is None else threat.duration, threat.cooldown)
 
     def after(self, k: int, held: tuple[int, int, int], attack: bool) -> tuple[int, int, int] | None:
-        """(used, burst, cooldown) after step k with an attack or without; None where it would be refused."""
+        """Return (used, burst, cooldown) after step k with an attack or without; None where it would be refused."""
         used, burst, pause = held
         if attack:
             ok = self.onset <= k <= self.last and pause == 0 and used < self.budget and burst < self.duration
@@ -53,7 +53,7 @@ class Rules(NamedTuple):
         return used, 0, max((self.cooldown if burst else pause) - 1, 0)
 
     def key(self, held: tuple[int, int, int]) -> tuple[int, int, int]:
-        """What of it matters for the future: the length of a burst only where bursts are limited or followed by a pause."""
+        """Return the part that matters for the future: the length of a burst only where bursts are limited or followed by a pause."""
         used, burst, pause = held
         if self.duration < self.budget:
             return held
@@ -72,11 +72,11 @@ class Filtering:
     lost: Array
 
     def predicted(self, P: Array) -> Array:
-        """A P A' + Q for P (M, n, n)."""
+        """Return A P A' + Q for P (M, n, n)."""
         return np.asarray(self.A @ P @ self.A.T + self.Q)
 
     def updated(self, P: Array, keep: Array) -> Array:
-        """The covariance (M, n, n) after the readings `keep` (q,) bool of a predicted one."""
+        """Return the covariance (M, n, n) after the readings `keep` (q,) bool of a predicted one."""
         if not keep.any():
             return P
         C = self.C[keep]
@@ -86,11 +86,11 @@ class Filtering:
         return np.asarray(0.5 * (out + np.swapaxes(out, 1, 2)))
 
     def step(self, P: Array, attack: bool) -> Array:
-        """The covariance (M, n, n) one step later."""
+        """Return the covariance (M, n, n) one step later."""
         return self.updated(self.predicted(P), ~self.lost if attack else np.ones_like(self.lost))
 
     def covariances(self, P: Array, schedule: Array) -> Array:
-        """(K, n, n) after each of K steps from P (n, n), with an attack where `schedule` (K,) bool says."""
+        """Return the covariances (K, n, n) after each of K steps from P (n, n), with an attack where `schedule` (K,) bool is true."""
         out = []
         held = P[None]
         for attack in schedule.tolist():
@@ -108,7 +108,7 @@ class Front(NamedTuple):
 
 
 def undominated(P: Array, total: Array | None = None, slack: float = SLACK) -> Array:
-    """Indices of the members of P (M, n, n), with `total` (M,) where it counts, that no other one dominates."""
+    """Return indices of the members of P (M, n, n), with `total` (M,) where it counts, that no other one dominates."""
     size = np.trace(P, axis1=1, axis2=2)
     order = np.argsort(-size, kind="stable")
     if P.shape[1] == 1 and total is None:
@@ -127,7 +127,7 @@ def undominated(P: Array, total: Array | None = None, slack: float = SLACK) -> A
 
 
 def _positive(D: Array) -> Array:
-    """(M,) bool: D (M, n, n) symmetric is positive semidefinite."""
+    """Return (M,) bool: the symmetric D (M, n, n) is positive semidefinite."""
     if D.shape[1] == 1:
         return np.asarray(D[:, 0, 0] >= 0.0)
     if D.shape[1] == 2:
@@ -139,7 +139,7 @@ def _positive(D: Array) -> Array:
 
 
 def best_losses(system: Filtering, P: Array, rules: Rules, horizon: int, objective: Objective = "final", slack: float = SLACK) -> Array:
-    """(horizon,) bool: the steps 1 .. horizon whose loss makes the trace of the covariance largest, at the horizon or summed.
+    """Return (horizon,) bool: the steps 1 .. horizon whose loss makes the trace of the covariance largest, at the horizon or summed.
 
     P (n, n) is the covariance before step 1. Exact up to the factor (1 + slack)^horizon. Raises NotApplicable where the sets grow too
     large.
@@ -171,7 +171,7 @@ def _best(parts: list[Front], objective: Objective, slack: float) -> Front:
 
 
 def reach(A: Array, P: Array, C: Array, R: Array, Q: Array, steps: int) -> list[Array]:
-    """L_j = S^1/2' K' (A')^j (q, n), j = steps - 1 .. 0, of a filter with the covariance P- (n, n) at the first step.
+    """Return L_j = S^1/2' K' (A')^j (q, n), j = steps - 1 .. 0, of a filter with the covariance P- (n, n) at the first step.
 
     Unnoticed innovations move the estimate along e by sqrt(gate) sum_j |L_j e| in all (`bounds.stealth_bound`).
     """
@@ -190,7 +190,7 @@ def reach(A: Array, P: Array, C: Array, R: Array, Q: Array, steps: int) -> list[
 
 
 def farthest(model: Model, P: Array, steps: int) -> Array:
-    """(n,) the unit vector e with the largest sum_j |L_j e|: the best of ascents from every axis and from the longest of each L_j.
+    """Return the unit vector e (n,) with the largest sum_j |L_j e|: the best of ascents from every axis and from the longest of each L_j.
 
     The sum is convex in e, and e <- its gradient, of length one, never lowers it.
     """
@@ -213,13 +213,13 @@ def farthest(model: Model, P: Array, steps: int) -> Array:
 
 
 def stealth_programme(model: Model, P: Array, direction: Array, gate: float, bound: float, steps: int) -> tuple[float, Array]:
-    """The largest e' (x^ - x) after `steps` steps without noise, and what is injected (steps, q), as one convex programme (needs cvxpy).
+    """Return the largest e' (x^ - x) after `steps` steps without noise, and the injected values (steps, q), by cvxpy.
 
     A value that is injected, and not an innovation, is bounded: r_k = a_k - C A d_(k-1) for a deviation d, so that a bound ties the steps
     together. P (n, n) is the predicted covariance at the first step.
     """
     try:
-        cvxpy: Any = import_module("cvxpy")
+        cvxpy = import_module("cvxpy")
     except ImportError as error:
         raise ImportError("cvxpy is missing: pip install 'tailgate[cvxpy]'") from error
     C, R = model.C[0], model.R[0]
@@ -257,13 +257,13 @@ class Grid(NamedTuple):
 
     @classmethod
     def of(cls, sd: float, reach: float, spacing: int) -> Grid:
-        """Up to `reach` standard deviations on either side of 0, `spacing` points to each."""
+        """Return a grid of up to `reach` standard deviations on either side of 0, `spacing` points to each."""
         half, wide = math.ceil(reach * spacing), 6 * spacing
         raw = num.exp(-0.5 * (np.arange(-wide, wide + 1) / spacing) ** 2)
         return cls(np.arange(-half, half + 1) * (sd / spacing), sd / spacing, raw / math.fsum(raw.tolist()))
 
     def blurred(self, V: Array) -> Array:
-        """E V(m + w, .) at every m of the grid, from V (G, ...); beyond the grid V is that at its end."""
+        """Return E V(m + w, .) at every m of the grid, from V (G, ...); beyond the grid V is that at its end."""
         wide = len(self.weights) // 2
         padded = np.concatenate([np.repeat(V[:1], wide, axis=0), V, np.repeat(V[-1:], wide, axis=0)])
         out = np.zeros_like(V)
@@ -272,12 +272,12 @@ class Grid(NamedTuple):
         return out
 
     def nearest(self, x: Array) -> Array:
-        """Indices of the points nearest to x."""
+        """Return indices of the points nearest to x."""
         half = len(self.points) // 2
         return np.clip(np.floor(x / self.step + 0.5).astype(np.int64) + half, 0, len(self.points) - 1)
 
     def cubic(self, m: Array) -> tuple[Array, list[Array]]:
-        """The first of the four points about each m, and their weights in the cubic through them."""
+        """Return the first of the four points about each m, and their weights in the cubic through them."""
         place = np.clip(m / self.step + len(self.points) // 2, 0.0, len(self.points) - 1.0)
         first = np.clip(np.floor(place).astype(np.int64) - 1, 0, len(self.points) - 4)
         t = place - first
@@ -287,20 +287,23 @@ class Grid(NamedTuple):
 
 
 class HoldTable(NamedTuple):
-    """When to hold. `hold` (K, budget + 1, G, G) bool by step, budget left, state and last good reading; value (G, G) before step 1."""
+    """A table of when to hold.
+
+    `hold` (K, budget + 1, G, G) bool by step, budget left, state and last good reading; value (G, G) before step 1.
+    """
 
     grid: Grid
     hold: Array
     value: Array
 
     def decide(self, k: Array, left: Array, x: Array, good: Array) -> Array:
-        """(B,) bool at steps k, with `left` of the budget, for a state x and a last good reading."""
+        """Return (B,) bool: hold at steps k, with `left` of the budget, for a state x and a last good reading."""
         whole = np.minimum(left, float(self.hold.shape[1] - 1)).astype(np.int64)
         return np.asarray(self.hold[k - 1, whole, self.grid.nearest(x), self.grid.nearest(good)])
 
 
 def best_holds(loop: Holding, rules: Rules, horizon: int, objective: Objective, grid: Grid) -> HoldTable:
-    """When to hold, by dynamic programming backwards over the state x, the last good reading h and the budget left.
+    """Return when to hold, by dynamic programming backwards over the state x, the last good reading h and the budget left.
 
     What is made large is the expected squared error of a defence that believes the reading. Held at h it is (x - h)^2, and
     x+ = a x - g h + w; else it is 0, x+ = (a - g) x + w, and x is the last good reading.

@@ -1,11 +1,12 @@
-"""What a parameter may be, by what it measures. A value outside is refused where a component is built, by the field's name.
+"""Types of parameters, by what they measure. A value outside is refused where a component is built, by the field's name.
 
 The widest limits, 1e30, keep products of several parameters finite; those of lengths, times and speeds are far outside of any road.
 """
 
 from typing import Annotated
 
-from pydantic import Field
+from pydantic import Field, GetPydanticSchema
+from pydantic_core import core_schema
 
 from tailgate.base.errors import InputError
 
@@ -41,6 +42,8 @@ Bounded = Annotated[float, Field(ge=-1e9, le=1e9, allow_inf_nan=False)]  # what 
 Decibel = Annotated[float, Field(ge=-200.0, le=200.0, allow_inf_nan=False)]
 
 TimeSpan = Annotated[tuple[Time, Time], Field(min_length=2, max_length=2)]
+
+Unchecked = GetPydanticSchema(lambda kind, handler: core_schema.any_schema())  # a component: it was checked when it was built
 
 
 def check_order(field: str, pair: tuple[float | None, float | None] | None, strict: bool = False) -> None:

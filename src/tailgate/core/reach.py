@@ -1,4 +1,4 @@
-"""Who hears whom, and whether each agent can know the whole state: detectability with reachability in the graph (spec of the networks)."""
+"""Detectability with reachability in the graph: can each agent know the whole state from what it and its neighbours measure?"""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ MARGIN = 1e-6  # eigenvalues this close to the unit circle do not die out, and s
 
 
 def reach(graph: Array) -> Array:
-    """(N, N) bool, [i, j] when what j knows comes to i, over any number of hops; everybody reaches itself."""
+    """Return (N, N) bool, [i, j] when the knowledge of j comes to i, over any number of hops; everybody reaches itself."""
     out = np.array(graph, bool) | np.eye(len(graph), dtype=bool)
     while True:
         wider = np.array([np.any(out[row], axis=0) for row in out])
@@ -23,7 +23,7 @@ def reach(graph: Array) -> Array:
 
 
 def eigenvalues(A: Array) -> Array:
-    """(n,) complex. States that do not drive each other in a circle are taken apart first.
+    """Return the eigenvalues (n,) complex. States that do not drive each other in a circle are taken apart first.
 
     In a long string of vehicles the same poles come again in every vehicle. Taken all together, their rounding spreads them far apart.
     """
@@ -34,7 +34,7 @@ def eigenvalues(A: Array) -> Array:
 
 
 def lasting(A: Array) -> tuple[Array, ...]:
-    """Orthonormal bases (n, g) of the eigenvectors of each eigenvalue that does not die out."""
+    """Return orthonormal bases (n, g) of the eigenvectors of each eigenvalue that does not die out."""
     return _lasting(np.ascontiguousarray(A, np.float64).tobytes(), len(A))
 
 
@@ -56,13 +56,13 @@ def _lasting(data: bytes, n: int) -> tuple[Array, ...]:
 
 
 def _null_space(A: Array, value: complex) -> Array:
-    """(n, g) orthonormal eigenvectors of A for an eigenvalue."""
+    """Return orthonormal eigenvectors (n, g) of A for an eigenvalue."""
     _, size, right = np.linalg.svd(np.eye(len(A)) * value - A)
     return np.asarray(right[size <= MARGIN * max(1.0, float(size[0]))].conj().T)
 
 
 def blind(model: Model, graph: Array | None = None) -> list[int]:
-    """The agents that cannot know the whole state, by their own sensors and those of the agents that reach them.
+    """Return the agents that cannot know the whole state from their own sensors and those of the agents that reach them.
 
     `graph` (N, N) stands in for the model's: nobody but oneself, for a filter that hears nobody.
 

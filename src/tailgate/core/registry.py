@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, TypedDict, TypeVar, Unpack
 
 from tailgate.base.errors import InputError, unknown
 from tailgate.base.lazy import components, loaded
@@ -47,9 +47,20 @@ _plugins_loaded: set[str] = set()
 T = TypeVar("T", bound=type)
 
 
+class Card(TypedDict, total=False):
+    """The fields of `Entry` that a component gives at its registration."""
+
+    version: int
+    reference: str
+    uses: tuple[str, ...]
+    knowledge: str
+    optimal: bool
+    sentinel: str
+
+
 @dataclass(frozen=True)
 class Entry:
-    """A registered component: what a card shows of it."""
+    """A registered component, as its card shows it."""
 
     family: Family
     name: str
@@ -63,12 +74,12 @@ class Entry:
 
     @property
     def built_in(self) -> bool:
-        """Whether it comes with this package; a plug-in is somebody else's code under a name."""
+        """True if it comes with this package; a plug-in is somebody else's code under a name."""
         return self.cls.__module__.partition(".")[0] == "tailgate"
 
     @property
     def learned(self) -> bool:
-        """Whether this attack plays trained policies."""
+        """True if this attack plays trained policies."""
         return bool(getattr(self.cls, "learned", False))
 
     @property
@@ -76,7 +87,7 @@ class Entry:
         return (inspect.getdoc(self.cls) or "").split("\n\n")[0].replace("\n", " ")
 
     def card(self) -> dict[str, Any]:
-        """JSON data: name, version, reference, uses and every parameter with its default and sentence."""
+        """Return JSON data: name, version, reference, uses and every parameter with its default and sentence."""
         params = {
             name: {"default": as_data(f.default), "doc": f.metadata.get("doc", "")} for name, f in fields_of(self.cls).items()
         }
@@ -88,8 +99,8 @@ class Entry:
         return out | {"parameters": params}
 
 
-def register(family: Family, name: str, **card: Any) -> Callable[[T], T]:
-    """Class decorator. Reusing a name is an error."""
+def register(family: Family, name: str, **card: Unpack[Card]) -> Callable[[T], T]:
+    """Return a class decorator that registers a component. Reusing a name is an error."""
 
     def add(cls: T) -> T:
         put(Entry(family, name, cls, **card))
@@ -109,7 +120,7 @@ def put(entry: Entry) -> None:
 
 
 def _at_home(family: Family, name: str) -> Entry | None:
-    """Return a built-in component, for which its own module alone is imported; None where no module registers it."""
+    """Return a built-in component after importing its own module alone; None where no module registers it."""
     if name not in _entries[family] and (module := components(_MODULES[family]).get((family, name))):
         importlib.import_module(module)
     return _entries[family].get(name)
@@ -138,12 +149,12 @@ def _load(family: Family) -> dict[str, Entry]:
 
 @cache
 def _plugged(points: Callable[..., Any], group: str) -> frozenset[str]:
-    """Names of the plug-ins of a group: all installed packages are read for them."""
+    """Return names of the plug-ins of a group; reading them reads all installed packages."""
     return frozenset(point.name for point in points(group=group))
 
 
 def entry_of(family: Family, name: str, cls: type) -> Entry:
-    """An entry for somebody else's class, which may carry `uses`, `reference` and `version` as class attributes."""
+    """Return an entry for somebody else's class, which may carry `uses`, `reference` and `version` as class attributes."""
     uses = tuple(getattr(cls, "uses", ("measurements",)))
     return Entry(
         family, name, cls, version=int(getattr(cls, "version", 1)), reference=str(getattr(cls, "reference", "")), uses=uses,
@@ -152,15 +163,15 @@ def entry_of(family: Family, name: str, cls: type) -> Entry:
 
 
 def entry_for(family: Family, cls: type) -> Entry:
-    """The entry under which a class is registered, or one made of its attributes."""
+    """Return the entry under which a class is registered, or one made of its attributes."""
     for entry in _load(family).values():
         if entry.cls is cls:
             return entry
     return entry_of(family, cls.__name__, cls)
 
 
-def text_of(entry: Entry, value: Any) -> str:
-    """The text that names this object on a command line, as far as one can."""
+def text_of(entry: Entry, value: object) -> str:
+    """Return the text that names this object on a command line, as far as a text can."""
     cls = type(value)
     name = entry.name if _entries[entry.family].get(entry.name) is entry else f"{cls.__module__}:{cls.__qualname__}"
     params = as_data(value)
@@ -171,7 +182,7 @@ def text_of(entry: Entry, value: Any) -> str:
 
 
 def entries(family: Family) -> dict[str, Entry]:
-    """Every registered component of a family by name, plug-ins included."""
+    """Return every registered component of a family by name, plug-ins included."""
     return dict(sorted(_load(family).items()))
 
 
@@ -184,16 +195,16 @@ def find(family: Family, name: str) -> Entry:
     return known[name]
 
 
-def make(family: Family, name: str, /, **params: Any) -> Any:
-    """A component by name, its parameters validated."""
+def make(family: Family, name: str, /, **params: object) -> Any:
+    """Return a component by name, its parameters validated."""
     if not isinstance(name, str):
         raise InputError(f"{family}.name", name, "the name of a registered component")
     entry = find(family, name)
     return build(entry.cls, params, f"{family} {name}")
 
 
-def make_from(family: Family, data: Any, where: str) -> Any:
-    """A component from configuration data: a name, or a mapping with `name` and parameters."""
+def make_from(family: Family, data: object, where: str) -> Any:
+    """Return a component from configuration data: a name, or a mapping with `name` and parameters."""
     if isinstance(data, str):
         data = {"name": data}
     if not isinstance(data, dict) or "name" not in data:
@@ -205,9 +216,8 @@ def make_from(family: Family, data: Any, where: str) -> Any:
 class Spec:
     """A component as a user names it: text that a row can record and another process can rebuild.
 
-    `name`, `name:key=value,key=value`, `module:Class`, `module:Class:key=value`, or (attacks) the JSON file of an exported policy or the
-    YAML file of a program. `part.key=value` is a parameter of the part that another
-    parameter names. A defence may stand behind a sandbox: `bwrap/module:Class`.
+    `name`, `name:key=value,key=value`, `module:Class`, `module:Class:key=value`, or (attacks) the JSON file of a policy or the YAML file of
+    a program. `part.key=value` is a parameter of a part that another parameter names. `bwrap/module:Class` is a defence in a sandbox.
     """
 
     family: Family
@@ -224,7 +234,7 @@ class Spec:
         return head, params
 
     def _imported(self) -> list[tuple[Family, str]]:
-        """Family and module:Class of everything that this text imports."""
+        """Return family and module:Class of everything that this text imports."""
         head, params = self._parts()
         named: list[tuple[Family, Any]] = [(self.family, head)]
         for part in PARTS:
@@ -265,18 +275,18 @@ class Spec:
 
     @property
     def imports(self) -> bool:
-        """Whether this names a class to import, outside of any sandbox."""
+        """True if this names a class to import, outside of any sandbox."""
         return not self.sandboxed and bool(self._imported())
 
     @property
     def foreign(self) -> bool:
-        """Whether playing this runs somebody else's code outside of any sandbox: a class to import, or a plug-in."""
+        """True if playing this runs somebody else's code outside of any sandbox: a class to import, or a plug-in."""
         plugged = _plugged(entry_points, _GROUPS[self.family]) if self.family in _GROUPS else frozenset()
         return self.imports or (not self.sandboxed and self._parts()[0] in plugged)
 
     @property
     def digest(self) -> str:
-        """Of the files that somebody else's components, or the zoo's, come from; empty for other registered ones: they carry a version."""
+        """The hash of the files of somebody else's component or a zoo's policy; empty for other registered ones, which carry a version."""
         if self.sandboxed:
             from tailgate.sandbox.sandboxed import digest_of
 
@@ -289,7 +299,7 @@ class Spec:
             paths += [Path(str(path)) for path in (held if isinstance(held, list) else [held])]
         if not paths and not self.entry.built_in:
             paths = [Path(inspect.getfile(self.entry.cls))]
-        if not paths and hasattr(self.entry.cls, "sources"):  # a name that stands for a file
+        if not paths and hasattr(self.entry.cls, "sources"):  # a name of a file
             paths = list(self.make().sources)
         if self.family == "defence" and len(paths) == 1 and (":" in head or not self.entry.built_in):
             from tailgate.sandbox import source
@@ -325,9 +335,9 @@ class Spec:
 
 
 def said(error: Exception) -> str:
-    """An error of somebody's code in a line: its type, its words, and the last line of that code on the way to it.
+    """Return an error of somebody's code in a line: its type, its words, and the last line of that code on the way to it.
 
-    Compiled code counts for none: its files are not there to be read.
+    Compiled code is left out, as its files cannot be read.
     """
     place = ""
     for frame, line in traceback.walk_tb(error.__traceback__):
@@ -338,7 +348,7 @@ def said(error: Exception) -> str:
 
 
 def imported(family: Family, text: str) -> Entry:
-    """The entry of a class that the user names as module:Class."""
+    """Return the entry of a class that the user names as module:Class."""
     module, _, name = text.partition(":")
     if module in _load(family):
         raise InputError(family, text, f"{module}:key=value,key=value")
@@ -358,19 +368,19 @@ def imported(family: Family, text: str) -> Entry:
 
 
 def split_text(text: str) -> tuple[str, str]:
-    """Head and parameters of a component's text: `name` and `key=value,...`, or the text and nothing."""
+    """Return head and parameters of a component's text: `name` and `key=value,...`, or the text and nothing."""
     found = re.fullmatch(r"(.*?):(\s*[A-Za-z_][\w.]*\s*=.*)", text, re.DOTALL)
     return (found[1], found[2]) if found else (text, "")
 
 
 def _takes(function: Callable[..., Any]) -> float:
-    """How many arguments a method takes at most."""
+    """Return how many arguments a method takes at most."""
     kinds = [p.kind for p in inspect.signature(function).parameters.values()]
     return float("inf") if inspect.Parameter.VAR_POSITIONAL in kinds else len(kinds)
 
 
-def _put(params: dict[str, Any], key: str, value: Any) -> None:
-    """params[key] = value; `part.key` goes into the mapping of the part, whose name may stand there already."""
+def _put(params: dict[str, Any], key: str, value: object) -> None:
+    """Set params[key] to the value; `part.key` goes into the mapping of the part, which may already hold a name."""
     part, dot, inner = key.partition(".")
     held = params.get(part)
     if not dot:

@@ -6,7 +6,7 @@ import dataclasses
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from tailgate.base.errors import InputError, unknown
 from tailgate.base.sizes import Episodes
@@ -18,6 +18,7 @@ from tailgate.core.registry import Spec, make_from
 from tailgate.core.schema import build, digest, fields_of, read_yaml
 from tailgate.core.threat import Brief, ThreatModel
 
+T = TypeVar("T")
 LINK = ("loss", "latency")
 WORDS = ("about", "shown")  # of a suite: what is read, not played; of `shown` the doses count
 _COMPONENTS = ("plant", "sensor", "controller", "manoeuvre")
@@ -27,12 +28,12 @@ _COMPONENTS = ("plant", "sensor", "controller", "manoeuvre")
 class Scenario:
     """plant + sensor + controller + manoeuvre + horizon + threat model.
 
-    `truth` says where the vehicle is another than everyone is told, who knows `plant` and `sensor` as they stand here: changes of the
-    fields of either; `load`, the mass over the nominal one, by which a commanded acceleration is divided; `loss` and `latency` of readings.
+    `truth` holds what differs from the `plant` and `sensor` that everyone knows: changed fields of either; `load`, the mass over the
+    nominal one, which divides a commanded acceleration; `loss` and `latency` of readings.
     """
 
     name: str
-    plant: Any
+    plant: Any  # a Plant, and so on; readers know the class of what they load
     sensor: Any
     controller: Any
     manoeuvre: Any
@@ -61,11 +62,11 @@ class Scenario:
         return loop
 
     def brief(self) -> Brief:
-        """What an attacker knows before the episode."""
+        """Return the attacker's knowledge before the episode."""
         return Brief(self.plant.model(self.sensor, self.controller), self.threat_model, self.horizon)
 
-    def with_threat(self, **changes: Any) -> Scenario:
-        """The same scenario under a changed threat model."""
+    def with_threat(self, **changes: object) -> Scenario:
+        """Return the same scenario under a changed threat model."""
         data = dataclasses.asdict(self.threat_model) | changes
         return dataclasses.replace(self, threat_model=build(ThreatModel, data, "threat_model"))
 
@@ -74,14 +75,14 @@ class Scenario:
         return digest(self)
 
 
-def _changed(part: Any, changes: Any, where: str) -> Any:
-    """A component with other values of some fields."""
+def _changed(part: T, changes: object, where: str) -> T:
+    """Return a component with other values of some fields."""
     if not isinstance(changes, dict):
         raise InputError(where, changes, "a mapping of fields")
     for key in changes:
         if key not in fields_of(type(part)):
             raise unknown(f"{where}: unknown field", key, fields_of(type(part)))
-    held = {f.name: getattr(part, f.name) for f in dataclasses.fields(part) if f.init}
+    held = {name: getattr(part, name) for name in fields_of(type(part))}
     return build(type(part), held | changes, where) if changes else part
 
 
@@ -116,7 +117,7 @@ class Suite:
 
     @property
     def hash(self) -> str:
-        """Of everything that is played; fields at their defaults leave no mark, so that a new field moves no old suite."""
+        """The hash of everything that is played; fields at their defaults leave no mark, so that a new field moves no old suite."""
         blank = Suite()
         held = {
             f.name: getattr(self, f.name) for f in dataclasses.fields(self)
@@ -126,7 +127,7 @@ class Suite:
 
     @property
     def nominal(self) -> tuple[str, ...]:
-        """Scenarios whose plant is the one that a defence is told; all of them where none is."""
+        """Scenarios whose plant is the public model's; all of them where none is."""
         return tuple(name for name in self.scenarios if name not in self.robustness) or self.scenarios
 
     @property
@@ -147,7 +148,7 @@ def _builtin(folder: str) -> dict[str, Path]:
 
 
 def config_path(folder: str, name: str, where: str) -> Path:
-    """A YAML file by its built-in name or its path."""
+    """Return the path of a YAML file from its built-in name or its path."""
     if name.endswith((".yaml", ".yml")):
         return Path(name)
     known = _builtin(folder)
@@ -165,7 +166,7 @@ def list_suites() -> list[str]:
 
 
 def load_scenario(name: str) -> Scenario:
-    """A scenario by name, or from a YAML file."""
+    """Return a scenario by name, or from a YAML file."""
     path = config_path("scenarios", name, "scenario")
     data = read_yaml(path, "scenario")
     where = f"scenario {path.stem}"
@@ -190,7 +191,7 @@ def load_scenario(name: str) -> Scenario:
 
 
 def load_suite(name: str) -> Suite:
-    """A suite by name, or from a YAML file, which is then looked through: a typing error shall not show hours later."""
+    """Return a suite by name, or from a YAML file, whose components are checked at once: a typing error must not show hours later."""
     path = config_path("suites", name, "suite")
     suite = _read_suite(path)
     if name.endswith((".yaml", ".yml")):
@@ -217,7 +218,7 @@ def _look_through(suite: Suite) -> None:
 
 
 def _read_suite(path: Path) -> Suite:
-    """The suite of a file, its own fields checked."""
+    """Return the suite of a file, its own fields checked."""
     suite = build(Suite, {"name": path.stem} | read_yaml(path, "suite"), f"suite {path.stem}")
     for key in suite.threat:
         if key not in fields_of(ThreatModel):

@@ -1,4 +1,4 @@
-"""From data to validated parameters: one typed schema (the dataclasses) is the single truth for defaults."""
+"""Data to validated parameters: the dataclasses are the only place of types and defaults."""
 
 import dataclasses
 import hashlib
@@ -58,14 +58,14 @@ def published(kind: type | Callable[..., object]) -> str:
 
 
 def fields_of(cls: type) -> dict[str, Any]:
-    """Name -> dataclasses.Field of the parameters that a user may set."""
+    """Return the parameters that a user may set: name -> dataclasses.Field."""
     if not dataclasses.is_dataclass(cls):
         return {}
     return {f.name: f for f in dataclasses.fields(cls) if f.init}
 
 
 @cache
-def _adapter(cls: Any) -> TypeAdapter[Any]:
+def _adapter(cls: type) -> TypeAdapter[Any]:
     try:
         return TypeAdapter(cls, config=ConfigDict(extra="forbid"))
     except PydanticUserError:  # the class carries its own configuration
@@ -73,7 +73,7 @@ def _adapter(cls: Any) -> TypeAdapter[Any]:
 
 
 def build(cls: type[T], data: dict[str, Any], where: str) -> T:
-    """An instance of dataclass `cls` from `data`; raises InputError that names `where`.field, value and expectation."""
+    """Return an instance of dataclass `cls` from `data`; raise InputError that names `where`.field, value and expectation."""
     known = fields_of(cls)
     for key in data:
         if key not in known:
@@ -95,15 +95,15 @@ def build(cls: type[T], data: dict[str, Any], where: str) -> T:
 
 
 def _made(cls: type[T], data: dict[str, Any], where: str) -> T:
-    """What the class's own constructor makes of the data."""
+    """Return the object that the class's own constructor makes of the data."""
     try:
         return cls(**data)
     except TypeError as error:
         raise InputError(where, data or None, f"parameters that its constructor takes ({error})") from None
 
 
-def as_data(value: Any) -> Any:
-    """Parameters as plain JSON data: the class, and every default written out, but for empty ones of fields marked `if_any`."""
+def as_data(value: object) -> Any:
+    """Return parameters as plain JSON data: the class and every field. Empty fields that are marked `if_any` are left out."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         kind = type(value)
         shown = [f.name for f in dataclasses.fields(value) if f.init and (getattr(value, f.name) or not f.metadata.get("if_any"))]
@@ -121,18 +121,18 @@ def as_data(value: Any) -> Any:
     return published(named)
 
 
-def canonical(value: Any) -> str:
-    """JSON text that is the same for the same parameters: what hashes are taken of."""
+def canonical(value: object) -> str:
+    """Return JSON text that is the same for the same parameters: the input of hashes."""
     return json.dumps(as_data(value), sort_keys=True, separators=(",", ":"))
 
 
-def digest(value: Any) -> str:
-    """Sixteen hexadecimal digits that are the same for the same parameters."""
+def digest(value: object) -> str:
+    """Return sixteen hexadecimal digits that are the same for the same parameters."""
     return hashlib.blake2b(canonical(value).encode(), digest_size=8).hexdigest()
 
 
 def read_model(model: type[M], path: Path, what: str, made_by: str) -> M:
-    """A JSON file of a model. Raises InputError that names the file, and the field, for anything else than what `made_by` writes."""
+    """Return a model from its JSON file. Raise InputError that names file and field for anything that `made_by` does not write."""
     try:
         content = read_bytes(path)
         parse_json(content)
@@ -150,7 +150,7 @@ def read_model(model: type[M], path: Path, what: str, made_by: str) -> M:
 
 
 def read_yaml(path: Path, where: str) -> dict[str, Any]:
-    """A mapping from a YAML file, read safely."""
+    """Return a mapping from a YAML file, read safely."""
     try:
         data = load_yaml(path)
     except OSError as error:
@@ -163,7 +163,7 @@ def read_yaml(path: Path, where: str) -> dict[str, Any]:
 
 
 def scalar(text: str) -> Any:
-    """A command-line value, read as YAML reads a scalar or a flow list ('3', 'true', '[1, 2]', 'none')."""
+    """Return a command-line value, read as YAML reads a scalar or a flow list ('3', 'true', '[1, 2]', 'none')."""
     if text.lower() in ("none", "null"):
         return None
     try:
@@ -179,7 +179,7 @@ def scalar(text: str) -> Any:
 
 
 def override(data: dict[str, Any], assignments: list[str], cls: type) -> dict[str, Any]:
-    """`data`, the fields of `cls`, with dotted `key=value` assignments put in. Whatever is given for a text field is that text."""
+    """Return `data`, the fields of `cls`, with dotted `key=value` assignments put in. A text field takes its value as text."""
     out: dict[str, Any] = json.loads(json.dumps(data))
     kinds = get_type_hints(cls)
     for text in assignments:

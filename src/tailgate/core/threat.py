@@ -1,4 +1,4 @@
-"""The threat model: what an attacker may do and see."""
+"""The threat model: the actions and the view that an attacker is granted."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ Pair = Annotated[tuple[Bounded, Bounded], Field(min_length=2, max_length=2)]
 
 @dataclass(frozen=True)
 class ThreatModel:
-    """What an attacker may do and see. A command outside of it has no effect and is counted as refused."""
+    """The actions and the view that an attacker is granted. A command outside of it has no effect and is counted as refused."""
 
     kinds: tuple[KindName, ...] = param(("dos_hold", "fdi"), "attack kinds that are granted")
     targets: tuple[str, ...] = param((), "wires that may be attacked; empty: every sensor, no V2V field and no actuator")
@@ -59,7 +59,7 @@ class ThreatModel:
 
 @dataclass(frozen=True, eq=False)
 class Brief:
-    """What an attacker knows before the episode: the public model, the threat model and the horizon [steps]."""
+    """The attacker's knowledge before the episode: the public model, the threat model and the horizon [steps]."""
 
     model: Model
     threat: ThreatModel
@@ -97,7 +97,7 @@ class Brief:
         return Limits(self.bounds, low, high, threat.memory, threat.jam_power, threat.delay_bound)
 
     def command(self, on: Array, kind: Array | Kind, target: Array, value: Array | float) -> Command:
-        """A command where `on` (B,) holds, else none. target and value broadcast to (B, N, w)."""
+        """Return a command where `on` (B,) holds, else none. target and value broadcast to (B, N, w)."""
         out = no_command(len(on), self.model.agents, len(self.model.wires))
         out.kind[...] = np.where(on, kind, 0)
         out.target[...] = on[:, None, None] & target
