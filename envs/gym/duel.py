@@ -12,6 +12,7 @@ from typing import Any, Literal, NamedTuple
 
 import gymnasium
 import numpy as np
+from numpy.random import Generator
 from numpy.typing import ArrayLike
 
 from tailgate.base.errors import InputError, unknown
@@ -223,7 +224,7 @@ def checked(space: gymnasium.Space[Any], action: ArrayLike, who: str) -> Array:
     return given[None]
 
 
-def next_game(duel: Duel, held: DuelState | None, seed: int | None, rng: np.random.Generator) -> DuelState:
+def next_game(duel: Duel, held: DuelState | None, seed: int | None, rng: Generator) -> DuelState:
     """Return a batch of one: the game of `seed`, or without one the next of the episodes that were running."""
     if held is not None and seed is None:
         return duel.restart(held, np.ones(1, bool))
