@@ -20,12 +20,12 @@ def progress(shown_on: Console) -> Iterator[Update]:
             tenth = 10 * done // max(total, 1)
             if tenth > shown.get(label, 0):
                 shown[label] = tenth
-                shown_on.print(f"{label}: {10 * tenth} % {figures}".rstrip(), highlight=False, soft_wrap=True)
+                shown_on.print(f"{label}: {10 * tenth} % {figures}".rstrip(), highlight=False, soft_wrap=True, markup=False)
 
         yield line
         return
     columns = (
-        TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[figures]}"), TimeElapsedColumn(), TimeRemainingColumn(),
+        TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[figures]}", markup=False), TimeElapsedColumn(), TimeRemainingColumn(),
     )  # fmt: skip
     with Progress(*columns, console=shown_on) as bars:
         tasks: dict[str, object] = {}

@@ -18,7 +18,7 @@ from tailgate.base.interrupts import Ending, orderly
 
 EXIT_INPUT = 2
 COMMANDS = (
-    "train", "tune", "selfplay", "evaluate", "timing", "dose", "transfer", "zoo", "calibrate", "leaderboard", "log", "replay",
+    "train", "tune", "selfplay", "ensemble", "evaluate", "timing", "dose", "transfer", "zoo", "calibrate", "leaderboard", "log", "replay",
     "reproduce", "trust", "bench", "list", "explain",
 )  # fmt: skip
 

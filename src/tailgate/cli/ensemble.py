@@ -1,0 +1,75 @@
+"""tailgate attack: the strongest attacks that a search finds against a defence."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from tailgate.cli.shared import Commands, add_options, own_classes, say, show, table, working
+from tailgate.ensemble.search import EFFORTS
+
+
+def add(commands: Commands) -> None:
+    command = commands.add_parser(
+        "attack", help="find the scripts that do most harm to a defence, and compare them with a suite's attacks",
+        description="Search scripts of every granted family, on every set of wires, with every trigger, against a defence. The best one "
+        "of each scenario and dose is compared with the best attack that the suite lists, on fresh episodes.",
+    )  # fmt: skip
+    command.add_argument("defence", metavar="NAME", help="defence to attack; a class: module:Class, or bwrap/module:Class")
+    command.add_argument("--suite", default="quick-v0", metavar="NAME", help="suite by name or YAML file (default: quick-v0)")
+    add_options(command, "--scenario", "--dose")
+    command.add_argument("--budget", default="standard", metavar="SIZE", help=f"{' or '.join(EFFORTS)} (default: standard)")
+    command.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the search (default 0)")
+    command.add_argument("--episodes", type=int, default=400, metavar="N", help="report episodes per comparison (default 400)")
+    command.add_argument("--workers", type=int, default=2, metavar="N", help="processes (default 2); change no result")
+    command.add_argument("--out", metavar="DIR", help="write attack.json, attacks.txt, searches and rows here; resumes")
+    add_options(command, "--json")
+    command.set_defaults(run=_attack)
+
+
+def _attack(options: argparse.Namespace) -> int:
+    from tailgate.base.errors import InputError
+    from tailgate.base.files import write_atomic
+    from tailgate.core.scenario import load_suite
+    from tailgate.core.schema import scalar
+    from tailgate.ensemble.standard import attack, attacks_of
+
+    own_classes()
+    options.kept = "the same command goes on" if options.out else "nothing is kept: --out DIR would"
+    doses = [scalar(text) for text in options.dose or ()]
+    for dose in doses:
+        if dose is not None and not isinstance(dose, int):
+            raise InputError("--dose", dose, "a whole number of attack steps, or none")
+    out = Path(options.out) if options.out else None
+    with working() as update:
+        report = attack(
+            load_suite(options.suite), options.defence, scenarios=options.scenario or (), doses=doses, budget=options.budget,
+            seed=options.seed, episodes=options.episodes, workers=options.workers, out=out, progress=update,
+        )  # fmt: skip
+    if out is not None:
+        write_atomic(out / "attacks.txt", "".join(f"{text}\n" for text in attacks_of(report)).encode())
+    show(options, report, _print)
+    return 0
+
+
+def _print(report: dict[str, Any]) -> None:
+    def figure(one: dict[str, Any] | None) -> str:
+        return "-" if one is None else f"{one['damage']:.1%} [{one['low']:.1%}, {one['high']:.1%}]"
+
+    lines, scripts = [], []
+    for cell in report["cells"]:
+        listed, found = cell["listed"], cell["found"]
+        dose = "own" if cell["dose"] is None else str(cell["dose"])
+        lines.append([cell["scenario"], dose, figure(listed), figure(found)])
+        if found:
+            scripts.append(f"{cell['scenario']}, dose {dose}: {found['attack']}")
+    table(
+        ["scenario", "dose", "best listed attack", "best script found"], lines,
+        f"{report['defence']} in {report['suite']}: damaged episodes under {report['ensemble']}, budget {report['budget']}",
+        f"{report['episodes']} report episodes; 95 % intervals",
+    )  # fmt: skip
+    for line in scripts:
+        say(line, soft_wrap=True)
+    better = [c for c in report["cells"] if c["found"] and c["listed"] and c["found"]["low"] > c["listed"]["high"]]
+    say(f"the search did more harm than every listed attack in {len(better)} of {len(report['cells'])} cells")
