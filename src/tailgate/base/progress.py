@@ -25,7 +25,8 @@ def progress(shown_on: Console) -> Iterator[Update]:
         yield line
         return
     columns = (
-        TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[figures]}", markup=False), TimeElapsedColumn(), TimeRemainingColumn(),
+        TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[figures]}", markup=False), TimeElapsedColumn(),
+        TimeRemainingColumn(),
     )  # fmt: skip
     with Progress(*columns, console=shown_on) as bars:
         tasks: dict[str, object] = {}

@@ -164,7 +164,7 @@ def _children(pool: Pool, count: int, rng: np.random.Generator) -> Array:
     jump = rng.random(out.shape)
     new = np.where(rng.random(out.shape) < 0.25, jump, np.abs(np.mod(small + 1.0, 2.0) - 1.0))  # reflected at 0 and 1
     changed[:, family] = False
-    return np.clip(np.where(changed, new, out), 0.0, np.nextafter(1.0, 0.0))
+    return np.asarray(np.clip(np.where(changed, new, out), 0.0, np.nextafter(1.0, 0.0)))
 
 
 def search(arena: Arena, effort: Effort, seed: int = 0, tell: Callable[[int, int, str, float], None] | None = None) -> list[Found]:

@@ -128,7 +128,7 @@ class Space:
     @cached_property
     def wires(self) -> tuple[tuple[str, ...], ...]:
         """The sets of wires that are tried; the empty one names all that are granted."""
-        granted = [name for name, hit in zip(self.brief.model.wires, self.brief.granted.any(axis=0).tolist(), strict=True) if hit]
+        granted = [name for name, hit in zip(self.brief.model.wires, np.any(self.brief.granted, axis=0).tolist(), strict=True) if hit]
         sets = [subset for size in range(1, len(granted)) for subset in itertools.combinations(granted, size)]
         return ((), *(sets if len(sets) < MOST_SETS else [(name,) for name in granted]))
 

@@ -82,14 +82,14 @@ def searched(job: Job, tell: Callable[[int, int, str, float], None] | None = Non
     """Run one search; return its best scripts, and the best attack that the suite lists, on the same select episodes."""
     arena = job.arena
     found = search(arena, EFFORTS[job.budget], job.seed, tell)
-    listed = []
+    listed: list[dict[str, Any]] = []
     for attack in job.listed:
         try:
             damage, score = arena.confirmed(attack, "select", 0, FINAL)
         except NotApplicable:
             continue
         listed.append({"attack": attack, "damage": damage, "score": score})
-    best = max(listed, key=lambda one: one["score"], default=None)
+    best = max(listed, key=lambda one: float(one["score"]), default=None)
     families = [family.name for family in arena.space.families]
     return {
         "scenario": arena.scenario, "dose": arena.dose, "families": list(dict.fromkeys(families)), "listed": best,
