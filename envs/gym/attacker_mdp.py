@@ -123,7 +123,8 @@ class Seat:
         place = load_scenario(scenario).with_threat(**threat)
         if isinstance(defence, str):
             spec = Spec("defence", defence)
-            built, uses, named = spec.make(), spec.entry.uses, {"spec": defence, "parameters": as_data(spec.make())}
+            built = spec.make()
+            uses, named = spec.entry.uses, {"spec": defence, "parameters": as_data(built)}
         else:
             if not all(hasattr(defence, name) for name in ("prepare", "start", "step")):
                 raise InputError("defence", defence, "a registered name, or an object with prepare, start and step")

@@ -1,7 +1,7 @@
 """Models, the threat model and its channel, the loop, random numbers, and the registry of components. The nouns are imported from here."""
 
 from tailgate.core.components import Attack, Controller, Defence, Manoeuvre, Plant, Receiver, Sensor, Sized
-from tailgate.core.kinds import AIRED, RADIATED, Kind, Mode
+from tailgate.core.kinds import AIRED, Kind, Mode
 from tailgate.core.nouns import (
     Air,
     Array,
@@ -22,7 +22,7 @@ from tailgate.core.nouns import (
 from tailgate.core.quantities import Count, Discount, Finite, NonNegative, Positive, PositiveCount, Probability
 
 __all__ = [
-    "AIRED", "RADIATED", "Air", "Array", "Attack", "Command", "Controller", "Count", "Defence", "Discount", "Estimate", "Finite", "Frame",
+    "AIRED", "Air", "Array", "Attack", "Command", "Controller", "Count", "Defence", "Discount", "Estimate", "Finite", "Frame",
     "Innovation", "Kind", "Manoeuvre", "Mode", "Model", "NonNegative", "Plant", "Positive", "PositiveCount", "Prior", "Probability",
     "Received", "Receiver", "Scene", "Sensor", "Sized", "View", "WhiteBox", "no_command", "pair_of", "param",
 ]  # fmt: skip

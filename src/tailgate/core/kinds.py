@@ -58,6 +58,7 @@ class Recording(NamedTuple):
 class Effect:
     """Base class of an effect. A subclass says what its kind does to a reading, and which values a threat model grants."""
 
+    kind: ClassVar[Kind]
     valued: ClassVar[bool] = False  # a command carries a value
     over_air: ClassVar[bool] = False  # one value reaches all that a receiver reads, and changes what it measures
     radiated: ClassVar[bool] = False  # a receiver that falls silent still hears it
@@ -77,12 +78,13 @@ class Effect:
 
     def reads(self, sent: Array, value: Array, memory: Memory, recording: Recording) -> Array:
         """Return what the receiver reads (B, N, w) in place of `sent` (B, N, w). Kinds over the air change the measurement instead."""
-        return memory.fresh
+        raise TypeError(f"{type(self).__name__} must define reads()")
 
 
 class DosJam(Effect):
     """The receiver reads the jammer's value."""
 
+    kind = Kind.DOS_JAM
     valued = radiated = True
     code, title, does = "JAM", "DoS jam", "the receiver reads the jammer's value"
 
@@ -96,6 +98,7 @@ class DosJam(Effect):
 class DosHold(Effect):
     """The receiver reads the last good sample before the first attack (6.18)."""
 
+    kind = Kind.DOS_HOLD
     code, title, does = "HOLD", "DoS hold", "the receiver is stuck at the last reading before the first attack"
 
     def reads(self, sent: Array, value: Array, memory: Memory, recording: Recording) -> Array:
@@ -105,18 +108,29 @@ class DosHold(Effect):
 class DosHoldFresh(Effect):
     """The receiver reads the last good sample before this burst."""
 
+    kind = Kind.DOS_HOLD_FRESH
     code, title, does = "HOLD*", "DoS hold (fresh)", "the receiver is stuck at the last reading before this burst"
+
+    def reads(self, sent: Array, value: Array, memory: Memory, recording: Recording) -> Array:
+        """Return the last good sample."""
+        return memory.fresh
 
 
 class Dropout(Effect):
     """Nothing is received, and the receiver knows it; it keeps its last value, as one that holds it does."""
 
+    kind = Kind.DROPOUT
     code, title, does = "DROP", "dropout", "nothing arrives, and the receiver knows it"
+
+    def reads(self, sent: Array, value: Array, memory: Memory, recording: Recording) -> Array:
+        """Return the last good sample."""
+        return memory.fresh
 
 
 class FalseData(Effect):
     """The value is added (4.4)."""
 
+    kind = Kind.FDI
     valued = True
     code, title, does = "FDI", "false data injection", "the value is added"
 
@@ -130,6 +144,7 @@ class FalseData(Effect):
 class Delay(Effect):
     """The receiver reads what was sent `value` steps ago."""
 
+    kind = Kind.DELAY
     valued = recorded = True
     code, title, does, unit = "DELAY", "delay", "the receiver reads what was sent so many steps ago", "steps"
 
@@ -143,6 +158,7 @@ class Delay(Effect):
 class Replay(Delay):
     """The receiver reads the last `value` samples before this replay, over and over."""
 
+    kind = Kind.REPLAY
     code, title, does = "REPLAY", "replay", "the receiver reads the last so many samples over and over"
 
     def reads(self, sent: Array, value: Array, memory: Memory, recording: Recording) -> Array:
@@ -153,6 +169,7 @@ class Replay(Delay):
 class NoiseJam(Effect):
     """Over the air: noise of `value` watts reaches the receiver."""
 
+    kind = Kind.NOISE_JAM
     valued = radiated = over_air = True
     code, title, does, unit = "NOISE", "noise jamming", "noise of so much power reaches the receiver over the air", "W"
 
@@ -170,21 +187,19 @@ class NoiseJam(Effect):
 class EchoDelay(NoiseJam):
     """Over the air: the receiver's own signal comes back `value` metres too late."""
 
+    kind = Kind.ECHO_DELAY
     code, title, does, unit = "ECHO", "late echo", "the probe is answered late, so that the car ahead seems so much farther away", "m"
 
     def most(self, limits: Limits) -> float:
         return limits.delay
 
 
-EFFECTS: dict[int, Effect] = {  # by plain numbers: in every comparison with a member of an enumeration numpy looks for array methods of it
-    int(kind): effect
-    for kind, effect in {
-        Kind.DOS_JAM: DosJam(), Kind.DOS_HOLD: DosHold(), Kind.DOS_HOLD_FRESH: DosHoldFresh(), Kind.DROPOUT: Dropout(),
-        Kind.FDI: FalseData(), Kind.DELAY: Delay(), Kind.REPLAY: Replay(), Kind.NOISE_JAM: NoiseJam(), Kind.ECHO_DELAY: EchoDelay(),
-    }.items()
-}  # fmt: skip
+# by plain numbers: in every comparison with a member of an enumeration numpy looks for array methods of it
+EFFECTS: dict[int, Effect] = {
+    int(effect.kind): effect()
+    for effect in (DosJam, DosHold, DosHoldFresh, Dropout, FalseData, Delay, Replay, NoiseJam, EchoDelay)
+}
 AIRED = tuple(Kind(kind) for kind, effect in EFFECTS.items() if effect.over_air)
-RADIATED = tuple(Kind(kind) for kind, effect in EFFECTS.items() if effect.radiated)
 
 
 class Mode(IntEnum):

@@ -21,7 +21,6 @@ from typing_extensions import TypeVar
 
 from tailgate.base.errors import InputError
 from tailgate.core.kinds import AIRED as AIRED
-from tailgate.core.kinds import RADIATED as RADIATED
 from tailgate.core.kinds import Kind as Kind
 from tailgate.core.kinds import Mode as Mode
 from tailgate.core.quantities import Count as Count

@@ -138,12 +138,10 @@ def _load(family: Family) -> dict[str, Entry]:
     if group and group not in _plugins_loaded:
         for point in entry_points(group=group):
             try:
-                cls = point.load()
+                put(entry_of(family, point.name, point.load()))
             except Exception as error:  # somebody's broken package shall not stop those who do not use it
                 warnings.warn(f"plug-in {point.name!r} of {group} cannot be loaded: {error}", stacklevel=2)
-                continue
-            put(entry_of(family, point.name, cls))
-        _plugins_loaded.add(group)  # only now: a plug-in that fails shall fail again, not vanish
+        _plugins_loaded.add(group)
     return _entries[family]
 
 
