@@ -288,7 +288,6 @@ def _peak(episodes: int) -> int:
 
 def memory() -> Go:
     """Measure the bytes that an episode of a vector environment takes at most: the difference between two batches."""
-
     _peak(1)  # what is imported on the way counts for neither
 
     def go(seconds: float) -> Sample:

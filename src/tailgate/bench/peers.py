@@ -104,7 +104,7 @@ def filterpy_kalman() -> Go:
     return repeated(chunk)
 
 
-# -- peers with processes of their own: they run in a child, so that no fork copies this process's threads
+# -- peers with processes: they run in a child, so that no fork copies this process's threads
 
 _CHILD = """
 import json, sys, time

@@ -1,7 +1,7 @@
 """The estimators' optimisation problems: ours in a batch, and cvxpy's parametrised solve of the same ones, one after the other.
 
-cvxpy compiles each problem once, and only the innovation differs between two solves, so that it does the least work that it can (Clarabel
-with its own tolerances, no warm start, whitened constants). Every second problem has the innovation of an attacked step.
+cvxpy compiles each problem once, and only the innovation differs between two solves: the least work possible. It solves by Clarabel with
+its default tolerances, without warm start, with whitened constants. Every second problem has the innovation of an attacked step.
 """
 
 from __future__ import annotations
@@ -145,6 +145,7 @@ class Robust(NamedTuple):
 
 @cache
 def robust(batch: int) -> Robust:
+    """Return states of which every second one has the innovation of an attacked step."""
     model, filter = load_scenario("stop-and-go-v0").brief().model, RobustKalmanFilter()
     plan = filter.prepare(model)
     S = num.matmul(num.matmul(plan.C, plan.held), num.transpose(plan.C)) + plan.R

@@ -59,8 +59,8 @@ def _round(loop: Loop, timed: _Timed, seed: int) -> float:
 def measure(suite: Suite, defences: Sequence[str] = (), *, rounds: int = ROUNDS, progress: Progress | None = None) -> Clock:
     """Measure step times of a suite's registered defences in its first scenario. Those that mean nothing there are left out.
 
-    The first round of each loads what the defence needs. Raises InputError for a defence that does not exist, that fails, or is a class of
-    somebody's own, for a named one that means nothing there, and where none is left.
+    The first round of each loads what the defence needs. Raises InputError for a defence that does not exist, that fails, or that is an
+    unregistered class. The same goes for a named one that means nothing there, and if none is left.
     """
     sizes.check("rounds", rounds)
     place = load_scenario(suite.scenarios[0])

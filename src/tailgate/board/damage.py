@@ -98,8 +98,9 @@ class Table:
         return list(self.suite.nominal)
 
     def applies(self, scenario: str) -> Array:
-        """Return (columns,) bool: counts in this scenario. An attack without a meaning against any defence does not, nor one nobody
-        owes.
+        """Return (columns,) bool: the attacks that count in this scenario.
+
+        An attack does not count without a meaning against any defence, or if no defence owes it.
         """
         state = self.state[scenario]
         played = ~np.isin(state, (SKIPPED, MISSING)).all(axis=(0, 2))

@@ -41,6 +41,7 @@ def shown(suite: Suite) -> list[int]:
 
 
 def entry_of(table: Table, defence: str, levels: dict[str, Worst], slot: int, origins: dict[str, Row], asked: list[Asked] | None) -> Data:
+    """Return the entry of a defence that is made of rows: status, gates, flags, worst episode and figures."""
     rows = [row for key in sorted(table.cells) if key.defence == defence for row in table.cells[key]]
     uses = [str(use) for use in rows[0]["uses"]]
     card = _card(defence)
@@ -64,8 +65,8 @@ def entry_of(table: Table, defence: str, levels: dict[str, Worst], slot: int, or
 def extended(entry: Data, table: Table, levels: dict[str, Worst], slot: int, trained: dict[str, str], added: Collection[str]) -> Data:
     """Return an entry of a board with more attacks, which have rows: shares of damage, status, flags and worst episode.
 
-    Its clean runs and gates stay as they are, and so do the suite's trainings that it met, and all that only rows can say of attacks that
-    it had met. trained: the defence that each learned attack was trained on.
+    Its clean runs, its gates and the suite's trainings that it met stay as they are. So does everything that needs the rows of attacks
+    that it had met. trained: the defence that each learned attack was trained on.
     """
     out = entry | of_worst(table, levels, slot)
     if entry["status"] != "unranked" and (why := _incomplete(table, levels["black"])):

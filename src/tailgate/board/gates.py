@@ -1,7 +1,7 @@
 """Gates of the safety board: the cost of a defence when nobody attacks, paired by episode with the undefended car.
 
-For gap, jerk and distance both the median and the mean of the ratios count, whichever is worse: a median alone would allow a defence to
-ruin almost half of its episodes. And nearly all episodes have to get nearly as far.
+For gap, jerk and distance the worse of the median and the mean of the ratios counts. A median alone would allow a defence to ruin almost
+half of its episodes. In addition nearly all episodes have to get nearly as far.
 """
 
 from __future__ import annotations

@@ -13,11 +13,11 @@ from tailgate.evaluation.paired import Harm, compare, duel, outdone
 
 from .entry import Levels
 from .schema import Data
-from .update import Beside
+from .update import KeptPart
 from .worst import Worst
 
 
-def rank(found: list[Data], levels: Levels, slot: int, alpha: float, held: Beside | None) -> list[Data]:
+def rank(found: list[Data], levels: Levels, slot: int, alpha: float, held: KeptPart | None) -> list[Data]:
     """Return the comparisons within each class, and put the rank sets into the entries that take one.
 
     Raises InputError where comparisons that a board has of entries that stay do not fit their cells.
@@ -44,7 +44,7 @@ def rank(found: list[Data], levels: Levels, slot: int, alpha: float, held: Besid
     return out
 
 
-def _still_bound(held: Beside, levels: Levels, harm: Mapping[str, Harm], slot: int, group: str) -> list[Data]:
+def _still_bound(held: KeptPart, levels: Levels, harm: Mapping[str, Harm], slot: int, group: str) -> list[Data]:
     """Return the comparisons of entries that have met more attacks since, as far as the old ones still bound p."""
     out = []
     for old in held.board["comparisons"]:

@@ -19,7 +19,7 @@ from .damage import SKIPPED, Column, Table, tabulate
 from .entry import Levels, curves, entry_of, extended, middle
 from .ranks import rank
 from .schema import FORMAT, Data
-from .update import Beside, beside
+from .update import KeptPart, kept_part
 from .worst import Worst
 
 
@@ -29,10 +29,21 @@ def score(
 ) -> Data:  # fmt: skip
     """Return the board of a suite from its rows, in the format of decision record 14. The order of the rows changes nothing.
 
-    attacks: attacks that joined the suite's after it was published (`attack_list.read`); every defence has to have met these too.
-    require_adaptive: rank only defences that met an attack which was trained against them. board: of the same suite; its other entries stay
-    (`update.beside`), and ranks are made of both. shared: attacks on no list that every defence has to have met (`cells.shared_of`). Raises
-    InputError for rows that do not belong together, or do not fit the board.
+    Parameters
+    ----------
+    attacks
+        Attacks that joined the suite's after it was published (`attack_list.read`); every defence has to have met these too.
+    require_adaptive
+        Rank only defences that met an attack which was trained against them.
+    board
+        An earlier board of the suite: its other entries stay (`update.kept_part`), and ranks are made of both.
+    shared
+        Attacks on no list that every defence has to have met (`cells.shared_of`).
+
+    Raises
+    ------
+    InputError
+        For rows that do not belong together, or do not fit the board.
     """
     if not 0.0 < alpha < 1.0:
         raise InputError("alpha", alpha, "a number above 0 and below 1")
@@ -45,7 +56,7 @@ def score(
     table = tabulate(rows, suite, joining, taken_back(attacks or ()))
     digests = {text: line.digest for text, line in lines.items() if line is not None}
     slot = middle(suite)
-    held = None if board is None else beside(table, board, suite, alpha, require_adaptive, digests)
+    held = None if board is None else kept_part(table, board, suite, alpha, require_adaptive, digests)
     table = dataclasses.replace(table, shared=frozenset(shared)) if held is None else held.table
     kept = {} if held is None else held.entries
     origins = _origins(table)
@@ -84,7 +95,7 @@ def _suite(table: Table, alpha: float) -> Data:
 
 
 def _attacks(
-    table: Table, lines: dict[str, Admitted | None], origins: dict[str, Row], cells: list[Data], held: Beside | None
+    table: Table, lines: dict[str, Admitted | None], origins: dict[str, Row], cells: list[Data], held: KeptPart | None
 ) -> list[Data]:  # fmt: skip
     out = []
     told = {} if held is None else {attack["attack"]: attack for attack in held.board["attacks"]}

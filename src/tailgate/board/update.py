@@ -22,10 +22,8 @@ SAME = ("n", "failed", "damage", "hits", "decisions")  # of a cell that was play
 
 
 @dataclass(frozen=True)
-class Beside:
-    """The part of a board that stays: entries that were not played whole, their cells, and the table that these and the rows make
-    together.
-    """
+class KeptPart:
+    """The part of a board that stays: entries that were not played whole, their cells, and the table of these and the rows."""
 
     board: Data
     table: Table
@@ -40,14 +38,24 @@ class Beside:
         return [line for line in self.board[part] if line["defence"] == defence]
 
 
-def beside(table: Table, board: Data, suite: Suite, alpha: float, require_adaptive: bool, digests: Mapping[str, str]) -> Beside:
-    """Return what stays of a board next to a table of rows.
+def kept_part(table: Table, board: Data, suite: Suite, alpha: float, require_adaptive: bool, digests: Mapping[str, str]) -> KeptPart:
+    """Return what stays of a board when a table of rows is added.
 
     A defence whose rows cover all cells that the board has of it is made of rows. Others stay as the board has them, or meet in rows
-    attacks that they had not met. Cells that both have must come out equal; their damaged episodes are then known, if they were not. board:
-    JSON that `read_board` has read; digests: of the files of the attacks that joined the list. Raises InputError for a board of another
-    suite, round, purpose, alpha, list of attacks or rule of who is ranked, for rows that differ from it, for new cells of an attack that a
-    defence has met already, and where an entry that stays would change by anything but its own rows.
+    attacks that they had not met. Cells that both have must come out equal; their damaged episodes are then known, if they were not.
+
+    Parameters
+    ----------
+    board
+        JSON that `read_board` has read.
+    digests
+        Digests of the files of attacks that joined the list.
+
+    Raises
+    ------
+    InputError
+        For a board of another suite, round, purpose, alpha, list of attacks or ranking rule; for rows that differ from it; for new cells
+        of an attack that a defence has met already; and if an entry that stays would change by anything but its own rows.
     """
     said = {"beacon": "", "require_adaptive": True} | {key: value for key, value in board["suite"].items() if value is not None}
     mine = {"hash": suite.hash, "purpose": table.purpose, "beacon": table.beacon, "alpha": alpha, "require_adaptive": require_adaptive}
@@ -104,7 +112,7 @@ def beside(table: Table, board: Data, suite: Suite, alpha: float, require_adapti
             raise InputError(f"rows of {column.attack} on {where}", "played", wanted)
     own = sum(len(rows) for rows in both.cells.values())
     whole = dataclasses.replace(both, rows=own + sum(len(held.seeds[c["scenario"]]) for c in cells))
-    return Beside(board, whole, entries, cells, held, added, frozenset(steady))
+    return KeptPart(board, whole, entries, cells, held, added, frozenset(steady))
 
 
 def _counted(table: Table, defence: str) -> set[tuple[str, Column, bool]]:

@@ -1,7 +1,6 @@
 """The worst over attacks and scenarios at each dose: rates, curves and the critical dose.
 
-Every value here falls or stays when an attack or a scenario is added: values are maxima of damage, and limits are corrected for their
-number.
+No value here rises when an attack or a scenario is added: values are maxima of damage, and limits are corrected for their number.
 """
 
 from __future__ import annotations
@@ -55,7 +54,7 @@ class Worst:
 
     @property
     def complete(self) -> bool:
-        """Return if every figure of this class can be had, and an attacker who knows just this was met: else it would be a lower one's."""
+        """Return if no cell of this class is missing, and an attacker who knows just this was met: else it would be a lower class's."""
         return any(self.table.columns[i].knowledge == self.knowledge for _, i in self.pairs) and not self.lost
 
     @cached_property

@@ -17,6 +17,7 @@ REFUSED = "refused: the scenario does not grant it"
 
 
 def add(commands: Commands) -> None:
+    """Add `evaluate` to the commands."""
     command = commands.add_parser(
         "evaluate", help="play defences against attacks and write one row per episode",
         description="Play a suite, or the part of it that the options name. NAME: a registered component, NAME:key=value,key=value, "

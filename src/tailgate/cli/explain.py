@@ -9,6 +9,7 @@ from tailgate.cli.shared import Commands, own_classes, show, table
 
 
 def add(commands: Commands) -> None:
+    """Add `explain` to the commands."""
     command = commands.add_parser(
         "explain", help="whether a scenario, a defence and an attack are traced, and if not, why",
         description="Say whether the engine can trace environments of a scenario and a defence, and, with an attack, whole episodes. "

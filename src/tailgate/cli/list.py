@@ -16,6 +16,7 @@ from tailgate.cli.shared import Commands, print_json
 
 
 def add(commands: Commands) -> None:
+    """Add `list` to the commands."""
     command = commands.add_parser("list", help="what there is: defences and their parts, attacks, the zoo, scenarios, suites; or a graph")
     groups = ["defences", "filters", "detectors", "mitigations", "attacks", "zoo", "scenarios", "suites"]
     command.add_argument("what", nargs="?", choices=groups, help="only these; attacks: with the zoo of trained policies")

@@ -12,6 +12,7 @@ from tailgate.cli.shared import Commands, print_json, say
 
 
 def add(commands: Commands) -> None:
+    """Add `replay` to the commands."""
     command = commands.add_parser(
         "replay", help="play one episode again from its row and write a page of it",
         description="Play one episode again from its row, check its hash, and write one HTML page. Of the rows that the options leave, the "

@@ -13,6 +13,7 @@ from tailgate.cli.shared import Commands, add_options, say, show, table
 
 
 def add(commands: Commands) -> None:
+    """Add `selfplay` to the commands."""
     from tailgate.training.selfplay import parameters
 
     fields = "\n".join(f"  {p['name']:<12} {p['doc']} (default: {json.dumps(p['default'])})" for p in parameters())

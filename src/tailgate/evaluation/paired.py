@@ -65,8 +65,8 @@ def outdone(a: Harm, b: Harm, least: bool = False) -> float:
 def apart(mine: Array, others: Array, vague: Array, least: bool = False) -> tuple[Array, Array]:
     """Return (attacks,) each: episodes in which `mine` (episodes,) alone shows damage, and in which `others` (attacks, episodes) alone do.
 
-    Vague pairs count as many as their numbers allow, or as few: the difference being given, a p below one half rises with the number of
-    pairs that differ.
+    Vague pairs count as many as their numbers allow, or with `least` as few. Their difference is known, and a p below one half rises with
+    the number of pairs that differ.
     """
     only, other = np.sum(mine > others, axis=1), np.sum(others > mine, axis=1)
     most = np.minimum(others.sum(axis=1), len(mine) - mine.sum()).astype(int)
@@ -77,9 +77,9 @@ def apart(mine: Array, others: Array, vague: Array, least: bool = False) -> tupl
 def duel(group: str, a: str, b: str, x: Harm, y: Harm) -> Data:
     """Compare two defences of a class.
 
-    only_a counts the episodes in which a alone came to damage, each against its worst attack; p is twice the smaller of the two sides of
-    `outdone`; `weaker` is the side that it speaks of. `bound`: some cell does not say which of its episodes came to damage, so that p, and
-    all counts of episodes, are as large as they can be. Raises InputError for other seeds.
+    only_a counts the episodes in which a alone came to damage, each against its worst attack. p is twice the smaller of the two sides of
+    `outdone`; `weaker` is the side with that p. `bound`: some cell does not say which of its episodes came to damage. Then p, and all
+    counts of episodes, are as large as they can be. Raises InputError for other seeds.
     """
     if x.seeds != y.seeds:
         raise InputError(f"rows of {a} and {b}: seeds", f"{len(x.seeds)} and {len(y.seeds)}", "the same seeds in every scenario")

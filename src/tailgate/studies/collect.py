@@ -51,8 +51,8 @@ def packed(file: Path) -> bytes:
 def add_policy(policy: Path, name: str, summary: str, *, episodes: int = EPISODES, replace: bool = False, folder: Path = FOLDER) -> Path:
     """Copy a trained policy into the zoo as `name`; returns its JSON file. Its outcome is measured again, on report seeds.
 
-    Raises InputError for a policy without a record of its training, for one that is too large, and, without `replace`, for a name
-    that is taken.
+    Raises InputError for a policy without a record of its training, and for one that is too large. Without `replace` it raises one too
+    for a name that is taken.
     """
     if not _NAME.fullmatch(name) or name.endswith((".json", ".safetensors")):
         raise InputError("zoo.name", name, "letters, digits, '-', '_' and '.', and no separator")

@@ -2,7 +2,7 @@
 
 The curve is a monotone (isotonic) regression of the measured means, as a larger budget can be left unspent. The critical dose is where the
 curve, straight between two measured doses, first exceeds the limit. Its interval is a percentile bootstrap over episodes, the same for
-every dose: it says nothing of how the curve runs between two doses that lie far apart.
+every dose. It does not cover the course of the curve between two doses that lie far apart.
 """
 
 from __future__ import annotations

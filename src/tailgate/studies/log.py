@@ -1,8 +1,8 @@
 """Logs: clean and attacked episodes as Parquet, for those who learn a detector.
 
 One row per step and agent. Training episodes have seeds of the purpose `train` and development episodes of `tune`: neither ever meets the
-seeds of a board. The attacks that a suite holds out are not in its logs, so that a board also shows what a detector makes of attacks that
-it has never seen. Each cell is a separate part until all are done, so that an interrupted log goes on; the same log has the same bytes.
+seeds of a board. The attacks that a suite holds out are not in its logs: a board also shows how a detector handles unseen attacks. Each
+cell is a separate part until all are done, so that an interrupted log goes on; the same log has the same bytes.
 """
 
 from __future__ import annotations

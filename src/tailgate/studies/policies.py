@@ -119,9 +119,9 @@ def origin_of(text: str) -> dict[str, Any] | None:
 
 
 def rising(curve: object) -> bool:
-    """Return whether a learning curve still rose when training ended.
+    """Return if a learning curve still rose when training ended.
 
-    The line through its last quarter rises by more than two standard errors of its slope, and by over a twentieth of all that was learned.
+    The slope of the line through its last quarter exceeds two standard errors, and its rise a twentieth of all that was learned.
     """
     rewards = [point.get("reward") for point in curve if isinstance(point, dict)] if isinstance(curve, list) else []
     y = np.array([x for x in rewards if isinstance(x, int | float)], np.float64)

@@ -3,8 +3,8 @@
     timing advantage = P(damage | own schedule) - P(damage | yoked schedule)
 
 Yoked: the steps at which another episode of the same policy attacked, recorded with termination off; values are still chosen in its own
-state. Two more twins show what it gains by attacking in bursts, which is not timing: shuffled, as many steps of the episode at random
-times that the threat model allows, and periodic, as many evenly spread.
+state. Two more twins show the gain of attacking in bursts, which is not timing. Shuffled: as many steps of the episode at random times that
+the threat model allows. Periodic: as many, evenly spread.
 """
 
 from __future__ import annotations

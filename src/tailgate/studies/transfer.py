@@ -55,9 +55,9 @@ def transfer(
 ) -> dict[str, Any]:  # fmt: skip
     """Play, and return the report. Without `defences` the policies are played on those that they were trained on.
 
-    The word `all` means these and every registered defence that has a meaning in the scenario: those that a suite plays there, or,
-    where no suite goes, those that it admits; sentinels and what plays one episode after the other have to be named. `skipped` says who
-    is left out, and why.
+    The word `all` adds every registered defence that has a meaning in the scenario. These are the defences of the suites with it; if none
+    has it, those that the scenario admits. Sentinels, and defences that play one episode after the other, have to be named. `skipped` lists
+    who is left out, with the reason.
 
     Scenario and threat model are those of the training, which have to agree where nothing else is given. A policy that does not fit them
     (another observation or action) is skipped, with the reason.

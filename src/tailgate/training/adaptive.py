@@ -1,8 +1,8 @@
-"""Attackers trained against one defence, as a suite says: what a defence has to stand before a board ranks it.
+"""Attackers trained against one defence, as a suite says: a board ranks a defence after it has met them.
 
-An attack that was made for another defence says little: most published defences fell to the first attack that knew them (Tramèr et al.,
-On Adaptive Attacks to Adversarial Example Defenses, NeurIPS 2020). So every learner that the suite names is trained on the defence itself,
-at the suite's dose and within its threat model, black and grey box, and its policies join the attacks of that defence's rows.
+An attack that was made for another defence says little: most published defences fell to the first attack that knew them. (Tramèr et al.,
+On Adaptive Attacks to Adversarial Example Defenses, NeurIPS 2020.) So every learner that the suite names is trained on the defence itself.
+It has the suite's dose and threat model, black and grey box. Its policies join the attacks of that defence's rows.
 """
 
 from __future__ import annotations

@@ -1,14 +1,15 @@
 """Self-play: attacker and defender train in turns against growing pools; then a fresh attacker measures what the defender is worth.
 
-Round r trains attacker r against the uniform mixture of defenders 0 to r - 1, then defender r against the uniform mixture of attackers 1
-to r; defender 0 is the defence with its knobs at the menu's setting nearest to its own values. At the end the last defender is frozen,
-and an attacker with new seeds and the same budget is trained against it: the best response. The same is done for the best fixed setting.
+Round r trains attacker r against the uniform mixture of defenders 0 to r - 1. Then it trains defender r against the uniform mixture of
+attackers 1 to r. Defender 0 is the defence with its knobs at the menu's setting nearest to its own values. At the end the last defender is
+frozen, and an attacker with new seeds and the same budget is trained against it: the best response. The same is done for the best fixed
+setting.
 
     exploitability = collisions under the worst known attack - collisions under the last attacker of self-play
 
-Known are scripts, pool and fresh attackers; the worst is chosen on select seeds and reported on report seeds, for the trained defender and
-for the best fixed setting. The best answer there is does at least as much. Where the fresh attacker does less than what was known without
-it the search was too weak to say how much more, and the report says so.
+The known attacks are scripts, pool and fresh attackers. The worst is chosen on select seeds and reported on report seeds, for the trained
+defender and for the best fixed setting. The best answer there is does at least as much. If the fresh attacker does less than the other
+known attacks, the search was too weak: the report says so.
 
 A member is trained for certain opponents: a run that goes on trains again what was trained for others.
 """

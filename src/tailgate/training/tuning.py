@@ -1,8 +1,8 @@
 """Search for hyper-parameters of a learner with Optuna (Akiba et al. 2019; extra: tune).
 
-A trial trains one policy with the values that the sampler proposes, and its objective is the policy's mean outcome on fresh episodes of
-the purpose `tune`: never those that are reported. Trials are kept as a journal of JSON lines, so that the same command goes on where an
-interrupted one stopped; a trial that was cut off is marked as failed and played again, with the same values where one process searches.
+A trial trains one policy with the values that the sampler proposes. Its objective is the policy's mean outcome on fresh episodes of the
+purpose `tune`, never on those that are reported. Trials are kept as a journal of JSON lines, so that the same command goes on where an
+interrupted one stopped. A trial that was cut off is marked as failed and played again, with the same values if one process searches.
 
 A space is a mapping of dotted fields of the training's configuration to one of
 
@@ -162,7 +162,7 @@ def configured(base: TrainConfig, values: dict[str, Any]) -> TrainConfig:
     data: dict[str, Any] = {}
     for field, value in values.items():
         head, dot, leaf = field.partition(".")
-        if dot and head not in fields_of(TrainConfig):  # a learner without a field of its own
+        if dot and head not in fields_of(TrainConfig):  # a learner without a field
             head, leaf, value = "settings", head, {**data.get("settings", base.settings).get(head, {}), leaf: value}
         data[head] = {**data.get(head, getattr(base, head)), leaf: value} if dot else value
     return dataclasses.replace(base, **data)

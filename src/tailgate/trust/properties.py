@@ -2,7 +2,7 @@
 
     no_collision   G (gap > 0 and rear_gap > 0)
     brakes         whenever a gap is unsafe once an attack has begun, that car begins to brake within 0.6 s, strictly later, and
-                   brakes on for 0.5 s, or stands, or is safe again
+                   brakes on for 0.5 s, or stops, or is safe again
     detects        an alarm within ten steps of the first step of an attack; it counts under a limit of false alarms (false_alarms.py)
     error          G (error <= bound), where nobody drives
 

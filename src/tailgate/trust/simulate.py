@@ -1,10 +1,13 @@
 """Random runs of a network of stochastic timed automata, many side by side; a run depends on its own seed alone, to the bit.
 
-Semantics (David et al., "Statistical model checking for networks of priced timed automata", FORMATS 2011): a component whose invariant
-ends draws its delay uniformly from [earliest moment at which it can move, end of the invariant], one without an invariant from the
-earliest moment on exponentially with the rate of its location; one in a committed location waits for nothing and goes before all others.
-The shortest delay wins, and its component takes one of the edges that are then open to it, each as likely; every other component that
-listens to what it sends moves with it, and nobody waits for listeners. If none is open by then, everybody draws again.
+Semantics: David et al., "Statistical model checking for networks of priced timed automata", FORMATS 2011. Each component draws a delay:
+
+        with an invariant that ends    uniform in [earliest moment at which it can move, end of the invariant]
+        without one                    exponential with the rate of its location, from the earliest moment on
+        in a committed location        none: it goes before all others
+
+The shortest delay wins, and its component takes one of the edges that are then open to it, each as likely. Every other component that
+listens to what it sends moves with it; nobody waits for listeners. If none is open by then, everybody draws again.
 """
 
 from __future__ import annotations
@@ -56,6 +59,7 @@ class State(NamedTuple):
 
 
 def prepare(network: Network) -> Plan:
+    """Return a network with the rows of its values, the indices of its locations, and its edges."""
     row = {name: i for i, name in enumerate((TIME, *network.clocks, *network.variables))}
     places = tuple({place.name: i for i, place in enumerate(c.locations)} for c in network.components)
     return Plan(network, row, places, tuple(network.edges()))
@@ -114,7 +118,8 @@ def simulate(
 
     queries: what to look for, the network's own if not given; within: how long, as the longest query says if not given. stop: a run ends
     as soon as all of them have held, or no longer can as their time is over. One in which nobody can move any more lasts to the end. Raises
-    InputError for a run of more than `steps` moves or a thousand in no time (Zeno), or in which a component may neither stay nor go.
+    InputError for a run of more than `steps` moves or a thousand in no time (Zeno). The same goes for a component that may neither stay
+    nor go.
     """
     plan, asked = prepare(network), tuple(network.queries if queries is None else queries)
     until = float(within) if within is not None else max((query.within for query in asked), default=math.nan)

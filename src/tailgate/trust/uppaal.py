@@ -65,6 +65,7 @@ def _named(wanted: list[str], taken: set[str]) -> dict[str, str]:
 
 
 def names_of(network: Network) -> Names:
+    """Return identifiers of UPPAAL for all names of a network, no two alike in a scope."""
     taken: set[str] = set()
     shared = _named([TIME, *network.clocks, *network.variables, *network.channels], taken)
     drawn = dict.fromkeys(clock for c in network.components for place in c.locations for clock in draws_of(place))
@@ -81,6 +82,7 @@ def names_of(network: Network) -> Names:
 
 
 def number(value: float) -> str:
+    """Return a number as UPPAAL reads it: whole ones without a point."""
     return str(int(value)) if value == int(value) and abs(value) <= LITERAL else repr(float(value))
 
 
@@ -97,6 +99,7 @@ def condition(atoms: tuple[Atom, ...], names: Names) -> str:
 
 
 def formula(query: Query, names: Names) -> str:
+    """Return a query in UPPAAL's language."""
     return f"Pr[<={number(query.within)}](<> {condition(query.holds, names)})"
 
 
